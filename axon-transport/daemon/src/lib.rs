@@ -1,17 +1,22 @@
 #![doc = include_str!("../README.md")]
 #![deny(unsafe_code)]
 
+#[doc(hidden)]
+pub mod bridge;
+mod check;
 mod control;
 mod discovery;
 mod engine;
+mod error;
 mod files;
-mod gateway;
+mod identity;
 mod keys;
 mod link;
 mod owner;
 mod reactor;
 #[cfg(test)]
 mod residue;
+mod watch;
 mod wire;
 
 /// The system's allocator, which in a daemon erases each block of at most 64 KiB before it is freed, and when it
@@ -28,17 +33,19 @@ mod wire;
 /// It erases nothing until [`run`] or [`main`] is called, so the program's other commands pay for one load.
 #[doc(inline)]
 pub use axon_shm::internal::ErasingHeap;
+pub use check::check;
 pub use control::{DaemonError, DaemonOptions, Start, log, main, run};
-pub use gateway::{GatewayError, check};
+pub use error::GatewayError;
 
 /// What the other crates of AXON and its tests use of this one. It is not part of its interface, and changes
 /// with any release.
 #[doc(hidden)]
 pub mod internal {
     pub use crate::{
+        bridge,
         control::GatewayEntry,
         discovery::{quic_ports, shared_group},
-        gateway::{Refusal, RefusedBy, attempt, bridge},
+        engine::refusal::{Refusal, RefusedBy},
     };
 
     /// Keys and the KME.

@@ -22,7 +22,7 @@ use super::{
     listen::{InternalPeer, serve},
     plane::Control,
 };
-use crate::gateway::bridge::{CHANNEL, GatewayParts, ToControl, ToGateway};
+use crate::bridge::{CHANNEL, GatewayParts, ToControl, ToGateway};
 
 /// What runs on the gateway's thread.
 pub type GatewayEntry = fn(GatewayParts) -> Result<(), String>;

@@ -37,7 +37,7 @@ use super::{
     plane::Control,
     turns::Turn,
 };
-use crate::{control::relayed::DaemonRelay, gateway::watch::watch};
+use crate::{control::relayed::DaemonRelay, watch::watch};
 
 /// How long a connection may take to say HELLO.
 const HELLO: Duration = Duration::from_secs(5);

@@ -2,7 +2,7 @@
 //! other hosts.
 //!
 //! It runs on the thread that calls [`run`]. The gateway to other hosts has a separate thread and runtime; the two
-//! share only `gateway::bridge`. Samples between processes of this host pass neither.
+//! share only `bridge`. Samples between processes of this host pass neither.
 
 mod admission;
 mod conversation;

@@ -26,8 +26,8 @@ use tokio::sync::{Notify, watch};
 
 use super::{admission::Admission, turns::Turns};
 use crate::{
+    bridge::{OTHER_TOPICS, ToControl},
     discovery::Wanted,
-    gateway::bridge::{OTHER_TOPICS, ToControl},
     owner::SessionKeys,
 };
 

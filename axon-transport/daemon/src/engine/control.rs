@@ -1,15 +1,16 @@
 //! The control stream of a connection: messages of the link protocol, each in a frame behind its length
 //! (`docs/formats.md`, section 4).
 
-use std::{collections::VecDeque, sync::Arc, time::Duration};
+use std::{collections::VecDeque, rc::Rc, time::Duration};
 
 use bytes::{Buf, Bytes};
 use quinn_proto::{ReadError, ReadableError, StreamId, WriteError};
 
 use crate::{
-    gateway::account::{Charge, Meter, cost, cost_of_frame},
+    engine::account::{Charge, Meter, cost, cost_of_frame},
     link::{
-        FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, Message, is_known, read_length,
+        CloseCode, FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, Message, is_known,
+        read_length,
     },
 };
 
@@ -27,10 +28,21 @@ pub(crate) enum ControlError {
     Frame(#[from] FrameError),
     /// The stream ended.
     #[error("the control stream ended: {0}")]
-    Ended(&'static str),
+    Ended(String),
     /// The peer does not read the messages.
     #[error("control messages are not read")]
     Unread,
+}
+
+impl ControlError {
+    /// The code with which the link is closed; `None` when the stream ended.
+    pub(crate) fn code(&self) -> Option<CloseCode> {
+        match self {
+            Self::Frame(FrameError::TooLarge { .. }) | Self::Unread => Some(CloseCode::TooLarge),
+            Self::Frame(_) => Some(CloseCode::Malformed),
+            Self::Ended(_) => None,
+        }
+    }
 }
 
 /// What may be read, as far as the link has been opened.
@@ -46,10 +58,6 @@ impl FrameLimits {
     /// Before the peer's HELLO was checked.
     pub(crate) const BEFORE_HELLO: Self =
         Self { frame: MAX_FRAME_BEFORE_HELLO, inflated: MAX_FRAME_BEFORE_HELLO };
-    /// After HELLO, before the peer has proven who it is.
-    pub(crate) const UNPROVEN: Self = Self { frame: MAX_FRAME, inflated: MAX_FRAME_BEFORE_HELLO };
-    /// The peer has proven who it is.
-    pub(crate) const PROVEN: Self = Self { frame: MAX_FRAME, inflated: MAX_INFLATED };
 }
 
 /// The control stream.
@@ -60,7 +68,7 @@ pub(crate) struct Control {
     /// Frames that wait, with what they weigh on the account.
     out: VecDeque<(Bytes, Option<Charge>)>,
     queued: usize,
-    meter: Option<Arc<Meter>>,
+    meter: Option<Rc<Meter>>,
     /// Nothing is sent after the frames that wait.
     finishing: bool,
     finished: bool,
@@ -115,7 +123,7 @@ impl Control {
     }
 
     /// Messages that wait count against this meter from now on.
-    pub(super) fn charge_to(&mut self, meter: Arc<Meter>) {
+    pub(super) fn charge_to(&mut self, meter: Rc<Meter>) {
         self.meter = Some(meter);
     }
 
@@ -279,9 +287,11 @@ impl Control {
         let mut stream = quic.recv_stream(stream);
         let mut chunks = match stream.read(true) {
             Ok(chunks) => chunks,
-            Err(ReadableError::ClosedStream) => return Err(ControlError::Ended("it is closed")),
+            Err(ReadableError::ClosedStream) => {
+                return Err(ControlError::Ended("it is closed".into()));
+            }
             Err(ReadableError::IllegalOrderedRead) => {
-                return Err(ControlError::Ended("it was read out of order"));
+                return Err(ControlError::Ended("it was read out of order".into()));
             }
         };
         let next = chunks.next(usize::MAX);
@@ -292,12 +302,12 @@ impl Control {
                 self.piece = chunk.bytes;
                 Ok(true)
             }
-            Ok(None) => Err(ControlError::Ended("the peer finished it")),
+            Ok(None) => Err(ControlError::Ended("the peer finished it".into())),
             Err(ReadError::Blocked) => {
                 self.readable = false;
                 Ok(false)
             }
-            Err(ReadError::Reset(_)) => Err(ControlError::Ended("the peer reset it")),
+            Err(ReadError::Reset(_)) => Err(ControlError::Ended("the peer reset it".into())),
         }
     }
 }

@@ -11,12 +11,12 @@ use axon_transport::config::{Config, Security};
 use rustls_pki_types::CertificateDer;
 
 use crate::{
-    gateway::{
-        GatewayError,
-        endpoint::transport,
-        identity::Identity,
+    engine::{
         tls_settings::{psk_kex, tls_cipher},
+        transport::transport,
     },
+    error::GatewayError,
+    identity::Identity,
     keys::{Attempt, Resolver},
     link::Side,
 };

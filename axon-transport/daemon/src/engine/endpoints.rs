@@ -181,9 +181,4 @@ impl Endpoints {
     pub(super) fn poll_packet(&mut self) -> Option<Packet> {
         self.packets.pop_front()
     }
-
-    /// Connections that are not over, of all endpoints.
-    pub(super) fn open_connections(&self) -> usize {
-        self.all.iter().map(|(_, endpoint)| endpoint.open_connections()).sum()
-    }
 }

@@ -17,7 +17,7 @@ use axon_envelope::{KeyId, KmeKey};
 use axon_transport::config::{Config, KeyMode, QkdConfig, Security};
 
 use crate::{
-    gateway::{keyring::warn_disagreement, tls_settings::tls_cipher},
+    engine::tls_settings::tls_cipher,
     keys::{
         Acceptor, Answer, Clock, Completion, Dial, Dialler, Event, Exporters, KeyMessage, Origin,
         Receiver, Request, Resolver, Sender, Statistics, SupplyError, UsedStatistics,
@@ -453,4 +453,15 @@ impl PeerKeys {
             warn_disagreement(config, &self.sae, &disagreement);
         }
     }
+}
+
+/// The peer's KME gave it another key than this host's KME gave here, under the same key_ID.
+pub(crate) fn warn_disagreement(config: &QkdConfig, peer: &str, what: &impl fmt::Display) {
+    tracing::warn!(
+        "the KMEs disagree about {what}: SAE {} has one key from {}, SAE {peer} another one from \
+         its own KME. It is given up and protects nothing. If this comes again, have the operators \
+         of both KMEs compare what they hold for these two SAEs",
+        config.sae_id,
+        config.kme_url,
+    );
 }

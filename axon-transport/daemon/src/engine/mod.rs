@@ -6,21 +6,28 @@
 
 #![forbid(unsafe_code)]
 
+pub(crate) mod account;
 pub(crate) mod connection;
 pub(crate) mod control;
+pub(crate) mod counters;
 pub(crate) mod credentials;
 pub(crate) mod endpoints;
+pub(crate) mod frames;
 pub(crate) mod inbound;
 pub(crate) mod keyring;
 pub(crate) mod link;
 pub(crate) mod links;
 pub(crate) mod outbound;
+mod pace;
 pub(crate) mod peer;
 pub(crate) mod protection;
+pub(crate) mod refusal;
 pub(crate) mod rings;
 #[cfg(test)]
 mod sim;
 pub(crate) mod stand_in;
+pub(crate) mod tls_settings;
+pub(crate) mod transport;
 
 use std::{
     cell::RefCell,
@@ -45,20 +52,19 @@ use self::{
     stand_in::StandIns,
 };
 use crate::{
-    gateway::{
-        GatewayError,
-        bridge::{ToControl, ToGateway},
-        counters::{self, Counters, Loss},
-        dial::Target,
-        hub::Local,
-        keyring::lock,
+    bridge::{ToControl, ToGateway},
+    engine::{
+        counters::{Counters, Loss},
+        link::target::Target,
         peer::{
+            Local,
             graph::{GraphChange, GraphTaken},
             owners::Prover,
+            stalls::Stalls,
         },
         refusal::{Refusal, RefusedBy},
-        stalls::Stalls,
     },
+    error::GatewayError,
     keys::{self, Origin, Request},
     link::{CloseCode, GraphResync, Message},
     owner::SessionKeys,
@@ -132,8 +138,7 @@ impl Engine {
     /// The settings make no TLS server.
     pub(crate) fn new(parts: EngineParts) -> Result<Self, GatewayError> {
         let EngineParts { links, rings, session_keys, session, epoch_nanos } = parts;
-        let (config, daemon, epoch) =
-            (Arc::clone(&links.config), links.hello.daemon, links.epoch);
+        let (config, daemon, epoch) = (Arc::clone(&links.config), links.hello.daemon, links.epoch);
         Ok(Self {
             budget: Budget::new(config.reliable_queue),
             config,
@@ -283,7 +288,9 @@ impl Engine {
             LinkEvent::Message(number, daemon, message) => {
                 self.handle_message(number, daemon, message, now);
             }
-            LinkEvent::Stream(number, daemon, event) => self.handle_stream(number, daemon, event, now),
+            LinkEvent::Stream(number, daemon, event) => {
+                self.handle_stream(number, daemon, event, now)
+            }
             LinkEvent::Keys(daemon) => {
                 if let Some(peer) = self.peers.get_mut(&daemon) {
                     peer.outbound.handle_keys();
@@ -325,15 +332,15 @@ impl Engine {
         let serves = summary.hello.routes.map_or(ROUTES_UNSAID, |routes| routes as usize);
         let needed = self.links.credentials.authenticates();
         let prover = Prover::new(&self.session_keys, self.daemon, needed, binding);
-        let counters = Arc::<Counters>::default();
+        let counters = Rc::<Counters>::default();
         let inbound = Inbound::new(
-            Arc::clone(&counters),
-            Arc::clone(&account.messages),
+            Rc::clone(&counters),
+            Rc::clone(&account.messages),
             self.config.max_message,
             self.epoch_nanos,
         );
         let stalled = self.config.link.stalled;
-        let outbound = Outbound::new(self.budget.of_peer(), Arc::clone(&counters), stalled, now);
+        let outbound = Outbound::new(self.budget.of_peer(), Rc::clone(&counters), stalled, now);
         let parts = PeerParts {
             daemon,
             link: number,
@@ -367,7 +374,8 @@ impl Engine {
                 }
             }
             message => {
-                let handled = self.with_peer(daemon, |p, with| p.handle_message(message, with, now));
+                let handled =
+                    self.with_peer(daemon, |p, with| p.handle_message(message, with, now));
                 if let Some(Err((code, why))) = handled {
                     self.links.violation(number, code, &why, now);
                 }
@@ -426,7 +434,8 @@ impl Engine {
                     peer.inbound.forget_stream((number, stream));
                     continue;
                 };
-                if let Err((code, why)) = peer.inbound.read((number, stream), quic, &mut open, now) {
+                if let Err((code, why)) = peer.inbound.read((number, stream), quic, &mut open, now)
+                {
                     violations.push((number, code, why));
                 }
                 self.links.touch(number);
@@ -516,14 +525,14 @@ impl Engine {
         let stirred: Vec<_> = stirred.map(|(daemon, _)| *daemon).collect();
         for daemon in stirred {
             let Some(peer) = self.peers.get_mut(&daemon) else { continue };
-            let account = Arc::clone(peer.remote.account());
-            if !lock(&account.turns).take(self.epoch + now) {
+            let account = Rc::clone(peer.remote.account());
+            if !account.turns.borrow_mut().take(self.epoch + now) {
                 continue;
             }
             peer.stirred = false;
             let endpoints = self.follow_graph(daemon, now) + self.local.len();
             let took = ENDPOINT * u32::try_from(endpoints).unwrap_or(u32::MAX);
-            lock(&account.turns).over(self.epoch + now, self.epoch + now + took);
+            account.turns.borrow_mut().over(self.epoch + now, self.epoch + now + took);
         }
     }
 
@@ -570,9 +579,8 @@ impl Engine {
     /// claim of another host is ignored.
     fn taken_over(&mut self, daemon: DaemonId, added: &[RemoteEndpoint]) -> Vec<u64> {
         let mut dead = Vec::new();
-        let identity = |engine: &Self, daemon: DaemonId| {
-            engine.links.identity(engine.links.current(daemon)?)
-        };
+        let identity =
+            |engine: &Self, daemon: DaemonId| engine.links.identity(engine.links.current(daemon)?);
         let Some(owner) = identity(self, daemon) else { return dead };
         let others: Vec<_> = self.peers.keys().filter(|d| **d != daemon).copied().collect();
         for other in others {
@@ -691,7 +699,7 @@ impl Engine {
         let peers = self.peers.values().flat_map(|peer| {
             let turn = peer.stirred.then(|| {
                 let account = peer.remote.account();
-                now + lock(&account.turns).wait(self.epoch + now)
+                now + account.turns.borrow_mut().wait(self.epoch + now)
             });
             let more = peer.inbound.has_work().then_some(now);
             let samples = [peer.inbound.poll_timeout(), peer.outbound.poll_timeout()];
@@ -782,10 +790,5 @@ impl Engine {
     /// Whether all connections are over.
     pub(crate) fn is_idle(&self) -> bool {
         self.links.is_idle()
-    }
-
-    /// Addresses of listed peers.
-    pub(crate) fn set_listed(&mut self, listed: BTreeSet<IpAddr>) {
-        self.links.set_listed(listed);
     }
 }

@@ -2,15 +2,18 @@
 
 use std::{borrow::Cow, time::Duration};
 
-use axon_envelope::{Delivery, Kind, Route, inner};
+use axon_envelope::{Delivery, Kind, OpenError, Route, TAG_LEN, inner};
 use axon_shm::ids::Gid;
 
 use super::rings::Sample;
 use crate::{
-    gateway::{frames::Frames, protection::RefusedMessage},
+    engine::frames::Frames,
     keys::{NoKey, Receiver, Sender},
 };
 use axon_transport::internal::session::unix_nanos;
+
+/// Largest inner header and envelope around a payload.
+pub(crate) const MAX_OVERHEAD: usize = axon_envelope::MAX_HEADER_LEN + inner::LEN + TAG_LEN;
 
 /// Bytes of the length before each message.
 const LENGTH: usize = 4;
@@ -184,4 +187,34 @@ pub(crate) fn writer_of(kind: Kind, of: Gid, header: &inner::Header) -> Result<G
         Kind::Response => header.request_id == call,
     };
     if fits { Ok(writer) } else { Err("a message names another publisher or call than its stream") }
+}
+
+/// Why a message is refused.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub(crate) enum RefusedMessage {
+    /// The envelope; the cause is for the local log alone.
+    #[error("{text}")]
+    Envelope {
+        /// Cause for log and status.
+        text: String,
+    },
+    /// The inner header or the compression.
+    #[error("{0}")]
+    Malformed(String),
+}
+
+impl RefusedMessage {
+    /// An envelope that was refused.
+    pub(crate) fn of_envelope(error: &OpenError) -> Self {
+        Self::Envelope { text: cause(error) }
+    }
+}
+
+/// For the local log: never told to the peer.
+fn cause(error: &OpenError) -> String {
+    match error.cause() {
+        Some(cause) => format!("envelope refused: {cause}"),
+        None => format!("envelope refused: {error}"),
+    }
 }

@@ -14,7 +14,7 @@ use axon_transport::{
 };
 
 use super::rings::{RingError, RingWriter, Rings};
-use crate::gateway::account::{Account, Charge};
+use crate::engine::account::{Account, Charge};
 
 /// A stand-in. A link and its successor share it.
 pub(crate) struct StandIn {

@@ -14,8 +14,9 @@ use tokio::{
 
 use super::rings::ShmRings;
 use crate::{
-    gateway::{bridge::ToGateway, watch::watch},
+    bridge::ToGateway,
     keys::{Event, Events, Statistics, UsedStatistics},
+    watch::watch,
 };
 
 /// Inputs of one kind that one pass takes.

@@ -4,7 +4,7 @@ use axon_transport::config::{Config, Security};
 use tokio::runtime::{Builder, Runtime};
 
 use crate::{
-    gateway::GatewayError,
+    error::GatewayError,
     keys::{Events, Kme, UsedKeys},
 };
 
@@ -21,8 +21,11 @@ pub(super) struct KmeThread {
 /// The settings make no client, or there is no thread for it.
 pub(super) fn start(config: &Config) -> Result<Option<(KmeThread, Events)>, GatewayError> {
     let Security::Qkd(qkd) = &config.security else { return Ok(None) };
-    let runtime =
-        Builder::new_multi_thread().worker_threads(1).thread_name("axon-kme").enable_all().build()?;
+    let runtime = Builder::new_multi_thread()
+        .worker_threads(1)
+        .thread_name("axon-kme")
+        .enable_all()
+        .build()?;
     let used = UsedKeys::open(config.runtime_dir.as_deref(), config.domain);
     let (kme, events) = {
         let _entered = runtime.enter();

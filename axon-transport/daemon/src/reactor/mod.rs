@@ -4,6 +4,7 @@
 //! and carries out its effects. The KME client has a thread of its own, and files are read and written on others.
 //! Timers have a granularity of 1 ms.
 
+mod bind;
 mod finishing;
 mod inputs;
 mod kme;
@@ -29,13 +30,13 @@ use self::{
     sockets::Sockets,
 };
 use crate::{
-    engine::{Engine, EngineParts, credentials::Credentials, links::LinkParts, peer::MAX_ROUTES},
-    gateway::{
-        GatewayError,
-        bridge::{GatewayParts, ToControl},
-        context::load_identity,
-        endpoint::{endpoint_config, reset_key},
+    bridge::{GatewayParts, ToControl},
+    engine::{
+        Engine, EngineParts, credentials::Credentials, links::LinkParts, peer::MAX_ROUTES,
+        transport::endpoint_config,
     },
+    error::GatewayError,
+    identity,
     keys::Events,
     link::Hello,
 };
@@ -50,7 +51,8 @@ const LAST_TASKS: Duration = Duration::from_secs(1);
 pub(crate) fn run(parts: GatewayParts) -> Result<(), GatewayError> {
     let runtime = Builder::new_current_thread().enable_all().build()?;
     let (kme, events) = kme::start(&parts.config)?.unzip();
-    let (kme, kme_runtime) = kme.map(|KmeThread { kme, used, runtime }| ((kme, used), runtime)).unzip();
+    let (kme, kme_runtime) =
+        kme.map(|KmeThread { kme, used, runtime }| ((kme, used), runtime)).unzip();
     let result = runtime.block_on(serve(parts, kme, events));
     let runtimes: [Option<Runtime>; 2] = [Some(runtime), kme_runtime];
     runtimes.into_iter().flatten().for_each(|runtime| runtime.shutdown_timeout(LAST_TASKS));
@@ -66,7 +68,7 @@ async fn serve(
     let mut hello = Hello::new(&config, daemon);
     hello.routes = u32::try_from(MAX_ROUTES).ok();
     let identity = match &config.security {
-        Security::Classic(classic) => Some(Arc::new(load_identity(classic, &hello.host)?)),
+        Security::Classic(classic) => Some(Arc::new(identity::load(classic, &hello.host)?)),
         Security::Qkd(_) => None,
     };
     if let Some(identity) = &identity {
@@ -76,7 +78,7 @@ async fn serve(
     let port = sockets.port();
     let (session, notices) = session::open(socket, &config)?;
     let rings = ShmRings::new(session.clone())?;
-    let reset = reset_key(config.runtime_dir.as_deref(), config.domain);
+    let reset = bind::reset_key(config.runtime_dir.as_deref(), config.domain);
     let mut of_session = [0; 12];
     of_session.copy_from_slice(&session.id().0[..12]);
     let epoch = Instant::now();

@@ -26,12 +26,10 @@ use super::{
     told::Told,
 };
 use crate::{
+    bridge::{ToControl, ToGateway},
     engine::{Effect, Engine},
-    gateway::{
-        GatewayError,
-        bridge::{ToControl, ToGateway},
-        identity::Identity,
-    },
+    error::GatewayError,
+    identity::Identity,
     keys::{Event, Events, Kme, UsedKeys},
 };
 
@@ -354,7 +352,8 @@ impl Reactor {
         // Datagrams stay with the kernel while the control plane is far behind.
         let reads = !told.is_behind();
         let ready = poll_fn(|cx| {
-            let ready = inputs.poll_ready(cx).is_ready() | (reads && sockets.poll_ready(cx).is_ready());
+            let ready =
+                inputs.poll_ready(cx).is_ready() | (reads && sockets.poll_ready(cx).is_ready());
             if ready { Poll::Ready(()) } else { Poll::Pending }
         });
         let slept = async {

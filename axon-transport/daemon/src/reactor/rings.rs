@@ -1,10 +1,6 @@
 //! The rings of this host as shared memory: relay subscriptions and stand-ins of the gateway's session.
 
-use std::{
-    cell::Cell,
-    collections::HashMap,
-    rc::Rc,
-};
+use std::{cell::Cell, collections::HashMap, rc::Rc};
 
 use axon_shm::{ExternalLeader, Meta, PublishError, ShmError, ids::Gid};
 use axon_transport::{

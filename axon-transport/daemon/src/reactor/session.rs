@@ -15,7 +15,7 @@ use axon_transport::{
 };
 use tokio::sync::Notify;
 
-use crate::gateway::hub::Local;
+use crate::engine::peer::Local;
 
 /// Events of the session, which its own thread reports.
 #[derive(Debug, Default)]

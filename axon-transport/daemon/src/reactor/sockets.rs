@@ -12,7 +12,7 @@ use quinn_proto::{EcnCodepoint, Transmit};
 use quinn_udp::{RecvMeta, UdpSockRef, UdpSocketState};
 use tokio::{io::Interest, net::UdpSocket};
 
-use crate::gateway::{EndpointError, endpoint::bind_daemon};
+use crate::{error::EndpointError, reactor::bind::bind_daemon};
 
 /// Messages that one system call receives. Each holds as many datagrams as the kernel coalesced.
 const MESSAGES: usize = 8;
@@ -173,9 +173,9 @@ impl Socket {
             segment_size: transmit.segment_size,
             src_ip: transmit.src_ip,
         };
-        let sent = self.io.try_io(Interest::WRITABLE, || {
-            self.state.send(UdpSockRef::from(&self.io), &transmit)
-        });
+        let sent = self
+            .io
+            .try_io(Interest::WRITABLE, || self.state.send(UdpSockRef::from(&self.io), &transmit));
         // Any other error is a lost packet.
         !sent.is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock)
     }

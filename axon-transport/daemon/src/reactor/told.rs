@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 use tokio::sync::mpsc::{Sender, error::TrySendError};
 
-use crate::gateway::bridge::{CHANNEL, ToControl};
+use crate::bridge::{CHANNEL, ToControl};
 
 /// Messages to the control plane, those that find the channel full among them.
 pub(super) struct Told {
@@ -81,11 +81,17 @@ mod tests {
                 told.send_next().await;
             }
         }
-        assert!(matches!(seen[..], [
-            Some(ToControl::Draining(true)),
-            Some(ToControl::Draining(false)),
-            Some(ToControl::Draining(true)),
-        ]), "{seen:?}");
+        assert!(
+            matches!(
+                seen[..],
+                [
+                    Some(ToControl::Draining(true)),
+                    Some(ToControl::Draining(false)),
+                    Some(ToControl::Draining(true)),
+                ]
+            ),
+            "{seen:?}"
+        );
         assert!(control.try_recv().is_err());
     }
 }

@@ -7,7 +7,7 @@ use axon_shm::ids::Gid;
 use bytes::{Bytes, BytesMut};
 use quinn_proto::{ReadError, ReadableError, StreamId};
 
-use crate::gateway::account::Charge;
+use crate::engine::account::Charge;
 
 /// Bytes of a stream's header.
 pub(super) const HEADER: usize = 24;
@@ -49,6 +49,15 @@ impl StreamHeader {
         gid.copy_from_slice(of);
         Ok(Self { reliable: kind == RELIABLE, route: u32::from_be_bytes(number), of: Gid(gid) })
     }
+}
+
+/// The header of a data stream.
+pub(crate) fn stream_header(reliable: bool, route: u32, gid: Gid) -> [u8; HEADER] {
+    let mut header = [0; HEADER];
+    header[0] = if reliable { RELIABLE } else { BEST_EFFORT };
+    header[4..8].copy_from_slice(&route.to_be_bytes());
+    header[8..].copy_from_slice(&gid.0);
+    header
 }
 
 /// What came of asking a stream for bytes.
@@ -172,7 +181,7 @@ fn next_chunk(id: StreamId, quic: &mut quinn_proto::Connection) -> Result<Option
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gateway::inbound::stream_header;
+    use crate::engine::inbound::stream_header;
 
     #[test]
     fn a_header_that_is_not_one_is_refused() {

@@ -23,6 +23,7 @@ use axon_transport::internal::{log_limit::LogLimit, session::Written};
 use bytes::Bytes;
 use quinn_proto::{StreamId, VarInt};
 
+pub(crate) use self::incoming::stream_header;
 use self::{
     incoming::{HEADER, Incoming, Message, Piece, Step, StreamHeader},
     receipts::Receipts,
@@ -33,7 +34,7 @@ use super::{
     stand_in::StandIn,
 };
 use crate::{
-    gateway::{
+    engine::{
         account::Meter,
         counters::Counters,
         protection::{MAX_OVERHEAD, RefusedMessage},
@@ -96,8 +97,8 @@ pub(crate) struct Inbound {
     /// Streams that wait for memory.
     without_room: VecDeque<Key>,
     receipts: Receipts,
-    counters: Arc<Counters>,
-    intake: Arc<Meter>,
+    counters: Rc<Counters>,
+    intake: Rc<Meter>,
     max_message: u64,
     /// CLOCK_MONOTONIC, in nanoseconds, when the engine's time was zero.
     epoch_nanos: u64,
@@ -107,8 +108,8 @@ pub(crate) struct Inbound {
 impl Inbound {
     /// Takes nothing yet. `intake` is the memory for long messages.
     pub(crate) fn new(
-        counters: Arc<Counters>,
-        intake: Arc<Meter>,
+        counters: Rc<Counters>,
+        intake: Rc<Meter>,
         max_message: u64,
         epoch_nanos: u64,
     ) -> Self {

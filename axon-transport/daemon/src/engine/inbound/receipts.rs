@@ -31,13 +31,7 @@ pub(super) struct Receipts {
 
 impl Receipts {
     /// A sample is in the ring, or was before.
-    pub(super) fn came(
-        &mut self,
-        flow: (u32, Gid),
-        sequence: u64,
-        bytes: usize,
-        now: Duration,
-    ) {
+    pub(super) fn came(&mut self, flow: (u32, Gid), sequence: u64, bytes: usize, now: Duration) {
         self.note(flow, sequence, 0, bytes, now);
     }
 
@@ -46,14 +40,7 @@ impl Receipts {
         self.note(flow, sequence, 1, 0, now);
     }
 
-    fn note(
-        &mut self,
-        flow: (u32, Gid),
-        sequence: u64,
-        dropped: u64,
-        bytes: usize,
-        now: Duration,
-    ) {
+    fn note(&mut self, flow: (u32, Gid), sequence: u64, dropped: u64, bytes: usize, now: Duration) {
         let due = self.due.entry(flow).or_default();
         due.sequence = due.sequence.max(sequence);
         due.dropped += dropped;

@@ -9,13 +9,12 @@ use axon_envelope::KeyId;
 use quinn_proto::{ConnectError, ConnectionError};
 
 use crate::{
-    engine::keyring::Keyring,
-    gateway::{
-        Refusal,
-        dial::{
+    engine::{
+        keyring::{Keyring, warn_disagreement},
+        link::target::{
             DECRYPT_ERROR, HANDSHAKE_TIMEOUT, Target, UNKNOWN_PSK_IDENTITY, Unreached, dial_limit,
         },
-        keyring::warn_disagreement,
+        refusal::Refusal,
     },
     keys::{Attempt, Completion, Dial},
     link::CloseCode,

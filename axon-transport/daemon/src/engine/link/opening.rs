@@ -16,12 +16,11 @@ use rustls_pki_types::CertificateDer;
 
 use super::proving::Proving;
 use crate::{
-    engine::keyring::Keyring,
-    engine::control::FrameLimits,
-    gateway::{
-        Refusal,
-        control::ControlError,
-        establish::{Failure, HELLO_TIMEOUT, admits, agreed, names_its_host, reused},
+    engine::{
+        control::{ControlError, FrameLimits},
+        keyring::Keyring,
+        link::failure::{Failure, HELLO_TIMEOUT, admits, agreed, names_its_host, reused},
+        refusal::Refusal,
     },
     keys::{Answer, Completion, Exporters, Origin, Request},
     link::{

@@ -3,12 +3,12 @@
 use std::{mem, net::IpAddr, time::Duration};
 
 use axon_envelope::{KeyId, KmeKey};
+use axon_transport::config::QkdConfig;
 
 use crate::{
-    engine::keyring::Keyring,
-    gateway::{
-        establish::{Failure, proof_limit},
-        prove::unproven,
+    engine::{
+        keyring::Keyring,
+        link::failure::{Failure, proof_limit},
     },
     keys::{
         Acceptor, Answer, ClientProof, Exporters, KeyMessage, Origin, ProofFailure, ProofResponder,
@@ -264,4 +264,20 @@ fn attach(
 ) -> Result<(), Failure> {
     let internal = |e| Failure::Ours(CloseCode::Internal, format!("message keys: {e}"));
     keyring.attach_receiver(now, connection, sae, exporters).map_err(internal)
+}
+
+/// What the peer is told, and what the log says: there is more in it where keys differ.
+fn unproven(config: &QkdConfig, failure: &ProofFailure) -> Failure {
+    let code = CloseCode::from_code(failure.code()).unwrap_or(CloseCode::Proof);
+    if !matches!(failure, ProofFailure::WrongProof(_)) {
+        return Failure::Ours(code, failure.to_string());
+    }
+    let told = "the proof does not fit the announced key";
+    let why = format!(
+        "{failure}: it holds another key than this host, SAE {}, has from {}. Either the two KMEs \
+         disagree, and their operators must compare what they hold for these two SAEs, or somebody \
+         poses as that SAE",
+        config.sae_id, config.kme_url,
+    );
+    Failure::Quietly { code, told, why }
 }

@@ -1,6 +1,6 @@
 //! Which of several connections with a peer becomes its link, and when a link is renewed.
 
-use std::{net::IpAddr, sync::Arc, time::Duration};
+use std::{net::IpAddr, rc::Rc, time::Duration};
 
 use axon_shm::ids::DaemonId;
 use quinn_proto::{Dir, VarInt};
@@ -11,15 +11,15 @@ use super::{
 };
 use crate::{
     discovery::AddressConfidence,
-    engine::link::opening::{Opened, Sealing},
-    gateway::{
-        Refusal,
-        dial::Target,
-        endpoint::{LINK_WINDOW, STREAMS_OPEN},
-        establish::peer_text,
-        hub::Summary,
-        shares::gives_way,
-        status::Who,
+    engine::{
+        link::{
+            failure::peer_text,
+            opening::{Opened, Sealing},
+            target::Target,
+        },
+        links::{link::Summary, shares::gives_way, who::Who},
+        refusal::Refusal,
+        transport::{LINK_WINDOW, STREAMS_OPEN},
     },
     link::{Candidate, CloseCode, Elected, Message, Side, keep},
 };
@@ -50,7 +50,8 @@ impl Links {
         }
         let auth = self.credentials.auth();
         let who = Who::of(self.keyring.is_some(), auth.as_ref(), &hello, &negotiated);
-        let current = self.current(daemon).and_then(|number| self.links.get(&number)?.peer.as_ref());
+        let current =
+            self.current(daemon).and_then(|number| self.links.get(&number)?.peer.as_ref());
         if current.is_some_and(|current| !current.summary.who.is(&who)) {
             return self.turn_away(number, &hello, TAKEN.into(), now);
         }
@@ -73,7 +74,8 @@ impl Links {
             self.links.remove(&number);
             return self.close_connection(number, CloseCode::NotAllowed, text, now);
         }
-        let current = self.current(daemon).and_then(|number| self.links.get(&number)?.peer.as_ref());
+        let current =
+            self.current(daemon).and_then(|number| self.links.get(&number)?.peer.as_ref());
         let successor = replaces.is_some()
             && current.is_some_and(|current| current.elected.map(|e| e.link) == replaces);
         let candidate = Candidate { side, successor };
@@ -88,7 +90,7 @@ impl Links {
         }
         let account = self.accounts.of(&who.host_identity(address));
         let Some(connection) = self.connections.get_mut(&number) else { return };
-        connection.control.charge_to(Arc::clone(&account.unsent));
+        connection.control.charge_to(Rc::clone(&account.unsent));
         let Some(link) = self.links.get_mut(&number) else { return };
         link.phase = Phase::Electing(now + ELECTION_TIMEOUT);
         link.peer = Some(LinkPeer {
@@ -118,13 +120,7 @@ impl Links {
         self.touch(number);
     }
 
-    fn turn_away(
-        &mut self,
-        number: u64,
-        hello: &crate::link::Hello,
-        why: String,
-        now: Duration,
-    ) {
+    fn turn_away(&mut self, number: u64, hello: &crate::link::Hello, why: String, now: Duration) {
         let address = self.connections.get(&number).map(|c| c.quic.remote_address());
         self.links.remove(&number);
         self.close_connection(number, CloseCode::NotAllowed, &why, now);
@@ -161,7 +157,9 @@ impl Links {
 
     /// A link is elected: it carries samples from now on.
     pub(super) fn open(&mut self, number: u64, elected: Elected, now: Duration) {
-        let Some(peer) = self.links.get(&number).and_then(|link| link.peer.as_ref()) else { return };
+        let Some(peer) = self.links.get(&number).and_then(|link| link.peer.as_ref()) else {
+            return;
+        };
         let daemon = peer.summary.hello.daemon;
         let current = self.current(daemon);
         let current_peer = current.and_then(|number| self.links.get(&number)?.peer.as_ref());
@@ -190,7 +188,8 @@ impl Links {
             self.hand_over(number, now);
             return;
         }
-        let sealing = self.links.get_mut(&number).and_then(|link| link.peer.as_mut()?.sealing.take());
+        let sealing =
+            self.links.get_mut(&number).and_then(|link| link.peer.as_mut()?.sealing.take());
         if let (Some(keyring), Some(Sealing { exporters, first })) = (&mut self.keyring, sealing)
             && let Err(error) = keyring.attach_sender(now, number, &exporters, first)
         {
@@ -231,7 +230,9 @@ impl Links {
 
     /// A successor is dialled, or the link is at its end.
     pub(super) fn open_timeout(&mut self, number: u64, now: Duration) {
-        let Some(peer) = self.links.get(&number).and_then(|link| link.peer.as_ref()) else { return };
+        let Some(peer) = self.links.get(&number).and_then(|link| link.peer.as_ref()) else {
+            return;
+        };
         if peer.until.is_some_and(|until| until <= now) {
             let text = "AXON_QKD_SESSION_MAX_AGE is reached and no successor came";
             self.close_connection(number, CloseCode::KeySupply, text, now);
@@ -269,11 +270,7 @@ impl Links {
     }
 
     /// Remembers for whom a connection was dialled, should its opening fail.
-    pub(super) fn note_dialled(
-        &mut self,
-        number: u64,
-        of: Option<(DaemonId, AddressConfidence)>,
-    ) {
+    pub(super) fn note_dialled(&mut self, number: u64, of: Option<(DaemonId, AddressConfidence)>) {
         self.dialled.extend(of.map(|of| (number, of)));
     }
 

@@ -9,7 +9,7 @@ use super::{
     link::{Leaving, Link, Phase},
 };
 use crate::{
-    gateway::silence::Traffic,
+    engine::links::prober::Traffic,
     link::{CloseCode, LinkClosed},
 };
 
@@ -37,9 +37,8 @@ impl Links {
         self.nonces.retain(|_, number| *number != old);
         tracing::debug!(link = old, silent, "the link is superseded");
         let leaving = self.links.iter().filter(|(_, link)| matches!(link.phase, Phase::Leaving(_)));
-        let of_identity = leaving.filter(|(_, link)| {
-            link.peer.as_ref().is_some_and(|peer| peer.summary.who.is(&who))
-        });
+        let of_identity = leaving
+            .filter(|(_, link)| link.peer.as_ref().is_some_and(|peer| peer.summary.who.is(&who)));
         let of_identity: Vec<u64> = of_identity.map(|(number, _)| *number).collect();
         if of_identity.len() > MAX_LEAVING
             && let Some(oldest) = of_identity.iter().min()
@@ -97,14 +96,18 @@ impl Links {
     /// The superseded links.
     pub(in crate::engine) fn leaving(&self) -> Vec<(u64, DaemonId)> {
         let leaving = self.links.iter().filter(|(_, link)| matches!(link.phase, Phase::Leaving(_)));
-        let of = leaving.filter_map(|(number, link)| {
-            Some((*number, link.peer.as_ref()?.summary.hello.daemon))
-        });
+        let of = leaving
+            .filter_map(|(number, link)| Some((*number, link.peer.as_ref()?.summary.hello.daemon)));
         of.collect()
     }
 
     /// Closes a superseded link once all has arrived in both directions. So many of its streams are being read.
-    pub(in crate::engine) fn look_at_leaving(&mut self, number: u64, reading: usize, now: Duration) {
+    pub(in crate::engine) fn look_at_leaving(
+        &mut self,
+        number: u64,
+        reading: usize,
+        now: Duration,
+    ) {
         let (Some(connection), Some(link)) =
             (self.connections.get_mut(&number), self.links.get_mut(&number))
         else {

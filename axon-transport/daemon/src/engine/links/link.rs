@@ -1,19 +1,22 @@
 //! One link: a connection with the state that it has as a link.
 
-use std::{sync::Arc, time::Duration};
+use std::{rc::Rc, sync::Arc, time::Duration};
 
+use axon_tls::Negotiated;
 use rustls_pki_types::CertificateDer;
 
 use crate::{
-    engine::link::opening::{Opening, Sealing},
-    gateway::{
+    engine::{
         account::{Account, Charge},
-        hub::Summary,
-        shares::Place,
-        silence::{Prober, Traffic},
+        link::opening::{Opening, Sealing},
+        links::{
+            prober::{Prober, Traffic},
+            shares::Place,
+            who::Who,
+        },
     },
     keys::Resolver,
-    link::{Candidate, Elected, Order, Side},
+    link::{Candidate, Elected, Hello, Order, Side},
 };
 
 /// How far a link has come.
@@ -59,6 +62,17 @@ pub(super) struct Link {
     pub(super) resolver: Option<Arc<Resolver>>,
 }
 
+/// What is kept of a link's beginning.
+#[derive(Clone)]
+pub(crate) struct Summary {
+    /// The peer's HELLO.
+    pub(crate) hello: Hello,
+    /// What the handshake agreed on.
+    pub(crate) negotiated: Negotiated,
+    /// As whom the peer proved itself.
+    pub(crate) who: Who,
+}
+
 /// The peer of a link.
 pub(super) struct LinkPeer {
     pub(super) summary: Summary,
@@ -73,7 +87,7 @@ pub(super) struct LinkPeer {
     pub(super) renew_at: Option<Duration>,
     pub(super) until: Option<Duration>,
     pub(super) since_unix_ms: u64,
-    pub(super) account: Arc<Account>,
+    pub(super) account: Rc<Account>,
     /// Unread stream data that the peer may send.
     pub(super) unread: Charge,
     /// The certificates that it showed.
@@ -127,9 +141,7 @@ impl Link {
             Phase::Opening(opening) => opening.poll_timeout(),
             Phase::Electing(until) => Some(*until),
             Phase::Open => None,
-            Phase::Leaving(leaving) => {
-                [leaving.until, leaving.wait].into_iter().flatten().min()
-            }
+            Phase::Leaving(leaving) => [leaving.until, leaving.wait].into_iter().flatten().min(),
         };
         let peer = self.peer.as_ref();
         let ends = peer.into_iter().filter(|_| matches!(self.phase, Phase::Open));

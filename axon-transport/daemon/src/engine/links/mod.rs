@@ -2,13 +2,18 @@
 //! successor and the close.
 
 mod election;
+mod explained;
 mod leaving;
 mod link;
+mod prober;
+mod shares;
 mod silence;
+mod who;
 
 use std::{
     collections::{BTreeSet, HashMap, HashSet, VecDeque},
     net::{IpAddr, SocketAddr},
+    rc::Rc,
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -36,21 +41,29 @@ use super::{
 };
 use crate::{
     discovery::{AddressConfidence, is_discovery},
-    gateway::{
-        Refusal,
+    engine::{
         account::{Account, Accounts},
-        accept::{HANDSHAKE_TIMEOUT, MAX_HANDSHAKES, explained},
-        dial::Target,
-        establish::peer_text,
-        hub::Summary,
-        refusal::RefusedBy,
-        shares::{Handshakes, Said},
-        status,
+        link::{
+            failure::{close_text, peer_text},
+            target::Target,
+        },
+        links::{
+            explained::explained,
+            link::Summary,
+            shares::{Handshakes, Said},
+        },
+        refusal::{Refusal, RefusedBy},
     },
     keys::{self, Exporters},
     link::{CloseCode, Hello, LinkClosed, Message, Side},
     owner::{Binding, EXPORTER},
 };
+
+/// Handshakes under way at once, but for those of listed peers; further dials are refused and come again.
+const MAX_HANDSHAKES: usize = 64;
+
+/// A dialler that has its Retry is given this long for the rest of the handshake.
+const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// What came of the links, for the owner of the peers.
 #[derive(Debug)]
@@ -107,7 +120,7 @@ pub(super) struct Links {
     dialled: HashMap<u64, (DaemonId, AddressConfidence)>,
     next_number: u64,
     next_election: u64,
-    handshakes: Arc<Handshakes>,
+    handshakes: Rc<Handshakes>,
     /// Addresses of listed peers.
     listed: BTreeSet<IpAddr>,
     crowded: Said,
@@ -149,7 +162,7 @@ impl Links {
     ///
     /// # Errors
     /// The settings make no TLS server.
-    pub(super) fn new(parts: LinkParts) -> Result<Self, crate::gateway::GatewayError> {
+    pub(super) fn new(parts: LinkParts) -> Result<Self, crate::error::GatewayError> {
         let LinkParts { config, credentials, hello, addresses, endpoint, epoch } = parts;
         let keyring = Keyring::new(&config);
         let unspecified = IpAddr::from([0, 0, 0, 0]);
@@ -426,13 +439,7 @@ impl Links {
     }
 
     /// Begins HELLO on a connection whose handshake is complete.
-    fn begin_opening(
-        &mut self,
-        number: u64,
-        ours: Hello,
-        dialled: Option<String>,
-        now: Duration,
-    ) {
+    fn begin_opening(&mut self, number: u64, ours: Hello, dialled: Option<String>, now: Duration) {
         let (Some(connection), Some(link)) =
             (self.connections.get_mut(&number), self.links.get_mut(&number))
         else {
@@ -589,7 +596,7 @@ impl Links {
                 return;
             }
             let (instant, account) =
-                (self.epoch + now, link.peer.as_ref().map(|peer| Arc::clone(&peer.account)));
+                (self.epoch + now, link.peer.as_ref().map(|peer| Rc::clone(&peer.account)));
             let owe = |cost| account.as_ref().map_or(Duration::ZERO, |a| a.owe(cost, instant));
             match connection.control.read(&mut connection.quic, owe, now) {
                 Ok(Some(message)) => self.handle_message(number, message, now),
@@ -697,12 +704,7 @@ impl Links {
             Action::Open => {
                 let Some((dialling, Some(number))) = self.dials.remove(&dial) else { return };
                 let target = dialling.target();
-                let hello = Hello {
-                    expects: target.daemon,
-                    static_peer: target.listed,
-                    replaces: target.replaces,
-                    ..self.hello.clone()
-                };
+                let hello = target.hello(&self.hello);
                 let sae = target.sae.clone();
                 self.note_dialled(number, target.daemon.zip(target.standing.clone()));
                 self.begin_opening(number, hello, sae, now);
@@ -845,8 +847,8 @@ impl Links {
     }
 
     /// The account of a link's peer.
-    pub(super) fn account(&self, number: u64) -> Option<Arc<Account>> {
-        Some(Arc::clone(&self.links.get(&number)?.peer.as_ref()?.account))
+    pub(super) fn account(&self, number: u64) -> Option<Rc<Account>> {
+        Some(Rc::clone(&self.links.get(&number)?.peer.as_ref()?.account))
     }
 
     /// Who the peer of a link proved to be, beyond its daemon id.
@@ -859,7 +861,7 @@ impl Links {
     pub(super) fn status(&self, number: u64) -> Option<LinkStatus> {
         let quic = &self.connections.get(&number)?.quic;
         let peer = self.links.get(&number)?.peer.as_ref()?;
-        Some(status::link(&peer.summary, quic.remote_address(), quic.rtt(), peer.since_unix_ms))
+        Some(who::link(&peer.summary, quic.remote_address(), quic.rtt(), peer.since_unix_ms))
     }
 
     /// Datagrams that came over a link.
@@ -927,10 +929,9 @@ impl Links {
             keyring.forget_connection(now, number);
         }
         let Some(connection) = self.connections.get_mut(&number) else { return };
-        let end = reason.char_indices().map(|(i, c)| i + c.len_utf8()).take_while(|e| *e <= 300);
-        let reason = &reason.as_bytes()[..end.last().unwrap_or(0)];
         let code = VarInt::from_u32(code.code());
-        connection.quic.close(instant, code, bytes::Bytes::copy_from_slice(reason));
+        let reason = bytes::Bytes::copy_from_slice(close_text(reason));
+        connection.quic.close(instant, code, reason);
         self.touch(number);
     }
 
@@ -993,9 +994,13 @@ impl Links {
         {
             keyring.handle_timeout(now);
         }
-        let dials = self.dials.iter().filter(|(_, (d, _))| d.poll_timeout().is_some_and(|t| t <= now));
+        let dials =
+            self.dials.iter().filter(|(_, (d, _))| d.poll_timeout().is_some_and(|t| t <= now));
         self.stirred_dials.extend(dials.map(|(dial, _)| *dial));
-        let paused = self.connections.iter().filter(|(_, c)| c.control.poll_timeout().is_some_and(|t| t <= now));
+        let paused = self
+            .connections
+            .iter()
+            .filter(|(_, c)| c.control.poll_timeout().is_some_and(|t| t <= now));
         let paused: Vec<u64> = paused.map(|(number, _)| *number).collect();
         paused.into_iter().for_each(|number| self.touch(number));
         let due = self.links.iter().filter(|(_, l)| l.poll_timeout().is_some_and(|t| t <= now));

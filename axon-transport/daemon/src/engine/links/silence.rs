@@ -6,7 +6,7 @@ use bytes::BytesMut;
 
 use super::{LinkReport, Links, link::Probing};
 use crate::{
-    gateway::silence::{Prober, Step, Traffic},
+    engine::links::prober::{Prober, Step, Traffic},
     wire::beacon::Datagram,
 };
 

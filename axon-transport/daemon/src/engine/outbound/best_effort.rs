@@ -2,11 +2,7 @@
 //! over. Two samples at a time are with QUIC, or as many as fit the congestion window. The rest waits in the queue,
 //! where a newer sample replaces it.
 
-use std::{
-    collections::VecDeque,
-    sync::Arc,
-    time::Duration,
-};
+use std::{collections::VecDeque, sync::Arc, time::Duration};
 
 use axon_envelope::{Delivery, Route};
 use axon_shm::ids::Gid;
@@ -19,8 +15,7 @@ use super::{
     schedule::Class,
 };
 use crate::{
-    engine::connection::Carrier,
-    gateway::{counters::Counters, frames::Frames, inbound::stream_header},
+    engine::{connection::Carrier, counters::Counters, frames::Frames, inbound::stream_header},
     link::CloseCode,
 };
 

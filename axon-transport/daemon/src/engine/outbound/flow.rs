@@ -20,8 +20,10 @@ use super::{
     source::Source,
 };
 use crate::{
-    engine::{connection::Carrier, rings::Sample},
-    gateway::{counters::Counters, frames::Frames, inbound::stream_header},
+    engine::{
+        connection::Carrier, counters::Counters, frames::Frames, inbound::stream_header,
+        rings::Sample,
+    },
     keys::NoKey,
     link::CloseCode,
 };
@@ -234,8 +236,7 @@ impl Flow {
         let first = sources.iter().find(|source| source.reads(&self.of));
         let qos = first.map_or_else(Qos::keep_all, Source::qos);
         self.queue.set_qos(&qos);
-        let waits = qos.history == History::KeepAll
-            && qos.reliability == Reliability::Reliable;
+        let waits = qos.history == History::KeepAll && qos.reliability == Reliability::Reliable;
         let (mut samples, mut bytes, mut dropped) = (0, 0, 0);
         // A flow that is behind looks at all, to keep the newest.
         let most = if self.queue.is_behind(now) { usize::MAX } else { FILL.1 };
@@ -310,7 +311,8 @@ impl Flow {
         let mut left = TURN;
         loop {
             if self.pending.is_empty() && !self.best_effort.is_writing() {
-                let queued = self.fill(sources, counters, now) + std::mem::take(&mut self.undemanded);
+                let queued =
+                    self.fill(sources, counters, now) + std::mem::take(&mut self.undemanded);
                 carrier.seal.demand(queued, now);
             }
             let before = carrier.taken;
@@ -427,7 +429,9 @@ impl Flow {
             let Some(sample) = self.queue.send() else { break };
             let (sequence, payload) = (sample.info.sequence, sample.payload.len());
             let delivery = Delivery::Reliable;
-            if let Err(why) = carrier.seal.write(sample, self.route, delivery, &mut self.frames, now) {
+            if let Err(why) =
+                carrier.seal.write(sample, self.route, delivery, &mut self.frames, now)
+            {
                 self.queue.take_back();
                 if samples == 0 {
                     return Err(why);
@@ -528,7 +532,13 @@ impl Flow {
     }
 
     /// The peer's QUIC has all of this best-effort stream.
-    pub(super) fn handle_finished(&mut self, stream: StreamId, carrier_quic: &mut quinn_proto::Connection, counters: &Counters, now: Duration) {
+    pub(super) fn handle_finished(
+        &mut self,
+        stream: StreamId,
+        carrier_quic: &mut quinn_proto::Connection,
+        counters: &Counters,
+        now: Duration,
+    ) {
         self.best_effort.handle_finished(stream, carrier_quic, counters, now);
     }
 

@@ -22,10 +22,7 @@ use std::{
 };
 
 use axon_envelope::Route;
-use axon_shm::{
-    ids::Gid,
-    qos::Qos,
-};
+use axon_shm::{ids::Gid, qos::Qos};
 use quinn_proto::StreamId;
 
 use self::{
@@ -35,9 +32,12 @@ use self::{
     schedule::Schedule,
     stall::Stalls,
 };
-pub(crate) use self::{schedule::{Class, FlowId}, source::Source};
+pub(crate) use self::{
+    schedule::{Class, FlowId},
+    source::Source,
+};
 use super::connection::Carrier;
-use crate::{gateway::counters::Counters, link::ReceivedOf};
+use crate::{engine::counters::Counters, link::ReceivedOf};
 
 /// A flow without a key looks again after this time, if nobody told it of one.
 const KEY_RETRY: Duration = Duration::from_millis(250);
@@ -102,7 +102,7 @@ pub(crate) struct Outbound {
     budget: Rc<Budget>,
     /// What the budget had released when flows that found no room were tried last.
     released: usize,
-    counters: Arc<Counters>,
+    counters: Rc<Counters>,
     timers: BTreeSet<(Duration, FlowId)>,
     without_stream: BTreeSet<FlowId>,
     without_key: BTreeSet<FlowId>,
@@ -120,7 +120,7 @@ impl Outbound {
     /// Serves nothing yet.
     pub(crate) fn new(
         budget: Rc<Budget>,
-        counters: Arc<Counters>,
+        counters: Rc<Counters>,
         stalled_after: Duration,
         now: Duration,
     ) -> Self {
@@ -203,8 +203,7 @@ impl Outbound {
 
     fn look_for_samples(&mut self, number: u32, now: Duration) {
         let Some(served) = self.routes.get(&number) else { return };
-        let mut waiting: Vec<Gid> =
-            served.sources.iter().flat_map(Source::with_data).collect();
+        let mut waiting: Vec<Gid> = served.sources.iter().flat_map(Source::with_data).collect();
         if served.sources.len() > 1 {
             waiting.sort_unstable();
             waiting.dedup();

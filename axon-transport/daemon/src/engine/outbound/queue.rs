@@ -157,8 +157,8 @@ impl Queue {
             return true;
         }
         // KEEP_LAST: a sample that is being sent does not keep a newer one out.
-        let alone = self.waiting.is_empty()
-            && (self.sent.is_empty() || self.policy != Policy::KeepAll);
+        let alone =
+            self.waiting.is_empty() && (self.sent.is_empty() || self.policy != Policy::KeepAll);
         if alone {
             self.budget.overtake(size);
         }
@@ -381,9 +381,14 @@ mod tests {
         let budget = Budget::new(32 * MIB);
         let mut queue = Queue::new(&Qos::keep_all(), budget.of_peer());
         assert_eq!(dropped(queue.offer(sample(1, 3 << 20, at(0)), at(0))), 0);
-        assert!(matches!(queue.offer(sample(2, 1, at(0)), at(0)), Offered::Full(s) if s.info.sequence == 2));
+        assert!(
+            matches!(queue.offer(sample(2, 1, at(0)), at(0)), Offered::Full(s) if s.info.sequence == 2)
+        );
         assert_eq!(queue.send().unwrap().info.sequence, 1);
-        assert!(matches!(queue.offer(sample(2, 1, at(1)), at(1)), Offered::Full(_)), "not acknowledged");
+        assert!(
+            matches!(queue.offer(sample(2, 1, at(1)), at(1)), Offered::Full(_)),
+            "not acknowledged"
+        );
         assert_eq!(queue.acknowledge(1), (1, Some(1)));
         assert_eq!(dropped(queue.offer(sample(2, 1, at(2)), at(2))), 0);
         drop(queue);
@@ -444,7 +449,11 @@ mod tests {
         assert_eq!(queue.waiting(), 3);
         assert_eq!(budget.taken(), 0, "best effort takes no other's room");
         assert_eq!(queue.drop_late(at(200), at(100), at(145)), 2);
-        assert_eq!(queue.drop_late(at(200), at(100), at(9000)), 0, "the newest is sent however old");
+        assert_eq!(
+            queue.drop_late(at(200), at(100), at(9000)),
+            0,
+            "the newest is sent however old"
+        );
         let last = queue.pop_best_effort().unwrap();
         assert_eq!((last.info.sequence, queue.is_empty()), (5, true));
     }

@@ -7,9 +7,10 @@ use axon_shm::{
     qos::{Qos, Reliability},
 };
 
-use crate::{
-    engine::{rings::{RingReader, Sample}, stand_in::StandIn},
-    gateway::routes::RelaySpec,
+use crate::engine::{
+    peer::routes::RelaySpec,
+    rings::{RingReader, Sample},
+    stand_in::StandIn,
 };
 
 /// A source of samples.

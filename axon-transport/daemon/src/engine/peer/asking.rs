@@ -17,9 +17,9 @@ use super::{
 use crate::{
     engine::{
         inbound::RouteIn,
+        peer::routes::{self, RouteKey, Wanted},
         stand_in::{NoStandIn, StandIn},
     },
-    gateway::routes::{self, RouteKey, Wanted},
     link::{LastSeen, Message, Subscribe, Unsubscribe},
 };
 
@@ -95,12 +95,7 @@ impl Peer {
         requests.flat_map(|served| served.subscribers.iter().copied()).collect()
     }
 
-    fn want(
-        &mut self,
-        wanted: BTreeMap<RouteKey, Wanted>,
-        with: &Surroundings<'_>,
-        now: Duration,
-    ) {
+    fn want(&mut self, wanted: BTreeMap<RouteKey, Wanted>, with: &Surroundings<'_>, now: Duration) {
         let gone: Vec<_> = self.asked.keys().filter(|k| !wanted.contains_key(k)).cloned().collect();
         self.refused.retain_unasked(|key| wanted.contains_key(key));
         let given_up = gone.len();
@@ -126,13 +121,7 @@ impl Peer {
         }
     }
 
-    fn want_one(
-        &mut self,
-        key: RouteKey,
-        wanted: Wanted,
-        with: &Surroundings<'_>,
-        now: Duration,
-    ) {
+    fn want_one(&mut self, key: RouteKey, wanted: Wanted, with: &Surroundings<'_>, now: Duration) {
         let known = self.asked.get(&key);
         if known.is_some_and(|asked| asked.wanted == wanted && !asked.incomplete) {
             return;
@@ -249,7 +238,8 @@ impl Peer {
         for number in asks {
             self.attaching.remove(&number);
             let key = self.numbers.get(&number).cloned();
-            if let Some((key, asked)) = key.and_then(|key| Some((self.asked.get(&key)?, key)))
+            if let Some((key, asked)) = key
+                .and_then(|key| Some((self.asked.get(&key)?, key)))
                 .map(|(asked, key)| (key, asked))
             {
                 let message = asked.message(&key);

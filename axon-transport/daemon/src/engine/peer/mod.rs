@@ -1,12 +1,17 @@
 //! A peer: its graph, the routes in both directions, and the samples that cross.
 
 mod asking;
+pub(super) mod graph;
+pub(super) mod owners;
 mod refused;
+pub(super) mod routes;
 mod serving;
+pub(super) mod stalls;
 
 use std::{
     cell::RefCell,
     collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
+    rc::Rc,
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -17,17 +22,17 @@ use axon_transport::{
     graph::{Endpoint, EndpointKind},
     internal::{
         events::Alive,
-        graph::{RangeToHost, RemoteEndpoint},
+        graph::{EndpointRange, RangeToHost, RemoteEndpoint},
     },
     status::LinkStatus,
 };
 
+pub(crate) use self::serving::{MAX_ROUTES, StalledRoute};
 use self::{
     asking::{Asked, Attaching},
     refused::RefusedRoutes,
     serving::Served,
 };
-pub(crate) use self::serving::{MAX_ROUTES, StalledRoute};
 use super::{
     inbound::Inbound,
     outbound::{Outbound, Source},
@@ -35,16 +40,15 @@ use super::{
     stand_in::StandIns,
 };
 use crate::{
-    gateway::{
+    engine::{
         account::{Account, MAX_STAND_INS},
         counters::Counters,
-        hub::Local,
         peer::{
             graph::{GraphTaken, Remote},
             owners::Prover,
+            routes::RouteKey,
+            stalls::Stalls,
         },
-        routes::RouteKey,
-        stalls::Stalls,
     },
     link::{Asserted, CloseCode, Graph, Message},
     owner::Binding,
@@ -58,6 +62,9 @@ const RESYNC: Duration = Duration::from_secs(1);
 const POLL: Duration = Duration::from_millis(5);
 /// Routes of a peer whose HELLO does not say how many it serves.
 pub(crate) const ROUTES_UNSAID: usize = 1024;
+
+/// The endpoints of applications on this host, and how far their sessions are discovered.
+pub(crate) type Local = BTreeMap<Gid, (Arc<Endpoint>, EndpointRange)>;
 
 /// The parts of the engine that all peers use.
 pub(crate) struct Surroundings<'a> {
@@ -91,7 +98,7 @@ pub(crate) struct Peer {
     pub(super) link: u64,
     /// Who it proved to be.
     identity: String,
-    pub(super) counters: Arc<Counters>,
+    pub(super) counters: Rc<Counters>,
     /// Its graph.
     pub(super) remote: Remote,
     prover: Prover,
@@ -137,11 +144,11 @@ pub(crate) struct PeerParts {
     /// Who it proved to be.
     pub(crate) identity: String,
     /// Its account.
-    pub(crate) account: Arc<Account>,
+    pub(crate) account: Rc<Account>,
     /// Proves that sessions are of this host.
     pub(crate) prover: Prover,
     /// Counts its samples.
-    pub(crate) counters: Arc<Counters>,
+    pub(crate) counters: Rc<Counters>,
     /// Samples from it.
     pub(crate) inbound: Inbound,
     /// Samples to it.

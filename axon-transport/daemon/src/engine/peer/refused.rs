@@ -9,7 +9,7 @@ use axon_transport::{internal::log_limit::LogLimit, status::LinkStatus};
 
 use super::Peer;
 use crate::{
-    gateway::routes::RouteKey,
+    engine::peer::routes::RouteKey,
     link::{Message, RouteRefused},
 };
 

@@ -8,10 +8,10 @@ use axon_transport::EndpointSpec;
 
 use super::{POLL, Peer, Surroundings};
 use crate::{
-    engine::outbound::{RouteOut, Source},
-    gateway::{
+    engine::{
         account::Charge,
-        routes::{RelaySpec, RouteKey, admit, relays},
+        outbound::{RouteOut, Source},
+        peer::routes::{RelaySpec, RouteKey, admit, relays},
     },
     link::{Message, RouteReady, Subscribe, Subscriber},
 };

@@ -23,14 +23,12 @@ use super::{
     rng::{Stream, stream},
 };
 use crate::{
+    bridge::{ToControl, ToGateway},
     discovery::AddressConfidence,
     engine::{
         Effect, Engine, EngineParts, credentials::Credentials, links::LinkParts, peer::MAX_ROUTES,
     },
-    gateway::{
-        bridge::{ToControl, ToGateway},
-        identity::Identity,
-    },
+    identity::Identity,
     keys::{Origin, Request},
     link::Hello,
     owner::SessionKeys,
@@ -243,7 +241,8 @@ impl Host {
     /// When the host has something to do.
     pub(super) fn poll_timeout(&self, now: Duration) -> Option<Duration> {
         let engine = self.engine.as_ref()?;
-        let ready = (self.graph_changed || self.rings_rang || !self.records.is_empty()).then_some(now);
+        let ready =
+            (self.graph_changed || self.rings_rang || !self.records.is_empty()).then_some(now);
         let dials = self.peers.iter().filter(|(daemon, _)| !self.linked.contains(daemon));
         let dials = dials.filter_map(|(_, wanted)| wanted.dial_at).min();
         [engine.poll_timeout(now), ready, dials].into_iter().flatten().min()
@@ -338,7 +337,11 @@ impl Host {
     }
 
     /// The next packets.
-    pub(super) fn poll_transmit(&mut self, buffer: &mut Vec<u8>, now: Duration) -> Option<Transmit> {
+    pub(super) fn poll_transmit(
+        &mut self,
+        buffer: &mut Vec<u8>,
+        now: Duration,
+    ) -> Option<Transmit> {
         Some(self.engine.as_mut()?.poll_transmit(10, buffer, now)?.1)
     }
 }

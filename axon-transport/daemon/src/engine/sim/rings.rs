@@ -157,7 +157,8 @@ impl SimRings {
         state.readers.retain(|reader| !reader.closed.get());
         let Some(of) = state.publishers.get_mut(&publisher) else { return false };
         let holds = state.readers.iter().filter(|reader| {
-            reader.reads(&of.endpoint) && reader.spec.qos.history == History::KeepAll
+            reader.reads(&of.endpoint)
+                && reader.spec.qos.history == History::KeepAll
                 && reader.spec.qos.reliability == Reliability::Reliable
         });
         let oldest = holds
@@ -215,9 +216,10 @@ impl SimRings {
     /// The publishers of a topic that have not ended.
     pub(super) fn publishers(&self, topic: &str) -> Vec<Gid> {
         let state = self.state.borrow();
-        let of = state.publishers.iter().filter(|(_, p)| {
-            p.endpoint.topic == topic && p.endpoint.node != "ended"
-        });
+        let of = state
+            .publishers
+            .iter()
+            .filter(|(_, p)| p.endpoint.topic == topic && p.endpoint.node != "ended");
         of.map(|(gid, _)| *gid).collect()
     }
 
@@ -385,8 +387,7 @@ impl RingWriter for SimWriter {
             return Err(RingError::Full);
         }
         // For BEST_EFFORT readers alone, streams of one sample each may overtake each other.
-        let reliable =
-            readers.iter().any(|s| s.endpoint.qos.reliability == Reliability::Reliable);
+        let reliable = readers.iter().any(|s| s.endpoint.qos.reliability == Reliability::Reliable);
         if reliable && meta.sequence <= self.last.replace(meta.sequence) {
             state.disordered += 1;
         }
@@ -448,11 +449,7 @@ impl Rings for SimRings {
     }
 
     fn open_writer(&self, remote: &Endpoint) -> Result<Rc<dyn RingWriter>, String> {
-        Ok(Rc::new(SimWriter {
-            rings: self.clone(),
-            endpoint: remote.clone(),
-            last: Cell::new(0),
-        }))
+        Ok(Rc::new(SimWriter { rings: self.clone(), endpoint: remote.clone(), last: Cell::new(0) }))
     }
 
     fn set_waiting_for_room(&self, waiting: bool) {

@@ -136,8 +136,8 @@ impl World {
             for (subscription, publisher, first, came) in there.rings.complete() {
                 let from = self.hosts.iter().find_map(|host| {
                     let (qos, published) = host.rings.publisher(publisher)?;
-                    let complete = qos.history == History::KeepAll
-                        && qos.reliability == Reliability::Reliable;
+                    let complete =
+                        qos.history == History::KeepAll && qos.reliability == Reliability::Reliable;
                     complete.then_some((host.number, published))
                 });
                 let Some((from, published)) = from else { continue };
@@ -165,8 +165,7 @@ impl World {
         let subscription = self.hosts[to].rings.create_subscription(topic, qos, None);
         self.hosts[from].touch_graph();
         self.hosts[to].touch_graph();
-        let complete =
-            qos.history == History::KeepAll && qos.reliability == Reliability::Reliable;
+        let complete = qos.history == History::KeepAll && qos.reliability == Reliability::Reliable;
         let pair = Pair {
             publisher: (from, publisher),
             subscription: (to, subscription),

@@ -6,11 +6,13 @@ use quinn_proto::{ConnectionClose, TransportErrorCode};
 
 use super::*;
 use crate::{
-    engine::keyring::{
-        Answered,
-        tests::{Kmes, config, id, keyring, ms, s},
+    engine::{
+        keyring::{
+            Answered,
+            tests::{Kmes, config, id, keyring, ms, s},
+        },
+        refusal::RefusedBy,
     },
-    gateway::RefusedBy,
     keys::{Event, FailureKind},
 };
 

@@ -20,11 +20,13 @@ use axon_transport::config::KeyMode;
 
 use super::*;
 use crate::{
-    engine::keyring::{
-        Answered,
-        tests::{Kmes, config, exporters, id, ms, s},
+    engine::{
+        keyring::{
+            Answered,
+            tests::{Kmes, config, exporters, id, ms, s},
+        },
+        refusal::RefusedBy,
     },
-    gateway::RefusedBy,
     keys::{Event, KeyMessage},
 };
 

@@ -6,8 +6,8 @@ use crate::files::FileRules;
 use axon_tls::identity::TrustFile;
 use zeroize::Zeroizing;
 
+use crate::error::GatewayError;
 pub(super) use crate::files::FileStamp;
-use crate::gateway::GatewayError;
 
 /// A file that a setting names.
 #[derive(Clone, Debug)]

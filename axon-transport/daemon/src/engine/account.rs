@@ -4,45 +4,29 @@
 //! [`Charge`] holds what counts for a [`Meter`], and gives it back when it is dropped.
 
 use std::{
+    cell::{Cell, RefCell},
     collections::HashMap,
-    sync::{
-        Arc, Mutex, Weak,
-        atomic::{AtomicUsize, Ordering},
-    },
-    time::Instant,
+    rc::{Rc, Weak},
+    time::{Duration, Instant},
 };
 
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
-
-use super::{
-    intake::Intake,
-    keyring::lock,
-    pace::{Bucket, Turns},
-    routes::MAX_RELAYS,
-};
+use super::pace::{Bucket, Turns};
 use crate::{
     keys::KeyMessage,
-    link::{MAX_FRAME, MAX_INFLATED, Message, is_known, unpacked_length},
+    link::{MAX_INFLATED, Message, is_known, unpacked_length},
 };
 
+/// Relays that one identity may have here. Each costs an endpoint of the engine's session.
+pub(crate) const MAX_RELAYS: usize = 32 << 10;
 /// Stand-ins of one identity. Each costs a ring.
-pub(crate) const MAX_STAND_INS: usize = 1024;
-/// Stream data of one identity that was not read, in bytes: beside it each of its links has
-/// [`LINK_WINDOW`](super::endpoint::LINK_WINDOW).
+pub(crate) const MAX_STAND_INS: usize = 32 << 10;
+/// Unread stream data of one identity, in bytes. Each of its links has
+/// [`LINK_WINDOW`](super::transport::LINK_WINDOW) more.
 const UNREAD: usize = 64 << 20;
-/// Messages of one identity that are on their way in, in bytes; of one that is longer it is that one.
-const INTAKE: usize = 64 << 20;
+/// Long messages of one identity that are being read, in bytes. One message may always be read.
+const MESSAGES: usize = 64 << 20;
 /// Control messages that wait for one identity to read them, in bytes.
 const UNSENT: usize = 128 << 20;
-/// Bytes that a unit of a semaphore stands for.
-const UNIT: usize = 1024;
-/// Control frames of one identity that are being read, in bytes.
-const READING: usize = 2 * MAX_FRAME;
-/// Control messages of one identity between decompression and the end of their handling, in bytes
-/// before they are decoded.
-const UNPACKED: usize = MAX_INFLATED;
-/// What each of them counts for at least: so many may wait before another peer's.
-const MESSAGE: usize = 64 << 10;
 /// What one identity may say a second, and at once, by [`cost`] and [`cost_of_frame`].
 const SAID: (u32, u32) = (4096, 16_384);
 /// Bytes of a control message that cost as much as one change: what it takes to decompress and decode
@@ -55,37 +39,36 @@ const LOOKED_UP: usize = 32;
 #[derive(Debug)]
 pub(crate) struct Meter {
     most: usize,
-    held: AtomicUsize,
+    held: Cell<usize>,
 }
 
-/// A part of what a meter allows, until it is dropped.
+/// A part of what a [`Meter`] allows.
 #[derive(Debug)]
 pub(crate) struct Charge {
-    meter: Arc<Meter>,
+    meter: Rc<Meter>,
     amount: usize,
 }
 
 impl Meter {
-    pub(crate) fn new(most: usize) -> Arc<Self> {
-        Arc::new(Self { most, held: AtomicUsize::new(0) })
+    /// Allows up to `most`.
+    pub(crate) fn new(most: usize) -> Rc<Self> {
+        Rc::new(Self { most, held: Cell::new(0) })
     }
 
-    /// Holds nothing yet.
-    pub(crate) fn nothing(self: &Arc<Self>) -> Charge {
-        Charge { meter: Arc::clone(self), amount: 0 }
+    /// A charge of nothing.
+    pub(crate) fn nothing(self: &Rc<Self>) -> Charge {
+        Charge { meter: Rc::clone(self), amount: 0 }
     }
 
-    /// Holds `amount` more, if that is within the bound.
-    pub(crate) fn charge(self: &Arc<Self>, amount: usize) -> Option<Charge> {
-        let more = |held: usize| held.checked_add(amount).filter(|sum| *sum <= self.most);
-        // Relaxed: a bound, not a hand-over.
-        self.held.fetch_update(Ordering::Relaxed, Ordering::Relaxed, more).ok()?;
-        Some(Charge { meter: Arc::clone(self), amount })
+    /// Charges `amount`, if it fits.
+    pub(crate) fn charge(self: &Rc<Self>, amount: usize) -> Option<Charge> {
+        let sum = self.held.get().checked_add(amount).filter(|sum| *sum <= self.most)?;
+        self.held.set(sum);
+        Some(Charge { meter: Rc::clone(self), amount })
     }
 
-    /// Has `charge` hold half of what it holds and nobody else does, if that is more than it holds: so
-    /// something is left for those that come later. Whether it is more.
-    pub(crate) fn share(self: &Arc<Self>, charge: &mut Charge) -> bool {
+    /// Raises a charge to half of what the others leave. Returns whether it grew.
+    pub(crate) fn share(self: &Rc<Self>, charge: &mut Charge) -> bool {
         let others = self.held().saturating_sub(charge.amount);
         let share = self.most.saturating_sub(others) / 2;
         let more = share.checked_sub(charge.amount).filter(|more| *more > 0);
@@ -98,19 +81,19 @@ impl Meter {
         }
     }
 
-    /// How much is held.
+    /// What is held now.
     pub(crate) fn held(&self) -> usize {
-        self.held.load(Ordering::Relaxed)
+        self.held.get()
     }
 
-    /// The bound.
+    /// What may be held.
     pub(crate) fn most(&self) -> usize {
         self.most
     }
 }
 
 impl Charge {
-    /// How much it holds.
+    /// What it holds.
     pub(crate) fn amount(&self) -> usize {
         self.amount
     }
@@ -118,7 +101,7 @@ impl Charge {
 
 impl Drop for Charge {
     fn drop(&mut self) {
-        self.meter.held.fetch_sub(self.amount, Ordering::Relaxed);
+        self.meter.held.set(self.meter.held.get() - self.amount);
     }
 }
 
@@ -126,32 +109,22 @@ impl Drop for Charge {
 #[derive(Debug)]
 pub(crate) struct Account {
     /// Bytes of its graph.
-    pub(crate) graph: Arc<Meter>,
+    pub(crate) graph: Rc<Meter>,
     /// Bytes of the routes that it asks for: as many again, so that one whose graph is full is served.
-    pub(crate) routes: Arc<Meter>,
+    pub(crate) routes: Rc<Meter>,
     /// Relays for the routes that it asks for.
-    pub(crate) relays: Arc<Meter>,
+    pub(crate) relays: Rc<Meter>,
     /// Control messages that it has not read.
-    pub(crate) unsent: Arc<Meter>,
+    pub(crate) unsent: Rc<Meter>,
     /// Its publishers, servers and clients that are shown here.
-    pub(crate) stand_ins: Arc<Meter>,
+    pub(crate) stand_ins: Rc<Meter>,
     /// Stream data that it may send and that was not read.
-    pub(crate) unread: Arc<Meter>,
-    /// Memory for its messages.
-    pub(crate) intake: Arc<Intake>,
+    pub(crate) unread: Rc<Meter>,
     /// Memory for its long messages, in bytes.
-    pub(crate) messages: Arc<Meter>,
+    pub(crate) messages: Rc<Meter>,
     /// When its changes are followed up.
-    pub(crate) turns: Mutex<Turns>,
-    reading: Arc<Semaphore>,
-    unpacked: Arc<Semaphore>,
-    said: Mutex<Bucket>,
-}
-
-/// Room for a control message, until it is dropped.
-#[derive(Debug)]
-pub(crate) struct Unpacked {
-    _room: Option<OwnedSemaphorePermit>,
+    pub(crate) turns: RefCell<Turns>,
+    said: RefCell<Bucket>,
 }
 
 impl Account {
@@ -163,36 +136,15 @@ impl Account {
             unsent: Meter::new(UNSENT),
             stand_ins: Meter::new(MAX_STAND_INS),
             unread: Meter::new(UNREAD),
-            intake: Arc::new(Intake::new(INTAKE)),
-            messages: Meter::new(INTAKE),
-            reading: Arc::new(Semaphore::new(READING / UNIT)),
-            unpacked: Arc::new(Semaphore::new(UNPACKED / UNIT)),
-            turns: Mutex::default(),
-            said: Mutex::new(Bucket::new(SAID.0, SAID.1)),
+            messages: Meter::new(MESSAGES),
+            turns: RefCell::default(),
+            said: RefCell::new(Bucket::new(SAID.0, SAID.1)),
         }
-    }
-
-    /// Room to read a frame of `length` bytes.
-    pub(crate) async fn reading(&self, length: usize) -> Unpacked {
-        room(&self.reading, length, READING).await
-    }
-
-    /// Room for a message of `length` bytes once it is decompressed.
-    pub(crate) async fn unpacked(&self, length: usize) -> Unpacked {
-        room(&self.unpacked, length.max(MESSAGE), UNPACKED).await
     }
 
     /// Counts a control message of this cost. Returns how long the identity has to wait before its next one.
-    pub(crate) fn owe(&self, cost: u32, now: Instant) -> std::time::Duration {
-        lock(&self.said).owe(cost, now)
-    }
-
-    /// Takes this much of what the identity may say, and waits for as long as that is more than it may.
-    pub(crate) async fn pace(&self, cost: u32) {
-        let wait = lock(&self.said).owe(cost, Instant::now());
-        if !wait.is_zero() {
-            tokio::time::sleep(wait).await;
-        }
+    pub(crate) fn owe(&self, cost: u32, now: Instant) -> Duration {
+        self.said.borrow_mut().owe(cost, now)
     }
 }
 
@@ -235,35 +187,28 @@ fn costs(elements: usize) -> u32 {
     u32::try_from(1 + elements).unwrap_or(u32::MAX)
 }
 
-/// Waits for its turn and for room. What is longer than all the room takes all of it.
-async fn room(semaphore: &Arc<Semaphore>, length: usize, all: usize) -> Unpacked {
-    let units = u32::try_from(length.clamp(1, all).div_ceil(UNIT)).unwrap_or(u32::MAX);
-    // It is never closed.
-    Unpacked { _room: Arc::clone(semaphore).acquire_many_owned(units).await.ok() }
-}
-
-/// The accounts of all peers, each for as long as it is used.
+/// The accounts of all identities that have a link.
 #[derive(Debug)]
 pub(crate) struct Accounts {
+    /// Bytes of a graph.
     graph: usize,
-    open: Mutex<HashMap<String, Weak<Account>>>,
+    open: HashMap<String, Weak<Account>>,
 }
 
 impl Accounts {
-    /// `graph` bytes are what the graph of one identity may take.
+    /// Accounts whose graphs may take so many bytes.
     pub(crate) fn new(graph: usize) -> Self {
-        Self { graph, open: Mutex::default() }
+        Self { graph, open: HashMap::new() }
     }
 
     /// The account of an identity.
-    pub(crate) fn of(&self, identity: &str) -> Arc<Account> {
-        let mut open = lock(&self.open);
-        if let Some(account) = open.get(identity).and_then(Weak::upgrade) {
+    pub(crate) fn of(&mut self, identity: &str) -> Rc<Account> {
+        if let Some(account) = self.open.get(identity).and_then(Weak::upgrade) {
             return account;
         }
-        open.retain(|_, account| account.strong_count() > 0);
-        let account = Arc::new(Account::new(self.graph));
-        open.insert(identity.to_owned(), Arc::downgrade(&account));
+        self.open.retain(|_, account| account.strong_count() > 0);
+        let account = Rc::new(Account::new(self.graph));
+        self.open.insert(identity.to_owned(), Rc::downgrade(&account));
         account
     }
 }
@@ -271,15 +216,12 @@ impl Accounts {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{
-        gateway::played::block_on,
-        link::{Received, ReceivedOf, RouteReady},
-    };
+    use crate::link::{Received, ReceivedOf, RouteReady};
     use axon_shm::ids::Gid;
 
     #[test]
     fn an_identity_has_one_account_and_what_is_dropped_is_given_back() {
-        let accounts = Accounts::new(100);
+        let mut accounts = Accounts::new(100);
         let (one, again, other) = (accounts.of("a"), accounts.of("a"), accounts.of("b"));
         let charge = one.graph.charge(60).unwrap();
         assert!(again.graph.charge(41).is_none(), "of the same identity");
@@ -290,7 +232,7 @@ mod tests {
         assert!(again.graph.charge(100).is_some());
         drop((one, again));
         assert_eq!(accounts.of("a").graph.held(), 0);
-        assert_eq!(lock(&accounts.open).len(), 2);
+        assert_eq!(accounts.open.len(), 2);
     }
 
     #[test]
@@ -324,21 +266,5 @@ mod tests {
         assert_eq!(cost_of_frame(&frame(0xff, 4 << 20)), 1);
         assert_eq!(cost_of_frame(&vec![0x7f; 1 << 20]), 257);
         assert_eq!(cost_of_frame(&[8, 0xa0]), 1);
-    }
-
-    #[test]
-    fn a_message_waits_until_those_before_it_are_handled() {
-        block_on(async {
-            let account = Accounts::new(0).of("a");
-            let first = account.unpacked(MAX_INFLATED).await;
-            let mut second = std::pin::pin!(account.unpacked(1));
-            let waits = std::future::poll_fn(|context| {
-                std::task::Poll::Ready(second.as_mut().poll(context).is_pending())
-            });
-            assert!(waits.await);
-            drop(first);
-            second.await;
-            account.unpacked(10 * MAX_INFLATED).await;
-        });
     }
 }

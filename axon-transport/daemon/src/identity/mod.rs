@@ -15,13 +15,13 @@ use std::{
 };
 
 use axon_tls::identity::Auth;
-use axon_transport::config::ClassicConfig;
+use axon_transport::config::{ClassicAuth, ClassicConfig};
 
 use self::{
     load::Sources,
     watch::{Look, Watch},
 };
-use super::{GatewayError, keyring::lock};
+use crate::error::GatewayError;
 
 /// Whether the files that `classic` names can be used.
 ///
@@ -126,4 +126,25 @@ impl Identity {
     fn write(&self) -> std::sync::RwLockWriteGuard<'_, InForce> {
         self.in_force.write().unwrap_or_else(PoisonError::into_inner)
     }
+}
+
+/// The classic identity that the settings name.
+///
+/// # Errors
+/// A file of it cannot be used.
+pub(crate) fn load(classic: &ClassicConfig, node: &str) -> Result<Identity, GatewayError> {
+    Identity::load(classic, node).inspect(|_| {
+        if classic.auth == ClassicAuth::None {
+            tracing::warn!(
+                "AXON_CLASSIC_AUTH=none: peers are UNAUTHENTICATED. A recording adversary learns \
+                 nothing; an active one can pose as a peer. Set AXON_CLASSIC_KEY and \
+                 AXON_CLASSIC_TRUST to pin peers."
+            );
+        }
+    })
+}
+
+/// A lock whose holder does not panic in a state that matters.
+fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -4,13 +4,12 @@
 //! Hosts behind one translated address share it, so the limits apply only where there is scarcity.
 
 use std::{
+    cell::RefCell,
     collections::{HashMap, VecDeque},
     net::{IpAddr, Ipv6Addr},
-    sync::{Arc, Mutex},
+    rc::Rc,
     time::{Duration, Instant},
 };
-
-use super::keyring::lock;
 
 /// What may be under way beyond that to listed peers.
 const FOR_LISTED: usize = 16;
@@ -34,26 +33,26 @@ pub(crate) fn place(address: IpAddr) -> IpAddr {
 #[derive(Debug)]
 pub(crate) struct Handshakes {
     most: usize,
-    under_way: Mutex<HashMap<IpAddr, usize>>,
+    under_way: RefCell<HashMap<IpAddr, usize>>,
 }
 
 /// A handshake that counts until this is dropped.
 #[derive(Debug)]
 pub(crate) struct Place {
-    of: Arc<Handshakes>,
+    of: Rc<Handshakes>,
     at: IpAddr,
 }
 
 impl Handshakes {
-    pub(crate) fn new(most: usize) -> Arc<Self> {
-        Arc::new(Self { most, under_way: Mutex::default() })
+    pub(crate) fn new(most: usize) -> Rc<Self> {
+        Rc::new(Self { most, under_way: RefCell::default() })
     }
 
     /// A place for one more from this address: it may have as many as are free, so that another
     /// address always finds one. A listed peer has some that nobody else gets.
-    pub(crate) fn enter(self: &Arc<Self>, address: IpAddr, listed: bool) -> Option<Place> {
+    pub(crate) fn enter(self: &Rc<Self>, address: IpAddr, listed: bool) -> Option<Place> {
         let at = place(address);
-        let mut under_way = lock(&self.under_way);
+        let mut under_way = self.under_way.borrow_mut();
         let all: usize = under_way.values().sum();
         let own = under_way.get(&at).copied().unwrap_or_default();
         let free = self.most.saturating_sub(all);
@@ -62,13 +61,13 @@ impl Handshakes {
             return None;
         }
         *under_way.entry(at).or_default() += 1;
-        Some(Place { of: Arc::clone(self), at })
+        Some(Place { of: Rc::clone(self), at })
     }
 }
 
 impl Drop for Place {
     fn drop(&mut self) {
-        let mut under_way = lock(&self.of.under_way);
+        let mut under_way = self.of.under_way.borrow_mut();
         if let Some(count) = under_way.get_mut(&self.at) {
             *count -= 1;
             if *count == 0 {
@@ -144,7 +143,7 @@ mod tests {
         assert!(handshakes.enter(at(250), false).is_none());
         assert_eq!(take(251, true).len(), 16);
         drop((greedy, second, many));
-        assert!(lock(&handshakes.under_way).is_empty());
+        assert!(handshakes.under_way.borrow().is_empty());
         // A host may take any IPv6 address of its network.
         let in_net = |n: u16| IpAddr::from([0x2001, 0xdb8, 0, 1, 0, 0, 0, n]);
         let places: Vec<_> = (0..100).filter_map(|n| handshakes.enter(in_net(n), false)).collect();

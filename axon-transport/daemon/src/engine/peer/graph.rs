@@ -2,6 +2,7 @@
 
 use std::{
     collections::{BTreeMap, BTreeSet},
+    rc::Rc,
     sync::Arc,
 };
 
@@ -14,7 +15,7 @@ use axon_transport::{
 
 use super::owners::Proven;
 use crate::{
-    gateway::account::{Account, Charge},
+    engine::account::{Account, Charge},
     link::Graph,
     owner::{Binding, Prefix, Proof, prefix_of},
 };
@@ -45,7 +46,7 @@ pub(crate) enum GraphTaken {
 #[derive(Clone, Debug)]
 struct Held {
     remote: RemoteEndpoint,
-    _charge: Arc<Charge>,
+    _charge: Rc<Charge>,
 }
 
 /// An endpoint for which there was no room.
@@ -60,7 +61,7 @@ struct Refused {
 /// The graph of one peer.
 #[derive(Debug)]
 pub(crate) struct Remote {
-    account: Arc<Account>,
+    account: Rc<Account>,
     proven: Proven,
     all: BTreeMap<Gid, Held>,
     version: u64,
@@ -77,7 +78,7 @@ pub(crate) struct Remote {
 
 impl Remote {
     /// That of a peer which must prove its sessions, if `proofs`.
-    pub(crate) fn new(account: Arc<Account>, proofs: bool) -> Self {
+    pub(crate) fn new(account: Rc<Account>, proofs: bool) -> Self {
         Self {
             account,
             proven: Proven::new(proofs),
@@ -184,12 +185,7 @@ impl Remote {
     }
 
     /// Takes what the peer's daemon proves on the connection that `binding` is of.
-    pub(crate) fn prove(
-        &mut self,
-        proofs: &[Proof],
-        binding: &Binding,
-        from: DaemonId,
-    ) {
+    pub(crate) fn prove(&mut self, proofs: &[Proof], binding: &Binding, from: DaemonId) {
         let all = &self.all;
         let used = |session: &Prefix| {
             let mut first = [0; 16];
@@ -227,7 +223,7 @@ impl Remote {
             && let Some(charge) = self.account.graph.charge(bytes)
         {
             let remote = RemoteEndpoint { endpoint: Arc::new(endpoint), toward };
-            return Some(Held { remote, _charge: Arc::new(charge) });
+            return Some(Held { remote, _charge: Rc::new(charge) });
         }
         self.left_out += 1;
         if self.refused.is_none() {
@@ -284,7 +280,7 @@ impl Remote {
     }
 
     /// The peer's account.
-    pub(crate) fn account(&self) -> &Arc<Account> {
+    pub(crate) fn account(&self) -> &Rc<Account> {
         &self.account
     }
 
@@ -333,7 +329,7 @@ mod tests {
     use axon_shm::qos::Qos;
     use axon_transport::internal::SessionKey;
 
-    use crate::{gateway::account::Accounts, owner::prove};
+    use crate::{engine::account::Accounts, owner::prove};
 
     fn endpoint(number: u8, name: &str) -> Endpoint {
         Endpoint {
@@ -394,7 +390,7 @@ mod tests {
     fn what_there_is_no_room_for_is_left_out_by_name_and_the_rest_counts() {
         let account = Accounts::new(2 * one()).of("a");
         let (mut remote, mut other) =
-            (Remote::new(Arc::clone(&account), false), Remote::new(Arc::clone(&account), false));
+            (Remote::new(Rc::clone(&account), false), Remote::new(Rc::clone(&account), false));
         assert_eq!(
             remote.take(graph(0, vec![endpoint(1, "/t")], vec![], false)),
             GraphTaken::Changed { whole: true }
@@ -417,7 +413,7 @@ mod tests {
     #[test]
     fn a_whole_graph_that_is_said_again_takes_no_more_and_changes_nothing() {
         let account = Accounts::new(3 * one()).of("a");
-        let mut remote = Remote::new(Arc::clone(&account), false);
+        let mut remote = Remote::new(Rc::clone(&account), false);
         let all = || (1..=3).map(|n| endpoint(n, "/t")).collect::<Vec<_>>();
         remote.take(graph(0, all(), vec![], false));
         assert_eq!(changes(&mut remote), (vec![1, 2, 3], vec![]));

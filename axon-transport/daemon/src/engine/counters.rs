@@ -1,19 +1,14 @@
 //! The counters of a link for status: what it carried, and what was dropped on the way.
 
 use std::{
+    cell::{Cell, RefCell},
     collections::BTreeMap,
-    ops::Deref,
-    sync::{
-        Arc, Mutex,
-        atomic::{AtomicU64, Ordering},
-    },
+    sync::Arc,
 };
 
 use axon_transport::internal::text::plain;
-use tokio::sync::watch;
 
-use super::keyring::lock;
-use crate::gateway::bridge::OTHER_TOPICS;
+use crate::bridge::OTHER_TOPICS;
 
 /// Topics of which losses are noted between two looks: as many as routes may cross each way.
 const TOPICS: usize = 2048;
@@ -30,77 +25,35 @@ pub(crate) struct Loss {
     pub(crate) samples: u64,
 }
 
-/// The counters of one peer. Relaxed throughout: they are shown, never acted upon.
+/// The counters of one peer.
 #[derive(Debug, Default)]
 pub(crate) struct Counters {
-    samples_in: AtomicU64,
-    bytes_in: AtomicU64,
-    samples_out: AtomicU64,
-    bytes_out: AtomicU64,
-    dropped: Mutex<BTreeMap<&'static str, u64>>,
+    samples_in: Cell<u64>,
+    bytes_in: Cell<u64>,
+    samples_out: Cell<u64>,
+    bytes_out: Cell<u64>,
+    dropped: RefCell<BTreeMap<&'static str, u64>>,
     /// What was dropped since it was looked at last.
-    lost: Mutex<BTreeMap<Arc<str>, BTreeMap<&'static str, u64>>>,
-}
-
-/// The counters of one peer, as the hub has them.
-#[derive(Debug, Default)]
-pub(crate) struct Tally {
-    counters: Arc<Counters>,
-    counting: watch::Sender<()>,
-}
-
-/// The counters of one peer, as a task has them that counts.
-#[derive(Clone, Debug)]
-pub(crate) struct Counting {
-    counters: Arc<Counters>,
-    _of: watch::Receiver<()>,
-}
-
-impl Tally {
-    /// For one more task that counts.
-    pub(crate) fn counting(&self) -> Counting {
-        Counting { counters: Arc::clone(&self.counters), _of: self.counting.subscribe() }
-    }
-
-    /// Waits until nobody counts any more.
-    pub(crate) async fn is_final(&self) {
-        self.counting.closed().await;
-    }
-}
-
-impl Deref for Tally {
-    type Target = Counters;
-
-    fn deref(&self) -> &Counters {
-        &self.counters
-    }
-}
-
-impl Deref for Counting {
-    type Target = Counters;
-
-    fn deref(&self) -> &Counters {
-        &self.counters
-    }
+    lost: RefCell<BTreeMap<Arc<str>, BTreeMap<&'static str, u64>>>,
 }
 
 impl Counters {
     /// A sample arrived and was published here.
     pub(crate) fn arrived(&self, bytes: usize) {
-        self.samples_in.fetch_add(1, Ordering::Relaxed);
-        self.bytes_in.fetch_add(bytes as u64, Ordering::Relaxed);
+        self.samples_in.set(self.samples_in.get() + 1);
+        self.bytes_in.set(self.bytes_in.get() + bytes as u64);
     }
 
     /// A sample was handed to QUIC.
     pub(crate) fn sent(&self, bytes: usize) {
-        self.samples_out.fetch_add(1, Ordering::Relaxed);
-        self.bytes_out.fetch_add(bytes as u64, Ordering::Relaxed);
+        self.samples_out.set(self.samples_out.get() + 1);
+        self.bytes_out.set(self.bytes_out.get() + bytes as u64);
     }
 
     /// `count` samples were dropped for `cause`.
     pub(crate) fn dropped(&self, cause: &'static str, count: u64) {
         if count > 0 {
-            *lock(&self.dropped).entry(cause).or_default() += count;
+            *self.dropped.borrow_mut().entry(cause).or_default() += count;
         }
     }
 
@@ -110,7 +63,7 @@ impl Counters {
             return;
         }
         self.dropped(cause, count);
-        let mut lost = lock(&self.lost);
+        let mut lost = self.lost.borrow_mut();
         let there = lost.contains_key(topic) || lost.len() < TOPICS && topic.len() <= NAME;
         let topic = if there { Arc::clone(topic) } else { OTHER_TOPICS.into() };
         let samples = lost.entry(topic).or_default().entry(cause).or_default();
@@ -119,7 +72,7 @@ impl Counters {
 
     /// What was lost since the last call, by topic and cause: each sample once.
     pub(crate) fn take_lost(&self) -> Vec<Loss> {
-        let lost = std::mem::take(&mut *lock(&self.lost));
+        let lost = self.lost.take();
         let each = lost.into_iter().flat_map(|(topic, causes)| {
             causes.into_iter().map(move |(cause, samples)| {
                 let topic = Arc::clone(&topic);
@@ -131,12 +84,12 @@ impl Counters {
 
     /// Puts the counters into `status`.
     pub(crate) fn fill(&self, status: &mut axon_transport::status::LinkStatus) {
-        status.samples_in = self.samples_in.load(Ordering::Relaxed);
-        status.bytes_in = self.bytes_in.load(Ordering::Relaxed);
-        status.samples_out = self.samples_out.load(Ordering::Relaxed);
-        status.bytes_out = self.bytes_out.load(Ordering::Relaxed);
+        status.samples_in = self.samples_in.get();
+        status.bytes_in = self.bytes_in.get();
+        status.samples_out = self.samples_out.get();
+        status.bytes_out = self.bytes_out.get();
         status.dropped =
-            lock(&self.dropped).iter().map(|(cause, n)| ((*cause).to_owned(), *n)).collect();
+            self.dropped.borrow().iter().map(|(cause, n)| ((*cause).to_owned(), *n)).collect();
     }
 }
 
@@ -165,31 +118,7 @@ fn worst(losses: &[Loss]) -> Option<(&str, String, u64, u64)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gateway::played::block_on;
     use axon_transport::status::LinkStatus;
-
-    #[test]
-    fn a_tally_is_final_once_the_last_task_that_counts_has_ended() {
-        block_on(async {
-            let tally = Tally::default();
-            let (one, other) = (tally.counting(), tally.counting().clone());
-            let topic = Arc::<str>::from("/scan");
-            let counts = |counting: Counting| {
-                let topic = Arc::clone(&topic);
-                tokio::spawn(async move {
-                    tokio::task::yield_now().await;
-                    counting.lost(&topic, "no_link", 1);
-                })
-            };
-            let tasks = [counts(one), counts(other)];
-            tally.is_final().await;
-            let loss = Loss { topic: Arc::clone(&topic), cause: "no_link", samples: 2 };
-            assert_eq!(tally.take_lost(), [loss]);
-            for task in tasks {
-                task.await.unwrap();
-            }
-        });
-    }
 
     #[test]
     fn losses_are_counted_by_topic_and_handed_over_once() {

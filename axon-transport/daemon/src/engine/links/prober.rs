@@ -8,61 +8,29 @@
 //! What counts is acknowledgements. A packet that the peer sends of itself does not end our QUIC's pause:
 //! what waits here would still wait for it.
 
-use std::{
-    collections::HashMap,
-    sync::{Arc, Mutex},
-    time::Duration,
-};
+use std::time::Duration;
 
-use axon_shm::ids::DaemonId;
-use quinn::Connection;
-use tokio::sync::{mpsc, oneshot};
-
-use super::{endpoint::Endpoints, hub::Event, keyring::lock, socket};
-use crate::{link::Side, wire::beacon::Datagram};
+use crate::link::Side;
 
 /// Between two probes.
 const PROBE_EVERY: Duration = Duration::from_millis(250);
+
 /// QUIC is given so long after an answer: a packet of its own may be on its way.
 const GRACE: Duration = Duration::from_millis(300);
+
 /// After a long silence QUIC's next packet is as far away as the silence was long.
 const LONG: Duration = Duration::from_secs(1);
+
 const GRACE_AFTER_LONG: Duration = Duration::from_millis(50);
+
 /// The side that was dialled waits for so much longer: two successors would be one too many.
 const DIALLED: Duration = Duration::from_millis(100);
+
 /// When a successor did not come about, probing begins again after this, and after twice as long each time:
 /// a dial may cost a key.
 const AGAIN: Duration = Duration::from_secs(1);
+
 const AGAIN_AT_MOST: Duration = Duration::from_secs(8);
-
-/// The answers to probes that somebody waits for, by the nonce of the probe.
-#[derive(Debug, Default)]
-pub(crate) struct Echoes(Mutex<HashMap<[u8; 8], oneshot::Sender<()>>>);
-
-impl Echoes {
-    /// Takes a datagram that answers a probe. Whether it did.
-    pub(crate) fn take(&self, datagram: &socket::Datagram) -> bool {
-        let mut awaited = lock(&self.0);
-        if awaited.is_empty() {
-            return false;
-        }
-        let Ok(Datagram::Echo { nonce, .. }) = Datagram::decode(&datagram.bytes) else {
-            return false;
-        };
-        // An error: nobody waits any more.
-        awaited.remove(&nonce).is_some_and(|waits| waits.send(()).is_ok())
-    }
-
-    fn await_one(&self, nonce: [u8; 8]) -> oneshot::Receiver<()> {
-        let (sender, receiver) = oneshot::channel();
-        lock(&self.0).insert(nonce, sender);
-        receiver
-    }
-
-    fn forget(&self, nonce: [u8; 8]) {
-        lock(&self.0).remove(&nonce);
-    }
-}
 
 /// What went over a connection, as far as silence is concerned.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -77,10 +45,6 @@ pub(crate) struct Traffic {
 }
 
 impl Traffic {
-    pub(crate) fn of(connection: &Connection) -> Self {
-        Self::from(&connection.stats())
-    }
-
     /// The counters in these statistics of a connection.
     pub(crate) fn from(stats: &quinn_proto::ConnectionStats) -> Self {
         let sent = stats.frame_tx;
@@ -101,76 +65,6 @@ impl Traffic {
     /// Whether something was asked since `before` and nothing came.
     pub(crate) fn is_silent_since(self, before: Self) -> bool {
         self.came == before.came && self.asked > before.asked
-    }
-}
-
-/// A link to be watched.
-pub(crate) struct Watch {
-    /// Its number at the hub.
-    pub(crate) number: u64,
-    /// The connection.
-    pub(crate) connection: Connection,
-    /// What had gone over it when it was found silent. An answer may have come since.
-    pub(crate) traffic: Traffic,
-    /// Which end this side is.
-    pub(crate) side: Side,
-    /// This daemon.
-    pub(crate) daemon: DaemonId,
-    /// Where probes are sent from.
-    pub(crate) endpoints: Arc<Endpoints>,
-    /// Where answers come.
-    pub(crate) echoes: Arc<Echoes>,
-    /// To the hub.
-    pub(crate) events: mpsc::Sender<Event>,
-}
-
-impl Watch {
-    /// Probes until the peer acknowledges something, or the link ends; tells the hub when the path works
-    /// and the link stays silent.
-    pub(crate) async fn run(self) {
-        let nonce = rand::random();
-        self.probe(nonce).await;
-        self.echoes.forget(nonce);
-    }
-
-    async fn probe(&self, nonce: [u8; 8]) {
-        let silent = || {
-            let over = self.connection.close_reason().is_some();
-            !over && !Traffic::of(&self.connection).answered_since(self.traffic)
-        };
-        let bytes = Datagram::Probe { daemon: self.daemon, nonce }.encode();
-        let mut echo = None;
-        let began = tokio::time::Instant::now();
-        let mut prober = Prober::new(self.side);
-        while silent() {
-            match prober.handle_timeout(began.elapsed()) {
-                Some(Step::Probe) => {
-                    echo.get_or_insert_with(|| self.echoes.await_one(nonce));
-                    self.endpoints.send(self.connection.remote_address(), &bytes);
-                }
-                Some(Step::Replace) => {
-                    let silence = Event::Silent(self.number, self.traffic);
-                    if self.events.send(silence).await.is_err() {
-                        return;
-                    }
-                }
-                None => {}
-            }
-            let due = began + prober.poll_timeout().unwrap_or(PROBE_EVERY);
-            let asked = echo.as_mut().filter(|_| prober.awaits_echo());
-            let Some(asked) = asked else {
-                tokio::time::sleep_until(due).await;
-                continue;
-            };
-            if let Ok(answer) = tokio::time::timeout_at(due, asked).await {
-                echo = None;
-                // An error: nobody will answer, and it is not asked for again.
-                if answer.is_err() {
-                    return;
-                }
-                prober.handle_echo(began.elapsed());
-            }
-        }
     }
 }
 

@@ -9,7 +9,7 @@ use axon_tls::{
 use axon_transport::config::{ClassicAuth, ClassicConfig};
 
 use super::file::Named;
-use crate::gateway::GatewayError;
+use crate::error::GatewayError;
 
 /// The files that `classic` names.
 pub(super) struct Sources {

@@ -1,11 +1,10 @@
 //! Why a gateway could not start.
 
-use std::path::PathBuf;
+use std::{io, path::PathBuf};
 
 use axon_shm::ShmError;
 use axon_transport::SessionError;
 
-use super::EndpointError;
 use crate::keys::KmeError;
 
 /// Why a gateway could not start.
@@ -42,11 +41,35 @@ pub enum GatewayError {
     Memory(#[from] ShmError),
     /// The runtime.
     #[error("the gateway's runtime: {0}")]
-    Runtime(#[from] std::io::Error),
+    Runtime(#[from] io::Error),
     /// The control plane dropped the gateway's session.
     #[error("the control plane dropped the gateway's session; its log says why")]
     SessionLost,
     /// Called for the mode that is not in force: a defect of AXON.
     #[error("a configuration for the other security mode was asked for")]
     WrongMode,
+}
+
+/// Why no endpoint could be opened.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum EndpointError {
+    /// Every port of the domain's range is taken or refused.
+    #[error(
+        "no QUIC port of {first}..={last} can be bound on {addresses}: {source}; another daemon \
+         holds it, or AXON_BIND_ADDRS names an address that this host does not have"
+    )]
+    NoPort {
+        /// First port tried.
+        first: u16,
+        /// Last port tried.
+        last: u16,
+        /// The addresses, for people.
+        addresses: String,
+        /// What the last attempt said.
+        source: io::Error,
+    },
+    /// quinn refused the socket.
+    #[error("the QUIC endpoint could not be started: {0}")]
+    Start(#[from] io::Error),
 }

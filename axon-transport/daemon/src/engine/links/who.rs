@@ -8,7 +8,7 @@ use axon_tls::{
 };
 use axon_transport::status::LinkStatus;
 
-use super::hub::Summary;
+use super::link::Summary;
 use crate::link::Hello;
 
 /// As whom a peer proved itself.

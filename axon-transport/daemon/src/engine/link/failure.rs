@@ -1,0 +1,135 @@
+//! Why a connection does not become a link, and the checks that every link has to pass.
+
+use std::{net::SocketAddr, time::Duration};
+
+use axon_tls::{KeyExchange, Negotiated, identity::CaMaterial, quic::ALPN};
+use axon_transport::config::{Config, QkdKex, Security};
+use quinn_proto::ConnectionError;
+use rustls_pki_types::CertificateDer;
+
+use crate::{
+    engine::{control::ControlError, refusal::Refusal, tls_settings::tls_cipher},
+    link::{CloseCode, Hello},
+};
+
+/// HELLO must be done in this time.
+pub(crate) const HELLO_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// The proof must be done in this time and that of its KME calls: this side's, and three tries of
+/// the peer's.
+const PROOF_TIMEOUT: Duration = Duration::from_secs(3);
+
+const PROOF_CALLS: u32 = 4;
+
+/// How long the proof may take, where a KME call may take as long as `kme_answer`.
+pub(crate) fn proof_limit(kme_answer: Duration) -> Duration {
+    PROOF_TIMEOUT + PROOF_CALLS * kme_answer
+}
+
+/// The bytes of `reason` that fit into a close: at most 300, and no part of a character.
+pub(crate) fn close_text(reason: &str) -> &[u8] {
+    let end = reason.char_indices().map(|(i, c)| i + c.len_utf8()).take_while(|e| *e <= 300).last();
+    &reason.as_bytes()[..end.unwrap_or(0)]
+}
+
+/// What went wrong on the way.
+pub(crate) enum Failure {
+    /// This side refuses.
+    Ours(CloseCode, String),
+    /// This side refuses, and tells the peer less than its own people.
+    Quietly { code: CloseCode, told: &'static str, why: String },
+    /// The peer closed, or the connection broke.
+    Connection,
+    /// The control stream said so; the connection may know more.
+    Control(ControlError),
+}
+
+impl Failure {
+    /// The refusal for log and status, and the code and text with which this side closes, if it does.
+    /// `ended` is why the connection ended, if it did.
+    pub(crate) fn into_refusal(
+        self,
+        ended: Option<&ConnectionError>,
+    ) -> (Refusal, Option<(CloseCode, String)>) {
+        let lost = |fallback: String| match ended {
+            Some(error) => Refusal::of(error),
+            None => Refusal::network(fallback),
+        };
+        let (refusal, code) = match self {
+            Self::Quietly { code, told, why } => {
+                return (Refusal::here(code, why), Some((code, told.into())));
+            }
+            Self::Ours(code, reason) => (Refusal::here(code, reason), Some(code)),
+            Self::Connection => (lost("the connection broke".into()), None),
+            Self::Control(error) => match error.code() {
+                Some(code) => (Refusal::here(code, &error), Some(code)),
+                None => (lost(error.to_string()), Some(CloseCode::Internal)),
+            },
+        };
+        let closes = code.map(|code| (code, refusal.reason.clone()));
+        (refusal, closes)
+    }
+}
+
+impl From<ControlError> for Failure {
+    fn from(error: ControlError) -> Self {
+        Self::Control(error)
+    }
+}
+
+/// What the handshake agreed on, checked against the settings once more: a defect in the TLS
+/// configuration must end here and not in a weaker link.
+pub(crate) fn agreed(
+    config: &Config,
+    negotiated: Option<Negotiated>,
+) -> Result<Negotiated, Failure> {
+    let internal = |text: &str| Failure::Ours(CloseCode::Internal, text.into());
+    let negotiated = negotiated.ok_or_else(|| internal("the handshake is not complete"))?;
+    let wanted = match &config.security {
+        Security::Classic(_) => KeyExchange::X25519MlKem768,
+        Security::Qkd(qkd) => match qkd.kex {
+            QkdKex::PskKe => KeyExchange::PskKe,
+            QkdKex::PskDheKe => KeyExchange::PskDheKe,
+        },
+    };
+    if negotiated.key_exchange != wanted || negotiated.cipher != tls_cipher(config.cipher) {
+        return Err(internal("the handshake agreed on something else than the settings"));
+    }
+    if negotiated.alpn != ALPN {
+        return Err(internal("the handshake agreed on another protocol than axon/1"));
+    }
+    Ok(negotiated)
+}
+
+/// Refuses a peer while this host does not know whom to trust; `closed` says why.
+pub(crate) fn admits(closed: Option<String>) -> Result<(), Failure> {
+    let told = "this host cannot read whom it trusts, and takes nobody; its log says more";
+    match closed {
+        Some(why) => Err(Failure::Quietly { code: CloseCode::NotAllowed, told, why }),
+        None => Ok(()),
+    }
+}
+
+/// In `ca` a certificate stands for the hosts that it names: the peer must be one of them. In
+/// `pinned` the pin has the peer's name, and what it calls itself counts for nothing.
+pub(crate) fn names_its_host(chain: &[CertificateDer<'_>], theirs: &Hello) -> Result<(), Failure> {
+    if chain.first().is_some_and(|c| CaMaterial::is_for_host(c, &theirs.host)) {
+        return Ok(());
+    }
+    let text = format!(
+        "its certificate does not name the host {:?}; give it one with that DNS name (no wildcard)",
+        theirs.host
+    );
+    Err(Failure::Ours(CloseCode::NotAllowed, text))
+}
+
+/// The PSK of the handshake was spent before.
+pub(crate) fn reused() -> Failure {
+    let text = "this PSK has completed a handshake before; a KME key is used once";
+    Failure::Ours(CloseCode::KeyReused, text.into())
+}
+
+/// Where a peer is, for log and status.
+pub(crate) fn peer_text(sae: Option<&str>, address: SocketAddr) -> String {
+    sae.map_or_else(|| address.to_string(), |sae| format!("{sae} at {address}"))
+}
