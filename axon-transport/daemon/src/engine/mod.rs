@@ -279,6 +279,9 @@ impl Engine {
                     peer.send_graph(with.local, true);
                 });
                 self.next_report = now;
+                // Streams that the peer opened before this host knew it: QUIC told of them once.
+                let opened = StreamEvent::Opened { dir: quinn_proto::Dir::Uni };
+                self.handle_stream(number, daemon, opened, now);
             }
             LinkEvent::Message(number, daemon, message) => {
                 self.handle_message(number, daemon, message, now);
