@@ -701,7 +701,9 @@ impl Engine {
             samples.into_iter().chain([peer.poll_timeout(self.epoch, now), turn, more])
         });
         let report = (!self.peers.is_empty()).then_some(self.next_report);
-        peers.chain([links, report]).flatten().min()
+        // What the last packets of a pass brought about.
+        let events = self.links.has_events().then_some(now);
+        peers.chain([links, report, events]).flatten().min()
     }
 
     /// Does what is due. [`settle`](Self::settle) has to follow.
