@@ -284,6 +284,9 @@ impl Engine {
                     peer.send_graph(with.local, true);
                 });
                 self.next_report = now;
+                // Streams that the peer opened before this host knew it: QUIC told of them once.
+                let opened = StreamEvent::Opened { dir: quinn_proto::Dir::Uni };
+                self.handle_stream(number, daemon, opened, now);
             }
             LinkEvent::Message(number, daemon, message) => {
                 self.handle_message(number, daemon, message, now);
@@ -706,7 +709,9 @@ impl Engine {
             samples.into_iter().chain([peer.poll_timeout(self.epoch, now), turn, more])
         });
         let report = (!self.peers.is_empty()).then_some(self.next_report);
-        peers.chain([links, report]).flatten().min()
+        // What the last packets of a pass brought about.
+        let events = self.links.has_events().then_some(now);
+        peers.chain([links, report, events]).flatten().min()
     }
 
     /// Does what is due. [`settle`](Self::settle) has to follow.

@@ -341,6 +341,11 @@ impl Links {
         self.reports.pop_front()
     }
 
+    /// Whether there are events for the peers.
+    pub(super) fn has_events(&self) -> bool {
+        !self.events.is_empty()
+    }
+
     /// The next event for the peers.
     pub(super) fn poll_event(&mut self) -> Option<LinkEvent> {
         self.events.pop_front()
