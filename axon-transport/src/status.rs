@@ -268,6 +268,27 @@ pub struct LinkStatus {
     pub since_unix_ms: u64,
     /// Round-trip time in microseconds.
     pub rtt_us: u64,
+    /// Shortest round-trip time so far, in microseconds.
+    #[serde(default)]
+    pub rtt_min_us: u64,
+    /// Congestion window in bytes.
+    #[serde(default)]
+    pub congestion_window: u64,
+    /// Packets that were lost.
+    #[serde(default)]
+    pub packets_lost: u64,
+    /// Times that the congestion controller took packets for lost, or marked.
+    #[serde(default)]
+    pub congestion_events: u64,
+    /// Largest UDP payload, in bytes.
+    #[serde(default)]
+    pub mtu: u64,
+    /// Bytes of samples that wait for the link.
+    #[serde(default)]
+    pub waiting_bytes: u64,
+    /// Milliseconds that the oldest of them has waited.
+    #[serde(default)]
+    pub waiting_ms: u64,
     /// Samples received.
     pub samples_in: u64,
     /// Samples sent.

@@ -8,10 +8,7 @@ use quinn_proto::{ReadError, ReadableError, StreamId, WriteError};
 
 use crate::{
     engine::account::{Charge, Meter, cost, cost_of_frame},
-    link::{
-        CloseCode, FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, Message, is_known,
-        read_length,
-    },
+    link::{CloseCode, FrameError, MAX_FRAME_BEFORE_HELLO, Message, is_known, read_length},
 };
 
 /// Bytes of messages that wait for a peer that does not read them.

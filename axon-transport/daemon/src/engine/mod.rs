@@ -31,7 +31,7 @@ pub(crate) mod transport;
 
 use std::{
     cell::RefCell,
-    collections::{BTreeSet, HashMap, VecDeque},
+    collections::{HashMap, VecDeque},
     net::{IpAddr, SocketAddr},
     rc::Rc,
     sync::Arc,
@@ -678,11 +678,11 @@ impl Engine {
     }
 
     /// Reports losses and the status of each link.
-    fn report(&mut self) {
+    fn report(&mut self, now: Duration) {
         let mut reports = Vec::new();
         for peer in self.peers.values() {
             let text = self.links.peer_text(peer.link);
-            reports.push((text, peer.counters.take_lost(), self.link_status(peer)));
+            reports.push((text, peer.counters.take_lost(), self.link_status(peer, now)));
         }
         for (peer, losses, status) in reports {
             self.tell_lost(&peer, losses);
@@ -690,9 +690,9 @@ impl Engine {
         }
     }
 
-    fn link_status(&self, peer: &Peer) -> Option<LinkStatus> {
+    fn link_status(&self, peer: &Peer, now: Duration) -> Option<LinkStatus> {
         let mut status = self.links.status(peer.link)?;
-        peer.fill(&mut status);
+        peer.fill(&mut status, now);
         Some(status)
     }
 
@@ -737,7 +737,7 @@ impl Engine {
             self.next_report = now + REPORT;
             self.resync();
             self.peers.values_mut().for_each(|peer| peer.outbound.count_overwritten());
-            self.report();
+            self.report(now);
         }
     }
 

@@ -12,7 +12,7 @@ use crate::{
     engine::{
         keyring::{Keyring, warn_disagreement},
         link::target::{
-            DECRYPT_ERROR, HANDSHAKE_TIMEOUT, Target, UNKNOWN_PSK_IDENTITY, Unreached, dial_limit,
+            DECRYPT_ERROR, HANDSHAKE_TIMEOUT, Target, UNKNOWN_PSK_IDENTITY, dial_limit,
         },
         refusal::Refusal,
     },
@@ -60,12 +60,13 @@ enum State {
 struct Round {
     attempt: Option<Arc<Attempt>>,
     next: usize,
-    last: Unreached,
+    /// Why the last address is no connection.
+    last: String,
 }
 
 impl Round {
     fn new(attempt: Option<Arc<Attempt>>) -> Self {
-        Self { attempt, next: 0, last: Unreached::Silence("no address to dial".into()) }
+        Self { attempt, next: 0, last: "no address to dial".into() }
     }
 }
 
@@ -217,7 +218,7 @@ impl Dialling {
                 }
                 State::Try(mut round) => {
                     let Some(address) = self.target.addresses.get(round.next).copied() else {
-                        let refusal = round.last.refusal();
+                        let refusal = Refusal::network(&round.last);
                         match self.refused(now, &round, refusal, keyring.as_deref_mut()) {
                             Some(action) => return Some(action),
                             None => continue,
@@ -288,7 +289,7 @@ impl Dialling {
                 Some(Action::Failed(Refusal::here(CloseCode::Internal, error)))
             }
             Outcome::Unreachable(reason) => {
-                round.last = Unreached::Silence(reason);
+                round.last = reason;
                 self.state = State::Try(round);
                 None
             }
@@ -304,7 +305,7 @@ impl Dialling {
     /// The address before `next` did not answer.
     fn silent(&mut self, mut round: Round) {
         let address = self.target.addresses[round.next - 1];
-        round.last = Unreached::Silence(format!("{address} does not answer"));
+        round.last = format!("{address} does not answer");
         self.state = State::Try(round);
     }
 

@@ -172,16 +172,6 @@ impl Opening {
         opening
     }
 
-    /// This daemon's number for the connection.
-    pub(crate) fn connection(&self) -> u64 {
-        self.connection
-    }
-
-    /// Which end this side is.
-    pub(crate) fn side(&self) -> Side {
-        self.side
-    }
-
     /// Whether the owner may read the next message from the control stream. What the peer sends
     /// meanwhile waits in the stream.
     pub(crate) fn reads(&self) -> bool {

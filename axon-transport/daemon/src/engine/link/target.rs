@@ -3,9 +3,8 @@
 use std::{net::SocketAddr, time::Duration};
 
 use axon_shm::ids::DaemonId;
-use quinn_proto::ConnectionError;
 
-use crate::{discovery::AddressConfidence, engine::refusal::Refusal, link::Hello};
+use crate::{discovery::AddressConfidence, link::Hello};
 
 /// One address is given this long to complete the handshake.
 pub(crate) const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);
@@ -60,21 +59,4 @@ impl Target {
 /// How long a whole dial may take; in qkd a KME call may take as long as `kme_answer`.
 pub(crate) fn dial_limit(kme_answer: Option<Duration>) -> Duration {
     DIAL_TIMEOUT + kme_answer.map(|answer| 2 * answer).unwrap_or_default()
-}
-
-/// Why no address answered.
-pub(crate) enum Unreached {
-    /// A peer, or this side, ended the handshake.
-    Handshake(ConnectionError),
-    /// Nothing came back.
-    Silence(String),
-}
-
-impl Unreached {
-    pub(crate) fn refusal(&self) -> Refusal {
-        match self {
-            Self::Handshake(error) => Refusal::of(error),
-            Self::Silence(reason) => Refusal::network(reason),
-        }
-    }
 }

@@ -866,7 +866,7 @@ impl Links {
     pub(super) fn status(&self, number: u64) -> Option<LinkStatus> {
         let quic = &self.connections.get(&number)?.quic;
         let peer = self.links.get(&number)?.peer.as_ref()?;
-        Some(who::link(&peer.summary, quic.remote_address(), quic.rtt(), peer.since_unix_ms))
+        Some(who::link(&peer.summary, quic, peer.since_unix_ms))
     }
 
     /// Datagrams that came over a link.

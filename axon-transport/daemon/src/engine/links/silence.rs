@@ -24,7 +24,9 @@ impl Links {
             && let Some(number) = self.nonces.remove(&nonce)
         {
             let peer = self.links.get_mut(&number).and_then(|link| link.peer.as_mut());
-            if let Some(probing) = peer.and_then(|peer| peer.silence.probing.as_mut()) {
+            if let Some(probing) = peer.and_then(|peer| peer.silence.probing.as_mut())
+                && probing.prober.awaits_echo()
+            {
                 probing.prober.handle_echo(now.saturating_sub(probing.begun));
             }
             return;

@@ -86,10 +86,11 @@ impl fmt::Display for Who {
 /// The status of a link, its counters aside.
 pub(crate) fn link(
     summary: &Summary,
-    address: SocketAddr,
-    rtt: Duration,
+    quic: &quinn_proto::Connection,
     since_unix_ms: u64,
 ) -> LinkStatus {
+    let path = quic.stats().path;
+    let micros = |time: Duration| u64::try_from(time.as_micros()).unwrap_or(u64::MAX);
     LinkStatus {
         peer: summary.hello.daemon.to_string(),
         host: match &summary.who {
@@ -98,13 +99,18 @@ pub(crate) fn link(
             _ => summary.hello.host.clone(),
         },
         sae: summary.hello.sae.clone(),
-        address: address.to_string(),
+        address: quic.remote_address().to_string(),
         state: "connected".into(),
         key_exchange: summary.negotiated.key_exchange.to_string(),
         cipher: summary.negotiated.cipher.name().into(),
         authenticated_as: summary.who.to_string(),
         since_unix_ms,
-        rtt_us: u64::try_from(rtt.as_micros()).unwrap_or(u64::MAX),
+        rtt_us: micros(quic.rtt()),
+        rtt_min_us: micros(quic.min_rtt()),
+        congestion_window: path.cwnd,
+        packets_lost: path.lost_packets,
+        congestion_events: path.congestion_events,
+        mtu: path.current_mtu.into(),
         ..LinkStatus::default()
     }
 }

@@ -39,7 +39,6 @@ struct Writing {
 struct UnderWay {
     stream: StreamId,
     priority: i32,
-    sequence: u64,
     /// With header and envelope.
     bytes: u64,
     payload: usize,
@@ -108,15 +107,8 @@ impl BestEffort {
             carrier.streams.insert(stream, carrier.flow);
             let left = sample.lifespan_left(now).unwrap_or(LONGEST).min(LONGEST);
             let bytes = pending.iter().map(|piece| piece.len() as u64).sum();
-            let sample = UnderWay {
-                stream,
-                priority,
-                sequence,
-                bytes,
-                payload,
-                begun: now,
-                deadline: now + left,
-            };
+            let sample =
+                UnderWay { stream, priority, bytes, payload, begun: now, deadline: now + left };
             self.writing = Some(Writing { stream, pending, sample });
         }
         let Writing { stream, pending, sample } = self.writing.as_mut()?;

@@ -460,9 +460,13 @@ impl Peer {
     }
 
     /// Adds its graph and refused routes to the link's status.
-    pub(super) fn fill(&self, status: &mut LinkStatus) {
+    pub(super) fn fill(&self, status: &mut LinkStatus, now: Duration) {
         self.counters.fill(status);
         self.show_refused(status);
+        let backlog = self.outbound.backlog();
+        status.waiting_bytes = backlog.bytes as u64;
+        let waited = backlog.oldest.map_or(Duration::ZERO, |oldest| now.saturating_sub(oldest));
+        status.waiting_ms = u64::try_from(waited.as_millis()).unwrap_or(u64::MAX);
         status.endpoints = self.remote.len() as u64;
         status.endpoints_left_out = self.remote.left_out();
         status.graph_bytes = self.remote.account().graph.held() as u64;

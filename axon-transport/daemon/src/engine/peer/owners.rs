@@ -9,23 +9,16 @@ use std::{
 
 use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::internal::SessionKey;
-use quinn::Connection;
 
 use crate::{
     link::{MAX_PROOFS, Message, Owners},
-    owner::{Binding, EXPORTER, Prefix, Proof, SessionKeys, prefix, prefix_of, prove},
+    owner::{Binding, Prefix, Proof, SessionKeys, prefix, prefix_of, prove},
 };
 
 /// Sessions of one daemon that are taken for proven.
 const MAX_PROVEN: usize = 8192;
 /// How often sessions without endpoints are looked for, where there are too many.
 const SWEEP: Duration = Duration::from_secs(1);
-
-/// The bytes that both ends of this connection share and no other connection has.
-pub(crate) fn binding(connection: &Connection) -> Option<Binding> {
-    let mut binding = [0; 32];
-    connection.export_keying_material(&mut binding, EXPORTER, b"").ok().map(|()| binding)
-}
 
 /// Proves to one peer that sessions are this daemon's.
 pub(crate) struct Prover {

@@ -34,7 +34,7 @@ fn classic() {
     assert!(client.sealing.is_none() && server.sealing.is_none());
     assert_eq!(client.negotiated, hybrid());
     let opening = &pair.server.opening;
-    assert_eq!((opening.connection(), opening.side()), (LINK, Side::Server));
+    assert_eq!((opening.connection, opening.side), (LINK, Side::Server));
     assert_eq!(pair.client.opening.poll_timeout(), None);
     assert!(pair.kmes.asked.is_empty());
 }
