@@ -1,6 +1,7 @@
 #![doc = include_str!("../README.md")]
 #![deny(unsafe_code)]
 
+mod attempt;
 mod control;
 mod discovery;
 mod engine;
@@ -38,8 +39,13 @@ pub mod internal {
     pub use crate::{
         control::GatewayEntry,
         discovery::{quic_ports, shared_group},
-        gateway::{Refusal, RefusedBy, attempt, bridge},
+        gateway::{Refusal, RefusedBy, bridge},
     };
+
+    /// Single links made by hand.
+    pub mod attempt {
+        pub use crate::attempt::*;
+    }
 
     /// Keys and the KME.
     pub mod keys {

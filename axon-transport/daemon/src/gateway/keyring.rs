@@ -178,25 +178,6 @@ impl Keyring {
         lock(&self.proofs).remove(&link);
     }
 
-    /// One fresh key for the peer `slave`, outside every machine: for [`super::attempt`].
-    pub(super) async fn fetch_one(
-        &self,
-        slave: &str,
-        link: u64,
-    ) -> Result<(KeyId, KmeKey), String> {
-        let mut answers = self.proof_answers(link);
-        let request =
-            Request::Enc { slave: slave.to_owned(), number: 1, purpose: Purpose::Bootstrap };
-        self.submit(Origin::Proof(link), request);
-        let answer = answers.recv().await;
-        self.proof_over(link);
-        match answer.map(|a| a.outcome) {
-            Some(Ok(Fetched::Keys(mut keys))) if !keys.is_empty() => Ok(keys.swap_remove(0)),
-            Some(Err(failure)) => Err(failure.to_string()),
-            _ => Err("the KME gave no key".into()),
-        }
-    }
-
     /// Hands a request to the KME; when its queue is full the machine is told at once.
     pub(super) fn submit(&self, origin: Origin, request: Request) {
         if let Err(event) = self.kme.submit(origin, request) {

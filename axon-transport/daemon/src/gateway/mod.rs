@@ -2,13 +2,10 @@
 //!
 //! It is one more session of its daemon: relays read the rings of local publishers, stand-ins write
 //! rings for remote ones. It runs on a thread and runtime of its own, so that its faults and stalls
-//! are not the control plane's (`docs/architecture.md`). [`attempt`] makes single links by hand,
-//! for tools that try what a daemon refuses.
+//! are not the control plane's (`docs/architecture.md`).
 
 // The engine and the reactor replace it. What they do not use goes.
 #![allow(dead_code, private_interfaces)]
-
-pub mod attempt;
 
 pub(crate) mod accept;
 pub(crate) mod account;
