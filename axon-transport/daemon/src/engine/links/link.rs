@@ -99,6 +99,8 @@ pub(super) struct LinkPeer {
 pub(super) struct Silence {
     /// What came and went at the last look.
     pub(super) traffic: Traffic,
+    /// What had gone when the last datagram came.
+    pub(super) heard: Traffic,
     /// Probes of the path, while the link is silent.
     pub(super) probing: Option<Probing>,
     /// A successor was dialled since it is silent, and nothing was acknowledged since.
@@ -117,7 +119,8 @@ pub(super) struct Probing {
 
 impl Silence {
     pub(super) fn new() -> Self {
-        Self { traffic: Traffic::default(), probing: None, silent: false }
+        let (traffic, heard) = (Traffic::default(), Traffic::default());
+        Self { traffic, heard, probing: None, silent: false }
     }
 }
 

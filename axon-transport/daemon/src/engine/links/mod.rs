@@ -387,6 +387,7 @@ impl Links {
             }
         }
         self.read_control(number, now);
+        self.note_heard(number);
         self.note_connection(number);
     }
 

@@ -62,9 +62,15 @@ impl Traffic {
         self.acknowledged != before.acknowledged
     }
 
-    /// Whether something was asked since `before` and nothing came.
-    pub(crate) fn is_silent_since(self, before: Self) -> bool {
-        self.came == before.came && self.asked > before.asked
+    /// Whether nothing came since `before`, and something was asked since the last datagram came, when the traffic
+    /// was `heard`.
+    pub(crate) fn is_silent(self, before: Self, heard: Self) -> bool {
+        self.came == before.came && self.asked > heard.asked
+    }
+
+    /// Whether a datagram came since `before`.
+    pub(crate) fn has_come_since(self, before: Self) -> bool {
+        self.came != before.came
     }
 }
 

@@ -34,6 +34,21 @@ impl Links {
         self.report(LinkReport::Datagram { from, bytes: bytes.to_vec() });
     }
 
+    /// Notes what had gone over a link when a datagram came. What is sent later has no answer yet. QUIC does not always
+    /// send it again: its probes may ask for an acknowledgement alone.
+    pub(super) fn note_heard(&mut self, number: u64) {
+        let (Some(connection), Some(peer)) = (
+            self.connections.get(&number),
+            self.links.get_mut(&number).and_then(|link| link.peer.as_mut()),
+        ) else {
+            return;
+        };
+        let traffic = Traffic::from(&connection.quic.stats());
+        if traffic.has_come_since(peer.silence.heard) {
+            peer.silence.heard = traffic;
+        }
+    }
+
     /// Probes the path of links over which something went out, and nothing came in the last second.
     pub(super) fn look_for_silence(&mut self, now: Duration) {
         let open = self.links.iter().filter(|(_, link)| link.is_open()).map(|(number, _)| *number);
@@ -47,7 +62,8 @@ impl Links {
             let before = std::mem::replace(&mut peer.silence.traffic, traffic);
             // It is no longer silent: what is under way arrives.
             peer.silence.silent &= !traffic.answered_since(before);
-            if peer.silence.probing.is_some() || !traffic.is_silent_since(before) {
+            let heard = peer.silence.heard;
+            if peer.silence.probing.is_some() || !traffic.is_silent(before, heard) {
                 continue;
             }
             tracing::debug!(peer = %peer.summary.hello.daemon,
