@@ -121,11 +121,7 @@ fn a_full_keep_all_ring_holds_the_publisher_back_and_loses_nothing() {
 fn best_effort_overload(load: f64, depth: u32) -> (f64, Duration) {
     let mut world = World::new(7, 2, classic);
     let rate = super::network::Rate::new(54_000_000 / 8, millis(50));
-    world.network.set_default_path(Path {
-        delay: millis(1),
-        rate: Some(rate),
-        ..Path::default()
-    });
+    world.network.set_default_path(Path { delay: millis(1), rate: Some(rate), ..Path::default() });
     let pair = world.pair(0, 1, "/camera", Qos { depth, ..Qos::sensor_data() });
     world.until(secs(10), World::is_whole);
     world.run_for(secs(1));

@@ -132,7 +132,36 @@ impl World {
             for (subscription, publisher, first, came) in there.rings.complete() {
                 let from = self.hosts.iter().find_map(|host| {
                     let (qos, published) = host.rings.publisher(publisher)?;
-                    let pair = Pair { publisher: (from, publisher), subscription: (to, subscription) };
+                    let complete =
+                        qos.history == History::KeepAll && qos.reliability == Reliability::Reliable;
+                    complete.then_some((host.number, published))
+                });
+                let Some((from, published)) = from else { continue };
+                let missing = (published + 1 - first).saturating_sub(came);
+                losses.push(((from, publisher), ((there.number, subscription), missing)));
+            }
+        }
+        losses
+    }
+
+    /// Starts a host's daemon again, under a new id. The others forget the old one.
+    pub(super) fn restart(&mut self, host: usize) {
+        let old = self.hosts[host].daemon;
+        for other in &mut self.hosts {
+            other.unwant(old);
+        }
+        let now = self.now;
+        self.hosts[host].start(now);
+        self.introduce(host);
+    }
+
+    /// Creates a publisher and a subscription of the same topic on two hosts.
+    pub(super) fn pair(&mut self, from: usize, to: usize, topic: &str, qos: Qos) -> Pair {
+        let publisher = self.hosts[from].rings.create_publisher(topic, qos);
+        let subscription = self.hosts[to].rings.create_subscription(topic, qos, None);
+        self.hosts[from].touch_graph();
+        self.hosts[to].touch_graph();
+        let pair = Pair { publisher: (from, publisher), subscription: (to, subscription) };
         self.pairs.push(pair);
         pair
     }
