@@ -201,7 +201,9 @@ impl Flow {
     /// Moves a burst of a KEEP_LAST publisher into the queue while QUIC takes nothing: in the ring it would be
     /// overwritten. BEST_EFFORT samples stay there: only the newest will be sent. A KEEP_ALL publisher waits.
     pub(super) fn take_burst(&mut self, sources: &[Source], counters: &Counters, now: Duration) {
-        if !(self.blocked || !self.pending.is_empty()) || !self.queue.keeps_bursts() {
+        // A flow that is behind takes the newest sample once it can be sent.
+        let waits = self.blocked || !self.pending.is_empty();
+        if !waits || !self.queue.keeps_bursts() || self.queue.is_behind(now) {
             return;
         }
         while self.more {

@@ -189,7 +189,7 @@ fn a_partition_that_outlasts_the_links_heals() {
 fn a_clock_that_jumps_changes_nothing() {
     // The engine is given monotonic time alone: a host whose time starts elsewhere behaves alike.
     let mut world = World::new(10, 2, classic);
-    world.run_until(secs(1_000_000));
+    world.run_until(secs(10_000));
     let pair = world.pair(0, 1, "/t", Qos::keep_all());
     world.until(secs(5), World::is_whole);
     world.run_for(secs(1));
