@@ -1,8 +1,8 @@
 #![doc = include_str!("../README.md")]
 #![deny(unsafe_code)]
 
-#[doc(hidden)]
-pub mod bridge;
+mod attempt;
+mod bridge;
 mod check;
 mod control;
 mod discovery;
@@ -42,12 +42,20 @@ pub use error::GatewayError;
 #[doc(hidden)]
 pub mod internal {
     pub use crate::{
-        bridge,
         control::GatewayEntry,
         discovery::{quic_ports, shared_group},
         engine::refusal::{Refusal, RefusedBy},
     };
 
+    /// Single links made by hand.
+    pub mod attempt {
+        pub use crate::attempt::*;
+    }
+
+    /// The messages between the control plane and the reactor.
+    pub mod bridge {
+        pub use crate::bridge::*;
+    }
     /// Keys and the KME.
     pub mod keys {
         pub use crate::keys::*;

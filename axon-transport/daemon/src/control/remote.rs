@@ -9,7 +9,10 @@ use tokio::{
     task::{JoinHandle, spawn_local},
 };
 
-use super::{gateway::GatewayEntry, gateway::Pause, gateway::Running, plane::Control};
+use super::{
+    gateway::{GatewayEntry, Pause, Running},
+    plane::Control,
+};
 use crate::{
     bridge::{CHANNEL, ToControl, ToGateway},
     discovery::{self, Action, Event},

@@ -16,10 +16,11 @@ use crate::{
     link::{MAX_INFLATED, Message, is_known, unpacked_length},
 };
 
-/// Relays that one identity may have here. Each costs an endpoint of the engine's session.
-pub(crate) const MAX_RELAYS: usize = 32 << 10;
+/// Relays that one identity may have here: a thirty-second of the endpoints that the engine's session may have for all
+/// peers. Each takes a lane for each publisher here that it reads.
+pub(crate) const MAX_RELAYS: usize = 2048;
 /// Stand-ins of one identity. Each costs a ring.
-pub(crate) const MAX_STAND_INS: usize = 32 << 10;
+pub(crate) const MAX_STAND_INS: usize = 1024;
 /// Unread stream data of one identity, in bytes. Each of its links has
 /// [`LINK_WINDOW`](super::transport::LINK_WINDOW) more.
 const UNREAD: usize = 64 << 20;

@@ -8,7 +8,10 @@ use quinn_proto::{ReadError, ReadableError, StreamId, WriteError};
 
 use crate::{
     engine::account::{Charge, Meter, cost, cost_of_frame},
-    link::{CloseCode, FrameError, MAX_FRAME_BEFORE_HELLO, Message, is_known, read_length},
+    link::{
+        CloseCode, FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, Message, is_known,
+        read_length,
+    },
 };
 
 /// Bytes of messages that wait for a peer that does not read them.
@@ -55,6 +58,10 @@ impl FrameLimits {
     /// Before the peer's HELLO was checked.
     pub(crate) const BEFORE_HELLO: Self =
         Self { frame: MAX_FRAME_BEFORE_HELLO, inflated: MAX_FRAME_BEFORE_HELLO };
+    /// After HELLO, before the peer has proven who it is.
+    pub(crate) const UNPROVEN: Self = Self { frame: MAX_FRAME, inflated: MAX_FRAME_BEFORE_HELLO };
+    /// The peer has proven who it is.
+    pub(crate) const PROVEN: Self = Self { frame: MAX_FRAME, inflated: MAX_INFLATED };
 }
 
 /// The control stream.

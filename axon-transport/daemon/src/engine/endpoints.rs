@@ -35,6 +35,13 @@ pub(super) enum Received {
     Done,
 }
 
+/// Whether a socket bound to `local` reaches the address `to`.
+pub(crate) fn reaches(local: SocketAddr, to: SocketAddr) -> bool {
+    // 127.0.0.1 alone must not be asked to reach another host.
+    let same_reach = local.ip().is_loopback() == to.ip().is_loopback();
+    local.is_ipv4() == to.is_ipv4() && (same_reach || local.ip().is_unspecified())
+}
+
 /// The endpoints.
 pub(super) struct Endpoints {
     all: Vec<(SocketAddr, Endpoint)>,
@@ -61,10 +68,7 @@ impl Endpoints {
 
     /// The endpoint that reaches an address.
     pub(super) fn towards(&self, to: SocketAddr) -> Option<usize> {
-        let family = |a: &SocketAddr| a.is_ipv4() == to.is_ipv4();
-        let local = |a: &SocketAddr| a.ip().is_loopback() == to.ip().is_loopback();
-        // 127.0.0.1 alone must not be asked to reach another host.
-        self.all.iter().position(|(a, _)| family(a) && (local(a) || a.ip().is_unspecified()))
+        self.all.iter().position(|(address, _)| reaches(*address, to))
     }
 
     /// Handles a datagram.

@@ -14,6 +14,8 @@ mod session;
 mod sockets;
 mod told;
 
+pub(crate) use self::bind::bind_daemon;
+
 use std::{
     sync::Arc,
     time::{Duration, Instant},

@@ -23,10 +23,7 @@ use crate::{
         refusal::Refusal,
     },
     keys::{Answer, Completion, Exporters, Origin, Request},
-    link::{
-        CloseCode, FrameError, Hello, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, Message,
-        Order, Side, check,
-    },
+    link::{CloseCode, FrameError, Hello, Message, Order, Side, check},
 };
 
 #[cfg(test)]
@@ -184,9 +181,10 @@ impl Opening {
 
     /// The limits of the next frame.
     pub(crate) fn limits(&self) -> FrameLimits {
-        FrameLimits {
-            frame: if self.greeted { MAX_FRAME } else { MAX_FRAME_BEFORE_HELLO },
-            inflated: if self.opened { MAX_INFLATED } else { MAX_FRAME_BEFORE_HELLO },
+        match (self.greeted, self.opened) {
+            (_, true) => FrameLimits::PROVEN,
+            (true, false) => FrameLimits::UNPROVEN,
+            (false, false) => FrameLimits::BEFORE_HELLO,
         }
     }
 

@@ -17,7 +17,7 @@ use axon_transport::{
     internal::graph::{Pairing, RangeToHost, RemoteEndpoint, out_of_range, pairing, reads, writes},
 };
 
-use crate::link::Subscriber;
+use crate::{engine::account::MAX_RELAYS, link::Subscriber};
 
 /// What a route carries: samples, requests or responses, of one name and type.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -109,10 +109,7 @@ pub(crate) fn wanted<'a>(
     routes
 }
 
-/// Relays that a peer may have: a thirty-second of the endpoints that the gateway's session may have for
-/// all peers. Each takes a lane for each publisher here that it reads.
-pub(crate) const MAX_RELAYS: usize = 2048;
-/// Those for one route.
+/// Relays for one route.
 const MAX_RELAYS_OF_ROUTE: usize = 16;
 
 /// One relay subscription that the sending side opens for a topic's route.

@@ -19,10 +19,10 @@ use crate::{
 /// A route is said to be ready once it has a writer, or after this time.
 const READY_TIMEOUT: Duration = Duration::from_secs(2);
 /// Memory of a route, in bytes, beside the names and subscribers of which it holds three copies.
-const ROUTE: usize = 512;
+const ROUTE: usize = 2048;
 const COPIES: usize = 3;
 /// Routes that a peer is served. HELLO says it.
-pub(crate) const MAX_ROUTES: usize = 32 << 10;
+pub(crate) const MAX_ROUTES: usize = 1024;
 
 /// A route that the peer asked for.
 pub(super) struct Served {

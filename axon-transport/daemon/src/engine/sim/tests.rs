@@ -90,6 +90,114 @@ fn a_daemon_that_is_killed_and_started_again_links_again() {
     world.until(secs(30), World::is_whole);
 }
 
+#[test]
+fn a_full_keep_all_ring_holds_the_publisher_back_and_loses_nothing() {
+    let mut world = World::new(6, 2, classic);
+    let publisher = world.hosts[0].rings.create_publisher("/t", Qos::keep_all());
+    let subscription = world.hosts[1].rings.create_subscription("/t", Qos::keep_all(), Some(10));
+    world.hosts[0].touch_graph();
+    world.hosts[1].touch_graph();
+    world.until(secs(5), World::is_whole);
+    world.run_for(secs(1));
+    let mut published = 0;
+    for _ in 0..2000 {
+        published += u64::from(world.hosts[0].rings.publish(publisher, 20_000));
+        world.hosts[0].ring();
+        world.run_for(millis(2));
+    }
+    assert!(published < 2000, "the publisher was held back");
+    assert_eq!(world.hosts[1].rings.received(subscription, publisher).len(), 10);
+    assert!(world.hosts[1].rings.waits_for_room());
+    world.hosts[1].rings.make_room(subscription);
+    world.hosts[1].ring();
+    world.run_for(secs(10));
+    let received = world.hosts[1].rings.received(subscription, publisher);
+    assert_eq!(received, (1..=published).collect::<Vec<_>>());
+    assert!(!world.hosts[1].rings.waits_for_room());
+}
+
+/// Offers best-effort samples of 512 KiB to a path of 54 Mbit/s for 20 s, `load` times what it carries. Returns the
+/// share that arrives, and the median of their ages.
+fn best_effort_overload(load: f64, depth: u32) -> (f64, Duration) {
+    let mut world = World::new(7, 2, classic);
+    let rate = super::network::Rate::new(54_000_000 / 8, millis(50));
+    world.network.set_default_path(Path { delay: millis(1), rate: Some(rate), ..Path::default() });
+    let pair = world.pair(0, 1, "/camera", Qos { depth, ..Qos::sensor_data() });
+    world.until(secs(10), World::is_whole);
+    world.run_for(secs(1));
+    let length = 512 << 10;
+    let every = Duration::from_secs_f64(length as f64 * 8.0 / (54e6 * load));
+    let (mut published, mut ages, mut seen) = (Vec::new(), Vec::new(), 0);
+    let (end, mut next) = (world.now + secs(20), world.now);
+    while world.now < end {
+        if world.now >= next {
+            world.publish(pair, length);
+            published.push(world.now);
+            next += every;
+        }
+        world.run_for(millis(1));
+        let received = world.received(pair);
+        let of = |number: &u64| world.now - published[*number as usize - 1];
+        ages.extend(received[seen..].iter().map(of));
+        seen = received.len();
+    }
+    ages.sort_unstable();
+    (seen as f64 / published.len() as f64, ages[ages.len() / 2])
+}
+
+#[test]
+fn best_effort_beyond_the_rate_delivers_whole_samples_near_the_ceiling() {
+    for (load, depth) in [(1.01, 5), (2.33, 5), (2.33, 1)] {
+        let (share, median) = best_effort_overload(load, depth);
+        println!("{load} of the rate, depth {depth}: {share:.2} arrive, median age {median:?}");
+        assert!(share > 0.8 / load, "{load}, depth {depth}: {share}");
+        assert!(median < millis(500), "{load}, depth {depth}: {median:?}");
+    }
+}
+
+#[test]
+fn a_segment_of_many_hosts_is_whole_after_a_cold_start() {
+    let hosts = setting("SIMULATE_HOSTS", 20) as usize;
+    let mut world = World::new(8, hosts, classic);
+    for host in 0..hosts {
+        for topic in 0..20 {
+            world.hosts[host].rings.create_publisher(&format!("/{host}/{topic}"), Qos::default());
+        }
+    }
+    world.until(secs(5), World::is_whole);
+    let most = (0..hosts).map(|host| world.network.counters(host).sent_bytes).max().unwrap();
+    println!("{hosts} hosts are whole after {:?}; at most {most} bytes sent by one", world.now);
+}
+
+#[test]
+fn a_partition_that_outlasts_the_links_heals() {
+    let mut world = World::new(9, 4, classic);
+    let pair = world.pair(0, 3, "/t", Qos::keep_all());
+    world.until(secs(5), World::is_whole);
+    let cut = world.network.partition(&[0, 1], None);
+    world.run_for(secs(40));
+    assert!(!world.is_linked());
+    world.network.heal(cut);
+    world.until(secs(10), World::is_whole);
+    world.run_for(secs(2));
+    assert!(world.publish(pair, 10));
+    world.run_for(secs(1));
+    assert_eq!(world.received(pair).len(), 1, "{}", world.describe());
+}
+
+#[test]
+fn a_clock_that_jumps_changes_nothing() {
+    // The engine is given monotonic time alone: a host whose time starts elsewhere behaves alike.
+    let mut world = World::new(10, 2, classic);
+    world.run_until(secs(1_000_000));
+    let pair = world.pair(0, 1, "/t", Qos::keep_all());
+    world.until(secs(5), World::is_whole);
+    world.run_for(secs(1));
+    (0..50).for_each(|_| assert!(world.publish(pair, 10)));
+    world.run_for(secs(2));
+    assert_eq!(world.received(pair).len(), 50);
+}
+
 /// The script of a seed: mixed faults of so many hosts.
 fn script(seed: u64, hosts: usize) -> Script {
     let recipe = Recipe {

@@ -41,10 +41,6 @@ pub(super) struct World {
 pub(super) struct Pair {
     pub(super) publisher: (usize, Gid),
     pub(super) subscription: (usize, Gid),
-    /// RELIABLE and KEEP_ALL on both sides.
-    pub(super) complete: bool,
-    /// Samples that were published before the pair was whole.
-    pub(super) before: u64,
 }
 
 impl World {
@@ -165,13 +161,7 @@ impl World {
         let subscription = self.hosts[to].rings.create_subscription(topic, qos, None);
         self.hosts[from].touch_graph();
         self.hosts[to].touch_graph();
-        let complete = qos.history == History::KeepAll && qos.reliability == Reliability::Reliable;
-        let pair = Pair {
-            publisher: (from, publisher),
-            subscription: (to, subscription),
-            complete,
-            before: 0,
-        };
+        let pair = Pair { publisher: (from, publisher), subscription: (to, subscription) };
         self.pairs.push(pair);
         pair
     }

@@ -4,6 +4,7 @@ use axon_envelope::{Delivery, Kind, Route, TopicHash};
 use axon_tls::qkd::PskResolver;
 
 use super::*;
+use crate::link::{MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED};
 use crate::{keys::Lookup, link::Graph, wire::link::samples::elected};
 
 const PROOF: [(Side, &str); 4] = [

@@ -1,0 +1,86 @@
+//! The KME keys of an attempt in qkd.
+
+use std::{collections::VecDeque, time::Duration};
+
+use axon_envelope::{KeyId, KmeKey};
+use axon_transport::config::{Config, Security};
+
+use crate::{
+    engine::keyring::{Answered, Keyring},
+    keys::{Event, Events, Fetched, Kme, KmeError, Origin, Purpose, Request, UsedKeys},
+};
+
+/// The keyring and its KME client.
+pub(super) struct Keys {
+    pub(super) keyring: Keyring,
+    kme: Kme,
+    events: Events,
+    /// Answers to requests that the full KME client did not take.
+    refused: VecDeque<Event>,
+}
+
+impl Keys {
+    /// The keys of an attempt with these settings, `None` in classic. Must run within a tokio runtime.
+    ///
+    /// # Errors
+    /// The settings make no KME client.
+    pub(super) fn start(config: &Config) -> Result<Option<Self>, KmeError> {
+        let (Security::Qkd(qkd), Some(keyring)) = (&config.security, Keyring::new(config)) else {
+            return Ok(None);
+        };
+        let (kme, events) = Kme::start(qkd, UsedKeys::in_memory())?;
+        Ok(Some(Self { keyring, kme, events, refused: VecDeque::new() }))
+    }
+
+    /// Hands a request to the KME client.
+    pub(super) fn submit(&mut self, (origin, request): (Origin, Request)) {
+        if let Err(answer) = self.kme.submit(origin, request) {
+            self.refused.push_back(*answer);
+        }
+    }
+
+    /// Hands the keyring's requests to the KME client.
+    pub(super) fn submit_all(&mut self, now: Duration) {
+        while let Some(request) = self.keyring.poll_request(now) {
+            self.submit(request);
+        }
+    }
+
+    /// The next answer. Cancel safe.
+    pub(super) async fn answer(&mut self) -> Event {
+        if let Some(event) = self.refused.pop_front() {
+            return event;
+        }
+        match self.events.recv().await {
+            Some(event) => event,
+            // The client ended with the runtime.
+            None => std::future::pending().await,
+        }
+    }
+
+    /// A fresh key for the peer `slave`, for a handshake that no machine knows of.
+    ///
+    /// # Errors
+    /// The KME gave none, and why.
+    pub(super) async fn fetch(
+        &mut self,
+        now: Duration,
+        slave: &str,
+    ) -> Result<(KeyId, KmeKey), String> {
+        let slave = slave.to_owned();
+        let request = Request::Enc { slave, number: 1, purpose: Purpose::Bootstrap };
+        // The origin of an opening: the keyring passes the answer on. No opening is under way.
+        self.submit((Origin::Proof(0), request));
+        loop {
+            let event = self.answer().await;
+            let Answered::Opening(_, answer) = self.keyring.handle_answer(now, event) else {
+                continue;
+            };
+            return match answer.outcome {
+                Ok(Fetched::Keys(mut keys)) if !keys.is_empty() => Ok(keys.swap_remove(0)),
+                Err(failure) => Err(failure.to_string()),
+                _ => Err("the KME gave no key".into()),
+            };
+        }
+    }
+}
