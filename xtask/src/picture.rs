@@ -238,7 +238,7 @@ mod tests {
         let drawn = fs::read_to_string(workspace().join(FILE)).unwrap();
         let today = picture(workspace()).unwrap();
         assert!(drawn == today, "{FILE} is out of date: cargo xtask picture draws it anew");
-        for room in ["axon-shm", "gateway", "registry"] {
+        for room in ["axon-shm", "reactor", "registry"] {
             assert!(drawn.contains(&format!(">{room}</text>")), "{room}");
         }
     }

@@ -3,8 +3,7 @@
 use axon_shm::internal::erase_from_now_on;
 use axon_transport::config::{Config, Security};
 
-use super::{GatewayError, identity};
-use crate::keys::Kme;
+use crate::{error::GatewayError, identity, keys::Kme};
 
 /// Reads the files that a daemon with this configuration would read, its private key included, and says
 /// what the daemon would say of them. Opens no connection and keeps nothing.

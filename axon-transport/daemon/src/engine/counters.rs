@@ -10,7 +10,7 @@ use axon_transport::internal::text::plain;
 
 use crate::bridge::OTHER_TOPICS;
 
-/// Topics of which losses are noted between two looks: as many as routes may cross each way.
+/// Topics of which losses are noted between two looks. Losses of further topics are noted together.
 const TOPICS: usize = 2048;
 /// The longest name, in bytes, under which losses are noted.
 const NAME: usize = 1024;

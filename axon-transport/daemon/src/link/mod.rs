@@ -1,7 +1,7 @@
 //! The protocol between two daemons: frames of the control stream, the terms that HELLO must agree on, the order in
 //! which a connection becomes a link, and the choice between two connections.
 //!
-//! Plain data in, data out (`docs/formats.md`, section 6); the gateway owns the sockets.
+//! Plain data in, data out (`docs/formats.md`, section 6); the reactor owns the sockets.
 
 mod election;
 mod hello;

@@ -1,7 +1,7 @@
 //! Samples to one peer: from the rings of local publishers into QUIC streams.
 //!
-//! Samples that wait, wait here, where QoS can act on them. QUIC holds at most twice the congestion window of bulk,
-//! so that the newest sample is soon the next. A pass costs the flows that have something to send, and no others.
+//! Samples wait here and not in QUIC, because QoS can act on them here. Of bulk, QUIC holds the congestion window and a
+//! little more ([`connection`](super::connection)), so that the newest sample is soon the next. A pass costs the flows that have something to send, and no others.
 
 mod best_effort;
 pub(crate) mod budget;

@@ -1,4 +1,4 @@
-//! Which topics a peer must send here, and under which QoS the gateway asks for them on the
+//! Which topics a peer must send here, and under which QoS the engine asks for them on the
 //! other side: plain data in, data out.
 
 use std::{
