@@ -609,6 +609,10 @@ impl Links {
                 Ok(None) => return,
                 Err(error) => return self.handle_control_error(number, error, now),
             }
+            // A message is handled before the next is decoded, so that a peer fills no queue here.
+            if !self.events.is_empty() {
+                return self.touch(number);
+            }
         }
     }
 
