@@ -117,7 +117,8 @@ mod tests {
     #[test]
     fn frames_split_anywhere_are_read_and_unknown_types_are_skipped() {
         let unknown = [0, 0, 0, 3, 0x7f, 1, 2];
-        let frames = [&elected(1).to_frame().unwrap()[..], &unknown, &elected(2).to_frame().unwrap()];
+        let frames =
+            [&elected(1).to_frame().unwrap()[..], &unknown, &elected(2).to_frame().unwrap()];
         let mut incoming = Incoming::default();
         let mut read = Vec::new();
         for byte in frames.concat() {

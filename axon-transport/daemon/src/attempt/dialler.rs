@@ -129,13 +129,13 @@ impl Dialler {
     ) -> Result<Connection, Refusal> {
         let own_keys = forged.is_none();
         let (now, target) = (self.now(), self.target.clone());
-        let mut dialling = Dialling::new(now, target, self.keyring().filter(|_| own_keys).as_deref());
+        let mut dialling =
+            Dialling::new(now, target, self.keyring().filter(|_| own_keys).as_deref());
         let (mut connecting, mut connected) = (None::<Connecting>, None::<Connection>);
         loop {
             let now = self.now();
             // A dial without a keyring uses its one key as it is.
-            while let Some(action) =
-                dialling.poll_action(now, self.keyring().filter(|_| own_keys))
+            while let Some(action) = dialling.poll_action(now, self.keyring().filter(|_| own_keys))
             {
                 match action {
                     Action::Connect { address, attempt } => {
@@ -293,9 +293,8 @@ impl Dialler {
     }
 
     fn opening(&mut self, connection: &Connection) -> Opening {
-        let exporters = Exporters::derive(|out, label| {
-            connection.export_keying_material(out, label, b"")
-        });
+        let exporters =
+            Exporters::derive(|out, label| connection.export_keying_material(out, label, b""));
         let shown = connection.peer_identity().and_then(|shown| shown.downcast().ok());
         let handshake = Handshake {
             connection: LINK,

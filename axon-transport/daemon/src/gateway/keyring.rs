@@ -18,9 +18,8 @@ use tokio::sync::{Notify, mpsc};
 use super::{control::Outbox, tls_settings::tls_cipher};
 use crate::{
     keys::{
-        Acceptor, Answer, Clock, Completion, Dialler, Event, Events, Exporters, Fetched,
-        KeyMessage, Kme, KmeError, Origin, Purpose, Receiver, Request, Sender, SupplyError,
-        UsedKeys,
+        Acceptor, Answer, Clock, Completion, Dialler, Event, Events, Exporters, KeyMessage, Kme,
+        KmeError, Origin, Receiver, Request, Sender, SupplyError, UsedKeys,
     },
     link::Message,
 };
