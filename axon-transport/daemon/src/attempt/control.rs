@@ -41,12 +41,23 @@ impl Control {
         self.incoming.limits = limits;
     }
 
-    /// Queues a message. [`next`](Self::next) writes it.
+    /// Queues a message. [`flush`](Self::flush) and [`next`](Self::next) write it.
     ///
     /// # Errors
     /// The message is too large.
     pub(super) fn send(&mut self, message: &Message) -> Result<(), FrameError> {
         self.out.extend(message.to_frame()?);
+        Ok(())
+    }
+
+    /// Writes what was queued. Cancel safe.
+    ///
+    /// # Errors
+    /// The stream ended.
+    pub(super) async fn flush(&mut self) -> Result<(), Unreadable> {
+        while !self.out.is_empty() {
+            write(&mut self.sending, &mut self.out).await?;
+        }
         Ok(())
     }
 
@@ -60,9 +71,8 @@ impl Control {
                 return Ok(message);
             }
             tokio::select! {
-                written = self.sending.write(&self.out), if !self.out.is_empty() => {
-                    let written = written.map_err(|e| Unreadable::Ended(e.to_string()))?;
-                    self.out.drain(..written);
+                written = write(&mut self.sending, &mut self.out), if !self.out.is_empty() => {
+                    written?;
                 }
                 chunk = self.receiving.read_chunk(READ, true), if reads => match chunk {
                     Ok(Some(chunk)) => self.incoming.bytes.extend_from_slice(&chunk.bytes),
@@ -73,6 +83,13 @@ impl Control {
             }
         }
     }
+}
+
+/// Writes the front of `out`. Cancel safe.
+async fn write(sending: &mut SendStream, out: &mut Vec<u8>) -> Result<(), Unreadable> {
+    let written = sending.write(out).await.map_err(|e| Unreadable::Ended(e.to_string()))?;
+    out.drain(..written);
+    Ok(())
 }
 
 /// Bytes of the daemon that are not yet a message.

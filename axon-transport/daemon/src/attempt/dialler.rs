@@ -253,7 +253,12 @@ impl Dialler {
             self.say_keys(&mut control);
             control.set_limits(opening.limits());
             match outcome {
-                Some(Ok(opened)) => return Ok((opened, control)),
+                Some(Ok(opened)) => {
+                    // The daemon waits for the proof, whatever the caller does with the link. An error shows with
+                    // the next message.
+                    let _ = tokio::time::timeout(HELLO_TIMEOUT, control.flush()).await;
+                    return Ok((opened, control));
+                }
                 Some(Err(Refused { refusal, close: told })) => {
                     if let Some((code, told)) = told {
                         close(connection, code, &told);

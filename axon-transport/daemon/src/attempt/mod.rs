@@ -65,7 +65,7 @@ pub enum Tamper {
     Replay,
 }
 
-/// A link that a daemon accepted.
+/// A link that a daemon accepted. It takes messages and keys only during a call.
 pub struct Link {
     connection: Connection,
     control: Control,
