@@ -153,8 +153,8 @@ mod tests {
     #[test]
     fn frame_beyond_its_limit_is_refused_before_it_has_arrived() {
         let length = u32::try_from(FrameLimits::BEFORE_HELLO.frame).unwrap() + 1;
-        let mut incoming = Incoming::default();
-        incoming.bytes = length.to_be_bytes().to_vec();
+        let bytes = length.to_be_bytes().to_vec();
+        let mut incoming = Incoming { bytes, ..Incoming::default() };
         assert!(matches!(incoming.take(), Err(FrameError::TooLarge { .. })));
         incoming.limits = FrameLimits::UNPROVEN;
         assert_eq!(incoming.take().unwrap(), None);

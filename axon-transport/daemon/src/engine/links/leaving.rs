@@ -125,7 +125,7 @@ impl Links {
         }
         connection.control.finish();
         let wait = *leaving.wait.get_or_insert(now + HAND_OVER);
-        let over = leaving.ended && reading == 0 || now >= wait && reading == 0;
+        let over = reading == 0 && (leaving.ended || now >= wait);
         if over {
             return self.close_leaving(number, now);
         }

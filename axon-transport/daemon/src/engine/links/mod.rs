@@ -716,14 +716,14 @@ impl Links {
                 let target = dialling.target();
                 let hello = target.hello(&self.hello);
                 let sae = target.sae.clone();
-                self.note_dialled(number, target.daemon.zip(target.standing.clone()));
+                self.note_dialled(number, target.daemon.zip(target.standing));
                 self.begin_opening(number, hello, sae, now);
             }
             Action::Failed(refusal) => {
                 let Some((dialling, _)) = self.dials.remove(&dial) else { return };
                 let target = dialling.target();
                 self.reports.push_back(LinkReport::Refused(target.text(), refusal));
-                if let (Some(daemon), Some(standing)) = (target.daemon, target.standing.clone()) {
+                if let (Some(daemon), Some(standing)) = (target.daemon, target.standing) {
                     self.reports.push_back(LinkReport::DialFailed { daemon, standing });
                 }
             }

@@ -1,5 +1,7 @@
 //! Scenarios.
 
+#![allow(clippy::print_stdout, reason = "a scenario prints its figures")]
+
 use std::time::Duration;
 
 use axon_shm::qos::Qos;
@@ -25,8 +27,11 @@ fn classic(_host: usize) -> Config {
     Config::default()
 }
 
+/// Makes the settings of a host.
+type Settings = Box<dyn Fn(usize) -> Config>;
+
 /// All modes that a link can have here.
-fn modes() -> Vec<(&'static str, Box<dyn Fn(usize) -> Config>)> {
+fn modes() -> Vec<(&'static str, Settings)> {
     let of = |mode| move |host: usize| qkd(&format!("sae-{host}"), mode);
     vec![
         ("classic", Box::new(classic)),

@@ -22,6 +22,9 @@ use crate::{engine::keyring::tests::Kmes, keys::Event};
 /// A KME answers after this time.
 const KME: Duration = Duration::from_millis(20);
 
+/// An endpoint, and its host.
+type HostEndpoint = (usize, Gid);
+
 /// Hosts on a network.
 pub(super) struct World {
     pub(super) now: Duration,
@@ -126,7 +129,7 @@ impl World {
 
     /// For each RELIABLE and KEEP_ALL pair of which samples came: the publisher, and the subscription with the
     /// samples that are missing after the first that came.
-    pub(super) fn losses(&self) -> Vec<((usize, Gid), ((usize, Gid), u64))> {
+    pub(super) fn losses(&self) -> Vec<(HostEndpoint, (HostEndpoint, u64))> {
         let mut losses = Vec::new();
         for there in &self.hosts {
             for (subscription, publisher, first, came) in there.rings.complete() {
