@@ -41,6 +41,8 @@ const LOOKED_UP: usize = 32;
 pub(crate) struct Meter {
     most: usize,
     held: Cell<usize>,
+    /// What was given back since the start.
+    released: Cell<usize>,
 }
 
 /// A part of what a [`Meter`] allows.
@@ -53,7 +55,7 @@ pub(crate) struct Charge {
 impl Meter {
     /// Allows up to `most`.
     pub(crate) fn new(most: usize) -> Rc<Self> {
-        Rc::new(Self { most, held: Cell::new(0) })
+        Rc::new(Self { most, held: Cell::new(0), released: Cell::new(0) })
     }
 
     /// A charge of nothing.
@@ -87,6 +89,11 @@ impl Meter {
         self.held.get()
     }
 
+    /// What was given back since the start. It changes when a charge that did not fit may fit now.
+    pub(crate) fn released(&self) -> usize {
+        self.released.get()
+    }
+
     /// What may be held.
     pub(crate) fn most(&self) -> usize {
         self.most
@@ -103,6 +110,7 @@ impl Charge {
 impl Drop for Charge {
     fn drop(&mut self) {
         self.meter.held.set(self.meter.held.get() - self.amount);
+        self.meter.released.set(self.meter.released.get().wrapping_add(self.amount));
     }
 }
 

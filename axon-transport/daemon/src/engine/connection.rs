@@ -33,6 +33,8 @@ pub(crate) struct Connection {
     pub(super) flows: HashMap<StreamId, FlowId>,
     /// Whether it is in the list of connections with something to do.
     pub(super) is_dirty: bool,
+    /// Whether it is in the list of connections that may transmit.
+    pub(super) is_transmitting: bool,
     /// The deadline under which the engine knows it.
     pub(super) deadline: Option<std::time::Instant>,
 }
@@ -50,6 +52,7 @@ impl Connection {
             control: Control::default(),
             flows: HashMap::new(),
             is_dirty: false,
+            is_transmitting: false,
             deadline: None,
         }
     }

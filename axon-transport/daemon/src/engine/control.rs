@@ -154,6 +154,12 @@ impl Control {
         self.finishing = true;
     }
 
+    /// The connection is closed: nothing is read any more.
+    pub(super) fn close(&mut self) {
+        self.paused_until = None;
+        self.ended = true;
+    }
+
     /// Whether frames wait.
     pub(super) fn has_output(&self) -> bool {
         !self.out.is_empty() || self.finishing && !self.finished

@@ -72,6 +72,8 @@ use crate::{
 
 /// Between two reports of the links' status.
 const REPORT: Duration = Duration::from_secs(1);
+/// Bytes of streams that one pass reads. The rest has the next pass, after timers and packets that came meanwhile.
+const READ: usize = 8 << 20;
 /// What following a change costs for each endpoint of both graphs, as an estimate: other peers have nine times as long
 /// before this one's next turn.
 const ENDPOINT: Duration = Duration::from_nanos(500);
@@ -251,6 +253,7 @@ impl Engine {
 
     /// Does all that the inputs since the last call ask for. One call for all inputs that were ready.
     pub(crate) fn settle(&mut self, now: Duration) {
+        let mut left = READ;
         loop {
             self.links.settle(now);
             let mut idle = true;
@@ -259,10 +262,12 @@ impl Engine {
                 self.handle_link_event(event, now);
             }
             self.follow_graphs(now);
-            idle &= !self.read_streams(now);
+            if left > 0 {
+                idle &= !self.read_streams(&mut left, now);
+            }
             idle &= !self.say(now);
             // All that came over a lost connection is read before its link ends.
-            if idle && !self.links.end_lost(now) {
+            if idle && (left == 0 || !self.links.end_lost(now)) {
                 break;
             }
         }
@@ -271,6 +276,7 @@ impl Engine {
             let reading = self.peers.get(&daemon).map_or(0, |p| p.inbound.streams_of(number));
             self.links.look_at_leaving(number, reading, now);
         }
+        self.say(now);
         self.links.settle(now);
         self.collect(now);
     }
@@ -417,7 +423,8 @@ impl Engine {
             StreamEvent::Stopped { id, .. } if in_use => {
                 let Some(flow) = self.links.flow_of(number, id) else { return };
                 if let Some(connection) = self.links.connection(number) {
-                    peer.outbound.handle_stopped(flow, id, &mut connection.quic, now);
+                    connection.flows.remove(&id);
+                    peer.outbound.handle_stopped(flow, id, &mut connection.quic);
                 }
             }
             _ => {}
@@ -425,21 +432,25 @@ impl Engine {
     }
 
     /// Reads data streams as far as they go. Returns whether there was anything.
-    fn read_streams(&mut self, now: Duration) -> bool {
+    fn read_streams(&mut self, left: &mut usize, now: Duration) -> bool {
         let mut read = false;
         let mut violations = Vec::new();
         for peer in self.peers.values_mut() {
+            peer.inbound.look_for_memory();
             // As many as are ready now: one that goes on comes after the others, and after what they cause.
             for _ in 0..peer.inbound.ready() {
+                if *left == 0 {
+                    break;
+                }
                 let Some((number, stream)) = peer.inbound.next_ready() else { break };
                 read = true;
                 let Some((quic, mut open)) = self.links.reader(number) else {
                     peer.inbound.forget_stream((number, stream));
                     continue;
                 };
-                if let Err((code, why)) = peer.inbound.read((number, stream), quic, &mut open, now)
-                {
-                    violations.push((number, code, why));
+                match peer.inbound.read((number, stream), quic, &mut open, now) {
+                    Ok(bytes) => *left = left.saturating_sub(bytes),
+                    Err((code, why)) => violations.push((number, code, why)),
                 }
                 self.links.touch(number);
             }
@@ -710,8 +721,8 @@ impl Engine {
         });
         let report = (!self.peers.is_empty()).then_some(self.next_report);
         // What the last packets of a pass brought about.
-        let events = self.links.has_events().then_some(now);
-        peers.chain([links, report, events]).flatten().min()
+        let work = self.links.has_work().then_some(now);
+        peers.chain([links, report, work]).flatten().min()
     }
 
     /// Does what is due. [`settle`](Self::settle) has to follow.
@@ -728,10 +739,9 @@ impl Engine {
                 continue;
             }
             let heard = self.links.heard(peer.link);
-            if let Some(mut carrier) = self.links.carrier(peer.link) {
-                peer.outbound.handle_timeout(&mut carrier, heard, now);
-                self.links.touch(peer.link);
-            }
+            let mut carrier = self.links.carrier(peer.link);
+            peer.outbound.handle_timeout(carrier.as_mut(), heard, now);
+            self.links.touch(peer.link);
         }
         if now >= self.next_report {
             self.next_report = now + REPORT;

@@ -48,6 +48,8 @@ const ARRIVAL: Duration = Duration::from_secs(2);
 const LONG: usize = 32 << 10;
 /// Bytes of a stream that are read before others have their turn.
 const TURN: usize = 1 << 20;
+/// A stream whose ring was full tries again after this time, if no reader said that it made room.
+const FULL_RETRY: Duration = Duration::from_millis(100);
 /// What a stream is told whose route there is not.
 const NO_ROUTE: VarInt = VarInt::from_u32(CloseCode::OutOfOrder as u32);
 
@@ -96,6 +98,10 @@ pub(crate) struct Inbound {
     full: HashSet<Key>,
     /// Streams that wait for memory.
     without_room: VecDeque<Key>,
+    /// When streams try again whose ring was full: the reader that it waited for may be gone.
+    full_retry: Option<Duration>,
+    /// What the memory for long messages had given back when it was looked at last.
+    released: usize,
     receipts: Receipts,
     counters: Rc<Counters>,
     intake: Rc<Meter>,
@@ -121,6 +127,8 @@ impl Inbound {
             waiting: BTreeSet::new(),
             full: HashSet::new(),
             without_room: VecDeque::new(),
+            full_retry: None,
+            released: intake.released(),
             receipts: Receipts::default(),
             counters,
             intake,
@@ -162,8 +170,21 @@ impl Inbound {
 
     /// Readers made room in rings.
     pub(crate) fn handle_room(&mut self) {
+        self.full_retry = None;
         for key in std::mem::take(&mut self.full) {
             self.make_ready(key);
+        }
+    }
+
+    /// Lets streams go on that wait for memory, if another stream of the peer's identity gave some back.
+    pub(crate) fn look_for_memory(&mut self) {
+        let released = self.intake.released();
+        if !self.without_room.is_empty()
+            && released != std::mem::replace(&mut self.released, released)
+        {
+            for key in std::mem::take(&mut self.without_room) {
+                self.make_ready(key);
+            }
         }
     }
 
@@ -214,7 +235,7 @@ impl Inbound {
         }
     }
 
-    /// Reads a stream as far as it goes.
+    /// Reads a stream as far as it goes. Returns how many bytes that were, or became by decompression.
     ///
     /// # Errors
     /// The peer broke a rule.
@@ -224,11 +245,20 @@ impl Inbound {
         quic: &mut quinn_proto::Connection,
         open: &mut Open<'_>,
         now: Duration,
-    ) -> Result<(), Violation> {
-        let Some(mut stream) = self.streams.remove(&key) else { return Ok(()) };
+    ) -> Result<usize, Violation> {
+        let Some(mut stream) = self.streams.remove(&key) else { return Ok(0) };
         let mut read = 0;
         loop {
-            match self.step(key, &mut stream, quic, open, &mut read, now)? {
+            let step = self.step(key, &mut stream, quic, open, &mut read, now);
+            let next = match step {
+                Ok(next) => next,
+                Err(violation) => {
+                    self.release(&mut stream);
+                    self.end_turn(key, &stream);
+                    return Err(violation);
+                }
+            };
+            match next {
                 Next::Go if read < TURN => {}
                 Next::Go => {
                     stream.is_ready = true;
@@ -238,12 +268,12 @@ impl Inbound {
                 Next::Wait => break,
                 Next::Over => {
                     self.end_turn(key, &stream);
-                    return Ok(());
+                    return Ok(read);
                 }
             }
         }
         self.streams.insert(key, stream);
-        Ok(())
+        Ok(read)
     }
 
     fn step(
@@ -311,7 +341,7 @@ impl Inbound {
                         return Ok(Next::Over);
                     }
                 };
-                self.open(stream, body, open, now)
+                self.open(stream, body, open, read, now)
             }
             Step::Writer(message, until) => Ok(self.deliver(key, stream, message, until, now)),
             Step::Ring(message) => Ok(self.deliver(key, stream, message, now, now)),
@@ -358,6 +388,7 @@ impl Inbound {
         stream: &mut Incoming,
         body: Bytes,
         open: &mut Open<'_>,
+        read: &mut usize,
         now: Duration,
     ) -> Result<Next, Violation> {
         let Some((header, Some(route))) = stream.header else { return Ok(Next::Over) };
@@ -368,6 +399,9 @@ impl Inbound {
             self.release(stream);
             return Ok(Next::Go);
         };
+        if opened.compressed {
+            *read += payload.len();
+        }
         let writer = writer_of(route.kind, header.of, &opened)
             .map_err(|text| (CloseCode::Malformed, text.to_owned()))?;
         let meta = Meta {
@@ -427,6 +461,7 @@ impl Inbound {
             }
             Err(RingError::Full) => {
                 self.full.insert(key);
+                self.full_retry.get_or_insert(now + FULL_RETRY);
                 return wait(stream, Step::Ring(message));
             }
             Err(RingError::Lost(why)) => {
@@ -479,11 +514,14 @@ impl Inbound {
     /// When [`handle_timeout`](Self::handle_timeout) or [`poll_receipt`](Self::poll_receipt) is due.
     pub(crate) fn poll_timeout(&self) -> Option<Duration> {
         let waiting = self.waiting.first().map(|(due, _)| *due);
-        [waiting, self.receipts.poll_timeout()].into_iter().flatten().min()
+        [waiting, self.full_retry, self.receipts.poll_timeout()].into_iter().flatten().min()
     }
 
     /// Lets streams go on whose wait is over.
     pub(crate) fn handle_timeout(&mut self, now: Duration) {
+        if self.full_retry.is_some_and(|due| due <= now) {
+            self.handle_room();
+        }
         let due: Vec<_> =
             self.waiting.iter().take_while(|(at, _)| *at <= now).map(|(_, key)| *key).collect();
         due.into_iter().for_each(|key| self.make_ready(key));

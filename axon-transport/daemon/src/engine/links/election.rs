@@ -3,7 +3,7 @@
 use std::{net::IpAddr, rc::Rc, time::Duration};
 
 use axon_shm::ids::DaemonId;
-use quinn_proto::{Dir, VarInt};
+use quinn_proto::{Dir, StreamEvent, VarInt};
 
 use super::{
     LinkEvent, LinkReport, Links, chain,
@@ -82,6 +82,8 @@ impl Links {
         let we_elect = ours < daemon;
         if we_elect && current.is_some_and(|c| !keep(ours, daemon, c.candidate, candidate)) {
             self.links.remove(&number);
+            // The dial did not fail: the peer is linked.
+            self.dialled.remove(&number);
             self.close_connection(number, CloseCode::Duplicate, "another connection stands", now);
             if side == Side::Client {
                 self.report(LinkReport::Up { daemon, address });
@@ -92,6 +94,7 @@ impl Links {
         let Some(connection) = self.connections.get_mut(&number) else { return };
         connection.control.charge_to(Rc::clone(&account.unsent));
         let Some(link) = self.links.get_mut(&number) else { return };
+        link.place = None;
         link.phase = Phase::Electing(now + ELECTION_TIMEOUT);
         link.peer = Some(LinkPeer {
             summary: Summary { hello, negotiated, who },
@@ -185,7 +188,13 @@ impl Links {
         self.widen(number);
         if superseded {
             tracing::debug!(peer = %daemon, "superseded before its election was heard of");
+            if let Some(peer) = self.links.get_mut(&number).and_then(|link| link.peer.as_mut()) {
+                // Nothing is sent over it: its keys are not needed.
+                peer.sealing = None;
+            }
             self.hand_over(number, now);
+            let opened = StreamEvent::Opened { dir: Dir::Uni };
+            self.events.push_back(LinkEvent::Stream(number, daemon, opened));
             return;
         }
         let sealing =
@@ -195,6 +204,7 @@ impl Links {
         {
             tracing::error!(peer = %daemon, %error, "no message keys for this link");
         }
+        self.dialled.remove(&number);
         self.current.insert(daemon, number);
         let closed = current.and_then(|old| self.hand_over(old, now));
         self.events.push_back(LinkEvent::Up { number, daemon, old: current, closed });

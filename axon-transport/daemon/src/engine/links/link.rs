@@ -154,6 +154,11 @@ impl Link {
         [phase, ends, probe].into_iter().flatten().min()
     }
 
+    /// Whether data may come over it: it is, or was, elected.
+    pub(super) fn carries(&self) -> bool {
+        matches!(self.phase, Phase::Open | Phase::Leaving(_))
+    }
+
     /// Whether it carries samples.
     pub(super) fn is_open(&self) -> bool {
         matches!(self.phase, Phase::Open)

@@ -23,7 +23,8 @@ use axon_tls::quic::from_handshake_data;
 use axon_transport::{config::Config, status::LinkStatus};
 use bytes::BytesMut;
 use quinn_proto::{
-    ConnectionError, ConnectionHandle, EcnCodepoint, Event, Incoming, StreamEvent, Transmit, VarInt,
+    ConnectionError, ConnectionHandle, Dir, EcnCodepoint, Event, Incoming, StreamEvent, Transmit,
+    VarInt,
 };
 
 use self::link::{Link, Phase};
@@ -124,10 +125,14 @@ pub(super) struct Links {
     /// Addresses of listed peers.
     listed: BTreeSet<IpAddr>,
     crowded: Said,
+    /// Whether the daemon ends: no link begins any more.
+    closing: bool,
     /// Connections with something to do.
     dirty: VecDeque<u64>,
     /// Links whose connection was lost, and that are not read to the end.
     lost: VecDeque<(u64, ConnectionError)>,
+    /// Connections whose control stream has more, once the events that came are handled.
+    later: Vec<u64>,
     /// Connections that may have something to transmit.
     transmitting: VecDeque<u64>,
     deadlines: BTreeSet<(Instant, u64)>,
@@ -189,6 +194,8 @@ impl Links {
             crowded: Said::default(),
             dirty: VecDeque::new(),
             lost: VecDeque::new(),
+            later: Vec::new(),
+            closing: false,
             transmitting: VecDeque::new(),
             deadlines: BTreeSet::new(),
             nonces: HashMap::new(),
@@ -250,6 +257,9 @@ impl Links {
 
     /// Begins to dial a peer.
     pub(super) fn dial(&mut self, target: Target, now: Duration) {
+        if self.closing {
+            return;
+        }
         let number = self.number();
         let dialling = Dialling::new(now, target, self.keyring.as_ref());
         self.dials.insert(number, (dialling, None));
@@ -267,6 +277,9 @@ impl Links {
     }
 
     fn accept(&mut self, endpoint: usize, incoming: Incoming, now: Duration) {
+        if self.closing {
+            return self.endpoints.refuse(endpoint, incoming);
+        }
         if !incoming.remote_address_validated() {
             return self.endpoints.retry(endpoint, incoming);
         }
@@ -341,11 +354,6 @@ impl Links {
         self.reports.pop_front()
     }
 
-    /// Whether there are events for the peers.
-    pub(super) fn has_events(&self) -> bool {
-        !self.events.is_empty()
-    }
-
     /// The next event for the peers.
     pub(super) fn poll_event(&mut self) -> Option<LinkEvent> {
         self.events.pop_front()
@@ -353,6 +361,9 @@ impl Links {
 
     /// Looks at the connections with something to do. Their events follow.
     pub(super) fn settle(&mut self, now: Duration) {
+        for number in std::mem::take(&mut self.later) {
+            self.touch(number);
+        }
         self.go_on_dialling(now);
         while let Some(number) = self.dirty.pop_front() {
             self.drive(number, now);
@@ -408,7 +419,7 @@ impl Links {
             }
             return;
         }
-        if !self.transmitting.contains(&number) {
+        if !std::mem::replace(&mut connection.is_transmitting, true) {
             self.transmitting.push_back(number);
         }
         self.note_deadline(number);
@@ -429,7 +440,6 @@ impl Links {
     fn handle_connected(&mut self, number: u64, now: Duration) {
         let Some(link) = self.links.get_mut(&number) else { return };
         let Phase::Handshake(_, dial) = link.phase else { return };
-        link.place = None;
         match dial {
             Some(dial) => {
                 if let Some((dialling, _)) = self.dials.get_mut(&dial) {
@@ -465,7 +475,7 @@ impl Links {
             dialled,
         };
         if link.side == Side::Client
-            && let Some(stream) = connection.quic.streams().open(quinn_proto::Dir::Bi)
+            && let Some(stream) = connection.quic.streams().open(Dir::Bi)
         {
             connection.control.open(stream, &mut connection.quic);
         }
@@ -563,8 +573,8 @@ impl Links {
     fn handle_stream(&mut self, number: u64, event: StreamEvent) {
         let Some(connection) = self.connections.get_mut(&number) else { return };
         match event {
-            StreamEvent::Opened { dir: quinn_proto::Dir::Bi } => {
-                let stream = connection.quic.streams().accept(quinn_proto::Dir::Bi);
+            StreamEvent::Opened { dir: Dir::Bi } => {
+                let stream = connection.quic.streams().accept(Dir::Bi);
                 if let (Some(stream), None) = (stream, connection.control.stream()) {
                     connection.control.open(stream, &mut connection.quic);
                 }
@@ -576,8 +586,12 @@ impl Links {
             | StreamEvent::Finished { id }
             | StreamEvent::Stopped { id, .. }
                 if connection.control.stream() == Some(id) => {}
+            // Data is sent over unidirectional streams.
+            StreamEvent::Readable { id } if id.dir() == Dir::Bi => {}
             event => {
-                let peer = self.links.get(&number).and_then(|link| link.peer.as_ref());
+                // Before the election a link carries nothing, whoever its peer says to be.
+                let link = self.links.get(&number).filter(|link| link.carries());
+                let peer = link.and_then(|link| link.peer.as_ref());
                 if let Some(daemon) = peer.map(|peer| peer.summary.hello.daemon) {
                     self.events.push_back(LinkEvent::Stream(number, daemon, event));
                 }
@@ -611,7 +625,7 @@ impl Links {
             }
             // A message is handled before the next is decoded, so that a peer fills no queue here.
             if !self.events.is_empty() {
-                return self.touch(number);
+                return self.later.push(number);
             }
         }
     }
@@ -718,6 +732,9 @@ impl Links {
                 let sae = target.sae.clone();
                 self.note_dialled(number, target.daemon.zip(target.standing));
                 self.begin_opening(number, hello, sae, now);
+                if !self.links.contains_key(&number) {
+                    self.failed_after_dial(number);
+                }
             }
             Action::Failed(refusal) => {
                 let Some((dialling, _)) = self.dials.remove(&dial) else { return };
@@ -826,7 +843,8 @@ impl Links {
         number: u64,
     ) -> Option<(&mut quinn_proto::Connection, Open<'_>)> {
         let connection = self.connections.get_mut(&number)?;
-        let seals = self.links.get(&number)?.peer.as_ref()?.seals;
+        let link = self.links.get(&number).filter(|link| link.carries())?;
+        let seals = link.peer.as_ref()?.seals;
         let open = match self.keyring.as_mut().filter(|_| seals) {
             Some(keyring) => {
                 let receiver = keyring.receiver(number)?;
@@ -938,7 +956,9 @@ impl Links {
         if let Some(keyring) = &mut self.keyring {
             keyring.forget_connection(now, number);
         }
+        self.failed_after_dial(number);
         let Some(connection) = self.connections.get_mut(&number) else { return };
+        connection.control.close();
         let code = VarInt::from_u32(code.code());
         let reason = bytes::Bytes::copy_from_slice(close_text(reason));
         connection.quic.close(instant, code, reason);
@@ -1052,6 +1072,11 @@ impl Links {
         }
     }
 
+    /// Whether [`settle`](Self::settle) has something to do.
+    pub(super) fn has_work(&self) -> bool {
+        !self.dirty.is_empty() || !self.later.is_empty() || !self.events.is_empty()
+    }
+
     /// The next packets. `buffer` is cleared and filled.
     pub(super) fn poll_transmit(
         &mut self,
@@ -1080,6 +1105,9 @@ impl Links {
                 self.transmitting.push_back(number);
                 return Some(transmit);
             }
+            if let Some(connection) = self.connections.get_mut(&number) {
+                connection.is_transmitting = false;
+            }
         }
         None
     }
@@ -1091,6 +1119,8 @@ impl Links {
 
     /// Closes all links: this host's daemon ends.
     pub(super) fn close_all(&mut self, now: Duration) {
+        self.closing = true;
+        self.dials.clear();
         let numbers: Vec<u64> = self.connections.keys().copied().collect();
         for number in numbers {
             self.close_connection(number, CloseCode::Goodbye, "the daemon ends", now);

@@ -160,14 +160,31 @@ impl BestEffort {
         self.under_way.iter().map(|sample| sample.deadline).chain(writing).min()
     }
 
-    /// Gives up the samples whose time is over.
+    /// The peer wants no more of a sample.
+    pub(super) fn handle_stopped(
+        &mut self,
+        stream: StreamId,
+        quic: &mut Connection,
+        counters: &Counters,
+        topic: &Arc<str>,
+    ) {
+        let before = self.under_way.len();
+        self.under_way.retain(|sample| sample.stream != stream);
+        let writing = self.writing.take_if(|writing| writing.stream == stream).is_some();
+        if writing || self.under_way.len() < before {
+            let _ = quic.send_stream(stream).reset(goodbye());
+            counters.lost(topic, "no_route", 1);
+        }
+    }
+
+    /// Gives up the samples whose time is over. Returns whether there were any.
     pub(super) fn handle_timeout(
         &mut self,
         carrier: &mut Carrier<'_>,
         counters: &Counters,
         topic: &Arc<str>,
         now: Duration,
-    ) {
+    ) -> bool {
         let mut late = Vec::new();
         late.extend(self.writing.take_if(|w| w.sample.deadline <= now).map(|w| w.stream));
         self.under_way.retain(|sample| {
@@ -178,8 +195,10 @@ impl BestEffort {
         for stream in &late {
             // Not finished: the sample would look whole.
             let _ = carrier.quic.send_stream(*stream).reset(goodbye());
+            carrier.streams.remove(stream);
         }
         counters.lost(topic, "late", late.len() as u64);
+        !late.is_empty()
     }
 
     /// A new link carries the flow. The old one delivers what it has, and the rest of a sample if it takes it.

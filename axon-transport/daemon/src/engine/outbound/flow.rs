@@ -551,13 +551,12 @@ impl Flow {
         quic: &mut quinn_proto::Connection,
         counters: &Counters,
         done: &mut Done,
-        now: Duration,
     ) {
         if self.stream == Some(stream) {
             let _ = quic.send_stream(stream).reset(VarInt::from_u32(CloseCode::Goodbye.code()));
             self.stop(counters, done);
         } else {
-            self.best_effort.handle_finished(stream, quic, counters, now);
+            self.best_effort.handle_stopped(stream, quic, counters, &self.topic);
         }
     }
 
@@ -575,7 +574,10 @@ impl Flow {
         now: Duration,
     ) {
         self.timer = None;
-        self.best_effort.handle_timeout(carrier, counters, &self.topic, now);
+        if self.best_effort.handle_timeout(carrier, counters, &self.topic, now) {
+            // QUIC says nothing of a stream that was reset.
+            self.blocked = false;
+        }
         self.set_timer(self.best_effort.poll_timeout());
         let idle_at = self.active_at + STREAM_IDLE;
         if self.stream.is_some() {

@@ -42,6 +42,9 @@ use crate::{engine::counters::Counters, link::ReceivedOf};
 /// A flow without a key looks again after this time, if nobody told it of one.
 const KEY_RETRY: Duration = Duration::from_millis(250);
 
+/// Flows look again after this time at a link that has no keys.
+const NO_CARRIER: Duration = Duration::from_secs(1);
+
 /// A route that the peer asked for.
 pub(crate) struct RouteOut {
     /// The topic's name.
@@ -373,11 +376,10 @@ impl Outbound {
         id: FlowId,
         stream: StreamId,
         quic: &mut quinn_proto::Connection,
-        now: Duration,
     ) {
         let Some(flow) = self.flows.get_mut(id).and_then(Option::as_mut) else { return };
         let mut done = Done::default();
-        flow.handle_stopped(stream, quic, &self.counters, &mut done, now);
+        flow.handle_stopped(stream, quic, &self.counters, &mut done);
         flow.blocked = false;
         if let Some(served) = self.routes.get(&flow.route_number) {
             served.done(flow.of, done);
@@ -403,6 +405,11 @@ impl Outbound {
 
     /// A new link carries all flows. What the old link did not deliver is sent again.
     pub(crate) fn succeed(&mut self, mut old: Option<&mut quinn_proto::Connection>) {
+        for stream in self.ended.drain(..) {
+            if let Some(old) = old.as_deref_mut() {
+                let _ = old.send_stream(stream).finish();
+            }
+        }
         for id in 0..self.flows.len() {
             if let Some(flow) = &mut self.flows[id] {
                 flow.succeed(old.as_deref_mut(), &self.counters);
@@ -455,13 +462,22 @@ impl Outbound {
     }
 
     /// Does what is due. `heard` counts the datagrams that came over the link.
-    pub(crate) fn handle_timeout(&mut self, carrier: &mut Carrier<'_>, heard: u64, now: Duration) {
+    /// Without a carrier there are no keys for the link.
+    pub(crate) fn handle_timeout(
+        &mut self,
+        mut carrier: Option<&mut Carrier<'_>>,
+        heard: u64,
+        now: Duration,
+    ) {
         while let Some((due, id)) = self.timers.first().copied()
             && due <= now
         {
             self.timers.pop_first();
             let Some(flow) = &mut self.flows[id] else { continue };
-            flow.handle_timeout(carrier, &self.counters, now);
+            match carrier.as_deref_mut() {
+                Some(carrier) => flow.handle_timeout(carrier, &self.counters, now),
+                None => flow.timer = Some(now + NO_CARRIER),
+            }
             let (of, number, timer, idle) =
                 (flow.of, flow.route_number, flow.timer, flow.is_idle());
             match timer {

@@ -82,9 +82,14 @@ impl Peer {
         self.feed_services(now);
     }
 
+    /// Whether the routes of services that the peer asked for changed, and with them those that are asked for here.
+    pub(super) fn services_changed(&self) -> bool {
+        self.answering != self.now_answering()
+    }
+
     /// Asks for the routes that follow from services, if those changed.
     pub(super) fn update_services(&mut self, with: &Surroundings<'_>, now: Duration) {
-        if self.answering != self.now_answering() {
+        if self.services_changed() {
             self.update(with, now);
         }
     }

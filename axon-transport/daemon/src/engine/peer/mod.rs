@@ -244,12 +244,12 @@ impl Peer {
             Message::GraphResync(_) => self.resync(with.local, now),
             Message::Subscribe(subscribe) => {
                 let served = self.serve(subscribe, with, now);
-                self.update_services(with, now);
+                self.stirred |= self.services_changed();
                 return served.map_err(|reason| (CloseCode::Malformed, reason));
             }
             Message::Unsubscribe(unsubscribe) => {
                 self.unserve(unsubscribe.route);
-                self.update_services(with, now);
+                self.stirred |= self.services_changed();
             }
             Message::Asserted(asserted) => self.handle_asserted(&asserted),
             Message::Received(received) => self.outbound.handle_received(&received.flows),
