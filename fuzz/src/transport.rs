@@ -201,6 +201,7 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
         replaces: Some([3; 16]),
         expects: Some(DaemonId([4; 16])),
         static_peer: true,
+        routes: Some(1024),
     };
     let gid = Gid([6; 16]);
     let key_id = KeyId::new("bc490419-7d60-487f-adc1-4ddcc177c139").unwrap();
