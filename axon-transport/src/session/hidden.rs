@@ -178,6 +178,14 @@ impl Subscription {
         if self.session.is_forked() { 0 } else { self.inner.lock().lost_of(writer) }
     }
 
+    /// For a relay: passes over all samples of this publisher but the newest `depth`, which count as
+    /// [lost](Self::lost_of).
+    pub fn skip_of(&self, writer: &Gid, depth: u64) {
+        if !self.session.is_forked() {
+            self.inner.lock().skip_of(writer, depth);
+        }
+    }
+
     /// For a relay: samples of this publisher up to this number are where they are to go. Until then
     /// nobody takes them as acknowledged.
     pub fn acknowledge_of(&self, writer: &Gid, sequence: u64) {

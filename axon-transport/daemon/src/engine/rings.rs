@@ -41,7 +41,9 @@ pub(crate) trait RingReader {
     fn matched(&self) -> Vec<Gid>;
     /// Takes the next sample of a publisher.
     fn take_of(&self, publisher: &Gid) -> Option<(MessageInfo, Vec<u8>)>;
-    /// How many samples of this publisher newer ones replaced before they were taken.
+    /// Passes over all samples of this publisher but the newest `depth`.
+    fn skip_of(&self, publisher: &Gid, depth: u64);
+    /// How many samples of this publisher newer ones replaced before they were taken, or were passed over.
     fn lost_of(&self, _publisher: &Gid) -> u64 {
         0
     }

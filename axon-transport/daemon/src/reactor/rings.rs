@@ -99,6 +99,10 @@ impl RingReader for Relay {
         self.0.take_of(publisher)
     }
 
+    fn skip_of(&self, publisher: &Gid, depth: u64) {
+        self.0.skip_of(publisher, depth);
+    }
+
     fn lost_of(&self, publisher: &Gid) -> u64 {
         self.0.lost_of(publisher)
     }

@@ -127,6 +127,22 @@ impl Reader {
         Ok(())
     }
 
+    /// Passes over all samples that are to be taken but the newest `depth`, without a look at their bytes. As if the
+    /// subscription had that depth, they count as skipped, and those among the rest that were overwritten as lost.
+    pub fn skip_to_depth(&mut self, depth: u64) {
+        if self.corrupt.is_some() || self.given_up || self.attachment.lane.is_forked() {
+            return;
+        }
+        // The next take says what is wrong with the memory.
+        let Ok((_, head)) = protocol::bounds(self.attachment.ring()) else { return };
+        let unread = head.saturating_sub(self.cursor);
+        if unread > depth {
+            self.missing = None;
+            self.skipped += unread - depth;
+            self.advance(head - depth);
+        }
+    }
+
     /// Where the descriptors are that the ring's word speaks of.
     pub(super) fn resolve(&self, word: u64) -> Result<Descriptors, Obstacle> {
         let wrong = Obstacle::Corrupt("its descriptors are nowhere");

@@ -485,3 +485,22 @@ fn a_number_that_no_publisher_can_have_reached_is_refused() {
         assert_eq!(reader.lost(), 0);
     }
 }
+
+#[test]
+fn a_reader_that_skips_to_a_depth_takes_the_newest_and_counts_the_others() {
+    let (a, b) = (session(), session());
+    let writer = writer(&a, keep_last(100), 1 << 20);
+    let mut reader = attach(&writer, &a, &b, keep_last(100));
+    for sequence in 0..50 {
+        writer.publish(meta(sequence), &pattern(sequence, 200)).unwrap();
+    }
+    reader.skip_to_depth(60);
+    assert_eq!((reader.unread(), reader.skipped()), (50, 0));
+    reader.skip_to_depth(3);
+    assert_eq!((reader.unread(), reader.skipped(), reader.lost()), (3, 47, 0));
+    for sequence in 47..50 {
+        assert_eq!(take(&mut reader), Some((sequence, pattern(sequence, 200))));
+    }
+    reader.skip_to_depth(0);
+    assert_eq!((take(&mut reader), reader.received(), reader.skipped()), (None, 3, 47));
+}

@@ -237,6 +237,12 @@ impl MatchedReaders {
         .sum()
     }
 
+    /// Passes over all samples of `writer` but the newest `depth`. They count as those beyond the subscription's depth.
+    pub(in crate::session) fn skip_of(&mut self, writer: &Gid, depth: u64) {
+        let of = self.matched_readers.iter_mut().filter(|slot| slot.reader.writer() == *writer);
+        of.for_each(|slot| slot.reader.skip_to_depth(depth));
+    }
+
     /// Samples of `writer` that were lost before they came to its ring here. Samples missing before
     /// the `first` in that ring are seen by its number, where the subscription knows an earlier one.
     pub(in crate::session) fn lost_elsewhere(&mut self, writer: &Gid, samples: u64, first: bool) {

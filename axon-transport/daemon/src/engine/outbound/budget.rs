@@ -46,6 +46,12 @@ impl Budget {
         self.of_flow
     }
 
+    /// Whether so many bytes are free here and in the whole daemon.
+    pub(super) fn has(&self, bytes: usize) -> bool {
+        self.taken.get().saturating_add(bytes) <= self.most
+            && self.parent.as_ref().is_none_or(|parent| parent.has(bytes))
+    }
+
     /// Takes these bytes if they are free here and in the whole daemon.
     pub(super) fn try_take(&self, bytes: usize) -> bool {
         let fits = self.taken.get().saturating_add(bytes) <= self.most;

@@ -11,6 +11,7 @@ mod queue;
 mod schedule;
 mod source;
 mod stall;
+mod taking;
 #[cfg(test)]
 mod tests;
 

@@ -112,12 +112,31 @@ impl Queue {
         }
     }
 
-    /// Whether the engine should move samples from the ring into the queue now. A flow that is behind leaves them
-    /// in the ring, where newer samples replace them without a copy.
+    /// Whether the engine should move samples from the ring into the queue now. A KEEP_LAST flow that is behind, or
+    /// has no bytes left for a sample like its last, leaves them in the ring, where newer samples replace them without
+    /// a copy.
     pub(super) fn wants_more(&self, now: Duration) -> bool {
+        match (self.policy, self.waiting.back()) {
+            (Policy::KeepAll | Policy::BestEffort(_), _) | (_, None) => true,
+            (Policy::KeepLast(_), Some(last)) => !self.is_behind(now) && self.has_room(last.size()),
+        }
+    }
+
+    /// Whether a RELIABLE sample of this size, in memory, would find room.
+    fn has_room(&self, size: usize) -> bool {
+        self.bytes + size <= self.budget.of_flow() && self.budget.has(size)
+    }
+
+    /// Whether it is RELIABLE and KEEP_ALL.
+    pub(super) fn keeps_all(&self) -> bool {
+        self.policy == Policy::KeepAll
+    }
+
+    /// The history's depth; `None` for RELIABLE and KEEP_ALL.
+    pub(super) fn depth(&self) -> Option<usize> {
         match self.policy {
-            Policy::KeepLast(_) => self.waiting.is_empty() || !self.is_behind(now),
-            Policy::KeepAll | Policy::BestEffort(_) => true,
+            Policy::KeepAll => None,
+            Policy::KeepLast(depth) | Policy::BestEffort(depth) => Some(depth),
         }
     }
 

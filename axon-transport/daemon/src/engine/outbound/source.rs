@@ -61,7 +61,14 @@ impl Source {
         }
     }
 
-    /// How many samples of this publisher newer ones replaced before they were taken.
+    /// Passes over all samples of this publisher but the newest `depth`.
+    pub(super) fn skip_of(&self, of: &Gid, depth: usize) {
+        if let Self::Relay(_, reader) = self {
+            reader.skip_of(of, depth as u64);
+        }
+    }
+
+    /// How many samples of this publisher newer ones replaced before they were taken, or were passed over.
     pub(super) fn lost_of(&self, of: &Gid) -> u64 {
         match self {
             Self::Relay(_, reader) => reader.lost_of(of),

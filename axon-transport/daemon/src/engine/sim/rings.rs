@@ -63,6 +63,8 @@ struct Cursors {
     gid: Gid,
     spec: EndpointSpec,
     read: RefCell<HashMap<Gid, u64>>,
+    /// Samples of each publisher that were passed over.
+    lost: RefCell<HashMap<Gid, u64>>,
     acknowledged: RefCell<HashMap<Gid, u64>>,
     closed: Cell<bool>,
 }
@@ -293,6 +295,17 @@ impl SimReader {
     }
 }
 
+impl SimReader {
+    /// Passes over the samples up to this number.
+    fn pass_to(&self, publisher: &Gid, number: u64) {
+        let mut read = self.cursors.read.borrow_mut();
+        let read = read.entry(*publisher).or_default();
+        *self.cursors.lost.borrow_mut().entry(*publisher).or_default() +=
+            number.saturating_sub(*read);
+        *read = number.max(*read);
+    }
+}
+
 impl RingReader for SimReader {
     fn gid(&self) -> Gid {
         self.cursors.gid
@@ -315,8 +328,23 @@ impl RingReader for SimReader {
 
     fn take_of(&self, publisher: &Gid) -> Option<(MessageInfo, Vec<u8>)> {
         let (sequence, payload) = self.peek(publisher)?;
+        self.pass_to(publisher, sequence - 1);
         self.cursors.read.borrow_mut().insert(*publisher, sequence);
         Some((MessageInfo::of(*publisher, sequence), payload))
+    }
+
+    fn skip_of(&self, publisher: &Gid, depth: u64) {
+        let state = self.rings.state.borrow();
+        let published = state.publishers.get(publisher).map_or(0, |of| of.published);
+        self.pass_to(publisher, published.saturating_sub(depth));
+    }
+
+    fn lost_of(&self, publisher: &Gid) -> u64 {
+        // A look finds the losses, as with a ring in memory.
+        if let Some((next, _)) = self.peek(publisher) {
+            self.pass_to(publisher, next - 1);
+        }
+        self.cursors.lost.borrow().get(publisher).copied().unwrap_or(0)
     }
 
     fn acknowledge_of(&self, publisher: &Gid, sequence: u64) {
@@ -441,6 +469,7 @@ impl Rings for SimRings {
             spec,
             acknowledged: RefCell::new(known.clone()),
             read: RefCell::new(known),
+            lost: RefCell::default(),
             closed: Cell::new(false),
         });
         state.readers.push(Rc::clone(&cursors));
