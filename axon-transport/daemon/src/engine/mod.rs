@@ -23,6 +23,7 @@ pub(crate) mod peer;
 pub(crate) mod protection;
 pub(crate) mod refusal;
 pub(crate) mod rings;
+pub(crate) mod short_header;
 #[cfg(test)]
 mod sim;
 pub(crate) mod stand_in;

@@ -231,8 +231,9 @@ impl Reader {
         u64::from(record.len) <= self.reads.in_place
     }
 
-    /// Copies the payload at the cursor; false when the publisher was faster.
-    pub(super) fn copy_out(
+    /// Adds a copy of the payload at the cursor to `out`; false when the publisher was faster, and what was added is
+    /// of no use.
+    pub(super) fn copy_to(
         &self,
         record: &Record,
         bytes: &Bytes,
@@ -242,8 +243,7 @@ impl Reader {
         let Some(descriptors) = &self.descriptors else { return Ok(false) };
         let view = descriptors.view(&self.attachment);
         let mut copy = |words: &[AtomicU64], skip| {
-            copy::copy_out(words, skip, len, out)
-                .map_err(|_| TakeError::NoMemory { len: len as u64 })
+            copy::append(words, skip, len, out).map_err(|_| TakeError::NoMemory { len: len as u64 })
         };
         match bytes {
             Bytes::Inline => copy(view.inline(self.cursor), 0)?,

@@ -13,13 +13,18 @@ use super::{
     taking::Taking,
 };
 use crate::{
-    engine::{connection::Carrier, counters::Counters, frames::Frames, inbound::stream_header},
+    engine::{
+        connection::Carrier, counters::Counters, frames::Frames, inbound::stream_header,
+        short_header::ShortHeaders,
+    },
     keys::NoKey,
     link::CloseCode,
 };
 
 /// Bytes of samples that are sealed and written together.
 const TOGETHER: usize = 64 << 10;
+/// A sample of at most so many bytes is copied to its neighbours.
+const COPIED: usize = 4096;
 /// Bytes that one turn writes before other flows have theirs.
 const TURN: usize = 256 << 10;
 /// Bytes that count as progress of a long sample.
@@ -69,12 +74,16 @@ pub(super) struct Flow {
     route: Route,
     /// Whether the peer acknowledges the samples.
     acknowledged: bool,
+    /// Whether the peer reads short headers.
+    short_headers: bool,
     taking: Taking,
     /// Samples for which the sender of message keys was not told that it will need keys.
     undemanded: u32,
     queue: Queue,
     /// The stream of its RELIABLE samples.
     stream: Option<StreamId>,
+    /// The headers of that stream, or of the one that the pending batch will open, if they are short.
+    headers: Option<ShortHeaders>,
     priority: i32,
     frames: Frames,
     /// Frames that QUIC has not taken.
@@ -102,6 +111,7 @@ pub(super) struct FlowRoute {
     pub(super) topic: Arc<str>,
     pub(super) route: Route,
     pub(super) acknowledged: bool,
+    pub(super) short_headers: bool,
 }
 
 impl Flow {
@@ -113,17 +123,19 @@ impl Flow {
         budget: &Rc<Budget>,
         now: Duration,
     ) -> Self {
-        let FlowRoute { number, ref topic, route, acknowledged } = *of_route;
+        let FlowRoute { number, ref topic, route, acknowledged, short_headers } = *of_route;
         Self {
             route_number: number,
             of,
             topic: Arc::clone(topic),
             route,
             acknowledged,
+            short_headers,
             taking: Taking::new(of, route.kind),
             undemanded: 0,
             queue: Queue::new(qos, Rc::clone(budget)),
             stream: None,
+            headers: None,
             priority: 0,
             frames: Frames::default(),
             pending: VecDeque::new(),
@@ -236,6 +248,10 @@ impl Flow {
             match pause {
                 None if left == 0 => return Pause::Turn,
                 None => {}
+                // All that it looked at in this turn was sent before.
+                Some(Pause::Empty) if self.taking.goes_on() && self.queue.peek().is_none() => {
+                    return Pause::Turn;
+                }
                 Some(pause) => return pause,
             }
         }
@@ -263,7 +279,8 @@ impl Flow {
                 let Some(id) = carrier.quic.streams().open(Dir::Uni) else {
                     return Some(Pause::NoStream);
                 };
-                let header = stream_header(true, self.route_number, self.of);
+                let short = self.headers.is_some();
+                let header = stream_header(true, short, self.route_number, self.of);
                 self.pending.push_front(Bytes::copy_from_slice(&header));
                 self.sealed.iter_mut().for_each(|sealed| sealed.end += header.len() as u64);
                 carrier.streams.insert(id, carrier.flow);
@@ -330,15 +347,22 @@ impl Flow {
 
     /// Seals a batch of waiting samples. Returns how many.
     fn seal(&mut self, carrier: &mut Carrier<'_>, now: Duration) -> Result<usize, NoKey> {
-        let (mut bytes, mut samples) = (0, 0);
-        (self.written, self.sealed) = (0, VecDeque::new());
-        let mut end = 0;
+        let (mut bytes, mut samples, mut end) = (0, 0, 0);
+        self.written = 0;
+        self.sealed.clear();
+        if self.stream.is_none() {
+            self.headers = carrier.seal.short_headers().filter(|_| self.short_headers);
+        }
+        if self.queue.peek().is_some_and(|next| next.payload.len() <= COPIED) {
+            // A sample takes more in the queue than its header does in the batch.
+            self.frames.reserve(self.queue.waiting_bytes().min(TOGETHER + COPIED));
+        }
         while bytes < TOGETHER {
             let Some(sample) = self.queue.send() else { break };
             let (sequence, payload) = (sample.info.sequence, sample.payload.len());
-            let delivery = Delivery::Reliable;
-            if let Err(why) =
-                carrier.seal.write(sample, self.route, delivery, &mut self.frames, now)
+            let (delivery, headers) = (Delivery::Reliable, self.headers.as_mut());
+            let frames = &mut self.frames;
+            if let Err(why) = carrier.seal.write(sample, self.route, delivery, headers, frames, now)
             {
                 self.queue.take_back();
                 if samples == 0 {
@@ -424,7 +448,7 @@ impl Flow {
         let (number, of, route) = (self.route_number, self.of, self.route);
         let before = carrier.taken;
         let pause = self.best_effort.write(
-            (number, of, route, &self.topic),
+            (number, of, route, self.short_headers, &self.topic),
             &mut self.queue,
             &mut self.frames,
             carrier,

@@ -118,13 +118,14 @@ impl Queue {
     pub(super) fn wants_more(&self, now: Duration) -> bool {
         match (self.policy, self.waiting.back()) {
             (Policy::KeepAll | Policy::BestEffort(_), _) | (_, None) => true,
-            (Policy::KeepLast(_), Some(last)) => !self.is_behind(now) && self.has_room(last.size()),
+            (Policy::KeepLast(_), Some(last)) => !self.is_behind(now) && last.size() <= self.room(),
         }
     }
 
-    /// Whether a RELIABLE sample of this size, in memory, would find room.
-    fn has_room(&self, size: usize) -> bool {
-        self.bytes + size <= self.budget.of_flow() && self.budget.has(size)
+    /// Bytes, in memory, of the samples that would find room.
+    pub(super) fn room(&self) -> usize {
+        let left = self.budget.of_flow().saturating_sub(self.bytes);
+        if self.policy.is_reliable() { left.min(self.budget.free()) } else { left }
     }
 
     /// Whether it is RELIABLE and KEEP_ALL.
@@ -338,7 +339,7 @@ mod tests {
     }
 
     fn sample(sequence: u64, length: usize, now: Duration) -> Sample {
-        Sample::new(MessageInfo::of(Gid([1; 16]), sequence), vec![0; length], now)
+        Sample::new(MessageInfo::of(Gid([1; 16]), sequence), vec![0; length].into(), now)
     }
 
     fn keep_last(depth: u32) -> Qos {

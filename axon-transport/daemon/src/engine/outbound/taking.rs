@@ -1,13 +1,16 @@
 //! Moves the samples of one flow from their rings into its queue.
 
-use std::{sync::Arc, time::Duration};
+use std::{collections::VecDeque, sync::Arc, time::Duration};
 
 use axon_envelope::Kind;
 use axon_shm::{
     ids::Gid,
     qos::{Durability, Qos},
 };
-use axon_transport::internal::session::merge::{Merge, Taken};
+use axon_transport::internal::session::{
+    TakeLimit,
+    merge::{Merge, Taken},
+};
 
 use super::{
     queue::{Offered, Queue},
@@ -16,13 +19,17 @@ use super::{
 use crate::engine::{counters::Counters, rings::Sample};
 
 /// Samples, and bytes, that one turn moves from the rings.
-const FILL: (usize, usize) = (256, 256 << 10);
+const FILL: (usize, usize) = (1024, 256 << 10);
+/// Bytes of short samples that share memory. A part of it stays as long as one of them is not acknowledged.
+const SHARED: usize = 32 << 10;
+/// Takes in one turn that found only samples that were sent before.
+const REPEATS: u32 = 16;
 /// A KEEP_ALL flow with so many bytes waiting leaves further samples in the ring, which keeps them.
 const AHEAD: usize = 1 << 20;
 /// Bytes that a KEEP_LAST flow moves that is behind. What it leaves in the ring is replaced there without a copy.
 const BEHIND: usize = 64 << 10;
 /// Turns that move a burst while QUIC takes nothing. A publisher that never rests must not keep the others waiting.
-const BURST: usize = 16;
+const BURST: usize = 4;
 
 /// The samples of a flow that are in its rings.
 pub(super) struct Taking {
@@ -31,8 +38,10 @@ pub(super) struct Taking {
     kind: Kind,
     /// The samples of all sources, in one order.
     merge: Merge<Sample>,
-    /// A sample that the queue had no room for.
-    held: Option<Sample>,
+    /// Samples that were taken and are not in the queue.
+    taken: VecDeque<Sample>,
+    /// Whether the queue had no room for the first of them.
+    held: bool,
     /// Whether the rings may hold more samples than the last turn moved.
     more: bool,
     /// The relay whose losses are counted, and how many are.
@@ -42,7 +51,15 @@ pub(super) struct Taking {
 impl Taking {
     /// Takes from nothing yet.
     pub(super) fn new(of: Gid, kind: Kind) -> Self {
-        Self { of, kind, merge: Merge::default(), held: None, more: false, counted: None }
+        Self {
+            of,
+            kind,
+            merge: Merge::default(),
+            taken: VecDeque::new(),
+            held: false,
+            more: false,
+            counted: None,
+        }
     }
 
     /// Takes these sources; the peer has the samples up to number `seen`.
@@ -59,22 +76,28 @@ impl Taking {
 
     /// Whether there may be samples to move.
     pub(super) fn has_more(&self) -> bool {
-        self.more || self.held.is_some()
+        self.more || !self.taken.is_empty()
     }
 
     /// Whether a sample found no room.
     pub(super) fn is_held(&self) -> bool {
-        self.held.is_some()
+        self.held
+    }
+
+    /// Whether the rings may hold samples that it did not come to.
+    pub(super) fn goes_on(&self) -> bool {
+        self.more && !self.held
     }
 
     /// Whether it has taken no sample that is not in the queue.
     pub(super) fn is_idle(&self) -> bool {
-        self.held.is_none() && !self.merge.holds_any()
+        self.taken.is_empty() && !self.merge.holds_any()
     }
 
     /// Forgets the samples that it has taken and that are not in the queue. Returns how many.
     pub(super) fn end(&mut self) -> usize {
-        usize::from(self.held.take().is_some()) + self.merge.held()
+        self.held = false;
+        std::mem::take(&mut self.taken).len() + self.merge.held()
     }
 
     /// Moves samples from the rings into the queue. Returns how many were queued.
@@ -92,17 +115,31 @@ impl Taking {
         let first = sources.iter().find(|source| source.reads(&self.of));
         queue.set_qos(&first.map_or_else(Qos::keep_all, Source::qos));
         let most_bytes = self.leave_stale(sources, queue, now);
-        let (mut samples, mut bytes, mut dropped) = (0, 0, 0);
+        let is_behind = queue.is_behind(now);
+        let (mut samples, mut bytes, mut dropped, mut repeats) = (0, 0, 0, 0);
+        self.held = false;
         while samples < FILL.0 && bytes < most_bytes {
-            if queue.keeps_all() && queue.waiting_bytes() >= AHEAD {
+            let has_enough = match queue.keeps_all() {
+                true => queue.waiting_bytes() >= AHEAD,
+                false => !is_behind && !queue.wants_more(now),
+            };
+            if has_enough {
                 break;
             }
-            let Some(sample) = self.next(sources, now) else {
-                self.more = self.merge.is_behind();
-                if !self.more {
-                    queue.handle_empty_ring();
+            let Some(sample) = self.taken.pop_front() else {
+                let most = limit(queue.room(), FILL.0 - samples, most_bytes - bytes);
+                if !self.take(sources, most, now) {
+                    self.more = self.merge.is_behind();
+                    if !self.more {
+                        queue.handle_empty_ring();
+                    }
+                    break;
                 }
-                break;
+                repeats += u32::from(self.taken.is_empty());
+                if repeats > REPEATS {
+                    break;
+                }
+                continue;
             };
             bytes += sample.payload.len();
             match queue.offer(sample, now) {
@@ -111,7 +148,8 @@ impl Taking {
                     dropped += older;
                 }
                 Offered::Full(sample) => {
-                    self.held = Some(sample);
+                    self.taken.push_front(sample);
+                    self.held = true;
                     break;
                 }
             }
@@ -172,19 +210,39 @@ impl Taking {
         counters.lost(topic, "queue", lost.saturating_sub(counted));
     }
 
-    fn next(&mut self, sources: &[Source], now: Duration) -> Option<Sample> {
-        let of = self.of;
-        if let Some(held) = self.held.take() {
-            return Some(held);
+    /// Takes the next samples, as many as `most` says. Whether there was any, even one that was sent before.
+    fn take(&mut self, sources: &[Source], most: TakeLimit, now: Duration) -> bool {
+        let Self { of, kind, merge, taken, .. } = self;
+        if *kind == Kind::Response {
+            taken.extend(sources.iter().find_map(|source| source.take_of(of, now)));
+            return !taken.is_empty();
         }
-        if self.kind == Kind::Response {
-            return sources.iter().find_map(|source| source.take_of(&of, now));
+        if let [source] = sources
+            && merge.is_of_one()
+        {
+            let mut each = |sample: Sample| {
+                if merge.give(sample.info.sequence) {
+                    taken.push_back(sample);
+                }
+            };
+            return source.take_many(of, most, now, &mut each) > 0;
         }
-        let next = self.merge.next(|reader| {
+        let next = merge.next(|reader| {
             let source = sources.iter().find(|source| source.gid() == *reader)?;
-            let content = source.take_of(&of, now)?;
+            let content = source.take_of(of, now)?;
             Some(Taken { number: content.info.sequence, lost: 0, content })
         });
-        Some(next?.content)
+        taken.extend(next.map(|next| next.content));
+        !taken.is_empty()
+    }
+}
+
+/// What to take for a queue that has room for so many bytes, in memory, and is to get so many samples and bytes. It has
+/// room for all that is taken, unless that is one sample.
+fn limit(room: usize, samples: usize, bytes: usize) -> TakeLimit {
+    let half = room / 2;
+    TakeLimit {
+        samples: samples.min(half / size_of::<Sample>()).max(1),
+        bytes: bytes.min(half).min(SHARED),
     }
 }

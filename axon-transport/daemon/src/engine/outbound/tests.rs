@@ -8,7 +8,8 @@ use std::{
 
 use axon_envelope::Kind;
 use axon_shm::{ids::Gid, qos::Qos};
-use axon_transport::MessageInfo;
+use axon_transport::{MessageInfo, internal::session::TakeLimit};
+use bytes::Bytes;
 
 use super::{budget::Budget, queue::Queue, source::Source, taking::Taking};
 use crate::engine::{counters::Counters, peer::routes::RelaySpec, rings::RingReader};
@@ -56,15 +57,28 @@ impl RingReader for Ring {
         vec![PUBLISHER]
     }
 
-    fn take_of(&self, publisher: &Gid) -> Option<(MessageInfo, Vec<u8>)> {
-        let (number, length) = self.samples.borrow_mut().pop_front()?;
-        self.copied.set(self.copied.get() + 1);
-        let (samples, times) = self.meanwhile.get();
-        if times > 0 {
-            self.meanwhile.set((samples, times - 1));
-            self.publish(samples, length);
+    fn take_many(
+        &self,
+        publisher: &Gid,
+        most: TakeLimit,
+        each: &mut dyn FnMut(MessageInfo, Bytes),
+    ) -> usize {
+        let (mut taken, mut bytes) = (0, 0);
+        while taken < most.samples {
+            let next = self.samples.borrow().front().copied();
+            let fits = |length| taken == 0 || bytes + length <= most.bytes;
+            let Some((number, length)) = next.filter(|(_, length)| fits(*length)) else { break };
+            self.samples.borrow_mut().pop_front();
+            self.copied.set(self.copied.get() + 1);
+            (taken, bytes) = (taken + 1, bytes + length);
+            let (samples, times) = self.meanwhile.get();
+            if times > 0 {
+                self.meanwhile.set((samples, times - 1));
+                self.publish(samples, length);
+            }
+            each(MessageInfo::of(*publisher, number), vec![0; length].into());
         }
-        Some((MessageInfo::of(*publisher, number), vec![0; length]))
+        taken
     }
 
     fn skip_of(&self, _publisher: &Gid, depth: u64) {
@@ -209,7 +223,7 @@ fn a_burst_of_a_publisher_that_never_rests_ends() {
     way.ring.meanwhile.set((1, u64::MAX));
     way.ring.publish(1, 16);
     let Way { taking, sources, queue, topic, counters, .. } = &mut way;
-    assert_eq!(taking.take_burst(sources, queue, topic, counters, at(0)), 16 * 256);
+    assert_eq!(taking.take_burst(sources, queue, topic, counters, at(0)), 4 * 1024);
     assert!(taking.has_more());
 }
 
@@ -240,4 +254,35 @@ fn keep_all_leaves_no_sample_behind() {
     }
     assert_eq!(sent, (1..=3000).collect::<Vec<_>>());
     assert_eq!((way.dropped(), way.ring.lost.get()), (0, 0));
+}
+
+#[test]
+fn samples_that_the_peer_has_are_not_queued() {
+    let mut way = Way::new(Qos::keep_all());
+    way.taking.set_sources(&way.sources, Some(20_000));
+    way.ring.publish(20_003, 10);
+    let mut turns = 0;
+    while way.fill(at(0)) == 0 {
+        turns += 1;
+        assert!(turns < 10, "it goes on after each turn");
+    }
+    assert_eq!(way.send_all(), [20_001, 20_002, 20_003]);
+}
+
+#[test]
+fn a_flow_without_room_takes_one_sample_and_keeps_it() {
+    let mut way = Way::new(Qos::keep_all());
+    // All the memory that the daemon has is another flow's.
+    let budget = Budget::new(1024);
+    budget.overtake(1024);
+    way.queue = Queue::new(&Qos::keep_all(), budget.of_peer());
+    way.ring.publish(10, 100);
+    assert_eq!(way.fill(at(0)), 1, "one sample may always wait");
+    assert_eq!((way.fill(at(0)), way.ring.copied.get()), (0, 2));
+    assert!(way.taking.is_held() && !way.taking.is_idle());
+    assert_eq!((way.fill(at(0)), way.ring.copied.get()), (0, 2));
+    assert_eq!(way.send_all(), [1]);
+    assert_eq!(way.fill(at(0)), 1);
+    assert_eq!(way.send_all(), [2]);
+    assert_eq!(way.taking.end(), 1);
 }

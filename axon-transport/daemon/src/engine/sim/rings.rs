@@ -2,7 +2,7 @@
 
 use std::{
     cell::{Cell, RefCell},
-    collections::{BTreeMap, HashMap, VecDeque},
+    collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
     rc::Rc,
     sync::Arc,
 };
@@ -18,9 +18,10 @@ use axon_transport::{
     internal::{
         OWNER, SessionKey,
         graph::{Pairing, pairing},
-        session::Written,
+        session::{TakeLimit, Written},
     },
 };
+use bytes::Bytes;
 
 use crate::engine::rings::{RingError, RingReader, RingWriter, Rings};
 
@@ -52,6 +53,8 @@ struct State {
     given_up: BTreeMap<Gid, u64>,
     /// Samples that came damaged.
     damaged: u64,
+    /// Stand-ins that wrote samples and did not wake their readers.
+    unannounced: BTreeSet<Gid>,
     /// RELIABLE samples that a stand-in wrote after a newer one, or twice.
     disordered: u64,
     next: u32,
@@ -200,6 +203,11 @@ impl SimRings {
         self.state.borrow().publishers.get(&publisher).map_or(0, |p| p.published)
     }
 
+    /// Whether readers sleep though a stand-in wrote a sample for them.
+    pub(super) fn has_unannounced(&self) -> bool {
+        !self.state.borrow().unannounced.is_empty()
+    }
+
     /// Samples of a publisher that relays gave up.
     pub(super) fn given_up(&self, publisher: Gid) -> u64 {
         self.state.borrow().given_up.get(&publisher).copied().unwrap_or(0)
@@ -326,11 +334,23 @@ impl RingReader for SimReader {
         of.map(|(gid, _)| *gid).collect()
     }
 
-    fn take_of(&self, publisher: &Gid) -> Option<(MessageInfo, Vec<u8>)> {
-        let (sequence, payload) = self.peek(publisher)?;
-        self.pass_to(publisher, sequence - 1);
-        self.cursors.read.borrow_mut().insert(*publisher, sequence);
-        Some((MessageInfo::of(*publisher, sequence), payload))
+    fn take_many(
+        &self,
+        publisher: &Gid,
+        most: TakeLimit,
+        each: &mut dyn FnMut(MessageInfo, Bytes),
+    ) -> usize {
+        let (mut samples, mut bytes) = (0, 0);
+        while samples < most.samples
+            && let Some((sequence, payload)) = self.peek(publisher)
+            && (samples == 0 || bytes + payload.len() <= most.bytes)
+        {
+            self.pass_to(publisher, sequence - 1);
+            self.cursors.read.borrow_mut().insert(*publisher, sequence);
+            (samples, bytes) = (samples + 1, bytes + payload.len());
+            each(MessageInfo::of(*publisher, sequence), payload.into());
+        }
+        samples
     }
 
     fn skip_of(&self, publisher: &Gid, depth: u64) {
@@ -419,6 +439,7 @@ impl RingWriter for SimWriter {
         if reliable && meta.sequence <= self.last.replace(meta.sequence) {
             state.disordered += 1;
         }
+        state.unannounced.insert(publisher);
         for subscription in &mut readers {
             let received = subscription.received.entry(publisher).or_default();
             // As a session does: a sample that is not newer is dropped.
@@ -431,6 +452,10 @@ impl RingWriter for SimWriter {
             received.push(meta.sequence);
         }
         Ok(Written::Yes)
+    }
+
+    fn announce(&self) {
+        self.rings.state.borrow_mut().unannounced.remove(&self.endpoint.gid);
     }
 
     fn assert_alive(&self) {}
