@@ -1,6 +1,6 @@
 //! The TLS settings of both sides of a handshake, and whether a peer is trusted.
 
-use std::{sync::Arc, time::SystemTime};
+use std::{net::IpAddr, sync::Arc, time::SystemTime};
 
 use axon_tls::{
     Negotiated,
@@ -13,7 +13,7 @@ use rustls_pki_types::CertificateDer;
 use crate::{
     engine::{
         tls_settings::{psk_kex, tls_cipher},
-        transport::transport,
+        transport::Transports,
     },
     error::GatewayError,
     identity::Identity,
@@ -29,13 +29,13 @@ pub(crate) struct Credentials {
     config: Arc<Config>,
     /// The classic identity; `None` in qkd.
     identity: Option<Arc<Identity>>,
-    transport: Arc<quinn_proto::TransportConfig>,
+    transports: Transports,
 }
 
 impl Credentials {
     /// The settings of `config`, with the identity that its files say.
     pub(crate) fn new(config: Arc<Config>, identity: Option<Arc<Identity>>) -> Self {
-        Self { transport: transport(&config), config, identity }
+        Self { transports: Transports::new(&config), config, identity }
     }
 
     /// The classic identity in force; `None` in qkd.
@@ -53,13 +53,14 @@ impl Credentials {
         self.identity.as_ref().and_then(|identity| identity.closed())
     }
 
-    /// The client's side of a handshake, in qkd on one PSK.
+    /// The client's side of a handshake with a server at `address`, in qkd on one PSK.
     ///
     /// # Errors
     /// The settings, or the key, make no TLS client.
     pub(crate) fn client(
         &self,
         attempt: Option<&Attempt>,
+        address: IpAddr,
     ) -> Result<quinn_proto::ClientConfig, GatewayError> {
         let mut client = match (&self.config.security, attempt, self.auth()) {
             (Security::Qkd(qkd), Some(attempt), _) => {
@@ -70,17 +71,18 @@ impl Credentials {
             }
             _ => return Err(GatewayError::WrongMode),
         };
-        client.transport_config(Arc::clone(&self.transport));
+        client.transport_config(self.transports.towards(address));
         Ok(client)
     }
 
-    /// The server's side of a handshake, in qkd with the resolver of PSKs.
+    /// The server's side of a handshake with a client at `address`, in qkd with the resolver of PSKs.
     ///
     /// # Errors
     /// The settings make no TLS server.
     pub(crate) fn server(
         &self,
         resolver: Option<Arc<Resolver>>,
+        address: IpAddr,
     ) -> Result<quinn_proto::ServerConfig, GatewayError> {
         let cipher = tls_cipher(self.config.cipher);
         let mut server = match (&self.config.security, resolver, self.auth()) {
@@ -91,7 +93,7 @@ impl Credentials {
             _ => return Err(GatewayError::WrongMode),
         };
         server
-            .transport_config(Arc::clone(&self.transport))
+            .transport_config(self.transports.towards(address))
             .migration(true)
             .max_incoming(MAX_INCOMING);
         Ok(server)

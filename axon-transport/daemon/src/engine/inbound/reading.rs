@@ -291,10 +291,10 @@ impl Inbound {
             Ok(Written::Yes) => {
                 self.counters.arrived(payload.len());
                 let before = self.written.as_ref();
-                if before.is_none_or(|before| !Rc::ptr_eq(before, stand_in)) {
-                    if let Some(before) = self.written.replace(Rc::clone(stand_in)) {
-                        before.announce();
-                    }
+                if before.is_none_or(|before| !Rc::ptr_eq(before, stand_in))
+                    && let Some(before) = self.written.replace(Rc::clone(stand_in))
+                {
+                    before.announce();
                 }
                 Some(true)
             }

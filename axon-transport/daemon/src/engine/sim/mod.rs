@@ -7,6 +7,7 @@
 
 mod host;
 pub(crate) mod network;
+mod radio;
 mod rings;
 pub(crate) mod rng;
 mod run;
