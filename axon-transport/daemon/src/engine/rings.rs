@@ -41,6 +41,10 @@ pub(crate) trait RingReader {
     fn matched(&self) -> Vec<Gid>;
     /// Takes the next sample of a publisher.
     fn take_of(&self, publisher: &Gid) -> Option<(MessageInfo, Vec<u8>)>;
+    /// After what time [`take_of`](Self::take_of) may have a sample, where it had none although some wait: it passes
+    /// over a number that do not count, such as expired ones, and then lets others have their turn; or there was no
+    /// memory for a sample.
+    fn retry_of(&self, publisher: &Gid) -> Option<Duration>;
     /// How many samples of this publisher newer ones replaced before they were taken.
     fn lost_of(&self, _publisher: &Gid) -> u64 {
         0

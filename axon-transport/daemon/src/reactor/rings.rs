@@ -1,6 +1,6 @@
 //! The rings of this host as shared memory: relay subscriptions and stand-ins of the gateway's session.
 
-use std::{cell::Cell, collections::HashMap, rc::Rc};
+use std::{cell::Cell, collections::HashMap, rc::Rc, time::Duration};
 
 use axon_shm::{ExternalLeader, Meta, PublishError, ShmError, ids::Gid};
 use axon_transport::{
@@ -97,6 +97,10 @@ impl RingReader for Relay {
 
     fn take_of(&self, publisher: &Gid) -> Option<(MessageInfo, Vec<u8>)> {
         self.0.take_of(publisher)
+    }
+
+    fn retry_of(&self, publisher: &Gid) -> Option<Duration> {
+        self.0.retry_of(publisher)
     }
 
     fn lost_of(&self, publisher: &Gid) -> u64 {

@@ -1,6 +1,9 @@
 //! Chooses the publisher from which a subscription takes the next sample.
 
-use std::{collections::HashMap, time::Instant};
+use std::{
+    collections::HashMap,
+    time::{Duration, Instant},
+};
 
 use axon_shm::{Meta, Sample, TakeError, internal::Reader};
 
@@ -224,6 +227,12 @@ impl MatchedReaders {
         self.matched_readers
             .iter()
             .any(|slot| slot.reader.writer() == *writer && slot.reader.has_data())
+    }
+
+    /// After what time a sample of `writer` may be taken, if any waits.
+    pub(in crate::session) fn retry_of(&self, writer: &Gid) -> Option<Duration> {
+        let wait = |until: Instant| until.saturating_duration_since(Instant::now());
+        self.has_from(writer).then(|| self.short_until().map_or(Duration::ZERO, wait))
     }
 
     /// Samples of `writer` that newer ones replaced before they were taken, in its ring or within the depth.

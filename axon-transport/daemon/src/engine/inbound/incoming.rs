@@ -159,6 +159,18 @@ impl Incoming {
     }
 }
 
+#[cfg(test)]
+impl Incoming {
+    /// Bytes of samples that were read from QUIC and are not delivered.
+    pub(super) fn held(&self) -> usize {
+        let message = match &self.step {
+            Step::Writer(message, _) | Step::Ring(message) => message.payload.len(),
+            _ => 0,
+        };
+        self.chunk.len() + self.gathered.len() + message
+    }
+}
+
 /// A stream that ended, was reset, or was stopped.
 struct End;
 

@@ -4,6 +4,8 @@
 //! order when a successor takes over. A stream whose ring is full is not read on: QUIC's flow control holds back the
 //! peer.
 
+#[cfg(test)]
+mod held;
 mod incoming;
 mod receipts;
 #[cfg(test)]
@@ -268,6 +270,11 @@ impl Inbound {
                 Next::Wait => break,
                 Next::Over => {
                     self.end_turn(key, &stream);
+                    // QUIC forgets a stream, and allows another one, once its end was read. It comes with the last
+                    // bytes, and then nothing says that it came.
+                    if let Piece::Whole(_) = stream.take(1, key.1, quic, &mut read) {
+                        let _ = quic.recv_stream(key.1).stop(NO_ROUTE);
+                    }
                     return Ok(read);
                 }
             }
@@ -449,6 +456,12 @@ impl Inbound {
             self.receipts.came(flow, sequence, length, now);
             self.release(stream);
             return Next::Go;
+        }
+        if !header.reliable && stand_in.last_sequence() >= Some(sequence) {
+            // A newer one overtook it: readers drop it.
+            self.counters.lost(&self.topic(header.route), "late", 1);
+            self.release(stream);
+            return Next::Over;
         }
         let there = match stand_in.try_write(&header.of, message.meta, &message.payload) {
             Ok(Written::Yes) => {

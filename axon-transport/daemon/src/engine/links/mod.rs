@@ -3,6 +3,8 @@
 
 mod election;
 mod explained;
+#[cfg(test)]
+mod held;
 mod leaving;
 mod link;
 mod prober;
@@ -232,6 +234,7 @@ impl Links {
         if let Some(keyring) = &self.keyring {
             keyring.set_time(now);
         }
+        self.credentials.set_time(now);
         let instant = self.instant(now);
         match self.endpoints.handle(instant, endpoint, from, local, ecn, bytes) {
             Received::Connection(handle, event) => {

@@ -89,6 +89,8 @@ pub(super) struct Flow {
     held: Option<Sample>,
     /// Whether the rings may hold more samples than the last turn moved.
     more: bool,
+    /// After what time that is looked at again, where the last turn moved none.
+    retry: Option<Duration>,
     /// Samples for which the sender of message keys was not told that it will need keys.
     undemanded: u32,
     /// The relay whose losses are counted, and how many are.
@@ -144,6 +146,7 @@ impl Flow {
             merge: Merge::default(),
             held: None,
             more: false,
+            retry: None,
             undemanded: 0,
             counted: None,
             queue: Queue::new(qos, Rc::clone(budget)),
@@ -247,7 +250,10 @@ impl Flow {
                 break;
             }
             let Some(sample) = self.next(sources, now) else {
-                self.more = self.merge.is_behind();
+                let behind = self.merge.is_behind().then_some(Duration::ZERO);
+                let retries = sources.iter().filter_map(|source| source.retry_of(&self.of));
+                self.retry = retries.chain(behind).min();
+                self.more = self.retry.is_some();
                 if !self.more {
                     self.queue.handle_empty_ring();
                 }
@@ -327,6 +333,12 @@ impl Flow {
                 _ => self.write_reliable(carrier, counters, done, now),
             };
             left = left.saturating_sub((carrier.taken - before) as usize);
+            if pause == Some(Pause::Empty)
+                && let Some(wait) = self.retry.take()
+            {
+                // In a pass of its own, so that other flows and links have their turn.
+                self.set_timer(Some(now + wait));
+            }
             match pause {
                 None if left == 0 => return Pause::Turn,
                 None => {}
