@@ -21,16 +21,18 @@ pub(in crate::engine) struct HeldByLinks {
 
 impl Links {
     pub(in crate::engine) fn held(&self) -> HeldByLinks {
-        let links = self.links.values().filter(|link| link.peer.is_some()).count();
-        let control = self.connections.values().map(|connection| connection.control.held());
-        let (unsent, unhandled) =
-            control.fold((0, 0), |most, held| (held.0.max(most.0), held.1.max(most.1)));
+        let (all, links) = (self.table.iter().count(), self.table.peers().count());
+        let numbers = self.connections.numbers();
+        let connections = numbers.iter().filter_map(|number| self.connections.get(*number));
+        let (unsent, unhandled) = connections
+            .map(|connection| connection.control.held())
+            .fold((0, 0), |most, held| (held.0.max(most.0), held.1.max(most.1)));
         HeldByLinks {
-            connections: self.connections.len(),
+            connections: numbers.len(),
             links,
-            opening: self.links.len() - links,
+            opening: all - links,
             dials: self.dials.len(),
-            events: self.events.len(),
+            events: self.outbox.waiting(),
             unsent,
             unhandled,
         }

@@ -30,7 +30,7 @@ pub(super) fn check(engine: &Engine, queue: usize, dials: usize) {
     assert!(held.unsent <= UNSENT && held.unhandled <= UNREAD, "{held:?}");
     // Control messages are handled one by one: what a pass leaves to the next is of data streams.
     assert!(held.events <= STREAMS_OPEN as usize * (held.links + 1), "{held:?}");
-    for peer in engine.peers.values() {
+    for (_, peer) in engine.peers.iter() {
         let (streams, bytes) = peer.inbound.held();
         let most = 8 * STREAMS_OPEN as usize;
         assert!(streams <= most, "{streams} streams of one peer");

@@ -5,7 +5,6 @@
 //! sends one probe. So these run in release alone: `cargo xtask simulate --scenarios`.
 
 #![allow(clippy::print_stdout, reason = "a scenario prints its figures")]
-#![cfg_attr(debug_assertions, allow(dead_code, reason = "its tests run in release"))]
 
 use std::time::Duration;
 
