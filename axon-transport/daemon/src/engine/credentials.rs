@@ -1,6 +1,13 @@
 //! The TLS settings of both sides of a handshake, and whether a peer is trusted.
 
-use std::{net::IpAddr, sync::Arc, time::SystemTime};
+use std::{
+    net::IpAddr,
+    sync::{
+        Arc,
+        atomic::{AtomicU64, Ordering},
+    },
+    time::{Duration, SystemTime},
+};
 
 use axon_tls::{
     Negotiated,
@@ -8,6 +15,7 @@ use axon_tls::{
     quic::{ALPN, hybrid_client, hybrid_server, qkd_client, qkd_server},
 };
 use axon_transport::config::{Config, Security};
+use quinn_proto::TimeSource;
 use rustls_pki_types::CertificateDer;
 
 use crate::{
@@ -24,18 +32,37 @@ use crate::{
 /// Handshakes of unvalidated addresses that QUIC keeps.
 const MAX_INCOMING: usize = 256;
 
+/// The engine's time, in seconds, as QUIC dates the tokens that validate addresses. QUIC's own default is the wall clock:
+/// one that jumps would refuse a handshake that is under way. Another daemon does not see these tokens.
+#[derive(Debug, Default)]
+struct TokenTime(AtomicU64);
+
+impl TimeSource for TokenTime {
+    fn now(&self) -> SystemTime {
+        // Relaxed: the engine's thread alone writes and reads it.
+        SystemTime::UNIX_EPOCH + Duration::from_secs(self.0.load(Ordering::Relaxed))
+    }
+}
+
 /// This host's identity and settings for handshakes.
 pub(crate) struct Credentials {
     config: Arc<Config>,
     /// The classic identity; `None` in qkd.
     identity: Option<Arc<Identity>>,
     transports: Transports,
+    time: Arc<TokenTime>,
 }
 
 impl Credentials {
     /// The settings of `config`, with the identity that its files say.
     pub(crate) fn new(config: Arc<Config>, identity: Option<Arc<Identity>>) -> Self {
-        Self { transports: Transports::new(&config), config, identity }
+        Self { transports: Transports::new(&config), config, identity, time: Arc::default() }
+    }
+
+    /// The engine's time goes on.
+    pub(super) fn set_time(&self, now: Duration) {
+        // Relaxed: see `TokenTime`.
+        self.time.0.store(now.as_secs(), Ordering::Relaxed);
     }
 
     /// The classic identity in force; `None` in qkd.
@@ -94,6 +121,7 @@ impl Credentials {
         };
         server
             .transport_config(self.transports.towards(address))
+            .time_source(Arc::clone(&self.time) as _)
             .migration(true)
             .max_incoming(MAX_INCOMING);
         Ok(server)

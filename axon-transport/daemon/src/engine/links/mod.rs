@@ -8,6 +8,8 @@ mod election;
 mod ending;
 mod events;
 mod explained;
+#[cfg(test)]
+mod held;
 mod keys;
 mod leaving;
 mod link;
@@ -152,6 +154,7 @@ impl Links {
         if let Some(keyring) = &self.keyring {
             keyring.set_time(now);
         }
+        self.credentials.set_time(now);
         let instant = self.instant(now);
         let incoming = self.connections.handle_datagram(endpoint, from, local, ecn, bytes, instant);
         if let Some(incoming) = incoming {
