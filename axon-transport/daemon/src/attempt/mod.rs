@@ -221,7 +221,8 @@ impl Link {
         let domain = self.dialler.config().domain;
         let hash = TopicHash::new(domain, topic, type_name).map_err(internal)?;
         let route = Route { kind: Kind::Topic, topic: hash };
-        let sample = Sample::new(MessageInfo::of(publisher, 1), b"an attempt".as_slice().into(), now);
+        let sample =
+            Sample::new(MessageInfo::of(publisher, 1), b"an attempt".as_slice().into(), now);
         loop {
             let (now, mut frames) = (self.dialler.now(), Frames::default());
             if let Some(mut seal) = self.protection()
