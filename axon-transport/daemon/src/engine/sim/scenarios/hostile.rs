@@ -14,7 +14,7 @@ use axon_transport::{
 };
 use quinn_proto::VarInt;
 
-use super::{
+use crate::engine::sim::{
     network::Path,
     raw::RawLink,
     rings::{FOREIGN, payload},
@@ -30,7 +30,7 @@ pub(super) const LOWEST: DaemonId = DaemonId([0; 16]);
 pub(super) const HIGHEST: DaemonId = DaemonId([0xff; 16]);
 
 /// A world of so many honest hosts, all linked, and one raw peer.
-pub(super) fn world(seed: u64, hosts: usize, daemon: DaemonId) -> World {
+fn world(seed: u64, hosts: usize, daemon: DaemonId) -> World {
     let mut world = World::new(seed, hosts, |_| Config::default());
     world.add_raw(Config::default(), daemon);
     world.until(secs(5), World::is_whole);
