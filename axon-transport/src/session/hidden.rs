@@ -3,6 +3,7 @@
 
 use std::{
     collections::{BTreeMap, HashMap},
+    ops::Range,
     os::fd::OwnedFd,
     sync::Arc,
     time::{Duration, SystemTime},
@@ -12,11 +13,11 @@ use axon_shm::{Meta, PublishError, Sample, internal::SessionSegment};
 
 use super::{
     EndpointSpec, Lifetime, MessageInfo, Node, Publisher, Server, Session, SessionError,
-    SessionOptions, Subscription,
+    SessionOptions, Subscription, TakeLimit,
     daemon::connect::Caller,
     daemon::control::Start,
     state::Outgoing,
-    subscription::{SubscriptionInner, take_of},
+    subscription::{SubscriptionInner, take_many_of, take_of},
 };
 use crate::{
     config::Config,
@@ -150,6 +151,21 @@ impl Publisher {
     pub fn try_publish_with(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
         self.inner.published(self.writer.try_publish(meta, payload)).map(drop)
     }
+
+    /// As [`try_publish_with`](Self::try_publish_with), but readers that sleep may sleep on until
+    /// [`announce`](Self::announce).
+    ///
+    /// # Errors
+    /// As for [`try_publish_with`](Self::try_publish_with).
+    pub fn try_publish_quietly(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
+        self.inner.published(self.writer.try_publish_quietly(meta, payload)).map(drop)
+    }
+
+    /// Wakes the readers that sleep, for samples that were published
+    /// [quietly](Self::try_publish_quietly).
+    pub fn announce(&self) {
+        self.writer.announce();
+    }
 }
 
 #[doc(hidden)]
@@ -176,6 +192,14 @@ impl Subscription {
     /// For a relay: how many samples of this publisher newer ones replaced before they were taken.
     pub fn lost_of(&self, writer: &Gid) -> u64 {
         if self.session.is_forked() { 0 } else { self.inner.lock().lost_of(writer) }
+    }
+
+    /// For a relay: passes over all samples of this publisher but the newest `depth`, which count as
+    /// [lost](Self::lost_of).
+    pub fn skip_of(&self, writer: &Gid, depth: u64) {
+        if !self.session.is_forked() {
+            self.inner.lock().skip_of(writer, depth);
+        }
     }
 
     /// For a relay: samples of this publisher up to this number are where they are to go. Until then
@@ -207,6 +231,18 @@ impl Subscription {
     /// For a relay: the next sample of one publisher, as bytes.
     pub fn take_of(&self, writer: &Gid) -> Option<(MessageInfo, Vec<u8>)> {
         take_of(&self.inner, &self.session, writer)
+    }
+
+    /// For a relay: the next samples of one publisher, with their payloads one behind the other in `out`, which
+    /// they replace. `each` is told where a sample's payload is. Returns how many samples it took.
+    pub fn take_many_of(
+        &self,
+        writer: &Gid,
+        most: TakeLimit,
+        out: &mut Vec<u8>,
+        each: impl FnMut(MessageInfo, Range<usize>),
+    ) -> usize {
+        take_many_of(&self.inner, &self.session, writer, most, out, each)
     }
 
     /// The publishers of which there is something to take.

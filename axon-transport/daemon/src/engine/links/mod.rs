@@ -111,7 +111,7 @@ impl Links {
         let keyring = Keyring::new(&config);
         let unspecified = IpAddr::from([0, 0, 0, 0]);
         let resolver = keyring.as_ref().map(|keys| keys.resolver(Duration::ZERO, unspecified));
-        let server = Arc::new(credentials.server(resolver)?);
+        let server = Arc::new(credentials.server(resolver, unspecified)?);
         Ok(Self {
             accounts: Accounts::new(config.link.graph),
             config,

@@ -317,6 +317,7 @@ impl Host {
             engine.handle_timeout(now);
         }
         engine.settle(now);
+        assert!(!self.rings.has_unannounced(), "readers are woken for all that was written");
         let mut effects = Vec::new();
         while let Some(effect) = engine.poll_effect() {
             effects.push(effect);

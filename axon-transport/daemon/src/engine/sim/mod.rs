@@ -8,6 +8,7 @@
 mod held;
 mod host;
 pub(crate) mod network;
+mod radio;
 mod raw;
 mod rings;
 pub(crate) mod rng;

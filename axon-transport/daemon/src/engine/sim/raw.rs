@@ -22,7 +22,7 @@ use super::{
     rng::{SimRng, Stream, stream},
 };
 use crate::{
-    engine::{credentials::Credentials, peer::MAX_ROUTES},
+    engine::{credentials::Credentials, peer::MAX_ROUTES, transport::Transports},
     identity::Identity,
     link::{CloseCode, Hello, MAX_FRAME, MAX_INFLATED, Message, read_length},
 };
@@ -70,15 +70,16 @@ impl Raw {
         let Security::Classic(classic) = &config.security else { panic!("classic alone") };
         let identity = Arc::new(Identity::load(classic, "raw").unwrap());
         let credentials = Credentials::new(Arc::clone(&config), Some(identity));
-        let server = Arc::new(credentials.server(None).unwrap());
+        let address = Ipv4Addr::new(10, 0, high, low);
+        let server = Arc::new(credentials.server(None, address.into()).unwrap());
         let mut endpoint = EndpointConfig::default();
         endpoint.rng_seed(Some(random.random())).grease_quic_bit(false);
         endpoint.supported_versions(vec![1]);
         Self {
-            address: Ipv4Addr::new(10, 0, high, low),
+            address,
             daemon,
             links: Vec::new(),
-            transport: crate::engine::transport::transport(&config),
+            transport: Transports::new(&config).towards(address.into()),
             config,
             credentials,
             endpoint: Endpoint::new(Arc::new(endpoint), Some(server), true, None),
@@ -94,7 +95,7 @@ impl Raw {
 
     /// Begins a connection. Returns its number.
     pub(super) fn dial(&mut self, to: Ipv4Addr, now: Duration) -> usize {
-        let mut client = self.credentials.client(None).unwrap();
+        let mut client = self.credentials.client(None, to.into()).unwrap();
         client.transport_config(Arc::clone(&self.transport));
         let to = SocketAddr::from((to, PORT));
         let (handle, quic) = self.endpoint.connect(self.epoch + now, client, to, "axon").unwrap();

@@ -2,7 +2,7 @@
 
 use std::{
     cell::{Cell, RefCell},
-    collections::{BTreeMap, HashMap, VecDeque},
+    collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
     rc::Rc,
     sync::Arc,
     time::Duration,
@@ -19,9 +19,10 @@ use axon_transport::{
     internal::{
         OWNER, SessionKey,
         graph::{Pairing, pairing},
-        session::Written,
+        session::{TakeLimit, Written},
     },
 };
+use bytes::Bytes;
 
 use crate::engine::rings::{RingError, RingReader, RingWriter, Rings};
 
@@ -55,6 +56,8 @@ struct State {
     given_up: BTreeMap<Gid, u64>,
     /// Samples that came damaged.
     damaged: u64,
+    /// Stand-ins that wrote samples and did not wake their readers.
+    unannounced: BTreeSet<Gid>,
     /// RELIABLE samples that a stand-in wrote after a newer one, or twice.
     disordered: u64,
     next: u32,
@@ -66,7 +69,7 @@ struct Cursors {
     gid: Gid,
     spec: EndpointSpec,
     read: RefCell<HashMap<Gid, u64>>,
-    /// Samples of each publisher that newer ones replaced before they were read.
+    /// Samples of each publisher that newer ones replaced before they were read, or that were passed over.
     lost: RefCell<HashMap<Gid, u64>>,
     acknowledged: RefCell<HashMap<Gid, u64>>,
     closed: Cell<bool>,
@@ -216,6 +219,11 @@ impl SimRings {
         self.state.borrow().publishers.get(&publisher).map_or(0, |p| p.published)
     }
 
+    /// Whether readers sleep though a stand-in wrote a sample for them.
+    pub(super) fn has_unannounced(&self) -> bool {
+        !self.state.borrow().unannounced.is_empty()
+    }
+
     /// Samples of a publisher that relays gave up.
     pub(super) fn given_up(&self, publisher: Gid) -> u64 {
         self.state.borrow().given_up.get(&publisher).copied().unwrap_or(0)
@@ -296,12 +304,6 @@ impl Drop for SimReader {
 }
 
 impl SimReader {
-    /// Samples between this reader's cursor and the one that it has next.
-    fn overwritten(&self, publisher: &Gid, next: u64) -> u64 {
-        let read = self.cursors.read.borrow().get(publisher).copied().unwrap_or(0);
-        next.saturating_sub(read + 1)
-    }
-
     /// The next sample of a publisher after this reader's cursor.
     fn peek(&self, publisher: &Gid) -> Option<(u64, Vec<u8>)> {
         let state = self.rings.state.borrow();
@@ -314,6 +316,17 @@ impl SimReader {
         };
         let next = of.history.iter().find(|(sequence, _)| *sequence > read.max(skip));
         next.cloned()
+    }
+}
+
+impl SimReader {
+    /// Passes over the samples up to this number.
+    fn pass_to(&self, publisher: &Gid, number: u64) {
+        let mut read = self.cursors.read.borrow_mut();
+        let read = read.entry(*publisher).or_default();
+        *self.cursors.lost.borrow_mut().entry(*publisher).or_default() +=
+            number.saturating_sub(*read);
+        *read = number.max(*read);
     }
 }
 
@@ -337,28 +350,47 @@ impl RingReader for SimReader {
         of.map(|(gid, _)| *gid).collect()
     }
 
-    fn take_of(&self, publisher: &Gid) -> Option<(MessageInfo, Vec<u8>)> {
+    fn take_many(
+        &self,
+        publisher: &Gid,
+        most: TakeLimit,
+        each: &mut dyn FnMut(MessageInfo, Bytes),
+    ) -> usize {
         let expired = self.rings.state.borrow().expired.get(publisher).copied();
-        for _ in 0..PASSED_OVER {
-            let (sequence, payload) = self.peek(publisher)?;
-            let lost = self.overwritten(publisher, sequence);
-            *self.cursors.lost.borrow_mut().entry(*publisher).or_default() += lost;
+        let (mut samples, mut bytes, mut passed_over) = (0, 0, 0);
+        while samples < most.samples
+            && passed_over < PASSED_OVER
+            && let Some((sequence, payload)) = self.peek(publisher)
+            && (samples == 0 || bytes + payload.len() <= most.bytes)
+        {
+            self.pass_to(publisher, sequence - 1);
             self.cursors.read.borrow_mut().insert(*publisher, sequence);
-            if Some(sequence) > expired {
-                return Some((MessageInfo::of(*publisher, sequence), payload));
+            if Some(sequence) <= expired {
+                passed_over += 1;
+                continue;
             }
+            (samples, bytes) = (samples + 1, bytes + payload.len());
+            each(MessageInfo::of(*publisher, sequence), payload.into());
         }
-        None
+        samples
     }
 
     fn retry_of(&self, publisher: &Gid) -> Option<Duration> {
         self.peek(publisher).map(|_| Duration::ZERO)
     }
 
+    fn skip_of(&self, publisher: &Gid, depth: u64) {
+        let state = self.rings.state.borrow();
+        let published = state.publishers.get(publisher).map_or(0, |of| of.published);
+        self.pass_to(publisher, published.saturating_sub(depth));
+    }
+
     fn lost_of(&self, publisher: &Gid) -> u64 {
-        let next = self.peek(publisher);
-        let found = next.map_or(0, |(sequence, _)| self.overwritten(publisher, sequence));
-        self.cursors.lost.borrow().get(publisher).copied().unwrap_or(0) + found
+        // A look finds the losses, as with a ring in memory.
+        if let Some((next, _)) = self.peek(publisher) {
+            self.pass_to(publisher, next - 1);
+        }
+        self.cursors.lost.borrow().get(publisher).copied().unwrap_or(0)
     }
 
     fn acknowledge_of(&self, publisher: &Gid, sequence: u64) {
@@ -434,6 +466,7 @@ impl RingWriter for SimWriter {
         if reliable && !foreign && meta.sequence <= self.last.replace(meta.sequence) {
             state.disordered += 1;
         }
+        state.unannounced.insert(publisher);
         for subscription in &mut readers {
             let received = subscription.received.entry(publisher).or_default();
             // As a session does: a sample that is not newer is dropped.
@@ -446,6 +479,10 @@ impl RingWriter for SimWriter {
             received.push(meta.sequence);
         }
         Ok(Written::Yes)
+    }
+
+    fn announce(&self) {
+        self.rings.state.borrow_mut().unannounced.remove(&self.endpoint.gid);
     }
 
     fn assert_alive(&self) {}

@@ -75,6 +75,7 @@ fn subscribe(route: u32, topic: &str, qos: Qos) -> Message {
         subscribers: vec![Subscriber { gid: of_raw(200), qos }],
         last: Vec::new(),
         acknowledges: Some(true),
+        short_headers: None,
     })
 }
 
@@ -115,14 +116,16 @@ fn asked(world: &mut World, on: usize, topic: &str) -> u32 {
 
 /// A data stream with some samples of a publisher.
 fn samples(route: u32, topic: &str, gid: Gid, numbers: std::ops::RangeInclusive<u64>) -> Vec<u8> {
-    let mut bytes = stream_header(true, route, gid).to_vec();
+    let mut bytes = stream_header(true, false, route, gid).to_vec();
     let hash = TopicHash::new(0, topic, "T").unwrap();
     let mut frames = Frames::default();
     for number in numbers {
         let info = MessageInfo::of(gid, number);
-        let sample = Sample::new(info, payload(gid, number, 10), Duration::ZERO);
+        let sample = Sample::new(info, payload(gid, number, 10).into(), Duration::ZERO);
         let of = Route { kind: Kind::Topic, topic: hash };
-        Seal::Link.write(&sample, of, Delivery::Reliable, &mut frames, Duration::ZERO).unwrap();
+        Seal::Link
+            .write(&sample, of, Delivery::Reliable, None, &mut frames, Duration::ZERO)
+            .unwrap();
     }
     frames.take().iter().for_each(|piece| bytes.extend_from_slice(piece));
     bytes

@@ -157,7 +157,9 @@ impl Torture {
     /// What a data stream may begin with.
     fn data(&mut self) -> Bytes {
         let (gid, route) = (self.gid(), self.number() as u32);
-        let mut bytes = stream_header(self.rng.random_bool(0.7), route, gid).to_vec();
+        let mut bytes =
+            stream_header(self.rng.random_bool(0.7), self.rng.random_bool(0.3), route, gid)
+                .to_vec();
         if self.rng.random_bool(0.1) {
             let at = self.rng.random_range(0..4);
             bytes[at] = self.rng.random();
