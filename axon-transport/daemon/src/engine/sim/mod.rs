@@ -8,7 +8,6 @@
 mod held;
 mod host;
 pub(crate) mod network;
-mod radio;
 mod raw;
 mod rings;
 pub(crate) mod rng;

@@ -4,5 +4,6 @@ mod hostile;
 mod kills;
 mod losses;
 mod moves;
+mod radio;
 mod segment;
 mod torture;
