@@ -255,6 +255,12 @@ impl Subscription {
         !self.session.is_forked() && self.inner.lock().reads(writer)
     }
 
+    /// For a relay: after what time [`take_of`](Self::take_of) may have a sample of this publisher, where it had none
+    /// although some wait. It had passed over samples that do not count, or there was no memory for one.
+    pub fn retry_of(&self, writer: &Gid) -> Option<Duration> {
+        if self.session.is_forked() { None } else { self.inner.lock().retry_of(writer) }
+    }
+
     /// Whether there is something to take of this publisher.
     pub fn has_from(&self, writer: &Gid) -> bool {
         !self.session.is_forked() && self.inner.lock().has_from(writer)

@@ -50,6 +50,10 @@ pub(crate) trait RingReader {
         most: TakeLimit,
         each: &mut dyn FnMut(MessageInfo, Bytes),
     ) -> usize;
+    /// After what time [`take_many`](Self::take_many) may have a sample, where it had none although some wait: it passes
+    /// over a number that do not count, such as expired ones, and then lets others have their turn; or there was no
+    /// memory for a sample.
+    fn retry_of(&self, publisher: &Gid) -> Option<Duration>;
     /// Passes over all samples of this publisher but the newest `depth`.
     fn skip_of(&self, publisher: &Gid, depth: u64);
     /// How many samples of this publisher newer ones replaced before they were taken, or were passed over.

@@ -5,6 +5,7 @@ use std::{
     collections::HashMap,
     ops::Range,
     rc::Rc,
+    time::Duration,
 };
 
 use axon_shm::{ExternalLeader, Meta, PublishError, ShmError, ids::Gid};
@@ -133,6 +134,10 @@ impl RingReader for Relay {
 
     fn skip_of(&self, publisher: &Gid, depth: u64) {
         self.subscription.skip_of(publisher, depth);
+    }
+
+    fn retry_of(&self, publisher: &Gid) -> Option<Duration> {
+        self.subscription.retry_of(publisher)
     }
 
     fn lost_of(&self, publisher: &Gid) -> u64 {

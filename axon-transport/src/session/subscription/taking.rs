@@ -3,7 +3,7 @@
 use std::{
     collections::HashMap,
     ops::Range,
-    time::{Instant, SystemTime},
+    time::{Duration, Instant, SystemTime},
 };
 
 use axon_shm::{Meta, Sample, TakeError, internal::Reader};
@@ -291,6 +291,12 @@ impl MatchedReaders {
         self.matched_readers
             .iter()
             .any(|slot| slot.reader.writer() == *writer && slot.reader.has_data())
+    }
+
+    /// After what time a sample of `writer` may be taken, if any waits.
+    pub(in crate::session) fn retry_of(&self, writer: &Gid) -> Option<Duration> {
+        let wait = |until: Instant| until.saturating_duration_since(Instant::now());
+        self.has_from(writer).then(|| self.short_until().map_or(Duration::ZERO, wait))
     }
 
     /// Samples of `writer` that newer ones replaced before they were taken, in its ring or within the depth.

@@ -99,6 +99,8 @@ pub(super) enum Step {
     Writer(Message, Duration),
     /// Room in the ring.
     Ring(Message),
+    /// Its end: nothing more is wanted from it.
+    Over,
 }
 
 /// A message that was read and opened.
@@ -170,6 +172,33 @@ impl Incoming {
                 Err(End) => return Piece::End,
             }
         }
+    }
+
+    /// Whether a stream from which nothing more is wanted is at its end. QUIC forgets a stream, and allows the peer
+    /// another one, once its end was read; the end may come with the last bytes, and then nothing says that it came. A
+    /// peer that sends more is told to stop.
+    pub(super) fn is_over(&mut self, id: StreamId, quic: &mut quinn_proto::Connection) -> bool {
+        (self.chunk, self.gathered) = (Bytes::new(), BytesMut::new());
+        match next_chunk(id, quic) {
+            Err(End) => true,
+            Ok(Some(_)) => {
+                let _ = quic.recv_stream(id).stop(super::NO_ROUTE);
+                true
+            }
+            Ok(None) => false,
+        }
+    }
+}
+
+#[cfg(test)]
+impl Incoming {
+    /// Bytes of samples that were read from QUIC and are not delivered.
+    pub(super) fn held(&self) -> usize {
+        let message = match &self.step {
+            Step::Writer(message, _) | Step::Ring(message) => message.payload.len(),
+            _ => 0,
+        };
+        self.chunk.len() + self.gathered.len() + message
     }
 }
 

@@ -4,6 +4,8 @@
 //! order when a successor takes over. A stream whose ring is full is not read on: QUIC's flow control holds back the
 //! peer.
 
+#[cfg(test)]
+mod held;
 mod incoming;
 mod reading;
 mod receipts;

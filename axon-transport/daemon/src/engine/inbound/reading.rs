@@ -69,7 +69,11 @@ impl Inbound {
                 Next::Wait => break,
                 Next::Over => {
                     self.end_turn(key, &stream);
-                    return Ok(read);
+                    if stream.is_over(key.1, quic) {
+                        return Ok(read);
+                    }
+                    stream.step = Step::Over;
+                    break;
                 }
             }
         }
@@ -147,6 +151,7 @@ impl Inbound {
                 };
                 self.open(stream, body, open, read, now)
             }
+            Step::Over => Ok(Next::Over),
             Step::Writer(message, until) => Ok(self.deliver(key, stream, message, until, now)),
             Step::Ring(message) => Ok(self.deliver(key, stream, message, now, now)),
         }
@@ -266,6 +271,12 @@ impl Inbound {
             self.release(stream);
             return Next::Go;
         }
+        if !header.reliable && stand_in.last_sequence() >= Some(sequence) {
+            // A newer one overtook it: readers drop it.
+            self.counters.lost(&self.topic(header.route), "late", 1);
+            self.release(stream);
+            return Next::Over;
+        }
         let stand_in = Rc::clone(stand_in);
         let Some(there) = self.write(&stand_in, header, message.meta, &message.payload) else {
             return self.wait_for_room(key, stream, message, now);
@@ -291,10 +302,10 @@ impl Inbound {
             Ok(Written::Yes) => {
                 self.counters.arrived(payload.len());
                 let before = self.written.as_ref();
-                if before.is_none_or(|before| !Rc::ptr_eq(before, stand_in)) {
-                    if let Some(before) = self.written.replace(Rc::clone(stand_in)) {
-                        before.announce();
-                    }
+                if before.is_none_or(|before| !Rc::ptr_eq(before, stand_in))
+                    && let Some(before) = self.written.replace(Rc::clone(stand_in))
+                {
+                    before.announce();
                 }
                 Some(true)
             }

@@ -245,6 +245,13 @@ impl Flow {
                 _ => self.write_reliable(carrier, counters, done, now),
             };
             left = left.saturating_sub((carrier.taken - before) as usize);
+            if pause == Some(Pause::Empty)
+                && let Some(wait) = self.taking.take_retry()
+            {
+                // In a pass of its own, so that other flows and links have their turn.
+                self.set_timer(Some(now + wait));
+                return Pause::Empty;
+            }
             match pause {
                 None if left == 0 => return Pause::Turn,
                 None => {}

@@ -89,6 +89,14 @@ impl Source {
         }
     }
 
+    /// After what time a sample of this publisher may be taken, where none could be although some wait.
+    pub(super) fn retry_of(&self, of: &Gid) -> Option<Duration> {
+        match self {
+            Self::Relay(_, reader) => reader.retry_of(of),
+            Self::StandIn(_) => None,
+        }
+    }
+
     /// How many samples of this publisher newer ones replaced before they were taken, or were passed over.
     pub(super) fn lost_of(&self, of: &Gid) -> u64 {
         match self {

@@ -44,6 +44,8 @@ pub(super) struct Taking {
     held: bool,
     /// Whether the rings may hold more samples than the last turn moved.
     more: bool,
+    /// After what time that is looked at again, where the last turn moved none.
+    retry: Option<Duration>,
     /// The relay whose losses are counted, and how many are.
     counted: Option<(Gid, u64)>,
 }
@@ -58,6 +60,7 @@ impl Taking {
             taken: VecDeque::new(),
             held: false,
             more: false,
+            retry: None,
             counted: None,
         }
     }
@@ -82,6 +85,11 @@ impl Taking {
     /// Whether a sample found no room.
     pub(super) fn is_held(&self) -> bool {
         self.held
+    }
+
+    /// After what time the rings are to be looked at again, where the last turn moved nothing although samples wait.
+    pub(super) fn take_retry(&mut self) -> Option<Duration> {
+        self.retry.take()
     }
 
     /// Whether the rings may hold samples that it did not come to.
@@ -123,7 +131,7 @@ impl Taking {
         };
         let most_samples = if is_behind { together } else { FILL.0 };
         let (mut samples, mut bytes, mut dropped, mut repeats) = (0, 0, 0, 0);
-        self.held = false;
+        (self.held, self.retry) = (false, None);
         while samples < most_samples && bytes < most_bytes {
             let has_enough = match queue.keeps_all() {
                 true => queue.waiting_bytes() >= AHEAD,
@@ -136,7 +144,10 @@ impl Taking {
                 let left = together.min(most_samples - samples);
                 let most = limit(queue.room(), left, most_bytes - bytes);
                 if !self.take(sources, most, now) {
-                    self.more = self.merge.is_behind();
+                    let behind = self.merge.is_behind().then_some(Duration::ZERO);
+                    let retries = sources.iter().filter_map(|source| source.retry_of(&self.of));
+                    self.retry = retries.chain(behind).min();
+                    self.more = self.retry.is_some();
                     if !self.more {
                         queue.handle_empty_ring();
                     }

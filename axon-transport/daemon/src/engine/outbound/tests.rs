@@ -84,6 +84,10 @@ impl RingReader for Ring {
         taken
     }
 
+    fn retry_of(&self, _publisher: &Gid) -> Option<Duration> {
+        (!self.samples.borrow().is_empty()).then_some(Duration::ZERO)
+    }
+
     fn skip_of(&self, _publisher: &Gid, depth: u64) {
         let mut samples = self.samples.borrow_mut();
         let stale = samples.len().saturating_sub(depth as usize);
