@@ -7,6 +7,7 @@ mod best_effort;
 pub(crate) mod budget;
 mod ending;
 mod flow;
+mod nudges;
 mod queue;
 mod schedule;
 mod source;
@@ -30,6 +31,7 @@ use self::{
     budget::Budget,
     ending::Endings,
     flow::{Done, Flow, FlowRoute, Pause},
+    nudges::Nudges,
     schedule::Schedule,
     stall::Stalls,
 };
@@ -119,6 +121,7 @@ pub(crate) struct Outbound {
     ended: Vec<StreamId>,
     endings: Endings,
     stalls: Stalls,
+    nudges: Nudges,
     events: Vec<OutboundEvent>,
 }
 
@@ -146,6 +149,7 @@ impl Outbound {
             ended: Vec::new(),
             endings: Endings::default(),
             stalls: Stalls::new(stalled_after, now),
+            nudges: Nudges::default(),
             events: Vec::new(),
         }
     }
@@ -275,6 +279,7 @@ impl Outbound {
         self.without_stream.remove(&id);
         self.without_key.remove(&id);
         self.held.remove(&id);
+        self.nudges.forget(id);
         if flow.scheduled.is_some() {
             self.schedule.remove(id);
         }
@@ -293,10 +298,13 @@ impl Outbound {
             let Some(served) = self.routes.get(&flow.route_number) else { continue };
             flow.scheduled = None;
             carrier.flow = id;
-            let before = flow.timer;
+            let (before, taken) = (flow.timer, carrier.taken);
             let mut done = Done::default();
             let pause = flow.write(&served.sources, carrier, &self.counters, &mut done, now);
             served.done(flow.of, done);
+            if carrier.loses && carrier.taken > taken {
+                self.nudges.handle_sent(id, carrier.quic.rtt(), now);
+            }
             if flow.is_held() {
                 self.held.insert(id);
             }
@@ -461,7 +469,8 @@ impl Outbound {
         let flow = self.timers.first().map(|(due, _)| *due);
         let endings = self.endings.poll_timeout();
         let stalls = (!self.routes.is_empty()).then(|| self.stalls.poll_timeout()).flatten();
-        [flow, endings, stalls, self.key_retry].into_iter().flatten().min()
+        let nudges = self.nudges.poll_timeout();
+        [flow, endings, stalls, nudges, self.key_retry].into_iter().flatten().min()
     }
 
     /// Does what is due. `heard` counts the datagrams that came over the link.
@@ -494,6 +503,15 @@ impl Outbound {
         }
         if self.key_retry.is_some_and(|due| due <= now) {
             self.handle_keys();
+        }
+        let rtt = carrier.as_deref().map_or(NO_CARRIER, |carrier| carrier.quic.rtt());
+        let is_on_the_way = |id: FlowId| {
+            self.flows.get(id).and_then(Option::as_ref).is_some_and(Flow::is_on_the_way)
+        };
+        if self.nudges.handle_timeout(rtt, now, is_on_the_way)
+            && let Some(carrier) = carrier
+        {
+            carrier.quic.ping();
         }
         self.look_at_endings(now);
         self.look_at_stalls(heard, now);
