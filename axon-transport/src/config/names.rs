@@ -41,8 +41,14 @@ pub(super) const SETTINGS: &[&str] = &[
 ];
 
 /// What `[link]` of `axon.toml` holds, as variables: there `AXON_LINK_MTU` is `mtu`.
-pub(super) const LINK: &[&str] =
-    &["AXON_LINK_GRACE_S", "AXON_LINK_STALLED_S", "AXON_LINK_MTU", "AXON_LINK_GRAPH_MB"];
+pub(super) const LINK: &[&str] = &[
+    "AXON_LINK_GRACE_S",
+    "AXON_LINK_STALLED_S",
+    "AXON_LINK_MTU",
+    "AXON_LINK_GRAPH_MB",
+    "AXON_LINK_POLL",
+    QLOG,
+];
 
 /// Settings that name files. A relative one is another file for a process in another directory.
 pub(super) const PATHS: &[&str] = &[
@@ -60,6 +66,9 @@ pub(super) const PATHS: &[&str] = &[
 
 /// Where a daemon keeps files, always an absolute path.
 pub(super) const RUNTIME_DIR: &str = "AXON_RUNTIME_DIR";
+
+/// Where the daemon writes QUIC's events, always an absolute path.
+pub(super) const QLOG: &str = "AXON_LINK_QLOG";
 
 /// Users who are let in.
 pub(super) const TRUSTED_UIDS: &str = "AXON_TRUSTED_UIDS";

@@ -8,6 +8,7 @@ use axon_tls::{
     quic::{ALPN, hybrid_client, hybrid_server, qkd_client, qkd_server},
 };
 use axon_transport::config::{Config, Security};
+use quinn_proto::{QlogStream, TransportConfig};
 use rustls_pki_types::CertificateDer;
 
 use crate::{
@@ -29,13 +30,13 @@ pub(crate) struct Credentials {
     config: Arc<Config>,
     /// The classic identity; `None` in qkd.
     identity: Option<Arc<Identity>>,
-    transport: Arc<quinn_proto::TransportConfig>,
+    transport: Arc<TransportConfig>,
 }
 
 impl Credentials {
     /// The settings of `config`, with the identity that its files say.
     pub(crate) fn new(config: Arc<Config>, identity: Option<Arc<Identity>>) -> Self {
-        Self { transport: transport(&config), config, identity }
+        Self { transport: Arc::new(transport(&config)), config, identity }
     }
 
     /// The classic identity in force; `None` in qkd.
@@ -51,6 +52,13 @@ impl Credentials {
     /// Why no new peer is accepted, if so: a file of the identity cannot be used.
     pub(crate) fn closed(&self) -> Option<String> {
         self.identity.as_ref().and_then(|identity| identity.closed())
+    }
+
+    /// The transport settings of one connection whose events are written.
+    pub(crate) fn logged(&self, stream: QlogStream) -> Arc<TransportConfig> {
+        let mut transport = transport(&self.config);
+        transport.qlog_stream(Some(stream));
+        Arc::new(transport)
     }
 
     /// The client's side of a handshake, in qkd on one PSK.

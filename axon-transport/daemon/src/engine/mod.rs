@@ -19,11 +19,13 @@ pub(crate) mod inbound;
 pub(crate) mod keyring;
 pub(crate) mod link;
 pub(crate) mod links;
+mod marks;
 pub(crate) mod outbound;
 mod pace;
 pub(crate) mod peer;
 mod peers;
 pub(crate) mod protection;
+pub(crate) mod qlog;
 pub(crate) mod refusal;
 pub(crate) mod rings;
 #[cfg(test)]

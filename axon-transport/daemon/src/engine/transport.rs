@@ -7,8 +7,11 @@ use axon_transport::config::Config;
 use quinn_proto::{
     EndpointConfig, HashedConnectionIdGenerator, IdleTimeout, MtuDiscoveryConfig, TransportConfig,
     VarInt,
+    congestion::CubicConfig,
     crypto::{CryptoError, HmacKey},
 };
+
+use super::marks::CountingFactory;
 
 /// A silent peer is given up after this.
 const IDLE_TIMEOUT_MS: u32 = 20_000;
@@ -62,7 +65,7 @@ pub(crate) fn endpoint_config(reset_key: &[u8; 32]) -> EndpointConfig {
 }
 
 /// The transport settings of a link, for either end.
-pub(crate) fn transport(config: &Config) -> Arc<TransportConfig> {
+pub(crate) fn transport(config: &Config) -> TransportConfig {
     let mut transport = TransportConfig::default();
     let window = (config.max_message * 2).clamp(STREAM_WINDOW.0, STREAM_WINDOW.1);
     let mut mtu = MtuDiscoveryConfig::default();
@@ -75,7 +78,8 @@ pub(crate) fn transport(config: &Config) -> Arc<TransportConfig> {
         .stream_receive_window(VarInt::from_u64(window).unwrap_or(VarInt::MAX))
         .receive_window(VarInt::from_u32(LINK_WINDOW))
         .send_window(SEND_WINDOW)
+        .congestion_controller_factory(Arc::new(CountingFactory(Arc::new(CubicConfig::default()))))
         .initial_mtu(1200)
         .mtu_discovery_config(Some(mtu));
-    Arc::new(transport)
+    transport
 }
