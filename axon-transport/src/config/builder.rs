@@ -3,9 +3,9 @@
 use std::{fmt::Display, net::IpAddr, path::Path, time::Duration};
 
 use super::{
-    ClassicAuth, Config, ConfigError, DaemonPolicy, DiscoveryRange, KeyMode, LinkPoll, OsFiles,
-    QkdKex, QkdPeers, QuicCipher, SecurityMode, daemon_env::DaemonEnv, names, resolve::resolve,
-    sources::Given, values::method,
+    ClassicAuth, Config, ConfigError, Congestion, DaemonPolicy, DiscoveryRange, KeyMode, LinkPoll,
+    OsFiles, QkdKex, QkdPeers, QuicCipher, SecurityMode, daemon_env::DaemonEnv, names,
+    resolve::resolve, sources::Given, values::method,
 };
 
 /// Makes a [`Config`] in code. Each method gives the setting of `docs/configuration.md` that has its name:
@@ -376,5 +376,16 @@ impl ConfigBuilder {
     /// The absolute path of the directory to which the daemon writes QUIC's events. Default none.
     pub fn link_qlog(self, directory: impl AsRef<Path>) -> Self {
         self.path("AXON_LINK_QLOG", directory)
+    }
+
+    /// The congestion controller of links. Default [`Congestion::Auto`].
+    pub fn link_congestion(self, congestion: Congestion) -> Self {
+        let word = match congestion {
+            Congestion::Auto => "auto",
+            Congestion::Delay => "delay",
+            Congestion::Cubic => "cubic",
+            Congestion::Bbr => "bbr",
+        };
+        self.set("AXON_LINK_CONGESTION", word)
     }
 }

@@ -322,6 +322,8 @@ pub struct LinkConfig {
     pub poll: LinkPoll,
     /// Where QUIC's events are written, in the format qlog.
     pub qlog: Option<PathBuf>,
+    /// How a link finds its share of the path.
+    pub congestion: Congestion,
 }
 
 /// Whether the daemon looks for the next input before it sleeps (`AXON_LINK_POLL`).
@@ -336,6 +338,20 @@ pub enum LinkPoll {
     Never,
 }
 
+/// The congestion controller of links (`AXON_LINK_CONGESTION`). Either side of a link decides for what it sends.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Congestion {
+    /// `Delay` to private and link-local addresses, `Cubic` to all others.
+    #[default]
+    Auto,
+    /// AXON's own: it keeps queues short and ignores random loss, as radio links need it.
+    Delay,
+    /// CUBIC (RFC 9438), which most of the Internet uses.
+    Cubic,
+    /// BBR, as the QUIC library has it.
+    Bbr,
+}
+
 impl Default for LinkConfig {
     fn default() -> Self {
         let ten = Duration::from_secs(10);
@@ -346,6 +362,7 @@ impl Default for LinkConfig {
             graph: 16 << 20,
             poll: LinkPoll::Adaptive,
             qlog: None,
+            congestion: Congestion::Auto,
         }
     }
 }

@@ -48,6 +48,7 @@ pub(super) const LINK: &[&str] = &[
     "AXON_LINK_GRAPH_MB",
     "AXON_LINK_POLL",
     QLOG,
+    "AXON_LINK_CONGESTION",
 ];
 
 /// Settings that name files. A relative one is another file for a process in another directory.

@@ -7,8 +7,8 @@ use std::{
 };
 
 use super::{
-    ClassicAuth, ClassicConfig, Config, ConfigError, DaemonPolicy, DiscoveryRange, KeyMode,
-    LinkConfig, LinkPoll, QkdConfig, QkdKex, QkdPeers, QuicCipher, Security, SecurityMode,
+    ClassicAuth, ClassicConfig, Config, ConfigError, Congestion, DaemonPolicy, DiscoveryRange,
+    KeyMode, LinkConfig, LinkPoll, QkdConfig, QkdKex, QkdPeers, QuicCipher, Security, SecurityMode,
     daemon_env::DaemonEnv,
     files::Files,
     names,
@@ -313,6 +313,14 @@ fn qlog(
     path.ok_or_else(|| ConfigError::value(name, text, values::DIRECTORY).at(place))
 }
 
+/// The values of `AXON_LINK_CONGESTION`.
+const CONGESTION: [(&str, Congestion); 4] = [
+    ("auto", Congestion::Auto),
+    ("delay", Congestion::Delay),
+    ("cubic", Congestion::Cubic),
+    ("bbr", Congestion::Bbr),
+];
+
 fn link(values: &Values<'_, impl Files>) -> Result<LinkConfig, ConfigError> {
     let sources = values.sources;
     let mut link = LinkConfig::default();
@@ -343,8 +351,16 @@ fn link(values: &Values<'_, impl Files>) -> Result<LinkConfig, ConfigError> {
                     .ok_or_else(|| ConfigError::value(&name, word, accepted()).at(&*place))?;
             }
             "qlog" => link.qlog = Some(qlog(&name, value, &place, values.files)?),
+            "congestion" => {
+                let word = value.as_str().unwrap_or_else(|| value.type_str());
+                let known = CONGESTION.iter().find(|(name, _)| *name == word);
+                let accepted = || CONGESTION.map(|(word, _)| word).join(", ");
+                link.congestion = known
+                    .map(|(_, congestion)| *congestion)
+                    .ok_or_else(|| ConfigError::value(&name, word, accepted()).at(&*place))?;
+            }
             _ => {
-                let known = "grace_s, stalled_s, mtu, graph_mb, poll, qlog";
+                let known = "grace_s, stalled_s, mtu, graph_mb, poll, qlog, congestion";
                 return Err(ConfigError::name(&name, known).at(place));
             }
         }
@@ -367,6 +383,9 @@ fn link(values: &Values<'_, impl Files>) -> Result<LinkConfig, ConfigError> {
     }
     if let Some(qlog) = values.directory(names::QLOG)? {
         link.qlog = Some(qlog);
+    }
+    if let Some(congestion) = values.choice("AXON_LINK_CONGESTION", &CONGESTION)? {
+        link.congestion = congestion;
     }
     Ok(link)
 }

@@ -45,6 +45,7 @@ fn all_of_qkd() -> ConfigBuilder {
         .link_graph_mb(4)
         .link_poll(LinkPoll::Never)
         .link_qlog("/var/qlog")
+        .link_congestion(Congestion::Cubic)
 }
 
 fn all_of_classic() -> ConfigBuilder {
@@ -93,6 +94,7 @@ fn what_is_built_is_what_the_environment_would_make_and_so_it_is_passed_on() {
     assert_eq!((built.link.mtu, built.link.graph), (9_000, 4 << 20));
     assert_eq!(built.link.poll, LinkPoll::Never);
     assert_eq!(built.link.qlog.as_deref(), Some(Path::new("/var/qlog")));
+    assert_eq!(built.link.congestion, Congestion::Cubic);
     assert_eq!((built.domain, built.static_peers.len()), (232, 2));
     assert_eq!(built.range, DiscoveryRange::Localhost);
 }

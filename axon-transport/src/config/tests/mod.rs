@@ -137,6 +137,7 @@ fn nothing_given_is_the_table_of_defaults() {
             graph: 16 << 20,
             poll: LinkPoll::Adaptive,
             qlog: None,
+            congestion: Congestion::Auto,
         }
     );
     assert!(config.warnings().iter().any(|w| w.contains("not authenticated")));
@@ -261,6 +262,7 @@ fn the_environment_wins_over_the_file() {
         graph_mb = 4
         poll = 'always'
         qlog = '/var/qlog'
+        congestion = 'bbr'
     ";
     let config = with_file(&[], file).unwrap();
     assert_eq!(qkd(&config).peers.to_string(), "sae-b;sae-c");
@@ -277,6 +279,7 @@ fn the_environment_wins_over_the_file() {
             graph: 4 << 20,
             poll: LinkPoll::Always,
             qlog: Some("/var/qlog".into()),
+            congestion: Congestion::Bbr,
         }
     );
 

@@ -57,7 +57,7 @@ impl Links {
             return;
         };
         let resolver = self.keyring.as_ref().map(|keys| keys.resolver(now, source.ip()));
-        let mut server = match self.credentials.server(resolver.clone()) {
+        let mut server = match self.credentials.server(resolver.clone(), source.ip()) {
             Ok(server) => server,
             Err(error) => {
                 self.connections.endpoints().refuse(endpoint, incoming);
@@ -198,7 +198,7 @@ impl Links {
         let Some(Dial { dialling, connection }) = self.dials.get_mut(dial) else { return };
         match action {
             Action::Connect { address, attempt } => {
-                let mut client = match self.credentials.client(attempt.as_deref()) {
+                let mut client = match self.credentials.client(attempt.as_deref(), address.ip()) {
                     Ok(client) => client,
                     Err(error) => return dialling.handle_unusable(error),
                 };
