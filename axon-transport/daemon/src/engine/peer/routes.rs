@@ -43,7 +43,7 @@ impl fmt::Display for RouteKey {
 
 impl RouteKey {
     /// The key of what `writer` writes; `None` where it writes nothing.
-    fn of(writer: &Endpoint) -> Option<Self> {
+    pub(super) fn of(writer: &Endpoint) -> Option<Self> {
         let kind = match writer.kind {
             EndpointKind::Publisher => Kind::Topic,
             EndpointKind::Client => Kind::Request,

@@ -139,6 +139,7 @@ impl Host {
             hello,
             addresses: vec![SocketAddr::from(([0, 0, 0, 0], PORT))],
             endpoint: Arc::new(endpoint),
+            qlogs: None,
             epoch: self.epoch,
         };
         let session_keys = SessionKeys::default();
