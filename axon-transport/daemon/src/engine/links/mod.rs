@@ -14,8 +14,6 @@ mod keys;
 mod leaving;
 mod link;
 mod opening;
-mod prober;
-mod shares;
 mod silence;
 mod table;
 mod who;
