@@ -3,18 +3,17 @@
 //! Samples wait here and not in QUIC, because QoS can act on them here. Of bulk, QUIC holds the congestion window and a
 //! little more ([`connection`](super::connection)), so that the newest sample is soon the next. A pass costs the flows that have something to send, and no others.
 
-mod best_effort;
+mod backlog;
 pub(crate) mod budget;
 mod ending;
 mod flow;
 mod nudges;
 mod queue;
 mod schedule;
+mod served;
 mod source;
 mod stall;
-mod taking;
-#[cfg(test)]
-mod tests;
+mod without;
 
 use std::{
     collections::{BTreeSet, HashMap},
@@ -23,47 +22,30 @@ use std::{
     time::Duration,
 };
 
-use axon_envelope::Route;
 use axon_shm::{ids::Gid, qos::Qos};
-use axon_transport::status::LinkStatus;
 use quinn_proto::StreamId;
 
+pub(crate) use self::{
+    backlog::Backlog,
+    schedule::{Class, FlowId},
+    served::RouteOut,
+    source::Source,
+};
 use self::{
     budget::Budget,
     ending::Endings,
-    flow::{Done, Flow, FlowRoute, Pause},
+    flow::{Done, Flow, Pause},
     nudges::Nudges,
     schedule::Schedule,
+    served::{FlowRoute, Served},
     stall::Stalls,
-};
-pub(crate) use self::{
-    schedule::{Class, FlowId},
-    source::Source,
+    without::Without,
 };
 use super::connection::Carrier;
 use crate::{engine::counters::Counters, link::ReceivedOf};
 
-/// A flow without a key looks again after this time, if nobody told it of one.
-const KEY_RETRY: Duration = Duration::from_millis(250);
-
 /// Flows look again after this time at a link that has no keys.
 const NO_CARRIER: Duration = Duration::from_secs(1);
-
-/// A route that the peer asked for.
-pub(crate) struct RouteOut {
-    /// The topic's name.
-    pub(crate) topic: Arc<str>,
-    /// Topic and kind, for the envelope.
-    pub(crate) route: Route,
-    /// Whether the peer acknowledges the samples.
-    pub(crate) acknowledged: bool,
-    /// Whether the peer reads short headers.
-    pub(crate) short_headers: bool,
-    /// Where its samples are taken.
-    pub(crate) sources: Vec<Source>,
-    /// The newest sample of each publisher that the peer has already.
-    pub(crate) seen: HashMap<Gid, u64>,
-}
 
 /// What the peer's owner has to know.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -83,25 +65,6 @@ pub(crate) enum OutboundEvent {
     Stalled(u32),
 }
 
-/// A route and its flows.
-struct Served {
-    shared: FlowRoute,
-    /// Its peer reads nothing, as its owner knows.
-    stalled: bool,
-    sources: Vec<Source>,
-    seen: HashMap<Gid, u64>,
-    flows: HashMap<Gid, FlowId>,
-}
-
-/// Bytes and samples that wait for one peer.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Backlog {
-    /// Bytes that wait for QUIC, by the class of their flow's next sample.
-    bytes: [usize; 4],
-    /// When the oldest sample that waits was taken from its ring.
-    pub(crate) oldest: Option<Duration>,
-}
-
 /// The samples to one peer.
 pub(crate) struct Outbound {
     routes: HashMap<u32, Served>,
@@ -109,15 +72,9 @@ pub(crate) struct Outbound {
     free: Vec<FlowId>,
     schedule: Schedule,
     budget: Rc<Budget>,
-    /// What the budget had released when flows that found no room were tried last.
-    released: usize,
     counters: Rc<Counters>,
     timers: BTreeSet<(Duration, FlowId)>,
-    without_stream: BTreeSet<FlowId>,
-    without_key: BTreeSet<FlowId>,
-    key_retry: Option<Duration>,
-    /// Flows whose next sample found no room in the queue.
-    held: BTreeSet<FlowId>,
+    without: Without,
     /// Streams of routes that ended, and whether they are reset.
     ended: Vec<StreamId>,
     endings: Endings,
@@ -139,14 +96,10 @@ impl Outbound {
             flows: Vec::new(),
             free: Vec::new(),
             schedule: Schedule::default(),
-            released: budget.released(),
+            without: Without::new(&budget),
             budget,
             counters,
             timers: BTreeSet::new(),
-            without_stream: BTreeSet::new(),
-            without_key: BTreeSet::new(),
-            key_retry: None,
-            held: BTreeSet::new(),
             ended: Vec::new(),
             endings: Endings::default(),
             stalls: Stalls::new(stalled_after, now),
@@ -277,9 +230,7 @@ impl Outbound {
         let Some(mut flow) = self.flows[id].take() else { return };
         self.ended.extend(flow.take_streams());
         self.timers.remove(&(flow.timer.unwrap_or_default(), id));
-        self.without_stream.remove(&id);
-        self.without_key.remove(&id);
-        self.held.remove(&id);
+        self.without.forget(id);
         self.nudges.forget(id);
         if flow.scheduled.is_some() {
             self.schedule.remove(id);
@@ -307,7 +258,7 @@ impl Outbound {
                 self.nudges.handle_sent(id, carrier.quic.rtt(), now);
             }
             if flow.is_held() {
-                self.held.insert(id);
+                self.without.room(id);
             }
             if flow.timer != before {
                 self.timers.remove(&(before.unwrap_or_default(), id));
@@ -322,11 +273,10 @@ impl Outbound {
                     small_blocked |= class != Class::Bulk;
                 }
                 Pause::NoStream => {
-                    self.without_stream.insert(id);
+                    self.without.stream(id);
                 }
                 Pause::NoKey => {
-                    self.without_key.insert(id);
-                    self.key_retry.get_or_insert(now + KEY_RETRY);
+                    self.without.key(id, now);
                 }
             }
         }
@@ -335,11 +285,7 @@ impl Outbound {
 
     /// Tries the flows again that found no room, if there is more now.
     fn retry_held(&mut self) {
-        let released = self.budget.released();
-        if self.held.is_empty() || released == std::mem::replace(&mut self.released, released) {
-            return;
-        }
-        for id in std::mem::take(&mut self.held) {
+        for id in self.without.take_for_room(&self.budget) {
             self.schedule(id);
         }
     }
@@ -354,15 +300,14 @@ impl Outbound {
 
     /// The peer allows more streams.
     pub(crate) fn handle_streams_available(&mut self) {
-        for id in std::mem::take(&mut self.without_stream) {
+        for id in self.without.take_for_stream() {
             self.schedule(id);
         }
     }
 
     /// There may be keys for messages.
     pub(crate) fn handle_keys(&mut self) {
-        self.key_retry = None;
-        for id in std::mem::take(&mut self.without_key) {
+        for id in self.without.take_for_key() {
             self.schedule(id);
         }
     }
@@ -471,7 +416,7 @@ impl Outbound {
         let endings = self.endings.poll_timeout();
         let stalls = (!self.routes.is_empty()).then(|| self.stalls.poll_timeout()).flatten();
         let nudges = self.nudges.poll_timeout();
-        [flow, endings, stalls, nudges, self.key_retry].into_iter().flatten().min()
+        [flow, endings, stalls, nudges, self.without.poll_timeout()].into_iter().flatten().min()
     }
 
     /// Does what is due. `heard` counts the datagrams that came over the link.
@@ -502,7 +447,7 @@ impl Outbound {
             }
             self.schedule_if_there(id);
         }
-        if self.key_retry.is_some_and(|due| due <= now) {
+        if self.without.poll_timeout().is_some_and(|due| due <= now) {
             self.handle_keys();
         }
         let rtt = carrier.as_deref().map_or(NO_CARRIER, |carrier| carrier.quic.rtt());
@@ -565,60 +510,5 @@ impl Outbound {
     /// Whether there is anything to hand to QUIC.
     pub(crate) fn has_work(&self) -> bool {
         !self.schedule.is_empty() || !self.ended.is_empty()
-    }
-}
-
-impl Backlog {
-    /// Puts it into the status of a link.
-    pub(crate) fn fill(&self, status: &mut LinkStatus, now: Duration) {
-        let of = |class: Class| self.bytes[class as usize] as u64;
-        status.waiting_bytes = self.bytes.iter().sum::<usize>() as u64;
-        status.waiting.services = of(Class::Service);
-        status.waiting.small_reliable = of(Class::SmallReliable);
-        status.waiting.small_best_effort = of(Class::SmallBestEffort);
-        status.waiting.bulk = of(Class::Bulk);
-        let waited = self.oldest.map_or(Duration::ZERO, |oldest| now.saturating_sub(oldest));
-        status.waiting_ms = u64::try_from(waited.as_millis()).unwrap_or(u64::MAX);
-    }
-}
-
-impl Served {
-    fn is_service(&self) -> bool {
-        self.shared.route.kind != axon_envelope::Kind::Topic
-    }
-
-    /// Tells the sources up to which number they may forget the samples of a publisher.
-    fn done(&self, of: Gid, Done { sequence, given_up }: Done) {
-        let Some(sequence) = sequence else { return };
-        let sources = self.sources.iter().filter(|source| source.reads(&of));
-        for (number, source) in sources.enumerate() {
-            if number == 0 && given_up > 0 {
-                source.give_up(of, given_up);
-            }
-            source.acknowledge_of(&of, sequence);
-        }
-    }
-
-    /// RELIABLE samples that are not acknowledged, by publisher.
-    fn unacknowledged(&self) -> HashMap<Gid, u64> {
-        let mut most = HashMap::new();
-        for (of, samples) in self.sources.iter().flat_map(Source::unacknowledged) {
-            let known: &mut u64 = most.entry(of).or_default();
-            *known = samples.max(*known);
-        }
-        most
-    }
-
-    /// Tells the publishers which samples will not reach the peer. Returns how many.
-    fn give_up(&self) -> u64 {
-        let mut all = 0;
-        for (of, samples) in self.unacknowledged() {
-            all += samples;
-            let source = self.sources.iter().find(|source| source.has_unacknowledged(&of));
-            if let Some(source) = source {
-                source.give_up(of, samples);
-            }
-        }
-        all
     }
 }

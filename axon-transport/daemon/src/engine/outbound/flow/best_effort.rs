@@ -9,13 +9,15 @@ use axon_shm::ids::Gid;
 use bytes::Bytes;
 use quinn_proto::{Connection, Dir, StreamId, VarInt, WriteError};
 
-use super::{
-    flow::{Done, Pause},
-    queue::Queue,
-    schedule::Class,
-};
+use super::{Done, Pause};
 use crate::{
-    engine::{connection::Carrier, counters::Counters, frames::Frames, inbound::stream_header},
+    engine::{
+        connection::Carrier,
+        counters::Counters,
+        frames::Frames,
+        inbound::stream_header,
+        outbound::{queue::Queue, schedule::Class},
+    },
     link::CloseCode,
 };
 
