@@ -1,7 +1,8 @@
 //! Samples to one peer: from the rings of local publishers into QUIC streams.
 //!
 //! Samples wait here and not in QUIC, because QoS can act on them here. Of bulk, QUIC holds the congestion window and a
-//! little more ([`connection`](super::connection)), so that the newest sample is soon the next. A pass costs the flows that have something to send, and no others.
+//! little more ([`connection`](super::connection)), so that the newest sample is soon the next. A pass costs the flows
+//! that have something to send, and no others.
 
 mod backlog;
 pub(crate) mod budget;
@@ -23,7 +24,7 @@ use std::{
 };
 
 use axon_shm::{ids::Gid, qos::Qos};
-use quinn_proto::StreamId;
+use quinn_proto::{StreamId, VarInt};
 
 pub(crate) use self::{
     backlog::Backlog,
@@ -42,7 +43,10 @@ use self::{
     without::Without,
 };
 use super::connection::Carrier;
-use crate::{engine::counters::Counters, link::ReceivedOf};
+use crate::{
+    engine::counters::Counters,
+    link::{CloseCode, ReceivedOf},
+};
 
 /// Flows look again after this time at a link that has no keys.
 const NO_CARRIER: Duration = Duration::from_secs(1);
@@ -75,8 +79,8 @@ pub(crate) struct Outbound {
     counters: Rc<Counters>,
     timers: BTreeSet<(Duration, FlowId)>,
     without: Without,
-    /// Streams of routes that ended, and whether they are reset.
-    ended: Vec<StreamId>,
+    /// Streams of flows that ended, and whether a sample is cut off there.
+    ended: Vec<(StreamId, bool)>,
     endings: Endings,
     stalls: Stalls,
     nudges: Nudges,
@@ -240,8 +244,9 @@ impl Outbound {
 
     /// Hands samples to QUIC until it takes no more, or none is left.
     pub(crate) fn pump(&mut self, carrier: &mut Carrier<'_>, now: Duration) {
-        for stream in self.ended.drain(..) {
-            let _ = carrier.quic.send_stream(stream).finish();
+        for (stream, is_cut) in self.ended.drain(..) {
+            carrier.streams.remove(&stream);
+            end(carrier.quic, stream, is_cut);
         }
         self.retry_held();
         let mut small_blocked = false;
@@ -362,9 +367,9 @@ impl Outbound {
 
     /// A new link carries all flows. What the old link did not deliver is sent again.
     pub(crate) fn succeed(&mut self, mut old: Option<&mut quinn_proto::Connection>) {
-        for stream in self.ended.drain(..) {
+        for (stream, is_cut) in self.ended.drain(..) {
             if let Some(old) = old.as_deref_mut() {
-                let _ = old.send_stream(stream).finish();
+                end(old, stream, is_cut);
             }
         }
         for id in 0..self.flows.len() {
@@ -511,4 +516,14 @@ impl Outbound {
     pub(crate) fn has_work(&self) -> bool {
         !self.schedule.is_empty() || !self.ended.is_empty()
     }
+}
+
+/// Ends a stream. One on which a sample is cut off must not look whole.
+fn end(quic: &mut quinn_proto::Connection, stream: StreamId, is_cut: bool) {
+    let mut stream = quic.send_stream(stream);
+    // Either error says that the stream is over.
+    let _ = match is_cut {
+        true => stream.reset(VarInt::from_u32(CloseCode::Goodbye.code())).map_err(drop),
+        false => stream.finish().map_err(drop),
+    };
 }

@@ -69,6 +69,11 @@ impl BestEffort {
         self.writing.is_none() && self.under_way.is_empty()
     }
 
+    /// The stream of a sample that QUIC does not have entirely. It is given up.
+    pub(super) fn take_cut(&mut self) -> Option<StreamId> {
+        Some(self.writing.take()?.stream)
+    }
+
     /// Hands the next sample, or a part of it, to QUIC. `None`: go on.
     #[expect(clippy::too_many_arguments, reason = "the parts of a flow, borrowed one by one")]
     pub(super) fn write(

@@ -404,9 +404,10 @@ impl Flow {
         self.rewind();
     }
 
-    /// The streams that carry it, which end with it.
-    pub(super) fn take_streams(&mut self) -> Option<StreamId> {
-        self.stream.take()
+    /// The streams that carry it, which end with it, and whether a sample is cut off there.
+    pub(super) fn take_streams(&mut self) -> impl Iterator<Item = (StreamId, bool)> + use<> {
+        let cut = self.best_effort.take_cut().map(|stream| (stream, true));
+        self.stream.take().map(|stream| (stream, false)).into_iter().chain(cut)
     }
 
     /// Samples that the peer acknowledged, and how often QUIC took a quarter of a MiB.
