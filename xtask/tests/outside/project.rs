@@ -95,17 +95,16 @@ impl Project {
     }
 
     /// Runs `cargo add` with these arguments. A crate of ours is taken from its package: until it is
-    /// published, a registry does not have it.
+    /// published, a registry does not have it. `cargo add` takes one path at a time, so each crate of
+    /// ours has a command of its own.
     ///
     /// `None` without a registry, and says so.
     pub(crate) fn add(&self, args: &[&str]) -> Option<()> {
-        let mut add = self.cargo(&["add"]);
-        for arg in args {
-            match PUBLISHED.iter().find(|(name, _)| name == arg) {
-                Some((name, _)) => add.arg("--path").arg(package(name)),
-                None => add.arg(arg),
-            };
+        let is_ours = |arg: &&str| PUBLISHED.iter().any(|(name, _)| name == arg);
+        let (ours, rest): (Vec<&str>, Vec<&str>) = args.iter().copied().partition(is_ours);
+        for name in &ours {
+            reached(self.cargo(&["add", "--path"]).arg(package(name)).args(&rest))?;
         }
-        reached(&mut add)
+        if ours.is_empty() { reached(self.cargo(&["add"]).args(&rest)) } else { Some(()) }
     }
 }
