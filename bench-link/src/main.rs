@@ -1,0 +1,192 @@
+//! Measures AXON, beside TCP, over a path that loses packets, delays them and limits their rate: two hosts are two
+//! network namespaces, and this program carries the packets between them.
+#![forbid(unsafe_code)]
+#![allow(clippy::print_stdout, reason = "what it prints is its result")]
+
+mod host;
+mod part;
+mod path;
+mod place;
+mod relay;
+mod scenarios;
+mod table;
+mod tcp;
+
+use std::{error, fs, path::PathBuf, process::ExitCode, time::Duration};
+
+use axon_daemon::{ErasingHeap, Start};
+use clap::{Parser, Subcommand, ValueEnum};
+use serde_json::{Map, Value, json};
+
+use self::{
+    part::Part,
+    path::{Loss, Settings},
+    scenarios::Options,
+};
+
+/// Whatever stops a measurement.
+type Error = Box<dyn error::Error + Send + Sync>;
+/// What it stops.
+type Result<T> = std::result::Result<T, Error>;
+
+#[global_allocator]
+static HEAP: ErasingHeap = ErasingHeap;
+
+/// Measures AXON, beside TCP, between two network namespaces.
+///
+/// The path between them loses packets, delays them and limits their rate. Needs Linux with /dev/net/tun, iproute2, and
+/// the right to make network namespaces: root, or user namespaces.
+#[derive(Parser)]
+struct Arguments {
+    #[command(subcommand)]
+    command: Option<Command>,
+    /// What is measured [default: all].
+    #[arg(value_enum)]
+    scenarios: Vec<Scenario>,
+    /// The path's rate in Mbit/s.
+    #[arg(long, default_value_t = 54.0)]
+    rate: f64,
+    /// The path's round trip in milliseconds.
+    #[arg(long, default_value_t = 3.0)]
+    round_trip: f64,
+    /// Bytes that may wait for their turn, each way.
+    #[arg(long, default_value_t = 256 << 10)]
+    queue: usize,
+    /// Losses in percent, both ways.
+    #[arg(long, value_delimiter = ',', default_values_t = [0.0, 10.0, 20.0, 30.0, 40.0])]
+    losses: Vec<f64>,
+    /// Packets that are lost in a row, on average.
+    #[arg(long, default_value_t = 1.0)]
+    burst: f64,
+    /// How long each stream flows, in seconds.
+    #[arg(long, default_value_t = 20.0)]
+    seconds: f64,
+    /// `[link] congestion` of both daemons.
+    #[arg(long, default_value = "auto", value_parser = ["auto", "delay", "cubic", "bbr"])]
+    congestion: String,
+    /// Decides which packets are lost.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Writes the figures to this file.
+    #[arg(long)]
+    json: Option<PathBuf>,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Is a program of a measurement.
+    #[command(hide = true)]
+    Part { part: String },
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Scenario {
+    /// What arrives in time at which loss.
+    Losses,
+    /// How much of the rate a stream gets.
+    Flood,
+    /// A command beside a camera that fills the link.
+    Camera,
+    /// A path whose rate falls, and comes back.
+    Slow,
+    /// A path that is cut, and comes back.
+    Cut,
+}
+
+impl Scenario {
+    fn run(self, options: &Options) -> Result<Value> {
+        match self {
+            Self::Losses => scenarios::losses(options),
+            Self::Flood => scenarios::flood(options),
+            Self::Camera => scenarios::camera(options),
+            Self::Slow => scenarios::slow(options),
+            Self::Cut => scenarios::cut(options),
+        }
+    }
+}
+
+fn main() -> ExitCode {
+    // A session starts this program as its daemon.
+    if let Some(start @ (Start::Spawned | Start::Detached)) =
+        Start::from_arguments(std::env::args_os().skip(1))
+    {
+        return axon_daemon::main(start);
+    }
+    match run(&Arguments::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("axon-bench-link: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(arguments: &Arguments) -> Result<()> {
+    if let Some(Command::Part { part }) = &arguments.command {
+        return serde_json::from_str::<Part>(part)?.run();
+    }
+    let options = options(arguments)?;
+    host::prepare()?;
+    println!(
+        "{} Mbit/s, round trip {} ms, queue {} bytes, bursts of {} packets; AXON in classic, congestion = {}; TCP \
+         with the kernel's {}",
+        arguments.rate,
+        arguments.round_trip,
+        arguments.queue,
+        options.burst,
+        options.congestion,
+        tcp::congestion()?
+    );
+    let chosen = match &arguments.scenarios[..] {
+        [] => Scenario::value_variants(),
+        chosen => chosen,
+    };
+    let mut figures = Map::new();
+    for scenario in chosen {
+        let name = scenario.to_possible_value().ok_or("a scenario without a name")?;
+        figures.insert(name.get_name().to_owned(), scenario.run(&options)?);
+    }
+    if let Some(file) = &arguments.json {
+        let document = json!({
+            "benchmark": "axon-bench-link",
+            "rate_mbits": arguments.rate,
+            "round_trip_ms": arguments.round_trip,
+            "queue_bytes": arguments.queue,
+            "burst_packets": arguments.burst,
+            "seconds": arguments.seconds,
+            "congestion": options.congestion,
+            "tcp_congestion": tcp::congestion()?,
+            "optimized": !cfg!(debug_assertions),
+            "figures": figures,
+        });
+        fs::write(file, format!("{document:#}\n"))?;
+    }
+    Ok(())
+}
+
+fn options(arguments: &Arguments) -> Result<Options> {
+    let is_share = |percent: &f64| (0.0..100.0).contains(percent);
+    if !arguments.losses.iter().all(is_share) {
+        return Err("--losses are percentages from 0 to below 100".into());
+    }
+    for (name, value) in [("rate", arguments.rate), ("seconds", arguments.seconds)] {
+        if !(value > 0.0 && value.is_finite()) {
+            return Err(format!("--{name} has to be above 0").into());
+        }
+    }
+    let path = Settings {
+        rate: arguments.rate * 1e6,
+        queue: arguments.queue,
+        delay: Duration::try_from_secs_f64(arguments.round_trip / 2e3)?,
+        loss: Loss::NONE,
+        is_cut: false,
+    };
+    Ok(Options {
+        path,
+        time: Duration::from_secs_f64(arguments.seconds),
+        losses: arguments.losses.iter().map(|percent| percent / 100.0).collect(),
+        burst: arguments.burst,
+        congestion: arguments.congestion.clone(),
+        seed: arguments.seed,
+    })
+}

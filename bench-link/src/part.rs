@@ -1,0 +1,206 @@
+//! The programs of a measurement: each publishes or takes what has a number and a time in it.
+
+use std::{
+    io::{self, Write, stdin},
+    sync::mpsc::{Receiver, RecvTimeoutError, channel},
+    thread,
+    time::{Duration, Instant},
+};
+
+use axon_shm::{
+    PublishError,
+    qos::{History, Qos, Reliability},
+};
+use axon_transport::{DaemonCommand, EndpointSpec, Session, SessionOptions, config::Config};
+use rustix::time::{ClockId, clock_gettime};
+use serde::{Deserialize, Serialize};
+
+use crate::{Result, tcp};
+
+/// For daemons that start, find each other over a path that loses packets, and agree on keys.
+const PATIENCE: Duration = Duration::from_secs(60);
+/// How often a subscriber looks whether it is to end.
+const LOOK: Duration = Duration::from_millis(20);
+/// Bytes of a message's number and time.
+pub(crate) const STAMP: usize = 16;
+
+/// Messages of one size at one rate.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(crate) struct Stream {
+    pub(crate) topic: String,
+    pub(crate) bytes: usize,
+    /// From message to message. Zero: as fast as possible.
+    pub(crate) every: Duration,
+    pub(crate) is_reliable: bool,
+    /// KEEP_LAST's depth. `None`: KEEP_ALL.
+    pub(crate) depth: Option<u32>,
+}
+
+impl Stream {
+    fn spec(&self) -> EndpointSpec {
+        let mut qos = Qos::default();
+        if !self.is_reliable {
+            qos.reliability = Reliability::BestEffort;
+        }
+        match self.depth {
+            Some(depth) => qos.depth = depth,
+            None => qos.history = History::KeepAll,
+        }
+        EndpointSpec::new(&self.topic, "bench/Bytes", qos)
+    }
+}
+
+/// What a program does.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(crate) enum Part {
+    Publish(Stream),
+    Subscribe(Stream),
+    /// The same messages over a TCP connection to this address.
+    Send(Stream, String),
+    Receive(String),
+}
+
+/// What a publisher did.
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
+pub(crate) struct Sent {
+    pub(crate) messages: u64,
+    /// Those of them that the publisher was refused, since its history was full.
+    pub(crate) refused: u64,
+}
+
+/// A message that arrived. Times are those of the monotonic clock, in nanoseconds.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+pub(crate) struct Arrival {
+    pub(crate) number: u64,
+    pub(crate) sent: u64,
+    pub(crate) arrived: u64,
+}
+
+/// What a subscriber took.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub(crate) struct Taken {
+    pub(crate) arrivals: Vec<Arrival>,
+    /// What the subscription counts as lost.
+    pub(crate) lost: u64,
+}
+
+impl Part {
+    /// Is this program, until its standard input ends. What it found is the last line of its output.
+    pub(crate) fn run(&self) -> Result<()> {
+        let orders = lines();
+        match self {
+            Self::Publish(stream) => publish(stream, &orders),
+            Self::Subscribe(stream) => subscribe(stream, &orders),
+            Self::Send(stream, address) => tcp::send(stream, address, &orders),
+            Self::Receive(address) => tcp::receive(address, &orders),
+        }
+    }
+}
+
+/// Says that it is ready for its orders.
+pub(crate) fn say<T: Serialize>(value: &T) -> Result<()> {
+    let mut out = io::stdout().lock();
+    writeln!(out, "{}", serde_json::to_string(value)?)?;
+    Ok(out.flush()?)
+}
+
+/// The lines of standard input. It disconnects where that ends.
+fn lines() -> Receiver<()> {
+    let (sender, receiver) = channel();
+    thread::spawn(move || {
+        for line in stdin().lines() {
+            if line.is_err() || sender.send(()).is_err() {
+                return;
+            }
+        }
+    });
+    receiver
+}
+
+/// Nanoseconds of the clock that all programs share.
+pub(crate) fn now_ns() -> u64 {
+    let now = clock_gettime(ClockId::Monotonic);
+    now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
+}
+
+/// Writes a message's number and time into its first bytes.
+pub(crate) fn stamp(bytes: &mut [u8], number: u64) {
+    bytes[..8].copy_from_slice(&number.to_le_bytes());
+    bytes[8..STAMP].copy_from_slice(&now_ns().to_le_bytes());
+}
+
+/// The message that these bytes are of, which arrives now.
+pub(crate) fn arrival(bytes: &[u8]) -> Result<Arrival> {
+    let word = |at: usize| bytes.get(at..at + 8).and_then(|word| word.try_into().ok());
+    let number = word(0).map(u64::from_le_bytes).ok_or("a message without a number")?;
+    let sent = word(8).map(u64::from_le_bytes).ok_or("a message without a time")?;
+    Ok(Arrival { number, sent, arrived: now_ns() })
+}
+
+/// Calls `send` with the number of each message, at the stream's rate, until the orders end. Messages that
+/// came too late to be sent in time are sent at once: a timer that fires late changes no rate.
+pub(crate) fn paced(
+    stream: &Stream,
+    orders: &Receiver<()>,
+    mut send: impl FnMut(u64) -> Result<()>,
+) -> Result<()> {
+    let begin = Instant::now();
+    for number in 1.. {
+        let due = begin + stream.every.mul_f64((number - 1) as f64);
+        match orders.recv_timeout(due.saturating_duration_since(Instant::now())) {
+            Err(RecvTimeoutError::Timeout) => send(number)?,
+            Ok(()) => return Err("an order in the middle of a stream".into()),
+            Err(RecvTimeoutError::Disconnected) => break,
+        }
+    }
+    Ok(())
+}
+
+fn session() -> Result<Session> {
+    let itself = DaemonCommand::current_executable([""; 0])?;
+    let options = SessionOptions::new("bench-link").daemon_command(itself);
+    Ok(Session::open(&Config::from_env()?, options)?)
+}
+
+fn publish(stream: &Stream, orders: &Receiver<()>) -> Result<()> {
+    let session = session()?;
+    let publisher = session.create_publisher(stream.spec())?;
+    if !publisher.wait_matched(1, PATIENCE) {
+        return Err("the two hosts do not meet".into());
+    }
+    say(&())?;
+    orders.recv()?;
+    let mut bytes = vec![0x5a; stream.bytes.max(STAMP)];
+    let mut sent = Sent::default();
+    paced(stream, orders, |number| {
+        stamp(&mut bytes, number);
+        sent.messages = number;
+        match publisher.publish(&bytes) {
+            Ok(_) => {}
+            Err(PublishError::Blocked { .. }) => sent.refused += 1,
+            Err(error) => return Err(error.into()),
+        }
+        Ok(())
+    })?;
+    say(&sent)?;
+    // What waits goes on until the one that measures ends this process.
+    thread::sleep(PATIENCE);
+    Ok(())
+}
+
+fn subscribe(stream: &Stream, orders: &Receiver<()>) -> Result<()> {
+    let session = session()?;
+    let subscription = session.create_subscription(stream.spec())?;
+    if !subscription.wait_matched(1, PATIENCE) {
+        return Err("the two hosts do not meet".into());
+    }
+    say(&())?;
+    let (mut taken, mut bytes) = (Taken::default(), Vec::new());
+    while !matches!(orders.try_recv(), Err(std::sync::mpsc::TryRecvError::Disconnected)) {
+        if subscription.recv(&mut bytes, Some(LOOK)).is_ok() {
+            taken.arrivals.push(arrival(&bytes)?);
+        }
+    }
+    taken.lost = subscription.lost();
+    say(&taken)
+}

@@ -1,0 +1,124 @@
+//! Where a measurement takes place: two hosts and the path between them.
+
+use std::{sync::Arc, thread, time::Duration};
+
+use tempfile::TempDir;
+
+use crate::{
+    Result,
+    host::{Host, Running},
+    part::{Part, Sent, Stream, Taken},
+    path::Settings,
+    relay::Relay,
+};
+
+/// Where TCP's receiver listens.
+const PORT: u16 = 7400;
+/// How long what was sent may still be under way.
+const SETTLE: Duration = Duration::from_millis(1_500);
+
+/// What carries the messages.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Carrier {
+    Axon,
+    Tcp,
+}
+
+impl Carrier {
+    pub(crate) const ALL: [Self; 2] = [Self::Axon, Self::Tcp];
+
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::Axon => "AXON",
+            Self::Tcp => "TCP",
+        }
+    }
+}
+
+/// What became of a stream.
+#[derive(Clone, Debug)]
+pub(crate) struct Outcome {
+    pub(crate) sent: Sent,
+    pub(crate) taken: Taken,
+}
+
+/// Two hosts.
+pub(crate) struct Place {
+    hosts: [Host; 2],
+    pub(crate) relay: Relay,
+    /// Where the hosts keep their files, such as the logs of their daemons.
+    _directory: TempDir,
+}
+
+impl Place {
+    pub(crate) fn new(settings: Settings, congestion: &str, seed: u64) -> Result<Self> {
+        let directory = tempfile::Builder::new().prefix("axon-link-").tempdir()?;
+        let host = |number| Host::start(directory.path(), number, congestion);
+        let hosts = [host(1)?, host(2)?];
+        let devices = hosts.each_ref().map(|host| Arc::clone(&host.device));
+        Ok(Self { relay: Relay::start(devices, settings, seed), hosts, _directory: directory })
+    }
+
+    /// Starts streams from the first host to the second. They are ready when this returns.
+    pub(crate) fn streams(&self, carrier: Carrier, streams: &[Stream]) -> Result<Streams> {
+        let mut running = Vec::new();
+        for (index, stream) in (0..).zip(streams) {
+            running.push(match carrier {
+                Carrier::Axon => {
+                    let there = self.hosts[1].start_part(&Part::Subscribe(stream.clone()))?;
+                    (self.hosts[0].start_part(&Part::Publish(stream.clone()))?, there)
+                }
+                Carrier::Tcp => {
+                    let address = format!("{}:{}", self.hosts[1].address(), PORT + index);
+                    let mut there = self.hosts[1].start_part(&Part::Receive(address.clone()))?;
+                    there.hear::<()>()?;
+                    (self.hosts[0].start_part(&Part::Send(stream.clone(), address))?, there)
+                }
+            });
+        }
+        for (here, there) in &mut running {
+            here.hear::<()>()?;
+            if carrier == Carrier::Axon {
+                there.hear::<()>()?;
+            }
+        }
+        Ok(Streams(running))
+    }
+
+    /// What became of streams that flow for this long.
+    pub(crate) fn measure(
+        &self,
+        carrier: Carrier,
+        streams: &[Stream],
+        time: Duration,
+    ) -> Result<Vec<Outcome>> {
+        let mut streams = self.streams(carrier, streams)?;
+        streams.begin()?;
+        thread::sleep(time);
+        streams.end()
+    }
+}
+
+/// Streams that are ready or flow.
+pub(crate) struct Streams(Vec<(Running, Running)>);
+
+impl Streams {
+    pub(crate) fn begin(&mut self) -> Result<()> {
+        self.0.iter_mut().try_for_each(|(here, _)| here.tell(&()))
+    }
+
+    /// Ends the publishers, and the subscribers when nothing is under way any more.
+    pub(crate) fn end(self) -> Result<Vec<Outcome>> {
+        let mut heres = Vec::new();
+        let mut theres = Vec::new();
+        for (mut here, there) in self.0 {
+            here.close();
+            heres.push(here);
+            theres.push(there);
+        }
+        let sent = heres.iter_mut().map(Running::hear::<Sent>).collect::<Result<Vec<_>>>()?;
+        thread::sleep(SETTLE);
+        let taken = theres.into_iter().map(Running::end::<Taken>).collect::<Result<Vec<_>>>()?;
+        Ok(sent.into_iter().zip(taken).map(|(sent, taken)| Outcome { sent, taken }).collect())
+    }
+}

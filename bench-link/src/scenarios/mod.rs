@@ -1,0 +1,67 @@
+//! What is measured. Each scenario prints its figures and returns them as JSON.
+
+mod camera;
+mod cut;
+mod flood;
+mod losses;
+mod slow;
+
+use std::time::Duration;
+
+pub(crate) use camera::camera;
+pub(crate) use cut::cut;
+pub(crate) use flood::flood;
+pub(crate) use losses::losses;
+pub(crate) use slow::slow;
+
+use crate::{path::Settings, place::Outcome};
+
+/// What all scenarios are told.
+#[derive(Clone, Debug)]
+pub(crate) struct Options {
+    /// The path, without losses.
+    pub(crate) path: Settings,
+    /// How long each stream flows.
+    pub(crate) time: Duration,
+    /// The losses that are tried.
+    pub(crate) losses: Vec<f64>,
+    /// Packets that are lost in a row, on average.
+    pub(crate) burst: f64,
+    /// `[link] congestion` of both daemons.
+    pub(crate) congestion: String,
+    pub(crate) seed: u64,
+}
+
+const MS: u64 = 1_000_000;
+
+impl Outcome {
+    /// Ages of the messages that arrived while these were sent, in nanoseconds, in order.
+    fn ages(&self) -> Vec<u64> {
+        let mut ages: Vec<u64> =
+            self.taken.arrivals.iter().map(|a| a.arrived.saturating_sub(a.sent)).collect();
+        ages.sort_unstable();
+        ages
+    }
+
+    /// The share of the messages that arrived within this time, in percent.
+    fn within(&self, time: Duration) -> f64 {
+        let most = time.as_nanos() as u64;
+        let count = self.ages().iter().filter(|age| **age <= most).count();
+        100.0 * count as f64 / self.sent.messages.max(1) as f64
+    }
+
+    /// The share that arrived at all, in percent.
+    fn arrived(&self) -> f64 {
+        self.within(Duration::MAX)
+    }
+}
+
+/// The age below which so many percent are, in milliseconds.
+fn quantile(ages: &[u64], percent: usize) -> Option<f64> {
+    let at = (ages.len().checked_sub(1)? * percent) / 100;
+    Some(ages[at] as f64 / MS as f64)
+}
+
+fn ms(value: Option<f64>) -> String {
+    value.map_or_else(|| "-".to_owned(), |value| format!("{value:.1} ms"))
+}

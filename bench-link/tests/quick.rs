@@ -1,0 +1,55 @@
+//! The program itself, over a path that loses a fifth of the packets, for a second each.
+
+use std::{fs, process::Command};
+
+use serde_json::Value;
+
+/// What the program says where it may not make hosts.
+const NOT_HERE: [&str; 3] = [
+    "a network namespace cannot be made",
+    "the device of a host cannot be made",
+    "is iproute2 installed",
+];
+
+/// The figures, or `None` where this machine cannot have them.
+fn figures(arguments: &[&str]) -> Option<Value> {
+    let directory = tempfile::tempdir().unwrap();
+    let file = directory.path().join("figures.json");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_axon-bench-link"));
+    let output = command.args(arguments).arg("--json").arg(&file).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    if let Some(why) = NOT_HERE.iter().find(|why| said.contains(**why)) {
+        eprintln!("skipped: hosts in network namespaces, {why}");
+        return None;
+    }
+    assert!(output.status.success(), "{said}{}", String::from_utf8_lossy(&output.stdout));
+    Some(serde_json::from_str(&fs::read_to_string(file).unwrap()).unwrap())
+}
+
+/// A RELIABLE sample crosses a path that loses a fifth of all packets. How soon is not asserted.
+#[test]
+fn all_that_is_reliable_arrives_and_the_path_loses_what_it_is_told_to() {
+    let Some(all) = figures(&["losses", "--losses", "20", "--seconds", "1"]) else { return };
+    let rows = all["figures"]["losses"].as_array().unwrap();
+    assert_eq!(rows.len(), 7);
+    for row in rows {
+        assert!(row["published"].as_u64().unwrap() > 10, "{row}");
+        assert!(row["packets_lost"].as_u64().unwrap() > 0, "{row}");
+        let arrived = row["arrived_percent"].as_f64().unwrap();
+        match row["message"].as_str().unwrap() {
+            "1 KB, RELIABLE" if row["carrier"] == "AXON" => assert_eq!(arrived, 100.0, "{row}"),
+            // Of lone packets a fifth is lost.
+            "1 KB, BEST_EFFORT" => assert!(arrived > 50.0, "{row}"),
+            _ => assert!(arrived > 0.0, "{row}"),
+        }
+    }
+}
+
+#[test]
+fn a_loss_that_is_no_share_is_refused() {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_axon-bench-link"));
+    let output = command.args(["losses", "--losses", "100"]).output().unwrap();
+    assert!(!output.status.success());
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(said.contains("from 0 to below 100"), "{said}");
+}
