@@ -6,6 +6,7 @@
 
 mod backlog;
 pub(crate) mod budget;
+mod burst;
 mod ending;
 mod flow;
 mod nudges;

@@ -1,19 +1,16 @@
 //! The queue of one flow: samples that wait to be sent, and samples that were sent and are not acknowledged.
 //!
-//! KEEP_LAST never blocks its publisher. A burst is lossless: a flow that had no sample waiting within the last 500 ms
-//! holds as many as its bytes allow. A flow that had some for longer is behind: it holds its depth, and drops the
-//! oldest. KEEP_ALL drops nothing: what does not fit stays in the ring, and in time holds the publisher back.
+//! KEEP_LAST never blocks its publisher. A [burst](Burst) is lossless: the flow holds as many samples as its bytes allow.
+//! A flow that had some waiting for too long is behind: it holds its depth, and drops the oldest. KEEP_ALL drops nothing:
+//! what does not fit stays in the ring, and in time holds the publisher back.
 
 use std::{collections::VecDeque, rc::Rc, time::Duration};
 
 use axon_envelope::Delivery;
 use axon_shm::qos::{History, Qos, Reliability};
 
-use super::budget::Budget;
+use super::{budget::Budget, burst::Burst};
 use crate::engine::rings::Sample;
-
-/// A flow that had samples waiting for this long is behind.
-const BURST: Duration = Duration::from_millis(500);
 
 /// What became of a sample that was offered.
 #[derive(Debug)]
@@ -65,8 +62,7 @@ pub(super) struct Queue {
     sent_bytes: usize,
     /// The highest number that was ever sent.
     newest_sent: u64,
-    /// Since when samples have waited, here or in the ring, without a moment in which none did.
-    since: Option<Duration>,
+    burst: Burst,
 }
 
 impl Queue {
@@ -80,7 +76,7 @@ impl Queue {
             bytes: 0,
             sent_bytes: 0,
             newest_sent: 0,
-            since: None,
+            burst: Burst::default(),
         }
     }
 
@@ -102,23 +98,24 @@ impl Queue {
 
     /// Whether samples waited for so long that this is no burst.
     pub(super) fn is_behind(&self, now: Duration) -> bool {
-        self.since.is_some_and(|since| now.saturating_sub(since) >= BURST)
+        self.burst.is_over(now)
     }
 
-    /// The ring holds no sample. If the queue is empty too, the flow has caught up.
-    pub(super) fn handle_empty_ring(&mut self) {
+    /// The ring holds no sample. If none waits here either, the flow has caught up.
+    pub(super) fn handle_empty_ring(&mut self, now: Duration) {
         if self.waiting.is_empty() {
-            self.since = None;
+            self.burst.handle_caught_up(now);
         }
     }
 
     /// Whether the engine should move samples from the ring into the queue now. A KEEP_LAST flow that is behind, or
     /// has no bytes left for a sample like its last, leaves them in the ring, where newer samples replace them without
-    /// a copy.
+    /// a copy. What it holds of a burst beyond its depth makes way for them.
     pub(super) fn wants_more(&self, now: Duration) -> bool {
         match (self.policy, self.waiting.back()) {
             (Policy::KeepAll | Policy::BestEffort(_), _) | (_, None) => true,
-            (Policy::KeepLast(_), Some(last)) => !self.is_behind(now) && last.size() <= self.room(),
+            (Policy::KeepLast(depth), Some(_)) if self.is_behind(now) => self.waiting.len() > depth,
+            (Policy::KeepLast(_), Some(last)) => last.size() <= self.room(),
         }
     }
 
@@ -153,7 +150,7 @@ impl Queue {
 
     /// Adds a sample.
     pub(super) fn offer(&mut self, sample: Sample, now: Duration) -> Offered {
-        self.since.get_or_insert(now);
+        self.burst.handle_waiting(now);
         let most = match self.policy {
             Policy::KeepAll => usize::MAX,
             Policy::KeepLast(depth) if self.is_behind(now) => depth,
@@ -381,8 +378,11 @@ mod tests {
         for sequence in 1..=10 {
             dropped(queue.offer(sample(sequence, 100, at(0)), at(0)));
         }
-        assert!(queue.wants_more(at(499)) && !queue.wants_more(at(500)));
+        // What is too much of the burst makes way for a newer sample, and for that alone.
+        assert!(queue.wants_more(at(499)) && queue.wants_more(at(500)));
+        assert_eq!(queue.waiting(), 10);
         assert_eq!(dropped(queue.offer(sample(11, 100, at(600)), at(600))), 9);
+        assert!(!queue.wants_more(at(600)));
         assert_eq!(numbers(&mut queue), [10, 11]);
         // The queue is empty, but the ring is not: it is still behind.
         assert!(queue.wants_more(at(700)) && queue.is_behind(at(700)));
@@ -390,8 +390,8 @@ mod tests {
             dropped(queue.offer(sample(sequence, 100, at(800)), at(800)));
         }
         assert_eq!(numbers(&mut queue), [13, 14]);
-        queue.handle_empty_ring();
-        // It has caught up: the next samples are a burst.
+        queue.handle_empty_ring(at(1000));
+        // It has caught up, and time has passed: the next samples are a burst.
         assert!(queue.wants_more(at(1500)));
         for sequence in 15..=20 {
             assert_eq!(dropped(queue.offer(sample(sequence, 100, at(1500)), at(1500))), 0);

@@ -250,6 +250,10 @@ impl Flow {
                 Some(Pause::Empty) if self.taking.goes_on() && self.queue.peek().is_none() => {
                     return Pause::Turn;
                 }
+                Some(Pause::Empty) if !self.taking.has_more() => {
+                    self.queue.handle_empty_ring(now);
+                    return Pause::Empty;
+                }
                 Some(pause) => return pause,
             }
         }

@@ -152,7 +152,7 @@ impl Taking {
                     self.retry = retries.chain(behind).min();
                     self.more = self.retry.is_some();
                     if !self.more {
-                        queue.handle_empty_ring();
+                        queue.handle_empty_ring(now);
                     }
                     break;
                 }
