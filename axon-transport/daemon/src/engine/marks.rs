@@ -32,6 +32,12 @@ pub(super) fn marks_reported(quic: &quinn_proto::Connection) -> u64 {
     controller.downcast_ref::<Counting>().map_or(0, |counting| counting.marks)
 }
 
+/// A copy of the controller that is wrapped.
+pub(super) fn wrapped(quic: &quinn_proto::Connection) -> Option<Box<dyn Any>> {
+    let counting = quic.congestion_state().clone_box().into_any().downcast::<Counting>().ok()?;
+    Some(counting.inner.into_any())
+}
+
 impl Controller for Counting {
     fn on_sent(&mut self, now: Instant, bytes: u64, last_packet_number: u64) {
         self.inner.on_sent(now, bytes, last_packet_number);

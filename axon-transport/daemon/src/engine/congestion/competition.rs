@@ -37,17 +37,25 @@ impl Standing {
         Self { since: now, peak: window, window, rate, times: 0 }
     }
 
-    /// Takes that the window is about to shrink once more. Returns the window from before if others fill the queue:
-    /// the rate shrank with the window. A queue of this link alone keeps its rate.
-    pub(super) fn shrink(&mut self, now: Instant, window: u64, rate: f64) -> Option<u64> {
+    /// Takes that the window is about to shrink once more. `least` is the smallest window. Returns the window from
+    /// before if others fill the queue: the rate shrank with the window, or a window that can shrink no more has a queue
+    /// before it. A queue of this link alone keeps its rate.
+    pub(super) fn shrink(
+        &mut self,
+        now: Instant,
+        window: u64,
+        rate: f64,
+        least: u64,
+    ) -> Option<u64> {
         self.times += 1;
         if self.times == 2 {
             (self.window, self.rate) = (window, rate);
         }
         let share = window as f64 / self.window as f64;
         let is_long = now.saturating_duration_since(self.since) >= STANDING.0;
-        let is_telling = is_long && self.times >= STANDING.1 && share <= SHRUNK;
-        (is_telling && rate < self.rate * (1.0 + share) / 2.0).then_some(self.peak)
+        let is_telling = is_long && self.times >= STANDING.1;
+        let has_less = share <= SHRUNK && rate < self.rate * (1.0 + share) / 2.0;
+        (is_telling && (has_less || window <= least)).then_some(self.peak)
     }
 }
 
@@ -165,16 +173,26 @@ mod tests {
         let mut own = Standing::new(start, 100_000, 1e6);
         for time in 1..20_u32 {
             let window = 100_000 >> time.min(6);
-            assert_eq!(own.shrink(start + millis(200) * time, window, 1e6), None);
+            assert_eq!(own.shrink(start + millis(200) * time, window, 1e6, 1_000), None);
         }
         let mut others = Standing::new(start, 100_000, 1e6);
         let mut shrink = |time: u32, window: u64| {
-            others.shrink(start + millis(200) * time, window, window as f64 * 10.0)
+            others.shrink(start + millis(200) * time, window, window as f64 * 10.0, 1_000)
         };
         assert_eq!(shrink(1, 50_000), None, "it may still drain");
         assert_eq!(shrink(2, 25_000), None);
         assert_eq!(shrink(3, 12_500), None);
         assert_eq!(shrink(5, 6_250), Some(100_000));
+    }
+
+    #[test]
+    fn a_queue_before_the_smallest_window_is_not_of_this_link() {
+        let start = Instant::now();
+        let mut standing = Standing::new(start, 100_000, 1e6);
+        for time in 1..=5 {
+            assert_eq!(standing.shrink(start + millis(190) * time, 4_000, 5e4, 4_000), None);
+        }
+        assert_eq!(standing.shrink(start + millis(1_000), 4_000, 5e4, 4_000), Some(100_000));
     }
 
     /// Ends rounds of 40 ms until a look is over, which sees `shortest`.

@@ -10,12 +10,14 @@
 //!   and drain it together. So each sees the path without a queue, and all come to equal shares.
 //! * Where packets are lost, growth must bring more bytes through: a queue too short to be seen drops instead
 //!   ([`growth`]).
+//! * While nothing is acknowledged, probes may exceed the window ([`silence`]).
 //! * Where the window shrinks and the queue does not, somebody else fills it, or the path has become longer. Until that
 //!   is known CUBIC decides, which has its share beside other CUBICs ([`competition`]).
 
 mod competition;
 mod growth;
 mod path;
+mod silence;
 
 use std::{
     any::Any,
@@ -31,6 +33,9 @@ use quinn_proto::{
 use competition::{Competition, Outcome, Standing};
 use growth::{Growth, TRIAL};
 use path::Path;
+use silence::Silence;
+
+use super::marks::wrapped;
 
 /// The queue that is wanted: half as long as the path, within these.
 const WANTED: (Duration, Duration) = (Duration::from_millis(2), Duration::from_millis(10));
@@ -68,6 +73,14 @@ pub(crate) struct DelayConfig;
 impl ControllerFactory for DelayConfig {
     fn build(self: Arc<Self>, now: Instant, current_mtu: u16) -> Box<dyn Controller> {
         Box::new(Delay::new(now, current_mtu))
+    }
+}
+
+/// Has the next packet leave although the window is full. It shows which packets before it are lost.
+pub(crate) fn let_probe_through(quic: &quinn_proto::Connection) {
+    // CUBIC and BBR have none.
+    if let Some(delay) = wrapped(quic).and_then(|controller| controller.downcast::<Delay>().ok()) {
+        delay.silence.let_probe_through();
     }
 }
 
@@ -134,6 +147,7 @@ pub(crate) struct Delay {
     growth: Growth,
     /// A queue that has stood since the window began to shrink.
     standing: Option<Standing>,
+    silence: Silence,
     last_sent: u64,
     /// What shortest round trips of rounds differ by chance.
     jitter: Duration,
@@ -165,6 +179,7 @@ impl Delay {
             round: Round::new(now, 0),
             growth: Growth::new(window),
             standing: None,
+            silence: Silence::new(now),
             last_sent: 0,
             jitter: Duration::ZERO,
             last_shortest: None,
@@ -214,7 +229,9 @@ impl Delay {
 
     fn end_round(&mut self, now: Instant, is_app_limited: bool) {
         let round = std::mem::replace(&mut self.round, Round::new(now, self.last_sent));
+        self.silence.add_round(round.acknowledged, round.lost);
         let Some(shortest) = round.shortest else { return };
+        self.silence.set_round_trip(shortest);
         let queue = shortest.saturating_sub(self.path.get());
         if self.settling > 0 {
             self.last_shortest = None;
@@ -283,7 +300,7 @@ impl Delay {
     fn end_round_of_queue(&mut self, now: Instant, rate: f64, shortest: Duration, queue: Duration) {
         let window = self.window;
         let standing = self.standing.get_or_insert_with(|| Standing::new(now, window, rate));
-        if let Some(peak) = standing.shrink(now, window, rate) {
+        if let Some(peak) = standing.shrink(now, window, rate, FLOOR * self.mtu) {
             self.standing = None;
             self.phase = Phase::Compete(Competition::new(now, peak, self.mtu, shortest));
         } else {
@@ -337,6 +354,7 @@ impl Delay {
 impl Controller for Delay {
     fn on_sent(&mut self, now: Instant, bytes: u64, last_packet_number: u64) {
         self.last_sent = last_packet_number;
+        self.silence.handle_sent(now, bytes, self.mtu);
         if let Phase::Compete(competition) = &mut self.phase {
             competition.cubic_always().on_sent(now, bytes, last_packet_number);
         }
@@ -380,6 +398,7 @@ impl Controller for Delay {
         app_limited: bool,
         largest_packet_num_acked: Option<u64>,
     ) {
+        self.silence.handle_acks(now, in_flight);
         let on_the_way = in_flight + std::mem::take(&mut self.acknowledged_now);
         self.round.most_in_flight = self.round.most_in_flight.max(on_the_way);
         let (in_a_row, shortest) = self.urgent;
@@ -436,8 +455,9 @@ impl Controller for Delay {
     fn window(&self) -> u64 {
         let floor = FLOOR * self.mtu;
         match &self.phase {
+            // It looks at the queue with few packets on the way.
             Phase::Compete(competition) => competition.window().unwrap_or(floor).max(floor),
-            _ => self.window,
+            _ => self.silence.widen(self.window, self.mtu),
         }
     }
 

@@ -43,7 +43,7 @@ use self::{
     stall::Stalls,
     without::Without,
 };
-use super::connection::Carrier;
+use super::{congestion::let_probe_through, connection::Carrier};
 use crate::{
     engine::counters::Counters,
     link::{CloseCode, ReceivedOf},
@@ -464,6 +464,7 @@ impl Outbound {
             && let Some(carrier) = carrier
         {
             carrier.quic.ping();
+            let_probe_through(carrier.quic);
         }
         self.look_at_endings(now);
         self.look_at_stalls(heard, now);

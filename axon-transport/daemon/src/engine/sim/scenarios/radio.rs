@@ -8,7 +8,7 @@ use axon_shm::qos::Qos;
 use axon_transport::config::{Config, Congestion};
 
 use crate::engine::sim::{
-    network::{Path, Rate},
+    network::{BurstLoss, Path, Rate},
     world::{Pair, World},
 };
 
@@ -20,6 +20,14 @@ fn secs(seconds: u64) -> Duration {
 fn radio(mbits: u64, loss: f64) -> Path {
     let rate = Rate::new(mbits * 1_000_000 / 8, Duration::from_millis(40));
     Path { delay: Duration::from_micros(1_500), rate: Some(rate), loss, ..Path::default() }
+}
+
+/// The same, but packets are lost in bursts of so many on average (Gilbert's model).
+fn bursts(mbits: u64, loss: f64, packets: f64) -> Path {
+    let bad_to_good = 1.0 / packets;
+    let good_to_bad = bad_to_good * loss / (1.0 - loss);
+    let burst_loss = Some(BurstLoss { good_to_bad, bad_to_good, loss_in_bad: 1.0 });
+    Path { burst_loss, ..radio(mbits, 0.0) }
 }
 
 /// Two linked hosts with this controller.
@@ -103,9 +111,9 @@ fn share(world: &mut World, streams: &mut [Stream; 1]) -> f64 {
     bytes as f64 * 8.0 / 4.0 / 54e6
 }
 
-/// The share of 54 Mbit/s that a stream without a rate of its own gets through, with this loss.
-fn goodput(congestion: Congestion, loss: f64) -> f64 {
-    let mut world = hosts(congestion, radio(54, loss));
+/// The share of 54 Mbit/s that a stream without a rate of its own gets through.
+fn goodput(congestion: Congestion, path: Path) -> f64 {
+    let mut world = hosts(congestion, path);
     let mut streams = flood(&mut world);
     drive(&mut world, &mut streams, secs(4));
     share(&mut world, &mut streams)
@@ -114,10 +122,20 @@ fn goodput(congestion: Congestion, loss: f64) -> f64 {
 #[test]
 fn random_loss_leaves_a_link_its_rate() {
     for (loss, least) in [(0.05, 0.75), (0.2, 0.6), (0.4, 0.35)] {
-        let (delay, cubic) = (goodput(Congestion::Delay, loss), goodput(Congestion::Cubic, loss));
+        let [delay, cubic] = [Congestion::Delay, Congestion::Cubic]
+            .map(|congestion| goodput(congestion, radio(54, loss)));
         println!("loss {loss}: delay {delay:.2}, cubic {cubic:.2}");
         assert!(delay > least, "loss {loss}: {delay}");
         assert!(cubic < delay / 2.0, "loss {loss}: cubic {cubic}, delay {delay}");
+    }
+}
+
+#[test]
+fn losses_in_bursts_leave_a_link_its_rate() {
+    for (loss, least) in [(0.05, 0.7), (0.1, 0.6), (0.2, 0.45)] {
+        let share = goodput(Congestion::Delay, bursts(54, loss, 8.0));
+        println!("loss {loss} in bursts of 8: {share:.2}");
+        assert!(share > least, "loss {loss}: {share}");
     }
 }
 
@@ -215,10 +233,10 @@ struct Row {
     within: [u64; 2],
 }
 
-/// Samples at 30 Hz for some seconds over a link with this loss: the share that is not older than each of `within` when
+/// Samples at 30 Hz for some seconds over a path: the share that is not older than each of `within` when
 /// it arrives, the share that arrives at all, and the median age.
-fn shares(row: &Row, loss: f64, time: Duration) -> ([f64; 2], f64, Duration) {
-    let mut world = hosts(Congestion::Auto, radio(54, loss));
+fn shares(row: &Row, path: Path, time: Duration) -> ([f64; 2], f64, Duration) {
+    let mut world = hosts(Congestion::Auto, path);
     let every = Duration::from_micros(33_333);
     let stream = Stream::new(&mut world, "/topic", row.qos, row.length, every);
     world.until(secs(30), World::is_whole);
@@ -255,11 +273,11 @@ fn rows() -> [Row; 4] {
 #[test]
 fn lone_samples_cross_a_link_that_loses_many_packets_in_time() {
     let [reliable, _, best_effort, _] = rows();
-    let ([in_time, _], all, median) = shares(&reliable, 0.4, secs(10));
+    let ([in_time, _], all, median) = shares(&reliable, radio(54, 0.4), secs(10));
     println!("RELIABLE: {in_time:.3} in time, {all:.3} at all, median age {median:?}");
     assert!(in_time > 0.9, "{in_time}");
     assert!(all > 0.999, "{all}");
-    let ([in_time, _], ..) = shares(&best_effort, 0.4, secs(10));
+    let ([in_time, _], ..) = shares(&best_effort, radio(54, 0.4), secs(10));
     println!("BEST_EFFORT: {in_time:.3} in time");
     assert!(in_time > 0.75, "{in_time}");
 }
@@ -267,16 +285,44 @@ fn lone_samples_cross_a_link_that_loses_many_packets_in_time() {
 #[test]
 #[ignore = "prints a table, and takes minutes"]
 fn what_arrives_at_which_loss() {
-    for row in rows() {
-        for loss in [0.0, 0.05, 0.1, 0.2, 0.3, 0.4] {
-            let (shares, all, median) = shares(&row, loss, secs(60));
-            let [first, second] = shares.map(|share| format!("{:.1} %", share * 100.0));
-            let [soon, late] = row.within;
-            println!(
-                "{}, loss {loss}: {first} within {soon} ms, {second} within {late} ms, {:.1} % at all, median {median:?}",
-                row.name,
-                all * 100.0
-            );
+    for packets in [1, 8] {
+        for row in rows() {
+            for loss in [0.0, 0.05, 0.1, 0.2, 0.3, 0.4] {
+                let path = match packets {
+                    1 => radio(54, loss),
+                    _ => bursts(54, loss, f64::from(packets)),
+                };
+                let (shares, all, median) = shares(&row, path, secs(60));
+                let [first, second] = shares.map(|share| format!("{:.1} %", share * 100.0));
+                let [soon, late] = row.within;
+                println!(
+                    "{}, loss {loss} in bursts of {packets}: {first} within {soon} ms, {second} within {late} ms, {:.1} % at all, \
+                     median {median:?}",
+                    row.name,
+                    all * 100.0
+                );
+            }
         }
     }
+}
+
+#[test]
+fn publishers_that_fill_a_link_have_equal_shares_whatever_their_samples_are() {
+    let mut world = hosts(Congestion::Auto, radio(54, 0.0));
+    let ms = Duration::from_millis(1);
+    let mut streams =
+        [(1_000, ms / 10), (30_000, ms), (1_000_000, ms * 30)].map(|(length, every)| {
+            Stream::new(&mut world, &format!("/log/{length}"), Qos::keep_all(), length, every)
+        });
+    world.until(secs(20), World::is_whole);
+    world.run_for(secs(1));
+    drive(&mut world, &mut streams, secs(3));
+    let before = streams.each_ref().map(|stream| stream.seen);
+    drive(&mut world, &mut streams, secs(6));
+    let bytes =
+        [0, 1, 2].map(|which| (streams[which].seen - before[which]) * streams[which].length);
+    let all = bytes.iter().sum::<usize>() as f64;
+    let shares = bytes.map(|bytes| bytes as f64 / all);
+    println!("shares {shares:.2?} of {:.2} of the rate", all * 8.0 / 6.0 / 54e6);
+    assert!(shares.iter().all(|share| (0.23..0.45).contains(share)), "{shares:?}");
 }

@@ -1,0 +1,172 @@
+//! What may be sent beyond the window while nothing is acknowledged.
+//!
+//! A radio that loses packets in bursts may lose all of a window, and then QUIC's probes with them. QUIC sends two
+//! probes after a time that doubles each time, and nothing else while the window is full. Some packets more with each
+//! probe outlast the burst, and so do the engine's own probes in between.
+
+use std::{
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::{Duration, Instant},
+};
+
+/// Packets that each probe lets through, and beyond the window in all.
+const PACKETS: (u64, u64) = (16, 64);
+/// The share of packets lost from which on a silence may be a burst of losses.
+const LOSES: f64 = 0.01;
+/// What a round adds to the average of losses.
+const AVERAGED: f64 = 1.0 / 16.0;
+/// An acknowledgement may be so much later than the first ones of the last round.
+const LATE: Duration = Duration::from_millis(3);
+
+/// The time since the peer acknowledged something.
+#[derive(Debug, Clone)]
+pub(super) struct Silence {
+    /// When the peer was last heard, or sent something after it had acknowledged all.
+    since: Instant,
+    /// The shortest round trip of the last round.
+    round_trip: Duration,
+    /// Bytes on the way.
+    in_flight: u64,
+    /// When the last probe was sent.
+    probed_at: Option<Instant>,
+    /// Bytes that may be on the way since then.
+    allowed: u64,
+    /// Whether one packet may leave although the window is full. All copies of a controller share it, since QUIC shows
+    /// copies alone. One thread uses all of them, so that no order is needed.
+    probe: Arc<AtomicBool>,
+    /// The share of packets that is lost.
+    loss: f64,
+}
+
+impl Silence {
+    pub(super) fn new(now: Instant) -> Self {
+        Self {
+            since: now,
+            round_trip: Duration::MAX,
+            in_flight: 0,
+            probed_at: None,
+            allowed: 0,
+            probe: Arc::default(),
+            loss: 0.0,
+        }
+    }
+
+    /// One packet may leave although the window is full.
+    pub(super) fn let_probe_through(&self) {
+        self.probe.store(true, Ordering::Relaxed);
+    }
+
+    /// The shortest round trip of a round.
+    pub(super) fn set_round_trip(&mut self, round_trip: Duration) {
+        self.round_trip = round_trip;
+    }
+
+    /// Bytes are sent. If nothing was acknowledged for longer than a round trip, they are a probe.
+    pub(super) fn handle_sent(&mut self, now: Instant, bytes: u64, mtu: u64) {
+        if self.in_flight == 0 {
+            self.since = now;
+        }
+        let silent = now.saturating_duration_since(self.since);
+        if silent > self.round_trip.saturating_add(LATE) && self.probed_at.is_none_or(|at| at < now)
+        {
+            self.probed_at = Some(now);
+            self.allowed = self.in_flight + PACKETS.0 * mtu;
+        }
+        self.in_flight += bytes;
+        self.probe.store(false, Ordering::Relaxed);
+    }
+
+    /// Packets were acknowledged, and so many bytes are on the way.
+    pub(super) fn handle_acks(&mut self, now: Instant, in_flight: u64) {
+        (self.since, self.in_flight) = (now, in_flight);
+        (self.probed_at, self.allowed) = (None, 0);
+    }
+
+    /// Adds the losses of a round, in bytes.
+    pub(super) fn add_round(&mut self, acknowledged: u64, lost: u64) {
+        let share = lost as f64 / (acknowledged + lost).max(1) as f64;
+        self.loss += (share - self.loss) * AVERAGED;
+    }
+
+    /// The bytes that may be on the way, where they would be `window`.
+    pub(super) fn widen(&self, window: u64, mtu: u64) -> u64 {
+        if self.loss < LOSES {
+            return window;
+        }
+        // QUIC sends while less than the window is on the way.
+        let probe = if self.probe.load(Ordering::Relaxed) { self.in_flight + mtu + 1 } else { 0 };
+        self.allowed.max(probe).min(window + PACKETS.1 * mtu).max(window)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ROUND_TRIP: Duration = Duration::from_millis(3);
+    const MTU: u64 = 1_000;
+    const WINDOW: u64 = 20 * MTU;
+
+    /// A window that is sent at once.
+    fn full(start: Instant, lost: u64) -> Silence {
+        let mut silence = Silence::new(start);
+        for _ in 0..4 {
+            silence.add_round(1_000 - lost, lost);
+        }
+        silence.set_round_trip(ROUND_TRIP);
+        silence.handle_sent(start, WINDOW, MTU);
+        silence
+    }
+
+    fn at(start: Instant, ms: u64) -> Instant {
+        start + Duration::from_millis(ms)
+    }
+
+    #[test]
+    fn each_probe_of_a_silent_path_lets_more_packets_through_until_one_is_acknowledged() {
+        let start = Instant::now();
+        let mut silence = full(start, 100);
+        assert_eq!(silence.widen(WINDOW, MTU), WINDOW);
+        for (ms, packets) in [(7, 36), (15, 52), (30, 68), (60, 84), (120, 84)] {
+            // Two probes, and what the window has left.
+            silence.handle_sent(at(start, ms), 2 * MTU, MTU);
+            assert_eq!(silence.widen(WINDOW, MTU), packets * MTU, "after {ms} ms");
+            silence.handle_sent(at(start, ms), 14 * MTU, MTU);
+            assert_eq!(silence.widen(WINDOW, MTU), packets * MTU, "one probe at a time");
+        }
+        silence.handle_acks(at(start, 200), MTU);
+        assert_eq!(silence.widen(WINDOW, MTU), WINDOW);
+    }
+
+    #[test]
+    fn a_probe_of_the_engine_is_one_packet() {
+        let start = Instant::now();
+        let mut silence = full(start, 100);
+        // QUIC shows copies of a controller.
+        silence.clone().let_probe_through();
+        assert_eq!(silence.widen(WINDOW, MTU), WINDOW + MTU + 1);
+        silence.handle_sent(at(start, 1), MTU, MTU);
+        assert_eq!(silence.widen(WINDOW, MTU), WINDOW);
+    }
+
+    #[test]
+    fn a_path_that_had_nothing_to_carry_was_not_silent() {
+        let start = Instant::now();
+        let mut silence = full(start, 100);
+        silence.handle_acks(at(start, 3), 0);
+        silence.handle_sent(at(start, 5_000), MTU, MTU);
+        silence.handle_sent(at(start, 5_006), MTU, MTU);
+        assert_eq!(silence.widen(WINDOW, MTU), WINDOW);
+    }
+
+    #[test]
+    fn a_path_that_loses_nothing_has_no_more_than_its_window() {
+        let start = Instant::now();
+        let mut silence = full(start, 1);
+        silence.handle_sent(at(start, 100), MTU, MTU);
+        assert_eq!(silence.widen(WINDOW, MTU), WINDOW);
+    }
+}
