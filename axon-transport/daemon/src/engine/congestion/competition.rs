@@ -9,6 +9,8 @@ use quinn_proto::congestion::{Controller, Cubic, CubicConfig};
 
 /// A queue that stands for so long, while the window shrinks so often, may be of others.
 const STANDING: (Duration, u32) = (Duration::from_secs(1), 4);
+/// A queue that stands for so long before a window that cannot shrink may be of others, too.
+const UNCLEAR: Duration = Duration::from_secs(3);
 /// The window must shrink to this share before it says anything.
 const SHRUNK: f64 = 0.75;
 /// While CUBIC decides, the controller looks this often whether the queue is gone.
@@ -38,8 +40,8 @@ impl Standing {
     }
 
     /// Takes that the window is about to shrink once more. `least` is the smallest window. Returns the window from
-    /// before if others fill the queue: the rate shrank with the window, or a window that can shrink no more has a queue
-    /// before it. A queue of this link alone keeps its rate.
+    /// before if others fill the queue: the rate shrank with the window. A queue of this link alone keeps its rate. A
+    /// window that was too small to shrink says nothing, and CUBIC finds out.
     pub(super) fn shrink(
         &mut self,
         now: Instant,
@@ -52,10 +54,11 @@ impl Standing {
             (self.window, self.rate) = (window, rate);
         }
         let share = window as f64 / self.window as f64;
-        let is_long = now.saturating_duration_since(self.since) >= STANDING.0;
-        let is_telling = is_long && self.times >= STANDING.1;
+        let time = now.saturating_duration_since(self.since);
+        let is_telling = time >= STANDING.0 && self.times >= STANDING.1;
         let has_less = share <= SHRUNK && rate < self.rate * (1.0 + share) / 2.0;
-        (is_telling && (has_less || window <= least)).then_some(self.peak)
+        let cannot_shrink = time >= UNCLEAR && self.window as f64 * SHRUNK < least as f64;
+        (is_telling && (has_less || cannot_shrink)).then_some(self.peak)
     }
 }
 
@@ -186,13 +189,13 @@ mod tests {
     }
 
     #[test]
-    fn a_queue_before_the_smallest_window_is_not_of_this_link() {
+    fn a_queue_that_stands_before_the_smallest_window_is_not_of_this_link() {
         let start = Instant::now();
         let mut standing = Standing::new(start, 100_000, 1e6);
         for time in 1..=5 {
-            assert_eq!(standing.shrink(start + millis(190) * time, 4_000, 5e4, 4_000), None);
+            assert_eq!(standing.shrink(start + millis(590) * time, 4_000, 5e4, 4_000), None);
         }
-        assert_eq!(standing.shrink(start + millis(1_000), 4_000, 5e4, 4_000), Some(100_000));
+        assert_eq!(standing.shrink(start + millis(3_000), 4_000, 5e4, 4_000), Some(100_000));
     }
 
     /// Ends rounds of 40 ms until a look is over, which sees `shortest`.

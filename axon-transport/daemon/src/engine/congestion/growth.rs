@@ -15,6 +15,9 @@ const PACKETS: (u64, u64) = (40, 200);
 const EXCESS: (f64, f64) = (0.02, 0.1);
 /// The part of its growth that the window must bring in bytes.
 const PAYS: f64 = 0.3;
+/// What a round adds to the averages of losses, and the most by which losses in bursts differ more than single ones.
+const AVERAGED: f64 = 1.0 / 16.0;
+const MOST_DISPERSED: f64 = 8.0;
 /// Rounds to wait before growth is tried again where it did not pay, at first and at most.
 const PATIENCE: (u32, u32) = (4, 64);
 
@@ -42,6 +45,11 @@ pub(super) struct Growth {
     trial: Trial,
     /// The share of packets that is lost however small the window is.
     random_loss: f64,
+    /// The share that is lost, on average.
+    mean_loss: f64,
+    /// How much the losses of rounds differ: their variance, by that of packets that are lost each by itself. A radio
+    /// loses packets in bursts, and then a trial says as much as one of so many times fewer packets.
+    dispersion: f64,
     /// The share that was lost before the window was cut for it.
     cut: Option<f64>,
     /// Rounds to wait before growth is tried again, and those that are left.
@@ -52,7 +60,15 @@ pub(super) struct Growth {
 impl Growth {
     pub(super) fn new(window: u64) -> Self {
         let trial = Trial::new(window, None);
-        Self { trial, random_loss: 0.0, cut: None, patience: 0, waiting: 0 }
+        Self {
+            trial,
+            random_loss: 0.0,
+            mean_loss: 0.0,
+            dispersion: 1.0,
+            cut: None,
+            patience: 0,
+            waiting: 0,
+        }
     }
 
     /// The share of packets that is lost by chance.
@@ -77,10 +93,20 @@ impl Growth {
     }
 
     /// Adds a round.
-    pub(super) fn add(&mut self, acknowledged: u64, lost: u64, time: Duration) {
+    pub(super) fn add(&mut self, acknowledged: u64, lost: u64, time: Duration, mtu: u64) {
         self.trial.acknowledged += acknowledged;
         self.trial.lost += lost;
         self.trial.time += time;
+        let (packets, lost) = ((acknowledged + lost) as f64 / mtu as f64, lost as f64 / mtu as f64);
+        if packets < 1.0 {
+            return;
+        }
+        let by_chance = packets * self.mean_loss * (1.0 - self.mean_loss);
+        if by_chance > 0.5 {
+            let dispersion = (lost - packets * self.mean_loss).powi(2) / by_chance;
+            self.dispersion += (dispersion.min(4.0 * MOST_DISPERSED) - self.dispersion) * AVERAGED;
+        }
+        self.mean_loss += (lost / packets - self.mean_loss) * AVERAGED;
     }
 
     /// Begins a trial, after the window changed for another reason.
@@ -116,6 +142,7 @@ impl Growth {
         if trial.acknowledged < mtu * if has_grown { PACKETS.0 } else { PACKETS.1 } {
             return None;
         }
+        let dispersion = self.dispersion.clamp(1.0, MOST_DISPERSED);
         let bytes = (trial.lost + trial.acknowledged) as f64;
         let lost = trial.lost as f64 / bytes;
         let rate = trial.acknowledged as f64 / trial.time.as_secs_f64().max(1e-6);
@@ -133,7 +160,7 @@ impl Growth {
         }
         // Two standard deviations of what chance loses of so many packets.
         let share = self.random_loss;
-        let by_chance = 2.0 * (share * (1.0 - share) * mtu as f64 / bytes).sqrt();
+        let by_chance = 2.0 * (share * (1.0 - share) * dispersion * mtu as f64 / bytes).sqrt();
         let excess = lost - share - by_chance;
         let is_futile = has_grown && pays == Some(false) && excess > EXCESS.0;
         if !is_futile && excess < EXCESS.1 {
@@ -166,7 +193,7 @@ mod tests {
     fn rounds(growth: &mut Growth, mut window: u64, most: u64, random: f64, rounds: u32) -> u64 {
         for _ in 0..rounds {
             let through = (window.min(most) as f64 * (1.0 - random)) as u64;
-            growth.add(through, window - through, RTT);
+            growth.add(through, window - through, RTT, MTU);
             if let Some(smaller) = growth.judge(window, MTU, 3 * MTU, RTT) {
                 assert!(smaller < window);
                 window = smaller;

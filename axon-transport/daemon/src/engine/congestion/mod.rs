@@ -260,7 +260,7 @@ impl Delay {
                 } else if queue > self.wanted() * 2 {
                     self.end_round_of_queue(now, rate, shortest, queue);
                 } else {
-                    self.growth.add(round.acknowledged, round.lost, time);
+                    self.growth.add(round.acknowledged, round.lost, time, self.mtu);
                     // A window that was never half used says nothing of a larger one.
                     if round.most_in_flight >= self.window / 2 {
                         self.grow(queue);
