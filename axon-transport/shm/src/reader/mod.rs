@@ -29,10 +29,12 @@ use crate::{
         window::{depth, holds},
     },
     session::{
+        activity::WatchKey,
         attachment::{Attachment, Pinning},
         lane::Lane,
         peer::{Found, Peer},
     },
+    sync::Ordering,
     wake::{Purpose, settle},
 };
 
@@ -120,6 +122,8 @@ struct Reads {
     in_place: u64,
     /// Whether a publisher may wait for it.
     tells: bool,
+    /// Has its session find it when there is something to take.
+    watch: Option<WatchKey>,
 }
 
 impl Reader {
@@ -168,7 +172,7 @@ impl Reader {
             skipped: 0,
             corrupt: None,
             given_up: false,
-            reads: Reads { writer, peer, grant, depth, max_message, in_place, tells },
+            reads: Reads { writer, peer, grant, depth, max_message, in_place, tells, watch: None },
         })
     }
 
@@ -476,6 +480,23 @@ impl Reader {
         self.make_room_known();
     }
 
+    /// Has its session find it by [`take_active`](crate::session::segment::SessionSegment::take_active) when there may
+    /// be something to take, and now, where the session [follows](crate::session::segment::SessionSegment::follow).
+    pub fn follow(&mut self, reader: Gid) {
+        let Some(words) = self.ring_words() else { return };
+        let ring = words[layout::ring::NUMBER].load(Ordering::Relaxed) as u32;
+        let session = self.attachment.lane.session();
+        let (pair, peer) = ((reader, self.reads.writer), self.reads.peer.remote());
+        self.reads.watch = session.activity().watch(pair, peer, session.journal(), ring);
+    }
+
+    /// Has its session find it at the next look, if it is followed.
+    pub fn mark_active(&self) {
+        if let Some(watch) = &self.reads.watch {
+            watch.mark();
+        }
+    }
+
     /// Has its publisher woken by whatever is taken, if it waits for that: of what stands for others.
     #[inline]
     pub fn tell_progress(&mut self) {
@@ -505,10 +526,13 @@ impl Reader {
 impl Drop for Reader {
     fn drop(&mut self) {
         // The lane closes with the last sample; until then it only stops to hold the publisher.
-        if !self.attachment.lane.is_forked() {
-            self.attachment.lane.leave();
-            self.make_room_known();
+        if self.attachment.lane.is_forked() {
+            // A thread of the parent may have held its lock.
+            std::mem::forget(self.reads.watch.take());
+            return;
         }
+        self.attachment.lane.leave();
+        self.make_room_known();
     }
 }
 

@@ -121,6 +121,9 @@ impl Writer {
             };
             let meta = self.number(state, numbering);
             let position = self.show(state, meta, extent, place, payload);
+            if state.reader_set.has_followers() {
+                self.session.journal().note(self.number);
+            }
             settle::<AtomicU64>();
             Ok((meta, Some(position), state.reader_set.waiting()))
         })?;

@@ -1,0 +1,185 @@
+//! Which readers of a session have something to look at: for a session that reads so many rings that it cannot look at
+//! all of them whenever one of them rings.
+//!
+//! The session reads the [journal](crate::ring::journal) of each session whose rings it reads. What no journal says, its
+//! own threads [mark](Activity::mark): a reader that was just attached, whose writer ended, or whose memory came. Each
+//! look also passes over a few further readers in turn, so that in time all are looked at, whatever other sessions write
+//! to their journals.
+
+use std::{
+    collections::{BTreeMap, HashMap},
+    ops::Bound,
+    sync::{
+        Arc, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicBool, AtomicU64, Ordering},
+    },
+};
+
+use crate::{
+    ids::Gid,
+    ring::journal::{Journal, News, Place},
+    session::peer::PeerSession,
+};
+
+/// Readers that each look passes over in turn.
+const IN_TURN: usize = 2;
+
+/// The readers of a session, and which of them are to be looked at.
+#[derive(Default)]
+pub(crate) struct Activity {
+    /// Whether somebody takes what is found. Otherwise nothing is kept.
+    followed: AtomicBool,
+    state: Mutex<State>,
+}
+
+#[derive(Default)]
+struct State {
+    /// By the address of the other session; 0 is this session itself.
+    journals: HashMap<usize, Followed>,
+    readers: BTreeMap<u64, Watched>,
+    next: u64,
+    /// Those that are to be looked at, each once.
+    marked: Vec<u64>,
+    /// The reader that was passed over last.
+    turn: u64,
+}
+
+/// A session whose journal is read.
+struct Followed {
+    /// `None` is this session itself.
+    peer: Option<Arc<PeerSession>>,
+    place: Place,
+    /// The readers of each ring, by its number.
+    rings: HashMap<u32, Vec<u64>>,
+}
+
+struct Watched {
+    reader: Gid,
+    writer: Gid,
+    journal: usize,
+    ring: u32,
+    marked: bool,
+}
+
+/// A reader's entry, until it is dropped.
+pub(crate) struct WatchKey {
+    of: Arc<Activity>,
+    key: u64,
+}
+
+impl Activity {
+    /// Somebody takes what is found, from now on.
+    pub(crate) fn follow(&self) {
+        // Relaxed: there is no reader yet.
+        self.followed.store(true, Ordering::Relaxed);
+    }
+
+    /// Watches the ring of this number for a reader, which is to be looked at. `None` if nobody follows.
+    pub(crate) fn watch(
+        self: &Arc<Self>,
+        (reader, writer): (Gid, Gid),
+        peer: Option<&Arc<PeerSession>>,
+        own: Journal<'_, AtomicU64>,
+        ring: u32,
+    ) -> Option<WatchKey> {
+        if !self.followed.load(Ordering::Relaxed) {
+            return None;
+        }
+        let journal = peer.map_or(0, |peer| Arc::as_ptr(peer).addr());
+        let mut state = self.lock();
+        let key = state.next;
+        state.next += 1;
+        let followed = state.journals.entry(journal).or_insert_with(|| {
+            let words = peer.map_or(own, |peer| peer.journal());
+            Followed { peer: peer.cloned(), place: Place::end(words), rings: HashMap::new() }
+        });
+        followed.rings.entry(ring).or_default().push(key);
+        state.readers.insert(key, Watched { reader, writer, journal, ring, marked: false });
+        state.mark(key);
+        drop(state);
+        Some(WatchKey { of: Arc::clone(self), key })
+    }
+
+    /// The readers that are to be looked at now, each with its writer, are added to `found`. After
+    /// [`arm`](crate::wake::arm): what comes later rings.
+    pub(crate) fn take(&self, own: Journal<'_, AtomicU64>, found: &mut Vec<(Gid, Gid)>) {
+        let mut state = self.lock();
+        let State { journals, readers, marked, turn, .. } = &mut *state;
+        let mut mark = |key: &u64| mark(readers, marked, *key);
+        for Followed { peer, place, rings } in journals.values_mut() {
+            let words = peer.as_ref().map_or(own, |peer| peer.journal());
+            let news = place
+                .read(words, |ring| rings.get(&ring).into_iter().flatten().for_each(&mut mark));
+            let changed = peer.as_ref().is_some_and(|peer| peer.take_changed());
+            if changed || news == News::All {
+                rings.values().flatten().for_each(&mut mark);
+            }
+        }
+        for _ in 0..IN_TURN.min(readers.len()) {
+            let after = readers.range((Bound::Excluded(*turn), Bound::Unbounded)).next();
+            let Some(next) = after.or_else(|| readers.iter().next()).map(|(key, _)| *key) else {
+                break;
+            };
+            *turn = next;
+            self::mark(readers, marked, next);
+        }
+        for key in marked.drain(..) {
+            if let Some(watched) = readers.get_mut(&key) {
+                watched.marked = false;
+                found.push((watched.reader, watched.writer));
+            }
+        }
+    }
+
+    /// All readers are to be looked at.
+    pub(crate) fn mark_all(&self) {
+        let State { readers, marked, .. } = &mut *self.lock();
+        let keys: Vec<u64> = readers.keys().copied().collect();
+        keys.into_iter().for_each(|key| mark(readers, marked, key));
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl State {
+    fn mark(&mut self, key: u64) {
+        mark(&mut self.readers, &mut self.marked, key);
+    }
+}
+
+fn mark(readers: &mut BTreeMap<u64, Watched>, marked: &mut Vec<u64>, key: u64) {
+    if let Some(watched) = readers.get_mut(&key)
+        && !std::mem::replace(&mut watched.marked, true)
+    {
+        marked.push(key);
+    }
+}
+
+impl WatchKey {
+    /// The reader is to be looked at, whatever its ring's journal says.
+    pub(crate) fn mark(&self) {
+        self.of.lock().mark(self.key);
+    }
+}
+
+impl Drop for WatchKey {
+    fn drop(&mut self) {
+        let mut state = self.of.lock();
+        let Some(Watched { journal, ring, .. }) = state.readers.remove(&self.key) else { return };
+        let Some(followed) = state.journals.get_mut(&journal) else { return };
+        if let Some(keys) = followed.rings.get_mut(&ring) {
+            keys.retain(|key| *key != self.key);
+            if keys.is_empty() {
+                followed.rings.remove(&ring);
+            }
+        }
+        if followed.rings.is_empty() {
+            let unfollowed = state.journals.remove(&journal);
+            // The session that is let go of is unmapped without the lock.
+            drop(state);
+            drop(unfollowed);
+        }
+    }
+}
