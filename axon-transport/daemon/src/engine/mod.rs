@@ -126,6 +126,8 @@ pub(crate) struct Engine {
     epoch: Instant,
     epoch_nanos: u64,
     effects: VecDeque<Effect>,
+    /// Readers with samples to take; kept for its memory.
+    active: Vec<(Gid, Gid)>,
     waiting_for_room: bool,
     draining: bool,
     /// A peer let go of endpoints that another one may have claimed.
@@ -156,6 +158,7 @@ impl Engine {
             epoch,
             epoch_nanos,
             effects: VecDeque::new(),
+            active: Vec::new(),
             waiting_for_room: false,
             draining: false,
             freed: false,
@@ -200,10 +203,14 @@ impl Engine {
 
     /// Samples wait in rings, or readers made room in them.
     pub(crate) fn handle_rings(&mut self, now: Duration) {
+        let mut active = std::mem::take(&mut self.active);
+        self.rings.take_active(&mut active);
         for peer in self.peers.values_mut() {
-            peer.outbound.handle_samples(now);
+            peer.outbound.handle_active(&active, now);
             peer.inbound.handle_room();
         }
+        active.clear();
+        self.active = active;
     }
 
     /// The KME answered.

@@ -299,6 +299,10 @@ impl MatchedReaders {
             resumed,
             missed,
         });
+        if let Some(slot) = self.matched_readers.last() {
+            // It could not be taken from before it was here.
+            slot.reader.mark_active();
+        }
         self.forget_older(writer);
     }
 
@@ -308,6 +312,7 @@ impl MatchedReaders {
         self.pending.remove(writer);
         for slot in self.matched_readers.iter_mut().filter(|slot| slot.reader.writer() == *writer) {
             slot.reader.end();
+            slot.reader.mark_active();
         }
         self.end_where(|reader| reader.writer() == *writer)
     }
@@ -344,6 +349,8 @@ impl MatchedReaders {
         for slot in self.matched_readers.iter_mut().filter(|s| !s.over && which(&s.reader)) {
             slot.over = true;
             news = true;
+            // A writer that died may have left samples without a word.
+            slot.reader.mark_active();
         }
         self.sweep();
         news

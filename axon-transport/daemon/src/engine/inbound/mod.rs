@@ -149,11 +149,6 @@ impl Inbound {
         waiting.into_iter().for_each(|key| self.make_ready(key));
     }
 
-    /// The stand-in of a remote publisher.
-    pub(crate) fn stand_in(&self, gid: &Gid) -> Option<&Rc<StandIn>> {
-        self.routes.values().find_map(|route| route.writers.get(gid))
-    }
-
     /// The peer opened a stream, or more of it arrived.
     pub(crate) fn handle_readable(&mut self, link: u64, stream: StreamId) {
         self.streams.entry((link, stream)).or_default();

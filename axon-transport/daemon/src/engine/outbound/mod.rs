@@ -11,6 +11,7 @@ mod queue;
 mod schedule;
 mod source;
 mod stall;
+mod streams;
 #[cfg(test)]
 mod tests;
 
@@ -99,6 +100,8 @@ pub(crate) struct Backlog {
 /// The samples to one peer.
 pub(crate) struct Outbound {
     routes: HashMap<u32, Served>,
+    /// The routes of the sources.
+    by_source: HashMap<Gid, u32>,
     flows: Vec<Option<Flow>>,
     free: Vec<FlowId>,
     schedule: Schedule,
@@ -108,12 +111,16 @@ pub(crate) struct Outbound {
     counters: Rc<Counters>,
     timers: BTreeSet<(Duration, FlowId)>,
     without_stream: BTreeSet<FlowId>,
+    /// Streams may have become idle since a flow found none.
+    frees_streams: bool,
     without_key: BTreeSet<FlowId>,
     key_retry: Option<Duration>,
     /// Flows whose next sample found no room in the queue.
     held: BTreeSet<FlowId>,
     /// Streams of routes that ended, and whether they are reset.
     ended: Vec<StreamId>,
+    /// Flows with samples that are not acknowledged. The others cost nothing.
+    busy: BTreeSet<FlowId>,
     endings: Endings,
     stalls: Stalls,
     events: Vec<OutboundEvent>,
@@ -129,6 +136,7 @@ impl Outbound {
     ) -> Self {
         Self {
             routes: HashMap::new(),
+            by_source: HashMap::new(),
             flows: Vec::new(),
             free: Vec::new(),
             schedule: Schedule::default(),
@@ -137,10 +145,12 @@ impl Outbound {
             counters,
             timers: BTreeSet::new(),
             without_stream: BTreeSet::new(),
+            frees_streams: false,
             without_key: BTreeSet::new(),
             key_retry: None,
             held: BTreeSet::new(),
             ended: Vec::new(),
+            busy: BTreeSet::new(),
             endings: Endings::default(),
             stalls: Stalls::new(stalled_after, now),
             events: Vec::new(),
@@ -158,19 +168,29 @@ impl Outbound {
             seen: HashMap::new(),
             flows: HashMap::new(),
         });
+        for gone in served.sources.iter().map(Source::gid) {
+            self.by_source.remove(&gone);
+        }
+        self.by_source.extend(sources.iter().map(|source| (source.gid(), number)));
         served.sources = sources;
         served.seen = seen;
         let Served { sources, seen, flows, .. } = served;
-        let mut unread = Vec::new();
+        let (mut unread, mut read) = (Vec::new(), Vec::new());
         for (of, id) in flows.iter() {
             let Some(flow) = &mut self.flows[*id] else { continue };
             flow.set_sources(sources, seen.get(of).copied());
             if flow.is_idle() && !sources.iter().any(|source| source.reads(of)) {
                 unread.push(*of);
+            } else {
+                read.push(*id);
             }
         }
         for of in unread {
             self.remove_flow(number, &of);
+        }
+        for id in read {
+            self.note_busy(id, now);
+            self.schedule(id);
         }
         self.look_for_samples(number, now);
     }
@@ -178,6 +198,9 @@ impl Outbound {
     /// The peer no longer wants this route.
     pub(crate) fn end_route(&mut self, number: u32) {
         let Some(served) = self.routes.remove(&number) else { return };
+        for source in &served.sources {
+            self.by_source.remove(&source.gid());
+        }
         for id in served.flows.into_values() {
             self.forget_flow(id);
         }
@@ -191,16 +214,20 @@ impl Outbound {
         given_up
     }
 
-    /// A publisher ended: the samples that it left are sent, and then [`OutboundEvent::Drained`] comes.
-    pub(crate) fn handle_publisher_ended(&mut self, publisher: Gid, now: Duration) {
-        self.endings.add(publisher, now);
+    /// A publisher of a route ended: the samples that it left are sent, and then [`OutboundEvent::Drained`] comes.
+    pub(crate) fn handle_publisher_ended(&mut self, number: u32, publisher: Gid, now: Duration) {
+        self.endings.add(number, publisher, now);
     }
 
-    /// A ring rang: samples may wait in any of them.
-    pub(crate) fn handle_samples(&mut self, now: Duration) {
-        let numbers: Vec<u32> = self.routes.keys().copied().collect();
-        for number in numbers {
-            self.look_for_samples(number, now);
+    /// Samples may wait for these sources, each of a writer. Those of other peers are among them.
+    pub(crate) fn handle_active(&mut self, active: &[(Gid, Gid)], now: Duration) {
+        for (source, writer) in active {
+            let Some(number) = self.by_source.get(source).copied() else { continue };
+            let Some(served) = self.routes.get(&number) else { continue };
+            let found = served.sources.iter().find(|other| other.gid() == *source);
+            for of in found.map_or_else(Vec::new, |source| source.with_data_of(writer)) {
+                self.take_in(number, of, now);
+            }
         }
     }
 
@@ -211,15 +238,19 @@ impl Outbound {
             waiting.sort_unstable();
             waiting.dedup();
         }
-        for of in waiting {
-            let Some(id) = self.flow(number, of, now) else { continue };
-            let (Some(flow), Some(served)) = (&mut self.flows[id], self.routes.get(&number)) else {
-                continue;
-            };
-            flow.handle_samples();
-            flow.take_burst(&served.sources, &self.counters, now);
-            self.schedule(id);
-        }
+        waiting.into_iter().for_each(|of| self.take_in(number, of, now));
+    }
+
+    /// Samples of a publisher, or client, wait.
+    fn take_in(&mut self, number: u32, of: Gid, now: Duration) {
+        let Some(id) = self.flow(number, of, now) else { return };
+        let (Some(flow), Some(served)) = (&mut self.flows[id], self.routes.get(&number)) else {
+            return;
+        };
+        flow.handle_samples();
+        flow.take_burst(&served.sources, &self.counters, now);
+        self.note_busy(id, now);
+        self.schedule(id);
     }
 
     /// The flow of a publisher, or client, over a route.
@@ -272,6 +303,7 @@ impl Outbound {
         self.without_stream.remove(&id);
         self.without_key.remove(&id);
         self.held.remove(&id);
+        self.busy.remove(&id);
         if flow.scheduled.is_some() {
             self.schedule.remove(id);
         }
@@ -311,12 +343,16 @@ impl Outbound {
                 }
                 Pause::NoStream => {
                     self.without_stream.insert(id);
+                    self.frees_streams = true;
                 }
                 Pause::NoKey => {
                     self.without_key.insert(id);
                     self.key_retry.get_or_insert(now + KEY_RETRY);
                 }
             }
+        }
+        if std::mem::take(&mut self.frees_streams) {
+            self.finish_idle_streams(carrier);
         }
         carrier.rest(small_blocked);
     }
@@ -401,6 +437,7 @@ impl Outbound {
                 self.schedule(id);
             }
         }
+        self.frees_streams |= !self.without_stream.is_empty();
     }
 
     /// A new link carries all flows. What the old link did not deliver is sent again.
@@ -457,7 +494,7 @@ impl Outbound {
     pub(crate) fn poll_timeout(&self) -> Option<Duration> {
         let flow = self.timers.first().map(|(due, _)| *due);
         let endings = self.endings.poll_timeout();
-        let stalls = (!self.routes.is_empty()).then(|| self.stalls.poll_timeout()).flatten();
+        let stalls = (!self.busy.is_empty()).then(|| self.stalls.poll_timeout()).flatten();
         [flow, endings, stalls, self.key_retry].into_iter().flatten().min()
     }
 
@@ -512,13 +549,12 @@ impl Outbound {
 
     /// Counts the samples that were overwritten in their rings while their flows left them there.
     pub(crate) fn count_overwritten(&mut self) {
-        for served in self.routes.values() {
-            for id in served.flows.values() {
-                if let Some(flow) = &mut self.flows[*id]
-                    && flow.class().is_some()
-                {
-                    flow.count_overwritten(&served.sources, &self.counters);
-                }
+        for id in &self.busy {
+            if let Some(flow) = &mut self.flows[*id]
+                && flow.class().is_some()
+                && let Some(served) = self.routes.get(&flow.route_number)
+            {
+                flow.count_overwritten(&served.sources, &self.counters);
             }
         }
     }
@@ -530,7 +566,7 @@ impl Outbound {
 
     /// What waits for the peer.
     pub(crate) fn backlog(&self) -> Backlog {
-        let flows = self.flows.iter().flatten();
+        let flows = self.busy.iter().filter_map(|id| self.flows[*id].as_ref());
         flows.fold(Backlog::default(), |all, flow| Backlog {
             bytes: all.bytes + flow.waiting_bytes(),
             oldest: [all.oldest, flow.oldest()].into_iter().flatten().min(),
@@ -539,7 +575,7 @@ impl Outbound {
 
     /// Whether there is anything to hand to QUIC.
     pub(crate) fn has_work(&self) -> bool {
-        !self.schedule.is_empty() || !self.ended.is_empty()
+        !self.schedule.is_empty() || !self.ended.is_empty() || self.frees_streams
     }
 }
 

@@ -12,5 +12,6 @@ pub(crate) mod rng;
 mod run;
 pub(crate) mod script;
 mod tests;
+mod topics;
 pub(crate) mod trace;
 mod world;

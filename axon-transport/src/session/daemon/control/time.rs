@@ -37,6 +37,7 @@ impl Control {
         let next = state.again;
         drop(state);
         if again.is_some() {
+            self.shared.segment.mark_all_active();
             self.shared.segment.notify();
         }
         next
