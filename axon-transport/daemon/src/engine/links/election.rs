@@ -2,7 +2,6 @@
 
 use std::{net::IpAddr, rc::Rc, time::Duration};
 
-use axon_shm::ids::DaemonId;
 use quinn_proto::{Dir, StreamEvent, VarInt};
 
 use super::{
@@ -10,14 +9,13 @@ use super::{
     link::{LinkPeer, Phase, Silence},
 };
 use crate::{
-    discovery::AddressConfidence,
     engine::{
         link::{
             failure::peer_text,
             opening::{Opened, Sealing},
             target::Target,
         },
-        links::{link::Summary, shares::gives_way, who::Who},
+        links::{link::Summary, who::Who},
         refusal::Refusal,
         transport::{LINK_WINDOW, STREAMS_OPEN},
     },
@@ -35,8 +33,7 @@ const TAKEN: &str = "this daemon id is linked already, under another identity";
 impl Links {
     /// A connection's peer said HELLO and proved its name.
     pub(super) fn established(&mut self, number: u64, opened: Opened, now: Duration) {
-        let (Some(connection), Some(link)) =
-            (self.connections.get(&number), self.links.get(&number))
+        let (Some(connection), Some(link)) = (self.connections.get(number), self.table.get(number))
         else {
             return;
         };
@@ -50,14 +47,12 @@ impl Links {
         }
         let auth = self.credentials.auth();
         let who = Who::of(self.keyring.is_some(), auth.as_ref(), &hello, &negotiated);
-        let current =
-            self.current(daemon).and_then(|number| self.links.get(&number)?.peer.as_ref());
+        let current = self.table.current_peer(daemon);
         if current.is_some_and(|current| !current.summary.who.is(&who)) {
             return self.turn_away(number, &hello, TAKEN.into(), now);
         }
-        let peers = self.links.values().filter_map(|link| link.peer.as_ref());
-        let of_identity = peers.filter(|peer| peer.summary.who.is(&who)).count();
-        let links = self.links.values().filter(|link| link.peer.is_some()).count();
+        let of_identity = self.table.of_identity(&who);
+        let links = self.table.peers().count();
         let is_new = current.is_none();
         let too_many = if of_identity >= MAX_LINKS_OF_PEER {
             Some("this peer has as many connections as it may")
@@ -68,32 +63,31 @@ impl Links {
         };
         if let Some(text) = too_many {
             let instant = self.instant(now);
-            if self.crowded.is_news(address.ip(), instant) {
+            if self.admission.is_news(address.ip(), instant) {
                 return self.turn_away(number, &hello, text.into(), now);
             }
-            self.links.remove(&number);
+            self.table.remove(number);
             return self.close_connection(number, CloseCode::NotAllowed, text, now);
         }
-        let current =
-            self.current(daemon).and_then(|number| self.links.get(&number)?.peer.as_ref());
+        let current = self.table.current_peer(daemon);
         let successor = replaces.is_some()
             && current.is_some_and(|current| current.elected.map(|e| e.link) == replaces);
         let candidate = Candidate { side, successor };
         let we_elect = ours < daemon;
         if we_elect && current.is_some_and(|c| !keep(ours, daemon, c.candidate, candidate)) {
-            self.links.remove(&number);
+            self.table.remove(number);
             // The dial did not fail: the peer is linked.
-            self.dialled.remove(&number);
+            self.dials.opened(number);
             self.close_connection(number, CloseCode::Duplicate, "another connection stands", now);
             if side == Side::Client {
-                self.report(LinkReport::Up { daemon, address });
+                self.outbox.report(LinkReport::Up { daemon, address });
             }
             return;
         }
         let account = self.accounts.of(&who.host_identity(address));
-        let Some(connection) = self.connections.get_mut(&number) else { return };
+        let Some(connection) = self.connections.get_mut(number) else { return };
         connection.control.charge_to(Rc::clone(&account.unsent));
-        let Some(link) = self.links.get_mut(&number) else { return };
+        let Some(link) = self.table.get_mut(number) else { return };
         link.place = None;
         link.phase = Phase::Electing(now + ELECTION_TIMEOUT);
         link.peer = Some(LinkPeer {
@@ -115,43 +109,42 @@ impl Links {
             let elected = Elected { link: rand::random(), election: self.next_election };
             self.next_election += 1;
             self.send(number, &Message::Elected(elected), now);
-            if let Some(peer) = self.links.get_mut(&number).and_then(|link| link.peer.as_mut()) {
+            if let Some(peer) = self.table.peer_mut(number) {
                 peer.order.elected();
             }
             self.open(number, elected, now);
         }
-        self.touch(number);
+        self.connections.touch(number);
     }
 
     fn turn_away(&mut self, number: u64, hello: &crate::link::Hello, why: String, now: Duration) {
-        let address = self.connections.get(&number).map(|c| c.quic.remote_address());
-        self.links.remove(&number);
+        let address = self.connections.address(number);
+        self.table.remove(number);
         self.close_connection(number, CloseCode::NotAllowed, &why, now);
         if let Some(address) = address {
             let peer = peer_text(hello.sae.as_deref(), address);
-            self.report(LinkReport::Refused(peer, Refusal::here(CloseCode::NotAllowed, why)));
+            self.outbox
+                .report(LinkReport::Refused(peer, Refusal::here(CloseCode::NotAllowed, why)));
         }
     }
 
     /// Ends a link of an address that has more of them than a newcomer's.
     fn make_place(&mut self, newcomer: IpAddr, now: Duration) -> bool {
-        let links = self.links.iter().filter(|(_, link)| link.peer.is_some());
+        let links = self.table.peers();
         let links: Vec<_> = links
-            .filter_map(|(number, _)| {
-                Some((self.connections.get(number)?.quic.remote_address().ip(), *number))
-            })
+            .filter_map(|(number, _)| Some((self.connections.address(number)?.ip(), number)))
             .collect();
-        let listed = |address: IpAddr| self.listed.contains(&address.to_canonical());
-        let Some(number) = gives_way(newcomer, &links, listed) else { return false };
+        let Some(number) = self.admission.gives_way(newcomer, &links) else { return false };
         let text = "a host at an address that has fewer links takes its place";
         tracing::info!(%newcomer, "{text}");
         let address = links.iter().find(|(_, other)| *other == number).map(|(ip, _)| *ip);
         let instant = self.instant(now);
         if let Some(address) = address
-            && self.crowded.is_news(address, instant)
+            && self.admission.is_news(address, instant)
         {
             let peer = self.peer_text(number);
-            self.report(LinkReport::Refused(peer, Refusal::here(CloseCode::NotAllowed, text)));
+            self.outbox
+                .report(LinkReport::Refused(peer, Refusal::here(CloseCode::NotAllowed, text)));
         }
         self.close_connection(number, CloseCode::NotAllowed, text, now);
         self.end_link(number, text, None, now);
@@ -160,19 +153,19 @@ impl Links {
 
     /// A link is elected: it carries samples from now on.
     pub(super) fn open(&mut self, number: u64, elected: Elected, now: Duration) {
-        let Some(peer) = self.links.get(&number).and_then(|link| link.peer.as_ref()) else {
+        let Some(peer) = self.table.peer(number) else {
             return;
         };
         let daemon = peer.summary.hello.daemon;
         let current = self.current(daemon);
-        let current_peer = current.and_then(|number| self.links.get(&number)?.peer.as_ref());
+        let current_peer = self.table.current_peer(daemon);
         if current_peer.is_some_and(|current| !current.summary.who.is(&peer.summary.who)) {
             return self.violation(number, CloseCode::NotAllowed, TAKEN, now);
         }
         let newer = current_peer.and_then(|current| current.elected);
         let superseded = newer.is_some_and(|current| current.election > elected.election);
         let age = self.keyring.as_ref().map(|keyring| keyring.config.session_max_age);
-        let Some(link) = self.links.get_mut(&number) else { return };
+        let Some(link) = self.table.get_mut(number) else { return };
         let side = link.side;
         let Some(peer) = &mut link.peer else { return };
         peer.elected = Some(elected);
@@ -181,66 +174,63 @@ impl Links {
             peer.renew_at = (side == Side::Client).then(|| now + renewal_at(age));
         }
         link.phase = Phase::Open;
-        if let Some(connection) = self.connections.get_mut(&number) {
+        if let Some(connection) = self.connections.get_mut(number) {
             let streams = VarInt::from_u32(STREAMS_OPEN);
             connection.quic.set_max_concurrent_streams(Dir::Uni, streams);
         }
         self.widen(number);
         if superseded {
             tracing::debug!(peer = %daemon, "superseded before its election was heard of");
-            if let Some(peer) = self.links.get_mut(&number).and_then(|link| link.peer.as_mut()) {
+            if let Some(peer) = self.table.peer_mut(number) {
                 // Nothing is sent over it: its keys are not needed.
                 peer.sealing = None;
             }
             self.hand_over(number, now);
             let opened = StreamEvent::Opened { dir: Dir::Uni };
-            self.events.push_back(LinkEvent::Stream(number, daemon, opened));
+            self.outbox.event(LinkEvent::Stream(number, daemon, opened));
             return;
         }
         let sealing =
-            self.links.get_mut(&number).and_then(|link| link.peer.as_mut()?.sealing.take());
+            self.table.get_mut(number).and_then(|link| link.peer.as_mut()?.sealing.take());
         if let (Some(keyring), Some(Sealing { exporters, first })) = (&mut self.keyring, sealing)
             && let Err(error) = keyring.attach_sender(now, number, &exporters, first)
         {
             tracing::error!(peer = %daemon, %error, "no message keys for this link");
         }
-        self.dialled.remove(&number);
-        self.current.insert(daemon, number);
+        self.dials.opened(number);
+        self.table.put_in_use(daemon, number);
         let closed = current.and_then(|old| self.hand_over(old, now));
-        self.events.push_back(LinkEvent::Up { number, daemon, old: current, closed });
-        if let Some(connection) = self.connections.get(&number) {
+        self.outbox.event(LinkEvent::Up { number, daemon, old: current, closed });
+        if let Some(connection) = self.connections.get(number) {
             let address = connection.quic.remote_address();
             tracing::info!(peer = %daemon, %address, new = current.is_none(), "link up");
-            self.report(LinkReport::Up { daemon, address });
+            self.outbox.report(LinkReport::Up { daemon, address });
         }
-        self.touch(number);
+        self.connections.touch(number);
     }
 
     /// Lets the peer send more that is not read, as far as its identity has room.
     pub(super) fn widen(&mut self, number: u64) {
-        let (Some(connection), Some(peer)) = (
-            self.connections.get_mut(&number),
-            self.links.get_mut(&number).and_then(|link| link.peer.as_mut()),
-        ) else {
+        let (Some(connection), Some(peer)) =
+            (self.connections.get_mut(number), self.table.peer_mut(number))
+        else {
             return;
         };
         if peer.account.unread.share(&mut peer.unread) {
             let share = u32::try_from(peer.unread.amount()).unwrap_or(u32::MAX);
             let window = VarInt::from_u32(LINK_WINDOW.saturating_add(share));
             connection.quic.set_receive_window(window);
-            self.touch(number);
+            self.connections.touch(number);
         }
     }
 
     pub(super) fn widen_all(&mut self) {
-        let open = self.links.iter().filter(|(_, link)| link.is_open()).map(|(number, _)| *number);
-        let open: Vec<u64> = open.collect();
-        open.into_iter().for_each(|number| self.widen(number));
+        self.table.open().into_iter().for_each(|number| self.widen(number));
     }
 
     /// A successor is dialled, or the link is at its end.
     pub(super) fn open_timeout(&mut self, number: u64, now: Duration) {
-        let Some(peer) = self.links.get(&number).and_then(|link| link.peer.as_ref()) else {
+        let Some(peer) = self.table.peer(number) else {
             return;
         };
         if peer.until.is_some_and(|until| until <= now) {
@@ -252,7 +242,7 @@ impl Links {
             let age = self.keyring.as_ref().map(|keyring| keyring.config.session_max_age);
             // Should the dial fail, the next one is due before the key's age is reached.
             let again = age.unwrap_or_default().mul_f64(0.04).max(Duration::from_secs(1));
-            if let Some(peer) = self.links.get_mut(&number).and_then(|link| link.peer.as_mut()) {
+            if let Some(peer) = self.table.peer_mut(number) {
                 peer.renew_at = Some(now + again);
             }
             self.dial_successor(number, now);
@@ -262,10 +252,9 @@ impl Links {
 
     /// Dials a connection that replaces a link.
     pub(super) fn dial_successor(&mut self, number: u64, now: Duration) {
-        let (Some(connection), Some(peer)) = (
-            self.connections.get(&number),
-            self.links.get(&number).and_then(|link| link.peer.as_ref()),
-        ) else {
+        let (Some(connection), Some(peer)) =
+            (self.connections.get(number), self.table.peer(number))
+        else {
             return;
         };
         let target = Target {
@@ -279,27 +268,15 @@ impl Links {
         self.dial(target, now);
     }
 
-    /// Remembers for whom a connection was dialled, should its opening fail.
-    pub(super) fn note_dialled(&mut self, number: u64, of: Option<(DaemonId, AddressConfidence)>) {
-        self.dialled.extend(of.map(|of| (number, of)));
-    }
-
-    /// The opening of a dialled connection failed.
-    pub(super) fn failed_after_dial(&mut self, number: u64) {
-        if let Some((daemon, standing)) = self.dialled.remove(&number) {
-            self.report(LinkReport::DialFailed { daemon, standing });
-        }
-    }
-
     /// Closes the links of peers that are no longer trusted. Certificates are looked at if `certificates` says so:
     /// that costs signatures.
     pub(in crate::engine) fn close_untrusted(&mut self, certificates: bool, now: Duration) {
         let mut untrusted = Vec::new();
-        for (number, link) in &self.links {
+        for (number, link) in self.table.iter() {
             let Some(peer) = &link.peer else { continue };
             let chain = certificates.then_some(&peer.chain[..]);
             let why = self.credentials.distrust(&peer.summary.negotiated, link.side, chain);
-            untrusted.extend(why.map(|why| (*number, why)));
+            untrusted.extend(why.map(|why| (number, why)));
         }
         for (number, why) in untrusted {
             self.violation(number, CloseCode::NotAllowed, &why, now);

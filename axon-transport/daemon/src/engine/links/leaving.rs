@@ -23,8 +23,8 @@ impl Links {
     /// A successor took over from a link. Returns what the peer is told if the link is silent.
     pub(super) fn hand_over(&mut self, old: u64, now: Duration) -> Option<LinkClosed> {
         let ours = self.hello.daemon;
-        let stats = self.connections.get(&old)?.quic.stats();
-        let link = self.links.get_mut(&old)?;
+        let stats = self.connections.get(old)?.quic.stats();
+        let link = self.table.get_mut(old)?;
         let peer = link.peer.as_mut()?;
         peer.silence.silent &= !Traffic::from(&stats).answered_since(peer.silence.traffic);
         peer.silence.probing = None;
@@ -36,10 +36,8 @@ impl Links {
             Phase::Leaving(Leaving { until, succeeded, ended: false, closed: false, wait: None });
         self.nonces.retain(|_, number| *number != old);
         tracing::debug!(link = old, silent, "the link is superseded");
-        let leaving = self.links.iter().filter(|(_, link)| matches!(link.phase, Phase::Leaving(_)));
-        let of_identity = leaving
-            .filter(|(_, link)| link.peer.as_ref().is_some_and(|peer| peer.summary.who.is(&who)));
-        let of_identity: Vec<u64> = of_identity.map(|(number, _)| *number).collect();
+        let of_identity = self.table.leaving().filter(|(_, peer)| peer.summary.who.is(&who));
+        let of_identity: Vec<u64> = of_identity.map(|(number, _)| number).collect();
         if of_identity.len() > MAX_LEAVING
             && let Some(oldest) = of_identity.iter().min()
         {
@@ -49,14 +47,11 @@ impl Links {
     }
 
     fn leaving_of(&mut self, daemon: DaemonId) -> impl Iterator<Item = (u64, &mut Link)> {
-        self.links
-            .iter_mut()
-            .filter(move |(_, link)| {
-                let of_peer =
-                    link.peer.as_ref().is_some_and(|peer| peer.summary.hello.daemon == daemon);
-                of_peer && matches!(link.phase, Phase::Leaving(_))
-            })
-            .map(|(number, link)| (*number, link))
+        self.table.iter_mut().filter(move |(_, link)| {
+            let of_peer =
+                link.peer.as_ref().is_some_and(|peer| peer.summary.hello.daemon == daemon);
+            of_peer && matches!(link.phase, Phase::Leaving(_))
+        })
     }
 
     /// The peer sends over the successor.
@@ -88,17 +83,14 @@ impl Links {
 
     /// The peer's control stream of a superseded link ended.
     pub(super) fn leaving_ended(&mut self, number: u64) {
-        if let Some(Link { phase: Phase::Leaving(leaving), .. }) = self.links.get_mut(&number) {
+        if let Some(Link { phase: Phase::Leaving(leaving), .. }) = self.table.get_mut(number) {
             leaving.ended = true;
         }
     }
 
     /// The superseded links.
     pub(in crate::engine) fn leaving(&self) -> Vec<(u64, DaemonId)> {
-        let leaving = self.links.iter().filter(|(_, link)| matches!(link.phase, Phase::Leaving(_)));
-        let of = leaving
-            .filter_map(|(number, link)| Some((*number, link.peer.as_ref()?.summary.hello.daemon)));
-        of.collect()
+        self.table.leaving().map(|(number, peer)| (number, peer.summary.hello.daemon)).collect()
     }
 
     /// Closes a superseded link once all has arrived in both directions. So many of its streams are being read.
@@ -109,7 +101,7 @@ impl Links {
         now: Duration,
     ) {
         let (Some(connection), Some(link)) =
-            (self.connections.get_mut(&number), self.links.get_mut(&number))
+            (self.connections.get_mut(number), self.table.get_mut(number))
         else {
             return;
         };
@@ -132,12 +124,12 @@ impl Links {
         if now >= wait {
             leaving.wait = Some(now + HAND_OVER);
         }
-        self.touch(number);
+        self.connections.touch(number);
     }
 
     /// The time of a superseded link is over.
     pub(super) fn leaving_timeout(&mut self, number: u64, now: Duration) {
-        let Some(Link { phase: Phase::Leaving(leaving), .. }) = self.links.get(&number) else {
+        let Some(Link { phase: Phase::Leaving(leaving), .. }) = self.table.get(number) else {
             return;
         };
         if leaving.until.is_some_and(|until| until <= now) {
@@ -146,11 +138,11 @@ impl Links {
     }
 
     fn close_leaving(&mut self, number: u64, now: Duration) {
-        let Some(link) = self.links.remove(&number) else { return };
+        let Some(link) = self.table.remove(number) else { return };
         tracing::debug!(link = number, "the superseded link ends");
         self.close_connection(number, CloseCode::Replaced, SUPERSEDED, now);
         if let Some(peer) = link.peer {
-            self.events.push_back(LinkEvent::Gone(number, peer.summary.hello.daemon));
+            self.outbox.event(LinkEvent::Gone(number, peer.summary.hello.daemon));
         }
     }
 }

@@ -23,7 +23,7 @@ impl Links {
             && let Ok(Datagram::Echo { nonce, .. }) = Datagram::decode(&bytes)
             && let Some(number) = self.nonces.remove(&nonce)
         {
-            let peer = self.links.get_mut(&number).and_then(|link| link.peer.as_mut());
+            let peer = self.table.peer_mut(number);
             if let Some(probing) = peer.and_then(|peer| peer.silence.probing.as_mut())
                 && probing.prober.awaits_echo()
             {
@@ -31,16 +31,15 @@ impl Links {
             }
             return;
         }
-        self.report(LinkReport::Datagram { from, bytes: bytes.to_vec() });
+        self.outbox.report(LinkReport::Datagram { from, bytes: bytes.to_vec() });
     }
 
     /// Notes what had gone over a link when a datagram came. What is sent later has no answer yet. QUIC does not always
     /// send it again: its probes may ask for an acknowledgement alone.
     pub(super) fn note_heard(&mut self, number: u64) {
-        let (Some(connection), Some(peer)) = (
-            self.connections.get(&number),
-            self.links.get_mut(&number).and_then(|link| link.peer.as_mut()),
-        ) else {
+        let (Some(connection), Some(peer)) =
+            (self.connections.get(number), self.table.peer_mut(number))
+        else {
             return;
         };
         let traffic = Traffic::from(&connection.quic.stats());
@@ -51,12 +50,10 @@ impl Links {
 
     /// Probes the path of links over which something went out, and nothing came in the last second.
     pub(super) fn look_for_silence(&mut self, now: Duration) {
-        let open = self.links.iter().filter(|(_, link)| link.is_open()).map(|(number, _)| *number);
-        let open: Vec<u64> = open.collect();
-        for number in open {
-            let Some(connection) = self.connections.get(&number) else { continue };
+        for number in self.table.open() {
+            let Some(connection) = self.connections.get(number) else { continue };
             let traffic = Traffic::from(&connection.quic.stats());
-            let Some(link) = self.links.get_mut(&number) else { continue };
+            let Some(link) = self.table.get_mut(number) else { continue };
             let side = link.side;
             let Some(peer) = &mut link.peer else { continue };
             let before = std::mem::replace(&mut peer.silence.traffic, traffic);
@@ -80,10 +77,9 @@ impl Links {
 
     /// Goes on with the probes of a silent link.
     pub(super) fn probe(&mut self, number: u64, now: Duration) {
-        let (Some(connection), Some(peer)) = (
-            self.connections.get(&number),
-            self.links.get_mut(&number).and_then(|link| link.peer.as_mut()),
-        ) else {
+        let (Some(connection), Some(peer)) =
+            (self.connections.get(number), self.table.peer_mut(number))
+        else {
             return;
         };
         let (address, daemon) = (connection.quic.remote_address(), peer.summary.hello.daemon);
@@ -98,7 +94,7 @@ impl Links {
             Some(Step::Probe) => {
                 self.nonces.insert(probing.nonce, number);
                 let probe = Datagram::Probe { daemon: self.hello.daemon, nonce: probing.nonce };
-                self.endpoints.send(address, probe.encode());
+                self.connections.endpoints().send(address, probe.encode());
             }
             Some(Step::Replace) => {
                 peer.silence.silent = true;

@@ -1,0 +1,119 @@
+//! The graphs of the peers: changes are followed by turns, and each endpoint has one host.
+
+use std::{rc::Rc, time::Duration};
+
+use axon_shm::ids::{DaemonId, Gid};
+use axon_transport::internal::graph::RemoteEndpoint;
+
+use super::{Engine, peer::graph::GraphChange};
+use crate::{
+    bridge::ToControl,
+    link::{GraphResync, Message},
+};
+
+/// What following a change costs for each endpoint of both graphs, as an estimate: other peers have nine times as long
+/// before this one's next turn.
+const ENDPOINT: Duration = Duration::from_nanos(500);
+
+impl Engine {
+    /// Follows the changes of the peers' graphs whose turn it is.
+    pub(super) fn follow_graphs(&mut self, now: Duration) {
+        let stirred = self.peers.iter().filter(|(_, peer)| peer.stirred);
+        let stirred: Vec<_> = stirred.map(|(daemon, _)| daemon).collect();
+        for daemon in stirred {
+            let Some(peer) = self.peers.get_mut(daemon) else { continue };
+            let account = Rc::clone(peer.remote.account());
+            if !account.turns.borrow_mut().take(self.epoch + now) {
+                continue;
+            }
+            peer.stirred = false;
+            let endpoints = self.follow_graph(daemon, now) + self.peers.local().len();
+            let took = ENDPOINT * u32::try_from(endpoints).unwrap_or(u32::MAX);
+            account.turns.borrow_mut().over(self.epoch + now, self.epoch + now + took);
+        }
+    }
+
+    /// Follows the changes of a peer's graph. Returns how many endpoints it has.
+    fn follow_graph(&mut self, daemon: DaemonId, now: Duration) -> usize {
+        let Some(peer) = self.peers.get_mut(daemon) else { return 0 };
+        let number = peer.link;
+        if let Some(reason) = peer.newly_refused() {
+            let who = self.links.summary(number).map(|summary| summary.who.to_string());
+            let peer = format!("{} at {}", who.unwrap_or_default(), self.links.peer_text(number));
+            self.effects.tell(ToControl::Refusal { peer, what: "graph".into(), reason });
+        }
+        let Some(peer) = self.peers.get_mut(daemon) else { return 0 };
+        let GraphChange { reset, mut added, removed } = peer.remote.changes();
+        // An endpoint is its host's: no other host speaks for one of ours, or for the engine.
+        let ours: Vec<Gid> = added
+            .iter()
+            .map(|e| e.endpoint.gid)
+            .filter(|gid| self.peers.local().contains_key(gid) || gid.0[..12] == self.session)
+            .collect();
+        if !ours.is_empty() {
+            tracing::warn!(peer = %daemon, endpoints = ours.len(),
+                "ignored endpoints announced by a peer: they belong to this host");
+            added.retain(|e| !ours.contains(&e.endpoint.gid));
+            if let Some(peer) = self.peers.get_mut(daemon) {
+                peer.remote.forget(&ours);
+            }
+        }
+        self.freed |= !removed.is_empty();
+        let dead = self.taken_over(daemon, &added);
+        // Before the dead links let go of their stand-ins: rings and readers stay as they are.
+        self.peers.with(daemon, |peer, with| peer.handle_remote_graph(with, now));
+        for link in dead {
+            let text = "its host's daemon was restarted";
+            self.links.replace(link, text, now);
+        }
+        // The control plane forgets the endpoints of the dead link before it learns of the same ones here.
+        while let Some(event) = self.links.poll_event() {
+            self.handle_link_event(event, now);
+        }
+        self.effects.tell(ToControl::RemoteGraph { daemon, reset, added, removed });
+        self.peers.get(daemon).map_or(0, |peer| peer.remote.len())
+    }
+
+    /// The links of peers whose endpoints a restarted daemon of the same host announces: those links are dead. The
+    /// claim of another host is ignored.
+    fn taken_over(&mut self, daemon: DaemonId, added: &[RemoteEndpoint]) -> Vec<u64> {
+        let mut dead = Vec::new();
+        let identity =
+            |engine: &Self, daemon: DaemonId| engine.links.identity(engine.links.current(daemon)?);
+        let Some(owner) = identity(self, daemon) else { return dead };
+        let others: Vec<_> =
+            self.peers.iter().map(|(other, _)| other).filter(|other| *other != daemon).collect();
+        for other in others {
+            let same_host = identity(self, other).is_some_and(|i| i == owner);
+            let Some(peer) = self.peers.get(other) else { continue };
+            let gids = added.iter().map(|e| e.endpoint.gid);
+            let moved: Vec<_> = gids.filter(|gid| peer.remote.has(gid)).collect();
+            if moved.is_empty() {
+                continue;
+            }
+            if same_host {
+                dead.push(peer.link);
+                continue;
+            }
+            tracing::warn!(peer = %daemon, endpoints = moved.len(),
+                "ignored endpoints announced by a peer: they belong to another peer");
+            if let Some(claimer) = self.peers.get_mut(daemon) {
+                claimer.remote.forget(&moved);
+                claimer.displaced = true;
+            }
+        }
+        dead
+    }
+
+    /// Asks peers again for the parts of their graphs that were left out and have room now.
+    pub(super) fn resync(&mut self) {
+        let freed = std::mem::take(&mut self.freed);
+        for peer in self.peers.values_mut() {
+            let displaced = freed && std::mem::take(&mut peer.displaced);
+            if displaced || peer.remote.has_room_again() {
+                let version = peer.remote.version();
+                peer.say(Message::GraphResync(GraphResync { version }));
+            }
+        }
+    }
+}

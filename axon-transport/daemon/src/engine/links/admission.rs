@@ -1,0 +1,47 @@
+//! Admits handshakes and links by the address of the peer.
+
+use std::{collections::BTreeSet, net::IpAddr, rc::Rc, time::Instant};
+
+use super::shares::{Handshakes, Place, Said, gives_way};
+
+/// Handshakes under way at once, but for those of listed peers; further dials are refused and come again.
+const MAX_HANDSHAKES: usize = 64;
+
+/// What the addresses of peers have, and what they may have.
+pub(super) struct Admission {
+    handshakes: Rc<Handshakes>,
+    /// Addresses of listed peers.
+    listed: BTreeSet<IpAddr>,
+    said: Said,
+}
+
+impl Admission {
+    /// Nobody has anything yet.
+    pub(super) fn new() -> Self {
+        Self {
+            handshakes: Handshakes::new(MAX_HANDSHAKES),
+            listed: BTreeSet::new(),
+            said: Said::default(),
+        }
+    }
+
+    /// The addresses of listed peers.
+    pub(super) fn set_listed(&mut self, addresses: BTreeSet<IpAddr>) {
+        self.listed = addresses;
+    }
+
+    /// A place for a handshake from this address.
+    pub(super) fn enter(&self, address: IpAddr) -> Option<Place> {
+        self.handshakes.enter(address, self.listed.contains(&address.to_canonical()))
+    }
+
+    /// Whether a refusal at this address is to be said, which it then was.
+    pub(super) fn is_news(&mut self, address: IpAddr, now: Instant) -> bool {
+        self.said.is_news(address, now)
+    }
+
+    /// The link that gives way to one of a newcomer. `links` are those there are.
+    pub(super) fn gives_way(&self, newcomer: IpAddr, links: &[(IpAddr, u64)]) -> Option<u64> {
+        gives_way(newcomer, links, |address| self.listed.contains(&address.to_canonical()))
+    }
+}

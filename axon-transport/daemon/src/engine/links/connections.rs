@@ -1,0 +1,287 @@
+//! The QUIC connections of this host: which have something to do, when each is due, and whose turn it is to transmit.
+
+use std::{
+    collections::{BTreeSet, HashMap, VecDeque},
+    net::{IpAddr, SocketAddr},
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use bytes::{Bytes, BytesMut};
+use quinn_proto::{
+    ClientConfig, ConnectError, ConnectionError, ConnectionHandle, EcnCodepoint, Incoming,
+    ServerConfig, Transmit, VarInt,
+};
+
+use crate::{
+    engine::{
+        connection::Connection,
+        endpoints::{Endpoints, Packet, Received},
+        link::failure::close_text,
+    },
+    link::CloseCode,
+};
+
+/// All connections of all endpoints. Each has a number that no other one of this daemon ever has.
+pub(super) struct Connections {
+    epoch: Instant,
+    endpoints: Endpoints,
+    all: HashMap<u64, Connection>,
+    handles: HashMap<(usize, ConnectionHandle), u64>,
+    next_number: u64,
+    /// Connections with something to do.
+    dirty: VecDeque<u64>,
+    /// Connections that may have something to transmit.
+    transmitting: VecDeque<u64>,
+    deadlines: BTreeSet<(Instant, u64)>,
+}
+
+impl Connections {
+    /// No connections yet. The engine's time was zero at `epoch`.
+    pub(super) fn new(endpoints: Endpoints, epoch: Instant) -> Self {
+        Self {
+            epoch,
+            endpoints,
+            all: HashMap::new(),
+            handles: HashMap::new(),
+            next_number: 1,
+            dirty: VecDeque::new(),
+            transmitting: VecDeque::new(),
+            deadlines: BTreeSet::new(),
+        }
+    }
+
+    /// The endpoints.
+    pub(super) fn endpoints(&mut self) -> &mut Endpoints {
+        &mut self.endpoints
+    }
+
+    /// A connection.
+    pub(super) fn get(&self, number: u64) -> Option<&Connection> {
+        self.all.get(&number)
+    }
+
+    /// A connection.
+    pub(super) fn get_mut(&mut self, number: u64) -> Option<&mut Connection> {
+        self.all.get_mut(&number)
+    }
+
+    /// The address of the other end.
+    pub(super) fn address(&self, number: u64) -> Option<SocketAddr> {
+        Some(self.get(number)?.quic.remote_address())
+    }
+
+    /// The numbers of all.
+    pub(super) fn numbers(&self) -> Vec<u64> {
+        self.all.keys().copied().collect()
+    }
+
+    /// Whether all are over.
+    pub(super) fn is_empty(&self) -> bool {
+        self.all.is_empty()
+    }
+
+    /// Handles a datagram of QUIC. Returns the connection that it begins, if it begins one.
+    pub(super) fn handle_datagram(
+        &mut self,
+        endpoint: usize,
+        from: SocketAddr,
+        local: Option<IpAddr>,
+        ecn: Option<EcnCodepoint>,
+        bytes: BytesMut,
+        now: Instant,
+    ) -> Option<Incoming> {
+        match self.endpoints.handle(now, endpoint, from, local, ecn, bytes) {
+            Received::Connection(handle, event) => {
+                let number = self.handles.get(&(endpoint, handle)).copied()?;
+                if let Some(connection) = self.all.get_mut(&number) {
+                    connection.quic.handle_event(event);
+                    self.touch(number);
+                }
+                None
+            }
+            Received::Incoming(incoming) => Some(incoming),
+            Received::Done => None,
+        }
+    }
+
+    /// Begins a connection to an address. Returns its number.
+    ///
+    /// # Errors
+    /// QUIC refuses; `None` if no endpoint reaches the address.
+    pub(super) fn connect(
+        &mut self,
+        to: SocketAddr,
+        config: ClientConfig,
+        now: Instant,
+    ) -> Result<u64, Option<ConnectError>> {
+        let (endpoint, handle, quic) = self.endpoints.connect(now, to, config)?;
+        Ok(self.insert(endpoint, handle, quic))
+    }
+
+    /// Accepts a connection. Returns its number.
+    ///
+    /// # Errors
+    /// Why it failed at once. The peer has been told.
+    pub(super) fn accept(
+        &mut self,
+        endpoint: usize,
+        incoming: Incoming,
+        config: Arc<ServerConfig>,
+        now: Instant,
+    ) -> Result<u64, ConnectionError> {
+        let (handle, quic) = self.endpoints.accept(now, endpoint, incoming, config)?;
+        Ok(self.insert(endpoint, handle, quic))
+    }
+
+    fn insert(
+        &mut self,
+        endpoint: usize,
+        handle: ConnectionHandle,
+        quic: quinn_proto::Connection,
+    ) -> u64 {
+        let number = self.next_number;
+        self.next_number += 1;
+        self.handles.insert((endpoint, handle), number);
+        self.all.insert(number, Connection::new(endpoint, handle, quic));
+        self.touch(number);
+        number
+    }
+
+    /// Has a connection looked at in this pass.
+    pub(super) fn touch(&mut self, number: u64) {
+        if let Some(connection) = self.all.get_mut(&number)
+            && !std::mem::replace(&mut connection.is_dirty, true)
+        {
+            self.dirty.push_back(number);
+        }
+    }
+
+    /// Whether any has something to do.
+    pub(super) fn has_work(&self) -> bool {
+        !self.dirty.is_empty()
+    }
+
+    /// The next connection with something to do. What it has for its endpoint is done.
+    pub(super) fn poll_dirty(&mut self) -> Option<u64> {
+        while let Some(number) = self.dirty.pop_front() {
+            let Some(connection) = self.all.get_mut(&number) else { continue };
+            connection.is_dirty = false;
+            while let Some(event) = connection.quic.poll_endpoint_events() {
+                let (endpoint, handle) = (connection.endpoint, connection.handle);
+                if let Some(event) = self.endpoints.handle_event(endpoint, handle, event) {
+                    connection.quic.handle_event(event);
+                }
+            }
+            return Some(number);
+        }
+        None
+    }
+
+    /// Writes what waits on the control stream, and notes when the connection is due and that it may transmit. One that
+    /// is drained is removed, unless it `stays`.
+    pub(super) fn note(&mut self, number: u64, stays: bool) {
+        let Some(connection) = self.all.get_mut(&number) else { return };
+        if connection.control.has_output() {
+            connection.control.write(&mut connection.quic);
+        }
+        if connection.quic.is_drained() && !stays {
+            return self.remove(number);
+        }
+        if !std::mem::replace(&mut connection.is_transmitting, true) {
+            self.transmitting.push_back(number);
+        }
+        self.note_deadline(number);
+    }
+
+    fn remove(&mut self, number: u64) {
+        let Some(connection) = self.all.remove(&number) else { return };
+        let handle = (connection.endpoint, connection.handle);
+        // QUIC may have given it to another connection since.
+        if self.handles.get(&handle) == Some(&number) {
+            self.handles.remove(&handle);
+        }
+        self.deadlines.remove(&(connection.deadline.unwrap_or(self.epoch), number));
+    }
+
+    fn note_deadline(&mut self, number: u64) {
+        let Some(connection) = self.all.get_mut(&number) else { return };
+        let due = connection.quic.poll_timeout();
+        if due != connection.deadline {
+            if let Some(before) = std::mem::replace(&mut connection.deadline, due) {
+                self.deadlines.remove(&(before, number));
+            }
+            self.deadlines.extend(due.map(|due| (due, number)));
+        }
+    }
+
+    /// Closes a connection. Its last packets leave with the pass.
+    pub(super) fn close(&mut self, number: u64, code: CloseCode, reason: &str, now: Instant) {
+        let Some(connection) = self.all.get_mut(&number) else { return };
+        connection.control.close();
+        let code = VarInt::from_u32(code.code());
+        let reason = Bytes::copy_from_slice(close_text(reason));
+        connection.quic.close(now, code, reason);
+        self.touch(number);
+    }
+
+    /// When [`handle_timeout`](Self::handle_timeout) is due.
+    pub(super) fn poll_timeout(&self) -> Option<Duration> {
+        let quic = self.deadlines.first().map(|(due, _)| due.saturating_duration_since(self.epoch));
+        let control = self.all.values().filter_map(|c| c.control.poll_timeout()).min();
+        [quic, control].into_iter().flatten().min()
+    }
+
+    /// Runs QUIC's timers, and has those connections looked at whose control streams may be read again.
+    pub(super) fn handle_timeout(&mut self, now: Duration) {
+        let instant = self.epoch + now;
+        while let Some((due, number)) = self.deadlines.first().copied()
+            && due <= instant
+        {
+            self.deadlines.pop_first();
+            if let Some(connection) = self.all.get_mut(&number) {
+                connection.deadline = None;
+                connection.quic.handle_timeout(instant);
+                self.touch(number);
+            }
+        }
+        let paused =
+            self.all.iter().filter(|(_, c)| c.control.poll_timeout().is_some_and(|t| t <= now));
+        let paused: Vec<u64> = paused.map(|(number, _)| *number).collect();
+        paused.into_iter().for_each(|number| self.touch(number));
+    }
+
+    /// The next packets, and the endpoint that sends them. `buffer` is cleared and filled.
+    pub(super) fn poll_transmit(
+        &mut self,
+        max_datagrams: usize,
+        buffer: &mut Vec<u8>,
+        now: Instant,
+    ) -> Option<(usize, Transmit)> {
+        buffer.clear();
+        if let Some(Packet { endpoint, to, from, ecn, bytes }) = self.endpoints.poll_packet() {
+            let size = bytes.len();
+            *buffer = bytes;
+            let transmit =
+                Transmit { destination: to, ecn, size, segment_size: None, src_ip: from };
+            return Some((endpoint, transmit));
+        }
+        while let Some(number) = self.transmitting.front().copied() {
+            let transmit = self.all.get_mut(&number).and_then(|connection| {
+                let transmit = connection.quic.poll_transmit(now, max_datagrams, buffer)?;
+                Some((connection.endpoint, transmit))
+            });
+            // Connections take turns.
+            self.transmitting.pop_front();
+            self.note_deadline(number);
+            if let Some(transmit) = transmit {
+                self.transmitting.push_back(number);
+                return Some(transmit);
+            }
+            if let Some(connection) = self.all.get_mut(&number) {
+                connection.is_transmitting = false;
+            }
+        }
+        None
+    }
+}

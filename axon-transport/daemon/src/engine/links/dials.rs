@@ -1,0 +1,138 @@
+//! The dials under way, and for whom the connections were dialled that are being opened.
+
+use std::{
+    collections::{HashMap, HashSet},
+    time::Duration,
+};
+
+use axon_shm::ids::DaemonId;
+use quinn_proto::ConnectionError;
+
+use super::events::LinkReport;
+use crate::{
+    discovery::AddressConfidence,
+    engine::{
+        keyring::Keyring,
+        link::{
+            dialling::{Action, Dialling},
+            target::Target,
+        },
+    },
+};
+
+/// The dials of this host. Each has a number.
+#[derive(Default)]
+pub(super) struct Dials {
+    under_way: HashMap<u64, Dial>,
+    next_number: u64,
+    /// Dials that may go on.
+    stirred: HashSet<u64>,
+    /// For whom connections were dialled that are being opened.
+    opening: HashMap<u64, (DaemonId, AddressConfidence)>,
+}
+
+/// One dial.
+pub(super) struct Dial {
+    pub(super) dialling: Dialling,
+    /// The connection whose handshake is under way.
+    pub(super) connection: Option<u64>,
+}
+
+impl Dials {
+    /// Begins to dial a peer.
+    pub(super) fn begin(&mut self, target: Target, keyring: Option<&Keyring>, now: Duration) {
+        let dialling = Dialling::new(now, target, keyring);
+        let number = self.next_number;
+        self.next_number += 1;
+        self.under_way.insert(number, Dial { dialling, connection: None });
+        self.stirred.insert(number);
+    }
+
+    /// A dial.
+    pub(super) fn get_mut(&mut self, number: u64) -> Option<&mut Dial> {
+        self.under_way.get_mut(&number)
+    }
+
+    /// Ends a dial.
+    pub(super) fn remove(&mut self, number: u64) -> Option<Dial> {
+        self.under_way.remove(&number)
+    }
+
+    /// Ends all dials.
+    pub(super) fn clear(&mut self) {
+        self.under_way.clear();
+    }
+
+    /// The handshake of a dial's connection is complete.
+    pub(super) fn handle_connected(&mut self, number: u64) {
+        if let Some(dial) = self.under_way.get_mut(&number) {
+            dial.dialling.handle_connected();
+            self.stirred.insert(number);
+        }
+    }
+
+    /// A dial's connection ended before its handshake was complete.
+    pub(super) fn handle_failed(&mut self, number: u64, error: &ConnectionError) {
+        if let Some(dial) = self.under_way.get_mut(&number) {
+            dial.dialling.handle_failed(error);
+            self.stirred.insert(number);
+        }
+    }
+
+    /// The KME answered: those that wait for a key ask for it again.
+    pub(super) fn handle_key(&mut self) {
+        for (number, dial) in &mut self.under_way {
+            dial.dialling.handle_key();
+            self.stirred.insert(*number);
+        }
+    }
+
+    /// Takes the numbers of those that may go on.
+    pub(super) fn take_stirred(&mut self) -> HashSet<u64> {
+        std::mem::take(&mut self.stirred)
+    }
+
+    /// What a dial has to do next.
+    pub(super) fn poll_action(
+        &mut self,
+        number: u64,
+        now: Duration,
+        keyring: Option<&mut Keyring>,
+    ) -> Option<Action> {
+        self.under_way.get_mut(&number)?.dialling.poll_action(now, keyring)
+    }
+
+    /// When [`handle_timeout`](Self::handle_timeout) is due.
+    pub(super) fn poll_timeout(&self) -> Option<Duration> {
+        self.under_way.values().filter_map(|dial| dial.dialling.poll_timeout()).min()
+    }
+
+    /// Has those go on that are due.
+    pub(super) fn handle_timeout(&mut self, now: Duration) {
+        let due = self
+            .under_way
+            .iter()
+            .filter(|(_, dial)| dial.dialling.poll_timeout().is_some_and(|due| due <= now));
+        self.stirred.extend(due.map(|(number, _)| *number));
+    }
+
+    /// Remembers for whom a connection was dialled, should its opening fail.
+    pub(super) fn note_opening(
+        &mut self,
+        connection: u64,
+        of: Option<(DaemonId, AddressConfidence)>,
+    ) {
+        self.opening.extend(of.map(|of| (connection, of)));
+    }
+
+    /// The opening of a dialled connection succeeded.
+    pub(super) fn opened(&mut self, connection: u64) {
+        self.opening.remove(&connection);
+    }
+
+    /// The opening of a connection failed. Returns the report of it if it was dialled.
+    pub(super) fn opening_failed(&mut self, connection: u64) -> Option<LinkReport> {
+        let (daemon, standing) = self.opening.remove(&connection)?;
+        Some(LinkReport::DialFailed { daemon, standing })
+    }
+}

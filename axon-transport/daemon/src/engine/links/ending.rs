@@ -1,0 +1,153 @@
+//! The ends of links: lost connections, broken rules, the end of the daemon.
+
+use std::time::Duration;
+
+use quinn_proto::ConnectionError;
+
+use super::{LinkEvent, LinkReport, Links, explained::explained, link::Phase};
+use crate::{
+    engine::refusal::{Refusal, RefusedBy},
+    link::CloseCode,
+};
+
+impl Links {
+    /// Ends the links whose connection was lost. Returns whether there were any.
+    pub(in crate::engine) fn end_lost(&mut self, now: Duration) -> bool {
+        let any = !self.lost.is_empty();
+        while let Some((number, reason)) = self.lost.pop_front() {
+            self.handle_lost(number, &reason, now);
+            self.connections.touch(number);
+        }
+        any
+    }
+
+    /// A connection was lost.
+    pub(super) fn handle_lost(&mut self, number: u64, reason: &ConnectionError, now: Duration) {
+        let Some(link) = self.table.get_mut(number) else { return };
+        match &mut link.phase {
+            Phase::Handshake(_, Some(dial)) => {
+                self.dials.handle_failed(*dial, reason);
+                self.table.remove(number);
+            }
+            Phase::Handshake(_, None) => {
+                let link = self.table.remove(number);
+                let resolver = link.and_then(|link| link.resolver);
+                let address = self.connections.address(number);
+                if let Some(address) = address
+                    && let Some(refusal) = explained(reason, resolver.as_deref(), address)
+                {
+                    self.refused_incoming(address, resolver.as_deref(), refusal);
+                }
+            }
+            Phase::Opening(opening) => {
+                opening.handle_lost(now, reason, self.keyring.as_mut());
+                self.go_on_opening(number, now);
+            }
+            Phase::Electing(_) | Phase::Open | Phase::Leaving(_) => {
+                let refusal = Refusal::of(reason);
+                let text = refusal.to_string();
+                self.end_link(number, &text, Some(refusal), now);
+            }
+        }
+    }
+
+    /// Ends a link since its host has another one.
+    pub(in crate::engine) fn replace(&mut self, number: u64, why: &str, now: Duration) {
+        self.close_connection(number, CloseCode::Replaced, why, now);
+        self.end_link(number, why, None, now);
+    }
+
+    /// Ends a link whose peer broke a rule.
+    pub(in crate::engine) fn violation(
+        &mut self,
+        number: u64,
+        code: CloseCode,
+        why: &str,
+        now: Duration,
+    ) {
+        self.violation_told(number, code, why, why, now);
+    }
+
+    /// As [`violation`](Self::violation), with another text for the peer.
+    pub(in crate::engine) fn violation_told(
+        &mut self,
+        number: u64,
+        code: CloseCode,
+        why: &str,
+        told: &str,
+        now: Duration,
+    ) {
+        if self.table.contains(number) {
+            let peer = self.peer_text(number);
+            self.outbox.report(LinkReport::Refused(peer, Refusal::here(code, why)));
+            self.close_connection(number, code, told, now);
+        }
+        self.end_link(number, why, None, now);
+    }
+
+    /// Reports a connection that was dialled and whose opening failed.
+    pub(super) fn opening_failed(&mut self, number: u64) {
+        if let Some(report) = self.dials.opening_failed(number) {
+            self.outbox.report(report);
+        }
+    }
+
+    /// Closes a connection. Its last packets leave with the pass.
+    pub(super) fn close_connection(
+        &mut self,
+        number: u64,
+        code: CloseCode,
+        reason: &str,
+        now: Duration,
+    ) {
+        let instant = self.instant(now);
+        if let Some(keyring) = &mut self.keyring {
+            keyring.forget_connection(now, number);
+        }
+        self.opening_failed(number);
+        self.connections.close(number, code, reason, instant);
+    }
+
+    /// A link is over.
+    pub(super) fn end_link(
+        &mut self,
+        number: u64,
+        reason: &str,
+        refusal: Option<Refusal>,
+        now: Duration,
+    ) {
+        let Some(link) = self.table.get(number) else { return };
+        let peer = self.peer_text(number);
+        let daemon = link.peer.as_ref().map(|peer| peer.summary.hello.daemon);
+        self.table.remove(number);
+        self.close_connection(number, CloseCode::Goodbye, "the control stream ended", now);
+        self.nonces.retain(|_, link| *link != number);
+        let Some(daemon) = daemon else { return };
+        if !self.table.let_go(daemon, number) {
+            return self.outbox.event(LinkEvent::Gone(number, daemon));
+        }
+        self.abandon_leaving(daemon, now);
+        tracing::info!(peer = %daemon, reason, "link down");
+        if let Some(refusal) = refusal.filter(|refusal| refusal.by == RefusedBy::Peer)
+            && !["GOODBYE", "DUPLICATE", "REPLACED"].contains(&refusal.name.as_str())
+        {
+            self.outbox.report(LinkReport::Refused(peer.clone(), refusal));
+        }
+        let reason = reason.to_owned();
+        self.outbox.event(LinkEvent::Down { number, daemon, peer, reason });
+    }
+
+    /// Whether all connections are over.
+    pub(in crate::engine) fn is_idle(&self) -> bool {
+        self.connections.is_empty()
+    }
+
+    /// Closes all links: this host's daemon ends.
+    pub(in crate::engine) fn close_all(&mut self, now: Duration) {
+        self.closing = true;
+        self.dials.clear();
+        for number in self.connections.numbers() {
+            self.close_connection(number, CloseCode::Goodbye, "the daemon ends", now);
+        }
+    }
+}

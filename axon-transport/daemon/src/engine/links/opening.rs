@@ -1,0 +1,238 @@
+//! The beginnings of links: a connection is dialled or accepted, its handshake ends, HELLO follows.
+
+use std::{net::SocketAddr, sync::Arc, time::Duration};
+
+use axon_tls::quic::from_handshake_data;
+use quinn_proto::{Dir, Incoming};
+
+use super::{
+    LinkReport, Links, chain,
+    dials::Dial,
+    explained::explained,
+    link::{Link, Phase},
+};
+use crate::{
+    engine::{
+        link::{
+            dialling::Action,
+            failure::peer_text,
+            opening::{Handshake, Opening, Refused},
+            target::Target,
+        },
+        refusal::Refusal,
+    },
+    keys::{self, Exporters},
+    link::{CloseCode, Hello, Side},
+};
+
+/// A dialler that has its Retry is given this long for the rest of the handshake.
+const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
+
+impl Links {
+    /// Begins to dial a peer.
+    pub(in crate::engine) fn dial(&mut self, target: Target, now: Duration) {
+        if self.closing {
+            return;
+        }
+        self.dials.begin(target, self.keyring.as_ref(), now);
+    }
+
+    /// Accepts a connection, refuses it, or has its dialler prove where it is.
+    pub(super) fn accept(&mut self, endpoint: usize, incoming: Incoming, now: Duration) {
+        if self.closing {
+            return self.connections.endpoints().refuse(endpoint, incoming);
+        }
+        if !incoming.remote_address_validated() {
+            return self.connections.endpoints().retry(endpoint, incoming);
+        }
+        let source = incoming.remote_address();
+        let Some(place) = self.admission.enter(source.ip()) else {
+            self.connections.endpoints().refuse(endpoint, incoming);
+            let instant = self.instant(now);
+            if self.admission.is_news(source.ip(), instant) {
+                let text = "hosts at this address have as many handshakes under way as they may";
+                let refusal = Refusal::here(CloseCode::NotAllowed, text);
+                self.outbox.report(LinkReport::Refused(peer_text(None, source), refusal));
+            }
+            return;
+        };
+        let resolver = self.keyring.as_ref().map(|keys| keys.resolver(now, source.ip()));
+        let server = match self.credentials.server(resolver.clone()) {
+            Ok(server) => Arc::new(server),
+            Err(error) => {
+                self.connections.endpoints().refuse(endpoint, incoming);
+                let refusal = Refusal::here(CloseCode::Internal, error);
+                return self.outbox.report(LinkReport::Refused(peer_text(None, source), refusal));
+            }
+        };
+        let instant = self.instant(now);
+        match self.connections.accept(endpoint, incoming, server, instant) {
+            Ok(number) => {
+                let mut link = Link::new(Side::Server, now + HANDSHAKE_TIMEOUT, None);
+                (link.place, link.resolver) = (Some(place), resolver);
+                self.table.insert(number, link);
+            }
+            Err(error) => {
+                if let Some(refusal) = explained(&error, resolver.as_deref(), source) {
+                    self.refused_incoming(source, resolver.as_deref(), refusal);
+                }
+            }
+        }
+    }
+
+    /// Reports an incoming handshake that failed.
+    pub(super) fn refused_incoming(
+        &mut self,
+        source: SocketAddr,
+        resolver: Option<&keys::Resolver>,
+        refusal: Refusal,
+    ) {
+        let claimed = resolver.and_then(keys::Resolver::identity);
+        let peer = peer_text(claimed.as_ref().map(|i| i.client_sae()), source);
+        self.outbox.report(LinkReport::Refused(peer, refusal));
+    }
+
+    /// The TLS handshake of a connection is complete.
+    pub(super) fn handle_connected(&mut self, number: u64, now: Duration) {
+        let Some(link) = self.table.get_mut(number) else { return };
+        let Phase::Handshake(_, dial) = link.phase else { return };
+        match dial {
+            Some(dial) => self.dials.handle_connected(dial),
+            None => {
+                let ours = self.hello.clone();
+                self.begin_opening(number, ours, None, now);
+            }
+        }
+    }
+
+    /// Begins HELLO on a connection whose handshake is complete.
+    fn begin_opening(&mut self, number: u64, ours: Hello, dialled: Option<String>, now: Duration) {
+        let (Some(connection), Some(link)) =
+            (self.connections.get_mut(number), self.table.get_mut(number))
+        else {
+            return;
+        };
+        let session = connection.quic.crypto_session();
+        let exporters = Exporters::derive(|out, label| {
+            session.export_keying_material(out, label, b"").map_err(|_| ())
+        });
+        let handshake = Handshake {
+            connection: number,
+            side: link.side,
+            remote: connection.quic.remote_address(),
+            negotiated: session.handshake_data().and_then(from_handshake_data),
+            exporters: exporters.ok(),
+            chain: chain(&connection.quic),
+            dialled,
+        };
+        if link.side == Side::Client
+            && let Some(stream) = connection.quic.streams().open(Dir::Bi)
+        {
+            connection.control.open(stream, &mut connection.quic);
+        }
+        let closed = self.credentials.closed();
+        let opening =
+            Opening::new(now, handshake, ours, &self.config, closed, self.keyring.as_mut());
+        link.phase = Phase::Opening(Box::new(opening));
+        self.go_on_opening(number, now);
+        self.connections.touch(number);
+    }
+
+    /// Passes on what an opening says, and what came of it.
+    pub(super) fn go_on_opening(&mut self, number: u64, now: Duration) {
+        let (Some(connection), Some(link)) =
+            (self.connections.get_mut(number), self.table.get_mut(number))
+        else {
+            return;
+        };
+        let Phase::Opening(opening) = &mut link.phase else { return };
+        let outcome = opening.poll_outcome(now, self.keyring.as_mut());
+        while let Some(message) = opening.poll_message() {
+            // HELLO and proofs always fit.
+            let _ = connection.control.send(&message);
+        }
+        connection.control.set_limits(opening.limits());
+        self.connections.touch(number);
+        match outcome {
+            Some(Ok(opened)) => self.established(number, opened, now),
+            Some(Err(refused)) => self.opening_refused(number, refused, now),
+            None => {}
+        }
+    }
+
+    fn opening_refused(&mut self, number: u64, refused: Refused, now: Duration) {
+        let Some(link) = self.table.remove(number) else { return };
+        let Refused { refusal, close } = refused;
+        let address = self.connections.address(number);
+        if let Some((code, told)) = close {
+            self.close_connection(number, code, &told, now);
+        }
+        let Some(address) = address else { return };
+        match link.side {
+            Side::Server => self.refused_incoming(address, link.resolver.as_deref(), refusal),
+            Side::Client => {
+                self.outbox.report(LinkReport::Refused(peer_text(None, address), refusal));
+                self.opening_failed(number);
+            }
+        }
+    }
+
+    /// Goes on with the dials that have something to do.
+    pub(super) fn go_on_dialling(&mut self, now: Duration) {
+        for dial in self.dials.take_stirred() {
+            while let Some(action) = self.dials.poll_action(dial, now, self.keyring.as_mut()) {
+                self.act(dial, action, now);
+            }
+        }
+    }
+
+    fn act(&mut self, dial: u64, action: Action, now: Duration) {
+        let instant = self.instant(now);
+        let Some(Dial { dialling, connection }) = self.dials.get_mut(dial) else { return };
+        match action {
+            Action::Connect { address, attempt } => {
+                let client = match self.credentials.client(attempt.as_deref()) {
+                    Ok(client) => client,
+                    Err(error) => return dialling.handle_unusable(error),
+                };
+                match self.connections.connect(address, client, instant) {
+                    Ok(number) => {
+                        *connection = Some(number);
+                        let mut link = Link::new(Side::Client, Duration::MAX, Some(dial));
+                        link.replaces = dialling.target().replaces;
+                        self.table.insert(number, link);
+                    }
+                    Err(error) => dialling.handle_unreachable(error.as_ref()),
+                }
+            }
+            Action::Close { code, reason } => {
+                if let Some(number) = connection.take() {
+                    self.table.remove(number);
+                    self.close_connection(number, code, reason, now);
+                }
+            }
+            Action::Open => {
+                let Some(Dial { dialling, connection: Some(number) }) = self.dials.remove(dial)
+                else {
+                    return;
+                };
+                let target = dialling.target();
+                let hello = target.hello(&self.hello);
+                let sae = target.sae.clone();
+                self.dials.note_opening(number, target.daemon.zip(target.standing));
+                self.begin_opening(number, hello, sae, now);
+                if !self.table.contains(number) {
+                    self.opening_failed(number);
+                }
+            }
+            Action::Failed(refusal) => {
+                let Some(Dial { dialling, .. }) = self.dials.remove(dial) else { return };
+                let target = dialling.target();
+                self.outbox.report(LinkReport::Refused(target.text(), refusal));
+                if let (Some(daemon), Some(standing)) = (target.daemon, target.standing) {
+                    self.outbox.report(LinkReport::DialFailed { daemon, standing });
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,203 @@
+//! The peers with an elected link, and what all of them use.
+
+use std::{
+    cell::RefCell,
+    collections::{HashMap, hash_map},
+    rc::Rc,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use axon_shm::ids::{DaemonId, Gid};
+use axon_transport::config::Config;
+
+use super::{
+    peer::{Local, Peer, Surroundings, stalls::Stalls},
+    rings::Rings,
+    stand_in::StandIns,
+};
+
+/// What following a change of this host's graph costs for each endpoint of both graphs, as an estimate: samples have
+/// nine times as long before the next one.
+const ENDPOINT: Duration = Duration::from_nanos(500);
+const OTHERS: u32 = 9;
+
+/// All peers.
+pub(super) struct Peers {
+    all: HashMap<DaemonId, Peer>,
+    config: Arc<Config>,
+    rings: Rc<dyn Rings>,
+    stand_ins: StandIns,
+    stalls: RefCell<Stalls>,
+    local: Local,
+    epoch: Instant,
+    waiting_for_room: bool,
+    /// Readers with samples to take; kept for its memory.
+    active: Vec<(Gid, Gid)>,
+    /// When the graph of this host is followed again.
+    follow_local_at: Duration,
+}
+
+impl Peers {
+    /// No peers yet, and nothing on this host. The engine's time was zero at `epoch`.
+    pub(super) fn new(config: Arc<Config>, rings: Rc<dyn Rings>, epoch: Instant) -> Self {
+        Self {
+            all: HashMap::new(),
+            config,
+            rings,
+            stand_ins: StandIns::default(),
+            stalls: RefCell::default(),
+            local: Local::new(),
+            epoch,
+            waiting_for_room: false,
+            active: Vec::new(),
+            follow_local_at: Duration::ZERO,
+        }
+    }
+
+    /// The endpoints of this host.
+    pub(super) fn local(&self) -> &Local {
+        &self.local
+    }
+
+    /// Adds a peer.
+    pub(super) fn insert(&mut self, daemon: DaemonId, peer: Peer) {
+        self.all.insert(daemon, peer);
+    }
+
+    /// Removes a peer.
+    pub(super) fn remove(&mut self, daemon: DaemonId) -> Option<Peer> {
+        self.all.remove(&daemon)
+    }
+
+    /// Whether there are none.
+    pub(super) fn is_empty(&self) -> bool {
+        self.all.is_empty()
+    }
+
+    /// A peer.
+    pub(super) fn get(&self, daemon: DaemonId) -> Option<&Peer> {
+        self.all.get(&daemon)
+    }
+
+    /// A peer.
+    pub(super) fn get_mut(&mut self, daemon: DaemonId) -> Option<&mut Peer> {
+        self.all.get_mut(&daemon)
+    }
+
+    /// All peers.
+    pub(super) fn iter(&self) -> impl Iterator<Item = (DaemonId, &Peer)> {
+        self.all.iter().map(|(daemon, peer)| (*daemon, peer))
+    }
+
+    /// All peers.
+    pub(super) fn iter_mut(&mut self) -> impl Iterator<Item = (DaemonId, &mut Peer)> {
+        self.all.iter_mut().map(|(daemon, peer)| (*daemon, peer))
+    }
+
+    /// All peers.
+    pub(super) fn values_mut(&mut self) -> hash_map::ValuesMut<'_, DaemonId, Peer> {
+        self.all.values_mut()
+    }
+
+    /// Has a peer act with what all peers use.
+    pub(super) fn with<T>(
+        &mut self,
+        daemon: DaemonId,
+        act: impl FnOnce(&mut Peer, &Surroundings<'_>) -> T,
+    ) -> Option<T> {
+        let Self { all, config, rings, stand_ins, stalls, local, epoch, .. } = self;
+        let with = surroundings(config, &**rings, stand_ins, stalls, local, *epoch);
+        all.get_mut(&daemon).map(|peer| act(peer, &with))
+    }
+
+    /// Has each peer act with what all peers use.
+    pub(super) fn with_each(&mut self, mut each: impl FnMut(&mut Peer, &Surroundings<'_>)) {
+        let Self { all, config, rings, stand_ins, stalls, local, epoch, .. } = self;
+        let with = surroundings(config, &**rings, stand_ins, stalls, local, *epoch);
+        all.values_mut().for_each(|peer| each(peer, &with));
+    }
+
+    /// The graph of this host changed.
+    pub(super) fn handle_local_graph(&mut self, local: Local, now: Duration) {
+        self.local = local;
+        let endpoints = self.all.values().map(|peer| peer.remote.len() + self.local.len());
+        let took = ENDPOINT * u32::try_from(endpoints.sum::<usize>()).unwrap_or(u32::MAX);
+        self.follow_local_at = now + OTHERS * took;
+        self.with_each(|peer, with| peer.handle_local_graph(with, now));
+    }
+
+    /// When the graph of this host should be followed next. What changes until then is followed together.
+    pub(super) fn follow_local_at(&self) -> Duration {
+        self.follow_local_at
+    }
+
+    /// Samples wait in rings, or readers made room in them.
+    pub(super) fn handle_rings(&mut self, now: Duration) {
+        let mut active = std::mem::take(&mut self.active);
+        self.rings.take_active(&mut active);
+        for peer in self.all.values_mut() {
+            peer.outbound.handle_active(&active, now);
+            peer.inbound.handle_room();
+        }
+        active.clear();
+        self.active = active;
+    }
+
+    /// Has the rings say when there is room, while a peer waits for it.
+    pub(super) fn wait_for_room(&mut self) {
+        let waiting = self.all.values().any(|peer| peer.inbound.waits_for_room());
+        if waiting || self.waiting_for_room {
+            self.waiting_for_room = waiting;
+            self.rings.set_waiting_for_room(waiting);
+        }
+    }
+
+    /// Whether samples of publishers that ended are on their way.
+    pub(super) fn are_draining(&self) -> bool {
+        self.all.values().any(Peer::is_draining)
+    }
+
+    /// When one of them has something due.
+    pub(super) fn poll_timeout(&self, now: Duration) -> Option<Duration> {
+        let due = self.all.values().flat_map(|peer| {
+            let turn = peer.stirred.then(|| {
+                let account = peer.remote.account();
+                now + account.turns.borrow_mut().wait(self.epoch + now)
+            });
+            let more = peer.inbound.has_work().then_some(now);
+            let samples = [peer.inbound.poll_timeout(), peer.outbound.poll_timeout()];
+            samples.into_iter().chain([peer.poll_timeout(self.epoch, now), turn, more])
+        });
+        due.flatten().min()
+    }
+
+    /// Does what is due, but for samples to peers, which needs their links.
+    pub(super) fn handle_timeout(&mut self, now: Duration) {
+        self.with_each(|peer, with| {
+            peer.inbound.handle_timeout(now);
+            if peer.poll_timeout(with.epoch, now).is_some_and(|due| due <= now) {
+                peer.handle_timeout(with, now);
+            }
+        });
+    }
+}
+
+fn surroundings<'a>(
+    config: &Config,
+    rings: &'a dyn Rings,
+    stand_ins: &'a StandIns,
+    stalls: &'a RefCell<Stalls>,
+    local: &'a Local,
+    epoch: Instant,
+) -> Surroundings<'a> {
+    Surroundings {
+        rings,
+        stand_ins,
+        local,
+        domain: config.domain,
+        stalled_after: config.link.stalled,
+        stalls,
+        epoch,
+    }
+}
