@@ -1,7 +1,7 @@
 //! The readers of a subscription, one for each publisher: their attachment and removal.
 
 use std::{
-    collections::HashMap,
+    collections::{BTreeSet, HashMap},
     time::{Duration, Instant},
 };
 
@@ -342,6 +342,12 @@ impl MatchedReaders {
     /// The writers that are attached, or asked to be.
     pub(in crate::session) fn writers(&self) -> Vec<Gid> {
         self.lanes().into_iter().map(|(gid, _)| gid).collect()
+    }
+
+    /// The writers of which anything is read, or may be soon, those that have ended among them.
+    pub(in crate::session) fn all_writers(&self) -> BTreeSet<Gid> {
+        let there = self.matched_readers.iter().map(|slot| slot.reader.writer());
+        there.chain(self.pending.keys().copied()).collect()
     }
 
     fn end_where(&mut self, which: impl Fn(&Reader) -> bool) -> bool {
