@@ -34,6 +34,8 @@ usage: cargo xtask COMMAND
   simulate [--seeds N] [--hosts M] [--first SEED]
                        drive M simulated hosts through mixed faults, for each of N seeds, and shrink
                        the script of a seed that fails
+  simulate --scenarios run all cases of the simulator's scenarios: daemons killed at each step, hostile
+                       peers, rebinding NATs, many hosts. cargo test runs some of them
   rustls-digests       after a change to patches/ or added/: write patched.sha256 anew
   rustls-checkout DIR [VERSION]
                        make DIR a git repository with rustls's source and a commit a patch, and

@@ -7,7 +7,16 @@ type Result<T> = std::result::Result<T, String>;
 
 /// What is simulated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Options {
+pub(crate) enum Options {
+    /// Mixed faults.
+    Seeds(Seeds),
+    /// The scenarios, each with all of its cases.
+    Scenarios,
+}
+
+/// Runs of mixed faults.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Seeds {
     /// The first seed.
     pub(crate) first: u64,
     /// How many seeds.
@@ -19,7 +28,10 @@ pub(crate) struct Options {
 impl Options {
     /// Reads the options of the command line. `None`: they are wrong.
     pub(crate) fn parse(options: &[&str]) -> Option<Self> {
-        let mut parsed = Self { first: 1, seeds: 5000, hosts: 3 };
+        if options == ["--scenarios"] {
+            return Some(Self::Scenarios);
+        }
+        let mut parsed = Seeds { first: 1, seeds: 5000, hosts: 3 };
         let mut options = options.iter();
         while let Some(name) = options.next() {
             let value: u64 = options.next()?.parse().ok()?;
@@ -30,32 +42,38 @@ impl Options {
                 _ => return None,
             }
         }
-        Some(parsed)
+        Some(Self::Seeds(parsed))
     }
 }
 
-/// Runs the seeds in release: faster, and without the debug assertions of other crates.
+/// Runs the seeds, or the scenarios, in release: faster, and without the debug assertions of other crates.
 ///
 /// # Errors
-/// A seed fails; what the simulator printed has a short script that fails too.
+/// A seed fails, and what the simulator printed has a short script that fails too; or a scenario does.
 pub(crate) fn simulate(options: Options) -> Result<String> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("xtask is in the repository");
     let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-    let status = Command::new(cargo)
-        .current_dir(root)
-        .args(["test", "--release", "-p", "axon-daemon", "--lib", "--"])
-        .args(["--exact", "engine::sim::tests::mixed_faults_break_no_promise", "--nocapture"])
-        .env("SIMULATE_FIRST", options.first.to_string())
-        .env("SIMULATE_SEEDS", options.seeds.to_string())
-        .env("SIMULATE_HOSTS", options.hosts.to_string())
-        .status()
-        .map_err(|error| format!("cargo cannot be started: {error}"))?;
-    let Options { first, seeds, hosts } = options;
-    let last = first + seeds - 1;
+    let mut command = Command::new(cargo);
+    command.current_dir(root).args(["test", "--release", "-p", "axon-daemon", "--lib", "--"]);
+    match options {
+        Options::Seeds(Seeds { first, seeds, hosts }) => command
+            .args(["--exact", "engine::sim::tests::mixed_faults_break_no_promise", "--nocapture"])
+            .env("SIMULATE_FIRST", first.to_string())
+            .env("SIMULATE_SEEDS", seeds.to_string())
+            .env("SIMULATE_HOSTS", hosts.to_string()),
+        Options::Scenarios => command.args(["engine::sim", "--nocapture"]).env("SIMULATE_ALL", "1"),
+    };
+    let status = command.status().map_err(|error| format!("cargo cannot be started: {error}"))?;
+    let what = match options {
+        Options::Seeds(Seeds { first, seeds, hosts }) => {
+            format!("seeds {first} to {}, {hosts} hosts each", first + seeds - 1)
+        }
+        Options::Scenarios => "all cases of the scenarios".to_owned(),
+    };
     if status.success() {
-        Ok(format!("seeds {first} to {last}, {hosts} hosts each: no promise was broken"))
+        Ok(format!("{what}: no promise was broken"))
     } else {
-        Err(format!("a seed of {first} to {last} with {hosts} hosts fails"))
+        Err(format!("{what}: one fails"))
     }
 }
 
@@ -65,10 +83,20 @@ mod tests {
 
     #[test]
     fn wrong_options_are_refused() {
-        assert_eq!(Options::parse(&[]), Some(Options { first: 1, seeds: 5000, hosts: 3 }));
-        let some = Options { first: 7, seeds: 10, hosts: 50 };
-        assert_eq!(Options::parse(&["--first", "7", "--seeds", "10", "--hosts", "50"]), Some(some));
-        for wrong in [&["--hosts", "1"][..], &["--seeds"], &["--seeds", "0"], &["--many", "1"]] {
+        let some = |first, seeds, hosts| Some(Options::Seeds(Seeds { first, seeds, hosts }));
+        assert_eq!(Options::parse(&[]), some(1, 5000, 3));
+        assert_eq!(Options::parse(&["--scenarios"]), Some(Options::Scenarios));
+        assert_eq!(
+            Options::parse(&["--first", "7", "--seeds", "10", "--hosts", "50"]),
+            some(7, 10, 50)
+        );
+        for wrong in [
+            &["--hosts", "1"][..],
+            &["--seeds"],
+            &["--seeds", "0"],
+            &["--many", "1"],
+            &["--scenarios", "1"],
+        ] {
             assert_eq!(Options::parse(wrong), None, "{wrong:?}");
         }
     }

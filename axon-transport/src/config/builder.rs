@@ -3,8 +3,8 @@
 use std::{fmt::Display, net::IpAddr, path::Path, time::Duration};
 
 use super::{
-    ClassicAuth, Config, ConfigError, DaemonPolicy, DiscoveryRange, KeyMode, OsFiles, QkdKex,
-    QkdPeers, QuicCipher, SecurityMode, daemon_env::DaemonEnv, names, resolve::resolve,
+    ClassicAuth, Config, ConfigError, Congestion, DaemonPolicy, DiscoveryRange, KeyMode, OsFiles,
+    QkdKex, QkdPeers, QuicCipher, SecurityMode, daemon_env::DaemonEnv, names, resolve::resolve,
     sources::Given, values::method,
 };
 
@@ -361,5 +361,16 @@ impl ConfigBuilder {
     /// What the graph of one peer may take, and its routes as much again, 1 to 1024 MiB. Default 16.
     pub fn link_graph_mb(self, mib: u64) -> Self {
         self.set("AXON_LINK_GRAPH_MB", mib)
+    }
+
+    /// The congestion controller of links. Default [`Congestion::Auto`].
+    pub fn link_congestion(self, congestion: Congestion) -> Self {
+        let word = match congestion {
+            Congestion::Auto => "auto",
+            Congestion::Delay => "delay",
+            Congestion::Cubic => "cubic",
+            Congestion::Bbr => "bbr",
+        };
+        self.set("AXON_LINK_CONGESTION", word)
     }
 }

@@ -35,8 +35,8 @@ pub use builder::ConfigBuilder;
 pub use error::ConfigError;
 pub use files::{FileFacts, FileKind, Files, OsFiles};
 pub use model::{
-    ClassicAuth, ClassicConfig, Config, DaemonPolicy, DiscoveryRange, KeyMode, LinkConfig,
-    PeerAddress, QkdConfig, QkdKex, QkdPeers, QuicCipher, Security, SecurityMode,
+    ClassicAuth, ClassicConfig, Config, Congestion, DaemonPolicy, DiscoveryRange, KeyMode,
+    LinkConfig, PeerAddress, QkdConfig, QkdKex, QkdPeers, QuicCipher, Security, SecurityMode,
 };
 pub use place::DaemonPlace;
 pub use summary::security_settings;

@@ -318,11 +318,27 @@ pub struct LinkConfig {
     pub mtu: u16,
     /// What the graph of one peer may take here, and its routes as much again, in bytes.
     pub graph: usize,
+    /// How a link finds its share of the path.
+    pub congestion: Congestion,
+}
+
+/// The congestion controller of links (`AXON_LINK_CONGESTION`). Either side of a link decides for what it sends.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Congestion {
+    /// `Delay` to private and link-local addresses, `Cubic` to all others.
+    #[default]
+    Auto,
+    /// AXON's own: it keeps queues short and ignores random loss, as radio links need it.
+    Delay,
+    /// CUBIC (RFC 9438), which most of the Internet uses.
+    Cubic,
+    /// BBR, as the QUIC library has it.
+    Bbr,
 }
 
 impl Default for LinkConfig {
     fn default() -> Self {
         let ten = Duration::from_secs(10);
-        Self { grace: ten, stalled: ten, mtu: 1452, graph: 16 << 20 }
+        Self { grace: ten, stalled: ten, mtu: 1452, graph: 16 << 20, congestion: Congestion::Auto }
     }
 }

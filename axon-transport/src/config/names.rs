@@ -41,8 +41,13 @@ pub(super) const SETTINGS: &[&str] = &[
 ];
 
 /// What `[link]` of `axon.toml` holds, as variables: there `AXON_LINK_MTU` is `mtu`.
-pub(super) const LINK: &[&str] =
-    &["AXON_LINK_GRACE_S", "AXON_LINK_STALLED_S", "AXON_LINK_MTU", "AXON_LINK_GRAPH_MB"];
+pub(super) const LINK: &[&str] = &[
+    "AXON_LINK_GRACE_S",
+    "AXON_LINK_STALLED_S",
+    "AXON_LINK_MTU",
+    "AXON_LINK_GRAPH_MB",
+    "AXON_LINK_CONGESTION",
+];
 
 /// Settings that name files. A relative one is another file for a process in another directory.
 pub(super) const PATHS: &[&str] = &[

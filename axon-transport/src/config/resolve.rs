@@ -7,8 +7,8 @@ use std::{
 };
 
 use super::{
-    ClassicAuth, ClassicConfig, Config, ConfigError, DaemonPolicy, DiscoveryRange, KeyMode,
-    LinkConfig, QkdConfig, QkdKex, QkdPeers, QuicCipher, Security, SecurityMode,
+    ClassicAuth, ClassicConfig, Config, ConfigError, Congestion, DaemonPolicy, DiscoveryRange,
+    KeyMode, LinkConfig, QkdConfig, QkdKex, QkdPeers, QuicCipher, Security, SecurityMode,
     daemon_env::DaemonEnv,
     files::Files,
     names,
@@ -297,6 +297,14 @@ pub(super) fn runtime_dir(
     Ok((xdg.filter(|path| path.is_absolute()).map(|path| path.join("axon")), false))
 }
 
+/// The values of `AXON_LINK_CONGESTION`.
+const CONGESTION: [(&str, Congestion); 4] = [
+    ("auto", Congestion::Auto),
+    ("delay", Congestion::Delay),
+    ("cubic", Congestion::Cubic),
+    ("bbr", Congestion::Bbr),
+];
+
 fn link(values: &Values<'_, impl Files>) -> Result<LinkConfig, ConfigError> {
     let sources = values.sources;
     let mut link = LinkConfig::default();
@@ -318,8 +326,17 @@ fn link(values: &Values<'_, impl Files>) -> Result<LinkConfig, ConfigError> {
             "stalled_s" => link.stalled = Duration::from_secs(number(1, 86_400, "seconds")?),
             "mtu" => link.mtu = number(1_200, 65_527, "bytes")? as u16,
             "graph_mb" => link.graph = (number(1, 1_024, "MiB")? as usize) << 20,
+            "congestion" => {
+                let word = value.as_str().unwrap_or_else(|| value.type_str());
+                let known = CONGESTION.iter().find(|(name, _)| *name == word);
+                let accepted = || CONGESTION.map(|(word, _)| word).join(", ");
+                link.congestion = known
+                    .map(|(_, congestion)| *congestion)
+                    .ok_or_else(|| ConfigError::value(&name, word, accepted()).at(&*place))?;
+            }
             _ => {
-                return Err(ConfigError::name(&name, "grace_s, stalled_s, mtu, graph_mb").at(place));
+                let known = "grace_s, stalled_s, mtu, graph_mb, congestion";
+                return Err(ConfigError::name(&name, known).at(place));
             }
         }
     }
@@ -335,6 +352,9 @@ fn link(values: &Values<'_, impl Files>) -> Result<LinkConfig, ConfigError> {
     }
     if let Some(graph) = values.number("AXON_LINK_GRAPH_MB", 1..=1_024, "MiB")? {
         link.graph = (graph as usize) << 20;
+    }
+    if let Some(congestion) = values.choice("AXON_LINK_CONGESTION", &CONGESTION)? {
+        link.congestion = congestion;
     }
     Ok(link)
 }

@@ -3,6 +3,7 @@
 
 use std::{
     collections::{BTreeMap, HashMap},
+    ops::Range,
     os::fd::OwnedFd,
     sync::Arc,
     time::{Duration, SystemTime},
@@ -12,11 +13,11 @@ use axon_shm::{Meta, PublishError, Sample, internal::SessionSegment};
 
 use super::{
     EndpointSpec, Lifetime, MessageInfo, Node, Publisher, Server, Session, SessionError,
-    SessionOptions, Subscription,
+    SessionOptions, Subscription, TakeLimit,
     daemon::connect::Caller,
     daemon::control::Start,
     state::Outgoing,
-    subscription::{SubscriptionInner, take_of},
+    subscription::{SubscriptionInner, take_many_of, take_of},
 };
 use crate::{
     config::Config,
@@ -150,6 +151,21 @@ impl Publisher {
     pub fn try_publish_with(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
         self.inner.published(self.writer.try_publish(meta, payload)).map(drop)
     }
+
+    /// As [`try_publish_with`](Self::try_publish_with), but readers that sleep may sleep on until
+    /// [`announce`](Self::announce).
+    ///
+    /// # Errors
+    /// As for [`try_publish_with`](Self::try_publish_with).
+    pub fn try_publish_quietly(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
+        self.inner.published(self.writer.try_publish_quietly(meta, payload)).map(drop)
+    }
+
+    /// Wakes the readers that sleep, for samples that were published
+    /// [quietly](Self::try_publish_quietly).
+    pub fn announce(&self) {
+        self.writer.announce();
+    }
 }
 
 #[doc(hidden)]
@@ -176,6 +192,14 @@ impl Subscription {
     /// For a relay: how many samples of this publisher newer ones replaced before they were taken.
     pub fn lost_of(&self, writer: &Gid) -> u64 {
         if self.session.is_forked() { 0 } else { self.inner.lock().lost_of(writer) }
+    }
+
+    /// For a relay: passes over all samples of this publisher but the newest `depth`, which count as
+    /// [lost](Self::lost_of).
+    pub fn skip_of(&self, writer: &Gid, depth: u64) {
+        if !self.session.is_forked() {
+            self.inner.lock().skip_of(writer, depth);
+        }
     }
 
     /// For a relay: samples of this publisher up to this number are where they are to go. Until then
@@ -209,6 +233,18 @@ impl Subscription {
         take_of(&self.inner, &self.session, writer)
     }
 
+    /// For a relay: the next samples of one publisher, with their payloads one behind the other in `out`, which
+    /// they replace. `each` is told where a sample's payload is. Returns how many samples it took.
+    pub fn take_many_of(
+        &self,
+        writer: &Gid,
+        most: TakeLimit,
+        out: &mut Vec<u8>,
+        each: impl FnMut(MessageInfo, Range<usize>),
+    ) -> usize {
+        take_many_of(&self.inner, &self.session, writer, most, out, each)
+    }
+
     /// The publishers of which there is something to take.
     pub fn with_data(&self) -> Vec<Gid> {
         if self.session.is_forked() { Vec::new() } else { self.inner.lock().with_data().collect() }
@@ -217,6 +253,12 @@ impl Subscription {
     /// Whether it reads what this publisher writes or wrote, or may do so soon.
     pub fn reads(&self, writer: &Gid) -> bool {
         !self.session.is_forked() && self.inner.lock().reads(writer)
+    }
+
+    /// For a relay: after what time [`take_of`](Self::take_of) may have a sample of this publisher, where it had none
+    /// although some wait. It had passed over samples that do not count, or there was no memory for one.
+    pub fn retry_of(&self, writer: &Gid) -> Option<Duration> {
+        if self.session.is_forked() { None } else { self.inner.lock().retry_of(writer) }
     }
 
     /// Whether there is something to take of this publisher.

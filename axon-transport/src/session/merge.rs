@@ -79,6 +79,19 @@ impl<T> Merge<T> {
         self.given = self.given.max(Some(number));
     }
 
+    /// Whether there is one reader, whose messages may go [past it](Self::give).
+    pub fn is_of_one(&self) -> bool {
+        self.ways.len() == 1 && !self.behind && !self.holds_any()
+    }
+
+    /// Gives on the message of this number, which its caller has taken from the only reader. False: it was given on
+    /// before.
+    pub fn give(&mut self, number: u64) -> bool {
+        let is_new = Some(number) > self.given;
+        self.given = self.given.max(Some(number));
+        is_new
+    }
+
     /// Whether there is a message that a reader has given up to it.
     pub fn holds(&self, reader: &Gid) -> bool {
         self.ways.get(reader).is_some_and(|way| way.next.is_some())
@@ -282,6 +295,20 @@ mod tests {
         readers.have(OTHER, whole(4..=4));
         readers.have(OTHER, whole(7..=7));
         assert_eq!(all(&mut merge, &readers), [(5, 0), (7, 0)]);
+    }
+
+    #[test]
+    fn messages_of_one_reader_that_go_past_it_are_not_given_on_again() {
+        let (mut merge, readers) = (merge(), Readers::default());
+        assert!(!merge.is_of_one());
+        merge.set([ONE]);
+        merge.pass(3);
+        assert!(merge.is_of_one());
+        let given: Vec<_> = (1..=6).filter(|number| merge.give(*number)).collect();
+        assert_eq!(given, [4, 5, 6]);
+        merge.set([ONE, OTHER]);
+        readers.have(OTHER, whole(1..=7));
+        assert!(all(&mut merge, &readers).into_iter().eq(whole(7..=7)));
     }
 
     #[test]

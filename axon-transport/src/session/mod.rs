@@ -54,7 +54,7 @@ pub use remote_writer::{RemoteWriter, Written};
 pub use service::{Client, Server};
 pub use state::SessionEvent;
 pub(crate) use state::Shared;
-pub use subscription::{Lifetime, MessageInfo, Subscription, TrustedSubscription};
+pub use subscription::{Lifetime, MessageInfo, Subscription, TakeLimit, TrustedSubscription};
 pub use tasks::{CallError, Messages};
 pub use waiting::{Ready, Waitable};
 

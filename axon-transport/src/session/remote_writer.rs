@@ -114,6 +114,32 @@ impl RemoteWriter {
         Ok(if there { Written::Yes } else { Written::Nobody })
     }
 
+    /// As [`try_write`](Self::try_write), but readers of a sample that sleep may sleep on until
+    /// [`announce`](Self::announce): for several that are written together.
+    ///
+    /// # Errors
+    /// As for [`try_write`](Self::try_write).
+    pub fn try_write_quietly(
+        &self,
+        client: &Gid,
+        meta: Meta,
+        payload: &[u8],
+    ) -> Result<Written, PublishError> {
+        match self {
+            Self::Publisher(publisher) => {
+                publisher.try_publish_quietly(meta, payload).map(|()| Written::Yes)
+            }
+            Self::Client(_) | Self::Server(_) => self.try_write(client, meta, payload),
+        }
+    }
+
+    /// Wakes the readers that sleep, for samples that were written [quietly](Self::try_write_quietly).
+    pub fn announce(&self) {
+        if let Self::Publisher(publisher) = self {
+            publisher.announce();
+        }
+    }
+
     /// The number up to which what it has written is where it is to go, as far as that takes longer than
     /// writing it.
     pub fn delivered_up_to(&self) -> Option<u64> {

@@ -139,7 +139,7 @@ impl Dialler {
             {
                 match action {
                     Action::Connect { address, attempt } => {
-                        match self.credentials.client(forged.or(attempt.as_deref())) {
+                        match self.credentials.client(forged.or(attempt.as_deref()), address.ip()) {
                             Ok(client) => match self.begin(client, address) {
                                 Ok(begun) => connecting = Some(begun),
                                 Err(error) => dialling.handle_unreachable(error.as_ref()),

@@ -135,7 +135,7 @@ impl Link {
         .await
         .map_err(|_| Refusal::network("the daemon did not subscribe, or no key became READY"))??;
 
-        let header = stream_header(true, subscribe.route, publisher);
+        let header = stream_header(true, false, subscribe.route, publisher);
         let mut stream = self.connection.open_uni().await.map_err(internal)?;
         if write(&mut stream, &header, frame, tamper).await.is_err() {
             return Err(self.closed().await);
@@ -221,11 +221,12 @@ impl Link {
         let domain = self.dialler.config().domain;
         let hash = TopicHash::new(domain, topic, type_name).map_err(internal)?;
         let route = Route { kind: Kind::Topic, topic: hash };
-        let sample = Sample::new(MessageInfo::of(publisher, 1), b"an attempt".to_vec(), now);
+        let sample =
+            Sample::new(MessageInfo::of(publisher, 1), b"an attempt".as_slice().into(), now);
         loop {
             let (now, mut frames) = (self.dialler.now(), Frames::default());
             if let Some(mut seal) = self.protection()
-                && seal.write(&sample, route, Delivery::Reliable, &mut frames, now).is_ok()
+                && seal.write(&sample, route, Delivery::Reliable, None, &mut frames, now).is_ok()
             {
                 return Ok(frames.take().concat());
             }

@@ -1,6 +1,6 @@
 //! One QUIC connection and its control stream.
 
-use std::collections::HashMap;
+use std::{collections::HashMap, time::Duration};
 
 use quinn_proto::{ConnectionHandle, StreamId};
 
@@ -10,12 +10,18 @@ use super::{
     protection::Seal,
 };
 
-/// Bulk that QUIC holds, at least and at most. Between them it is the congestion window and a little more: as much as
-/// may be on the way, and what leaves before the next pass. All else waits in the flows, where a newer sample can
-/// replace it.
-const BULK: (u64, u64) = (128 << 10, 16 << 20);
-/// Bulk that QUIC holds beyond the congestion window, at least.
+/// Bulk that QUIC holds at most. Below that it is the congestion window and a little more: as much as may be on the
+/// way, and what leaves before the next pass. All else waits in the flows, where a newer sample can replace it.
+const MOST_BULK: u64 = 16 << 20;
+/// Bulk that QUIC holds beyond the congestion window: so much, or as much again as a smaller window, or an eighth of a
+/// larger one. On a slow path 64 KiB would take a quarter of a second.
 const AHEAD: u64 = 64 << 10;
+/// How often the share of lost packets is measured, and how many packets make a measure.
+const LOSS_EVERY: (Duration, u64) = (Duration::from_millis(100), 20);
+/// Loss below this asks for no more bulk.
+const NOTABLE_LOSS: f64 = 0.001;
+/// Times that bulk is multiplied under loss, at most.
+const MOST_ROUNDS: f64 = 6.0;
 /// Bytes more that QUIC holds for all other classes.
 const RESERVE: u64 = 1 << 20;
 
@@ -31,6 +37,8 @@ pub(crate) struct Connection {
     pub(super) control: Control,
     /// The flow of each data stream that this side opened.
     pub(super) flows: HashMap<StreamId, FlowId>,
+    /// How much is lost on the way.
+    loss: Loss,
     /// Whether it is in the list of connections with something to do.
     pub(super) is_dirty: bool,
     /// Whether it is in the list of connections that may transmit.
@@ -51,6 +59,7 @@ impl Connection {
             quic,
             control: Control::default(),
             flows: HashMap::new(),
+            loss: Loss::default(),
             is_dirty: false,
             is_transmitting: false,
             deadline: None,
@@ -58,9 +67,12 @@ impl Connection {
     }
 
     /// The connection as a carrier of samples.
-    pub(super) fn carrier<'a>(&'a mut self, seal: Seal<'a>) -> Carrier<'a> {
+    pub(super) fn carrier<'a>(&'a mut self, seal: Seal<'a>, now: Duration) -> Carrier<'a> {
         let window = self.quic.congestion_state().window();
-        let bulk = (window + AHEAD.max(window / 8)).clamp(BULK.0, BULK.1);
+        self.loss.measure(&self.quic, now);
+        let rounds = self.loss.rounds(window, self.quic.current_mtu());
+        let ahead = AHEAD.min(window).max(window / 8);
+        let bulk = (((window + ahead) as f64 * rounds) as u64).min(MOST_BULK);
         Carrier {
             quic: &mut self.quic,
             seal,
@@ -70,6 +82,45 @@ impl Connection {
             window,
             bulk,
         }
+    }
+}
+
+/// The share of packets that are lost lately.
+#[derive(Debug, Default)]
+struct Loss {
+    /// When it is measured again.
+    due: Duration,
+    /// Packets sent and lost at the last measure.
+    sent: u64,
+    lost: u64,
+    share: f64,
+}
+
+impl Loss {
+    fn measure(&mut self, quic: &quinn_proto::Connection, now: Duration) {
+        if now < self.due {
+            return;
+        }
+        let path = quic.stats().path;
+        let sent = path.sent_packets.saturating_sub(self.sent);
+        self.due = now + LOSS_EVERY.0;
+        if sent < LOSS_EVERY.1 {
+            return;
+        }
+        let lost = path.lost_packets.saturating_sub(self.lost) as f64 / sent as f64;
+        (self.sent, self.lost) = (path.sent_packets, path.lost_packets);
+        self.share += (lost.min(0.9) - self.share) / 2.0;
+    }
+
+    /// Windows of bulk that QUIC needs to keep the path full. It counts all bytes of a stream from the first one that
+    /// is not acknowledged. Of a window of n packets all but one have arrived after as many rounds as it takes until
+    /// `share` to their power is 1/n; what was sent in these rounds behind the last one counts too.
+    fn rounds(&self, window: u64, mtu: u16) -> f64 {
+        if self.share < NOTABLE_LOSS {
+            return 1.0;
+        }
+        let packets = (window as f64 / f64::from(mtu)).max(2.0);
+        (1.0 + packets.ln() / -self.share.ln()).min(MOST_ROUNDS)
     }
 }
 

@@ -160,6 +160,12 @@ impl Control {
         self.ended = true;
     }
 
+    /// Bytes that wait to be sent, and that came and are not handled.
+    #[cfg(test)]
+    pub(super) fn held(&self) -> (usize, usize) {
+        (self.queued, self.piece.len() + self.frame.len())
+    }
+
     /// Whether frames wait.
     pub(super) fn has_output(&self) -> bool {
         !self.out.is_empty() || self.finishing && !self.finished

@@ -1,6 +1,13 @@
 //! The TLS settings of both sides of a handshake, and whether a peer is trusted.
 
-use std::{sync::Arc, time::SystemTime};
+use std::{
+    net::IpAddr,
+    sync::{
+        Arc,
+        atomic::{AtomicU64, Ordering},
+    },
+    time::{Duration, SystemTime},
+};
 
 use axon_tls::{
     Negotiated,
@@ -8,12 +15,13 @@ use axon_tls::{
     quic::{ALPN, hybrid_client, hybrid_server, qkd_client, qkd_server},
 };
 use axon_transport::config::{Config, Security};
+use quinn_proto::TimeSource;
 use rustls_pki_types::CertificateDer;
 
 use crate::{
     engine::{
         tls_settings::{psk_kex, tls_cipher},
-        transport::transport,
+        transport::Transports,
     },
     error::GatewayError,
     identity::Identity,
@@ -24,18 +32,37 @@ use crate::{
 /// Handshakes of unvalidated addresses that QUIC keeps.
 const MAX_INCOMING: usize = 256;
 
+/// The engine's time, in seconds, as QUIC dates the tokens that validate addresses. QUIC's own default is the wall clock:
+/// one that jumps would refuse a handshake that is under way. Another daemon does not see these tokens.
+#[derive(Debug, Default)]
+struct TokenTime(AtomicU64);
+
+impl TimeSource for TokenTime {
+    fn now(&self) -> SystemTime {
+        // Relaxed: the engine's thread alone writes and reads it.
+        SystemTime::UNIX_EPOCH + Duration::from_secs(self.0.load(Ordering::Relaxed))
+    }
+}
+
 /// This host's identity and settings for handshakes.
 pub(crate) struct Credentials {
     config: Arc<Config>,
     /// The classic identity; `None` in qkd.
     identity: Option<Arc<Identity>>,
-    transport: Arc<quinn_proto::TransportConfig>,
+    transports: Transports,
+    time: Arc<TokenTime>,
 }
 
 impl Credentials {
     /// The settings of `config`, with the identity that its files say.
     pub(crate) fn new(config: Arc<Config>, identity: Option<Arc<Identity>>) -> Self {
-        Self { transport: transport(&config), config, identity }
+        Self { transports: Transports::new(&config), config, identity, time: Arc::default() }
+    }
+
+    /// The engine's time goes on.
+    pub(super) fn set_time(&self, now: Duration) {
+        // Relaxed: see `TokenTime`.
+        self.time.0.store(now.as_secs(), Ordering::Relaxed);
     }
 
     /// The classic identity in force; `None` in qkd.
@@ -53,13 +80,14 @@ impl Credentials {
         self.identity.as_ref().and_then(|identity| identity.closed())
     }
 
-    /// The client's side of a handshake, in qkd on one PSK.
+    /// The client's side of a handshake with a server at `address`, in qkd on one PSK.
     ///
     /// # Errors
     /// The settings, or the key, make no TLS client.
     pub(crate) fn client(
         &self,
         attempt: Option<&Attempt>,
+        address: IpAddr,
     ) -> Result<quinn_proto::ClientConfig, GatewayError> {
         let mut client = match (&self.config.security, attempt, self.auth()) {
             (Security::Qkd(qkd), Some(attempt), _) => {
@@ -70,17 +98,18 @@ impl Credentials {
             }
             _ => return Err(GatewayError::WrongMode),
         };
-        client.transport_config(Arc::clone(&self.transport));
+        client.transport_config(self.transports.towards(address));
         Ok(client)
     }
 
-    /// The server's side of a handshake, in qkd with the resolver of PSKs.
+    /// The server's side of a handshake with a client at `address`, in qkd with the resolver of PSKs.
     ///
     /// # Errors
     /// The settings make no TLS server.
     pub(crate) fn server(
         &self,
         resolver: Option<Arc<Resolver>>,
+        address: IpAddr,
     ) -> Result<quinn_proto::ServerConfig, GatewayError> {
         let cipher = tls_cipher(self.config.cipher);
         let mut server = match (&self.config.security, resolver, self.auth()) {
@@ -91,7 +120,8 @@ impl Credentials {
             _ => return Err(GatewayError::WrongMode),
         };
         server
-            .transport_config(Arc::clone(&self.transport))
+            .transport_config(self.transports.towards(address))
+            .time_source(Arc::clone(&self.time) as _)
             .migration(true)
             .max_incoming(MAX_INCOMING);
         Ok(server)

@@ -16,6 +16,11 @@ pub(crate) struct Frames {
 }
 
 impl Frames {
+    /// Has room for so many bytes that are copied, in one allocation.
+    pub(crate) fn reserve(&mut self, bytes: usize) {
+        self.growing.reserve_exact(bytes);
+    }
+
     /// Adds a copy of `bytes`.
     pub(crate) fn copy(&mut self, bytes: &[u8]) {
         self.growing.extend_from_slice(bytes);
@@ -30,26 +35,23 @@ impl Frames {
         self.pieces.push(payload.clone());
     }
 
-    /// Adds what `write` makes of so many zeros at most: as many bytes of their front as it says. If it
-    /// fails, nothing.
-    pub(crate) fn fill<E>(
+    /// Has `write` add so many bytes at most to those that it is given, and no more, in memory of their own where they
+    /// are many. If it fails, nothing is added.
+    pub(crate) fn append<E>(
         &mut self,
         most: usize,
-        write: impl FnOnce(&mut [u8]) -> Result<usize, E>,
+        write: impl FnOnce(&mut Vec<u8>) -> Result<(), E>,
     ) -> Result<(), E> {
         if most > COPIED {
             self.close();
+            self.growing.reserve_exact(most);
         }
         let at = self.growing.len();
-        if at == 0 && most > self.growing.capacity() {
-            // Zeroed memory is what the allocator may have anyway.
-            self.growing = vec![0; most];
-        } else {
-            self.growing.resize(at + most, 0);
+        let written = write(&mut self.growing);
+        if written.is_err() {
+            self.growing.truncate(at);
         }
-        let written = write(&mut self.growing[at..]);
-        self.growing.truncate(at + written.as_ref().copied().unwrap_or(0));
-        written.map(drop)
+        written
     }
 
     /// Takes what there is.
@@ -94,17 +96,20 @@ mod tests {
     }
 
     #[test]
-    fn what_fails_leaves_nothing_and_what_is_shorter_than_announced_no_gap() {
+    fn what_fails_leaves_nothing() {
         let mut frames = Frames::default();
         frames.copy(b"a");
         for most in [4, COPIED + 4] {
-            assert_eq!(frames.fill(most, |_| Err("no")), Err("no"));
-            let write = |out: &mut [u8]| {
-                assert!(out.len() == most && out.iter().all(|byte| *byte == 0));
-                out[..2].copy_from_slice(b"bc");
-                Ok::<_, &str>(2)
+            let fails = |out: &mut Vec<u8>| {
+                out.extend_from_slice(b"xy");
+                Err("no")
             };
-            assert_eq!(frames.fill(most, write), Ok(()));
+            assert_eq!(frames.append(most, fails), Err("no"));
+            let write = |out: &mut Vec<u8>| {
+                out.extend_from_slice(b"bc");
+                Ok::<_, &str>(())
+            };
+            assert_eq!(frames.append(most, write), Ok(()));
         }
         frames.copy(b"d");
         assert_eq!(bytes(&mut frames), b"abcbcd");

@@ -7,6 +7,7 @@
 #![forbid(unsafe_code)]
 
 pub(crate) mod account;
+mod congestion;
 pub(crate) mod connection;
 pub(crate) mod control;
 pub(crate) mod counters;
@@ -26,6 +27,7 @@ mod peers;
 pub(crate) mod protection;
 pub(crate) mod refusal;
 pub(crate) mod rings;
+pub(crate) mod short_header;
 #[cfg(test)]
 mod sim;
 pub(crate) mod stand_in;
@@ -351,7 +353,7 @@ impl Engine {
         let mut events = Vec::new();
         for (daemon, peer) in self.peers.iter_mut() {
             if peer.outbound.has_work()
-                && let Some(mut carrier) = self.links.carrier(peer.link)
+                && let Some(mut carrier) = self.links.carrier(peer.link, now)
             {
                 peer.outbound.pump(&mut carrier, now);
                 self.links.touch(peer.link);
@@ -443,7 +445,7 @@ impl Engine {
                 continue;
             }
             let heard = self.links.heard(peer.link);
-            let mut carrier = self.links.carrier(peer.link);
+            let mut carrier = self.links.carrier(peer.link, now);
             peer.outbound.handle_timeout(carrier.as_mut(), heard, now);
             self.links.touch(peer.link);
         }

@@ -4,8 +4,12 @@ use std::{borrow::Cow, time::Duration};
 
 use axon_envelope::{Delivery, Kind, OpenError, Route, TAG_LEN, inner};
 use axon_shm::ids::Gid;
+use bytes::Bytes;
 
-use super::rings::Sample;
+use super::{
+    rings::Sample,
+    short_header::{ShortHeaders, Told},
+};
 use crate::{
     engine::frames::Frames,
     keys::{NoKey, Receiver, Sender},
@@ -39,7 +43,12 @@ impl Seal<'_> {
         }
     }
 
-    /// Adds a message to `frames`.
+    /// The short headers of a new stream, if its messages have such: within an envelope stands the inner header.
+    pub(crate) fn short_headers(&self) -> Option<ShortHeaders> {
+        matches!(self, Self::Link).then(ShortHeaders::default)
+    }
+
+    /// Adds a message to `frames`, behind its inner header or, in a stream that has such, a short one.
     ///
     /// # Errors
     /// There is no key for it. Nothing is added then.
@@ -48,39 +57,61 @@ impl Seal<'_> {
         sample: &Sample,
         route: Route,
         delivery: Delivery,
+        short: Option<&mut ShortHeaders>,
         frames: &mut Frames,
         now: Duration,
     ) -> Result<(), NoKey> {
-        let header = header(sample, now).encode();
-        let plain = header.len() + sample.payload.len();
-        match self {
-            Self::Link => {
-                frames.copy(&(plain as u32).to_be_bytes());
-                frames.copy(&header);
-                frames.share(&sample.payload);
+        match (self, short) {
+            (Self::Link, Some(short)) => {
+                let header = short.write(Told {
+                    sequence: sample.info.sequence,
+                    source_timestamp: unix_nanos(sample.info.source_timestamp),
+                    age_ms: age(sample, now),
+                });
+                plain(header.as_slice(), &sample.payload, frames);
                 Ok(())
             }
-            Self::Envelope { sender, connection } => {
+            (Self::Link, None) => {
+                plain(&header(sample, now).encode(), &sample.payload, frames);
+                Ok(())
+            }
+            (Self::Envelope { sender, connection }, _) => {
                 if sender.attached() != Some(*connection) {
                     return Err(NoKey::Detached);
                 }
-                let most = LENGTH + sender.overhead() + plain;
+                let header = header(sample, now).encode();
                 let slot = sender.slot(now, delivery)?;
-                let parts: [&[u8]; 2] = [&header, &sample.payload];
-                frames.fill(most, |frame| {
-                    let sealed = slot.seal_into(route, &parts, &mut frame[LENGTH..]);
-                    let length = sealed.map_err(|_| NoKey::None)?;
-                    frame[..LENGTH].copy_from_slice(&(length as u32).to_be_bytes());
-                    Ok(LENGTH + length)
+                let length = slot.overhead() + header.len() + sample.payload.len();
+                frames.append(LENGTH + length, |frame| {
+                    frame.extend_from_slice(&(length as u32).to_be_bytes());
+                    // Sealed where it leaves from.
+                    let at = frame.len();
+                    frame.resize(at + slot.header_len(), 0);
+                    frame.extend_from_slice(&header);
+                    frame.extend_from_slice(&sample.payload);
+                    frame.resize(at + length, 0);
+                    slot.seal_in_place(route, &mut frame[at..]).map_err(|_| NoKey::None)
                 })
             }
         }
     }
 }
 
+/// Adds a message that has no envelope.
+fn plain(header: &[u8], payload: &Bytes, frames: &mut Frames) {
+    let length = header.len() + payload.len();
+    frames.copy(&(length as u32).to_be_bytes());
+    frames.copy(header);
+    frames.share(payload);
+}
+
+/// A sample's age in milliseconds.
+fn age(sample: &Sample, now: Duration) -> u32 {
+    u32::try_from(sample.age(now).as_millis()).unwrap_or(u32::MAX)
+}
+
 /// The header of a message.
 fn header(sample: &Sample, now: Duration) -> inner::Header {
-    let age = sample.age(now).as_millis();
     let request_id = sample.client.map_or_else(inner::RequestId::default, |client| {
         inner::RequestId { client: client.0, sequence: number(sample.info.sequence) }
     });
@@ -90,7 +121,7 @@ fn header(sample: &Sample, now: Duration) -> inner::Header {
         source_timestamp: unix_nanos(sample.info.source_timestamp),
         request_id,
         compressed: false,
-        age_ms: u32::try_from(age).unwrap_or(u32::MAX),
+        age_ms: age(sample, now),
         uncompressed_len: u32::try_from(sample.payload.len()).unwrap_or(u32::MAX),
     }
 }

@@ -4,7 +4,11 @@
 use std::{collections::HashMap, rc::Rc, time::Duration};
 
 use axon_shm::{Meta, ids::Gid};
-use axon_transport::{EndpointSpec, MessageInfo, graph::Endpoint, internal::session::Written};
+use axon_transport::{
+    EndpointSpec, MessageInfo,
+    graph::Endpoint,
+    internal::session::{TakeLimit, Written},
+};
 use bytes::Bytes;
 
 /// Opens readers and writers.
@@ -45,9 +49,20 @@ pub(crate) trait RingReader {
     fn reads(&self, publisher: &Gid) -> bool;
     /// The publishers that it reads.
     fn matched(&self) -> Vec<Gid>;
-    /// Takes the next sample of a publisher.
-    fn take_of(&self, publisher: &Gid) -> Option<(MessageInfo, Vec<u8>)>;
-    /// How many samples of this publisher newer ones replaced before they were taken.
+    /// Takes the next samples of a publisher, as many as `most` says. Returns how many.
+    fn take_many(
+        &self,
+        publisher: &Gid,
+        most: TakeLimit,
+        each: &mut dyn FnMut(MessageInfo, Bytes),
+    ) -> usize;
+    /// After what time [`take_many`](Self::take_many) may have a sample, where it had none although some wait: it passes
+    /// over a number that do not count, such as expired ones, and then lets others have their turn; or there was no
+    /// memory for a sample.
+    fn retry_of(&self, publisher: &Gid) -> Option<Duration>;
+    /// Passes over all samples of this publisher but the newest `depth`.
+    fn skip_of(&self, publisher: &Gid, depth: u64);
+    /// How many samples of this publisher newer ones replaced before they were taken, or were passed over.
     fn lost_of(&self, _publisher: &Gid) -> u64 {
         0
     }
@@ -79,11 +94,14 @@ pub(crate) trait RingWriter {
     fn endpoint(&self) -> &Endpoint;
     /// The local endpoints that it reaches.
     fn partners(&self) -> Vec<Gid>;
-    /// Writes a sample; `client` is the client that a response answers.
+    /// Writes a sample; `client` is the client that a response answers. A subscription that sleeps may sleep on until
+    /// [`announce`](Self::announce).
     ///
     /// # Errors
     /// The ring is full, or the sample is lost.
     fn try_write(&self, client: &Gid, meta: Meta, payload: &[u8]) -> Result<Written, RingError>;
+    /// Wakes the subscriptions that sleep, for all samples that were written.
+    fn announce(&self);
     /// The remote publisher asserted its liveliness.
     fn assert_alive(&self);
     /// The clients whose calls, or responses, wait to be taken.
@@ -109,8 +127,8 @@ pub(crate) struct Sample {
 
 impl Sample {
     /// A sample of a topic.
-    pub(crate) fn new(info: MessageInfo, payload: Vec<u8>, now: Duration) -> Self {
-        Self { info, client: None, payload: payload.into(), taken: now }
+    pub(crate) fn new(info: MessageInfo, payload: Bytes, now: Duration) -> Self {
+        Self { info, client: None, payload, taken: now }
     }
 
     /// Time since it was published, as far as this host knows.

@@ -37,7 +37,7 @@ impl StandIn {
         &*self.ring
     }
 
-    /// Writes a sample.
+    /// Writes a sample. A subscription that sleeps may sleep on until [`announce`](Self::announce).
     ///
     /// # Errors
     /// The ring is full, or the sample is lost.
@@ -51,6 +51,11 @@ impl StandIn {
         let written = self.ring.try_write(client, meta, payload)?;
         self.last.set(sequence);
         Ok(written)
+    }
+
+    /// Wakes the subscriptions that sleep, for all samples that were written.
+    pub(crate) fn announce(&self) {
+        self.ring.announce();
     }
 
     /// The number of the newest sample of a publisher that is in the ring.

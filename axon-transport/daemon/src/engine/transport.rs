@@ -1,14 +1,17 @@
 //! The QUIC settings of endpoints and links.
 
-use std::{sync::Arc, time::Duration};
+use std::{net::IpAddr, sync::Arc, time::Duration};
 
 use aws_lc_rs::hmac;
-use axon_transport::config::Config;
+use axon_transport::config::{Config, Congestion};
 use quinn_proto::{
-    EndpointConfig, HashedConnectionIdGenerator, IdleTimeout, MtuDiscoveryConfig, TransportConfig,
-    VarInt,
+    AckFrequencyConfig, EndpointConfig, HashedConnectionIdGenerator, IdleTimeout,
+    MtuDiscoveryConfig, TransportConfig, VarInt,
+    congestion::{BbrConfig, CubicConfig},
     crypto::{CryptoError, HmacKey},
 };
+
+use super::congestion::DelayConfig;
 
 /// A silent peer is given up after this.
 const IDLE_TIMEOUT_MS: u32 = 20_000;
@@ -61,12 +64,54 @@ pub(crate) fn endpoint_config(reset_key: &[u8; 32]) -> EndpointConfig {
     config
 }
 
-/// The transport settings of a link, for either end.
-pub(crate) fn transport(config: &Config) -> Arc<TransportConfig> {
+/// The longest time for which a peer may keep an acknowledgement of a lone packet. QUIC's default is 25 ms, which
+/// would be most of a round trip on a local path: the time after which a lost packet is sent again grows with it.
+const ACK_DELAY: Duration = Duration::from_millis(2);
+/// A packet in so many is acknowledged at once, as is usual. Under heavy loss each acknowledgement counts.
+const ACK_THRESHOLD: u32 = 1;
+/// The round trip that is assumed of a private path until one was measured. QUIC's default of 333 ms is for the
+/// Internet: with it, a first packet that is lost delays the link by a second.
+const PRIVATE_RTT: Duration = Duration::from_millis(50);
+
+/// The transport settings of links, which depend on where the peer is.
+pub(crate) struct Transports {
+    /// For private and link-local addresses.
+    private: Arc<TransportConfig>,
+    /// For all others.
+    other: Arc<TransportConfig>,
+}
+
+impl Transports {
+    /// The settings of `config`.
+    pub(crate) fn new(config: &Config) -> Self {
+        Self {
+            private: Arc::new(transport(config, true)),
+            other: Arc::new(transport(config, false)),
+        }
+    }
+
+    /// The settings of a link to this address.
+    pub(crate) fn towards(&self, address: IpAddr) -> Arc<TransportConfig> {
+        Arc::clone(if is_private(address) { &self.private } else { &self.other })
+    }
+}
+
+/// Whether an address is one of a robot's own networks. Loopback is not: it loses no packet that its receiver has
+/// room for, and has no queue but the receiver's.
+fn is_private(address: IpAddr) -> bool {
+    match address.to_canonical() {
+        IpAddr::V4(v4) => v4.is_private() || v4.is_link_local(),
+        IpAddr::V6(v6) => v6.is_unique_local() || v6.is_unicast_link_local(),
+    }
+}
+
+fn transport(config: &Config, is_private: bool) -> TransportConfig {
     let mut transport = TransportConfig::default();
     let window = (config.max_message * 2).clamp(STREAM_WINDOW.0, STREAM_WINDOW.1);
     let mut mtu = MtuDiscoveryConfig::default();
     mtu.upper_bound(config.link.mtu);
+    let mut acks = AckFrequencyConfig::default();
+    acks.max_ack_delay(Some(ACK_DELAY)).ack_eliciting_threshold(VarInt::from_u32(ACK_THRESHOLD));
     transport
         .max_concurrent_bidi_streams(VarInt::from_u32(1))
         .max_concurrent_uni_streams(VarInt::from_u32(STREAMS_BEFORE_HELLO))
@@ -75,7 +120,41 @@ pub(crate) fn transport(config: &Config) -> Arc<TransportConfig> {
         .stream_receive_window(VarInt::from_u64(window).unwrap_or(VarInt::MAX))
         .receive_window(VarInt::from_u32(LINK_WINDOW))
         .send_window(SEND_WINDOW)
+        .ack_frequency_config(Some(acks))
         .initial_mtu(1200)
         .mtu_discovery_config(Some(mtu));
-    Arc::new(transport)
+    if is_private {
+        transport.initial_rtt(PRIVATE_RTT);
+    }
+    match config.link.congestion {
+        Congestion::Auto if !is_private => {
+            transport.congestion_controller_factory(Arc::new(CubicConfig::default()))
+        }
+        Congestion::Auto | Congestion::Delay => {
+            transport.congestion_controller_factory(Arc::new(DelayConfig))
+        }
+        Congestion::Cubic => {
+            transport.congestion_controller_factory(Arc::new(CubicConfig::default()))
+        }
+        Congestion::Bbr => transport.congestion_controller_factory(Arc::new(BbrConfig::default())),
+    };
+    transport
+}
+
+#[cfg(test)]
+mod tests {
+    use super::is_private;
+
+    #[test]
+    fn a_robots_own_networks_are_private_and_loopback_is_not() {
+        for address in
+            ["10.1.2.3", "172.16.0.1", "192.168.7.7", "169.254.1.1", "fd00::1", "fe80::1"]
+        {
+            assert!(is_private(address.parse().unwrap()), "{address}");
+        }
+        for address in ["127.0.0.1", "::1", "8.8.8.8", "100.64.0.1", "2001:db8::1", "172.32.0.1"] {
+            assert!(!is_private(address.parse().unwrap()), "{address}");
+        }
+        assert!(is_private("::ffff:192.168.1.1".parse().unwrap()));
+    }
 }

@@ -1,13 +1,20 @@
 //! The rings of this host as shared memory: relay subscriptions and stand-ins of the gateway's session.
 
-use std::{cell::Cell, collections::HashMap, rc::Rc};
+use std::{
+    cell::{Cell, RefCell},
+    collections::HashMap,
+    ops::Range,
+    rc::Rc,
+    time::Duration,
+};
 
 use axon_shm::{ExternalLeader, Meta, PublishError, ShmError, ids::Gid};
 use axon_transport::{
     EndpointSpec, MessageInfo, Session, Subscription,
     graph::Endpoint,
-    internal::session::{RemoteWriter, Written},
+    internal::session::{RemoteWriter, TakeLimit, Written},
 };
+use bytes::Bytes;
 
 use crate::engine::rings::{RingError, RingReader, RingWriter, Rings};
 
@@ -63,7 +70,8 @@ impl Rings for ShmRings {
         stands_for: Vec<Gid>,
     ) -> Result<Rc<dyn RingReader>, String> {
         let subscription = self.session.create_relay(spec, stands_for);
-        Ok(Rc::new(Relay(subscription.map_err(|error| error.to_string())?)))
+        let subscription = subscription.map_err(|error| error.to_string())?;
+        Ok(Rc::new(Relay { subscription, taken: RefCell::default() }))
     }
 
     fn open_writer(&self, remote: &Endpoint) -> Result<Rc<dyn RingWriter>, String> {
@@ -82,55 +90,84 @@ impl Rings for ShmRings {
 }
 
 /// A relay subscription.
-struct Relay(Subscription);
+struct Relay {
+    subscription: Subscription,
+    /// The samples of one take, and where their payloads are.
+    taken: RefCell<Vec<(MessageInfo, Range<usize>)>>,
+}
 
 impl RingReader for Relay {
     fn gid(&self) -> Gid {
-        self.0.gid()
+        self.subscription.gid()
     }
 
     fn with_data(&self) -> Vec<Gid> {
-        self.0.with_data()
+        self.subscription.with_data()
     }
 
     fn has_data_of(&self, publisher: &Gid) -> bool {
-        self.0.has_from(publisher)
+        self.subscription.has_from(publisher)
     }
 
     fn reads(&self, publisher: &Gid) -> bool {
-        self.0.reads(publisher)
+        self.subscription.reads(publisher)
     }
 
     fn matched(&self) -> Vec<Gid> {
-        self.0.matched()
+        self.subscription.matched()
     }
 
-    fn take_of(&self, publisher: &Gid) -> Option<(MessageInfo, Vec<u8>)> {
-        self.0.take_of(publisher)
+    fn take_many(
+        &self,
+        publisher: &Gid,
+        most: TakeLimit,
+        each: &mut dyn FnMut(MessageInfo, Bytes),
+    ) -> usize {
+        let (mut taken, mut payloads) = (self.taken.borrow_mut(), Vec::new());
+        self.subscription.take_many_of(publisher, most, &mut payloads, |info, payload| {
+            taken.push((info, payload));
+        });
+        if payloads.len() < payloads.capacity() / 2 {
+            // Fewer came than were waiting.
+            payloads.shrink_to_fit();
+        }
+        let (samples, payloads) = (taken.len(), Bytes::from(payloads));
+        for (info, payload) in taken.drain(..) {
+            each(info, payloads.slice(payload));
+        }
+        samples
+    }
+
+    fn skip_of(&self, publisher: &Gid, depth: u64) {
+        self.subscription.skip_of(publisher, depth);
+    }
+
+    fn retry_of(&self, publisher: &Gid) -> Option<Duration> {
+        self.subscription.retry_of(publisher)
     }
 
     fn lost_of(&self, publisher: &Gid) -> u64 {
-        self.0.lost_of(publisher)
+        self.subscription.lost_of(publisher)
     }
 
     fn acknowledge_of(&self, publisher: &Gid, sequence: u64) {
-        self.0.acknowledge_of(publisher, sequence);
+        self.subscription.acknowledge_of(publisher, sequence);
     }
 
     fn unacknowledged(&self) -> HashMap<Gid, u64> {
-        self.0.unacknowledged()
+        self.subscription.unacknowledged()
     }
 
     fn give_up(&self, publisher: Gid, samples: u64) {
-        self.0.give_up(publisher, samples);
+        self.subscription.give_up(publisher, samples);
     }
 
     fn assertions(&self) -> Vec<(Gid, u64)> {
-        self.0.assertions()
+        self.subscription.assertions()
     }
 
     fn set_stands_for(&self, gids: Vec<Gid>) {
-        self.0.set_stands_for(gids);
+        self.subscription.set_stands_for(gids);
     }
 }
 
@@ -147,10 +184,14 @@ impl RingWriter for Writer {
     }
 
     fn try_write(&self, client: &Gid, meta: Meta, payload: &[u8]) -> Result<Written, RingError> {
-        self.0.try_write(client, meta, payload).map_err(|error| match error {
+        self.0.try_write_quietly(client, meta, payload).map_err(|error| match error {
             PublishError::Blocked { .. } => RingError::Full,
             error => RingError::Lost(error.to_string()),
         })
+    }
+
+    fn announce(&self) {
+        self.0.announce();
     }
 
     fn assert_alive(&self) {

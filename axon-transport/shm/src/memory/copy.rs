@@ -45,10 +45,26 @@ pub(crate) fn copy_out(
     out: &mut Vec<u8>,
 ) -> Result<(), TryReserveError> {
     out.clear();
+    append(words, at, len, out)
+}
+
+/// Adds the `len` bytes of `words` from `at` on to `out`.
+///
+/// # Errors
+/// Memory for them is not to be had.
+///
+/// # Panics
+/// The words have fewer.
+pub(crate) fn append(
+    words: &[AtomicU64],
+    at: usize,
+    len: usize,
+    out: &mut Vec<u8>,
+) -> Result<(), TryReserveError> {
     out.try_reserve(len)?;
     copy(words, at, &mut out.spare_capacity_mut()[..len]);
-    // SAFETY: within the reserved capacity, and `copy` wrote each of the `len` bytes.
-    unsafe { out.set_len(len) };
+    // SAFETY: within the reserved capacity, and `copy` wrote each of the `len` bytes behind those that there were.
+    unsafe { out.set_len(out.len() + len) };
     Ok(())
 }
 
@@ -200,6 +216,18 @@ mod tests {
                 assert!(out == bytes[at..at + len], "{len} from {at} on");
             }
         }
+    }
+
+    #[test]
+    fn what_is_appended_stands_behind_what_was_there() {
+        let (words, bytes) = words(5000);
+        let mut out = Vec::new();
+        for (at, len) in [(0, 9), (3, 0), (5, 1030), (8, 64)] {
+            let before = out.clone();
+            append(&words, at, len, &mut out).unwrap();
+            assert!(out == [&before[..], &bytes[at..at + len]].concat(), "{len} from {at} on");
+        }
+        assert!(append(&words, 0, 1 << 60, &mut out).is_err());
     }
 
     #[test]

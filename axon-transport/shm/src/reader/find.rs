@@ -127,6 +127,22 @@ impl Reader {
         Ok(())
     }
 
+    /// Passes over all samples that are to be taken but the newest `depth`, without a look at their bytes. As if the
+    /// subscription had that depth, they count as skipped, and those among the rest that were overwritten as lost.
+    pub fn skip_to_depth(&mut self, depth: u64) {
+        if self.corrupt.is_some() || self.given_up || self.attachment.lane.is_forked() {
+            return;
+        }
+        // The next take says what is wrong with the memory.
+        let Ok((_, head)) = protocol::bounds(self.attachment.ring()) else { return };
+        let unread = head.saturating_sub(self.cursor);
+        if unread > depth {
+            self.missing = None;
+            self.skipped += unread - depth;
+            self.advance(head - depth);
+        }
+    }
+
     /// Where the descriptors are that the ring's word speaks of.
     pub(super) fn resolve(&self, word: u64) -> Result<Descriptors, Obstacle> {
         let wrong = Obstacle::Corrupt("its descriptors are nowhere");
@@ -215,8 +231,9 @@ impl Reader {
         u64::from(record.len) <= self.reads.in_place
     }
 
-    /// Copies the payload at the cursor; false when the publisher was faster.
-    pub(super) fn copy_out(
+    /// Adds a copy of the payload at the cursor to `out`; false when the publisher was faster, and what was added is
+    /// of no use.
+    pub(super) fn copy_to(
         &self,
         record: &Record,
         bytes: &Bytes,
@@ -226,8 +243,7 @@ impl Reader {
         let Some(descriptors) = &self.descriptors else { return Ok(false) };
         let view = descriptors.view(&self.attachment);
         let mut copy = |words: &[AtomicU64], skip| {
-            copy::copy_out(words, skip, len, out)
-                .map_err(|_| TakeError::NoMemory { len: len as u64 })
+            copy::append(words, skip, len, out).map_err(|_| TakeError::NoMemory { len: len as u64 })
         };
         match bytes {
             Bytes::Inline => copy(view.inline(self.cursor), 0)?,

@@ -1,5 +1,6 @@
 //! The reading end of a ring.
 
+mod batch;
 mod find;
 pub(crate) mod sample;
 pub(crate) mod slice;
@@ -265,7 +266,8 @@ impl Reader {
     pub fn take(&mut self, out: &mut Vec<u8>) -> Result<Option<Taken>, TakeError> {
         for _ in 0..ATTEMPTS {
             let Some((record, bytes)) = self.find_whole()? else { break };
-            if self.copy_out(&record, &bytes, out)? {
+            out.clear();
+            if self.copy_to(&record, &bytes, out)? {
                 return Ok(Some(self.taken(&record)));
             }
         }
@@ -295,7 +297,7 @@ impl Reader {
                 copied => copied,
             };
             let mut out = Vec::new();
-            if self.copy_out(&record, &bytes, &mut out)? {
+            if self.copy_to(&record, &bytes, &mut out)? {
                 return Ok(Some(Sample::copied(self.taken(&record), out)));
             }
         }
@@ -456,13 +458,21 @@ impl Reader {
     /// The sample at the cursor is the caller's.
     #[inline]
     fn taken(&mut self, record: &Record) -> Taken {
+        let taken = self.taken_untold(record);
+        self.tell_cursor();
+        taken
+    }
+
+    /// As [`taken`](Self::taken), but its publisher does not hear of it.
+    #[inline]
+    fn taken_untold(&mut self, record: &Record) -> Taken {
         let taken = Taken { meta: meta(record), position: self.cursor };
         self.received += 1;
         self.attachment.lane.taken(record.timestamp);
         if let Some(under_way) = &mut self.under_way {
             under_way.add(record.sequence, self.cursor);
         }
-        self.advance(self.cursor + 1);
+        self.cursor += 1;
         taken
     }
 

@@ -28,6 +28,15 @@ use crate::{
     },
 };
 
+/// When readers that sleep are woken for a sample.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Bells {
+    /// When it is published.
+    Now,
+    /// When the publisher [announces](Writer::announce) it.
+    Later,
+}
+
 /// How long a publish waits altogether, from the first time on that it has to.
 pub(crate) struct PublishDeadline {
     whole: Duration,
@@ -66,11 +75,12 @@ impl Writer {
         numbering: Numbering,
         payload: &[u8],
         deadline: Duration,
+        bells: Bells,
     ) -> Result<(u64, Published), PublishError> {
         let bytes = self.check(payload.len())?;
         let mut deadline = PublishDeadline::new(deadline);
         if payload.len() as u64 <= COPIED {
-            return self.commit(numbering, Payload::Bytes(payload), deadline);
+            return self.commit(numbering, Payload::Bytes(payload), deadline, bells);
         }
         let lent: Result<LoanPlace, Meta> = self.retry_until(&mut deadline, |state| {
             judge(state, numbering)?;
@@ -96,6 +106,7 @@ impl Writer {
         numbering: Numbering,
         payload: Payload<'_>,
         mut deadline: PublishDeadline,
+        bells: Bells,
     ) -> Result<(u64, Published), PublishError> {
         // A loan may have been made before the fork.
         if self.is_forked() {
@@ -124,6 +135,9 @@ impl Writer {
             if state.reader_set.has_followers() {
                 self.session.journal().note(self.number);
             }
+            if bells == Bells::Later {
+                return Ok((meta, Some(position), None));
+            }
             settle::<AtomicU64>();
             Ok((meta, Some(position), state.reader_set.waiting()))
         })?;
@@ -132,6 +146,19 @@ impl Writer {
             peer.ring_if(Purpose::Samples);
         }
         Ok((meta.sequence, Published { position }))
+    }
+
+    /// Wakes the readers that sleep, for samples that were published [without that](Self::try_publish_quietly).
+    pub fn announce(&self) {
+        if self.is_forked() {
+            return;
+        }
+        // A reader that goes to sleep after this looks at the ring once more, and sees them.
+        settle::<AtomicU64>();
+        let waiting = self.lock().reader_set.waiting();
+        for peer in waiting.iter().flat_map(|peers| &**peers) {
+            peer.ring_if(Purpose::Samples);
+        }
     }
 
     /// Whether nobody will ever read what is published now.

@@ -18,7 +18,7 @@ use crate::{
         layout::{ALIGNED, Location},
         types::{Meta, Published},
     },
-    writer::{Numbering, PATIENCE, Payload, PublishDeadline, Writer},
+    writer::{Bells, Numbering, PATIENCE, Payload, PublishDeadline, Writer},
 };
 
 /// Memory to be filled and published: shared memory where such a sample is read in place. Dropping
@@ -177,7 +177,7 @@ impl<'a> Loan<'a> {
             LoanMemory::Published => unreachable!("publishing takes the loan"),
         };
         let taken = matches!(payload, Payload::Written { .. });
-        let (sequence, published) = self.writer.commit(numbering, payload, deadline)?;
+        let (sequence, published) = self.writer.commit(numbering, payload, deadline, Bells::Now)?;
         // What nobody reads has not become a sample, and its memory is given back.
         if taken && published.position.is_some() {
             self.memory = LoanMemory::Published;

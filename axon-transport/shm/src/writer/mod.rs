@@ -14,7 +14,7 @@ mod times;
 use std::{sync::Arc, time::Duration};
 
 pub use self::commit::MAX_GAP;
-pub(super) use self::commit::PublishDeadline;
+pub(super) use self::commit::{Bells, PublishDeadline};
 
 use crate::{
     alloc::{
@@ -372,7 +372,7 @@ impl Writer {
     /// The sample was not published; what to do is in the error.
     #[inline]
     pub fn publish(&self, meta: Meta, payload: &[u8]) -> Result<Published, PublishError> {
-        self.publish_within(Numbering::Given(meta), payload, PATIENCE)
+        self.publish_within(Numbering::Given(meta), payload, PATIENCE, Bells::Now)
             .map(|(_, published)| published)
     }
 
@@ -383,7 +383,24 @@ impl Writer {
     #[inline]
     pub fn try_publish(&self, meta: Meta, payload: &[u8]) -> Result<Published, PublishError> {
         let numbering = Numbering::Given(meta);
-        self.publish_within(numbering, payload, Duration::ZERO).map(|(_, published)| published)
+        self.publish_within(numbering, payload, Duration::ZERO, Bells::Now)
+            .map(|(_, published)| published)
+    }
+
+    /// As [`try_publish`](Self::try_publish), but a reader that sleeps may sleep on until the publisher
+    /// [announces](Self::announce) its samples: for several that are published together.
+    ///
+    /// # Errors
+    /// As [`try_publish`](Self::try_publish).
+    #[inline]
+    pub fn try_publish_quietly(
+        &self,
+        meta: Meta,
+        payload: &[u8],
+    ) -> Result<Published, PublishError> {
+        let numbering = Numbering::Given(meta);
+        self.publish_within(numbering, payload, Duration::ZERO, Bells::Later)
+            .map(|(_, published)| published)
     }
 
     /// As [`publish`](Self::publish), with the sequence number that follows the last, which is
@@ -394,7 +411,7 @@ impl Writer {
     #[inline]
     pub fn publish_next(&self, source_timestamp: i64, payload: &[u8]) -> Result<u64, PublishError> {
         let numbering = Numbering::Next(source_timestamp);
-        self.publish_within(numbering, payload, PATIENCE).map(|(sequence, _)| sequence)
+        self.publish_within(numbering, payload, PATIENCE, Bells::Now).map(|(sequence, _)| sequence)
     }
 
     /// As [`publish_next`](Self::publish_next), but does not wait.
@@ -408,7 +425,8 @@ impl Writer {
         payload: &[u8],
     ) -> Result<u64, PublishError> {
         let numbering = Numbering::Next(source_timestamp);
-        self.publish_within(numbering, payload, Duration::ZERO).map(|(sequence, _)| sequence)
+        self.publish_within(numbering, payload, Duration::ZERO, Bells::Now)
+            .map(|(sequence, _)| sequence)
     }
 
     /// Lends `len` bytes to be written and then published: of shared memory where it is more than

@@ -43,6 +43,7 @@ fn all_of_qkd() -> ConfigBuilder {
         .link_stalled(Duration::from_secs(4))
         .link_mtu(9_000)
         .link_graph_mb(4)
+        .link_congestion(Congestion::Cubic)
 }
 
 fn all_of_classic() -> ConfigBuilder {
@@ -89,6 +90,7 @@ fn what_is_built_is_what_the_environment_would_make_and_so_it_is_passed_on() {
     let read = Config::resolve(environment, None, &OsFiles).unwrap();
     assert_eq!(without_origin(&read), without_origin(&built));
     assert_eq!((built.link.mtu, built.link.graph), (9_000, 4 << 20));
+    assert_eq!(built.link.congestion, Congestion::Cubic);
     assert_eq!((built.domain, built.static_peers.len()), (232, 2));
     assert_eq!(built.range, DiscoveryRange::Localhost);
 }

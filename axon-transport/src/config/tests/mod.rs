@@ -135,6 +135,7 @@ fn nothing_given_is_the_table_of_defaults() {
             stalled: Duration::from_secs(10),
             mtu: 1452,
             graph: 16 << 20,
+            congestion: Congestion::Auto,
         }
     );
     assert!(config.warnings().iter().any(|w| w.contains("not authenticated")));
@@ -257,6 +258,7 @@ fn the_environment_wins_over_the_file() {
         stalled_s = 4
         mtu = 9000
         graph_mb = 4
+        congestion = 'bbr'
     ";
     let config = with_file(&[], file).unwrap();
     assert_eq!(qkd(&config).peers.to_string(), "sae-b;sae-c");
@@ -271,6 +273,7 @@ fn the_environment_wins_over_the_file() {
             stalled: Duration::from_secs(4),
             mtu: 9000,
             graph: 4 << 20,
+            congestion: Congestion::Bbr,
         }
     );
 

@@ -286,6 +286,8 @@ fn files_that_are_not_a_configuration_are_refused() {
         ("[link]\nmtu = 100", "link.mtu"),
         ("[link]\nmtu = '1500'", "link.mtu"),
         ("[link]\ngrace_s = -1", "link.grace_s"),
+        ("[link]\ncongestion = 'reno'", "link.congestion"),
+        ("[link]\ncongestion = 3", "link.congestion"),
         ("[link]\nstalled_s = 0", "link.stalled_s"),
         ("[link]\nspeed = 1", "link.speed"),
         ("[linc]\nmtu = 1500", "AXON_LINC"),

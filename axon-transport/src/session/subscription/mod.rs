@@ -7,6 +7,7 @@ mod trusted;
 
 use std::{
     fmt,
+    ops::Range,
     sync::Arc,
     time::{Duration, Instant, SystemTime},
 };
@@ -17,11 +18,11 @@ use axon_shm::{
 };
 
 use self::matched_readers::MatchedReaders;
-pub use self::trusted::TrustedSubscription;
 pub(super) use self::{
     inner::SubscriptionInner,
     matched_readers::{Accept, Asking, Numbers},
 };
+pub use self::{taking::TakeLimit, trusted::TrustedSubscription};
 use super::{
     OnNew, RecvError, Session, SessionError, clock,
     events::{Event, Source},
@@ -262,11 +263,29 @@ pub(super) fn take_of(
     Some((info, out))
 }
 
+/// Samples of one writer, into `out`, which it replaces. `each` is told where a sample's payload is. Returns how many.
+pub(super) fn take_many_of(
+    inner: &SubscriptionInner,
+    session: &Session,
+    writer: &Gid,
+    most: TakeLimit,
+    out: &mut Vec<u8>,
+    each: impl FnMut(MessageInfo, Range<usize>),
+) -> usize {
+    out.clear();
+    let taken = take_with(inner, session.shared(), |matched_readers| {
+        Some(matched_readers.take_many_of(writer, most, out, inner, each))
+            .filter(|taken| *taken > 0)
+    });
+    taken.unwrap_or(0)
+}
+
+/// What `take` takes; `None` when there is nothing.
 fn take_with<T>(
     inner: &SubscriptionInner,
     shared: &Shared,
-    take: impl FnOnce(&mut MatchedReaders) -> Option<(MessageInfo, T)>,
-) -> Option<(MessageInfo, T)> {
+    take: impl FnOnce(&mut MatchedReaders) -> Option<T>,
+) -> Option<T> {
     // A thread of the parent may have held the lock when this process was forked.
     if shared.segment.is_forked() {
         tracing::error!("an endpoint of the parent process is used after fork");

@@ -1,6 +1,10 @@
 //! Chooses the publisher from which a subscription takes the next sample.
 
-use std::{collections::HashMap, time::Instant};
+use std::{
+    collections::HashMap,
+    ops::Range,
+    time::{Duration, Instant, SystemTime},
+};
 
 use axon_shm::{Meta, Sample, TakeError, internal::Reader};
 
@@ -13,6 +17,19 @@ use crate::{graph::Endpoint, ids::Gid, session::clock, wire::session::EndpointRo
 
 /// Samples that one take passes over because they were taken before.
 const REPEATS: usize = 64;
+
+/// How much a relay takes in one go: one sample in any case.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct TakeLimit {
+    /// Samples.
+    pub samples: usize,
+    /// Bytes of several samples together.
+    pub bytes: usize,
+}
+
+fn clock_now() -> SystemTime {
+    clock::from_unix_nanos(clock::wall())
+}
 
 impl MatchedReaders {
     pub(super) fn take<T>(
@@ -35,7 +52,7 @@ impl MatchedReaders {
                 }
                 return None;
             };
-            if let Some(taken) = self.take_at(index, &mut take, of) {
+            if let Some(taken) = self.take_at(index, &mut take, of, None) {
                 return Some(taken);
             }
         }
@@ -51,19 +68,67 @@ impl MatchedReaders {
     ) -> Option<(MessageInfo, T)> {
         self.matched_readers.iter_mut().for_each(|slot| slot.overtaken = false);
         for _ in 0..REPEATS {
-            self.skip_missing();
-            let next = self.matched_readers.iter().position(|slot| {
-                !slot.overtaken && slot.reader.writer() == *writer && slot.reader.has_data()
-            });
-            let Some(index) = next else {
+            let Some(index) = self.next_of(writer) else {
                 self.sweep();
                 return None;
             };
-            if let Some(taken) = self.take_at(index, &mut take, of) {
+            if let Some(taken) = self.take_at(index, &mut take, of, None) {
                 return Some(taken);
             }
         }
         None
+    }
+
+    /// Takes samples of one writer, with their payloads one behind the other in `out`, which holds nothing. `each` is
+    /// told where a sample's payload is. Returns how many samples it took.
+    pub(super) fn take_many_of(
+        &mut self,
+        writer: &Gid,
+        most: TakeLimit,
+        out: &mut Vec<u8>,
+        of: &SubscriptionInner,
+        mut each: impl FnMut(MessageInfo, Range<usize>),
+    ) -> usize {
+        self.matched_readers.iter_mut().for_each(|slot| slot.overtaken = false);
+        let received_timestamp = clock_now();
+        let (mut taken, mut passed_over) = (0, 0);
+        let mut last = None;
+        while taken < most.samples && passed_over < REPEATS {
+            // Most often the next one is where the last one was.
+            let Some(index) = last.take().or_else(|| self.next_of(writer)) else {
+                self.sweep();
+                break;
+            };
+            let start = out.len();
+            let mut take = |reader: &mut Reader| {
+                let taken = reader.take_behind(out, most.bytes)?;
+                Ok(taken.map(|(taken, len)| (taken.meta, len)))
+            };
+            match self.take_at(index, &mut take, of, Some(received_timestamp)) {
+                Some((info, len)) => {
+                    each(info, start..start + len);
+                    taken += 1;
+                    let slot = self.matched_readers.get(index);
+                    last = slot.filter(|s| !s.over && s.reader.writer() == *writer).map(|_| index);
+                }
+                None => {
+                    // A sample that does not count is no part of it.
+                    out.truncate(start);
+                    passed_over += 1;
+                }
+            }
+        }
+        let of = self.matched_readers.iter().filter(|slot| slot.reader.writer() == *writer);
+        of.for_each(|slot| slot.reader.tell_taken());
+        taken
+    }
+
+    /// Where the next sample of a writer is.
+    fn next_of(&mut self, writer: &Gid) -> Option<usize> {
+        self.skip_missing();
+        self.matched_readers.iter().position(|slot| {
+            !slot.overtaken && slot.reader.writer() == *writer && slot.reader.has_data()
+        })
     }
 
     /// The publishers that have a lease, and when each was last alive, by the monotonic clock.
@@ -80,12 +145,14 @@ impl MatchedReaders {
         some.map(|slot| slot.reader.writer())
     }
 
-    /// Takes from a slot, unless nothing is to be had there, or nothing that counts.
+    /// Takes from a slot, unless nothing is to be had there, or nothing that counts. Without a time the sample's is
+    /// that at which it was taken.
     fn take_at<T>(
         &mut self,
         index: usize,
         take: &mut impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
         of: &SubscriptionInner,
+        received_timestamp: Option<SystemTime>,
     ) -> Option<(MessageInfo, T)> {
         let endpoint = &of.endpoint;
         let slot = &mut self.matched_readers[index];
@@ -116,7 +183,7 @@ impl MatchedReaders {
             }
         };
         let over = slot.over;
-        let received_timestamp = clock::from_unix_nanos(clock::wall());
+        let received_timestamp = received_timestamp.unwrap_or_else(clock_now);
         let lifetime = slot.lifespan.map(|lifespan| Lifetime::of(&meta, lifespan));
         let expired = lifetime.is_some_and(Lifetime::is_over);
         slot.passed(meta.sequence);
@@ -226,6 +293,12 @@ impl MatchedReaders {
             .any(|slot| slot.reader.writer() == *writer && slot.reader.has_data())
     }
 
+    /// After what time a sample of `writer` may be taken, if any waits.
+    pub(in crate::session) fn retry_of(&self, writer: &Gid) -> Option<Duration> {
+        let wait = |until: Instant| until.saturating_duration_since(Instant::now());
+        self.has_from(writer).then(|| self.short_until().map_or(Duration::ZERO, wait))
+    }
+
     /// Samples of `writer` that newer ones replaced before they were taken, in its ring or within the depth.
     pub(in crate::session) fn lost_of(&mut self, writer: &Gid) -> u64 {
         let of = self.matched_readers.iter_mut().filter(|slot| slot.reader.writer() == *writer);
@@ -235,6 +308,12 @@ impl MatchedReaders {
             slot.reader.lost().saturating_add(slot.reader.skipped())
         })
         .sum()
+    }
+
+    /// Passes over all samples of `writer` but the newest `depth`. They count as those beyond the subscription's depth.
+    pub(in crate::session) fn skip_of(&mut self, writer: &Gid, depth: u64) {
+        let of = self.matched_readers.iter_mut().filter(|slot| slot.reader.writer() == *writer);
+        of.for_each(|slot| slot.reader.skip_to_depth(depth));
     }
 
     /// Samples of `writer` that were lost before they came to its ring here. Samples missing before

@@ -7,7 +7,7 @@ use axon_shm::ids::Gid;
 use bytes::{Bytes, BytesMut};
 use quinn_proto::{ReadError, ReadableError, StreamId};
 
-use crate::engine::account::Charge;
+use crate::engine::{account::Charge, short_header::ShortHeaders};
 
 /// Bytes of a stream's header.
 pub(super) const HEADER: usize = 24;
@@ -15,11 +15,15 @@ pub(super) const HEADER: usize = 24;
 pub(super) const RELIABLE: u8 = 1;
 /// A stream of one BEST_EFFORT sample.
 pub(super) const BEST_EFFORT: u8 = 2;
+/// A flag: the messages have short headers.
+const SHORT: u8 = 1;
 
 /// What a stream carries, as its header says.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct StreamHeader {
     pub(super) reliable: bool,
+    /// Whether its messages have short headers.
+    pub(super) short: bool,
     pub(super) route: u32,
     /// The publisher; of responses the client.
     pub(super) of: Gid,
@@ -41,20 +45,27 @@ impl StreamHeader {
         if !matches!(kind, RELIABLE | BEST_EFFORT) {
             return Err("a data stream of unknown kind");
         }
-        if flags != [0; 3] {
+        if flags[0] & !SHORT != 0 || flags[1..] != [0; 2] {
             return Err("a data stream with unknown flags");
         }
         let (mut number, mut gid) = ([0; 4], [0; 16]);
         number.copy_from_slice(route);
         gid.copy_from_slice(of);
-        Ok(Self { reliable: kind == RELIABLE, route: u32::from_be_bytes(number), of: Gid(gid) })
+        let short = flags[0] == SHORT;
+        Ok(Self {
+            reliable: kind == RELIABLE,
+            short,
+            route: u32::from_be_bytes(number),
+            of: Gid(gid),
+        })
     }
 }
 
 /// The header of a data stream.
-pub(crate) fn stream_header(reliable: bool, route: u32, gid: Gid) -> [u8; HEADER] {
+pub(crate) fn stream_header(reliable: bool, short: bool, route: u32, gid: Gid) -> [u8; HEADER] {
     let mut header = [0; HEADER];
     header[0] = if reliable { RELIABLE } else { BEST_EFFORT };
+    header[1] = if short { SHORT } else { 0 };
     header[4..8].copy_from_slice(&route.to_be_bytes());
     header[8..].copy_from_slice(&gid.0);
     header
@@ -88,6 +99,8 @@ pub(super) enum Step {
     Writer(Message, Duration),
     /// Room in the ring.
     Ring(Message),
+    /// Its end: nothing more is wanted from it.
+    Over,
 }
 
 /// A message that was read and opened.
@@ -103,10 +116,12 @@ pub(super) struct Message {
 pub(super) struct Incoming {
     pub(super) step: Step,
     pub(super) header: Option<(StreamHeader, Option<Route>)>,
+    /// The last short header, where the messages have such.
+    pub(super) headers: Option<ShortHeaders>,
     /// The rest of what QUIC gave last.
-    chunk: Bytes,
+    pub(super) chunk: Bytes,
     /// A piece that came in several chunks.
-    gathered: BytesMut,
+    pub(super) gathered: BytesMut,
     /// The memory of a long message.
     pub(super) room: Option<Charge>,
     pub(super) is_ready: bool,
@@ -117,6 +132,7 @@ impl Default for Incoming {
         Self {
             step: Step::Header,
             header: None,
+            headers: None,
             chunk: Bytes::new(),
             gathered: BytesMut::new(),
             room: None,
@@ -157,6 +173,33 @@ impl Incoming {
             }
         }
     }
+
+    /// Whether a stream from which nothing more is wanted is at its end. QUIC forgets a stream, and allows the peer
+    /// another one, once its end was read; the end may come with the last bytes, and then nothing says that it came. A
+    /// peer that sends more is told to stop.
+    pub(super) fn is_over(&mut self, id: StreamId, quic: &mut quinn_proto::Connection) -> bool {
+        (self.chunk, self.gathered) = (Bytes::new(), BytesMut::new());
+        match next_chunk(id, quic) {
+            Err(End) => true,
+            Ok(Some(_)) => {
+                let _ = quic.recv_stream(id).stop(super::NO_ROUTE);
+                true
+            }
+            Ok(None) => false,
+        }
+    }
+}
+
+#[cfg(test)]
+impl Incoming {
+    /// Bytes of samples that were read from QUIC and are not delivered.
+    pub(super) fn held(&self) -> usize {
+        let message = match &self.step {
+            Step::Writer(message, _) | Step::Ring(message) => message.payload.len(),
+            _ => 0,
+        };
+        self.chunk.len() + self.gathered.len() + message
+    }
 }
 
 /// A stream that ended, was reset, or was stopped.
@@ -185,10 +228,14 @@ mod tests {
 
     #[test]
     fn a_header_that_is_not_one_is_refused() {
-        let header = stream_header(true, 7, Gid([9; 16]));
-        let parsed = StreamHeader::parse(&header).unwrap();
-        assert!(parsed.reliable && parsed.route == 7 && parsed.of == Gid([9; 16]));
-        for (at, byte) in [(0, 0), (0, 3), (1, 1), (3, 0x80)] {
+        for (reliable, short) in [(true, true), (true, false), (false, true), (false, false)] {
+            let header = stream_header(reliable, short, 7, Gid([9; 16]));
+            let parsed = StreamHeader::parse(&header).unwrap();
+            assert_eq!((parsed.reliable, parsed.short), (reliable, short));
+            assert_eq!((parsed.route, parsed.of), (7, Gid([9; 16])));
+        }
+        let header = stream_header(true, false, 7, Gid([9; 16]));
+        for (at, byte) in [(0, 0), (0, 3), (1, 2), (1, 3), (2, 1), (3, 0x80)] {
             let mut broken = header;
             broken[at] = byte;
             StreamHeader::parse(&broken).unwrap_err();

@@ -4,13 +4,16 @@
 //! order when a successor takes over. A stream whose ring is full is not read on: QUIC's flow control holds back the
 //! peer.
 
+#[cfg(test)]
+mod held;
 mod incoming;
+mod reading;
 mod receipts;
+mod run;
 #[cfg(test)]
 mod tests;
 
 use std::{
-    borrow::Cow,
     collections::{BTreeSet, HashMap, HashSet, VecDeque},
     rc::Rc,
     sync::Arc,
@@ -18,27 +21,17 @@ use std::{
 };
 
 use axon_envelope::{Kind, Route};
-use axon_shm::{Meta, ids::Gid};
-use axon_transport::internal::{log_limit::LogLimit, session::Written};
-use bytes::Bytes;
+use axon_shm::ids::Gid;
+use axon_transport::internal::log_limit::LogLimit;
 use quinn_proto::{StreamId, VarInt};
 
 pub(crate) use self::incoming::stream_header;
 use self::{
-    incoming::{HEADER, Incoming, Message, Piece, Step, StreamHeader},
+    incoming::{Incoming, Step, StreamHeader},
     receipts::Receipts,
 };
-use super::{
-    protection::{Open, writer_of},
-    rings::RingError,
-    stand_in::StandIn,
-};
 use crate::{
-    engine::{
-        account::Meter,
-        counters::Counters,
-        protection::{MAX_OVERHEAD, RefusedMessage},
-    },
+    engine::{account::Meter, counters::Counters, stand_in::StandIn},
     link::{CloseCode, Received},
 };
 
@@ -103,6 +96,10 @@ pub(crate) struct Inbound {
     /// What the memory for long messages had given back when it was looked at last.
     released: usize,
     receipts: Receipts,
+    /// The stand-in whose subscriptions were not woken for what was written.
+    written: Option<Rc<StandIn>>,
+    /// Where a short message is opened.
+    envelope: Vec<u8>,
     counters: Rc<Counters>,
     intake: Rc<Meter>,
     max_message: u64,
@@ -130,6 +127,8 @@ impl Inbound {
             full_retry: None,
             released: intake.released(),
             receipts: Receipts::default(),
+            written: None,
+            envelope: Vec::new(),
             counters,
             intake,
             max_message,
@@ -230,271 +229,6 @@ impl Inbound {
         }
     }
 
-    /// Reads a stream as far as it goes. Returns how many bytes that were, or became by decompression.
-    ///
-    /// # Errors
-    /// The peer broke a rule.
-    pub(crate) fn read(
-        &mut self,
-        key: Key,
-        quic: &mut quinn_proto::Connection,
-        open: &mut Open<'_>,
-        now: Duration,
-    ) -> Result<usize, Violation> {
-        let Some(mut stream) = self.streams.remove(&key) else { return Ok(0) };
-        let mut read = 0;
-        loop {
-            let step = self.step(key, &mut stream, quic, open, &mut read, now);
-            let next = match step {
-                Ok(next) => next,
-                Err(violation) => {
-                    self.release(&mut stream);
-                    self.end_turn(key, &stream);
-                    return Err(violation);
-                }
-            };
-            match next {
-                Next::Go if read < TURN => {}
-                Next::Go => {
-                    stream.is_ready = true;
-                    self.ready.push_back(key);
-                    break;
-                }
-                Next::Wait => break,
-                Next::Over => {
-                    self.end_turn(key, &stream);
-                    return Ok(read);
-                }
-            }
-        }
-        self.streams.insert(key, stream);
-        Ok(read)
-    }
-
-    fn step(
-        &mut self,
-        key: Key,
-        stream: &mut Incoming,
-        quic: &mut quinn_proto::Connection,
-        open: &mut Open<'_>,
-        read: &mut usize,
-        now: Duration,
-    ) -> Result<Next, Violation> {
-        match std::mem::replace(&mut stream.step, Step::Length) {
-            Step::Header => {
-                let header = match stream.take(HEADER, key.1, quic, read) {
-                    Piece::Whole(header) => header,
-                    Piece::Later => return Ok(wait(stream, Step::Header)),
-                    Piece::End => return Ok(Next::Over),
-                };
-                let header = StreamHeader::parse(&header)
-                    .map_err(|reason| (CloseCode::Malformed, reason.to_owned()))?;
-                stream.header = Some((header, None));
-                let turns = self.turns.entry((header.route, header.of)).or_default();
-                turns.push_back(key);
-                self.waiting.insert((now + ARRIVAL, key));
-                stream.step = Step::Turn(now + ARRIVAL);
-                Ok(Next::Go)
-            }
-            Step::Turn(until) => Ok(self.begin(key, stream, quic, until, now)),
-            Step::Length => {
-                let prefix = match stream.take(4, key.1, quic, read) {
-                    Piece::Whole(prefix) => prefix,
-                    Piece::Later => return Ok(wait(stream, Step::Length)),
-                    Piece::End => return Ok(Next::Over),
-                };
-                let mut bytes = [0; 4];
-                bytes.copy_from_slice(&prefix);
-                let length = u64::from(u32::from_be_bytes(bytes));
-                let limit = self.max_message + MAX_OVERHEAD as u64;
-                if length > limit {
-                    let text = format!("a message of {length} bytes, at most {limit} are allowed");
-                    return Err((CloseCode::TooLarge, text));
-                }
-                stream.step = Step::Room(length as usize);
-                Ok(Next::Go)
-            }
-            Step::Room(length) => {
-                if length > LONG {
-                    // One message may always be read, however long.
-                    let most = length.min(self.intake.most());
-                    let Some(room) = self.intake.charge(most) else {
-                        self.without_room.push_back(key);
-                        return Ok(wait(stream, Step::Room(length)));
-                    };
-                    stream.room = Some(room);
-                }
-                stream.step = Step::Body(length);
-                Ok(Next::Go)
-            }
-            Step::Body(length) => {
-                let body = match stream.take(length, key.1, quic, read) {
-                    Piece::Whole(body) => body,
-                    Piece::Later => return Ok(wait(stream, Step::Body(length))),
-                    Piece::End => {
-                        self.release(stream);
-                        return Ok(Next::Over);
-                    }
-                };
-                self.open(stream, body, open, read, now)
-            }
-            Step::Writer(message, until) => Ok(self.deliver(key, stream, message, until, now)),
-            Step::Ring(message) => Ok(self.deliver(key, stream, message, now, now)),
-        }
-    }
-
-    /// Begins to read a stream once its route is there and it is its turn.
-    fn begin(
-        &mut self,
-        key: Key,
-        stream: &mut Incoming,
-        quic: &mut quinn_proto::Connection,
-        until: Duration,
-        now: Duration,
-    ) -> Next {
-        let Some((header, _)) = stream.header else { return Next::Over };
-        let route = self.routes.get(&header.route);
-        let found = route.filter(|route| route.has_flow(&header.of));
-        let Some(found) = found else {
-            let until = if until == Duration::MAX { now + ARRIVAL } else { until };
-            if route.is_some() && now < until {
-                self.waiting.insert((until, key));
-                return wait(stream, Step::Turn(until));
-            }
-            self.waiting.remove(&(until, key));
-            self.counters.lost(&self.topic(header.route), "no_route", 1);
-            let _ = quic.recv_stream(key.1).stop(NO_ROUTE);
-            return Next::Over;
-        };
-        stream.header = Some((header, Some(found.route)));
-        self.waiting.remove(&(until, key));
-        let turns = self.turns.get(&(header.route, header.of));
-        if turns.is_some_and(|turns| turns.front() != Some(&key)) {
-            // The stream before it ends at some time, and then it is ready.
-            return wait(stream, Step::Turn(Duration::MAX));
-        }
-        stream.step = Step::Length;
-        Next::Go
-    }
-
-    /// Opens a message that has arrived.
-    fn open(
-        &mut self,
-        stream: &mut Incoming,
-        body: Bytes,
-        open: &mut Open<'_>,
-        read: &mut usize,
-        now: Duration,
-    ) -> Result<Next, Violation> {
-        let Some((header, Some(route))) = stream.header else { return Ok(Next::Over) };
-        let Some((opened, payload)) =
-            open_body(open, body, route, self.max_message, now).map_err(refused)?
-        else {
-            self.lost("no_link", header, "the link ended before they were read");
-            self.release(stream);
-            return Ok(Next::Go);
-        };
-        if opened.compressed {
-            *read += payload.len();
-        }
-        let writer = writer_of(route.kind, header.of, &opened)
-            .map_err(|text| (CloseCode::Malformed, text.to_owned()))?;
-        let meta = Meta {
-            sequence: opened.sequence,
-            source_timestamp: opened.source_timestamp,
-            published: self.published(opened.age_ms, now),
-        };
-        stream.step = Step::Writer(Message { writer, meta, payload }, now + ARRIVAL);
-        Ok(Next::Go)
-    }
-
-    /// When a sample of this age was published, in nanoseconds of this host's CLOCK_MONOTONIC.
-    fn published(&self, age_ms: u32, now: Duration) -> u64 {
-        let arrived = self.epoch_nanos.saturating_add(now.as_nanos() as u64);
-        // Zero would say that the lifespan is infinite.
-        arrived.saturating_sub(u64::from(age_ms) * 1_000_000).max(1)
-    }
-
-    /// Writes a message to its ring.
-    fn deliver(
-        &mut self,
-        key: Key,
-        stream: &mut Incoming,
-        message: Message,
-        until: Duration,
-        now: Duration,
-    ) -> Next {
-        let Some((header, Some(route))) = stream.header else { return Next::Over };
-        let found = self.routes.get(&header.route);
-        let Some(stand_in) = found.and_then(|route| route.writers.get(&message.writer)) else {
-            if found.is_some() && now < until {
-                self.waiting.insert((until, key));
-                return wait(stream, Step::Writer(message, until));
-            }
-            self.waiting.remove(&(until, key));
-            self.counters.lost(&self.topic(header.route), "no_route", 1);
-            self.release(stream);
-            return Next::Go;
-        };
-        self.waiting.remove(&(until, key));
-        let acknowledged = header.reliable && route.kind == Kind::Topic;
-        let flow = (header.route, header.of);
-        let (sequence, length) = (message.meta.sequence, message.payload.len());
-        if acknowledged && stand_in.last_sequence() >= Some(sequence) {
-            self.receipts.came(flow, sequence, length, now);
-            self.release(stream);
-            return Next::Go;
-        }
-        let there = match stand_in.try_write(&header.of, message.meta, &message.payload) {
-            Ok(Written::Yes) => {
-                self.counters.arrived(length);
-                true
-            }
-            Ok(Written::Nobody) => {
-                self.counters.lost(&self.topic(header.route), "no_client", 1);
-                false
-            }
-            Err(RingError::Full) => {
-                self.full.insert(key);
-                self.full_retry.get_or_insert(now + FULL_RETRY);
-                return wait(stream, Step::Ring(message));
-            }
-            Err(RingError::Lost(why)) => {
-                self.lost("ring", header, &why);
-                false
-            }
-        };
-        match acknowledged {
-            true if there => self.receipts.came(flow, sequence, length, now),
-            true => self.receipts.dropped(flow, sequence, now),
-            false => {}
-        }
-        self.release(stream);
-        if header.reliable { Next::Go } else { Next::Over }
-    }
-
-    /// Gives back the memory of a message, which another stream may wait for.
-    fn release(&mut self, stream: &mut Incoming) {
-        if stream.room.take().is_some() {
-            for key in std::mem::take(&mut self.without_room) {
-                self.make_ready(key);
-            }
-        }
-    }
-
-    fn end_turn(&mut self, key: Key, stream: &Incoming) {
-        let Some((header, _)) = stream.header else { return };
-        let flow = (header.route, header.of);
-        let Some(turns) = self.turns.get_mut(&flow) else { return };
-        turns.retain(|other| *other != key);
-        match turns.front().copied() {
-            Some(next) => self.make_ready(next),
-            None => {
-                self.turns.remove(&flow);
-            }
-        }
-    }
-
     fn forget(&mut self, key: Key) {
         let Some(mut stream) = self.streams.remove(&key) else { return };
         self.release(&mut stream);
@@ -539,63 +273,4 @@ impl Inbound {
             tracing::warn!(%topic, publisher = %header.of, why, samples, "samples from a peer are lost");
         }
     }
-}
-
-/// What a step says.
-enum Next {
-    /// Take the next one.
-    Go,
-    /// Nothing more can be done now.
-    Wait,
-    /// The stream is at its end.
-    Over,
-}
-
-fn wait(stream: &mut Incoming, step: Step) -> Next {
-    stream.step = step;
-    Next::Wait
-}
-
-fn refused(error: RefusedMessage) -> Violation {
-    let code = match error {
-        RefusedMessage::Envelope { .. } => CloseCode::Envelope,
-        RefusedMessage::Malformed(_) => CloseCode::Malformed,
-    };
-    (code, error.to_string())
-}
-
-/// Opens a body. The payload shares its memory, unless it was compressed.
-fn open_body(
-    open: &mut Open<'_>,
-    body: Bytes,
-    route: Route,
-    most: u64,
-    now: Duration,
-) -> Result<Option<(axon_envelope::inner::Header, Bytes)>, RefusedMessage> {
-    // An envelope is opened in place, so in memory of its own.
-    let body = match open {
-        Open::Link => body,
-        Open::Envelope { .. } => {
-            let mut own = body.try_into_mut().unwrap_or_else(|shared| shared.as_ref().into());
-            let start = own.as_ptr().addr();
-            let Some(opened) = open.open(&mut own, route, now)? else { return Ok(None) };
-            let header = opened.header;
-            let payload = match opened.payload(most)? {
-                Cow::Owned(payload) => payload.into(),
-                Cow::Borrowed(payload) => {
-                    let at = payload.as_ptr().addr() - start;
-                    let range = at..at + payload.len();
-                    own.freeze().slice(range)
-                }
-            };
-            return Ok(Some((header, payload)));
-        }
-    };
-    let opened = super::protection::Opened::plain(&body)?;
-    let (header, payload) = (opened.header, opened.payload(most)?);
-    let payload = match payload {
-        Cow::Owned(payload) => payload.into(),
-        Cow::Borrowed(payload) => body.slice_ref(payload),
-    };
-    Ok(Some((header, payload)))
 }

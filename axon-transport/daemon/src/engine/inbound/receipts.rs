@@ -32,19 +32,33 @@ pub(super) struct Receipts {
 impl Receipts {
     /// A sample is in the ring, or was before.
     pub(super) fn came(&mut self, flow: (u32, Gid), sequence: u64, bytes: usize, now: Duration) {
-        self.note(flow, sequence, 0, bytes, now);
+        self.came_all(flow, sequence, 1, bytes, now);
+    }
+
+    /// As [`came`](Self::came), of so many samples, the newest of which has this number.
+    pub(super) fn came_all(
+        &mut self,
+        flow: (u32, Gid),
+        sequence: u64,
+        samples: u64,
+        bytes: usize,
+        now: Duration,
+    ) {
+        let due = self.due.entry(flow).or_default();
+        due.sequence = due.sequence.max(sequence);
+        self.note(samples, bytes, now);
     }
 
     /// A sample was dropped here.
     pub(super) fn dropped(&mut self, flow: (u32, Gid), sequence: u64, now: Duration) {
-        self.note(flow, sequence, 1, 0, now);
-    }
-
-    fn note(&mut self, flow: (u32, Gid), sequence: u64, dropped: u64, bytes: usize, now: Duration) {
         let due = self.due.entry(flow).or_default();
         due.sequence = due.sequence.max(sequence);
-        due.dropped += dropped;
-        self.samples += 1;
+        due.dropped += 1;
+        self.note(1, 0, now);
+    }
+
+    fn note(&mut self, samples: u64, bytes: usize, now: Duration) {
+        self.samples += samples;
         self.bytes += bytes as u64;
         let many = self.samples >= SAMPLES || self.bytes >= BYTES;
         let at = if many { now } else { now + DELAY };

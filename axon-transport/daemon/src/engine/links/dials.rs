@@ -48,6 +48,12 @@ impl Dials {
         self.stirred.insert(number);
     }
 
+    /// How many there are.
+    #[cfg(test)]
+    pub(super) fn len(&self) -> usize {
+        self.under_way.len()
+    }
+
     /// A dial.
     pub(super) fn get_mut(&mut self, number: u64) -> Option<&mut Dial> {
         self.under_way.get_mut(&number)

@@ -65,6 +65,12 @@ impl Outbox {
         self.reports.push_back(report);
     }
 
+    /// How many events wait.
+    #[cfg(test)]
+    pub(super) fn waiting(&self) -> usize {
+        self.events.len()
+    }
+
     /// Whether events wait.
     pub(super) fn has_events(&self) -> bool {
         !self.events.is_empty()

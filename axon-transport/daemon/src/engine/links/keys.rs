@@ -79,7 +79,7 @@ impl Links {
     }
 
     /// The connection of a link as a carrier of samples.
-    pub(in crate::engine) fn carrier(&mut self, number: u64) -> Option<Carrier<'_>> {
+    pub(in crate::engine) fn carrier(&mut self, number: u64, now: Duration) -> Option<Carrier<'_>> {
         let connection = self.connections.get_mut(number)?;
         let seals = self.table.get(number)?.peer.as_ref()?.seals;
         let seal = match self.keyring.as_mut().filter(|_| seals) {
@@ -89,7 +89,7 @@ impl Links {
             },
             None => Seal::Link,
         };
-        Some(connection.carrier(seal))
+        Some(connection.carrier(seal, now))
     }
 
     /// The connection of a link, and what opens its messages.

@@ -8,6 +8,8 @@ mod election;
 mod ending;
 mod events;
 mod explained;
+#[cfg(test)]
+mod held;
 mod keys;
 mod leaving;
 mod link;
@@ -109,7 +111,7 @@ impl Links {
         let keyring = Keyring::new(&config);
         let unspecified = IpAddr::from([0, 0, 0, 0]);
         let resolver = keyring.as_ref().map(|keys| keys.resolver(Duration::ZERO, unspecified));
-        let server = Arc::new(credentials.server(resolver)?);
+        let server = Arc::new(credentials.server(resolver, unspecified)?);
         Ok(Self {
             accounts: Accounts::new(config.link.graph),
             config,
@@ -152,6 +154,7 @@ impl Links {
         if let Some(keyring) = &self.keyring {
             keyring.set_time(now);
         }
+        self.credentials.set_time(now);
         let instant = self.instant(now);
         let incoming = self.connections.handle_datagram(endpoint, from, local, ecn, bytes, instant);
         if let Some(incoming) = incoming {

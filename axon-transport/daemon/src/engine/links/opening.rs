@@ -57,7 +57,7 @@ impl Links {
             return;
         };
         let resolver = self.keyring.as_ref().map(|keys| keys.resolver(now, source.ip()));
-        let server = match self.credentials.server(resolver.clone()) {
+        let server = match self.credentials.server(resolver.clone(), source.ip()) {
             Ok(server) => Arc::new(server),
             Err(error) => {
                 self.connections.endpoints().refuse(endpoint, incoming);
@@ -191,7 +191,7 @@ impl Links {
         let Some(Dial { dialling, connection }) = self.dials.get_mut(dial) else { return };
         match action {
             Action::Connect { address, attempt } => {
-                let client = match self.credentials.client(attempt.as_deref()) {
+                let client = match self.credentials.client(attempt.as_deref(), address.ip()) {
                     Ok(client) => client,
                     Err(error) => return dialling.handle_unusable(error),
                 };

@@ -71,7 +71,7 @@ impl BestEffort {
     #[expect(clippy::too_many_arguments, reason = "the parts of a flow, borrowed one by one")]
     pub(super) fn write(
         &mut self,
-        (number, of, route, topic): (u32, Gid, Route, &Arc<str>),
+        (number, of, route, short, topic): (u32, Gid, Route, bool, &Arc<str>),
         queue: &mut Queue,
         frames: &mut Frames,
         carrier: &mut Carrier<'_>,
@@ -94,13 +94,16 @@ impl BestEffort {
             let Some(sample) = queue.pop_best_effort() else { return Some(Pause::Empty) };
             let (sequence, payload) = (sample.info.sequence, sample.payload.len());
             done.sequence = done.sequence.max(Some(sequence));
-            if carrier.seal.write(&sample, route, Delivery::BestEffort, frames, now).is_err() {
+            let mut headers = carrier.seal.short_headers().filter(|_| short);
+            let short = headers.is_some();
+            let (delivery, headers) = (Delivery::BestEffort, headers.as_mut());
+            if carrier.seal.write(&sample, route, delivery, headers, frames, now).is_err() {
                 counters.lost(topic, "no_key", 1);
                 let _ = carrier.quic.send_stream(stream).reset(goodbye());
                 return None;
             }
             let mut pending = VecDeque::from(frames.take());
-            pending.push_front(Bytes::copy_from_slice(&stream_header(false, number, of)));
+            pending.push_front(Bytes::copy_from_slice(&stream_header(false, short, number, of)));
             let class = Class::of(false, false, payload);
             let priority = class.priority() - i32::from(!self.under_way.is_empty());
             let _ = carrier.quic.send_stream(stream).set_priority(priority);

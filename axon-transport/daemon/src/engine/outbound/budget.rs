@@ -46,6 +46,12 @@ impl Budget {
         self.of_flow
     }
 
+    /// Bytes that are free here and in the whole daemon.
+    pub(super) fn free(&self) -> usize {
+        let free = self.most.saturating_sub(self.taken.get());
+        self.parent.as_ref().map_or(free, |parent| free.min(parent.free()))
+    }
+
     /// Takes these bytes if they are free here and in the whole daemon.
     pub(super) fn try_take(&self, bytes: usize) -> bool {
         let fits = self.taken.get().saturating_add(bytes) <= self.most;
@@ -93,13 +99,14 @@ mod tests {
     fn a_peer_takes_a_quarter_and_all_peers_no_more_than_there_is() {
         let daemon = Budget::new(1024);
         let peers: Vec<_> = (0..5).map(|_| daemon.of_peer()).collect();
-        assert_eq!(peers[0].of_flow(), 32);
+        assert_eq!((peers[0].of_flow(), peers[0].free()), (32, 256));
         assert!(!peers[0].try_take(257));
         for peer in &peers[..4] {
             assert!(peer.try_take(256));
             assert!(!peer.try_take(1));
         }
         assert!(!peers[4].try_take(1), "the daemon has no more");
+        assert_eq!(peers[4].free(), 0);
         let before = peers[4].released();
         peers[0].release(256);
         assert_ne!(peers[4].released(), before, "every peer sees that bytes were given back");

@@ -4,36 +4,27 @@
 use std::{collections::VecDeque, rc::Rc, sync::Arc, time::Duration};
 
 use axon_envelope::{Delivery, Kind, Route};
-use axon_shm::{
-    ids::Gid,
-    qos::{Durability, History, Qos, Reliability},
-};
-use axon_transport::internal::session::merge::{Merge, Taken};
+use axon_shm::{ids::Gid, qos::Qos};
 use bytes::Bytes;
 use quinn_proto::{Dir, StreamId, VarInt, WriteError};
 
 use super::{
-    best_effort::BestEffort,
-    budget::Budget,
-    queue::{Offered, Queue},
-    schedule::Class,
-    source::Source,
+    best_effort::BestEffort, budget::Budget, queue::Queue, schedule::Class, source::Source,
+    taking::Taking,
 };
 use crate::{
     engine::{
         connection::Carrier, counters::Counters, frames::Frames, inbound::stream_header,
-        rings::Sample,
+        short_header::ShortHeaders,
     },
     keys::NoKey,
     link::CloseCode,
 };
 
-/// Samples, and bytes, that one turn moves from the rings.
-const FILL: (usize, usize) = (256, 256 << 10);
-/// A KEEP_ALL flow with so many bytes waiting leaves further samples in the ring, which keeps them.
-const AHEAD: usize = 1 << 20;
 /// Bytes of samples that are sealed and written together.
 const TOGETHER: usize = 64 << 10;
+/// A sample of at most so many bytes is copied to its neighbours.
+const COPIED: usize = 4096;
 /// Bytes that one turn writes before other flows have theirs.
 const TURN: usize = 256 << 10;
 /// Bytes that count as progress of a long sample.
@@ -83,19 +74,16 @@ pub(super) struct Flow {
     route: Route,
     /// Whether the peer acknowledges the samples.
     acknowledged: bool,
-    /// The samples of all sources, in one order.
-    merge: Merge<Sample>,
-    /// A sample that the queue had no room for.
-    held: Option<Sample>,
-    /// Whether the rings may hold more samples than the last turn moved.
-    more: bool,
+    /// Whether the peer reads short headers.
+    short_headers: bool,
+    taking: Taking,
     /// Samples for which the sender of message keys was not told that it will need keys.
     undemanded: u32,
-    /// The relay whose losses are counted, and how many are.
-    counted: Option<(Gid, u64)>,
     queue: Queue,
     /// The stream of its RELIABLE samples.
     stream: Option<StreamId>,
+    /// The headers of that stream, or of the one that the pending batch will open, if they are short.
+    headers: Option<ShortHeaders>,
     priority: i32,
     frames: Frames,
     /// Frames that QUIC has not taken.
@@ -123,6 +111,7 @@ pub(super) struct FlowRoute {
     pub(super) topic: Arc<str>,
     pub(super) route: Route,
     pub(super) acknowledged: bool,
+    pub(super) short_headers: bool,
 }
 
 impl Flow {
@@ -134,20 +123,19 @@ impl Flow {
         budget: &Rc<Budget>,
         now: Duration,
     ) -> Self {
-        let FlowRoute { number, ref topic, route, acknowledged } = *of_route;
+        let FlowRoute { number, ref topic, route, acknowledged, short_headers } = *of_route;
         Self {
             route_number: number,
             of,
             topic: Arc::clone(topic),
             route,
             acknowledged,
-            merge: Merge::default(),
-            held: None,
-            more: false,
+            short_headers,
+            taking: Taking::new(of, route.kind),
             undemanded: 0,
-            counted: None,
             queue: Queue::new(qos, Rc::clone(budget)),
             stream: None,
+            headers: None,
             priority: 0,
             frames: Frames::default(),
             pending: VecDeque::new(),
@@ -165,15 +153,12 @@ impl Flow {
 
     /// Takes these sources; the peer has the samples up to number `seen`.
     pub(super) fn set_sources(&mut self, sources: &[Source], seen: Option<u64>) {
-        self.merge.set(sources.iter().map(Source::gid));
-        self.merge.pass(seen.unwrap_or(0));
-        self.more = true;
+        self.taking.set_sources(sources, seen);
     }
 
     /// Whether it has no sample that waits or is not acknowledged. There may be some in its rings.
     fn has_none(&self) -> bool {
-        self.held.is_none()
-            && !self.merge.holds_any()
+        self.taking.is_idle()
             && self.queue.is_empty()
             && self.pending.is_empty()
             && self.best_effort.is_idle()
@@ -186,7 +171,7 @@ impl Flow {
 
     /// Whether nothing of it waits, in its rings either, or is not acknowledged.
     pub(super) fn is_quiet(&self) -> bool {
-        self.has_none() && !self.more
+        self.has_none() && !self.taking.has_more()
     }
 
     /// Whether its stream carries nothing.
@@ -200,7 +185,7 @@ impl Flow {
             _ if !self.pending.is_empty() => self.pending.iter().map(Bytes::len).sum(),
             Some(next) => next.payload.len(),
             None if self.best_effort.is_writing() => usize::MAX,
-            None if self.more || self.held.is_some() => 0,
+            None if self.taking.has_more() => 0,
             None => return None,
         };
         let reliable = self.queue.delivery() == Delivery::Reliable;
@@ -209,7 +194,7 @@ impl Flow {
 
     /// Samples wait in a ring.
     pub(super) fn handle_samples(&mut self) {
-        self.more = true;
+        self.taking.handle_samples();
     }
 
     /// Moves a burst of a KEEP_LAST publisher into the queue while QUIC takes nothing: in the ring it would be
@@ -220,18 +205,13 @@ impl Flow {
         if !waits || !self.queue.keeps_bursts() || self.queue.is_behind(now) {
             return;
         }
-        while self.more {
-            let queued = self.fill(sources, counters, now);
-            self.undemanded += queued;
-            if queued == 0 {
-                return;
-            }
-        }
+        let Self { taking, queue, topic, .. } = self;
+        self.undemanded += taking.take_burst(sources, queue, topic, counters, now);
     }
 
     /// Whether a sample found no room.
     pub(super) fn is_held(&self) -> bool {
-        self.held.is_some()
+        self.taking.is_held()
     }
 
     /// Bytes that wait for QUIC.
@@ -244,75 +224,13 @@ impl Flow {
         self.queue.oldest()
     }
 
-    /// Moves samples from the rings into the queue. Returns how many were queued.
-    pub(super) fn fill(&mut self, sources: &[Source], counters: &Counters, now: Duration) -> u32 {
-        if !(self.more || self.held.is_some()) || !self.queue.wants_more(now) {
-            return 0;
-        }
-        let first = sources.iter().find(|source| source.reads(&self.of));
-        let qos = first.map_or_else(Qos::keep_all, Source::qos);
-        self.queue.set_qos(&qos);
-        let waits = qos.history == History::KeepAll && qos.reliability == Reliability::Reliable;
-        let (mut samples, mut bytes, mut dropped) = (0, 0, 0);
-        // A flow that is behind looks at all, to keep the newest.
-        let most = if self.queue.is_behind(now) { usize::MAX } else { FILL.1 };
-        while samples < FILL.0 && bytes < most {
-            if waits && self.queue.waiting_bytes() >= AHEAD {
-                break;
-            }
-            let Some(sample) = self.next(sources, now) else {
-                self.more = self.merge.is_behind();
-                if !self.more {
-                    self.queue.handle_empty_ring();
-                }
-                break;
-            };
-            bytes += sample.payload.len();
-            match self.queue.offer(sample, now) {
-                Offered::Queued { dropped: older } => {
-                    samples += 1;
-                    dropped += older;
-                }
-                Offered::Full(sample) => {
-                    self.held = Some(sample);
-                    break;
-                }
-            }
-        }
-        counters.lost(&self.topic, "queue", dropped);
-        self.count_overwritten(sources, counters);
-        samples as u32
+    fn fill(&mut self, sources: &[Source], counters: &Counters, now: Duration) -> u32 {
+        self.taking.fill(sources, &mut self.queue, &self.topic, counters, now)
     }
 
-    /// Counts the samples that newer ones replaced in the ring. The relay that asks for most loses the fewest: a sample
-    /// that it has is sent.
+    /// Counts the samples that newer ones replaced in the ring.
     pub(super) fn count_overwritten(&mut self, sources: &[Source], counters: &Counters) {
-        let Some(first) = sources.iter().find(|source| source.reads(&self.of)) else { return };
-        let (relay, lost) = (first.gid(), first.lost_of(&self.of));
-        let before = self.counted.replace((relay, lost));
-        let counted = match before {
-            Some((before, counted)) if before == relay => counted,
-            // What a relay with history passes over when it begins is no loss.
-            _ if first.qos().durability == Durability::TransientLocal => lost,
-            _ => 0,
-        };
-        counters.lost(&self.topic, "queue", lost.saturating_sub(counted));
-    }
-
-    fn next(&mut self, sources: &[Source], now: Duration) -> Option<Sample> {
-        let of = self.of;
-        if let Some(held) = self.held.take() {
-            return Some(held);
-        }
-        if self.route.kind == Kind::Response {
-            return sources.iter().find_map(|source| source.take_of(&of, now));
-        }
-        let next = self.merge.next(|reader| {
-            let source = sources.iter().find(|source| source.gid() == *reader)?;
-            let content = source.take_of(&of, now)?;
-            Some(Taken { number: content.info.sequence, lost: 0, content })
-        });
-        Some(next?.content)
+        self.taking.count_overwritten(sources, &self.topic, counters);
     }
 
     /// Has a turn: hands samples to QUIC until its turn is over or QUIC takes no more.
@@ -341,9 +259,20 @@ impl Flow {
                 _ => self.write_reliable(carrier, counters, done, now),
             };
             left = left.saturating_sub((carrier.taken - before) as usize);
+            if pause == Some(Pause::Empty)
+                && let Some(wait) = self.taking.take_retry()
+            {
+                // In a pass of its own, so that other flows and links have their turn.
+                self.set_timer(Some(now + wait));
+                return Pause::Empty;
+            }
             match pause {
                 None if left == 0 => return Pause::Turn,
                 None => {}
+                // All that it looked at in this turn was sent before.
+                Some(Pause::Empty) if self.taking.goes_on() && self.queue.peek().is_none() => {
+                    return Pause::Turn;
+                }
                 Some(pause) => return pause,
             }
         }
@@ -371,7 +300,8 @@ impl Flow {
                 let Some(id) = carrier.quic.streams().open(Dir::Uni) else {
                     return Some(Pause::NoStream);
                 };
-                let header = stream_header(true, self.route_number, self.of);
+                let short = self.headers.is_some();
+                let header = stream_header(true, short, self.route_number, self.of);
                 self.pending.push_front(Bytes::copy_from_slice(&header));
                 self.sealed.iter_mut().for_each(|sealed| sealed.end += header.len() as u64);
                 carrier.streams.insert(id, carrier.flow);
@@ -438,15 +368,22 @@ impl Flow {
 
     /// Seals a batch of waiting samples. Returns how many.
     fn seal(&mut self, carrier: &mut Carrier<'_>, now: Duration) -> Result<usize, NoKey> {
-        let (mut bytes, mut samples) = (0, 0);
-        (self.written, self.sealed) = (0, VecDeque::new());
-        let mut end = 0;
+        let (mut bytes, mut samples, mut end) = (0, 0, 0);
+        self.written = 0;
+        self.sealed.clear();
+        if self.stream.is_none() {
+            self.headers = carrier.seal.short_headers().filter(|_| self.short_headers);
+        }
+        if self.queue.peek().is_some_and(|next| next.payload.len() <= COPIED) {
+            // A sample takes more in the queue than its header does in the batch.
+            self.frames.reserve(self.queue.waiting_bytes().min(TOGETHER + COPIED));
+        }
         while bytes < TOGETHER {
             let Some(sample) = self.queue.send() else { break };
             let (sequence, payload) = (sample.info.sequence, sample.payload.len());
-            let delivery = Delivery::Reliable;
-            if let Err(why) =
-                carrier.seal.write(sample, self.route, delivery, &mut self.frames, now)
+            let (delivery, headers) = (Delivery::Reliable, self.headers.as_mut());
+            let frames = &mut self.frames;
+            if let Err(why) = carrier.seal.write(sample, self.route, delivery, headers, frames, now)
             {
                 self.queue.take_back();
                 if samples == 0 {
@@ -532,7 +469,7 @@ impl Flow {
         let (number, of, route) = (self.route_number, self.of, self.route);
         let before = carrier.taken;
         let pause = self.best_effort.write(
-            (number, of, route, &self.topic),
+            (number, of, route, self.short_headers, &self.topic),
             &mut self.queue,
             &mut self.frames,
             carrier,
@@ -611,7 +548,7 @@ impl Flow {
     /// The link is over and no other carries the flow. Returns the samples that were taken and did not leave.
     pub(super) fn end(&mut self, counters: &Counters) -> u64 {
         self.best_effort.link_over(counters, &self.topic);
-        let held = usize::from(self.held.take().is_some()) + self.merge.held();
+        let held = self.taking.end();
         self.rewind();
         held as u64 + self.queue.waiting()
     }

@@ -12,6 +12,7 @@ mod schedule;
 mod source;
 mod stall;
 mod streams;
+mod taking;
 #[cfg(test)]
 mod tests;
 
@@ -54,6 +55,8 @@ pub(crate) struct RouteOut {
     pub(crate) route: Route,
     /// Whether the peer acknowledges the samples.
     pub(crate) acknowledged: bool,
+    /// Whether the peer reads short headers.
+    pub(crate) short_headers: bool,
     /// Where its samples are taken.
     pub(crate) sources: Vec<Source>,
     /// The newest sample of each publisher that the peer has already.
@@ -159,8 +162,8 @@ impl Outbound {
 
     /// Serves this route from now on, or changes it.
     pub(crate) fn set_route(&mut self, number: u32, route: RouteOut, now: Duration) {
-        let RouteOut { topic, route, acknowledged, sources, seen } = route;
-        let shared = FlowRoute { number, topic, route, acknowledged };
+        let RouteOut { topic, route, acknowledged, short_headers, sources, seen } = route;
+        let shared = FlowRoute { number, topic, route, acknowledged, short_headers };
         let served = self.routes.entry(number).or_insert_with(|| Served {
             shared,
             stalled: false,

@@ -112,12 +112,32 @@ impl Queue {
         }
     }
 
-    /// Whether the engine should move samples from the ring into the queue now. A flow that is behind leaves them
-    /// in the ring, where newer samples replace them without a copy.
+    /// Whether the engine should move samples from the ring into the queue now. A KEEP_LAST flow that is behind, or
+    /// has no bytes left for a sample like its last, leaves them in the ring, where newer samples replace them without
+    /// a copy.
     pub(super) fn wants_more(&self, now: Duration) -> bool {
+        match (self.policy, self.waiting.back()) {
+            (Policy::KeepAll | Policy::BestEffort(_), _) | (_, None) => true,
+            (Policy::KeepLast(_), Some(last)) => !self.is_behind(now) && last.size() <= self.room(),
+        }
+    }
+
+    /// Bytes, in memory, of the samples that would find room.
+    pub(super) fn room(&self) -> usize {
+        let left = self.budget.of_flow().saturating_sub(self.bytes);
+        if self.policy.is_reliable() { left.min(self.budget.free()) } else { left }
+    }
+
+    /// Whether it is RELIABLE and KEEP_ALL.
+    pub(super) fn keeps_all(&self) -> bool {
+        self.policy == Policy::KeepAll
+    }
+
+    /// The history's depth; `None` for RELIABLE and KEEP_ALL.
+    pub(super) fn depth(&self) -> Option<usize> {
         match self.policy {
-            Policy::KeepLast(_) => self.waiting.is_empty() || !self.is_behind(now),
-            Policy::KeepAll | Policy::BestEffort(_) => true,
+            Policy::KeepAll => None,
+            Policy::KeepLast(depth) | Policy::BestEffort(depth) => Some(depth),
         }
     }
 
@@ -319,7 +339,7 @@ mod tests {
     }
 
     fn sample(sequence: u64, length: usize, now: Duration) -> Sample {
-        Sample::new(MessageInfo::of(Gid([1; 16]), sequence), vec![0; length], now)
+        Sample::new(MessageInfo::of(Gid([1; 16]), sequence), vec![0; length].into(), now)
     }
 
     fn keep_last(depth: u32) -> Qos {

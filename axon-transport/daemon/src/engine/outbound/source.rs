@@ -6,12 +6,16 @@ use axon_shm::{
     ids::Gid,
     qos::{Qos, Reliability},
 };
+use axon_transport::internal::session::TakeLimit;
 
 use crate::engine::{
     peer::routes::RelaySpec,
     rings::{RingReader, Sample},
     stand_in::StandIn,
 };
+
+/// One sample, however long.
+const ONE: TakeLimit = TakeLimit { samples: 1, bytes: 0 };
 
 /// A source of samples.
 #[derive(Clone)]
@@ -60,19 +64,51 @@ impl Source {
 
     /// Takes the next sample of a publisher or client.
     pub(super) fn take_of(&self, of: &Gid, now: Duration) -> Option<Sample> {
+        let mut taken = None;
+        self.take_many(of, ONE, now, &mut |sample| taken = Some(sample));
+        taken
+    }
+
+    /// Takes the next samples of a publisher or client, as many as `most` says. Returns how many.
+    pub(super) fn take_many(
+        &self,
+        of: &Gid,
+        most: TakeLimit,
+        now: Duration,
+        each: &mut dyn FnMut(Sample),
+    ) -> usize {
         match self {
-            Self::Relay(_, reader) => {
-                let (info, payload) = reader.take_of(of)?;
-                Some(Sample::new(info, payload, now))
-            }
+            Self::Relay(_, reader) => reader
+                .take_many(of, most, &mut |info, payload| each(Sample::new(info, payload, now))),
             Self::StandIn(stand_in) => {
-                let (info, payload) = stand_in.ring().take_call_of(of)?;
-                Some(Sample { client: Some(*of), ..Sample::new(info, payload, now) })
+                let mut taken = 0;
+                while taken < most.samples
+                    && let Some((info, payload)) = stand_in.ring().take_call_of(of)
+                {
+                    each(Sample { client: Some(*of), ..Sample::new(info, payload.into(), now) });
+                    taken += 1;
+                }
+                taken
             }
         }
     }
 
-    /// How many samples of this publisher newer ones replaced before they were taken.
+    /// Passes over all samples of this publisher but the newest `depth`.
+    pub(super) fn skip_of(&self, of: &Gid, depth: usize) {
+        if let Self::Relay(_, reader) = self {
+            reader.skip_of(of, depth as u64);
+        }
+    }
+
+    /// After what time a sample of this publisher may be taken, where none could be although some wait.
+    pub(super) fn retry_of(&self, of: &Gid) -> Option<Duration> {
+        match self {
+            Self::Relay(_, reader) => reader.retry_of(of),
+            Self::StandIn(_) => None,
+        }
+    }
+
+    /// How many samples of this publisher newer ones replaced before they were taken, or were passed over.
     pub(super) fn lost_of(&self, of: &Gid) -> u64 {
         match self {
             Self::Relay(_, reader) => reader.lost_of(of),

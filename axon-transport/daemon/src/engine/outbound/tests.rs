@@ -1,1 +1,292 @@
+use std::{
+    cell::{Cell, RefCell},
+    collections::{HashMap, VecDeque},
+    rc::Rc,
+    sync::Arc,
+    time::Duration,
+};
 
+use axon_envelope::Kind;
+use axon_shm::{ids::Gid, qos::Qos};
+use axon_transport::{MessageInfo, internal::session::TakeLimit};
+use bytes::Bytes;
+
+use super::{budget::Budget, queue::Queue, source::Source, taking::Taking};
+use crate::engine::{counters::Counters, peer::routes::RelaySpec, rings::RingReader};
+
+const PUBLISHER: Gid = Gid([1; 16]);
+
+fn at(millis: u64) -> Duration {
+    Duration::from_millis(millis)
+}
+
+/// The ring of one publisher. It keeps every sample.
+#[derive(Default)]
+struct Ring {
+    samples: RefCell<VecDeque<(u64, usize)>>,
+    published: Cell<u64>,
+    copied: Cell<u64>,
+    lost: Cell<u64>,
+    /// How many samples are published when one is copied, and how often.
+    meanwhile: Cell<(u64, u64)>,
+}
+
+impl Ring {
+    fn publish(&self, samples: u64, length: usize) {
+        for _ in 0..samples {
+            self.published.set(self.published.get() + 1);
+            self.samples.borrow_mut().push_back((self.published.get(), length));
+        }
+    }
+}
+
+impl RingReader for Ring {
+    fn gid(&self) -> Gid {
+        Gid([2; 16])
+    }
+
+    fn with_data(&self) -> Vec<Gid> {
+        self.matched()
+    }
+
+    fn reads(&self, publisher: &Gid) -> bool {
+        *publisher == PUBLISHER
+    }
+
+    fn matched(&self) -> Vec<Gid> {
+        vec![PUBLISHER]
+    }
+
+    fn take_many(
+        &self,
+        publisher: &Gid,
+        most: TakeLimit,
+        each: &mut dyn FnMut(MessageInfo, Bytes),
+    ) -> usize {
+        let (mut taken, mut bytes) = (0, 0);
+        while taken < most.samples {
+            let next = self.samples.borrow().front().copied();
+            let fits = |length| taken == 0 || bytes + length <= most.bytes;
+            let Some((number, length)) = next.filter(|(_, length)| fits(*length)) else { break };
+            self.samples.borrow_mut().pop_front();
+            self.copied.set(self.copied.get() + 1);
+            (taken, bytes) = (taken + 1, bytes + length);
+            let (samples, times) = self.meanwhile.get();
+            if times > 0 {
+                self.meanwhile.set((samples, times - 1));
+                self.publish(samples, length);
+            }
+            each(MessageInfo::of(*publisher, number), vec![0; length].into());
+        }
+        taken
+    }
+
+    fn retry_of(&self, _publisher: &Gid) -> Option<Duration> {
+        (!self.samples.borrow().is_empty()).then_some(Duration::ZERO)
+    }
+
+    fn skip_of(&self, _publisher: &Gid, depth: u64) {
+        let mut samples = self.samples.borrow_mut();
+        let stale = samples.len().saturating_sub(depth as usize);
+        samples.drain(..stale);
+        self.lost.set(self.lost.get() + stale as u64);
+    }
+
+    fn lost_of(&self, _publisher: &Gid) -> u64 {
+        self.lost.get()
+    }
+
+    fn acknowledge_of(&self, _publisher: &Gid, _sequence: u64) {}
+
+    fn unacknowledged(&self) -> HashMap<Gid, u64> {
+        HashMap::new()
+    }
+
+    fn give_up(&self, _publisher: Gid, _samples: u64) {}
+
+    fn assertions(&self) -> Vec<(Gid, u64)> {
+        Vec::new()
+    }
+
+    fn set_stands_for(&self, _gids: Vec<Gid>) {}
+}
+
+/// The way of one publisher's samples from its ring to QUIC.
+struct Way {
+    ring: Rc<Ring>,
+    sources: Vec<Source>,
+    queue: Queue,
+    taking: Taking,
+    topic: Arc<str>,
+    counters: Counters,
+}
+
+impl Way {
+    fn new(qos: Qos) -> Self {
+        let ring = Rc::new(Ring::default());
+        let spec =
+            RelaySpec { qos, depth: qos.depth, type_hash: Vec::new(), stands_for: Vec::new() };
+        let sources = vec![Source::Relay(spec, Rc::clone(&ring) as Rc<dyn RingReader>)];
+        let mut taking = Taking::new(PUBLISHER, Kind::Topic);
+        taking.set_sources(&sources, None);
+        Self {
+            ring,
+            sources,
+            queue: Queue::new(&qos, Budget::new(256 << 20).of_peer()),
+            taking,
+            topic: "/t".into(),
+            counters: Counters::default(),
+        }
+    }
+
+    fn fill(&mut self, now: Duration) -> u32 {
+        self.taking.handle_samples();
+        let Self { taking, sources, queue, topic, counters, .. } = self;
+        taking.fill(sources, queue, topic, counters, now)
+    }
+
+    /// The numbers of the samples that wait, which all leave and are acknowledged.
+    fn send_all(&mut self) -> Vec<u64> {
+        let queue = &mut self.queue;
+        let sent: Vec<_> =
+            std::iter::from_fn(|| queue.send().map(|sample| sample.info.sequence)).collect();
+        if let Some(last) = sent.last() {
+            queue.acknowledge(*last);
+        }
+        sent
+    }
+
+    fn dropped(&self) -> u64 {
+        self.counters.take_lost().iter().map(|loss| loss.samples).sum()
+    }
+}
+
+fn keep_last(depth: u32) -> Qos {
+    Qos { depth, ..Qos::default() }
+}
+
+/// A KEEP_LAST flow that had samples waiting for longer than a burst lasts. One sample was sent.
+fn behind(depth: u32) -> Way {
+    let mut way = Way::new(keep_last(depth));
+    way.ring.publish(1, 1 << 20);
+    assert_eq!(way.fill(at(0)), 1);
+    way.ring.publish(1000, 1 << 20);
+    assert_eq!(way.send_all(), [1]);
+    way
+}
+
+#[test]
+fn keep_last_that_is_behind_copies_only_samples_that_it_sends() {
+    let mut way = behind(3);
+    let mut sent = vec![1];
+    // The publisher goes on while the flow takes its samples, and is faster.
+    way.ring.meanwhile.set((10, 50));
+    for turn in 0..100 {
+        way.fill(at(600 + turn));
+        sent.extend(way.send_all());
+    }
+    assert_eq!(way.ring.copied.get(), sent.len() as u64, "each copied sample was sent");
+    assert!(sent.is_sorted_by(|one, next| one < next));
+    let published = way.ring.published.get();
+    assert_eq!(published, 1501);
+    assert_eq!(sent[sent.len() - 3..], [1499, 1500, 1501], "the newest of the depth arrive");
+    assert_eq!(way.dropped(), published - sent.len() as u64, "all others are counted once");
+}
+
+#[test]
+fn keep_last_that_is_behind_leaves_long_samples_in_the_ring_until_they_are_sent() {
+    let mut way = behind(10);
+    assert_eq!(way.fill(at(600)), 1);
+    assert_eq!(way.fill(at(601)), 0, "one waits");
+    // Newer samples replace the older ones in the ring.
+    way.ring.publish(100, 1 << 20);
+    assert_eq!(way.send_all(), [992]);
+    assert_eq!(way.fill(at(602)), 1);
+    assert_eq!(way.send_all(), [1092]);
+    assert_eq!(way.ring.copied.get(), 3);
+}
+
+#[test]
+fn a_burst_of_keep_last_that_exceeds_its_bytes_stays_in_the_ring() {
+    let mut way = Way::new(keep_last(10));
+    way.ring.publish(100, 1 << 20);
+    let mut queued = 0;
+    for _ in 0..100 {
+        queued += way.fill(at(0));
+    }
+    // 8 MiB, less what a sample takes besides its bytes.
+    assert_eq!((queued, way.ring.copied.get(), way.dropped()), (7, 7, 0));
+    assert_eq!(way.send_all(), (1..=7).collect::<Vec<_>>());
+    assert!(way.fill(at(1)) > 0);
+    assert_eq!(way.send_all()[0], 8, "nothing of the burst is lost");
+}
+
+#[test]
+fn a_burst_of_a_publisher_that_never_rests_ends() {
+    let mut way = Way::new(keep_last(10));
+    way.ring.meanwhile.set((1, u64::MAX));
+    way.ring.publish(1, 16);
+    let Way { taking, sources, queue, topic, counters, .. } = &mut way;
+    assert_eq!(taking.take_burst(sources, queue, topic, counters, at(0)), 4 * 1024);
+    assert!(taking.has_more());
+}
+
+#[test]
+fn best_effort_that_is_behind_looks_at_no_more_than_its_depth() {
+    let mut way = Way::new(Qos { depth: 5, ..Qos::sensor_data() });
+    way.ring.publish(1, 1 << 20);
+    assert_eq!(way.fill(at(0)), 1);
+    way.ring.publish(1000, 1 << 20);
+    way.fill(at(600));
+    assert_eq!(way.ring.copied.get(), 6);
+    let left: Vec<_> = std::iter::from_fn(|| way.queue.pop_best_effort()).collect();
+    assert_eq!(
+        left.iter().map(|s| s.info.sequence).collect::<Vec<_>>(),
+        [997, 998, 999, 1000, 1001]
+    );
+    assert_eq!(way.dropped(), 996);
+}
+
+#[test]
+fn keep_all_leaves_no_sample_behind() {
+    let mut way = Way::new(Qos::keep_all());
+    way.ring.publish(3000, 1000);
+    let mut sent = Vec::new();
+    for turn in 0..100 {
+        way.fill(at(turn * 100));
+        sent.extend(way.send_all());
+    }
+    assert_eq!(sent, (1..=3000).collect::<Vec<_>>());
+    assert_eq!((way.dropped(), way.ring.lost.get()), (0, 0));
+}
+
+#[test]
+fn samples_that_the_peer_has_are_not_queued() {
+    let mut way = Way::new(Qos::keep_all());
+    way.taking.set_sources(&way.sources, Some(20_000));
+    way.ring.publish(20_003, 10);
+    let mut turns = 0;
+    while way.fill(at(0)) == 0 {
+        turns += 1;
+        assert!(turns < 10, "it goes on after each turn");
+    }
+    assert_eq!(way.send_all(), [20_001, 20_002, 20_003]);
+}
+
+#[test]
+fn a_flow_without_room_takes_one_sample_and_keeps_it() {
+    let mut way = Way::new(Qos::keep_all());
+    // All the memory that the daemon has is another flow's.
+    let budget = Budget::new(1024);
+    budget.overtake(1024);
+    way.queue = Queue::new(&Qos::keep_all(), budget.of_peer());
+    way.ring.publish(10, 100);
+    assert_eq!(way.fill(at(0)), 1, "one sample may always wait");
+    assert_eq!((way.fill(at(0)), way.ring.copied.get()), (0, 2));
+    assert!(way.taking.is_held() && !way.taking.is_idle());
+    assert_eq!((way.fill(at(0)), way.ring.copied.get()), (0, 2));
+    assert_eq!(way.send_all(), [1]);
+    assert_eq!(way.fill(at(0)), 1);
+    assert_eq!(way.send_all(), [2]);
+    assert_eq!(way.taking.end(), 1);
+}

@@ -60,6 +60,7 @@ impl Asked {
             subscribers: self.wanted.subscribers.clone(),
             last: last.collect(),
             acknowledges: Some(key.kind == Kind::Topic),
+            short_headers: Some(key.kind == Kind::Topic),
         })
     }
 }

@@ -67,6 +67,7 @@ impl Peer {
             other => return Err(format!("a route of kind {other}")),
         };
         let acknowledged = kind == Kind::Topic && subscribe.acknowledges == Some(true);
+        let short_headers = kind == Kind::Topic && subscribe.short_headers == Some(true);
         let key = RouteKey { kind, topic, type_name };
         if let Some(other) = self.served_as.get(&key).copied().filter(|other| *other != number) {
             if self.served.get(&other).is_some_and(|served| served.repeated) {
@@ -117,7 +118,9 @@ impl Peer {
         let route = Route { kind, topic: hash };
         let seen = last.iter().map(|l| (l.publisher, l.sequence)).collect();
         let topic = key.topic.as_str().into();
-        let out = RouteOut { topic, route, acknowledged, sources: sources.clone(), seen };
+        let sources_out = sources.clone();
+        let out =
+            RouteOut { topic, route, acknowledged, short_headers, sources: sources_out, seen };
         self.outbound.set_route(number, out, now);
         self.served_as.insert(key.clone(), number);
         let served = Served {
@@ -265,8 +268,9 @@ impl Peer {
             let Some(served) = self.served.get_mut(&number) else { continue };
             served.sources.clone_from(&sources);
             let topic = served.key.topic.as_str().into();
-            let (route, acknowledged, seen) = (served.route, false, HashMap::new());
-            let out = RouteOut { topic, route, acknowledged, sources, seen };
+            let (route, seen) = (served.route, HashMap::new());
+            let (acknowledged, short_headers) = (false, false);
+            let out = RouteOut { topic, route, acknowledged, short_headers, sources, seen };
             self.outbound.set_route(number, out, now);
         }
     }

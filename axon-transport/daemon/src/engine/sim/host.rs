@@ -1,6 +1,7 @@
 //! A simulated host: one engine with rings, a KME and a control plane that dials.
 
 use std::{
+    cell::Cell,
     collections::{BTreeMap, BTreeSet, VecDeque},
     net::{IpAddr, Ipv4Addr, SocketAddr},
     rc::Rc,
@@ -32,12 +33,16 @@ use crate::{
     keys::{Origin, Request},
     link::Hello,
     owner::SessionKeys,
+    wire::beacon::Datagram,
 };
 
 /// The port of QUIC on each host.
 pub(super) const PORT: u16 = 61_300;
 /// Time between a failed dial, or the end of a link, and the next dial.
 const REDIAL: Duration = Duration::from_millis(250);
+
+/// A dial has come to an end after this time.
+const LONGEST_DIAL: Duration = Duration::from_secs(60);
 
 /// A simulated host.
 pub(super) struct Host {
@@ -65,6 +70,10 @@ pub(super) struct Host {
     used: BTreeSet<String>,
     graph_changed: bool,
     rings_rang: bool,
+    /// When the host has something to do, while nothing changed since that was asked.
+    due: Cell<Option<Option<Duration>>>,
+    /// When dials began.
+    dialled: VecDeque<Duration>,
 }
 
 struct Wanted {
@@ -98,11 +107,14 @@ impl Host {
             used: BTreeSet::new(),
             graph_changed: false,
             rings_rang: false,
+            due: Cell::new(None),
+            dialled: VecDeque::new(),
         }
     }
 
     /// Starts the daemon.
     pub(super) fn start(&mut self, now: Duration) {
+        self.due.set(None);
         self.starts += 1;
         let host = Stream::Host { host: self.number as u32, start: self.starts };
         let mut random = stream(self.seed, host);
@@ -150,6 +162,7 @@ impl Host {
 
     /// Kills the daemon: it says nothing, and its state is gone.
     pub(super) fn kill(&mut self) {
+        self.due.set(None);
         self.engine = None;
         self.linked.clear();
         self.graph.clear();
@@ -162,6 +175,7 @@ impl Host {
 
     /// Ends the daemon in order. Its packets leave with the next transmit.
     pub(super) fn close(&mut self, now: Duration) {
+        self.due.set(None);
         if let Some(engine) = &mut self.engine {
             engine.close(now);
             engine.settle(now);
@@ -184,6 +198,7 @@ impl Host {
         sae: Option<String>,
         now: Duration,
     ) {
+        self.due.set(None);
         let address = SocketAddr::from((address, PORT));
         // The other one dials too, later, as discovery has it.
         let wait = if self.daemon < daemon { Duration::ZERO } else { Duration::from_millis(300) };
@@ -192,6 +207,7 @@ impl Host {
 
     /// Forgets a peer that is gone.
     pub(super) fn unwant(&mut self, daemon: DaemonId) {
+        self.due.set(None);
         self.peers.remove(&daemon);
     }
 
@@ -200,8 +216,19 @@ impl Host {
         self.engine.as_ref().map_or((0, 0), Engine::backlog)
     }
 
+    /// Checks that the host holds no more than it may.
+    pub(super) fn check_held(&mut self, now: Duration) {
+        self.dialled.retain(|at| *at + LONGEST_DIAL >= now);
+        if let Some(engine) = &self.engine {
+            // Links dial their successors themselves.
+            let dials = self.dialled.len() + self.linked.len();
+            super::held::check(engine, self.config.reliable_queue as usize, dials);
+        }
+    }
+
     /// A peer has another address.
     pub(super) fn moved(&mut self, daemon: DaemonId, address: Ipv4Addr) {
+        self.due.set(None);
         if let Some(wanted) = self.peers.get_mut(&daemon) {
             wanted.address = SocketAddr::from((address, PORT));
         }
@@ -209,11 +236,13 @@ impl Host {
 
     /// The endpoints of the host changed.
     pub(super) fn touch_graph(&mut self) {
+        self.due.set(None);
         self.graph_changed = true;
     }
 
     /// A ring rang.
     pub(super) fn ring(&mut self) {
+        self.due.set(None);
         self.rings_rang = true;
     }
 
@@ -225,6 +254,7 @@ impl Host {
         bytes: BytesMut,
         now: Duration,
     ) {
+        self.due.set(None);
         if let Some(engine) = &mut self.engine {
             let local = Some(IpAddr::V4(self.address));
             engine.handle_datagram(0, from, local, ecn, bytes, now);
@@ -233,6 +263,7 @@ impl Host {
 
     /// The KME answered.
     pub(super) fn handle_key_event(&mut self, event: crate::keys::Event, now: Duration) {
+        self.due.set(None);
         if let Some(engine) = &mut self.engine {
             engine.handle_key_event(event, now);
         }
@@ -240,6 +271,12 @@ impl Host {
 
     /// When the host has something to do.
     pub(super) fn poll_timeout(&self, now: Duration) -> Option<Duration> {
+        let due = self.due.get().unwrap_or_else(|| self.look_when_due(now));
+        self.due.set(Some(due));
+        due
+    }
+
+    fn look_when_due(&self, now: Duration) -> Option<Duration> {
         let engine = self.engine.as_ref()?;
         let ready =
             (self.graph_changed || self.rings_rang || !self.records.is_empty()).then_some(now);
@@ -250,6 +287,7 @@ impl Host {
 
     /// One pass of the host.
     pub(super) fn pass(&mut self, now: Duration) {
+        self.due.set(None);
         let Some(engine) = &mut self.engine else { return };
         if std::mem::take(&mut self.graph_changed) {
             let range = EndpointRange { range: DiscoveryRange::Subnet, lists: Vec::new() };
@@ -269,6 +307,7 @@ impl Host {
                 continue;
             }
             wanted.dial_at = None;
+            self.dialled.push_back(now);
             let (addresses, sae) = (vec![wanted.address], wanted.sae.clone());
             let standing = AddressConfidence::Heard;
             let dial = ToGateway::Dial { daemon: *daemon, sae, addresses, listed: false, standing };
@@ -278,6 +317,7 @@ impl Host {
             engine.handle_timeout(now);
         }
         engine.settle(now);
+        assert!(!self.rings.has_unannounced(), "readers are woken for all that was written");
         let mut effects = Vec::new();
         while let Some(effect) = engine.poll_effect() {
             effects.push(effect);
@@ -322,6 +362,15 @@ impl Host {
             ToControl::Lost { topic, cause, samples } => {
                 *self.lost.entry((topic, cause)).or_default() += samples;
             }
+            // As the control plane answers a probe; beacons there are none.
+            ToControl::Datagram { from, bytes } => {
+                if let (Ok(Datagram::Probe { nonce, .. }), Some(engine)) =
+                    (Datagram::decode(&bytes), &mut self.engine)
+                {
+                    let bytes = Datagram::Echo { daemon: self.daemon, nonce }.encode();
+                    engine.handle_order(ToGateway::SendDatagram { to: from, bytes }, now);
+                }
+            }
             ToControl::Link(status) => {
                 self.status.insert(status.peer.clone(), *status);
             }
@@ -342,6 +391,7 @@ impl Host {
         buffer: &mut Vec<u8>,
         now: Duration,
     ) -> Option<Transmit> {
+        self.due.set(None);
         Some(self.engine.as_mut()?.poll_transmit(10, buffer, now)?.1)
     }
 }

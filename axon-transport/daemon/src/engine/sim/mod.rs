@@ -5,13 +5,22 @@
 //! [`rings`] models a host's rings, [`host`] a host with its engine, and [`world`] all hosts and the clock. [`run`] runs
 //! a script in a world.
 
+mod held;
 mod host;
+mod hostile;
+mod kills;
+mod losses;
+mod moves;
 pub(crate) mod network;
+mod radio;
+mod raw;
 mod rings;
 pub(crate) mod rng;
 mod run;
 pub(crate) mod script;
+mod segment;
 mod tests;
 mod topics;
+mod torture;
 pub(crate) mod trace;
 mod world;

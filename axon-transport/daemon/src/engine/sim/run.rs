@@ -225,16 +225,7 @@ impl Run<'_> {
             let (waiting, _) = host.backlog();
             assert_eq!(waiting, 0, "host {} holds samples: {}", host.number, self.world.describe());
         }
-        for (from, to) in self.world.losses() {
-            let there = &self.world.hosts[from.0].rings;
-            let (missing, given_up) = (to.1, there.given_up(from.1));
-            assert!(
-                missing <= given_up,
-                "{missing} samples of {from:?} are missing at {:?}, and {given_up} were given up: {}",
-                to.0,
-                self.world.describe()
-            );
-        }
+        self.world.check_losses("");
     }
 }
 

@@ -1,21 +1,24 @@
 //! A world of hosts on one network, with a virtual clock.
 
 use std::{
+    collections::BTreeSet,
     fmt::Write,
     net::SocketAddr,
     time::{Duration, Instant},
 };
 
 use axon_shm::{
-    ids::Gid,
+    ids::{DaemonId, Gid},
     qos::{History, Qos, Reliability},
 };
 use axon_transport::config::Config;
 use bytes::BytesMut;
+use quinn_proto::Transmit;
 
 use super::{
     host::{Host, PORT},
     network::Network,
+    raw::Raw,
 };
 use crate::{engine::keyring::tests::Kmes, keys::Event};
 
@@ -30,11 +33,14 @@ pub(super) struct World {
     pub(super) now: Duration,
     pub(super) network: Network,
     pub(super) hosts: Vec<Host>,
+    /// Peers without an engine.
+    pub(super) raws: Vec<Raw>,
+    epoch: Instant,
     pub(super) kmes: Kmes,
     answers: Vec<(Duration, usize, Event)>,
     stopped: Vec<bool>,
-    /// Passes of all hosts since the start.
-    pub(super) passes: u64,
+    /// Passes of each host since the start.
+    pub(super) passes: Vec<u64>,
     /// Publishers and subscriptions whose samples are checked.
     pub(super) pairs: Vec<Pair>,
 }
@@ -49,6 +55,13 @@ pub(super) struct Pair {
 impl World {
     /// So many hosts with these settings; their daemons are started and link with each other.
     pub(super) fn new(seed: u64, hosts: usize, config: impl Fn(usize) -> Config) -> Self {
+        let mut world = Self::apart(seed, hosts, config);
+        (0..hosts).for_each(|host| world.introduce(host));
+        world
+    }
+
+    /// As [`new`](Self::new), but nobody dials.
+    pub(super) fn apart(seed: u64, hosts: usize, config: impl Fn(usize) -> Config) -> Self {
         let epoch = Instant::now();
         let mut network = Network::new(seed);
         let mut all = Vec::new();
@@ -58,44 +71,77 @@ impl World {
             host.start(Duration::ZERO);
             all.push(host);
         }
-        let mut world = Self {
+        Self {
             now: Duration::ZERO,
             network,
             hosts: all,
+            raws: Vec::new(),
+            epoch,
             kmes: Kmes::default(),
             answers: Vec::new(),
             stopped: vec![false; hosts],
-            passes: 0,
+            passes: vec![0; hosts],
             pairs: Vec::new(),
-        };
-        for host in 0..hosts {
-            world.introduce(host);
         }
-        world
     }
 
     /// Tells all hosts of a host's daemon, and the other way round.
     fn introduce(&mut self, of: usize) {
-        let (daemon, address) = (self.hosts[of].daemon, self.hosts[of].address);
-        let sae = self.hosts[of].sae();
-        for other in 0..self.hosts.len() {
-            if other == of {
-                continue;
-            }
-            let (there, theirs) = (self.hosts[other].daemon, self.hosts[other].address);
-            let their_sae = self.hosts[other].sae();
-            self.hosts[other].want(daemon, address, sae.clone(), self.now);
-            self.hosts[of].want(there, theirs, their_sae, self.now);
+        for other in (0..self.hosts.len()).filter(|other| *other != of) {
+            self.tell(other, of);
+            self.tell(of, other);
+        }
+    }
+
+    /// Has a host link with another one, which it dials.
+    pub(super) fn tell(&mut self, host: usize, of: usize) {
+        let other = &self.hosts[of];
+        let (daemon, address, sae) = (other.daemon, other.address, other.sae());
+        self.hosts[host].want(daemon, address, sae, self.now);
+    }
+
+    /// Adds a peer that a test speaks for. Returns its number among those.
+    pub(super) fn add_raw(&mut self, config: Config, daemon: DaemonId) -> usize {
+        let host = self.hosts.len() + self.raws.len();
+        let raw = Raw::new(host, config, daemon, self.epoch);
+        assert_eq!(self.network.add_host(&[raw.address]), host);
+        self.raws.push(raw);
+        self.raws.len() - 1
+    }
+
+    /// Has a raw peer do something, and sends what comes of it.
+    pub(super) fn with_raw<T>(
+        &mut self,
+        number: usize,
+        act: impl FnOnce(&mut Raw, Duration) -> T,
+    ) -> T {
+        let done = act(&mut self.raws[number], self.now);
+        self.pass_raw(number);
+        done
+    }
+
+    fn pass_raw(&mut self, number: usize) {
+        let (now, raw) = (self.now, &mut self.raws[number]);
+        raw.pass(now);
+        let from = SocketAddr::from((raw.address, PORT));
+        while let Some((transmit, bytes)) = raw.poll_transmit(now) {
+            let Transmit { destination: to, ecn, size, segment_size, .. } = transmit;
+            self.network.send(now, from, to, ecn, &bytes[..size], segment_size);
         }
     }
 
     /// Ends a host's daemon: at once, or as after SIGTERM.
     pub(super) fn kill(&mut self, host: usize, orderly: bool) {
         if orderly {
-            self.hosts[host].close(self.now);
-            self.transmit(host);
+            self.close(host);
         }
         self.hosts[host].kill();
+    }
+
+    /// Has a host's daemon end in order, as far as it comes before it is killed.
+    pub(super) fn close(&mut self, host: usize) {
+        self.hosts[host].close(self.now);
+        self.transmit(host);
     }
 
     /// Stops a host, or lets it go on. Datagrams wait meanwhile.
@@ -129,7 +175,7 @@ impl World {
 
     /// For each RELIABLE and KEEP_ALL pair of which samples came: the publisher, and the subscription with the
     /// samples that are missing after the first that came.
-    pub(super) fn losses(&self) -> Vec<(HostEndpoint, (HostEndpoint, u64))> {
+    fn losses(&self) -> Vec<(HostEndpoint, (HostEndpoint, u64))> {
         let mut losses = Vec::new();
         for there in &self.hosts {
             for (subscription, publisher, first, came) in there.rings.complete() {
@@ -145,6 +191,19 @@ impl World {
             }
         }
         losses
+    }
+
+    /// What must hold once all is quiet: no RELIABLE and KEEP_ALL sample is missing but those that were given up.
+    pub(super) fn check_losses(&self, case: &str) {
+        for (from, to) in self.losses() {
+            let (missing, given_up) = (to.1, self.hosts[from.0].rings.given_up(from.1));
+            assert!(
+                missing <= given_up,
+                "{case}: {missing} samples of {from:?} are missing at {:?}, and {given_up} were given up: {}",
+                to.0,
+                self.describe()
+            );
+        }
     }
 
     /// Starts a host's daemon again, under a new id. The others forget the old one.
@@ -188,10 +247,17 @@ impl World {
     }
 
     /// The time of the next event.
-    fn next(&self) -> Option<Duration> {
+    fn next(&mut self) -> Option<Duration> {
+        let raws = self.raws.iter_mut().filter_map(Raw::poll_timeout).min();
         let hosts = (0..self.hosts.len()).filter_map(|host| self.due(host)).min();
         let answer = self.answers.iter().map(|(at, ..)| *at).min();
-        [hosts, answer, self.network.poll_timeout()].into_iter().flatten().min()
+        [hosts, raws, answer, self.network.poll_timeout()].into_iter().flatten().min()
+    }
+
+    /// Runs to the next event, and does it.
+    pub(super) fn run_one(&mut self) {
+        self.now = self.next().expect("a daemon that runs has something to do").max(self.now);
+        self.step();
     }
 
     /// Runs until this time.
@@ -223,17 +289,30 @@ impl World {
         }
     }
 
-    /// One event: all that is due now.
+    /// One event: all that is due now. A host handles all datagrams that came at one time in one pass, as the reactor
+    /// does.
     fn step(&mut self) {
         let now = self.now;
+        let mut came = BTreeSet::new();
         while let Some(delivery) = self.network.poll_delivery(now) {
             if delivery.at.port() != PORT {
                 continue;
             }
             let bytes = BytesMut::from(delivery.bytes);
-            let host = &mut self.hosts[delivery.host];
-            host.handle_datagram(delivery.from, delivery.ecn, bytes, now);
-            self.pass(delivery.host);
+            match self.hosts.get_mut(delivery.host) {
+                Some(host) => host.handle_datagram(delivery.from, delivery.ecn, bytes, now),
+                None => {
+                    let raw = &mut self.raws[delivery.host - self.hosts.len()];
+                    raw.handle_datagram(delivery.from, delivery.ecn, bytes, now);
+                }
+            }
+            came.insert(delivery.host);
+        }
+        for host in came {
+            match host.checked_sub(self.hosts.len()) {
+                None => self.pass(host),
+                Some(raw) => self.pass_raw(raw),
+            }
         }
         let due: Vec<_> = self.answers.extract_if(.., |(at, ..)| *at <= now).collect();
         for (_, host, event) in due {
@@ -246,11 +325,16 @@ impl World {
                 self.pass(host);
             }
         }
+        for raw in 0..self.raws.len() {
+            if self.raws[raw].poll_timeout().is_some_and(|due| due <= now) {
+                self.pass_raw(raw);
+            }
+        }
     }
 
     fn pass(&mut self, number: usize) {
         let now = self.now;
-        self.passes += 1;
+        self.passes[number] += 1;
         self.hosts[number].pass(now);
         self.transmit(number);
         let host = &mut self.hosts[number];
@@ -273,7 +357,8 @@ impl World {
     }
 
     /// What must hold after each pass: no sample twice, none out of order, none damaged.
-    fn check(&self, host: usize) {
+    fn check(&mut self, host: usize) {
+        self.hosts[host].check_held(self.now);
         let rings = &self.hosts[host].rings;
         assert_eq!(rings.damaged(), 0, "a sample was damaged: {}", self.describe());
         assert_eq!(rings.disordered(), 0, "a sample came twice or late: {}", self.describe());

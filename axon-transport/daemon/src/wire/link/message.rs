@@ -168,6 +168,9 @@ pub struct Subscribe {
     /// Whether the asking side acknowledges the samples of a topic with RECEIVED.
     #[n(6)]
     pub acknowledges: Option<bool>,
+    /// Whether the asking side reads short headers.
+    #[n(7)]
+    pub short_headers: Option<bool>,
 }
 
 impl Subscribe {

@@ -69,6 +69,7 @@ pub(crate) fn messages() -> Vec<Message> {
             subscribers: vec![Subscriber { gid: Gid([6; 16]), qos }],
             last: vec![LastSeen { publisher: Gid([7; 16]), sequence: 42 }],
             acknowledges: Some(true),
+            short_headers: Some(true),
         }),
         Message::Received(Received {
             flows: vec![ReceivedOf { route: 1, publisher: Gid([7; 16]), sequence: 43, dropped: 1 }],

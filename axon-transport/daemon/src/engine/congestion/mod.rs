@@ -1,0 +1,424 @@
+//! The congestion controller of links between robots: it obeys delay and ECN marks, and ignores random loss.
+//!
+//! Radio links lose packets that no queue dropped, and their queues are deep. CUBIC halves at each loss and fills each
+//! queue: at 1 % of loss it leaves most of a link unused, and without loss a command waits behind a full queue.
+//!
+//! Once a round, which is the time until a packet that was sent at its start is acknowledged, [`Delay`] compares the
+//! shortest round trip of the round with the shortest one of the path. The difference is the time in queues.
+//! * Up to twice the wanted queue the window grows, faster after quiet rounds.
+//! * Beyond it the window shrinks to what drains the queue. All links at one bottleneck see the queue at the same time
+//!   and drain it together. So each sees the path without a queue, and all come to equal shares.
+//! * Where packets are lost, growth must bring more bytes through: a queue too short to be seen drops instead
+//!   ([`growth`]).
+//! * Where the window shrinks and the queue does not, somebody else fills it, or the path has become longer. Until that
+//!   is known CUBIC decides, which has its share beside other CUBICs ([`competition`]).
+
+mod competition;
+mod growth;
+mod path;
+
+use std::{
+    any::Any,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use quinn_proto::{
+    RttEstimator,
+    congestion::{Controller, ControllerFactory, ControllerMetrics},
+};
+
+use competition::{Competition, Outcome, Standing};
+use growth::{Growth, TRIAL};
+use path::Path;
+
+/// The queue that is wanted: half as long as the path, within these.
+const WANTED: (Duration, Duration) = (Duration::from_millis(2), Duration::from_millis(10));
+/// The queue that is wanted, at least, in packets: a slow path cannot have a shorter one.
+const PACKETS_WANTED: f64 = 2.0;
+/// The wanted queue is so many times what round trips differ by chance, at least.
+const BY_CHANCE: u32 = 8;
+/// Packets that may always be on the way.
+const FLOOR: u64 = 2;
+/// The window at the start in packets and in bytes: the larger of the two (RFC 9002, 7.2).
+const INITIAL: (u64, u64) = (10, 14_720);
+/// The share of the path that is filled after the window shrank: a little less than all of it, so that the queue
+/// empties. A path that is new was perhaps never seen without a queue, and is drained further.
+const DRAINED: (f64, f64) = (0.95, 0.75);
+/// Times that the window shrinks until a path is not new any more.
+const NEW: u32 = 4;
+/// What is left of the window when it shrinks, at least and at most.
+const SHRUNK: (f64, f64) = (0.25, 0.9);
+/// A round trip that is so much longer than the path is acted upon before the round ends,
+const URGENT: Duration = Duration::from_millis(50);
+/// if so many follow each other.
+const URGENT_IN_A_ROW: u32 = 4;
+/// Packets at the beginning of a round that show a queue while the window doubles.
+const TELLING: u32 = 8;
+/// Rounds with more losses and no more bytes that end the start.
+const IDLE: u32 = 3;
+/// What is left of the window after an ECN mark, and after a time without any acknowledgement.
+const MARKED: (f64, f64) = (0.8, 0.5);
+
+/// The settings of [`Delay`]: none.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct DelayConfig;
+
+impl ControllerFactory for DelayConfig {
+    fn build(self: Arc<Self>, now: Instant, current_mtu: u16) -> Box<dyn Controller> {
+        Box::new(Delay::new(now, current_mtu))
+    }
+}
+
+/// What the window follows.
+#[derive(Debug, Clone)]
+enum Phase {
+    /// It doubles each round until a queue is seen, or until that does not pay.
+    Start {
+        /// The most bytes a second that a round brought through.
+        best: f64,
+        /// Rounds with losses in which `best` did not grow.
+        idle: u32,
+    },
+    /// The queue.
+    Steady,
+    /// CUBIC.
+    Compete(Competition),
+}
+
+/// What a round has shown so far.
+#[derive(Debug, Clone)]
+struct Round {
+    started: Instant,
+    /// The packet whose acknowledgement ends it.
+    last_packet: u64,
+    shortest: Option<Duration>,
+    packets: u32,
+    acknowledged: u64,
+    lost: u64,
+}
+
+impl Round {
+    fn new(started: Instant, last_packet: u64) -> Self {
+        Self { started, last_packet, shortest: None, packets: 0, acknowledged: 0, lost: 0 }
+    }
+}
+
+/// A window that follows the time that packets spend in queues.
+#[derive(Debug, Clone)]
+pub(crate) struct Delay {
+    window: u64,
+    mtu: u64,
+    phase: Phase,
+    path: Path,
+    /// Times that the window shrank on this path.
+    drains: u32,
+    round: Round,
+    growth: Growth,
+    /// A queue that has stood since the window began to shrink.
+    standing: Option<Standing>,
+    last_sent: u64,
+    /// What shortest round trips of rounds differ by chance.
+    jitter: Duration,
+    last_shortest: Option<Duration>,
+    /// Bytes a second that came through lately.
+    rate: f64,
+    /// Bytes by which the window may grow in the next round.
+    step: u64,
+    /// Rounds of packets that left before the window shrank: they say nothing of the smaller window.
+    settling: u32,
+    /// Round trips in a row that are urgent, and the shortest of them.
+    urgent: (u32, Duration),
+    /// Marks and losses of packets sent before this were obeyed.
+    obeyed: Option<Instant>,
+}
+
+impl Delay {
+    fn new(now: Instant, mtu: u16) -> Self {
+        let mtu = u64::from(mtu);
+        let window = INITIAL.1.max(INITIAL.0 * mtu);
+        Self {
+            window,
+            mtu,
+            phase: Phase::Start { best: 0.0, idle: 0 },
+            path: Path::new(now),
+            drains: 0,
+            round: Round::new(now, 0),
+            growth: Growth::new(window),
+            standing: None,
+            last_sent: 0,
+            jitter: Duration::ZERO,
+            last_shortest: None,
+            rate: 0.0,
+            step: mtu,
+            settling: 0,
+            urgent: (0, Duration::MAX),
+            obeyed: None,
+        }
+    }
+
+    /// The queue that this link wants.
+    fn wanted(&self) -> Duration {
+        let packets = PACKETS_WANTED * self.mtu as f64 / self.rate.max(1e3);
+        let wanted = (self.path.get() / 2).max(self.jitter * BY_CHANCE).clamp(WANTED.0, WANTED.1);
+        wanted.max(Duration::from_secs_f64(packets))
+    }
+
+    /// Sets the window so that a queue of this length drains.
+    fn drain(&mut self, queue: Duration) {
+        let path = self.path.get().as_secs_f64();
+        let by_chance = f64::from(BY_CHANCE) * self.jitter.as_secs_f64();
+        let filled = if self.drains < NEW { DRAINED.1 } else { DRAINED.0 };
+        let share = (filled * path + by_chance) / (path + queue.as_secs_f64());
+        self.drains += 1;
+        self.shrink(share.clamp(SHRUNK.0, SHRUNK.1));
+    }
+
+    /// Leaves this share of the window.
+    fn shrink(&mut self, share: f64) {
+        let window = ((self.window as f64 * share) as u64).max(FLOOR * self.mtu);
+        self.set_window(self.window.min(window));
+    }
+
+    /// Sets another window, and begins anew to grow once the packets that are on the way have arrived.
+    fn set_window(&mut self, window: u64) {
+        self.window = window;
+        self.step = self.mtu;
+        self.settling = 1;
+        self.urgent = (0, Duration::MAX);
+        self.growth.restart(window);
+    }
+
+    fn end_round(&mut self, now: Instant, is_app_limited: bool) {
+        let round = std::mem::replace(&mut self.round, Round::new(now, self.last_sent));
+        let Some(shortest) = round.shortest else { return };
+        let queue = shortest.saturating_sub(self.path.get());
+        if self.settling > 0 {
+            self.last_shortest = None;
+        } else if let Some(last) = self.last_shortest.replace(shortest) {
+            // A queue of our own only grows while the window does: what shrinks then is by chance.
+            self.jitter = (self.jitter * 7 + last.saturating_sub(shortest)) / 8;
+        }
+        let time = now.saturating_duration_since(round.started);
+        let rate = round.acknowledged as f64 / time.as_secs_f64().max(1e-6);
+        if !is_app_limited {
+            self.rate = rate.max(self.rate * 0.8);
+        }
+        match &self.phase {
+            Phase::Start { .. } => self.end_round_of_start(&round, rate, queue),
+            Phase::Compete(_) => self.end_round_of_competition(now, shortest),
+            Phase::Steady => {
+                if queue <= self.wanted() / 2 {
+                    self.standing = None;
+                }
+                if self.settling > 0 {
+                    self.settling -= 1;
+                } else if queue > self.wanted() * 2 {
+                    self.end_round_of_queue(now, rate, shortest, queue);
+                } else {
+                    self.growth.add(round.acknowledged, round.lost, time);
+                    if !is_app_limited {
+                        self.grow(queue);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Whether the window doubles and the first packets of this round were in a queue already: at its end it would have
+    /// doubled once more.
+    fn starts_too_fast(&self) -> bool {
+        let is_start = matches!(self.phase, Phase::Start { .. });
+        let queue = self.round.shortest.unwrap_or_default().saturating_sub(self.path.get());
+        is_start && self.round.packets >= TELLING && queue > self.wanted()
+    }
+
+    fn end_round_of_start(&mut self, round: &Round, rate: f64, queue: Duration) {
+        let wanted = self.wanted();
+        let Phase::Start { best, idle } = &mut self.phase else { return };
+        let lost = round.lost as f64 / (round.lost + round.acknowledged).max(1) as f64;
+        if rate > *best * TRIAL {
+            *idle = 0;
+            self.growth.add_random_loss(lost);
+        } else if self.growth.is_excessive(lost) {
+            *idle += 1;
+        }
+        *best = best.max(rate);
+        if queue > wanted || *idle >= IDLE {
+            // The last round doubled the window, and nobody has seen yet what that does.
+            let held = self.growth.held(*best, self.path.get() + queue);
+            self.phase = Phase::Steady;
+            self.set_window(self.window.min(held.max(self.window / 4)));
+        }
+    }
+
+    fn end_round_of_queue(&mut self, now: Instant, rate: f64, shortest: Duration, queue: Duration) {
+        let window = self.window;
+        let standing = self.standing.get_or_insert_with(|| Standing::new(now, window, rate));
+        if let Some(peak) = standing.shrink(now, window, rate) {
+            self.standing = None;
+            self.phase = Phase::Compete(Competition::new(now, peak, self.mtu, shortest));
+        } else {
+            self.drain(queue);
+        }
+    }
+
+    fn end_round_of_competition(&mut self, now: Instant, shortest: Duration) {
+        let (path, wanted) = (self.path.get(), self.wanted());
+        let Phase::Compete(competition) = &mut self.phase else { return };
+        let share = competition.share();
+        match competition.end_round(now, shortest, path, wanted) {
+            Outcome::Goes => return,
+            Outcome::Over => {}
+            Outcome::Longer(rtt) => {
+                self.path = Path::of(now, rtt);
+                self.drains = 0;
+            }
+        }
+        self.phase = Phase::Steady;
+        self.set_window(share);
+    }
+
+    /// Lets the window grow by a step, unless the last ones did not pay.
+    fn grow(&mut self, queue: Duration) {
+        let rtt = self.path.get() + queue;
+        if let Some(smaller) = self.growth.judge(self.window, self.mtu, rtt) {
+            self.window = smaller.max(FLOOR * self.mtu);
+            (self.step, self.settling) = (self.mtu, 1);
+            return;
+        }
+        if self.growth.waits(self.window) {
+            return;
+        }
+        let wanted = self.wanted();
+        let most = if queue < wanted / 4 {
+            self.window / 4
+        } else {
+            // A quarter of the wanted queue.
+            let share = wanted.as_secs_f64() / 4.0 / rtt.as_secs_f64();
+            (self.window as f64 * share.min(0.25)) as u64
+        };
+        self.window += self.step.min(most.max(self.mtu));
+        if !self.growth.is_careful() {
+            self.step = (self.step * 2).min(self.window / 4).max(self.mtu);
+        }
+    }
+}
+
+impl Controller for Delay {
+    fn on_sent(&mut self, now: Instant, bytes: u64, last_packet_number: u64) {
+        self.last_sent = last_packet_number;
+        if let Phase::Compete(competition) = &mut self.phase {
+            competition.cubic_always().on_sent(now, bytes, last_packet_number);
+        }
+    }
+
+    fn on_ack(
+        &mut self,
+        now: Instant,
+        sent: Instant,
+        bytes: u64,
+        app_limited: bool,
+        rtt: &RttEstimator,
+    ) {
+        let taken = now.saturating_duration_since(sent);
+        self.path.add(now, taken);
+        let shortest = self.round.shortest.map_or(taken, |shortest| shortest.min(taken));
+        self.round.shortest = Some(shortest);
+        self.round.acknowledged += bytes;
+        self.round.packets += 1;
+        match &mut self.phase {
+            Phase::Start { .. } if !app_limited => self.window += bytes,
+            Phase::Compete(competition) => {
+                if let Some(cubic) = competition.cubic() {
+                    cubic.on_ack(now, sent, bytes, app_limited, rtt);
+                }
+            }
+            _ => {}
+        }
+        self.urgent = if taken > self.path.get() + URGENT {
+            (self.urgent.0 + 1, self.urgent.1.min(taken))
+        } else {
+            (0, Duration::MAX)
+        };
+    }
+
+    fn on_end_acks(
+        &mut self,
+        now: Instant,
+        _in_flight: u64,
+        app_limited: bool,
+        largest_packet_num_acked: Option<u64>,
+    ) {
+        let (in_a_row, shortest) = self.urgent;
+        let may_drain = self.settling == 0 && !matches!(self.phase, Phase::Compete(_));
+        if in_a_row >= URGENT_IN_A_ROW && may_drain {
+            self.phase = Phase::Steady;
+            self.drain(shortest.saturating_sub(self.path.get()));
+            self.round.last_packet = self.last_sent;
+        } else if largest_packet_num_acked.is_some_and(|largest| largest >= self.round.last_packet)
+            || self.starts_too_fast()
+        {
+            self.end_round(now, app_limited);
+        }
+    }
+
+    fn on_congestion_event(
+        &mut self,
+        now: Instant,
+        sent: Instant,
+        is_persistent_congestion: bool,
+        lost_bytes: u64,
+    ) {
+        self.round.lost += lost_bytes;
+        if let Phase::Compete(competition) = &mut self.phase {
+            let cubic = competition.cubic_always();
+            return cubic.on_congestion_event(now, sent, is_persistent_congestion, lost_bytes);
+        }
+        // A mark of a router comes as a congestion event that lost nothing.
+        let share = match (is_persistent_congestion, lost_bytes) {
+            (true, _) => MARKED.1,
+            (false, 0) => MARKED.0,
+            (false, _) => return,
+        };
+        if self.obeyed.is_none_or(|obeyed| sent > obeyed) {
+            self.obeyed = Some(now);
+            self.phase = Phase::Steady;
+            self.shrink(share);
+        }
+    }
+
+    fn on_mtu_update(&mut self, new_mtu: u16) {
+        self.mtu = u64::from(new_mtu);
+        self.window = self.window.max(FLOOR * self.mtu);
+        if let Phase::Compete(competition) = &mut self.phase {
+            competition.cubic_always().on_mtu_update(new_mtu);
+        }
+    }
+
+    fn window(&self) -> u64 {
+        let floor = FLOOR * self.mtu;
+        match &self.phase {
+            Phase::Compete(competition) => competition.window().unwrap_or(floor).max(floor),
+            _ => self.window,
+        }
+    }
+
+    fn metrics(&self) -> ControllerMetrics {
+        let mut metrics = ControllerMetrics::default();
+        metrics.congestion_window = self.window();
+        metrics
+    }
+
+    fn clone_box(&self) -> Box<dyn Controller> {
+        Box::new(self.clone())
+    }
+
+    fn initial_window(&self) -> u64 {
+        INITIAL.1.max(INITIAL.0 * self.mtu)
+    }
+
+    fn into_any(self: Box<Self>) -> Box<dyn Any> {
+        self
+    }
+}

@@ -1,0 +1,18 @@
+//! What the samples from one peer take of this host's memory, for the simulator.
+
+use super::Inbound;
+
+impl Inbound {
+    /// Streams that are being read, and the bytes that were read from QUIC and are not delivered.
+    pub(in crate::engine) fn held(&self) -> (usize, usize) {
+        let bytes = self.streams.values().map(super::incoming::Incoming::held).sum();
+        (self.streams.len(), bytes)
+    }
+
+    /// Entries of lists that have one a stream at most.
+    pub(in crate::engine) fn listed(&self) -> usize {
+        let turns = self.turns.values().map(std::collections::VecDeque::len).sum::<usize>();
+        let lists = [turns, self.waiting.len(), self.full.len(), self.without_room.len()];
+        lists.into_iter().max().unwrap_or_default()
+    }
+}

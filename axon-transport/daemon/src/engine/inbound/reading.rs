@@ -1,0 +1,439 @@
+//! Reads data streams step by step.
+
+use std::{borrow::Cow, rc::Rc, time::Duration};
+
+use axon_envelope::{Kind, Route};
+use axon_shm::Meta;
+use axon_transport::internal::session::Written;
+use bytes::Bytes;
+
+use super::{
+    ARRIVAL, FULL_RETRY, Inbound, Key, LONG, NO_ROUTE, TURN, Violation,
+    incoming::{HEADER, Incoming, Message, Piece, Step, StreamHeader},
+};
+use crate::{
+    engine::{
+        protection::{MAX_OVERHEAD, Open, Opened, RefusedMessage, writer_of},
+        rings::RingError,
+        short_header::{ShortHeaders, Told},
+        stand_in::StandIn,
+    },
+    link::CloseCode,
+};
+
+impl Inbound {
+    /// Reads a stream as far as it goes. Returns how many bytes that were, or became by decompression.
+    ///
+    /// # Errors
+    /// The peer broke a rule.
+    pub(crate) fn read(
+        &mut self,
+        key: Key,
+        quic: &mut quinn_proto::Connection,
+        open: &mut Open<'_>,
+        now: Duration,
+    ) -> Result<usize, Violation> {
+        let read = self.read_turn(key, quic, open, now);
+        if let Some(written) = self.written.take() {
+            written.announce();
+        }
+        read
+    }
+
+    fn read_turn(
+        &mut self,
+        key: Key,
+        quic: &mut quinn_proto::Connection,
+        open: &mut Open<'_>,
+        now: Duration,
+    ) -> Result<usize, Violation> {
+        let Some(mut stream) = self.streams.remove(&key) else { return Ok(0) };
+        let mut read = 0;
+        loop {
+            let step = self.step(key, &mut stream, quic, open, &mut read, now);
+            let next = match step {
+                Ok(next) => next,
+                Err(violation) => {
+                    self.release(&mut stream);
+                    self.end_turn(key, &stream);
+                    return Err(violation);
+                }
+            };
+            match next {
+                Next::Go if read < TURN => {}
+                Next::Go => {
+                    stream.is_ready = true;
+                    self.ready.push_back(key);
+                    break;
+                }
+                Next::Wait => break,
+                Next::Over => {
+                    self.end_turn(key, &stream);
+                    if stream.is_over(key.1, quic) {
+                        return Ok(read);
+                    }
+                    stream.step = Step::Over;
+                    break;
+                }
+            }
+        }
+        self.streams.insert(key, stream);
+        Ok(read)
+    }
+
+    fn step(
+        &mut self,
+        key: Key,
+        stream: &mut Incoming,
+        quic: &mut quinn_proto::Connection,
+        open: &mut Open<'_>,
+        read: &mut usize,
+        now: Duration,
+    ) -> Result<Next, Violation> {
+        match std::mem::replace(&mut stream.step, Step::Length) {
+            Step::Header => {
+                let header = match stream.take(HEADER, key.1, quic, read) {
+                    Piece::Whole(header) => header,
+                    Piece::Later => return Ok(wait(stream, Step::Header)),
+                    Piece::End => return Ok(Next::Over),
+                };
+                let header = StreamHeader::parse(&header).map_err(malformed)?;
+                stream.header = Some((header, None));
+                stream.headers = header.short.then(ShortHeaders::default);
+                let turns = self.turns.entry((header.route, header.of)).or_default();
+                turns.push_back(key);
+                self.waiting.insert((now + ARRIVAL, key));
+                stream.step = Step::Turn(now + ARRIVAL);
+                Ok(Next::Go)
+            }
+            Step::Turn(until) => Ok(self.begin(key, stream, quic, until, now)),
+            Step::Length => {
+                if let Some(next) = self.run(key, stream, open, read, now)? {
+                    return Ok(next);
+                }
+                let prefix = match stream.take(4, key.1, quic, read) {
+                    Piece::Whole(prefix) => prefix,
+                    Piece::Later => return Ok(wait(stream, Step::Length)),
+                    Piece::End => return Ok(Next::Over),
+                };
+                let mut bytes = [0; 4];
+                bytes.copy_from_slice(&prefix);
+                let length = u64::from(u32::from_be_bytes(bytes));
+                let limit = self.max_message + MAX_OVERHEAD as u64;
+                if length > limit {
+                    let text = format!("a message of {length} bytes, at most {limit} are allowed");
+                    return Err((CloseCode::TooLarge, text));
+                }
+                stream.step = Step::Room(length as usize);
+                Ok(Next::Go)
+            }
+            Step::Room(length) => {
+                if length > LONG {
+                    // One message may always be read, however long.
+                    let most = length.min(self.intake.most());
+                    let Some(room) = self.intake.charge(most) else {
+                        self.without_room.push_back(key);
+                        return Ok(wait(stream, Step::Room(length)));
+                    };
+                    stream.room = Some(room);
+                }
+                stream.step = Step::Body(length);
+                Ok(Next::Go)
+            }
+            Step::Body(length) => {
+                let body = match stream.take(length, key.1, quic, read) {
+                    Piece::Whole(body) => body,
+                    Piece::Later => return Ok(wait(stream, Step::Body(length))),
+                    Piece::End => {
+                        self.release(stream);
+                        return Ok(Next::Over);
+                    }
+                };
+                self.open(stream, body, open, read, now)
+            }
+            Step::Over => Ok(Next::Over),
+            Step::Writer(message, until) => Ok(self.deliver(key, stream, message, until, now)),
+            Step::Ring(message) => Ok(self.deliver(key, stream, message, now, now)),
+        }
+    }
+
+    /// Begins to read a stream once its route is there and it is its turn.
+    fn begin(
+        &mut self,
+        key: Key,
+        stream: &mut Incoming,
+        quic: &mut quinn_proto::Connection,
+        until: Duration,
+        now: Duration,
+    ) -> Next {
+        let Some((header, _)) = stream.header else { return Next::Over };
+        let route = self.routes.get(&header.route);
+        let found = route.filter(|route| route.has_flow(&header.of));
+        let Some(found) = found else {
+            let until = if until == Duration::MAX { now + ARRIVAL } else { until };
+            if route.is_some() && now < until {
+                self.waiting.insert((until, key));
+                return wait(stream, Step::Turn(until));
+            }
+            self.waiting.remove(&(until, key));
+            self.counters.lost(&self.topic(header.route), "no_route", 1);
+            let _ = quic.recv_stream(key.1).stop(NO_ROUTE);
+            return Next::Over;
+        };
+        stream.header = Some((header, Some(found.route)));
+        self.waiting.remove(&(until, key));
+        let turns = self.turns.get(&(header.route, header.of));
+        if turns.is_some_and(|turns| turns.front() != Some(&key)) {
+            // The stream before it ends at some time, and then it is ready.
+            return wait(stream, Step::Turn(Duration::MAX));
+        }
+        stream.step = Step::Length;
+        Next::Go
+    }
+
+    /// Opens a message that has arrived.
+    fn open(
+        &mut self,
+        stream: &mut Incoming,
+        body: Bytes,
+        open: &mut Open<'_>,
+        read: &mut usize,
+        now: Duration,
+    ) -> Result<Next, Violation> {
+        let Some((header, Some(route))) = stream.header else { return Ok(Next::Over) };
+        if let Some(short) = &mut stream.headers {
+            permit_short(route, open)?;
+            let (told, payload) = short.read(&body).map_err(malformed)?;
+            let meta = self.meta(told, now);
+            let message = Message { writer: header.of, meta, payload: body.slice_ref(payload) };
+            stream.step = Step::Writer(message, now + ARRIVAL);
+            return Ok(Next::Go);
+        }
+        let Some((opened, payload)) =
+            open_body(open, body, route, self.max_message, now).map_err(refused)?
+        else {
+            self.lost("no_link", header, "the link ended before they were read");
+            self.release(stream);
+            return Ok(Next::Go);
+        };
+        if opened.compressed {
+            *read += payload.len();
+        }
+        let writer = writer_of(route.kind, header.of, &opened).map_err(malformed)?;
+        let meta = self.meta(told(&opened), now);
+        stream.step = Step::Writer(Message { writer, meta, payload }, now + ARRIVAL);
+        Ok(Next::Go)
+    }
+
+    /// What the ring gets to know of a sample.
+    pub(super) fn meta(&self, told: Told, now: Duration) -> Meta {
+        Meta {
+            sequence: told.sequence,
+            source_timestamp: told.source_timestamp,
+            published: self.published(told.age_ms, now),
+        }
+    }
+
+    /// When a sample of this age was published, in nanoseconds of this host's CLOCK_MONOTONIC.
+    fn published(&self, age_ms: u32, now: Duration) -> u64 {
+        let arrived = self.epoch_nanos.saturating_add(now.as_nanos() as u64);
+        // Zero would say that the lifespan is infinite.
+        arrived.saturating_sub(u64::from(age_ms) * 1_000_000).max(1)
+    }
+
+    /// Writes a message to its ring.
+    fn deliver(
+        &mut self,
+        key: Key,
+        stream: &mut Incoming,
+        message: Message,
+        until: Duration,
+        now: Duration,
+    ) -> Next {
+        let Some((header, Some(route))) = stream.header else { return Next::Over };
+        let found = self.routes.get(&header.route);
+        let Some(stand_in) = found.and_then(|route| route.writers.get(&message.writer)) else {
+            if found.is_some() && now < until {
+                self.waiting.insert((until, key));
+                return wait(stream, Step::Writer(message, until));
+            }
+            self.waiting.remove(&(until, key));
+            self.counters.lost(&self.topic(header.route), "no_route", 1);
+            self.release(stream);
+            return Next::Go;
+        };
+        self.waiting.remove(&(until, key));
+        let acknowledged = header.reliable && route.kind == Kind::Topic;
+        let flow = (header.route, header.of);
+        let (sequence, length) = (message.meta.sequence, message.payload.len());
+        if acknowledged && stand_in.last_sequence() >= Some(sequence) {
+            self.receipts.came(flow, sequence, length, now);
+            self.release(stream);
+            return Next::Go;
+        }
+        if !header.reliable && stand_in.last_sequence() >= Some(sequence) {
+            // A newer one overtook it: readers drop it.
+            self.counters.lost(&self.topic(header.route), "late", 1);
+            self.release(stream);
+            return Next::Over;
+        }
+        let stand_in = Rc::clone(stand_in);
+        let Some(there) = self.write(&stand_in, header, message.meta, &message.payload) else {
+            return self.wait_for_room(key, stream, message, now);
+        };
+        match acknowledged {
+            true if there => self.receipts.came(flow, sequence, length, now),
+            true => self.receipts.dropped(flow, sequence, now),
+            false => {}
+        }
+        self.release(stream);
+        if header.reliable { Next::Go } else { Next::Over }
+    }
+
+    /// Writes a sample to its ring. Whether it is there; `None`: the ring is full.
+    pub(super) fn write(
+        &mut self,
+        stand_in: &Rc<StandIn>,
+        header: StreamHeader,
+        meta: Meta,
+        payload: &[u8],
+    ) -> Option<bool> {
+        match stand_in.try_write(&header.of, meta, payload) {
+            Ok(Written::Yes) => {
+                self.counters.arrived(payload.len());
+                let before = self.written.as_ref();
+                if before.is_none_or(|before| !Rc::ptr_eq(before, stand_in))
+                    && let Some(before) = self.written.replace(Rc::clone(stand_in))
+                {
+                    before.announce();
+                }
+                Some(true)
+            }
+            Ok(Written::Nobody) => {
+                self.counters.lost(&self.topic(header.route), "no_client", 1);
+                Some(false)
+            }
+            Err(RingError::Full) => None,
+            Err(RingError::Lost(why)) => {
+                self.lost("ring", header, &why);
+                Some(false)
+            }
+        }
+    }
+
+    /// The message's ring is full.
+    pub(super) fn wait_for_room(
+        &mut self,
+        key: Key,
+        stream: &mut Incoming,
+        message: Message,
+        now: Duration,
+    ) -> Next {
+        self.full.insert(key);
+        self.full_retry.get_or_insert(now + FULL_RETRY);
+        wait(stream, Step::Ring(message))
+    }
+
+    /// Gives back the memory of a message, which another stream may wait for.
+    pub(super) fn release(&mut self, stream: &mut Incoming) {
+        if stream.room.take().is_some() {
+            for key in std::mem::take(&mut self.without_room) {
+                self.make_ready(key);
+            }
+        }
+    }
+
+    pub(super) fn end_turn(&mut self, key: Key, stream: &Incoming) {
+        let Some((header, _)) = stream.header else { return };
+        let flow = (header.route, header.of);
+        let Some(turns) = self.turns.get_mut(&flow) else { return };
+        turns.retain(|other| *other != key);
+        match turns.front().copied() {
+            Some(next) => self.make_ready(next),
+            None => {
+                self.turns.remove(&flow);
+            }
+        }
+    }
+}
+
+/// What a step says.
+#[derive(Debug)]
+pub(super) enum Next {
+    /// Take the next one.
+    Go,
+    /// Nothing more can be done now.
+    Wait,
+    /// The stream is at its end.
+    Over,
+}
+
+fn wait(stream: &mut Incoming, step: Step) -> Next {
+    stream.step = step;
+    Next::Wait
+}
+
+/// Whether a stream of this route may have short headers.
+///
+/// # Errors
+/// The peer broke the format.
+pub(super) fn permit_short(route: Route, open: &Open<'_>) -> Result<(), Violation> {
+    match (route.kind, open) {
+        (Kind::Topic, Open::Link) => Ok(()),
+        _ => Err(malformed("a data stream has short headers that may not have them")),
+    }
+}
+
+/// What a message's inner header tells besides its writer.
+pub(super) fn told(header: &axon_envelope::inner::Header) -> Told {
+    let axon_envelope::inner::Header { sequence, source_timestamp, age_ms, .. } = *header;
+    Told { sequence, source_timestamp, age_ms }
+}
+
+pub(super) fn malformed(reason: &str) -> Violation {
+    (CloseCode::Malformed, reason.to_owned())
+}
+
+pub(super) fn refused(error: RefusedMessage) -> Violation {
+    let code = match error {
+        RefusedMessage::Envelope { .. } => CloseCode::Envelope,
+        RefusedMessage::Malformed(_) => CloseCode::Malformed,
+    };
+    (code, error.to_string())
+}
+
+/// Opens a body. The payload shares its memory, unless it was compressed.
+fn open_body(
+    open: &mut Open<'_>,
+    body: Bytes,
+    route: Route,
+    most: u64,
+    now: Duration,
+) -> Result<Option<(axon_envelope::inner::Header, Bytes)>, RefusedMessage> {
+    // An envelope is opened in place, so in memory of its own.
+    let body = match open {
+        Open::Link => body,
+        Open::Envelope { .. } => {
+            let mut own = body.try_into_mut().unwrap_or_else(|shared| shared.as_ref().into());
+            let start = own.as_ptr().addr();
+            let Some(opened) = open.open(&mut own, route, now)? else { return Ok(None) };
+            let header = opened.header;
+            let payload = match opened.payload(most)? {
+                Cow::Owned(payload) => payload.into(),
+                Cow::Borrowed(payload) => {
+                    let at = payload.as_ptr().addr() - start;
+                    let range = at..at + payload.len();
+                    own.freeze().slice(range)
+                }
+            };
+            return Ok(Some((header, payload)));
+        }
+    };
+    let opened = Opened::plain(&body)?;
+    let (header, payload) = (opened.header, opened.payload(most)?);
+    let payload = match payload {
+        Cow::Owned(payload) => payload.into(),
+        Cow::Borrowed(payload) => body.slice_ref(payload),
+    };
+    Ok(Some((header, payload)))
+}

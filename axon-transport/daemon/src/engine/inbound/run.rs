@@ -1,0 +1,141 @@
+//! Delivers the short samples that lie whole in the piece that QUIC gave last, without a step of the stream for each.
+
+use std::{borrow::Cow, rc::Rc, time::Duration};
+
+use axon_envelope::{Kind, Route};
+use bytes::{Buf, Bytes};
+
+use super::{
+    Inbound, Key, LONG, RouteIn, Violation,
+    incoming::{Incoming, Message, StreamHeader},
+    reading::{Next, malformed, permit_short, refused, told},
+};
+use crate::engine::{
+    protection::{MAX_OVERHEAD, Open, writer_of},
+    short_header::Told,
+    stand_in::StandIn,
+};
+
+/// Bytes of the length before each message.
+const LENGTH: usize = 4;
+
+/// Where the samples of a run go.
+struct To {
+    header: StreamHeader,
+    route: Route,
+    stand_in: Rc<StandIn>,
+    /// The longest message.
+    most: u64,
+}
+
+/// What is to be acknowledged after a run.
+#[derive(Default)]
+struct Came {
+    newest: Option<u64>,
+    samples: u64,
+    bytes: usize,
+}
+
+impl Inbound {
+    /// Delivers the whole samples of a RELIABLE stream of a topic that are at hand. `None`: the stream goes on with a
+    /// step.
+    ///
+    /// # Errors
+    /// The peer broke a rule.
+    pub(super) fn run(
+        &mut self,
+        key: Key,
+        stream: &mut Incoming,
+        open: &mut Open<'_>,
+        read: &mut usize,
+        now: Duration,
+    ) -> Result<Option<Next>, Violation> {
+        let Some((header, Some(route))) = stream.header else { return Ok(None) };
+        if !header.reliable || route.kind != Kind::Topic || !stream.gathered.is_empty() {
+            return Ok(None);
+        }
+        let writers = |of: &RouteIn| of.writers.get(&header.of).cloned();
+        let Some(stand_in) = self.routes.get(&header.route).and_then(writers) else {
+            return Ok(None);
+        };
+        let most = self.max_message + MAX_OVERHEAD as u64;
+        let (to, mut came) = (To { header, route, stand_in, most }, Came::default());
+        let full = self.deliver_all(&to, stream, open, read, &mut came, now);
+        let flow = (header.route, header.of);
+        if let Some(newest) = came.newest {
+            self.receipts.came_all(flow, newest, came.samples, came.bytes, now);
+        }
+        Ok(full?.map(|message| self.wait_for_room(key, stream, message, now)))
+    }
+
+    /// Delivers samples until none is whole, or the ring has no room for the one that is returned.
+    fn deliver_all(
+        &mut self,
+        to: &To,
+        stream: &mut Incoming,
+        open: &mut Open<'_>,
+        read: &mut usize,
+        came: &mut Came,
+        now: Duration,
+    ) -> Result<Option<Message>, Violation> {
+        let Incoming { chunk, headers, .. } = stream;
+        let mut envelope = std::mem::take(&mut self.envelope);
+        while let Some(body) = next_body(chunk, to.most) {
+            let (told, payload): (Told, Cow<'_, [u8]>) = match headers {
+                Some(headers) => {
+                    permit_short(to.route, open)?;
+                    let (told, payload) = headers.read(body).map_err(malformed)?;
+                    (told, payload.into())
+                }
+                None => {
+                    // It is opened in place.
+                    envelope.clear();
+                    envelope.extend_from_slice(body);
+                    let opened = open.open(&mut envelope, to.route, now).map_err(refused)?;
+                    let Some(opened) = opened else {
+                        self.lost("no_link", to.header, "the link ended before they were read");
+                        chunk.advance(LENGTH + body.len());
+                        continue;
+                    };
+                    let payload = opened.payload(self.max_message).map_err(refused)?;
+                    if opened.header.compressed {
+                        *read += payload.len();
+                    }
+                    writer_of(to.route.kind, to.header.of, &opened.header).map_err(malformed)?;
+                    (told(&opened.header), payload)
+                }
+            };
+            let (length, bytes) = (LENGTH + body.len(), payload.len());
+            if to.stand_in.last_sequence() < Some(told.sequence) {
+                let meta = self.meta(told, now);
+                match self.write(&to.stand_in, to.header, meta, &payload) {
+                    Some(true) => {}
+                    Some(false) => {
+                        let flow = (to.header.route, to.header.of);
+                        self.receipts.dropped(flow, told.sequence, now);
+                        chunk.advance(length);
+                        continue;
+                    }
+                    None => {
+                        let payload = Bytes::copy_from_slice(&payload);
+                        chunk.advance(length);
+                        return Ok(Some(Message { writer: to.header.of, meta, payload }));
+                    }
+                }
+            }
+            came.newest = came.newest.max(Some(told.sequence));
+            came.samples += 1;
+            came.bytes += bytes;
+            chunk.advance(length);
+        }
+        self.envelope = envelope;
+        Ok(None)
+    }
+}
+
+/// The body at the front of a chunk, if it is whole and short.
+fn next_body(chunk: &Bytes, most: u64) -> Option<&[u8]> {
+    let (length, rest) = chunk.split_first_chunk::<LENGTH>()?;
+    let length = u32::from_be_bytes(*length) as usize;
+    if length > LONG || length as u64 > most { None } else { rest.get(..length) }
+}

@@ -1,0 +1,40 @@
+//! What connections and links take of this host's memory, for the simulator.
+
+use super::Links;
+
+/// What is held.
+#[derive(Clone, Copy, Debug)]
+pub(in crate::engine) struct HeldByLinks {
+    /// Connections, those included that are closed and not yet drained.
+    pub(in crate::engine) connections: usize,
+    /// Links whose peer is known.
+    pub(in crate::engine) links: usize,
+    /// Connections that are being opened.
+    pub(in crate::engine) opening: usize,
+    pub(in crate::engine) dials: usize,
+    /// Events that nobody has handled.
+    pub(in crate::engine) events: usize,
+    /// The longest queue of control messages of one connection, and the most that came and is not handled, in bytes.
+    pub(in crate::engine) unsent: usize,
+    pub(in crate::engine) unhandled: usize,
+}
+
+impl Links {
+    pub(in crate::engine) fn held(&self) -> HeldByLinks {
+        let (all, links) = (self.table.iter().count(), self.table.peers().count());
+        let numbers = self.connections.numbers();
+        let connections = numbers.iter().filter_map(|number| self.connections.get(*number));
+        let (unsent, unhandled) = connections
+            .map(|connection| connection.control.held())
+            .fold((0, 0), |most, held| (held.0.max(most.0), held.1.max(most.1)));
+        HeldByLinks {
+            connections: numbers.len(),
+            links,
+            opening: all - links,
+            dials: self.dials.len(),
+            events: self.outbox.waiting(),
+            unsent,
+            unhandled,
+        }
+    }
+}

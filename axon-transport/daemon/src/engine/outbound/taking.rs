@@ -1,0 +1,259 @@
+//! Moves the samples of one flow from their rings into its queue.
+
+use std::{collections::VecDeque, sync::Arc, time::Duration};
+
+use axon_envelope::Kind;
+use axon_shm::{
+    ids::Gid,
+    qos::{Durability, Qos},
+};
+use axon_transport::internal::session::{
+    TakeLimit,
+    merge::{Merge, Taken},
+};
+
+use super::{
+    queue::{Offered, Queue},
+    source::Source,
+};
+use crate::engine::{counters::Counters, rings::Sample};
+
+/// Samples, and bytes, that one turn moves from the rings.
+const FILL: (usize, usize) = (1024, 256 << 10);
+/// Bytes of short samples that share memory. A part of it stays as long as one of them is not acknowledged.
+const SHARED: usize = 32 << 10;
+/// Takes in one turn that found only samples that were sent before.
+const REPEATS: u32 = 16;
+/// A KEEP_ALL flow with so many bytes waiting leaves further samples in the ring, which keeps them.
+const AHEAD: usize = 1 << 20;
+/// Bytes that a KEEP_LAST flow moves that is behind. What it leaves in the ring is replaced there without a copy.
+const BEHIND: usize = 64 << 10;
+/// Turns that move a burst while QUIC takes nothing. A publisher that never rests must not keep the others waiting.
+const BURST: usize = 4;
+
+/// The samples of a flow that are in its rings.
+pub(super) struct Taking {
+    /// The publisher, or the client of a service.
+    of: Gid,
+    kind: Kind,
+    /// The samples of all sources, in one order.
+    merge: Merge<Sample>,
+    /// Samples that were taken and are not in the queue.
+    taken: VecDeque<Sample>,
+    /// Whether the queue had no room for the first of them.
+    held: bool,
+    /// Whether the rings may hold more samples than the last turn moved.
+    more: bool,
+    /// After what time that is looked at again, where the last turn moved none.
+    retry: Option<Duration>,
+    /// The relay whose losses are counted, and how many are.
+    counted: Option<(Gid, u64)>,
+}
+
+impl Taking {
+    /// Takes from nothing yet.
+    pub(super) fn new(of: Gid, kind: Kind) -> Self {
+        Self {
+            of,
+            kind,
+            merge: Merge::default(),
+            taken: VecDeque::new(),
+            held: false,
+            more: false,
+            retry: None,
+            counted: None,
+        }
+    }
+
+    /// Takes these sources; the peer has the samples up to number `seen`.
+    pub(super) fn set_sources(&mut self, sources: &[Source], seen: Option<u64>) {
+        self.merge.set(sources.iter().map(Source::gid));
+        self.merge.pass(seen.unwrap_or(0));
+        self.more = true;
+    }
+
+    /// Samples wait in a ring.
+    pub(super) fn handle_samples(&mut self) {
+        self.more = true;
+    }
+
+    /// Whether there may be samples to move.
+    pub(super) fn has_more(&self) -> bool {
+        self.more || !self.taken.is_empty()
+    }
+
+    /// Whether a sample found no room.
+    pub(super) fn is_held(&self) -> bool {
+        self.held
+    }
+
+    /// After what time the rings are to be looked at again, where the last turn moved nothing although samples wait.
+    pub(super) fn take_retry(&mut self) -> Option<Duration> {
+        self.retry.take()
+    }
+
+    /// Whether the rings may hold samples that it did not come to.
+    pub(super) fn goes_on(&self) -> bool {
+        self.more && !self.held
+    }
+
+    /// Whether it has taken no sample that is not in the queue.
+    pub(super) fn is_idle(&self) -> bool {
+        self.taken.is_empty() && !self.merge.holds_any()
+    }
+
+    /// Forgets the samples that it has taken and that are not in the queue. Returns how many.
+    pub(super) fn end(&mut self) -> usize {
+        self.held = false;
+        std::mem::take(&mut self.taken).len() + self.merge.held()
+    }
+
+    /// Moves samples from the rings into the queue. Returns how many were queued.
+    pub(super) fn fill(
+        &mut self,
+        sources: &[Source],
+        queue: &mut Queue,
+        topic: &Arc<str>,
+        counters: &Counters,
+        now: Duration,
+    ) -> u32 {
+        if !self.has_more() || !queue.wants_more(now) {
+            return 0;
+        }
+        let first = sources.iter().find(|source| source.reads(&self.of));
+        queue.set_qos(&first.map_or_else(Qos::keep_all, Source::qos));
+        let most_bytes = self.leave_stale(sources, queue, now);
+        let is_behind = queue.is_behind(now);
+        let (mut samples, mut bytes, mut dropped, mut repeats) = (0, 0, 0, 0);
+        (self.held, self.retry) = (false, None);
+        while samples < FILL.0 && bytes < most_bytes {
+            let has_enough = match queue.keeps_all() {
+                true => queue.waiting_bytes() >= AHEAD,
+                false => !is_behind && !queue.wants_more(now),
+            };
+            if has_enough {
+                break;
+            }
+            let Some(sample) = self.taken.pop_front() else {
+                let most = limit(queue.room(), FILL.0 - samples, most_bytes - bytes);
+                if !self.take(sources, most, now) {
+                    let behind = self.merge.is_behind().then_some(Duration::ZERO);
+                    let retries = sources.iter().filter_map(|source| source.retry_of(&self.of));
+                    self.retry = retries.chain(behind).min();
+                    self.more = self.retry.is_some();
+                    if !self.more {
+                        queue.handle_empty_ring();
+                    }
+                    break;
+                }
+                repeats += u32::from(self.taken.is_empty());
+                if repeats > REPEATS {
+                    break;
+                }
+                continue;
+            };
+            bytes += sample.payload.len();
+            match queue.offer(sample, now) {
+                Offered::Queued { dropped: older } => {
+                    samples += 1;
+                    dropped += older;
+                }
+                Offered::Full(sample) => {
+                    self.taken.push_front(sample);
+                    self.held = true;
+                    break;
+                }
+            }
+        }
+        counters.lost(topic, "queue", dropped);
+        self.count_overwritten(sources, topic, counters);
+        samples as u32
+    }
+
+    /// Moves a burst into the queue while QUIC takes nothing. Returns how many samples were queued.
+    pub(super) fn take_burst(
+        &mut self,
+        sources: &[Source],
+        queue: &mut Queue,
+        topic: &Arc<str>,
+        counters: &Counters,
+        now: Duration,
+    ) -> u32 {
+        let mut all = 0;
+        for _ in 0..BURST {
+            let queued = self.fill(sources, queue, topic, counters, now);
+            all += queued;
+            if queued == 0 || !self.more {
+                break;
+            }
+        }
+        all
+    }
+
+    /// Passes over the samples in the rings that the queue would drop for newer ones. Returns how many bytes are then
+    /// to be moved.
+    fn leave_stale(&self, sources: &[Source], queue: &Queue, now: Duration) -> usize {
+        let Some(depth) = queue.depth().filter(|_| queue.is_behind(now)) else { return FILL.1 };
+        for source in sources.iter().filter(|source| source.reads(&self.of)) {
+            source.skip_of(&self.of, depth);
+        }
+        // What is best effort is judged by its age, so it has to be looked at; that is the depth at most.
+        if queue.keeps_bursts() { BEHIND } else { usize::MAX }
+    }
+
+    /// Counts the samples that newer ones replaced in the ring. The relay that asks for most loses the fewest: a sample
+    /// that it has is sent.
+    pub(super) fn count_overwritten(
+        &mut self,
+        sources: &[Source],
+        topic: &Arc<str>,
+        counters: &Counters,
+    ) {
+        let Some(first) = sources.iter().find(|source| source.reads(&self.of)) else { return };
+        let (relay, lost) = (first.gid(), first.lost_of(&self.of));
+        let before = self.counted.replace((relay, lost));
+        let counted = match before {
+            Some((before, counted)) if before == relay => counted,
+            // What a relay with history passes over when it begins is no loss.
+            _ if first.qos().durability == Durability::TransientLocal => lost,
+            _ => 0,
+        };
+        counters.lost(topic, "queue", lost.saturating_sub(counted));
+    }
+
+    /// Takes the next samples, as many as `most` says. Whether there was any, even one that was sent before.
+    fn take(&mut self, sources: &[Source], most: TakeLimit, now: Duration) -> bool {
+        let Self { of, kind, merge, taken, .. } = self;
+        if *kind == Kind::Response {
+            taken.extend(sources.iter().find_map(|source| source.take_of(of, now)));
+            return !taken.is_empty();
+        }
+        if let [source] = sources
+            && merge.is_of_one()
+        {
+            let mut each = |sample: Sample| {
+                if merge.give(sample.info.sequence) {
+                    taken.push_back(sample);
+                }
+            };
+            return source.take_many(of, most, now, &mut each) > 0;
+        }
+        let next = merge.next(|reader| {
+            let source = sources.iter().find(|source| source.gid() == *reader)?;
+            let content = source.take_of(of, now)?;
+            Some(Taken { number: content.info.sequence, lost: 0, content })
+        });
+        taken.extend(next.map(|next| next.content));
+        !taken.is_empty()
+    }
+}
+
+/// What to take for a queue that has room for so many bytes, in memory, and is to get so many samples and bytes. It has
+/// room for all that is taken, unless that is one sample.
+fn limit(room: usize, samples: usize, bytes: usize) -> TakeLimit {
+    let half = room / 2;
+    TakeLimit {
+        samples: samples.min(half / size_of::<Sample>()).max(1),
+        bytes: bytes.min(half).min(SHARED),
+    }
+}

@@ -1,0 +1,43 @@
+//! That the memory of a host stays within its bounds, whatever its peers do: a look after each pass.
+
+use crate::{
+    engine::{Engine, transport::STREAMS_OPEN},
+    link::MAX_FRAME,
+};
+
+/// Links, as `links/election.rs` limits them.
+const LINKS: usize = 160;
+/// Connections that are being opened: 64, and 16 of listed peers, that were dialled to this host, and its own dials.
+const OPENING: usize = 64 + 16;
+/// Bytes of long messages of one identity, and of its unread data, as `account.rs` limits them.
+const OF_IDENTITY: usize = 128 << 20;
+/// Control messages of one connection that wait to be sent.
+const UNSENT: usize = (64 << 20) + MAX_FRAME;
+/// What one connection has unread, as `transport.rs` limits it.
+const UNREAD: usize = 65 << 20;
+
+/// Checks the bounds of a host, which had so many dials begun of late.
+///
+/// # Panics
+/// It holds more than it may.
+pub(super) fn check(engine: &Engine, queue: usize, dials: usize) {
+    let held = engine.links.held();
+    assert!(held.links <= LINKS, "{held:?}");
+    assert!(held.opening <= OPENING + dials && held.dials <= dials, "{held:?}, {dials} dials");
+    // As many again are closed, and are forgotten after three probe timeouts.
+    let open = LINKS + OPENING + dials;
+    assert!(held.connections <= 2 * open, "{held:?}");
+    assert!(held.unsent <= UNSENT && held.unhandled <= UNREAD, "{held:?}");
+    // Control messages are handled one by one: what a pass leaves to the next is of data streams.
+    assert!(held.events <= STREAMS_OPEN as usize * (held.links + 1), "{held:?}");
+    for (_, peer) in engine.peers.iter() {
+        let (streams, bytes) = peer.inbound.held();
+        let most = 8 * STREAMS_OPEN as usize;
+        assert!(streams <= most, "{streams} streams of one peer");
+        assert!(peer.inbound.listed() <= streams, "{} entries", peer.inbound.listed());
+        assert!(bytes <= OF_IDENTITY, "{bytes} bytes of one peer wait for rings");
+    }
+    // One sample a flow may be more: none is longer than 64 MiB.
+    let (waiting, _) = engine.backlog();
+    assert!(waiting <= queue + (64 << 20), "{waiting} bytes wait, {queue} are allowed");
+}

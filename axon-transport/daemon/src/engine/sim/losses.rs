@@ -1,0 +1,76 @@
+//! What is not delivered: what is passed over at the sender, and that each loss is counted once.
+
+use std::time::Duration;
+
+use axon_shm::qos::Qos;
+
+use super::{
+    network::{Path, Rate},
+    tests::{classic, millis, secs},
+    world::{Pair, World},
+};
+
+/// Two hosts and a publisher that is attached.
+fn attached(seed: u64, qos: Qos, path: Path) -> (World, Pair) {
+    let mut world = World::new(seed, 2, classic);
+    world.network.set_default_path(path);
+    let pair = world.pair(0, 1, "/t", qos);
+    world.until(secs(10), World::is_whole);
+    world.run_for(secs(2));
+    (world, pair)
+}
+
+#[test]
+fn a_live_sample_behind_many_expired_ones_is_sent_without_another_ring() {
+    for qos in [Qos::keep_all(), Qos { depth: 256, ..Qos::default() }] {
+        let (mut world, pair) = attached(60, qos, Path::default());
+        let (host, publisher) = pair.publisher;
+        // More than a take passes over, twice and a half.
+        for _ in 0..160 {
+            assert!(world.hosts[host].rings.publish(publisher, 10));
+        }
+        world.hosts[host].rings.expire(publisher);
+        assert!(world.hosts[host].rings.publish(publisher, 10));
+        world.hosts[host].ring();
+        world.run_for(millis(100));
+        assert_eq!(world.received(pair), [161], "{}", world.describe());
+    }
+}
+
+/// Samples of a topic that both hosts say are lost.
+fn counted(world: &World, topic: &str) -> u64 {
+    let lost = world.hosts.iter().flat_map(|host| &host.lost);
+    lost.filter(|((of, _), _)| of == topic).map(|(_, samples)| samples).sum()
+}
+
+#[test]
+fn each_sample_that_does_not_arrive_is_counted_once() {
+    let slow = Rate::new(2_000_000, millis(50));
+    let slow = Path { delay: millis(2), rate: Some(slow), ..Path::default() };
+    let lossy = Path { loss: 0.1, ..slow.clone() };
+    let depth = |depth, qos| Qos { depth, ..qos };
+    let all = [
+        (depth(1, Qos::default()), &slow, 20_000),
+        (depth(5, Qos::default()), &lossy, 20_000),
+        (depth(1, Qos::default()), &slow, 500_000),
+        (depth(1, Qos::sensor_data()), &slow, 20_000),
+        (depth(5, Qos::sensor_data()), &lossy, 500),
+        (depth(5, Qos::sensor_data()), &slow, 500_000),
+    ];
+    for (seed, (qos, path, length)) in (61..).zip(all) {
+        let (mut world, pair) = attached(seed, qos, path.clone());
+        // Three times what the path carries; small samples as fast as the clock of the test goes.
+        let every = Duration::from_secs_f64(length as f64 / 6_000_000.0).max(millis(1));
+        let end = world.now + secs(8);
+        while world.now < end {
+            assert!(world.publish(pair, length));
+            world.run_for(every);
+        }
+        world.run_for(secs(30));
+        let (host, publisher) = pair.publisher;
+        let published = world.hosts[host].rings.published(publisher);
+        let received = world.received(pair).len() as u64;
+        let case = format!("{qos:?}, {length} bytes: {received} of {published}");
+        assert_eq!(counted(&world, "/t"), published - received, "{case} {}", world.describe());
+    }
+}

@@ -1,0 +1,165 @@
+//! Scenarios of paths that lose packets, become slow, or are filled by a camera.
+
+#![allow(clippy::print_stdout, reason = "a scenario prints its figures")]
+
+use std::time::Duration;
+
+use axon_shm::qos::Qos;
+use axon_transport::config::{Config, Congestion};
+
+use super::{
+    network::{Path, Rate},
+    world::{Pair, World},
+};
+
+fn secs(seconds: u64) -> Duration {
+    Duration::from_secs(seconds)
+}
+
+/// A radio link of so many Mbit/s: a round trip of 3 ms, a queue of 40 ms, and this loss both ways.
+fn radio(mbits: u64, loss: f64) -> Path {
+    let rate = Rate::new(mbits * 1_000_000 / 8, Duration::from_millis(40));
+    Path { delay: Duration::from_micros(1_500), rate: Some(rate), loss, ..Path::default() }
+}
+
+/// Two linked hosts with this controller.
+fn hosts(congestion: Congestion, path: Path) -> World {
+    let mut world = World::new(21, 2, move |_| {
+        let mut config = Config::default();
+        config.link.congestion = congestion;
+        config
+    });
+    world.network.set_default_path(path);
+    world
+}
+
+/// Samples that are published at a rate.
+struct Stream {
+    pair: Pair,
+    length: usize,
+    every: Duration,
+    next: Duration,
+    published: Vec<Duration>,
+    seen: usize,
+    /// When each sample arrived, and its age then.
+    arrived: Vec<(Duration, Duration)>,
+}
+
+impl Stream {
+    fn new(world: &mut World, topic: &str, qos: Qos, length: usize, every: Duration) -> Self {
+        let pair = world.pair(0, 1, topic, qos);
+        let (published, arrived) = (Vec::new(), Vec::new());
+        Self { pair, length, every, next: Duration::ZERO, published, seen: 0, arrived }
+    }
+
+    /// The ages of what arrived from `from` on, in order.
+    fn ages(&self, from: Duration) -> Vec<Duration> {
+        let arrived = self.arrived.iter().filter(|(at, _)| *at >= from);
+        let mut ages: Vec<_> = arrived.map(|(_, age)| *age).collect();
+        ages.sort_unstable();
+        ages
+    }
+}
+
+/// Publishes these streams for a time.
+fn drive(world: &mut World, streams: &mut [Stream], time: Duration) {
+    let end = world.now + time;
+    while world.now < end {
+        for stream in &mut *streams {
+            stream.next = stream.next.max(world.now.saturating_sub(stream.every));
+            while stream.next <= world.now {
+                if world.publish(stream.pair, stream.length) {
+                    stream.published.push(world.now);
+                }
+                stream.next += stream.every;
+            }
+        }
+        world.run_for(Duration::from_millis(1));
+        for stream in &mut *streams {
+            let received = world.received(stream.pair);
+            for number in &received[stream.seen..] {
+                let age = world.now - stream.published[*number as usize - 1];
+                stream.arrived.push((world.now, age));
+            }
+            stream.seen = received.len();
+        }
+    }
+}
+
+/// The share of 54 Mbit/s that a stream without a rate of its own gets through, with this loss.
+fn goodput(congestion: Congestion, loss: f64) -> f64 {
+    let mut world = hosts(congestion, radio(54, loss));
+    let length = 16 << 10;
+    let every = Duration::from_millis(1);
+    let stream = Stream::new(&mut world, "/log", Qos::keep_all(), length, every);
+    world.until(secs(20), World::is_whole);
+    world.run_for(secs(1));
+    let mut streams = [stream];
+    drive(&mut world, &mut streams, secs(4));
+    let before = streams[0].seen;
+    drive(&mut world, &mut streams, secs(4));
+    (streams[0].seen - before) as f64 * length as f64 * 8.0 / 4.0 / 54e6
+}
+
+#[test]
+fn random_loss_leaves_a_link_its_rate() {
+    for (loss, least) in [(0.05, 0.75), (0.2, 0.6), (0.4, 0.35)] {
+        let (delay, cubic) = (goodput(Congestion::Delay, loss), goodput(Congestion::Cubic, loss));
+        println!("loss {loss}: delay {delay:.2}, cubic {cubic:.2}");
+        assert!(delay > least, "loss {loss}: {delay}");
+        assert!(cubic < delay / 2.0, "loss {loss}: cubic {cubic}, delay {delay}");
+    }
+}
+
+#[test]
+fn a_command_is_quick_beside_a_camera_that_fills_the_link() {
+    let mut world = hosts(Congestion::Auto, radio(54, 0.0));
+    let camera = Qos { depth: 1, ..Qos::default() };
+    let frame = Duration::from_micros(33_333);
+    let camera = Stream::new(&mut world, "/camera", camera, 830_000, frame);
+    let every = Duration::from_millis(10);
+    let command = Stream::new(&mut world, "/cmd_vel", Qos::default(), 100, every);
+    world.until(secs(20), World::is_whole);
+    world.run_for(secs(1));
+    let mut streams = [camera, command];
+    drive(&mut world, &mut streams, secs(8));
+    world.run_for(secs(1));
+    let ages = streams[1].ages(secs(0));
+    let at = |share: f64| ages[(ages.len() as f64 * share) as usize];
+    let sent = streams[1].published.len();
+    let command = world.received(streams[1].pair).len();
+    println!("command: {command} of {sent}, p50 {:?}, p99 {:?}", at(0.5), at(0.99));
+    assert_eq!(command, sent, "{}", world.describe());
+    assert!(at(0.5) < Duration::from_millis(8), "{:?}", at(0.5));
+    assert!(at(0.99) < Duration::from_millis(16), "{:?}", at(0.99));
+}
+
+#[test]
+fn a_link_that_becomes_slow_is_fresh_again_within_two_seconds() {
+    let mut world = hosts(Congestion::Auto, radio(54, 0.0));
+    let qos = Qos { depth: 1, ..Qos::default() };
+    let every = Duration::from_micros(33_333);
+    let stream = Stream::new(&mut world, "/scan", qos, 64_000, every);
+    world.until(secs(20), World::is_whole);
+    world.run_for(secs(1));
+    let mut streams = [stream];
+    drive(&mut world, &mut streams, secs(4));
+    world.network.set_default_path(radio(2, 0.0));
+    drive(&mut world, &mut streams, secs(2));
+    let slow = world.now;
+    drive(&mut world, &mut streams, secs(6));
+    let ages = streams[0].ages(slow);
+    let median = ages[ages.len() / 2];
+    println!("at 2 Mbit/s: {} arrive, median age {median:?}", ages.len());
+    // One sample takes 256 ms.
+    assert!(median < Duration::from_millis(450), "{median:?}");
+    assert!(ages.len() >= 15, "{}", ages.len());
+    world.network.set_default_path(radio(54, 0.0));
+    drive(&mut world, &mut streams, secs(2));
+    let back = world.now;
+    drive(&mut world, &mut streams, secs(2));
+    let ages = streams[0].ages(back);
+    println!("back at 54 Mbit/s: {} arrive, median age {:?}", ages.len(), ages[ages.len() / 2]);
+    assert!(ages.len() > 50, "{}", ages.len());
+    assert!(ages[ages.len() / 2] < Duration::from_millis(30));
+}

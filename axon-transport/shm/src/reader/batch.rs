@@ -1,0 +1,50 @@
+//! Takes samples one behind the other into one buffer, and tells their publisher once.
+
+use super::{ATTEMPTS, Reader};
+use crate::{error::TakeError, ring::types::Taken};
+
+impl Reader {
+    /// Takes the next sample, and adds its payload to `out`; returns its length besides. `None` also where `out` has
+    /// bytes and would have more than `most` with the payload.
+    ///
+    /// The publisher sees that the sample was taken, and may wait for that, after
+    /// [`tell_taken`](Self::tell_taken).
+    ///
+    /// # Errors
+    /// As for [`take`](Self::take). `out` is as it was.
+    pub fn take_behind(
+        &mut self,
+        out: &mut Vec<u8>,
+        most: usize,
+    ) -> Result<Option<(Taken, usize)>, TakeError> {
+        let before = out.len();
+        for _ in 0..ATTEMPTS {
+            let Some((record, bytes)) = self.find_whole()? else { break };
+            let len = record.len as usize;
+            if before > 0 && before + len > most {
+                break;
+            }
+            if before == 0 {
+                // Those that wait are most often alike. Where there is no memory for all, there may be for this one.
+                let waiting = usize::try_from(self.unread()).unwrap_or(usize::MAX);
+                let _ = out.try_reserve_exact(len.saturating_mul(waiting).min(most).max(len));
+            }
+            match self.copy_to(&record, &bytes, out) {
+                Ok(true) => return Ok(Some((self.taken_untold(&record), len))),
+                Ok(false) => out.truncate(before),
+                Err(error) => {
+                    out.truncate(before);
+                    return Err(error);
+                }
+            }
+        }
+        Ok(None)
+    }
+
+    /// Shows the publisher what was [taken](Self::take_behind), and wakes it if it waits for that.
+    pub fn tell_taken(&self) {
+        if !self.attachment.lane.is_forked() {
+            self.tell_cursor();
+        }
+    }
+}
