@@ -85,9 +85,25 @@ fn a_peer_that_asks_for_too_many_routes_is_refused_those_by_name_and_keeps_its_l
     until("it is shown no more", || refused(&host) == more - 1);
 }
 
+/// Threads that create endpoints. Each endpoint waits a while for those on the other host that it is matched with.
+const CREATORS: u32 = 64;
+
 /// One end of each of so many topics.
-fn ends<T>(session: &Session, count: u32, create: impl Fn(&Session, EndpointSpec) -> T) -> Vec<T> {
-    (0..count).map(|number| create(session, spec(number))).collect()
+fn ends<T: Send>(
+    session: &Session,
+    count: u32,
+    create: impl Fn(&Session, EndpointSpec) -> T + Sync,
+) -> Vec<T> {
+    let part = count.div_ceil(CREATORS);
+    let create = &create;
+    thread::scope(|scope| {
+        let creator = |first: u32| {
+            let numbers = first..count.min(first + part);
+            scope.spawn(move || numbers.map(|n| create(session, spec(n))).collect::<Vec<_>>())
+        };
+        let creators: Vec<_> = (0..count).step_by(part as usize).map(creator).collect();
+        creators.into_iter().flat_map(|creator| creator.join().unwrap()).collect()
+    })
 }
 
 /// Publishers on one host, and subscriptions of the same topics on the other.
