@@ -122,6 +122,7 @@ impl Elector {
             subscribers,
             last: vec![],
             acknowledges: None,
+            short_headers: None,
         };
         self.stranger.say(met, &Message::Subscribe(subscribe));
     }

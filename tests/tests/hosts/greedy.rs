@@ -129,6 +129,7 @@ fn subscribe(route: u32, topic: String, subscribers: Vec<Subscriber>) -> Message
         subscribers,
         last: Vec::new(),
         acknowledges: None,
+        short_headers: None,
     })
 }
 

@@ -38,6 +38,7 @@ fn subscribe(route: u32) -> Message {
         subscribers: vec![Subscriber { gid: Gid([7; 16]), qos: Qos::default() }],
         last: vec![],
         acknowledges: None,
+        short_headers: None,
     })
 }
 

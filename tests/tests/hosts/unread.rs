@@ -48,6 +48,7 @@ fn subscribe(stranger: &Stranger, met: &mut Met) {
         subscribers: vec![Subscriber { gid: SUBSCRIPTION, qos: Qos::keep_all() }],
         last: vec![],
         acknowledges: Some(true),
+        short_headers: None,
     };
     stranger.say(met, &Message::Subscribe(subscribe));
 }

@@ -20,6 +20,8 @@ const AHEAD: u64 = 64 << 10;
 const LOSS_EVERY: (Duration, u64) = (Duration::from_millis(100), 20);
 /// Loss below this asks for no more bulk.
 const NOTABLE_LOSS: f64 = 0.001;
+/// A link that loses this share of its packets, or more, is one that loses packets.
+const LOSES: f64 = 0.01;
 /// Times that bulk is multiplied under loss, at most.
 const MOST_ROUNDS: f64 = 6.0;
 /// Bytes more that QUIC holds for all other classes.
@@ -81,6 +83,7 @@ impl Connection {
             taken: 0,
             window,
             bulk,
+            loses: self.loss.share >= LOSES,
         }
     }
 }
@@ -138,6 +141,8 @@ pub(crate) struct Carrier<'a> {
     pub(super) taken: u64,
     window: u64,
     bulk: u64,
+    /// Whether the link loses packets.
+    pub(super) loses: bool,
 }
 
 impl Carrier<'_> {

@@ -213,13 +213,13 @@ impl Delay {
                 }
                 if self.settling > 0 {
                     self.settling -= 1;
+                } else if is_app_limited {
+                    // The window is not what fills a queue, and a lone packet is acknowledged late.
                 } else if queue > self.wanted() * 2 {
                     self.end_round_of_queue(now, rate, shortest, queue);
                 } else {
                     self.growth.add(round.acknowledged, round.lost, time);
-                    if !is_app_limited {
-                        self.grow(queue);
-                    }
+                    self.grow(queue);
                 }
             }
         }
@@ -351,7 +351,8 @@ impl Controller for Delay {
         largest_packet_num_acked: Option<u64>,
     ) {
         let (in_a_row, shortest) = self.urgent;
-        let may_drain = self.settling == 0 && !matches!(self.phase, Phase::Compete(_));
+        let is_competing = matches!(self.phase, Phase::Compete(_));
+        let may_drain = self.settling == 0 && !app_limited && !is_competing;
         if in_a_row >= URGENT_IN_A_ROW && may_drain {
             self.phase = Phase::Steady;
             self.drain(shortest.saturating_sub(self.path.get()));
@@ -376,12 +377,14 @@ impl Controller for Delay {
             return cubic.on_congestion_event(now, sent, is_persistent_congestion, lost_bytes);
         }
         // A mark of a router comes as a congestion event that lost nothing.
-        let share = match (is_persistent_congestion, lost_bytes) {
-            (true, _) => MARKED.1,
-            (false, 0) => MARKED.0,
+        let (share, least) = match (is_persistent_congestion, lost_bytes) {
+            // Chance does this too where little is sent and much is lost, and a window that has hardly any packet on
+            // the way does not learn that it could have more.
+            (true, _) => (MARKED.1, self.initial_window()),
+            (false, 0) => (MARKED.0, 0),
             (false, _) => return,
         };
-        if self.obeyed.is_none_or(|obeyed| sent > obeyed) {
+        if self.obeyed.is_none_or(|obeyed| sent > obeyed) && self.window > least {
             self.obeyed = Some(now);
             self.phase = Phase::Steady;
             self.shrink(share);

@@ -209,6 +209,11 @@ impl Flow {
         self.undemanded += taking.take_burst(sources, queue, topic, counters, now);
     }
 
+    /// Whether samples that were sent may not have arrived. Of a service nothing says that they did.
+    pub(super) fn is_on_the_way(&self) -> bool {
+        !self.acknowledged || self.queue.has_sent() || !self.best_effort.is_idle()
+    }
+
     /// Whether a sample found no room.
     pub(super) fn is_held(&self) -> bool {
         self.taking.is_held()

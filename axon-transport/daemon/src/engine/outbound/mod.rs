@@ -7,6 +7,7 @@ mod best_effort;
 pub(crate) mod budget;
 mod ending;
 mod flow;
+mod nudges;
 mod queue;
 mod schedule;
 mod source;
@@ -31,6 +32,7 @@ use self::{
     budget::Budget,
     ending::Endings,
     flow::{Done, Flow, FlowRoute, Pause},
+    nudges::Nudges,
     schedule::Schedule,
     stall::Stalls,
 };
@@ -126,6 +128,7 @@ pub(crate) struct Outbound {
     busy: BTreeSet<FlowId>,
     endings: Endings,
     stalls: Stalls,
+    nudges: Nudges,
     events: Vec<OutboundEvent>,
 }
 
@@ -156,6 +159,7 @@ impl Outbound {
             busy: BTreeSet::new(),
             endings: Endings::default(),
             stalls: Stalls::new(stalled_after, now),
+            nudges: Nudges::default(),
             events: Vec::new(),
         }
     }
@@ -307,6 +311,7 @@ impl Outbound {
         self.without_key.remove(&id);
         self.held.remove(&id);
         self.busy.remove(&id);
+        self.nudges.forget(id);
         if flow.scheduled.is_some() {
             self.schedule.remove(id);
         }
@@ -325,10 +330,13 @@ impl Outbound {
             let Some(served) = self.routes.get(&flow.route_number) else { continue };
             flow.scheduled = None;
             carrier.flow = id;
-            let before = flow.timer;
+            let (before, taken) = (flow.timer, carrier.taken);
             let mut done = Done::default();
             let pause = flow.write(&served.sources, carrier, &self.counters, &mut done, now);
             served.done(flow.of, done);
+            if carrier.loses && carrier.taken > taken {
+                self.nudges.handle_sent(id, carrier.quic.rtt(), now);
+            }
             if flow.is_held() {
                 self.held.insert(id);
             }
@@ -498,7 +506,8 @@ impl Outbound {
         let flow = self.timers.first().map(|(due, _)| *due);
         let endings = self.endings.poll_timeout();
         let stalls = (!self.busy.is_empty()).then(|| self.stalls.poll_timeout()).flatten();
-        [flow, endings, stalls, self.key_retry].into_iter().flatten().min()
+        let nudges = self.nudges.poll_timeout();
+        [flow, endings, stalls, nudges, self.key_retry].into_iter().flatten().min()
     }
 
     /// Does what is due. `heard` counts the datagrams that came over the link.
@@ -531,6 +540,15 @@ impl Outbound {
         }
         if self.key_retry.is_some_and(|due| due <= now) {
             self.handle_keys();
+        }
+        let rtt = carrier.as_deref().map_or(NO_CARRIER, |carrier| carrier.quic.rtt());
+        let is_on_the_way = |id: FlowId| {
+            self.flows.get(id).and_then(Option::as_ref).is_some_and(Flow::is_on_the_way)
+        };
+        if self.nudges.handle_timeout(rtt, now, is_on_the_way)
+            && let Some(carrier) = carrier
+        {
+            carrier.quic.ping();
         }
         self.look_at_endings(now);
         self.look_at_stalls(heard, now);

@@ -128,6 +128,11 @@ impl Queue {
         if self.policy.is_reliable() { left.min(self.budget.free()) } else { left }
     }
 
+    /// Whether RELIABLE samples were sent and are not acknowledged.
+    pub(super) fn has_sent(&self) -> bool {
+        !self.sent.is_empty()
+    }
+
     /// Whether it is RELIABLE and KEEP_ALL.
     pub(super) fn keeps_all(&self) -> bool {
         self.policy == Policy::KeepAll

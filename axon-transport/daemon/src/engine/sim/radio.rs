@@ -163,3 +163,78 @@ fn a_link_that_becomes_slow_is_fresh_again_within_two_seconds() {
     assert!(ages.len() > 50, "{}", ages.len());
     assert!(ages[ages.len() / 2] < Duration::from_millis(30));
 }
+
+/// A row of the table in docs/architecture.md.
+struct Row {
+    name: &'static str,
+    qos: Qos,
+    length: usize,
+    /// The ages in ms at which the share is told.
+    within: [u64; 2],
+}
+
+/// Samples at 30 Hz for some seconds over a link with this loss: the share that is not older than each of `within` when
+/// it arrives, the share that arrives at all, and the median age.
+fn shares(row: &Row, loss: f64, time: Duration) -> ([f64; 2], f64, Duration) {
+    let mut world = hosts(Congestion::Auto, radio(54, loss));
+    let every = Duration::from_micros(33_333);
+    let stream = Stream::new(&mut world, "/topic", row.qos, row.length, every);
+    world.until(secs(30), World::is_whole);
+    world.run_for(secs(2));
+    let mut streams = [stream];
+    drive(&mut world, &mut streams, time);
+    streams[0].next = world.now + secs(3);
+    let published = streams[0].published.len() as f64;
+    drive(&mut world, &mut streams, secs(2));
+    let ages = streams[0].ages(secs(0));
+    let share = |most: u64| {
+        let most = Duration::from_millis(most);
+        ages.iter().filter(|age| **age <= most).count() as f64 / published
+    };
+    let median = ages.get(ages.len() / 2).copied().unwrap_or_default();
+    (row.within.map(share), ages.len() as f64 / published, median)
+}
+
+fn rows() -> [Row; 4] {
+    let depth = |depth| Qos { depth, ..Qos::default() };
+    [
+        Row { name: "1 KB, RELIABLE", qos: depth(10), length: 1_000, within: [100, 300] },
+        Row { name: "64 KB, RELIABLE", qos: depth(10), length: 64_000, within: [100, 300] },
+        Row {
+            name: "1 KB, BEST_EFFORT",
+            qos: Qos::sensor_data(),
+            length: 1_000,
+            within: [100, 300],
+        },
+        Row { name: "512 KB, RELIABLE", qos: depth(1), length: 512_000, within: [250, 1_000] },
+    ]
+}
+
+#[test]
+fn lone_samples_cross_a_link_that_loses_many_packets_in_time() {
+    let [reliable, _, best_effort, _] = rows();
+    let ([in_time, _], all, median) = shares(&reliable, 0.4, secs(10));
+    println!("RELIABLE: {in_time:.3} in time, {all:.3} at all, median age {median:?}");
+    assert!(in_time > 0.9, "{in_time}");
+    assert!(all > 0.999, "{all}");
+    let ([in_time, _], ..) = shares(&best_effort, 0.4, secs(10));
+    println!("BEST_EFFORT: {in_time:.3} in time");
+    assert!(in_time > 0.75, "{in_time}");
+}
+
+#[test]
+#[ignore = "prints a table, and takes minutes"]
+fn what_arrives_at_which_loss() {
+    for row in rows() {
+        for loss in [0.0, 0.05, 0.1, 0.2, 0.3, 0.4] {
+            let (shares, all, median) = shares(&row, loss, secs(60));
+            let [first, second] = shares.map(|share| format!("{:.1} %", share * 100.0));
+            let [soon, late] = row.within;
+            println!(
+                "{}, loss {loss}: {first} within {soon} ms, {second} within {late} ms, {:.1} % at all, median {median:?}",
+                row.name,
+                all * 100.0
+            );
+        }
+    }
+}

@@ -80,11 +80,11 @@ fn topics_without_samples_cost_an_idle_link_nothing() {
 
 #[test]
 fn more_topics_than_streams_get_their_samples_soon() {
-    let count = STREAMS_OPEN as usize + 1000;
+    let count = 4 * STREAMS_OPEN as usize;
     let mut topics = Topics::matched(count, Qos::keep_all());
     for round in 1..=2 {
         (0..count).for_each(|topic| topics.publish(topic));
-        topics.world.run_for(Duration::from_secs(3));
+        topics.world.run_for(Duration::from_secs(5));
         let missing = (0..count).filter(|topic| topics.received(*topic).len() != round).count();
         assert_eq!(missing, 0, "in round {round}: {}", topics.world.describe());
     }

@@ -1,0 +1,109 @@
+//! Finds lost packets of short samples early on links that lose many.
+//!
+//! QUIC notices that a packet is lost when a later one is acknowledged. A camera sends later ones all the time. A
+//! command does not: then QUIC waits for a timer that doubles each time, and at 40 % of loss that soon takes longer than
+//! a command is worth. So while samples are on the way over a link that loses packets, and nothing else was sent, a
+//! PING follows them every few milliseconds. Each one that is acknowledged shows which packets before it are lost.
+
+use std::{collections::HashMap, time::Duration};
+
+use super::schedule::FlowId;
+
+/// PINGs follow each other at half a round trip, at least at this distance.
+const LEAST: Duration = Duration::from_millis(3);
+/// PINGs after the last sample of a flow. A call of a service is not acknowledged, and ends them so.
+const MOST: u8 = 100;
+
+/// The samples on the way that PINGs follow.
+#[derive(Debug, Default)]
+pub(super) struct Nudges {
+    /// Flows with samples on the way, and the PINGs since the last one.
+    flows: HashMap<FlowId, u8>,
+    due: Option<Duration>,
+    /// Whether samples were sent since the last PING: they show the same.
+    sent: bool,
+}
+
+impl Nudges {
+    /// A flow sent samples over a link that loses packets.
+    pub(super) fn handle_sent(&mut self, flow: FlowId, rtt: Duration, now: Duration) {
+        self.flows.insert(flow, 0);
+        self.sent = true;
+        self.due.get_or_insert(now + LEAST.max(rtt / 2));
+    }
+
+    /// A flow is gone.
+    pub(super) fn forget(&mut self, flow: FlowId) {
+        self.flows.remove(&flow);
+    }
+
+    /// When [`handle_timeout`](Self::handle_timeout) is due.
+    pub(super) fn poll_timeout(&self) -> Option<Duration> {
+        self.due
+    }
+
+    /// Whether a PING is to be sent now. `on_the_way` says whether a flow still has samples on the way.
+    pub(super) fn handle_timeout(
+        &mut self,
+        rtt: Duration,
+        now: Duration,
+        on_the_way: impl Fn(FlowId) -> bool,
+    ) -> bool {
+        if self.due.is_none_or(|due| due > now) {
+            return false;
+        }
+        self.flows.retain(|flow, pings| {
+            *pings += 1;
+            *pings <= MOST && on_the_way(*flow)
+        });
+        let is_over = self.flows.is_empty();
+        self.due = (!is_over).then(|| now + LEAST.max(rtt / 2));
+        !std::mem::take(&mut self.sent) && !is_over
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const RTT: Duration = Duration::from_millis(4);
+
+    /// The number of PINGs until nothing is due.
+    fn pings(nudges: &mut Nudges, on_the_way: impl Fn(Duration) -> bool) -> u32 {
+        let mut pings = 0;
+        while let Some(now) = nudges.poll_timeout() {
+            pings += u32::from(nudges.handle_timeout(RTT, now, |_| on_the_way(now)));
+        }
+        pings
+    }
+
+    #[test]
+    fn pings_follow_samples_until_they_have_arrived() {
+        let mut nudges = Nudges::default();
+        assert_eq!(nudges.poll_timeout(), None);
+        nudges.handle_sent(7, RTT, Duration::ZERO);
+        assert_eq!(nudges.poll_timeout(), Some(LEAST));
+        // At 3 ms the sample itself had just been sent; then there are PINGs at 6, 9 and 12 ms.
+        assert_eq!(pings(&mut nudges, |now| now < Duration::from_millis(15)), 3);
+        nudges.handle_sent(7, RTT, Duration::ZERO);
+        nudges.forget(7);
+        assert_eq!(pings(&mut nudges, |_| true), 0);
+    }
+
+    #[test]
+    fn pings_end_where_nothing_says_that_a_sample_arrived() {
+        let mut nudges = Nudges::default();
+        nudges.handle_sent(7, RTT, Duration::ZERO);
+        assert_eq!(pings(&mut nudges, |_| true), u32::from(MOST) - 1);
+    }
+
+    #[test]
+    fn samples_that_follow_each_other_need_no_pings() {
+        let mut nudges = Nudges::default();
+        for time in 0..100 {
+            let now = Duration::from_millis(time);
+            nudges.handle_sent(7, RTT, now);
+            assert!(!nudges.handle_timeout(RTT, now, |_| true), "{time}");
+        }
+    }
+}
