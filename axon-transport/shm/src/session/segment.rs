@@ -149,6 +149,18 @@ impl SessionSegment {
         !self.is_forked() && self.orphans.sweep(&self.heap, &self.segments)
     }
 
+    /// How many publishers that are gone were looked at since the start.
+    #[cfg(test)]
+    pub(crate) fn looks_at_orphans(&self) -> usize {
+        self.orphans.looks()
+    }
+
+    /// As [`tidy`](Self::tidy), but not whenever it is called where there are many publishers that are gone: call `tidy`
+    /// later if this returns true.
+    pub fn tidy_some(&self) -> bool {
+        !self.is_forked() && self.orphans.sweep_some(&self.heap, &self.segments)
+    }
+
     /// A lane for a reader that is about to attach.
     ///
     /// # Errors
@@ -380,7 +392,7 @@ impl SessionSegment {
     /// Keeps what a publisher leaves for as long as somebody reads it.
     pub(crate) fn adopt(&self, orphan: Orphan) {
         self.orphans.adopt(orphan);
-        self.tidy();
+        self.tidy_some();
     }
 
     pub(crate) fn map(&self, number: u32) -> Option<Arc<Map>> {

@@ -219,7 +219,7 @@ impl Writer {
         if max_message > layout::MAX_MESSAGE || budget > layout::MAX_BUDGET {
             return Err(ShmError::TooLarge { max_message, budget });
         }
-        session.tidy();
+        session.tidy_some();
         let limit = match qos.history {
             Keep::KeepLast => (u64::from(qos.depth) + 1)
                 .next_power_of_two()

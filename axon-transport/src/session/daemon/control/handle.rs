@@ -465,7 +465,7 @@ impl Control {
             pair_log::over(pair, "the daemon said so to the writer");
             self.writer_changed(&publisher);
         }
-        if self.shared.segment.tidy() {
+        if self.shared.segment.tidy_some() {
             self.look_after_memory();
         }
     }
