@@ -4,7 +4,7 @@ use std::{collections::BTreeMap, fmt::Write as _, io::Write as _, process::ExitC
 
 use axon_transport::{
     config::DaemonPlace,
-    status::{LinkStatus, RelayStatus, SessionStatus, Status, TopicStatus},
+    status::{LinkStatus, RelayStatus, SessionStatus, Status, TopicStatus, WaitingStatus},
 };
 use serde_json::Value;
 
@@ -74,6 +74,9 @@ fn render(status: &Status) -> String {
     );
     section(&mut out, "Settings", "none", settings(status));
     section(&mut out, "Links", "no other host is linked", links(&status.links));
+    if !status.links.is_empty() {
+        section(&mut out, "Paths", "none", paths(&status.links));
+    }
     if status.links.iter().any(|link| !link.routes_refused.is_empty()) {
         section(&mut out, "Routes refused", "none", routes_refused(&status.links));
     }
@@ -140,6 +143,56 @@ fn links(links: &[LinkStatus]) -> Table {
         ]);
     }
     table
+}
+
+/// What shows why a link is slow.
+fn paths(links: &[LinkStatus]) -> Table {
+    let mut table = Table::new(&[
+        "host",
+        ">rtt",
+        ">shortest",
+        ">window",
+        ">packet",
+        ">sent",
+        ">lost",
+        ">marked in",
+        ">marked out",
+        "waiting",
+        ">oldest",
+    ]);
+    for link in links {
+        let rtt = |micros: u64| text::duration(micros.saturating_mul(1_000));
+        table.row([
+            link.host.clone(),
+            rtt(link.rtt_us),
+            rtt(link.rtt_min_us),
+            text::bytes(link.congestion_window),
+            text::bytes(link.mtu),
+            grouped(link.packets_sent),
+            format!("{} ({})", grouped(link.packets_lost), text::bytes(link.bytes_lost)),
+            grouped(link.ecn_marks_in),
+            grouped(link.ecn_marks_out),
+            waiting(&link.waiting),
+            text::duration(link.waiting_ms.saturating_mul(1_000_000)),
+        ]);
+    }
+    table
+}
+
+/// The classes of which something waits, in the order in which they are served.
+fn waiting(waiting: &WaitingStatus) -> String {
+    let WaitingStatus { control, services, small_reliable, small_best_effort, bulk } = *waiting;
+    let classes = [
+        (control, "control"),
+        (services, "services"),
+        (small_reliable, "small"),
+        (small_best_effort, "small best effort"),
+        (bulk, "bulk"),
+    ];
+    let classes = classes.iter().filter(|(bytes, _)| *bytes > 0);
+    let classes: Vec<String> =
+        classes.map(|(bytes, class)| format!("{} {class}", text::bytes(*bytes))).collect();
+    if classes.is_empty() { dash() } else { classes.join(", ") }
 }
 
 fn routes_refused(links: &[LinkStatus]) -> Table {
@@ -409,6 +462,12 @@ mod tests {
             links: vec![LinkStatus {
                 host: "evil\x1b[2J".to_owned(),
                 dropped: BTreeMap::from([("no_key".to_owned(), 1_000), ("other".to_owned(), 0)]),
+                rtt_min_us: 740,
+                packets_lost: 7_654,
+                bytes_lost: 9_100_000,
+                ecn_marks_out: 321,
+                waiting: WaitingStatus { control: 17, bulk: 4_500_000, ..WaitingStatus::default() },
+                waiting_ms: 88,
                 ..LinkStatus::default()
             }],
             keys: json!({"kme": {"enc": {"calls": 12}}, "peers": [{"ready": 4}]}),
@@ -437,6 +496,11 @@ mod tests {
             "qkd (messages10, psk_ke, chacha20-poly1305), SAE sae-a",
             "AXON_SECURITY_MODE",
             "1,000 no_key",
+            "740 us",
+            "7,654 (9.10 MB)",
+            "321",
+            "17 B control, 4.50 MB bulk",
+            "88.0 ms",
             "kme enc calls",
             "peers 1 ready",
             "/scan",

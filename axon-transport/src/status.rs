@@ -274,18 +274,37 @@ pub struct LinkStatus {
     /// Congestion window in bytes.
     #[serde(default)]
     pub congestion_window: u64,
+    /// Packets sent.
+    #[serde(default)]
+    pub packets_sent: u64,
     /// Packets that were lost.
     #[serde(default)]
     pub packets_lost: u64,
+    /// Bytes of these packets. QUIC retransmits what they carried and still matters: its own counter of that does not
+    /// exist.
+    #[serde(default)]
+    pub bytes_lost: u64,
+    /// Datagrams that arrived with an ECN mark: a router on the way here is congested.
+    #[serde(default)]
+    pub ecn_marks_in: u64,
+    /// Times that the peer reported new ECN marks on what was sent to it, since its address changed last.
+    #[serde(default)]
+    pub ecn_marks_out: u64,
     /// Times that the congestion controller took packets for lost, or marked.
     #[serde(default)]
     pub congestion_events: u64,
     /// Largest UDP payload, in bytes.
     #[serde(default)]
     pub mtu: u64,
+    /// Times that the path let packets of this size no longer pass, and the link went back to shorter ones.
+    #[serde(default)]
+    pub mtu_black_holes: u64,
     /// Bytes of samples that wait for the link.
     #[serde(default)]
     pub waiting_bytes: u64,
+    /// The same by class, and control messages.
+    #[serde(default)]
+    pub waiting: WaitingStatus,
     /// Milliseconds that the oldest of them has waited.
     #[serde(default)]
     pub waiting_ms: u64,
@@ -314,6 +333,23 @@ pub struct LinkStatus {
     /// Bytes that count for the graph of the peer's identity, over all of its daemon ids.
     #[serde(default)]
     pub graph_bytes: u64,
+}
+
+/// Bytes that wait in the daemon until QUIC takes them, by class: a class goes before those below it, and bulk has every
+/// eighth turn. A flow counts as a whole for the class of its next sample. BEST_EFFORT and KEEP_ALL samples wait in their
+/// publisher's ring: those that the daemon has not taken from there do not count.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WaitingStatus {
+    /// Control messages.
+    pub control: u64,
+    /// Requests and responses of services and actions.
+    pub services: u64,
+    /// RELIABLE samples of at most 4 KiB.
+    pub small_reliable: u64,
+    /// BEST_EFFORT samples of at most 4 KiB.
+    pub small_best_effort: u64,
+    /// Longer samples.
+    pub bulk: u64,
 }
 
 /// Somebody who was refused.

@@ -3,9 +3,9 @@
 use std::{fmt::Display, net::IpAddr, path::Path, time::Duration};
 
 use super::{
-    ClassicAuth, Config, ConfigError, Congestion, DaemonPolicy, DiscoveryRange, KeyMode, OsFiles,
-    QkdKex, QkdPeers, QuicCipher, SecurityMode, daemon_env::DaemonEnv, names, resolve::resolve,
-    sources::Given, values::method,
+    ClassicAuth, Config, ConfigError, Congestion, DaemonPolicy, DiscoveryRange, KeyMode, LinkPoll,
+    OsFiles, QkdKex, QkdPeers, QuicCipher, SecurityMode, daemon_env::DaemonEnv, names,
+    resolve::resolve, sources::Given, values::method,
 };
 
 /// Makes a [`Config`] in code. Each method gives the setting of `docs/configuration.md` that has its name:
@@ -361,6 +361,21 @@ impl ConfigBuilder {
     /// What the graph of one peer may take, and its routes as much again, 1 to 1024 MiB. Default 16.
     pub fn link_graph_mb(self, mib: u64) -> Self {
         self.set("AXON_LINK_GRAPH_MB", mib)
+    }
+
+    /// Whether the daemon looks for the next input before it sleeps. Default [`LinkPoll::Adaptive`].
+    pub fn link_poll(self, poll: LinkPoll) -> Self {
+        let word = match poll {
+            LinkPoll::Adaptive => "adaptive",
+            LinkPoll::Always => "always",
+            LinkPoll::Never => "never",
+        };
+        self.set("AXON_LINK_POLL", word)
+    }
+
+    /// The absolute path of the directory to which the daemon writes QUIC's events. Default none.
+    pub fn link_qlog(self, directory: impl AsRef<Path>) -> Self {
+        self.path("AXON_LINK_QLOG", directory)
     }
 
     /// The congestion controller of links. Default [`Congestion::Auto`].

@@ -15,7 +15,7 @@ use super::{ConfigError, names};
 
 /// Settings that name programs, files, directories, or users who are let in.
 fn refused() -> impl Iterator<Item = &'static str> {
-    names::PATHS.iter().copied().chain([names::RUNTIME_DIR, names::TRUSTED_UIDS])
+    names::PATHS.iter().copied().chain([names::RUNTIME_DIR, names::TRUSTED_UIDS, names::QLOG])
 }
 
 const ACCEPTED: &str = "nothing from the environment: this program runs with more rights than its caller \

@@ -36,7 +36,8 @@ pub use error::ConfigError;
 pub use files::{FileFacts, FileKind, Files, OsFiles};
 pub use model::{
     ClassicAuth, ClassicConfig, Config, Congestion, DaemonPolicy, DiscoveryRange, KeyMode,
-    LinkConfig, PeerAddress, QkdConfig, QkdKex, QkdPeers, QuicCipher, Security, SecurityMode,
+    LinkConfig, LinkPoll, PeerAddress, QkdConfig, QkdKex, QkdPeers, QuicCipher, Security,
+    SecurityMode,
 };
 pub use place::DaemonPlace;
 pub use summary::security_settings;

@@ -318,8 +318,24 @@ pub struct LinkConfig {
     pub mtu: u16,
     /// What the graph of one peer may take here, and its routes as much again, in bytes.
     pub graph: usize,
+    /// What the daemon does between two inputs.
+    pub poll: LinkPoll,
+    /// Where QUIC's events are written, in the format qlog.
+    pub qlog: Option<PathBuf>,
     /// How a link finds its share of the path.
     pub congestion: Congestion,
+}
+
+/// Whether the daemon looks for the next input before it sleeps (`AXON_LINK_POLL`).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum LinkPoll {
+    /// For some tens of microseconds, while that often finds an input.
+    #[default]
+    Adaptive,
+    /// It never sleeps, and keeps a processor busy.
+    Always,
+    /// It sleeps at once.
+    Never,
 }
 
 /// The congestion controller of links (`AXON_LINK_CONGESTION`). Either side of a link decides for what it sends.
@@ -339,6 +355,14 @@ pub enum Congestion {
 impl Default for LinkConfig {
     fn default() -> Self {
         let ten = Duration::from_secs(10);
-        Self { grace: ten, stalled: ten, mtu: 1452, graph: 16 << 20, congestion: Congestion::Auto }
+        Self {
+            grace: ten,
+            stalled: ten,
+            mtu: 1452,
+            graph: 16 << 20,
+            poll: LinkPoll::Adaptive,
+            qlog: None,
+            congestion: Congestion::Auto,
+        }
     }
 }

@@ -46,6 +46,8 @@ pub(super) const LINK: &[&str] = &[
     "AXON_LINK_STALLED_S",
     "AXON_LINK_MTU",
     "AXON_LINK_GRAPH_MB",
+    "AXON_LINK_POLL",
+    QLOG,
     "AXON_LINK_CONGESTION",
 ];
 
@@ -65,6 +67,9 @@ pub(super) const PATHS: &[&str] = &[
 
 /// Where a daemon keeps files, always an absolute path.
 pub(super) const RUNTIME_DIR: &str = "AXON_RUNTIME_DIR";
+
+/// Where the daemon writes QUIC's events, always an absolute path.
+pub(super) const QLOG: &str = "AXON_LINK_QLOG";
 
 /// Users who are let in.
 pub(super) const TRUSTED_UIDS: &str = "AXON_TRUSTED_UIDS";

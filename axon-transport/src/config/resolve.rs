@@ -8,7 +8,7 @@ use std::{
 
 use super::{
     ClassicAuth, ClassicConfig, Config, ConfigError, Congestion, DaemonPolicy, DiscoveryRange,
-    KeyMode, LinkConfig, QkdConfig, QkdKex, QkdPeers, QuicCipher, Security, SecurityMode,
+    KeyMode, LinkConfig, LinkPoll, QkdConfig, QkdKex, QkdPeers, QuicCipher, Security, SecurityMode,
     daemon_env::DaemonEnv,
     files::Files,
     names,
@@ -297,6 +297,22 @@ pub(super) fn runtime_dir(
     Ok((xdg.filter(|path| path.is_absolute()).map(|path| path.join("axon")), false))
 }
 
+/// The values of `AXON_LINK_POLL`.
+const POLL: [(&str, LinkPoll); 3] =
+    [("adaptive", LinkPoll::Adaptive), ("always", LinkPoll::Always), ("never", LinkPoll::Never)];
+
+/// `qlog` of the section `[link]`.
+fn qlog(
+    name: &str,
+    value: &toml::Value,
+    place: &str,
+    files: &impl Files,
+) -> Result<PathBuf, ConfigError> {
+    let text = value.as_str().unwrap_or_else(|| value.type_str());
+    let path = value.as_str().and_then(|text| values::absolute_directory(text, files));
+    path.ok_or_else(|| ConfigError::value(name, text, values::DIRECTORY).at(place))
+}
+
 /// The values of `AXON_LINK_CONGESTION`.
 const CONGESTION: [(&str, Congestion); 4] = [
     ("auto", Congestion::Auto),
@@ -326,6 +342,15 @@ fn link(values: &Values<'_, impl Files>) -> Result<LinkConfig, ConfigError> {
             "stalled_s" => link.stalled = Duration::from_secs(number(1, 86_400, "seconds")?),
             "mtu" => link.mtu = number(1_200, 65_527, "bytes")? as u16,
             "graph_mb" => link.graph = (number(1, 1_024, "MiB")? as usize) << 20,
+            "poll" => {
+                let word = value.as_str().unwrap_or_else(|| value.type_str());
+                let known = POLL.iter().find(|(name, _)| *name == word);
+                let accepted = || POLL.map(|(word, _)| word).join(", ");
+                link.poll = known
+                    .map(|(_, poll)| *poll)
+                    .ok_or_else(|| ConfigError::value(&name, word, accepted()).at(&*place))?;
+            }
+            "qlog" => link.qlog = Some(qlog(&name, value, &place, values.files)?),
             "congestion" => {
                 let word = value.as_str().unwrap_or_else(|| value.type_str());
                 let known = CONGESTION.iter().find(|(name, _)| *name == word);
@@ -335,7 +360,7 @@ fn link(values: &Values<'_, impl Files>) -> Result<LinkConfig, ConfigError> {
                     .ok_or_else(|| ConfigError::value(&name, word, accepted()).at(&*place))?;
             }
             _ => {
-                let known = "grace_s, stalled_s, mtu, graph_mb, congestion";
+                let known = "grace_s, stalled_s, mtu, graph_mb, poll, qlog, congestion";
                 return Err(ConfigError::name(&name, known).at(place));
             }
         }
@@ -352,6 +377,12 @@ fn link(values: &Values<'_, impl Files>) -> Result<LinkConfig, ConfigError> {
     }
     if let Some(graph) = values.number("AXON_LINK_GRAPH_MB", 1..=1_024, "MiB")? {
         link.graph = (graph as usize) << 20;
+    }
+    if let Some(poll) = values.choice("AXON_LINK_POLL", &POLL)? {
+        link.poll = poll;
+    }
+    if let Some(qlog) = values.directory(names::QLOG)? {
+        link.qlog = Some(qlog);
     }
     if let Some(congestion) = values.choice("AXON_LINK_CONGESTION", &CONGESTION)? {
         link.congestion = congestion;

@@ -249,14 +249,11 @@ impl<F: Files> Values<'_, F> {
 
     /// A directory: an absolute path that may be created later, but is no other kind of file.
     pub(super) fn directory(&self, name: &str) -> Result<Option<PathBuf>, ConfigError> {
-        let accepted = "the absolute path of a directory";
-        let Some(setting) = self.text(name, accepted)? else { return Ok(None) };
-        let path = PathBuf::from(&setting.text);
-        let taken = self.files.facts(&path).is_ok_and(|facts| facts.kind != FileKind::Directory);
-        if !path.is_absolute() || taken || setting.text.contains('\0') {
-            return Err(refuse(name, setting, accepted));
+        let Some(setting) = self.text(name, DIRECTORY)? else { return Ok(None) };
+        match absolute_directory(&setting.text, self.files) {
+            Some(path) => Ok(Some(path)),
+            None => Err(refuse(name, setting, DIRECTORY)),
         }
-        Ok(Some(path))
     }
 
     fn path(&self, name: &str, setting: &Setting) -> Result<PathBuf, ConfigError> {
@@ -266,6 +263,16 @@ impl<F: Files> Values<'_, F> {
         };
         sources::absolute(name, &setting.text, file, self.files)
     }
+}
+
+/// What [`absolute_directory`] takes.
+pub(super) const DIRECTORY: &str = "the absolute path of a directory";
+
+/// An absolute path at which there is a directory, or nothing yet.
+pub(super) fn absolute_directory(text: &str, files: &impl Files) -> Option<PathBuf> {
+    let path = PathBuf::from(text);
+    let taken = files.facts(&path).is_ok_and(|facts| facts.kind != FileKind::Directory);
+    (path.is_absolute() && !taken && !text.contains('\0')).then_some(path)
 }
 
 fn refuse(name: &str, setting: &Setting, accepted: impl Into<String>) -> ConfigError {

@@ -15,7 +15,7 @@ const SOME: u64 = 300;
 const PROBED: [&str; 1] = ["the link does not answer: probing its path"];
 const DIALLED: [&str; 1] = ["the link is silent though its path works: dialling a successor"];
 
-fn wired(settings: [Settings; 2]) -> ([Host; 2], Wire) {
+pub(crate) fn wired(settings: [Settings; 2]) -> ([Host; 2], Wire) {
     let [mut a, mut b] = Plan { wired: true, ..Plan::new(settings) }.prepare();
     b.start();
     let wire = b.wire();

@@ -17,7 +17,7 @@ fn hosts() -> [Host; 2] {
 }
 
 /// A publisher on the first host and a subscription on the second that have met.
-fn across(hosts: &[Host; 2], topic: &str, qos: Qos) -> (Publisher, Subscription) {
+pub(crate) fn across(hosts: &[Host; 2], topic: &str, qos: Qos) -> (Publisher, Subscription) {
     let (here, there) = (hosts[0].session("publisher"), hosts[1].session("subscription"));
     let spec = || EndpointSpec::new(topic, "test/Bytes", qos);
     let subscription = there.create_subscription(spec()).unwrap();

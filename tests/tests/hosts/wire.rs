@@ -16,12 +16,19 @@ const MOST: usize = 1000;
 const ALL: u8 = 0;
 const NOTHING: u8 = 1;
 const NEWCOMERS: u8 = 2;
+const LOSSY: u8 = 3;
+/// Values of ECN in the TOS byte: a packet that may be marked, and one that is.
+const ECN_CAPABLE: u8 = 2;
+const CONGESTION_EXPERIENCED: u8 = 3;
+/// A lossy wire drops one datagram in so many.
+const ONE_IN: u64 = 8;
 
-/// Whether a datagram with this first byte gets through.
-fn pass(passes: &AtomicU8, first: u8) -> bool {
+/// Whether the datagram of this number, with this first byte, gets through.
+fn pass(passes: &AtomicU8, first: u8, number: u64) -> bool {
     match passes.load(Ordering::Relaxed) {
         ALL => true,
         NOTHING => false,
+        LOSSY => !number.is_multiple_of(ONE_IN),
         // A long header: a handshake.
         _ if first & 0x80 != 0 => {
             passes.store(ALL, Ordering::Relaxed);
@@ -50,6 +57,7 @@ impl Wire {
         let [near, towards] = [near, far].map(|address| {
             let socket = UdpSocket::bind(address).unwrap();
             socket.set_read_timeout(Some(Duration::from_millis(10))).unwrap();
+            rustix::net::sockopt::set_ip_tos(&socket, ECN_CAPABLE).unwrap();
             Arc::new(socket)
         });
         let wire = Self {
@@ -64,11 +72,12 @@ impl Wire {
         let (back, out, passes) =
             (Arc::clone(&near), Arc::clone(&towards), Arc::clone(&wire.passes));
         thread::spawn(move || {
-            let mut bytes = [0; 65_536];
+            let (mut bytes, mut number) = ([0; 65_536], 0);
             while !over.load(Ordering::Relaxed) {
                 let Ok((length, address)) = near.recv_from(&mut bytes) else { continue };
                 *from.lock().unwrap() = Some(address);
-                if !pass(&passes, bytes[0]) {
+                number += 1;
+                if !pass(&passes, bytes[0], number) {
                     continue;
                 }
                 let mut said = said.lock().unwrap();
@@ -81,10 +90,12 @@ impl Wire {
         });
         let (over, passes) = (Arc::clone(&wire.over), Arc::clone(&wire.passes));
         thread::spawn(move || {
-            let mut bytes = [0; 65_536];
+            let (mut bytes, mut number) = ([0; 65_536], 0);
             while !over.load(Ordering::Relaxed) {
                 let Ok((length, _)) = towards.recv_from(&mut bytes) else { continue };
-                if let (Some(address), false) = (*client.lock().unwrap(), !pass(&passes, bytes[0]))
+                number += 1;
+                if let Some(address) = *client.lock().unwrap()
+                    && pass(&passes, bytes[0], number)
                 {
                     let _ = back.send_to(&bytes[..length], address);
                 }
@@ -96,6 +107,16 @@ impl Wire {
     /// From now on nothing gets through.
     pub(crate) fn cut(&self) {
         self.passes.store(NOTHING, Ordering::Relaxed);
+    }
+
+    /// From now on some datagrams do not get through.
+    pub(crate) fn lose(&self) {
+        self.passes.store(LOSSY, Ordering::Relaxed);
+    }
+
+    /// Marks what the client says as a congested router does.
+    pub(crate) fn mark(&self) {
+        rustix::net::sockopt::set_ip_tos(&self.towards, CONGESTION_EXPERIENCED).unwrap();
     }
 
     /// All gets through again.

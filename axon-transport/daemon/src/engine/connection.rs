@@ -2,10 +2,12 @@
 
 use std::{collections::HashMap, time::Duration};
 
+use axon_transport::status::LinkStatus;
 use quinn_proto::{ConnectionHandle, StreamId};
 
 use super::{
     control::Control,
+    marks::marks_reported,
     outbound::{Class, FlowId},
     protection::Seal,
 };
@@ -47,6 +49,8 @@ pub(crate) struct Connection {
     pub(super) is_transmitting: bool,
     /// The deadline under which the engine knows it.
     pub(super) deadline: Option<std::time::Instant>,
+    /// Datagrams that came with an ECN mark.
+    pub(super) ecn_marks: u64,
 }
 
 impl Connection {
@@ -65,7 +69,27 @@ impl Connection {
             is_dirty: false,
             is_transmitting: false,
             deadline: None,
+            ecn_marks: 0,
         }
+    }
+
+    /// Adds what QUIC measures to the link's status.
+    pub(super) fn fill(&self, status: &mut LinkStatus) {
+        let path = self.quic.stats().path;
+        let micros = |time: Duration| u64::try_from(time.as_micros()).unwrap_or(u64::MAX);
+        status.address = self.quic.remote_address().to_string();
+        status.rtt_us = micros(self.quic.rtt());
+        status.rtt_min_us = micros(self.quic.min_rtt());
+        status.congestion_window = path.cwnd;
+        status.congestion_events = path.congestion_events;
+        status.packets_sent = path.sent_packets;
+        status.packets_lost = path.lost_packets;
+        status.bytes_lost = path.lost_bytes;
+        status.mtu = path.current_mtu.into();
+        status.mtu_black_holes = path.black_holes_detected;
+        status.ecn_marks_in = self.ecn_marks;
+        status.ecn_marks_out = marks_reported(&self.quic);
+        status.waiting.control = self.control.queued() as u64;
     }
 
     /// The connection as a carrier of samples.

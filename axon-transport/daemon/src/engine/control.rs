@@ -171,6 +171,11 @@ impl Control {
         !self.out.is_empty() || self.finishing && !self.finished
     }
 
+    /// Bytes of messages that wait for QUIC.
+    pub(super) fn queued(&self) -> usize {
+        self.queued
+    }
+
     /// Hands frames to QUIC. Returns whether it took any.
     pub(super) fn write(&mut self, quic: &mut quinn_proto::Connection) -> bool {
         let Some(stream) = self.stream else { return false };

@@ -15,7 +15,7 @@ use axon_tls::{
     quic::{ALPN, hybrid_client, hybrid_server, qkd_client, qkd_server},
 };
 use axon_transport::config::{Config, Security};
-use quinn_proto::TimeSource;
+use quinn_proto::{QlogStream, TimeSource, TransportConfig};
 use rustls_pki_types::CertificateDer;
 
 use crate::{
@@ -78,6 +78,11 @@ impl Credentials {
     /// Why no new peer is accepted, if so: a file of the identity cannot be used.
     pub(crate) fn closed(&self) -> Option<String> {
         self.identity.as_ref().and_then(|identity| identity.closed())
+    }
+
+    /// The transport settings of one connection with a peer at `address`, whose events are written.
+    pub(crate) fn logged(&self, stream: QlogStream, address: IpAddr) -> Arc<TransportConfig> {
+        Transports::logged(&self.config, stream, address)
     }
 
     /// The client's side of a handshake with a server at `address`, in qkd on one PSK.

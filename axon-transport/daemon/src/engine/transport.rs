@@ -6,12 +6,12 @@ use aws_lc_rs::hmac;
 use axon_transport::config::{Config, Congestion};
 use quinn_proto::{
     AckFrequencyConfig, EndpointConfig, HashedConnectionIdGenerator, IdleTimeout,
-    MtuDiscoveryConfig, TransportConfig, VarInt,
-    congestion::{BbrConfig, CubicConfig},
+    MtuDiscoveryConfig, QlogStream, TransportConfig, VarInt,
+    congestion::{BbrConfig, ControllerFactory, CubicConfig},
     crypto::{CryptoError, HmacKey},
 };
 
-use super::congestion::DelayConfig;
+use super::{congestion::DelayConfig, marks::CountingFactory};
 
 /// A silent peer is given up after this.
 const IDLE_TIMEOUT_MS: u32 = 20_000;
@@ -94,6 +94,17 @@ impl Transports {
     pub(crate) fn towards(&self, address: IpAddr) -> Arc<TransportConfig> {
         Arc::clone(if is_private(address) { &self.private } else { &self.other })
     }
+
+    /// The same for one link, whose events are written.
+    pub(crate) fn logged(
+        config: &Config,
+        stream: QlogStream,
+        address: IpAddr,
+    ) -> Arc<TransportConfig> {
+        let mut transport = transport(config, is_private(address));
+        transport.qlog_stream(Some(stream));
+        Arc::new(transport)
+    }
 }
 
 /// Whether an address is one of a robot's own networks. Loopback is not: it loses no packet that its receiver has
@@ -127,18 +138,20 @@ fn transport(config: &Config, is_private: bool) -> TransportConfig {
         transport.initial_rtt(PRIVATE_RTT);
     }
     match config.link.congestion {
-        Congestion::Auto if !is_private => {
-            transport.congestion_controller_factory(Arc::new(CubicConfig::default()))
-        }
-        Congestion::Auto | Congestion::Delay => {
-            transport.congestion_controller_factory(Arc::new(DelayConfig))
-        }
-        Congestion::Cubic => {
-            transport.congestion_controller_factory(Arc::new(CubicConfig::default()))
-        }
-        Congestion::Bbr => transport.congestion_controller_factory(Arc::new(BbrConfig::default())),
-    };
+        Congestion::Auto if !is_private => control(&mut transport, CubicConfig::default()),
+        Congestion::Auto | Congestion::Delay => control(&mut transport, DelayConfig),
+        Congestion::Cubic => control(&mut transport, CubicConfig::default()),
+        Congestion::Bbr => control(&mut transport, BbrConfig::default()),
+    }
     transport
+}
+
+/// Has a link use this congestion controller.
+fn control<F>(transport: &mut TransportConfig, factory: F)
+where
+    F: ControllerFactory + Send + Sync + 'static,
+{
+    transport.congestion_controller_factory(Arc::new(CountingFactory(Arc::new(factory))));
 }
 
 #[cfg(test)]

@@ -2,32 +2,38 @@
 //!
 //! One thread does all that concerns links. Each pass takes in what is ready, has the engine settle, sends its packets
 //! and carries out its effects. The KME client has a thread of its own, and files are read and written on others.
-//! Timers have a granularity of 1 ms.
 
 mod bind;
 mod finishing;
 mod inputs;
+mod key_reports;
 mod kme;
+mod looks;
 mod pass;
+mod qlog;
 mod rings;
 mod session;
 mod sockets;
+mod timer;
 mod told;
 
 pub(crate) use self::bind::bind_daemon;
 
 use std::{
+    path::Path,
+    rc::Rc,
     sync::Arc,
     time::{Duration, Instant},
 };
 
-use axon_shm::internal::monotonic;
+use axon_shm::{ids::DaemonId, internal::monotonic};
 use axon_transport::config::Security;
 use tokio::runtime::{Builder, Runtime};
 
 use self::{
     kme::KmeThread,
     pass::{Reactor, ReactorParts},
+    qlog::{LastWrites, QlogFiles},
     rings::ShmRings,
     sockets::Sockets,
 };
@@ -35,7 +41,7 @@ use crate::{
     bridge::{GatewayParts, ToControl},
     engine::{
         Engine, EngineParts, credentials::Credentials, links::LinkParts, peer::MAX_ROUTES,
-        transport::endpoint_config,
+        qlog::Qlogs, transport::endpoint_config,
     },
     error::GatewayError,
     identity,
@@ -83,13 +89,16 @@ async fn serve(
     let reset = bind::reset_key(config.runtime_dir.as_deref(), config.domain);
     let mut of_session = [0; 12];
     of_session.copy_from_slice(&session.id().0[..12]);
-    let epoch = Instant::now();
+    let (epoch, poll) = (Instant::now(), config.link.poll);
+    let qlogs = config.link.qlog.as_deref().and_then(|directory| start_qlog(directory, daemon));
+    let (qlogs, last_writes) = qlogs.unzip();
     let engine = Engine::new(EngineParts {
         links: LinkParts {
             credentials: Credentials::new(Arc::clone(&config), identity.clone()),
             hello,
             addresses: sockets.addresses(),
             endpoint: Arc::new(endpoint_config(&reset)),
+            qlogs: qlogs.map(|files| Rc::new(files) as Rc<dyn Qlogs>),
             epoch,
             config,
         },
@@ -102,6 +111,7 @@ async fn serve(
     let _ = control.send(ToControl::Started { port }).await;
     let reactor = Reactor::new(ReactorParts {
         engine,
+        poll,
         epoch,
         sockets,
         rings,
@@ -113,5 +123,20 @@ async fn serve(
         key_events,
         identity,
     })?;
-    reactor.run().await
+    let result = reactor.run().await;
+    if let Some(last) = last_writes {
+        last.wait(LAST_TASKS);
+    }
+    result
+}
+
+/// The files of QUIC's events. A daemon does without them rather than not start.
+fn start_qlog(directory: &Path, daemon: DaemonId) -> Option<(QlogFiles, LastWrites)> {
+    let started = QlogFiles::start(directory, daemon);
+    started
+        .inspect_err(|error| {
+            tracing::warn!(directory = %directory.display(), %error,
+                "could not start the thread that writes QUIC's events: there are none");
+        })
+        .ok()
 }

@@ -3,6 +3,7 @@
 use std::{
     future::poll_fn,
     io,
+    pin::pin,
     rc::Rc,
     sync::Arc,
     task::Poll,
@@ -10,7 +11,7 @@ use std::{
 };
 
 use axon_shm::internal::return_free_memory;
-use axon_transport::Session;
+use axon_transport::{Session, config::LinkPoll};
 use tokio::{
     sync::mpsc,
     task::{spawn_blocking, yield_now},
@@ -20,9 +21,12 @@ use tokio::{
 use super::{
     finishing::Finishing,
     inputs::{Done, Input, Inputs},
+    key_reports::KeyReports,
+    looks::{Look, Looks},
     rings::ShmRings,
     session::{Notices, local_graph},
     sockets::{Datagram, Sockets},
+    timer::Timer,
     told::Told,
 };
 use crate::{
@@ -33,14 +37,10 @@ use crate::{
     keys::{Event, Events, Kme, UsedKeys},
 };
 
-/// After a pass that did something, the next inputs are looked for this long before the thread sleeps.
-const POLL: Duration = Duration::from_micros(50);
 /// Packets that one pass sends before it takes in what has come, in system calls.
 const SENDS: usize = 64;
 /// Between two looks at the files of the identity: a change is in force within a second.
 const LOOK: Duration = Duration::from_millis(250);
-/// Between two reports of the keys.
-const KEYS: Duration = Duration::from_secs(1);
 /// How long the last packets of closed connections may take.
 const GOODBYE: Duration = Duration::from_millis(500);
 /// Freed memory is given back to the system after this time.
@@ -49,6 +49,8 @@ const RETURN: Duration = Duration::from_secs(1);
 /// The parts of a reactor.
 pub(super) struct ReactorParts {
     pub(super) engine: Engine,
+    /// Whether it looks for inputs before it sleeps.
+    pub(super) poll: LinkPoll,
     /// When the engine's time was zero.
     pub(super) epoch: Instant,
     pub(super) sockets: Sockets,
@@ -83,8 +85,9 @@ pub(super) struct Reactor {
     has_packets: bool,
     finishing: Option<Finishing>,
     shutdown: bool,
-    next_keys: Duration,
-    polls: bool,
+    key_reports: KeyReports,
+    looks: Looks,
+    timer: Timer,
 }
 
 impl Reactor {
@@ -97,6 +100,7 @@ impl Reactor {
         if let Some(identity) = parts.identity.filter(|identity| identity.has_files()) {
             tokio::spawn(watch_files(identity, report_done.clone()));
         }
+        let processors = std::thread::available_parallelism().map_or(1, usize::from);
         let inputs = Inputs::new(parts.orders, parts.key_events, done, &parts.rings)?;
         Ok(Self {
             engine: parts.engine,
@@ -114,8 +118,9 @@ impl Reactor {
             has_packets: false,
             finishing: None,
             shutdown: false,
-            next_keys: Duration::ZERO,
-            polls: std::thread::available_parallelism().is_ok_and(|n| n.get() > 1),
+            key_reports: KeyReports::default(),
+            looks: Looks::new(parts.poll, processors),
+            timer: Timer::new(),
         })
     }
 
@@ -229,6 +234,7 @@ impl Reactor {
             Done::Recorded(link, first) => self.engine.handle_recorded(link, first, now),
             Done::Identity => self.engine.handle_identity(now),
             Done::Keys(statistics) => {
+                self.key_reports.handle_report();
                 let (kme, used) = *statistics;
                 if let Some(status) = self.engine.key_status(&kme, &used, now) {
                     self.told.tell(ToControl::Keys(status));
@@ -300,19 +306,21 @@ impl Reactor {
 
     /// Has the counters of the keys read, on another thread: the ledger may wait for the disk.
     fn report_keys(&mut self, now: Duration) {
-        let Some((kme, used)) = self.kme.as_ref().filter(|_| now >= self.next_keys) else { return };
-        self.next_keys = now + KEYS;
+        let Some((kme, used)) = &self.kme else { return };
+        if !self.key_reports.begin(now) {
+            return;
+        }
         let (kme, used, report) = (kme.clone(), used.clone(), self.report_done.clone());
         spawn_blocking(move || {
             let _ = report.send(Done::Keys(Box::new((kme.statistics(), used.statistics()))));
         });
     }
 
-    /// Waits until there is something to do. After a `busy` pass it polls for a while before it sleeps.
+    /// Waits until there is something to do. The pass before had work if it was `busy`.
     async fn wait(&mut self, busy: bool) {
         let now = self.now();
         let finishing = self.finishing.as_ref().map(Finishing::poll_timeout);
-        let keys = self.kme.is_some().then_some(self.next_keys);
+        let keys = self.kme.as_ref().and_then(|_| self.key_reports.poll_timeout());
         let follow = self.notices.has_graph().then(|| self.engine.follow_local_at());
         let due = [self.engine.poll_timeout(now), finishing, keys, follow];
         let until = due.into_iter().flatten().min();
@@ -322,26 +330,41 @@ impl Reactor {
             let _ = self.look().await;
             return;
         }
-        if busy && self.polls {
-            let end = until.map_or(now + POLL, |until| until.min(now + POLL));
-            loop {
-                yield_now().await;
-                if self.look().await {
-                    return;
-                }
-                if self.now() >= end {
-                    break;
-                }
+        let end = match self.looks.after_pass(busy) {
+            Look::Not => return self.wait_until(until).await,
+            Look::For(time) => Some(until.map_or(now + time, |until| until.min(now + time))),
+            Look::On => until,
+        };
+        let found = self.look_until(end).await;
+        self.looks.handle_look(found);
+        if !found && until.is_none_or(|until| self.now() < until) {
+            self.wait_until(until).await;
+        }
+    }
+
+    /// Looks for an input until this time. Returns whether there is one.
+    async fn look_until(&mut self, end: Option<Duration>) -> bool {
+        loop {
+            yield_now().await;
+            if self.look().await {
+                return true;
+            }
+            if end.is_some_and(|end| self.now() >= end) {
+                return false;
             }
         }
-        self.wait_until(until).await;
     }
 
     /// Whether there is an input now.
     async fn look(&mut self) -> bool {
-        let Self { inputs, sockets, .. } = self;
+        let Self { inputs, sockets, notices, told, .. } = self;
+        let reads = !told.is_behind();
+        let (mut noticed, mut sent) = (pin!(notices.wait()), pin!(told.send_next()));
         poll_fn(|cx| {
-            let ready = inputs.poll_ready(cx).is_ready() | sockets.poll_ready(cx).is_ready();
+            let ready = inputs.poll_ready(cx).is_ready()
+                | (reads && sockets.poll_ready(cx).is_ready())
+                | noticed.as_mut().poll(cx).is_ready()
+                | sent.as_mut().poll(cx).is_ready();
             Poll::Ready(ready)
         })
         .await
@@ -350,7 +373,7 @@ impl Reactor {
     /// Waits for inputs until this time at most.
     async fn wait_until(&mut self, until: Option<Duration>) {
         let left = until.map(|until| until.saturating_sub(self.now()));
-        let Self { inputs, sockets, notices, told, .. } = self;
+        let Self { inputs, sockets, notices, told, timer, .. } = self;
         // Datagrams stay with the kernel while the control plane is far behind.
         let reads = !told.is_behind();
         let ready = poll_fn(|cx| {
@@ -358,18 +381,12 @@ impl Reactor {
                 inputs.poll_ready(cx).is_ready() | (reads && sockets.poll_ready(cx).is_ready());
             if ready { Poll::Ready(()) } else { Poll::Pending }
         });
-        let slept = async {
-            match left {
-                Some(left) => sleep(left).await,
-                None => std::future::pending().await,
-            }
-        };
         tokio::select! {
             biased;
             () = ready => {}
             () = notices.wait() => {}
             () = told.send_next() => {}
-            () = slept => {}
+            () = timer.wait(left) => {}
         }
     }
 }

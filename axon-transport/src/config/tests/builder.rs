@@ -43,6 +43,8 @@ fn all_of_qkd() -> ConfigBuilder {
         .link_stalled(Duration::from_secs(4))
         .link_mtu(9_000)
         .link_graph_mb(4)
+        .link_poll(LinkPoll::Never)
+        .link_qlog("/var/qlog")
         .link_congestion(Congestion::Cubic)
 }
 
@@ -90,6 +92,8 @@ fn what_is_built_is_what_the_environment_would_make_and_so_it_is_passed_on() {
     let read = Config::resolve(environment, None, &OsFiles).unwrap();
     assert_eq!(without_origin(&read), without_origin(&built));
     assert_eq!((built.link.mtu, built.link.graph), (9_000, 4 << 20));
+    assert_eq!(built.link.poll, LinkPoll::Never);
+    assert_eq!(built.link.qlog.as_deref(), Some(Path::new("/var/qlog")));
     assert_eq!(built.link.congestion, Congestion::Cubic);
     assert_eq!((built.domain, built.static_peers.len()), (232, 2));
     assert_eq!(built.range, DiscoveryRange::Localhost);
@@ -146,6 +150,8 @@ fn what_the_environment_may_not_say_a_builder_may_not_either() {
         (new().log("loud"), "AXON_LOG"),
         (new().max_message_mb(4_096), "AXON_MAX_MESSAGE_MB"),
         (new().link_mtu(1_199), "AXON_LINK_MTU"),
+        (new().link_qlog("relative"), "AXON_LINK_QLOG"),
+        (new().link_qlog("/dev/null"), "AXON_LINK_QLOG"),
         (new().link_stalled(Duration::ZERO), "AXON_LINK_STALLED_S"),
         (new().link_grace(Duration::from_millis(1)), "AXON_LINK_GRACE_S"),
         (new().daemon_path("/nowhere/daemon"), "AXON_DAEMON_PATH"),

@@ -135,6 +135,8 @@ fn nothing_given_is_the_table_of_defaults() {
             stalled: Duration::from_secs(10),
             mtu: 1452,
             graph: 16 << 20,
+            poll: LinkPoll::Adaptive,
+            qlog: None,
             congestion: Congestion::Auto,
         }
     );
@@ -258,6 +260,8 @@ fn the_environment_wins_over_the_file() {
         stalled_s = 4
         mtu = 9000
         graph_mb = 4
+        poll = 'always'
+        qlog = '/var/qlog'
         congestion = 'bbr'
     ";
     let config = with_file(&[], file).unwrap();
@@ -273,6 +277,8 @@ fn the_environment_wins_over_the_file() {
             stalled: Duration::from_secs(4),
             mtu: 9000,
             graph: 4 << 20,
+            poll: LinkPoll::Always,
+            qlog: Some("/var/qlog".into()),
             congestion: Congestion::Bbr,
         }
     );

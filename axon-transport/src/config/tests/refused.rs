@@ -290,6 +290,10 @@ fn files_that_are_not_a_configuration_are_refused() {
         ("[link]\ncongestion = 3", "link.congestion"),
         ("[link]\nstalled_s = 0", "link.stalled_s"),
         ("[link]\nspeed = 1", "link.speed"),
+        ("[link]\npoll = 'often'", "link.poll"),
+        ("[link]\npoll = true", "link.poll"),
+        ("[link]\nqlog = 'relative'", "link.qlog"),
+        ("[link]\nqlog = 1", "link.qlog"),
         ("[linc]\nmtu = 1500", "AXON_LINC"),
     ] {
         let error = with_file(&[], text).unwrap_err();

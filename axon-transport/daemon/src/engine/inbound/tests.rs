@@ -206,7 +206,7 @@ fn the_whole_samples_of_a_piece_are_delivered_together() {
         assert_eq!(way.inbound.poll_timeout(), Some(NOW));
         let of = ReceivedOf { route: ROUTE, publisher: PUBLISHER, sequence: 100, dropped: 0 };
         assert_eq!(way.acknowledged(), Some(of));
-        // Whoever has the stream read wakes the readers, once.
+        // The caller of `run` wakes the readers, once.
         assert_eq!(way.ring.quiet.get(), 100);
         way.inbound.written.take().unwrap().announce();
         assert_eq!(way.ring.quiet.get(), 0);

@@ -95,6 +95,7 @@ impl Connections {
             Received::Connection(handle, event) => {
                 let number = self.handles.get(&(endpoint, handle)).copied()?;
                 if let Some(connection) = self.all.get_mut(&number) {
+                    connection.ecn_marks += u64::from(ecn == Some(EcnCodepoint::Ce));
                     connection.quic.handle_event(event);
                     self.touch(number);
                 }

@@ -9,7 +9,7 @@ use super::{
     link::{Leaving, Link, Phase},
 };
 use crate::{
-    engine::links::prober::Traffic,
+    engine::links::silence::Traffic,
     link::{CloseCode, LinkClosed},
 };
 

@@ -10,8 +10,8 @@ use crate::{
         account::{Account, Charge},
         link::opening::{Opening, Sealing},
         links::{
-            prober::{Prober, Traffic},
-            shares::Place,
+            admission::Place,
+            silence::{Prober, Traffic},
             who::Who,
         },
     },

@@ -14,8 +14,6 @@ mod keys;
 mod leaving;
 mod link;
 mod opening;
-mod prober;
-mod shares;
 mod silence;
 mod table;
 mod who;
@@ -31,7 +29,9 @@ use std::{
 use axon_shm::ids::DaemonId;
 use axon_transport::{config::Config, status::LinkStatus};
 use bytes::BytesMut;
-use quinn_proto::{ConnectionError, Dir, EcnCodepoint, Event, StreamEvent, Transmit};
+use quinn_proto::{
+    ConnectionError, Dir, EcnCodepoint, Event, StreamEvent, Transmit, TransportConfig,
+};
 
 pub(super) use self::events::{LinkEvent, LinkReport};
 use self::{
@@ -51,10 +51,11 @@ use crate::{
     engine::{
         account::{Account, Accounts},
         link::failure::peer_text,
+        qlog::{self, Qlogs},
         refusal::Refusal,
     },
     error::GatewayError,
-    link::{CloseCode, FrameError, Hello, Message},
+    link::{CloseCode, FrameError, Hello, Message, Side},
     owner::{Binding, EXPORTER},
 };
 
@@ -64,6 +65,7 @@ pub(super) struct Links {
     pub(super) credentials: Credentials,
     pub(super) keyring: Option<Keyring>,
     hello: Hello,
+    qlogs: Option<Rc<dyn Qlogs>>,
     epoch: Instant,
     accounts: Accounts,
     connections: Connections,
@@ -97,6 +99,8 @@ pub(crate) struct LinkParts {
     pub(crate) addresses: Vec<SocketAddr>,
     /// The settings of the endpoints.
     pub(crate) endpoint: Arc<quinn_proto::EndpointConfig>,
+    /// Where QUIC's events are written, if anywhere.
+    pub(crate) qlogs: Option<Rc<dyn Qlogs>>,
     /// When the engine's time was zero.
     pub(crate) epoch: Instant,
 }
@@ -107,7 +111,7 @@ impl Links {
     /// # Errors
     /// The settings make no TLS server.
     pub(super) fn new(parts: LinkParts) -> Result<Self, GatewayError> {
-        let LinkParts { config, credentials, hello, addresses, endpoint, epoch } = parts;
+        let LinkParts { config, credentials, hello, addresses, endpoint, qlogs, epoch } = parts;
         let keyring = Keyring::new(&config);
         let unspecified = IpAddr::from([0, 0, 0, 0]);
         let resolver = keyring.as_ref().map(|keys| keys.resolver(Duration::ZERO, unspecified));
@@ -118,6 +122,7 @@ impl Links {
             credentials,
             keyring,
             hello,
+            qlogs,
             epoch,
             connections: Connections::new(Endpoints::new(&addresses, &endpoint, &server), epoch),
             table: Table::default(),
@@ -132,6 +137,12 @@ impl Links {
             next_second: Duration::from_secs(1),
             seconds: 0,
         })
+    }
+
+    /// The transport settings of a new connection, where its events are written.
+    fn logged(&self, side: Side, peer: SocketAddr, now: Duration) -> Option<Arc<TransportConfig>> {
+        let stream = qlog::stream(self.qlogs.as_deref(), side, peer, self.instant(now))?;
+        Some(self.credentials.logged(stream, peer.ip()))
     }
 
     fn instant(&self, now: Duration) -> Instant {
@@ -385,9 +396,10 @@ impl Links {
 
     /// The status of a link.
     pub(super) fn status(&self, number: u64) -> Option<LinkStatus> {
-        let quic = &self.connections.get(number)?.quic;
-        let peer = self.table.get(number)?.peer.as_ref()?;
-        Some(who::link(&peer.summary, quic, peer.since_unix_ms))
+        let (connection, peer) = (self.connections.get(number)?, self.table.peer(number)?);
+        let mut status = who::link(&peer.summary, peer.since_unix_ms);
+        connection.fill(&mut status);
+        Some(status)
     }
 
     /// Datagrams that came over a link.

@@ -57,16 +57,19 @@ impl Links {
             return;
         };
         let resolver = self.keyring.as_ref().map(|keys| keys.resolver(now, source.ip()));
-        let server = match self.credentials.server(resolver.clone(), source.ip()) {
-            Ok(server) => Arc::new(server),
+        let mut server = match self.credentials.server(resolver.clone(), source.ip()) {
+            Ok(server) => server,
             Err(error) => {
                 self.connections.endpoints().refuse(endpoint, incoming);
                 let refusal = Refusal::here(CloseCode::Internal, error);
                 return self.outbox.report(LinkReport::Refused(peer_text(None, source), refusal));
             }
         };
+        if let Some(logged) = self.logged(Side::Server, source, now) {
+            server.transport_config(logged);
+        }
         let instant = self.instant(now);
-        match self.connections.accept(endpoint, incoming, server, instant) {
+        match self.connections.accept(endpoint, incoming, Arc::new(server), instant) {
             Ok(number) => {
                 let mut link = Link::new(Side::Server, now + HANDSHAKE_TIMEOUT, None);
                 (link.place, link.resolver) = (Some(place), resolver);
@@ -188,13 +191,20 @@ impl Links {
 
     fn act(&mut self, dial: u64, action: Action, now: Duration) {
         let instant = self.instant(now);
+        let logged = match action {
+            Action::Connect { address, .. } => self.logged(Side::Client, address, now),
+            _ => None,
+        };
         let Some(Dial { dialling, connection }) = self.dials.get_mut(dial) else { return };
         match action {
             Action::Connect { address, attempt } => {
-                let client = match self.credentials.client(attempt.as_deref(), address.ip()) {
+                let mut client = match self.credentials.client(attempt.as_deref(), address.ip()) {
                     Ok(client) => client,
                     Err(error) => return dialling.handle_unusable(error),
                 };
+                if let Some(logged) = logged {
+                    client.transport_config(logged);
+                }
                 match self.connections.connect(address, client, instant) {
                     Ok(number) => {
                         *connection = Some(number);

@@ -1,6 +1,6 @@
 //! Who a peer is, and the status of a link.
 
-use std::{fmt, net::SocketAddr, time::Duration};
+use std::{fmt, net::SocketAddr};
 
 use axon_tls::{
     Negotiated,
@@ -83,14 +83,8 @@ impl fmt::Display for Who {
     }
 }
 
-/// The status of a link, its counters aside.
-pub(crate) fn link(
-    summary: &Summary,
-    quic: &quinn_proto::Connection,
-    since_unix_ms: u64,
-) -> LinkStatus {
-    let path = quic.stats().path;
-    let micros = |time: Duration| u64::try_from(time.as_micros()).unwrap_or(u64::MAX);
+/// The status of a link, as far as its beginning says it.
+pub(crate) fn link(summary: &Summary, since_unix_ms: u64) -> LinkStatus {
     LinkStatus {
         peer: summary.hello.daemon.to_string(),
         host: match &summary.who {
@@ -99,18 +93,11 @@ pub(crate) fn link(
             _ => summary.hello.host.clone(),
         },
         sae: summary.hello.sae.clone(),
-        address: quic.remote_address().to_string(),
         state: "connected".into(),
         key_exchange: summary.negotiated.key_exchange.to_string(),
         cipher: summary.negotiated.cipher.name().into(),
         authenticated_as: summary.who.to_string(),
         since_unix_ms,
-        rtt_us: micros(quic.rtt()),
-        rtt_min_us: micros(quic.min_rtt()),
-        congestion_window: path.cwnd,
-        packets_lost: path.lost_packets,
-        congestion_events: path.congestion_events,
-        mtu: path.current_mtu.into(),
         ..LinkStatus::default()
     }
 }

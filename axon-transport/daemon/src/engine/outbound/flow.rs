@@ -219,9 +219,12 @@ impl Flow {
         self.taking.is_held()
     }
 
-    /// Bytes that wait for QUIC.
-    pub(super) fn waiting_bytes(&self) -> usize {
-        self.queue.waiting_bytes()
+    /// Bytes that wait for QUIC, and the class of the sample that is next among them.
+    pub(super) fn waiting(&self) -> Option<(Class, usize)> {
+        let next = self.queue.peek()?;
+        let reliable = self.queue.delivery() == Delivery::Reliable;
+        let class = Class::of(self.route.kind != Kind::Topic, reliable, next.payload.len());
+        Some((class, self.queue.waiting_bytes()))
     }
 
     /// When the oldest sample that waits was taken from its ring.

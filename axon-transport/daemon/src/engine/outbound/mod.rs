@@ -26,6 +26,7 @@ use std::{
 
 use axon_envelope::Route;
 use axon_shm::{ids::Gid, qos::Qos};
+use axon_transport::status::LinkStatus;
 use quinn_proto::StreamId;
 
 use self::{
@@ -96,8 +97,8 @@ struct Served {
 /// Bytes and samples that wait for one peer.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Backlog {
-    /// Bytes that wait for QUIC.
-    pub(crate) bytes: usize,
+    /// Bytes that wait for QUIC, by the class of their flow's next sample.
+    bytes: [usize; 4],
     /// When the oldest sample that waits was taken from its ring.
     pub(crate) oldest: Option<Duration>,
 }
@@ -587,16 +588,33 @@ impl Outbound {
 
     /// What waits for the peer.
     pub(crate) fn backlog(&self) -> Backlog {
-        let flows = self.busy.iter().filter_map(|id| self.flows[*id].as_ref());
-        flows.fold(Backlog::default(), |all, flow| Backlog {
-            bytes: all.bytes + flow.waiting_bytes(),
-            oldest: [all.oldest, flow.oldest()].into_iter().flatten().min(),
-        })
+        let mut backlog = Backlog::default();
+        for flow in self.busy.iter().filter_map(|id| self.flows[*id].as_ref()) {
+            if let Some((class, bytes)) = flow.waiting() {
+                backlog.bytes[class as usize] += bytes;
+            }
+            backlog.oldest = [backlog.oldest, flow.oldest()].into_iter().flatten().min();
+        }
+        backlog
     }
 
     /// Whether there is anything to hand to QUIC.
     pub(crate) fn has_work(&self) -> bool {
         !self.schedule.is_empty() || !self.ended.is_empty() || self.frees_streams
+    }
+}
+
+impl Backlog {
+    /// Puts it into the status of a link.
+    pub(crate) fn fill(&self, status: &mut LinkStatus, now: Duration) {
+        let of = |class: Class| self.bytes[class as usize] as u64;
+        status.waiting_bytes = self.bytes.iter().sum::<usize>() as u64;
+        status.waiting.services = of(Class::Service);
+        status.waiting.small_reliable = of(Class::SmallReliable);
+        status.waiting.small_best_effort = of(Class::SmallBestEffort);
+        status.waiting.bulk = of(Class::Bulk);
+        let waited = self.oldest.map_or(Duration::ZERO, |oldest| now.saturating_sub(oldest));
+        status.waiting_ms = u64::try_from(waited.as_millis()).unwrap_or(u64::MAX);
     }
 }
 

@@ -178,7 +178,9 @@ impl Queue {
         if !self.policy.is_reliable() {
             return fits || self.waiting.is_empty();
         }
-        if fits && self.budget.try_take(size) {
+        // The next sample is on its way while the peer acknowledges the one before it, however long they are.
+        let is_next = self.waiting.is_empty() && self.sent.len() == 1;
+        if (fits || is_next) && self.budget.try_take(size) {
             return true;
         }
         // KEEP_LAST: a sample that is being sent does not keep a newer one out.
@@ -210,10 +212,10 @@ impl Queue {
     }
 
     /// The next RELIABLE sample to send. It stays in the queue until it is acknowledged or written; there is none
-    /// while such samples fill the flow's share.
+    /// while several such samples fill the flow's share.
     pub(super) fn send(&mut self) -> Option<&Sample> {
         let size = self.waiting.front()?.size();
-        if !self.sent.is_empty() && self.sent_bytes + size > self.budget.of_flow() {
+        if self.sent.len() > 1 && self.sent_bytes + size > self.budget.of_flow() {
             return None;
         }
         let sample = self.waiting.pop_front()?;
@@ -400,19 +402,36 @@ mod tests {
     fn keep_all_refuses_beyond_its_bytes_and_takes_one_sample_of_any_length() {
         let budget = Budget::new(32 * MIB);
         let mut queue = Queue::new(&Qos::keep_all(), budget.of_peer());
-        assert_eq!(dropped(queue.offer(sample(1, 3 << 20, at(0)), at(0))), 0);
+        assert_eq!(dropped(queue.offer(sample(1, 9 << 20, at(0)), at(0))), 0);
         assert!(
             matches!(queue.offer(sample(2, 1, at(0)), at(0)), Offered::Full(s) if s.info.sequence == 2)
         );
         assert_eq!(queue.send().unwrap().info.sequence, 1);
         assert!(
             matches!(queue.offer(sample(2, 1, at(1)), at(1)), Offered::Full(_)),
-            "not acknowledged"
+            "not acknowledged, and the peer's share is used up"
         );
         assert_eq!(queue.acknowledge(1), (1, Some(1)));
         assert_eq!(dropped(queue.offer(sample(2, 1, at(2)), at(2))), 0);
         drop(queue);
         assert_eq!(budget.taken(), 0);
+    }
+
+    #[test]
+    fn a_long_sample_leaves_before_the_one_before_it_is_acknowledged_and_a_third_waits() {
+        for qos in [Qos::keep_all(), keep_last(1)] {
+            // 1 MiB a flow, 8 MiB towards one peer.
+            let budget = Budget::new(32 * MIB);
+            let mut queue = Queue::new(&qos, budget.of_peer());
+            for sequence in 1..=2 {
+                dropped(queue.offer(sample(sequence, 3 << 20, at(0)), at(0)));
+                assert_eq!(queue.send().unwrap().info.sequence, sequence);
+            }
+            let third = queue.offer(sample(3, 1, at(0)), at(0));
+            assert_eq!(matches!(third, Offered::Full(_)), qos == Qos::keep_all(), "{third:?}");
+            assert!(queue.send().is_none());
+            assert_eq!(queue.acknowledge(2), (2, Some(2)));
+        }
     }
 
     #[test]

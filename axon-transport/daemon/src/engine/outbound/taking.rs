@@ -124,9 +124,15 @@ impl Taking {
         queue.set_qos(&first.map_or_else(Qos::keep_all, Source::qos));
         let most_bytes = self.leave_stale(sources, queue, now);
         let is_behind = queue.is_behind(now);
+        // What the queue drops for a newer sample must not hold memory that they share.
+        let together = match queue.depth() {
+            Some(depth) if is_behind || !queue.keeps_bursts() => depth.min(FILL.0),
+            _ => FILL.0,
+        };
+        let most_samples = if is_behind { together } else { FILL.0 };
         let (mut samples, mut bytes, mut dropped, mut repeats) = (0, 0, 0, 0);
         (self.held, self.retry) = (false, None);
-        while samples < FILL.0 && bytes < most_bytes {
+        while samples < most_samples && bytes < most_bytes {
             let has_enough = match queue.keeps_all() {
                 true => queue.waiting_bytes() >= AHEAD,
                 false => !is_behind && !queue.wants_more(now),
@@ -135,7 +141,8 @@ impl Taking {
                 break;
             }
             let Some(sample) = self.taken.pop_front() else {
-                let most = limit(queue.room(), FILL.0 - samples, most_bytes - bytes);
+                let left = together.min(most_samples - samples);
+                let most = limit(queue.room(), left, most_bytes - bytes);
                 if !self.take(sources, most, now) {
                     let behind = self.merge.is_behind().then_some(Duration::ZERO);
                     let retries = sources.iter().filter_map(|source| source.retry_of(&self.of));

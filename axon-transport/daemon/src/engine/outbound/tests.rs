@@ -27,6 +27,8 @@ struct Ring {
     published: Cell<u64>,
     copied: Cell<u64>,
     lost: Cell<u64>,
+    /// The most samples that were taken together.
+    most_together: Cell<usize>,
     /// How many samples are published when one is copied, and how often.
     meanwhile: Cell<(u64, u64)>,
 }
@@ -82,6 +84,7 @@ impl RingReader for Ring {
             }
             each(MessageInfo::of(*publisher, number), vec![0; length].into());
         }
+        self.most_together.set(taken.max(self.most_together.get()));
         taken
     }
 
@@ -249,6 +252,27 @@ fn best_effort_that_is_behind_looks_at_no_more_than_its_depth() {
         [997, 998, 999, 1000, 1001]
     );
     assert_eq!(way.dropped(), 996);
+}
+
+#[test]
+fn samples_of_which_the_queue_keeps_a_few_are_taken_a_few_at_a_time() {
+    // A sample that waits holds the memory of all that were taken with it.
+    for (qos, sent_before) in
+        [(keep_last(3), true), (Qos { depth: 3, ..Qos::sensor_data() }, false)]
+    {
+        let mut way = Way::new(qos);
+        way.ring.publish(1, 10);
+        way.fill(at(0));
+        if sent_before {
+            way.ring.publish(1, 10);
+            way.send_all();
+        }
+        way.ring.publish(500, 10);
+        way.ring.meanwhile.set((1, 500));
+        way.fill(at(600));
+        assert!(way.ring.most_together.get() <= 3, "{qos:?}: {}", way.ring.most_together.get());
+        assert!(way.queue.waiting() <= 3);
+    }
 }
 
 #[test]

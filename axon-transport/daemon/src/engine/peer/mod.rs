@@ -440,6 +440,7 @@ impl Peer {
 
     fn handle_asserted(&self, asserted: &Asserted) {
         let known = asserted.publishers.iter().filter_map(|gid| self.remote.get(gid));
+        // Its topic names the one route that may have a stand-in of it.
         let stand_ins = known.take(MAX_STAND_INS).filter_map(|publisher| {
             let asked = self.asked.get(&RouteKey::of(publisher)?)?;
             asked.stand_ins.get(&publisher.gid)
@@ -483,10 +484,7 @@ impl Peer {
     pub(super) fn fill(&self, status: &mut LinkStatus, now: Duration) {
         self.counters.fill(status);
         self.show_refused(status);
-        let backlog = self.outbound.backlog();
-        status.waiting_bytes = backlog.bytes as u64;
-        let waited = backlog.oldest.map_or(Duration::ZERO, |oldest| now.saturating_sub(oldest));
-        status.waiting_ms = u64::try_from(waited.as_millis()).unwrap_or(u64::MAX);
+        self.outbound.backlog().fill(status, now);
         status.endpoints = self.remote.len() as u64;
         status.endpoints_left_out = self.remote.left_out();
         status.graph_bytes = self.remote.account().graph.held() as u64;

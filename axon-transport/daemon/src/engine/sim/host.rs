@@ -139,6 +139,7 @@ impl Host {
             hello,
             addresses: vec![SocketAddr::from(([0, 0, 0, 0], PORT))],
             endpoint: Arc::new(endpoint),
+            qlogs: None,
             epoch: self.epoch,
         };
         let session_keys = SessionKeys::default();
@@ -220,8 +221,8 @@ impl Host {
     pub(super) fn check_held(&mut self, now: Duration) {
         self.dialled.retain(|at| *at + LONGEST_DIAL >= now);
         if let Some(engine) = &self.engine {
-            // Links dial their successors themselves.
-            let dials = self.dialled.len() + self.linked.len();
+            // A silent link dials a successor again after 1, 2, 4 and 8 s, whatever became of the one before.
+            let dials = self.dialled.len() + 5 * self.peers.len();
             super::held::check(engine, self.config.reliable_queue as usize, dials);
         }
     }

@@ -3,24 +3,18 @@
 //! Everything follows from one seed, but for the bytes of TLS. [`network`] carries datagrams, [`script`] says which
 //! fault happens when, [`trace`] tells whether two runs were the same, and [`rng`] gives each part its own generator.
 //! [`rings`] models a host's rings, [`host`] a host with its engine, and [`world`] all hosts and the clock. [`run`] runs
-//! a script in a world.
+//! a script in a world. [`raw`] is a peer without an engine, and [`held`] checks that memory is bounded.
 
 mod held;
 mod host;
-mod hostile;
-mod kills;
-mod losses;
-mod moves;
 pub(crate) mod network;
-mod radio;
 mod raw;
 mod rings;
 pub(crate) mod rng;
 mod run;
+mod scenarios;
 pub(crate) mod script;
-mod segment;
 mod tests;
 mod topics;
-mod torture;
 pub(crate) mod trace;
 mod world;

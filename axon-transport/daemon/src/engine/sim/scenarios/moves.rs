@@ -11,7 +11,7 @@ use std::time::Duration;
 use axon_shm::qos::Qos;
 use axon_transport::config::Config;
 
-use super::{
+use crate::engine::sim::{
     network::{Filtering, Path},
     tests::{millis, modes, secs},
     world::{Pair, World},
@@ -21,7 +21,7 @@ use super::{
 struct Moving {
     world: World,
     pairs: [Pair; 2],
-    nat: Option<super::network::NatId>,
+    nat: Option<crate::engine::sim::network::NatId>,
     published: [u64; 2],
 }
 
@@ -93,7 +93,8 @@ fn a_nat_that_rebinds_loses_no_sample_and_no_link() {
 #[test]
 #[cfg_attr(debug_assertions, ignore = "a debug assertion of quinn-proto fails")]
 fn a_nat_whose_mapping_ends_while_nothing_is_published_keeps_the_link() {
-    let mut moving = Moving::new(41, &super::tests::classic, Some(Filtering::EndpointIndependent));
+    let mut moving =
+        Moving::new(41, &crate::engine::sim::tests::classic, Some(Filtering::EndpointIndependent));
     let nat = moving.nat.unwrap();
     for _ in 0..4 {
         moving.world.run_for(secs(45));

@@ -9,12 +9,12 @@ use std::time::Duration;
 use axon_shm::qos::Qos;
 use axon_transport::config::{Config, KeyMode, Security};
 
-use super::{
+use crate::engine::keyring::tests::config as qkd;
+use crate::engine::sim::{
     network::{Path, Rate},
     tests::{all_cases, millis, modes, secs},
     world::{Pair, World},
 };
-use crate::engine::keyring::tests::config as qkd;
 
 /// Between two datagrams on the path, so that each is a pass of its own.
 const APART: Duration = Duration::from_micros(500);

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use axon_shm::qos::Qos;
 
-use super::{
+use crate::engine::sim::{
     network::{Path, Rate},
     tests::{classic, millis, secs},
     world::{Pair, World},

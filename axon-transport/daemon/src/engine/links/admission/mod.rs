@@ -1,8 +1,11 @@
 //! Admits handshakes and links by the address of the peer.
 
+mod shares;
+
 use std::{collections::BTreeSet, net::IpAddr, rc::Rc, time::Instant};
 
-use super::shares::{Handshakes, Place, Said, gives_way};
+pub(super) use self::shares::Place;
+use self::shares::{Handshakes, Said, gives_way};
 
 /// Handshakes under way at once, but for those of listed peers; further dials are refused and come again.
 const MAX_HANDSHAKES: usize = 64;

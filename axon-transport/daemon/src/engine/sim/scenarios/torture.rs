@@ -7,8 +7,8 @@ use bytes::Bytes;
 use quinn_proto::StreamId;
 use rand::{Rng, RngExt};
 
-use super::{
-    hostile::{HIGHEST, LOWEST},
+use super::hostile::{HIGHEST, LOWEST};
+use crate::engine::sim::{
     raw::Raw,
     rings::FOREIGN,
     rng::{SimRng, Stream, stream},

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use axon_shm::qos::Qos;
 
-use super::{
+use crate::engine::sim::{
     tests::{all_cases, classic, millis, secs, setting},
     world::World,
 };

@@ -7,7 +7,7 @@ use std::time::Duration;
 use axon_shm::qos::Qos;
 use axon_transport::config::{Config, Congestion};
 
-use super::{
+use crate::engine::sim::{
     network::{Path, Rate},
     world::{Pair, World},
 };

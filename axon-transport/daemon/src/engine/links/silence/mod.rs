@@ -1,12 +1,15 @@
 //! Links that do not answer: their path is probed, and a successor is dialled once it works.
 
+mod prober;
+
 use std::{net::SocketAddr, time::Duration};
 
 use bytes::BytesMut;
 
-use super::{LinkReport, Links, link::Probing};
+use self::prober::Step;
+pub(super) use self::prober::{Prober, Traffic};
 use crate::{
-    engine::links::prober::{Prober, Step, Traffic},
+    engine::links::{LinkReport, Links, link::Probing},
     wire::beacon::Datagram,
 };
 

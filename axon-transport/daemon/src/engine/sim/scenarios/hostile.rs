@@ -14,10 +14,11 @@ use axon_transport::{
 };
 use quinn_proto::VarInt;
 
-use super::{
+use crate::engine::sim::{
     network::Path,
     raw::RawLink,
     rings::{FOREIGN, payload},
+    tests::{millis, secs},
     world::World,
 };
 use crate::{
@@ -28,12 +29,8 @@ use crate::{
 pub(super) const LOWEST: DaemonId = DaemonId([0; 16]);
 pub(super) const HIGHEST: DaemonId = DaemonId([0xff; 16]);
 
-fn secs(seconds: u64) -> Duration {
-    Duration::from_secs(seconds)
-}
-
 /// A world of so many honest hosts, all linked, and one raw peer.
-pub(super) fn world(seed: u64, hosts: usize, daemon: DaemonId) -> World {
+fn world(seed: u64, hosts: usize, daemon: DaemonId) -> World {
     let mut world = World::new(seed, hosts, |_| Config::default());
     world.add_raw(Config::default(), daemon);
     world.until(secs(5), World::is_whole);
@@ -189,10 +186,14 @@ fn streams_of_an_ended_route_are_finished_on_their_own_connection() {
     // Over the successor, which the peer dials, the host's streams are a server's.
     let successor = dial(&mut world, 0);
     greet(&mut world, successor, Some([1; 16]));
-    world.with_raw(0, |raw, _| {
-        raw.links[0].say(&Message::Unsubscribe(Unsubscribe { route: 1 }));
-        raw.links[successor].say(&elect(2));
-    });
+    // One pass of the host ends the route, and then moves to the successor.
+    world.run_for(millis(50));
+    world.stop(0, true);
+    say(&mut world, 0, &Message::Unsubscribe(Unsubscribe { route: 1 }));
+    world.run_for(millis(1));
+    say(&mut world, successor, &elect(2));
+    world.run_for(millis(1));
+    world.stop(0, false);
     world.run_for(secs(1));
     say(&mut world, successor, &subscribe(1, "/t", Qos::keep_all()));
     world.run_for(secs(3));

@@ -1,0 +1,120 @@
+//! Counts the ECN marks that the peer of a connection reports.
+//!
+//! QUIC passes them to its congestion controller alone, and its statistics do not tell them from losses. So the
+//! controller is wrapped.
+
+use std::{any::Any, sync::Arc, time::Instant};
+
+use quinn_proto::{
+    RttEstimator,
+    congestion::{Controller, ControllerFactory, ControllerMetrics},
+};
+
+/// A congestion controller that counts reports of marks, and otherwise does as the one that it wraps.
+struct Counting {
+    inner: Box<dyn Controller>,
+    marks: u64,
+}
+
+/// Makes [`Counting`] controllers around those of another factory.
+pub(super) struct CountingFactory<F>(pub(super) Arc<F>);
+
+impl<F: ControllerFactory> ControllerFactory for CountingFactory<F> {
+    fn build(self: Arc<Self>, now: Instant, current_mtu: u16) -> Box<dyn Controller> {
+        Box::new(Counting { inner: Arc::clone(&self.0).build(now, current_mtu), marks: 0 })
+    }
+}
+
+/// How often the peer of a connection reported new marks. A connection starts again at a new address of its peer.
+pub(super) fn marks_reported(quic: &quinn_proto::Connection) -> u64 {
+    // A copy is the only way to it. It is made for status, once a second.
+    let controller = quic.congestion_state().clone_box().into_any();
+    controller.downcast_ref::<Counting>().map_or(0, |counting| counting.marks)
+}
+
+impl Controller for Counting {
+    fn on_sent(&mut self, now: Instant, bytes: u64, last_packet_number: u64) {
+        self.inner.on_sent(now, bytes, last_packet_number);
+    }
+
+    fn on_ack(
+        &mut self,
+        now: Instant,
+        sent: Instant,
+        bytes: u64,
+        app_limited: bool,
+        rtt: &RttEstimator,
+    ) {
+        self.inner.on_ack(now, sent, bytes, app_limited, rtt);
+    }
+
+    fn on_end_acks(
+        &mut self,
+        now: Instant,
+        in_flight: u64,
+        app_limited: bool,
+        largest_packet_num_acked: Option<u64>,
+    ) {
+        self.inner.on_end_acks(now, in_flight, app_limited, largest_packet_num_acked);
+    }
+
+    fn on_congestion_event(
+        &mut self,
+        now: Instant,
+        sent: Instant,
+        is_persistent_congestion: bool,
+        lost_bytes: u64,
+    ) {
+        // Nothing is lost only where packets were marked.
+        self.marks += u64::from(lost_bytes == 0);
+        self.inner.on_congestion_event(now, sent, is_persistent_congestion, lost_bytes);
+    }
+
+    fn on_mtu_update(&mut self, new_mtu: u16) {
+        self.inner.on_mtu_update(new_mtu);
+    }
+
+    fn window(&self) -> u64 {
+        self.inner.window()
+    }
+
+    fn metrics(&self) -> ControllerMetrics {
+        self.inner.metrics()
+    }
+
+    fn clone_box(&self) -> Box<dyn Controller> {
+        Box::new(Self { inner: self.inner.clone_box(), marks: self.marks })
+    }
+
+    fn initial_window(&self) -> u64 {
+        self.inner.initial_window()
+    }
+
+    fn into_any(self: Box<Self>) -> Box<dyn Any> {
+        self
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use quinn_proto::congestion::CubicConfig;
+
+    use super::*;
+
+    #[test]
+    fn marks_are_counted_and_losses_are_not_and_both_reach_the_wrapped_controller() {
+        let now = Instant::now();
+        let factory = Arc::new(CountingFactory(Arc::new(CubicConfig::default())));
+        let mut controller = factory.build(now, 1200);
+        let at = |seconds| now + Duration::from_secs(seconds);
+        let initial = controller.window();
+        controller.on_congestion_event(at(1), at(1), false, 0);
+        let marked = controller.window();
+        controller.on_congestion_event(at(2), at(2), false, 1200);
+        assert!(initial > marked && marked > controller.window());
+        let copy = controller.clone_box().into_any();
+        assert_eq!(copy.downcast_ref::<Counting>().map(|counting| counting.marks), Some(1));
+    }
+}

@@ -1,0 +1,9 @@
+//! Scenarios with many cases. `cargo test` runs a sample of them, `cargo xtask simulate --scenarios` all.
+
+mod hostile;
+mod kills;
+mod losses;
+mod moves;
+mod radio;
+mod segment;
+mod torture;

@@ -1,0 +1,53 @@
+//! When the counters of the keys are read for status: on another thread, since the ledger may wait for the disk.
+
+use std::time::Duration;
+
+/// Between two reports of the keys.
+const EVERY: Duration = Duration::from_secs(1);
+
+/// The reports of the keys. One is under way at a time: a disk that hangs gets no queue of them.
+#[derive(Debug, Default)]
+pub(super) struct KeyReports {
+    next: Duration,
+    is_asked: bool,
+}
+
+impl KeyReports {
+    /// When [`begin`](Self::begin) is due; not before the last report came.
+    pub(super) fn poll_timeout(&self) -> Option<Duration> {
+        (!self.is_asked).then_some(self.next)
+    }
+
+    /// Whether a report is to be asked for now, which the caller then does.
+    pub(super) fn begin(&mut self, now: Duration) -> bool {
+        let due = self.poll_timeout().is_some_and(|due| due <= now);
+        if due {
+            (self.next, self.is_asked) = (now + EVERY, true);
+        }
+        due
+    }
+
+    /// The report came.
+    pub(super) fn handle_report(&mut self) {
+        self.is_asked = false;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_report_is_asked_for_while_one_is_under_way_and_one_a_second_otherwise() {
+        let mut reports = KeyReports::default();
+        assert!(reports.begin(Duration::ZERO));
+        let later = Duration::from_secs(60);
+        assert!(!reports.begin(later), "the disk hangs");
+        assert_eq!(reports.poll_timeout(), None, "the loop is not woken for it");
+        reports.handle_report();
+        assert!(reports.begin(later));
+        reports.handle_report();
+        assert!(!reports.begin(later + EVERY / 2));
+        assert_eq!(reports.poll_timeout(), Some(later + EVERY));
+    }
+}

@@ -1,0 +1,141 @@
+//! Decides whether the reactor looks for the next input before it sleeps.
+//!
+//! To wake up costs more than an input that comes at once. To look costs processor time, and an input that is not about
+//! to come makes that a waste. So looking has to pay: its results are counted, and it stops while too few looks find an
+//! input.
+
+use std::time::Duration;
+
+use axon_transport::config::LinkPoll;
+
+/// How long one look lasts.
+const LOOK: Duration = Duration::from_micros(50);
+/// Looks that are judged together.
+const TRIAL: u32 = 16;
+/// At least one look in so many has to find an input.
+const PAYS: u32 = 4;
+/// Passes without a look after a trial that did not pay, at first and at most. Each such trial doubles them.
+const PAUSE: (u32, u32) = (64, 4096);
+
+/// What the reactor does after a pass.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Look {
+    /// It sleeps.
+    Not,
+    /// It looks for so long, and then sleeps.
+    For(Duration),
+    /// It looks until there is an input.
+    On,
+}
+
+/// The rule, and what looking brought.
+#[derive(Debug)]
+pub(super) struct Looks {
+    poll: LinkPoll,
+    /// Looks of this trial, and those among them that found an input.
+    made: u32,
+    found: u32,
+    /// Passes left without a look.
+    skipped: u32,
+    /// Passes without a look after the next trial that does not pay.
+    pause: u32,
+}
+
+impl Looks {
+    /// Nothing was looked for yet. On a host with one processor a look would keep the sender of the input from it.
+    pub(super) fn new(poll: LinkPoll, processors: usize) -> Self {
+        let poll = match poll {
+            LinkPoll::Adaptive if processors < 2 => LinkPoll::Never,
+            poll => poll,
+        };
+        Self { poll, made: 0, found: 0, skipped: 0, pause: PAUSE.0 }
+    }
+
+    /// What to do after a pass, which had work if it was `busy`.
+    pub(super) fn after_pass(&mut self, busy: bool) -> Look {
+        match self.poll {
+            LinkPoll::Always => Look::On,
+            LinkPoll::Adaptive if busy && self.skipped == 0 => Look::For(LOOK),
+            LinkPoll::Adaptive => {
+                self.skipped = self.skipped.saturating_sub(u32::from(busy));
+                Look::Not
+            }
+            LinkPoll::Never => Look::Not,
+        }
+    }
+
+    /// A look ended.
+    pub(super) fn handle_look(&mut self, found: bool) {
+        self.made += 1;
+        self.found += u32::from(found);
+        // The rest of the trial cannot change its result.
+        let lost = self.made - self.found > TRIAL - TRIAL / PAYS;
+        if lost {
+            self.skipped = self.pause;
+            self.pause = (self.pause * 2).min(PAUSE.1);
+        } else if self.made == TRIAL {
+            self.pause = PAUSE.0;
+        }
+        if lost || self.made == TRIAL {
+            (self.made, self.found) = (0, 0);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Looks made in so many busy passes, the input following a look in time if `comes` says so.
+    fn looks(looks: &mut Looks, passes: u32, comes: impl Fn(u32) -> bool) -> u32 {
+        let mut made = 0;
+        for pass in 0..passes {
+            if looks.after_pass(true) != Look::Not {
+                made += 1;
+                looks.handle_look(comes(pass));
+            }
+        }
+        made
+    }
+
+    #[test]
+    fn a_daemon_whose_looks_find_nothing_nearly_stops_looking() {
+        let mut adaptive = Looks::new(LinkPoll::Adaptive, 2);
+        assert_eq!(looks(&mut adaptive, 13, |_| false), 13, "a trial");
+        assert_eq!(looks(&mut adaptive, 64, |_| false), 0, "and a pause");
+        looks(&mut adaptive, 20_000, |_| false);
+        assert!(looks(&mut adaptive, 40_960, |_| false) <= 10 * 13);
+    }
+
+    #[test]
+    fn a_daemon_whose_inputs_follow_each_other_looks_after_each_pass() {
+        let mut adaptive = Looks::new(LinkPoll::Adaptive, 2);
+        assert_eq!(looks(&mut adaptive, 10_000, |_| true), 10_000);
+        assert_eq!(looks(&mut adaptive, 10_000, |pass| pass % PAYS == 0), 10_000);
+        // It notices that they stopped, and soon that they began again.
+        assert!(looks(&mut adaptive, 100, |_| false) < 50);
+        assert!(looks(&mut adaptive, 1_000, |_| true) > 800);
+    }
+
+    #[test]
+    fn a_pass_without_work_is_not_followed_by_a_look() {
+        let mut adaptive = Looks::new(LinkPoll::Adaptive, 2);
+        assert_eq!(adaptive.after_pass(false), Look::Not);
+        assert_eq!(adaptive.after_pass(true), Look::For(LOOK));
+        // Nor does it shorten a pause.
+        looks(&mut adaptive, 13, |_| false);
+        assert!((0..1_000).all(|_| adaptive.after_pass(false) == Look::Not));
+        assert_eq!(looks(&mut adaptive, PAUSE.0, |_| true), 0);
+        assert_eq!(looks(&mut adaptive, 1, |_| true), 1);
+    }
+
+    #[test]
+    fn always_and_never_are_what_they_say_and_one_processor_is_left_to_the_others() {
+        for busy in [false, true] {
+            let after = |poll, processors| Looks::new(poll, processors).after_pass(busy);
+            assert_eq!(after(LinkPoll::Always, 1), Look::On);
+            assert_eq!(after(LinkPoll::Never, 64), Look::Not);
+            assert_eq!(after(LinkPoll::Adaptive, 1), Look::Not);
+        }
+    }
+}
