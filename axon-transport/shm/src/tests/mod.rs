@@ -1,6 +1,5 @@
 //! Two ends of a ring: in one process, in two, with a hostile one, and under the model checker.
 
-mod activity;
 mod api;
 mod bounds;
 mod hostile;
