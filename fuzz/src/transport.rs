@@ -233,6 +233,7 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
             subscribers: vec![link::Subscriber { gid, qos: Qos::default() }],
             last: vec![link::LastSeen { publisher: gid, sequence: 42 }],
             acknowledges: Some(true),
+            short_headers: None,
         }),
         Message::Received(link::Received {
             flows: vec![link::ReceivedOf { route: 1, publisher: gid, sequence: 43, dropped: 1 }],

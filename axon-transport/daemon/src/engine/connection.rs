@@ -15,7 +15,7 @@ use super::{
 /// Bulk that QUIC holds at most. Below that it is the congestion window and a little more: as much as may be on the
 /// way, and what leaves before the next pass. All else waits in the flows, where a newer sample can replace it.
 const MOST_BULK: u64 = 16 << 20;
-/// Bulk that QUIC holds beyond the congestion window: so much, or as much again as a smaller window, or an eighth of a
+/// Bulk that QUIC holds beyond the congestion window: so much, or half as much as a smaller window, or an eighth of a
 /// larger one. On a slow path 64 KiB would take a quarter of a second.
 const AHEAD: u64 = 64 << 10;
 /// How often the share of lost packets is measured, and how many packets make a measure.
@@ -97,7 +97,7 @@ impl Connection {
         let window = self.quic.congestion_state().window();
         self.loss.measure(&self.quic, now);
         let rounds = self.loss.rounds(window, self.quic.current_mtu());
-        let ahead = AHEAD.min(window).max(window / 8);
+        let ahead = AHEAD.min(window / 2).max(window / 8);
         let bulk = (((window + ahead) as f64 * rounds) as u64).min(MOST_BULK);
         Carrier {
             quic: &mut self.quic,

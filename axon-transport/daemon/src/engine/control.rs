@@ -82,7 +82,7 @@ pub(crate) struct Control {
     frame: Vec<u8>,
     /// Whether the frame that was read is paid for.
     paid: Option<u32>,
-    /// The peer said as much as it may for now.
+    /// Until when no further frame is read: the peer has used up its rate.
     paused_until: Option<Duration>,
     readable: bool,
     ended: bool,

@@ -18,7 +18,7 @@ impl KeyReports {
         (!self.is_asked).then_some(self.next)
     }
 
-    /// Whether a report is to be asked for now, which the caller then does.
+    /// Begins a report if one is due. Returns whether it did: the caller then asks for the report.
     pub(super) fn begin(&mut self, now: Duration) -> bool {
         let due = self.poll_timeout().is_some_and(|due| due <= now);
         if due {

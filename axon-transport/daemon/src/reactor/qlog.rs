@@ -157,7 +157,8 @@ impl Drop for Writer {
 /// The directory, as the thread has it.
 struct Disk {
     directory: PathBuf,
-    open: BTreeMap<u64, File>,
+    /// The files that are being written, and their names.
+    open: BTreeMap<u64, (String, File)>,
     /// Whether a failure was logged.
     is_said: bool,
 }
@@ -186,32 +187,40 @@ impl Disk {
 
     fn open(&mut self, number: u64, name: &str) -> io::Result<()> {
         DirBuilder::new().recursive(true).mode(0o700).create(&self.directory)?;
-        self.make_room()?;
         if self.open.len() >= MOST {
-            self.open.pop_first();
+            return Err(io::Error::other(format!("{MOST} connections write already")));
         }
+        self.make_room()?;
         let mut options = OpenOptions::new();
         let file = options.write(true).create_new(true).mode(0o600);
-        self.open.insert(number, file.open(self.directory.join(name))?);
+        let file = file.open(self.directory.join(name))?;
+        self.open.insert(number, (name.to_owned(), file));
         Ok(())
     }
 
-    /// Removes the oldest files of daemons until there is room for one more. Other files stay.
+    /// Removes the oldest files of daemons until there is room for one more. Other files stay, and those that this
+    /// daemon writes.
     fn make_room(&self) -> io::Result<()> {
         let mut names: Vec<_> = fs::read_dir(&self.directory)?
             .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
             .filter(|name| name.starts_with(NAME.0) && name.ends_with(NAME.1))
             .collect();
         names.sort_unstable();
-        for name in names.iter().take((names.len() + 1).saturating_sub(MOST)) {
-            fs::remove_file(self.directory.join(name))?;
+        let too_many = (names.len() + 1).saturating_sub(MOST);
+        names.retain(|name| self.open.values().all(|(open, _)| open != name));
+        for name in names.iter().take(too_many) {
+            match fs::remove_file(self.directory.join(name)) {
+                // Another daemon removed it.
+                Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+                removed => removed?,
+            }
         }
         Ok(())
     }
 
     fn write(&mut self, number: u64, records: &[u8]) -> io::Result<()> {
         // A file that failed before gets no more.
-        let Some(file) = self.open.get_mut(&number) else { return Ok(()) };
+        let Some((_, file)) = self.open.get_mut(&number) else { return Ok(()) };
         let written = file.write_all(records);
         if written.is_err() {
             self.open.remove(&number);
@@ -297,6 +306,25 @@ mod tests {
     }
 
     #[test]
+    fn files_that_are_being_written_stay() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut disk = Disk::new(dir.path());
+        let name = |number: u64| format!("{}{number:014}{}", NAME.0, NAME.1);
+        disk.carry_out(Order::Open(0, name(0)));
+        for number in 1..2 * MOST as u64 {
+            disk.carry_out(Order::Open(number, name(number)));
+            disk.carry_out(Order::Close(number));
+        }
+        assert!(names(dir.path()).contains(&name(0)));
+        assert_eq!(names(dir.path()).len(), MOST);
+        for number in 200..300 {
+            disk.carry_out(Order::Open(number, name(number)));
+        }
+        assert_eq!((disk.open.len(), names(dir.path()).len()), (MOST, MOST));
+        assert!(disk.is_said && disk.open.contains_key(&0));
+    }
+
+    #[test]
     fn a_directory_that_cannot_be_and_a_full_disk_fail_no_write() {
         let dir = tempfile::tempdir().unwrap();
         fs::write(dir.path().join("file"), "").unwrap();
@@ -309,7 +337,7 @@ mod tests {
 
         let mut disk = Disk::new(dir.path());
         let full = OpenOptions::new().write(true).open("/dev/full").unwrap();
-        disk.open.insert(1, full);
+        disk.open.insert(1, ("full".to_owned(), full));
         disk.carry_out(Order::Write(1, b"a record\n".to_vec()));
         assert!(disk.is_said && disk.open.is_empty(), "it is given up");
         disk.carry_out(Order::Write(1, b"a record\n".to_vec()));

@@ -1,6 +1,7 @@
 //! Two ends of a ring: in one process, in two, with a hostile one, and under the model checker.
 
 mod api;
+mod batches;
 mod bounds;
 mod hostile;
 mod images;
@@ -13,7 +14,6 @@ mod pins;
 mod processes;
 mod samples;
 mod segment_channels;
-mod slices;
 mod wire;
 
 use std::{
@@ -52,6 +52,15 @@ const EVER: Duration = Duration::from_secs(60);
 fn woken(wait: impl FnOnce() -> bool) {
     let start = Instant::now();
     assert!(wait() && start.elapsed() < EVER, "a wake-up was lost");
+}
+
+/// Takes the next sample: its number and payload.
+fn take(reader: &mut Reader) -> Option<(u64, Vec<u8>)> {
+    let mut out = Vec::new();
+    reader.take(&mut out).unwrap().map(|taken| {
+        assert_eq!(taken.meta, meta(taken.meta.sequence));
+        (taken.meta.sequence, out)
+    })
 }
 
 fn await_data(session: &SessionSegment, reader: &Reader) {

@@ -22,7 +22,10 @@ const ALIKE: u32 = 2;
 #[derive(Debug, Clone)]
 pub(super) struct Standing {
     since: Instant,
-    /// The window and the bytes a second at the start.
+    /// The window before it shrank.
+    peak: u64,
+    /// The window and the bytes a second to compare with. They are those of the second time: at the first one the rate
+    /// may be of the time before the queue.
     window: u64,
     rate: f64,
     /// Times that the window shrank since.
@@ -31,17 +34,20 @@ pub(super) struct Standing {
 
 impl Standing {
     pub(super) fn new(now: Instant, window: u64, rate: f64) -> Self {
-        Self { since: now, window, rate, times: 0 }
+        Self { since: now, peak: window, window, rate, times: 0 }
     }
 
-    /// Takes that the window is about to shrink once more. Returns the window of the start if others fill the queue:
+    /// Takes that the window is about to shrink once more. Returns the window from before if others fill the queue:
     /// the rate shrank with the window. A queue of this link alone keeps its rate.
     pub(super) fn shrink(&mut self, now: Instant, window: u64, rate: f64) -> Option<u64> {
         self.times += 1;
+        if self.times == 2 {
+            (self.window, self.rate) = (window, rate);
+        }
         let share = window as f64 / self.window as f64;
         let is_long = now.saturating_duration_since(self.since) >= STANDING.0;
         let is_telling = is_long && self.times >= STANDING.1 && share <= SHRUNK;
-        (is_telling && rate < self.rate * (1.0 + share) / 2.0).then_some(self.window)
+        (is_telling && rate < self.rate * (1.0 + share) / 2.0).then_some(self.peak)
     }
 }
 
@@ -76,9 +82,12 @@ impl Competition {
     /// Begins with a window. `shortest` is what a round without much on the way has just shown.
     pub(super) fn new(now: Instant, window: u64, mtu: u64, shortest: Duration) -> Self {
         let mut config = CubicConfig::default();
-        config.initial_window(window);
+        config.initial_window(window * 10 / 7);
+        let mut cubic = Cubic::new(Arc::new(config), now, mtu as u16);
+        // It begins as after a loss, with 0.7 of that window: a new one would double until it lost packets.
+        cubic.on_congestion_event(now, now, false, 0);
         Self {
-            cubic: Cubic::new(Arc::new(config), now, mtu as u16),
+            cubic,
             next_look: now + LOOK_EVERY,
             looking: 0,
             seen: None,

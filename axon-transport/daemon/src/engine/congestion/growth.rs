@@ -103,8 +103,14 @@ impl Growth {
         (0.95 * rate * rtt.as_secs_f64() / (1.0 - self.random_loss).max(0.1)) as u64
     }
 
-    /// Judges a trial that is over. Returns a smaller window if that would lose fewer packets.
-    pub(super) fn judge(&mut self, window: u64, mtu: u64, rtt: Duration) -> Option<u64> {
+    /// Judges a trial that is over. Returns a smaller window, of `least` bytes or more, if that would lose fewer packets.
+    pub(super) fn judge(
+        &mut self,
+        window: u64,
+        mtu: u64,
+        least: u64,
+        rtt: Duration,
+    ) -> Option<u64> {
         let trial = &self.trial;
         let has_grown = window as f64 >= trial.window as f64 * TRIAL;
         if trial.acknowledged < mtu * if has_grown { PACKETS.0 } else { PACKETS.1 } {
@@ -137,7 +143,7 @@ impl Growth {
             self.trial = Trial::new(window, Some(rate));
             return None;
         }
-        let smaller = self.held(rate, rtt).clamp(window / 2, window / 10 * 9);
+        let smaller = self.held(rate, rtt).clamp(window / 2, window / 10 * 9).max(least);
         self.cut = Some(lost);
         self.trial = Trial::new(smaller, is_futile.then_some(rate));
         if is_futile {
@@ -161,7 +167,7 @@ mod tests {
         for _ in 0..rounds {
             let through = (window.min(most) as f64 * (1.0 - random)) as u64;
             growth.add(through, window - through, RTT);
-            if let Some(smaller) = growth.judge(window, MTU, RTT) {
+            if let Some(smaller) = growth.judge(window, MTU, 3 * MTU, RTT) {
                 assert!(smaller < window);
                 window = smaller;
             } else if !growth.waits(window) {

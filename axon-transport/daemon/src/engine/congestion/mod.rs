@@ -38,8 +38,9 @@ const WANTED: (Duration, Duration) = (Duration::from_millis(2), Duration::from_m
 const PACKETS_WANTED: f64 = 2.0;
 /// The wanted queue is so many times what round trips differ by chance, at least.
 const BY_CHANCE: u32 = 8;
-/// Packets that may always be on the way.
-const FLOOR: u64 = 2;
+/// The smallest window in packets. QUIC sends while less than the window is on the way, so it is two whole packets and
+/// a third that is not: the second one is acknowledged at once.
+const FLOOR: u64 = 3;
 /// The window at the start in packets and in bytes: the larger of the two (RFC 9002, 7.2).
 const INITIAL: (u64, u64) = (10, 14_720);
 /// The share of the path that is filled after the window shrank: a little less than all of it, so that the queue
@@ -96,11 +97,27 @@ struct Round {
     packets: u32,
     acknowledged: u64,
     lost: u64,
+    most_in_flight: u64,
 }
 
 impl Round {
     fn new(started: Instant, last_packet: u64) -> Self {
-        Self { started, last_packet, shortest: None, packets: 0, acknowledged: 0, lost: 0 }
+        Self {
+            started,
+            last_packet,
+            shortest: None,
+            packets: 0,
+            acknowledged: 0,
+            lost: 0,
+            most_in_flight: 0,
+        }
+    }
+
+    /// How long it has lasted. Acknowledgements of several round trips may come at one time, but a round is no shorter
+    /// than a round trip.
+    fn time(&self, now: Instant) -> Duration {
+        let least = self.shortest.unwrap_or_default().max(Duration::from_micros(1));
+        now.saturating_duration_since(self.started).max(least)
     }
 }
 
@@ -129,6 +146,8 @@ pub(crate) struct Delay {
     settling: u32,
     /// Round trips in a row that are urgent, and the shortest of them.
     urgent: (u32, Duration),
+    /// Bytes of the acknowledgements that are being handled.
+    acknowledged_now: u64,
     /// Marks and losses of packets sent before this were obeyed.
     obeyed: Option<Instant>,
 }
@@ -153,6 +172,7 @@ impl Delay {
             step: mtu,
             settling: 0,
             urgent: (0, Duration::MAX),
+            acknowledged_now: 0,
             obeyed: None,
         }
     }
@@ -160,14 +180,18 @@ impl Delay {
     /// The queue that this link wants.
     fn wanted(&self) -> Duration {
         let packets = PACKETS_WANTED * self.mtu as f64 / self.rate.max(1e3);
-        let wanted = (self.path.get() / 2).max(self.jitter * BY_CHANCE).clamp(WANTED.0, WANTED.1);
-        wanted.max(Duration::from_secs_f64(packets))
+        self.wanted_at_any_rate().max(Duration::from_secs_f64(packets))
+    }
+
+    /// The queue that this link wants, were a packet no time.
+    fn wanted_at_any_rate(&self) -> Duration {
+        (self.path.get() / 2).max(self.jitter * BY_CHANCE).clamp(WANTED.0, WANTED.1)
     }
 
     /// Sets the window so that a queue of this length drains.
     fn drain(&mut self, queue: Duration) {
         let path = self.path.get().as_secs_f64();
-        let by_chance = f64::from(BY_CHANCE) * self.jitter.as_secs_f64();
+        let by_chance = (self.jitter * BY_CHANCE).min(WANTED.1).as_secs_f64();
         let filled = if self.drains < NEW { DRAINED.1 } else { DRAINED.0 };
         let share = (filled * path + by_chance) / (path + queue.as_secs_f64());
         self.drains += 1;
@@ -176,17 +200,16 @@ impl Delay {
 
     /// Leaves this share of the window.
     fn shrink(&mut self, share: f64) {
-        let window = ((self.window as f64 * share) as u64).max(FLOOR * self.mtu);
-        self.set_window(self.window.min(window));
+        self.set_window((self.window as f64 * share) as u64);
     }
 
     /// Sets another window, and begins anew to grow once the packets that are on the way have arrived.
     fn set_window(&mut self, window: u64) {
-        self.window = window;
+        self.window = window.max(FLOOR * self.mtu);
         self.step = self.mtu;
         self.settling = 1;
         self.urgent = (0, Duration::MAX);
-        self.growth.restart(window);
+        self.growth.restart(self.window);
     }
 
     fn end_round(&mut self, now: Instant, is_app_limited: bool) {
@@ -199,12 +222,13 @@ impl Delay {
             // A queue of our own only grows while the window does: what shrinks then is by chance.
             self.jitter = (self.jitter * 7 + last.saturating_sub(shortest)) / 8;
         }
-        let time = now.saturating_duration_since(round.started);
-        let rate = round.acknowledged as f64 / time.as_secs_f64().max(1e-6);
+        let time = round.time(now);
+        let rate = round.acknowledged as f64 / time.as_secs_f64();
         if !is_app_limited {
             self.rate = rate.max(self.rate * 0.8);
         }
         match &self.phase {
+            Phase::Start { .. } if is_app_limited => {}
             Phase::Start { .. } => self.end_round_of_start(&round, rate, queue),
             Phase::Compete(_) => self.end_round_of_competition(now, shortest),
             Phase::Steady => {
@@ -213,13 +237,17 @@ impl Delay {
                 }
                 if self.settling > 0 {
                     self.settling -= 1;
+                    self.urgent = (0, Duration::MAX);
                 } else if is_app_limited {
                     // The window is not what fills a queue, and a lone packet is acknowledged late.
                 } else if queue > self.wanted() * 2 {
                     self.end_round_of_queue(now, rate, shortest, queue);
                 } else {
                     self.growth.add(round.acknowledged, round.lost, time);
-                    self.grow(queue);
+                    // A window that was never half used says nothing of a larger one.
+                    if round.most_in_flight >= self.window / 2 {
+                        self.grow(queue);
+                    }
                 }
             }
         }
@@ -264,26 +292,27 @@ impl Delay {
     }
 
     fn end_round_of_competition(&mut self, now: Instant, shortest: Duration) {
-        let (path, wanted) = (self.path.get(), self.wanted());
+        // A small share of the path makes the rate small, and would make any queue look like one of two packets.
+        let (path, wanted) = (self.path.get(), self.wanted_at_any_rate());
         let Phase::Compete(competition) = &mut self.phase else { return };
         let share = competition.share();
         match competition.end_round(now, shortest, path, wanted) {
             Outcome::Goes => return,
-            Outcome::Over => {}
+            Outcome::Over => self.phase = Phase::Steady,
             Outcome::Longer(rtt) => {
                 self.path = Path::of(now, rtt);
                 self.drains = 0;
+                self.phase = Phase::Start { best: 0.0, idle: 0 };
             }
         }
-        self.phase = Phase::Steady;
         self.set_window(share);
     }
 
     /// Lets the window grow by a step, unless the last ones did not pay.
     fn grow(&mut self, queue: Duration) {
         let rtt = self.path.get() + queue;
-        if let Some(smaller) = self.growth.judge(self.window, self.mtu, rtt) {
-            self.window = smaller.max(FLOOR * self.mtu);
+        if let Some(smaller) = self.growth.judge(self.window, self.mtu, FLOOR * self.mtu, rtt) {
+            self.window = smaller;
             (self.step, self.settling) = (self.mtu, 1);
             return;
         }
@@ -327,6 +356,7 @@ impl Controller for Delay {
         self.round.shortest = Some(shortest);
         self.round.acknowledged += bytes;
         self.round.packets += 1;
+        self.acknowledged_now += bytes;
         match &mut self.phase {
             Phase::Start { .. } if !app_limited => self.window += bytes,
             Phase::Compete(competition) => {
@@ -346,17 +376,21 @@ impl Controller for Delay {
     fn on_end_acks(
         &mut self,
         now: Instant,
-        _in_flight: u64,
+        in_flight: u64,
         app_limited: bool,
         largest_packet_num_acked: Option<u64>,
     ) {
+        let on_the_way = in_flight + std::mem::take(&mut self.acknowledged_now);
+        self.round.most_in_flight = self.round.most_in_flight.max(on_the_way);
         let (in_a_row, shortest) = self.urgent;
         let is_competing = matches!(self.phase, Phase::Compete(_));
         let may_drain = self.settling == 0 && !app_limited && !is_competing;
         if in_a_row >= URGENT_IN_A_ROW && may_drain {
             self.phase = Phase::Steady;
-            self.drain(shortest.saturating_sub(self.path.get()));
-            self.round.last_packet = self.last_sent;
+            let queue = shortest.saturating_sub(self.path.get());
+            let rate = self.round.acknowledged as f64 / self.round.time(now).as_secs_f64();
+            self.end_round_of_queue(now, rate, shortest, queue);
+            self.round = Round::new(now, self.last_sent);
         } else if largest_packet_num_acked.is_some_and(|largest| largest >= self.round.last_packet)
             || self.starts_too_fast()
         {

@@ -6,7 +6,7 @@ use axon_envelope::{Kind, Route};
 use bytes::{Buf, Bytes};
 
 use super::{
-    Inbound, Key, LONG, RouteIn, Violation,
+    Inbound, Key, LONG, RouteIn, TURN, Violation,
     incoming::{Incoming, Message, StreamHeader},
     reading::{Next, malformed, permit_short, refused, told},
 };
@@ -26,6 +26,7 @@ struct To {
     stand_in: Rc<StandIn>,
     /// The longest message.
     most: u64,
+    now: Duration,
 }
 
 /// What is to be acknowledged after a run.
@@ -59,8 +60,10 @@ impl Inbound {
             return Ok(None);
         };
         let most = self.max_message + MAX_OVERHEAD as u64;
-        let (to, mut came) = (To { header, route, stand_in, most }, Came::default());
-        let full = self.deliver_all(&to, stream, open, read, &mut came, now);
+        let (to, mut came) = (To { header, route, stand_in, most, now }, Came::default());
+        let mut envelope = std::mem::take(&mut self.envelope);
+        let full = self.deliver_all(&to, stream, open, &mut envelope, read, &mut came);
+        self.envelope = envelope;
         let flow = (header.route, header.of);
         if let Some(newest) = came.newest {
             self.receipts.came_all(flow, newest, came.samples, came.bytes, now);
@@ -74,13 +77,16 @@ impl Inbound {
         to: &To,
         stream: &mut Incoming,
         open: &mut Open<'_>,
+        envelope: &mut Vec<u8>,
         read: &mut usize,
         came: &mut Came,
-        now: Duration,
     ) -> Result<Option<Message>, Violation> {
+        let now = to.now;
         let Incoming { chunk, headers, .. } = stream;
-        let mut envelope = std::mem::take(&mut self.envelope);
-        while let Some(body) = next_body(chunk, to.most) {
+        // What is decompressed counts for the turn.
+        while *read < TURN
+            && let Some(body) = next_body(chunk, to.most)
+        {
             let (told, payload): (Told, Cow<'_, [u8]>) = match headers {
                 Some(headers) => {
                     permit_short(to.route, open)?;
@@ -91,7 +97,7 @@ impl Inbound {
                     // It is opened in place.
                     envelope.clear();
                     envelope.extend_from_slice(body);
-                    let opened = open.open(&mut envelope, to.route, now).map_err(refused)?;
+                    let opened = open.open(envelope, to.route, now).map_err(refused)?;
                     let Some(opened) = opened else {
                         self.lost("no_link", to.header, "the link ended before they were read");
                         chunk.advance(LENGTH + body.len());
@@ -128,7 +134,6 @@ impl Inbound {
             came.bytes += bytes;
             chunk.advance(length);
         }
-        self.envelope = envelope;
         Ok(None)
     }
 }

@@ -1,4 +1,4 @@
-//! The dials under way, and for whom the connections were dialled that are being opened.
+//! The dials under way. Of each connection that is being opened, the dial that it belongs to.
 
 use std::{
     collections::{HashMap, HashSet},
@@ -27,7 +27,7 @@ pub(super) struct Dials {
     next_number: u64,
     /// Dials that may go on.
     stirred: HashSet<u64>,
-    /// For whom connections were dialled that are being opened.
+    /// The daemon that a dial looked for, by the connection that is being opened.
     opening: HashMap<u64, (DaemonId, AddressConfidence)>,
 }
 
@@ -122,7 +122,7 @@ impl Dials {
         self.stirred.extend(due.map(|(number, _)| *number));
     }
 
-    /// Remembers for whom a connection was dialled, should its opening fail.
+    /// Notes which daemon a dial looked for, for the case that the connection cannot be opened.
     pub(super) fn note_opening(
         &mut self,
         connection: u64,

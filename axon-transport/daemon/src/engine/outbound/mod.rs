@@ -1,21 +1,21 @@
 //! Samples to one peer: from the rings of local publishers into QUIC streams.
 //!
 //! Samples wait here and not in QUIC, because QoS can act on them here. Of bulk, QUIC holds the congestion window and a
-//! little more ([`connection`](super::connection)), so that the newest sample is soon the next. A pass costs the flows that have something to send, and no others.
+//! little more ([`connection`](super::connection)), so that the newest sample is soon the next. A pass costs the flows
+//! that have something to send, and no others.
 
-mod best_effort;
+mod backlog;
 pub(crate) mod budget;
 mod ending;
 mod flow;
 mod nudges;
 mod queue;
 mod schedule;
+mod served;
 mod source;
 mod stall;
 mod streams;
-mod taking;
-#[cfg(test)]
-mod tests;
+mod without;
 
 use std::{
     collections::{BTreeSet, HashMap},
@@ -24,47 +24,33 @@ use std::{
     time::Duration,
 };
 
-use axon_envelope::Route;
 use axon_shm::{ids::Gid, qos::Qos};
-use axon_transport::status::LinkStatus;
-use quinn_proto::StreamId;
+use quinn_proto::{StreamId, VarInt};
 
+pub(crate) use self::{
+    backlog::Backlog,
+    schedule::{Class, FlowId},
+    served::RouteOut,
+    source::Source,
+};
 use self::{
     budget::Budget,
     ending::Endings,
-    flow::{Done, Flow, FlowRoute, Pause},
+    flow::{Done, Flow, Pause},
     nudges::Nudges,
     schedule::Schedule,
+    served::{FlowRoute, Served},
     stall::Stalls,
-};
-pub(crate) use self::{
-    schedule::{Class, FlowId},
-    source::Source,
+    without::Without,
 };
 use super::connection::Carrier;
-use crate::{engine::counters::Counters, link::ReceivedOf};
-
-/// A flow without a key looks again after this time, if nobody told it of one.
-const KEY_RETRY: Duration = Duration::from_millis(250);
+use crate::{
+    engine::counters::Counters,
+    link::{CloseCode, ReceivedOf},
+};
 
 /// Flows look again after this time at a link that has no keys.
 const NO_CARRIER: Duration = Duration::from_secs(1);
-
-/// A route that the peer asked for.
-pub(crate) struct RouteOut {
-    /// The topic's name.
-    pub(crate) topic: Arc<str>,
-    /// Topic and kind, for the envelope.
-    pub(crate) route: Route,
-    /// Whether the peer acknowledges the samples.
-    pub(crate) acknowledged: bool,
-    /// Whether the peer reads short headers.
-    pub(crate) short_headers: bool,
-    /// Where its samples are taken.
-    pub(crate) sources: Vec<Source>,
-    /// The newest sample of each publisher that the peer has already.
-    pub(crate) seen: HashMap<Gid, u64>,
-}
 
 /// What the peer's owner has to know.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -84,25 +70,6 @@ pub(crate) enum OutboundEvent {
     Stalled(u32),
 }
 
-/// A route and its flows.
-struct Served {
-    shared: FlowRoute,
-    /// Its peer reads nothing, as its owner knows.
-    stalled: bool,
-    sources: Vec<Source>,
-    seen: HashMap<Gid, u64>,
-    flows: HashMap<Gid, FlowId>,
-}
-
-/// Bytes and samples that wait for one peer.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Backlog {
-    /// Bytes that wait for QUIC, by the class of their flow's next sample.
-    bytes: [usize; 4],
-    /// When the oldest sample that waits was taken from its ring.
-    pub(crate) oldest: Option<Duration>,
-}
-
 /// The samples to one peer.
 pub(crate) struct Outbound {
     routes: HashMap<u32, Served>,
@@ -112,19 +79,13 @@ pub(crate) struct Outbound {
     free: Vec<FlowId>,
     schedule: Schedule,
     budget: Rc<Budget>,
-    /// What the budget had released when flows that found no room were tried last.
-    released: usize,
     counters: Rc<Counters>,
     timers: BTreeSet<(Duration, FlowId)>,
-    without_stream: BTreeSet<FlowId>,
+    without: Without,
     /// Streams may have become idle since a flow found none.
     frees_streams: bool,
-    without_key: BTreeSet<FlowId>,
-    key_retry: Option<Duration>,
-    /// Flows whose next sample found no room in the queue.
-    held: BTreeSet<FlowId>,
-    /// Streams of routes that ended, and whether they are reset.
-    ended: Vec<StreamId>,
+    /// Streams of flows that ended, and whether a sample is cut off there.
+    ended: Vec<(StreamId, bool)>,
     /// Flows with samples that are not acknowledged. The others cost nothing.
     busy: BTreeSet<FlowId>,
     endings: Endings,
@@ -147,15 +108,11 @@ impl Outbound {
             flows: Vec::new(),
             free: Vec::new(),
             schedule: Schedule::default(),
-            released: budget.released(),
+            without: Without::new(&budget),
             budget,
             counters,
             timers: BTreeSet::new(),
-            without_stream: BTreeSet::new(),
             frees_streams: false,
-            without_key: BTreeSet::new(),
-            key_retry: None,
-            held: BTreeSet::new(),
             ended: Vec::new(),
             busy: BTreeSet::new(),
             endings: Endings::default(),
@@ -308,9 +265,7 @@ impl Outbound {
         let Some(mut flow) = self.flows[id].take() else { return };
         self.ended.extend(flow.take_streams());
         self.timers.remove(&(flow.timer.unwrap_or_default(), id));
-        self.without_stream.remove(&id);
-        self.without_key.remove(&id);
-        self.held.remove(&id);
+        self.without.forget(id);
         self.busy.remove(&id);
         self.nudges.forget(id);
         if flow.scheduled.is_some() {
@@ -321,8 +276,9 @@ impl Outbound {
 
     /// Hands samples to QUIC until it takes no more, or none is left.
     pub(crate) fn pump(&mut self, carrier: &mut Carrier<'_>, now: Duration) {
-        for stream in self.ended.drain(..) {
-            let _ = carrier.quic.send_stream(stream).finish();
+        for (stream, is_cut) in self.ended.drain(..) {
+            carrier.streams.remove(&stream);
+            end(carrier.quic, stream, is_cut);
         }
         self.retry_held();
         let mut small_blocked = false;
@@ -339,7 +295,7 @@ impl Outbound {
                 self.nudges.handle_sent(id, carrier.quic.rtt(), now);
             }
             if flow.is_held() {
-                self.held.insert(id);
+                self.without.room(id);
             }
             if flow.timer != before {
                 self.timers.remove(&(before.unwrap_or_default(), id));
@@ -354,12 +310,11 @@ impl Outbound {
                     small_blocked |= class != Class::Bulk;
                 }
                 Pause::NoStream => {
-                    self.without_stream.insert(id);
+                    self.without.stream(id);
                     self.frees_streams = true;
                 }
                 Pause::NoKey => {
-                    self.without_key.insert(id);
-                    self.key_retry.get_or_insert(now + KEY_RETRY);
+                    self.without.key(id, now);
                 }
             }
         }
@@ -371,11 +326,7 @@ impl Outbound {
 
     /// Tries the flows again that found no room, if there is more now.
     fn retry_held(&mut self) {
-        let released = self.budget.released();
-        if self.held.is_empty() || released == std::mem::replace(&mut self.released, released) {
-            return;
-        }
-        for id in std::mem::take(&mut self.held) {
+        for id in self.without.take_for_room(&self.budget) {
             self.schedule(id);
         }
     }
@@ -390,15 +341,14 @@ impl Outbound {
 
     /// The peer allows more streams.
     pub(crate) fn handle_streams_available(&mut self) {
-        for id in std::mem::take(&mut self.without_stream) {
+        for id in self.without.take_for_stream() {
             self.schedule(id);
         }
     }
 
     /// There may be keys for messages.
     pub(crate) fn handle_keys(&mut self) {
-        self.key_retry = None;
-        for id in std::mem::take(&mut self.without_key) {
+        for id in self.without.take_for_key() {
             self.schedule(id);
         }
     }
@@ -449,14 +399,14 @@ impl Outbound {
                 self.schedule(id);
             }
         }
-        self.frees_streams |= !self.without_stream.is_empty();
+        self.frees_streams |= self.without.waits_for_stream() > 0;
     }
 
     /// A new link carries all flows. What the old link did not deliver is sent again.
     pub(crate) fn succeed(&mut self, mut old: Option<&mut quinn_proto::Connection>) {
-        for stream in self.ended.drain(..) {
+        for (stream, is_cut) in self.ended.drain(..) {
             if let Some(old) = old.as_deref_mut() {
-                let _ = old.send_stream(stream).finish();
+                end(old, stream, is_cut);
             }
         }
         for id in 0..self.flows.len() {
@@ -508,7 +458,7 @@ impl Outbound {
         let endings = self.endings.poll_timeout();
         let stalls = (!self.busy.is_empty()).then(|| self.stalls.poll_timeout()).flatten();
         let nudges = self.nudges.poll_timeout();
-        [flow, endings, stalls, nudges, self.key_retry].into_iter().flatten().min()
+        [flow, endings, stalls, nudges, self.without.poll_timeout()].into_iter().flatten().min()
     }
 
     /// Does what is due. `heard` counts the datagrams that came over the link.
@@ -539,7 +489,7 @@ impl Outbound {
             }
             self.schedule_if_there(id);
         }
-        if self.key_retry.is_some_and(|due| due <= now) {
+        if self.without.poll_timeout().is_some_and(|due| due <= now) {
             self.handle_keys();
         }
         let rtt = carrier.as_deref().map_or(NO_CARRIER, |carrier| carrier.quic.rtt());
@@ -604,57 +554,12 @@ impl Outbound {
     }
 }
 
-impl Backlog {
-    /// Puts it into the status of a link.
-    pub(crate) fn fill(&self, status: &mut LinkStatus, now: Duration) {
-        let of = |class: Class| self.bytes[class as usize] as u64;
-        status.waiting_bytes = self.bytes.iter().sum::<usize>() as u64;
-        status.waiting.services = of(Class::Service);
-        status.waiting.small_reliable = of(Class::SmallReliable);
-        status.waiting.small_best_effort = of(Class::SmallBestEffort);
-        status.waiting.bulk = of(Class::Bulk);
-        let waited = self.oldest.map_or(Duration::ZERO, |oldest| now.saturating_sub(oldest));
-        status.waiting_ms = u64::try_from(waited.as_millis()).unwrap_or(u64::MAX);
-    }
-}
-
-impl Served {
-    fn is_service(&self) -> bool {
-        self.shared.route.kind != axon_envelope::Kind::Topic
-    }
-
-    /// Tells the sources up to which number they may forget the samples of a publisher.
-    fn done(&self, of: Gid, Done { sequence, given_up }: Done) {
-        let Some(sequence) = sequence else { return };
-        let sources = self.sources.iter().filter(|source| source.reads(&of));
-        for (number, source) in sources.enumerate() {
-            if number == 0 && given_up > 0 {
-                source.give_up(of, given_up);
-            }
-            source.acknowledge_of(&of, sequence);
-        }
-    }
-
-    /// RELIABLE samples that are not acknowledged, by publisher.
-    fn unacknowledged(&self) -> HashMap<Gid, u64> {
-        let mut most = HashMap::new();
-        for (of, samples) in self.sources.iter().flat_map(Source::unacknowledged) {
-            let known: &mut u64 = most.entry(of).or_default();
-            *known = samples.max(*known);
-        }
-        most
-    }
-
-    /// Tells the publishers which samples will not reach the peer. Returns how many.
-    fn give_up(&self) -> u64 {
-        let mut all = 0;
-        for (of, samples) in self.unacknowledged() {
-            all += samples;
-            let source = self.sources.iter().find(|source| source.has_unacknowledged(&of));
-            if let Some(source) = source {
-                source.give_up(of, samples);
-            }
-        }
-        all
-    }
+/// Ends a stream. One on which a sample is cut off must not look whole.
+fn end(quic: &mut quinn_proto::Connection, stream: StreamId, is_cut: bool) {
+    let mut stream = quic.send_stream(stream);
+    // Either error says that the stream is over.
+    let _ = match is_cut {
+        true => stream.reset(VarInt::from_u32(CloseCode::Goodbye.code())).map_err(drop),
+        false => stream.finish().map_err(drop),
+    };
 }

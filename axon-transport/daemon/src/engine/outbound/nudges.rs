@@ -2,8 +2,8 @@
 //!
 //! QUIC notices that a packet is lost when a later one is acknowledged. A camera sends later ones all the time. A
 //! command does not: then QUIC waits for a timer that doubles each time, and at 40 % of loss that soon takes longer than
-//! a command is worth. So while samples are on the way over a link that loses packets, and nothing else was sent, a
-//! PING follows them every few milliseconds. Each one that is acknowledged shows which packets before it are lost.
+//! a command is worth. So while samples are on the way over a link that loses packets, and no other was handed to QUIC,
+//! a PING follows them every few milliseconds. Each one that is acknowledged shows which packets before it are lost.
 
 use std::{collections::HashMap, time::Duration};
 

@@ -14,7 +14,7 @@ impl Outbound {
     pub(super) fn finish_idle_streams(&mut self, carrier: &mut Carrier<'_>) {
         // A flow's timer runs since it began its stream, or was last found to use it.
         let oldest: Vec<FlowId> = self.timers.iter().take(SEARCHED).map(|(_, id)| *id).collect();
-        let mut left = self.without_stream.len();
+        let mut left = self.without.waits_for_stream();
         for id in oldest {
             if left == 0 {
                 break;

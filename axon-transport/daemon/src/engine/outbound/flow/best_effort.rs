@@ -9,13 +9,15 @@ use axon_shm::ids::Gid;
 use bytes::Bytes;
 use quinn_proto::{Connection, Dir, StreamId, VarInt, WriteError};
 
-use super::{
-    flow::{Done, Pause},
-    queue::Queue,
-    schedule::Class,
-};
+use super::{Done, Pause};
 use crate::{
-    engine::{connection::Carrier, counters::Counters, frames::Frames, inbound::stream_header},
+    engine::{
+        connection::Carrier,
+        counters::Counters,
+        frames::Frames,
+        inbound::stream_header,
+        outbound::{queue::Queue, schedule::Class},
+    },
     link::CloseCode,
 };
 
@@ -65,6 +67,11 @@ impl BestEffort {
     /// Whether no sample is under way.
     pub(super) fn is_idle(&self) -> bool {
         self.writing.is_none() && self.under_way.is_empty()
+    }
+
+    /// The stream of a sample that QUIC does not have entirely. It is given up.
+    pub(super) fn take_cut(&mut self) -> Option<StreamId> {
+        Some(self.writing.take()?.stream)
     }
 
     /// Hands the next sample, or a part of it, to QUIC. `None`: go on.

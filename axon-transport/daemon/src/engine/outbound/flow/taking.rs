@@ -12,11 +12,14 @@ use axon_transport::internal::session::{
     merge::{Merge, Taken},
 };
 
-use super::{
-    queue::{Offered, Queue},
-    source::Source,
+use crate::engine::{
+    counters::Counters,
+    outbound::{
+        queue::{Offered, Queue},
+        source::Source,
+    },
+    rings::Sample,
 };
-use crate::engine::{counters::Counters, rings::Sample};
 
 /// Samples, and bytes, that one turn moves from the rings.
 const FILL: (usize, usize) = (1024, 256 << 10);

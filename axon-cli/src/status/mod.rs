@@ -1,10 +1,12 @@
 //! `axon status`: what the daemon says of itself, as tables.
 
+mod paths;
+
 use std::{collections::BTreeMap, fmt::Write as _, io::Write as _, process::ExitCode};
 
 use axon_transport::{
     config::DaemonPlace,
-    status::{LinkStatus, RelayStatus, SessionStatus, Status, TopicStatus, WaitingStatus},
+    status::{LinkStatus, RelayStatus, SessionStatus, Status, TopicStatus},
 };
 use serde_json::Value;
 
@@ -75,7 +77,7 @@ fn render(status: &Status) -> String {
     section(&mut out, "Settings", "none", settings(status));
     section(&mut out, "Links", "no other host is linked", links(&status.links));
     if !status.links.is_empty() {
-        section(&mut out, "Paths", "none", paths(&status.links));
+        section(&mut out, "Paths", "none", paths::paths(&status.links));
     }
     if status.links.iter().any(|link| !link.routes_refused.is_empty()) {
         section(&mut out, "Routes refused", "none", routes_refused(&status.links));
@@ -143,56 +145,6 @@ fn links(links: &[LinkStatus]) -> Table {
         ]);
     }
     table
-}
-
-/// What shows why a link is slow.
-fn paths(links: &[LinkStatus]) -> Table {
-    let mut table = Table::new(&[
-        "host",
-        ">rtt",
-        ">shortest",
-        ">window",
-        ">packet",
-        ">sent",
-        ">lost",
-        ">marked in",
-        ">marked out",
-        "waiting",
-        ">oldest",
-    ]);
-    for link in links {
-        let rtt = |micros: u64| text::duration(micros.saturating_mul(1_000));
-        table.row([
-            link.host.clone(),
-            rtt(link.rtt_us),
-            rtt(link.rtt_min_us),
-            text::bytes(link.congestion_window),
-            text::bytes(link.mtu),
-            grouped(link.packets_sent),
-            format!("{} ({})", grouped(link.packets_lost), text::bytes(link.bytes_lost)),
-            grouped(link.ecn_marks_in),
-            grouped(link.ecn_marks_out),
-            waiting(&link.waiting),
-            text::duration(link.waiting_ms.saturating_mul(1_000_000)),
-        ]);
-    }
-    table
-}
-
-/// The classes of which something waits, in the order in which they are served.
-fn waiting(waiting: &WaitingStatus) -> String {
-    let WaitingStatus { control, services, small_reliable, small_best_effort, bulk } = *waiting;
-    let classes = [
-        (control, "control"),
-        (services, "services"),
-        (small_reliable, "small"),
-        (small_best_effort, "small best effort"),
-        (bulk, "bulk"),
-    ];
-    let classes = classes.iter().filter(|(bytes, _)| *bytes > 0);
-    let classes: Vec<String> =
-        classes.map(|(bytes, class)| format!("{} {class}", text::bytes(*bytes))).collect();
-    if classes.is_empty() { dash() } else { classes.join(", ") }
 }
 
 fn routes_refused(links: &[LinkStatus]) -> Table {
@@ -405,6 +357,8 @@ mod tests {
         DiscoveryStatus, OutOfRangeStatus, ReaderStatus, RefusalStatus, TrafficStatus, WriterStatus,
     };
     use serde_json::json;
+
+    use axon_transport::status::WaitingStatus;
 
     use super::*;
 

@@ -1,11 +1,12 @@
 //! Models of a host's rings: publishers, subscriptions, relays and stand-ins, without shared memory.
 
+mod reader;
+
 use std::{
     cell::{Cell, RefCell},
     collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
     rc::Rc,
     sync::Arc,
-    time::Duration,
 };
 
 use axon_shm::{
@@ -19,11 +20,11 @@ use axon_transport::{
     internal::{
         OWNER, SessionKey,
         graph::{Pairing, pairing},
-        session::{TakeLimit, Written},
+        session::Written,
     },
 };
-use bytes::Bytes;
 
+use self::reader::SimReader;
 use crate::engine::rings::{RingError, RingReader, RingWriter, Rings};
 
 /// Samples that a publisher's ring holds.
@@ -88,9 +89,6 @@ pub(super) struct SimRings {
     key: Arc<SessionKey>,
     state: Rc<RefCell<State>>,
 }
-
-/// Samples that one take passes over since they do not count, as a session does.
-const PASSED_OVER: usize = 64;
 
 /// GIDs of endpoints of a peer without an engine begin with this. Nobody vouches for their samples.
 pub(super) const FOREIGN: [u8; 12] = [0xaa; 12];
@@ -314,148 +312,6 @@ impl Cursors {
     fn reads(&self, publisher: &Endpoint) -> bool {
         publisher.topic == self.spec.topic && publisher.type_name == self.spec.type_name
     }
-}
-
-/// A relay.
-struct SimReader {
-    rings: SimRings,
-    cursors: Rc<Cursors>,
-}
-
-impl Drop for SimReader {
-    fn drop(&mut self) {
-        self.cursors.closed.set(true);
-        // A relay that ends gives up what is not acknowledged.
-        if self.cursors.spec.qos.reliability == Reliability::Reliable {
-            for (publisher, samples) in self.unacknowledged() {
-                self.give_up(publisher, samples);
-            }
-        }
-    }
-}
-
-impl SimReader {
-    /// The next sample of a publisher after this reader's cursor.
-    fn peek(&self, publisher: &Gid) -> Option<(u64, Vec<u8>)> {
-        let state = self.rings.state.borrow();
-        let of = state.publishers.get(publisher)?;
-        let read = self.cursors.read.borrow().get(publisher).copied().unwrap_or(0);
-        let qos = &self.cursors.spec.qos;
-        let skip = match (qos.reliability, qos.history) {
-            (Reliability::Reliable, History::KeepAll) => 0,
-            _ => of.published.saturating_sub(u64::from(qos.depth)),
-        };
-        let next = of.history.iter().find(|(sequence, _)| *sequence > read.max(skip));
-        next.cloned()
-    }
-}
-
-impl SimReader {
-    /// Passes over the samples up to this number.
-    fn pass_to(&self, publisher: &Gid, number: u64) {
-        let mut read = self.cursors.read.borrow_mut();
-        let read = read.entry(*publisher).or_default();
-        *self.cursors.lost.borrow_mut().entry(*publisher).or_default() +=
-            number.saturating_sub(*read);
-        *read = number.max(*read);
-    }
-}
-
-impl RingReader for SimReader {
-    fn gid(&self) -> Gid {
-        self.cursors.gid
-    }
-
-    fn with_data(&self) -> Vec<Gid> {
-        self.matched().into_iter().filter(|publisher| self.has_data_of(publisher)).collect()
-    }
-
-    fn has_data_of(&self, publisher: &Gid) -> bool {
-        self.rings.state.borrow_mut().looks += 1;
-        self.peek(publisher).is_some()
-    }
-
-    fn reads(&self, publisher: &Gid) -> bool {
-        let state = self.rings.state.borrow();
-        state.publishers.get(publisher).is_some_and(|p| self.cursors.reads(&p.endpoint))
-    }
-
-    fn matched(&self) -> Vec<Gid> {
-        let state = self.rings.state.borrow();
-        let of = state.publishers_of(&self.cursors.spec.topic);
-        of.filter(|(_, p)| self.cursors.reads(&p.endpoint)).map(|(gid, _)| *gid).collect()
-    }
-
-    fn take_many(
-        &self,
-        publisher: &Gid,
-        most: TakeLimit,
-        each: &mut dyn FnMut(MessageInfo, Bytes),
-    ) -> usize {
-        let expired = self.rings.state.borrow().expired.get(publisher).copied();
-        let (mut samples, mut bytes, mut passed_over) = (0, 0, 0);
-        while samples < most.samples
-            && passed_over < PASSED_OVER
-            && let Some((sequence, payload)) = self.peek(publisher)
-            && (samples == 0 || bytes + payload.len() <= most.bytes)
-        {
-            self.pass_to(publisher, sequence - 1);
-            self.cursors.read.borrow_mut().insert(*publisher, sequence);
-            if Some(sequence) <= expired {
-                passed_over += 1;
-                continue;
-            }
-            (samples, bytes) = (samples + 1, bytes + payload.len());
-            each(MessageInfo::of(*publisher, sequence), payload.into());
-        }
-        samples
-    }
-
-    fn retry_of(&self, publisher: &Gid) -> Option<Duration> {
-        self.peek(publisher).map(|_| Duration::ZERO)
-    }
-
-    fn skip_of(&self, publisher: &Gid, depth: u64) {
-        let state = self.rings.state.borrow();
-        let published = state.publishers.get(publisher).map_or(0, |of| of.published);
-        self.pass_to(publisher, published.saturating_sub(depth));
-    }
-
-    fn lost_of(&self, publisher: &Gid) -> u64 {
-        // A look finds the losses, as with a ring in memory.
-        if let Some((next, _)) = self.peek(publisher) {
-            self.pass_to(publisher, next - 1);
-        }
-        self.cursors.lost.borrow().get(publisher).copied().unwrap_or(0)
-    }
-
-    fn acknowledge_of(&self, publisher: &Gid, sequence: u64) {
-        let mut acknowledged = self.cursors.acknowledged.borrow_mut();
-        let known = acknowledged.entry(*publisher).or_default();
-        *known = sequence.max(*known);
-    }
-
-    fn unacknowledged(&self) -> HashMap<Gid, u64> {
-        let state = self.rings.state.borrow();
-        let acknowledged = self.cursors.acknowledged.borrow();
-        let of = state.publishers_of(&self.cursors.spec.topic);
-        let of = of.filter(|(_, p)| self.cursors.reads(&p.endpoint));
-        let left = of.map(|(gid, publisher)| {
-            let done = acknowledged.get(gid).copied().unwrap_or(0);
-            (*gid, publisher.published.saturating_sub(done))
-        });
-        left.filter(|(_, left)| *left > 0).collect()
-    }
-
-    fn give_up(&self, publisher: Gid, samples: u64) {
-        *self.rings.state.borrow_mut().given_up.entry(publisher).or_default() += samples;
-    }
-
-    fn assertions(&self) -> Vec<(Gid, u64)> {
-        Vec::new()
-    }
-
-    fn set_stands_for(&self, _gids: Vec<Gid>) {}
 }
 
 /// A stand-in.

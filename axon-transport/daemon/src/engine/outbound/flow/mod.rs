@@ -1,17 +1,24 @@
 //! One flow: the samples of a publisher, or of a client's service calls, towards one peer. It moves them from their
 //! rings into its queue, and from there into QUIC streams as the scheduler gives it turns.
 
-use std::{collections::VecDeque, rc::Rc, sync::Arc, time::Duration};
+mod batch;
+mod best_effort;
+mod taking;
+#[cfg(test)]
+mod tests;
+
+use std::{rc::Rc, sync::Arc, time::Duration};
 
 use axon_envelope::{Delivery, Kind, Route};
 use axon_shm::{ids::Gid, qos::Qos};
-use bytes::Bytes;
 use quinn_proto::{Dir, StreamId, VarInt, WriteError};
 
-use super::{
-    best_effort::BestEffort, budget::Budget, queue::Queue, schedule::Class, source::Source,
+use self::{
+    batch::{Batch, Sealed},
+    best_effort::BestEffort,
     taking::Taking,
 };
+use super::{budget::Budget, queue::Queue, schedule::Class, served::FlowRoute, source::Source};
 use crate::{
     engine::{
         connection::Carrier, counters::Counters, frames::Frames, inbound::stream_header,
@@ -56,15 +63,6 @@ pub(super) struct Done {
     pub(super) given_up: u64,
 }
 
-/// A message that was sealed and is not entirely with QUIC.
-#[derive(Debug)]
-struct Sealed {
-    sequence: u64,
-    payload: usize,
-    /// Where its frame ends, in bytes since the batch was sealed.
-    end: u64,
-}
-
 /// One flow.
 pub(super) struct Flow {
     pub(super) route_number: u32,
@@ -86,11 +84,7 @@ pub(super) struct Flow {
     headers: Option<ShortHeaders>,
     priority: i32,
     frames: Frames,
-    /// Frames that QUIC has not taken.
-    pending: VecDeque<Bytes>,
-    sealed: VecDeque<Sealed>,
-    /// Bytes of the batch that QUIC has taken.
-    written: u64,
+    batch: Batch,
     best_effort: BestEffort,
     /// When it last handed something to QUIC.
     active_at: Duration,
@@ -103,15 +97,6 @@ pub(super) struct Flow {
     acknowledged_samples: u64,
     /// Bytes that QUIC took.
     taken_bytes: u64,
-}
-
-/// The parts of a route that its flows share.
-pub(super) struct FlowRoute {
-    pub(super) number: u32,
-    pub(super) topic: Arc<str>,
-    pub(super) route: Route,
-    pub(super) acknowledged: bool,
-    pub(super) short_headers: bool,
 }
 
 impl Flow {
@@ -138,9 +123,7 @@ impl Flow {
             headers: None,
             priority: 0,
             frames: Frames::default(),
-            pending: VecDeque::new(),
-            sealed: VecDeque::new(),
-            written: 0,
+            batch: Batch::default(),
             best_effort: BestEffort::default(),
             active_at: now,
             scheduled: None,
@@ -160,7 +143,7 @@ impl Flow {
     fn has_none(&self) -> bool {
         self.taking.is_idle()
             && self.queue.is_empty()
-            && self.pending.is_empty()
+            && self.batch.is_empty()
             && self.best_effort.is_idle()
     }
 
@@ -176,13 +159,13 @@ impl Flow {
 
     /// Whether its stream carries nothing.
     pub(super) fn has_idle_stream(&self) -> bool {
-        self.stream.is_some() && self.queue.is_empty() && self.pending.is_empty()
+        self.stream.is_some() && self.queue.is_empty() && self.batch.is_empty()
     }
 
     /// The class of what it sends next, or `None` if it has nothing to send.
     pub(super) fn class(&self) -> Option<Class> {
         let length = match self.queue.peek() {
-            _ if !self.pending.is_empty() => self.pending.iter().map(Bytes::len).sum(),
+            _ if !self.batch.is_empty() => self.batch.left(),
             Some(next) => next.payload.len(),
             None if self.best_effort.is_writing() => usize::MAX,
             None if self.taking.has_more() => 0,
@@ -201,7 +184,7 @@ impl Flow {
     /// overwritten. BEST_EFFORT samples stay there: only the newest will be sent. A KEEP_ALL publisher waits.
     pub(super) fn take_burst(&mut self, sources: &[Source], counters: &Counters, now: Duration) {
         // A flow that is behind takes the newest sample once it can be sent.
-        let waits = self.blocked || !self.pending.is_empty();
+        let waits = self.blocked || !self.batch.is_empty();
         if !waits || !self.queue.keeps_bursts() || self.queue.is_behind(now) {
             return;
         }
@@ -252,7 +235,7 @@ impl Flow {
     ) -> Pause {
         let mut left = TURN;
         loop {
-            if self.pending.is_empty() && !self.best_effort.is_writing() {
+            if self.batch.is_empty() && !self.best_effort.is_writing() {
                 let queued =
                     self.fill(sources, counters, now) + std::mem::take(&mut self.undemanded);
                 carrier.seal.demand(queued, now);
@@ -260,7 +243,7 @@ impl Flow {
             let before = carrier.taken;
             let pause = match self.queue.delivery() {
                 // What is left of a batch goes first, however the next sample is delivered.
-                Delivery::BestEffort if self.pending.is_empty() => {
+                Delivery::BestEffort if self.batch.is_empty() => {
                     self.finish_stream(carrier);
                     self.write_best_effort(carrier, counters, done, now)
                 }
@@ -294,7 +277,7 @@ impl Flow {
         done: &mut Done,
         now: Duration,
     ) -> Option<Pause> {
-        if self.pending.is_empty() {
+        if self.batch.is_empty() {
             match self.seal(carrier, now) {
                 Ok(0) => return Some(Pause::Empty),
                 Ok(_) => {}
@@ -310,8 +293,7 @@ impl Flow {
                 };
                 let short = self.headers.is_some();
                 let header = stream_header(true, short, self.route_number, self.of);
-                self.pending.push_front(Bytes::copy_from_slice(&header));
-                self.sealed.iter_mut().for_each(|sealed| sealed.end += header.len() as u64);
+                self.batch.put_before(&header);
                 carrier.streams.insert(id, carrier.flow);
                 self.priority = 0;
                 *self.stream.insert(id)
@@ -323,9 +305,9 @@ impl Flow {
             let _ = carrier.quic.send_stream(stream).set_priority(self.priority);
         }
         carrier.limit(class);
-        match carrier.quic.send_stream(stream).write_chunks(self.pending.make_contiguous()) {
+        match carrier.quic.send_stream(stream).write_chunks(self.batch.chunks()) {
             Ok(taken) => {
-                self.pending.drain(..taken.chunks);
+                self.batch.drop_chunks(taken.chunks);
                 self.handle_taken(taken.bytes as u64, carrier, counters, done, now);
                 None
             }
@@ -352,20 +334,16 @@ impl Flow {
         now: Duration,
     ) {
         carrier.taken += bytes;
-        self.written += bytes;
         self.taken_bytes += bytes;
         self.active_at = now;
         let mut whole = 0;
-        while let Some(sealed) = self.sealed.front()
-            && sealed.end <= self.written
-        {
+        self.batch.handle_taken(bytes, |sealed| {
             counters.sent(sealed.payload);
             if !self.acknowledged {
                 done.sequence = done.sequence.max(Some(sealed.sequence));
             }
-            self.sealed.pop_front();
             whole += 1;
-        }
+        });
         if !self.acknowledged {
             self.queue.written(whole);
         }
@@ -377,8 +355,7 @@ impl Flow {
     /// Seals a batch of waiting samples. Returns how many.
     fn seal(&mut self, carrier: &mut Carrier<'_>, now: Duration) -> Result<usize, NoKey> {
         let (mut bytes, mut samples, mut end) = (0, 0, 0);
-        self.written = 0;
-        self.sealed.clear();
+        self.batch.clear();
         if self.stream.is_none() {
             self.headers = carrier.seal.short_headers().filter(|_| self.short_headers);
         }
@@ -402,18 +379,17 @@ impl Flow {
             end = self.frames.len() as u64;
             bytes += payload;
             samples += 1;
-            self.sealed.push_back(Sealed { sequence, payload, end });
+            self.batch.add(Sealed { sequence, payload, end });
         }
         debug_assert!(samples == 0 || end > 0, "a sealed message has bytes");
-        self.pending.extend(self.frames.take());
+        self.batch.set_chunks(self.frames.take());
         Ok(samples)
     }
 
     /// The peer takes no more of this route: the samples that it was sent are given up.
     fn stop(&mut self, counters: &Counters, done: &mut Done) {
         self.stream = None;
-        self.pending.clear();
-        self.sealed.clear();
+        self.batch.clear();
         let (given_up, newest) = self.queue.give_up_sent();
         counters.lost(&self.topic, "no_route", given_up);
         done.sequence = done.sequence.max(newest);
@@ -422,8 +398,7 @@ impl Flow {
 
     /// Sends all samples again that are not acknowledged, or not entirely with QUIC.
     fn rewind(&mut self) {
-        self.pending.clear();
-        self.sealed.clear();
+        self.batch.clear();
         self.queue.rewind();
     }
 
@@ -443,9 +418,10 @@ impl Flow {
         self.rewind();
     }
 
-    /// The streams that carry it, which end with it.
-    pub(super) fn take_streams(&mut self) -> Option<StreamId> {
-        self.stream.take()
+    /// The streams that carry it, which end with it, and whether a sample is cut off there.
+    pub(super) fn take_streams(&mut self) -> impl Iterator<Item = (StreamId, bool)> + use<> {
+        let cut = self.best_effort.take_cut().map(|stream| (stream, true));
+        self.stream.take().map(|stream| (stream, false)).into_iter().chain(cut)
     }
 
     /// Samples that the peer acknowledged, and how often QUIC took a quarter of a MiB.
@@ -545,7 +521,7 @@ impl Flow {
         self.set_timer(self.best_effort.poll_timeout());
         let idle_at = self.active_at + STREAM_IDLE;
         if self.stream.is_some() {
-            if now >= idle_at && self.queue.is_empty() && self.pending.is_empty() {
+            if now >= idle_at && self.queue.is_empty() && self.batch.is_empty() {
                 self.finish_stream(carrier);
             } else {
                 self.set_timer(Some(idle_at.max(now + Duration::from_secs(1))));

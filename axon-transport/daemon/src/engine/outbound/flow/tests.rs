@@ -11,8 +11,13 @@ use axon_shm::{ids::Gid, qos::Qos};
 use axon_transport::{MessageInfo, internal::session::TakeLimit};
 use bytes::Bytes;
 
-use super::{budget::Budget, queue::Queue, source::Source, taking::Taking};
-use crate::engine::{counters::Counters, peer::routes::RelaySpec, rings::RingReader};
+use super::taking::Taking;
+use crate::engine::{
+    counters::Counters,
+    outbound::{budget::Budget, queue::Queue, source::Source},
+    peer::routes::RelaySpec,
+    rings::RingReader,
+};
 
 const PUBLISHER: Gid = Gid([1; 16]);
 

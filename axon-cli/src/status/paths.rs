@@ -1,0 +1,56 @@
+//! What a link's QUIC connection measures and what waits for it: why a link is slow.
+
+use axon_transport::status::{LinkStatus, WaitingStatus};
+
+use super::dash;
+use crate::text::{self, Table, grouped};
+
+/// A row for each link.
+pub(super) fn paths(links: &[LinkStatus]) -> Table {
+    let mut table = Table::new(&[
+        "host",
+        ">rtt",
+        ">shortest",
+        ">window",
+        ">packet",
+        ">sent",
+        ">lost",
+        ">marked in",
+        ">marked out",
+        "waiting",
+        ">oldest",
+    ]);
+    for link in links {
+        let rtt = |micros: u64| text::duration(micros.saturating_mul(1_000));
+        table.row([
+            link.host.clone(),
+            rtt(link.rtt_us),
+            rtt(link.rtt_min_us),
+            text::bytes(link.congestion_window),
+            text::bytes(link.mtu),
+            grouped(link.packets_sent),
+            format!("{} ({})", grouped(link.packets_lost), text::bytes(link.bytes_lost)),
+            grouped(link.ecn_marks_in),
+            grouped(link.ecn_marks_out),
+            waiting(&link.waiting),
+            text::duration(link.waiting_ms.saturating_mul(1_000_000)),
+        ]);
+    }
+    table
+}
+
+/// The classes of which something waits, in the order in which they are served.
+fn waiting(waiting: &WaitingStatus) -> String {
+    let WaitingStatus { control, services, small_reliable, small_best_effort, bulk } = *waiting;
+    let classes = [
+        (control, "control"),
+        (services, "services"),
+        (small_reliable, "small"),
+        (small_best_effort, "small best effort"),
+        (bulk, "bulk"),
+    ];
+    let classes = classes.iter().filter(|(bytes, _)| *bytes > 0);
+    let classes: Vec<String> =
+        classes.map(|(bytes, class)| format!("{} {class}", text::bytes(*bytes))).collect();
+    if classes.is_empty() { dash() } else { classes.join(", ") }
+}

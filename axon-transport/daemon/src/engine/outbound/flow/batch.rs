@@ -1,0 +1,104 @@
+//! The messages that a flow sealed together, while QUIC takes them.
+
+use std::collections::VecDeque;
+
+use bytes::Bytes;
+
+/// A message that was sealed and is not entirely with QUIC.
+#[derive(Debug)]
+pub(super) struct Sealed {
+    pub(super) sequence: u64,
+    /// Bytes of the sample.
+    pub(super) payload: usize,
+    /// Where its frame ends, in bytes of the batch.
+    pub(super) end: u64,
+}
+
+/// A batch of sealed messages.
+#[derive(Debug, Default)]
+pub(super) struct Batch {
+    /// What QUIC has not taken.
+    chunks: VecDeque<Bytes>,
+    sealed: VecDeque<Sealed>,
+    /// Bytes that QUIC has taken.
+    taken: u64,
+}
+
+impl Batch {
+    /// Whether QUIC has all of it.
+    pub(super) fn is_empty(&self) -> bool {
+        self.chunks.is_empty()
+    }
+
+    /// Bytes that QUIC has not taken.
+    pub(super) fn left(&self) -> usize {
+        self.chunks.iter().map(Bytes::len).sum()
+    }
+
+    /// Forgets it, for the next one.
+    pub(super) fn clear(&mut self) {
+        self.chunks.clear();
+        self.sealed.clear();
+        self.taken = 0;
+    }
+
+    /// A message belongs to it.
+    pub(super) fn add(&mut self, sealed: Sealed) {
+        self.sealed.push_back(sealed);
+    }
+
+    /// The bytes of all its messages.
+    pub(super) fn set_chunks(&mut self, chunks: impl IntoIterator<Item = Bytes>) {
+        self.chunks.extend(chunks);
+    }
+
+    /// Puts bytes before its first message, of which QUIC has taken nothing.
+    pub(super) fn put_before(&mut self, bytes: &[u8]) {
+        self.chunks.push_front(Bytes::copy_from_slice(bytes));
+        self.sealed.iter_mut().for_each(|sealed| sealed.end += bytes.len() as u64);
+    }
+
+    /// What QUIC has not taken, for it to take from.
+    pub(super) fn chunks(&mut self) -> &mut [Bytes] {
+        self.chunks.make_contiguous()
+    }
+
+    /// QUIC took so many of the chunks wholly.
+    pub(super) fn drop_chunks(&mut self, chunks: usize) {
+        self.chunks.drain(..chunks);
+    }
+
+    /// QUIC took so many bytes. `each` is told of the messages that it has wholly then.
+    pub(super) fn handle_taken(&mut self, bytes: u64, mut each: impl FnMut(&Sealed)) {
+        self.taken += bytes;
+        while let Some(sealed) = self.sealed.front()
+            && sealed.end <= self.taken
+        {
+            each(sealed);
+            self.sealed.pop_front();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_message_is_sent_once_its_last_byte_is_taken() {
+        let mut batch = Batch::default();
+        batch.add(Sealed { sequence: 1, payload: 5, end: 10 });
+        batch.add(Sealed { sequence: 2, payload: 5, end: 20 });
+        batch.set_chunks([Bytes::from_static(&[0; 20])]);
+        batch.put_before(&[0; 4]);
+        assert_eq!(batch.left(), 24);
+        let mut sent = |bytes| {
+            let mut sent = Vec::new();
+            batch.handle_taken(bytes, |sealed| sent.push(sealed.sequence));
+            sent
+        };
+        assert!(sent(13).is_empty(), "the header counts");
+        assert_eq!(sent(1), [1]);
+        assert_eq!(sent(10), [2]);
+    }
+}

@@ -1,0 +1,85 @@
+//! A route that the peer asked for, and what its sources are told.
+
+use std::{collections::HashMap, sync::Arc};
+
+use axon_envelope::{Kind, Route};
+use axon_shm::ids::Gid;
+
+use super::{flow::Done, schedule::FlowId, source::Source};
+
+/// A route that the peer asked for.
+pub(crate) struct RouteOut {
+    /// The topic's name.
+    pub(crate) topic: Arc<str>,
+    /// Topic and kind, for the envelope.
+    pub(crate) route: Route,
+    /// Whether the peer acknowledges the samples.
+    pub(crate) acknowledged: bool,
+    /// Whether the peer reads short headers.
+    pub(crate) short_headers: bool,
+    /// Where its samples are taken.
+    pub(crate) sources: Vec<Source>,
+    /// The newest sample of each publisher that the peer has already.
+    pub(crate) seen: HashMap<Gid, u64>,
+}
+
+/// The parts of a route that its flows share.
+pub(super) struct FlowRoute {
+    pub(super) number: u32,
+    pub(super) topic: Arc<str>,
+    pub(super) route: Route,
+    pub(super) acknowledged: bool,
+    pub(super) short_headers: bool,
+}
+
+/// A route and its flows.
+pub(super) struct Served {
+    pub(super) shared: FlowRoute,
+    /// Its peer reads nothing, as its owner knows.
+    pub(super) stalled: bool,
+    pub(super) sources: Vec<Source>,
+    pub(super) seen: HashMap<Gid, u64>,
+    pub(super) flows: HashMap<Gid, FlowId>,
+}
+
+impl Served {
+    /// Whether it is of a service.
+    pub(super) fn is_service(&self) -> bool {
+        self.shared.route.kind != Kind::Topic
+    }
+
+    /// Tells the sources up to which number they may forget the samples of a publisher.
+    pub(super) fn done(&self, of: Gid, Done { sequence, given_up }: Done) {
+        let Some(sequence) = sequence else { return };
+        let sources = self.sources.iter().filter(|source| source.reads(&of));
+        for (number, source) in sources.enumerate() {
+            if number == 0 && given_up > 0 {
+                source.give_up(of, given_up);
+            }
+            source.acknowledge_of(&of, sequence);
+        }
+    }
+
+    /// RELIABLE samples that are not acknowledged, by publisher.
+    pub(super) fn unacknowledged(&self) -> HashMap<Gid, u64> {
+        let mut most = HashMap::new();
+        for (of, samples) in self.sources.iter().flat_map(Source::unacknowledged) {
+            let known: &mut u64 = most.entry(of).or_default();
+            *known = samples.max(*known);
+        }
+        most
+    }
+
+    /// Tells the publishers which samples will not reach the peer. Returns how many.
+    pub(super) fn give_up(&self) -> u64 {
+        let mut all = 0;
+        for (of, samples) in self.unacknowledged() {
+            all += samples;
+            let source = self.sources.iter().find(|source| source.has_unacknowledged(&of));
+            if let Some(source) = source {
+                source.give_up(of, samples);
+            }
+        }
+        all
+    }
+}
