@@ -502,7 +502,10 @@ impl Reader {
 
     /// Has its session find it at the next look, if it is followed.
     pub fn mark_active(&self) {
-        if let Some(watch) = &self.reads.watch {
+        // In a forked child, a thread of the parent may have held the lock.
+        if let Some(watch) = &self.reads.watch
+            && !self.attachment.lane.is_forked()
+        {
             watch.mark();
         }
     }

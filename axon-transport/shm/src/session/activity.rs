@@ -7,7 +7,7 @@
 //! to their journals.
 
 use std::{
-    collections::{BTreeMap, HashMap},
+    collections::{BTreeMap, BTreeSet, HashMap},
     ops::Bound,
     sync::{
         Arc, Mutex, MutexGuard, PoisonError,
@@ -36,12 +36,23 @@ pub(crate) struct Activity {
 struct State {
     /// By the address of the other session; 0 is this session itself.
     journals: HashMap<usize, Followed>,
-    readers: BTreeMap<u64, Watched>,
+    readers: Readers,
     next: u64,
+    /// How many calls of [`take`](Activity::take) there were.
+    looks: u64,
+}
+
+/// The readers, by key.
+#[derive(Default)]
+struct Readers {
+    all: BTreeMap<u64, Watched>,
     /// Those that are to be looked at, each once.
     marked: Vec<u64>,
     /// The reader that was passed over last.
     turn: u64,
+    /// How often one was marked, again or not.
+    #[cfg(test)]
+    marks: u64,
 }
 
 /// A session whose journal is read.
@@ -49,8 +60,16 @@ struct Followed {
     /// `None` is this session itself.
     peer: Option<Arc<PeerSession>>,
     place: Place,
-    /// The readers of each ring, by its number.
-    rings: HashMap<u32, Vec<u64>>,
+    /// By number.
+    rings: HashMap<u32, Ring>,
+}
+
+/// The readers of the rings of one number. A session may give all of its rings the same one.
+#[derive(Default)]
+struct Ring {
+    keys: BTreeSet<u64>,
+    /// The last look in which the journal named it. It may name it in all of its entries.
+    named: u64,
 }
 
 struct Watched {
@@ -93,9 +112,9 @@ impl Activity {
             let words = peer.map_or(own, |peer| peer.journal());
             Followed { peer: peer.cloned(), place: Place::end(words), rings: HashMap::new() }
         });
-        followed.rings.entry(ring).or_default().push(key);
-        state.readers.insert(key, Watched { reader, writer, journal, ring, marked: false });
-        state.mark(key);
+        followed.rings.entry(ring).or_default().keys.insert(key);
+        state.readers.all.insert(key, Watched { reader, writer, journal, ring, marked: false });
+        state.readers.mark(key);
         drop(state);
         Some(WatchKey { of: Arc::clone(self), key })
     }
@@ -104,38 +123,39 @@ impl Activity {
     /// [`arm`](crate::wake::arm): what comes later rings.
     pub(crate) fn take(&self, own: Journal<'_, AtomicU64>, found: &mut Vec<(Gid, Gid)>) {
         let mut state = self.lock();
-        let State { journals, readers, marked, turn, .. } = &mut *state;
-        let mut mark = |key: &u64| mark(readers, marked, *key);
+        let State { journals, readers, looks, .. } = &mut *state;
+        *looks += 1;
         for Followed { peer, place, rings } in journals.values_mut() {
             let words = peer.as_ref().map_or(own, |peer| peer.journal());
-            let news = place
-                .read(words, |ring| rings.get(&ring).into_iter().flatten().for_each(&mut mark));
+            let news = place.read(words, |number| {
+                if let Some(ring) = rings.get_mut(&number)
+                    && std::mem::replace(&mut ring.named, *looks) != *looks
+                {
+                    ring.keys.iter().for_each(|key| readers.mark(*key));
+                }
+            });
             let changed = peer.as_ref().is_some_and(|peer| peer.take_changed());
             if changed || news == News::All {
-                rings.values().flatten().for_each(&mut mark);
+                rings.values().flat_map(|ring| &ring.keys).for_each(|key| readers.mark(*key));
             }
         }
-        for _ in 0..IN_TURN.min(readers.len()) {
-            let after = readers.range((Bound::Excluded(*turn), Bound::Unbounded)).next();
-            let Some(next) = after.or_else(|| readers.iter().next()).map(|(key, _)| *key) else {
-                break;
-            };
-            *turn = next;
-            self::mark(readers, marked, next);
+        for _ in 0..IN_TURN.min(readers.all.len()) {
+            readers.mark_next();
         }
-        for key in marked.drain(..) {
-            if let Some(watched) = readers.get_mut(&key) {
-                watched.marked = false;
-                found.push((watched.reader, watched.writer));
-            }
-        }
+        readers.take(found);
     }
 
     /// All readers are to be looked at.
     pub(crate) fn mark_all(&self) {
-        let State { readers, marked, .. } = &mut *self.lock();
-        let keys: Vec<u64> = readers.keys().copied().collect();
-        keys.into_iter().for_each(|key| mark(readers, marked, key));
+        let readers = &mut self.lock().readers;
+        let keys: Vec<u64> = readers.all.keys().copied().collect();
+        keys.into_iter().for_each(|key| readers.mark(key));
+    }
+
+    /// How often a reader was marked since the start, again or not.
+    #[cfg(test)]
+    pub(crate) fn marks(&self) -> u64 {
+        self.lock().readers.marks
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
@@ -143,35 +163,56 @@ impl Activity {
     }
 }
 
-impl State {
+impl Readers {
     fn mark(&mut self, key: u64) {
-        mark(&mut self.readers, &mut self.marked, key);
+        #[cfg(test)]
+        {
+            self.marks += 1;
+        }
+        if let Some(watched) = self.all.get_mut(&key)
+            && !std::mem::replace(&mut watched.marked, true)
+        {
+            self.marked.push(key);
+        }
     }
-}
 
-fn mark(readers: &mut BTreeMap<u64, Watched>, marked: &mut Vec<u64>, key: u64) {
-    if let Some(watched) = readers.get_mut(&key)
-        && !std::mem::replace(&mut watched.marked, true)
-    {
-        marked.push(key);
+    /// Marks the reader whose turn it is.
+    fn mark_next(&mut self) {
+        let after = self.all.range((Bound::Excluded(self.turn), Bound::Unbounded)).next();
+        if let Some((key, _)) = after.or_else(|| self.all.first_key_value()) {
+            self.turn = *key;
+            self.mark(self.turn);
+        }
+    }
+
+    /// Adds those that are to be looked at to `found`.
+    fn take(&mut self, found: &mut Vec<(Gid, Gid)>) {
+        for key in self.marked.drain(..) {
+            if let Some(watched) = self.all.get_mut(&key) {
+                watched.marked = false;
+                found.push((watched.reader, watched.writer));
+            }
+        }
     }
 }
 
 impl WatchKey {
     /// The reader is to be looked at, whatever its ring's journal says.
     pub(crate) fn mark(&self) {
-        self.of.lock().mark(self.key);
+        self.of.lock().readers.mark(self.key);
     }
 }
 
 impl Drop for WatchKey {
     fn drop(&mut self) {
         let mut state = self.of.lock();
-        let Some(Watched { journal, ring, .. }) = state.readers.remove(&self.key) else { return };
+        let Some(Watched { journal, ring, .. }) = state.readers.all.remove(&self.key) else {
+            return;
+        };
         let Some(followed) = state.journals.get_mut(&journal) else { return };
-        if let Some(keys) = followed.rings.get_mut(&ring) {
-            keys.retain(|key| *key != self.key);
-            if keys.is_empty() {
+        if let Some(of) = followed.rings.get_mut(&ring) {
+            of.keys.remove(&self.key);
+            if of.keys.is_empty() {
                 followed.rings.remove(&ring);
             }
         }

@@ -27,11 +27,23 @@ fn topics(
     numbers: std::ops::Range<u32>,
     relays: bool,
 ) -> Vec<Topic> {
+    topics_with(of, from, numbers, relays, |_| {})
+}
+
+/// The same of publishers with which something is done before they are read.
+fn topics_with(
+    of: &Arc<SessionSegment>,
+    from: &Arc<SessionSegment>,
+    numbers: std::ops::Range<u32>,
+    relays: bool,
+    prepare: impl Fn(&Writer),
+) -> Vec<Topic> {
     let (there, back) = (peer(from, of), peer(of, from));
     let topic = |number| {
         let (gid, qos) = (Gid::new(of.id(), number), keep_last(1));
         let options = RingOptions { gid, qos, budget: 0, max_message: MAX, expected: 0 };
         let writer = Writer::create(of.clone(), options).unwrap();
+        prepare(&writer);
         let (lane, reader) = (from.allocate_lane().unwrap(), Gid::new(from.id(), number));
         let at = lane.location();
         let stands_for = relays.then(|| vec![Gid([7; 16])]);
@@ -119,6 +131,82 @@ fn a_journal_that_its_session_scribbles_over_costs_a_look_at_its_rings_alone() {
         rest[0].publish(noted & 7 | 8);
         assert!(active(&from).contains(&rest[0].pair()));
     }
+}
+
+#[test]
+fn a_session_that_numbers_all_of_its_rings_alike_has_each_of_them_looked_at_once() {
+    let (of, from) = (session(), session());
+    from.follow();
+    let number = |writer: &Writer| writer.ring.words()[layout::ring::NUMBER].store(7, Relaxed);
+    let topics = topics_with(&of, &from, 1..101, true, number);
+    active(&from);
+    for _ in 0..3 {
+        let before = from.activity().marks();
+        (0..layout::JOURNAL).for_each(|_| of.journal().note(7));
+        let found = active(&from);
+        assert!(topics.iter().all(|topic| found.contains(&topic.pair())));
+        let marks = from.activity().marks() - before;
+        assert!(marks <= (topics.len() + IN_TURN) as u64, "{marks} marks");
+    }
+}
+
+#[test]
+fn a_sample_that_was_not_noted_is_found_when_its_publisher_is_seen_to_end() {
+    let (of, from) = (session(), session());
+    from.follow();
+    let topics = topics(&of, &from, 1..101, true);
+    active(&from);
+    // Its process died after the sample was there, and before the entry was.
+    topics[50].publish(1);
+    of.journal().noted.store(0, Relaxed);
+    assert!(!active(&from).contains(&topics[50].pair()), "nothing says so");
+    topics[50].reader.mark_active();
+    assert!(active(&from).contains(&topics[50].pair()));
+}
+
+#[test]
+fn a_sample_whose_entry_was_counted_and_not_stored_is_found() {
+    let (of, from) = (session(), session());
+    from.follow();
+    let topics = topics(&of, &from, 1..101, true);
+    active(&from);
+    topics[50].publish(1);
+    // Its process died in between.
+    of.journal().entries[0].store(0, Relaxed);
+    assert!(active(&from).contains(&topics[50].pair()));
+}
+
+#[test]
+fn a_relay_that_joins_late_is_found_with_what_came_before_and_comes_after() {
+    let (of, from) = (session(), session());
+    from.follow();
+    let late = transient(keep_last(5));
+    let writer = writer(&of, late, 0);
+    writer.publish(meta(1), b"before").unwrap();
+    assert_eq!(of.journal().noted.load(Relaxed), 0, "nobody follows");
+    let (there, lane) = (peer(&from, &of), from.allocate_lane().unwrap());
+    let (gid, at) = (Gid::new(from.id(), 1), lane.location());
+    let (back, stands_for) = (peer(&of, &from), Some(vec![Gid([7; 16])]));
+    let info = ReaderInfo { gid, lane: at, qos: late, peer: back, stands_for };
+    let grant = writer.attach(info).unwrap();
+    // Between the grant and the map.
+    writer.publish(meta(2), b"between").unwrap();
+    let options = ReaderOptions {
+        reader: gid,
+        writer: writer.gid(),
+        peer: there,
+        ring: writer.location(),
+        lane,
+        grant,
+        qos: late,
+        max_message: MAX,
+    };
+    let mut reader = Reader::map(options).unwrap();
+    reader.follow(gid);
+    assert_eq!(active(&from), [(gid, writer.gid())]);
+    assert_eq!(std::iter::from_fn(|| take(&mut reader)).count(), 2);
+    writer.publish(meta(3), b"after").unwrap();
+    assert_eq!(of.journal().noted.load(Relaxed), 2, "what came since it was attached");
 }
 
 #[test]
