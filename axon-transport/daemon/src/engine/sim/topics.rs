@@ -89,3 +89,19 @@ fn more_topics_than_streams_get_their_samples_soon() {
         assert_eq!(missing, 0, "in round {round}: {}", topics.world.describe());
     }
 }
+
+#[test]
+fn a_topic_whose_ring_is_to_be_looked_at_again_keeps_its_stream() {
+    let streams = STREAMS_OPEN as usize;
+    let mut topics = Topics::matched(2 * streams, Qos::keep_all());
+    // Each stream is open, and carries nothing.
+    (0..streams).for_each(|topic| topics.publish(topic));
+    topics.world.run_for(Duration::from_secs(2));
+    // More than one look passes over, and one behind them, while others ask for streams.
+    (0..160).for_each(|_| topics.publish(0));
+    topics.world.hosts[0].rings.expire(topics.pairs[0].0);
+    topics.publish(0);
+    (streams..2 * streams).for_each(|topic| topics.publish(topic));
+    topics.world.run_for(Duration::from_secs(5));
+    assert_eq!(topics.received(0), [1, 162], "{}", topics.world.describe());
+}

@@ -157,9 +157,12 @@ impl Flow {
         self.has_none() && !self.taking.has_more()
     }
 
-    /// Whether its stream carries nothing.
+    /// Whether its stream carries nothing, and nothing in its rings is to be looked at: its timer is free.
     pub(super) fn has_idle_stream(&self) -> bool {
-        self.stream.is_some() && self.queue.is_empty() && self.batch.is_empty()
+        self.stream.is_some()
+            && self.queue.is_empty()
+            && self.batch.is_empty()
+            && !self.taking.has_more()
     }
 
     /// The class of what it sends next, or `None` if it has nothing to send.
