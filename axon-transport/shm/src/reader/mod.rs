@@ -494,6 +494,8 @@ impl Reader {
     /// be something to take, and now, where the session [follows](crate::session::segment::SessionSegment::follow).
     pub fn follow(&mut self, reader: Gid) {
         let Some(words) = self.ring_words() else { return };
+        // Relaxed: written before anybody was told where the ring is. Another number hides no ring for ever: each look
+        // passes over some in turn.
         let ring = words[layout::ring::NUMBER].load(Ordering::Relaxed) as u32;
         let session = self.attachment.lane.session();
         let (pair, peer) = ((reader, self.reads.writer), self.reads.peer.remote());

@@ -81,6 +81,7 @@ impl Place {
         }
         for place in (0..count).map(|step| from.wrapping_add(step)) {
             let at = place as usize & (journal.entries.len() - 1);
+            // Relaxed: the count orders the sample, and the entry is one word, which says which one it is.
             let found = journal.entries[at].load(Ordering::Relaxed);
             let ring = found as u32;
             if found != entry(place, ring) {
