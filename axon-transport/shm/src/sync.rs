@@ -18,6 +18,8 @@ pub(crate) trait Word {
     fn store(&self, value: u64, order: Ordering);
     /// Stores the larger of the two and returns what was there. For words private to a process.
     fn fetch_max(&self, value: u64, order: Ordering) -> u64;
+    /// Adds to what is there and returns it. For words that one process alone writes.
+    fn fetch_add(&self, value: u64, order: Ordering) -> u64;
     fn fence(order: Ordering);
 }
 
@@ -43,6 +45,7 @@ pub(crate) trait LockWord {
 /// | `OpenStore` | `GenerationLoad` | a publisher that sees a lane open sees its cursor |
 /// | `CloseStore`, `AskStore` | `GenerationLoad` | a publisher that sees a reader gone writes after it read |
 /// | `CursorStore` | `CursorLoad` | a sample is copied out before KEEP_ALL writes over it |
+/// | `NotedAdd` | `NotedLoad` | a follower that sees an entry counted sees the sample that it is of |
 /// | `ArmFence` | `SettleFence` | the sleeper sees the news, or the waker sees the ticket |
 /// | `LetGoSwap` | `TakeSwap` | a thread that takes a lock sees what its last holder did |
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -71,6 +74,8 @@ pub(crate) enum Site {
     GenerationLoad,
     CursorStore,
     CursorLoad,
+    NotedAdd,
+    NotedLoad,
     ArmFence,
     SettleFence,
     LetGoSwap,
@@ -102,6 +107,7 @@ impl Site {
             | Self::OpenStore
             | Self::CloseStore
             | Self::CursorStore
+            | Self::NotedAdd
             | Self::LetGoSwap => Ordering::Release,
             Self::StampLoad
             | Self::HeadLoad
@@ -113,6 +119,7 @@ impl Site {
             | Self::ScanLoad
             | Self::GenerationLoad
             | Self::CursorLoad
+            | Self::NotedLoad
             | Self::TakeSwap => Ordering::Acquire,
             // Each side stores one word and loads another.
             Self::ReclaimFence | Self::PinFence | Self::ArmFence | Self::SettleFence => {
@@ -134,7 +141,7 @@ pub(crate) fn fence_at<W: Word>(site: Site) {
 
 #[cfg(test)]
 impl Site {
-    pub(crate) const ALL: [Self; 28] = [
+    pub(crate) const ALL: [Self; 30] = [
         Self::StampStore,
         Self::StampLoad,
         Self::HeadStore,
@@ -159,6 +166,8 @@ impl Site {
         Self::GenerationLoad,
         Self::CursorStore,
         Self::CursorLoad,
+        Self::NotedAdd,
+        Self::NotedLoad,
         Self::ArmFence,
         Self::SettleFence,
         Self::LetGoSwap,
@@ -203,6 +212,11 @@ impl Word for AtomicU64 {
     }
 
     #[inline]
+    fn fetch_add(&self, value: u64, order: Ordering) -> u64 {
+        self.fetch_add(value, order)
+    }
+
+    #[inline]
     fn fence(order: Ordering) {
         fence(order);
     }
@@ -220,6 +234,10 @@ impl Word for loom::sync::atomic::AtomicU64 {
 
     fn fetch_max(&self, value: u64, order: Ordering) -> u64 {
         self.fetch_max(value, order)
+    }
+
+    fn fetch_add(&self, value: u64, order: Ordering) -> u64 {
+        self.fetch_add(value, order)
     }
 
     fn fence(order: Ordering) {

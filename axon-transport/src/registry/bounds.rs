@@ -277,11 +277,10 @@ fn a_pair_that_cannot_share_memory_is_shown_with_the_reason() {
     assert!(registry.take_refused().is_empty());
 }
 
-#[test]
-fn memory_that_is_given_up_does_not_wait_for_who_is_stopped() {
-    let mut registry = registry(&[SessionRole::Application; 2]);
-    announce(&mut registry, 1, 1, EndpointKind::Publisher);
-    announce(&mut registry, 2, 1, EndpointKind::Subscription);
+/// Session 2 reads from this publisher of session 1.
+fn attached(registry: &mut Registry<Label>) -> Gid {
+    announce(registry, 1, 1, EndpointKind::Publisher);
+    announce(registry, 2, 1, EndpointKind::Subscription);
     let (writer, reader) = (Gid::new(id(1), 1), Gid::new(id(2), 1));
     let (lane, qos) = (Location { segment: 0, offset: 4096 }, Qos::default());
     let (session, stands_for, segments) = (id(2), None, vec![]);
@@ -303,7 +302,14 @@ fn memory_that_is_given_up_does_not_wait_for_who_is_stopped() {
         relayed,
     };
     registry.handle_message(&id(1), Message::Grant(granted), vec![]).unwrap();
-    drain(&mut registry, 2);
+    drain(registry, 2);
+    writer
+}
+
+#[test]
+fn memory_that_is_given_up_does_not_wait_for_who_is_stopped() {
+    let mut registry = registry(&[SessionRole::Application; 2]);
+    let writer = attached(&mut registry);
     let mut turn = |number| {
         let (session, publisher) = (id(1), Some(writer));
         let segment = Segment { number, publisher };
@@ -323,6 +329,23 @@ fn memory_that_is_given_up_does_not_wait_for_who_is_stopped() {
         "{} packets wait",
         waiting.len()
     );
+}
+
+#[test]
+fn a_session_that_asked_again_for_memory_hears_that_it_is_given_up() {
+    let mut registry = registry(&[SessionRole::Application; 2]);
+    let publisher = Some(attached(&mut registry));
+    let (session, number) = (id(1), 1);
+    let segment = Segment { number, publisher };
+    let opened = Message::Segment(SegmentOpened { session, segment });
+    registry.handle_message(&session, opened, vec!["map"]).unwrap();
+    assert_eq!(drain(&mut registry, 2).len(), 1);
+    // It has it, and it is on its way once more.
+    let name = SegmentName { session, number };
+    registry.handle_message(&id(2), Message::Need(name), vec![]).unwrap();
+    registry.handle_message(&session, Message::SegmentGone(name), vec![]).unwrap();
+    let waiting = drain(&mut registry, 2);
+    assert!(matches!(&waiting[..], [Message::SegmentGone(gone)] if *gone == name), "{waiting:?}");
 }
 
 #[test]

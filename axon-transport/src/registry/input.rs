@@ -18,6 +18,9 @@ use crate::{
     },
 };
 
+/// How many times as many endpoints as another session the gateway's may have.
+const GATEWAYS: usize = 4;
+
 impl<F: Clone> Registry<F> {
     /// A session whose HELLO was taken. It will be told the whole graph, or as much of it as its
     /// `scope` lets it see; without one ranges do not apply to it.
@@ -158,7 +161,7 @@ impl<F: Clone> Registry<F> {
         }
         let refusal = if !endpoint.is_sane() {
             Some("a name, type hash or depth out of bounds")
-        } else if entry.endpoints.len() >= LIMITS.endpoints {
+        } else if entry.endpoints.len() >= most_endpoints(entry.role) {
             Some("too many endpoints in one session")
         } else {
             self.too_many_pairs(entry, &endpoint)
@@ -439,6 +442,11 @@ impl<F: Clone> Registry<F> {
             }
         }
     }
+}
+
+/// Endpoints of one session. The gateway's are those that it has for its peers, for which it has bounds of its own.
+fn most_endpoints(role: SessionRole) -> usize {
+    if role == SessionRole::Gateway { GATEWAYS * LIMITS.endpoints } else { LIMITS.endpoints }
 }
 
 impl<F> SessionEntry<F> {

@@ -145,6 +145,8 @@ struct SentSegments {
     pairs: HashSet<Pair>,
     /// The numbers of the segments that it was handed.
     segments: BTreeSet<u32>,
+    /// Those of them for which it asked: it may have had them before.
+    asked: BTreeSet<u32>,
 }
 
 /// An endpoint of a session here.

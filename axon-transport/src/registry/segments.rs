@@ -69,22 +69,29 @@ impl<F: Clone> Registry<F> {
         let gone = Message::SegmentGone(SegmentName { session: *id, number });
         let mut readers = Vec::new();
         for (reader, entry) in &mut self.sessions {
-            if entry.known.get_mut(id).is_some_and(|known| known.segments.remove(&number)) {
-                readers.push(*reader);
+            if let Some(known) = entry.known.get_mut(id)
+                && known.segments.remove(&number)
+            {
+                readers.push((*reader, known.asked.remove(&number)));
             }
         }
-        // A session that has not taken it, as that of a stopped process, need not hear of it, nor keep
-        // its memory.
-        readers.retain(|reader| !self.take_back(reader, id, number));
+        // A session that has not taken it, as that of a stopped process, need not hear of it, nor keep its memory. One
+        // that asked for it may have it from before, and then keeps it until it hears.
+        readers.retain(|(reader, asked)| !self.take_back(reader, id, number) || *asked);
+        let readers: Vec<_> = readers.into_iter().map(|(reader, _)| reader).collect();
         self.push_shared(&readers, &gone);
     }
 
     /// A session misses a segment of another, which it reads from.
     pub(super) fn need_segment(&mut self, id: &SessionId, of: &SessionId, number: u32) {
         let known = self.sessions.get_mut(id).and_then(|entry| entry.known.get_mut(of));
-        if let Some(known) = known {
-            known.segments.remove(&number);
-            self.hand(id, of, number);
+        let Some(known) = known else { return };
+        known.segments.remove(&number);
+        self.hand(id, of, number);
+        if let Some(known) = self.sessions.get_mut(id).and_then(|entry| entry.known.get_mut(of))
+            && known.segments.contains(&number)
+        {
+            known.asked.insert(number);
         }
     }
 

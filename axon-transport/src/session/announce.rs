@@ -1,6 +1,9 @@
 //! Adds endpoints to a session and announces them to the daemon. Removes them when they are dropped.
 
-use std::{sync::Arc, time::Duration};
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use axon_shm::{
     ShmError,
@@ -194,7 +197,8 @@ impl Session {
     }
 
     /// Waits until a new endpoint is matched with all that the graph shows and that go with it: a
-    /// caller that counts them reaches them. Not for long, and not where nobody could do it.
+    /// caller that counts them reaches them. Not for long, and not where nobody could do it. Those of other hosts are
+    /// not awaited while many endpoints are created ([`PairWaits`](super::pair_waits::PairWaits)).
     pub(super) fn await_pairs(&self, own: &Endpoint, matched: impl Fn(&Gid) -> bool) {
         let shared = self.shared();
         if shared.control.get() == Some(&std::thread::current().id()) {
@@ -210,11 +214,23 @@ impl Session {
             }
             state.graph.clone()
         };
-        let foreign = graph.endpoints.values().map(|other| &other.endpoint);
-        let foreign = foreign.filter(|other| other.gid.0[..12] != own.gid.0[..12] && goes(other));
-        let others: Vec<Gid> = foreign.map(|other| other.gid).collect();
+        let begun = Instant::now();
+        let far = shared.pair_waits().are_due(begun);
+        let foreign = graph.endpoints.values().filter(|entry| {
+            let other = &entry.endpoint;
+            (far || entry.daemon.is_none()) && !other.gid.is_of_session_of(&own.gid) && goes(other)
+        });
+        let (mut others, mut waits_far) = (Vec::new(), false);
+        for entry in foreign {
+            others.push(entry.endpoint.gid);
+            waits_far |= entry.daemon.is_some();
+        }
         drop(graph);
         let there = |other: &Gid| shared.state().graph.endpoints.contains_key(other);
         shared.wait_changed(PAIRS, || others.iter().all(|other| matched(other) || !there(other)));
+        if waits_far {
+            let now = Instant::now();
+            shared.pair_waits().waited(now - begun, now);
+        }
     }
 }

@@ -21,6 +21,7 @@ mod node;
 mod open;
 mod options;
 mod own_pairs;
+mod pair_waits;
 mod peers;
 mod publisher;
 pub mod relayed;

@@ -21,6 +21,7 @@ use super::{
     SessionOptions,
     events::{Changes, Source},
     guard::GuardCondition,
+    pair_waits::PairWaits,
     publisher::PublisherInner,
     rings::ClientLimit,
     subscription::SubscriptionInner,
@@ -68,6 +69,7 @@ pub(crate) struct Shared {
     pub(super) listener: Mutex<Option<Listener>>,
     /// One status request at a time.
     pub(super) asking: Mutex<()>,
+    pair_waits: Mutex<PairWaits>,
     /// Held while pairs of the session's own endpoints come or go.
     pub(super) own_pairs: Mutex<()>,
     /// For the clients of its servers.
@@ -336,6 +338,7 @@ impl Shared {
             listening: Listening::default(),
             listener: Mutex::new(None),
             asking: Mutex::new(()),
+            pair_waits: Mutex::default(),
             own_pairs: Mutex::default(),
             room,
             state: Mutex::default(),
@@ -371,6 +374,11 @@ impl Shared {
 
     pub(super) fn state(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// How new endpoints wait for those of other hosts.
+    pub(super) fn pair_waits(&self) -> MutexGuard<'_, PairWaits> {
+        self.pair_waits.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Has the control thread listen for samples on behalf of one subscription more.

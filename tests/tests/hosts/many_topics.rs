@@ -1,4 +1,9 @@
-//! More topics between two hosts than may cross.
+//! Very many topics between two hosts, and more than may cross.
+
+use std::{
+    fs, thread,
+    time::{Duration, Instant},
+};
 
 use axon_daemon::internal::link::{Message, Subscribe, Subscriber, Unsubscribe};
 use axon_tls::identity::{Auth, SigningKey};
@@ -16,19 +21,18 @@ use super::{
     stranger::{Claim, Stranger},
 };
 
-/// What may cross.
-const ROUTES: u32 = 1024;
-const MORE: u32 = 30;
+/// More than may cross where the graph of a peer is bounded to 1 MiB.
+const CROWD: u32 = 2_000;
 const TYPE: &str = "test/Bytes";
 
 fn spec(number: u32) -> EndpointSpec {
-    EndpointSpec::new(format!("/crowd_{number:04}"), TYPE, Qos::default())
+    EndpointSpec::new(format!("/crowd_{number:05}"), TYPE, Qos::default())
 }
 
 fn subscribe(route: u32) -> Message {
     Message::Subscribe(Subscribe {
         route,
-        topic: format!("/crowd_{route:04}"),
+        topic: format!("/crowd_{route:05}"),
         type_name: TYPE.into(),
         kind: 0,
         subscribers: vec![Subscriber { gid: Gid([7; 16]), qos: Qos::default() }],
@@ -44,67 +48,192 @@ fn refused(host: &Host) -> usize {
     links.iter().map(|link| link.routes_refused.len() + link.more_routes_refused).sum()
 }
 
+/// Two hosts that have little room for each other.
+fn small_hosts() -> [Host; 2] {
+    let plan = Plan::new([classic(&[]), classic(&[])]);
+    Plan { graph_mb: Some(1), ..plan }.start()
+}
+
 #[test]
 fn a_peer_that_asks_for_too_many_routes_is_refused_those_by_name_and_keeps_its_link() {
-    let [host, _other] = Plan::new([classic(&[]), classic(&[])]).start();
+    let [host, _other] = small_hosts();
     let (stranger, auth) = (Stranger::new(), Auth::None(SigningKey::generate().unwrap()));
     let claim = Claim { host: "greedy", daemon: DaemonId([0xff; 16]), auth: 0 };
     let mut met = stranger.dial(&host, &auth, &claim).expect("a link");
-    for route in 0..ROUTES + MORE {
+    for route in 0..CROWD {
         stranger.say(&mut met, &subscribe(route));
     }
-    for route in ROUTES..ROUTES + MORE {
+    let is_refused = |m: &Message| matches!(m, Message::RouteRefused(_));
+    let Ok(Message::RouteRefused(first)) = stranger.hear(&mut met, is_refused) else {
+        panic!("nothing is refused")
+    };
+    assert!(first.route > 1024 && first.reason.contains("graph_mb"), "{first:?}");
+    for route in first.route + 1..CROWD {
         let refused = |m: &Message| matches!(m, Message::RouteRefused(r) if r.route == route);
         stranger.hear(&mut met, refused).expect("it is refused");
     }
-    until("it is shown", || refused(&host) == MORE as usize);
+    let more = (CROWD - first.route) as usize;
+    until("it is shown", || refused(&host) == more);
     let shown = host.status().links.into_iter().find(|link| link.host == "greedy").unwrap();
-    assert!(shown.routes_refused.keys().any(|topic| topic.contains("/crowd_1024")), "{shown:?}");
+    let name = format!("/crowd_{:05}", first.route);
+    assert!(shown.routes_refused.keys().any(|topic| topic.contains(&name)), "{shown:?}");
     // Where there is room it gets it.
     stranger.say(&mut met, &Message::Unsubscribe(Unsubscribe { route: 0 }));
-    stranger.say(&mut met, &subscribe(ROUTES));
-    let ready = |m: &Message| matches!(m, Message::RouteReady(ready) if ready.route == ROUTES);
+    stranger.say(&mut met, &subscribe(first.route));
+    let ready = |m: &Message| matches!(m, Message::RouteReady(ready) if ready.route == first.route);
     stranger.hear(&mut met, ready).expect("it is served");
     assert_eq!(met.connection.close_reason(), None);
-    until("it is shown no more", || refused(&host) == MORE as usize - 1);
+    until("it is shown no more", || refused(&host) == more - 1);
 }
 
+/// Threads that create endpoints. Each endpoint waits a while for those on the other host that it is matched with.
+const CREATORS: u32 = 64;
+
 /// One end of each of so many topics.
-fn ends<T>(session: &Session, create: impl Fn(&Session, EndpointSpec) -> T) -> Vec<T> {
-    (0..ROUTES + MORE).map(|number| create(session, spec(number))).collect()
+fn ends<T: Send>(
+    session: &Session,
+    count: u32,
+    create: impl Fn(&Session, EndpointSpec) -> T + Sync,
+) -> Vec<T> {
+    let part = count.div_ceil(CREATORS);
+    let create = &create;
+    thread::scope(|scope| {
+        let creator = |first: u32| {
+            let numbers = first..count.min(first + part);
+            scope.spawn(move || numbers.map(|n| create(session, spec(n))).collect::<Vec<_>>())
+        };
+        let creators: Vec<_> = (0..count).step_by(part as usize).map(creator).collect();
+        creators.into_iter().flat_map(|creator| creator.join().unwrap()).collect()
+    })
+}
+
+/// Publishers on one host, and subscriptions of the same topics on the other.
+struct Crowd {
+    publishers: Vec<Publisher>,
+    subscriptions: Vec<Subscription>,
+}
+
+impl Crowd {
+    fn new(hosts: &[Host; 2], count: u32) -> Self {
+        let (here, there) = (hosts[0].session("publishers"), hosts[1].session("subscriptions"));
+        let subscriptions = ends(&there, count, |s, spec| s.create_subscription(spec).unwrap());
+        let publishers = ends(&here, count, |s, spec| s.create_publisher(spec).unwrap());
+        Self { publishers, subscriptions }
+    }
+
+    fn crossing(&self) -> usize {
+        self.publishers.iter().filter(|publisher| !publisher.matched().is_empty()).count()
+    }
+
+    /// Publishes one sample on each topic that crosses, and waits for it.
+    fn exchange(&self) {
+        let topics = self.subscriptions.iter().zip(&self.publishers);
+        let crossing: Vec<_> = topics.filter(|(_, p)| !p.matched().is_empty()).collect();
+        for (_, publisher) in &crossing {
+            publisher.publish(b"one").unwrap();
+        }
+        let mut bytes = Vec::new();
+        for (subscription, publisher) in crossing {
+            let topic = &publisher.endpoint().topic;
+            assert!(subscription.recv(&mut bytes, Some(PATIENCE)).is_ok(), "{topic}");
+        }
+    }
 }
 
 #[test]
 fn topics_beyond_what_may_cross_are_named_on_the_subscribing_host_and_harm_nothing_else() {
-    let hosts = Plan::new([classic(&[]), classic(&[])]).start();
-    let (here, there) = (hosts[0].session("publishers"), hosts[1].session("subscriptions"));
-    let subscriptions: Vec<Subscription> =
-        ends(&there, |session, spec| session.create_subscription(spec).unwrap());
-    let publishers: Vec<Publisher> =
-        ends(&here, |session, spec| session.create_publisher(spec).unwrap());
-    let crossing = || publishers.iter().filter(|p| !p.matched().is_empty()).count();
-    until("as many cross as may", || crossing() == ROUTES as usize);
-    until("the others are named there", || refused(&hosts[1]) == MORE as usize);
-    for publisher in &publishers {
-        publisher.publish(b"one").unwrap();
-    }
-    let mut bytes = Vec::new();
-    for (subscription, publisher) in subscriptions.iter().zip(&publishers) {
-        if !publisher.matched().is_empty() {
-            assert!(subscription.recv(&mut bytes, Some(PATIENCE)).is_ok());
-        }
-    }
-    assert_eq!(crossing(), ROUTES as usize);
+    let hosts = small_hosts();
+    let mut crowd = Crowd::new(&hosts, CROWD);
+    // What does not cross is refused, by its name on one of the hosts: as a route, or as an endpoint of a graph.
+    until("as many cross as may", || {
+        let links = hosts.iter().map(Host::link);
+        let left_out = links.map(|link| link.endpoints_left_out).sum::<u64>() as usize;
+        let crossing = crowd.crossing();
+        crossing < CROWD as usize && crossing + refused(&hosts[1]) + left_out >= CROWD as usize
+    });
+    let crossing = crowd.crossing();
+    assert!(crossing > 1024, "{crossing} cross");
+    crowd.exchange();
+    assert_eq!(crowd.crossing(), crossing);
     // One that ends makes room for another.
-    let first = publishers.iter().position(|publisher| !publisher.matched().is_empty()).unwrap();
-    let mut publishers = publishers;
-    drop(publishers.remove(first));
-    let crossing = || publishers.iter().filter(|p| !p.matched().is_empty()).count();
-    until("another crosses", || crossing() == ROUTES as usize);
+    let of = |publisher: &Publisher| !publisher.matched().is_empty();
+    let first = crowd.publishers.iter().position(of).unwrap();
+    drop(crowd.publishers.remove(first));
+    drop(crowd.subscriptions.remove(first));
+    until("another crosses", || crowd.crossing() == crossing);
     // That both dialled, and one of the two connections was closed, ends no link.
     for host in &hosts {
         host.link();
         assert_eq!(host.log_lines(&["link down"]), 0, "the link stood");
+    }
+}
+
+/// Topics that two hosts are to bear.
+const MANY: u32 = 20_000;
+
+#[test]
+fn twenty_thousand_topics_cross_between_two_hosts() {
+    let hosts = Plan::new([classic(&[]), classic(&[])]).start();
+    let crowd = Crowd::new(&hosts, MANY);
+    let mut before = 0;
+    // As long as it gets on: a machine may be slow.
+    while before < MANY as usize {
+        until("more topics cross", || crowd.crossing() > before);
+        before = crowd.crossing();
+    }
+    crowd.exchange();
+    assert_eq!([0, 1].map(|host| refused(&hosts[host])), [0, 0]);
+    for host in &hosts {
+        host.link();
+        assert_eq!(host.log_lines(&["link down"]), 0, "the link stood");
+    }
+}
+
+/// Processor time that all threads of a host's daemon have used.
+fn processor(host: &Host) -> Duration {
+    let pid = host.daemon.as_ref().unwrap().0.id();
+    let tasks = fs::read_dir(format!("/proc/{pid}/task")).unwrap();
+    let used = tasks.filter_map(|task| {
+        let text = fs::read_to_string(task.ok()?.path().join("schedstat")).ok()?;
+        text.split(' ').next()?.parse::<u64>().ok()
+    });
+    Duration::from_nanos(used.sum())
+}
+
+/// Messages of 64 bytes, one at a time, over 1 to 10,000 topics: what each costs the daemons.
+#[test]
+#[ignore = "prints what it measures"]
+#[allow(clippy::print_stdout, reason = "it prints what it measures")]
+fn what_a_message_costs_with_many_topics() {
+    const MESSAGES: u32 = 10_000;
+    for topics in [1, 100, 1_000, 10_000] {
+        let hosts = Plan::new([classic(&[]), classic(&[])]).start();
+        hosts[0].link();
+        let begun = Instant::now();
+        let crowd = Crowd::new(&hosts, topics);
+        let created = begun.elapsed();
+        until("all cross", || crowd.crossing() == topics as usize);
+        let matched = begun.elapsed();
+        thread::sleep(Duration::from_secs(3));
+        let idle = hosts.each_ref().map(processor);
+        thread::sleep(Duration::from_secs(10));
+        let idle = [0, 1].map(|host| (processor(&hosts[host]) - idle[host]) / 10);
+        let mut costs = Vec::new();
+        for all in [false, true] {
+            let before = hosts.each_ref().map(processor);
+            for number in 0..MESSAGES {
+                let topic = if all { number as usize % crowd.publishers.len() } else { 0 };
+                crowd.publishers[topic].publish(&[7; 64]).unwrap();
+                thread::sleep(Duration::from_micros(500));
+            }
+            thread::sleep(Duration::from_millis(500));
+            costs.push([0, 1].map(|host| (processor(&hosts[host]) - before[host]) / MESSAGES));
+        }
+        println!(
+            "{topics} topics: created in {created:?}, matched in {matched:?}; idle {idle:?} a second; \
+             a message over one of them {:?}, over each in turn {:?} (sending, receiving daemon)",
+            costs[0], costs[1]
+        );
     }
 }
 

@@ -38,6 +38,8 @@ pub(crate) struct Plan {
     pub(crate) grace_s: u32,
     /// Seconds after which a peer that reads nothing is disconnected from a topic.
     pub(crate) stalled_s: u32,
+    /// MiB that the graph of a peer may take, and its routes four times as much; the default if `None`.
+    pub(crate) graph_mb: Option<u32>,
     /// Whether host B is in another domain.
     pub(crate) other_domain: bool,
     /// Whether only what lies between them leads from one to the other: [`Host::wire`].
@@ -52,6 +54,7 @@ impl Plan {
             settings,
             grace_s: 300,
             stalled_s: 300,
+            graph_mb: None,
             other_domain: false,
             wired: false,
             listed: true,
@@ -91,7 +94,10 @@ impl Plan {
                 }
             }
             let settings = self.settings[host].iter().cloned().chain(more);
-            Host::new(["A", "B"][host], addresses[host], settings, [self.grace_s, self.stalled_s])
+            let graph = self.graph_mb.map_or_else(String::new, |mib| format!("graph_mb = {mib}\n"));
+            let [grace_s, stalled_s] = [self.grace_s, self.stalled_s];
+            let link = format!("[link]\ngrace_s = {grace_s}\nstalled_s = {stalled_s}\n{graph}");
+            Host::new(["A", "B"][host], addresses[host], settings, &link)
         })
     }
 }
@@ -111,11 +117,10 @@ impl Host {
         name: &'static str,
         address: Ipv4Addr,
         settings: impl IntoIterator<Item = (&'static str, String)>,
-        [grace_s, stalled_s]: [u32; 2],
+        toml: &str,
     ) -> Self {
         let dir = tempfile::tempdir().unwrap();
         let path = |name: &str| dir.path().join(name).to_str().unwrap().to_owned();
-        let toml = format!("[link]\ngrace_s = {grace_s}\nstalled_s = {stalled_s}\n");
         fs::write(path("axon.toml"), toml).unwrap();
         let mut env = vec![
             ("AXON_RUNTIME_DIR".to_owned(), path("run")),

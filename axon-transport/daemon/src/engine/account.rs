@@ -16,11 +16,17 @@ use crate::{
     link::{MAX_INFLATED, Message, is_known, unpacked_length},
 };
 
-/// Relays that one identity may have here: a thirty-second of the endpoints that the engine's session may have for all
-/// peers. Each takes a lane for each publisher here that it reads.
-pub(crate) const MAX_RELAYS: usize = 2048;
-/// Stand-ins of one identity. Each costs a ring.
-pub(crate) const MAX_STAND_INS: usize = 1024;
+/// Relays that one identity may have here: those of 20,000 topics, and more. Each takes some 4 KiB, and a lane for each
+/// publisher here that it reads.
+pub(crate) const MAX_RELAYS: usize = 1 << 15;
+/// Stand-ins of one identity. Each costs a ring: with all that belongs to it some 6 KiB.
+pub(crate) const MAX_STAND_INS: usize = 1 << 15;
+/// Relays of all identities, and as many stand-ins. The registry lets the engine's session have both. An identity may
+/// take half of what the others leave, so that none takes the last.
+const OF_ALL: usize = 1 << 17;
+/// How much more an identity's routes may take than its graph: three copies of names and subscribers are held, and a
+/// route has more to it than an endpoint.
+const ROUTES_TO_GRAPH: usize = 4;
 /// Unread stream data of one identity, in bytes. Each of its links has
 /// [`LINK_WINDOW`](super::transport::LINK_WINDOW) more.
 const UNREAD: usize = 64 << 20;
@@ -29,7 +35,7 @@ const MESSAGES: usize = 64 << 20;
 /// Control messages that wait for one identity to read them, in bytes.
 const UNSENT: usize = 128 << 20;
 /// What one identity may say a second, and at once, by [`cost`] and [`cost_of_frame`].
-const SAID: (u32, u32) = (4096, 16_384);
+const SAID: (u32, u32) = (16_384, 65_536);
 /// Bytes of a control message that cost as much as one change: what it takes to decompress and decode
 /// them.
 const BYTES: usize = 4096;
@@ -40,6 +46,8 @@ const LOOKED_UP: usize = 32;
 #[derive(Debug)]
 pub(crate) struct Meter {
     most: usize,
+    /// What all identities share.
+    pool: Option<Rc<Meter>>,
     held: Cell<usize>,
     /// What was given back since the start.
     released: Cell<usize>,
@@ -55,7 +63,23 @@ pub(crate) struct Charge {
 impl Meter {
     /// Allows up to `most`.
     pub(crate) fn new(most: usize) -> Rc<Self> {
-        Rc::new(Self { most, held: Cell::new(0), released: Cell::new(0) })
+        Rc::new(Self { most, pool: None, held: Cell::new(0), released: Cell::new(0) })
+    }
+
+    /// Allows up to `most`, and half of what others leave in a pool.
+    fn within(pool: &Rc<Self>, most: usize) -> Rc<Self> {
+        let pool = Some(Rc::clone(pool));
+        Rc::new(Self { most, pool, held: Cell::new(0), released: Cell::new(0) })
+    }
+
+    /// What it allows besides what is held.
+    pub(crate) fn left(&self) -> usize {
+        let own = self.most.saturating_sub(self.held());
+        let shared = self.pool.as_ref().map_or(usize::MAX, |pool| {
+            let others = pool.held().saturating_sub(self.held());
+            (pool.most.saturating_sub(others) / 2).saturating_sub(self.held())
+        });
+        own.min(shared)
     }
 
     /// A charge of nothing.
@@ -65,8 +89,13 @@ impl Meter {
 
     /// Charges `amount`, if it fits.
     pub(crate) fn charge(self: &Rc<Self>, amount: usize) -> Option<Charge> {
-        let sum = self.held.get().checked_add(amount).filter(|sum| *sum <= self.most)?;
-        self.held.set(sum);
+        if amount > self.left() {
+            return None;
+        }
+        self.held.set(self.held.get() + amount);
+        if let Some(pool) = &self.pool {
+            pool.held.set(pool.held.get() + amount);
+        }
         Some(Charge { meter: Rc::clone(self), amount })
     }
 
@@ -110,6 +139,9 @@ impl Charge {
 impl Drop for Charge {
     fn drop(&mut self) {
         self.meter.held.set(self.meter.held.get() - self.amount);
+        if let Some(pool) = &self.meter.pool {
+            pool.held.set(pool.held.get() - self.amount);
+        }
         self.meter.released.set(self.meter.released.get().wrapping_add(self.amount));
     }
 }
@@ -119,7 +151,7 @@ impl Drop for Charge {
 pub(crate) struct Account {
     /// Bytes of its graph.
     pub(crate) graph: Rc<Meter>,
-    /// Bytes of the routes that it asks for: as many again, so that one whose graph is full is served.
+    /// Bytes of the routes that it asks for: on their own, so that one whose graph is full is served.
     pub(crate) routes: Rc<Meter>,
     /// Relays for the routes that it asks for.
     pub(crate) relays: Rc<Meter>,
@@ -137,13 +169,13 @@ pub(crate) struct Account {
 }
 
 impl Account {
-    fn new(graph: usize) -> Self {
+    fn new(graph: usize, relays: &Rc<Meter>, stand_ins: &Rc<Meter>) -> Self {
         Self {
             graph: Meter::new(graph),
-            routes: Meter::new(graph),
-            relays: Meter::new(MAX_RELAYS),
+            routes: Meter::new(ROUTES_TO_GRAPH.saturating_mul(graph)),
+            relays: Meter::within(relays, MAX_RELAYS),
             unsent: Meter::new(UNSENT),
-            stand_ins: Meter::new(MAX_STAND_INS),
+            stand_ins: Meter::within(stand_ins, MAX_STAND_INS),
             unread: Meter::new(UNREAD),
             messages: Meter::new(MESSAGES),
             turns: RefCell::default(),
@@ -201,13 +233,16 @@ fn costs(elements: usize) -> u32 {
 pub(crate) struct Accounts {
     /// Bytes of a graph.
     graph: usize,
+    relays: Rc<Meter>,
+    stand_ins: Rc<Meter>,
     open: HashMap<String, Weak<Account>>,
 }
 
 impl Accounts {
     /// Accounts whose graphs may take so many bytes.
     pub(crate) fn new(graph: usize) -> Self {
-        Self { graph, open: HashMap::new() }
+        let [relays, stand_ins] = [(); 2].map(|()| Meter::new(OF_ALL));
+        Self { graph, relays, stand_ins, open: HashMap::new() }
     }
 
     /// The account of an identity.
@@ -216,7 +251,7 @@ impl Accounts {
             return account;
         }
         self.open.retain(|_, account| account.strong_count() > 0);
-        let account = Rc::new(Account::new(self.graph));
+        let account = Rc::new(Account::new(self.graph, &self.relays, &self.stand_ins));
         self.open.insert(identity.to_owned(), Rc::downgrade(&account));
         account
     }
@@ -242,6 +277,21 @@ mod tests {
         drop((one, again));
         assert_eq!(accounts.of("a").graph.held(), 0);
         assert_eq!(accounts.open.len(), 2);
+    }
+
+    #[test]
+    fn no_identity_takes_the_last_of_what_all_share() {
+        let pool = Meter::new(100);
+        let [one, two, three] = [80, 80, 10].map(|most| Meter::within(&pool, most));
+        let first = one.charge(50).unwrap();
+        assert!(one.charge(1).is_none(), "half of all");
+        let second = two.charge(25).unwrap();
+        assert!(two.charge(1).is_none() && three.charge(11).is_none());
+        assert_eq!((one.left(), two.left(), three.left()), (0, 0, 10));
+        drop(first);
+        assert_eq!((one.left(), two.left()), (37, 25));
+        drop(second);
+        assert_eq!((pool.held(), three.charge(10).is_some()), (0, true));
     }
 
     #[test]

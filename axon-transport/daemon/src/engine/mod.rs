@@ -163,6 +163,12 @@ impl Engine {
         self.effects.tell_draining(self.peers.are_draining());
     }
 
+    /// When [`handle_local_graph`](Self::handle_local_graph) should be called next: thousands of endpoints that come one
+    /// after the other are followed together.
+    pub(crate) fn follow_local_at(&self) -> Duration {
+        self.peers.follow_local_at()
+    }
+
     /// Samples wait in rings, or readers made room in them.
     pub(crate) fn handle_rings(&mut self, now: Duration) {
         self.peers.handle_rings(now);

@@ -8,7 +8,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_shm::ids::DaemonId;
+use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::config::Config;
 
 use super::{
@@ -16,6 +16,11 @@ use super::{
     rings::Rings,
     stand_in::StandIns,
 };
+
+/// What following a change of this host's graph costs for each endpoint of both graphs, as an estimate: samples have
+/// nine times as long before the next one.
+const ENDPOINT: Duration = Duration::from_nanos(500);
+const OTHERS: u32 = 9;
 
 /// All peers.
 pub(super) struct Peers {
@@ -27,6 +32,10 @@ pub(super) struct Peers {
     local: Local,
     epoch: Instant,
     waiting_for_room: bool,
+    /// Readers with samples to take; kept for its memory.
+    active: Vec<(Gid, Gid)>,
+    /// When the graph of this host is followed again.
+    follow_local_at: Duration,
 }
 
 impl Peers {
@@ -41,6 +50,8 @@ impl Peers {
             local: Local::new(),
             epoch,
             waiting_for_room: false,
+            active: Vec::new(),
+            follow_local_at: Duration::ZERO,
         }
     }
 
@@ -110,15 +121,27 @@ impl Peers {
     /// The graph of this host changed.
     pub(super) fn handle_local_graph(&mut self, local: Local, now: Duration) {
         self.local = local;
+        let endpoints = self.all.values().map(|peer| peer.remote.len() + self.local.len());
+        let took = ENDPOINT * u32::try_from(endpoints.sum::<usize>()).unwrap_or(u32::MAX);
+        self.follow_local_at = now + OTHERS * took;
         self.with_each(|peer, with| peer.handle_local_graph(with, now));
+    }
+
+    /// When the graph of this host should be followed next. What changes until then is followed together.
+    pub(super) fn follow_local_at(&self) -> Duration {
+        self.follow_local_at
     }
 
     /// Samples wait in rings, or readers made room in them.
     pub(super) fn handle_rings(&mut self, now: Duration) {
+        let mut active = std::mem::take(&mut self.active);
+        self.rings.take_active(&mut active);
         for peer in self.all.values_mut() {
-            peer.outbound.handle_samples(now);
+            peer.outbound.handle_active(&active, now);
             peer.inbound.handle_room();
         }
+        active.clear();
+        self.active = active;
     }
 
     /// Has the rings say when there is room, while a peer waits for it.

@@ -29,6 +29,10 @@ pub(crate) trait Rings {
     /// Why there is none, for the log.
     fn open_writer(&self, remote: &Endpoint) -> Result<Rc<dyn RingWriter>, String>;
 
+    /// Adds to `found` the readers that may have samples to take, each with the publisher: those whose rings got samples
+    /// since the last call, and a few others. So the cost of a sample does not grow with the number of readers.
+    fn take_active(&self, found: &mut Vec<(Gid, Gid)>);
+
     /// Says whether the engine waits for room in a ring: while it does, a reader that makes room wakes it.
     fn set_waiting_for_room(&self, waiting: bool);
 }
@@ -39,6 +43,8 @@ pub(crate) trait RingReader {
     fn gid(&self) -> Gid;
     /// The publishers that have samples to take.
     fn with_data(&self) -> Vec<Gid>;
+    /// Whether this publisher has samples to take.
+    fn has_data_of(&self, publisher: &Gid) -> bool;
     /// Whether it reads this publisher.
     fn reads(&self, publisher: &Gid) -> bool;
     /// The publishers that it reads.

@@ -81,7 +81,14 @@ pub(crate) enum NoStandIn {
 
 /// All stand-ins of this host.
 #[derive(Default)]
-pub(crate) struct StandIns(RefCell<HashMap<Gid, Weak<StandIn>>>);
+pub(crate) struct StandIns {
+    known: RefCell<HashMap<Gid, Weak<StandIn>>>,
+    /// When so many are known, those that are gone are forgotten.
+    clean_at: Cell<usize>,
+}
+
+/// As many are known before those that are gone are forgotten.
+const KNOWN: usize = 64;
 
 impl StandIns {
     /// The stand-in for `remote`: the one that exists, or a new one that `account` pays for.
@@ -94,7 +101,7 @@ impl StandIns {
         remote: &Endpoint,
         account: &Account,
     ) -> Result<Rc<StandIn>, NoStandIn> {
-        let mut known = self.0.borrow_mut();
+        let mut known = self.known.borrow_mut();
         if let Some(stand_in) = known.get(&remote.gid).and_then(Weak::upgrade) {
             if stand_in.ring.endpoint() == remote {
                 return Ok(stand_in);
@@ -109,7 +116,11 @@ impl StandIns {
             last: Cell::new(0),
             _place: place,
         });
-        known.retain(|_, other| other.strong_count() > 0);
+        // Once for as many as there are: of thousands one comes at a time.
+        if known.len() >= self.clean_at.get() {
+            known.retain(|_, other| other.strong_count() > 0);
+            self.clean_at.set(2 * known.len().max(KNOWN));
+        }
         known.insert(remote.gid, Rc::downgrade(&stand_in));
         Ok(stand_in)
     }

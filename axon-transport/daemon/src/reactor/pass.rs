@@ -206,7 +206,7 @@ impl Reactor {
                 Input::Done(done) => self.handle_done(done, now),
             }
         }
-        if self.notices.take_graph() {
+        if self.engine.follow_local_at() <= now && self.notices.take_graph() {
             let local = local_graph(&self.session);
             self.engine.handle_local_graph(local, now);
             busy = true;
@@ -321,7 +321,9 @@ impl Reactor {
         let now = self.now();
         let finishing = self.finishing.as_ref().map(Finishing::poll_timeout);
         let keys = self.kme.as_ref().and_then(|_| self.key_reports.poll_timeout());
-        let until = [self.engine.poll_timeout(now), finishing, keys].into_iter().flatten().min();
+        let follow = self.notices.has_graph().then(|| self.engine.follow_local_at());
+        let due = [self.engine.poll_timeout(now), finishing, keys, follow];
+        let until = due.into_iter().flatten().min();
         if self.has_packets || until.is_some_and(|until| until <= now) {
             // The kernel is asked for readiness all the same.
             yield_now().await;

@@ -34,6 +34,8 @@ impl ShmRings {
     /// # Errors
     /// The session's doorbell is taken.
     pub(super) fn new(session: Session) -> Result<Rc<Self>, ShmError> {
+        // Before there is any reader: the engine looks at those that have something to take, and at no others.
+        session.segment().follow();
         Ok(Rc::new(Self {
             doorbell: session.segment().external_leader()?,
             session,
@@ -77,6 +79,10 @@ impl Rings for ShmRings {
         Ok(Rc::new(Writer(writer.map_err(|error| error.to_string())?)))
     }
 
+    fn take_active(&self, found: &mut Vec<(Gid, Gid)>) {
+        self.session.segment().take_active(found);
+    }
+
     fn set_waiting_for_room(&self, waiting: bool) {
         // The loop arms the doorbell again before it sleeps.
         self.waits_for_room.set(waiting);
@@ -97,6 +103,10 @@ impl RingReader for Relay {
 
     fn with_data(&self) -> Vec<Gid> {
         self.subscription.with_data()
+    }
+
+    fn has_data_of(&self, publisher: &Gid) -> bool {
+        self.subscription.has_from(publisher)
     }
 
     fn reads(&self, publisher: &Gid) -> bool {

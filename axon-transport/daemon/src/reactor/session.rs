@@ -31,6 +31,11 @@ impl Notices {
         self.wake.notify_one();
     }
 
+    /// Whether the graph changed since it was taken.
+    pub(super) fn has_graph(&self) -> bool {
+        self.graph.load(Ordering::Acquire)
+    }
+
     /// Whether the graph changed since the last call.
     pub(super) fn take_graph(&self) -> bool {
         self.graph.swap(false, Ordering::AcqRel)

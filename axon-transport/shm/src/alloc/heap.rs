@@ -16,7 +16,9 @@ use crate::{
     error::ShmError,
     memory::segment::Map,
     ring::{
-        layout::{self, HEAP_AT, HEAP_BYTES, HEAP_BYTES_MAX, LANES_AT, Location, SegmentKind},
+        layout::{
+            self, FIRST_AT, HEAP_AT, HEAP_BYTES, HEAP_BYTES_MAX, LANES_AT, Location, SegmentKind,
+        },
         protocol::about_to_write,
     },
 };
@@ -72,8 +74,9 @@ struct Part {
 impl Part {
     fn new(segment: Arc<OwnSegment>) -> Self {
         let bytes = segment.memory.bytes();
-        let limit = if segment.number() == 0 { LANES_AT } else { bytes };
-        let area = Area::new(HEAP_AT..bytes, 16);
+        let (start, limit) =
+            if segment.number() == 0 { (FIRST_AT, LANES_AT) } else { (HEAP_AT, bytes) };
+        let area = Area::new(start..bytes, 16);
         Self { segment, area, limit, committed: layout::ALIGN, since: Instant::now() }
     }
 

@@ -30,10 +30,12 @@ use crate::{
         window::{depth, holds},
     },
     session::{
+        activity::WatchKey,
         attachment::{Attachment, Pinning},
         lane::Lane,
         peer::{Found, Peer},
     },
+    sync::Ordering,
     wake::{Purpose, settle},
 };
 
@@ -121,6 +123,8 @@ struct Reads {
     in_place: u64,
     /// Whether a publisher may wait for it.
     tells: bool,
+    /// Has its session find it when there is something to take.
+    watch: Option<WatchKey>,
 }
 
 impl Reader {
@@ -169,7 +173,7 @@ impl Reader {
             skipped: 0,
             corrupt: None,
             given_up: false,
-            reads: Reads { writer, peer, grant, depth, max_message, in_place, tells },
+            reads: Reads { writer, peer, grant, depth, max_message, in_place, tells, watch: None },
         })
     }
 
@@ -486,6 +490,28 @@ impl Reader {
         self.make_room_known();
     }
 
+    /// Has its session find it by [`take_active`](crate::session::segment::SessionSegment::take_active) when there may
+    /// be something to take, and now, where the session [follows](crate::session::segment::SessionSegment::follow).
+    pub fn follow(&mut self, reader: Gid) {
+        let Some(words) = self.ring_words() else { return };
+        // Relaxed: written before anybody was told where the ring is. Another number hides no ring for ever: each look
+        // passes over some in turn.
+        let ring = words[layout::ring::NUMBER].load(Ordering::Relaxed) as u32;
+        let session = self.attachment.lane.session();
+        let (pair, peer) = ((reader, self.reads.writer), self.reads.peer.remote());
+        self.reads.watch = session.activity().watch(pair, peer, session.journal(), ring);
+    }
+
+    /// Has its session find it at the next look, if it is followed.
+    pub fn mark_active(&self) {
+        // In a forked child, a thread of the parent may have held the lock.
+        if let Some(watch) = &self.reads.watch
+            && !self.attachment.lane.is_forked()
+        {
+            watch.mark();
+        }
+    }
+
     /// Has its publisher woken by whatever is taken, if it waits for that: of what stands for others.
     #[inline]
     pub fn tell_progress(&mut self) {
@@ -515,10 +541,13 @@ impl Reader {
 impl Drop for Reader {
     fn drop(&mut self) {
         // The lane closes with the last sample; until then it only stops to hold the publisher.
-        if !self.attachment.lane.is_forked() {
-            self.attachment.lane.leave();
-            self.make_room_known();
+        if self.attachment.lane.is_forked() {
+            // A thread of the parent may have held its lock.
+            std::mem::forget(self.reads.watch.take());
+            return;
         }
+        self.attachment.lane.leave();
+        self.make_room_known();
     }
 }
 

@@ -19,19 +19,28 @@ pub(crate) const COPIED_ALWAYS: u64 = 512;
 pub(crate) const INLINE: usize = 88;
 /// What is lent is aligned to so many bytes, or what is behind its header: as any type of C is at least.
 pub(crate) const ALIGNED: usize = align_of::<u128>();
-/// Lanes of a session: how many rings it can read at a time.
-pub(crate) const LANES: u32 = 4096;
+/// Lanes of a session: how many rings it can read at a time. A gateway reads the rings of all topics that its peers
+/// subscribe to. Each lane takes memory once it is used.
+pub(crate) const LANES: u32 = 1 << 17;
 
-/// Bytes of a session's first segment. In its upper half there is nothing but lanes, so that there is
-/// room for all of them whatever else the session has.
-pub(crate) const SESSION_BYTES: u64 = 1 << 20;
-pub(crate) const LANES_AT: u64 = SESSION_BYTES - LANES as u64 * LANE;
+/// Where the lanes begin in a session's first segment. Above there is nothing else, so that there is room for all of
+/// them whatever else the session has.
+pub(crate) const LANES_AT: u64 = 512 << 10;
+/// Bytes of that segment.
+pub(crate) const SESSION_BYTES: u64 = LANES_AT + LANES as u64 * LANE;
 /// Bytes of a further one, which holds no object of more than [`HEAP_BYTES_MAX`] less a header.
 pub(crate) const HEAP_BYTES: u64 = 8 << 20;
 pub(crate) const HEAP_BYTES_MAX: u64 = MAX_DESCRIPTORS * DESCRIPTOR + HEAP_BYTES;
-/// Where the objects of either begin, and where the slots of a publisher's segment do.
+/// Where the objects of a further segment begin, and where the slots of a publisher's segment do.
 pub(crate) const HEAP_AT: u64 = 4096;
 pub(crate) const SLOTS_AT: u64 = ALIGN;
+
+/// Entries of a session's journal, which is in its first segment before the objects. As many samples may come between
+/// two looks of a follower before it has to look at all rings: so it looks at few rings for each sample, however many
+/// there are.
+pub(crate) const JOURNAL: usize = 2048;
+/// Where the objects of a session's first segment begin.
+pub(crate) const FIRST_AT: u64 = HEAP_AT + JOURNAL as u64 * 8;
 
 /// Numbers of segments have 24 bits.
 pub(crate) const MAX_NUMBER: u32 = (1 << 24) - 1;
@@ -51,7 +60,7 @@ pub(crate) const RING: u64 = 384;
 #[cfg(test)]
 pub(crate) const RING_WORDS: usize = RING as usize / 8;
 
-const VERSION: u32 = 3;
+const VERSION: u32 = 4;
 /// Reads otherwise on a machine of another byte order.
 const ORDER: u32 = 0x0a0b_0c0d;
 const SEGMENT_MAGIC: u64 = u64::from_ne_bytes(*b"AXONSEG2");
@@ -63,6 +72,11 @@ pub(crate) mod session {
     pub(crate) const ARMED: usize = 128 / 8;
     /// Ticket of the wait for room.
     pub(crate) const BLOCKED: usize = 256 / 8;
+    /// How many entries the journal has had.
+    pub(crate) const NOTED: usize = 384 / 8;
+    /// The entries.
+    pub(crate) const JOURNAL: std::ops::Range<usize> =
+        super::HEAP_AT as usize / 8..super::FIRST_AT as usize / 8;
 }
 
 /// Words of a lane.
@@ -95,6 +109,8 @@ pub(crate) mod ring {
     pub(crate) const BLOCKED: usize = 6;
     pub(crate) const NO_MEMORY: usize = 7;
     pub(crate) const PINNED: usize = 8;
+    /// The ring's number in its session, by which the journal names it.
+    pub(crate) const NUMBER: usize = 9;
     pub(crate) const HEAD: usize = 128 / 8;
     /// Samples published, those that nobody was there to read among them.
     pub(crate) const PUBLISHED: usize = 136 / 8;
@@ -257,9 +273,10 @@ pub(crate) fn check_segment(
 }
 
 /// Writes the header of an empty ring, which nobody knows of yet.
-pub(crate) fn write_ring(words: &[AtomicU64], writer: Gid, array: &Array) {
+pub(crate) fn write_ring(words: &[AtomicU64], writer: Gid, number: u32, array: &Array) {
     words.iter().for_each(|word| word.store(0, Ordering::Relaxed));
     write_id(words, ring::WRITER, writer.0);
+    words[ring::NUMBER].store(number.into(), Ordering::Relaxed);
     words[ring::ARRAY].store(array.word(), Ordering::Relaxed);
     words[0].store(RING_MAGIC, Ordering::Relaxed);
 }

@@ -223,6 +223,11 @@ impl Lane {
         self.session.is_forked()
     }
 
+    /// The session of its reader.
+    pub(crate) fn session(&self) -> &Arc<SessionSegment> {
+        &self.session
+    }
+
     /// Whether a grant may be the answer to this reader.
     pub(crate) fn is_meant_by(&self, grant: Grant) -> bool {
         is_for(grant.generation, self.number)

@@ -1,5 +1,6 @@
 //! A session, as its own process and as other sessions see it: segments, doorbell, lanes, and pinned samples.
 
+pub(crate) mod activity;
 pub(crate) mod attachment;
 pub(crate) mod lane;
 pub(crate) mod leader;

@@ -1,7 +1,7 @@
 //! Memory of publishers that were dropped while readers still pinned their samples. The session's owner
 //! frees it once no reader pins it.
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use crate::{
     alloc::{
@@ -20,18 +20,50 @@ pub(crate) struct Orphan {
     pub(crate) samples: Vec<u32>,
 }
 
+/// So many of them are looked at whenever one comes or a reader leaves.
+const FEW: usize = 64;
+
 /// The memory of a session's publishers that are gone.
 #[derive(Default)]
-pub(crate) struct Orphans(Mutex<Vec<Orphan>>);
+pub(crate) struct Orphans(Mutex<State>);
+
+#[derive(Default)]
+struct State {
+    all: Vec<Orphan>,
+    /// How often [`sweep_some`](Orphans::sweep_some) was called since all were looked at.
+    calls: usize,
+    /// How many were looked at since the start.
+    #[cfg(test)]
+    looks: usize,
+}
 
 impl Orphans {
     pub(crate) fn adopt(&self, orphan: Orphan) {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).push(orphan);
+        self.lock().all.push(orphan);
+    }
+
+    /// As [`sweep`](Self::sweep), but of many once for as many calls as there are: thousands of publishers end one after
+    /// the other, and a look at each asks whether its readers' processes live.
+    pub(crate) fn sweep_some(&self, heap: &Heap, segments: &Segments) -> bool {
+        {
+            let mut state = self.lock();
+            state.calls += 1;
+            if state.all.len() > FEW && state.calls < state.all.len() {
+                return true;
+            }
+        }
+        self.sweep(heap, segments)
     }
 
     /// Takes back what nobody reads any more. Whether something is left.
     pub(crate) fn sweep(&self, heap: &Heap, segments: &Segments) -> bool {
-        let mut orphans = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut state = self.lock();
+        state.calls = 0;
+        #[cfg(test)]
+        {
+            state.looks += state.all.len();
+        }
+        let orphans = &mut state.all;
         orphans.retain_mut(|orphan| {
             orphan.pin_lanes.sweep(|_| true);
             if !orphan.pin_lanes.is_empty() {
@@ -42,5 +74,14 @@ impl Orphans {
             false
         });
         !orphans.is_empty()
+    }
+
+    #[cfg(test)]
+    pub(crate) fn looks(&self) -> usize {
+        self.lock().looks
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -6,7 +6,7 @@ use std::{
     os::fd::{AsFd, AsRawFd, BorrowedFd},
     sync::{
         Arc, Mutex, MutexGuard, OnceLock, PoisonError, Weak,
-        atomic::{AtomicU64, Ordering},
+        atomic::{AtomicBool, AtomicU64, Ordering},
     },
 };
 
@@ -21,7 +21,10 @@ use crate::{
     ids::{Gid, SessionId},
     memory::{quota::Quota, segment::Map},
     os::descriptors::PassedFd,
-    ring::layout::{self, Location, SegmentKind},
+    ring::{
+        journal::Journal,
+        layout::{self, Location, SegmentKind},
+    },
     session::{attachment::Attachment, lane::LaneView, segment::SessionSegment},
     wake::{Bell, Purpose, due, waits},
 };
@@ -104,6 +107,8 @@ pub struct PeerSession {
     pidfd: PassedFd,
     /// The last ticket of each of its armed words that this process rang for.
     rung: [AtomicU64; 2],
+    /// Memory of its came, for which readers may wait.
+    changed: AtomicBool,
 }
 
 /// What is known of the segments besides the first.
@@ -117,6 +122,8 @@ struct Further {
     wanted: BTreeSet<u32>,
     /// The readers, whose lanes tell the session which of its segments they have.
     readers: Vec<Weak<Attachment>>,
+    /// When there are so many of them, those that are gone are forgotten.
+    clean_at: usize,
     /// How many subscribers a publisher has here, where nobody else looks after its memory.
     subscribed: BTreeMap<Gid, usize>,
 }
@@ -178,6 +185,7 @@ impl PeerSession {
             bell,
             pidfd,
             rung: Default::default(),
+            changed: AtomicBool::new(false),
         }))
     }
 
@@ -216,7 +224,22 @@ impl PeerSession {
             }
             None => false,
         });
+        // Pairs with `take_changed`: who sees it finds the segment.
+        self.changed.store(true, Ordering::Release);
         result
+    }
+
+    /// Whether memory of its came since the last call.
+    pub(crate) fn take_changed(&self) -> bool {
+        // Loads first: there is seldom any. Pairs with the store in `add_segment`.
+        self.changed.load(Ordering::Relaxed) && self.changed.swap(false, Ordering::Acquire)
+    }
+
+    /// The journal of the session. A first segment that is too short for one has none, and all rings are looked at.
+    pub(crate) fn journal(&self) -> Journal<'_, AtomicU64> {
+        let words = self.first.words();
+        let entries = words.get(layout::session::JOURNAL).unwrap_or_default();
+        Journal { noted: &words[layout::session::NOTED], entries }
     }
 
     /// Forgets a segment that its session has given up. Samples in it stay for as long as they are
@@ -277,7 +300,11 @@ impl PeerSession {
     /// Has a reader tell the session which of its segments are mapped.
     pub(crate) fn keep_told(&self, reader: &Arc<Attachment>) {
         let mut further = self.further();
-        further.readers.retain(|reader| reader.strong_count() > 0);
+        // Once for as many as there were: of thousands of readers one comes at a time.
+        if further.readers.len() >= further.clean_at {
+            further.readers.retain(|reader| reader.strong_count() > 0);
+            further.clean_at = 2 * further.readers.len().max(8);
+        }
         further.readers.push(Arc::downgrade(reader));
         reader.set_mapped(further.highest);
     }

@@ -5,7 +5,7 @@ use std::{
     os::fd::{AsFd, BorrowedFd, OwnedFd},
     sync::{
         Arc, Mutex, PoisonError,
-        atomic::{AtomicU64, Ordering},
+        atomic::{AtomicU32, AtomicU64, Ordering},
     },
     time::Duration,
 };
@@ -20,8 +20,12 @@ use crate::{
     error::ShmError,
     ids::{Gid, SessionId},
     memory::segment::Map,
-    ring::layout::{self, SegmentKind},
+    ring::{
+        journal::Journal,
+        layout::{self, SegmentKind},
+    },
     session::{
+        activity::Activity,
         lane::Lane,
         leader::ExternalLeader,
         orphans::{Orphan, Orphans},
@@ -44,6 +48,9 @@ pub struct SessionSegment {
     lanes: Mutex<Lanes>,
     /// The last ticket of each of our own armed words that we rang for.
     rung: [AtomicU64; 2],
+    /// How many rings there have been, by which they are numbered.
+    rings: AtomicU32,
+    activity: Arc<Activity>,
 }
 
 #[derive(Default)]
@@ -74,6 +81,8 @@ impl SessionSegment {
             doorbell: Doorbell::new().map_err(ShmError::system("creating a doorbell"))?,
             lanes: Mutex::default(),
             rung: Default::default(),
+            rings: AtomicU32::new(0),
+            activity: Arc::default(),
         }))
     }
 
@@ -140,6 +149,18 @@ impl SessionSegment {
         !self.is_forked() && self.orphans.sweep(&self.heap, &self.segments)
     }
 
+    /// How many publishers that are gone were looked at since the start.
+    #[cfg(test)]
+    pub(crate) fn looks_at_orphans(&self) -> usize {
+        self.orphans.looks()
+    }
+
+    /// As [`tidy`](Self::tidy), but not whenever it is called where there are many publishers that are gone: call `tidy`
+    /// later if this returns true.
+    pub fn tidy_some(&self) -> bool {
+        !self.is_forked() && self.orphans.sweep_some(&self.heap, &self.segments)
+    }
+
     /// A lane for a reader that is about to attach.
     ///
     /// # Errors
@@ -163,6 +184,43 @@ impl SessionSegment {
         };
         lanes.given += 1;
         Ok(Lane::new(Arc::clone(self), object, lanes.given))
+    }
+
+    /// From now on readers that [are followed](crate::reader::Reader::follow) are found by
+    /// [`take_active`](Self::take_active), which somebody has to call when the doorbell rang.
+    pub fn follow(&self) {
+        self.activity.follow();
+    }
+
+    /// Adds to `found` the followed readers that may have something to take, each with its writer: those whose rings
+    /// got samples since the last call, and a few others. After the doorbell was armed: what comes later rings.
+    pub fn take_active(&self, found: &mut Vec<(Gid, Gid)>) {
+        if !self.is_forked() {
+            self.activity.take(self.journal(), found);
+        }
+    }
+
+    /// The next [`take_active`](Self::take_active) finds all readers.
+    pub fn mark_all_active(&self) {
+        if !self.is_forked() {
+            self.activity.mark_all();
+        }
+    }
+
+    /// The number of a new ring.
+    pub(crate) fn number_ring(&self) -> u32 {
+        // Relaxed: the number alone counts. Two rings of one number are looked at together.
+        self.rings.fetch_add(1, Ordering::Relaxed)
+    }
+
+    #[inline]
+    pub(crate) fn journal(&self) -> Journal<'_, AtomicU64> {
+        let words = self.first.memory.words();
+        Journal { noted: &words[layout::session::NOTED], entries: &words[layout::session::JOURNAL] }
+    }
+
+    pub(crate) fn activity(&self) -> &Arc<Activity> {
+        &self.activity
     }
 
     /// Blocks until `ready`, which is asked again whenever a publisher or [`Self::notify`] rang,
@@ -334,7 +392,7 @@ impl SessionSegment {
     /// Keeps what a publisher leaves for as long as somebody reads it.
     pub(crate) fn adopt(&self, orphan: Orphan) {
         self.orphans.adopt(orphan);
-        self.tidy();
+        self.tidy_some();
     }
 
     pub(crate) fn map(&self, number: u32) -> Option<Arc<Map>> {

@@ -42,7 +42,7 @@ impl Scribble {
         let at = Location { segment: 0, offset: ARRAY };
         let array = layout::Array { at, descriptors: SLOTS };
         let ring = &segment.words()[RING as usize / 8..][..layout::RING_WORDS];
-        layout::write_ring(ring, gid, &array);
+        layout::write_ring(ring, gid, 0, &array);
         Self { segment, id, gid, reader: session(), generation: ALL | 1 }
     }
 
@@ -209,10 +209,10 @@ fn grants_that_make_no_sense_are_refused() {
 fn segments_of_others_versions_and_machines_are_refused_by_name() {
     let cases: [(u64, u64, &str); 9] = [
         (0, u64::from_ne_bytes(*b"AXONSES1"), "not a segment"),
-        (8, 2 | 0x0a0b_0c0d << 32, "another version"),
-        (8, 4 | 0x0a0b_0c0d << 32, "another version"),
-        (8, 3 | 0x0d0c_0b0a << 32, "another byte order"),
-        (8, u64::from(3u32.swap_bytes()) | 0x0d0c_0b0a << 32, "another byte order"),
+        (8, 3 | 0x0a0b_0c0d << 32, "another version"),
+        (8, 5 | 0x0a0b_0c0d << 32, "another version"),
+        (8, 4 | 0x0d0c_0b0a << 32, "another byte order"),
+        (8, u64::from(4u32.swap_bytes()) | 0x0d0c_0b0a << 32, "another byte order"),
         (16, 7, "another session"),
         (32, 1, "another one"),
         (32, 1 << 32, "another one"),

@@ -1,5 +1,7 @@
 //! Both ends in one process, in one session and in two.
 
+mod activity;
+
 use std::{
     io::Write as _,
     sync::atomic::{AtomicU64, Ordering},

@@ -337,6 +337,22 @@ fn what_publishers_leave_is_used_again() {
 }
 
 #[test]
+fn thousands_of_publishers_that_end_one_after_the_other_are_not_looked_at_each_time() {
+    const MANY: usize = 3000;
+    let (a, b) = (session(), session());
+    let from = peer(&b, &a);
+    let writers: Vec<_> = (0..MANY).map(|_| writer(&a, keep_last(1), 0)).collect();
+    let attached = writers.iter().map(|w| attach_to(w, &a, &b, from.clone(), keep_last(1)));
+    let readers: Vec<_> = attached.collect();
+    drop(writers);
+    assert!(a.tidy(), "they are read");
+    let looks = a.looks_at_orphans();
+    assert!(looks < 4 * MANY, "{looks} looks");
+    drop(readers);
+    assert!(!a.tidy(), "nobody reads them any more");
+}
+
+#[test]
 fn a_publisher_that_is_gone_is_read_to_the_end() {
     let (a, b) = (session(), session());
     let gone = writer(&a, Qos::keep_all(), 1 << 20);

@@ -38,6 +38,9 @@ fn caught_by(site: Site) -> &'static str {
             "tests::model::lanes::a_reader_that_has_left_has_read_all"
         }
         LetGoSwap | TakeSwap => "tests::model::lock::a_new_lock_holder_sees_what_the_last_one_did",
+        NotedAdd | NotedLoad => {
+            "tests::model::journal::a_follower_finds_each_sample_in_the_rings_that_are_named"
+        }
         ArmFence | SettleFence => "wake::tests::the_last_look_or_the_ring_finds_what_came",
     }
 }

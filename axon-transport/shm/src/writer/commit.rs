@@ -132,6 +132,9 @@ impl Writer {
             };
             let meta = self.number(state, numbering);
             let position = self.show(state, meta, extent, place, payload);
+            if state.reader_set.has_followers() {
+                self.session.journal().note(self.number);
+            }
             if bells == Bells::Later {
                 return Ok((meta, Some(position), None));
             }

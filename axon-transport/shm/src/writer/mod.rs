@@ -115,6 +115,8 @@ pub struct Writer {
     pub(super) session: Arc<SessionSegment>,
     /// The ring's header.
     pub(super) ring: Object,
+    /// Its number in the session's journal.
+    pub(super) number: u32,
     /// The most descriptors.
     pub(super) limit: u64,
     state: PiMutex<State>,
@@ -217,7 +219,7 @@ impl Writer {
         if max_message > layout::MAX_MESSAGE || budget > layout::MAX_BUDGET {
             return Err(ShmError::TooLarge { max_message, budget });
         }
-        session.tidy();
+        session.tidy_some();
         let limit = match qos.history {
             Keep::KeepLast => (u64::from(qos.depth) + 1)
                 .next_power_of_two()
@@ -242,7 +244,8 @@ impl Writer {
         };
         protocol::copy_descriptors(array.words(), array.words(), 0, 0);
         let at = Array { at: array.block.at, descriptors };
-        layout::write_ring(ring.words(), options.gid, &at);
+        let number = session.number_ring();
+        layout::write_ring(ring.words(), options.gid, number, &at);
         offer(ring.words(), &options.qos);
         let mut history = History::new(descriptors, budget);
         if keeps_all(&qos) {
@@ -250,7 +253,7 @@ impl Writer {
         }
         let reader_set = ReaderSet::new(qos, limit - 1, Pool::new(budget, max_message));
         let state = State::new(reader_set, history, array);
-        let writer = Self { options, session, ring, limit, state: PiMutex::new(state)? };
+        let writer = Self { options, session, ring, number, limit, state: PiMutex::new(state)? };
         writer.add_bytes(layout::RING + descriptors * layout::DESCRIPTOR);
         writer.show_window(&writer.lock());
         if expected > COPIED_ALWAYS {

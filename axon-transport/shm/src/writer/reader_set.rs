@@ -36,6 +36,9 @@ pub(crate) struct ReaderSet {
     /// Their sessions, each once, shared with publishes that ring after they have unlocked.
     peers: Arc<[Peer]>,
     window: u64,
+    /// Whether samples are noted in the session's journal, for readers that may follow it: relays, and where each
+    /// reader waits for calls, all in other sessions.
+    followers: bool,
     /// Samples that readers who stand for others gave up.
     given_up: u64,
 }
@@ -145,6 +148,7 @@ impl ReaderSet {
             pin_lanes: PinLanes::new(pool),
             peers: Arc::new([]),
             window: 0,
+            followers: false,
             given_up: 0,
         };
         reader_set.changed();
@@ -178,6 +182,17 @@ impl ReaderSet {
 
     pub(crate) fn peers(&self) -> Arc<[Peer]> {
         Arc::clone(&self.peers)
+    }
+
+    /// Whether there are readers that may follow the session's journal.
+    #[inline]
+    pub(crate) fn has_followers(&self) -> bool {
+        self.followers
+    }
+
+    /// Whether a reader may follow the journal. Others cost a publish nothing.
+    fn may_follow(&self, reader: &ReaderInfo) -> bool {
+        reader.stands_for.is_some() || (self.heeds_depths && reader.peer.remote().is_some())
     }
 
     /// The sessions, if anybody there waits for a sample, after [`settle`](crate::wake::settle).
@@ -224,6 +239,7 @@ impl ReaderSet {
                 && known.cursor(head).is_some()
         });
         if let Some(index) = known {
+            self.followers |= self.may_follow(&info);
             let known = &mut self.readers[index];
             known.info.stands_for = info.stands_for;
             known.carries = carries;
@@ -459,6 +475,7 @@ impl ReaderSet {
     /// There is one reader more. A publisher of hundreds gets them one by one, so that what stands is
     /// added to, and not found anew.
     fn joined(&mut self, info: &ReaderInfo) {
+        self.followers |= self.may_follow(info);
         self.window = self.window.max(wanted(&info.qos)).min(self.capacity);
         let id = info.peer.id();
         if self.peers.iter().all(|peer| peer.id() != id) {
@@ -475,6 +492,7 @@ impl ReaderSet {
             let most = readers.chain([&self.offered]).map(wanted).max().unwrap_or(BURST);
             most.min(self.capacity)
         };
+        self.followers = self.readers.iter().any(|reader| self.may_follow(&reader.info));
         let mut met = HashSet::new();
         let peers = self.readers.iter().map(|reader| &reader.info.peer);
         self.peers = peers.filter(|peer| met.insert(peer.id())).cloned().collect();

@@ -56,6 +56,9 @@ struct Client {
     /// Segments of its own, and those of the sessions that it holds.
     segments: BTreeMap<u32, Segment>,
     mapped: HashMap<SessionId, BTreeSet<u32>>,
+    /// Those of them that were handed over since the daemon began to tell everything anew. It does not say when others
+    /// are gone.
+    named: HashMap<SessionId, BTreeSet<u32>>,
     graph: BTreeMap<Gid, Option<DaemonId>>,
     building: Option<BTreeMap<Gid, Option<DaemonId>>>,
     repeated: Option<HashSet<Pair>>,
@@ -84,7 +87,9 @@ impl Client {
 
     fn map(&mut self, of: SessionId, segment: &Segment, label: &Label) {
         assert_eq!(*label, (of, "map"));
-        self.mapped.entry(of).or_default().insert(segment.number);
+        for held in [&mut self.mapped, &mut self.named] {
+            held.entry(of).or_default().insert(segment.number);
+        }
     }
 
     fn release(&mut self, pair: &Pair) {
@@ -92,6 +97,7 @@ impl Client {
             pairs.remove(pair);
             if pairs.is_empty() {
                 self.mapped.remove(of);
+                self.named.remove(of);
             }
             !pairs.is_empty()
         });
@@ -104,6 +110,7 @@ impl Client {
                 if graph.whole {
                     self.building = Some(BTreeMap::new());
                     self.held.clear();
+                    self.named.clear();
                     self.repeated = self.told.then(HashSet::new);
                     self.told = true;
                 }
@@ -118,6 +125,7 @@ impl Client {
                     }
                     if let Some(repeated) = self.repeated.take() {
                         self.attached.retain(|pair| repeated.contains(pair));
+                        self.mapped.clone_from(&self.named);
                     }
                 }
             }
@@ -186,8 +194,10 @@ impl Client {
                 self.map(session, &segment, &fds[0]);
             }
             Message::SegmentGone(SegmentName { session, number }) => {
-                if let Some(mapped) = self.mapped.get_mut(&session) {
-                    mapped.remove(&number);
+                for held in [&mut self.mapped, &mut self.named] {
+                    if let Some(numbers) = held.get_mut(&session) {
+                        numbers.remove(&number);
+                    }
                 }
             }
             other => panic!("a session is never told {other:?}"),

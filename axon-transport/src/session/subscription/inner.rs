@@ -166,6 +166,10 @@ impl SubscriptionInner {
         if matches!(self.endpoint.kind, EndpointKind::Server | EndpointKind::Client) {
             mapped.tell_room();
         }
+        // Where its session is a gateway's, which reads too many rings to look at all of them.
+        if self.role != EndpointRole::Application {
+            mapped.follow(self.endpoint.gid);
+        }
         Ok(mapped)
     }
 

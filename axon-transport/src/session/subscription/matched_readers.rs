@@ -1,7 +1,7 @@
 //! The readers of a subscription, one for each publisher: their attachment and removal.
 
 use std::{
-    collections::HashMap,
+    collections::{BTreeSet, HashMap},
     time::{Duration, Instant},
 };
 
@@ -299,6 +299,10 @@ impl MatchedReaders {
             resumed,
             missed,
         });
+        if let Some(slot) = self.matched_readers.last() {
+            // It could not be taken from before it was here.
+            slot.reader.mark_active();
+        }
         self.forget_older(writer);
     }
 
@@ -308,6 +312,7 @@ impl MatchedReaders {
         self.pending.remove(writer);
         for slot in self.matched_readers.iter_mut().filter(|slot| slot.reader.writer() == *writer) {
             slot.reader.end();
+            slot.reader.mark_active();
         }
         self.end_where(|reader| reader.writer() == *writer)
     }
@@ -339,11 +344,19 @@ impl MatchedReaders {
         self.lanes().into_iter().map(|(gid, _)| gid).collect()
     }
 
+    /// The writers of which anything is read, or may be soon, those that have ended among them.
+    pub(in crate::session) fn all_writers(&self) -> BTreeSet<Gid> {
+        let there = self.matched_readers.iter().map(|slot| slot.reader.writer());
+        there.chain(self.pending.keys().copied()).collect()
+    }
+
     fn end_where(&mut self, which: impl Fn(&Reader) -> bool) -> bool {
         let mut news = false;
         for slot in self.matched_readers.iter_mut().filter(|s| !s.over && which(&s.reader)) {
             slot.over = true;
             news = true;
+            // A writer that died may have left samples without a word.
+            slot.reader.mark_active();
         }
         self.sweep();
         news

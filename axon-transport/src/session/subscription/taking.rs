@@ -432,6 +432,32 @@ mod tests {
     }
 
     #[test]
+    fn what_a_writer_left_without_a_word_is_looked_at_when_it_is_over() {
+        let session = SessionSegment::create(SessionId::random()).unwrap();
+        session.follow();
+        let [gid, writers @ ..] =
+            std::array::from_fn::<_, 20, _>(|number| Gid::new(session.id(), number as u32));
+        let mut matched_readers = MatchedReaders::default();
+        let publishers = writers.map(|writer| {
+            let (publisher, mut reader) = reading(&session, writer, gid);
+            reader.follow(gid);
+            matched_readers.add(reader, None, Numbers::None);
+            publisher
+        });
+        let active = || {
+            let mut found = Vec::new();
+            session.take_active(&mut found);
+            found
+        };
+        assert_eq!(active().len(), writers.len());
+        // As one that died before it noted the sample: no relay reads here, so none is noted.
+        publishers[10].publish_next(0, b"sample").unwrap();
+        assert!(!active().contains(&(gid, writers[10])));
+        assert!(matched_readers.end(&writers[10]));
+        assert!(active().contains(&(gid, writers[10])) && matched_readers.has_from(&writers[10]));
+    }
+
+    #[test]
     fn numbers_from_other_hosts_leave_losses_that_can_be_counted() {
         const FURTHEST: u64 = 1 + (1 << 32);
         let session = SessionSegment::create(SessionId::random()).unwrap();

@@ -95,6 +95,8 @@ impl Rings for One {
         Ok(Rc::clone(&self.0) as Rc<dyn RingWriter>)
     }
 
+    fn take_active(&self, _found: &mut Vec<(Gid, Gid)>) {}
+
     fn set_waiting_for_room(&self, _waiting: bool) {}
 }
 

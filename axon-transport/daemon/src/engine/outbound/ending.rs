@@ -4,7 +4,7 @@ use std::{collections::HashMap, sync::Arc, time::Duration};
 
 use axon_shm::ids::Gid;
 
-use super::{Outbound, OutboundEvent, Source};
+use super::{Outbound, OutboundEvent, Served, Source};
 
 /// The samples of a publisher that ended are given up after this time without progress.
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -20,6 +20,8 @@ pub(super) struct Endings {
 
 #[derive(Debug)]
 struct Ending {
+    /// Its route, until the peer asks for that anew.
+    route: u32,
     /// The flow's progress at the last look, and since when it has been the same.
     progress: (u64, u64),
     since: Duration,
@@ -27,8 +29,8 @@ struct Ending {
 
 impl Endings {
     /// A publisher ended.
-    pub(super) fn add(&mut self, publisher: Gid, now: Duration) {
-        let ending = Ending { progress: (0, 0), since: now };
+    pub(super) fn add(&mut self, route: u32, publisher: Gid, now: Duration) {
+        let ending = Ending { route, progress: (0, 0), since: now };
         self.publishers.entry(publisher).or_insert(ending);
         self.next = Some(now);
     }
@@ -48,10 +50,14 @@ impl Outbound {
         self.endings.next = Some(now + LOOK);
         let mut over = Vec::new();
         for (of, ending) in &mut self.endings.publishers {
-            let left = self.routes.iter().find_map(|(number, served)| {
-                Some((*number, served.unacknowledged().get(of).copied()?))
-            });
-            let Some((number, left)) = left else {
+            if !self.routes.contains_key(&ending.route) {
+                let reads = |served: &Served| served.sources.iter().any(|source| source.reads(of));
+                let found = self.routes.iter().find(|(_, served)| reads(served));
+                ending.route = found.map_or(ending.route, |(number, _)| *number);
+            }
+            let number = ending.route;
+            let served = self.routes.get(&number);
+            let Some(left) = served.and_then(|s| s.unacknowledged().get(of).copied()) else {
                 over.push((*of, None));
                 continue;
             };
@@ -59,7 +65,7 @@ impl Outbound {
             let flow = id.and_then(|id| self.flows[*id].as_ref());
             let progress = flow.map_or((0, 0), super::Flow::progress);
             if progress != ending.progress {
-                *ending = Ending { progress, since: now };
+                *ending = Ending { progress, since: now, ..*ending };
             }
             if now.saturating_sub(ending.since) >= PATIENCE {
                 over.push((*of, Some((number, left))));

@@ -4,6 +4,7 @@
 //! little more ([`connection`](super::connection)), so that the newest sample is soon the next. A pass costs the flows
 //! that have something to send, and no others.
 
+mod active;
 mod backlog;
 pub(crate) mod budget;
 mod burst;
@@ -15,6 +16,7 @@ mod schedule;
 mod served;
 mod source;
 mod stall;
+mod streams;
 mod without;
 
 use std::{
@@ -24,7 +26,7 @@ use std::{
     time::Duration,
 };
 
-use axon_shm::{ids::Gid, qos::Qos};
+use axon_shm::ids::Gid;
 use quinn_proto::{StreamId, VarInt};
 
 pub(crate) use self::{
@@ -73,6 +75,8 @@ pub(crate) enum OutboundEvent {
 /// The samples to one peer.
 pub(crate) struct Outbound {
     routes: HashMap<u32, Served>,
+    /// The routes of the sources.
+    by_source: HashMap<Gid, u32>,
     flows: Vec<Option<Flow>>,
     free: Vec<FlowId>,
     schedule: Schedule,
@@ -80,8 +84,12 @@ pub(crate) struct Outbound {
     counters: Rc<Counters>,
     timers: BTreeSet<(Duration, FlowId)>,
     without: Without,
+    /// Streams may have become idle since a flow found none.
+    frees_streams: bool,
     /// Streams of flows that ended, and whether a sample is cut off there.
     ended: Vec<(StreamId, bool)>,
+    /// Flows with samples that are not acknowledged. The others cost nothing.
+    busy: BTreeSet<FlowId>,
     endings: Endings,
     stalls: Stalls,
     nudges: Nudges,
@@ -98,6 +106,7 @@ impl Outbound {
     ) -> Self {
         Self {
             routes: HashMap::new(),
+            by_source: HashMap::new(),
             flows: Vec::new(),
             free: Vec::new(),
             schedule: Schedule::default(),
@@ -105,7 +114,9 @@ impl Outbound {
             budget,
             counters,
             timers: BTreeSet::new(),
+            frees_streams: false,
             ended: Vec::new(),
+            busy: BTreeSet::new(),
             endings: Endings::default(),
             stalls: Stalls::new(stalled_after, now),
             nudges: Nudges::default(),
@@ -124,19 +135,29 @@ impl Outbound {
             seen: HashMap::new(),
             flows: HashMap::new(),
         });
+        for gone in served.sources.iter().map(Source::gid) {
+            self.by_source.remove(&gone);
+        }
+        self.by_source.extend(sources.iter().map(|source| (source.gid(), number)));
         served.sources = sources;
         served.seen = seen;
         let Served { sources, seen, flows, .. } = served;
-        let mut unread = Vec::new();
+        let (mut unread, mut read) = (Vec::new(), Vec::new());
         for (of, id) in flows.iter() {
             let Some(flow) = &mut self.flows[*id] else { continue };
             flow.set_sources(sources, seen.get(of).copied());
             if flow.is_idle() && !sources.iter().any(|source| source.reads(of)) {
                 unread.push(*of);
+            } else {
+                read.push(*id);
             }
         }
         for of in unread {
             self.remove_flow(number, &of);
+        }
+        for id in read {
+            self.note_busy(id, now);
+            self.schedule(id);
         }
         self.look_for_samples(number, now);
     }
@@ -144,6 +165,9 @@ impl Outbound {
     /// The peer no longer wants this route.
     pub(crate) fn end_route(&mut self, number: u32) {
         let Some(served) = self.routes.remove(&number) else { return };
+        for source in &served.sources {
+            self.by_source.remove(&source.gid());
+        }
         for id in served.flows.into_values() {
             self.forget_flow(id);
         }
@@ -157,59 +181,9 @@ impl Outbound {
         given_up
     }
 
-    /// A publisher ended: the samples that it left are sent, and then [`OutboundEvent::Drained`] comes.
-    pub(crate) fn handle_publisher_ended(&mut self, publisher: Gid, now: Duration) {
-        self.endings.add(publisher, now);
-    }
-
-    /// A ring rang: samples may wait in any of them.
-    pub(crate) fn handle_samples(&mut self, now: Duration) {
-        let numbers: Vec<u32> = self.routes.keys().copied().collect();
-        for number in numbers {
-            self.look_for_samples(number, now);
-        }
-    }
-
-    fn look_for_samples(&mut self, number: u32, now: Duration) {
-        let Some(served) = self.routes.get(&number) else { return };
-        let mut waiting: Vec<Gid> = served.sources.iter().flat_map(Source::with_data).collect();
-        if served.sources.len() > 1 {
-            waiting.sort_unstable();
-            waiting.dedup();
-        }
-        for of in waiting {
-            let Some(id) = self.flow(number, of, now) else { continue };
-            let (Some(flow), Some(served)) = (&mut self.flows[id], self.routes.get(&number)) else {
-                continue;
-            };
-            flow.handle_samples();
-            flow.take_burst(&served.sources, &self.counters, now);
-            self.schedule(id);
-        }
-    }
-
-    /// The flow of a publisher, or client, over a route.
-    fn flow(&mut self, number: u32, of: Gid, now: Duration) -> Option<FlowId> {
-        let served = self.routes.get_mut(&number)?;
-        if let Some(id) = served.flows.get(&of) {
-            return Some(*id);
-        }
-        let first = served.sources.iter().find(|source| source.reads(&of));
-        let qos = first.map_or_else(Qos::keep_all, Source::qos);
-        let mut flow = Flow::new(of, &served.shared, &qos, &self.budget, now);
-        flow.set_sources(&served.sources, served.seen.get(&of).copied());
-        let id = match self.free.pop() {
-            Some(id) => {
-                self.flows[id] = Some(flow);
-                id
-            }
-            None => {
-                self.flows.push(Some(flow));
-                self.flows.len() - 1
-            }
-        };
-        served.flows.insert(of, id);
-        Some(id)
+    /// A publisher of a route ended: the samples that it left are sent, and then [`OutboundEvent::Drained`] comes.
+    pub(crate) fn handle_publisher_ended(&mut self, number: u32, publisher: Gid, now: Duration) {
+        self.endings.add(number, publisher, now);
     }
 
     fn schedule(&mut self, id: FlowId) {
@@ -236,6 +210,7 @@ impl Outbound {
         self.ended.extend(flow.take_streams());
         self.timers.remove(&(flow.timer.unwrap_or_default(), id));
         self.without.forget(id);
+        self.busy.remove(&id);
         self.nudges.forget(id);
         if flow.scheduled.is_some() {
             self.schedule.remove(id);
@@ -280,11 +255,15 @@ impl Outbound {
                 }
                 Pause::NoStream => {
                     self.without.stream(id);
+                    self.frees_streams = true;
                 }
                 Pause::NoKey => {
                     self.without.key(id, now);
                 }
             }
+        }
+        if std::mem::take(&mut self.frees_streams) {
+            self.finish_idle_streams(carrier);
         }
         carrier.rest(small_blocked);
     }
@@ -364,6 +343,7 @@ impl Outbound {
                 self.schedule(id);
             }
         }
+        self.frees_streams |= self.without.waits_for_stream() > 0;
     }
 
     /// A new link carries all flows. What the old link did not deliver is sent again.
@@ -420,7 +400,7 @@ impl Outbound {
     pub(crate) fn poll_timeout(&self) -> Option<Duration> {
         let flow = self.timers.first().map(|(due, _)| *due);
         let endings = self.endings.poll_timeout();
-        let stalls = (!self.routes.is_empty()).then(|| self.stalls.poll_timeout()).flatten();
+        let stalls = (!self.busy.is_empty()).then(|| self.stalls.poll_timeout()).flatten();
         let nudges = self.nudges.poll_timeout();
         [flow, endings, stalls, nudges, self.without.poll_timeout()].into_iter().flatten().min()
     }
@@ -486,13 +466,12 @@ impl Outbound {
 
     /// Counts the samples that were overwritten in their rings while their flows left them there.
     pub(crate) fn count_overwritten(&mut self) {
-        for served in self.routes.values() {
-            for id in served.flows.values() {
-                if let Some(flow) = &mut self.flows[*id]
-                    && flow.class().is_some()
-                {
-                    flow.count_overwritten(&served.sources, &self.counters);
-                }
+        for id in &self.busy {
+            if let Some(flow) = &mut self.flows[*id]
+                && flow.class().is_some()
+                && let Some(served) = self.routes.get(&flow.route_number)
+            {
+                flow.count_overwritten(&served.sources, &self.counters);
             }
         }
     }
@@ -505,7 +484,7 @@ impl Outbound {
     /// What waits for the peer.
     pub(crate) fn backlog(&self) -> Backlog {
         let mut backlog = Backlog::default();
-        for flow in self.flows.iter().flatten() {
+        for flow in self.busy.iter().filter_map(|id| self.flows[*id].as_ref()) {
             if let Some((class, bytes)) = flow.waiting() {
                 backlog.bytes[class as usize] += bytes;
             }
@@ -516,7 +495,7 @@ impl Outbound {
 
     /// Whether there is anything to hand to QUIC.
     pub(crate) fn has_work(&self) -> bool {
-        !self.schedule.is_empty() || !self.ended.is_empty()
+        !self.schedule.is_empty() || !self.ended.is_empty() || self.frees_streams
     }
 }
 

@@ -35,6 +35,17 @@ impl Source {
         }
     }
 
+    /// The publishers, or clients, that have samples to take, of which `writer` wrote some.
+    pub(super) fn with_data_of(&self, writer: &Gid) -> Vec<Gid> {
+        match self {
+            Self::Relay(_, reader) => {
+                reader.has_data_of(writer).then_some(*writer).into_iter().collect()
+            }
+            // The responses to a client come from any of its servers.
+            Self::StandIn(_) => self.with_data(),
+        }
+    }
+
     /// Whether it reads this publisher or client.
     pub(super) fn reads(&self, of: &Gid) -> bool {
         match self {

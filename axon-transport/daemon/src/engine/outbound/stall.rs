@@ -4,7 +4,7 @@ use std::{collections::HashMap, time::Duration};
 
 use axon_shm::{ids::Gid, qos::History};
 
-use super::{Outbound, OutboundEvent, Served, Source};
+use super::{FlowId, Outbound, OutboundEvent, Served, Source};
 
 /// Between two looks.
 const LOOK: Duration = Duration::from_secs(1);
@@ -16,7 +16,7 @@ const SILENT: Duration = Duration::from_secs(6);
 #[derive(Debug)]
 pub(super) struct Stalls {
     limit: Duration,
-    flows: HashMap<(u32, Gid), Progress>,
+    flows: HashMap<FlowId, Progress>,
     /// Datagrams of the peer, and when there was a new one.
     heard: (u64, Duration),
     next: Duration,
@@ -51,33 +51,48 @@ impl Outbound {
         }
         let silent = now.saturating_sub(self.stalls.heard.1) >= SILENT;
         let before = std::mem::take(&mut self.stalls.flows);
-        for (number, served) in self.routes.iter_mut().filter(|(_, served)| !served.stalled) {
-            for of in served.awaited() {
-                let flow = served.flows.get(&of).and_then(|id| self.flows[*id].as_ref());
-                let at = flow.map_or((0, 0), super::Flow::progress);
-                let progress = match before.get(&(*number, of)) {
-                    Some(progress) if progress.at == at && !silent => *progress,
-                    _ => Progress { at, since: now },
-                };
-                if now.saturating_sub(progress.since) >= self.stalls.limit {
-                    served.stalled = true;
-                    self.events.push(OutboundEvent::Stalled(*number));
-                    break;
-                }
-                self.stalls.flows.insert((*number, of), progress);
+        let mut quiet = Vec::new();
+        for id in &self.busy {
+            let Some(flow) = &self.flows[*id] else { continue };
+            let Some(served) = self.routes.get_mut(&flow.route_number) else { continue };
+            if !served.holds(&flow.of) {
+                quiet.extend(flow.is_quiet().then_some(*id));
+                continue;
             }
+            if served.stalled {
+                continue;
+            }
+            let at = flow.progress();
+            let progress = match before.get(id) {
+                Some(progress) if progress.at == at && !silent => *progress,
+                _ => Progress { at, since: now },
+            };
+            if now.saturating_sub(progress.since) >= self.stalls.limit {
+                served.stalled = true;
+                self.events.push(OutboundEvent::Stalled(flow.route_number));
+                continue;
+            }
+            self.stalls.flows.insert(*id, progress);
         }
+        for id in quiet {
+            self.busy.remove(&id);
+        }
+    }
+
+    /// Samples of a flow wait.
+    pub(super) fn note_busy(&mut self, id: FlowId, now: Duration) {
+        if self.busy.is_empty() {
+            // Nobody looked while there was nothing.
+            self.stalls.next = self.stalls.next.max(now + LOOK);
+        }
+        self.busy.insert(id);
     }
 }
 
 impl Served {
-    /// The publishers that a KEEP_ALL relay holds back.
-    fn awaited(&self) -> Vec<Gid> {
-        let keeping = self.sources.iter().filter(|source| source.qos().history == History::KeepAll);
-        let mut awaited: Vec<_> =
-            keeping.flat_map(|source| Source::unacknowledged(source).into_keys()).collect();
-        awaited.sort_unstable();
-        awaited.dedup();
-        awaited
+    /// Whether a KEEP_ALL relay holds a publisher back.
+    fn holds(&self, of: &Gid) -> bool {
+        let keeping = |source: &Source| source.qos().history == History::KeepAll;
+        self.sources.iter().any(|source| keeping(source) && source.has_unacknowledged(of))
     }
 }

@@ -58,6 +58,11 @@ impl Without {
         self.key_retry
     }
 
+    /// How many flows wait for a stream.
+    pub(super) fn waits_for_stream(&self) -> usize {
+        self.stream.len()
+    }
+
     /// Takes the flows that wait for a stream.
     pub(super) fn take_for_stream(&mut self) -> BTreeSet<FlowId> {
         std::mem::take(&mut self.stream)

@@ -11,7 +11,7 @@ use axon_shm::ids::Gid;
 use axon_transport::graph::{Endpoint, EndpointKind};
 
 use super::{
-    POLL, Peer, Surroundings,
+    Peer, Surroundings, poll_after,
     refused::{TOO_MANY_ASKED, TOO_MANY_WRITERS},
 };
 use crate::{
@@ -25,6 +25,9 @@ use crate::{
 
 /// The peer is asked for a route once the local readers are attached, or after this time.
 const ATTACH_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// Publishers, or clients, of one route that are shown here: a reader looks at all of its publishers.
+const MAX_WRITERS_OF_ROUTE: usize = 1024;
 
 /// A route that this host asked for.
 pub(super) struct Asked {
@@ -97,7 +100,8 @@ impl Peer {
 
     /// The servers of the peer to which requests of this host go: their responses are wanted.
     fn now_answering(&self) -> std::collections::BTreeSet<Gid> {
-        let requests = self.served.values().filter(|served| served.key.kind == Kind::Request);
+        let services = self.services.iter().filter_map(|number| self.served.get(number));
+        let requests = services.filter(|served| served.key.kind == Kind::Request);
         requests.flat_map(|served| served.subscribers.iter().copied()).collect()
     }
 
@@ -194,6 +198,11 @@ impl Peer {
             if asked.stand_ins.contains_key(&writer.gid) {
                 continue;
             }
+            if asked.stand_ins.len() >= MAX_WRITERS_OF_ROUTE {
+                self.refused.unasked(key, TOO_MANY_WRITERS);
+                asked.incomplete = true;
+                break;
+            }
             match with.stand_ins.get(with.rings, writer, self.remote.account()) {
                 Ok(stand_in) => {
                     asked.stand_ins.insert(writer.gid, stand_in);
@@ -252,6 +261,7 @@ impl Peer {
                 self.say(message);
             }
         }
-        self.look_at_attaching = (!self.attaching.is_empty()).then(|| now + POLL);
+        let waiting = self.attaching.len();
+        self.look_at_attaching = (waiting > 0).then(|| now + poll_after(waiting));
     }
 }

@@ -16,6 +16,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use axon_envelope::Kind;
 use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::{
     config::DiscoveryRange,
@@ -58,10 +59,17 @@ use crate::{
 const GRAPH_PART: usize = 512;
 /// A whole graph is sent so often at most.
 const RESYNC: Duration = Duration::from_secs(1);
-/// Between two looks at pairs that are being attached.
+/// Between two looks at pairs that are being attached, at least.
 const POLL: Duration = Duration::from_millis(5);
+/// The same for each of them: thousands of pairs that wait leave time for samples.
+const POLL_EACH: Duration = Duration::from_micros(4);
 /// Routes of a peer whose HELLO does not say how many it serves.
 pub(crate) const ROUTES_UNSAID: usize = 1024;
+
+/// The time until the next look at so many pairs.
+fn poll_after(pairs: usize) -> Duration {
+    POLL.max(POLL_EACH * u32::try_from(pairs).unwrap_or(u32::MAX))
+}
 
 /// The endpoints of applications on this host, and how far their sessions are discovered.
 pub(crate) type Local = BTreeMap<Gid, (Arc<Endpoint>, EndpointRange)>;
@@ -126,6 +134,8 @@ pub(crate) struct Peer {
     /// Publishers here that ended and whose samples have not all arrived: the peer sees them until then.
     ending: BTreeMap<Gid, RemoteEndpoint>,
     served: HashMap<u32, Served>,
+    /// Those of them that are of services.
+    services: BTreeSet<u32>,
     /// The numbers of `served`.
     served_as: HashMap<RouteKey, u32>,
     announcing: BTreeMap<u32, Duration>,
@@ -196,6 +206,7 @@ impl Peer {
             outbound,
             ending: BTreeMap::new(),
             served: HashMap::new(),
+            services: BTreeSet::new(),
             served_as: HashMap::new(),
             announcing: BTreeMap::new(),
             look_at_announcing: None,
@@ -243,13 +254,18 @@ impl Peer {
         match message {
             Message::GraphResync(_) => self.resync(with.local, now),
             Message::Subscribe(subscribe) => {
+                let services = self.services.len();
+                let of_service = subscribe.kind != Kind::Topic as u8;
                 let served = self.serve(subscribe, with, now);
-                self.stirred |= self.services_changed();
+                if of_service || self.services.len() != services {
+                    self.stirred |= self.services_changed();
+                }
                 return served.map_err(|reason| (CloseCode::Malformed, reason));
             }
             Message::Unsubscribe(unsubscribe) => {
+                let of_service = self.services.contains(&unsubscribe.route);
                 self.unserve(unsubscribe.route);
-                self.stirred |= self.services_changed();
+                self.stirred |= of_service && self.services_changed();
             }
             Message::Asserted(asserted) => self.handle_asserted(&asserted),
             Message::Received(received) => self.outbound.handle_received(&received.flows),
@@ -293,14 +309,15 @@ impl Peer {
                 && !local.contains_key(gid)
                 && !self.ending.contains_key(gid)
         });
-        let carried = |gid: &Gid| {
-            let mut sources = self.served.values().flat_map(|served| &served.sources);
-            sources.any(|source| source.has_unacknowledged(gid))
+        let carried = |gid: &Gid, shown: &RemoteEndpoint| {
+            let number = *self.served_as.get(&RouteKey::of(&shown.endpoint)?)?;
+            let sources = &self.served.get(&number)?.sources;
+            sources.iter().any(|source| source.has_unacknowledged(gid)).then_some(number)
         };
-        let ended = ended.filter(|(gid, _)| carried(gid));
-        let ended: Vec<_> = ended.map(|(gid, shown)| (*gid, shown.clone())).collect();
-        for (gid, shown) in ended {
-            self.outbound.handle_publisher_ended(gid, now);
+        let ended =
+            ended.filter_map(|(gid, shown)| Some((carried(gid, shown)?, *gid, shown.clone())));
+        for (number, gid, shown) in ended.collect::<Vec<_>>() {
+            self.outbound.handle_publisher_ended(number, gid, now);
             self.ending.insert(gid, shown);
         }
     }

@@ -1,7 +1,7 @@
 //! Routes that do not cross, by name: for status, for the log, and for the peer.
 
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, BTreeSet},
     time::{Duration, Instant},
 };
 
@@ -34,6 +34,8 @@ pub(super) struct RefusedRoutes {
     unasked: BTreeMap<RouteKey, &'static str>,
     /// Routes that the peer does not serve, and when to ask again.
     unserved: BTreeMap<RouteKey, (String, Option<Duration>)>,
+    /// Those of them that are asked for again, by that time.
+    again: BTreeSet<(Duration, RouteKey)>,
     /// Routes that the peer asked for and does not get, by its number.
     theirs: BTreeMap<u32, (RouteKey, String)>,
     logged: LogLimit,
@@ -67,7 +69,21 @@ impl RefusedRoutes {
     /// The route is no longer wanted, or the peer serves it.
     pub(super) fn settle(&mut self, key: &RouteKey) {
         self.unasked.remove(key);
-        self.unserved.remove(key);
+        self.served(key);
+    }
+
+    /// The peer serves a route, or is not asked for it any more.
+    fn served(&mut self, key: &RouteKey) {
+        if let Some((_, Some(again))) = self.unserved.remove(key) {
+            self.again.remove(&(again, key.clone()));
+        }
+    }
+
+    /// The peer does not serve a route. It is asked again then, if at all.
+    fn unserved(&mut self, key: RouteKey, reason: String, again: Option<Duration>) {
+        self.served(&key);
+        self.again.extend(again.map(|again| (again, key.clone())));
+        self.unserved.insert(key, (reason, again));
     }
 
     /// The peer no longer wants the route, or gets it.
@@ -77,16 +93,19 @@ impl RefusedRoutes {
 
     /// When a refused route is asked for again.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
-        self.unserved.values().filter_map(|(_, again)| *again).min()
+        self.again.first().map(|(again, _)| *again)
     }
 
     fn due(&mut self, now: Duration) -> Vec<RouteKey> {
-        let due = self.unserved.iter_mut().filter_map(|(key, (_, again))| {
-            (*again).filter(|again| *again <= now)?;
-            *again = None;
-            Some(key.clone())
-        });
-        due.collect()
+        let mut due = Vec::new();
+        while self.poll_timeout().is_some_and(|again| again <= now) {
+            let Some((_, key)) = self.again.pop_first() else { break };
+            if let Some((_, again)) = self.unserved.get_mut(&key) {
+                *again = None;
+            }
+            due.push(key);
+        }
+        due
     }
 }
 
@@ -117,13 +136,13 @@ impl Peer {
         let reason: String = reason.chars().filter(|c| !c.is_control()).take(REASON).collect();
         self.refused.log(&key, &reason);
         let again = retry_s.map(|seconds| now + Duration::from_secs(seconds.into()));
-        self.refused.unserved.insert(key, (reason, again));
+        self.refused.unserved(key, reason, again);
     }
 
     /// The peer serves a route.
     pub(super) fn handle_route_ready(&mut self, route: u32) {
         if let Some(key) = self.numbers.get(&route) {
-            self.refused.unserved.remove(key);
+            self.refused.served(key);
         }
     }
 
@@ -150,14 +169,16 @@ impl Peer {
     /// Names the refused routes in the link's status.
     pub(super) fn show_refused(&self, status: &mut LinkStatus) {
         let RefusedRoutes { unasked, unserved, theirs, .. } = &self.refused;
-        let unasked = unasked.iter().map(|(key, why)| (key, format!("not asked for: {why}")));
-        let unserved =
-            unserved.iter().map(|(key, (why, _))| (key, format!("refused by the peer: {why}")));
-        let theirs = theirs.values().map(|(key, why)| (key, format!("refused here: {why}")));
-        for (key, why) in unasked.chain(unserved).chain(theirs) {
-            if status.routes_refused.len() < LISTED {
-                status.routes_refused.insert(key.to_string(), why);
-            } else if !status.routes_refused.contains_key(&key.to_string()) {
+        let unasked = unasked.iter().map(|(key, why)| (key, "not asked for", *why));
+        let unserved = unserved.iter().map(|(key, (why, _))| (key, "refused by the peer", &**why));
+        let theirs = theirs.values().map(|(key, why)| (key, "refused here", &**why));
+        let mut listed = BTreeSet::new();
+        // Of thousands nothing but the number is shown.
+        for (key, by, why) in unasked.chain(unserved).chain(theirs) {
+            if listed.len() < LISTED {
+                listed.insert(key);
+                status.routes_refused.insert(key.to_string(), format!("{by}: {why}"));
+            } else if !listed.contains(key) {
                 status.more_routes_refused += 1;
             }
         }

@@ -17,7 +17,7 @@ use axon_transport::{
     internal::graph::{Pairing, RangeToHost, RemoteEndpoint, out_of_range, pairing, reads, writes},
 };
 
-use crate::{engine::account::MAX_RELAYS, link::Subscriber};
+use crate::link::Subscriber;
 
 /// What a route carries: samples, requests or responses, of one name and type.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -173,15 +173,15 @@ pub(crate) fn relays(subscribers: &[Subscriber], hash: impl Fn(&Gid) -> Vec<u8>)
     groups.into_values().collect()
 }
 
-/// Leaves of `specs` those that there are already, and as many of the others as a peer may have that has
-/// so many relays for other routes. How many it leaves out.
+/// Leaves of `specs` those that there are already, and as many of the others as a peer may have that may have so many
+/// relays for this route. How many it leaves out.
 pub(crate) fn admit(
     specs: &mut Vec<RelaySpec>,
     is_there: impl Fn(&RelaySpec) -> bool,
-    elsewhere: usize,
+    room: usize,
 ) -> usize {
     let (asked, there) = (specs.len(), specs.iter().filter(|spec| is_there(spec)).count());
-    let most = MAX_RELAYS_OF_ROUTE.min(MAX_RELAYS.saturating_sub(elsewhere));
+    let most = MAX_RELAYS_OF_ROUTE.min(room);
     let mut more = most.saturating_sub(there);
     specs.retain(|spec| {
         let new = !is_there(spec);
@@ -336,14 +336,14 @@ mod tests {
             relays(&all, |gid| vec![gid.0[0]])
         };
         let mut specs = of(0..20);
-        assert_eq!((admit(&mut specs, |_| false, 0), specs.len()), (4, 16));
+        assert_eq!((admit(&mut specs, |_| false, usize::MAX), specs.len()), (4, 16));
         let mut specs = of(0..20);
         let later = |spec: &RelaySpec| spec.type_hash[0] >= 10;
-        assert_eq!((admit(&mut specs, later, 0), specs.len()), (4, 16));
+        assert_eq!((admit(&mut specs, later, 100), specs.len()), (4, 16));
         assert_eq!(specs.iter().filter(|spec| later(spec)).count(), 10);
         let mut specs = of(0..5);
-        assert_eq!((admit(&mut specs, |_| false, MAX_RELAYS - 3), specs.len()), (2, 3));
+        assert_eq!((admit(&mut specs, |_| false, 3), specs.len()), (2, 3));
         let mut specs = of(0..5);
-        assert_eq!((admit(&mut specs, |_| true, MAX_RELAYS), specs.len()), (0, 5));
+        assert_eq!((admit(&mut specs, |_| true, 0), specs.len()), (0, 5));
     }
 }

@@ -6,7 +6,7 @@ use axon_envelope::{Kind, Route, TopicHash};
 use axon_shm::ids::Gid;
 use axon_transport::EndpointSpec;
 
-use super::{POLL, Peer, Surroundings};
+use super::{Peer, Surroundings, poll_after};
 use crate::{
     engine::{
         account::Charge,
@@ -21,8 +21,8 @@ const READY_TIMEOUT: Duration = Duration::from_secs(2);
 /// Memory of a route, in bytes, beside the names and subscribers of which it holds three copies.
 const ROUTE: usize = 2048;
 const COPIES: usize = 3;
-/// Routes that a peer is served. HELLO says it.
-pub(crate) const MAX_ROUTES: usize = 1024;
+/// Routes that a peer is served. HELLO says it. What they take is bounded apart from it.
+pub(crate) const MAX_ROUTES: usize = 1 << 15;
 
 /// A route that the peer asked for.
 pub(super) struct Served {
@@ -79,7 +79,7 @@ impl Peer {
         if self.served.get(&number).is_some_and(|old| !old.repeated && old.key != key) {
             self.unserve(number);
         }
-        let old = match self.served.remove(&number) {
+        let old = match self.take_served(number) {
             Some(served) if served.key == key => served.sources,
             Some(_) => return Err("a route number for two topics".into()),
             None => {
@@ -131,8 +131,17 @@ impl Peer {
             _charges: [charge, relays],
             repeated: true,
         };
+        if served.key.kind != Kind::Topic {
+            self.services.insert(number);
+        }
         self.served.insert(number, served);
         Ok(())
+    }
+
+    /// Takes a route out of those that are served.
+    fn take_served(&mut self, number: u32) -> Option<Served> {
+        self.services.remove(&number);
+        self.served.remove(&number)
     }
 
     /// The subscribers that are of the peer's own sessions.
@@ -153,7 +162,7 @@ impl Peer {
         with: &Surroundings<'_>,
         now: Duration,
     ) -> Option<StalledRoute> {
-        let served = self.served.remove(&route)?;
+        let served = self.take_served(route)?;
         self.served_as.remove(&served.key);
         self.announcing.remove(&route);
         let samples = self.outbound.give_up_route(route);
@@ -174,7 +183,7 @@ impl Peer {
     pub(super) fn unserve(&mut self, route: u32) {
         self.refused.forget(route);
         self.announcing.remove(&route);
-        if let Some(served) = self.served.remove(&route) {
+        if let Some(served) = self.take_served(route) {
             self.served_as.remove(&served.key);
         }
         self.outbound.end_route(route);
@@ -203,8 +212,8 @@ impl Peer {
                 _ => None,
             })
         };
-        let elsewhere = self.remote.account().relays.held();
-        let refused = admit(&mut specs, |spec| there(spec).is_some(), elsewhere);
+        let room = self.remote.account().relays.left();
+        let refused = admit(&mut specs, |spec| there(spec).is_some(), room);
         if refused > 0 {
             let topic = &key.topic;
             tracing::warn!(
@@ -244,7 +253,8 @@ impl Peer {
 
     /// Has the routes of services use the stand-ins that exist now.
     pub(super) fn feed_services(&mut self, now: Duration) {
-        let services = self.served.iter().filter(|(_, served)| served.key.kind != Kind::Topic);
+        let services = self.services.iter();
+        let services = services.filter_map(|number| Some((number, self.served.get(number)?)));
         let mut changes = Vec::new();
         for (number, served) in services {
             let sources = self.sources_of_service(&served.key);
@@ -282,6 +292,7 @@ impl Peer {
             self.announcing.remove(&ready.route);
             self.say(Message::RouteReady(ready));
         }
-        self.look_at_announcing = (!self.announcing.is_empty()).then(|| now + POLL);
+        let waiting = self.announcing.len();
+        self.look_at_announcing = (waiting > 0).then(|| now + poll_after(waiting));
     }
 }

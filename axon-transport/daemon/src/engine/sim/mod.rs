@@ -15,5 +15,6 @@ mod run;
 mod scenarios;
 pub(crate) mod script;
 mod tests;
+mod topics;
 pub(crate) mod trace;
 mod world;

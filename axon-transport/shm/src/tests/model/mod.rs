@@ -8,6 +8,7 @@
 #![allow(unsafe_code)]
 
 mod growth;
+mod journal;
 mod lanes;
 mod lock;
 mod pins;

@@ -24,6 +24,7 @@ impl Control {
     pub(super) fn graph(&mut self, graph: Graph) {
         if graph.whole {
             self.building = Some(GraphView::default());
+            self.topics.clear();
             self.arrivals.restart();
             self.peers.recount();
             // A daemon that tells everything to a session it knew repeats every pair that it told it
@@ -103,7 +104,7 @@ impl Control {
                 Source::Subscription(_) => Pair { reader: own.gid, writer: other },
             });
         }
-        self.timed = None;
+        self.note_timed(source);
         // Whether a service is available is no more than that.
         self.graph_changed |= matches!(own.kind, EndpointKind::Server | EndpointKind::Client);
         self.shared.notify(Some(&SessionEvent::Matched(own.gid)));
@@ -170,6 +171,12 @@ impl Control {
         let mut entry = self.arrivals.remove(gid);
         self.view(|view| entry = view.endpoints.remove(gid).or(entry.take()));
         let Some(entry) = entry else { return };
+        if let Some(gids) = self.topics.get_mut(&entry.endpoint.topic) {
+            gids.remove(gid);
+            if gids.is_empty() {
+                self.topics.remove(&entry.endpoint.topic);
+            }
+        }
         for own in self.own(&entry.endpoint.topic) {
             own.events().forget(gid);
         }
@@ -177,6 +184,7 @@ impl Control {
 
     fn show(&mut self, entry: GraphEntry) {
         self.graph_changed = true;
+        self.topics.entry(entry.endpoint.topic.clone()).or_default().insert(entry.endpoint.gid);
         self.view(|view| drop(view.endpoints.insert(entry.endpoint.gid, entry)));
     }
 
@@ -227,7 +235,10 @@ impl Control {
         };
         let shown = self.shared.state().graph.clone();
         let shown = self.building.as_ref().unwrap_or(&shown);
-        for other in shown.endpoints.values().chain(self.arrivals.entries()) {
+        // The session's own that nobody was told of yet are met when they are told.
+        let others = self.topics.get(&endpoint.topic).into_iter().flatten();
+        let others = others.filter_map(|gid| shown.endpoints.get(gid));
+        for other in others.chain(self.arrivals.entries()) {
             if !ended(&other.endpoint.gid) {
                 self.report(source, &other.endpoint);
             }

@@ -69,10 +69,14 @@ impl Control {
         if gids.is_empty() {
             return;
         }
+        // Thousands may end at a time, and be attached to one each.
+        let gids: HashSet<Gid> = gids.iter().copied().collect();
         self.spoken.retain(|pair| !gids.contains(&pair.reader) && !gids.contains(&pair.writer));
         let (publishers, subscriptions) = self.endpoints();
         for publisher in publishers {
-            let detached = gids.iter().filter(|gid| publisher.detach(**gid));
+            let attached = publisher.attached().clone();
+            let ended = attached.iter().filter(|gid| gids.contains(gid));
+            let detached = ended.filter(|gid| publisher.detach(**gid));
             let writer = publisher.endpoint.gid;
             let detached = detached.inspect(|gid| {
                 pair_log::over(&Pair { reader: **gid, writer }, "the reader ended");
@@ -84,9 +88,11 @@ impl Control {
         for subscription in subscriptions {
             let mut matched_readers = subscription.lock();
             let reader = subscription.endpoint.gid;
-            let ended = gids.iter().filter(|gid| matched_readers.end(gid));
+            let writers = matched_readers.all_writers().into_iter();
+            let ended = writers.filter(|gid| gids.contains(gid));
+            let ended = ended.filter(|gid| matched_readers.end(gid));
             let ended = ended.inspect(|gid| {
-                pair_log::over(&Pair { reader, writer: **gid }, "the writer ended");
+                pair_log::over(&Pair { reader, writer: *gid }, "the writer ended");
             });
             let news = ended.count();
             drop(matched_readers);
@@ -228,6 +234,9 @@ impl Control {
             Err(error) => {
                 let topic = &subscription.endpoint.topic;
                 tracing::error!(topic, %error, "a publisher cannot be received from");
+                // For its status: the caller that waits for samples is on another host, where this is a gateway.
+                let pair = Pair { reader: subscription.endpoint.gid, writer };
+                self.tell_failure(&pair, error.to_string());
             }
         }
     }
@@ -456,7 +465,7 @@ impl Control {
             pair_log::over(pair, "the daemon said so to the writer");
             self.writer_changed(&publisher);
         }
-        if self.shared.segment.tidy() {
+        if self.shared.segment.tidy_some() {
             self.look_after_memory();
         }
     }

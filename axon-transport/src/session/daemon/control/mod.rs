@@ -9,7 +9,7 @@ mod pair_log;
 mod time;
 
 use std::{
-    collections::{BTreeMap, BTreeSet, HashSet, VecDeque},
+    collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque},
     os::fd::{AsFd, BorrowedFd},
     sync::{Arc, atomic::Ordering, mpsc::Receiver},
     time::{Duration, Instant},
@@ -78,6 +78,9 @@ pub(in crate::session) struct Control {
     /// This process had no descriptors left: when it asks to be told everything anew.
     retry: Option<Instant>,
     arrivals: Arrivals,
+    /// The endpoints of the graph by their topics: of the whole one of which parts are to come, or of the one that is
+    /// shown.
+    topics: HashMap<String, BTreeSet<Gid>>,
     /// Endpoints of whose pairs some came or went since [`tell_matched`](Self::tell_matched).
     rematching: Rematching,
     /// The graph is another one than was last told.
@@ -139,6 +142,7 @@ impl Control {
             pause: Duration::ZERO,
             retry: None,
             arrivals: Arrivals::default(),
+            topics: HashMap::new(),
             rematching: Rematching::default(),
             graph_changed: false,
             timed: None,
@@ -224,9 +228,6 @@ impl Control {
         }
         let (mut gone, mut fences) = (Vec::new(), BTreeMap::new());
         let mut state = shared.state();
-        if !state.outgoing.is_empty() {
-            self.timed = None;
-        }
         if matches!(self.link, Link::Reconnecting(_) | Link::Ended) {
             // All of it is said to the next daemon from what stands then.
             state.outgoing.clear();
@@ -236,6 +237,7 @@ impl Control {
             match outgoing {
                 Outgoing::Message(message) => {
                     if let Message::EndpointGone(Gone { gid }) = *message {
+                        self.timed = None;
                         gone.push(gid);
                     }
                     self.say(*message);
@@ -250,6 +252,7 @@ impl Control {
                 }
                 Outgoing::Announce(gid) => {
                     if let Some(publisher) = state.publishers.get(&gid) {
+                        self.note_timed(&Source::Publisher(publisher.clone()));
                         let announce = Announce {
                             endpoint: publisher.endpoint.clone(),
                             role: publisher.role,
@@ -259,6 +262,7 @@ impl Control {
                         };
                         self.say(Message::Endpoint(announce));
                     } else if let Some(subscription) = state.subscriptions.get(&gid) {
+                        self.note_timed(&Source::Subscription(subscription.clone()));
                         let announce = Announce {
                             endpoint: subscription.endpoint.clone(),
                             role: subscription.role,

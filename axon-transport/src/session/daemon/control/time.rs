@@ -37,6 +37,7 @@ impl Control {
         let next = state.again;
         drop(state);
         if again.is_some() {
+            self.shared.segment.mark_all_active();
             self.shared.segment.notify();
         }
         next
@@ -48,15 +49,33 @@ impl Control {
         Some(Duration::from_nanos(alarm.saturating_sub(clock::monotonic())))
     }
 
+    /// An endpoint came, or its matches changed. If it has times to be looked at, those of all are found anew.
+    pub(super) fn note_timed(&mut self, source: &Source) {
+        let watched = |timed: &Vec<Source>| {
+            timed.iter().any(|other| other.endpoint().gid == source.endpoint().gid)
+        };
+        if is_timed(source) || self.timed.as_ref().is_some_and(watched) {
+            self.timed = None;
+        }
+    }
+
     fn find_timed(&self) -> Vec<Source> {
         let (publishers, subscriptions) = self.endpoints();
-        let publishers = publishers.into_iter().filter(|publisher| {
-            publisher.endpoint.qos.deadline.is_some() || publisher.endpoint.qos.lease.is_some()
-        });
-        let subscriptions = subscriptions.into_iter().filter(|subscription| {
+        let publishers = publishers.into_iter().map(Source::Publisher);
+        let all = publishers.chain(subscriptions.into_iter().map(Source::Subscription));
+        all.filter(is_timed).collect()
+    }
+}
+
+/// Whether somebody watches its deadlines or leases.
+fn is_timed(source: &Source) -> bool {
+    match source {
+        Source::Publisher(publisher) => {
+            let qos = &publisher.endpoint.qos;
+            qos.deadline.is_some() || qos.lease.is_some()
+        }
+        Source::Subscription(subscription) => {
             subscription.endpoint.qos.deadline.is_some() || subscription.lock().offers_lease()
-        });
-        let publishers = publishers.map(Source::Publisher);
-        publishers.chain(subscriptions.map(Source::Subscription)).collect()
+        }
     }
 }

@@ -139,13 +139,30 @@ impl Flow {
         self.taking.set_sources(sources, seen);
     }
 
-    /// Whether anything of it waits or is not acknowledged.
-    pub(super) fn is_idle(&self) -> bool {
+    /// Whether it has no sample that waits or is not acknowledged. There may be some in its rings.
+    fn has_none(&self) -> bool {
         self.taking.is_idle()
             && self.queue.is_empty()
             && self.batch.is_empty()
-            && self.stream.is_none()
             && self.best_effort.is_idle()
+    }
+
+    /// Whether nothing of it waits or is not acknowledged, and no stream is open.
+    pub(super) fn is_idle(&self) -> bool {
+        self.has_none() && self.stream.is_none()
+    }
+
+    /// Whether nothing of it waits, in its rings either, or is not acknowledged.
+    pub(super) fn is_quiet(&self) -> bool {
+        self.has_none() && !self.taking.has_more()
+    }
+
+    /// Whether its stream carries nothing, and nothing in its rings is to be looked at: its timer is free.
+    pub(super) fn has_idle_stream(&self) -> bool {
+        self.stream.is_some()
+            && self.queue.is_empty()
+            && self.batch.is_empty()
+            && !self.taking.has_more()
     }
 
     /// The class of what it sends next, or `None` if it has nothing to send.
@@ -427,7 +444,7 @@ impl Flow {
     }
 
     /// The reliable stream carries nothing more.
-    fn finish_stream(&mut self, carrier: &mut Carrier<'_>) {
+    pub(super) fn finish_stream(&mut self, carrier: &mut Carrier<'_>) {
         if let Some(stream) = self.stream.take() {
             let _ = carrier.quic.send_stream(stream).finish();
         }
@@ -489,6 +506,11 @@ impl Flow {
         if let Some(due) = due {
             self.timer = Some(self.timer.map_or(due, |timer| timer.min(due)));
         }
+    }
+
+    /// Sets the timer for what is left when there is no stream any more.
+    pub(super) fn restart_timer(&mut self) {
+        self.timer = self.best_effort.poll_timeout();
     }
 
     /// Resets best-effort samples whose time is over, and finishes a stream that has been idle.

@@ -56,6 +56,10 @@ impl RingReader for Ring {
         self.matched()
     }
 
+    fn has_data_of(&self, publisher: &Gid) -> bool {
+        self.reads(publisher) && !self.samples.borrow().is_empty()
+    }
+
     fn reads(&self, publisher: &Gid) -> bool {
         *publisher == PUBLISHER
     }

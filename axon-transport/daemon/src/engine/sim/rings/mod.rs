@@ -50,7 +50,13 @@ struct Subscription {
 struct State {
     publishers: BTreeMap<Gid, Publisher>,
     subscriptions: BTreeMap<Gid, Subscription>,
-    readers: Vec<Rc<Cursors>>,
+    readers: HashMap<String, Vec<Rc<Cursors>>>,
+    /// The publishers and subscriptions of each topic.
+    topics: HashMap<String, BTreeSet<Gid>>,
+    /// Relays whose publishers have news for them.
+    active: Vec<(Gid, Gid)>,
+    /// How often a relay was asked whether it has samples.
+    looks: u64,
     /// Samples of each publisher up to this number are past their lifespan.
     expired: BTreeMap<Gid, u64>,
     /// What was given up of each publisher.
@@ -132,7 +138,9 @@ impl SimRings {
         let endpoint = Arc::new(self.endpoint(EndpointKind::Publisher, topic, qos));
         let gid = endpoint.gid;
         let publisher = Publisher { endpoint, published: 0, history: VecDeque::new() };
-        self.state.borrow_mut().publishers.insert(gid, publisher);
+        let state = &mut *self.state.borrow_mut();
+        state.publishers.insert(gid, publisher);
+        state.topics.entry(topic.into()).or_default().insert(gid);
         gid
     }
 
@@ -141,7 +149,9 @@ impl SimRings {
         let endpoint = Arc::new(self.endpoint(EndpointKind::Subscription, topic, qos));
         let gid = endpoint.gid;
         let subscription = Subscription { endpoint, received: BTreeMap::new(), room };
-        self.state.borrow_mut().subscriptions.insert(gid, subscription);
+        let state = &mut *self.state.borrow_mut();
+        state.subscriptions.insert(gid, subscription);
+        state.topics.entry(topic.into()).or_default().insert(gid);
         gid
     }
 
@@ -166,9 +176,10 @@ impl SimRings {
     /// Publishes a sample with so many bytes of filling. `false`: a KEEP_ALL reader has no room for it.
     pub(super) fn publish(&self, publisher: Gid, length: usize) -> bool {
         let state = &mut *self.state.borrow_mut();
-        state.readers.retain(|reader| !reader.closed.get());
         let Some(of) = state.publishers.get_mut(&publisher) else { return false };
-        let holds = state.readers.iter().filter(|reader| {
+        let readers = state.readers.entry(of.endpoint.topic.clone()).or_default();
+        readers.retain(|reader| !reader.closed.get());
+        let holds = readers.iter().filter(|reader| {
             reader.reads(&of.endpoint)
                 && reader.spec.qos.history == History::KeepAll
                 && reader.spec.qos.reliability == Reliability::Reliable
@@ -186,6 +197,8 @@ impl SimRings {
         of.published += 1;
         let sequence = of.published;
         of.history.push_back((sequence, payload(publisher, sequence, length)));
+        let reading = readers.iter().filter(|reader| reader.reads(&of.endpoint));
+        state.active.extend(reading.map(|reader| (reader.gid, publisher)));
         true
     }
 
@@ -271,9 +284,27 @@ impl SimRings {
         (!ended).then_some((publisher.endpoint.qos, publisher.published))
     }
 
+    /// Relays that are open.
+    pub(super) fn relays(&self) -> usize {
+        let state = self.state.borrow();
+        state.readers.values().flatten().filter(|reader| !reader.closed.get()).count()
+    }
+
+    /// How often the engine asked a relay whether it has samples.
+    pub(super) fn looks(&self) -> u64 {
+        self.state.borrow().looks
+    }
+
     /// Whether the engine waits for room.
     pub(super) fn waits_for_room(&self) -> bool {
         self.state.borrow().waits_for_room
+    }
+}
+
+impl State {
+    fn publishers_of(&self, topic: &str) -> impl Iterator<Item = (&Gid, &Publisher)> {
+        let members = self.topics.get(topic).into_iter().flatten();
+        members.filter_map(|gid| Some((gid, self.publishers.get(gid)?)))
     }
 }
 
@@ -297,9 +328,9 @@ impl RingWriter for SimWriter {
 
     fn partners(&self) -> Vec<Gid> {
         let state = self.rings.state.borrow();
-        let matching = state
-            .subscriptions
-            .iter()
+        let members = state.topics.get(&self.endpoint.topic).into_iter().flatten();
+        let matching = members
+            .filter_map(|gid| Some((gid, state.subscriptions.get(gid)?)))
             .filter(|(_, s)| pairing(&self.endpoint, &s.endpoint) == Pairing::Match);
         matching.map(|(gid, _)| *gid).collect()
     }
@@ -372,7 +403,7 @@ impl Rings for SimRings {
         state.next += 1;
         let late_join = spec.qos.durability == Durability::TransientLocal;
         // A volatile reader gets what is published after it; an ended publisher's are all old.
-        let known = state.publishers.iter().map(|(gid, p)| {
+        let known = state.publishers_of(&spec.topic).map(|(gid, p)| {
             let depth = u64::from(p.endpoint.qos.depth);
             let skip = if late_join { p.published.saturating_sub(depth) } else { p.published };
             (*gid, skip)
@@ -386,13 +417,22 @@ impl Rings for SimRings {
             lost: RefCell::default(),
             closed: Cell::new(false),
         });
-        state.readers.push(Rc::clone(&cursors));
+        let State { readers, topics, active, .. } = &mut *state;
+        let topic = &cursors.spec.topic;
+        readers.entry(topic.clone()).or_default().push(Rc::clone(&cursors));
+        // Those that are there may have history.
+        let members = topics.get(topic).into_iter().flatten();
+        active.extend(members.map(|member| (cursors.gid, *member)));
         drop(state);
         Ok(Rc::new(SimReader { rings: self.clone(), cursors }))
     }
 
     fn open_writer(&self, remote: &Endpoint) -> Result<Rc<dyn RingWriter>, String> {
         Ok(Rc::new(SimWriter { rings: self.clone(), endpoint: remote.clone(), last: Cell::new(0) }))
+    }
+
+    fn take_active(&self, found: &mut Vec<(Gid, Gid)>) {
+        found.append(&mut self.state.borrow_mut().active);
     }
 
     fn set_waiting_for_room(&self, waiting: bool) {

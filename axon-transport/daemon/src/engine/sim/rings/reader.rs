@@ -64,7 +64,12 @@ impl RingReader for SimReader {
     }
 
     fn with_data(&self) -> Vec<Gid> {
-        self.matched().into_iter().filter(|publisher| self.peek(publisher).is_some()).collect()
+        self.matched().into_iter().filter(|publisher| self.has_data_of(publisher)).collect()
+    }
+
+    fn has_data_of(&self, publisher: &Gid) -> bool {
+        self.rings.state.borrow_mut().looks += 1;
+        self.peek(publisher).is_some()
     }
 
     fn reads(&self, publisher: &Gid) -> bool {
@@ -74,8 +79,8 @@ impl RingReader for SimReader {
 
     fn matched(&self) -> Vec<Gid> {
         let state = self.rings.state.borrow();
-        let of = state.publishers.iter().filter(|(_, p)| self.cursors.reads(&p.endpoint));
-        of.map(|(gid, _)| *gid).collect()
+        let of = state.publishers_of(&self.cursors.spec.topic);
+        of.filter(|(_, p)| self.cursors.reads(&p.endpoint)).map(|(gid, _)| *gid).collect()
     }
 
     fn take_many(
@@ -130,7 +135,8 @@ impl RingReader for SimReader {
     fn unacknowledged(&self) -> HashMap<Gid, u64> {
         let state = self.rings.state.borrow();
         let acknowledged = self.cursors.acknowledged.borrow();
-        let of = state.publishers.iter().filter(|(_, p)| self.cursors.reads(&p.endpoint));
+        let of = state.publishers_of(&self.cursors.spec.topic);
+        let of = of.filter(|(_, p)| self.cursors.reads(&p.endpoint));
         let left = of.map(|(gid, publisher)| {
             let done = acknowledged.get(gid).copied().unwrap_or(0);
             (*gid, publisher.published.saturating_sub(done))

@@ -1,0 +1,110 @@
+//! A follower of a journal, which looks at no other rings than those that are named.
+
+use loom::{
+    sync::{Arc, Condvar, Mutex, atomic::AtomicU64},
+    thread,
+};
+
+use crate::{
+    ring::journal::{Journal, News, Place},
+    sync::{Ordering, Word},
+    tests::model::{check, zeros},
+    wake::{arm, due, settle},
+};
+
+/// The shared words of a session with two rings, and its follower's.
+#[derive(Clone)]
+struct Words {
+    noted: Arc<AtomicU64>,
+    entries: Arc<Vec<AtomicU64>>,
+    rings: Arc<Vec<AtomicU64>>,
+    armed: Arc<AtomicU64>,
+    rung: Arc<AtomicU64>,
+    bell: Arc<(Mutex<bool>, Condvar)>,
+}
+
+impl Words {
+    fn new() -> Self {
+        Self {
+            noted: Arc::new(AtomicU64::new(0)),
+            entries: zeros(2),
+            rings: zeros(2),
+            armed: Arc::new(AtomicU64::new(0)),
+            rung: Arc::new(AtomicU64::new(0)),
+            bell: Arc::new((Mutex::new(false), Condvar::new())),
+        }
+    }
+
+    fn journal(&self) -> Journal<'_, AtomicU64> {
+        Journal { noted: &self.noted, entries: &self.entries }
+    }
+
+    fn publish(&self, ring: u32) {
+        // Relaxed: only the journal says that it is there.
+        Word::store(&self.rings[ring as usize], 1, Ordering::Relaxed);
+        self.journal().note(ring);
+        settle::<AtomicU64>();
+        if due(&*self.armed, &*self.rung) {
+            *self.bell.0.lock().unwrap() = true;
+            self.bell.1.notify_one();
+        }
+    }
+
+    /// Sleeps and looks until there is a sample in each ring.
+    fn follow(&self) {
+        let (mut place, mut found) = (Place::end(self.journal()), [false; 2]);
+        // As for a reader that has just come.
+        let mut all = true;
+        let mut ticket = 0;
+        loop {
+            ticket += 1;
+            arm(&*self.armed, ticket);
+            let mut named = Vec::new();
+            all |= place.read(self.journal(), |ring| named.push(ring)) == News::All;
+            for ring in 0..2 {
+                if all || named.contains(&ring) {
+                    let sample = Word::load(&self.rings[ring as usize], Ordering::Relaxed);
+                    found[ring as usize] |= sample == 1;
+                }
+            }
+            all = false;
+            if found == [true; 2] {
+                return;
+            }
+            let mut rung = self.bell.0.lock().unwrap();
+            while !*rung {
+                // The model fails here when nobody is left to ring.
+                rung = self.bell.1.wait(rung).unwrap();
+            }
+            *rung = false;
+        }
+    }
+}
+
+/// `NotedAdd`, `NotedLoad`: who sees the count finds the sample, and who does not is woken.
+#[test]
+fn a_follower_finds_each_sample_in_the_rings_that_are_named() {
+    check(3, || {
+        let words = Words::new();
+        let publisher = {
+            let words = words.clone();
+            thread::spawn(move || (0..2).for_each(|ring| words.publish(ring)))
+        };
+        words.follow();
+        publisher.join().unwrap();
+    });
+}
+
+/// An entry that another thread has counted and not stored yet names no ring, and hides none.
+#[test]
+fn a_follower_finds_what_threads_of_one_process_note_at_the_same_time() {
+    check(2, || {
+        let words = Words::new();
+        let publishers = [0, 1].map(|ring| {
+            let words = words.clone();
+            thread::spawn(move || words.publish(ring))
+        });
+        words.follow();
+        publishers.into_iter().for_each(|publisher| publisher.join().unwrap());
+    });
+}

@@ -1,0 +1,63 @@
+//! How long new endpoints wait for endpoints of other hosts. One that waits is a convenience; a thousand that are created
+//! one after the other would keep their program waiting for a minute, while they could be matched together.
+//!
+//! Plain data.
+
+use std::time::{Duration, Instant};
+
+/// Pairs on one host take less than this.
+const SHORT: Duration = Duration::from_millis(5);
+/// After a longer wait others do not wait for so many times as long.
+const PAUSE: u32 = 9;
+
+/// The waits of one session.
+#[derive(Debug, Default)]
+pub(super) struct PairWaits {
+    not_before: Option<Instant>,
+}
+
+impl PairWaits {
+    /// Whether a new endpoint waits for those of other hosts now.
+    pub(super) fn are_due(&self, now: Instant) -> bool {
+        self.not_before.is_none_or(|due| due <= now)
+    }
+
+    /// One that did has waited for so long.
+    pub(super) fn waited(&mut self, time: Duration, now: Instant) {
+        if time > SHORT {
+            self.not_before = Some(now + PAUSE * time);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn endpoints_wait_a_tenth_of_the_time_where_each_takes_long() {
+        let (mut waits, mut now) = (PairWaits::default(), Instant::now());
+        let mut waited = 0;
+        // A millisecond for each endpoint, and fifty where it waits.
+        for _ in 0..1000 {
+            if waits.are_due(now) {
+                let time = Duration::from_millis(50);
+                now += time;
+                waits.waited(time, now);
+                waited += 1;
+            }
+            now += Duration::from_millis(1);
+        }
+        assert_eq!(waited, 3);
+    }
+
+    #[test]
+    fn endpoints_wait_each_time_where_that_is_short() {
+        let (mut waits, mut now) = (PairWaits::default(), Instant::now());
+        for _ in 0..1000 {
+            assert!(waits.are_due(now));
+            now += SHORT;
+            waits.waited(SHORT, now);
+        }
+    }
+}
