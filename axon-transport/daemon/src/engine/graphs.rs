@@ -70,8 +70,13 @@ impl Engine {
         while let Some(event) = self.links.poll_event() {
             self.handle_link_event(event, now);
         }
-        self.effects.tell(ToControl::RemoteGraph { daemon, reset, added, removed });
-        self.peers.get(daemon).map_or(0, |peer| peer.remote.len())
+        let Some(peer) = self.peers.get(daemon) else { return 0 };
+        let endpoints = peer.remote.len();
+        // A peer that is silent is told of as a whole once it is back.
+        if !peer.silent {
+            self.effects.tell(ToControl::RemoteGraph { daemon, reset, added, removed });
+        }
+        endpoints
     }
 
     /// The links of peers whose endpoints a restarted daemon of the same host announces: those links are dead. The

@@ -237,6 +237,14 @@ impl Engine {
                     peer.outbound.handle_keys();
                 }
             }
+            LinkEvent::Silent(daemon) => {
+                if let Some(peer) = self.peers.get_mut(daemon) {
+                    tracing::info!(peer = %daemon, "the peer is silent: its endpoints are taken for gone");
+                    peer.silent = true;
+                    self.effects.tell(ToControl::Silent { daemon });
+                }
+            }
+            LinkEvent::Back(daemon) => self.back(daemon, now),
             LinkEvent::Gone(number, daemon) => {
                 if let Some(peer) = self.peers.get_mut(daemon) {
                     peer.inbound.link_over(number);
@@ -255,6 +263,17 @@ impl Engine {
         }
     }
 
+    /// A peer that was silent is back.
+    fn back(&mut self, daemon: DaemonId, now: Duration) {
+        let Some(peer) = self.peers.get_mut(daemon) else { return };
+        if std::mem::take(&mut peer.silent) {
+            tracing::info!(peer = %daemon, "the peer is back");
+            peer.remote.tell_anew();
+            peer.stirred = true;
+            self.next_report = now;
+        }
+    }
+
     /// A link of a peer is elected, the first or a successor.
     fn link_up(&mut self, number: u64, daemon: DaemonId, old: Option<u64>, now: Duration) {
         let binding = self.links.binding(number);
@@ -264,6 +283,7 @@ impl Engine {
                 peer.succeed(number, binding, with.local);
                 peer.outbound.succeed(old);
             });
+            self.back(daemon, now);
             return;
         }
         let (Some(summary), Some(account)) =
@@ -407,7 +427,8 @@ impl Engine {
         let mut reports = Vec::new();
         for (_, peer) in self.peers.iter() {
             let text = self.links.peer_text(peer.link);
-            reports.push((text, peer.counters.take_lost(), self.link_status(peer, now)));
+            let status = if peer.silent { None } else { self.link_status(peer, now) };
+            reports.push((text, peer.counters.take_lost(), status));
         }
         for (peer, losses, status) in reports {
             self.effects.tell_lost(&peer, losses);

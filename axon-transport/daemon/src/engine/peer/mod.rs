@@ -109,6 +109,8 @@ pub(crate) struct Peer {
     sent_version: u64,
     resynced: Option<Duration>,
     resync_due: bool,
+    /// It has been silent for so long that the control plane takes it for gone.
+    pub(super) silent: bool,
     /// Its graph changed, and what follows was not done.
     pub(super) stirred: bool,
     refusal_said: bool,
@@ -183,6 +185,7 @@ impl Peer {
             sent_version: 0,
             resynced: None,
             resync_due: false,
+            silent: false,
             stirred: false,
             refusal_said: false,
             next_route: 1,
