@@ -6,7 +6,7 @@ use axon_tests::Sizes;
 
 use super::{
     mode::{Kmes, Settings, classic},
-    pair::{Host, Plan, TOPIC},
+    pair::{Host, Plan},
     process::until,
     wire::Wire,
 };

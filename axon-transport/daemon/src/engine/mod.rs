@@ -250,9 +250,12 @@ impl Engine {
                     peer.inbound.link_over(number);
                 }
             }
-            LinkEvent::Down { number, daemon, peer: text, reason } => {
+            LinkEvent::Down { number, daemon, peer: text, reason, restarted } => {
                 if let Some(mut peer) = self.peers.remove(daemon) {
                     peer.inbound.link_over(number);
+                    if restarted {
+                        self.peers.keep_relays(&mut peer, now);
+                    }
                     self.count_lost(daemon, &text, &mut peer);
                     self.effects.push(Effect::ReturnMemory);
                 }
@@ -337,6 +340,9 @@ impl Engine {
                 }
             }
             message => {
+                if let Message::Subscribe(asks) = &message {
+                    self.take_over_route(daemon, asks, now);
+                }
                 let handled =
                     self.peers.with(daemon, |p, with| p.handle_message(message, with, now));
                 if let Some(Err((code, why))) = handled {
@@ -457,6 +463,7 @@ impl Engine {
     pub(crate) fn handle_timeout(&mut self, now: Duration) {
         self.links.handle_timeout(now);
         self.peers.handle_timeout(now);
+        self.give_up_relays(now);
         for peer in self.peers.values_mut() {
             if peer.outbound.poll_timeout().is_none_or(|due| due > now) {
                 continue;
@@ -514,6 +521,7 @@ impl Engine {
                 self.count_lost(daemon, &text, &mut peer);
             }
         }
+        self.give_up_relays(Duration::MAX);
     }
 
     /// Counts and logs the samples that the last link of a peer did not carry.
@@ -523,6 +531,18 @@ impl Engine {
                 "the link ended before the peer acknowledged them: samples may be lost");
         }
         self.effects.tell_lost(text, peer.counters.take_lost());
+    }
+
+    /// Counts and logs what kept relays hold whose peers did not come back by this time.
+    fn give_up_relays(&mut self, now: Duration) {
+        for (topic, samples) in self.peers.give_up_relays(now) {
+            tracing::warn!(
+                topic,
+                samples,
+                "a peer's daemon was restarted and did not ask for the topic again: samples are lost"
+            );
+            self.effects.tell(ToControl::Lost { topic, cause: "link_ended", samples });
+        }
     }
 
     /// Whether all connections are over.

@@ -35,7 +35,14 @@ pub(in crate::engine) enum LinkEvent {
     /// A link that was not in use is over: nothing more of its streams can be read.
     Gone(u64, DaemonId),
     /// The last link of a peer is over.
-    Down { number: u64, daemon: DaemonId, peer: String, reason: String },
+    Down {
+        number: u64,
+        daemon: DaemonId,
+        peer: String,
+        reason: String,
+        /// Another daemon of its host takes its place.
+        restarted: bool,
+    },
 }
 
 /// What the links say to the control plane.

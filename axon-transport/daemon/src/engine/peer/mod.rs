@@ -2,6 +2,7 @@
 
 mod asking;
 pub(super) mod graph;
+pub(super) mod kept;
 pub(super) mod owners;
 mod refused;
 pub(super) mod routes;
@@ -45,6 +46,7 @@ use crate::{
         counters::Counters,
         peer::{
             graph::{GraphTaken, Remote},
+            kept::KeptRelays,
             owners::Prover,
             routes::RouteKey,
             stalls::Stalls,
@@ -80,6 +82,8 @@ pub(crate) struct Surroundings<'a> {
     pub(crate) stalled_after: Duration,
     /// Routes that were given up.
     pub(crate) stalls: &'a RefCell<Stalls>,
+    /// Relays that are kept for daemons that are restarted.
+    pub(crate) kept: &'a RefCell<KeptRelays>,
     /// When the engine's time was zero.
     pub(crate) epoch: Instant,
 }
