@@ -3,13 +3,14 @@
 use std::{thread, time::Duration};
 
 use axon_shm::PublishError;
+use axon_tests::Sizes;
 use axon_transport::{EndpointSpec, Publisher, Subscription, qos::Qos};
 
 use super::{
     cut::wired,
     mode::classic,
-    pair::{Host, Plan, kill},
-    process::PATIENCE,
+    pair::{self, Host, Plan, kill},
+    process::{PATIENCE, until},
 };
 
 const TOPIC: &str = "/seam";
@@ -107,6 +108,30 @@ fn what_a_keep_all_publisher_leaves_in_a_cut_link_arrives() {
 #[test]
 fn what_a_keep_last_publisher_leaves_in_a_cut_link_arrives() {
     what_a_publisher_leaves_in_a_cut_link_arrives(Qos { depth: 100, ..Qos::default() });
+}
+
+#[test]
+fn what_a_killed_process_published_into_a_cut_link_arrives() {
+    let (hosts, wire) = wired([classic(&[]), classic(&[])]);
+    let mut there = hosts[1].subscribe(Sizes::Small);
+    let mut publisher = hosts[0].publish(Sizes::Small, 2, Some(100));
+    until("one of the two readers is there", || {
+        let topics = hosts[0].status().topics;
+        topics.iter().any(|topic| topic.topic == pair::TOPIC && topic.remote_subscriptions == 1)
+    });
+    thread::sleep(Duration::from_millis(500));
+    wire.cut();
+    // The other reader has it begin.
+    let here = hosts[0].session("here");
+    let spec = EndpointSpec::new(pair::TOPIC, "test/Bytes", Qos::keep_all());
+    let _subscription = here.create_subscription(spec).unwrap();
+    publisher.wait_sent();
+    kill(publisher.pid());
+    thread::sleep(Duration::from_secs(5));
+    wire.mend();
+    there.wait_taken(100);
+    let tally = there.tally();
+    assert_eq!((tally.taken, tally.lost), (100, 0), "{tally:?}");
 }
 
 /// Publishes while daemons are killed and started again.
