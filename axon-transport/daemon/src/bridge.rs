@@ -68,6 +68,12 @@ pub enum ToControl {
     },
     /// How a link does: at its start and from time to time. Replaces what was known of the peer.
     Link(Box<LinkStatus>),
+    /// A peer has been silent for so long that its endpoints are forgotten. Its link stands:
+    /// [`RemoteGraph`](Self::RemoteGraph) brings them back, or the link goes down.
+    Silent {
+        /// The peer.
+        daemon: DaemonId,
+    },
     /// A link is over. The peer's endpoints are forgotten.
     LinkDown {
         /// The peer.

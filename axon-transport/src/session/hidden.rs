@@ -23,6 +23,7 @@ use crate::{
     config::Config,
     graph::Endpoint,
     ids::{Gid, SessionId},
+    qos::Durability,
     wire::session::{EndpointRole, GivenUp, Message, SessionRole},
 };
 
@@ -199,6 +200,15 @@ impl Subscription {
     pub fn skip_of(&self, writer: &Gid, depth: u64) {
         if !self.session.is_forked() {
             self.inner.lock().skip_of(writer, depth);
+        }
+    }
+
+    /// For a relay: what was taken and not acknowledged is to be taken once more; where its publisher
+    /// keeps a history, all of that.
+    pub fn take_back(&self) {
+        if !self.session.is_forked() {
+            let history = self.inner.qos.durability == Durability::TransientLocal;
+            self.inner.lock().take_back(history);
         }
     }
 

@@ -33,6 +33,7 @@ mod renewal;
 mod repeated;
 mod restart;
 mod rules;
+mod seams;
 mod secrets;
 mod services;
 mod slow;

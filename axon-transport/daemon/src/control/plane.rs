@@ -227,6 +227,10 @@ impl Control {
                 }
                 self.links.insert(status.peer.clone(), *status);
             }
+            ToControl::Silent { daemon } => {
+                self.links.remove(&daemon.to_string());
+                self.registry.remote_gone(&daemon);
+            }
             ToControl::LinkDown { daemon, reason } => {
                 tracing::info!(%daemon, reason, "link down");
                 self.links.remove(&daemon.to_string());

@@ -8,7 +8,7 @@ use axon_transport::internal::graph::RemoteEndpoint;
 use super::{Engine, peer::graph::GraphChange};
 use crate::{
     bridge::ToControl,
-    link::{GraphResync, Message},
+    link::{GraphResync, Message, Subscribe},
 };
 
 /// What following a change costs for each endpoint of both graphs, as an estimate: other peers have nine times as long
@@ -62,16 +62,42 @@ impl Engine {
         let dead = self.taken_over(daemon, &added);
         // Before the dead links let go of their stand-ins: rings and readers stay as they are.
         self.peers.with(daemon, |peer, with| peer.handle_remote_graph(with, now));
-        for link in dead {
-            let text = "its host's daemon was restarted";
-            self.links.replace(link, text, now);
+        self.end_dead(dead, now);
+        let Some(peer) = self.peers.get(daemon) else { return 0 };
+        let endpoints = peer.remote.len();
+        // A peer that is silent is told of as a whole once it is back.
+        if !peer.silent {
+            self.effects.tell(ToControl::RemoteGraph { daemon, reset, added, removed });
         }
-        // The control plane forgets the endpoints of the dead link before it learns of the same ones here.
+        endpoints
+    }
+
+    /// Ends dead links. The control plane forgets their endpoints before it learns of the same ones of another link.
+    fn end_dead(&mut self, dead: Vec<u64>, now: Duration) {
+        for link in dead {
+            self.links.replace(link, "its host's daemon was restarted", now);
+        }
         while let Some(event) = self.links.poll_event() {
             self.handle_link_event(event, now);
         }
-        self.effects.tell(ToControl::RemoteGraph { daemon, reset, added, removed });
-        self.peers.get(daemon).map_or(0, |peer| peer.remote.len())
+    }
+
+    /// A peer asks for a route. Ends the links of daemons of the same host that were asked for by the same
+    /// subscriptions: those links are dead, and the route begins with what they did not carry.
+    pub(super) fn take_over_route(&mut self, daemon: DaemonId, asks: &Subscribe, now: Duration) {
+        let others = self.peers.iter().filter(|(other, _)| *other != daemon);
+        let others: Vec<_> =
+            others.filter(|(_, peer)| peer.serves_one_of(asks)).map(|(other, _)| other).collect();
+        let identity = |other| self.links.identity(self.links.current(other)?);
+        let owner = if others.is_empty() { None } else { identity(daemon) };
+        let Some(owner) = owner else { return };
+        let same_host =
+            others.into_iter().filter(|other| identity(*other).as_ref() == Some(&owner));
+        let dead: Vec<_> =
+            same_host.filter_map(|other| Some(self.peers.get(other)?.link)).collect();
+        if !dead.is_empty() {
+            self.end_dead(dead, now);
+        }
     }
 
     /// The links of peers whose endpoints a restarted daemon of the same host announces: those links are dead. The

@@ -243,14 +243,25 @@ impl Engine {
                     peer.outbound.handle_keys();
                 }
             }
+            LinkEvent::Silent(daemon) => {
+                if let Some(peer) = self.peers.get_mut(daemon) {
+                    tracing::info!(peer = %daemon, "the peer is silent: its endpoints are taken for gone");
+                    peer.silent = true;
+                    self.effects.tell(ToControl::Silent { daemon });
+                }
+            }
+            LinkEvent::Back(daemon) => self.back(daemon, now),
             LinkEvent::Gone(number, daemon) => {
                 if let Some(peer) = self.peers.get_mut(daemon) {
                     peer.inbound.link_over(number);
                 }
             }
-            LinkEvent::Down { number, daemon, peer: text, reason } => {
+            LinkEvent::Down { number, daemon, peer: text, reason, restarted } => {
                 if let Some(mut peer) = self.peers.remove(daemon) {
                     peer.inbound.link_over(number);
+                    if restarted {
+                        self.peers.keep_relays(&mut peer, now);
+                    }
                     self.count_lost(daemon, &text, &mut peer);
                     self.effects.push(Effect::ReturnMemory);
                 }
@@ -258,6 +269,17 @@ impl Engine {
                 self.effects.tell_draining(self.peers.are_draining());
                 self.effects.tell(ToControl::LinkDown { daemon, reason });
             }
+        }
+    }
+
+    /// A peer that was silent is back.
+    fn back(&mut self, daemon: DaemonId, now: Duration) {
+        let Some(peer) = self.peers.get_mut(daemon) else { return };
+        if std::mem::take(&mut peer.silent) {
+            tracing::info!(peer = %daemon, "the peer is back");
+            peer.remote.tell_anew();
+            peer.stirred = true;
+            self.next_report = now;
         }
     }
 
@@ -270,6 +292,7 @@ impl Engine {
                 peer.succeed(number, binding, with.local);
                 peer.outbound.succeed(old);
             });
+            self.back(daemon, now);
             return;
         }
         let (Some(summary), Some(account)) =
@@ -323,6 +346,9 @@ impl Engine {
                 }
             }
             message => {
+                if let Message::Subscribe(asks) = &message {
+                    self.take_over_route(daemon, asks, now);
+                }
                 let handled =
                     self.peers.with(daemon, |p, with| p.handle_message(message, with, now));
                 if let Some(Err((code, why))) = handled {
@@ -413,7 +439,8 @@ impl Engine {
         let mut reports = Vec::new();
         for (_, peer) in self.peers.iter() {
             let text = self.links.peer_text(peer.link);
-            reports.push((text, peer.counters.take_lost(), self.link_status(peer, now)));
+            let status = if peer.silent { None } else { self.link_status(peer, now) };
+            reports.push((text, peer.counters.take_lost(), status));
         }
         for (peer, losses, status) in reports {
             self.effects.tell_lost(&peer, losses);
@@ -442,6 +469,7 @@ impl Engine {
     pub(crate) fn handle_timeout(&mut self, now: Duration) {
         self.links.handle_timeout(now);
         self.peers.handle_timeout(now);
+        self.give_up_relays(now);
         for peer in self.peers.values_mut() {
             if peer.outbound.poll_timeout().is_none_or(|due| due > now) {
                 continue;
@@ -499,6 +527,7 @@ impl Engine {
                 self.count_lost(daemon, &text, &mut peer);
             }
         }
+        self.give_up_relays(Duration::MAX);
     }
 
     /// Counts and logs the samples that the last link of a peer did not carry.
@@ -508,6 +537,18 @@ impl Engine {
                 "the link ended before the peer acknowledged them: samples may be lost");
         }
         self.effects.tell_lost(text, peer.counters.take_lost());
+    }
+
+    /// Counts and logs what kept relays hold whose peers did not come back by this time.
+    fn give_up_relays(&mut self, now: Duration) {
+        for (topic, samples) in self.peers.give_up_relays(now) {
+            tracing::warn!(
+                topic,
+                samples,
+                "a peer's daemon was restarted and did not ask for the topic again: samples are lost"
+            );
+            self.effects.tell(ToControl::Lost { topic, cause: "link_ended", samples });
+        }
     }
 
     /// Whether all connections are over.

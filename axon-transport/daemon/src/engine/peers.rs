@@ -12,7 +12,7 @@ use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::config::Config;
 
 use super::{
-    peer::{Local, Peer, Surroundings, stalls::Stalls},
+    peer::{Local, Peer, Surroundings, kept::KeptRelays, stalls::Stalls},
     rings::Rings,
     stand_in::StandIns,
 };
@@ -29,6 +29,7 @@ pub(super) struct Peers {
     rings: Rc<dyn Rings>,
     stand_ins: StandIns,
     stalls: RefCell<Stalls>,
+    kept: RefCell<KeptRelays>,
     local: Local,
     epoch: Instant,
     waiting_for_room: bool,
@@ -47,6 +48,7 @@ impl Peers {
             rings,
             stand_ins: StandIns::default(),
             stalls: RefCell::default(),
+            kept: RefCell::default(),
             local: Local::new(),
             epoch,
             waiting_for_room: false,
@@ -106,15 +108,15 @@ impl Peers {
         daemon: DaemonId,
         act: impl FnOnce(&mut Peer, &Surroundings<'_>) -> T,
     ) -> Option<T> {
-        let Self { all, config, rings, stand_ins, stalls, local, epoch, .. } = self;
-        let with = surroundings(config, &**rings, stand_ins, stalls, local, *epoch);
+        let Self { all, config, rings, stand_ins, stalls, kept, local, epoch, .. } = self;
+        let with = surroundings(config, &**rings, stand_ins, (stalls, kept), local, *epoch);
         all.get_mut(&daemon).map(|peer| act(peer, &with))
     }
 
     /// Has each peer act with what all peers use.
     pub(super) fn with_each(&mut self, mut each: impl FnMut(&mut Peer, &Surroundings<'_>)) {
-        let Self { all, config, rings, stand_ins, stalls, local, epoch, .. } = self;
-        let with = surroundings(config, &**rings, stand_ins, stalls, local, *epoch);
+        let Self { all, config, rings, stand_ins, stalls, kept, local, epoch, .. } = self;
+        let with = surroundings(config, &**rings, stand_ins, (stalls, kept), local, *epoch);
         all.values_mut().for_each(|peer| each(peer, &with));
     }
 
@@ -153,6 +155,16 @@ impl Peers {
         }
     }
 
+    /// Keeps the KEEP_ALL relays of a peer that is gone, for the next daemon of its host.
+    pub(super) fn keep_relays(&mut self, peer: &mut Peer, now: Duration) {
+        self.kept.borrow_mut().add(peer, now);
+    }
+
+    /// Gives up what relays hold that were kept until now. Returns the samples, by topic.
+    pub(super) fn give_up_relays(&mut self, now: Duration) -> Vec<(String, u64)> {
+        self.kept.borrow_mut().give_up(now)
+    }
+
     /// Whether samples of publishers that ended are on their way.
     pub(super) fn are_draining(&self) -> bool {
         self.all.values().any(Peer::is_draining)
@@ -169,7 +181,7 @@ impl Peers {
             let samples = [peer.inbound.poll_timeout(), peer.outbound.poll_timeout()];
             samples.into_iter().chain([peer.poll_timeout(self.epoch, now), turn, more])
         });
-        due.flatten().min()
+        due.flatten().chain(self.kept.borrow().poll_timeout()).min()
     }
 
     /// Does what is due, but for samples to peers, which needs their links.
@@ -187,7 +199,7 @@ fn surroundings<'a>(
     config: &Config,
     rings: &'a dyn Rings,
     stand_ins: &'a StandIns,
-    stalls: &'a RefCell<Stalls>,
+    (stalls, kept): (&'a RefCell<Stalls>, &'a RefCell<KeptRelays>),
     local: &'a Local,
     epoch: Instant,
 ) -> Surroundings<'a> {
@@ -198,6 +210,7 @@ fn surroundings<'a>(
         domain: config.domain,
         stalled_after: config.link.stalled,
         stalls,
+        kept,
         epoch,
     }
 }

@@ -68,6 +68,8 @@ pub(crate) trait RingReader {
     }
     /// The peer has the samples of this publisher up to this number, or will never have them.
     fn acknowledge_of(&self, publisher: &Gid, sequence: u64);
+    /// Has what was taken and not acknowledged taken once more.
+    fn take_back(&self);
     /// How many samples of each publisher are not acknowledged.
     fn unacknowledged(&self) -> HashMap<Gid, u64>;
     /// So many samples of this publisher will never reach the peer.

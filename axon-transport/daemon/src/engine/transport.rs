@@ -13,8 +13,8 @@ use quinn_proto::{
 
 use super::{congestion::DelayConfig, marks::CountingFactory};
 
-/// A silent peer is given up after this.
-const IDLE_TIMEOUT_MS: u32 = 20_000;
+/// A link whose peer is silent ends after this. Until then its flows and routes stand, and a successor takes them over.
+const IDLE_TIMEOUT_MS: u32 = 120_000;
 
 /// Data streams a peer may open before its HELLO is checked; quinn allocates each of them.
 const STREAMS_BEFORE_HELLO: u32 = 128;

@@ -158,6 +158,10 @@ impl RingReader for Relay {
         self.subscription.acknowledge_of(publisher, sequence);
     }
 
+    fn take_back(&self) {
+        self.subscription.take_back();
+    }
+
     fn unacknowledged(&self) -> HashMap<Gid, u64> {
         self.subscription.unacknowledged()
     }

@@ -1,8 +1,9 @@
-//! Readers whose process ended while they carried samples to another process. The publisher keeps their unconfirmed
-//! samples for 10 s.
+//! Readers whose process ended while they carried samples to another process or host. The publisher keeps their
+//! unconfirmed samples for 10 s.
 //!
-//! Such a reader belongs to the daemon, which reads on behalf of a relayed session. The next daemon attaches under
-//! the same GID, and continues at the last reader's position.
+//! Such a reader belongs to the daemon. On behalf of a relayed session, the next daemon attaches under the same GID. On
+//! behalf of subscriptions of another host, it attaches under a GID of its own and stands for the same subscriptions.
+//! Either reader continues at the last one's position.
 
 use std::time::{Duration, Instant};
 
@@ -18,6 +19,8 @@ pub(crate) struct Absences(Vec<Absent>);
 #[derive(Debug)]
 struct Absent {
     gid: Gid,
+    /// The subscriptions of another host that it stood for.
+    stood_for: Vec<Gid>,
     /// The oldest position that was not delivered.
     position: u64,
     until: Instant,
@@ -25,14 +28,18 @@ struct Absent {
 
 impl Absences {
     /// Keeps samples from `position` on for a reader.
-    pub(crate) fn add(&mut self, gid: Gid, position: u64) {
+    pub(crate) fn add(&mut self, gid: Gid, stood_for: Vec<Gid>, position: u64) {
         self.0.retain(|absent| absent.gid != gid);
-        self.0.push(Absent { gid, position, until: Instant::now() + ABSENCE });
+        self.0.push(Absent { gid, stood_for, position, until: Instant::now() + ABSENCE });
     }
 
-    /// The reader is there again.
-    pub(crate) fn end(&mut self, gid: &Gid) {
-        self.0.retain(|absent| absent.gid != *gid);
+    /// The reader is there again, or another one that stands for the same subscriptions.
+    pub(crate) fn end(&mut self, gid: &Gid, stands_for: &[Gid]) {
+        self.0.retain_mut(|absent| {
+            let stood = !absent.stood_for.is_empty();
+            absent.stood_for.retain(|of| !stands_for.contains(of));
+            absent.gid != *gid && !(stood && absent.stood_for.is_empty())
+        });
     }
 
     /// Forgets the readers that were absent for too long; how many samples below `head` are given up.
@@ -46,7 +53,7 @@ impl Absences {
             let samples = head.saturating_sub(position);
             tracing::warn!(
                 reader = %gid, samples,
-                "gave up samples: the relayed reader did not reconnect within {ABSENCE:?}"
+                "gave up samples: the daemon's reader did not reconnect within {ABSENCE:?}"
             );
             all.saturating_add(samples)
         })
@@ -70,9 +77,12 @@ impl Absences {
         Some(until.saturating_duration_since(Instant::now()))
     }
 
-    /// Where a reader goes on.
-    pub(crate) fn position_of(&self, gid: &Gid) -> Option<u64> {
-        self.there().find(|absent| absent.gid == *gid).map(|absent| absent.position)
+    /// Where a reader goes on that stands for these subscriptions.
+    pub(crate) fn position_of(&self, gid: &Gid, stands_for: &[Gid]) -> Option<u64> {
+        let same = |absent: &&Absent| {
+            absent.gid == *gid || absent.stood_for.iter().any(|of| stands_for.contains(of))
+        };
+        self.there().filter(same).map(|absent| absent.position).min()
     }
 
     /// The oldest position that is kept, and the reader that it is kept for.
@@ -91,16 +101,32 @@ mod tests {
         let mut absences = Absences::default();
         assert!(absences.is_empty() && absences.oldest().is_none() && absences.left().is_none());
         let [one, other] = [1, 2].map(|byte| Gid([byte; 16]));
-        absences.add(one, 7);
-        absences.add(other, 5);
+        absences.add(one, Vec::new(), 7);
+        absences.add(other, Vec::new(), 5);
         // It died once more before it had got on.
-        absences.add(one, 6);
-        assert_eq!((absences.position_of(&one), absences.oldest()), (Some(6), Some((5, other))));
+        absences.add(one, Vec::new(), 6);
+        assert_eq!(
+            (absences.position_of(&one, &[]), absences.oldest()),
+            (Some(6), Some((5, other)))
+        );
         assert_eq!(absences.expire(9), 0, "they were not absent for long");
-        absences.end(&other);
-        assert_eq!((absences.position_of(&other), absences.oldest()), (None, Some((6, one))));
+        absences.end(&other, &[]);
+        assert_eq!((absences.position_of(&other, &[]), absences.oldest()), (None, Some((6, one))));
         absences.0[0].until = Instant::now();
-        assert!(absences.is_empty() && absences.position_of(&one).is_none());
+        assert!(absences.is_empty() && absences.position_of(&one, &[]).is_none());
         assert_eq!((absences.expire(9), absences.left()), (3, None));
+    }
+
+    #[test]
+    fn a_relay_goes_on_where_one_for_the_same_subscriptions_ended() {
+        let mut absences = Absences::default();
+        let [old, new, here, there, later] = [1, 2, 3, 4, 5].map(|byte| Gid([byte; 16]));
+        absences.add(old, vec![here, there], 7);
+        assert_eq!(absences.position_of(&new, &[later]), None);
+        assert_eq!(absences.position_of(&new, &[there, later]), Some(7));
+        absences.end(&new, &[there, later]);
+        assert_eq!(absences.oldest(), Some((7, old)), "one subscription is not back");
+        absences.end(&new, &[here, there]);
+        assert!(absences.is_empty());
     }
 }

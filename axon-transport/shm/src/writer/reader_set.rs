@@ -226,9 +226,11 @@ impl ReaderSet {
         carries: bool,
     ) -> Result<Grant, ShmError> {
         // One whose process ended has nothing to do with this one, though they share GID and lane.
-        if self.readers.iter().any(|known| known.info.gid == info.gid) {
+        // A relay may follow one of a daemon that ended.
+        if info.is_relay() || self.readers.iter().any(|known| known.info.gid == info.gid) {
             self.mark_dead(head);
         }
+        let stands_for = info.stands_for.clone().unwrap_or_default();
         let known = self.readers.iter().position(|known| {
             let same = &known.info;
             !known.dead
@@ -239,6 +241,7 @@ impl ReaderSet {
                 && known.cursor(head).is_some()
         });
         if let Some(index) = known {
+            self.absent.end(&info.gid, &stands_for);
             self.followers |= self.may_follow(&info);
             let known = &mut self.readers[index];
             known.info.stands_for = info.stands_for;
@@ -252,14 +255,14 @@ impl ReaderSet {
         } else {
             head
         };
-        let absent = self.absent.position_of(&info.gid);
+        let absent = self.absent.position_of(&info.gid, &stands_for);
         let resumed = absent.into_iter().chain(resumed).min();
         let first = resumed.map_or(first, |resumed| resumed.clamp(tail, head).min(first));
         let tenancy = self.pin_lanes.admit(info.gid, &info.peer, info.lane, &lane)?;
         let grant = Grant { generation: tenancy.generation(), first };
         self.detach(info.gid, head);
         self.joined(&info);
-        self.absent.end(&info.gid);
+        self.absent.end(&info.gid, &stands_for);
         self.readers.push(Attached {
             info,
             lane,
@@ -346,8 +349,9 @@ impl ReaderSet {
             }
             let Some(position) = reader.delivered(head) else { continue };
             self.given_up = self.given_up.saturating_add(reader.newly_given_up(head));
-            if reader.carries && holds(&self.offered) && holds(&reader.info.qos) {
-                self.absent.add(reader.info.gid, position);
+            if holds(&self.offered) && holds(&reader.info.qos) {
+                let stood_for = reader.info.stands_for.clone().unwrap_or_default();
+                self.absent.add(reader.info.gid, stood_for, position);
             } else {
                 let left = head.saturating_sub(position).saturating_sub(reader.given_up);
                 self.given_up = self.given_up.saturating_add(left);
@@ -445,6 +449,11 @@ impl ReaderSet {
 
     fn carriers(&self) -> impl Iterator<Item = &Attached> {
         self.readers.iter().filter(|reader| !reader.dead && reader.is_carrier())
+    }
+
+    /// Whether a reader that carries samples elsewhere has not taken the one at `tail`.
+    pub(crate) fn has_carrier_behind(&self, tail: u64) -> bool {
+        self.carriers().filter_map(Attached::position).any(|position| position <= tail)
     }
 
     /// How long it takes until one of the absent readers is given up.

@@ -113,7 +113,10 @@ impl Writer {
             if surplus == 0 || state.history.capacity() < wanted {
                 // A publish that waits for readers leaves them the time to map what they lack.
                 // Nor does one give up what it keeps for others because of a reader that lacks it.
-                let now = floors.held < u64::MAX || state.reader_set.keeps_all();
+                // Nor does one lose what another host wants: the daemon is about to map it.
+                let now = floors.held < u64::MAX
+                    || state.reader_set.keeps_all()
+                    || (surplus == 0 && state.reader_set.has_carrier_behind(state.history.tail()));
                 let need = if now { Need::Now } else { Need::Mapped };
                 short = self.grow(state, need).err().map(no_memory);
             }

@@ -32,7 +32,6 @@ use crate::{
     events::EventKind,
     graph::Endpoint,
     ids::Gid,
-    qos::Durability,
     wire::session::{Message, Pair},
 };
 
@@ -193,15 +192,6 @@ impl Subscription {
     /// Samples taken.
     pub fn received(&self) -> u64 {
         if self.session.is_forked() { 0 } else { self.inner.lock().received }
-    }
-
-    /// For a relay: what was taken and not acknowledged is to be taken once more; where its publisher
-    /// keeps a history, all of that.
-    pub(crate) fn take_back(&self) {
-        if !self.session.is_forked() {
-            let history = self.inner.qos.durability == Durability::TransientLocal;
-            self.inner.lock().take_back(history);
-        }
     }
 }
 

@@ -270,8 +270,14 @@ impl MatchedReaders {
     /// What was taken and is not done with is to be taken once more; and all of the `history` that
     /// stands, if so.
     pub(in crate::session) fn take_back(&mut self, history: bool) {
-        for MatchedReader { reader, .. } in &mut self.matched_readers {
-            if history { reader.rewind() } else { reader.take_back() }
+        for MatchedReader { reader, last, .. } in &mut self.matched_readers {
+            if history {
+                reader.rewind()
+            } else {
+                reader.take_back()
+            }
+            // They are no repeats of those that were taken before.
+            *last = None;
         }
     }
 

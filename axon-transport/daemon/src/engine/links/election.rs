@@ -70,8 +70,10 @@ impl Links {
             return self.close_connection(number, CloseCode::NotAllowed, text, now);
         }
         let current = self.table.current_peer(daemon);
-        let successor = replaces.is_some()
+        let replaced = replaces.is_some()
             && current.is_some_and(|current| current.elected.map(|e| e.link) == replaces);
+        // The peer may have given up the link that is silent here.
+        let successor = replaced || current.is_some_and(|peer| peer.silence.gone.is_some());
         let candidate = Candidate { side, successor };
         let we_elect = ours < daemon;
         if we_elect && current.is_some_and(|c| !keep(ours, daemon, c.candidate, candidate)) {
@@ -103,7 +105,7 @@ impl Links {
             unread: account.unread.nothing(),
             account,
             chain,
-            silence: Silence::new(),
+            silence: Silence::new(now),
         });
         if we_elect {
             let elected = Elected { link: rand::random(), election: self.next_election };

@@ -46,7 +46,9 @@ impl Links {
             Phase::Electing(_) | Phase::Open | Phase::Leaving(_) => {
                 let refusal = Refusal::of(reason);
                 let text = refusal.to_string();
-                self.end_link(number, &text, Some(refusal), now);
+                // A stateless reset: another daemon has the peer's port.
+                let restarted = matches!(reason, ConnectionError::Reset);
+                self.end_link_of(number, &text, Some(refusal), restarted, now);
             }
         }
     }
@@ -54,7 +56,7 @@ impl Links {
     /// Ends a link since its host has another one.
     pub(in crate::engine) fn replace(&mut self, number: u64, why: &str, now: Duration) {
         self.close_connection(number, CloseCode::Replaced, why, now);
-        self.end_link(number, why, None, now);
+        self.end_link_of(number, why, None, true, now);
     }
 
     /// Ends a link whose peer broke a rule.
@@ -116,6 +118,18 @@ impl Links {
         refusal: Option<Refusal>,
         now: Duration,
     ) {
+        self.end_link_of(number, reason, refusal, false, now);
+    }
+
+    /// A link is over. `restarted`: another daemon of the peer's host takes the place of its own.
+    fn end_link_of(
+        &mut self,
+        number: u64,
+        reason: &str,
+        refusal: Option<Refusal>,
+        restarted: bool,
+        now: Duration,
+    ) {
         let Some(link) = self.table.get(number) else { return };
         let peer = self.peer_text(number);
         let daemon = link.peer.as_ref().map(|peer| peer.summary.hello.daemon);
@@ -134,7 +148,7 @@ impl Links {
             self.outbox.report(LinkReport::Refused(peer.clone(), refusal));
         }
         let reason = reason.to_owned();
-        self.outbox.event(LinkEvent::Down { number, daemon, peer, reason });
+        self.outbox.event(LinkEvent::Down { number, daemon, peer, reason, restarted });
     }
 
     /// Whether all connections are over.

@@ -28,10 +28,21 @@ pub(in crate::engine) enum LinkEvent {
     Stream(u64, DaemonId, StreamEvent),
     /// The keys of this link changed.
     Keys(DaemonId),
+    /// The peer has been silent for so long that it is taken for gone. Its link stands.
+    Silent(DaemonId),
+    /// A peer that was silent is back, over the same link.
+    Back(DaemonId),
     /// A link that was not in use is over: nothing more of its streams can be read.
     Gone(u64, DaemonId),
     /// The last link of a peer is over.
-    Down { number: u64, daemon: DaemonId, peer: String, reason: String },
+    Down {
+        number: u64,
+        daemon: DaemonId,
+        peer: String,
+        reason: String,
+        /// Another daemon of its host takes its place.
+        restarted: bool,
+    },
 }
 
 /// What the links say to the control plane.

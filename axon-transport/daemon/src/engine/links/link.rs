@@ -105,6 +105,10 @@ pub(super) struct Silence {
     pub(super) probing: Option<Probing>,
     /// A successor was dialled since it is silent, and nothing was acknowledged since.
     pub(super) silent: bool,
+    /// When the last datagram came.
+    pub(super) heard_at: Duration,
+    /// What had come and gone when the peer was taken for gone, while it is.
+    pub(super) gone: Option<Traffic>,
 }
 
 /// Probes of the path of a silent link.
@@ -118,9 +122,9 @@ pub(super) struct Probing {
 }
 
 impl Silence {
-    pub(super) fn new() -> Self {
+    pub(super) fn new(now: Duration) -> Self {
         let (traffic, heard) = (Traffic::default(), Traffic::default());
-        Self { traffic, heard, probing: None, silent: false }
+        Self { traffic, heard, probing: None, silent: false, heard_at: now, gone: None }
     }
 }
 

@@ -229,7 +229,7 @@ impl Links {
             }
         }
         self.read_control(number, now);
-        self.note_heard(number);
+        self.note_heard(number, now);
         let stays = self.lost.iter().any(|(lost, _)| *lost == number);
         self.connections.note(number, stays);
     }

@@ -181,6 +181,20 @@ impl Outbound {
         given_up
     }
 
+    /// Takes the KEEP_ALL relays of a route, as many as `most` says, whose samples another daemon of the peer's host may
+    /// ask for. Nothing of their flows is given up.
+    pub(crate) fn take_kept(&mut self, number: u32, most: usize) -> Vec<Source> {
+        let Some(served) = self.routes.get_mut(&number) else { return Vec::new() };
+        let kept: Vec<_> = served.sources.extract_if(.., |s| s.keeps_all()).take(most).collect();
+        for source in &kept {
+            self.by_source.remove(&source.gid());
+        }
+        let read = |of: &Gid| kept.iter().any(|source| source.reads(of));
+        let flows: Vec<_> = served.flows.extract_if(|of, _| read(of)).collect();
+        flows.into_iter().for_each(|(_, id)| self.forget_flow(id));
+        kept
+    }
+
     /// A publisher of a route ended: the samples that it left are sent, and then [`OutboundEvent::Drained`] comes.
     pub(crate) fn handle_publisher_ended(&mut self, number: u32, publisher: Gid, now: Duration) {
         self.endings.add(number, publisher, now);

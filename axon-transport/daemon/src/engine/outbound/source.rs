@@ -4,7 +4,7 @@ use std::{collections::HashMap, rc::Rc, time::Duration};
 
 use axon_shm::{
     ids::Gid,
-    qos::{Qos, Reliability},
+    qos::{History, Qos, Reliability},
 };
 use axon_transport::internal::session::TakeLimit;
 
@@ -124,6 +124,12 @@ impl Source {
         }
     }
 
+    /// Whether it is a relay of RELIABLE and KEEP_ALL subscriptions: its publishers keep what it has not acknowledged.
+    pub(super) fn keeps_all(&self) -> bool {
+        matches!(self, Self::Relay(spec, _) if spec.qos.reliability == Reliability::Reliable
+            && spec.qos.history == History::KeepAll)
+    }
+
     /// The samples of this publisher up to this number reached the peer, or never will.
     pub(super) fn acknowledge_of(&self, of: &Gid, sequence: u64) {
         if let Self::Relay(_, reader) = self {
@@ -132,7 +138,7 @@ impl Source {
     }
 
     /// RELIABLE samples that are not acknowledged, by publisher.
-    pub(super) fn unacknowledged(&self) -> HashMap<Gid, u64> {
+    pub(crate) fn unacknowledged(&self) -> HashMap<Gid, u64> {
         match self {
             Self::Relay(spec, reader) if spec.qos.reliability == Reliability::Reliable => {
                 reader.unacknowledged()

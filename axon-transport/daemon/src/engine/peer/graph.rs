@@ -239,6 +239,12 @@ impl Remote {
         None
     }
 
+    /// What is told of it from now on is all of it.
+    pub(crate) fn tell_anew(&mut self) {
+        self.fresh = true;
+        self.changed.extend(self.all.keys());
+    }
+
     /// What changed since the last call.
     pub(crate) fn changes(&mut self) -> GraphChange {
         let reset = std::mem::replace(&mut self.fresh, false);

@@ -2,6 +2,7 @@
 
 mod asking;
 pub(super) mod graph;
+pub(super) mod kept;
 pub(super) mod owners;
 mod refused;
 pub(super) mod routes;
@@ -46,6 +47,7 @@ use crate::{
         counters::Counters,
         peer::{
             graph::{GraphTaken, Remote},
+            kept::KeptRelays,
             owners::Prover,
             routes::RouteKey,
             stalls::Stalls,
@@ -88,6 +90,8 @@ pub(crate) struct Surroundings<'a> {
     pub(crate) stalled_after: Duration,
     /// Routes that were given up.
     pub(crate) stalls: &'a RefCell<Stalls>,
+    /// Relays that are kept for daemons that are restarted.
+    pub(crate) kept: &'a RefCell<KeptRelays>,
     /// When the engine's time was zero.
     pub(crate) epoch: Instant,
 }
@@ -117,6 +121,8 @@ pub(crate) struct Peer {
     sent_version: u64,
     resynced: Option<Duration>,
     resync_due: bool,
+    /// It has been silent for so long that the control plane takes it for gone.
+    pub(super) silent: bool,
     /// Its graph changed, and what follows was not done.
     pub(super) stirred: bool,
     refusal_said: bool,
@@ -193,6 +199,7 @@ impl Peer {
             sent_version: 0,
             resynced: None,
             resync_due: false,
+            silent: false,
             stirred: false,
             refusal_said: false,
             next_route: 1,

@@ -122,6 +122,12 @@ impl Peer {
         let out =
             RouteOut { topic, route, acknowledged, short_headers, sources: sources_out, seen };
         self.outbound.set_route(number, out, now);
+        // Of a relay that was kept: publishers that ended meanwhile.
+        for of in sources.iter().flat_map(Source::unacknowledged).map(|(of, _)| of) {
+            if !with.local.contains_key(&of) {
+                self.outbound.handle_publisher_ended(number, of, now);
+            }
+        }
         self.served_as.insert(key.clone(), number);
         let served = Served {
             key,
@@ -142,6 +148,19 @@ impl Peer {
     fn take_served(&mut self, number: u32) -> Option<Served> {
         self.services.remove(&number);
         self.served.remove(&number)
+    }
+
+    /// Whether it is served a topic's route for one of these subscriptions.
+    pub(in crate::engine) fn serves_one_of(&self, asks: &Subscribe) -> bool {
+        let is_same = |served: &&Served| {
+            let key = &served.key;
+            key.kind == Kind::Topic && key.topic == asks.topic && key.type_name == asks.type_name
+        };
+        let same = self.served.values().find(is_same).filter(|_| asks.kind == Kind::Topic as u8);
+        let is_read = |served: &Served| {
+            asks.subscribers.iter().any(|reader| served.subscribers.contains(&reader.gid))
+        };
+        same.is_some_and(is_read)
     }
 
     /// The subscribers that are of the peer's own sessions.
@@ -226,6 +245,10 @@ impl Peer {
         for spec in specs {
             if let Some(reader) = there(&spec) {
                 reader.set_stands_for(spec.stands_for.clone());
+                sources.push(Source::Relay(spec, reader));
+                continue;
+            }
+            if let Some(reader) = with.kept.borrow_mut().adopt(key, &spec) {
                 sources.push(Source::Relay(spec, reader));
                 continue;
             }

@@ -347,6 +347,10 @@ impl Host {
                 removed.iter().for_each(|gid| drop(graph.remove(gid)));
                 graph.extend(added.into_iter().map(|e| (e.endpoint.gid, e)));
             }
+            ToControl::Silent { daemon } => {
+                self.graph.remove(&daemon);
+                self.refusals.push_back((now, "silent".into()));
+            }
             ToControl::LinkUp { daemon, .. } => {
                 self.linked.insert(daemon);
             }

@@ -180,7 +180,7 @@ fn a_partition_that_outlasts_the_links_heals() {
     let pair = world.pair(0, 3, "/t", Qos::keep_all());
     world.until(secs(5), World::is_whole);
     let cut = world.network.partition(&[0, 1], None);
-    world.run_for(secs(40));
+    world.run_for(secs(150));
     assert!(!world.is_linked());
     world.network.heal(cut);
     world.until(secs(10), World::is_whole);

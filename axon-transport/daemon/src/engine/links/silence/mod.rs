@@ -9,10 +9,14 @@ use bytes::BytesMut;
 use self::prober::Step;
 pub(super) use self::prober::{Prober, Traffic};
 use crate::{
-    engine::links::{LinkReport, Links, link::Probing},
+    engine::links::{LinkEvent, LinkReport, Links, link::Probing},
     wire::beacon::Datagram,
 };
 
+/// A link over which nothing came for so long is probed, even if nothing was asked: two of QUIC's keep-alives are lost.
+const UNHEARD: Duration = Duration::from_secs(10);
+/// A peer that is silent for so long is taken for gone. Its link stands until QUIC gives it up.
+const GONE: Duration = Duration::from_secs(20);
 /// No message of discovery is longer.
 const MAX_DISCOVERY: usize = 512;
 
@@ -39,19 +43,25 @@ impl Links {
 
     /// Notes what had gone over a link when a datagram came. What is sent later has no answer yet. QUIC does not always
     /// send it again: its probes may ask for an acknowledgement alone.
-    pub(super) fn note_heard(&mut self, number: u64) {
+    pub(super) fn note_heard(&mut self, number: u64, now: Duration) {
         let (Some(connection), Some(peer)) =
             (self.connections.get(number), self.table.peer_mut(number))
         else {
             return;
         };
         let traffic = Traffic::from(&connection.quic.stats());
-        if traffic.has_come_since(peer.silence.heard) {
-            peer.silence.heard = traffic;
+        if !traffic.has_come_since(peer.silence.heard) {
+            return;
+        }
+        (peer.silence.heard, peer.silence.heard_at) = (traffic, now);
+        // What comes over a path that works one way alone brings no peer back.
+        if peer.silence.gone.take_if(|gone| traffic.answered_since(*gone)).is_some() {
+            self.outbox.event(LinkEvent::Back(peer.summary.hello.daemon));
         }
     }
 
-    /// Probes the path of links over which something went out, and nothing came in the last second.
+    /// Probes the path of links over which something went out, and nothing came in the last second. Takes peers for gone
+    /// of which nothing came for long.
     pub(super) fn look_for_silence(&mut self, now: Duration) {
         for number in self.table.open() {
             let Some(connection) = self.connections.get(number) else { continue };
@@ -62,8 +72,13 @@ impl Links {
             let before = std::mem::replace(&mut peer.silence.traffic, traffic);
             // It is no longer silent: what is under way arrives.
             peer.silence.silent &= !traffic.answered_since(before);
-            let heard = peer.silence.heard;
-            if peer.silence.probing.is_some() || !traffic.is_silent(before, heard) {
+            let unheard = now.saturating_sub(peer.silence.heard_at);
+            if unheard >= GONE && peer.silence.gone.is_none() {
+                peer.silence.gone = Some(traffic);
+                self.outbox.event(LinkEvent::Silent(peer.summary.hello.daemon));
+            }
+            let silent = traffic.is_silent(before, peer.silence.heard) || unheard >= UNHEARD;
+            if peer.silence.probing.is_some() || !silent {
                 continue;
             }
             tracing::debug!(peer = %peer.summary.hello.daemon,

@@ -110,6 +110,8 @@ impl RingReader for Ring {
 
     fn acknowledge_of(&self, _publisher: &Gid, _sequence: u64) {}
 
+    fn take_back(&self) {}
+
     fn unacknowledged(&self) -> HashMap<Gid, u64> {
         HashMap::new()
     }

@@ -27,7 +27,7 @@ use axon_transport::{
 use self::reader::SimReader;
 use crate::engine::rings::{RingError, RingReader, RingWriter, Rings};
 
-/// Samples that a publisher's ring holds.
+/// Samples that a publisher's ring holds, or as many as its depth.
 const RING: usize = 256;
 
 /// A local publisher.
@@ -187,7 +187,11 @@ impl SimRings {
         let oldest = holds
             .map(|reader| reader.acknowledged.borrow().get(&publisher).copied().unwrap_or(0))
             .min();
-        if of.history.len() >= RING {
+        let most = match of.endpoint.qos.history {
+            History::KeepAll => RING,
+            History::KeepLast => RING.max(of.endpoint.qos.depth as usize),
+        };
+        if of.history.len() >= most {
             let first = of.history.front().map_or(0, |(sequence, _)| *sequence);
             if oldest.is_some_and(|oldest| oldest < first) {
                 return false;

@@ -132,6 +132,10 @@ impl RingReader for SimReader {
         *known = sequence.max(*known);
     }
 
+    fn take_back(&self) {
+        self.cursors.read.borrow_mut().clone_from(&self.cursors.acknowledged.borrow());
+    }
+
     fn unacknowledged(&self) -> HashMap<Gid, u64> {
         let state = self.rings.state.borrow();
         let acknowledged = self.cursors.acknowledged.borrow();

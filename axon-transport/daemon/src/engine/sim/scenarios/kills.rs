@@ -135,3 +135,31 @@ fn a_daemon_killed_while_it_or_its_peer_ends_in_order_links_again() {
         }
     }
 }
+
+#[test]
+fn keep_all_outlasts_a_killed_daemon_of_the_subscription() {
+    for (mode, config) in modes() {
+        for (down, samples) in [(millis(200), 300), (secs(3), 100)] {
+            let mut world = World::new(90, 2, &config);
+            let pair = world.pair(0, 1, "/t", Qos::keep_all());
+            world.until(secs(10), World::is_whole);
+            world.run_for(secs(1));
+            let mut published = 0;
+            for number in 0..samples {
+                if number == samples / 4 {
+                    world.kill(1, false);
+                }
+                let sent = world.publish(pair, 500);
+                published += u64::from(sent);
+                world.run_for(down / (samples / 4));
+                if number == samples / 2 {
+                    world.restart(1);
+                }
+            }
+            world.run_for(secs(15));
+            let case = format!("{mode}, {down:?}");
+            let received = world.received(pair);
+            assert!(received.into_iter().eq(1..=published), "{case}: {}", world.describe());
+        }
+    }
+}

@@ -74,3 +74,35 @@ fn each_sample_that_does_not_arrive_is_counted_once() {
         assert_eq!(counted(&world, "/t"), published - received, "{case} {}", world.describe());
     }
 }
+
+/// A burst that the depth holds, published into a link that is cut for so long. `rings` says whether the engine hears of
+/// each sample or of the last alone. Returns the samples that arrived.
+fn burst_into_a_cut(cut: Duration, rings: bool) -> (u64, u64) {
+    let qos = Qos { depth: 1024, ..Qos::default() };
+    let (mut world, pair) = attached(70, qos, Path { delay: millis(2), ..Path::default() });
+    let broken = world.network.partition(&[0], None);
+    let (host, publisher) = pair.publisher;
+    for _ in 0..1024 {
+        assert!(world.hosts[host].rings.publish(publisher, 4096));
+        if rings {
+            world.hosts[host].ring();
+            world.run_for(Duration::from_micros(20));
+        }
+    }
+    world.hosts[host].ring();
+    world.run_for(cut);
+    world.network.heal(broken);
+    world.run_for(secs(5));
+    let received = world.received(pair);
+    (received.len() as u64, counted(&world, "/t"))
+}
+
+#[test]
+fn a_burst_within_the_depth_outlasts_a_cut() {
+    for cut in [millis(300), secs(2), secs(5), secs(20), secs(60)] {
+        for rings in [false, true] {
+            let arrived = burst_into_a_cut(cut, rings);
+            assert_eq!(arrived, (1024, 0), "{cut:?}, {rings}");
+        }
+    }
+}

@@ -1,0 +1,172 @@
+//! Nothing is lost at a seam: cut links, publishers that end, killed daemons.
+
+use std::{thread, time::Duration};
+
+use axon_shm::PublishError;
+use axon_tests::Sizes;
+use axon_transport::{EndpointSpec, Publisher, Subscription, qos::Qos};
+
+use super::{
+    cut::wired,
+    mode::classic,
+    pair::{self, Host, Plan, kill},
+    process::{PATIENCE, until},
+};
+
+const TOPIC: &str = "/seam";
+
+fn spec(qos: Qos) -> EndpointSpec {
+    EndpointSpec::new(TOPIC, "test/Bytes", qos)
+}
+
+/// A publisher on the first host and a subscription on the second that have met.
+fn across(hosts: &[Host; 2], qos: Qos) -> (Publisher, Subscription) {
+    let (here, there) = (hosts[0].session("publisher"), hosts[1].session("subscription"));
+    let subscription = there.create_subscription(spec(qos)).unwrap();
+    let publisher = here.create_publisher(spec(qos)).unwrap();
+    assert!(publisher.wait_matched(1, PATIENCE) && subscription.wait_matched(1, PATIENCE));
+    (publisher, subscription)
+}
+
+fn publish(publisher: &Publisher, samples: u64, length: usize, every: Duration) {
+    let bytes = vec![0x5a; length];
+    for _ in 0..samples {
+        while let Err(error) = publisher.publish(&bytes) {
+            assert!(matches!(error, PublishError::Blocked { .. }), "{error}");
+        }
+        thread::sleep(every);
+    }
+}
+
+/// The numbers of what comes, to the last that must.
+fn take(subscription: &Subscription, last: u64) -> Vec<u64> {
+    let (mut bytes, mut numbers) = (Vec::new(), Vec::new());
+    while numbers.last() != Some(&last) {
+        let Ok(info) = subscription.recv(&mut bytes, Some(PATIENCE)) else { break };
+        numbers.push(info.sequence);
+    }
+    numbers
+}
+
+/// What the status of a host counts as lost, by cause.
+fn lost(host: &Host) -> Vec<(String, u64)> {
+    let topics = host.status().topics;
+    let topics = topics.into_iter().filter(|topic| topic.topic == TOPIC);
+    topics.flat_map(|topic| topic.dropped).filter(|(_, samples)| *samples > 0).collect()
+}
+
+fn all_came(case: &str, hosts: &[Host; 2], numbers: &[u64], last: u64) {
+    let causes = hosts.each_ref().map(lost);
+    let came = numbers.len();
+    let missing: Vec<_> = (1..=last).filter(|number| !numbers.contains(number)).collect();
+    assert!(
+        numbers.iter().copied().eq(1..=last),
+        "{case}: {came} of {last} came, {missing:?} did not; lost {causes:?}"
+    );
+}
+
+#[test]
+fn a_burst_within_the_depth_outlasts_a_cut() {
+    let (hosts, wire) = wired([classic(&[]), classic(&[])]);
+    let (publisher, subscription) = across(&hosts, Qos { depth: 1024, ..Qos::default() });
+    wire.cut();
+    publish(&publisher, 1024, 4096, Duration::ZERO);
+    thread::sleep(Duration::from_secs(3));
+    wire.mend();
+    all_came("burst", &hosts, &take(&subscription, 1024), 1024);
+}
+
+#[test]
+fn what_is_published_during_a_cut_that_outlasts_the_graph_arrives() {
+    let (hosts, wire) = wired([classic(&[]), classic(&[])]);
+    let (publisher, subscription) = across(&hosts, Qos::keep_all());
+    publish(&publisher, 20, 4096, Duration::ZERO);
+    wire.cut();
+    publish(&publisher, 300, 4096, Duration::from_millis(80));
+    assert!(hosts.iter().all(|host| host.status().links.is_empty()), "each is taken for gone");
+    wire.mend();
+    all_came("cut", &hosts, &take(&subscription, 320), 320);
+    assert!(publisher.wait_acknowledged(PATIENCE));
+}
+
+fn what_a_publisher_leaves_in_a_cut_link_arrives(qos: Qos) {
+    let (hosts, wire) = wired([classic(&[]), classic(&[])]);
+    let (publisher, subscription) = across(&hosts, qos);
+    wire.cut();
+    publish(&publisher, 100, 4096, Duration::ZERO);
+    drop(publisher);
+    thread::sleep(Duration::from_secs(5));
+    wire.mend();
+    all_came("left", &hosts, &take(&subscription, 100), 100);
+}
+
+#[test]
+fn what_a_keep_all_publisher_leaves_in_a_cut_link_arrives() {
+    what_a_publisher_leaves_in_a_cut_link_arrives(Qos::keep_all());
+}
+
+#[test]
+fn what_a_keep_last_publisher_leaves_in_a_cut_link_arrives() {
+    what_a_publisher_leaves_in_a_cut_link_arrives(Qos { depth: 100, ..Qos::default() });
+}
+
+#[test]
+fn what_a_killed_process_published_into_a_cut_link_arrives() {
+    let (hosts, wire) = wired([classic(&[]), classic(&[])]);
+    let mut there = hosts[1].subscribe(Sizes::Small);
+    let mut publisher = hosts[0].publish(Sizes::Small, 2, Some(100));
+    until("one of the two readers is there", || {
+        let topics = hosts[0].status().topics;
+        topics.iter().any(|topic| topic.topic == pair::TOPIC && topic.remote_subscriptions == 1)
+    });
+    thread::sleep(Duration::from_millis(500));
+    wire.cut();
+    // The other reader has it begin.
+    let here = hosts[0].session("here");
+    let spec = EndpointSpec::new(pair::TOPIC, "test/Bytes", Qos::keep_all());
+    let _subscription = here.create_subscription(spec).unwrap();
+    publisher.wait_sent();
+    kill(publisher.pid());
+    thread::sleep(Duration::from_secs(5));
+    wire.mend();
+    there.wait_taken(100);
+    let tally = there.tally();
+    assert_eq!((tally.taken, tally.lost), (100, 0), "{tally:?}");
+}
+
+/// Publishes while daemons are killed and started again.
+fn outlasts(killed: &[usize]) {
+    let mut hosts = Plan::new([classic(&[]), classic(&[])]).start();
+    let (publisher, subscription) = across(&hosts, Qos::keep_all());
+    let publishing = thread::spawn(move || {
+        publish(&publisher, 500, 4096, Duration::from_millis(5));
+        publisher
+    });
+    let taking = thread::spawn(move || (take(&subscription, 500), subscription));
+    thread::sleep(Duration::from_millis(500));
+    for host in killed {
+        kill(hosts[*host].status().pid);
+    }
+    for host in killed {
+        hosts[*host].daemon = None;
+        hosts[*host].start();
+    }
+    let _publisher = publishing.join().unwrap();
+    let (numbers, _subscription) = taking.join().unwrap();
+    all_came(&format!("{killed:?}"), &hosts, &numbers, 500);
+}
+
+#[test]
+fn keep_all_outlasts_a_killed_daemon_of_the_publisher() {
+    outlasts(&[0]);
+}
+
+#[test]
+fn keep_all_outlasts_a_killed_daemon_of_the_subscription() {
+    outlasts(&[1]);
+}
+
+#[test]
+fn keep_all_outlasts_killed_daemons_of_both() {
+    outlasts(&[0, 1]);
+}
