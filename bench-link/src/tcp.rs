@@ -2,7 +2,7 @@
 
 use std::{
     collections::VecDeque,
-    io::{BufReader, Read, Write},
+    io::{BufReader, ErrorKind, Read, Write},
     net::{TcpListener, TcpStream},
     sync::{
         Arc, Condvar, Mutex, PoisonError,
@@ -21,6 +21,9 @@ use crate::{
 
 /// What the kernel may hold that it has not sent yet, so that a newer message can replace an older one.
 const UNSENT: u32 = 16 << 10;
+/// How often a connection is tried, and for how long. TCP waits longer each time for an answer.
+const ATTEMPTS: u32 = 8;
+const ATTEMPT: Duration = Duration::from_secs(4);
 /// How often a receiver looks whether it is to end.
 const LOOK: Duration = Duration::from_millis(20);
 /// Messages that a stream without a depth holds.
@@ -40,16 +43,35 @@ pub(crate) fn congestion() -> Result<String> {
     Ok(String::from_utf8_lossy(&name).trim_end_matches('\0').to_owned())
 }
 
+/// A connection; `None` where the path loses too much for one.
+fn connect(address: &str) -> Result<Option<TcpStream>> {
+    let address = address.parse()?;
+    for _ in 0..ATTEMPTS {
+        match TcpStream::connect_timeout(&address, ATTEMPT) {
+            Ok(socket) => {
+                socket.set_nodelay(true)?;
+                SockRef::from(&socket).set_tcp_notsent_lowat(UNSENT)?;
+                return Ok(Some(socket));
+            }
+            Err(error) if error.kind() == ErrorKind::TimedOut => {}
+            Err(error) => return Err(error.into()),
+        }
+    }
+    Ok(None)
+}
+
 /// Sends at the stream's rate. A message that waits while the socket is full makes way for a newer one.
 pub(crate) fn send(stream: &Stream, address: &str, orders: &Receiver<()>) -> Result<()> {
-    let socket = TcpStream::connect(address)?;
-    socket.set_nodelay(true)?;
-    SockRef::from(&socket).set_tcp_notsent_lowat(UNSENT)?;
+    let socket = connect(address)?;
     say(&())?;
     orders.recv()?;
     let waiting = Arc::new(Waiting::default());
     let of_writer = Arc::clone(&waiting);
-    let writer = thread::spawn(move || write(socket, &of_writer));
+    let writer = thread::spawn(move || {
+        if let Some(socket) = socket {
+            write(socket, &of_writer);
+        }
+    });
     let depth = stream.depth.map_or(MOST_WAITING, |depth| depth as usize);
     let mut sent = Sent::default();
     paced(stream, orders, |number| {
@@ -101,17 +123,17 @@ fn write(mut socket: TcpStream, waiting: &Waiting) {
 pub(crate) fn receive(address: &str, orders: &Receiver<()>) -> Result<()> {
     let listener = TcpListener::bind(address)?;
     say(&())?;
-    let (socket, _) = listener.accept()?;
     let taken = Arc::new(Mutex::new(Taken::default()));
     let of_reader = Arc::clone(&taken);
-    thread::spawn(move || read(socket, &of_reader));
+    thread::spawn(move || read(&listener, &of_reader));
     while !matches!(orders.try_recv(), Err(TryRecvError::Disconnected)) {
         thread::sleep(LOOK);
     }
     say(&*taken.lock().unwrap_or_else(PoisonError::into_inner))
 }
 
-fn read(socket: TcpStream, taken: &Mutex<Taken>) -> Result<()> {
+fn read(listener: &TcpListener, taken: &Mutex<Taken>) -> Result<()> {
+    let (socket, _) = listener.accept()?;
     let mut socket = BufReader::with_capacity(256 << 10, socket);
     let mut bytes = Vec::new();
     loop {
