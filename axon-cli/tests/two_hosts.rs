@@ -42,15 +42,17 @@ fn play_fails_where_the_other_host_takes_nothing_more() {
     let (code, said) = outcome(play);
     signal(there, Signal::CONT);
     assert_eq!(code, Some(1), "{said}");
-    // The link is given up after 20 s without a sign of life, which may be first.
+    // The link is given up after 120 s without a sign of life, which may be first.
     let unheard = ["messages were not acknowledged, none of them for 15 s", "lost with a link"];
     assert!(unheard.iter().any(|why| said.contains(why)), "{said}");
 }
 
+/// The next daemon sends what the killed one had. Until it is there the publisher has no subscription, which `play` says,
+/// though these messages arrive too.
 #[test]
-fn play_fails_where_messages_are_lost_with_its_daemon() {
+fn no_message_is_lost_with_the_daemon_of_play() {
     let [a, b] = Host::pair();
-    let _echoes = Echoes::start(&b);
+    let echoes = Echoes::start(&b);
     let play = play(&a, "60");
     eventually("the middle of the replay", || a.published() > 500);
     let there = b.wait_daemon();
@@ -60,8 +62,9 @@ fn play_fails_where_messages_are_lost_with_its_daemon() {
     signal(a.wait_daemon(), Signal::KILL);
     signal(there, Signal::CONT);
     let (code, said) = outcome(play);
-    assert_eq!(code, Some(1), "{said}");
-    assert!(said.contains("messages were lost with a link or a daemon"), "{said}");
+    assert!(!said.contains("lost with a link or a daemon"), "{said}");
+    assert_eq!(code, Some(i32::from(said.contains("found fewer subscriptions"))), "{said}");
+    echoes.assert_whole();
 }
 
 /// Nothing is on its way when the other host's subscriptions leave, so that nothing is given up.

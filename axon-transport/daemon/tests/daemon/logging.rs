@@ -63,11 +63,13 @@ fn a_daemon_outlives_the_reader_of_its_standard_error() {
 fn a_daemon_outlives_a_limit_on_the_size_of_files() {
     let host = Host::new();
     let log = host.dir.path().join("stderr");
-    fs::write(&log, vec![b'\n'; 4 << 20]).unwrap();
+    // Its log file is as long as any may be. Shared memory must fit: a session's takes 17 MiB, most of it sparse.
+    let length = 32 << 20;
+    let file = File::create(&log).unwrap();
+    file.set_len(length).unwrap();
     let full = OpenOptions::new().append(true).open(&log).unwrap();
-    // Units of 512 bytes: its log file is as long as any may be.
-    assert_it_goes_on(&host, foreground(&host, limited(&host, 8192), full));
-    assert_eq!(fs::metadata(&log).unwrap().len(), 4 << 20);
+    assert_it_goes_on(&host, foreground(&host, limited(&host, length / 512), full));
+    assert_eq!(fs::metadata(&log).unwrap().len(), length);
 }
 
 #[test]
@@ -85,7 +87,7 @@ fn a_daemon_that_may_not_write_at_all_ends_with_an_error_and_not_by_a_signal() {
 }
 
 /// A daemon none of whose files may be longer.
-fn limited(host: &Host, blocks: u32) -> Command {
+fn limited(host: &Host, blocks: u64) -> Command {
     let mut shell = host.command("sh");
     let script = format!("ulimit -f {blocks}; exec \"$0\"");
     shell.args(["-c", &script, env!("CARGO_BIN_EXE_axon_daemon")]);
