@@ -134,6 +134,8 @@ impl<F: Clone> Registry<F> {
             };
             let (to_writer, to_reader) = (w.session, r.session);
             match self.apart(w, r) {
+                // A host that is silent is not in the graph. The gateway ends its endpoints here when it is gone.
+                Some(OutOfRange::Unknown) => {}
                 Some(why) => {
                     self.remove_pair(&pair);
                     self.forget(&to_writer, &to_reader, &pair);

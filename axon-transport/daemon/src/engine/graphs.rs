@@ -85,16 +85,17 @@ impl Engine {
     /// A peer asks for a route. Ends the links of daemons of the same host that were asked for by the same
     /// subscriptions: those links are dead, and the route begins with what they did not carry.
     pub(super) fn take_over_route(&mut self, daemon: DaemonId, asks: &Subscribe, now: Duration) {
-        let others = self.peers.iter().filter(|(other, _)| *other != daemon);
-        let others: Vec<_> =
-            others.filter(|(_, peer)| peer.serves_one_of(asks)).map(|(other, _)| other).collect();
         let identity = |other| self.links.identity(self.links.current(other)?);
-        let owner = if others.is_empty() { None } else { identity(daemon) };
-        let Some(owner) = owner else { return };
-        let same_host =
-            others.into_iter().filter(|other| identity(*other).as_ref() == Some(&owner));
-        let dead: Vec<_> =
-            same_host.filter_map(|other| Some(self.peers.get(other)?.link)).collect();
+        let (Some(owner), Some(asking)) = (identity(daemon), self.peers.get(daemon)) else {
+            return;
+        };
+        let others = self.peers.iter().filter(|(other, _)| *other != daemon);
+        let same_host = others.filter(|(other, _)| identity(*other).as_ref() == Some(&owner));
+        // The subscriptions of another daemon are no reason, whoever names them.
+        let own = asks.subscribers.iter().map(|reader| reader.gid);
+        let own: Vec<_> = own.filter(|gid| asking.remote.owns(gid)).collect();
+        let dead = same_host.filter(|(_, peer)| peer.serves_one_of(asks, &own));
+        let dead: Vec<_> = dead.map(|(_, peer)| peer.link).collect();
         if !dead.is_empty() {
             self.end_dead(dead, now);
         }

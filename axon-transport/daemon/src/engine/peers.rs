@@ -21,6 +21,7 @@ use super::{
 /// nine times as long before the next one.
 const ENDPOINT: Duration = Duration::from_nanos(500);
 const OTHERS: u32 = 9;
+const LONGEST_PAUSE: Duration = Duration::from_millis(200);
 
 /// All peers.
 pub(super) struct Peers {
@@ -125,7 +126,7 @@ impl Peers {
         self.local = local;
         let endpoints = self.all.values().map(|peer| peer.remote.len() + self.local.len());
         let took = ENDPOINT * u32::try_from(endpoints.sum::<usize>()).unwrap_or(u32::MAX);
-        self.follow_local_at = now + OTHERS * took;
+        self.follow_local_at = now + (OTHERS * took).min(LONGEST_PAUSE);
         self.with_each(|peer, with| peer.handle_local_graph(with, now));
     }
 

@@ -79,7 +79,7 @@ pub(crate) fn reset_key(runtime_dir: Option<&Path>, domain: u32) -> [u8; 32] {
         .and_then(|mut f| f.write_all(&key));
     if let Err(e) = written {
         tracing::warn!(path = %path.display(), error = %e,
-            "the reset key cannot be kept: after a restart peers notice only by their idle timeout");
+            "the reset key cannot be kept: after a restart peers notice it after 120 s only");
     }
     key
 }

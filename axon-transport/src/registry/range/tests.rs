@@ -194,6 +194,34 @@ fn a_session_without_a_range_is_localhost() {
 }
 
 #[test]
+fn pairs_outlast_the_silence_of_a_host_whose_endpoints_left_the_graph() {
+    let mut world = World::new(&[scope(Subnet, &[LISTED])]);
+    let (writer, reader) = (world.own(1, 1, Publisher), world.own(1, 2, Subscription));
+    let [one, two] = [151, 152].map(|number| Gid([number; 16]));
+    let relay = world.relay(1, vec![one]);
+    world.stand_in(REMOTE);
+    world.remote(PEER, one, Subscription, SUBNET);
+    world.remote(PEER, REMOTE, Publisher, SUBNET);
+    let far = [Pair { reader: relay, writer }, Pair { reader, writer: REMOTE }];
+    let is_whole = |world: &World| far.iter().all(|pair| world.pairs().contains(pair));
+    assert!(is_whole(&world));
+
+    world.registry.remote_gone(&PEER);
+    // Lists change, and another subscription there joins, before anything is known of it.
+    world.link();
+    world.unlink();
+    let endpoint = Endpoint::example(relay, Subscription);
+    world.announce(GATEWAY, of(endpoint, EndpointRole::Relay, vec![one, two]));
+    assert!(is_whole(&world), "{:?}", world.pairs());
+
+    // It is back, and out of range now.
+    world.remote(PEER, one, Subscription, LOCALHOST);
+    world.remote(PEER, two, Subscription, LOCALHOST);
+    world.remote(PEER, REMOTE, Publisher, LOCALHOST);
+    assert!(!far.iter().any(|pair| world.pairs().contains(pair)), "{:?}", world.pairs());
+}
+
+#[test]
 fn pairs_and_graph_follow_a_link_that_comes_and_goes() {
     let mut world = World::new(&[scope(Localhost, &[LISTED]), scope(Localhost, &[])]);
     let writer = world.own(1, 1, Publisher);

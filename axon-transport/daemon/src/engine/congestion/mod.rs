@@ -425,6 +425,7 @@ impl Controller for Delay {
         lost_bytes: u64,
     ) {
         self.round.lost += lost_bytes;
+        self.silence.handle_lost(lost_bytes);
         if let Phase::Compete(competition) = &mut self.phase {
             let cubic = competition.cubic_always();
             return cubic.on_congestion_event(now, sent, is_persistent_congestion, lost_bytes);

@@ -69,14 +69,22 @@ impl Silence {
         if self.in_flight == 0 {
             self.since = now;
         }
+        // A probe of the engine is no reason for more.
+        let is_own = self.probe.swap(false, Ordering::Relaxed);
         let silent = now.saturating_duration_since(self.since);
-        if silent > self.round_trip.saturating_add(LATE) && self.probed_at.is_none_or(|at| at < now)
+        if !is_own
+            && silent > self.round_trip.saturating_add(LATE)
+            && self.probed_at.is_none_or(|at| at < now)
         {
             self.probed_at = Some(now);
             self.allowed = self.in_flight + PACKETS.0 * mtu;
         }
         self.in_flight += bytes;
-        self.probe.store(false, Ordering::Relaxed);
+    }
+
+    /// Bytes are lost, and no longer on the way.
+    pub(super) fn handle_lost(&mut self, bytes: u64) {
+        self.in_flight = self.in_flight.saturating_sub(bytes);
     }
 
     /// Packets were acknowledged, and so many bytes are on the way.
@@ -148,8 +156,13 @@ mod tests {
         // QUIC shows copies of a controller.
         silence.clone().let_probe_through();
         assert_eq!(silence.widen(WINDOW, MTU), WINDOW + MTU + 1);
-        silence.handle_sent(at(start, 1), MTU, MTU);
-        assert_eq!(silence.widen(WINDOW, MTU), WINDOW);
+        // However long nothing was acknowledged, it opens the window no further.
+        for (number, ms) in (1..).zip([8, 11, 14]) {
+            silence.handle_sent(at(start, ms), MTU, MTU);
+            assert_eq!(silence.widen(WINDOW, MTU), WINDOW, "after {ms} ms");
+            silence.let_probe_through();
+            assert_eq!(silence.widen(WINDOW, MTU), WINDOW + (number + 1) * MTU + 1);
+        }
     }
 
     #[test]

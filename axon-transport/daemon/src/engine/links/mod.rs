@@ -40,6 +40,7 @@ use self::{
     dials::Dials,
     events::Outbox,
     link::{Link, Phase, Summary},
+    silence::frames_came,
     table::Table,
 };
 use super::{
@@ -402,9 +403,9 @@ impl Links {
         Some(status)
     }
 
-    /// Datagrams that came over a link.
+    /// Frames that came over a link.
     pub(super) fn heard(&self, number: u64) -> u64 {
-        self.connections.get(number).map_or(0, |c| c.quic.stats().udp_rx.datagrams)
+        self.connections.get(number).map_or(0, |c| frames_came(&c.quic.stats()))
     }
 
     /// The peer of a link, as log and status name it.

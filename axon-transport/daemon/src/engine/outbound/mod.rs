@@ -226,6 +226,7 @@ impl Outbound {
         self.without.forget(id);
         self.busy.remove(&id);
         self.nudges.forget(id);
+        self.stalls.forget(id);
         if flow.scheduled.is_some() {
             self.schedule.remove(id);
         }

@@ -55,7 +55,7 @@ impl Source {
     }
 
     /// The reader's own GID.
-    pub(super) fn gid(&self) -> Gid {
+    pub(crate) fn gid(&self) -> Gid {
         match self {
             Self::Relay(_, reader) => reader.gid(),
             Self::StandIn(stand_in) => stand_in.gid(),

@@ -8,7 +8,7 @@ use super::{FlowId, Outbound, OutboundEvent, Served, Source};
 
 /// Between two looks.
 const LOOK: Duration = Duration::from_secs(1);
-/// After so long without any datagram of the peer the link is at fault: the link's own limits apply, and the time of
+/// After so long without anything of the peer the link is at fault: the link's own limits apply, and the time of
 /// the routes begins again.
 const SILENT: Duration = Duration::from_secs(6);
 
@@ -17,7 +17,7 @@ const SILENT: Duration = Duration::from_secs(6);
 pub(super) struct Stalls {
     limit: Duration,
     flows: HashMap<FlowId, Progress>,
-    /// Datagrams of the peer, and when there was a new one.
+    /// Frames of the peer, and when there was a new one.
     heard: (u64, Duration),
     next: Duration,
 }
@@ -31,6 +31,11 @@ struct Progress {
 impl Stalls {
     pub(super) fn new(limit: Duration, now: Duration) -> Self {
         Self { limit, flows: HashMap::new(), heard: (0, now), next: now + LOOK }
+    }
+
+    /// A flow is gone. Its number is another's next.
+    pub(super) fn forget(&mut self, flow: FlowId) {
+        self.flows.remove(&flow);
     }
 
     /// When to look again.

@@ -16,6 +16,8 @@ const MOST: usize = 1024;
 pub(crate) struct KeptRelays(Vec<Kept>);
 
 struct Kept {
+    /// The identity that the peer proved.
+    identity: String,
     key: RouteKey,
     spec: RelaySpec,
     reader: Rc<dyn RingReader>,
@@ -29,18 +31,25 @@ impl KeptRelays {
             let room = MOST.saturating_sub(self.0.len());
             for source in peer.outbound.take_kept(*number, room) {
                 let Source::Relay(spec, reader) = source else { continue };
+                let identity = peer.identity.clone();
                 let (key, until) = (served.key.clone(), now + PATIENCE);
-                self.0.push(Kept { key, spec, reader, until });
+                self.0.push(Kept { identity, key, spec, reader, until });
             }
         }
     }
 
-    /// The relay that was kept for one of the subscriptions for which a new one is to stand. It begins with what was not
-    /// acknowledged.
-    pub(super) fn adopt(&mut self, key: &RouteKey, spec: &RelaySpec) -> Option<Rc<dyn RingReader>> {
+    /// The relay that was kept, of a peer with this identity, for one of the subscriptions for which a new one is to
+    /// stand. It begins with what was not acknowledged.
+    pub(super) fn adopt(
+        &mut self,
+        key: &RouteKey,
+        spec: &RelaySpec,
+        identity: &str,
+    ) -> Option<Rc<dyn RingReader>> {
         let fits = |kept: &Kept| {
             let same = |gid| kept.spec.stands_for.contains(gid);
-            kept.key == *key && kept.spec.is(spec) && spec.stands_for.iter().any(same)
+            let is_same_topic = kept.key == *key && kept.spec.is(spec);
+            is_same_topic && kept.identity == identity && spec.stands_for.iter().any(same)
         };
         let at = self.0.iter().position(fits)?;
         let Kept { reader, .. } = self.0.swap_remove(at);

@@ -106,9 +106,9 @@ impl Peer {
             return Ok(());
         };
         self.refused.forget(number);
-        let sources = match kind {
+        let (sources, adopted) = match kind {
             Kind::Topic => self.open_relays(&key, &subscribers, &old, with),
-            Kind::Request | Kind::Response => self.sources_of_service(&key),
+            Kind::Request | Kind::Response => (self.sources_of_service(&key), Vec::new()),
         };
         let relays = sources.iter().filter(|source| matches!(source, Source::Relay(..))).count();
         let room = &self.remote.account().relays;
@@ -122,8 +122,10 @@ impl Peer {
         let out =
             RouteOut { topic, route, acknowledged, short_headers, sources: sources_out, seen };
         self.outbound.set_route(number, out, now);
-        // Of a relay that was kept: publishers that ended meanwhile.
-        for of in sources.iter().flat_map(Source::unacknowledged).map(|(of, _)| of) {
+        // Of a relay that was kept: publishers that ended meanwhile. The graph of this host is followed late, so others
+        // may be newer than it.
+        let adopted = sources.iter().filter(|source| adopted.contains(&source.gid()));
+        for of in adopted.flat_map(Source::unacknowledged).map(|(of, _)| of) {
             if !with.local.contains_key(&of) {
                 self.outbound.handle_publisher_ended(number, of, now);
             }
@@ -150,17 +152,14 @@ impl Peer {
         self.served.remove(&number)
     }
 
-    /// Whether it is served a topic's route for one of these subscriptions.
-    pub(in crate::engine) fn serves_one_of(&self, asks: &Subscribe) -> bool {
-        let is_same = |served: &&Served| {
-            let key = &served.key;
-            key.kind == Kind::Topic && key.topic == asks.topic && key.type_name == asks.type_name
-        };
-        let same = self.served.values().find(is_same).filter(|_| asks.kind == Kind::Topic as u8);
-        let is_read = |served: &Served| {
-            asks.subscribers.iter().any(|reader| served.subscribers.contains(&reader.gid))
-        };
-        same.is_some_and(is_read)
+    /// Whether it is served this topic's route for one of these subscriptions.
+    pub(in crate::engine) fn serves_one_of(&self, asks: &Subscribe, subscriptions: &[Gid]) -> bool {
+        let (topic, type_name) = (asks.topic.clone(), asks.type_name.clone());
+        let key = RouteKey { kind: Kind::Topic, topic, type_name };
+        let served = self.served_as.get(&key).and_then(|number| self.served.get(number));
+        served
+            .filter(|_| asks.kind == Kind::Topic as u8)
+            .is_some_and(|served| subscriptions.iter().any(|gid| served.subscribers.contains(gid)))
     }
 
     /// The subscribers that are of the peer's own sessions.
@@ -215,14 +214,15 @@ impl Peer {
         lost.into_iter().for_each(|route| self.unserve(route));
     }
 
-    /// Opens the relays of a topic; those that the route has are kept.
+    /// Opens the relays of a topic; those that the route has are kept. Returns them, and those among them that another
+    /// daemon of the peer's host had.
     fn open_relays(
         &self,
         key: &RouteKey,
         subscribers: &[Subscriber],
         old: &[Source],
         with: &Surroundings<'_>,
-    ) -> Vec<Source> {
+    ) -> (Vec<Source>, Vec<Gid>) {
         let hash = |gid: &Gid| self.remote.get(gid).map_or_else(Vec::new, |e| e.type_hash.clone());
         let mut specs = relays(subscribers, hash);
         let there = |spec: &RelaySpec| {
@@ -241,15 +241,17 @@ impl Peer {
                 "peer exceeded its relay limit; some of its subscriptions to this topic get no samples"
             );
         }
-        let mut sources = Vec::new();
+        let (mut sources, mut adopted) = (Vec::new(), Vec::new());
         for spec in specs {
             if let Some(reader) = there(&spec) {
                 reader.set_stands_for(spec.stands_for.clone());
                 sources.push(Source::Relay(spec, reader));
                 continue;
             }
-            if let Some(reader) = with.kept.borrow_mut().adopt(key, &spec) {
-                sources.push(Source::Relay(spec, reader));
+            if let Some(reader) = with.kept.borrow_mut().adopt(key, &spec, &self.identity) {
+                let source = Source::Relay(spec, reader);
+                adopted.push(source.gid());
+                sources.push(source);
                 continue;
             }
             let endpoint = EndpointSpec::new(&*key.topic, &*key.type_name, spec.qos)
@@ -262,7 +264,7 @@ impl Peer {
                 }
             }
         }
-        sources
+        (sources, adopted)
     }
 
     /// The stand-ins from which the calls, or responses, of a service are taken.

@@ -7,7 +7,7 @@ use std::{net::SocketAddr, time::Duration};
 use bytes::BytesMut;
 
 use self::prober::Step;
-pub(super) use self::prober::{Prober, Traffic};
+pub(super) use self::prober::{Prober, Traffic, frames_came};
 use crate::{
     engine::links::{LinkEvent, LinkReport, Links, link::Probing},
     wire::beacon::Datagram,

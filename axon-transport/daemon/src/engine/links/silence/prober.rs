@@ -35,7 +35,7 @@ const AGAIN_AT_MOST: Duration = Duration::from_secs(8);
 /// What went over a connection, as far as silence is concerned.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Traffic {
-    /// Datagrams that came.
+    /// Frames that came. Datagrams would count that anybody sends; what is not authentic, or comes twice, has no frame.
     came: u64,
     /// Acknowledgements among what came.
     acknowledged: u64,
@@ -54,7 +54,7 @@ impl Traffic {
             + sent.stop_sending
             + sent.max_data
             + sent.max_stream_data;
-        Self { came: stats.udp_rx.datagrams, acknowledged: stats.frame_rx.acks, asked }
+        Self { came: frames_came(stats), acknowledged: stats.frame_rx.acks, asked }
     }
 
     /// Whether the peer acknowledged something since `before`: QUIC repeats at once what it has not got.
@@ -72,6 +72,24 @@ impl Traffic {
     pub(crate) fn has_come_since(self, before: Self) -> bool {
         self.came != before.came
     }
+}
+
+/// Frames of the peer that show that it lives: in each of its packets is one of them.
+pub(crate) fn frames_came(stats: &quinn_proto::ConnectionStats) -> u64 {
+    let came = stats.frame_rx;
+    let data = came.stream + came.datagram + came.crypto + came.reset_stream + came.stop_sending;
+    let limits =
+        came.max_data + came.max_stream_data + came.max_streams_uni + came.max_streams_bidi;
+    let blocked = came.data_blocked + came.stream_data_blocked + came.streams_blocked_uni;
+    let paths = came.path_challenge + came.path_response + came.new_connection_id;
+    came.acks
+        + came.ping
+        + came.immediate_ack
+        + came.ack_frequency
+        + data
+        + limits
+        + blocked
+        + paths
 }
 
 /// What to do for a silent link.
