@@ -2,6 +2,7 @@
 
 use std::{
     net::{Ipv4Addr, SocketAddr},
+    sync::Arc,
     time::Duration,
 };
 
@@ -15,7 +16,7 @@ use axon_tls::{
     quic::{ALPN, hybrid_client},
 };
 use axon_transport::{ids::DaemonId, internal::SessionKey};
-use quinn::{Connection, Endpoint, RecvStream, SendStream};
+use quinn::{Connection, Endpoint, RecvStream, SendStream, TransportConfig};
 
 use super::{pair::Host, process::PATIENCE};
 
@@ -84,7 +85,12 @@ impl Stranger {
         auth: &Auth,
         claim: &Claim<'_>,
     ) -> Result<Met, String> {
-        let config = hybrid_client(auth, Cipher::default(), ALPN).unwrap();
+        let mut config = hybrid_client(auth, Cipher::default(), ALPN).unwrap();
+        // A message is a packet. A receiver that was away for a moment loses some, and QUIC closes a connection whose
+        // stream has 1,024 gaps.
+        let mut transport = TransportConfig::default();
+        transport.send_window(64 << 10);
+        config.transport_config(Arc::new(transport));
         let mut met = self.limited(async {
             let endpoint = Endpoint::client((Ipv4Addr::UNSPECIFIED, 0).into()).unwrap();
             let connection = endpoint.connect_with(config, to, "axon").unwrap().await;

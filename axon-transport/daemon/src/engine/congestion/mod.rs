@@ -354,7 +354,7 @@ impl Delay {
 impl Controller for Delay {
     fn on_sent(&mut self, now: Instant, bytes: u64, last_packet_number: u64) {
         self.last_sent = last_packet_number;
-        self.silence.handle_sent(now, bytes, self.mtu);
+        self.silence.handle_sent(now, bytes);
         if let Phase::Compete(competition) = &mut self.phase {
             competition.cubic_always().on_sent(now, bytes, last_packet_number);
         }

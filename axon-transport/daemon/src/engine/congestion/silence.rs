@@ -12,8 +12,11 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// Packets that each probe lets through, and beyond the window in all.
+/// Packets that each probe of QUIC lets through, at most, and beyond the window in all. A window has fewer.
 const PACKETS: (u64, u64) = (16, 64);
+/// Packets that a probe of the engine lets through, at most, and the share of a window that they are. They come much
+/// more often.
+const OWN: (u64, u64) = (4, 8);
 /// The share of packets lost from which on a silence may be a burst of losses.
 const LOSES: f64 = 0.01;
 /// What a round adds to the average of losses.
@@ -32,8 +35,10 @@ pub(super) struct Silence {
     in_flight: u64,
     /// When the last probe was sent.
     probed_at: Option<Instant>,
-    /// Bytes that may be on the way since then.
-    allowed: u64,
+    /// Bytes that were on the way then.
+    before: u64,
+    /// Whether the engine had it sent.
+    is_own: bool,
     /// Whether one packet may leave although the window is full. All copies of a controller share it, since QUIC shows
     /// copies alone. One thread uses all of them, so that no order is needed.
     probe: Arc<AtomicBool>,
@@ -48,7 +53,8 @@ impl Silence {
             round_trip: Duration::MAX,
             in_flight: 0,
             probed_at: None,
-            allowed: 0,
+            before: 0,
+            is_own: false,
             probe: Arc::default(),
             loss: 0.0,
         }
@@ -65,19 +71,15 @@ impl Silence {
     }
 
     /// Bytes are sent. If nothing was acknowledged for longer than a round trip, they are a probe.
-    pub(super) fn handle_sent(&mut self, now: Instant, bytes: u64, mtu: u64) {
+    pub(super) fn handle_sent(&mut self, now: Instant, bytes: u64) {
         if self.in_flight == 0 {
             self.since = now;
         }
-        // A probe of the engine is no reason for more.
         let is_own = self.probe.swap(false, Ordering::Relaxed);
         let silent = now.saturating_duration_since(self.since);
-        if !is_own
-            && silent > self.round_trip.saturating_add(LATE)
-            && self.probed_at.is_none_or(|at| at < now)
+        if silent > self.round_trip.saturating_add(LATE) && self.probed_at.is_none_or(|at| at < now)
         {
-            self.probed_at = Some(now);
-            self.allowed = self.in_flight + PACKETS.0 * mtu;
+            (self.probed_at, self.before, self.is_own) = (Some(now), self.in_flight, is_own);
         }
         self.in_flight += bytes;
     }
@@ -90,7 +92,7 @@ impl Silence {
     /// Packets were acknowledged, and so many bytes are on the way.
     pub(super) fn handle_acks(&mut self, now: Instant, in_flight: u64) {
         (self.since, self.in_flight) = (now, in_flight);
-        (self.probed_at, self.allowed) = (None, 0);
+        self.probed_at = None;
     }
 
     /// Adds the losses of a round, in bytes.
@@ -104,9 +106,14 @@ impl Silence {
         if self.loss < LOSES {
             return window;
         }
+        let more = match (self.is_own, self.probed_at) {
+            (_, None) => 0,
+            (true, _) => self.before + (window / OWN.1).clamp(mtu, OWN.0 * mtu),
+            (false, _) => self.before + window.min(PACKETS.0 * mtu),
+        };
         // QUIC sends while less than the window is on the way.
         let probe = if self.probe.load(Ordering::Relaxed) { self.in_flight + mtu + 1 } else { 0 };
-        self.allowed.max(probe).min(window + PACKETS.1 * mtu).max(window)
+        more.max(probe).min(window + window.min(PACKETS.1 * mtu)).max(window)
     }
 }
 
@@ -125,7 +132,7 @@ mod tests {
             silence.add_round(1_000 - lost, lost);
         }
         silence.set_round_trip(ROUND_TRIP);
-        silence.handle_sent(start, WINDOW, MTU);
+        silence.handle_sent(start, WINDOW);
         silence
     }
 
@@ -138,11 +145,11 @@ mod tests {
         let start = Instant::now();
         let mut silence = full(start, 100);
         assert_eq!(silence.widen(WINDOW, MTU), WINDOW);
-        for (ms, packets) in [(7, 36), (15, 52), (30, 68), (60, 84), (120, 84)] {
+        for (ms, packets) in [(7, 36), (15, 40), (30, 40)] {
             // Two probes, and what the window has left.
-            silence.handle_sent(at(start, ms), 2 * MTU, MTU);
+            silence.handle_sent(at(start, ms), 2 * MTU);
             assert_eq!(silence.widen(WINDOW, MTU), packets * MTU, "after {ms} ms");
-            silence.handle_sent(at(start, ms), 14 * MTU, MTU);
+            silence.handle_sent(at(start, ms), 14 * MTU);
             assert_eq!(silence.widen(WINDOW, MTU), packets * MTU, "one probe at a time");
         }
         silence.handle_acks(at(start, 200), MTU);
@@ -150,18 +157,19 @@ mod tests {
     }
 
     #[test]
-    fn a_probe_of_the_engine_is_one_packet() {
+    fn a_probe_of_the_engine_lets_few_packets_through() {
         let start = Instant::now();
         let mut silence = full(start, 100);
         // QUIC shows copies of a controller.
         silence.clone().let_probe_through();
         assert_eq!(silence.widen(WINDOW, MTU), WINDOW + MTU + 1);
-        // However long nothing was acknowledged, it opens the window no further.
+        // While nothing is acknowledged, it lets as many through as the window has eighths, four at most.
         for (number, ms) in (1..).zip([8, 11, 14]) {
-            silence.handle_sent(at(start, ms), MTU, MTU);
-            assert_eq!(silence.widen(WINDOW, MTU), WINDOW, "after {ms} ms");
+            silence.handle_sent(at(start, ms), MTU);
+            let more = silence.widen(WINDOW, MTU) - WINDOW;
+            // Two and a half packets: an eighth of the window.
+            assert_eq!(more, number * MTU + WINDOW / 8 - MTU, "after {ms} ms");
             silence.let_probe_through();
-            assert_eq!(silence.widen(WINDOW, MTU), WINDOW + (number + 1) * MTU + 1);
         }
     }
 
@@ -170,8 +178,8 @@ mod tests {
         let start = Instant::now();
         let mut silence = full(start, 100);
         silence.handle_acks(at(start, 3), 0);
-        silence.handle_sent(at(start, 5_000), MTU, MTU);
-        silence.handle_sent(at(start, 5_006), MTU, MTU);
+        silence.handle_sent(at(start, 5_000), MTU);
+        silence.handle_sent(at(start, 5_006), MTU);
         assert_eq!(silence.widen(WINDOW, MTU), WINDOW);
     }
 
@@ -179,7 +187,7 @@ mod tests {
     fn a_path_that_loses_nothing_has_no_more_than_its_window() {
         let start = Instant::now();
         let mut silence = full(start, 1);
-        silence.handle_sent(at(start, 100), MTU, MTU);
+        silence.handle_sent(at(start, 100), MTU);
         assert_eq!(silence.widen(WINDOW, MTU), WINDOW);
     }
 }
