@@ -28,6 +28,8 @@ pub struct Receiver {
     local: String,
     peer: String,
     links: HashMap<u64, Link>,
+    /// Connections that were attached so far.
+    attached: u64,
     /// Being fetched, with the connection that last announced it. The answer goes there.
     wanted: HashMap<KeyId, u64>,
     fetches: Fetches,
@@ -38,6 +40,8 @@ pub struct Receiver {
 }
 
 struct Link {
+    /// Its place in the order of connections.
+    order: u64,
     opener: Opener,
     ready: Exporter,
 }
@@ -89,6 +93,7 @@ impl Receiver {
             local: local_sae.to_owned(),
             peer: peer_sae.to_owned(),
             links: HashMap::new(),
+            attached: 0,
             wanted: HashMap::new(),
             fetches: Fetches::new(peer_sae, Purpose::Messages),
             kept: VecDeque::new(),
@@ -110,7 +115,9 @@ impl Receiver {
         self.detach(now, conn);
         let channel = Channel::new(&self.peer, &self.local, exporters.envelope())?;
         let opener = Opener::new(channel)?;
-        self.links.insert(conn, Link { opener, ready: Arc::clone(exporters.ready()) });
+        self.attached += 1;
+        let (order, ready) = (self.attached, Arc::clone(exporters.ready()));
+        self.links.insert(conn, Link { order, opener, ready });
         Ok(())
     }
 
@@ -219,6 +226,14 @@ impl Receiver {
     fn announced(&mut self, conn: u64, key_id: &KeyId) -> bool {
         if self.links.get(&conn).is_some_and(|l| l.opener.contains(key_id.as_bytes())) {
             self.fail(conn, key_id.clone(), "announced twice".to_owned());
+            return false;
+        }
+        let order = |conn: &u64| self.links.get(conn).map_or(0, |link| link.order);
+        let (this, waiting) = (order(&conn), self.wanted.get(key_id).map(order));
+        let holds = |link: &&Link| link.opener.contains(key_id.as_bytes());
+        let held = self.links.values().find(holds).map(|link| link.order);
+        // The sender announced it on a later connection meanwhile, and seals for that one.
+        if held.max(waiting).is_some_and(|order| order > this) {
             return false;
         }
         if let Some(key) = self.take_unused(key_id) {

@@ -29,6 +29,28 @@ fn a_batch_with_an_unknown_key_is_fetched_one_by_one() {
 }
 
 #[test]
+fn a_late_announcement_on_a_connection_before_takes_no_key_from_its_successor() {
+    for is_fetched in [false, true] {
+        let mut pair = Pair::new();
+        let (key_id, _) = pair.kmes.issue();
+        pair.connect();
+        let announce = KeyMessage::Announce(vec![key_id.clone()]);
+        pair.receiver.handle_message(pair.now, 2, &announce).unwrap();
+        if !is_fetched {
+            pair.receiver.handle_message(pair.now, 1, &announce).unwrap();
+        }
+        while let Some(request) = pair.receiver.poll_request(pair.now) {
+            let answer = pair.kmes.answer(request);
+            pair.receiver.handle_answer(pair.now, answer);
+        }
+        assert!(matches!(pair.receiver.poll_message(), Some((2, KeyMessage::Ready { .. }))));
+        pair.receiver.handle_message(pair.now, 1, &announce).unwrap();
+        assert!(pair.receiver.poll_message().is_none());
+        assert!(pair.receiver.opener(2).unwrap().contains(key_id.as_bytes()), "{is_fetched}");
+    }
+}
+
+#[test]
 fn dec_keys_is_tried_three_times_with_the_same_ids() {
     let mut pair = Pair::new();
     let (key_id, _) = pair.kmes.issue();
