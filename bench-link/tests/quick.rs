@@ -38,6 +38,8 @@ fn all_that_is_reliable_arrives_and_the_path_loses_what_it_is_told_to() {
         let arrived = row["arrived_percent"].as_f64().unwrap();
         match row["message"].as_str().unwrap() {
             "1 KB, RELIABLE" if row["carrier"] == "AXON" => assert_eq!(arrived, 100.0, "{row}"),
+            // TCP promises nothing over such a path.
+            _ if row["carrier"] == "TCP" => {}
             // Of lone packets a fifth is lost.
             "1 KB, BEST_EFFORT" => assert!(arrived > 50.0, "{row}"),
             _ => assert!(arrived > 0.0, "{row}"),
