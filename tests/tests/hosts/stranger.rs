@@ -89,7 +89,7 @@ impl Stranger {
         // A message is a packet. A receiver that was away for a moment loses some, and QUIC closes a connection whose
         // stream has 1,024 gaps.
         let mut transport = TransportConfig::default();
-        transport.send_window(64 << 10);
+        transport.send_window(16 << 10);
         config.transport_config(Arc::new(transport));
         let mut met = self.limited(async {
             let endpoint = Endpoint::client((Ipv4Addr::UNSPECIFIED, 0).into()).unwrap();
