@@ -38,7 +38,7 @@ fn publish(publisher: &Publisher, samples: u64) {
 }
 
 /// The numbers of what comes, to the last that must.
-fn take(subscription: &Subscription, last: u64) -> Vec<u64> {
+pub(crate) fn take(subscription: &Subscription, last: u64) -> Vec<u64> {
     let (mut bytes, mut numbers) = (Vec::new(), Vec::new());
     while numbers.last() != Some(&last) {
         let Ok(info) = subscription.recv(&mut bytes, Some(PATIENCE)) else { break };

@@ -8,6 +8,7 @@ use axon_transport::{EndpointSpec, Publisher, Subscription, qos::Qos};
 
 use super::{
     cut::wired,
+    ending::take,
     mode::classic,
     pair::{self, Host, Plan, kill},
     process::{PATIENCE, until},
@@ -36,16 +37,6 @@ fn publish(publisher: &Publisher, samples: u64, length: usize, every: Duration) 
         }
         thread::sleep(every);
     }
-}
-
-/// The numbers of what comes, to the last that must.
-fn take(subscription: &Subscription, last: u64) -> Vec<u64> {
-    let (mut bytes, mut numbers) = (Vec::new(), Vec::new());
-    while numbers.last() != Some(&last) {
-        let Ok(info) = subscription.recv(&mut bytes, Some(PATIENCE)) else { break };
-        numbers.push(info.sequence);
-    }
-    numbers
 }
 
 /// What the status of a host counts as lost, by cause.

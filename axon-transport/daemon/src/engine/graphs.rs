@@ -91,7 +91,7 @@ impl Engine {
         };
         let others = self.peers.iter().filter(|(other, _)| *other != daemon);
         let same_host = others.filter(|(other, _)| identity(*other).as_ref() == Some(&owner));
-        // The subscriptions of another daemon are no reason, whoever names them.
+        // A daemon ends links for its own subscriptions alone: it may name those of others, which it reads in the graph.
         let own = asks.subscribers.iter().map(|reader| reader.gid);
         let own: Vec<_> = own.filter(|gid| asking.remote.owns(gid)).collect();
         let dead = same_host.filter(|(_, peer)| peer.serves_one_of(asks, &own));

@@ -420,7 +420,7 @@ impl Outbound {
         [flow, endings, stalls, nudges, self.without.poll_timeout()].into_iter().flatten().min()
     }
 
-    /// Does what is due. `heard` counts the datagrams that came over the link.
+    /// Does what is due. `heard` counts the frames that came over the link.
     /// Without a carrier there are no keys for the link.
     pub(crate) fn handle_timeout(
         &mut self,
