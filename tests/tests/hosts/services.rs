@@ -1,13 +1,20 @@
 //! A service on A, clients on A and B: each gets its own responses, and each end knows exactly when the
 //! other is there.
 
-use std::{fs, thread, time::Duration};
+use std::{
+    collections::BTreeMap,
+    fs,
+    sync::atomic::{AtomicBool, Ordering},
+    thread,
+    time::Duration,
+};
 
 use axon_tests::{Sizes, payload};
 use axon_transport::{Client, EndpointSpec, MessageInfo, Server, Session, qos::Qos};
 use rustix::process::Signal;
 
 use super::{
+    cut::wired,
     mode::{Kmes, Settings, classic},
     pair::{Host, Plan, kill, signal},
     process::{PATIENCE, until},
@@ -253,4 +260,93 @@ fn a_service_is_back_with_the_daemon_of_its_host_or_of_its_clients() {
         });
         assert_eq!((client.servers(), server.clients()), (vec![server.gid()], vec![client.gid()]));
     }
+}
+
+/// Requests that a server saw, or responses that a client got: how often, by client or server, and number.
+type Calls = BTreeMap<(String, u64), u32>;
+
+/// Takes the responses to a client until none has come for some seconds: the link may have to be replaced first.
+fn responses(client: &Client) -> Calls {
+    let mut got = Calls::new();
+    let mut bytes = Vec::new();
+    while let Ok(info) = client.recv_response(&mut bytes, Some(Duration::from_secs(5))) {
+        *got.entry((info.publisher.to_string(), info.sequence)).or_default() += 1;
+    }
+    got
+}
+
+/// Answers requests until `over`, two at a time and the newer one first.
+fn serve(server: &Server, over: &AtomicBool) -> Calls {
+    let mut seen = Calls::new();
+    let mut held = Vec::new();
+    let mut bytes = Vec::new();
+    loop {
+        let request = server.recv_request(&mut bytes, Some(Duration::from_millis(200))).ok();
+        let waits = request.is_none();
+        if let Some(request) = request {
+            *seen.entry((request.publisher.to_string(), request.sequence)).or_default() += 1;
+            held.push((request, bytes.iter().rev().copied().collect::<Vec<_>>()));
+        }
+        if held.len() > 1 || waits {
+            for (request, answer) in held.drain(..).rev() {
+                server.send_response(request.publisher, request.sequence, &answer).unwrap();
+            }
+        }
+        if waits && over.load(Ordering::Relaxed) {
+            return seen;
+        }
+    }
+}
+
+/// Two servers on each host answer a client on the other one while the link between them breaks: the wire is cut for
+/// some seconds, and then works for new connections alone. Each server sees each request once, and each client gets
+/// each response once.
+fn calls_outlive_a_link(settings: [Settings; 2]) {
+    let (hosts, wire) = wired(settings);
+    let sessions = hosts.each_ref().map(|host| host.session("calls"));
+    let name = |host: usize| EndpointSpec::new(["/a", "/b"][host], "test/Echo", Qos::keep_all());
+    let servers: Vec<_> = [0, 0, 1, 1].map(|h| sessions[h].create_server(name(h)).unwrap()).into();
+    let clients = [0, 1].map(|host| sessions[host].create_client(name(1 - host)).unwrap());
+    until("all are available", || clients.iter().all(|client| client.servers().len() == 2));
+    let over = AtomicBool::new(false);
+    thread::scope(|scope| {
+        let serving = servers.iter().map(|server| scope.spawn(|| serve(server, &over)));
+        let serving: Vec<_> = serving.collect();
+        let mut sent = [0; 2];
+        let mut send = |number: usize, pause: Duration| {
+            for _ in 0..number {
+                for (client, sent) in clients.iter().zip(&mut sent) {
+                    *sent = client.send_request(b"over a link that breaks").unwrap();
+                }
+                thread::sleep(pause);
+            }
+        };
+        send(300, Duration::from_millis(2));
+        wire.cut();
+        send(400, Duration::from_millis(20));
+        wire.mend_for_newcomers();
+        send(300, Duration::from_millis(5));
+        let got = clients.each_ref().map(responses);
+        over.store(true, Ordering::Relaxed);
+        let seen: Vec<_> = serving.into_iter().map(|serving| serving.join().unwrap()).collect();
+        let whole = |seen: &Calls| (seen.len() as u64, seen.values().filter(|n| **n != 1).count());
+        let counts: Vec<_> = got.iter().chain(&seen).map(whole).collect();
+        // Two servers answer each request.
+        let [a, b] = sent;
+        let expected = [2 * a, 2 * b, b, b, a, a].map(|all| (all, 0));
+        assert_eq!(counts, expected, "responses to each client, and requests that each server saw");
+    });
+    // The link that broke was replaced.
+    assert!(hosts.iter().all(|host| host.status().links.len() == 1));
+}
+
+#[test]
+fn in_classic_calls_outlive_a_link() {
+    calls_outlive_a_link([classic(&[]), classic(&[])]);
+}
+
+#[test]
+fn in_messages10_calls_outlive_a_link() {
+    let kmes = Kmes::start();
+    calls_outlive_a_link([0, 1].map(|h| kmes.settings(h, &[("AXON_QKD_KEY_MODE", "messages10")])));
 }

@@ -27,7 +27,7 @@ use self::{
 };
 use crate::{
     engine::{
-        frames::Frames, inbound::stream_header, link::opening::Opened, protection::Seal,
+        frames::Frames, inbound::StreamHeader, link::opening::Opened, protection::Seal,
         refusal::Refusal, rings::Sample,
     },
     error::GatewayError,
@@ -135,9 +135,15 @@ impl Link {
         .await
         .map_err(|_| Refusal::network("the daemon did not subscribe, or no key became READY"))??;
 
-        let header = stream_header(true, false, subscribe.route, publisher);
+        let header = StreamHeader {
+            reliable: true,
+            short: false,
+            acknowledged: false,
+            route: subscribe.route,
+            of: publisher,
+        };
         let mut stream = self.connection.open_uni().await.map_err(internal)?;
-        if write(&mut stream, &header, frame, tamper).await.is_err() {
+        if write(&mut stream, &header.encode(), frame, tamper).await.is_err() {
             return Err(self.closed().await);
         }
         let closed = tokio::time::timeout(REFUSAL_TIMEOUT, async {

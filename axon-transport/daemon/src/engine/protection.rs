@@ -112,23 +112,20 @@ fn age(sample: &Sample, now: Duration) -> u32 {
 
 /// The header of a message.
 fn header(sample: &Sample, now: Duration) -> inner::Header {
-    let request_id = sample.client.map_or_else(inner::RequestId::default, |client| {
-        inner::RequestId { client: client.0, sequence: number(sample.info.sequence) }
-    });
     inner::Header {
         gid: sample.info.publisher.0,
         sequence: sample.info.sequence,
         source_timestamp: unix_nanos(sample.info.source_timestamp),
-        request_id,
+        request_id: sample.call.unwrap_or_default(),
         compressed: false,
         age_ms: age(sample, now),
         uncompressed_len: u32::try_from(sample.payload.len()).unwrap_or(u32::MAX),
     }
 }
 
-/// The number of a call, which is signed in ROS 2.
-fn number(sequence: u64) -> i64 {
-    i64::try_from(sequence).unwrap_or(i64::MAX)
+/// A call of a client. Its number is signed in ROS 2.
+pub(crate) fn call(client: Gid, sequence: u64) -> inner::RequestId {
+    inner::RequestId { client: client.0, sequence: i64::try_from(sequence).unwrap_or(i64::MAX) }
 }
 
 /// Opens the messages that arrive over one connection.
@@ -205,16 +202,25 @@ impl Open<'_> {
     }
 }
 
-/// The writer of a message on the stream of publisher, or client, `of`.
+/// The writer of a message on the stream of publisher, or client, `of`. The header of a response has the number of the
+/// call twice, or, if it is `numbered`, its own number in the flow and that of the call.
 ///
 /// # Errors
 /// The message names another writer or call than its stream.
-pub(crate) fn writer_of(kind: Kind, of: Gid, header: &inner::Header) -> Result<Gid, &'static str> {
+pub(crate) fn writer_of(
+    kind: Kind,
+    of: Gid,
+    numbered: bool,
+    header: &inner::Header,
+) -> Result<Gid, &'static str> {
     let writer = Gid(header.gid);
-    let call = inner::RequestId { client: of.0, sequence: number(header.sequence) };
+    let call = call(of, header.sequence);
     let fits = match kind {
         Kind::Topic => writer == of && header.request_id == inner::RequestId::default(),
         Kind::Request => writer == of && header.request_id == call,
+        Kind::Response if numbered => {
+            header.request_id.client == of.0 && header.request_id.sequence > 0
+        }
         Kind::Response => header.request_id == call,
     };
     if fits { Ok(writer) } else { Err("a message names another publisher or call than its stream") }

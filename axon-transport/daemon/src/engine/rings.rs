@@ -3,6 +3,7 @@
 
 use std::{collections::HashMap, rc::Rc, time::Duration};
 
+use axon_envelope::inner::RequestId;
 use axon_shm::{Meta, ids::Gid};
 use axon_transport::{
     EndpointSpec, MessageInfo,
@@ -119,8 +120,8 @@ pub(crate) trait RingWriter {
 pub(crate) struct Sample {
     /// Its publisher, number and times.
     pub(crate) info: MessageInfo,
-    /// The client that a request comes from, or a response answers.
-    pub(crate) client: Option<Gid>,
+    /// The call that it is the request of, or answers.
+    pub(crate) call: Option<RequestId>,
     /// The serialized message.
     pub(crate) payload: Bytes,
     /// When the engine took it from its ring.
@@ -130,7 +131,7 @@ pub(crate) struct Sample {
 impl Sample {
     /// A sample of a topic.
     pub(crate) fn new(info: MessageInfo, payload: Bytes, now: Duration) -> Self {
-        Self { info, client: None, payload, taken: now }
+        Self { info, call: None, payload, taken: now }
     }
 
     /// Time since it was published, as far as this host knows.

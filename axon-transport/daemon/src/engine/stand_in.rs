@@ -20,8 +20,9 @@ use crate::engine::account::{Account, Charge};
 pub(crate) struct StandIn {
     ring: Rc<dyn RingWriter>,
     gid: Gid,
-    is_publisher: bool,
-    /// The highest number that was written; 0 is none.
+    /// Whether it writes samples or requests, whose numbers rise. A server answers calls in any order.
+    rises: bool,
+    /// The number that was written last; 0 is none.
     last: Cell<u64>,
     _place: Charge,
 }
@@ -58,9 +59,9 @@ impl StandIn {
         self.ring.announce();
     }
 
-    /// The number of the newest sample of a publisher that is in the ring.
+    /// The number of the newest sample of a publisher, or request of a client, that is in the ring.
     pub(crate) fn last_sequence(&self) -> Option<u64> {
-        Some(self.last.get()).filter(|last| self.is_publisher && *last > 0)
+        Some(self.last.get()).filter(|last| self.rises && *last > 0)
     }
 }
 
@@ -112,7 +113,7 @@ impl StandIns {
         let stand_in = Rc::new(StandIn {
             ring: rings.open_writer(remote).map_err(NoStandIn::Failed)?,
             gid: remote.gid,
-            is_publisher: remote.kind == EndpointKind::Publisher,
+            rises: remote.kind != EndpointKind::Server,
             last: Cell::new(0),
             _place: place,
         });

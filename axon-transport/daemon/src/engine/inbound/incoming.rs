@@ -17,16 +17,22 @@ pub(super) const RELIABLE: u8 = 1;
 pub(super) const BEST_EFFORT: u8 = 2;
 /// A flag: the messages have short headers.
 const SHORT: u8 = 1;
+/// A flag: RECEIVED is awaited for these requests or responses, and responses are numbered by their flow.
+const ACKNOWLEDGED: u8 = 2;
 
 /// What a stream carries, as its header says.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct StreamHeader {
-    pub(super) reliable: bool,
+pub(crate) struct StreamHeader {
+    /// Whether it carries RELIABLE samples, requests or responses, one after the other.
+    pub(crate) reliable: bool,
     /// Whether its messages have short headers.
-    pub(super) short: bool,
-    pub(super) route: u32,
+    pub(crate) short: bool,
+    /// Whether its requests or responses are acknowledged. Whether samples of a topic are, SUBSCRIBE says.
+    pub(crate) acknowledged: bool,
+    /// The receiver's number for the route.
+    pub(crate) route: u32,
     /// The publisher; of responses the client.
-    pub(super) of: Gid,
+    pub(crate) of: Gid,
 }
 
 impl StreamHeader {
@@ -45,30 +51,31 @@ impl StreamHeader {
         if !matches!(kind, RELIABLE | BEST_EFFORT) {
             return Err("a data stream of unknown kind");
         }
-        if flags[0] & !SHORT != 0 || flags[1..] != [0; 2] {
+        if flags[0] & !(SHORT | ACKNOWLEDGED) != 0 || flags[1..] != [0; 2] {
             return Err("a data stream with unknown flags");
         }
         let (mut number, mut gid) = ([0; 4], [0; 16]);
         number.copy_from_slice(route);
         gid.copy_from_slice(of);
-        let short = flags[0] == SHORT;
         Ok(Self {
             reliable: kind == RELIABLE,
-            short,
+            short: flags[0] & SHORT != 0,
+            acknowledged: flags[0] & ACKNOWLEDGED != 0,
             route: u32::from_be_bytes(number),
             of: Gid(gid),
         })
     }
-}
 
-/// The header of a data stream.
-pub(crate) fn stream_header(reliable: bool, short: bool, route: u32, gid: Gid) -> [u8; HEADER] {
-    let mut header = [0; HEADER];
-    header[0] = if reliable { RELIABLE } else { BEST_EFFORT };
-    header[1] = if short { SHORT } else { 0 };
-    header[4..8].copy_from_slice(&route.to_be_bytes());
-    header[8..].copy_from_slice(&gid.0);
-    header
+    /// The header's bytes.
+    pub(crate) fn encode(&self) -> [u8; HEADER] {
+        let mut header = [0; HEADER];
+        header[0] = if self.reliable { RELIABLE } else { BEST_EFFORT };
+        header[1] = if self.short { SHORT } else { 0 };
+        header[1] |= if self.acknowledged { ACKNOWLEDGED } else { 0 };
+        header[4..8].copy_from_slice(&self.route.to_be_bytes());
+        header[8..].copy_from_slice(&self.of.0);
+        header
+    }
 }
 
 /// What came of asking a stream for bytes.
@@ -107,6 +114,8 @@ pub(super) enum Step {
 #[derive(Debug)]
 pub(super) struct Message {
     pub(super) writer: Gid,
+    /// Its number in its flow, which rises. Of a topic, and of requests, it is the sample's own.
+    pub(super) number: u64,
     pub(super) meta: axon_shm::Meta,
     pub(super) payload: Bytes,
 }
@@ -224,18 +233,26 @@ fn next_chunk(id: StreamId, quic: &mut quinn_proto::Connection) -> Result<Option
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::engine::inbound::stream_header;
+
+    fn header(reliable: bool, short: bool, acknowledged: bool) -> [u8; HEADER] {
+        StreamHeader { reliable, short, acknowledged, route: 7, of: Gid([9; 16]) }.encode()
+    }
+
+    #[test]
+    fn a_header_is_read_as_it_was_written() {
+        for flags in 0..8 {
+            let [reliable, short, acknowledged] = [1, 2, 4].map(|flag| flags & flag != 0);
+            let parsed = StreamHeader::parse(&header(reliable, short, acknowledged)).unwrap();
+            let flags = (parsed.reliable, parsed.short, parsed.acknowledged);
+            assert_eq!(flags, (reliable, short, acknowledged));
+            assert_eq!((parsed.route, parsed.of), (7, Gid([9; 16])));
+        }
+    }
 
     #[test]
     fn a_header_that_is_not_one_is_refused() {
-        for (reliable, short) in [(true, true), (true, false), (false, true), (false, false)] {
-            let header = stream_header(reliable, short, 7, Gid([9; 16]));
-            let parsed = StreamHeader::parse(&header).unwrap();
-            assert_eq!((parsed.reliable, parsed.short), (reliable, short));
-            assert_eq!((parsed.route, parsed.of), (7, Gid([9; 16])));
-        }
-        let header = stream_header(true, false, 7, Gid([9; 16]));
-        for (at, byte) in [(0, 0), (0, 3), (1, 2), (1, 3), (2, 1), (3, 0x80)] {
+        let header = header(true, false, false);
+        for (at, byte) in [(0, 0), (0, 3), (1, 4), (1, 0x81), (2, 1), (3, 0x80)] {
             let mut broken = header;
             broken[at] = byte;
             StreamHeader::parse(&broken).unwrap_err();

@@ -25,9 +25,9 @@ use axon_shm::ids::Gid;
 use axon_transport::internal::log_limit::LogLimit;
 use quinn_proto::{StreamId, VarInt};
 
-pub(crate) use self::incoming::stream_header;
+pub(crate) use self::incoming::StreamHeader;
 use self::{
-    incoming::{Incoming, Step, StreamHeader},
+    incoming::{Incoming, Step},
     receipts::Receipts,
 };
 use crate::{
@@ -60,19 +60,26 @@ pub(crate) struct RouteIn {
     pub(crate) route: Route,
     /// The stand-ins that are written to, by the GID of the remote publisher, client or server.
     pub(crate) writers: HashMap<Gid, Rc<StandIn>>,
-    /// Of responses: the local clients that they answer.
-    pub(crate) clients: HashSet<Gid>,
+    /// Of responses: the local clients that they answer, and up to which number of its flow each has them.
+    clients: HashMap<Gid, u64>,
 }
 
 impl RouteIn {
     /// A route without writers.
     pub(crate) fn new(topic: Arc<str>, route: Route) -> Self {
-        Self { topic, route, writers: HashMap::new(), clients: HashSet::new() }
+        Self { topic, route, writers: HashMap::new(), clients: HashMap::new() }
+    }
+
+    /// The route's responses go to these local clients.
+    pub(crate) fn set_clients(&mut self, clients: impl Iterator<Item = Gid>) {
+        let before = std::mem::take(&mut self.clients);
+        let has = |client: Gid| (client, before.get(&client).copied().unwrap_or(0));
+        self.clients = clients.map(has).collect();
     }
 
     fn has_flow(&self, of: &Gid) -> bool {
         match self.route.kind {
-            Kind::Response => self.clients.contains(of),
+            Kind::Response => self.clients.contains_key(of),
             Kind::Topic | Kind::Request => self.writers.contains_key(of),
         }
     }

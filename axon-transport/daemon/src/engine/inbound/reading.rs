@@ -205,7 +205,8 @@ impl Inbound {
             permit_short(route, open)?;
             let (told, payload) = short.read(&body).map_err(malformed)?;
             let meta = self.meta(told, now);
-            let message = Message { writer: header.of, meta, payload: body.slice_ref(payload) };
+            let (writer, number, payload) = (header.of, meta.sequence, body.slice_ref(payload));
+            let message = Message { writer, number, meta, payload };
             stream.step = Step::Writer(message, now + ARRIVAL);
             return Ok(Next::Go);
         }
@@ -219,9 +220,14 @@ impl Inbound {
         if opened.compressed {
             *read += payload.len();
         }
-        let writer = writer_of(route.kind, header.of, &opened).map_err(malformed)?;
-        let meta = self.meta(told(&opened), now);
-        stream.step = Step::Writer(Message { writer, meta, payload }, now + ARRIVAL);
+        let numbered = header.acknowledged && route.kind == Kind::Response;
+        let writer = writer_of(route.kind, header.of, numbered, &opened).map_err(malformed)?;
+        let mut meta = self.meta(told(&opened), now);
+        let number = meta.sequence;
+        if numbered {
+            meta.sequence = opened.request_id.sequence.unsigned_abs();
+        }
+        stream.step = Step::Writer(Message { writer, number, meta, payload }, now + ARRIVAL);
         Ok(Next::Go)
     }
 
@@ -263,15 +269,20 @@ impl Inbound {
             return Next::Go;
         };
         self.waiting.remove(&(until, key));
-        let acknowledged = header.reliable && route.kind == Kind::Topic;
+        let of_topic = route.kind == Kind::Topic;
+        let acknowledged = header.reliable && (of_topic || header.acknowledged);
         let flow = (header.route, header.of);
-        let (sequence, length) = (message.meta.sequence, message.payload.len());
-        if acknowledged && stand_in.last_sequence() >= Some(sequence) {
+        let (sequence, length) = (message.number, message.payload.len());
+        let last = match route.kind {
+            Kind::Topic | Kind::Request => stand_in.last_sequence(),
+            Kind::Response => found.and_then(|route| route.clients.get(&header.of)).copied(),
+        };
+        if acknowledged && last >= Some(sequence) {
             self.receipts.came(flow, sequence, length, now);
             self.release(stream);
             return Next::Go;
         }
-        if !header.reliable && stand_in.last_sequence() >= Some(sequence) {
+        if !header.reliable && last >= Some(sequence) {
             // A newer one overtook it: readers drop it.
             self.counters.lost(&self.topic(header.route), "late", 1);
             self.release(stream);
@@ -281,6 +292,12 @@ impl Inbound {
         let Some(there) = self.write(&stand_in, header, message.meta, &message.payload) else {
             return self.wait_for_room(key, stream, message, now);
         };
+        if acknowledged
+            && route.kind == Kind::Response
+            && let Some(found) = self.routes.get_mut(&header.route)
+        {
+            found.clients.entry(header.of).and_modify(|last| *last = sequence);
+        }
         match acknowledged {
             true if there => self.receipts.came(flow, sequence, length, now),
             true => self.receipts.dropped(flow, sequence, now),

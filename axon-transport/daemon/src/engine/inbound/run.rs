@@ -107,7 +107,8 @@ impl Inbound {
                     if opened.header.compressed {
                         *read += payload.len();
                     }
-                    writer_of(to.route.kind, to.header.of, &opened.header).map_err(malformed)?;
+                    writer_of(to.route.kind, to.header.of, false, &opened.header)
+                        .map_err(malformed)?;
                     (told(&opened.header), payload)
                 }
             };
@@ -125,7 +126,8 @@ impl Inbound {
                     None => {
                         let payload = Bytes::copy_from_slice(&payload);
                         chunk.advance(length);
-                        return Ok(Some(Message { writer: to.header.of, meta, payload }));
+                        let (writer, number) = (to.header.of, meta.sequence);
+                        return Ok(Some(Message { writer, number, meta, payload }));
                     }
                 }
             }

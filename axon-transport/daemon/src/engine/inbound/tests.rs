@@ -134,7 +134,13 @@ impl Way {
         let mut into = RouteIn::new("/t".into(), route);
         into.writers.insert(PUBLISHER, stand_in.unwrap());
         inbound.routes().insert(ROUTE, into);
-        let header = StreamHeader { reliable: true, short, route: ROUTE, of: PUBLISHER };
+        let header = StreamHeader {
+            reliable: true,
+            short,
+            acknowledged: false,
+            route: ROUTE,
+            of: PUBLISHER,
+        };
         let stream = Incoming {
             step: Step::Length,
             header: Some((header, Some(route))),

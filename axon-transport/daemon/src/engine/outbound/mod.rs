@@ -41,7 +41,7 @@ use self::{
     flow::{Done, Flow, Pause},
     nudges::Nudges,
     schedule::Schedule,
-    served::{FlowRoute, Served},
+    served::{FlowRoute, ResponseNumbers, Served},
     stall::Stalls,
     without::Without,
 };
@@ -93,6 +93,7 @@ pub(crate) struct Outbound {
     endings: Endings,
     stalls: Stalls,
     nudges: Nudges,
+    responses: ResponseNumbers,
     events: Vec<OutboundEvent>,
 }
 
@@ -120,6 +121,7 @@ impl Outbound {
             endings: Endings::default(),
             stalls: Stalls::new(stalled_after, now),
             nudges: Nudges::default(),
+            responses: ResponseNumbers::default(),
             events: Vec::new(),
         }
     }
@@ -127,7 +129,8 @@ impl Outbound {
     /// Serves this route from now on, or changes it.
     pub(crate) fn set_route(&mut self, number: u32, route: RouteOut, now: Duration) {
         let RouteOut { topic, route, acknowledged, short_headers, sources, seen } = route;
-        let shared = FlowRoute { number, topic, route, acknowledged, short_headers };
+        let responses = self.responses.clone();
+        let shared = FlowRoute { number, topic, route, acknowledged, short_headers, responses };
         let served = self.routes.entry(number).or_insert_with(|| Served {
             shared,
             stalled: false,

@@ -11,7 +11,7 @@ use super::schedule::FlowId;
 
 /// PINGs follow each other at half a round trip, at least at this distance.
 const LEAST: Duration = Duration::from_millis(3);
-/// PINGs after the last sample of a flow. A call of a service is not acknowledged, and ends them so.
+/// PINGs after the last sample of a flow, where no acknowledgement ends them.
 const MOST: u8 = 100;
 
 /// The samples on the way that PINGs follow.

@@ -1,6 +1,6 @@
 //! A route that the peer asked for, and what its sources are told.
 
-use std::{collections::HashMap, sync::Arc};
+use std::{cell::Cell, collections::HashMap, rc::Rc, sync::Arc};
 
 use axon_envelope::{Kind, Route};
 use axon_shm::ids::Gid;
@@ -30,6 +30,20 @@ pub(super) struct FlowRoute {
     pub(super) route: Route,
     pub(super) acknowledged: bool,
     pub(super) short_headers: bool,
+    pub(super) responses: ResponseNumbers,
+}
+
+/// Numbers responses in the order in which they are taken. A flow that ends and begins again goes on with higher ones,
+/// so the peer takes none of its responses for one that it has.
+#[derive(Clone, Debug, Default)]
+pub(super) struct ResponseNumbers(Rc<Cell<u64>>);
+
+impl ResponseNumbers {
+    /// The next number.
+    pub(super) fn next(&self) -> u64 {
+        self.0.set(self.0.get() + 1);
+        self.0.get()
+    }
 }
 
 /// A route and its flows.

@@ -10,6 +10,7 @@ use axon_transport::internal::session::TakeLimit;
 
 use crate::engine::{
     peer::routes::RelaySpec,
+    protection::call,
     rings::{RingReader, Sample},
     stand_in::StandIn,
 };
@@ -85,7 +86,8 @@ impl Source {
                 while taken < most.samples
                     && let Some((info, payload)) = stand_in.ring().take_call_of(of)
                 {
-                    each(Sample { client: Some(*of), ..Sample::new(info, payload.into(), now) });
+                    let call = Some(call(*of, info.sequence));
+                    each(Sample { call, ..Sample::new(info, payload.into(), now) });
                     taken += 1;
                 }
                 taken

@@ -59,7 +59,7 @@ impl Asked {
             kind: key.kind as u8,
             subscribers: self.wanted.subscribers.clone(),
             last: last.collect(),
-            acknowledges: Some(key.kind == Kind::Topic),
+            acknowledges: Some(true),
             short_headers: Some(key.kind == Kind::Topic),
         })
     }
@@ -169,7 +169,7 @@ impl Peer {
             .or_insert_with(|| RouteIn::new(key.topic.as_str().into(), asked.route));
         route.writers.retain(|gid, _| asked.stand_ins.contains_key(gid));
         if key.kind == Kind::Response {
-            route.clients = wanted.subscribers.iter().map(|client| client.gid).collect();
+            route.set_clients(wanted.subscribers.iter().map(|client| client.gid));
         }
         if changed {
             let awaited = wanted.writers.iter().filter_map(|(writer, readers)| {

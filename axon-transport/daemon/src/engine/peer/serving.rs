@@ -28,6 +28,8 @@ pub(crate) const MAX_ROUTES: usize = 1 << 15;
 pub(super) struct Served {
     pub(super) key: RouteKey,
     route: Route,
+    /// Whether the peer acknowledges what it gets.
+    acknowledged: bool,
     pub(super) subscribers: Vec<Gid>,
     pub(super) sources: Vec<Source>,
     _charges: [Charge; 2],
@@ -66,7 +68,7 @@ impl Peer {
             2 => Kind::Response,
             other => return Err(format!("a route of kind {other}")),
         };
-        let acknowledged = kind == Kind::Topic && subscribe.acknowledges == Some(true);
+        let acknowledged = subscribe.acknowledges == Some(true);
         let short_headers = kind == Kind::Topic && subscribe.short_headers == Some(true);
         let key = RouteKey { kind, topic, type_name };
         if let Some(other) = self.served_as.get(&key).copied().filter(|other| *other != number) {
@@ -134,6 +136,7 @@ impl Peer {
         let served = Served {
             key,
             route,
+            acknowledged,
             subscribers: subscribers.iter().map(|subscriber| subscriber.gid).collect(),
             sources,
             _charges: [charge, relays],
@@ -294,7 +297,7 @@ impl Peer {
             served.sources.clone_from(&sources);
             let topic = served.key.topic.as_str().into();
             let (route, seen) = (served.route, HashMap::new());
-            let (acknowledged, short_headers) = (false, false);
+            let (acknowledged, short_headers) = (served.acknowledged, false);
             let out = RouteOut { topic, route, acknowledged, short_headers, sources, seen };
             self.outbound.set_route(number, out, now);
         }

@@ -165,7 +165,7 @@ pub struct Subscribe {
     /// Where to resume.
     #[n(5)]
     pub last: Vec<LastSeen>,
-    /// Whether the asking side acknowledges the samples of a topic with RECEIVED.
+    /// Whether the asking side acknowledges with RECEIVED what it gets.
     #[n(6)]
     pub acknowledges: Option<bool>,
     /// Whether the asking side reads short headers.

@@ -15,7 +15,7 @@ use crate::{
         connection::Carrier,
         counters::Counters,
         frames::Frames,
-        inbound::stream_header,
+        inbound::StreamHeader,
         outbound::{queue::Queue, schedule::Class},
     },
     link::CloseCode,
@@ -110,7 +110,9 @@ impl BestEffort {
                 return None;
             }
             let mut pending = VecDeque::from(frames.take());
-            pending.push_front(Bytes::copy_from_slice(&stream_header(false, short, number, of)));
+            let (reliable, acknowledged) = (false, false);
+            let header = StreamHeader { reliable, short, acknowledged, route: number, of };
+            pending.push_front(Bytes::copy_from_slice(&header.encode()));
             let class = Class::of(false, false, payload);
             let priority = class.priority() - i32::from(!self.under_way.is_empty());
             let _ = carrier.quic.send_stream(stream).set_priority(priority);

@@ -21,7 +21,7 @@ use self::{
 use super::{budget::Budget, queue::Queue, schedule::Class, served::FlowRoute, source::Source};
 use crate::{
     engine::{
-        connection::Carrier, counters::Counters, frames::Frames, inbound::stream_header,
+        connection::Carrier, counters::Counters, frames::Frames, inbound::StreamHeader,
         short_header::ShortHeaders,
     },
     keys::NoKey,
@@ -108,7 +108,10 @@ impl Flow {
         budget: &Rc<Budget>,
         now: Duration,
     ) -> Self {
-        let FlowRoute { number, ref topic, route, acknowledged, short_headers } = *of_route;
+        let FlowRoute { number, ref topic, route, acknowledged, short_headers, ref responses } =
+            *of_route;
+        // Each response has a number that rises, so that the peer can acknowledge it and drop a second copy.
+        let numbers = (acknowledged && route.kind == Kind::Response).then(|| responses.clone());
         Self {
             route_number: number,
             of,
@@ -116,7 +119,7 @@ impl Flow {
             route,
             acknowledged,
             short_headers,
-            taking: Taking::new(of, route.kind),
+            taking: Taking::new(of, route.kind, numbers),
             undemanded: 0,
             queue: Queue::new(qos, Rc::clone(budget)),
             stream: None,
@@ -195,7 +198,7 @@ impl Flow {
         self.undemanded += taking.take_burst(sources, queue, topic, counters, now);
     }
 
-    /// Whether samples that were sent may not have arrived. Of a service nothing says that they did.
+    /// Whether samples that were sent may not have arrived. Where the peer acknowledges none, nothing says that they did.
     pub(super) fn is_on_the_way(&self) -> bool {
         !self.acknowledged || self.queue.has_sent() || !self.best_effort.is_idle()
     }
@@ -298,9 +301,14 @@ impl Flow {
                 let Some(id) = carrier.quic.streams().open(Dir::Uni) else {
                     return Some(Pause::NoStream);
                 };
-                let short = self.headers.is_some();
-                let header = stream_header(true, short, self.route_number, self.of);
-                self.batch.put_before(&header);
+                let header = StreamHeader {
+                    reliable: true,
+                    short: self.headers.is_some(),
+                    acknowledged: self.acknowledged && self.route.kind != Kind::Topic,
+                    route: self.route_number,
+                    of: self.of,
+                };
+                self.batch.put_before(&header.encode());
                 carrier.streams.insert(id, carrier.flow);
                 self.priority = 0;
                 *self.stream.insert(id)

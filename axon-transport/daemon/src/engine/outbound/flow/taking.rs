@@ -16,6 +16,7 @@ use crate::engine::{
     counters::Counters,
     outbound::{
         queue::{Offered, Queue},
+        served::ResponseNumbers,
         source::Source,
     },
     rings::Sample,
@@ -39,6 +40,8 @@ pub(super) struct Taking {
     /// The publisher, or the client of a service.
     of: Gid,
     kind: Kind,
+    /// The numbers that responses get, where they are acknowledged.
+    responses: Option<ResponseNumbers>,
     /// The samples of all sources, in one order.
     merge: Merge<Sample>,
     /// Samples that were taken and are not in the queue.
@@ -55,10 +58,11 @@ pub(super) struct Taking {
 
 impl Taking {
     /// Takes from nothing yet.
-    pub(super) fn new(of: Gid, kind: Kind) -> Self {
+    pub(super) fn new(of: Gid, kind: Kind, responses: Option<ResponseNumbers>) -> Self {
         Self {
             of,
             kind,
+            responses,
             merge: Merge::default(),
             taken: VecDeque::new(),
             held: false,
@@ -233,9 +237,13 @@ impl Taking {
 
     /// Takes the next samples, as many as `most` says. Whether there was any, even one that was sent before.
     fn take(&mut self, sources: &[Source], most: TakeLimit, now: Duration) -> bool {
-        let Self { of, kind, merge, taken, .. } = self;
+        let Self { of, kind, responses, merge, taken, .. } = self;
         if *kind == Kind::Response {
-            taken.extend(sources.iter().find_map(|source| source.take_of(of, now)));
+            let mut next = sources.iter().find_map(|source| source.take_of(of, now));
+            if let (Some(response), Some(numbers)) = (&mut next, responses) {
+                response.info.sequence = numbers.next();
+            }
+            taken.extend(next);
             return !taken.is_empty();
         }
         if let [source] = sources

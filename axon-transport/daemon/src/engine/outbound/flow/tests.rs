@@ -141,7 +141,7 @@ impl Way {
         let spec =
             RelaySpec { qos, depth: qos.depth, type_hash: Vec::new(), stands_for: Vec::new() };
         let sources = vec![Source::Relay(spec, Rc::clone(&ring) as Rc<dyn RingReader>)];
-        let mut taking = Taking::new(PUBLISHER, Kind::Topic);
+        let mut taking = Taking::new(PUBLISHER, Kind::Topic, None);
         taking.set_sources(&sources, None);
         Self {
             ring,

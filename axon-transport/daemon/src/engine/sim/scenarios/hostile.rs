@@ -22,7 +22,7 @@ use crate::engine::sim::{
     world::World,
 };
 use crate::{
-    engine::{frames::Frames, inbound::stream_header, protection::Seal, rings::Sample},
+    engine::{frames::Frames, inbound::StreamHeader, protection::Seal, rings::Sample},
     link::{CloseCode, Elected, Graph, Hello, Message, Subscribe, Subscriber, Unsubscribe},
 };
 
@@ -116,7 +116,9 @@ fn asked(world: &mut World, on: usize, topic: &str) -> u32 {
 
 /// A data stream with some samples of a publisher.
 fn samples(route: u32, topic: &str, gid: Gid, numbers: std::ops::RangeInclusive<u64>) -> Vec<u8> {
-    let mut bytes = stream_header(true, false, route, gid).to_vec();
+    let (reliable, short, acknowledged) = (true, false, false);
+    let header = StreamHeader { reliable, short, acknowledged, route, of: gid };
+    let mut bytes = header.encode().to_vec();
     let hash = TopicHash::new(0, topic, "T").unwrap();
     let mut frames = Frames::default();
     for number in numbers {

@@ -16,7 +16,7 @@ use crate::engine::sim::{
     world::{Pair, World},
 };
 use crate::{
-    engine::inbound::stream_header,
+    engine::inbound::StreamHeader,
     link::{CloseCode, Elected, Hello, LastSeen, Message},
     wire::link::samples,
 };
@@ -156,10 +156,14 @@ impl Torture {
 
     /// What a data stream may begin with.
     fn data(&mut self) -> Bytes {
-        let (gid, route) = (self.gid(), self.number() as u32);
-        let mut bytes =
-            stream_header(self.rng.random_bool(0.7), self.rng.random_bool(0.3), route, gid)
-                .to_vec();
+        let header = StreamHeader {
+            of: self.gid(),
+            route: self.number() as u32,
+            reliable: self.rng.random_bool(0.7),
+            short: self.rng.random_bool(0.3),
+            acknowledged: self.rng.random_bool(0.3),
+        };
+        let mut bytes = header.encode().to_vec();
         if self.rng.random_bool(0.1) {
             let at = self.rng.random_range(0..4);
             bytes[at] = self.rng.random();
@@ -175,7 +179,7 @@ impl Torture {
             self.rng.fill_bytes(&mut body);
         } else if let Some(first) = body.first_chunk_mut::<16>() {
             // The header of a message begins with its publisher.
-            *first = gid.0;
+            *first = header.of.0;
         }
         bytes.extend_from_slice(&body);
         bytes.truncate(self.rng.random_range(1..=bytes.len()));
