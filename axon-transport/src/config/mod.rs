@@ -26,6 +26,7 @@ mod sources;
 mod summary;
 #[cfg(test)]
 mod tests;
+mod topics;
 mod values;
 
 use daemon_env::DaemonEnv;
@@ -41,6 +42,7 @@ pub use model::{
 };
 pub use place::DaemonPlace;
 pub use summary::security_settings;
+pub use topics::{TopicPattern, TopicPriority, TopicRule};
 
 impl Config {
     /// The configuration of this process: its environment, and the `axon.toml` that `AXON_CONFIG`

@@ -4,7 +4,7 @@ use std::{net::IpAddr, path::PathBuf, time::Duration};
 
 use minicbor::{Decode, Encode};
 
-use super::daemon_env::DaemonEnv;
+use super::{TopicPriority, TopicRule, daemon_env::DaemonEnv, topics};
 
 /// Everything that the environment and `axon.toml`, or a [`ConfigBuilder`](super::ConfigBuilder), decide.
 ///
@@ -53,10 +53,19 @@ pub struct Config {
     pub log: String,
     /// `[link]` of `axon.toml`.
     pub link: LinkConfig,
+    /// `[[topic]]` of `axon.toml`. The first entry that a name fits counts.
+    pub topics: Vec<TopicRule>,
     /// Variables of the environment that begin with `AXON_` and are no settings. They count for nothing.
     pub unknown_variables: Vec<String>,
     /// How a daemon that a session starts comes to these settings.
     pub(crate) daemon_env: DaemonEnv,
+}
+
+impl Config {
+    /// The priority of a topic or service between hosts, by its name.
+    pub fn topic_priority(&self, name: &str) -> TopicPriority {
+        topics::priority(&self.topics, name)
+    }
 }
 
 /// The choice that [`Security`] holds the settings of (`AXON_SECURITY_MODE`).

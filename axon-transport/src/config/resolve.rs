@@ -93,6 +93,7 @@ pub(super) fn resolve(
         trusted_uids: values.uids(names::TRUSTED_UIDS)?,
         log: values.log_filter("AXON_LOG")?.unwrap_or_else(|| "warn".to_owned()),
         link: link(&values)?,
+        topics: sources.topics.clone(),
         daemon_env,
         unknown_variables: sources.strangers.clone(),
     })

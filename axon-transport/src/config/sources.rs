@@ -8,9 +8,9 @@ use std::{
 };
 
 use super::{
-    ConfigError,
+    ConfigError, TopicRule,
     files::{FileKind, Files},
-    names,
+    names, topics,
 };
 
 /// One setting as text, before anything is known about its value.
@@ -42,6 +42,8 @@ pub(super) struct Sources {
     only: Option<&'static [&'static str]>,
     /// `[link]` of the file.
     pub(super) link: toml::Table,
+    /// `[[topic]]` of the file.
+    pub(super) topics: Vec<TopicRule>,
     pub(super) file: Option<Rc<PathBuf>>,
 }
 
@@ -201,6 +203,10 @@ impl Sources {
                     return Err(ConfigError::name("link", "a section, [link]").at(shown));
                 };
                 self.link = link;
+                continue;
+            }
+            if key == "topic" {
+                self.topics = topics::rules(value, &shown)?;
                 continue;
             }
             if key == "qkd" {

@@ -8,7 +8,7 @@ use quinn_proto::{ConnectionHandle, StreamId};
 use super::{
     control::Control,
     marks::marks_reported,
-    outbound::{Class, FlowId},
+    outbound::{Class, FlowId, Priorities, Rank},
     protection::Seal,
 };
 
@@ -104,6 +104,8 @@ impl Connection {
             seal,
             streams: &mut self.flows,
             flow: 0,
+            priorities: Priorities::default(),
+            lender: None,
             taken: 0,
             window,
             bulk,
@@ -161,6 +163,10 @@ pub(crate) struct Carrier<'a> {
     pub(super) streams: &'a mut HashMap<StreamId, FlowId>,
     /// The flow whose turn it is.
     pub(super) flow: FlowId,
+    /// The priorities of the routes.
+    pub(super) priorities: Priorities,
+    /// The rank as which the flow sends, where that is another one than its own.
+    pub(super) lender: Option<Rank>,
     /// Bytes that QUIC took in this pass.
     pub(super) taken: u64,
     window: u64,
@@ -175,15 +181,26 @@ impl Carrier<'_> {
         self.window
     }
 
-    /// Lets QUIC take what it may hold while a flow of this class writes.
-    pub(super) fn limit(&mut self, class: Class) {
-        let reserve = if class == Class::Bulk { 0 } else { RESERVE };
-        self.quic.set_send_window(self.bulk + reserve);
+    /// What QUIC may hold while a flow of this rank writes. What others filled is no obstacle to a higher priority.
+    pub(super) fn limit_of(&self, rank: Rank) -> u64 {
+        let reserve = if rank.class == Class::Bulk { 0 } else { RESERVE };
+        (1 + self.priorities.below(rank.priority)) * self.bulk + reserve
     }
 
-    /// Ends the pass. QUIC says that it takes more once it would of those that are blocked.
-    pub(super) fn rest(&mut self, small_blocked: bool) {
-        let reserve = if small_blocked { RESERVE } else { 0 };
-        self.quic.set_send_window(self.bulk + reserve);
+    /// The rank as which a flow of this rank writes.
+    pub(super) fn rank(&self, own: Rank) -> Rank {
+        self.lender.unwrap_or(own)
+    }
+
+    /// Lets QUIC take what it may hold while a flow of this rank writes.
+    pub(super) fn limit(&mut self, rank: Rank) {
+        self.quic.set_send_window(self.limit_of(rank));
+    }
+
+    /// Ends the pass. QUIC says that it takes more once it would of each flow that is blocked: `least` is the least of
+    /// their limits. It would say so at once, and again and again, if it took more of one while another cannot write,
+    /// whose stream the peer does not read. A flow with a higher limit has samples in QUIC until then.
+    pub(super) fn rest(&mut self, least: Option<u64>) {
+        self.quic.set_send_window(least.unwrap_or(self.bulk));
     }
 }

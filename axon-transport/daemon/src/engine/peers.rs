@@ -197,21 +197,12 @@ impl Peers {
 }
 
 fn surroundings<'a>(
-    config: &Config,
+    config: &'a Config,
     rings: &'a dyn Rings,
     stand_ins: &'a StandIns,
     (stalls, kept): (&'a RefCell<Stalls>, &'a RefCell<KeptRelays>),
     local: &'a Local,
     epoch: Instant,
 ) -> Surroundings<'a> {
-    Surroundings {
-        rings,
-        stand_ins,
-        local,
-        domain: config.domain,
-        stalled_after: config.link.stalled,
-        stalls,
-        kept,
-        epoch,
-    }
+    Surroundings { rings, stand_ins, local, config, stalls, kept, epoch }
 }

@@ -438,3 +438,31 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn the_first_entry_of_a_topic_counts() {
+    let config = with_file(
+        &[],
+        r#"
+        [[topic]]
+        name = "/camera/front/**"
+        priority = "high"
+
+        [[topic]]
+        name = "/camera/**"
+        priority = "low"
+
+        [[topic]]
+        name = "/tf"
+        "#,
+    )
+    .unwrap();
+    for (name, priority) in [
+        ("/camera/front/image", TopicPriority::High),
+        ("/camera/rear/image", TopicPriority::Low),
+        ("/tf", TopicPriority::Normal),
+        ("/scan", TopicPriority::Normal),
+    ] {
+        assert_eq!(config.topic_priority(name), priority, "{name}");
+    }
+}

@@ -294,6 +294,17 @@ fn files_that_are_not_a_configuration_are_refused() {
         ("[link]\npoll = true", "link.poll"),
         ("[link]\nqlog = 'relative'", "link.qlog"),
         ("[link]\nqlog = 1", "link.qlog"),
+        ("topic = 3", "topic"),
+        ("topic = [3]", "topic"),
+        ("[topic]\nname = '/a'", "topic"),
+        ("[[topic]]", "topic.name"),
+        ("[[topic]]\npriority = 'high'", "topic.name"),
+        ("[[topic]]\nname = 'a'", "topic.name"),
+        ("[[topic]]\nname = '/a**'", "topic.name"),
+        ("[[topic]]\nname = ['/a']", "topic.name"),
+        ("[[topic]]\nname = '/a'\npriority = 'highest'", "topic.priority"),
+        ("[[topic]]\nname = '/a'\npriority = 1", "topic.priority"),
+        ("[[topic]]\nname = '/a'\nmax = 1", "topic.max"),
         ("[linc]\nmtu = 1500", "AXON_LINC"),
     ] {
         let error = with_file(&[], text).unwrap_err();

@@ -10,6 +10,7 @@ pub(crate) mod budget;
 mod burst;
 mod ending;
 mod flow;
+mod lending;
 mod nudges;
 mod queue;
 mod schedule;
@@ -31,7 +32,7 @@ use quinn_proto::{StreamId, VarInt};
 
 pub(crate) use self::{
     backlog::Backlog,
-    schedule::{Class, FlowId},
+    schedule::{Class, FlowId, Priorities, Rank},
     served::RouteOut,
     source::Source,
 };
@@ -39,6 +40,7 @@ use self::{
     budget::Budget,
     ending::Endings,
     flow::{Done, Flow, Pause},
+    lending::Lending,
     nudges::Nudges,
     schedule::Schedule,
     served::{FlowRoute, ResponseNumbers, Served},
@@ -80,6 +82,8 @@ pub(crate) struct Outbound {
     flows: Vec<Option<Flow>>,
     free: Vec<FlowId>,
     schedule: Schedule,
+    priorities: Priorities,
+    lending: Lending,
     budget: Rc<Budget>,
     counters: Rc<Counters>,
     timers: BTreeSet<(Duration, FlowId)>,
@@ -111,6 +115,8 @@ impl Outbound {
             flows: Vec::new(),
             free: Vec::new(),
             schedule: Schedule::default(),
+            priorities: Priorities::default(),
+            lending: Lending::default(),
             without: Without::new(&budget),
             budget,
             counters,
@@ -128,16 +134,42 @@ impl Outbound {
 
     /// Serves this route from now on, or changes it.
     pub(crate) fn set_route(&mut self, number: u32, route: RouteOut, now: Duration) {
-        let RouteOut { topic, route, acknowledged, short_headers, sources, seen } = route;
-        let responses = self.responses.clone();
-        let shared = FlowRoute { number, topic, route, acknowledged, short_headers, responses };
-        let served = self.routes.entry(number).or_insert_with(|| Served {
-            shared,
-            stalled: false,
-            sources: Vec::new(),
-            seen: HashMap::new(),
-            flows: HashMap::new(),
+        let RouteOut { sources, seen, .. } = route;
+        let shared = FlowRoute {
+            number,
+            topic: route.topic,
+            route: route.route,
+            priority: route.priority,
+            acknowledged: route.acknowledged,
+            short_headers: route.short_headers,
+            responses: self.responses.clone(),
+        };
+        self.routes.entry(number).or_insert_with(|| {
+            self.priorities.add(shared.priority);
+            Served {
+                shared,
+                stalled: false,
+                sources: Vec::new(),
+                seen: HashMap::new(),
+                flows: HashMap::new(),
+            }
         });
+        self.update_sources(number, sources, seen, now);
+    }
+
+    /// The route has these sources from now on.
+    pub(crate) fn set_sources(&mut self, number: u32, sources: Vec<Source>, now: Duration) {
+        self.update_sources(number, sources, HashMap::new(), now);
+    }
+
+    fn update_sources(
+        &mut self,
+        number: u32,
+        sources: Vec<Source>,
+        seen: HashMap<Gid, u64>,
+        now: Duration,
+    ) {
+        let Some(served) = self.routes.get_mut(&number) else { return };
         for gone in served.sources.iter().map(Source::gid) {
             self.by_source.remove(&gone);
         }
@@ -168,6 +200,7 @@ impl Outbound {
     /// The peer no longer wants this route.
     pub(crate) fn end_route(&mut self, number: u32) {
         let Some(served) = self.routes.remove(&number) else { return };
+        self.priorities.remove(served.shared.priority);
         for source in &served.sources {
             self.by_source.remove(&source.gid());
         }
@@ -207,10 +240,10 @@ impl Outbound {
         if let Some(flow) = &mut self.flows[id]
             && flow.scheduled.is_none()
             && !flow.blocked
-            && let Some(class) = flow.class()
+            && let Some(rank) = flow.rank()
         {
-            flow.scheduled = Some(class);
-            self.schedule.push(id, class);
+            flow.scheduled = Some(rank);
+            self.schedule.push(id, rank);
         }
     }
 
@@ -243,11 +276,13 @@ impl Outbound {
             end(carrier.quic, stream, is_cut);
         }
         self.retry_held();
-        let mut small_blocked = false;
-        while let Some((id, class)) = self.schedule.pop() {
+        carrier.priorities = self.priorities;
+        let mut blocked = None;
+        while let Some(id) = self.schedule.pop(|at| self.lending.borrows(at)) {
             let Some(flow) = &mut self.flows[id] else { continue };
             let Some(served) = self.routes.get(&flow.route_number) else { continue };
-            flow.scheduled = None;
+            let Some(rank) = flow.scheduled.take() else { continue };
+            carrier.lender = self.lending.borrow(rank);
             carrier.flow = id;
             let (before, taken) = (flow.timer, carrier.taken);
             let mut done = Done::default();
@@ -255,6 +290,11 @@ impl Outbound {
             served.done(flow.of, done);
             if carrier.loses && carrier.taken > taken {
                 self.nudges.handle_sent(id, carrier.quic.rtt(), now);
+            }
+            match (carrier.taken - taken, carrier.lender) {
+                (0, _) => {}
+                (bytes, Some(_)) => self.lending.handle_borrowed(rank, bytes),
+                (bytes, None) => self.lending.handle_sent(rank, bytes),
             }
             if flow.is_held() {
                 self.without.room(id);
@@ -269,7 +309,9 @@ impl Outbound {
                 Pause::Blocked => {
                     flow.blocked = true;
                     flow.take_burst(&served.sources, &self.counters, now);
-                    small_blocked |= class != Class::Bulk;
+                    let limit = carrier.limit_of(rank);
+                    blocked = Some(blocked.map_or(limit, |least: u64| least.min(limit)));
+                    self.lending.handle_blocked(rank);
                 }
                 Pause::NoStream => {
                     self.without.stream(id);
@@ -283,7 +325,7 @@ impl Outbound {
         if std::mem::take(&mut self.frees_streams) {
             self.finish_idle_streams(carrier);
         }
-        carrier.rest(small_blocked);
+        carrier.rest(blocked);
     }
 
     /// Tries the flows again that found no room, if there is more now.
@@ -486,7 +528,7 @@ impl Outbound {
     pub(crate) fn count_overwritten(&mut self) {
         for id in &self.busy {
             if let Some(flow) = &mut self.flows[*id]
-                && flow.class().is_some()
+                && flow.rank().is_some()
                 && let Some(served) = self.routes.get(&flow.route_number)
             {
                 flow.count_overwritten(&served.sources, &self.counters);

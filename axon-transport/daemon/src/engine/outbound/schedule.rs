@@ -1,17 +1,22 @@
 //! Which flow sends next. Plain data: it knows flows by number, and no QUIC types.
 //!
-//! A higher class goes first. Within a class flows take turns. Bulk is not starved: it has every eighth turn while it
-//! waits.
+//! A higher rank goes first: the priority of the topic, and within a priority the class. Within a rank flows take turns.
+//! What keeps a rank from starving is [`lending`](super::lending).
 
 use std::collections::VecDeque;
+
+use axon_transport::config::TopicPriority;
 
 /// The number of a flow towards one peer.
 pub(crate) type FlowId = usize;
 
 /// A sample of at most so many bytes is small.
 const SMALL: usize = 4096;
-/// Turns of higher classes after which bulk has one.
-const TURNS: u32 = 7;
+/// Classes, and ranks.
+const CLASSES: usize = 4;
+pub(super) const RANKS: usize = 3 * CLASSES;
+/// What a priority adds to that of QUIC's streams. It leaves room below each class.
+const PRIORITY: i32 = 8;
 
 /// What a flow sends next. Control messages go before all classes: QUIC itself sends their stream first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -36,59 +41,83 @@ impl Class {
             (_, false) => Self::SmallBestEffort,
         }
     }
+}
 
+/// What goes before what.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Rank {
+    /// Of the topic.
+    pub(crate) priority: TopicPriority,
+    /// Of the sample.
+    pub(crate) class: Class,
+}
+
+impl Rank {
     /// The priority of its QUIC streams. QUIC shares the link evenly among streams of the same priority.
-    pub(super) fn priority(self) -> i32 {
-        match self {
-            Self::Service => 3,
-            Self::SmallReliable => 2,
-            Self::SmallBestEffort => 1,
-            Self::Bulk => 0,
-        }
+    pub(super) fn of_stream(self) -> i32 {
+        let class = match self.class {
+            Class::Service => 3,
+            Class::SmallReliable => 2,
+            Class::SmallBestEffort => 1,
+            Class::Bulk => 0,
+        };
+        self.priority as i32 * PRIORITY + class
+    }
+
+    /// Its place among all ranks, the first one to go being 0.
+    pub(super) fn place(self) -> usize {
+        (TopicPriority::High as usize - self.priority as usize) * CLASSES + self.class as usize
+    }
+}
+
+/// The priorities of the routes of a link.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Priorities([usize; 3]);
+
+impl Priorities {
+    /// There is a route of this priority.
+    pub(super) fn add(&mut self, priority: TopicPriority) {
+        self.0[priority as usize] += 1;
+    }
+
+    /// There is one less.
+    pub(super) fn remove(&mut self, priority: TopicPriority) {
+        self.0[priority as usize] -= 1;
+    }
+
+    /// How many priorities below this one have routes.
+    pub(crate) fn below(&self, priority: TopicPriority) -> u64 {
+        self.0[..priority as usize].iter().filter(|routes| **routes > 0).count() as u64
     }
 }
 
 /// The flows that have something to send.
 #[derive(Debug, Default)]
 pub(super) struct Schedule {
-    classes: [VecDeque<FlowId>; 4],
-    turns: u32,
+    ranks: [VecDeque<FlowId>; RANKS],
 }
 
 impl Schedule {
-    /// Adds a flow behind the others of its class. The caller adds no flow twice.
-    pub(super) fn push(&mut self, flow: FlowId, class: Class) {
-        self.classes[class as usize].push_back(flow);
+    /// Adds a flow behind the others of its rank. The caller adds no flow twice.
+    pub(super) fn push(&mut self, flow: FlowId, rank: Rank) {
+        self.ranks[rank.place()].push_back(flow);
     }
 
-    /// The next flow, and its class when it was added.
-    pub(super) fn pop(&mut self) -> Option<(FlowId, Class)> {
-        const ORDER: [Class; 4] =
-            [Class::Service, Class::SmallReliable, Class::SmallBestEffort, Class::Bulk];
-        if self.turns >= TURNS {
-            self.turns = 0;
-            if let Some(flow) = self.classes[Class::Bulk as usize].pop_front() {
-                return Some((flow, Class::Bulk));
-            }
-        }
-        for class in ORDER {
-            if let Some(flow) = self.classes[class as usize].pop_front() {
-                let bulk_waits = !self.classes[Class::Bulk as usize].is_empty();
-                self.turns = if class != Class::Bulk && bulk_waits { self.turns + 1 } else { 0 };
-                return Some((flow, class));
-            }
-        }
-        None
+    /// The next flow. Ranks that `borrows` says, by their place, go before all others.
+    pub(super) fn pop(&mut self, borrows: impl Fn(usize) -> bool) -> Option<FlowId> {
+        let borrowers = self.ranks.iter_mut().enumerate().filter(|(at, _)| borrows(*at));
+        let borrower = borrowers.map(|(_, rank)| rank).find_map(VecDeque::pop_front);
+        borrower.or_else(|| self.ranks.iter_mut().find_map(VecDeque::pop_front))
     }
 
     /// Removes a flow that is gone.
     pub(super) fn remove(&mut self, flow: FlowId) {
-        self.classes.iter_mut().for_each(|class| class.retain(|other| *other != flow));
+        self.ranks.iter_mut().for_each(|rank| rank.retain(|other| *other != flow));
     }
 
     /// Whether no flow has anything to send.
     pub(super) fn is_empty(&self) -> bool {
-        self.classes.iter().all(VecDeque::is_empty)
+        self.ranks.iter().all(VecDeque::is_empty)
     }
 }
 
@@ -96,41 +125,44 @@ impl Schedule {
 mod tests {
     use super::*;
 
+    fn normal(class: Class) -> Rank {
+        Rank { priority: TopicPriority::Normal, class }
+    }
+
     #[test]
-    fn a_higher_class_goes_first_and_flows_of_a_class_take_turns() {
+    fn a_higher_rank_goes_first_and_flows_of_a_rank_take_turns() {
         let mut schedule = Schedule::default();
-        schedule.push(1, Class::Bulk);
-        schedule.push(2, Class::SmallBestEffort);
-        schedule.push(3, Class::SmallReliable);
-        schedule.push(4, Class::SmallReliable);
-        schedule.push(5, Class::Service);
-        let order: Vec<_> = std::iter::from_fn(|| schedule.pop()).map(|(flow, _)| flow).collect();
-        assert_eq!(order, [5, 3, 4, 2, 1]);
+        let of = |priority, class| Rank { priority, class };
+        schedule.push(1, normal(Class::Bulk));
+        schedule.push(2, normal(Class::SmallBestEffort));
+        schedule.push(3, normal(Class::SmallReliable));
+        schedule.push(4, normal(Class::SmallReliable));
+        schedule.push(5, normal(Class::Service));
+        schedule.push(6, of(TopicPriority::Low, Class::Service));
+        schedule.push(7, of(TopicPriority::High, Class::Bulk));
+        let order: Vec<_> = std::iter::from_fn(|| schedule.pop(|_| false)).collect();
+        assert_eq!(order, [7, 5, 3, 4, 2, 1, 6]);
         assert!(schedule.is_empty());
     }
 
     #[test]
-    fn bulk_has_every_eighth_turn_of_a_link_that_small_samples_fill() {
+    fn a_rank_that_borrows_goes_first() {
         let mut schedule = Schedule::default();
-        schedule.push(1, Class::Bulk);
-        schedule.push(2, Class::SmallReliable);
-        let mut bulk = 0;
-        for _ in 0..80 {
-            let (flow, class) = schedule.pop().unwrap();
-            bulk += u32::from(class == Class::Bulk);
-            schedule.push(flow, class);
-        }
-        assert_eq!(bulk, 10);
+        schedule.push(1, normal(Class::SmallReliable));
+        schedule.push(2, normal(Class::Bulk));
+        let bulk = normal(Class::Bulk).place();
+        assert_eq!(schedule.pop(|at| at == bulk), Some(2));
+        assert_eq!(schedule.pop(|at| at == bulk), Some(1));
     }
 
     #[test]
     fn a_flow_that_was_removed_has_no_turn() {
         let mut schedule = Schedule::default();
-        schedule.push(1, Class::Bulk);
-        schedule.push(2, Class::Bulk);
+        schedule.push(1, normal(Class::Bulk));
+        schedule.push(2, normal(Class::Bulk));
         schedule.remove(1);
-        assert_eq!(schedule.pop(), Some((2, Class::Bulk)));
-        assert_eq!(schedule.pop(), None);
+        assert_eq!(schedule.pop(|_| false), Some(2));
+        assert_eq!(schedule.pop(|_| false), None);
     }
 
     #[test]
@@ -138,6 +170,17 @@ mod tests {
         assert_eq!(Class::of(true, true, 1 << 20), Class::Service);
         assert_eq!(Class::of(false, true, 4096), Class::SmallReliable);
         assert_eq!(Class::of(false, false, 4097), Class::Bulk);
-        assert!(Class::Service.priority() > Class::Bulk.priority());
+    }
+
+    #[test]
+    fn streams_have_the_order_of_the_ranks() {
+        let classes = [Class::Service, Class::SmallReliable, Class::SmallBestEffort, Class::Bulk];
+        let priorities = [TopicPriority::High, TopicPriority::Normal, TopicPriority::Low];
+        let ranks = priorities.iter().flat_map(|priority| classes.map(|class| (*priority, class)));
+        let ranks: Vec<_> = ranks.map(|(priority, class)| Rank { priority, class }).collect();
+        assert!(ranks.is_sorted_by(|one, next| one.place() + 1 == next.place()));
+        // A second sample of best effort under way is one below its class.
+        assert!(ranks.is_sorted_by(|one, next| one.of_stream() > next.of_stream()));
+        assert!(ranks[3].of_stream() - 1 > ranks[4].of_stream());
     }
 }

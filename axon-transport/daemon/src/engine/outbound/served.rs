@@ -4,6 +4,7 @@ use std::{cell::Cell, collections::HashMap, rc::Rc, sync::Arc};
 
 use axon_envelope::{Kind, Route};
 use axon_shm::ids::Gid;
+use axon_transport::config::TopicPriority;
 
 use super::{flow::Done, schedule::FlowId, source::Source};
 
@@ -13,6 +14,8 @@ pub(crate) struct RouteOut {
     pub(crate) topic: Arc<str>,
     /// Topic and kind, for the envelope.
     pub(crate) route: Route,
+    /// Of the topic.
+    pub(crate) priority: TopicPriority,
     /// Whether the peer acknowledges the samples.
     pub(crate) acknowledged: bool,
     /// Whether the peer reads short headers.
@@ -28,6 +31,7 @@ pub(super) struct FlowRoute {
     pub(super) number: u32,
     pub(super) topic: Arc<str>,
     pub(super) route: Route,
+    pub(super) priority: TopicPriority,
     pub(super) acknowledged: bool,
     pub(super) short_headers: bool,
     pub(super) responses: ResponseNumbers,

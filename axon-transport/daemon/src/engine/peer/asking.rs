@@ -139,7 +139,7 @@ impl Peer {
         let mut asked = match self.asked.remove(&key) {
             Some(asked) => asked,
             None => {
-                let hash = TopicHash::new(with.domain, &key.topic, &key.type_name);
+                let hash = TopicHash::new(with.config.domain, &key.topic, &key.type_name);
                 // The peer's graph has no name that is too long.
                 let Ok(topic) = hash else { return };
                 self.next_route += 1;

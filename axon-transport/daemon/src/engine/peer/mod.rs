@@ -20,7 +20,7 @@ use std::{
 use axon_envelope::Kind;
 use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::{
-    config::DiscoveryRange,
+    config::{Config, DiscoveryRange},
     graph::{Endpoint, EndpointKind},
     internal::{
         events::Alive,
@@ -84,10 +84,8 @@ pub(crate) struct Surroundings<'a> {
     pub(crate) stand_ins: &'a StandIns,
     /// The endpoints of this host.
     pub(crate) local: &'a Local,
-    /// ROS_DOMAIN_ID.
-    pub(crate) domain: u32,
-    /// `[link] stalled_s`.
-    pub(crate) stalled_after: Duration,
+    /// The settings of this host.
+    pub(crate) config: &'a Config,
     /// Routes that were given up.
     pub(crate) stalls: &'a RefCell<Stalls>,
     /// Relays that are kept for daemons that are restarted.

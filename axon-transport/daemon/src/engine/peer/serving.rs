@@ -1,6 +1,6 @@
 //! The routes that a peer asked this host for.
 
-use std::{collections::HashMap, rc::Rc, time::Duration};
+use std::{rc::Rc, time::Duration};
 
 use axon_envelope::{Kind, Route, TopicHash};
 use axon_shm::ids::Gid;
@@ -27,9 +27,6 @@ pub(crate) const MAX_ROUTES: usize = 1 << 15;
 /// A route that the peer asked for.
 pub(super) struct Served {
     pub(super) key: RouteKey,
-    route: Route,
-    /// Whether the peer acknowledges what it gets.
-    acknowledged: bool,
     pub(super) subscribers: Vec<Gid>,
     pub(super) sources: Vec<Source>,
     _charges: [Charge; 2],
@@ -61,7 +58,8 @@ impl Peer {
         let bytes = ROUTE + COPIES * subscribe.bytes();
         let Subscribe { route: number, topic, type_name, kind, last, .. } = subscribe;
         let subscribers = self.proven_only(subscribe.subscribers, &topic);
-        let hash = TopicHash::new(with.domain, &topic, &type_name).map_err(|e| e.to_string())?;
+        let hash =
+            TopicHash::new(with.config.domain, &topic, &type_name).map_err(|e| e.to_string())?;
         let kind = match kind {
             0 => Kind::Topic,
             1 => Kind::Request,
@@ -119,10 +117,15 @@ impl Peer {
         self.look_at_announcing = Some(now);
         let route = Route { kind, topic: hash };
         let seen = last.iter().map(|l| (l.publisher, l.sequence)).collect();
-        let topic = key.topic.as_str().into();
-        let sources_out = sources.clone();
-        let out =
-            RouteOut { topic, route, acknowledged, short_headers, sources: sources_out, seen };
+        let out = RouteOut {
+            topic: key.topic.as_str().into(),
+            route,
+            priority: with.config.topic_priority(&key.topic),
+            acknowledged,
+            short_headers,
+            sources: sources.clone(),
+            seen,
+        };
         self.outbound.set_route(number, out, now);
         // Of a relay that was kept: publishers that ended meanwhile. The graph of this host is followed late, so others
         // may be newer than it.
@@ -135,8 +138,6 @@ impl Peer {
         self.served_as.insert(key.clone(), number);
         let served = Served {
             key,
-            route,
-            acknowledged,
             subscribers: subscribers.iter().map(|subscriber| subscriber.gid).collect(),
             sources,
             _charges: [charge, relays],
@@ -187,7 +188,7 @@ impl Peer {
         self.served_as.remove(&served.key);
         self.announcing.remove(&route);
         let samples = self.outbound.give_up_route(route);
-        let (limit, key) = (with.stalled_after, &served.key);
+        let (limit, key) = (with.config.link.stalled, &served.key);
         let instant = with.instant(now);
         let wait = with.stalls.borrow_mut().add(&self.identity, key, limit, instant);
         let reason = format!(
@@ -295,11 +296,7 @@ impl Peer {
         for (number, sources) in changes {
             let Some(served) = self.served.get_mut(&number) else { continue };
             served.sources.clone_from(&sources);
-            let topic = served.key.topic.as_str().into();
-            let (route, seen) = (served.route, HashMap::new());
-            let (acknowledged, short_headers) = (served.acknowledged, false);
-            let out = RouteOut { topic, route, acknowledged, short_headers, sources, seen };
-            self.outbound.set_route(number, out, now);
+            self.outbound.set_sources(number, sources, now);
         }
     }
 

@@ -6,6 +6,7 @@ use std::{collections::VecDeque, sync::Arc, time::Duration};
 
 use axon_envelope::{Delivery, Route};
 use axon_shm::ids::Gid;
+use axon_transport::config::TopicPriority;
 use bytes::Bytes;
 use quinn_proto::{Connection, Dir, StreamId, VarInt, WriteError};
 
@@ -16,7 +17,10 @@ use crate::{
         counters::Counters,
         frames::Frames,
         inbound::StreamHeader,
-        outbound::{queue::Queue, schedule::Class},
+        outbound::{
+            queue::Queue,
+            schedule::{Class, Rank},
+        },
     },
     link::CloseCode,
 };
@@ -78,7 +82,7 @@ impl BestEffort {
     #[expect(clippy::too_many_arguments, reason = "the parts of a flow, borrowed one by one")]
     pub(super) fn write(
         &mut self,
-        (number, of, route, short, topic): (u32, Gid, Route, bool, &Arc<str>),
+        (of_route, short, topic): ((u32, Gid, Route, TopicPriority), bool, &Arc<str>),
         queue: &mut Queue,
         frames: &mut Frames,
         carrier: &mut Carrier<'_>,
@@ -86,6 +90,10 @@ impl BestEffort {
         done: &mut Done,
         now: Duration,
     ) -> Option<Pause> {
+        let (number, of, route, priority) = of_route;
+        let lender = carrier.lender;
+        let rank =
+            |payload| lender.unwrap_or(Rank { priority, class: Class::of(false, false, payload) });
         if self.writing.is_none() {
             let under_way: u64 = self.under_way.iter().map(|sample| sample.bytes).sum();
             if self.under_way.len() >= ALWAYS && under_way >= carrier.window() {
@@ -113,8 +121,7 @@ impl BestEffort {
             let (reliable, acknowledged) = (false, false);
             let header = StreamHeader { reliable, short, acknowledged, route: number, of };
             pending.push_front(Bytes::copy_from_slice(&header.encode()));
-            let class = Class::of(false, false, payload);
-            let priority = class.priority() - i32::from(!self.under_way.is_empty());
+            let priority = rank(payload).of_stream() - i32::from(!self.under_way.is_empty());
             let _ = carrier.quic.send_stream(stream).set_priority(priority);
             carrier.streams.insert(stream, carrier.flow);
             let left = sample.lifespan_left(now).unwrap_or(LONGEST).min(LONGEST);
@@ -124,7 +131,7 @@ impl BestEffort {
             self.writing = Some(Writing { stream, pending, sample });
         }
         let Writing { stream, pending, sample } = self.writing.as_mut()?;
-        carrier.limit(Class::of(false, false, sample.payload));
+        carrier.limit(rank(sample.payload));
         let mut quic = carrier.quic.send_stream(*stream);
         match quic.write_chunks(pending.make_contiguous()) {
             Ok(taken) => {

@@ -11,6 +11,7 @@ use std::{rc::Rc, sync::Arc, time::Duration};
 
 use axon_envelope::{Delivery, Kind, Route};
 use axon_shm::{ids::Gid, qos::Qos};
+use axon_transport::config::TopicPriority;
 use quinn_proto::{Dir, StreamId, VarInt, WriteError};
 
 use self::{
@@ -18,7 +19,13 @@ use self::{
     best_effort::BestEffort,
     taking::Taking,
 };
-use super::{budget::Budget, queue::Queue, schedule::Class, served::FlowRoute, source::Source};
+use super::{
+    budget::Budget,
+    queue::Queue,
+    schedule::{Class, Rank},
+    served::FlowRoute,
+    source::Source,
+};
 use crate::{
     engine::{
         connection::Carrier, counters::Counters, frames::Frames, inbound::StreamHeader,
@@ -70,6 +77,8 @@ pub(super) struct Flow {
     pub(super) of: Gid,
     pub(super) topic: Arc<str>,
     route: Route,
+    /// Of the topic.
+    priority: TopicPriority,
     /// Whether the peer acknowledges the samples.
     acknowledged: bool,
     /// Whether the peer reads short headers.
@@ -82,14 +91,15 @@ pub(super) struct Flow {
     stream: Option<StreamId>,
     /// The headers of that stream, or of the one that the pending batch will open, if they are short.
     headers: Option<ShortHeaders>,
-    priority: i32,
+    /// The priority that QUIC knows of the stream.
+    stream_priority: i32,
     frames: Frames,
     batch: Batch,
     best_effort: BestEffort,
     /// When it last handed something to QUIC.
     active_at: Duration,
-    /// The class under which the scheduler has it.
-    pub(super) scheduled: Option<Class>,
+    /// The rank under which the scheduler has it.
+    pub(super) scheduled: Option<Rank>,
     /// Whether QUIC said that it takes no more.
     pub(super) blocked: bool,
     /// When [`handle_timeout`](Self::handle_timeout) is due, if it is.
@@ -108,8 +118,15 @@ impl Flow {
         budget: &Rc<Budget>,
         now: Duration,
     ) -> Self {
-        let FlowRoute { number, ref topic, route, acknowledged, short_headers, ref responses } =
-            *of_route;
+        let FlowRoute {
+            number,
+            ref topic,
+            route,
+            priority,
+            acknowledged,
+            short_headers,
+            ref responses,
+        } = *of_route;
         // Each response has a number that rises, so that the peer can acknowledge it and drop a second copy.
         let numbers = (acknowledged && route.kind == Kind::Response).then(|| responses.clone());
         Self {
@@ -117,6 +134,7 @@ impl Flow {
             of,
             topic: Arc::clone(topic),
             route,
+            priority,
             acknowledged,
             short_headers,
             taking: Taking::new(of, route.kind, numbers),
@@ -124,7 +142,7 @@ impl Flow {
             queue: Queue::new(qos, Rc::clone(budget)),
             stream: None,
             headers: None,
-            priority: 0,
+            stream_priority: 0,
             frames: Frames::default(),
             batch: Batch::default(),
             best_effort: BestEffort::default(),
@@ -168,8 +186,8 @@ impl Flow {
             && !self.taking.has_more()
     }
 
-    /// The class of what it sends next, or `None` if it has nothing to send.
-    pub(super) fn class(&self) -> Option<Class> {
+    /// The rank of what it sends next, or `None` if it has nothing to send.
+    pub(super) fn rank(&self) -> Option<Rank> {
         let length = match self.queue.peek() {
             _ if !self.batch.is_empty() => self.batch.left(),
             Some(next) => next.payload.len(),
@@ -178,7 +196,8 @@ impl Flow {
             None => return None,
         };
         let reliable = self.queue.delivery() == Delivery::Reliable;
-        Some(Class::of(self.route.kind != Kind::Topic, reliable, length))
+        let class = Class::of(self.route.kind != Kind::Topic, reliable, length);
+        Some(Rank { priority: self.priority, class })
     }
 
     /// Samples wait in a ring.
@@ -239,7 +258,7 @@ impl Flow {
         done: &mut Done,
         now: Duration,
     ) -> Pause {
-        let mut left = TURN;
+        let mut left = if carrier.lender.is_some() { TOGETHER } else { TURN };
         loop {
             if self.batch.is_empty() && !self.best_effort.is_writing() {
                 let queued =
@@ -310,18 +329,22 @@ impl Flow {
                 };
                 self.batch.put_before(&header.encode());
                 carrier.streams.insert(id, carrier.flow);
-                self.priority = 0;
+                self.stream_priority = 0;
                 *self.stream.insert(id)
             }
         };
-        let class = self.class().unwrap_or(Class::Bulk);
-        if class.priority() != self.priority {
-            self.priority = class.priority();
-            let _ = carrier.quic.send_stream(stream).set_priority(self.priority);
+        let bulk = Rank { priority: self.priority, class: Class::Bulk };
+        let rank = carrier.rank(self.rank().unwrap_or(bulk));
+        if rank.of_stream() > self.stream_priority {
+            self.set_priority(rank, stream, carrier);
         }
-        carrier.limit(class);
+        carrier.limit(rank);
         match carrier.quic.send_stream(stream).write_chunks(self.batch.chunks()) {
             Ok(taken) => {
+                // What the stream was lent leaves before its priority sinks.
+                if rank.of_stream() < self.stream_priority {
+                    self.set_priority(rank, stream, carrier);
+                }
                 self.batch.drop_chunks(taken.chunks);
                 self.handle_taken(taken.bytes as u64, carrier, counters, done, now);
                 None
@@ -337,6 +360,11 @@ impl Flow {
                 None
             }
         }
+    }
+
+    fn set_priority(&mut self, rank: Rank, stream: StreamId, carrier: &mut Carrier<'_>) {
+        self.stream_priority = rank.of_stream();
+        let _ = carrier.quic.send_stream(stream).set_priority(self.stream_priority);
     }
 
     /// QUIC took so many bytes of the batch.
@@ -465,10 +493,10 @@ impl Flow {
         done: &mut Done,
         now: Duration,
     ) -> Option<Pause> {
-        let (number, of, route) = (self.route_number, self.of, self.route);
+        let of = (self.route_number, self.of, self.route, self.priority);
         let before = carrier.taken;
         let pause = self.best_effort.write(
-            (number, of, route, self.short_headers, &self.topic),
+            (of, self.short_headers, &self.topic),
             &mut self.queue,
             &mut self.frames,
             carrier,

@@ -5,6 +5,7 @@ mod hostile;
 mod kills;
 mod losses;
 mod moves;
+mod priorities;
 mod radio;
 mod segment;
 mod torture;

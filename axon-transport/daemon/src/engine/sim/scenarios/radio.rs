@@ -12,12 +12,12 @@ use crate::engine::sim::{
     world::{Pair, World},
 };
 
-fn secs(seconds: u64) -> Duration {
+pub(super) fn secs(seconds: u64) -> Duration {
     Duration::from_secs(seconds)
 }
 
 /// A radio link of so many Mbit/s: a round trip of 3 ms, a queue of 40 ms, and this loss both ways.
-fn radio(mbits: u64, loss: f64) -> Path {
+pub(super) fn radio(mbits: u64, loss: f64) -> Path {
     let rate = Rate::new(mbits * 1_000_000 / 8, Duration::from_millis(40));
     Path { delay: Duration::from_micros(1_500), rate: Some(rate), loss, ..Path::default() }
 }
@@ -42,26 +42,37 @@ fn hosts(congestion: Congestion, path: Path) -> World {
 }
 
 /// Samples that are published at a rate.
-struct Stream {
+pub(super) struct Stream {
     pair: Pair,
-    length: usize,
+    pub(super) length: usize,
     every: Duration,
     next: Duration,
     published: Vec<Duration>,
-    seen: usize,
+    pub(super) seen: usize,
     /// When each sample arrived, and its age then.
     arrived: Vec<(Duration, Duration)>,
 }
 
 impl Stream {
-    fn new(world: &mut World, topic: &str, qos: Qos, length: usize, every: Duration) -> Self {
+    pub(super) fn new(
+        world: &mut World,
+        topic: &str,
+        qos: Qos,
+        length: usize,
+        every: Duration,
+    ) -> Self {
         let pair = world.pair(0, 1, topic, qos);
         let (published, arrived) = (Vec::new(), Vec::new());
         Self { pair, length, every, next: Duration::ZERO, published, seen: 0, arrived }
     }
 
+    /// Samples that were published.
+    pub(super) fn published(&self) -> usize {
+        self.published.len()
+    }
+
     /// The ages of what arrived from `from` on, in order.
-    fn ages(&self, from: Duration) -> Vec<Duration> {
+    pub(super) fn ages(&self, from: Duration) -> Vec<Duration> {
         let arrived = self.arrived.iter().filter(|(at, _)| *at >= from);
         let mut ages: Vec<_> = arrived.map(|(_, age)| *age).collect();
         ages.sort_unstable();
@@ -70,7 +81,7 @@ impl Stream {
 }
 
 /// Publishes these streams for a time.
-fn drive(world: &mut World, streams: &mut [Stream], time: Duration) {
+pub(super) fn drive(world: &mut World, streams: &mut [Stream], time: Duration) {
     let end = world.now + time;
     while world.now < end {
         for stream in &mut *streams {

@@ -1,0 +1,115 @@
+//! Ranks that others keep from the link. QUIC sends the streams of a higher priority first, so a topic that fills the
+//! link by itself would starve all below it. For each eight bytes that a rank sends, each rank that waits below it may
+//! send one as if it were of the same rank.
+
+use super::schedule::{RANKS, Rank};
+
+/// A rank that waits is lent a byte for so many of a higher one.
+const SHARE: i64 = 8;
+/// Bytes that are lent at least, and as many as a rank saves at most.
+const QUANTUM: i64 = 64 << 10;
+const MOST: i64 = 4 * QUANTUM;
+
+/// What is lent to ranks.
+#[derive(Debug, Default)]
+pub(super) struct Lending {
+    /// The bytes that are lent to each rank; `None`: it does not wait.
+    saved: [Option<i64>; RANKS],
+    /// The rank that sent last in its own right.
+    lender: Option<Rank>,
+}
+
+impl Lending {
+    /// A flow of this rank waits for QUIC.
+    pub(super) fn handle_blocked(&mut self, rank: Rank) {
+        self.saved[rank.place()].get_or_insert(0);
+    }
+
+    /// A flow of this rank sent so many bytes in its own right.
+    pub(super) fn handle_sent(&mut self, rank: Rank, bytes: u64) {
+        let at = rank.place();
+        self.saved[at] = None;
+        self.lender = Some(rank);
+        let share = i64::try_from(bytes).unwrap_or(i64::MAX) / SHARE;
+        for saved in self.saved[at + 1..].iter_mut().flatten() {
+            *saved = (*saved + share).min(MOST);
+        }
+    }
+
+    /// Whether the rank at this place may send as another one now.
+    pub(super) fn borrows(&self, at: usize) -> bool {
+        self.lender.is_some_and(|lender| lender.place() < at)
+            && self.saved[at].is_some_and(|saved| saved >= QUANTUM)
+    }
+
+    /// The rank as which a flow of this rank may send now.
+    pub(super) fn borrow(&self, rank: Rank) -> Option<Rank> {
+        self.lender.filter(|_| self.borrows(rank.place()))
+    }
+
+    /// A flow of this rank sent so many bytes as another rank.
+    pub(super) fn handle_borrowed(&mut self, rank: Rank, bytes: u64) {
+        if let Some(saved) = &mut self.saved[rank.place()] {
+            *saved -= i64::try_from(bytes).unwrap_or(i64::MAX);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use axon_transport::config::TopicPriority;
+
+    use super::*;
+    use crate::engine::outbound::schedule::Class;
+
+    const HIGH: Rank = Rank { priority: TopicPriority::High, class: Class::Bulk };
+    const SMALL: Rank = Rank { priority: TopicPriority::Normal, class: Class::SmallReliable };
+    const BULK: Rank = Rank { priority: TopicPriority::Normal, class: Class::Bulk };
+
+    #[test]
+    fn a_rank_that_waits_has_an_eighth_of_what_a_higher_one_sends() {
+        let mut lending = Lending::default();
+        [SMALL, BULK].iter().for_each(|rank| lending.handle_blocked(*rank));
+        let mut sent = [0; 2];
+        for _ in 0..1000 {
+            lending.handle_sent(HIGH, 16 << 10);
+            for (rank, sent) in [SMALL, BULK].iter().zip(&mut sent) {
+                if lending.borrow(*rank) == Some(HIGH) {
+                    lending.handle_borrowed(*rank, 64 << 10);
+                    *sent += 64 << 10;
+                }
+            }
+        }
+        let share = 1000 * (16 << 10) / 8;
+        assert!(sent.iter().all(|sent| (share - QUANTUM..=share).contains(sent)), "{sent:?}");
+    }
+
+    #[test]
+    fn a_rank_that_sends_in_its_own_right_is_lent_nothing() {
+        let mut lending = Lending::default();
+        lending.handle_blocked(BULK);
+        for _ in 0..1000 {
+            lending.handle_sent(SMALL, 100);
+            lending.handle_sent(BULK, 64 << 10);
+            lending.handle_blocked(BULK);
+            assert_eq!(lending.borrow(BULK), None);
+        }
+    }
+
+    #[test]
+    fn a_higher_rank_borrows_nothing_of_a_lower_one() {
+        let mut lending = Lending::default();
+        lending.handle_blocked(HIGH);
+        (0..100).for_each(|_| lending.handle_sent(BULK, 1 << 20));
+        assert_eq!(lending.borrow(HIGH), None);
+    }
+
+    #[test]
+    fn what_is_saved_has_a_bound() {
+        let mut lending = Lending::default();
+        lending.handle_blocked(BULK);
+        lending.handle_sent(SMALL, 1 << 30);
+        lending.handle_borrowed(BULK, MOST as u64 - 1);
+        assert_eq!(lending.borrow(BULK), None);
+    }
+}
