@@ -133,6 +133,15 @@ fn linked(hosts: &[Host; 2]) -> bool {
     has(&a, &b) && has(&b, &a)
 }
 
+/// Processor time that the host's daemon has taken.
+fn processor_time(host: &Host) -> Duration {
+    let stat = std::fs::read_to_string(format!("/proc/{}/stat", host.status().pid)).unwrap();
+    let fields = stat.rsplit_once(") ").unwrap().1.split(' ');
+    // utime and stime, in ticks of 10 ms (proc(5)).
+    let ticks: u64 = fields.skip(11).take(2).map(|ticks| ticks.parse::<u64>().unwrap()).sum();
+    Duration::from_millis(10 * ticks)
+}
+
 fn id_of(host: &Host) -> DaemonId {
     let id = host.status().daemon;
     let byte = |at: usize| u8::from_str_radix(&id[2 * at..][..2], 16).unwrap();
@@ -169,7 +178,11 @@ fn link_through_forged(plan: impl Fn([Settings; 2]) -> Plan) {
     for (what, settings, a_second, forged) in [
         ("300 a second of made-up daemons, none", none(), 300, Forged::MadeUp(0)),
         ("300 a second of made-up daemons, pinned", pins(), 300, Forged::MadeUp(1)),
+        ("5,000 a second of made-up daemons, none", none(), 5_000, Forged::MadeUp(0)),
+        ("5,000 a second of made-up daemons, pinned", pins(), 5_000, Forged::MadeUp(1)),
         ("20 a second in a host's name, none", none(), 20, Forged::Beacons(0, name())),
+        ("5,000 a second in a host's name, none", none(), 5_000, Forged::Beacons(0, name())),
+        ("5,000 a second in a host's name, pinned", pins(), 5_000, Forged::Beacons(1, name())),
         ("20 a second in a host's name, pinned", pins(), 20, Forged::Beacons(1, name())),
         ("20 goodbyes a second from its address, none", none(), 20, Forged::Goodbyes(name())),
     ] {
@@ -186,7 +199,11 @@ fn link_through_forged(plan: impl Fn([Settings; 2]) -> Plan) {
         // What is forged takes nothing from a link that stands.
         forger.wait_for(u64::from(a_second));
         let since = hosts[0].link().since_unix_ms;
-        forger.wait_for(u64::from(a_second));
+        let (begin, before) = (Instant::now(), hosts.each_ref().map(processor_time));
+        forger.wait_for(2 * u64::from(a_second));
+        let spent = [0, 1].map(|host| processor_time(&hosts[host]) - before[host]);
+        let share = spent.map(|spent| spent.as_secs_f64() / begin.elapsed().as_secs_f64());
+        eprintln!("{what}: the daemons take {share:.3?} of a processor");
         assert_eq!(hosts[0].link().since_unix_ms, since, "{what}");
         drop(forger);
     }
