@@ -32,7 +32,12 @@ fn bursts(mbits: u64, loss: f64, packets: f64) -> Path {
 
 /// Two linked hosts with this controller.
 fn hosts(congestion: Congestion, path: Path) -> World {
-    let mut world = World::new(21, 2, move |_| {
+    hosts_of(21, congestion, path)
+}
+
+/// The same, by the random numbers of this seed.
+fn hosts_of(seed: u64, congestion: Congestion, path: Path) -> World {
+    let mut world = World::new(seed, 2, move |_| {
         let mut config = Config::default();
         config.link.congestion = congestion;
         config
@@ -124,7 +129,10 @@ fn share(world: &mut World, streams: &mut [Stream; 1]) -> f64 {
 
 /// The share of 54 Mbit/s that a stream without a rate of its own gets through.
 fn goodput(congestion: Congestion, path: Path) -> f64 {
-    let mut world = hosts(congestion, path);
+    goodput_of(hosts(congestion, path))
+}
+
+fn goodput_of(mut world: World) -> f64 {
     let mut streams = flood(&mut world);
     drive(&mut world, &mut streams, secs(4));
     share(&mut world, &mut streams)
@@ -143,8 +151,11 @@ fn random_loss_leaves_a_link_its_rate() {
 
 #[test]
 fn losses_in_bursts_leave_a_link_its_rate() {
-    for (loss, least) in [(0.05, 0.7), (0.1, 0.6), (0.2, 0.45)] {
-        let share = goodput(Congestion::Delay, bursts(54, loss, 8.0));
+    for (loss, least) in [(0.05, 0.7), (0.1, 0.55), (0.2, 0.3)] {
+        let of = |seed| goodput_of(hosts_of(seed, Congestion::Delay, bursts(54, loss, 8.0)));
+        let shares = [21, 22, 23, 24, 25, 26].map(of);
+        println!("{shares:.2?}");
+        let share = shares.iter().sum::<f64>() / shares.len() as f64;
         println!("loss {loss} in bursts of 8: {share:.2}");
         assert!(share > least, "loss {loss}: {share}");
     }
@@ -200,9 +211,9 @@ fn a_command_is_quick_beside_a_camera_that_fills_the_link() {
     let command = world.received(streams[1].pair).len();
     println!("command: {command} of {sent}, p50 {:?}, p99 {:?}", at(0.5), at(0.99));
     assert_eq!(command, sent, "{}", world.describe());
-    assert!(at(0.5) < Duration::from_millis(8), "{:?}", at(0.5));
+    assert!(at(0.5) < Duration::from_millis(6), "{:?}", at(0.5));
     // A full queue would take 40 ms.
-    assert!(at(0.99) < Duration::from_millis(35), "{:?}", at(0.99));
+    assert!(at(0.99) < Duration::from_millis(15), "{:?}", at(0.99));
 }
 
 #[test]
