@@ -21,6 +21,7 @@ pub(crate) mod keyring;
 pub(crate) mod link;
 pub(crate) mod links;
 mod marks;
+mod numbers;
 pub(crate) mod outbound;
 mod pace;
 pub(crate) mod peer;

@@ -278,7 +278,7 @@ impl Inbound {
             return Next::Over;
         }
         let stand_in = Rc::clone(stand_in);
-        let Some(there) = self.write(&stand_in, header, message.meta, &message.payload) else {
+        let Some(there) = self.write(&stand_in, header, message.meta, &message.payload, now) else {
             return self.wait_for_room(key, stream, message, now);
         };
         match acknowledged {
@@ -297,8 +297,9 @@ impl Inbound {
         header: StreamHeader,
         meta: Meta,
         payload: &[u8],
+        now: Duration,
     ) -> Option<bool> {
-        match stand_in.try_write(&header.of, meta, payload) {
+        match stand_in.try_write(&header.of, meta, payload, now) {
             Ok(Written::Yes) => {
                 self.counters.arrived(payload.len());
                 let before = self.written.as_ref();

@@ -114,7 +114,7 @@ impl Inbound {
             let (length, bytes) = (LENGTH + body.len(), payload.len());
             if to.stand_in.last_sequence() < Some(told.sequence) {
                 let meta = self.meta(told, now);
-                match self.write(&to.stand_in, to.header, meta, &payload) {
+                match self.write(&to.stand_in, to.header, meta, &payload, now) {
                     Some(true) => {}
                     Some(false) => {
                         let flow = (to.header.route, to.header.of);

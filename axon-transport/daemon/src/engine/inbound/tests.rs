@@ -128,7 +128,7 @@ impl Way {
             quiet: Cell::new(0),
         });
         let account = Accounts::new(1 << 20).of("peer");
-        let stand_in = StandIns::default().get(&One(Rc::clone(&ring)), &endpoint, &account);
+        let stand_in = StandIns::default().get(&One(Rc::clone(&ring)), &endpoint, &account, NOW);
         let mut inbound = Inbound::new(Rc::default(), Meter::new(1 << 20), 1 << 20, 0);
         let route = Route { kind, topic: TopicHash::new(0, "/t", "T").unwrap() };
         let mut into = RouteIn::new("/t".into(), route);

@@ -154,7 +154,7 @@ impl Peer {
         };
         let writers: HashSet<_> = wanted.writers.iter().map(|(writer, _)| writer.gid).collect();
         asked.stand_ins.retain(|gid, _| writers.contains(gid));
-        let fresh = self.show(&key, &mut asked, &wanted.writers, with);
+        let fresh = self.show(&key, &mut asked, &wanted.writers, with, now);
         if asked.stand_ins.is_empty() && asked.wanted.subscribers.is_empty() {
             return;
         }
@@ -191,6 +191,7 @@ impl Peer {
         asked: &mut Asked,
         writers: &[(Endpoint, usize)],
         with: &Surroundings<'_>,
+        now: Duration,
     ) -> bool {
         let mut fresh = false;
         asked.incomplete = false;
@@ -203,7 +204,7 @@ impl Peer {
                 asked.incomplete = true;
                 break;
             }
-            match with.stand_ins.get(with.rings, writer, self.remote.account()) {
+            match with.stand_ins.get(with.rings, writer, self.remote.account(), now) {
                 Ok(stand_in) => {
                     asked.stand_ins.insert(writer.gid, stand_in);
                     fresh = true;
