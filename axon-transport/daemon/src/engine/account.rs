@@ -30,7 +30,7 @@ const ROUTES_TO_GRAPH: usize = 4;
 /// Unread stream data of one identity, in bytes. Each of its links has
 /// [`LINK_WINDOW`](super::transport::LINK_WINDOW) more.
 const UNREAD: usize = 64 << 20;
-/// Long messages of one identity that are being read, in bytes. One message may always be read.
+/// Messages of one identity that are being read, in bytes. One message may always be read.
 const MESSAGES: usize = 64 << 20;
 /// Control messages that wait for one identity to read them, in bytes.
 const UNSENT: usize = 128 << 20;
@@ -99,6 +99,11 @@ impl Meter {
         Some(Charge { meter: Rc::clone(self), amount })
     }
 
+    /// Charges `amount`, if it fits and leaves so much.
+    pub(crate) fn charge_beside(self: &Rc<Self>, amount: usize, leaves: usize) -> Option<Charge> {
+        if amount.saturating_add(leaves) > self.left() { None } else { self.charge(amount) }
+    }
+
     /// Raises a charge to half of what the others leave. Returns whether it grew.
     pub(crate) fn share(self: &Rc<Self>, charge: &mut Charge) -> bool {
         let others = self.held().saturating_sub(charge.amount);
@@ -161,7 +166,7 @@ pub(crate) struct Account {
     pub(crate) stand_ins: Rc<Meter>,
     /// Stream data that it may send and that was not read.
     pub(crate) unread: Rc<Meter>,
-    /// Memory for its long messages, in bytes.
+    /// Memory for its messages that have not come whole, in bytes.
     pub(crate) messages: Rc<Meter>,
     /// When its changes are followed up.
     pub(crate) turns: RefCell<Turns>,

@@ -122,7 +122,7 @@ pub(super) struct Incoming {
     pub(super) chunk: Bytes,
     /// A piece that came in several chunks.
     pub(super) gathered: BytesMut,
-    /// The memory of a long message.
+    /// The memory of a message that has not come whole.
     pub(super) room: Option<Charge>,
     pub(super) is_ready: bool,
 }
@@ -142,6 +142,11 @@ impl Default for Incoming {
 }
 
 impl Incoming {
+    /// Whether the next `length` bytes were read from QUIC already.
+    pub(super) fn has(&self, length: usize) -> bool {
+        self.gathered.len() + self.chunk.len() >= length
+    }
+
     /// The next `length` bytes of the stream. A piece within one chunk is not copied.
     pub(super) fn take(
         &mut self,

@@ -8,7 +8,7 @@ use axon_transport::internal::session::Written;
 use bytes::Bytes;
 
 use super::{
-    ARRIVAL, FULL_RETRY, Inbound, Key, LONG, NO_ROUTE, TURN, Violation,
+    ARRIVAL, FOR_SHORT, FULL_RETRY, Inbound, Key, LONG, NO_ROUTE, TURN, Violation,
     incoming::{HEADER, Incoming, Message, Piece, Step, StreamHeader},
 };
 use crate::{
@@ -130,9 +130,9 @@ impl Inbound {
             Step::Room(length) => {
                 if length > LONG {
                     // One message may always be read, however long.
-                    let most = length.min(self.intake.most());
-                    let Some(room) = self.intake.charge(most) else {
-                        self.without_room.push_back(key);
+                    let most = length.min(self.intake.most().saturating_sub(FOR_SHORT));
+                    let Some(room) = self.intake.charge_beside(most, FOR_SHORT) else {
+                        self.without_room.add(key);
                         return Ok(wait(stream, Step::Room(length)));
                     };
                     stream.room = Some(room);
@@ -141,6 +141,15 @@ impl Inbound {
                 Ok(Next::Go)
             }
             Step::Body(length) => {
+                // One that has come whole is held by nobody.
+                if stream.room.is_none() && !stream.has(length) {
+                    let room = self.intake.charge(length);
+                    let Some(room) = room.or_else(|| self.spare.charge(length)) else {
+                        self.without_room.add(key);
+                        return Ok(wait(stream, Step::Body(length)));
+                    };
+                    stream.room = Some(room);
+                }
                 let body = match stream.take(length, key.1, quic, read) {
                     Piece::Whole(body) => body,
                     Piece::Later => return Ok(wait(stream, Step::Body(length))),
@@ -338,9 +347,7 @@ impl Inbound {
     /// Gives back the memory of a message, which another stream may wait for.
     pub(super) fn release(&mut self, stream: &mut Incoming) {
         if stream.room.take().is_some() {
-            for key in std::mem::take(&mut self.without_room) {
-                self.make_ready(key);
-            }
+            self.try_without_room();
         }
     }
 

@@ -217,6 +217,12 @@ impl Host {
         self.engine.as_ref().map_or((0, 0), Engine::backlog)
     }
 
+    /// Bytes of samples that were read from QUIC and are not in a ring, of all peers.
+    pub(super) fn held_of_messages(&self) -> usize {
+        let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());
+        peers.map(|(_, peer)| peer.inbound.held().1).sum()
+    }
+
     /// Checks that the host holds no more than it may.
     pub(super) fn check_held(&mut self, now: Duration) {
         self.dialled.retain(|at| *at + LONGEST_DIAL >= now);

@@ -4,6 +4,7 @@ mod cuts;
 mod hostile;
 mod kills;
 mod losses;
+mod memory;
 mod moves;
 mod radio;
 mod segment;
