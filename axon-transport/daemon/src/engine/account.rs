@@ -67,7 +67,7 @@ impl Meter {
     }
 
     /// Allows up to `most`, and half of what others leave in a pool.
-    fn within(pool: &Rc<Self>, most: usize) -> Rc<Self> {
+    pub(crate) fn within(pool: &Rc<Self>, most: usize) -> Rc<Self> {
         let pool = Some(Rc::clone(pool));
         Rc::new(Self { most, pool, held: Cell::new(0), released: Cell::new(0) })
     }

@@ -54,6 +54,11 @@ impl RouteKey {
         Some(Self { kind, topic, type_name })
     }
 
+    /// Bytes of its names.
+    pub(crate) fn bytes(&self) -> usize {
+        self.topic.len() + self.type_name.len()
+    }
+
     /// The key of the same service in the other direction; of a topic its own.
     pub(crate) fn other_way(&self) -> Self {
         let kind = match self.kind {
