@@ -34,6 +34,8 @@ const UNREAD: usize = 64 << 20;
 const MESSAGES: usize = 64 << 20;
 /// Control messages that wait for one identity to read them, in bytes.
 const UNSENT: usize = 128 << 20;
+/// Sessions of one identity that are taken for proven.
+pub(crate) const MAX_PROVEN: usize = 8192;
 /// What one identity may say a second, and at once, by [`cost`] and [`cost_of_frame`].
 const SAID: (u32, u32) = (16_384, 65_536);
 /// Bytes of a control message that cost as much as one change: what it takes to decompress and decode
@@ -168,6 +170,8 @@ pub(crate) struct Account {
     pub(crate) unread: Rc<Meter>,
     /// Memory for its messages that have not come whole, in bytes.
     pub(crate) messages: Rc<Meter>,
+    /// Sessions that it proved to be its own.
+    pub(crate) sessions: Rc<Meter>,
     /// When its changes are followed up.
     pub(crate) turns: RefCell<Turns>,
     said: RefCell<Bucket>,
@@ -183,6 +187,7 @@ impl Account {
             stand_ins: Meter::within(stand_ins, MAX_STAND_INS),
             unread: Meter::new(UNREAD),
             messages: Meter::new(MESSAGES),
+            sessions: Meter::new(MAX_PROVEN),
             turns: RefCell::default(),
             said: RefCell::new(Bucket::new(SAID.0, SAID.1)),
         }
