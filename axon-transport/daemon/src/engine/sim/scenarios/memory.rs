@@ -22,7 +22,7 @@ use crate::{
             world::World,
         },
     },
-    link::{Graph, Hello, Message},
+    link::{Graph, Hello, Message, Subscribe, Subscriber},
 };
 
 /// Publishers of one topic of the hostile peer: as many as one route shows.
@@ -74,6 +74,18 @@ fn publishes(world: &mut World, link: usize, id: u8, topic: &str, count: u32) {
     world.with_raw(0, |raw, _| raw.links[link].say(&graph));
 }
 
+/// Waits until the host asked for a topic. Returns the number of its route.
+fn asked(world: &mut World, link: usize, topic: &str) -> u32 {
+    let route = |world: &World| {
+        world.raws[0].links[link].messages.iter().find_map(|message| match message {
+            Message::Subscribe(subscribe) if subscribe.topic == topic => Some(subscribe.route),
+            _ => None,
+        })
+    };
+    world.until(secs(20), |world| route(world).is_some());
+    route(world).unwrap()
+}
+
 /// Announces publishers of a topic under a daemon id, and has a stream of each stop before the end of its first
 /// message.
 fn stop_within_messages(world: &mut World, id: u8) {
@@ -82,14 +94,7 @@ fn stop_within_messages(world: &mut World, id: u8) {
     world.hosts[0].touch_graph();
     let number = linked_as(world, 0, id);
     publishes(world, number, id, &topic, PUBLISHERS);
-    let route = |world: &World| {
-        world.raws[0].links[number].messages.iter().find_map(|message| match message {
-            Message::Subscribe(subscribe) if subscribe.topic == topic => Some(subscribe.route),
-            _ => None,
-        })
-    };
-    world.until(secs(20), |world| route(world).is_some());
-    let route = route(world).unwrap();
+    let route = asked(world, number, &topic);
     let body = Bytes::from(vec![0x5a; COMES]);
     for publisher in 0..PUBLISHERS {
         world.with_raw(0, |raw, _| {
@@ -143,4 +148,89 @@ fn all_arrive(seed: u64, publishers: usize, length: usize, rounds: u64) {
 fn messages_of_many_publishers_at_once_arrive_however_long_they_are() {
     all_arrive(81, 18, 8 << 20, 1);
     all_arrive(82, 2_400, 31 << 10, 1);
+}
+
+fn subscribe(route: u32, topic: &str, subscriber: Gid) -> Message {
+    Message::Subscribe(Subscribe {
+        route,
+        topic: topic.into(),
+        type_name: "T".into(),
+        kind: 0,
+        subscribers: vec![Subscriber { gid: subscriber, qos: Qos::keep_all() }],
+        last: Vec::new(),
+        acknowledges: Some(true),
+        short_headers: None,
+    })
+}
+
+#[test]
+fn refused_routes_that_are_remembered_are_bounded_in_bytes_over_all_ids_of_an_identity() {
+    let mut world = World::new(83, 1, |_| {
+        let mut config = Config::default();
+        config.link.graph = 1 << 20;
+        config
+    });
+    world.add_raw(Config::default(), DaemonId([0xff; 16]));
+    for id in 0xf0..0xf3 {
+        let number = linked_as(&mut world, 0, id);
+        for route in 0..5_000 {
+            let topic = format!("/{route:0>500}");
+            let message = subscribe(route, &topic, gid(id, route));
+            world.with_raw(0, |raw, _| raw.links[number].say(&message));
+        }
+        world.run_for(secs(5));
+        let refused = |m: &&Message| matches!(m, Message::RouteRefused(_));
+        assert!(world.raws[0].links[number].messages.iter().filter(refused).count() > 3_000);
+    }
+    let held = world.hosts[0].held_of_refusals();
+    assert!((1 << 19..=2 << 20).contains(&held), "{} KiB", held >> 10);
+    assert!(world.raws[0].links.iter().all(|link| link.closed.is_none()), "{}", world.describe());
+}
+
+#[test]
+fn publishers_of_a_topic_are_bounded_over_all_ids_of_an_identity() {
+    let mut world = World::new(84, 1, |_| Config::default());
+    world.add_raw(Config::default(), DaemonId([0xff; 16]));
+    world.hosts[0].rings.create_subscription("/t", Qos::keep_all(), None);
+    world.hosts[0].touch_graph();
+    for id in 0xf0..0xf3 {
+        let number = linked_as(&mut world, 0, id);
+        publishes(&mut world, number, id, "/t", 600);
+        world.run_for(secs(2));
+    }
+    assert_eq!(world.hosts[0].shown(), 1024, "{}", world.describe());
+    // Those of one id that leaves make room for others.
+    world.with_raw(0, |raw, now| raw.close(0, now));
+    world.run_for(secs(2));
+    world.hosts[0].touch_graph();
+    world.hosts[0].rings.create_subscription("/t", Qos::keep_all(), None);
+    world.run_for(secs(2));
+    assert_eq!(world.hosts[0].shown(), 1024, "{}", world.describe());
+}
+
+/// The daemon of a peer is killed that had KEEP_ALL relays for so many topics, and the next one says so.
+fn restarts(world: &mut World, peer: usize, id: u8, topics: u32) {
+    let subscription = endpoint(EndpointKind::Subscription, gid(id, 0), "/moved");
+    let graph = Graph { version: 1, added: vec![subscription], ..Graph::default() };
+    let number = linked_as(world, peer, id);
+    world.with_raw(peer, |raw, _| raw.links[number].say(&Message::Graph(graph.clone())));
+    for route in 0..topics {
+        let message = subscribe(route, &format!("/topic_{route}"), gid(id, 1 + route));
+        world.with_raw(peer, |raw, _| raw.links[number].say(&message));
+    }
+    world.run_for(secs(3));
+    let next = linked_as(world, peer, id + 1);
+    world.with_raw(peer, |raw, _| raw.links[next].say(&Message::Graph(graph)));
+    world.run_for(secs(1));
+}
+
+#[test]
+fn relays_that_are_kept_for_one_identity_leave_room_for_those_of_another() {
+    let mut world = World::new(85, 1, |_| Config::default());
+    world.add_raw(Config::default(), DaemonId([0xff; 16]));
+    world.add_raw(Config::default(), DaemonId([0xfe; 16]));
+    restarts(&mut world, 0, 0xf4, 3_000);
+    assert_eq!(world.hosts[0].kept(), 1_024, "{}", world.describe());
+    restarts(&mut world, 1, 0xf8, 10);
+    assert_eq!(world.hosts[0].kept(), 1_034, "{}", world.describe());
 }

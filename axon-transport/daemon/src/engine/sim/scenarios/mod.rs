@@ -7,5 +7,6 @@ mod losses;
 mod memory;
 mod moves;
 mod radio;
+mod refused;
 mod segment;
 mod torture;
