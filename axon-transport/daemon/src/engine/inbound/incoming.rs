@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use axon_envelope::Route;
+use axon_envelope::{Route, inner};
 use axon_shm::ids::Gid;
 use bytes::{Bytes, BytesMut};
 use quinn_proto::{ReadError, ReadableError, StreamId};
@@ -95,6 +95,8 @@ pub(super) enum Step {
     Room(usize),
     /// The message of this length.
     Body(usize),
+    /// Memory for a message of this header, to decompress it.
+    Unpack(inner::Header, Bytes),
     /// The stand-in of the message's writer, until this time.
     Writer(Message, Duration),
     /// Room in the ring.
@@ -124,6 +126,8 @@ pub(super) struct Incoming {
     pub(super) gathered: BytesMut,
     /// The memory of a message that has not come whole.
     pub(super) room: Option<Charge>,
+    /// The memory by which it is longer once it is decompressed.
+    pub(super) unpacked: Option<Charge>,
     pub(super) is_ready: bool,
 }
 
@@ -136,6 +140,7 @@ impl Default for Incoming {
             chunk: Bytes::new(),
             gathered: BytesMut::new(),
             room: None,
+            unpacked: None,
             is_ready: false,
         }
     }
@@ -201,6 +206,7 @@ impl Incoming {
     pub(super) fn held(&self) -> usize {
         let message = match &self.step {
             Step::Writer(message, _) | Step::Ring(message) => message.payload.len(),
+            Step::Unpack(_, sent) => sent.len(),
             _ => 0,
         };
         self.chunk.len() + self.gathered.len() + message

@@ -236,7 +236,8 @@ impl Inbound {
         let keys: Vec<_> = self.streams.keys().filter(|(of, _)| *of == link).copied().collect();
         for key in keys {
             let stream = self.streams.get(&key);
-            let lost = stream.filter(|s| matches!(s.step, Step::Ring(_) | Step::Writer(..)));
+            let lost = stream
+                .filter(|s| matches!(s.step, Step::Ring(_) | Step::Writer(..) | Step::Unpack(..)));
             if let Some((header, _)) = lost.and_then(|stream| stream.header) {
                 self.lost("no_link", header, "the link ended before they were read");
             }

@@ -1,9 +1,9 @@
 //! Reads data streams step by step.
 
-use std::{borrow::Cow, rc::Rc, time::Duration};
+use std::{rc::Rc, time::Duration};
 
-use axon_envelope::{Kind, Route};
-use axon_shm::Meta;
+use axon_envelope::{Kind, Route, inner};
+use axon_shm::{Meta, ids::Gid};
 use axon_transport::internal::session::Written;
 use bytes::Bytes;
 
@@ -13,7 +13,10 @@ use super::{
 };
 use crate::{
     engine::{
-        protection::{MAX_OVERHEAD, Open, Opened, RefusedMessage, writer_of},
+        account::Charge,
+        protection::{
+            MAX_OVERHEAD, Open, Opened, RefusedMessage, unpack, unpacked_length, writer_of,
+        },
         rings::RingError,
         short_header::{ShortHeaders, Told},
         stand_in::StandIn,
@@ -108,7 +111,7 @@ impl Inbound {
             }
             Step::Turn(until) => Ok(self.begin(key, stream, quic, until, now)),
             Step::Length => {
-                if let Some(next) = self.run(key, stream, open, read, now)? {
+                if let Some(next) = self.run(key, stream, open, now)? {
                     return Ok(next);
                 }
                 let prefix = match stream.take(4, key.1, quic, read) {
@@ -158,8 +161,9 @@ impl Inbound {
                         return Ok(Next::Over);
                     }
                 };
-                self.open(stream, body, open, read, now)
+                self.open(stream, body, open, now)
             }
+            Step::Unpack(header, sent) => self.unpack(key, stream, header, sent, read, now),
             Step::Over => Ok(Next::Over),
             Step::Writer(message, until) => Ok(self.deliver(key, stream, message, until, now)),
             Step::Ring(message) => Ok(self.deliver(key, stream, message, now, now)),
@@ -206,7 +210,6 @@ impl Inbound {
         stream: &mut Incoming,
         body: Bytes,
         open: &mut Open<'_>,
-        read: &mut usize,
         now: Duration,
     ) -> Result<Next, Violation> {
         let Some((header, Some(route))) = stream.header else { return Ok(Next::Over) };
@@ -218,19 +221,53 @@ impl Inbound {
             stream.step = Step::Writer(message, now + ARRIVAL);
             return Ok(Next::Go);
         }
-        let Some((opened, payload)) =
-            open_body(open, body, route, self.max_message, now).map_err(refused)?
-        else {
+        let Some((opened, payload)) = open_body(open, body, route, now).map_err(refused)? else {
             self.lost("no_link", header, "the link ended before they were read");
             self.release(stream);
             return Ok(Next::Go);
         };
-        if opened.compressed {
-            *read += payload.len();
-        }
         let writer = writer_of(route.kind, header.of, &opened).map_err(malformed)?;
+        if opened.compressed {
+            stream.step = Step::Unpack(opened, payload);
+            return Ok(Next::Go);
+        }
         let meta = self.meta(told(&opened), now);
         stream.step = Step::Writer(Message { writer, meta, payload }, now + ARRIVAL);
+        Ok(Next::Go)
+    }
+
+    /// Decompresses a message once there is memory for it: a few bytes may become a long one, which then waits for its
+    /// ring.
+    fn unpack(
+        &mut self,
+        key: Key,
+        stream: &mut Incoming,
+        header: inner::Header,
+        sent: Bytes,
+        read: &mut usize,
+        now: Duration,
+    ) -> Result<Next, Violation> {
+        let length = unpacked_length(&header, self.max_message).map_err(refused)?;
+        let has = stream.room.as_ref().map_or(0, Charge::amount);
+        let is_long = length > LONG;
+        let most = if is_long { self.intake.most().saturating_sub(FOR_SHORT) } else { length };
+        let more = length.min(most).saturating_sub(has);
+        if more > 0 && stream.unpacked.is_none() {
+            let room = match is_long {
+                true => self.intake.charge_beside(more, FOR_SHORT),
+                false => self.intake.charge(more).or_else(|| self.spare.charge(more)),
+            };
+            let Some(room) = room else {
+                self.without_room.add(key);
+                return Ok(wait(stream, Step::Unpack(header, sent)));
+            };
+            stream.unpacked = Some(room);
+        }
+        let payload = unpack(&sent, length).map_err(refused)?.into();
+        *read += length;
+        let meta = self.meta(told(&header), now);
+        let message = Message { writer: Gid(header.gid), meta, payload };
+        stream.step = Step::Writer(message, now + ARRIVAL);
         Ok(Next::Go)
     }
 
@@ -346,7 +383,9 @@ impl Inbound {
 
     /// Gives back the memory of a message, which another stream may wait for.
     pub(super) fn release(&mut self, stream: &mut Incoming) {
-        if stream.room.take().is_some() {
+        let room = [stream.room.take(), stream.unpacked.take()];
+        if room.iter().any(Option::is_some) {
+            drop(room);
             self.try_without_room();
         }
     }
@@ -393,8 +432,8 @@ pub(super) fn permit_short(route: Route, open: &Open<'_>) -> Result<(), Violatio
 }
 
 /// What a message's inner header tells besides its writer.
-pub(super) fn told(header: &axon_envelope::inner::Header) -> Told {
-    let axon_envelope::inner::Header { sequence, source_timestamp, age_ms, .. } = *header;
+pub(super) fn told(header: &inner::Header) -> Told {
+    let inner::Header { sequence, source_timestamp, age_ms, .. } = *header;
     Told { sequence, source_timestamp, age_ms }
 }
 
@@ -410,38 +449,28 @@ pub(super) fn refused(error: RefusedMessage) -> Violation {
     (code, error.to_string())
 }
 
-/// Opens a body. The payload shares its memory, unless it was compressed.
+/// Opens a body. The payload, compressed if its header says so, shares its memory.
 fn open_body(
     open: &mut Open<'_>,
     body: Bytes,
     route: Route,
-    most: u64,
     now: Duration,
-) -> Result<Option<(axon_envelope::inner::Header, Bytes)>, RefusedMessage> {
+) -> Result<Option<(inner::Header, Bytes)>, RefusedMessage> {
     // An envelope is opened in place, so in memory of its own.
-    let body = match open {
-        Open::Link => body,
+    match open {
+        Open::Link => {
+            let opened = Opened::plain(&body)?;
+            let (header, sent) = (opened.header, body.slice_ref(opened.sent()));
+            Ok(Some((header, sent)))
+        }
         Open::Envelope { .. } => {
             let mut own = body.try_into_mut().unwrap_or_else(|shared| shared.as_ref().into());
             let start = own.as_ptr().addr();
             let Some(opened) = open.open(&mut own, route, now)? else { return Ok(None) };
-            let header = opened.header;
-            let payload = match opened.payload(most)? {
-                Cow::Owned(payload) => payload.into(),
-                Cow::Borrowed(payload) => {
-                    let at = payload.as_ptr().addr() - start;
-                    let range = at..at + payload.len();
-                    own.freeze().slice(range)
-                }
-            };
-            return Ok(Some((header, payload)));
+            let (header, sent) = (opened.header, opened.sent());
+            let at = sent.as_ptr().addr() - start;
+            let range = at..at + sent.len();
+            Ok(Some((header, own.freeze().slice(range))))
         }
-    };
-    let opened = Opened::plain(&body)?;
-    let (header, payload) = (opened.header, opened.payload(most)?);
-    let payload = match payload {
-        Cow::Owned(payload) => payload.into(),
-        Cow::Borrowed(payload) => body.slice_ref(payload),
-    };
-    Ok(Some((header, payload)))
+    }
 }

@@ -174,8 +174,8 @@ impl Way {
     /// QUIC gave this, and the stream is read. The code with which a violation ends the link.
     fn read(&mut self, bytes: Vec<u8>) -> Result<Option<Next>, CloseCode> {
         self.stream.chunk = bytes.into();
-        let (key, mut read) = ((1, StreamId::new(Side::Client, Dir::Uni, 0)), 0);
-        let run = self.inbound.run(key, &mut self.stream, &mut Open::Link, &mut read, NOW);
+        let key = (1, StreamId::new(Side::Client, Dir::Uni, 0));
+        let run = self.inbound.run(key, &mut self.stream, &mut Open::Link, NOW);
         run.map_err(|(code, _)| code)
     }
 
