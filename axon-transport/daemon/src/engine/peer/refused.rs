@@ -163,15 +163,9 @@ impl Peer {
 
     /// This side has no use for other routes than these.
     pub(super) fn want_no_more(&mut self, wanted: impl Fn(&RouteKey) -> bool) {
-        let gone: Vec<_> = self
-            .refused
-            .unasked
-            .extract_if(.., |key, _| !wanted(key))
-            .map(|(key, _)| key)
-            .collect();
-        for key in gone {
-            self.say(unasked(&key, None));
-        }
+        let gone = self.refused.unasked.keys().filter(|key| !wanted(key));
+        let gone: Vec<_> = gone.cloned().collect();
+        gone.iter().for_each(|key| self.asks(key));
     }
 
     /// A successor took over, and with it goes what was said and not heard.
