@@ -171,6 +171,21 @@ pub struct TopicStatus {
     /// endpoints on other hosts it has those that their daemons showed to this one.
     #[serde(default)]
     pub out_of_range: Vec<OutOfRangeStatus>,
+    /// Endpoints on this host that match some on another host, and to or from which nothing flows since a route is
+    /// refused: up to 64.
+    #[serde(default)]
+    pub refused: Vec<RefusedRouteStatus>,
+}
+
+/// An endpoint that waits for a route which one of two hosts refuses.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RefusedRouteStatus {
+    /// Its GID.
+    pub endpoint: String,
+    /// The other host, as it calls itself.
+    pub host: String,
+    /// Which host refuses it, and why.
+    pub reason: String,
 }
 
 /// A pair that the discovery ranges of its sessions keep apart.

@@ -243,6 +243,12 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
             reason: "why".into(),
             retry_s: Some(10),
         }),
+        Message::RouteUnasked(link::RouteUnasked {
+            topic: "/scan".into(),
+            type_name: "sensor_msgs/msg/LaserScan".into(),
+            kind: 0,
+            reason: Some("why".into()),
+        }),
         Message::Unsubscribe(link::Unsubscribe { route: 1 }),
         Message::RouteReady(link::RouteReady { route: 1, publishers: vec![gid] }),
         Message::Keepalive,

@@ -85,6 +85,9 @@ fn render(status: &Status) -> String {
     keys(&mut out, &status.keys);
     section(&mut out, "Topics", "none", topics(status));
     section(&mut out, "Out of range", "no pair", out_of_range(status));
+    if status.topics.iter().any(|topic| !topic.refused.is_empty()) {
+        section(&mut out, "Waiting for a refused route", "none", refused(status));
+    }
     section(&mut out, "Sessions", "none", sessions(status));
     section(&mut out, "Refusals", "nobody was refused", refusals(status));
     out
@@ -300,6 +303,22 @@ fn out_of_range(status: &Status) -> Table {
     table
 }
 
+/// The endpoints to or from which nothing flows since a route is refused.
+fn refused(status: &Status) -> Table {
+    let mut table = Table::new(&["topic", "endpoint", "other host", "why"]);
+    for topic in &status.topics {
+        for waiting in &topic.refused {
+            table.row([
+                topic.topic.clone(),
+                waiting.endpoint.clone(),
+                waiting.host.clone(),
+                waiting.reason.clone(),
+            ]);
+        }
+    }
+    table
+}
+
 /// Whether a session shares memory, and if not why, and what that costs.
 fn memory(relay: Option<&RelayStatus>) -> String {
     let Some(relay) = relay else { return "shared".to_owned() };
@@ -354,7 +373,8 @@ fn section(out: &mut String, title: &str, none: &str, table: Table) {
 #[cfg(test)]
 mod tests {
     use axon_transport::status::{
-        DiscoveryStatus, OutOfRangeStatus, ReaderStatus, RefusalStatus, TrafficStatus, WriterStatus,
+        DiscoveryStatus, OutOfRangeStatus, ReaderStatus, RefusalStatus, RefusedRouteStatus,
+        TrafficStatus, WriterStatus,
     };
     use serde_json::json;
 
@@ -409,6 +429,11 @@ mod tests {
                     writer: "aa".to_owned(),
                     reader: "bb".to_owned(),
                     reason: "the range is LOCALHOST".to_owned(),
+                }],
+                refused: vec![RefusedRouteStatus {
+                    endpoint: "cc".to_owned(),
+                    host: "robot-3".to_owned(),
+                    reason: "refused by the peer: no room".to_owned(),
                 }],
                 readers: vec![reader(41, Some(12_000), true), reader(42, Some(999), true)],
                 ..TopicStatus::default()
@@ -466,6 +491,7 @@ mod tests {
             "SUBNET, looks for robot-2",
             "LOCALHOST, lists robot-2; linked: none",
             "the range is LOCALHOST",
+            "refused by the peer: no room",
         ] {
             assert!(text.contains(part), "{part:?} is missing in:\n{text}");
         }

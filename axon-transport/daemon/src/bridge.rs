@@ -12,7 +12,9 @@ use std::{
 };
 
 use axon_shm::ids::{DaemonId, Gid};
-use axon_transport::{config::Config, internal::graph::RemoteEndpoint, status::LinkStatus};
+use axon_transport::{
+    config::Config, graph::EndpointKind, internal::graph::RemoteEndpoint, status::LinkStatus,
+};
 use tokio::sync::mpsc;
 
 use crate::{discovery::AddressConfidence, owner::SessionKeys};
@@ -38,6 +40,19 @@ pub struct GatewayParts {
     pub control: mpsc::Sender<ToControl>,
     /// From the control plane.
     pub orders: mpsc::Receiver<ToGateway>,
+}
+
+/// A route that does not cross, though endpoints of this host and the peer's match.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RefusedRoute {
+    /// Its topic or service.
+    pub topic: String,
+    /// Its type.
+    pub type_name: String,
+    /// The endpoints of this host that wait for it.
+    pub waits: EndpointKind,
+    /// Who refuses it, and why.
+    pub reason: String,
 }
 
 /// From the gateway to the control plane.
@@ -66,8 +81,9 @@ pub enum ToControl {
         /// Where it is.
         address: SocketAddr,
     },
-    /// How a link does: at its start and from time to time. Replaces what was known of the peer.
-    Link(Box<LinkStatus>),
+    /// How a link does, and routes that do not cross it: at its start and from time to time. Replaces what was known of
+    /// the peer.
+    Link(Box<LinkStatus>, Vec<RefusedRoute>),
     /// A peer has been silent for so long that its endpoints are forgotten. Its link stands:
     /// [`RemoteGraph`](Self::RemoteGraph) brings them back, or the link goes down.
     Silent {

@@ -110,6 +110,29 @@ fn samples_that_are_far_longer_than_what_comes_of_them_arrive_in_order_and_other
 }
 
 #[test]
+fn a_number_that_its_publisher_cannot_have_reached_counts_as_no_losses() {
+    let camera = Camera::new();
+    let subscription = subscription(&camera);
+    let (link, mut lies) = Lies::new(&camera);
+    for sequence in [1, 1 << 31, 2] {
+        lies.add(sequence, false, 6, b"sample");
+    }
+    let mut stream = camera.stranger.open(&link).expect("a stream");
+    camera.stranger.write_for(&mut stream, &lies.bytes, PATIENCE);
+    for sequence in 1..=2 {
+        let info = subscription.recv(&mut Vec::new(), Some(PATIENCE)).expect("a sample");
+        assert_eq!((info.sequence, subscription.lost()), (sequence, 0));
+    }
+    until("what was refused is counted where it was dropped", || {
+        let topics = camera.a.status().topics;
+        let topic = topics.iter().find(|topic| topic.topic == TOPIC);
+        topic.is_some_and(|topic| topic.dropped.get("ring") == Some(&1))
+    });
+    camera.a.wait_log(&["samples from a peer are lost", TOPIC, "its number is 2147483648"]);
+    assert_eq!(link.connection.close_reason(), None);
+}
+
+#[test]
 fn a_number_that_cannot_be_is_refused_counted_by_topic_and_loses_nothing_else() {
     let camera = Camera::new();
     let subscription = subscription(&camera);

@@ -1,6 +1,7 @@
 //! Very many topics between two hosts, and more than may cross.
 
 use std::{
+    collections::HashSet,
     fs, thread,
     time::{Duration, Instant},
 };
@@ -10,7 +11,7 @@ use axon_tls::identity::{Auth, SigningKey};
 use axon_transport::{
     EndpointSpec, Publisher, Session, Subscription,
     ids::{DaemonId, Gid},
-    qos::Qos,
+    qos::{Durability, Qos, Reliability},
     status::LinkStatus,
 };
 
@@ -166,6 +167,90 @@ fn topics_beyond_what_may_cross_are_named_on_the_subscribing_host_and_harm_nothi
         host.link();
         assert_eq!(host.log_lines(&["link down"]), 0, "the link stood");
     }
+}
+
+/// The reasons that a host's status shows at an endpoint for which nothing flows.
+fn waits(host: &Host, gid: Gid) -> Vec<String> {
+    let topics = host.status().topics;
+    let refused = topics.into_iter().flat_map(|topic| topic.refused);
+    let own = refused.filter(|refused| refused.endpoint == gid.to_string());
+    own.map(|refused| refused.reason).collect()
+}
+
+#[test]
+fn a_refused_route_is_shown_at_the_subscription_and_at_the_publisher_that_wait() {
+    let hosts = small_hosts();
+    let mut crowd = Crowd::new(&hosts, CROWD);
+    let shown_on_both = |crowd: &Crowd| {
+        let at = |host: &Host| -> HashSet<String> {
+            let topics = host.status().topics.into_iter();
+            topics.flat_map(|topic| topic.refused).map(|refused| refused.endpoint).collect()
+        };
+        let (here, there) = (at(&hosts[0]), at(&hosts[1]));
+        let topics = crowd.publishers.iter().zip(&crowd.subscriptions);
+        let both = topics.enumerate().filter(|(_, (publisher, subscription))| {
+            let shown = here.contains(&publisher.gid().to_string());
+            shown && there.contains(&subscription.gid().to_string())
+        });
+        both.map(|(topic, _)| topic).collect::<Vec<_>>()
+    };
+    until("refused topics are shown on both hosts", || !shown_on_both(&crowd).is_empty());
+    let refused = shown_on_both(&crowd);
+    for topic in &refused {
+        assert!(crowd.publishers[*topic].matched().is_empty(), "nothing flows");
+    }
+    let (publisher, subscription) =
+        (crowd.publishers[refused[0]].gid(), crowd.subscriptions[refused[0]].gid());
+    let [here, there] = [waits(&hosts[0], publisher), waits(&hosts[1], subscription)];
+    assert!(here.iter().chain(&there).all(|why| why.contains(": ")), "{here:?} {there:?}");
+    // Once there is room for all it is shown no more.
+    let keep = refused[0];
+    let keep = [crowd.publishers.swap_remove(keep)]
+        .into_iter()
+        .zip([crowd.subscriptions.swap_remove(keep)]);
+    let keep: Vec<_> = keep.collect();
+    drop(crowd);
+    until("it crosses", || !keep[0].0.matched().is_empty());
+    until("it is shown no more", || {
+        waits(&hosts[0], publisher).is_empty() && waits(&hosts[1], subscription).is_empty()
+    });
+}
+
+#[test]
+fn kinds_of_subscriptions_for_which_a_topic_has_no_relay_are_told_to_both_hosts() {
+    const TOPIC: &str = "/kinds";
+    let hosts = Plan::new([classic(&[]), classic(&[])]).start();
+    let (here, there) = (hosts[0].session("publisher"), hosts[1].session("subscriptions"));
+    let all = Qos { durability: Durability::TransientLocal, ..Qos::default() };
+    let publisher = here.create_publisher(EndpointSpec::new(TOPIC, TYPE, all)).unwrap();
+    let mut subscriptions = Vec::new();
+    for reliability in [Reliability::Reliable, Reliability::BestEffort] {
+        for durability in [Durability::Volatile, Durability::TransientLocal] {
+            for history in [Some(1), Some(17), Some(257), Some(4_097), None] {
+                let base =
+                    history.map_or_else(Qos::keep_all, |depth| Qos { depth, ..Qos::default() });
+                let qos = Qos { reliability, durability, ..base };
+                let spec = EndpointSpec::new(TOPIC, TYPE, qos);
+                subscriptions.push(there.create_subscription(spec).unwrap());
+            }
+        }
+    }
+    let told = |host: &Host, gid: Gid, by: &str| {
+        let why = "kinds of subscriptions get nothing: a topic has 16 relays";
+        waits(host, gid).iter().any(|reason| reason.starts_with(by) && reason.contains(why))
+    };
+    until("both hosts say so", || {
+        told(&hosts[0], publisher.gid(), "refused here")
+            && told(&hosts[1], subscriptions[0].gid(), "refused by the peer")
+    });
+    publisher.publish(b"one").unwrap();
+    let some = subscriptions[0].recv(&mut Vec::new(), Some(PATIENCE));
+    assert!(some.is_ok(), "the other kinds get samples: {some:?}");
+    subscriptions.truncate(10);
+    until("nothing is refused any more", || {
+        waits(&hosts[0], publisher.gid()).is_empty()
+            && waits(&hosts[1], subscriptions[0].gid()).is_empty()
+    });
 }
 
 /// Topics that two hosts are to bear.

@@ -151,11 +151,11 @@ impl Stranger {
         self.limited(met.connection.open_uni()).map_err(|error| error.to_string())
     }
 
-    /// Writes for so long, as much of it as the other side lets it.
-    pub(crate) fn write_for(&self, stream: &mut SendStream, bytes: &[u8], time: Duration) {
+    /// Writes for so long, as much of it as the other side lets it. Whether that is all.
+    pub(crate) fn write_for(&self, stream: &mut SendStream, bytes: &[u8], time: Duration) -> bool {
         let write = async { tokio::time::timeout(time, stream.write_all(bytes)).await };
         // An error: the other side takes no more in that time, or stopped the stream.
-        let _ = self.runtime.block_on(write);
+        self.runtime.block_on(write).is_ok_and(|written| written.is_ok())
     }
 
     /// Why the other side closed the connection.

@@ -26,7 +26,7 @@ use tokio::sync::{Notify, watch};
 
 use super::{admission::Admission, turns::Turns};
 use crate::{
-    bridge::{OTHER_TOPICS, ToControl},
+    bridge::{OTHER_TOPICS, RefusedRoute, ToControl},
     discovery::Wanted,
     owner::SessionKeys,
 };
@@ -44,6 +44,8 @@ pub(super) struct Control {
     pub(super) address: Address,
     pub(super) registry: Registry<Arc<PassedFd>>,
     pub(super) links: BTreeMap<String, LinkStatus>,
+    /// Routes that do not cross these links.
+    pub(super) refused_routes: BTreeMap<String, Vec<RefusedRoute>>,
     pub(super) refusals: VecDeque<RefusalStatus>,
     /// Samples that did not get to other hosts, by topic and cause.
     pub(super) lost: BTreeMap<String, BTreeMap<&'static str, u64>>,
@@ -84,6 +86,7 @@ impl Control {
             address: Address::of(&config),
             registry: Registry::default(),
             links: BTreeMap::new(),
+            refused_routes: BTreeMap::new(),
             refusals: VecDeque::new(),
             lost: BTreeMap::new(),
             draining: false,
@@ -218,22 +221,25 @@ impl Control {
             ToControl::RemoteGraph { daemon, reset, added, removed } => {
                 self.registry.remote_graph(daemon, reset, added, removed);
             }
-            ToControl::Link(status) => {
+            ToControl::Link(status, refused) => {
                 // A peer may have moved.
                 let daemon = self.linked.keys().find(|d| d.to_string() == status.peer).copied();
                 let address = status.address.parse::<std::net::SocketAddr>();
                 if let (Some(daemon), Ok(address)) = (daemon, address) {
                     self.linked_at(daemon, address.ip());
                 }
+                self.refused_routes.insert(status.peer.clone(), refused);
                 self.links.insert(status.peer.clone(), *status);
             }
             ToControl::Silent { daemon } => {
                 self.links.remove(&daemon.to_string());
+                self.refused_routes.remove(&daemon.to_string());
                 self.registry.remote_gone(&daemon);
             }
             ToControl::LinkDown { daemon, reason } => {
                 tracing::info!(%daemon, reason, "link down");
                 self.links.remove(&daemon.to_string());
+                self.refused_routes.remove(&daemon.to_string());
                 self.registry.remote_gone(&daemon);
                 self.linked.remove(&daemon);
                 self.relist();

@@ -38,6 +38,11 @@ pub(super) fn status(control: &Control) -> Status {
         lists: s.lists.iter().map(ToString::to_string).collect(),
         relay: s.relay.as_deref().map(axon_transport::internal::registry::RelayCounters::show),
     });
+    let refused = control.refused_routes.iter().filter_map(|(peer, routes)| {
+        let link = control.links.get(peer)?;
+        Some((link.host.as_str(), routes.as_slice()))
+    });
+    let refused: Vec<_> = refused.collect();
     Status {
         daemon: control.id.to_string(),
         pid: std::process::id(),
@@ -57,7 +62,7 @@ pub(super) fn status(control: &Control) -> Status {
         discovery: discovery(&control.wanted.borrow()),
         traffic: control.traffic,
         sessions: sessions.collect(),
-        topics: topics(&control.registry, &control.lost),
+        topics: topics(&control.registry, &control.lost, &refused),
         links: control.links.values().cloned().collect(),
         keys: control.keys.clone(),
         refusals: control.refusals.iter().cloned().collect(),

@@ -25,10 +25,12 @@ use axon_transport::{
         registry::{LocalEndpoint, Registry, SessionEntry},
         wire::session::{Attach, EndpointRole},
     },
-    status::{OutOfRangeStatus, ReaderStatus, TopicStatus, WriterStatus},
+    status::{OutOfRangeStatus, ReaderStatus, RefusedRouteStatus, TopicStatus, WriterStatus},
 };
 
-/// Publishers, and readers, of a topic that the status lists.
+use crate::bridge::RefusedRoute;
+
+/// Publishers, readers, and endpoints whose routes are refused, of a topic that the status lists.
 const LISTED: usize = 64;
 /// Readers that are looked at for one status: so many that it still takes a fraction of a second.
 const LOOKED_AT: usize = 1 << 16;
@@ -42,6 +44,7 @@ type Session = SessionEntry<Arc<PassedFd>>;
 pub(super) fn topics(
     registry: &Sessions,
     lost: &BTreeMap<String, BTreeMap<&'static str, u64>>,
+    refused: &[(&str, &[RefusedRoute])],
 ) -> Vec<TopicStatus> {
     let mut topics: BTreeMap<(String, String), TopicStatus> = BTreeMap::new();
     let mut rings = HashMap::new();
@@ -95,6 +98,7 @@ pub(super) fn topics(
             });
         }
     }
+    show_refused(registry, &mut topics, refused);
     let mut topics: Vec<_> = topics.into_values().map(summed_up).collect();
     for (name, causes) in lost {
         let known = topics.iter().position(|topic| topic.topic == *name);
@@ -107,6 +111,33 @@ pub(super) fn topics(
         }
     }
     topics
+}
+
+/// Names the endpoints that wait for routes that peers, or this host, refused.
+fn show_refused(
+    registry: &Sessions,
+    topics: &mut BTreeMap<(String, String), TopicStatus>,
+    refused: &[(&str, &[RefusedRoute])],
+) {
+    if refused.iter().all(|(_, routes)| routes.is_empty()) {
+        return;
+    }
+    let mut waiting: HashMap<_, Vec<_>> = HashMap::new();
+    for local in registry.endpoints().filter(|e| e.role == EndpointRole::Application) {
+        let Endpoint { kind, topic, type_name, gid, .. } = &local.endpoint;
+        waiting.entry((*kind, &**topic, &**type_name)).or_default().push(*gid);
+    }
+    for (peer, route) in refused.iter().flat_map(|(peer, all)| all.iter().map(move |r| (peer, r))) {
+        let RefusedRoute { topic, type_name, waits, reason } = route;
+        let Some(gids) = waiting.get(&(*waits, &**topic, &**type_name)) else { continue };
+        let Some(shown) = topics.get_mut(&(topic.clone(), type_name.clone())) else { continue };
+        let room = LISTED.saturating_sub(shown.refused.len());
+        shown.refused.extend(gids.iter().take(room).map(|gid| RefusedRouteStatus {
+            endpoint: gid.to_string(),
+            host: (*peer).to_owned(),
+            reason: reason.clone(),
+        }));
+    }
 }
 
 fn entry<'a>(

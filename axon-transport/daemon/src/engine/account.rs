@@ -10,7 +10,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::pace::{Bucket, Turns};
+use super::{
+    pace::{Bucket, Turns},
+    peer::routes::RouteKey,
+};
 use crate::{
     keys::KeyMessage,
     link::{MAX_INFLATED, Message, is_known, unpacked_length},
@@ -30,10 +33,16 @@ const ROUTES_TO_GRAPH: usize = 4;
 /// Unread stream data of one identity, in bytes. Each of its links has
 /// [`LINK_WINDOW`](super::transport::LINK_WINDOW) more.
 const UNREAD: usize = 64 << 20;
-/// Long messages of one identity that are being read, in bytes. One message may always be read.
+/// Messages of one identity that are being read, in bytes. One message may always be read.
 const MESSAGES: usize = 64 << 20;
 /// Control messages that wait for one identity to read them, in bytes.
 const UNSENT: usize = 128 << 20;
+/// Names and reasons of refused routes of one identity that are remembered for status, in bytes.
+const REFUSALS: usize = 2 << 20;
+/// Sessions of one identity that are taken for proven.
+pub(crate) const MAX_PROVEN: usize = 8192;
+/// Publishers, or clients, of one identity that one route shows here: a reader looks at all of its publishers.
+const MAX_WRITERS_OF_ROUTE: usize = 1024;
 /// What one identity may say a second, and at once, by [`cost`] and [`cost_of_frame`].
 const SAID: (u32, u32) = (16_384, 65_536);
 /// Bytes of a control message that cost as much as one change: what it takes to decompress and decode
@@ -67,7 +76,7 @@ impl Meter {
     }
 
     /// Allows up to `most`, and half of what others leave in a pool.
-    fn within(pool: &Rc<Self>, most: usize) -> Rc<Self> {
+    pub(crate) fn within(pool: &Rc<Self>, most: usize) -> Rc<Self> {
         let pool = Some(Rc::clone(pool));
         Rc::new(Self { most, pool, held: Cell::new(0), released: Cell::new(0) })
     }
@@ -97,6 +106,11 @@ impl Meter {
             pool.held.set(pool.held.get() + amount);
         }
         Some(Charge { meter: Rc::clone(self), amount })
+    }
+
+    /// Charges `amount`, if it fits and leaves so much.
+    pub(crate) fn charge_beside(self: &Rc<Self>, amount: usize, leaves: usize) -> Option<Charge> {
+        if amount.saturating_add(leaves) > self.left() { None } else { self.charge(amount) }
     }
 
     /// Raises a charge to half of what the others leave. Returns whether it grew.
@@ -130,6 +144,19 @@ impl Meter {
 }
 
 impl Charge {
+    /// Takes `amount` of it, or all, as a charge of its own.
+    pub(crate) fn split(&mut self, amount: usize) -> Self {
+        let amount = amount.min(self.amount);
+        self.amount -= amount;
+        Self { meter: Rc::clone(&self.meter), amount }
+    }
+
+    /// Adds another one of the same meter.
+    pub(crate) fn add(&mut self, mut other: Self) {
+        debug_assert!(Rc::ptr_eq(&self.meter, &other.meter), "charges of two meters");
+        self.amount += std::mem::take(&mut other.amount);
+    }
+
     /// What it holds.
     pub(crate) fn amount(&self) -> usize {
         self.amount
@@ -161,8 +188,14 @@ pub(crate) struct Account {
     pub(crate) stand_ins: Rc<Meter>,
     /// Stream data that it may send and that was not read.
     pub(crate) unread: Rc<Meter>,
-    /// Memory for its long messages, in bytes.
+    /// Memory for its messages that have not come whole, in bytes.
     pub(crate) messages: Rc<Meter>,
+    /// Bytes of refused routes that are remembered.
+    pub(crate) refusals: Rc<Meter>,
+    /// Sessions that it proved to be its own.
+    pub(crate) sessions: Rc<Meter>,
+    /// Its publishers, or clients, that each route shows.
+    writers: RefCell<HashMap<RouteKey, Weak<Meter>>>,
     /// When its changes are followed up.
     pub(crate) turns: RefCell<Turns>,
     said: RefCell<Bucket>,
@@ -178,9 +211,27 @@ impl Account {
             stand_ins: Meter::within(stand_ins, MAX_STAND_INS),
             unread: Meter::new(UNREAD),
             messages: Meter::new(MESSAGES),
+            refusals: Meter::new(REFUSALS),
+            sessions: Meter::new(MAX_PROVEN),
+            writers: RefCell::default(),
             turns: RefCell::default(),
             said: RefCell::new(Bucket::new(SAID.0, SAID.1)),
         }
+    }
+
+    /// Its publishers, or clients, that a route shows, over all of its daemon ids.
+    pub(crate) fn writers_of(&self, key: &RouteKey) -> Rc<Meter> {
+        let mut writers = self.writers.borrow_mut();
+        if let Some(meter) = writers.get(key).and_then(Weak::upgrade) {
+            return meter;
+        }
+        // Once for as many as there are.
+        if writers.len() == writers.capacity() {
+            writers.retain(|_, meter| meter.strong_count() > 0);
+        }
+        let meter = Meter::new(MAX_WRITERS_OF_ROUTE);
+        writers.insert(key.clone(), Rc::downgrade(&meter));
+        meter
     }
 
     /// Counts a control message of this cost. Returns how long the identity has to wait before its next one.
@@ -205,7 +256,7 @@ pub(crate) fn cost(message: &Message) -> u32 {
             graph.added.len() + graph.removed.len() + toward
         }
         Message::Subscribe(subscribe) => 7 + subscribe.subscribers.len() + subscribe.last.len(),
-        Message::Unsubscribe(_) | Message::RouteRefused(_) => 7,
+        Message::Unsubscribe(_) | Message::RouteRefused(_) | Message::RouteUnasked(_) => 7,
         Message::Asserted(asserted) => asserted.publishers.len() / 8,
         Message::Owners(owners) => 7 * owners.proofs.len(),
         Message::Received(received) => received.flows.len() / LOOKED_UP,

@@ -21,6 +21,7 @@ pub(crate) mod keyring;
 pub(crate) mod link;
 pub(crate) mod links;
 mod marks;
+mod numbers;
 pub(crate) mod outbound;
 mod pace;
 pub(crate) mod peer;
@@ -440,12 +441,13 @@ impl Engine {
         for (_, peer) in self.peers.iter() {
             let text = self.links.peer_text(peer.link);
             let status = if peer.silent { None } else { self.link_status(peer, now) };
+            let status = status.map(|status| (Box::new(status), peer.refused_routes()));
             reports.push((text, peer.counters.take_lost(), status));
         }
         for (peer, losses, status) in reports {
             self.effects.tell_lost(&peer, losses);
-            if let Some(status) = status {
-                self.effects.tell(ToControl::Link(Box::new(status)));
+            if let Some((status, refused)) = status {
+                self.effects.tell(ToControl::Link(status, refused));
             }
         }
     }

@@ -161,6 +161,12 @@ impl Peers {
         self.kept.borrow_mut().add(peer, now);
     }
 
+    /// Relays that are kept.
+    #[cfg(test)]
+    pub(super) fn kept(&self) -> usize {
+        self.kept.borrow().len()
+    }
+
     /// Gives up what relays hold that were kept until now. Returns the samples, by topic.
     pub(super) fn give_up_relays(&mut self, now: Duration) -> Vec<(String, u64)> {
         self.kept.borrow_mut().give_up(now)

@@ -1,6 +1,6 @@
 //! How a message stands in a data stream: behind its length, in `messages10` sealed as an AXQKD001 envelope.
 
-use std::{borrow::Cow, time::Duration};
+use std::time::Duration;
 
 use axon_envelope::{Delivery, Kind, OpenError, Route, TAG_LEN, inner};
 use axon_shm::ids::Gid;
@@ -159,25 +159,34 @@ impl<'a> Opened<'a> {
         Ok(Self { header, sent })
     }
 
-    /// The payload, decompressed to at most `most` bytes.
-    ///
-    /// # Errors
-    /// The peer broke the format.
-    pub(crate) fn payload(&self, most: u64) -> Result<Cow<'a, [u8]>, RefusedMessage> {
-        if !self.header.compressed {
-            return Ok(self.sent.into());
-        }
-        let length = u64::from(self.header.uncompressed_len);
-        if length > most {
-            let text = format!("{length} bytes when decompressed, at most {most} allowed");
-            return Err(RefusedMessage::Malformed(text));
-        }
-        let payload = zstd::bulk::decompress(self.sent, length as usize)
-            .ok()
-            .filter(|p| p.len() as u64 == length)
-            .ok_or_else(|| RefusedMessage::Malformed("not one zstd frame as declared".into()))?;
-        Ok(payload.into())
+    /// The payload as it was sent: compressed, if the header says so.
+    pub(crate) fn sent(&self) -> &'a [u8] {
+        self.sent
     }
+}
+
+/// The length that a compressed payload will have, at most `most`.
+///
+/// # Errors
+/// It would be longer.
+pub(crate) fn unpacked_length(header: &inner::Header, most: u64) -> Result<usize, RefusedMessage> {
+    let length = u64::from(header.uncompressed_len);
+    if length > most {
+        let text = format!("{length} bytes when decompressed, at most {most} allowed");
+        return Err(RefusedMessage::Malformed(text));
+    }
+    Ok(length as usize)
+}
+
+/// Decompresses a payload that will have this length.
+///
+/// # Errors
+/// The peer broke the format.
+pub(crate) fn unpack(sent: &[u8], length: usize) -> Result<Vec<u8>, RefusedMessage> {
+    zstd::bulk::decompress(sent, length)
+        .ok()
+        .filter(|payload| payload.len() == length)
+        .ok_or_else(|| RefusedMessage::Malformed("not one zstd frame as declared".into()))
 }
 
 impl Open<'_> {

@@ -124,6 +124,7 @@ impl Message {
             Self::Asserted(_) => "ASSERTED",
             Self::Received(_) => "RECEIVED",
             Self::RouteRefused(_) => "ROUTE_REFUSED",
+            Self::RouteUnasked(_) => "ROUTE_UNASKED",
             Self::Owners(_) => "OWNERS",
             Self::LinkClosed(_) => "LINK_CLOSED",
             Self::Keys(m) => m.name(),

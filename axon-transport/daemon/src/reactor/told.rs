@@ -22,7 +22,7 @@ impl Told {
     pub(super) fn tell(&mut self, what: ToControl) {
         let droppable = matches!(
             what,
-            ToControl::Link(_)
+            ToControl::Link(..)
                 | ToControl::Keys(_)
                 | ToControl::Refusal { .. }
                 | ToControl::Datagram { .. }

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use axon_envelope::Route;
+use axon_envelope::{Route, inner};
 use axon_shm::ids::Gid;
 use bytes::{Bytes, BytesMut};
 use quinn_proto::{ReadError, ReadableError, StreamId};
@@ -66,6 +66,12 @@ impl StreamHeader {
         })
     }
 
+    /// The header of a stream of samples that has no flags.
+    #[cfg(test)]
+    pub(crate) fn plain(route: u32, of: Gid) -> Self {
+        Self { reliable: true, short: false, acknowledged: false, route, of }
+    }
+
     /// The header's bytes.
     pub(crate) fn encode(&self) -> [u8; HEADER] {
         let mut header = [0; HEADER];
@@ -102,6 +108,8 @@ pub(super) enum Step {
     Room(usize),
     /// The message of this length.
     Body(usize),
+    /// Memory for a message of this header, to decompress it.
+    Unpack(inner::Header, Bytes),
     /// The stand-in of the message's writer, until this time.
     Writer(Message, Duration),
     /// Room in the ring.
@@ -131,8 +139,10 @@ pub(super) struct Incoming {
     pub(super) chunk: Bytes,
     /// A piece that came in several chunks.
     pub(super) gathered: BytesMut,
-    /// The memory of a long message.
+    /// The memory of a message that has not come whole.
     pub(super) room: Option<Charge>,
+    /// The memory by which it is longer once it is decompressed.
+    pub(super) unpacked: Option<Charge>,
     pub(super) is_ready: bool,
 }
 
@@ -145,12 +155,18 @@ impl Default for Incoming {
             chunk: Bytes::new(),
             gathered: BytesMut::new(),
             room: None,
+            unpacked: None,
             is_ready: false,
         }
     }
 }
 
 impl Incoming {
+    /// Whether the next `length` bytes were read from QUIC already.
+    pub(super) fn has(&self, length: usize) -> bool {
+        self.gathered.len() + self.chunk.len() >= length
+    }
+
     /// The next `length` bytes of the stream. A piece within one chunk is not copied.
     pub(super) fn take(
         &mut self,
@@ -205,6 +221,7 @@ impl Incoming {
     pub(super) fn held(&self) -> usize {
         let message = match &self.step {
             Step::Writer(message, _) | Step::Ring(message) => message.payload.len(),
+            Step::Unpack(_, sent) => sent.len(),
             _ => 0,
         };
         self.chunk.len() + self.gathered.len() + message

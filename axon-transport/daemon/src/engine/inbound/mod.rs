@@ -7,6 +7,7 @@
 #[cfg(test)]
 mod held;
 mod incoming;
+mod line;
 mod reading;
 mod receipts;
 mod run;
@@ -28,6 +29,7 @@ use quinn_proto::{StreamId, VarInt};
 pub(crate) use self::incoming::StreamHeader;
 use self::{
     incoming::{Incoming, Step},
+    line::Line,
     receipts::Receipts,
 };
 use crate::{
@@ -37,8 +39,13 @@ use crate::{
 
 /// A stream may come before the route that it belongs to.
 const ARRIVAL: Duration = Duration::from_secs(2);
-/// A message longer than this counts against the memory for messages of the peer's identity.
+/// A message longer than this waits for memory before anything of it is read. A shorter one takes some where it does not
+/// come whole.
 const LONG: usize = 32 << 10;
+/// Of the memory for messages of an identity, in bytes: what long messages leave to short ones. A peer hands to QUIC no
+/// more than about its congestion window, and each short message as a whole, so that few of them are on their way at a
+/// time and none waits.
+const FOR_SHORT: usize = 16 << 20;
 /// Bytes of a stream that are read before others have their turn.
 const TURN: usize = 1 << 20;
 /// A stream whose ring was full tries again after this time, if no reader said that it made room.
@@ -97,10 +104,13 @@ pub(crate) struct Inbound {
     /// Streams that wait for room in a ring.
     full: HashSet<Key>,
     /// Streams that wait for memory.
-    without_room: VecDeque<Key>,
+    without_room: Line,
+    /// Memory for one short message where the identity has none left: those that have come whole are read one after the
+    /// other.
+    spare: Rc<Meter>,
     /// When streams try again whose ring was full: the reader that it waited for may be gone.
     full_retry: Option<Duration>,
-    /// What the memory for long messages had given back when it was looked at last.
+    /// What the memory for messages had given back when it was looked at last.
     released: usize,
     receipts: Receipts,
     /// The stand-in whose subscriptions were not woken for what was written.
@@ -116,7 +126,7 @@ pub(crate) struct Inbound {
 }
 
 impl Inbound {
-    /// Takes nothing yet. `intake` is the memory for long messages.
+    /// Takes nothing yet. `intake` is the memory for messages.
     pub(crate) fn new(
         counters: Rc<Counters>,
         intake: Rc<Meter>,
@@ -130,7 +140,8 @@ impl Inbound {
             ready: VecDeque::new(),
             waiting: BTreeSet::new(),
             full: HashSet::new(),
-            without_room: VecDeque::new(),
+            without_room: Line::default(),
+            spare: Meter::new(LONG),
             full_retry: None,
             released: intake.released(),
             receipts: Receipts::default(),
@@ -183,9 +194,13 @@ impl Inbound {
         if !self.without_room.is_empty()
             && released != std::mem::replace(&mut self.released, released)
         {
-            for key in std::mem::take(&mut self.without_room) {
-                self.make_ready(key);
-            }
+            self.try_without_room();
+        }
+    }
+
+    fn try_without_room(&mut self) {
+        for key in self.without_room.take() {
+            self.make_ready(key);
         }
     }
 
@@ -228,7 +243,8 @@ impl Inbound {
         let keys: Vec<_> = self.streams.keys().filter(|(of, _)| *of == link).copied().collect();
         for key in keys {
             let stream = self.streams.get(&key);
-            let lost = stream.filter(|s| matches!(s.step, Step::Ring(_) | Step::Writer(..)));
+            let lost = stream
+                .filter(|s| matches!(s.step, Step::Ring(_) | Step::Writer(..) | Step::Unpack(..)));
             if let Some((header, _)) = lost.and_then(|stream| stream.header) {
                 self.lost("no_link", header, "the link ended before they were read");
             }
@@ -241,7 +257,7 @@ impl Inbound {
         self.release(&mut stream);
         self.end_turn(key, &stream);
         self.full.remove(&key);
-        self.without_room.retain(|other| *other != key);
+        self.without_room.remove(&key);
         if let Step::Turn(until) | Step::Writer(_, until) = stream.step {
             self.waiting.remove(&(until, key));
         }

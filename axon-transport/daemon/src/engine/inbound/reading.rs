@@ -1,19 +1,22 @@
 //! Reads data streams step by step.
 
-use std::{borrow::Cow, rc::Rc, time::Duration};
+use std::{rc::Rc, time::Duration};
 
-use axon_envelope::{Kind, Route};
-use axon_shm::Meta;
+use axon_envelope::{Kind, Route, inner};
+use axon_shm::{Meta, ids::Gid};
 use axon_transport::internal::session::Written;
 use bytes::Bytes;
 
 use super::{
-    ARRIVAL, FULL_RETRY, Inbound, Key, LONG, NO_ROUTE, TURN, Violation,
+    ARRIVAL, FOR_SHORT, FULL_RETRY, Inbound, Key, LONG, NO_ROUTE, TURN, Violation,
     incoming::{HEADER, Incoming, Message, Piece, Step, StreamHeader},
 };
 use crate::{
     engine::{
-        protection::{MAX_OVERHEAD, Open, Opened, RefusedMessage, writer_of},
+        account::Charge,
+        protection::{
+            MAX_OVERHEAD, Open, Opened, RefusedMessage, unpack, unpacked_length, writer_of,
+        },
         rings::RingError,
         short_header::{ShortHeaders, Told},
         stand_in::StandIn,
@@ -108,7 +111,7 @@ impl Inbound {
             }
             Step::Turn(until) => Ok(self.begin(key, stream, quic, until, now)),
             Step::Length => {
-                if let Some(next) = self.run(key, stream, open, read, now)? {
+                if let Some(next) = self.run(key, stream, open, now)? {
                     return Ok(next);
                 }
                 let prefix = match stream.take(4, key.1, quic, read) {
@@ -130,9 +133,9 @@ impl Inbound {
             Step::Room(length) => {
                 if length > LONG {
                     // One message may always be read, however long.
-                    let most = length.min(self.intake.most());
-                    let Some(room) = self.intake.charge(most) else {
-                        self.without_room.push_back(key);
+                    let most = length.min(self.intake.most().saturating_sub(FOR_SHORT));
+                    let Some(room) = self.intake.charge_beside(most, FOR_SHORT) else {
+                        self.without_room.add(key);
                         return Ok(wait(stream, Step::Room(length)));
                     };
                     stream.room = Some(room);
@@ -141,6 +144,15 @@ impl Inbound {
                 Ok(Next::Go)
             }
             Step::Body(length) => {
+                // One that has come whole is held by nobody.
+                if stream.room.is_none() && !stream.has(length) {
+                    let room = self.intake.charge(length);
+                    let Some(room) = room.or_else(|| self.spare.charge(length)) else {
+                        self.without_room.add(key);
+                        return Ok(wait(stream, Step::Body(length)));
+                    };
+                    stream.room = Some(room);
+                }
                 let body = match stream.take(length, key.1, quic, read) {
                     Piece::Whole(body) => body,
                     Piece::Later => return Ok(wait(stream, Step::Body(length))),
@@ -149,8 +161,9 @@ impl Inbound {
                         return Ok(Next::Over);
                     }
                 };
-                self.open(stream, body, open, read, now)
+                self.open(stream, body, open, now)
             }
+            Step::Unpack(header, sent) => self.unpack(key, stream, header, sent, read, now),
             Step::Over => Ok(Next::Over),
             Step::Writer(message, until) => Ok(self.deliver(key, stream, message, until, now)),
             Step::Ring(message) => Ok(self.deliver(key, stream, message, now, now)),
@@ -197,7 +210,6 @@ impl Inbound {
         stream: &mut Incoming,
         body: Bytes,
         open: &mut Open<'_>,
-        read: &mut usize,
         now: Duration,
     ) -> Result<Next, Violation> {
         let Some((header, Some(route))) = stream.header else { return Ok(Next::Over) };
@@ -210,25 +222,72 @@ impl Inbound {
             stream.step = Step::Writer(message, now + ARRIVAL);
             return Ok(Next::Go);
         }
-        let Some((opened, payload)) =
-            open_body(open, body, route, self.max_message, now).map_err(refused)?
-        else {
+        let Some((opened, payload)) = open_body(open, body, route, now).map_err(refused)? else {
             self.lost("no_link", header, "the link ended before they were read");
             self.release(stream);
             return Ok(Next::Go);
         };
-        if opened.compressed {
-            *read += payload.len();
-        }
         let numbered = header.acknowledged && route.kind == Kind::Response;
-        let writer = writer_of(route.kind, header.of, numbered, &opened).map_err(malformed)?;
-        let mut meta = self.meta(told(&opened), now);
-        let number = meta.sequence;
-        if numbered {
-            meta.sequence = opened.request_id.sequence.unsigned_abs();
+        writer_of(route.kind, header.of, numbered, &opened).map_err(malformed)?;
+        if opened.compressed {
+            stream.step = Step::Unpack(opened, payload);
+            return Ok(Next::Go);
         }
-        stream.step = Step::Writer(Message { writer, number, meta, payload }, now + ARRIVAL);
+        let message = self.message(header, route, &opened, payload, now);
+        stream.step = Step::Writer(message, now + ARRIVAL);
         Ok(Next::Go)
+    }
+
+    /// Decompresses a message once there is memory for it: a few bytes may become a long one, which then waits for its
+    /// ring.
+    fn unpack(
+        &mut self,
+        key: Key,
+        stream: &mut Incoming,
+        header: inner::Header,
+        sent: Bytes,
+        read: &mut usize,
+        now: Duration,
+    ) -> Result<Next, Violation> {
+        let length = unpacked_length(&header, self.max_message).map_err(refused)?;
+        let has = stream.room.as_ref().map_or(0, Charge::amount);
+        let is_long = length > LONG;
+        let most = if is_long { self.intake.most().saturating_sub(FOR_SHORT) } else { length };
+        let more = length.min(most).saturating_sub(has);
+        if more > 0 && stream.unpacked.is_none() {
+            let room = match is_long {
+                true => self.intake.charge_beside(more, FOR_SHORT),
+                false => self.intake.charge(more).or_else(|| self.spare.charge(more)),
+            };
+            let Some(room) = room else {
+                self.without_room.add(key);
+                return Ok(wait(stream, Step::Unpack(header, sent)));
+            };
+            stream.unpacked = Some(room);
+        }
+        let payload = unpack(&sent, length).map_err(refused)?.into();
+        *read += length;
+        let Some((of_stream, Some(route))) = stream.header else { return Ok(Next::Over) };
+        let message = self.message(of_stream, route, &header, payload, now);
+        stream.step = Step::Writer(message, now + ARRIVAL);
+        Ok(Next::Go)
+    }
+
+    /// A message of a stream. Its writer was judged before.
+    fn message(
+        &self,
+        of_stream: StreamHeader,
+        route: Route,
+        header: &inner::Header,
+        payload: Bytes,
+        now: Duration,
+    ) -> Message {
+        let mut meta = self.meta(told(header), now);
+        let number = meta.sequence;
+        if of_stream.acknowledged && route.kind == Kind::Response {
+            meta.sequence = header.request_id.sequence.unsigned_abs();
+        }
+        Message { writer: Gid(header.gid), number, meta, payload }
     }
 
     /// What the ring gets to know of a sample.
@@ -289,7 +348,7 @@ impl Inbound {
             return Next::Over;
         }
         let stand_in = Rc::clone(stand_in);
-        let Some(there) = self.write(&stand_in, header, message.meta, &message.payload) else {
+        let Some(there) = self.write(&stand_in, header, message.meta, &message.payload, now) else {
             return self.wait_for_room(key, stream, message, now);
         };
         if acknowledged
@@ -314,8 +373,9 @@ impl Inbound {
         header: StreamHeader,
         meta: Meta,
         payload: &[u8],
+        now: Duration,
     ) -> Option<bool> {
-        match stand_in.try_write(&header.of, meta, payload) {
+        match stand_in.try_write(&header.of, meta, payload, now) {
             Ok(Written::Yes) => {
                 self.counters.arrived(payload.len());
                 let before = self.written.as_ref();
@@ -353,10 +413,10 @@ impl Inbound {
 
     /// Gives back the memory of a message, which another stream may wait for.
     pub(super) fn release(&mut self, stream: &mut Incoming) {
-        if stream.room.take().is_some() {
-            for key in std::mem::take(&mut self.without_room) {
-                self.make_ready(key);
-            }
+        let room = [stream.room.take(), stream.unpacked.take()];
+        if room.iter().any(Option::is_some) {
+            drop(room);
+            self.try_without_room();
         }
     }
 
@@ -402,8 +462,8 @@ pub(super) fn permit_short(route: Route, open: &Open<'_>) -> Result<(), Violatio
 }
 
 /// What a message's inner header tells besides its writer.
-pub(super) fn told(header: &axon_envelope::inner::Header) -> Told {
-    let axon_envelope::inner::Header { sequence, source_timestamp, age_ms, .. } = *header;
+pub(super) fn told(header: &inner::Header) -> Told {
+    let inner::Header { sequence, source_timestamp, age_ms, .. } = *header;
     Told { sequence, source_timestamp, age_ms }
 }
 
@@ -419,38 +479,28 @@ pub(super) fn refused(error: RefusedMessage) -> Violation {
     (code, error.to_string())
 }
 
-/// Opens a body. The payload shares its memory, unless it was compressed.
+/// Opens a body. The payload, compressed if its header says so, shares its memory.
 fn open_body(
     open: &mut Open<'_>,
     body: Bytes,
     route: Route,
-    most: u64,
     now: Duration,
-) -> Result<Option<(axon_envelope::inner::Header, Bytes)>, RefusedMessage> {
+) -> Result<Option<(inner::Header, Bytes)>, RefusedMessage> {
     // An envelope is opened in place, so in memory of its own.
-    let body = match open {
-        Open::Link => body,
+    match open {
+        Open::Link => {
+            let opened = Opened::plain(&body)?;
+            let (header, sent) = (opened.header, body.slice_ref(opened.sent()));
+            Ok(Some((header, sent)))
+        }
         Open::Envelope { .. } => {
             let mut own = body.try_into_mut().unwrap_or_else(|shared| shared.as_ref().into());
             let start = own.as_ptr().addr();
             let Some(opened) = open.open(&mut own, route, now)? else { return Ok(None) };
-            let header = opened.header;
-            let payload = match opened.payload(most)? {
-                Cow::Owned(payload) => payload.into(),
-                Cow::Borrowed(payload) => {
-                    let at = payload.as_ptr().addr() - start;
-                    let range = at..at + payload.len();
-                    own.freeze().slice(range)
-                }
-            };
-            return Ok(Some((header, payload)));
+            let (header, sent) = (opened.header, opened.sent());
+            let at = sent.as_ptr().addr() - start;
+            let range = at..at + sent.len();
+            Ok(Some((header, own.freeze().slice(range))))
         }
-    };
-    let opened = Opened::plain(&body)?;
-    let (header, payload) = (opened.header, opened.payload(most)?);
-    let payload = match payload {
-        Cow::Owned(payload) => payload.into(),
-        Cow::Borrowed(payload) => body.slice_ref(payload),
-    };
-    Ok(Some((header, payload)))
+    }
 }

@@ -1,13 +1,13 @@
 //! Delivers the short samples that lie whole in the piece that QUIC gave last, without a step of the stream for each.
 
-use std::{borrow::Cow, rc::Rc, time::Duration};
+use std::{rc::Rc, time::Duration};
 
 use axon_envelope::{Kind, Route};
 use bytes::{Buf, Bytes};
 
 use super::{
-    Inbound, Key, LONG, RouteIn, TURN, Violation,
-    incoming::{Incoming, Message, StreamHeader},
+    Inbound, Key, LONG, RouteIn, Violation,
+    incoming::{Incoming, Message, Step, StreamHeader},
     reading::{Next, malformed, permit_short, refused, told},
 };
 use crate::engine::{
@@ -48,7 +48,6 @@ impl Inbound {
         key: Key,
         stream: &mut Incoming,
         open: &mut Open<'_>,
-        read: &mut usize,
         now: Duration,
     ) -> Result<Option<Next>, Violation> {
         let Some((header, Some(route))) = stream.header else { return Ok(None) };
@@ -62,36 +61,39 @@ impl Inbound {
         let most = self.max_message + MAX_OVERHEAD as u64;
         let (to, mut came) = (To { header, route, stand_in, most, now }, Came::default());
         let mut envelope = std::mem::take(&mut self.envelope);
-        let full = self.deliver_all(&to, stream, open, &mut envelope, read, &mut came);
+        let next = self.deliver_all(&to, stream, open, &mut envelope, &mut came);
         self.envelope = envelope;
         let flow = (header.route, header.of);
         if let Some(newest) = came.newest {
             self.receipts.came_all(flow, newest, came.samples, came.bytes, now);
         }
-        Ok(full?.map(|message| self.wait_for_room(key, stream, message, now)))
+        match next? {
+            None => Ok(None),
+            Some(Step::Ring(message)) => Ok(Some(self.wait_for_room(key, stream, message, now))),
+            Some(step) => {
+                stream.step = step;
+                Ok(Some(Next::Go))
+            }
+        }
     }
 
-    /// Delivers samples until none is whole, or the ring has no room for the one that is returned.
+    /// Delivers samples until none is whole, or one has to wait: for room in the ring, or to be decompressed. What the
+    /// stream goes on with.
     fn deliver_all(
         &mut self,
         to: &To,
         stream: &mut Incoming,
         open: &mut Open<'_>,
         envelope: &mut Vec<u8>,
-        read: &mut usize,
         came: &mut Came,
-    ) -> Result<Option<Message>, Violation> {
+    ) -> Result<Option<Step>, Violation> {
         let now = to.now;
         let Incoming { chunk, headers, .. } = stream;
-        // What is decompressed counts for the turn.
-        while *read < TURN
-            && let Some(body) = next_body(chunk, to.most)
-        {
-            let (told, payload): (Told, Cow<'_, [u8]>) = match headers {
+        while let Some(body) = next_body(chunk, to.most) {
+            let (told, payload): (Told, &[u8]) = match headers {
                 Some(headers) => {
                     permit_short(to.route, open)?;
-                    let (told, payload) = headers.read(body).map_err(malformed)?;
-                    (told, payload.into())
+                    headers.read(body).map_err(malformed)?
                 }
                 None => {
                     // It is opened in place.
@@ -103,19 +105,20 @@ impl Inbound {
                         chunk.advance(LENGTH + body.len());
                         continue;
                     };
-                    let payload = opened.payload(self.max_message).map_err(refused)?;
-                    if opened.header.compressed {
-                        *read += payload.len();
-                    }
                     writer_of(to.route.kind, to.header.of, false, &opened.header)
                         .map_err(malformed)?;
-                    (told(&opened.header), payload)
+                    if opened.header.compressed {
+                        let sent = Bytes::copy_from_slice(opened.sent());
+                        chunk.advance(LENGTH + body.len());
+                        return Ok(Some(Step::Unpack(opened.header, sent)));
+                    }
+                    (told(&opened.header), opened.sent())
                 }
             };
             let (length, bytes) = (LENGTH + body.len(), payload.len());
             if to.stand_in.last_sequence() < Some(told.sequence) {
                 let meta = self.meta(told, now);
-                match self.write(&to.stand_in, to.header, meta, &payload) {
+                match self.write(&to.stand_in, to.header, meta, payload, now) {
                     Some(true) => {}
                     Some(false) => {
                         let flow = (to.header.route, to.header.of);
@@ -124,10 +127,11 @@ impl Inbound {
                         continue;
                     }
                     None => {
-                        let payload = Bytes::copy_from_slice(&payload);
+                        let payload = Bytes::copy_from_slice(payload);
                         chunk.advance(length);
                         let (writer, number) = (to.header.of, meta.sequence);
-                        return Ok(Some(Message { writer, number, meta, payload }));
+                        let message = Message { writer, number, meta, payload };
+                        return Ok(Some(Step::Ring(message)));
                     }
                 }
             }

@@ -128,7 +128,7 @@ impl Way {
             quiet: Cell::new(0),
         });
         let account = Accounts::new(1 << 20).of("peer");
-        let stand_in = StandIns::default().get(&One(Rc::clone(&ring)), &endpoint, &account);
+        let stand_in = StandIns::default().get(&One(Rc::clone(&ring)), &endpoint, &account, NOW);
         let mut inbound = Inbound::new(Rc::default(), Meter::new(1 << 20), 1 << 20, 0);
         let route = Route { kind, topic: TopicHash::new(0, "/t", "T").unwrap() };
         let mut into = RouteIn::new("/t".into(), route);
@@ -180,8 +180,8 @@ impl Way {
     /// QUIC gave this, and the stream is read. The code with which a violation ends the link.
     fn read(&mut self, bytes: Vec<u8>) -> Result<Option<Next>, CloseCode> {
         self.stream.chunk = bytes.into();
-        let (key, mut read) = ((1, StreamId::new(Side::Client, Dir::Uni, 0)), 0);
-        let run = self.inbound.run(key, &mut self.stream, &mut Open::Link, &mut read, NOW);
+        let key = (1, StreamId::new(Side::Client, Dir::Uni, 0));
+        let run = self.inbound.run(key, &mut self.stream, &mut Open::Link, NOW);
         run.map_err(|(code, _)| code)
     }
 

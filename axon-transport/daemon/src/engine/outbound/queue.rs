@@ -242,16 +242,19 @@ impl Queue {
         }
     }
 
-    /// Drops waiting samples that would arrive too late: older than `life` once they have crossed the link, which
-    /// takes `transit`, or at the end of their lifespan. The newest sample is dropped for its lifespan alone.
+    /// Drops waiting samples that would arrive too late, the oldest first: at the end of their lifespan or, where that is
+    /// infinite, older than `life` once they have crossed the link, which takes `transit`. The newest sample is dropped
+    /// for its lifespan alone.
     pub(super) fn drop_late(&mut self, life: Duration, transit: Duration, now: Duration) -> u64 {
         let mut dropped = 0;
         while let Some(oldest) = self.waiting.front() {
             let newest = self.waiting.len() == 1;
             let transit = if newest { Duration::ZERO } else { transit };
-            let late = !newest && now.saturating_sub(oldest.taken) + transit > life;
-            let expired = oldest.lifespan_left(now).is_some_and(|left| left <= transit);
-            if !late && !expired {
+            let is_late = match oldest.lifespan_left(now) {
+                Some(left) => left <= transit,
+                None => !newest && now.saturating_sub(oldest.taken) + transit > life,
+            };
+            if !is_late {
                 break;
             }
             dropped += u64::from(self.pop().is_some());
@@ -332,7 +335,7 @@ impl Drop for Queue {
 #[cfg(test)]
 mod tests {
     use axon_shm::ids::Gid;
-    use axon_transport::MessageInfo;
+    use axon_transport::{Lifetime, MessageInfo};
 
     use super::*;
 
@@ -495,6 +498,21 @@ mod tests {
         );
         let last = queue.pop_best_effort().unwrap();
         assert_eq!((last.info.sequence, queue.is_empty()), (5, true));
+    }
+
+    #[test]
+    fn a_best_effort_sample_with_a_lifespan_is_late_at_its_end_and_not_before() {
+        let budget = Budget::new(256 * MIB);
+        let mut queue = Queue::new(&Qos { depth: 3, ..Qos::sensor_data() }, budget.of_peer());
+        for sequence in 1..=3 {
+            let mut sample = sample(sequence, 1, at(0));
+            sample.info.lifetime = Some(Lifetime::new(at(50), at(1000)));
+            dropped(queue.offer(sample, at(0)));
+        }
+        assert_eq!(queue.drop_late(at(200), at(600), at(0)), 0);
+        assert_eq!(queue.drop_late(at(200), at(600), at(349)), 0);
+        assert_eq!(queue.drop_late(at(200), at(600), at(350)), 2, "the newest crosses in no time");
+        assert_eq!(queue.drop_late(at(200), at(600), at(950)), 1);
     }
 
     #[test]

@@ -12,10 +12,11 @@ use axon_transport::graph::{Endpoint, EndpointKind};
 
 use super::{
     Peer, Surroundings, poll_after,
-    refused::{TOO_MANY_ASKED, TOO_MANY_WRITERS},
+    refused::{NO_STAND_IN, TOO_MANY_ASKED, TOO_MANY_WRITERS},
 };
 use crate::{
     engine::{
+        account::{Charge, Meter},
         inbound::RouteIn,
         peer::routes::{self, RouteKey, Wanted},
         stand_in::{NoStandIn, StandIn},
@@ -26,9 +27,6 @@ use crate::{
 /// The peer is asked for a route once the local readers are attached, or after this time.
 const ATTACH_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// Publishers, or clients, of one route that are shown here: a reader looks at all of its publishers.
-const MAX_WRITERS_OF_ROUTE: usize = 1024;
-
 /// A route that this host asked for.
 pub(super) struct Asked {
     pub(super) number: u32,
@@ -38,6 +36,9 @@ pub(super) struct Asked {
     /// Whether a writer of it is not shown.
     incomplete: bool,
     pub(super) stand_ins: HashMap<Gid, Rc<StandIn>>,
+    /// One for each stand-in, of what the route may show of the peer's identity.
+    places: Charge,
+    room: Rc<Meter>,
 }
 
 /// A route whose local readers are not all attached.
@@ -107,10 +108,11 @@ impl Peer {
 
     fn want(&mut self, wanted: BTreeMap<RouteKey, Wanted>, with: &Surroundings<'_>, now: Duration) {
         let gone: Vec<_> = self.asked.keys().filter(|k| !wanted.contains_key(k)).cloned().collect();
-        self.refused.retain_unasked(|key| wanted.contains_key(key));
+        self.want_no_more(|key| wanted.contains_key(key));
         let given_up = gone.len();
         for key in gone {
-            self.refused.settle(&key);
+            self.asks(&key);
+            self.refused.served(&key);
             if let Some(asked) = self.asked.remove(&key) {
                 self.numbers.remove(&asked.number);
                 self.attaching.remove(&asked.number);
@@ -120,7 +122,7 @@ impl Peer {
         }
         for (key, wanted) in wanted {
             if self.asked.len() >= self.serves && !self.asked.contains_key(&key) {
-                self.refused.unasked(&key, TOO_MANY_ASKED);
+                self.does_not_ask(&key, TOO_MANY_ASKED);
                 continue;
             }
             self.want_one(key, wanted, with, now);
@@ -143,7 +145,10 @@ impl Peer {
                 // The peer's graph has no name that is too long.
                 let Ok(topic) = hash else { return };
                 self.next_route += 1;
+                let room = self.remote.account().writers_of(&key);
                 Asked {
+                    places: room.nothing(),
+                    room,
                     number: self.next_route - 1,
                     route: Route { kind: key.kind, topic },
                     wanted: Wanted::default(),
@@ -154,12 +159,14 @@ impl Peer {
         };
         let writers: HashSet<_> = wanted.writers.iter().map(|(writer, _)| writer.gid).collect();
         asked.stand_ins.retain(|gid, _| writers.contains(gid));
-        let fresh = self.show(&key, &mut asked, &wanted.writers, with);
+        let gone = asked.places.amount() - asked.stand_ins.len();
+        drop(asked.places.split(gone));
+        let fresh = self.show(&key, &mut asked, &wanted.writers, with, now);
         if asked.stand_ins.is_empty() && asked.wanted.subscribers.is_empty() {
             return;
         }
         if !asked.incomplete {
-            self.refused.asked(&key);
+            self.asks(&key);
         }
         let changed = asked.wanted.subscribers != wanted.subscribers || fresh;
         let route = self
@@ -191,6 +198,7 @@ impl Peer {
         asked: &mut Asked,
         writers: &[(Endpoint, usize)],
         with: &Surroundings<'_>,
+        now: Duration,
     ) -> bool {
         let mut fresh = false;
         asked.incomplete = false;
@@ -198,18 +206,19 @@ impl Peer {
             if asked.stand_ins.contains_key(&writer.gid) {
                 continue;
             }
-            if asked.stand_ins.len() >= MAX_WRITERS_OF_ROUTE {
-                self.refused.unasked(key, TOO_MANY_WRITERS);
+            let Some(place) = asked.room.charge(1) else {
+                self.does_not_ask(key, TOO_MANY_WRITERS);
                 asked.incomplete = true;
                 break;
-            }
-            match with.stand_ins.get(with.rings, writer, self.remote.account()) {
+            };
+            match with.stand_ins.get(with.rings, writer, self.remote.account(), now) {
                 Ok(stand_in) => {
+                    asked.places.add(place);
                     asked.stand_ins.insert(writer.gid, stand_in);
                     fresh = true;
                 }
                 Err(NoStandIn::TooMany) => {
-                    self.refused.unasked(key, TOO_MANY_WRITERS);
+                    self.does_not_ask(key, TOO_MANY_WRITERS);
                     asked.incomplete = true;
                     break;
                 }
@@ -217,6 +226,7 @@ impl Peer {
                     asked.incomplete = true;
                     let topic = &key.topic;
                     tracing::error!(topic, error, "could not open a stand-in for a remote writer");
+                    self.does_not_ask(key, NO_STAND_IN);
                 }
             }
         }

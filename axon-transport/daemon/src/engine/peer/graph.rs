@@ -79,9 +79,10 @@ pub(crate) struct Remote {
 impl Remote {
     /// That of a peer which must prove its sessions, if `proofs`.
     pub(crate) fn new(account: Rc<Account>, proofs: bool) -> Self {
+        let proven = Proven::new(proofs, Rc::clone(&account.sessions));
         Self {
             account,
-            proven: Proven::new(proofs),
+            proven,
             all: BTreeMap::new(),
             version: 0,
             gathered: None,

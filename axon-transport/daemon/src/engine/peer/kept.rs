@@ -1,19 +1,32 @@
 //! KEEP_ALL relays of peers whose daemon was killed or restarted. They hold what the peer did not acknowledge, until
 //! the next daemon there asks for the topic for the same subscriptions.
 
-use std::{rc::Rc, time::Duration};
+use std::{
+    collections::HashMap,
+    rc::{Rc, Weak},
+    time::Duration,
+};
 
 use super::{Peer, routes::RelaySpec};
-use crate::engine::{outbound::Source, peer::routes::RouteKey, rings::RingReader};
+use crate::engine::{
+    account::{Charge, Meter},
+    outbound::Source,
+    peer::routes::RouteKey,
+    rings::RingReader,
+};
 
 /// A relay is kept for so long.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// Relays that are kept. What further ones hold is given up at once.
-const MOST: usize = 1024;
+/// Relays that are kept. An identity gets half of what the others leave. What further ones hold is given up at once.
+const MOST: usize = 2048;
 
 /// The relays that are kept.
-#[derive(Default)]
-pub(crate) struct KeptRelays(Vec<Kept>);
+pub(crate) struct KeptRelays {
+    all: Vec<Kept>,
+    room: Rc<Meter>,
+    /// That of each identity.
+    rooms: HashMap<String, Weak<Meter>>,
+}
 
 struct Kept {
     /// The identity that the peer proved.
@@ -22,18 +35,39 @@ struct Kept {
     spec: RelaySpec,
     reader: Rc<dyn RingReader>,
     until: Duration,
+    /// It counts among those that are kept, and still among the relays of the identity.
+    _charges: [Charge; 2],
+}
+
+impl Default for KeptRelays {
+    fn default() -> Self {
+        Self { all: Vec::new(), room: Meter::new(MOST), rooms: HashMap::new() }
+    }
 }
 
 impl KeptRelays {
+    /// What an identity may have kept.
+    fn room_of(&mut self, identity: &str) -> Rc<Meter> {
+        if let Some(room) = self.rooms.get(identity).and_then(Weak::upgrade) {
+            return room;
+        }
+        self.rooms.retain(|_, room| room.strong_count() > 0);
+        let room = Meter::within(&self.room, MOST);
+        self.rooms.insert(identity.to_owned(), Rc::downgrade(&room));
+        room
+    }
+
     /// Takes the KEEP_ALL relays of a peer that is gone.
     pub(crate) fn add(&mut self, peer: &mut Peer, now: Duration) {
-        for (number, served) in &peer.served {
-            let room = MOST.saturating_sub(self.0.len());
-            for source in peer.outbound.take_kept(*number, room) {
+        let room = self.room_of(&peer.identity);
+        for (number, served) in &mut peer.served {
+            for source in peer.outbound.take_kept(*number, room.left()) {
                 let Source::Relay(spec, reader) = source else { continue };
+                let Some(place) = room.charge(1) else { continue };
+                let charges = [place, served.relays.split(1)];
                 let identity = peer.identity.clone();
                 let (key, until) = (served.key.clone(), now + PATIENCE);
-                self.0.push(Kept { identity, key, spec, reader, until });
+                self.all.push(Kept { identity, key, spec, reader, until, _charges: charges });
             }
         }
     }
@@ -51,22 +85,28 @@ impl KeptRelays {
             let is_same_topic = kept.key == *key && kept.spec.is(spec);
             is_same_topic && kept.identity == identity && spec.stands_for.iter().any(same)
         };
-        let at = self.0.iter().position(fits)?;
-        let Kept { reader, .. } = self.0.swap_remove(at);
+        let at = self.all.iter().position(fits)?;
+        let Kept { reader, .. } = self.all.swap_remove(at);
         reader.take_back();
         reader.set_stands_for(spec.stands_for.clone());
         Some(reader)
     }
 
+    /// How many there are.
+    #[cfg(test)]
+    pub(crate) fn len(&self) -> usize {
+        self.all.len()
+    }
+
     /// When [`give_up`](Self::give_up) is due.
     pub(crate) fn poll_timeout(&self) -> Option<Duration> {
-        self.0.iter().map(|kept| kept.until).min()
+        self.all.iter().map(|kept| kept.until).min()
     }
 
     /// Gives up what relays hold that were kept until now. Returns the samples, by topic.
     pub(crate) fn give_up(&mut self, now: Duration) -> Vec<(String, u64)> {
         let mut lost = Vec::new();
-        for Kept { key, reader, .. } in self.0.extract_if(.., |kept| kept.until <= now) {
+        for Kept { key, reader, .. } in self.all.extract_if(.., |kept| kept.until <= now) {
             let mut all = 0;
             for (publisher, samples) in reader.unacknowledged() {
                 reader.give_up(publisher, samples);

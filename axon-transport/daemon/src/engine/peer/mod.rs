@@ -190,6 +190,7 @@ impl Peer {
             link,
             identity,
             counters,
+            refused: RefusedRoutes::new(Rc::clone(&account.refusals)),
             remote: Remote::new(account, prover.is_needed()),
             prover,
             displaced: false,
@@ -206,7 +207,6 @@ impl Peer {
             numbers: HashMap::new(),
             attaching: BTreeMap::new(),
             look_at_attaching: None,
-            refused: RefusedRoutes::default(),
             inbound,
             outbound,
             ending: BTreeMap::new(),
@@ -231,6 +231,7 @@ impl Peer {
         self.prove(&visible);
         let asks: Vec<_> = self.asked.iter().map(|(key, asked)| asked.message(key)).collect();
         asks.into_iter().for_each(|message| self.say(message));
+        self.say_unasked_again();
         for served in self.served.values_mut() {
             served.repeated = false;
         }
@@ -275,6 +276,7 @@ impl Peer {
             Message::Asserted(asserted) => self.handle_asserted(&asserted),
             Message::Received(received) => self.outbound.handle_received(&received.flows),
             Message::RouteRefused(refused) => self.handle_route_refused(refused, now),
+            Message::RouteUnasked(unasked) => self.handle_route_unasked(unasked),
             Message::RouteReady(ready) => {
                 self.handle_route_ready(ready.route);
                 tracing::debug!(peer = %self.daemon, route = ready.route,
@@ -493,5 +495,17 @@ impl Peer {
         status.endpoints = self.remote.len() as u64;
         status.endpoints_left_out = self.remote.left_out();
         status.graph_bytes = self.remote.account().graph.held() as u64;
+    }
+
+    /// Bytes of refused routes that are remembered.
+    #[cfg(test)]
+    pub(super) fn held_of_refusals(&self) -> usize {
+        self.refused.held()
+    }
+
+    /// Publishers, servers and clients of it that are shown here.
+    #[cfg(test)]
+    pub(super) fn stand_ins(&self) -> usize {
+        self.asked.values().map(|asked| asked.stand_ins.len()).sum()
     }
 }

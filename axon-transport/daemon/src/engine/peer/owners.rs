@@ -3,6 +3,7 @@
 
 use std::{
     collections::{BTreeSet, HashMap, HashSet},
+    rc::Rc,
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -11,12 +12,11 @@ use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::internal::SessionKey;
 
 use crate::{
+    engine::account::{Charge, Meter},
     link::{MAX_PROOFS, Message, Owners},
     owner::{Binding, Prefix, Proof, SessionKeys, prefix, prefix_of, prove},
 };
 
-/// Sessions of one daemon that are taken for proven.
-const MAX_PROVEN: usize = 8192;
 /// How often sessions without endpoints are looked for, where there are too many.
 const SWEEP: Duration = Duration::from_secs(1);
 
@@ -111,15 +111,17 @@ impl Prover {
 pub(crate) struct Proven {
     /// Whether proofs are asked for: where peers prove who they are.
     needed: bool,
-    sessions: HashSet<Prefix>,
+    /// How many there may be, over all daemon ids of the peer's identity.
+    room: Rc<Meter>,
+    sessions: HashMap<Prefix, Charge>,
     /// Those that were proved since the last GRAPH, which may bring their endpoints.
-    fresh: HashSet<Prefix>,
+    fresh: HashMap<Prefix, Charge>,
     swept: Option<Instant>,
 }
 
 impl Proven {
-    pub(crate) fn new(needed: bool) -> Self {
-        Self { needed, sessions: HashSet::new(), fresh: HashSet::new(), swept: None }
+    pub(crate) fn new(needed: bool, room: Rc<Meter>) -> Self {
+        Self { needed, room, sessions: HashMap::new(), fresh: HashMap::new(), swept: None }
     }
 
     /// Takes what the daemon `from` proves. `used` says of which sessions there are endpoints: the others
@@ -140,12 +142,14 @@ impl Proven {
             if self.has(&session) {
                 continue;
             }
-            if self.is_full() && self.swept.is_none_or(|swept| swept.elapsed() >= SWEEP) {
+            if self.room.left() == 0 && self.swept.is_none_or(|swept| swept.elapsed() >= SWEEP) {
                 self.swept = Some(Instant::now());
-                self.sessions.retain(&used);
+                self.sessions.retain(|session, _| used(session));
             }
-            if !self.is_full() && proof.session(binding, from).is_some() {
-                self.fresh.insert(session);
+            if let Some(charge) = self.room.charge(1)
+                && proof.session(binding, from).is_some()
+            {
+                self.fresh.insert(session, charge);
             }
         }
     }
@@ -167,17 +171,14 @@ impl Proven {
     }
 
     fn has(&self, session: &Prefix) -> bool {
-        self.sessions.contains(session) || self.fresh.contains(session)
-    }
-
-    fn is_full(&self) -> bool {
-        self.sessions.len() + self.fresh.len() >= MAX_PROVEN
+        self.sessions.contains_key(session) || self.fresh.contains_key(session)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::engine::account::MAX_PROVEN;
 
     const BINDING: Binding = [7; 32];
     const HERE: DaemonId = DaemonId([1; 16]);
@@ -194,18 +195,37 @@ mod tests {
         prove(key, &BINDING, HERE).unwrap()
     }
 
-    fn full_of(sessions: impl IntoIterator<Item = Prefix>) -> Proven {
-        let mut proven = Proven::new(true);
-        proven.sessions.extend(sessions);
-        for number in 0_u64.. {
-            if proven.is_full() {
-                break;
-            }
+    /// Adds sessions until there may be no more.
+    fn fill(proven: &mut Proven) {
+        for number in proven.sessions.len() as u64.. {
+            let Some(charge) = proven.room.charge(1) else { break };
             let mut prefix = [0; 12];
             prefix[..8].copy_from_slice(&number.to_be_bytes());
-            proven.sessions.insert(prefix);
+            proven.sessions.insert(prefix, charge);
         }
+    }
+
+    fn full_of(sessions: impl IntoIterator<Item = Prefix>) -> Proven {
+        let mut proven = Proven::new(true, Meter::new(MAX_PROVEN));
+        for session in sessions {
+            let charge = proven.room.charge(1).unwrap();
+            proven.sessions.insert(session, charge);
+        }
+        fill(&mut proven);
         proven
+    }
+
+    #[test]
+    fn sessions_count_over_all_daemon_ids_of_an_identity() {
+        let mut one = full_of([]);
+        let mut other = Proven::new(true, Rc::clone(&one.room));
+        let (first, second) = (key(), key());
+        other.take(&[proof(&first)], &BINDING, HERE, |_| true);
+        assert!(!other.owns(&gid(&first)), "the other id has them all");
+        one.succeed();
+        other.take(&[proof(&second)], &BINDING, HERE, |_| true);
+        assert!(other.owns(&gid(&second)));
+        assert_eq!(one.room.held(), 1);
     }
 
     #[test]
@@ -235,8 +255,7 @@ mod tests {
         let mut proven = full_of([]);
         proven.take(&[proof(&first), proof(&second)], &BINDING, HERE, |_| false);
         proven.swept = None;
-        let filling = full_of([]).sessions;
-        proven.sessions.extend(filling);
+        fill(&mut proven);
         proven.take(&[proof(&key())], &BINDING, HERE, |_| false);
         assert!(proven.owns(&gid(&first)) && proven.owns(&gid(&second)));
         proven.settle();
@@ -245,7 +264,7 @@ mod tests {
 
     #[test]
     fn where_nothing_is_proved_nothing_is_kept() {
-        let mut proven = Proven::new(false);
+        let mut proven = Proven::new(false, Meter::new(MAX_PROVEN));
         proven.take(&[proof(&key())], &BINDING, HERE, |_| true);
         assert!(proven.sessions.is_empty() && proven.fresh.is_empty());
         assert!(proven.owns(&gid(&key())));

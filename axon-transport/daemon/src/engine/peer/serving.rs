@@ -11,13 +11,15 @@ use crate::{
     engine::{
         account::Charge,
         outbound::{RouteOut, Source},
-        peer::routes::{RelaySpec, RouteKey, admit, relays},
+        peer::routes::{MAX_RELAYS_OF_ROUTE, RelaySpec, RouteKey, admit, relays},
     },
     link::{Message, RouteReady, Subscribe, Subscriber},
 };
 
 /// A route is said to be ready once it has a writer, or after this time.
 const READY_TIMEOUT: Duration = Duration::from_secs(2);
+/// A peer that lacks relays may ask for them again after this time.
+const ASK_AGAIN: Duration = Duration::from_secs(10);
 /// Memory of a route, in bytes, beside the names and subscribers of which it holds three copies.
 const ROUTE: usize = 2048;
 const COPIES: usize = 3;
@@ -29,9 +31,24 @@ pub(super) struct Served {
     pub(super) key: RouteKey,
     pub(super) subscribers: Vec<Gid>,
     pub(super) sources: Vec<Source>,
-    _charges: [Charge; 2],
+    _room: Charge,
+    /// One for each relay.
+    pub(super) relays: Charge,
+    /// Why some of the subscribers get nothing, and when the peer may ask again.
+    without: Option<Without>,
     /// Whether the peer asked for it over the link in use.
     pub(super) repeated: bool,
+}
+
+/// Why subscribers of a route have no relay, and after what time one may be had.
+type Without = (String, Option<Duration>);
+
+/// The relays of a route.
+struct Relays {
+    sources: Vec<Source>,
+    /// Those among them that another daemon of the peer's host had.
+    adopted: Vec<Gid>,
+    without: Option<Without>,
 }
 
 /// A route that was given up since the peer does not read it.
@@ -42,6 +59,11 @@ pub(crate) struct StalledRoute {
     pub(crate) reason: String,
     /// Samples that were lost.
     pub(crate) samples: u64,
+}
+
+/// What a route carries, as a message says it.
+pub(super) fn kind_of(kind: u8) -> Option<Kind> {
+    [Kind::Topic, Kind::Request, Kind::Response].into_iter().find(|k| *k as u8 == kind)
 }
 
 impl Peer {
@@ -60,12 +82,7 @@ impl Peer {
         let subscribers = self.proven_only(subscribe.subscribers, &topic);
         let hash =
             TopicHash::new(with.config.domain, &topic, &type_name).map_err(|e| e.to_string())?;
-        let kind = match kind {
-            0 => Kind::Topic,
-            1 => Kind::Request,
-            2 => Kind::Response,
-            other => return Err(format!("a route of kind {other}")),
-        };
+        let kind = kind_of(kind).ok_or_else(|| format!("a route of kind {kind}"))?;
         let acknowledged = subscribe.acknowledges == Some(true);
         let short_headers = kind == Kind::Topic && subscribe.short_headers == Some(true);
         let key = RouteKey { kind, topic, type_name };
@@ -79,8 +96,9 @@ impl Peer {
         if self.served.get(&number).is_some_and(|old| !old.repeated && old.key != key) {
             self.unserve(number);
         }
-        let old = match self.take_served(number) {
-            Some(served) if served.key == key => served.sources,
+        let relays = Rc::clone(&self.remote.account().relays);
+        let (old, mut places) = match self.take_served(number) {
+            Some(served) if served.key == key => (served.sources, served.relays),
             Some(_) => return Err("a route number for two topics".into()),
             None => {
                 if self.served.len() >= MAX_ROUTES {
@@ -88,7 +106,7 @@ impl Peer {
                     self.refuse(number, &key, why, None);
                     return Ok(());
                 }
-                Vec::new()
+                (Vec::new(), relays.nothing())
             }
         };
         self.served_as.remove(&key);
@@ -106,13 +124,14 @@ impl Peer {
             return Ok(());
         };
         self.refused.forget(number);
-        let (sources, adopted) = match kind {
-            Kind::Topic => self.open_relays(&key, &subscribers, &old, with),
-            Kind::Request | Kind::Response => (self.sources_of_service(&key), Vec::new()),
+        let relays = match kind {
+            Kind::Topic => self.open_relays(&key, &subscribers, &old, &mut places, with),
+            Kind::Request | Kind::Response => {
+                let sources = self.sources_of_service(&key);
+                Relays { sources, adopted: Vec::new(), without: None }
+            }
         };
-        let relays = sources.iter().filter(|source| matches!(source, Source::Relay(..))).count();
-        let room = &self.remote.account().relays;
-        let relays = room.charge(relays).unwrap_or_else(|| room.nothing());
+        let Relays { sources, adopted, without } = relays;
         self.announcing.insert(number, now + READY_TIMEOUT);
         self.look_at_announcing = Some(now);
         let route = Route { kind, topic: hash };
@@ -140,7 +159,9 @@ impl Peer {
             key,
             subscribers: subscribers.iter().map(|subscriber| subscriber.gid).collect(),
             sources,
-            _charges: [charge, relays],
+            _room: charge,
+            relays: places,
+            without,
             repeated: true,
         };
         if served.key.kind != Kind::Topic {
@@ -218,15 +239,16 @@ impl Peer {
         lost.into_iter().for_each(|route| self.unserve(route));
     }
 
-    /// Opens the relays of a topic; those that the route has are kept. Returns them, and those among them that another
-    /// daemon of the peer's host had.
+    /// Opens the relays of a topic; those that the route has are kept. `places` is what counts for these, and then for
+    /// all.
     fn open_relays(
         &self,
         key: &RouteKey,
         subscribers: &[Subscriber],
         old: &[Source],
+        places: &mut Charge,
         with: &Surroundings<'_>,
-    ) -> (Vec<Source>, Vec<Gid>) {
+    ) -> Relays {
         let hash = |gid: &Gid| self.remote.get(gid).map_or_else(Vec::new, |e| e.type_hash.clone());
         let mut specs = relays(subscribers, hash);
         let there = |spec: &RelaySpec| {
@@ -235,16 +257,14 @@ impl Peer {
                 _ => None,
             })
         };
-        let room = self.remote.account().relays.left();
-        let refused = admit(&mut specs, |spec| there(spec).is_some(), room);
-        if refused > 0 {
-            let topic = &key.topic;
-            tracing::warn!(
-                topic,
-                refused,
-                "peer exceeded its relay limit; some of its subscriptions to this topic get no samples"
-            );
+        let asked = specs.len();
+        let mut without = None;
+        if admit(&mut specs, |spec| there(spec).is_some()) > 0 {
+            let why = format!("a topic has {MAX_RELAYS_OF_ROUTE} relays for a peer at most");
+            without = Some((why, None));
         }
+        let stay = specs.iter().filter(|spec| there(spec).is_some()).count();
+        drop(places.split(places.amount().saturating_sub(stay)));
         let (mut sources, mut adopted) = (Vec::new(), Vec::new());
         for spec in specs {
             if let Some(reader) = there(&spec) {
@@ -252,23 +272,41 @@ impl Peer {
                 sources.push(Source::Relay(spec, reader));
                 continue;
             }
-            if let Some(reader) = with.kept.borrow_mut().adopt(key, &spec, &self.identity) {
-                let source = Source::Relay(spec, reader);
-                adopted.push(source.gid());
-                sources.push(source);
+            let kept = with.kept.borrow_mut().adopt(key, &spec, &self.identity);
+            let Some(place) = self.remote.account().relays.charge(1) else {
+                let why = "this host has as many relays as a peer may have, or all peers";
+                without = Some((why.to_owned(), Some(ASK_AGAIN)));
                 continue;
-            }
-            let endpoint = EndpointSpec::new(&*key.topic, &*key.type_name, spec.qos)
-                .type_hash(spec.type_hash.clone());
-            match with.rings.open_reader(endpoint, spec.stands_for.clone()) {
-                Ok(reader) => sources.push(Source::Relay(spec, reader)),
+            };
+            let reader = match kept {
+                Some(reader) => Ok((reader, true)),
+                None => {
+                    let endpoint = EndpointSpec::new(&*key.topic, &*key.type_name, spec.qos)
+                        .type_hash(spec.type_hash.clone());
+                    let opened = with.rings.open_reader(endpoint, spec.stands_for.clone());
+                    opened.map(|reader| (reader, false))
+                }
+            };
+            match reader {
+                Ok((reader, is_adopted)) => {
+                    places.add(place);
+                    let source = Source::Relay(spec, reader);
+                    adopted.extend(is_adopted.then(|| source.gid()));
+                    sources.push(source);
+                }
                 Err(error) => {
                     let topic = &key.topic;
                     tracing::error!(topic, error, "could not open a relay: a peer gets no samples");
+                    let why = "the publishers' host could not open a relay; its log says why";
+                    without = Some((why.to_owned(), Some(ASK_AGAIN)));
                 }
             }
         }
-        (sources, adopted)
+        let missing = asked - sources.len();
+        let without = without.map(|(why, again)| {
+            (format!("{missing} of {asked} kinds of subscriptions get nothing: {why}"), again)
+        });
+        Relays { sources, adopted, without }
     }
 
     /// The stand-ins from which the calls, or responses, of a service are taken.
@@ -314,8 +352,16 @@ impl Peer {
             }
         }
         for ready in ready {
-            self.announcing.remove(&ready.route);
+            let number = ready.route;
+            self.announcing.remove(&number);
             self.say(Message::RouteReady(ready));
+            // What is ready is not refused: it is said in this order.
+            if let Some(served) = self.served.get(&number)
+                && let Some((reason, again)) = served.without.clone()
+            {
+                let key = served.key.clone();
+                self.refuse(number, &key, reason, again);
+            }
         }
         let waiting = self.announcing.len();
         self.look_at_announcing = (waiting > 0).then(|| now + poll_after(waiting));

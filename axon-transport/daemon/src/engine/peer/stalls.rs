@@ -3,27 +3,80 @@
 
 use std::{
     collections::HashMap,
+    rc::Rc,
     time::{Duration, Instant},
 };
 
 use super::routes::RouteKey;
+use crate::engine::account::{Charge, Meter};
 
 /// The longest wait.
 const LONGEST: Duration = Duration::from_secs(320);
 /// A peer that read for so long is as good as any.
 const FORGIVEN: Duration = Duration::from_secs(600);
-/// Stalls that are remembered, of all peers.
-const REMEMBERED: usize = 4096;
+/// What is remembered of all peers, in bytes, and of one at most. Each gets half of what the others leave.
+const ROOM: (usize, usize) = (8 << 20, 1 << 20);
+/// Bytes that count for a stall besides its names.
+const ENTRY: usize = 200;
+/// Peers of which something is remembered.
+const PEERS: usize = 4096;
+/// How often what is forgiven is looked for.
+const SWEEP: Duration = Duration::from_secs(1);
 
 /// What is known of peers that stalled, by who they proved to be, so that a new link or daemon id is no
 /// way around it.
-#[derive(Debug, Default)]
-pub(crate) struct Stalls(HashMap<(String, RouteKey), Stall>);
-
 #[derive(Debug)]
+pub(crate) struct Stalls {
+    of: HashMap<String, OfPeer>,
+    room: Rc<Meter>,
+    swept: Option<Instant>,
+}
+
+/// The stalls of one peer.
+#[derive(Debug)]
+struct OfPeer {
+    room: Rc<Meter>,
+    routes: HashMap<RouteKey, (Stall, Charge)>,
+    /// That of all routes for which there was no room. A peer gains nothing by stalling very many.
+    others: Option<Stall>,
+}
+
+#[derive(Clone, Copy, Debug)]
 struct Stall {
     wait: Duration,
     until: Instant,
+}
+
+impl Stall {
+    /// A peer stalled, and this is what was known of it.
+    fn after(before: Option<Self>, limit: Duration, now: Instant) -> Self {
+        let before = before.filter(|before| !before.is_forgiven(now));
+        let wait = before.map_or(limit, |before| (before.wait * 2).min(LONGEST.max(limit)));
+        Self { wait, until: now + wait }
+    }
+
+    fn is_forgiven(&self, now: Instant) -> bool {
+        now >= self.until + FORGIVEN
+    }
+}
+
+impl OfPeer {
+    /// What is known of a route.
+    fn get(&self, key: &RouteKey) -> Option<Stall> {
+        self.routes.get(key).map(|(stall, _)| *stall).or(self.others)
+    }
+
+    /// When the last wait is over.
+    fn until(&self) -> Option<Instant> {
+        let routes = self.routes.values().map(|(stall, _)| stall);
+        routes.chain(&self.others).map(|stall| stall.until).max()
+    }
+}
+
+impl Default for Stalls {
+    fn default() -> Self {
+        Self { of: HashMap::new(), room: Meter::new(ROOM.0), swept: None }
+    }
 }
 
 impl Stalls {
@@ -35,23 +88,44 @@ impl Stalls {
         limit: Duration,
         now: Instant,
     ) -> Duration {
-        self.0.retain(|_, stall| now < stall.until + FORGIVEN);
-        let limit = limit.max(Duration::from_secs(1));
-        let place = (who.to_owned(), key.clone());
-        let wait =
-            self.0.get(&place).map_or(limit, |stall| (stall.wait * 2).min(LONGEST.max(limit)));
-        if self.0.len() >= REMEMBERED && !self.0.contains_key(&place) {
-            let first = self.0.iter().min_by_key(|(_, stall)| stall.until);
-            let first = first.map(|(place, _)| place.clone());
-            first.map(|place| self.0.remove(&place));
+        self.sweep(now);
+        if self.of.len() >= PEERS && !self.of.contains_key(who) {
+            let first = self.of.iter().min_by_key(|(_, of)| of.until());
+            let first = first.map(|(who, _)| who.clone());
+            first.map(|who| self.of.remove(&who));
         }
-        self.0.insert(place, Stall { wait, until: now + wait });
-        wait
+        let of = self.of.entry(who.to_owned()).or_insert_with(|| OfPeer {
+            room: Meter::within(&self.room, ROOM.1),
+            routes: HashMap::new(),
+            others: None,
+        });
+        let stall = Stall::after(of.get(key), limit.max(Duration::from_secs(1)), now);
+        if let Some((known, _)) = of.routes.get_mut(key) {
+            *known = stall;
+        } else if let Some(charge) = of.room.charge(ENTRY + key.bytes()) {
+            of.routes.insert(key.clone(), (stall, charge));
+        } else {
+            of.others = Some(stall);
+        }
+        stall.wait
+    }
+
+    /// Forgets what is forgiven.
+    fn sweep(&mut self, now: Instant) {
+        if self.swept.is_some_and(|swept| now < swept + SWEEP) {
+            return;
+        }
+        self.swept = Some(now);
+        self.of.retain(|_, of| {
+            of.routes.retain(|_, (stall, _)| !stall.is_forgiven(now));
+            of.others = of.others.filter(|others| !others.is_forgiven(now));
+            of.until().is_some()
+        });
     }
 
     /// How long this peer is not served this yet.
     pub(crate) fn left(&self, who: &str, key: &RouteKey, now: Instant) -> Option<Duration> {
-        let stall = self.0.get(&(who.to_owned(), key.clone()))?;
+        let stall = self.of.get(who)?.get(key)?;
         Some(stall.until.saturating_duration_since(now)).filter(|left| !left.is_zero())
     }
 }
@@ -85,11 +159,36 @@ mod tests {
     }
 
     #[test]
-    fn what_is_remembered_is_bounded() {
-        let (mut stalls, now) = (Stalls::default(), Instant::now());
-        for number in 0..REMEMBERED + 10 {
-            stalls.add("pin arm", &key(number), Duration::from_secs(10), now);
+    fn a_peer_that_stalls_on_very_many_topics_waits_on_all_and_no_other_is_served_sooner() {
+        let (mut stalls, ten, now) = (Stalls::default(), Duration::from_secs(10), Instant::now());
+        stalls.add("pin leg", &key(0), ten, now);
+        for number in 0..60_000 {
+            stalls.add("pin arm", &key(number), ten, now);
         }
-        assert_eq!(stalls.0.len(), REMEMBERED);
+        assert!(stalls.room.held() <= ROOM.1 + ENTRY + 10, "{} bytes", stalls.room.held());
+        for number in (0..70_000).step_by(1_000) {
+            assert!(stalls.left("pin arm", &key(number), now).is_some(), "{number}");
+        }
+        assert_eq!(stalls.left("pin leg", &key(0), now), Some(ten));
+        assert_eq!(stalls.left("pin leg", &key(1), now), None);
+        stalls.add("pin leg", &key(1), ten, now);
+        assert_eq!(stalls.left("pin leg", &key(1), now), Some(ten));
+        assert_eq!(stalls.left("pin leg", &key(2), now), None);
+        // In time it is as good as any.
+        let later = now + LONGEST + FORGIVEN;
+        stalls.add("pin tail", &key(0), ten, later);
+        assert_eq!((stalls.of.len(), stalls.left("pin arm", &key(5), later)), (1, None));
+    }
+
+    #[test]
+    fn of_very_many_addresses_those_whose_wait_ends_last_are_remembered() {
+        let (mut stalls, now) = (Stalls::default(), Instant::now());
+        for number in 0..PEERS + 10 {
+            let at = now + Duration::from_millis(number as u64);
+            stalls.add(&format!("address {number}"), &key(0), Duration::from_secs(60), at);
+        }
+        assert_eq!(stalls.of.len(), PEERS);
+        assert!(stalls.left("address 0", &key(0), now).is_none());
+        assert!(stalls.left("address 10", &key(0), now).is_some());
     }
 }

@@ -9,8 +9,12 @@ use crate::{
 const LINKS: usize = 160;
 /// Connections that are being opened: 64, and 16 of listed peers, that were dialled to this host, and its own dials.
 const OPENING: usize = 64 + 16;
-/// Bytes of long messages of one identity, and of its unread data, as `account.rs` limits them.
-const OF_IDENTITY: usize = 128 << 20;
+/// Bytes of the messages of one identity that have not all come, as `account.rs` limits them.
+const OF_IDENTITY: usize = 64 << 20;
+/// What a stream holds besides: the rest of a packet, or a message that came in one.
+const OF_STREAM: usize = 9_000;
+/// A message beyond the memory of the identity, for each daemon id.
+const SPARE: usize = 32 << 10;
 /// Control messages of one connection that wait to be sent.
 const UNSENT: usize = (64 << 20) + MAX_FRAME;
 /// What one connection has unread, as `transport.rs` limits it.
@@ -30,12 +34,19 @@ pub(super) fn check(engine: &Engine, queue: usize, dials: usize) {
     assert!(held.unsent <= UNSENT && held.unhandled <= UNREAD, "{held:?}");
     // Control messages are handled one by one: what a pass leaves to the next is of data streams.
     assert!(held.events <= STREAMS_OPEN as usize * (held.links + 1), "{held:?}");
+    let mut identities = std::collections::HashMap::new();
     for (_, peer) in engine.peers.iter() {
         let (streams, bytes) = peer.inbound.held();
         let most = 8 * STREAMS_OPEN as usize;
         assert!(streams <= most, "{streams} streams of one peer");
         assert!(peer.inbound.listed() <= streams, "{} entries", peer.inbound.listed());
-        assert!(bytes <= OF_IDENTITY, "{bytes} bytes of one peer wait for rings");
+        let account = std::rc::Rc::as_ptr(peer.remote.account());
+        let (held, most) = identities.entry(account).or_insert((0, OF_IDENTITY));
+        *held += bytes;
+        *most += SPARE + streams * OF_STREAM;
+    }
+    for (held, most) in identities.into_values() {
+        assert!(held <= most, "{held} bytes of one identity have not come whole or wait for rings");
     }
     // One sample a flow may be more: none is longer than 64 MiB.
     let (waiting, _) = engine.backlog();

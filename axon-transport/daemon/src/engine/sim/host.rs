@@ -217,6 +217,29 @@ impl Host {
         self.engine.as_ref().map_or((0, 0), Engine::backlog)
     }
 
+    /// Bytes of samples that were read from QUIC and are not in a ring, of all peers.
+    pub(super) fn held_of_messages(&self) -> usize {
+        let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());
+        peers.map(|(_, peer)| peer.inbound.held().1).sum()
+    }
+
+    /// Bytes of refused routes that are remembered, of all peers.
+    pub(super) fn held_of_refusals(&self) -> usize {
+        let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());
+        peers.map(|(_, peer)| peer.held_of_refusals()).sum()
+    }
+
+    /// Publishers, servers and clients of all peers that are shown here.
+    pub(super) fn shown(&self) -> usize {
+        let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());
+        peers.map(|(_, peer)| peer.stand_ins()).sum()
+    }
+
+    /// Relays that are kept for daemons that were restarted.
+    pub(super) fn kept(&self) -> usize {
+        self.engine.iter().map(|engine| engine.peers.kept()).sum()
+    }
+
     /// Checks that the host holds no more than it may.
     pub(super) fn check_held(&mut self, now: Duration) {
         self.dialled.retain(|at| *at + LONGEST_DIAL >= now);
@@ -376,7 +399,7 @@ impl Host {
                     engine.handle_order(ToGateway::SendDatagram { to: from, bytes }, now);
                 }
             }
-            ToControl::Link(status) => {
+            ToControl::Link(status, _) => {
                 self.status.insert(status.peer.clone(), *status);
             }
             _ => {}

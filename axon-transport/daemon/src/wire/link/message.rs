@@ -255,6 +255,24 @@ pub struct RouteRefused {
     pub retry_s: Option<u32>,
 }
 
+/// The sender does not ask for a route that both graphs call for, or for some of its publishers.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct RouteUnasked {
+    /// Topic name.
+    #[n(0)]
+    pub topic: String,
+    /// Type name.
+    #[n(1)]
+    pub type_name: String,
+    /// 0 topic, 1 request, 2 response.
+    #[n(2)]
+    pub kind: u8,
+    /// Why, for people; absent: it asks for all after all, or has no use for it.
+    #[n(3)]
+    pub reason: Option<String>,
+}
+
 /// That sessions are the sender's. Said before GRAPH, once on each connection.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
@@ -302,6 +320,8 @@ pub enum Message {
     Received(Received),
     /// This route is not served.
     RouteRefused(RouteRefused),
+    /// This route is not asked for.
+    RouteUnasked(RouteUnasked),
     /// These sessions are mine.
     Owners(Owners),
     /// A silent link that this one succeeds is closed.
@@ -327,6 +347,7 @@ impl Message {
             Self::RouteRefused(m) => (11, to_map(m)),
             Self::Owners(m) => (12, to_map(m)),
             Self::LinkClosed(m) => (13, to_map(m)),
+            Self::RouteUnasked(m) => (14, to_map(m)),
             Self::Keys(m) => {
                 let mut map = Vec::new();
                 m.encode(&mut map);
@@ -337,7 +358,7 @@ impl Message {
 
     /// Whether [`decode`](Self::decode) knows this type.
     pub(super) fn is_known(kind: u8) -> bool {
-        matches!(kind, 1..=13 | 16..=19)
+        matches!(kind, 1..=14 | 16..=19)
     }
 
     /// The message of type `kind`, `None` for an unknown type.
@@ -356,6 +377,7 @@ impl Message {
             11 => Self::RouteRefused(from_map(kind, map)?),
             12 => Self::Owners(from_map(kind, map)?),
             13 => Self::LinkClosed(from_map(kind, map)?),
+            14 => Self::RouteUnasked(from_map(kind, map)?),
             16..=19 => Self::Keys(
                 KeyMessage::decode(kind, map)
                     .map_err(|e| FrameError::Malformed { kind, reason: e.to_string() })?,
@@ -393,6 +415,13 @@ impl Message {
                 ok(m.flows.len() <= LIMITS.endpoints, "more publishers than there can be")
             }
             Self::RouteRefused(m) => ok(m.reason.len() <= MAX_REASON, "a reason is too long"),
+            Self::RouteUnasked(m) => ok(
+                m.topic.len() <= LIMITS.name
+                    && m.type_name.len() <= LIMITS.name
+                    && m.kind <= 2
+                    && m.reason.as_ref().is_none_or(|reason| reason.len() <= MAX_REASON),
+                "a route is out of bounds",
+            ),
             Self::Owners(m) => ok(m.proofs.len() <= MAX_PROOFS, "too many proofs"),
             Self::Subscribe(m) => ok(
                 m.topic.len() <= LIMITS.name

@@ -15,5 +15,6 @@ pub use frame::{
 };
 pub use message::{
     Asserted, Elected, Graph, GraphResync, Hello, LastSeen, LinkClosed, MAX_PROOFS, Message,
-    Owners, Received, ReceivedOf, RouteReady, RouteRefused, Subscribe, Subscriber, Unsubscribe,
+    Owners, Received, ReceivedOf, RouteReady, RouteRefused, RouteUnasked, Subscribe, Subscriber,
+    Unsubscribe,
 };

@@ -75,6 +75,12 @@ pub(crate) fn messages() -> Vec<Message> {
             flows: vec![ReceivedOf { route: 1, publisher: Gid([7; 16]), sequence: 43, dropped: 1 }],
         }),
         Message::RouteRefused(RouteRefused { route: 1, reason: "why".into(), retry_s: Some(10) }),
+        Message::RouteUnasked(RouteUnasked {
+            topic: "/chatter".into(),
+            type_name: "std_msgs/msg/String".into(),
+            kind: 0,
+            reason: Some("why".into()),
+        }),
         Message::Unsubscribe(Unsubscribe { route: 1 }),
         Message::RouteReady(RouteReady { route: 1, publishers: vec![Gid([7; 16])] }),
         Message::Keepalive,

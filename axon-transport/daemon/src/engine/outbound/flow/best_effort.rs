@@ -25,7 +25,7 @@ use crate::{
     link::CloseCode,
 };
 
-/// A sample that is older than this once it has crossed the link is dropped for a newer one.
+/// A sample without a lifespan that is older than this once it has crossed the link is dropped for a newer one.
 const LIFE: Duration = Duration::from_millis(200);
 /// A sample that QUIC did not deliver within this time is given up.
 const LONGEST: Duration = Duration::from_secs(10);

@@ -69,6 +69,8 @@ struct State {
     disordered: u64,
     next: u32,
     waits_for_room: bool,
+    /// No relay and no stand-in can be opened.
+    fails: bool,
 }
 
 /// How far a relay has read and acknowledged each publisher.
@@ -211,6 +213,11 @@ impl SimRings {
         let state = &mut *self.state.borrow_mut();
         let published = state.publishers.get(&publisher).map_or(0, |p| p.published);
         state.expired.insert(publisher, published);
+    }
+
+    /// Whether no relay and no stand-in can be opened from now on.
+    pub(super) fn set_fails(&self, fails: bool) {
+        self.state.borrow_mut().fails = fails;
     }
 
     /// The endpoints that the host shows.
@@ -404,6 +411,9 @@ impl Rings for SimRings {
         _stands_for: Vec<Gid>,
     ) -> Result<Rc<dyn RingReader>, String> {
         let mut state = self.state.borrow_mut();
+        if state.fails {
+            return Err("no memory".into());
+        }
         state.next += 1;
         let late_join = spec.qos.durability == Durability::TransientLocal;
         // A volatile reader gets what is published after it; an ended publisher's are all old.
@@ -432,6 +442,9 @@ impl Rings for SimRings {
     }
 
     fn open_writer(&self, remote: &Endpoint) -> Result<Rc<dyn RingWriter>, String> {
+        if self.state.borrow().fails {
+            return Err("no memory".into());
+        }
         Ok(Rc::new(SimWriter { rings: self.clone(), endpoint: remote.clone(), last: Cell::new(0) }))
     }
 

@@ -6,7 +6,7 @@ use axon_shm::{
     ids::Gid,
     qos::{History, Reliability},
 };
-use axon_transport::{MessageInfo, internal::session::TakeLimit};
+use axon_transport::{Lifetime, MessageInfo, internal::session::TakeLimit};
 use bytes::Bytes;
 
 use super::{Cursors, SimRings};
@@ -89,7 +89,10 @@ impl RingReader for SimReader {
         most: TakeLimit,
         each: &mut dyn FnMut(MessageInfo, Bytes),
     ) -> usize {
-        let expired = self.rings.state.borrow().expired.get(publisher).copied();
+        let state = self.rings.state.borrow();
+        let expired = state.expired.get(publisher).copied();
+        let lifespan = state.publishers.get(publisher).and_then(|of| of.endpoint.qos.lifespan);
+        drop(state);
         let (mut samples, mut bytes, mut passed_over) = (0, 0, 0);
         while samples < most.samples
             && passed_over < PASSED_OVER
@@ -103,7 +106,9 @@ impl RingReader for SimReader {
                 continue;
             }
             (samples, bytes) = (samples + 1, bytes + payload.len());
-            each(MessageInfo::of(*publisher, sequence), payload.into());
+            let mut info = MessageInfo::of(*publisher, sequence);
+            info.lifetime = lifespan.map(|lifespan| Lifetime::new(Duration::ZERO, lifespan));
+            each(info, payload.into());
         }
         samples
     }

@@ -115,10 +115,8 @@ fn asked(world: &mut World, on: usize, topic: &str) -> u32 {
 }
 
 /// A data stream with some samples of a publisher.
-fn samples(route: u32, topic: &str, gid: Gid, numbers: std::ops::RangeInclusive<u64>) -> Vec<u8> {
-    let (reliable, short, acknowledged) = (true, false, false);
-    let header = StreamHeader { reliable, short, acknowledged, route, of: gid };
-    let mut bytes = header.encode().to_vec();
+fn samples(route: u32, topic: &str, gid: Gid, numbers: impl IntoIterator<Item = u64>) -> Vec<u8> {
+    let mut bytes = StreamHeader::plain(route, gid).encode().to_vec();
     let hash = TopicHash::new(0, topic, "T").unwrap();
     let mut frames = Frames::default();
     for number in numbers {
@@ -287,4 +285,68 @@ fn a_peer_of_another_protocol_version_is_refused_in_words_and_harms_nothing() {
     world.until(secs(5), |world| link(world, accepted).is_elected());
     world.run_for(secs(1));
     assert_eq!(world.received(pair), [1, 2, 3], "{}", world.describe());
+}
+
+/// A raw peer that publishes `/t`, and a subscription of a host to it.
+fn publisher(world: &mut World) -> (usize, Gid, u32) {
+    let subscription = world.hosts[0].rings.create_subscription("/t", Qos::keep_all(), None);
+    world.hosts[0].touch_graph();
+    let on = dial(world, 0);
+    greet(world, on, None);
+    world.until(secs(5), |world| link(world, on).is_elected());
+    say(world, on, &publishes("/t", of_raw(1), Qos::keep_all()));
+    let route = asked(world, on, "/t");
+    (on, subscription, route)
+}
+
+/// Samples that were refused since their numbers cannot be.
+fn refused_numbers(world: &World) -> u64 {
+    world.hosts[0].lost.get(&("/t".to_owned(), "ring")).copied().unwrap_or(0)
+}
+
+#[test]
+fn a_number_that_its_publisher_cannot_have_reached_is_refused_and_later_ones_arrive() {
+    let mut world = world(25, 1, HIGHEST);
+    let (on, subscription, route) = publisher(&mut world);
+    let far = 1 << 31;
+    let bytes = samples(route, "/t", of_raw(1), [1, far, 2, u64::MAX, far / 2, 3]);
+    let stream = world.with_raw(0, |raw, _| raw.links[on].open(bytes)).unwrap();
+    world.run_for(secs(2));
+    let received = |world: &World| world.hosts[0].rings.received(subscription, of_raw(1));
+    assert_eq!(received(&world), [1, 2, 3], "{}", world.describe());
+    assert_eq!(refused_numbers(&world), 3);
+    // In a pause a publisher can have come so far.
+    world.run_for(secs(600));
+    let bytes = samples(route, "/t", of_raw(1), [far, 2 * far]).split_off(24);
+    world.with_raw(0, |raw, _| raw.links[on].write_to(stream, bytes.into()));
+    world.run_for(secs(2));
+    assert_eq!(received(&world), [1, 2, 3, far], "{}", world.describe());
+    assert_eq!(refused_numbers(&world), 4);
+    assert!(link(&world, on).closed.is_none());
+}
+
+#[test]
+fn a_publisher_that_is_announced_again_does_not_begin_with_any_number() {
+    let mut world = world(26, 1, HIGHEST);
+    let (on, subscription, route) = publisher(&mut world);
+    let bytes = samples(route, "/t", of_raw(1), 1..=2);
+    world.with_raw(0, |raw, _| raw.links[on].open(bytes));
+    world.run_for(secs(1));
+    let gone = Graph { version: 2, before: 1, removed: vec![of_raw(1)], ..Graph::default() };
+    say(&mut world, on, &Message::Graph(gone));
+    world.run_for(secs(1));
+    link_messages(&mut world, on).clear();
+    let Message::Graph(graph) = publishes("/t", of_raw(1), Qos::keep_all()) else { return };
+    say(&mut world, on, &Message::Graph(Graph { version: 3, before: 2, ..graph }));
+    let route = asked(&mut world, on, "/t");
+    let bytes = samples(route, "/t", of_raw(1), [1 << 31, 3]);
+    world.with_raw(0, |raw, _| raw.links[on].open(bytes));
+    world.run_for(secs(1));
+    let received = world.hosts[0].rings.received(subscription, of_raw(1));
+    assert_eq!(received, [1, 2, 3], "{}", world.describe());
+    assert_eq!(refused_numbers(&world), 1);
+}
+
+fn link_messages(world: &mut World, link: usize) -> &mut Vec<Message> {
+    &mut world.raws[0].links[link].messages
 }

@@ -348,3 +348,44 @@ fn publishers_that_fill_a_link_have_equal_shares_whatever_their_samples_are() {
     println!("shares {shares:.2?} of {:.2} of the rate", all * 8.0 / 6.0 / 54e6);
     assert!(shares.iter().all(|share| (0.23..0.45).contains(share)), "{shares:?}");
 }
+
+/// Bursts of three best-effort samples of 4 MB over a link that is idle otherwise: each sample takes 0.6 s to cross. The
+/// numbers of those that arrive.
+fn bursts_of_images(lifespan: Option<Duration>) -> Vec<u64> {
+    let mut world = hosts(Congestion::Auto, radio(54, 0.0));
+    let qos = Qos { depth: 8, lifespan, ..Qos::sensor_data() };
+    let pair = world.pair(0, 1, "/image", qos);
+    world.until(secs(20), World::is_whole);
+    world.run_for(secs(1));
+    for _ in 0..2 {
+        for _ in 0..3 {
+            assert!(world.publish(pair, 4_000_000));
+            world.run_for(Duration::from_millis(1));
+        }
+        world.run_for(secs(10));
+    }
+    world.received(pair)
+}
+
+#[test]
+fn a_best_effort_sample_that_takes_long_crosses_an_idle_link() {
+    for lifespan in [None, Some(secs(5))] {
+        let mut world = hosts(Congestion::Auto, radio(54, 0.0));
+        let qos = Qos { lifespan, ..Qos::sensor_data() };
+        let pair = world.pair(0, 1, "/image", qos);
+        world.until(secs(20), World::is_whole);
+        world.run_for(secs(1));
+        for number in 1..=2 {
+            assert!(world.publish(pair, 4_000_000));
+            world.run_for(secs(5));
+            assert_eq!(world.received(pair).last(), Some(&number), "{}", world.describe());
+        }
+    }
+}
+
+#[test]
+fn best_effort_samples_may_be_as_old_as_their_lifespan() {
+    // Once it is known how long a sample takes, none but the newest of a burst comes within 200 ms.
+    assert_eq!(bursts_of_images(None), [1, 2, 3, 4, 6]);
+    assert_eq!(bursts_of_images(Some(secs(10))), [1, 2, 3, 4, 5, 6]);
+}

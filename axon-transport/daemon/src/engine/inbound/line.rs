@@ -1,0 +1,45 @@
+//! Streams that wait in line, each once.
+
+use std::collections::{HashSet, VecDeque};
+
+use super::Key;
+
+/// A line of streams.
+#[derive(Debug, Default)]
+pub(super) struct Line {
+    order: VecDeque<Key>,
+    all: HashSet<Key>,
+}
+
+impl Line {
+    /// Adds a stream behind the others, unless it is in line.
+    pub(super) fn add(&mut self, key: Key) {
+        if self.all.insert(key) {
+            self.order.push_back(key);
+        }
+    }
+
+    /// Removes a stream.
+    pub(super) fn remove(&mut self, key: &Key) {
+        if self.all.remove(key) {
+            self.order.retain(|other| other != key);
+        }
+    }
+
+    /// Removes all, in order.
+    pub(super) fn take(&mut self) -> VecDeque<Key> {
+        self.all.clear();
+        std::mem::take(&mut self.order)
+    }
+
+    /// Whether nobody is in line.
+    pub(super) fn is_empty(&self) -> bool {
+        self.order.is_empty()
+    }
+
+    /// How many are in line.
+    #[cfg(test)]
+    pub(super) fn len(&self) -> usize {
+        self.order.len()
+    }
+}

@@ -1,0 +1,143 @@
+//! Judges the numbers of a remote publisher's samples by what it can have published. A peer may say any number, and
+//! what is missing between two numbers counts as lost for good.
+
+use std::{cell::Cell, time::Duration};
+
+/// Samples that a publisher may have published before the first one that comes here.
+const MAX_FIRST: u64 = 1 << 48;
+/// Nanoseconds that no publisher is faster than for a sample, read or not.
+const NANOS: u64 = 125;
+/// The same as a rate a second.
+const RATE: u64 = 1_000_000_000 / NANOS;
+/// Samples that a ring may hold between the one that was taken last and the next that still stands.
+const SLACK: u64 = 1 << 20;
+/// The longest time that a sample is on its way before a later one comes with it: as long as a silent link stands.
+const ON_THE_WAY: Duration = Duration::from_secs(120);
+/// After this time nothing is refused that a reader would count: it ignores larger gaps.
+pub(super) const FORGOTTEN: Duration = Duration::from_secs((1 << 32) / RATE + 1);
+
+/// So many samples a publisher can publish in this time.
+fn samples_in(time: Duration) -> u64 {
+    time.as_secs().saturating_mul(RATE).saturating_add(u64::from(time.subsec_nanos()) / NANOS)
+}
+
+/// The numbers of one publisher.
+#[derive(Debug)]
+pub(super) struct Numbers {
+    /// The highest number that was written; 0 is none.
+    last: Cell<u64>,
+    /// By how much the next number may exceed it, as it was at `at`.
+    ahead: Cell<u64>,
+    at: Cell<Duration>,
+}
+
+impl Numbers {
+    /// None came yet.
+    pub(super) fn new(now: Duration) -> Self {
+        Self { last: Cell::new(0), ahead: Cell::new(SLACK), at: Cell::new(now) }
+    }
+
+    /// The highest number that was written; 0 is none.
+    pub(super) fn last(&self) -> u64 {
+        self.last.get()
+    }
+
+    /// The highest number that the publisher can have reached.
+    fn most(&self, now: Duration) -> u64 {
+        match self.last.get() {
+            0 => MAX_FIRST,
+            last => last.saturating_add(self.ahead(now)),
+        }
+    }
+
+    fn ahead(&self, now: Duration) -> u64 {
+        self.ahead.get().saturating_add(samples_in(now.saturating_sub(self.at.get())))
+    }
+
+    /// Whether a sample may have this number.
+    ///
+    /// # Errors
+    /// It cannot; the text says why.
+    pub(super) fn judge(&self, sequence: u64, now: Duration) -> Result<(), String> {
+        let most = self.most(now);
+        if sequence <= most {
+            return Ok(());
+        }
+        Err(format!(
+            "its number is {sequence}, and the one before it was {}: the publisher can have reached {most} at most",
+            self.last.get()
+        ))
+    }
+
+    /// A sample of this number was written.
+    pub(super) fn pass(&self, sequence: u64, now: Duration) {
+        let last = self.last.replace(sequence.max(self.last.get()));
+        // This one may have been on its way for so long, and a later one comes with it.
+        let most = SLACK + samples_in(ON_THE_WAY);
+        let used = if last == 0 { 0 } else { sequence.saturating_sub(last) };
+        self.ahead.set(self.ahead(now).saturating_sub(used).min(most));
+        self.at.set(now);
+    }
+
+    /// When its last number came, or when it began.
+    pub(super) fn at(&self) -> Duration {
+        self.at.get()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(seconds: u64) -> Duration {
+        Duration::from_secs(seconds)
+    }
+
+    #[test]
+    fn a_number_may_be_ahead_of_the_last_by_what_can_have_been_published_since() {
+        let numbers = Numbers::new(at(0));
+        numbers.judge(MAX_FIRST, at(0)).unwrap();
+        numbers.judge(MAX_FIRST + 1, at(0)).unwrap_err();
+        numbers.pass(7, at(0));
+        numbers.judge(7 + SLACK, at(0)).unwrap();
+        numbers.judge(8 + SLACK, at(0)).unwrap_err();
+        numbers.judge(7 + SLACK + RATE, at(1)).unwrap();
+        numbers.judge(8 + SLACK + RATE, at(1)).unwrap_err();
+        // After days it is what can have been lost.
+        numbers.judge(7 + SLACK + 200_000 * RATE, at(200_000)).unwrap();
+    }
+
+    #[test]
+    fn many_numbers_are_together_no_further_ahead_than_one() {
+        let numbers = Numbers::new(at(0));
+        numbers.pass(1, at(0));
+        for step in 1..=4 {
+            let sequence = 1 + step * SLACK / 4;
+            numbers.judge(sequence, at(0)).unwrap();
+            numbers.pass(sequence, at(0));
+        }
+        numbers.judge(2 + SLACK, at(0)).unwrap_err();
+    }
+
+    #[test]
+    fn a_sample_that_was_on_its_way_for_long_leaves_the_next_one_its_number() {
+        let numbers = Numbers::new(at(0));
+        // A link was cut for 100 s: the sample from before comes with the newest one.
+        numbers.pass(1, at(0));
+        numbers.pass(2, at(100));
+        numbers.judge(2 + 99 * RATE, at(100)).unwrap();
+        // But not the sum of all such times.
+        numbers.pass(3, at(10_000));
+        numbers.judge(3 + SLACK + 121 * RATE, at(10_000)).unwrap_err();
+    }
+
+    #[test]
+    fn an_older_number_changes_nothing() {
+        let numbers = Numbers::new(at(0));
+        numbers.pass(10, at(0));
+        numbers.judge(3, at(0)).unwrap();
+        numbers.pass(3, at(0));
+        assert_eq!(numbers.last(), 10);
+        numbers.judge(11 + SLACK, at(0)).unwrap_err();
+    }
+}

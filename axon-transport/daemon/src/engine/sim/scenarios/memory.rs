@@ -1,0 +1,274 @@
+//! What peers have this host hold of messages that have not all come, and that honest ones go on all the same.
+
+use std::time::Duration;
+
+use axon_envelope::inner;
+use axon_shm::{
+    ids::{DaemonId, Gid},
+    qos::Qos,
+};
+use axon_transport::{
+    config::Config,
+    graph::{Endpoint, EndpointKind},
+};
+use bytes::Bytes;
+
+use crate::{
+    engine::{
+        inbound::StreamHeader,
+        sim::{
+            network::{Path, Rate},
+            rings::FOREIGN,
+            tests::{millis, secs},
+            world::World,
+        },
+    },
+    link::{Graph, Hello, Message, Subscribe, Subscriber},
+};
+
+/// Publishers of one topic of the hostile peer: as many as one route shows.
+const PUBLISHERS: u32 = 1024;
+/// What comes of each message, and what its length says.
+const COMES: usize = 31 << 10;
+const SAYS: u32 = 32 << 10;
+
+/// A peer of this number dials under a daemon id. Returns its link once it is elected.
+fn linked_as(world: &mut World, peer: usize, id: u8) -> usize {
+    let to = world.hosts[0].address;
+    let number = world.with_raw(peer, |raw, now| raw.dial(to, now));
+    world.until(secs(5), |world| world.raws[peer].links[number].connected);
+    world.with_raw(peer, |raw, _| {
+        let hello = Hello { daemon: DaemonId([id; 16]), ..raw.hello() };
+        raw.links[number].say(&Message::Hello(hello));
+    });
+    world.until(secs(5), |world| world.raws[peer].links[number].is_elected());
+    number
+}
+
+/// The GID of an endpoint that a daemon id announces.
+fn gid(id: u8, number: u32) -> Gid {
+    let mut gid = [0; 16];
+    gid[..12].copy_from_slice(&FOREIGN);
+    gid[12..].copy_from_slice(&(u32::from(id) << 16 | number).to_be_bytes());
+    Gid(gid)
+}
+
+fn endpoint(kind: EndpointKind, gid: Gid, topic: &str) -> Endpoint {
+    Endpoint {
+        gid,
+        kind,
+        topic: topic.into(),
+        type_name: "T".into(),
+        type_hash: Vec::new(),
+        qos: Qos::keep_all(),
+        node: "node".into(),
+        namespace: "/".into(),
+        enclave: String::new(),
+    }
+}
+
+/// Announces so many publishers of a topic.
+fn publishes(world: &mut World, link: usize, id: u8, topic: &str, count: u32) {
+    let publisher = |n| endpoint(EndpointKind::Publisher, gid(id, n), topic);
+    let added = (0..count).map(publisher).collect();
+    let graph = Message::Graph(Graph { version: 1, added, ..Graph::default() });
+    world.with_raw(0, |raw, _| raw.links[link].say(&graph));
+}
+
+/// Waits until the host asked for a topic. Returns the number of its route.
+fn asked(world: &mut World, link: usize, topic: &str) -> u32 {
+    let route = |world: &World| {
+        world.raws[0].links[link].messages.iter().find_map(|message| match message {
+            Message::Subscribe(subscribe) if subscribe.topic == topic => Some(subscribe.route),
+            _ => None,
+        })
+    };
+    world.until(secs(20), |world| route(world).is_some());
+    route(world).unwrap()
+}
+
+/// Announces publishers of a topic under a daemon id, and has a stream of each stop before the end of its first
+/// message.
+fn stop_within_messages(world: &mut World, id: u8) {
+    let topic = format!("/topic_{id}");
+    world.hosts[0].rings.create_subscription(&topic, Qos::keep_all(), None);
+    world.hosts[0].touch_graph();
+    let number = linked_as(world, 0, id);
+    publishes(world, number, id, &topic, PUBLISHERS);
+    let route = asked(world, number, &topic);
+    let body = Bytes::from(vec![0x5a; COMES]);
+    for publisher in 0..PUBLISHERS {
+        world.with_raw(0, |raw, _| {
+            let mut bytes = StreamHeader::plain(route, gid(id, publisher)).encode().to_vec();
+            bytes.extend_from_slice(&SAYS.to_be_bytes());
+            bytes.extend_from_slice(&body);
+            raw.links[number].open(bytes).expect("a stream");
+        });
+    }
+    world.run_for(secs(2));
+}
+
+#[test]
+fn short_messages_that_have_not_all_come_are_bounded_over_all_ids_of_an_identity() {
+    let mut world = World::new(80, 1, |_| Config::default());
+    world.add_raw(Config::default(), DaemonId([0xff; 16]));
+    let rate = Rate::new(1_000_000_000, millis(20));
+    let path = Path { delay: millis(1), rate: Some(rate), ..Path::default() };
+    world.network.set_default_path(path);
+    for id in 0xf0..0xf4 {
+        stop_within_messages(&mut world, id);
+    }
+    let held = world.hosts[0].held_of_messages();
+    let asked = 4 * PUBLISHERS as usize * COMES;
+    assert!(held <= 65 << 20, "{} MiB of {} MiB", held >> 20, asked >> 20);
+    assert!(held > 56 << 20, "as much as it may: {} MiB", held >> 20);
+    assert!(world.raws[0].links.iter().all(|link| link.closed.is_none()), "{}", world.describe());
+}
+
+#[test]
+fn messages_that_become_long_and_wait_for_a_reader_are_bounded() {
+    const LENGTH: usize = 8 << 20;
+    const MANY: u32 = 40;
+    let mut world = World::new(86, 1, |_| Config::default());
+    world.add_raw(Config::default(), DaemonId([0xff; 16]));
+    // A reader that takes nothing.
+    world.hosts[0].rings.create_subscription("/t", Qos::keep_all(), Some(0));
+    world.hosts[0].touch_graph();
+    let number = linked_as(&mut world, 0, 0xf0);
+    publishes(&mut world, number, 0xf0, "/t", MANY);
+    let route = asked(&mut world, number, "/t");
+    let packed = zstd::bulk::compress(&vec![0; LENGTH], 1).unwrap();
+    for publisher in 0..MANY {
+        let of = gid(0xf0, publisher);
+        let header = inner::Header {
+            gid: of.0,
+            sequence: 1,
+            source_timestamp: 0,
+            request_id: inner::RequestId::default(),
+            compressed: true,
+            age_ms: 0,
+            uncompressed_len: LENGTH as u32,
+        };
+        let header = header.encode();
+        let mut bytes = StreamHeader::plain(route, of).encode().to_vec();
+        bytes.extend_from_slice(&((header.len() + packed.len()) as u32).to_be_bytes());
+        bytes.extend_from_slice(&header);
+        bytes.extend_from_slice(&packed);
+        world.with_raw(0, |raw, _| raw.links[number].open(bytes).expect("a stream"));
+    }
+    world.run_for(secs(2));
+    let held = world.hosts[0].held_of_messages();
+    assert!((32 << 20..=64 << 20).contains(&held), "{} MiB", held >> 20);
+    assert!(world.raws[0].links[number].closed.is_none(), "{}", world.describe());
+}
+
+/// So many publishers publish a message of this length at once. Whether all arrive.
+fn all_arrive(seed: u64, publishers: usize, length: usize, rounds: u64) {
+    let mut world = World::new(seed, 2, |_| Config::default());
+    let rate = Rate::new(1_000_000_000, millis(20));
+    let path = Path { delay: millis(5), rate: Some(rate), loss: 0.01, ..Path::default() };
+    world.network.set_default_path(path);
+    let pairs: Vec<_> = (0..publishers)
+        .map(|number| world.pair(0, 1, &format!("/topic_{number}"), Qos::keep_all()))
+        .collect();
+    world.until(secs(20), World::is_whole);
+    world.run_for(secs(3));
+    for _ in 0..rounds {
+        for pair in &pairs {
+            assert!(world.publish(*pair, length));
+        }
+    }
+    let all = |world: &World| pairs.iter().all(|pair| world.received(*pair).len() as u64 == rounds);
+    world.until(Duration::from_secs(60), all);
+}
+
+#[test]
+fn messages_of_many_publishers_at_once_arrive_however_long_they_are() {
+    all_arrive(81, 12, 8 << 20, 1);
+    all_arrive(82, 2_200, 31 << 10, 1);
+}
+
+fn subscribe(route: u32, topic: &str, subscriber: Gid) -> Message {
+    Message::Subscribe(Subscribe {
+        route,
+        topic: topic.into(),
+        type_name: "T".into(),
+        kind: 0,
+        subscribers: vec![Subscriber { gid: subscriber, qos: Qos::keep_all() }],
+        last: Vec::new(),
+        acknowledges: Some(true),
+        short_headers: None,
+    })
+}
+
+#[test]
+fn refused_routes_that_are_remembered_are_bounded_in_bytes_over_all_ids_of_an_identity() {
+    let mut world = World::new(83, 1, |_| {
+        let mut config = Config::default();
+        config.link.graph = 1 << 20;
+        config
+    });
+    world.add_raw(Config::default(), DaemonId([0xff; 16]));
+    for id in 0xf0..0xf3 {
+        let number = linked_as(&mut world, 0, id);
+        for route in 0..5_000 {
+            let topic = format!("/{route:0>500}");
+            let message = subscribe(route, &topic, gid(id, route));
+            world.with_raw(0, |raw, _| raw.links[number].say(&message));
+        }
+        world.run_for(secs(5));
+        let refused = |m: &&Message| matches!(m, Message::RouteRefused(_));
+        assert!(world.raws[0].links[number].messages.iter().filter(refused).count() > 3_000);
+    }
+    let held = world.hosts[0].held_of_refusals();
+    assert!((1 << 19..=2 << 20).contains(&held), "{} KiB", held >> 10);
+    assert!(world.raws[0].links.iter().all(|link| link.closed.is_none()), "{}", world.describe());
+}
+
+#[test]
+fn publishers_of_a_topic_are_bounded_over_all_ids_of_an_identity() {
+    let mut world = World::new(84, 1, |_| Config::default());
+    world.add_raw(Config::default(), DaemonId([0xff; 16]));
+    world.hosts[0].rings.create_subscription("/t", Qos::keep_all(), None);
+    world.hosts[0].touch_graph();
+    for id in 0xf0..0xf3 {
+        let number = linked_as(&mut world, 0, id);
+        publishes(&mut world, number, id, "/t", 600);
+        world.run_for(secs(2));
+    }
+    assert_eq!(world.hosts[0].shown(), 1024, "{}", world.describe());
+    // Those of one id that leaves make room for others.
+    world.with_raw(0, |raw, now| raw.close(0, now));
+    world.run_for(secs(2));
+    world.hosts[0].touch_graph();
+    world.hosts[0].rings.create_subscription("/t", Qos::keep_all(), None);
+    world.run_for(secs(2));
+    assert_eq!(world.hosts[0].shown(), 1024, "{}", world.describe());
+}
+
+/// The daemon of a peer is killed that had KEEP_ALL relays for so many topics, and the next one says so.
+fn restarts(world: &mut World, peer: usize, id: u8, topics: u32) {
+    let subscription = endpoint(EndpointKind::Subscription, gid(id, 0), "/moved");
+    let graph = Graph { version: 1, added: vec![subscription], ..Graph::default() };
+    let number = linked_as(world, peer, id);
+    world.with_raw(peer, |raw, _| raw.links[number].say(&Message::Graph(graph.clone())));
+    for route in 0..topics {
+        let message = subscribe(route, &format!("/topic_{route}"), gid(id, 1 + route));
+        world.with_raw(peer, |raw, _| raw.links[number].say(&message));
+    }
+    world.run_for(secs(3));
+    let next = linked_as(world, peer, id + 1);
+    world.with_raw(peer, |raw, _| raw.links[next].say(&Message::Graph(graph)));
+    world.run_for(secs(1));
+}
+
+#[test]
+fn relays_that_are_kept_for_one_identity_leave_room_for_those_of_another() {
+    let mut world = World::new(85, 1, |_| Config::default());
+    world.add_raw(Config::default(), DaemonId([0xff; 16]));
+    world.add_raw(Config::default(), DaemonId([0xfe; 16]));
+    restarts(&mut world, 0, 0xf4, 3_000);
+    assert_eq!(world.hosts[0].kept(), 1_024, "{}", world.describe());
+    restarts(&mut world, 1, 0xf8, 10);
+    assert_eq!(world.hosts[0].kept(), 1_034, "{}", world.describe());
+}
