@@ -15,7 +15,7 @@ pub(crate) use self::{host::Namespaces, round::Round};
 use self::{
     host::{Ending, Host, Player, held},
     judge::{Ended, Past, come_to_rest, missed},
-    round::Done,
+    round::{Done, Gone},
 };
 use crate::sample::{LONGEST, Random};
 
@@ -124,8 +124,8 @@ pub(crate) fn run(plan: Plan, time: Duration, seed: u64, namespaces: &Namespaces
     assert!(most > 0, "no shared memory was found");
     let Game { mut players, done, mut past, leaving, host, .. } = game.without_leaving();
     drop(leaving);
-    come_to_rest(&mut players, &mut past);
-    let gone = missed(&mut players, &past);
+    let unmet = come_to_rest(&mut players, &mut past);
+    let gone = Gone { unmet, ..missed(&mut players, &past) };
     let mut counts = [0; 3];
     for player in &mut players {
         let answer = player.ask("count");
