@@ -28,6 +28,8 @@ use axon_transport::{
     status::{OutOfRangeStatus, ReaderStatus, TopicStatus, WriterStatus},
 };
 
+use super::losses::ByTopic;
+
 /// Publishers, and readers, of a topic that the status lists.
 const LISTED: usize = 64;
 /// Readers that are looked at for one status: so many that it still takes a fraction of a second.
@@ -39,10 +41,7 @@ type Sessions = Registry<Arc<PassedFd>>;
 type Session = SessionEntry<Arc<PassedFd>>;
 
 /// All topics with an endpoint somewhere.
-pub(super) fn topics(
-    registry: &Sessions,
-    lost: &BTreeMap<String, BTreeMap<&'static str, u64>>,
-) -> Vec<TopicStatus> {
+pub(super) fn topics(registry: &Sessions, lost: &ByTopic) -> Vec<TopicStatus> {
     let mut topics: BTreeMap<(String, String), TopicStatus> = BTreeMap::new();
     let mut rings = HashMap::new();
     for local in registry.endpoints().filter(|e| e.endpoint.kind != EndpointKind::Node) {
