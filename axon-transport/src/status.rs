@@ -152,7 +152,9 @@ pub struct TopicStatus {
     /// them within its depth; `blocked`, `no_memory`, `pinned` as for [`WriterStatus`]. And samples of
     /// publishers here that another host did not acknowledge: `link_ended` when its link did (so are
     /// requests and responses that were not sent), `publisher_ended` ten seconds without progress after
-    /// their publisher did, `stalled` when its readers took nothing. On the way to other hosts: `queue`
+    /// their publisher did, `stalled` when its readers took nothing. `publisher_ended` also counts what a
+    /// process that shares no memory left when it ended and no reader took for a second, and `ring` what
+    /// the daemon could not write for such a process. On the way to other hosts: `queue`
     /// while more waited than the history's depth, `late` for what could not arrive in time, `no_key` while there
     /// was none, `no_link`, `no_route` when the other host did not want them any more. On arrival: `ring`, `no_link`,
     /// `no_route`, `no_client`.

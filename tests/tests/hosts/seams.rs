@@ -22,7 +22,16 @@ fn spec(qos: Qos) -> EndpointSpec {
 
 /// A publisher on the first host and a subscription on the second that have met.
 fn across(hosts: &[Host; 2], qos: Qos) -> (Publisher, Subscription) {
-    let (here, there) = (hosts[0].session("publisher"), hosts[1].session("subscription"));
+    across_with(hosts, qos, [true, true])
+}
+
+/// The same; each says whether it shares memory with its daemon.
+fn across_with(hosts: &[Host; 2], qos: Qos, shm: [bool; 2]) -> (Publisher, Subscription) {
+    let session = |host: usize, name| match shm[host] {
+        true => hosts[host].session(name),
+        false => hosts[host].relayed_session(name),
+    };
+    let (here, there) = (session(0, "publisher"), session(1, "subscription"));
     let subscription = there.create_subscription(spec(qos)).unwrap();
     let publisher = here.create_publisher(spec(qos)).unwrap();
     assert!(publisher.wait_matched(1, PATIENCE) && subscription.wait_matched(1, PATIENCE));
@@ -125,15 +134,16 @@ fn what_a_killed_process_published_into_a_cut_link_arrives() {
     assert_eq!((tally.taken, tally.lost), (100, 0), "{tally:?}");
 }
 
-/// Publishes while daemons are killed and started again.
-fn outlasts(killed: &[usize]) {
+/// Publishes while daemons are killed and started again; each end says whether it shares memory with its daemon.
+fn outlasts(killed: &[usize], shm: [bool; 2]) {
+    const SAMPLES: u64 = 500;
     let mut hosts = Plan::new([classic(&[]), classic(&[])]).start();
-    let (publisher, subscription) = across(&hosts, Qos::keep_all());
+    let (publisher, subscription) = across_with(&hosts, Qos::keep_all(), shm);
     let publishing = thread::spawn(move || {
-        publish(&publisher, 500, 4096, Duration::from_millis(5));
+        publish(&publisher, SAMPLES, 4096, Duration::from_millis(5));
         publisher
     });
-    let taking = thread::spawn(move || (take(&subscription, 500), subscription));
+    let taking = thread::spawn(move || (take(&subscription, SAMPLES), subscription));
     thread::sleep(Duration::from_millis(500));
     for host in killed {
         kill(hosts[*host].status().pid);
@@ -142,22 +152,65 @@ fn outlasts(killed: &[usize]) {
         hosts[*host].daemon = None;
         hosts[*host].start();
     }
-    let _publisher = publishing.join().unwrap();
-    let (numbers, _subscription) = taking.join().unwrap();
-    all_came(&format!("{killed:?}"), &hosts, &numbers, 500);
+    let publisher = publishing.join().unwrap();
+    let (numbers, subscription) = taking.join().unwrap();
+    all_came(&format!("{killed:?}, {shm:?}"), &hosts, &numbers, SAMPLES);
+    assert!(publisher.wait_acknowledged(PATIENCE), "all came");
+    assert!(subscription.take(&mut Vec::new()).is_none(), "nothing is repeated");
+    assert_eq!((subscription.lost(), publisher.given_up()), (0, 0));
 }
 
 #[test]
 fn keep_all_outlasts_a_killed_daemon_of_the_publisher() {
-    outlasts(&[0]);
+    outlasts(&[0], [true, true]);
 }
 
 #[test]
 fn keep_all_outlasts_a_killed_daemon_of_the_subscription() {
-    outlasts(&[1]);
+    outlasts(&[1], [true, true]);
 }
 
 #[test]
 fn keep_all_outlasts_killed_daemons_of_both() {
-    outlasts(&[0, 1]);
+    outlasts(&[0, 1], [true, true]);
+}
+
+#[test]
+fn keep_all_of_a_relayed_publisher_outlasts_a_killed_daemon_of_its_own() {
+    outlasts(&[0], [false, true]);
+}
+
+#[test]
+fn keep_all_of_a_relayed_publisher_outlasts_a_killed_daemon_of_the_subscription() {
+    outlasts(&[1], [false, true]);
+}
+
+#[test]
+fn keep_all_of_a_relayed_publisher_outlasts_killed_daemons_of_both() {
+    outlasts(&[0, 1], [false, true]);
+}
+
+#[test]
+fn keep_all_for_a_relayed_subscription_outlasts_a_killed_daemon_of_the_publisher() {
+    outlasts(&[0], [true, false]);
+}
+
+#[test]
+fn keep_all_for_a_relayed_subscription_outlasts_a_killed_daemon_of_its_own() {
+    outlasts(&[1], [true, false]);
+}
+
+#[test]
+fn keep_all_for_a_relayed_subscription_outlasts_killed_daemons_of_both() {
+    outlasts(&[0, 1], [true, false]);
+}
+
+#[test]
+fn keep_all_between_relayed_sessions_outlasts_a_killed_daemon_of_the_publisher() {
+    outlasts(&[0], [false, false]);
+}
+
+#[test]
+fn keep_all_between_relayed_sessions_outlasts_a_killed_daemon_of_the_subscription() {
+    outlasts(&[1], [false, false]);
 }

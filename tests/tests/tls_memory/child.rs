@@ -1,27 +1,27 @@
-//! The process whose memory is looked at: both ends of one QUIC connection.
+//! The process whose memory is looked at: both ends of one QUIC connection, or one end.
 
-use std::any::Any;
 use std::fmt;
 use std::fs::File;
 use std::io::{Read, Write};
-use std::net::{Ipv4Addr, SocketAddr};
-use std::sync::{Arc, Mutex};
+use std::net::Ipv4Addr;
+use std::sync::Arc;
 use std::time::Duration;
 
 use axon_tls::qkd::{Psk, PskResolver, derive_psk};
-use axon_tls::{Cipher, PskKex, quic};
-use quinn::crypto::{
-    self, ExportKeyingMaterialError, HeaderKey, KeyPair, Keys, PacketKey, UnsupportedVersion,
-};
-use quinn::{Connection, Endpoint, Side, TransportConfig};
-use quinn_proto::transport_parameters::TransportParameters;
-use quinn_proto::{ConnectionId, TransportError};
+use axon_tls::{Cipher, PskKex, hybrid, quic};
+use quinn::{ClientConfig, Connection, Endpoint, ServerConfig, TransportConfig};
+use rustls::version::TLS13;
 use tokio::runtime::{Builder, Runtime};
 use zeroize::Zeroizing;
 
-/// Set in the environment of the child: cipher and mode.
+use crate::certificates;
+use crate::transcript::{Messages, TappedServer};
+
+/// Set in the environment of the child: cipher, mode, and which ends it has.
 pub(crate) const ASKED: &str = "AXON_TLS_MEMORY_CHILD";
-/// What the child says in front of its transcript, when it is connected and data was exchanged.
+/// What it says in front of the port of its server, where it has a server alone.
+pub(crate) const LISTENS: &str = "listens: ";
+/// What the child says in front of its transcript, if it has both ends, when it is connected and data was exchanged.
 pub(crate) const CONNECTED: &str = "connected: ";
 /// What it says when everything that had a secret is dropped.
 pub(crate) const DROPPED: &str = "dropped: ";
@@ -32,6 +32,41 @@ pub(crate) const SERVER_SAE: &str = "sae-server";
 pub(crate) const EXPORTER: &str = "EXPORTER-axon-test";
 const SENT: usize = 70_000;
 
+/// How a connection's secrets come about.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Mode {
+    Psk(PskKex),
+    Hybrid,
+}
+
+impl fmt::Display for Mode {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Psk(kex) => kex.fmt(f),
+            Self::Hybrid => f.write_str("hybrid"),
+        }
+    }
+}
+
+/// Which ends the child has.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Has {
+    Both,
+    /// A client, of the server at this port.
+    Client(u16),
+    Server,
+}
+
+impl fmt::Display for Has {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Both => f.write_str("both"),
+            Self::Client(port) => port.fmt(f),
+            Self::Server => f.write_str("server"),
+        }
+    }
+}
+
 /// What the child leaves in memory on purpose, from the key that it is given.
 pub(crate) fn marks(key: &[u8; 32]) -> [[u8; 32]; 2] {
     [0x55, 0xaa].map(|mask| key.map(|byte| byte ^ mask))
@@ -39,8 +74,10 @@ pub(crate) fn marks(key: &[u8; 32]) -> [[u8; 32]; 2] {
 
 pub(crate) fn run_if_asked() {
     let Ok(asked) = std::env::var(ASKED) else { return };
-    let (cipher, kex) = asked.split_once(' ').unwrap();
-    let (cipher, kex) = (cipher.parse().unwrap(), kex.parse().unwrap());
+    let words: Vec<&str> = asked.split(' ').collect();
+    let &[cipher, mode, has] = words.as_slice() else { panic!("{asked}") };
+    let cipher: Cipher = cipher.parse().unwrap();
+    let mode = if mode == "hybrid" { Mode::Hybrid } else { Mode::Psk(mode.parse().unwrap()) };
 
     // not through a buffer that keeps it, and not where moves would copy it
     let mut parent = File::open("/dev/stdin").unwrap();
@@ -50,7 +87,11 @@ pub(crate) fn run_if_asked() {
     let held: Vec<u8> = key.iter().map(|byte| byte ^ 0x55).collect();
 
     let runtime = Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
-    let ends = Ends::connect(&runtime, &key, cipher, kex);
+    let ends = match has {
+        "both" => Ends::connect(&runtime, &key, cipher, mode),
+        "server" => Ends::accept(&runtime, &key, cipher, mode),
+        port => Ends::dial(&runtime, &key, cipher, mode, port.parse().unwrap()),
+    };
     drop(key);
     say(CONNECTED, &ends.transcript());
     wait(&mut parent);
@@ -85,31 +126,64 @@ fn wait(parent: &mut File) {
 }
 
 struct Ends {
-    client: Endpoint,
-    server: Endpoint,
-    connections: [Connection; 2],
+    endpoints: Vec<Endpoint>,
+    connections: Vec<Connection>,
     messages: Messages,
 }
 
-impl Ends {
-    fn connect(runtime: &Runtime, key: &[u8; 32], cipher: Cipher, kex: PskKex) -> Self {
-        let derive = || Arc::new(derive_psk(key, KEY_ID, CLIENT_SAE, SERVER_SAE, cipher).unwrap());
-        let messages = Messages::default();
-        let mut server =
-            quic::qkd_server(Arc::new(OneKey(derive())), cipher, kex, quic::ALPN).unwrap();
-        server.crypto = Arc::new(TappedServer(server.crypto.clone(), messages.clone()));
-        let mut client = quic::qkd_client(derive(), kex, quic::ALPN).unwrap();
+fn client_config(key: &[u8; 32], cipher: Cipher, mode: Mode) -> ClientConfig {
+    let mut config = match mode {
+        Mode::Psk(kex) => quic::qkd_client(Arc::new(psk(key, cipher)), kex, quic::ALPN).unwrap(),
+        Mode::Hybrid => {
+            let provider = Arc::new(hybrid::provider_with(cipher));
+            let builder = rustls::ClientConfig::builder_with_provider(provider);
+            let builder = builder.with_protocol_versions(&[&TLS13]).unwrap();
+            quic::hybrid_client_with(certificates::client(builder)).unwrap()
+        }
+    };
+    config.transport_config(transport());
+    config
+}
 
-        // how long a closed connection is waited for depends on it
-        let mut transport = TransportConfig::default();
-        transport.initial_rtt(Duration::from_millis(20));
-        let transport = Arc::new(transport);
-        client.transport_config(Arc::clone(&transport));
-        server.transport_config(transport);
+fn server_config(key: &[u8; 32], cipher: Cipher, mode: Mode) -> ServerConfig {
+    let mut config = match mode {
+        Mode::Psk(kex) => {
+            let keys = Arc::new(OneKey(Arc::new(psk(key, cipher))));
+            quic::qkd_server(keys, cipher, kex, quic::ALPN).unwrap()
+        }
+        Mode::Hybrid => {
+            let provider = Arc::new(hybrid::provider_with(cipher));
+            let builder = rustls::ServerConfig::builder_with_provider(provider);
+            let builder = builder.with_protocol_versions(&[&TLS13]).unwrap();
+            quic::hybrid_server_with(certificates::server(builder)).unwrap()
+        }
+    };
+    config.transport_config(transport());
+    config
+}
+
+fn psk(key: &[u8; 32], cipher: Cipher) -> Psk {
+    derive_psk(key, KEY_ID, CLIENT_SAE, SERVER_SAE, cipher).unwrap()
+}
+
+/// How long a closed connection is waited for depends on the round trip.
+fn transport() -> Arc<TransportConfig> {
+    let mut transport = TransportConfig::default();
+    transport.initial_rtt(Duration::from_millis(20));
+    Arc::new(transport)
+}
+
+const LOCALHOST: Ipv4Addr = Ipv4Addr::LOCALHOST;
+
+impl Ends {
+    fn connect(runtime: &Runtime, key: &[u8; 32], cipher: Cipher, mode: Mode) -> Self {
+        let messages = Messages::default();
+        let mut server = server_config(key, cipher, mode);
+        server.crypto = Arc::new(TappedServer(server.crypto.clone(), messages.clone()));
+        let client = client_config(key, cipher, mode);
 
         runtime.block_on(async move {
-            let localhost = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
-            let server = Endpoint::server(server, localhost).unwrap();
+            let server = Endpoint::server(server, (LOCALHOST, 0).into()).unwrap();
             let addr = server.local_addr().unwrap();
             let accepting = server.clone();
             let serving = tokio::spawn(async move {
@@ -117,11 +191,35 @@ impl Ends {
                 serve(&connection).await;
                 connection
             });
-            let endpoint = Endpoint::client(localhost).unwrap();
+            let endpoint = Endpoint::client((LOCALHOST, 0).into()).unwrap();
             let dialled = endpoint.connect_with(client, addr, "axon").unwrap().await.unwrap();
             dial(&dialled).await;
-            let connections = [dialled, serving.await.unwrap()];
-            Self { client: endpoint, server, connections, messages }
+            let connections = vec![dialled, serving.await.unwrap()];
+            Self { endpoints: vec![endpoint, server], connections, messages }
+        })
+    }
+
+    fn dial(runtime: &Runtime, key: &[u8; 32], cipher: Cipher, mode: Mode, port: u16) -> Self {
+        let client = client_config(key, cipher, mode);
+        runtime.block_on(async move {
+            let endpoint = Endpoint::client((LOCALHOST, 0).into()).unwrap();
+            let address = (LOCALHOST, port).into();
+            let dialled = endpoint.connect_with(client, address, "axon").unwrap().await.unwrap();
+            dial(&dialled).await;
+            let (endpoints, connections) = (vec![endpoint], vec![dialled]);
+            Self { endpoints, connections, messages: Messages::default() }
+        })
+    }
+
+    fn accept(runtime: &Runtime, key: &[u8; 32], cipher: Cipher, mode: Mode) -> Self {
+        let server = server_config(key, cipher, mode);
+        runtime.block_on(async move {
+            let endpoint = Endpoint::server(server, (LOCALHOST, 0).into()).unwrap();
+            say(LISTENS, &endpoint.local_addr().unwrap().port().to_be_bytes());
+            let connection = endpoint.accept().await.unwrap().await.unwrap();
+            serve(&connection).await;
+            let (endpoints, connections) = (vec![endpoint], vec![connection]);
+            Self { endpoints, connections, messages: Messages::default() }
         })
     }
 
@@ -135,14 +233,15 @@ impl Ends {
                 connection.close(0_u32.into(), b"done");
             }
             drop(self.connections);
-            self.client.wait_idle().await;
-            self.server.wait_idle().await;
+            for endpoint in &self.endpoints {
+                endpoint.wait_idle().await;
+            }
         });
     }
 }
 
 /// Exports, sends and updates the keys, so that every secret was used.
-async fn dial(connection: &Connection) {
+pub(crate) async fn dial(connection: &Connection) {
     let mut exported = Zeroizing::new([0; 32]);
     connection.export_keying_material(&mut *exported, EXPORTER.as_bytes(), b"").unwrap();
     let (mut send, mut receive) = connection.open_bi().await.unwrap();
@@ -152,7 +251,7 @@ async fn dial(connection: &Connection) {
     assert_eq!(receive.read_to_end(SENT).await.unwrap().len(), SENT);
 }
 
-async fn serve(connection: &Connection) {
+pub(crate) async fn serve(connection: &Connection) {
     let mut exported = Zeroizing::new([0; 32]);
     connection.export_keying_material(&mut *exported, EXPORTER.as_bytes(), b"").unwrap();
     let (mut send, mut receive) = connection.accept_bi().await.unwrap();
@@ -172,89 +271,5 @@ impl fmt::Debug for OneKey {
 impl PskResolver for OneKey {
     fn resolve(&self, identity: &[u8]) -> Option<Arc<Psk>> {
         (identity == self.0.identity()).then(|| Arc::clone(&self.0))
-    }
-}
-
-type Messages = Arc<Mutex<Vec<u8>>>;
-
-/// A server that notes the handshake messages, none of which is a secret.
-struct TappedServer(Arc<dyn crypto::ServerConfig>, Messages);
-
-impl crypto::ServerConfig for TappedServer {
-    fn initial_keys(&self, version: u32, id: &ConnectionId) -> Result<Keys, UnsupportedVersion> {
-        self.0.initial_keys(version, id)
-    }
-
-    fn retry_tag(&self, version: u32, id: &ConnectionId, packet: &[u8]) -> [u8; 16] {
-        self.0.retry_tag(version, id, packet)
-    }
-
-    fn start_session(
-        self: Arc<Self>,
-        version: u32,
-        params: &TransportParameters,
-    ) -> Box<dyn crypto::Session> {
-        Box::new(Tapped(self.0.clone().start_session(version, params), self.1.clone()))
-    }
-}
-
-struct Tapped(Box<dyn crypto::Session>, Messages);
-
-impl crypto::Session for Tapped {
-    fn initial_keys(&self, id: &ConnectionId, side: Side) -> Keys {
-        self.0.initial_keys(id, side)
-    }
-
-    fn handshake_data(&self) -> Option<Box<dyn Any>> {
-        self.0.handshake_data()
-    }
-
-    fn peer_identity(&self) -> Option<Box<dyn Any>> {
-        self.0.peer_identity()
-    }
-
-    fn early_crypto(&self) -> Option<(Box<dyn HeaderKey>, Box<dyn PacketKey>)> {
-        self.0.early_crypto()
-    }
-
-    fn early_data_accepted(&self) -> Option<bool> {
-        self.0.early_data_accepted()
-    }
-
-    fn is_handshaking(&self) -> bool {
-        self.0.is_handshaking()
-    }
-
-    fn read_handshake(&mut self, buf: &[u8]) -> Result<bool, TransportError> {
-        self.1.lock().unwrap().extend(buf);
-        self.0.read_handshake(buf)
-    }
-
-    fn transport_parameters(&self) -> Result<Option<TransportParameters>, TransportError> {
-        self.0.transport_parameters()
-    }
-
-    fn write_handshake(&mut self, buf: &mut Vec<u8>) -> Option<Keys> {
-        let before = buf.len();
-        let keys = self.0.write_handshake(buf);
-        self.1.lock().unwrap().extend(&buf[before..]);
-        keys
-    }
-
-    fn next_1rtt_keys(&mut self) -> Option<KeyPair<Box<dyn PacketKey>>> {
-        self.0.next_1rtt_keys()
-    }
-
-    fn is_valid_retry(&self, id: &ConnectionId, header: &[u8], payload: &[u8]) -> bool {
-        self.0.is_valid_retry(id, header, payload)
-    }
-
-    fn export_keying_material(
-        &self,
-        output: &mut [u8],
-        label: &[u8],
-        context: &[u8],
-    ) -> Result<(), ExportKeyingMaterialError> {
-        self.0.export_keying_material(output, label, context)
     }
 }

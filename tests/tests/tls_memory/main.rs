@@ -4,17 +4,27 @@
 //! daemons do. This process knows the QKD key, is told the handshake messages, computes every secret
 //! of the key schedule by RFC 8446 section 7 by itself, and looks for each of them in all writable
 //! memory of the child: stacks, heap, and what was freed.
+//!
+//! Where there is a key exchange, the child has one end, and this process the other: a group of the test takes the
+//! shared secret there.
 
+mod certificates;
 mod child;
+mod erase;
 mod memory;
+mod quic;
 mod schedule;
+mod tapped;
+mod transcript;
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
 use axon_tls::{Cipher, PskKex};
+use child::{Has, Mode};
 use memory::Needles;
 use schedule::{Schedule, Secret};
+use tapped::{Learnt, TappedEnd, Terms};
 
 /// The process that is looked at.
 #[test]
@@ -29,10 +39,10 @@ struct Examined {
 }
 
 impl Examined {
-    fn start(cipher: Cipher, kex: PskKex, key: &[u8; 32]) -> Self {
+    fn start(cipher: Cipher, mode: Mode, has: Has, key: &[u8; 32]) -> Self {
         let mut process = Command::new(std::env::current_exe().unwrap())
             .args(["child", "--exact", "--nocapture", "--test-threads=1"])
-            .env(child::ASKED, format!("{cipher} {kex}"))
+            .env(child::ASKED, format!("{cipher} {mode} {has}"))
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()
@@ -88,7 +98,8 @@ fn unhex(text: &str) -> Vec<u8> {
 #[test]
 fn the_search_finds_what_was_freed_and_what_is_held() {
     let key = random();
-    let mut examined = Examined::start(Cipher::default(), PskKex::PskKe, &key);
+    let mut examined =
+        Examined::start(Cipher::default(), Mode::Psk(PskKex::PskKe), Has::Both, &key);
     examined.at(child::CONNECTED);
     examined.go_on();
     examined.at(child::DROPPED);
@@ -99,16 +110,40 @@ fn the_search_finds_what_was_freed_and_what_is_held() {
 
 fn nothing_is_left_of(cipher: Cipher, kex: PskKex) {
     let key = random();
-    let mut examined = Examined::start(cipher, kex, &key);
+    let mode = Mode::Psk(kex);
+    let mut examined = Examined::start(cipher, mode, Has::Both, &key);
     let transcript = unhex(&examined.at(child::CONNECTED));
-    let schedule = Schedule::new(cipher, kex, &key, &transcript);
-    let early = examined.left(&schedule.used_up());
+    let schedule = Schedule::new(cipher, mode, &key, &transcript, None);
+    nothing_is_left_behind(&mut examined, &schedule, &format!("{cipher}, {mode}"));
+}
+
+/// Secrets that rustls as released holds by value, out of the reach of a provider: it copies them as it moves them, and
+/// erases the last copy alone.
+const HELD_BY_RUSTLS: [&str; 6] = [
+    "client handshake traffic secret",
+    "server handshake traffic secret",
+    "client traffic secret 0",
+    "server traffic secret 0",
+    "exporter secret",
+    "resumption secret",
+];
+
+fn nothing_is_left_behind(examined: &mut Examined, schedule: &Schedule, case: &str) {
+    nothing_is_left_but(examined, schedule, case, &[]);
+}
+
+/// Looks while the connection is there, after traffic, and when it is gone.
+fn nothing_is_left_but(examined: &mut Examined, schedule: &Schedule, case: &str, allowed: &[&str]) {
+    let but = |found: Vec<String>| -> Vec<String> {
+        found.into_iter().filter(|name| !allowed.contains(&name.as_str())).collect()
+    };
+    let early = but(examined.left(&schedule.used_up()));
     examined.go_on();
     examined.at(child::DROPPED);
-    let late = examined.left(&schedule.all());
+    let late = but(examined.left(&schedule.all()));
     assert!(
         early.is_empty() && late.is_empty(),
-        "{cipher}, {kex}: while connected {early:?}, at the end {late:?}"
+        "{case}: while connected {early:?}, at the end {late:?}"
     );
 }
 
@@ -119,10 +154,63 @@ fn nothing_is_left_of_psk_ke() {
     }
 }
 
-/// The secrets before the key exchange comes in are those that this process can compute.
+/// The secrets before the key exchange comes in, where one process has both ends.
 #[test]
 fn nothing_is_left_of_psk_dhe_ke() {
     for cipher in Cipher::ALL {
         nothing_is_left_of(cipher, PskKex::PskDheKe);
     }
+}
+
+/// Each secret, where this process has the other end.
+fn nothing_is_left_of_one_end(mode: Mode, is_client: bool) {
+    for cipher in Cipher::ALL {
+        let key = random();
+        let psk = Schedule::psk(cipher, &key);
+        let terms = Terms { cipher, mode, psk: &psk };
+        let (mut examined, end, (connection, learnt));
+        if is_client {
+            let port;
+            (end, port) = TappedEnd::server(terms);
+            examined = Examined::start(cipher, mode, Has::Client(port), &key);
+            (connection, learnt) = end.accept();
+        } else {
+            end = TappedEnd::client(terms);
+            examined = Examined::start(cipher, mode, Has::Server, &key);
+            let port = unhex(&examined.at(child::LISTENS));
+            (connection, learnt) = end.dial(u16::from_be_bytes([port[0], port[1]]));
+        }
+        examined.at(child::CONNECTED);
+        let Learnt { transcript, shared } = learnt;
+        let schedule = Schedule::new(cipher, mode, &key, &transcript, Some(&shared));
+        let mut exported = [0; 32];
+        connection.export_keying_material(&mut exported, child::EXPORTER.as_bytes(), b"").unwrap();
+        assert_eq!(schedule.exported(), exported, "these are the secrets of the connection");
+        let side = if is_client { "client" } else { "server" };
+        let allowed = if mode == Mode::Hybrid { &HELD_BY_RUSTLS[..] } else { &[] };
+        let case = format!("{cipher}, {mode}, {side}");
+        nothing_is_left_but(&mut examined, &schedule, &case, allowed);
+        drop((connection, end));
+    }
+}
+
+#[test]
+fn nothing_is_left_of_a_client_in_psk_dhe_ke() {
+    nothing_is_left_of_one_end(Mode::Psk(PskKex::PskDheKe), true);
+}
+
+#[test]
+fn nothing_is_left_of_a_server_in_psk_dhe_ke() {
+    nothing_is_left_of_one_end(Mode::Psk(PskKex::PskDheKe), false);
+}
+
+/// The shared secret, and what is extracted from it and expanded for the next step, are nowhere.
+#[test]
+fn nothing_is_left_of_a_hybrid_client_but_what_rustls_holds() {
+    nothing_is_left_of_one_end(Mode::Hybrid, true);
+}
+
+#[test]
+fn nothing_is_left_of_a_hybrid_server_but_what_rustls_holds() {
+    nothing_is_left_of_one_end(Mode::Hybrid, false);
 }

@@ -4,7 +4,7 @@ use axon_tls::{Cipher, PskKex};
 use hmac::{Hmac, KeyInit, Mac};
 use sha2::{Digest, Sha256, Sha384};
 
-use crate::child::{CLIENT_SAE, EXPORTER, KEY_ID, SERVER_SAE};
+use crate::child::{CLIENT_SAE, EXPORTER, KEY_ID, Mode, SERVER_SAE};
 
 pub(crate) struct Secret {
     pub(crate) name: String,
@@ -68,27 +68,45 @@ pub(crate) struct Schedule {
     used_up: Vec<(String, Vec<u8>)>,
     /// Secrets that an established connection still uses.
     in_use: Vec<(String, Vec<u8>)>,
+    /// What the exporter gives for [`EXPORTER`] without a context.
+    exported: Vec<u8>,
 }
 
 impl Schedule {
-    /// `transcript` is ClientHello to the client's Finished. With psk_dhe_ke the schedule ends where
-    /// the key exchange comes in.
-    pub(crate) fn new(cipher: Cipher, kex: PskKex, key: &[u8; 32], transcript: &[u8]) -> Self {
-        let mut schedule = Self { hash: Hash(cipher), used_up: vec![], in_use: vec![] };
-        let psk = schedule.pre_shared_key(key);
+    /// `transcript` is ClientHello to the client's Finished, and `shared` what the key exchange gave. Where there
+    /// was one and that is not known, the schedule ends where it comes in.
+    pub(crate) fn new(
+        cipher: Cipher,
+        mode: Mode,
+        key: &[u8; 32],
+        transcript: &[u8],
+        shared: Option<&[u8]>,
+    ) -> Self {
+        let mut schedule =
+            Self { hash: Hash(cipher), used_up: vec![], in_use: vec![], exported: vec![] };
         let (hash, len) = (schedule.hash, schedule.hash.len());
         let zeros = vec![0; len];
 
-        let early = schedule.step("early secret", hash.hmac(&zeros, &psk));
-        let binder = schedule.step("binder key", hash.derive(&early, "ext binder", b""));
-        schedule.step("binder's finished key", hash.expand(&binder, "finished", b"", len));
-        let derived = schedule.step("derived secret", hash.derive(&early, "derived", b""));
-        if kex == PskKex::PskDheKe {
-            return schedule;
-        }
+        let derived = match mode {
+            Mode::Psk(_) => {
+                let psk = schedule.pre_shared_key(key);
+                let early = schedule.step("early secret", hash.hmac(&zeros, &psk));
+                let binder = schedule.step("binder key", hash.derive(&early, "ext binder", b""));
+                schedule.step("binder's finished key", hash.expand(&binder, "finished", b"", len));
+                schedule.step("derived secret", hash.derive(&early, "derived", b""))
+            }
+            // These are the same for every connection.
+            Mode::Hybrid => hash.derive(&hash.hmac(&zeros, &zeros), "derived", b""),
+        };
+        let exchanged = match (mode, shared) {
+            (Mode::Psk(PskKex::PskKe), None) => zeros.clone(),
+            (Mode::Psk(PskKex::PskKe), Some(_)) => unreachable!("nothing is exchanged"),
+            (_, None) => return schedule,
+            (_, Some(shared)) => schedule.step("shared secret", shared.to_vec()),
+        };
 
         let [server_hello, server_finished, client_finished] = flights(transcript);
-        let handshake = schedule.step("handshake secret", hash.hmac(&derived, &zeros));
+        let handshake = schedule.step("handshake secret", hash.hmac(&derived, &exchanged));
         for (name, label) in [("client", "c hs traffic"), ("server", "s hs traffic")] {
             let secret = hash.derive(&handshake, label, server_hello);
             schedule.step(format!("{name} handshake traffic secret"), secret.clone());
@@ -123,6 +141,7 @@ impl Schedule {
         }
         let exporter = hash.derive(&master, "exp master", server_finished);
         let exported = hash.derive(&exporter, EXPORTER, b"");
+        schedule.exported = hash.expand(&exported, "exporter", &hash.digest(b""), 32);
         schedule.later("exporter secret", exporter);
         schedule.step("secret of one exporter label", exported);
         let resumption = hash.derive(&master, "res master", client_finished);
@@ -130,7 +149,14 @@ impl Schedule {
         schedule
     }
 
-    /// What `derive_psk()` makes of a QKD key, by the words of its documentation.
+    /// What `derive_psk()` makes of a QKD key.
+    pub(crate) fn psk(cipher: Cipher, key: &[u8; 32]) -> Vec<u8> {
+        let mut schedule =
+            Self { hash: Hash(cipher), used_up: vec![], in_use: vec![], exported: vec![] };
+        schedule.pre_shared_key(key)
+    }
+
+    /// The same, by the words of its documentation.
     fn pre_shared_key(&mut self, key: &[u8; 32]) -> Vec<u8> {
         let (sha256, len) = (Hash(Cipher::ChaCha20Poly1305), self.hash.len());
         let prk = sha256.hmac(b"AXON-QKD-TLS13-EXTERNAL-PSK-v1", key);
@@ -162,6 +188,11 @@ impl Schedule {
         self.used_up.iter().map(|(name, bytes)| Secret::new(name, bytes)).collect()
     }
 
+    /// What either end exports: it shows that the schedule is that of the connection.
+    pub(crate) fn exported(&self) -> &[u8] {
+        &self.exported
+    }
+
     pub(crate) fn all(&self) -> Vec<Secret> {
         let all = self.used_up.iter().chain(&self.in_use);
         all.map(|(name, bytes)| Secret::new(name, bytes)).collect()
@@ -177,8 +208,11 @@ fn flights(transcript: &[u8]) -> [&[u8]; 3] {
         ends.push((kind, at));
     }
     let kinds: Vec<u8> = ends.iter().map(|(kind, _)| *kind).collect();
-    assert_eq!(kinds, [1, 2, 8, 20, 20], "hellos, EncryptedExtensions, Finished twice");
-    [ends[1].1, ends[3].1, ends[4].1].map(|end| &transcript[..end])
+    assert_eq!((kinds[..3].to_vec(), kinds.last()), (vec![1, 2, 8], Some(&20)), "{kinds:?}");
+    let finished: Vec<usize> =
+        ends.iter().filter(|(kind, _)| *kind == 20).map(|(_, end)| *end).collect();
+    assert_eq!(finished.len(), 2, "{kinds:?}");
+    [ends[1].1, finished[0], finished[1]].map(|end| &transcript[..end])
 }
 
 /// RFC 8448, section 3: what makes this key schedule worth anything.

@@ -238,6 +238,7 @@ fn relay(
         id: hello.session,
         tally,
         pool: Arc::clone(&state.pool),
+        losses: Arc::clone(&state.lost),
     };
     if let Err(error) = far.start() {
         tracing::error!(%error, "no thread to relay a session");

@@ -11,6 +11,7 @@ mod first;
 mod gateway;
 mod listen;
 pub mod log;
+mod losses;
 mod pending;
 mod plane;
 mod relayed;

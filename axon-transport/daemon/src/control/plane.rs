@@ -24,17 +24,15 @@ use axon_transport::{
 };
 use tokio::sync::{Notify, watch};
 
-use super::{admission::Admission, turns::Turns};
+use super::{admission::Admission, losses::Losses, turns::Turns};
 use crate::{
-    bridge::{OTHER_TOPICS, RefusedRoute, ToControl},
+    bridge::{RefusedRoute, ToControl},
     discovery::Wanted,
     owner::SessionKeys,
 };
 
 /// Refusals that are remembered.
 const REFUSALS: usize = 32;
-/// Topics whose losses on the way to other hosts are remembered.
-const TOPICS_WITH_LOSSES: usize = 1024;
 
 pub(super) struct Control {
     pub(super) config: Arc<Config>,
@@ -47,8 +45,8 @@ pub(super) struct Control {
     /// Routes that do not cross these links.
     pub(super) refused_routes: BTreeMap<String, Vec<RefusedRoute>>,
     pub(super) refusals: VecDeque<RefusalStatus>,
-    /// Samples that did not get to other hosts, by topic and cause.
-    pub(super) lost: BTreeMap<String, BTreeMap<&'static str, u64>>,
+    /// Samples that did not get to other hosts, or that ended relayed sessions left.
+    pub(super) lost: Arc<Losses>,
     /// Whether samples of publishers that ended are on their way to other hosts.
     draining: bool,
     pub(super) keys: serde_json::Value,
@@ -88,7 +86,7 @@ impl Control {
             links: BTreeMap::new(),
             refused_routes: BTreeMap::new(),
             refusals: VecDeque::new(),
-            lost: BTreeMap::new(),
+            lost: Arc::default(),
             draining: false,
             keys: serde_json::Value::Null,
             port: None,
@@ -176,14 +174,6 @@ impl Control {
         self.draining || self.registry.is_needed()
     }
 
-    /// Samples of a topic did not get to another host.
-    fn lost(&mut self, topic: String, cause: &'static str, samples: u64) {
-        let there = self.lost.contains_key(&topic) || self.lost.len() < TOPICS_WITH_LOSSES;
-        let topic = if there { topic } else { OTHER_TOPICS.to_owned() };
-        let count = self.lost.entry(topic).or_default().entry(cause).or_default();
-        *count = count.saturating_add(samples);
-    }
-
     /// Answers a session that asks for the status. One that asks again before it has taken the
     /// answer gets the same one from its beginning.
     pub(super) fn send_status(&mut self, id: &SessionId) {
@@ -246,7 +236,7 @@ impl Control {
             }
             ToControl::Refusal { peer, what, reason } => self.refused(peer, what, reason),
             ToControl::Keys(keys) => self.keys = keys,
-            ToControl::Lost { topic, cause, samples } => self.lost(topic, cause, samples),
+            ToControl::Lost { topic, cause, samples } => self.lost.add(&topic, cause, samples),
             ToControl::Draining(draining) => self.draining = draining,
             ToControl::DialFailed { .. } | ToControl::Datagram { .. } | ToControl::Finished => {}
         }

@@ -62,7 +62,7 @@ pub(super) fn status(control: &Control) -> Status {
         discovery: discovery(&control.wanted.borrow()),
         traffic: control.traffic,
         sessions: sessions.collect(),
-        topics: topics(&control.registry, &control.lost, &refused),
+        topics: topics(&control.registry, &control.lost.all(), &refused),
         links: control.links.values().cloned().collect(),
         keys: control.keys.clone(),
         refusals: control.refusals.iter().cloned().collect(),

@@ -28,6 +28,7 @@ use axon_transport::{
     status::{OutOfRangeStatus, ReaderStatus, RefusedRouteStatus, TopicStatus, WriterStatus},
 };
 
+use super::losses::ByTopic;
 use crate::bridge::RefusedRoute;
 
 /// Publishers, readers, and endpoints whose routes are refused, of a topic that the status lists.
@@ -43,7 +44,7 @@ type Session = SessionEntry<Arc<PassedFd>>;
 /// All topics with an endpoint somewhere.
 pub(super) fn topics(
     registry: &Sessions,
-    lost: &BTreeMap<String, BTreeMap<&'static str, u64>>,
+    lost: &ByTopic,
     refused: &[(&str, &[RefusedRoute])],
 ) -> Vec<TopicStatus> {
     let mut topics: BTreeMap<(String, String), TopicStatus> = BTreeMap::new();

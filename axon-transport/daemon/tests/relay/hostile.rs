@@ -10,7 +10,7 @@ use rustix::{
 use super::*;
 
 /// What a session under the id of nines says first.
-fn hello(host: &Host) -> Hello {
+pub(super) fn hello(host: &Host) -> Hello {
     hello_of(&host.config())
 }
 
@@ -61,7 +61,7 @@ fn refused(host: &Host, hello: Hello) -> Refused {
 }
 
 /// A relayed session that does as the test does.
-fn by_hand(host: &Host, hello: Hello) -> OwnedFd {
+pub(super) fn by_hand(host: &Host, hello: Hello) -> OwnedFd {
     let socket = Address::of(&host.config()).connect().unwrap();
     say_to(&socket, &Message::Hello(hello));
     assert!(matches!(hear(&socket, |_| true), Some(Message::Welcome(_))));
@@ -159,15 +159,18 @@ pub(crate) fn call_and_have_it_talk() -> u32 {
 }
 
 /// The publisher of a peer that speaks for itself.
-fn own() -> Gid {
+pub(super) fn own() -> Gid {
     Gid::new(SessionId([9; 16]), 1)
 }
 
-/// Has it publish as many as may be under way together.
-fn announce_and_await_credit(socket: &OwnedFd) {
+/// Has it publish as many as may be under way together; the bytes that it may send.
+pub(super) fn announce_and_await_credit(socket: &OwnedFd) -> u64 {
     say_to(socket, &announce(own(), EndpointKind::Publisher, EndpointRole::Application));
     let credit = |m: &Message| matches!(m, Message::Credit(c) if c.publisher == own());
-    assert!(hear(socket, credit).is_some());
+    match hear(socket, credit) {
+        Some(Message::Credit(credit)) => credit.bytes,
+        other => panic!("instead of credit: {other:?}"),
+    }
 }
 
 const SAID: u64 = 20;

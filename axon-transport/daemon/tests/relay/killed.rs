@@ -283,7 +283,7 @@ fn the_publisher_and_its_daemon_may_be_killed_together() {
         drop(talker);
         let _daemon = host.daemon();
         until("it is gone", || subscription.matched().is_empty());
-        take_rest_of_talker(&subscription);
+        talker::take_rest_of_talker(&host, &subscription);
         let publisher = listener.create_publisher(spec("/t", Qos::keep_all())).unwrap();
         await_pair(&publisher, &subscription);
         assert_eq!(publish(&publisher, &pattern(1, 10)), 1);

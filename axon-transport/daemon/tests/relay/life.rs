@@ -14,7 +14,7 @@ fn a_process_that_is_killed_leaves_whole_samples_and_nothing_else() {
     assert_eq!(take_until(&subscription, 100).len(), 100);
     signal(talker.pid(), Signal::KILL);
     until("it is gone", || subscription.matched().is_empty());
-    take_rest_of_talker(&subscription);
+    talker::take_rest_of_talker(&host, &subscription);
     drop(talker);
 
     let publisher = listener.create_publisher(spec("/t", Qos::keep_all())).unwrap();

@@ -3,6 +3,7 @@
 mod backlog;
 mod hostile;
 mod killed;
+mod left;
 mod life;
 mod played;
 mod refused;
@@ -10,6 +11,7 @@ mod services;
 #[allow(dead_code, reason = "for the tests of daemons too")]
 #[path = "../support/mod.rs"]
 mod support;
+mod talker;
 mod time;
 
 use std::{
@@ -157,16 +159,6 @@ fn take_until(subscription: &Subscription, last: u64) -> Vec<u64> {
     taken
 }
 
-/// Takes the remaining samples of the child "talker", whose first hundred samples were taken: all of it whole.
-fn take_rest_of_talker(subscription: &Subscription) {
-    let mut bytes = Vec::new();
-    let mut next = 101;
-    while let Some(info) = subscription.take(&mut bytes) {
-        assert_eq!((info.sequence, bytes.len()), (next, next as usize % 10_000));
-        next += 1;
-    }
-}
-
 fn relays(status: &Status) -> Vec<RelayStatus> {
     status.sessions.iter().filter_map(|s| s.relay.clone()).collect()
 }
@@ -177,14 +169,7 @@ fn child() {
     let Ok(part) = std::env::var("PLAY") else { return };
     let session = of_child(&part);
     match part.as_str() {
-        // Publishes without an end.
-        "talker" => {
-            let publisher = session.create_publisher(spec("/t", Qos::keep_all())).unwrap();
-            assert!(publisher.wait_matched(1, PATIENCE));
-            for sequence in 1.. {
-                publish(&publisher, &pattern(sequence, sequence as usize % 10_000));
-            }
-        }
+        "talker" => talker::talk(&session),
         // Publishes a little and ends.
         "brief" => {
             let publisher = session.create_publisher(spec("/t", Qos::keep_all())).unwrap();

@@ -101,7 +101,7 @@ impl Host {
     }
 
     /// What daemons in the foreground log.
-    fn log(&self) -> std::path::PathBuf {
+    pub(crate) fn log(&self) -> std::path::PathBuf {
         self.dir.path().join("daemon.txt")
     }
 

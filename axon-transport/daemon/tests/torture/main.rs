@@ -1,12 +1,15 @@
-//! Processes publish to each other while some of them are killed, stopped and continued at random,
-//! and the daemon is killed under them.
+//! Processes publish to each other and call each other while some of them are killed, stopped and continued at
+//! random, and the daemon is killed under them. Publishers, and processes, end 0.3 to 1 s after another process was
+//! continued. One process of three is in a PID namespace of its own, with the outer or a new `/proc`, where the
+//! machine allows that: the first line of output says where it does not.
 //!
-//! Samples are of 0 bytes to 8 MiB and carry their number and a pattern of it. What must hold: every
-//! sample is whole; a KEEP_ALL subscription misses none of a publisher that lives, repeats none of any,
-//! and what it misses of one that was killed it counts; no process fails or stands still; the memory
-//! they hold together stays below a ceiling. At the end the disturbances cease, and every process must
-//! come to have the last sample of every other. When something is missing, both processes print the
-//! history of the pair.
+//! Samples are of 0 bytes to 25 MB and carry their number and a pattern of it. Some are published through loans that
+//! are held while other samples go out; readers hold some. What must hold: every sample is whole; a KEEP_ALL
+//! subscription misses none of a publisher that lives, repeats none of any, takes all of one that ended, and what it
+//! misses of one that was killed it counts; every call is seen once by each server, and answered once by each that
+//! lives; no process fails or stands still; the memory they hold together stays below a ceiling. At the end the
+//! disturbances cease, every process must come to have the last sample of every other, and every call its answers.
+//! When something is missing, both processes print the history of the pair.
 //!
 //! There are two plans. `Brief`: eight processes, stopped for some tenths of a second, often. `Stops`:
 //! twelve, stopped for one to four seconds, while the daemon is killed.
@@ -28,7 +31,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use conductor::{Plan, Round};
+use conductor::{Namespaces, Plan, Round};
 
 /// How long the processes are disturbed in an ordinary run, by each plan.
 const SHORT: [(Plan, Duration); 2] =
@@ -51,10 +54,14 @@ fn main() -> ExitCode {
         arguments.get(at + 1)?.parse::<u64>().ok()
     };
     let seed = value("--seed").unwrap_or(1);
+    let namespaces = Namespaces::find();
+    if !namespaces.are_there() {
+        println!("skipped: PID namespaces, which `unshare` cannot make here");
+    }
     println!("{}", Round::heading());
     let Some(minutes) = value("--minutes") else {
         for (plan, time) in SHORT {
-            println!("{}", conductor::run(plan, time, seed));
+            println!("{}", conductor::run(plan, time, seed, &namespaces));
         }
         return ExitCode::SUCCESS;
     };
@@ -62,7 +69,7 @@ fn main() -> ExitCode {
     let (start, time) = (Instant::now(), Duration::from_secs(60 * minutes));
     for seed in seed.. {
         let plan = if stops || seed.is_multiple_of(2) { Plan::Stops } else { Plan::Brief };
-        println!("{}", conductor::run(plan, LONG, seed));
+        println!("{}", conductor::run(plan, LONG, seed, &namespaces));
         if start.elapsed() >= time {
             break;
         }

@@ -1,7 +1,9 @@
 //! Samples that say who they are, byte by byte.
 
 /// The longest.
-pub(crate) const LONGEST: usize = 8 << 20;
+pub(crate) const LONGEST: usize = 25_000_000;
+/// Of so many samples one may be as long as that.
+const RARITY: u64 = 50;
 
 /// Numbers that follow from a seed (splitmix64).
 pub(crate) struct Random(pub(crate) u64);
@@ -19,11 +21,15 @@ impl Random {
         self.next() % bound
     }
 
-    /// 0 to [`LONGEST`], each power of two as often as the next.
+    /// 0 to 8 MiB, each power of two as often as the next, or now and then up to [`LONGEST`].
     pub(crate) fn length(&mut self) -> usize {
         let power = self.below(25);
-        let most = if power == 24 { 0 } else { 1_u64 << power };
-        usize::try_from(self.below(most + 1)).expect("at most eight million")
+        let most = match power {
+            _ if self.below(RARITY) == 0 => LONGEST as u64,
+            24 => 0,
+            _ => 1 << power,
+        };
+        usize::try_from(self.below(most + 1)).expect("at most some million")
     }
 }
 

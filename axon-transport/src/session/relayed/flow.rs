@@ -386,6 +386,12 @@ impl Incoming {
         self.waiting.retain(|channel| channels.contains_key(channel));
     }
 
+    /// The channels of which a sample has come in part.
+    pub fn partial(&self) -> impl Iterator<Item = &Channel> {
+        let partial = self.channels.iter().filter(|(_, channel)| channel.partial.is_some());
+        partial.map(|(name, _)| name)
+    }
+
     /// Takes a piece; the sample, if it was the last.
     ///
     /// # Errors

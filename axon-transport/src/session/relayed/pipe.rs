@@ -209,9 +209,15 @@ impl Pipe {
         self.over
     }
 
-    /// Samples that came and are not published.
-    pub fn arrived(&self) -> usize {
-        self.arrived.values().map(VecDeque::len).sum()
+    /// Samples that came, whole or in part, and are not published, by their writer.
+    pub fn unpublished(&self) -> BTreeMap<Gid, u64> {
+        let whole = self.arrived.iter().map(|(channel, samples)| (channel, samples.len() as u64));
+        let parts = self.incoming.partial().map(|channel| (channel, 1));
+        let mut samples = BTreeMap::new();
+        for (channel, count) in whole.chain(parts) {
+            *samples.entry(channel.writer).or_default() += count;
+        }
+        samples
     }
 
     /// Takes packets; the messages among them that are not of samples, and whether there may be more.

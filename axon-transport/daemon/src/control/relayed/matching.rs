@@ -30,7 +30,7 @@ use axon_transport::{
     },
 };
 
-use super::RelayedSession;
+use super::{ENDED, RelayedSession};
 
 /// Partners of a session's endpoints that are gone and whose last samples are kept until it takes them.
 /// Those samples are in memory of a process that may have ended.
@@ -147,10 +147,18 @@ impl RelayedSession {
         };
         let samples = std::iter::from_fn(take).count() as u64;
         self.tally.lost(samples);
+        let endpoint = match self.writers.get(gid) {
+            Some(remote_writer) => Some(remote_writer.endpoint()),
+            None => self.subscriptions.get(gid).map(Subscription::endpoint),
+        };
+        let topic = endpoint.map_or("", |endpoint| endpoint.topic.as_str());
+        if samples > 0 {
+            self.losses.add(topic, ENDED, samples);
+        }
         if let Some(writers) = self.given_up.count(Instant::now()) {
             let (session, limit) = (&self.id, MAX_LEFT);
             tracing::warn!(
-                %session, %other, writers, limit,
+                %session, %other, topic, writers, limit,
                 "discarded samples of ended writers: the relayed session does not take them"
             );
         }

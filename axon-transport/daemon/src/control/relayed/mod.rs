@@ -45,6 +45,10 @@ use axon_transport::{
 use rustix::io::Errno;
 
 use self::matching::{Source, take};
+use super::losses::Losses;
+
+/// Why samples of a writer that ended are lost.
+const ENDED: &str = "publisher_ended";
 
 /// What a relay is started with.
 pub(crate) struct DaemonRelay {
@@ -58,6 +62,7 @@ pub(crate) struct DaemonRelay {
     pub(crate) id: SessionId,
     pub(crate) tally: Arc<RelayCounters>,
     pub(crate) pool: Arc<Pool>,
+    pub(crate) losses: Arc<Losses>,
 }
 
 impl DaemonRelay {
@@ -78,7 +83,7 @@ impl DaemonRelay {
     }
 
     fn open(self) -> Result<RelayedSession, End> {
-        let Self { socket, inside, config, name, id, tally, pool } = self;
+        let Self { socket, inside, config, name, id, tally, pool, losses } = self;
         let say = |message: Message| {
             let packet = message.encode().map_err(|e| End::Other(e.to_string()))?;
             // The connection is new: its buffer has room.
@@ -113,6 +118,7 @@ impl DaemonRelay {
             id,
             pipe: Pipe::new(socket, incoming, Arc::clone(&tally)),
             tally,
+            losses,
             writers: BTreeMap::new(),
             subscriptions: BTreeMap::new(),
             nodes: BTreeMap::new(),
@@ -159,6 +165,8 @@ struct RelayedSession {
     id: SessionId,
     pipe: Pipe,
     tally: Arc<RelayCounters>,
+    /// What the daemon counts as lost.
+    losses: Arc<Losses>,
     /// Its publishers, clients and servers.
     writers: BTreeMap<Gid, RemoteWriter>,
     subscriptions: BTreeMap<Gid, Subscription>,
@@ -248,11 +256,15 @@ impl RelayedSession {
     /// Writes what came, and tells the process what became of it.
     fn write(&mut self) -> Result<(), End> {
         let (writers, tally, unreached) = (&self.writers, &self.tally, &mut self.unreached);
+        let losses = &self.losses;
         let credits = self.pipe.write(
             |gid| writers.get(gid),
             |gid, loss| {
                 tally.lost(loss.samples());
                 if let LossReport::Unwritten = loss {
+                    if let Some(writer) = writers.get(gid) {
+                        losses.add(&writer.endpoint().topic, "ring", 1);
+                    }
                     unreached.entry(*gid).or_default().unwritten += 1;
                 }
             },
@@ -271,32 +283,61 @@ impl RelayedSession {
         self.pipe.give_back(credits)
     }
 
-    /// The process is gone, and was heard to the end: what it wrote goes to readers that make room for it
-    /// soon, while nobody counts it any more.
+    /// The process is gone, and was heard to the end: what it wrote goes to readers while they make room for it,
+    /// though nobody counts it any more.
     fn drain(mut self) -> Result<(), End> {
-        let end = Instant::now() + LINGER;
+        let mut end = Instant::now() + LINGER;
         self.subscriptions.clear();
         self.nodes.clear();
         self.writers.values().for_each(|remote_writer| remote_writer.leave(true));
+        let mut left = self.pipe.unpublished();
         while self.pipe.is_blocked() && !self.change_signal.is_lost() && Instant::now() < end {
             self.leader.clear();
             self.leader.arm(true);
             self.change_signal.take();
             self.write()?;
+            let before = std::mem::replace(&mut left, self.pipe.unpublished());
+            if before != left {
+                end = Instant::now() + LINGER;
+            }
             if self.pipe.is_blocked() {
                 let left = end.saturating_duration_since(Instant::now());
                 self.pipe.sleep(&self.leader, &self.change_signal, None, Some(left));
             }
         }
-        let samples = self.pipe.arrived();
-        if samples > 0 {
+        self.discard_all(&left);
+        Err(SocketError::Closed.into())
+    }
+
+    /// Counts and logs by topic what the process, which is gone, left of its writers, because no reader takes it.
+    fn discard_all(&self, left: &BTreeMap<Gid, u64>) {
+        let mut topics: BTreeMap<&str, u64> = BTreeMap::new();
+        for (gid, samples) in left {
+            let Some(writer) = self.writers.get(gid) else { continue };
+            *topics.entry(&writer.endpoint().topic).or_default() += samples;
+        }
+        for (topic, samples) in &topics {
+            self.tally.lost(*samples);
+            self.losses.add(topic, ENDED, *samples);
+        }
+        let samples: u64 = topics.values().sum();
+        // One line, however many topics it had.
+        if let Some((topic, most)) = topics.iter().max_by_key(|(_, samples)| **samples) {
+            let others = topics.len() - 1;
             tracing::warn!(
-                session = %self.id,
-                samples,
+                session = %self.id, topic, most, others, samples,
                 "discarded samples of a process that ended: no reader takes them"
             );
         }
-        Err(SocketError::Closed.into())
+        let open = || self.writers.values().map(RemoteWriter::endpoint);
+        let mut publishers = open().filter(|e| e.kind == EndpointKind::Publisher);
+        if let Some(Endpoint { topic, .. }) = publishers.next() {
+            let others = publishers.count();
+            tracing::warn!(
+                session = %self.id, topic, others,
+                "the process ended and had not ended its publishers: samples that it had not sent are lost"
+            );
+        }
     }
 
     fn handle(&mut self, message: Message) -> Result<(), End> {

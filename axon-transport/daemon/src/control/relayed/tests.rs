@@ -54,6 +54,7 @@ fn what_the_control_plane_refuses_its_process_is_told_of() {
         id,
         tally: Arc::default(),
         pool: Pool::new(0),
+        losses: Arc::default(),
     };
     relay.start().unwrap();
     hear(&control, |message| matches!(message, Message::Hello(_)).then_some(()));

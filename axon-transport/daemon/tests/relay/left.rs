@@ -1,0 +1,84 @@
+//! What a process leaves that ends: readers take it, or the daemon counts it and says so.
+
+use std::fs;
+
+use axon_transport::internal::session::relayed::flow::OVERHEAD;
+
+use super::{hostile::*, *};
+
+/// Bytes of each sample.
+const LENGTH: usize = 1000;
+
+/// Publishes by hand, as far as there is credit, until the reader's ring is full and takes no more; how many were
+/// sent whole. A part of one more follows.
+fn send_until_held_back(host: &Host, socket: &OwnedFd, mut credit: u64) -> u64 {
+    let cost = LENGTH as u64 + OVERHEAD;
+    let mut sent = 0;
+    let written = || relays(&host.status().unwrap())[0].samples_in;
+    let mut before = 0;
+    loop {
+        while credit >= 2 * cost {
+            sent += 1;
+            say_to(socket, &fragment(sent, LENGTH));
+            credit -= cost;
+        }
+        // The daemon has all that was sent before it shows its status a second time.
+        let now = written();
+        let is_held_back = now > 0 && now < sent && std::mem::replace(&mut before, now) == now;
+        let more = credits(socket);
+        credit += more;
+        if is_held_back && more == 0 {
+            say_to(socket, &fragment(sent + 1, LENGTH / 2));
+            return sent;
+        }
+        thread::sleep(Duration::from_millis(10));
+    }
+}
+
+/// The sample of this number, or the part of it that has so many bytes.
+fn fragment(sequence: u64, bytes: usize) -> Message {
+    let (length, source_timestamp, lost, published) = (LENGTH as u32, 0, 0, 0);
+    let head = Some(SampleHeader { length, sequence, source_timestamp, lost, published });
+    let bytes = pattern(sequence, bytes);
+    Message::SampleFragment(SampleFragment { publisher: own(), head, bytes, client: None })
+}
+
+/// The credit that has come.
+fn credits(socket: &OwnedFd) -> u64 {
+    let mut bytes = 0;
+    while let Ok(received) = socket::receive(socket, &mut Vec::new()) {
+        if let Message::Credit(credit) = received.message {
+            bytes += credit.bytes;
+        }
+    }
+    bytes
+}
+
+/// Samples of "/t" that the status counts as lost with this cause.
+pub(super) fn dropped(host: &Host, cause: &str) -> u64 {
+    let topics = host.status().unwrap().topics;
+    topics.iter().filter(|t| t.topic == "/t").filter_map(|t| t.dropped.get(cause)).sum()
+}
+
+#[test]
+fn what_an_ended_process_left_for_a_reader_that_takes_nothing_is_counted_by_topic() {
+    let host = host();
+    let _daemon = host.daemon();
+    let listener = session(&host, "listener", true);
+    let subscription = listener.create_subscription(spec("/t", Qos::keep_all())).unwrap();
+    let socket = by_hand(&host, hello(&host));
+    let credit = announce_and_await_credit(&socket);
+    until("it is received from", || subscription.matched() == [own()]);
+    let sent = send_until_held_back(&host, &socket, credit);
+    drop(socket);
+    until("nobody is relayed any more", || relays(&host.status().unwrap()).is_empty());
+    let mut bytes = Vec::new();
+    let taken = std::iter::from_fn(|| Some(subscription.take(&mut bytes)?.sequence));
+    let taken: Vec<u64> = taken.collect();
+    assert!(taken.iter().copied().eq(1..=taken.len() as u64), "{taken:?}");
+    // The sample that came in part is lost as well.
+    assert_eq!(taken.len() as u64 + dropped(&host, "publisher_ended"), sent + 1);
+    let log = fs::read_to_string(host.log()).unwrap();
+    let told = |line: &str| line.contains("discarded samples") && line.contains("topic=\"/t\"");
+    assert!(log.lines().any(told), "the log does not name the topic:\n{log}");
+}

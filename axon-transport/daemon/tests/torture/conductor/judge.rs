@@ -1,0 +1,159 @@
+//! Asks the processes in the end whether all is well.
+
+use std::collections::{HashMap, HashSet};
+
+use super::{
+    host::{Ending, Player},
+    round::Gone,
+};
+
+/// What happened to endpoints that are gone.
+#[derive(Default)]
+pub(super) struct Past {
+    /// When the process of each KEEP_ALL reader was killed, in milliseconds since the epoch.
+    pub(super) deaths: HashMap<String, u128>,
+    /// Publishers that ended.
+    pub(super) ended: Vec<Ended>,
+}
+
+/// A KEEP_ALL publisher that ended.
+pub(super) struct Ended {
+    gid: String,
+    last: String,
+    /// Those that were matched before it published its last sample.
+    readers: HashSet<String>,
+}
+
+impl Ended {
+    /// What a process says of it.
+    pub(super) fn parse(line: &str) -> Self {
+        let mut words = line.split_ascii_whitespace().map(str::to_owned);
+        let mut word = || words.next().expect("a GID and a number");
+        Self { gid: word(), last: word(), readers: words.collect() }
+    }
+}
+
+/// The session of an endpoint: a GID begins with that of its session.
+fn session(gid: &str) -> &str {
+    &gid[..24]
+}
+
+/// Every process must come to have the last samples of every other, and of those that ended. Every call must be
+/// answered.
+///
+/// Returns how many pairs of a reader and a publisher that ended never came about, though the publisher counted the
+/// reader: the daemon between them was killed before the reader was told, and the publisher ended before the next one
+/// matched them.
+pub(super) fn come_to_rest(players: &mut [Player], past: &mut Past) -> u64 {
+    for player in players.iter_mut() {
+        player.resume();
+    }
+    for player in players.iter_mut() {
+        if let Some(ending) = player.ending.take() {
+            assert!(ending == Ending::Publisher, "the process was not to play on");
+            past.ended.push(Ended::parse(&player.hear()));
+        }
+        player.tell("quiet");
+    }
+    for index in 0..players.len() {
+        let answer = players[index].ask("calls");
+        if let Some((client, server)) = answer.split_once(' ') {
+            let lives = print_pair(players, index, client, server);
+            panic!("{client} waits for {server}, whose process lives: {lives}");
+        }
+    }
+    let mut subscriptions = String::new();
+    for player in players.iter_mut() {
+        subscriptions += " ";
+        subscriptions += &player.reader();
+    }
+    let mut lasts = Vec::new();
+    for (index, player) in players.iter_mut().enumerate() {
+        lasts.push((index, player.ask(&format!("final{subscriptions}"))));
+    }
+    // What a process left is gone with it if it was killed later.
+    let killed: HashSet<&str> = past.deaths.keys().map(|reader| session(reader)).collect();
+    past.ended.retain(|ended| !killed.contains(session(&ended.gid)));
+    let mut unmet = 0;
+    for player in players.iter_mut() {
+        let reader = player.reader();
+        for Ended { gid, last, readers } in &past.ended {
+            if readers.contains(&reader) && session(gid) != session(&reader) {
+                match player.ask(&format!("expect {gid} {last}")).as_str() {
+                    "there" => {}
+                    answer => {
+                        assert_eq!(answer, "never");
+                        unmet += 1;
+                    }
+                }
+            }
+        }
+    }
+    for (of, last) in &lasts {
+        for (index, player) in players.iter_mut().enumerate() {
+            // A publisher does not wait for subscriptions of its own session.
+            if index != *of {
+                assert_eq!(player.ask(&format!("expect {last}")), "there");
+            }
+        }
+    }
+    unmet
+}
+
+/// What did not come. KEEP_ALL subscriptions must not miss a sample of a publisher that lived, and must count those
+/// that they missed of one that was dead by then. Servers and clients must not miss a message of one that lived.
+pub(super) fn missed(players: &mut [Player], past: &Past) -> Gone {
+    let deaths: HashMap<&str, u128> =
+        past.deaths.iter().map(|(reader, at)| (session(reader), *at)).collect();
+    let mut living = HashSet::new();
+    for player in players.iter_mut() {
+        living.insert(session(&player.reader()).to_owned());
+    }
+    let (mut gone, mut wrong) = (Gone::default(), Vec::new());
+    for (index, player) in players.iter_mut().enumerate() {
+        let answer = player.ask("missed");
+        let words: Vec<&str> = answer.split_ascii_whitespace().collect();
+        for [partner, messages, at, what] in words.as_chunks::<4>().0 {
+            let at: u128 = at.parse().expect("a time");
+            let number: u64 = messages.parse().expect("a number");
+            let was_dead = deaths.get(session(partner)).is_some_and(|death| *death <= at);
+            match *what {
+                "counted" if was_dead => gone.samples += number,
+                "request" | "response" if was_dead => gone.calls += number,
+                "unanswered" if !living.contains(session(partner)) => gone.calls += number,
+                _ => {
+                    let reader = player.reader();
+                    let partner = (*partner).to_owned();
+                    wrong.push((index, reader, partner, format!("{messages} ({what})")));
+                }
+            }
+        }
+    }
+    for (index, reader, partner, _) in &wrong {
+        print_pair(players, *index, reader, partner);
+    }
+    let describe = |(_, reader, partner, what): &(_, String, String, String)| {
+        format!("{reader} missed {what} of {partner}")
+    };
+    let told: Vec<String> = wrong.iter().map(describe).collect();
+    assert!(
+        wrong.is_empty(),
+        "messages of processes that live, or that nobody counts, are missing:\n{}",
+        told.join("\n")
+    );
+    gone
+}
+
+/// Has the process at `index` print what it knows of `other`, and the process of that one what it knows of `own`.
+/// Whether there is such a process.
+fn print_pair(players: &mut [Player], index: usize, own: &str, other: &str) -> bool {
+    players[index].ask(&format!("pair_log {other}"));
+    let mut lives = false;
+    for player in players.iter_mut() {
+        if session(&player.reader()) == session(other) {
+            player.ask(&format!("pair_log {own}"));
+            lives = true;
+        }
+    }
+    lives
+}
