@@ -316,7 +316,7 @@ pub struct LinkConfig {
     pub stalled: Duration,
     /// Largest UDP payload that path discovery tries, in bytes.
     pub mtu: u16,
-    /// What the graph of one peer may take here, and its routes as much again, in bytes.
+    /// Memory for the graph of one peer, in bytes. Its routes may take four times as much.
     pub graph: usize,
     /// What the daemon does between two inputs.
     pub poll: LinkPoll,
