@@ -80,7 +80,7 @@ pub mod internal {
             segment::SessionSegment,
             segment_message::{Segment, SegmentName, SegmentOpened},
         },
-        wake::{ForwardedWakeups, Look, Purpose},
+        wake::{ForwardedWakeups, Purpose, WakeCheck},
         writer::{MAX_GAP, Writer},
     };
 

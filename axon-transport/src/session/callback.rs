@@ -14,12 +14,12 @@ pub type OnNew = Arc<dyn Fn(u64) + Send + Sync>;
 /// What is to be told, and to whom.
 #[derive(Default)]
 pub(super) struct Callback {
-    state: Mutex<State>,
+    state: Mutex<CallbackState>,
     idle: Condvar,
 }
 
 #[derive(Default)]
-struct State {
+struct CallbackState {
     function: Option<OnNew>,
     untold: u64,
     /// The thread that is in a function. Another thread that has something to tell meanwhile leaves it to
@@ -82,7 +82,7 @@ impl Callback {
     }
 
     /// Has nobody told, and waits for the call that is under way on another thread.
-    fn vacate(&self) -> MutexGuard<'_, State> {
+    fn vacate(&self) -> MutexGuard<'_, CallbackState> {
         let me = thread::current().id();
         let mut state = self.lock();
         loop {
@@ -115,7 +115,7 @@ impl Callback {
         }
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
+    fn lock(&self) -> MutexGuard<'_, CallbackState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -10,7 +10,7 @@ use std::{
 
 use axon_shm::internal::SessionSegment;
 
-use super::state::Shared;
+use super::state::SessionShared;
 
 /// A condition that stands from when it is triggered until a wait has seen it. Thread-safe; cheap to
 /// clone, and all clones are the same condition.
@@ -22,11 +22,11 @@ pub struct GuardCondition {
 pub(super) struct Guard {
     triggered: AtomicBool,
     segment: Arc<SessionSegment>,
-    session: Weak<Shared>,
+    session: Weak<SessionShared>,
 }
 
 impl GuardCondition {
-    pub(super) fn new(session: &Arc<Shared>) -> Self {
+    pub(super) fn new(session: &Arc<SessionShared>) -> Self {
         let (segment, session) = (session.segment.clone(), Arc::downgrade(session));
         Self { inner: Arc::new(Guard { triggered: AtomicBool::new(false), segment, session }) }
     }
@@ -61,7 +61,7 @@ impl Guard {
     }
 
     /// Its session, where that is open still.
-    pub(super) fn session(&self) -> Option<Arc<Shared>> {
+    pub(super) fn session(&self) -> Option<Arc<SessionShared>> {
         self.session.upgrade()
     }
 

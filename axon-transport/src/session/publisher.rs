@@ -15,7 +15,7 @@ use axon_shm::{
 
 use super::{
     Session, clock,
-    events::{Changes, EndpointEvents, Event, Source},
+    events::{Changes, EndpointEvents, Event, EventSource},
     rings::Rings,
     state::Outgoing,
 };
@@ -126,7 +126,7 @@ impl Publisher {
 
     /// One of its events; `None` where `kind` is a subscription's.
     pub fn event(&self, kind: EventKind) -> Option<Event> {
-        Event::new(Source::Publisher(self.inner.clone()), kind, self.session.clone())
+        Event::new(EventSource::Publisher(self.inner.clone()), kind, self.session.clone())
     }
 
     /// Room for a sample of exactly `len` bytes, to serialize into: in shared memory where it is

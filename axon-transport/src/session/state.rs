@@ -19,7 +19,7 @@ use axon_shm::{
 
 use super::{
     SessionOptions,
-    events::{Changes, Source},
+    events::{Changes, EventSource},
     guard::GuardCondition,
     pair_waits::PairWaits,
     publisher::PublisherInner,
@@ -53,7 +53,7 @@ pub enum SessionEvent {
 
 type Listener = Arc<dyn Fn(&SessionEvent) + Send + Sync>;
 
-pub(crate) struct Shared {
+pub(crate) struct SessionShared {
     pub(crate) config: Config,
     pub(crate) options: SessionOptions,
     pub(crate) id: SessionId,
@@ -74,12 +74,12 @@ pub(crate) struct Shared {
     pub(super) own_pairs: Mutex<()>,
     /// For the clients of its servers.
     pub(super) room: Arc<ClientLimit>,
-    state: Mutex<State>,
+    state: Mutex<SessionState>,
     changed: Condvar,
 }
 
 #[derive(Default)]
-pub(super) struct State {
+pub(super) struct SessionState {
     pub(super) next_entity: u32,
     /// With what tells of changes of the graph.
     pub(super) nodes: HashMap<Gid, (Endpoint, GuardCondition)>,
@@ -98,14 +98,14 @@ pub(super) struct State {
     /// When those who wait shall look again, whether or not anything comes.
     pub(super) again: Option<Instant>,
     /// Pairs that came or went on other threads than the control thread, which has yet to tell.
-    pub(super) rematched: Vec<(Changes, Source)>,
+    pub(super) rematched: Vec<(Changes, EventSource)>,
     /// The graph is another one than the control thread has told of.
     pub(super) regraphed: bool,
     /// Counts what those who wait may want to look at.
     pub(super) changes: u64,
 }
 
-impl State {
+impl SessionState {
     /// The nodes and endpoints of the session's application.
     pub(super) fn own(&self) -> impl Iterator<Item = &Endpoint> {
         let application = |role| role == EndpointRole::Application;
@@ -309,7 +309,7 @@ pub(super) enum StatusAnswer {
     Lost,
 }
 
-impl Shared {
+impl SessionShared {
     pub(super) fn new(
         config: Config,
         options: SessionOptions,
@@ -372,7 +372,7 @@ impl Shared {
         subscriptions.iter().for_each(|s| s.lock().lost_elsewhere(writer, samples, first));
     }
 
-    pub(super) fn state(&self) -> MutexGuard<'_, State> {
+    pub(super) fn state(&self) -> MutexGuard<'_, SessionState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -471,9 +471,9 @@ impl Shared {
     }
 }
 
-impl fmt::Debug for Shared {
+impl fmt::Debug for SessionShared {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Shared").field("id", &self.id).finish_non_exhaustive()
+        f.debug_struct("SessionShared").field("id", &self.id).finish_non_exhaustive()
     }
 }
 

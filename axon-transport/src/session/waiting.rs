@@ -4,13 +4,13 @@ use std::{ops::Deref, sync::Arc, time::Duration};
 
 use axon_shm::{
     ShmError,
-    internal::{ForwardedWakeups, Look, SessionSegment},
+    internal::{ForwardedWakeups, SessionSegment, WakeCheck},
 };
 use smallvec::SmallVec;
 
 use super::{
-    Client, Event, GuardCondition, Server, Session, SessionError, Subscription, events::Source,
-    guard::Guard, state::Shared, subscription::SubscriptionInner,
+    Client, Event, GuardCondition, Server, Session, SessionError, Subscription,
+    events::EventSource, guard::Guard, state::SessionShared, subscription::SubscriptionInner,
 };
 use crate::events::EventKind;
 
@@ -43,31 +43,35 @@ const FEW: usize = 8;
 enum Part<'a> {
     Data(&'a Arc<SubscriptionInner>),
     Guard(&'a Arc<Guard>),
-    Event(&'a Source, EventKind),
+    Event(&'a EventSource, EventKind),
 }
 
 /// The same, kept for others to look at.
 enum OwnedWaitable {
     Data(Arc<SubscriptionInner>),
     Guard(Arc<Guard>),
-    Event(Source, EventKind),
+    Event(EventSource, EventKind),
 }
 
 /// The objects that a thread waits for, without keeping them from ending.
 pub(crate) struct WeakWaitSet {
     parts: Vec<OwnedWaitable>,
     /// The sessions that it belongs to, but for the one that waits.
-    others: Vec<Arc<Shared>>,
+    others: Vec<Arc<SessionShared>>,
 }
 
 /// While another session is waited at, its control thread listens for it, and passes on what comes.
 struct ForeignWait<'a> {
-    other: &'a Shared,
+    other: &'a SessionShared,
     _forwarded: ForwardedWakeups<'a>,
 }
 
 impl<'a> ForeignWait<'a> {
-    fn new(other: &'a Shared, watch: &Arc<WeakWaitSet>, waits: &Shared) -> Result<Self, ShmError> {
+    fn new(
+        other: &'a SessionShared,
+        watch: &Arc<WeakWaitSet>,
+        waits: &SessionShared,
+    ) -> Result<Self, ShmError> {
         other.listen()?;
         Ok(Self { other, _forwarded: other.segment.forward_wakeups(watch.clone(), &waits.segment) })
     }
@@ -179,7 +183,7 @@ impl Session {
             ready = take();
             !ready.is_empty()
         };
-        self.segment().wait_for(look, &|| -> Arc<dyn Look> { watch() }, timeout);
+        self.segment().wait_for(look, &|| -> Arc<dyn WakeCheck> { watch() }, timeout);
         Ok(ready)
     }
 }
@@ -230,7 +234,7 @@ impl Waitable<'_> {
     }
 
     /// Its session, where that is open.
-    fn session(&self) -> Option<Arc<Shared>> {
+    fn session(&self) -> Option<Arc<SessionShared>> {
         let session = match self {
             Waitable::Subscription(subscription) => &subscription.session,
             Waitable::Server(server) => &server.session,
@@ -281,7 +285,7 @@ impl OwnedWaitable {
     }
 }
 
-impl Look for WeakWaitSet {
+impl WakeCheck for WeakWaitSet {
     fn ready(&self) -> bool {
         self.parts.iter().any(|kept| kept.part().may_be_ready())
     }

@@ -115,7 +115,7 @@ pub(crate) struct Granted {
 
 /// What became of a publisher's memory.
 #[derive(Debug)]
-pub(crate) enum News {
+pub(crate) enum SegmentUpdate {
     Opened(SegmentOpened, PassedFd),
     Gone(SegmentName),
 }
@@ -275,15 +275,15 @@ impl<'a> Channel<'a> {
 
     /// The next segment that is handed over or given up. One for whose descriptor there is no room
     /// stays where it is. For one thread at a time.
-    pub(crate) fn take_news(&self) -> Result<News, ConnectError> {
+    pub(crate) fn take_news(&self) -> Result<SegmentUpdate, ConnectError> {
         loop {
             match self.receive_by(descriptors::receive_whole)? {
                 (Packet::Opened(opened), mut fds) => {
                     if let (Some(fd), true) = (fds.pop(), fds.is_empty()) {
-                        return Ok(News::Opened(opened, fd));
+                        return Ok(SegmentUpdate::Opened(opened, fd));
                     }
                 }
-                (Packet::Gone(gone), _) => return Ok(News::Gone(gone)),
+                (Packet::Gone(gone), _) => return Ok(SegmentUpdate::Gone(gone)),
                 (Packet::AttachRequest(_) | Packet::Granted(_) | Packet::Refused(_), _) => {}
             }
         }

@@ -31,13 +31,13 @@ const PAUSE: Duration = Duration::from_millis(10);
 /// All of a context's lines.
 pub(crate) struct SegmentChannels {
     session: SessionId,
-    state: Mutex<State>,
+    state: Mutex<ChannelsState>,
     /// Somebody has not been told all. A hint: what it is about is under the locks.
     behind: AtomicBool,
 }
 
 #[derive(Default)]
-struct State {
+struct ChannelsState {
     lines: Vec<SegmentChannel>,
     /// When those that are behind were told last.
     tried: Option<Instant>,
@@ -112,7 +112,7 @@ impl SegmentChannel {
     }
 }
 
-impl State {
+impl ChannelsState {
     /// Has each line told something, and parts with those that are closed, or that have ended and
     /// nothing left to tell. Whether all were told.
     fn each(
@@ -226,13 +226,13 @@ impl SegmentChannels {
     }
 
     #[cold]
-    fn retry(&self, state: MutexGuard<'_, State>, session: &SessionSegment) {
+    fn retry(&self, state: MutexGuard<'_, ChannelsState>, session: &SessionSegment) {
         if state.tried.is_none_or(|tried| tried.elapsed() >= PAUSE) {
             self.catch_up(state, session);
         }
     }
 
-    fn catch_up(&self, mut state: MutexGuard<'_, State>, session: &SessionSegment) {
+    fn catch_up(&self, mut state: MutexGuard<'_, ChannelsState>, session: &SessionSegment) {
         state.tried = Some(Instant::now());
         // Before the looks at what there is. What comes after such a look finds the lock taken, and
         // by the lock of the segments' table stores its `true` after this.
@@ -262,7 +262,7 @@ impl SegmentChannels {
         self.note(told);
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
+    fn lock(&self) -> MutexGuard<'_, ChannelsState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -24,7 +24,7 @@ use crate::{
     reader::sample::Sample,
     ring::{
         layout::{self, Location},
-        protocol::{self, MAX_POSITION, Record, State},
+        protocol::{self, MAX_POSITION, PositionState, Record},
         times::{Times, read},
         types::{Grant, Meta, Taken},
         window::{depth, holds},
@@ -210,12 +210,12 @@ impl Reader {
         };
         let view = descriptors.view(&self.attachment);
         match view.state(self.cursor) {
-            State::Ahead => self.cursor < self.seen,
-            State::Here => {
+            PositionState::Ahead => self.cursor < self.seen,
+            PositionState::Here => {
                 view.expect(self.cursor);
                 true
             }
-            State::Gone => true,
+            PositionState::Gone => true,
         }
     }
 

@@ -15,7 +15,7 @@ use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use super::*;
 use crate::{
     alloc::heap::Need,
-    direct::connect::{AttachRequest, Channel, Granted, News},
+    direct::connect::{AttachRequest, Channel, Granted, SegmentUpdate},
     os::descriptors::PassedFd,
     tests::api::{SOON, pair, publisher, together},
 };
@@ -119,8 +119,8 @@ fn what_was_given_up_does_not_pile_up_in_a_line_that_nobody_reads() {
         while let Ok(news) = at_once(&line).take_news() {
             packets += 1;
             match news {
-                News::Opened(opened, _) => assert!(kept.insert(opened.segment.number)),
-                News::Gone(gone) => assert!(kept.remove(&gone.number)),
+                SegmentUpdate::Opened(opened, _) => assert!(kept.insert(opened.segment.number)),
+                SegmentUpdate::Gone(gone) => assert!(kept.remove(&gone.number)),
             }
         }
         (packets, kept.len())

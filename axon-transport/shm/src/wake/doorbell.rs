@@ -33,7 +33,7 @@ pub(crate) const PURPOSES: [Purpose; 2] = [Purpose::Samples, Purpose::Room];
 pub(crate) type Words<'a> = [&'a AtomicU64; 2];
 
 /// What another thread may ask for a waiter: whether there is what it waits for.
-pub trait Look: Send + Sync {
+pub trait WakeCheck: Send + Sync {
     /// Must be quick, and must not wait for a thread that waits.
     fn ready(&self) -> bool;
 }
@@ -89,7 +89,7 @@ enum Leader {
 /// A waiter that sleeps while another one listens.
 struct Follower {
     turn: Condvar,
-    look: Option<Arc<dyn Look>>,
+    look: Option<Arc<dyn WakeCheck>>,
     /// It sleeps at the session's doorbell.
     elsewhere: Option<Arc<dyn WakeListener>>,
 }
@@ -133,7 +133,7 @@ impl Doorbell {
         words: Words<'_>,
         purpose: Purpose,
         mut ready: impl FnMut() -> bool,
-        look: Option<&dyn Fn() -> Arc<dyn Look>>,
+        look: Option<&dyn Fn() -> Arc<dyn WakeCheck>>,
         others: &[BorrowedFd<'_>],
         timeout: Option<Duration>,
     ) -> bool {
@@ -198,7 +198,7 @@ impl Doorbell {
         &self,
         words: Words<'_>,
         armed_at: u64,
-        look: Option<&dyn Fn() -> Arc<dyn Look>>,
+        look: Option<&dyn Fn() -> Arc<dyn WakeCheck>>,
         others: &[BorrowedFd<'_>],
         left: Option<Duration>,
     ) {
@@ -225,7 +225,7 @@ impl Doorbell {
     fn follow(
         &self,
         mut waiters: MutexGuard<'_, Waiters>,
-        look: Option<Arc<dyn Look>>,
+        look: Option<Arc<dyn WakeCheck>>,
         left: Option<Duration>,
     ) {
         let follower = Arc::new(Follower { turn: Condvar::new(), look, elsewhere: None });
@@ -272,7 +272,7 @@ impl Doorbell {
     pub(crate) fn forward_wakeups<'a>(
         &'a self,
         words: Words<'a>,
-        look: Arc<dyn Look>,
+        look: Arc<dyn WakeCheck>,
         elsewhere: Arc<dyn WakeListener>,
     ) -> ForwardedWakeups<'a> {
         let waiting = Waiting::new(self, words, Purpose::Samples);

@@ -16,7 +16,7 @@ use rustix::{
     net::{RecvFlags, Shutdown, recv, shutdown},
 };
 
-use super::{Bell, Doorbell, Look, Purpose, arm, disarm, due, receiver::whole_millis, settle};
+use super::{Bell, Doorbell, Purpose, WakeCheck, arm, disarm, due, receiver::whole_millis, settle};
 use crate::{
     ids::SessionId,
     os::descriptors::{
@@ -325,7 +325,7 @@ struct Flag {
     asked: AtomicU64,
 }
 
-impl Look for Flag {
+impl WakeCheck for Flag {
     fn ready(&self) -> bool {
         self.asked.fetch_add(1, Ordering::AcqRel);
         self.up.load(Ordering::Acquire)
@@ -343,7 +343,7 @@ fn of_those_that_follow_the_right_one_is_woken() {
             .iter()
             .map(|flag| {
                 let session = &session;
-                let look = move || -> Arc<dyn Look> { flag.clone() };
+                let look = move || -> Arc<dyn WakeCheck> { flag.clone() };
                 scope.spawn(move || session.wait_for(|| flag.ready(), &look, Some(EVER)))
             })
             .collect();

@@ -14,7 +14,7 @@ use std::{
 
 use axon_shm::{
     Meta, Sample, ShmError, TakeError,
-    internal::{Look, Reader},
+    internal::{Reader, WakeCheck},
 };
 
 use self::matched_readers::MatchedReaders;
@@ -25,8 +25,8 @@ pub(super) use self::{
 pub use self::{taking::TakeLimit, trusted::TrustedSubscription};
 use super::{
     OnNew, RecvError, Session, SessionError, clock,
-    events::{Event, Source},
-    state::{Outgoing, Shared},
+    events::{Event, EventSource},
+    state::{Outgoing, SessionShared},
 };
 use crate::{
     events::EventKind,
@@ -186,7 +186,7 @@ impl Subscription {
 
     /// One of its events; `None` where `kind` is a publisher's.
     pub fn event(&self, kind: EventKind) -> Option<Event> {
-        Event::new(Source::Subscription(self.inner.clone()), kind, self.session.clone())
+        Event::new(EventSource::Subscription(self.inner.clone()), kind, self.session.clone())
     }
 
     /// Samples taken.
@@ -211,7 +211,7 @@ impl Drop for Subscription {
 /// The oldest of what one may take, in place.
 pub(super) fn take_sample_from(
     inner: &SubscriptionInner,
-    shared: &Shared,
+    shared: &SessionShared,
 ) -> Option<(MessageInfo, Sample)> {
     let copy = shared.config.shm_copy;
     take_from(inner, shared, |reader| {
@@ -223,7 +223,7 @@ pub(super) fn take_sample_from(
 /// The oldest of what one may take.
 pub(super) fn take_from<T>(
     inner: &SubscriptionInner,
-    shared: &Shared,
+    shared: &SessionShared,
     take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
 ) -> Option<(MessageInfo, T)> {
     take_with(inner, shared, |matched_readers| matched_readers.take(take, inner))
@@ -232,7 +232,7 @@ pub(super) fn take_from<T>(
 /// The same as bytes, into `out`, which it replaces.
 pub(super) fn take_bytes_from(
     inner: &SubscriptionInner,
-    shared: &Shared,
+    shared: &SessionShared,
     out: &mut Vec<u8>,
 ) -> Option<MessageInfo> {
     let take = |reader: &mut Reader| Ok(reader.take(out)?.map(|taken| (taken.meta, ())));
@@ -273,7 +273,7 @@ pub(super) fn take_many_of(
 /// What `take` takes; `None` when there is nothing.
 fn take_with<T>(
     inner: &SubscriptionInner,
-    shared: &Shared,
+    shared: &SessionShared,
     take: impl FnOnce(&mut MatchedReaders) -> Option<T>,
 ) -> Option<T> {
     // A thread of the parent may have held the lock when this process was forked.
@@ -318,7 +318,7 @@ pub(super) fn recv_from<T>(
         let now = Instant::now();
         let waited = now.duration_since(*begun.get_or_insert(now));
         let left = timeout.map(|timeout| timeout.saturating_sub(waited));
-        let look = || -> Arc<dyn Look> { inner.clone() };
+        let look = || -> Arc<dyn WakeCheck> { inner.clone() };
         let over = left.is_some_and(|left| left.is_zero());
         if over || !session.segment().wait_for(|| inner.has_data(), &look, left) {
             return Err(RecvError::TimedOut);

@@ -18,7 +18,7 @@ use crate::{
     ids::Gid,
     session::{
         Client, RecvError, clock,
-        state::Shared,
+        state::SessionShared,
         subscription::{SubscriptionInner, take_sample_from},
     },
 };
@@ -94,7 +94,7 @@ impl Calls {
     }
 
     /// Hands out the responses that came, and drops those that nobody waits for. Whether a call still waits.
-    pub(super) fn collect(&self, of: &SubscriptionInner, shared: &Shared) -> bool {
+    pub(super) fn collect(&self, of: &SubscriptionInner, shared: &SessionShared) -> bool {
         // The lock is held from the moment that a response leaves its ring until its call has it. A reader of
         // `calls` therefore finds the response either in the ring or in its call.
         let mut calls = self.lock();
@@ -153,7 +153,7 @@ fn fail_those_without_server(
 /// A call that is under way, until it is dropped.
 struct Calling<'a> {
     inner: &'a SubscriptionInner,
-    shared: &'a Shared,
+    shared: &'a SessionShared,
     number: u64,
     _listener: Listener<'a>,
 }

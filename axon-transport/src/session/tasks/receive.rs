@@ -13,7 +13,7 @@ use futures_core::{FusedStream, Stream};
 use super::listening::Listener;
 use crate::session::{
     MessageInfo, RecvError, Server, Subscription,
-    state::Shared,
+    state::SessionShared,
     subscription::{SubscriptionInner, take_bytes_from},
 };
 
@@ -23,14 +23,14 @@ const IN_A_ROW: u32 = 32;
 /// A task that waits at an endpoint.
 struct Receiver<'a> {
     inner: &'a SubscriptionInner,
-    shared: &'a Shared,
+    shared: &'a SessionShared,
     listener: Option<Listener<'a>>,
     /// Its number among the endpoint's wakers, once it has waited.
     id: Option<u64>,
 }
 
 impl<'a> Receiver<'a> {
-    fn new(inner: &'a SubscriptionInner, shared: &'a Shared) -> Self {
+    fn new(inner: &'a SubscriptionInner, shared: &'a SessionShared) -> Self {
         Self { inner, shared, listener: None, id: None }
     }
 
@@ -87,7 +87,7 @@ pub struct Messages<'a> {
 }
 
 impl<'a> Messages<'a> {
-    fn new(inner: &'a SubscriptionInner, shared: &'a Shared) -> Self {
+    fn new(inner: &'a SubscriptionInner, shared: &'a SessionShared) -> Self {
         Self { receiver: Receiver::new(inner, shared), in_a_row: 0, ended: false }
     }
 }
@@ -213,7 +213,7 @@ impl Server {
 
 async fn recv(
     inner: &SubscriptionInner,
-    shared: &Shared,
+    shared: &SessionShared,
 ) -> Result<(MessageInfo, Vec<u8>), RecvError> {
     let (mut receiver, mut bytes) = (Receiver::new(inner, shared), Vec::new());
     let take = |context: &mut Context<'_>| {

@@ -38,7 +38,7 @@ const MAX_LEFT: usize = 256;
 
 /// A publisher's samples: they cross once, whatever the number of subscriptions.
 #[derive(Default)]
-pub(super) struct Source {
+pub(super) struct RelayedSource {
     samples: Merge<Sample>,
     /// How much of its history has been asked for.
     history: Option<u32>,
@@ -46,7 +46,7 @@ pub(super) struct Source {
     pub(super) done: Option<u64>,
 }
 
-impl Source {
+impl RelayedSource {
     /// Has its publisher know what the session has, by way of all subscriptions.
     pub(super) fn acknowledge(&self, to: &BTreeMap<Gid, Subscription>, writer: &Gid) {
         let Some(done) = self.done else { return };
@@ -236,7 +236,7 @@ fn history_of(qos: &Qos) -> Option<u32> {
 }
 
 pub(super) fn take(
-    source: &mut Source,
+    source: &mut RelayedSource,
     subscriptions: &BTreeMap<Gid, Subscription>,
     writer: &Gid,
 ) -> Option<OutboundSample<Sample>> {

@@ -44,7 +44,7 @@ use axon_transport::{
 };
 use rustix::io::Errno;
 
-use self::matching::{Source, take};
+use self::matching::{RelayedSource, take};
 
 /// What a relay is started with.
 pub(crate) struct DaemonRelay {
@@ -166,7 +166,7 @@ struct RelayedSession {
     /// The others that each endpoint was said to be matched with.
     told: BTreeMap<Gid, BTreeSet<Gid>>,
     /// The publishers whose samples the session gets.
-    sources: BTreeMap<Gid, Source>,
+    sources: BTreeMap<Gid, RelayedSource>,
     /// What is asked of its servers.
     calls: Calls,
     /// The clients that its process has for each of its servers: whose responses may come.

@@ -7,12 +7,12 @@ use tokio::sync::mpsc::{Sender, error::TrySendError};
 use crate::bridge::{CHANNEL, ToControl};
 
 /// Messages to the control plane, those that find the channel full among them.
-pub(super) struct Told {
+pub(super) struct ControlOutbox {
     control: Sender<ToControl>,
     waiting: VecDeque<ToControl>,
 }
 
-impl Told {
+impl ControlOutbox {
     /// Nothing waits yet.
     pub(super) fn new(control: Sender<ToControl>) -> Self {
         Self { control, waiting: VecDeque::new() }
@@ -69,7 +69,7 @@ mod tests {
     #[tokio::test]
     async fn messages_stay_in_order_and_status_is_dropped_when_the_channel_is_full() {
         let (sender, mut control) = mpsc::channel(1);
-        let mut told = Told::new(sender);
+        let mut told = ControlOutbox::new(sender);
         for draining in [true, false, true] {
             told.tell(ToControl::Draining(draining));
             told.tell(ToControl::Keys(serde_json::Value::Null));
