@@ -315,7 +315,7 @@ fn await_both(writes: &PublisherInner, reads: &SubscriptionInner, session: &Sess
     });
 }
 
-/// Those with whom both directions stand.
+/// Endpoints that are attached in both directions.
 fn both(writes: &PublisherInner, reads: &SubscriptionInner, session: &Session) -> Vec<Gid> {
     if session.is_forked() {
         return Vec::new();
@@ -325,7 +325,7 @@ fn both(writes: &PublisherInner, reads: &SubscriptionInner, session: &Session) -
     gids
 }
 
-/// The same, with those who have ended and have left something that is still to come.
+/// Attached endpoints, including ended ones with pending data.
 fn attached(writes: &PublisherInner, reads: &SubscriptionInner, session: &Session) -> Vec<Gid> {
     let mut gids = both(writes, reads, session);
     if !session.is_forked() {

@@ -88,20 +88,20 @@ pub(super) struct SessionState {
     /// Applications' endpoints of both kinds by topic or service.
     pub(super) topics: HashMap<String, BTreeSet<Gid>>,
     pub(super) outgoing: VecDeque<Outgoing>,
-    /// Endpoints that are gone, until a daemon has said so to everybody.
+    /// Ended endpoints, until a daemon has announced their end.
     pub(super) tombstones: BTreeSet<Gid>,
     pub(super) graph: Arc<GraphView>,
-    /// Endpoints of its own that the daemon does not take, and why: nobody else ever hears of them.
+    /// Own endpoints that the daemon refused, and why. No other session learns of them.
     pub(super) refused: BTreeMap<Gid, String>,
     pub(super) daemon: Option<DaemonId>,
     pub(super) status: StatusAnswer,
-    /// When those who wait shall look again, whether or not anything comes.
+    /// Deadline at which waiters check again without an event.
     pub(super) again: Option<Instant>,
-    /// Pairs that came or went on other threads than the control thread, which has yet to tell.
+    /// Pairs that other threads matched or unmatched, for the control thread to report.
     pub(super) rematched: Vec<(Changes, EventSource)>,
-    /// The graph is another one than the control thread has told of.
+    /// Whether the graph changed since the control thread last reported it.
     pub(super) regraphed: bool,
-    /// Counts what those who wait may want to look at.
+    /// Counts changes that may end a wait.
     pub(super) changes: u64,
 }
 

@@ -113,7 +113,7 @@ pub(crate) struct Granted {
     pub(crate) ring: Location,
 }
 
-/// What became of a publisher's memory.
+/// A segment that the publisher opened or dropped.
 #[derive(Debug)]
 pub(crate) enum SegmentUpdate {
     Opened(SegmentOpened, PassedFd),

@@ -39,11 +39,11 @@ pub(crate) struct SegmentChannels {
 #[derive(Default)]
 struct ChannelsState {
     lines: Vec<SegmentChannel>,
-    /// When those that are behind were told last.
+    /// The last attempt to send to channels that are behind.
     tried: Option<Instant>,
 }
 
-/// A subscriber that is to be told of segments.
+/// The channel over which one subscriber is told of segments.
 struct SegmentChannel {
     reader: Gid,
     writer: Gid,
@@ -87,7 +87,7 @@ impl SegmentChannel {
         Ok(())
     }
 
-    /// Makes what it was told what there is.
+    /// Announces new segments and withdraws dropped ones.
     fn catch_up(&mut self, session: &SessionSegment, first: u32) -> Result<(), ConnectError> {
         let mut segments = session.further();
         segments.sort_by_key(|segment| (segment.number() != first, segment.number()));
@@ -101,20 +101,20 @@ impl SegmentChannel {
         Ok(())
     }
 
-    /// What it has to tell when it is gone. Other segments stay for as long as the context does.
+    /// Sample segments, which are withdrawn when the publisher drops them. Other segments stay as long as the context.
     fn samples(&self) -> impl Iterator<Item = &SegmentInfo> {
         self.told.iter().filter(|told| matches!(told.kind, SegmentKind::Samples(_)))
     }
 
-    /// Does not wait.
+    /// The channel, whose sends do not block.
     fn channel(&self) -> Channel<'_> {
         Channel::new(self.socket.as_fd(), Some(Duration::ZERO))
     }
 }
 
 impl ChannelsState {
-    /// Has each line told something, and parts with those that are closed, or that have ended and
-    /// nothing left to tell. Whether all were told.
+    /// Calls `tell` for each channel. Removes channels that are closed, and ended ones with nothing left to send.
+    /// Returns whether all were told.
     fn each(
         &mut self,
         mut tell: impl FnMut(&mut SegmentChannel) -> Result<(), ConnectError>,
@@ -245,7 +245,7 @@ impl SegmentChannels {
         }));
     }
 
-    /// A subscriber is gone.
+    /// Removes the channel of a subscriber that is gone.
     pub(crate) fn forget(&self, reader: Gid) {
         let gone = |line: &mut SegmentChannel| line.reader == reader;
         let told =
@@ -253,7 +253,7 @@ impl SegmentChannels {
         self.note(told);
     }
 
-    /// Nothing more is published to a subscriber, or by a publisher. What was, may still be read.
+    /// Stops new samples to a subscriber, or of a publisher. Published samples stay readable.
     pub(crate) fn end(&self, gid: Gid) {
         let told = self.lock().each(|line| {
             line.ended |= line.reader == gid || line.writer == gid;

@@ -46,11 +46,11 @@ impl<W: Word> Journal<'_, W> {
     }
 }
 
-/// How far a follower has read a journal.
+/// A follower's position in a journal.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct JournalCursor(u64);
 
-/// What a follower has to look at.
+/// The rings that a follower has to look at.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum RingsToRead {
     /// The rings that were named.

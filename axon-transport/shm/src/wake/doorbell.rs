@@ -32,28 +32,28 @@ pub(crate) const PURPOSES: [Purpose; 2] = [Purpose::Samples, Purpose::Room];
 /// The armed words, in the order of [`PURPOSES`].
 pub(crate) type Words<'a> = [&'a AtomicU64; 2];
 
-/// What another thread may ask for a waiter: whether there is what it waits for.
+/// A check that another thread may make for a waiter: whether its wait is over.
 pub trait WakeCheck: Send + Sync {
-    /// Must be quick, and must not wait for a thread that waits.
+    /// Whether the wait is over. Must be quick, and must not block on a thread that waits at a doorbell.
     fn ready(&self) -> bool;
 }
 
 /// A session of this process, at whose doorbell a thread may sleep.
 pub(crate) trait WakeListener: Send + Sync {
-    /// Makes the thread that listens there look again.
+    /// Makes the listening thread check again.
     fn wake_listener(&self);
 }
 
-/// Who of this process sleeps, and who of them listens for all.
+/// The threads of this process that sleep, and the one of them that listens for all.
 ///
-/// One waiter leads: it listens to the bell, and when it rang, wakes those of the others that may
-/// have something. These sleep until then. All tickets are given out under the lock, so the armed
+/// One waiter leads: it listens to the bell, and when it rang, wakes the other waiters whose wait may be over.
+/// The others sleep until then. All tickets are given out under the lock, so the armed
 /// words only rise and a ringer never mistakes a new ticket for one it has rung for.
 pub(crate) struct Doorbell {
     receiver: BellReceiver,
     waiters: Mutex<Waiters>,
     spin: Spin,
-    /// Where a leader that is to make way says that it has.
+    /// Signalled by a leader that has given up its lead on request.
     way: Condvar,
 }
 

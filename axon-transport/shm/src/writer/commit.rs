@@ -257,7 +257,7 @@ impl Writer {
                 let short = match attempt(&mut state) {
                     Ok(done) => return Ok(done),
                     Err(Refusal::Error(error)) => return Err(error),
-                    Err(Refusal::PinnedMemory(kept)) => {
+                    Err(Refusal::Pinned(kept)) => {
                         drop(state);
                         return Err(kept.into_error());
                     }

@@ -440,7 +440,7 @@ impl Writer {
         self.loan_behind(0, len)
     }
 
-    /// As [`loan`](Self::loan); aligned to 16 is what is behind the first `header` bytes.
+    /// Like [`loan`](Self::loan); the bytes after the header are 16-byte aligned.
     ///
     /// # Errors
     /// As [`publish`](Self::publish).

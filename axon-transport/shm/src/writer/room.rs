@@ -26,15 +26,15 @@ pub(crate) enum Refusal {
         short: Option<PublishError>,
     },
     Error(PublishError),
-    /// Readers keep what memory there is.
-    PinnedMemory(PinnedMemory),
+    /// Readers pin the memory that samples could use.
+    Pinned(PinnedMemory),
 }
 
-/// Who keeps it.
+/// The reader that pins most of a publisher's memory.
 pub(crate) struct PinnedMemory {
     pub(crate) holder: PinningReader,
     pub(crate) samples: usize,
-    /// Why there is no more of it, where it is not that the segments are full.
+    /// Why no further memory is available, unless the segments are full.
     pub(crate) short: Option<PublishError>,
 }
 

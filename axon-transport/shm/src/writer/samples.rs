@@ -222,7 +222,7 @@ impl Writer {
                 None if look < LOOKS => {}
                 holder => {
                     let holder = holder.unwrap_or(PinningReader { reader: self.gid(), peer: None });
-                    return Err(Refusal::PinnedMemory(PinnedMemory {
+                    return Err(Refusal::Pinned(PinnedMemory {
                         holder,
                         samples: kept.len(),
                         short,

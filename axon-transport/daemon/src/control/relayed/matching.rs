@@ -215,12 +215,13 @@ impl RelayedSession {
         }
     }
 
-    /// Takes what has gone by way of another subscription or server; whether there is more.
+    /// Skips samples that the session already received through another subscription or server. Returns whether more
+    /// remain.
     pub(super) fn pass_over(&mut self) -> bool {
         let mut more = self.calls.pass_over(|gid| self.writers.get(gid));
         for (writer, source) in &mut self.sources {
             more |= source.samples.pass_over(|reader| taken(&self.subscriptions, reader, writer));
-            // What was passed over just now the session has by way of another.
+            // The session already received skipped samples through another subscription.
             if source.samples.readers().nth(1).is_some() {
                 source.acknowledge(&self.subscriptions, writer);
             }
@@ -229,7 +230,7 @@ impl RelayedSession {
     }
 }
 
-/// How much a subscription asks for of what was published before it was there.
+/// The samples that a subscription requests from before its creation.
 fn history_of(qos: &Qos) -> Option<u32> {
     let depth = if qos.history == History::KeepAll { u32::MAX } else { qos.depth };
     (qos.durability == Durability::TransientLocal).then_some(depth)

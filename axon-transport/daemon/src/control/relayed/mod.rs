@@ -405,13 +405,13 @@ impl RelayedSession {
         }
     }
 
-    /// The process has what stands for these clients of a server, whose responses they get by way of it.
+    /// The process holds stand-ins for these clients of a server. Their responses pass through it.
     fn callers(&mut self, matched: Matched) -> Result<(), End> {
         let Matched { gid, others } = matched;
         let others: BTreeSet<Gid> = others.into_iter().collect();
         match self.writers.get(&gid) {
             Some(RemoteWriter::Server(_)) => {}
-            // It was refused.
+            // The endpoint was refused.
             None if gid.is_of(&self.id) => return Ok(()),
             _ => return Err(End::Other(format!("{gid} is no server of its own"))),
         }
