@@ -28,7 +28,7 @@ fn figures(arguments: &[&str]) -> Option<Value> {
 
 /// A RELIABLE sample crosses a path that loses a fifth of all packets. How soon is not asserted.
 #[test]
-fn all_that_is_reliable_arrives_and_the_path_loses_what_it_is_told_to() {
+fn reliable_samples_arrive_over_a_lossy_path() {
     let Some(all) = figures(&["losses", "--losses", "20", "--seconds", "1"]) else { return };
     let rows = all["figures"]["losses"].as_array().unwrap();
     assert_eq!(rows.len(), 7);

@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_log_does_not_hold_is_different_and_never_a_panic() {
+    fn messages_absent_from_the_log_count_as_different() {
         let outcome = run(&[(0, 0, b""), (0, 4, b"a4"), (0, u64::MAX, b""), (9, 1, b"")]);
         assert_eq!((outcome.different, outcome.messages, outcome.lost), (4, 0, 4));
     }

@@ -439,7 +439,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_peer_calls_itself_cannot_steer_the_terminal() {
+    fn status_removes_control_characters_of_peer_names() {
         assert!(!render(&status()).contains('\x1b'));
     }
 

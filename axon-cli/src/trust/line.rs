@@ -30,7 +30,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_would_not_be_read_back_is_refused() {
+    fn trust_line_refuses_unparsable_names() {
         let key = SpkiDigest([7; 32]);
         assert_eq!(line("arm-2", key).unwrap(), format!("arm-2 {key}"));
         let long = "x".repeat(256);

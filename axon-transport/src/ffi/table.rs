@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn what_names_nothing_is_found_out() {
+    fn invalid_handles_are_refused_with_their_reason() {
         let table = table();
         let handle = table.insert("one").unwrap();
         let next_generation = handle + (1 << (PLACE + KIND + PROCESS));

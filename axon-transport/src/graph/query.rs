@@ -188,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn what_has_no_name_where_it_needs_one_is_not_sane() {
+    fn endpoints_with_missing_or_extra_names_are_not_sane() {
         let view = view();
         let node = view.endpoints[&Gid([1; 16])].endpoint.as_ref().clone();
         let talker = view.endpoints[&Gid([4; 16])].endpoint.as_ref().clone();

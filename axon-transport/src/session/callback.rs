@@ -156,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn what_happened_before_is_told_at_once_and_once() {
+    fn a_new_callback_receives_earlier_events_once() {
         let callback = Callback::default();
         callback.recount(2);
         callback.add(1);
@@ -218,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn what_happens_while_it_runs_it_is_told_afterwards_by_the_same_thread() {
+    fn events_during_a_callback_are_reported_after_it_by_the_same_thread() {
         let callback = Callback::default();
         let (function, entries, go, _) = gate();
         callback.set(Some(function));

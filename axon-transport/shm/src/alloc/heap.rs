@@ -284,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn what_fits_nowhere_is_refused() {
+    fn heap_refuses_an_allocation_beyond_its_limit() {
         let (segments, heap) = heap();
         let error = heap.allocate(&segments, HEAP_BYTES_MAX, Need::Now, |_| true).err();
         assert!(matches!(error, Some(ShmError::NoMemory { .. })), "{error:?}");

@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn what_could_not_be_backed_is_not_tried_before_what_is() {
+    fn backed_slots_are_taken_before_unbacked_ones() {
         let mut slots = slots(64 * MIB);
         let [low, high] = [(); 2].map(|()| take(&mut slots, 4 * MIB).unwrap());
         let unbacked = slots.take(MIB).unwrap();

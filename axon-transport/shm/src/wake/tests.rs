@@ -194,7 +194,7 @@ fn handed_out(session: &SessionSegment) -> PassedFd {
 }
 
 #[test]
-fn who_rings_never_waits_whatever_is_done_to_the_bell() {
+fn ringing_never_blocks() {
     let session = SessionSegment::create(SessionId::random()).unwrap();
     let fd = handed_out(&session);
     let flags = fcntl_getfl(&fd).unwrap();
@@ -291,7 +291,7 @@ fn descriptors_in_a_bell_are_not_taken_and_keep_nobody_waiting() {
 }
 
 #[test]
-fn what_epoll_would_round_is_not_left_to_it() {
+fn epoll_gets_whole_milliseconds_only() {
     let whole = |time: Duration| whole_millis(Some(time)).unwrap();
     for short in [0, 1, 999, 200_000, 999_999] {
         assert!(whole(Duration::from_nanos(short)).is_zero(), "{short} ns");

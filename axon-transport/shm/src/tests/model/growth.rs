@@ -55,7 +55,7 @@ impl Growing {
 
 /// `ArrayStore`, `ArrayLoad`: what stands when the ring grows is found in either array.
 #[test]
-fn what_stands_stays_while_the_ring_grows() {
+fn samples_survive_the_growth_of_their_ring() {
     check(3, || {
         let ring = Growing::new();
         let publisher = {
