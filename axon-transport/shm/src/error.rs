@@ -163,6 +163,7 @@ pub enum PublishError {
 
 /// A reader that pins samples which the publisher has given up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct PinHolder {
     /// The reader's GID.
     pub reader: Gid,

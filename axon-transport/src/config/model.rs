@@ -11,6 +11,7 @@ use super::daemon_env::DaemonEnv;
 /// To change one, change the builder: neither validation nor the daemon that a session starts knows of a
 /// field that was assigned to.
 #[derive(Clone, Debug)]
+#[non_exhaustive]
 pub struct Config {
     /// How peers prove themselves and agree on keys.
     pub security: Security,
@@ -89,6 +90,7 @@ pub enum Security {
 
 /// Settings of `classic`.
 #[derive(Clone, Debug)]
+#[non_exhaustive]
 pub struct ClassicConfig {
     /// `AXON_CLASSIC_AUTH`.
     pub auth: ClassicAuth,
@@ -102,6 +104,13 @@ pub struct ClassicConfig {
     pub cert: Option<PathBuf>,
     /// `AXON_CLASSIC_CRL`.
     pub crl: Option<PathBuf>,
+}
+
+impl ClassicConfig {
+    /// These settings, without any file.
+    pub fn new(auth: ClassicAuth) -> Self {
+        Self { auth, key: None, trust: None, ca: None, cert: None, crl: None }
+    }
 }
 
 /// How a peer is known in `classic`.
@@ -300,6 +309,7 @@ impl DiscoveryRange {
 
 /// A static peer (`AXON_DAEMON_PEERS`).
 #[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct PeerAddress {
     /// Address or name.
     pub host: String,
@@ -309,6 +319,7 @@ pub struct PeerAddress {
 
 /// `[link]` of `axon.toml`.
 #[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct LinkConfig {
     /// How long a daemon outlives its last session.
     pub grace: Duration,

@@ -143,16 +143,16 @@ impl axon_qos_t {
             nanoseconds => Choice::Exactly(Some(Duration::from_nanos(nanoseconds))),
         };
         let (deadline, lease, depth) = (period(self.deadline), period(self.lease), self.depth);
-        Ok(QosRequest {
-            reliability,
-            durability,
-            history,
-            depth,
-            deadline,
-            lifespan,
-            liveliness,
-            lease,
-        })
+        let mut request = QosRequest::default();
+        request.reliability = reliability;
+        request.durability = durability;
+        request.history = history;
+        request.depth = depth;
+        request.deadline = deadline;
+        request.lifespan = lifespan;
+        request.liveliness = liveliness;
+        request.lease = lease;
+        Ok(request)
     }
 }
 

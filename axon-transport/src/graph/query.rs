@@ -6,6 +6,7 @@ use super::{EndpointKind, GraphEntry, GraphView};
 
 /// A node as the graph lists it. Two nodes may have the same name: it lists both.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[non_exhaustive]
 pub struct NodeName {
     /// Its namespace.
     pub namespace: String,

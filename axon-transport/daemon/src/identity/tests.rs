@@ -35,9 +35,9 @@ fn key() -> zeroize::Zeroizing<String> {
 }
 
 fn config(dir: &Path) -> ClassicConfig {
-    let auth = ClassicAuth::Pinned;
-    let [key, trust] = ["key", "trust"].map(|name| Some(dir.join(name)));
-    ClassicConfig { auth, key, trust, ca: None, cert: None, crl: None }
+    let mut config = ClassicConfig::new(ClassicAuth::Pinned);
+    [config.key, config.trust] = ["key", "trust"].map(|name| Some(dir.join(name)));
+    config
 }
 
 impl Host {
@@ -275,15 +275,7 @@ fn a_file_that_cannot_be_used_at_the_start_is_named() {
 
 #[test]
 fn without_files_there_is_nothing_to_look_at() {
-    let none = ClassicConfig {
-        auth: ClassicAuth::None,
-        key: None,
-        trust: None,
-        ca: None,
-        cert: None,
-        crl: None,
-    };
-    let identity = Identity::load(&none, "node").unwrap();
+    let identity = Identity::load(&ClassicConfig::new(ClassicAuth::None), "node").unwrap();
     assert!(!identity.has_files());
     assert!(!identity.look(Instant::now()));
 }

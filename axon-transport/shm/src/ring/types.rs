@@ -1,6 +1,12 @@
 //! The types that a writer and a reader of a ring exchange with each other and with their owners.
 
-use crate::{ids::Gid, qos::Qos};
+use std::time::SystemTime;
+
+use crate::{
+    ids::Gid,
+    os::clock::{from_unix_nanos, unix_nanos},
+    qos::Qos,
+};
 
 /// What a ring is made for.
 #[derive(Clone, Copy, Debug)]
@@ -41,8 +47,21 @@ pub struct Meta {
     pub published: u64,
 }
 
+impl Meta {
+    /// Of a sample that is published now, with this number and source time.
+    pub fn new(sequence: u64, source_time: SystemTime) -> Self {
+        Self { sequence, source_timestamp: unix_nanos(source_time), published: 0 }
+    }
+
+    /// The time of publication by the publisher's wall clock.
+    pub fn source_time(&self) -> SystemTime {
+        from_unix_nanos(self.source_timestamp)
+    }
+}
+
 /// A sample that was published.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Published {
     /// Its position in the ring, counted from 0 without gaps. None where nobody reads: then only
     /// its number is used up.
