@@ -9,6 +9,32 @@ use std::{
 
 /// Told how often something happened since it was told last; at least once. It may be called on the
 /// session's control thread, but never by two threads at once, and must neither block nor panic.
+///
+/// ```
+/// # use std::time::Duration;
+/// use std::sync::{Arc, atomic::{AtomicU64, Ordering}};
+/// use axon_transport::OnNew;
+/// # use axon_transport::{
+/// #     EndpointSpec, Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// #     qos::Qos,
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// # let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default());
+/// let publisher = session.create_publisher(spec())?;
+/// let subscription = session.create_subscription(spec())?;
+/// assert!(publisher.wait_matched(1, Duration::from_secs(10)));
+/// let new = Arc::new(AtomicU64::new(0));
+/// let counter = new.clone();
+/// let callback: OnNew = Arc::new(move |count| {
+///     counter.fetch_add(count, Ordering::Relaxed);
+/// });
+/// publisher.publish(b"1.5 m/s")?;
+/// subscription.set_on_new_sample(Some(callback))?;
+/// assert_eq!(new.load(Ordering::Relaxed), 1);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub type OnNew = Arc<dyn Fn(u64) + Send + Sync>;
 
 /// What is to be told, and to whom.

@@ -5,6 +5,19 @@ use std::{ffi::OsString, io, path::PathBuf, sync::Arc};
 use crate::{qos::Qos, session_key::SessionKey, wire::session::SessionRole};
 
 /// How a session is opened.
+///
+/// ```
+/// # use axon_transport::{
+/// #     Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// # drop(session);
+/// let options = SessionOptions::new("camera");
+/// let session = Session::open(&config, options)?;
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Debug)]
 pub struct SessionOptions {
     pub(super) name: String,

@@ -35,6 +35,19 @@ use crate::{
 };
 
 /// Something that a session's owner may want to hear of.
+///
+/// ```
+/// use axon_transport::SessionEvent;
+///
+/// fn log(event: &SessionEvent) {
+///     match event {
+///         SessionEvent::DaemonLost => println!("the daemon is gone"),
+///         SessionEvent::DaemonFound(daemon) => println!("connected to daemon {daemon:?}"),
+///         other => println!("{other:?}"),
+///     }
+/// }
+/// # log(&SessionEvent::DaemonLost);
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum SessionEvent {

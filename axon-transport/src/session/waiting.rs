@@ -15,6 +15,29 @@ use super::{
 use crate::events::EventKind;
 
 /// Something to wait for.
+///
+/// ```
+/// # use std::time::Duration;
+/// use axon_transport::Waitable;
+/// # use axon_transport::{
+/// #     EndpointSpec, Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// #     qos::Qos,
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// # let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default());
+/// let publisher = session.create_publisher(spec())?;
+/// let subscription = session.create_subscription(spec())?;
+/// assert!(publisher.wait_matched(1, Duration::from_secs(10)));
+/// let stop = session.create_guard_condition();
+/// publisher.publish(b"1.5 m/s")?;
+///
+/// let all = [Waitable::GuardCondition(&stop), Waitable::Subscription(&subscription)];
+/// let ready = session.wait_for(&all, Some(Duration::from_secs(10)))?;
+/// assert_eq!(ready[..], [1]);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Copy, Debug)]
 #[non_exhaustive]
 pub enum Waitable<'a> {
@@ -32,6 +55,21 @@ pub enum Waitable<'a> {
 
 /// What was found ready: its indices among all that was waited for, in order. A slice; no allocation
 /// where it is a few.
+///
+/// ```
+/// # use std::time::Duration;
+/// use axon_transport::{Ready, Waitable};
+/// # use axon_transport::{
+/// #     Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// let stop = session.create_guard_condition();
+/// let nothing: Ready = session.wait_for(&[Waitable::GuardCondition(&stop)], Some(Duration::ZERO))?;
+/// assert!(nothing.is_empty());
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Ready(SmallVec<[usize; FEW]>);
 

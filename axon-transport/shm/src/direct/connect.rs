@@ -40,6 +40,19 @@ const MAX_DESCRIPTORS: usize = 4;
 const MAX_REASON: usize = 256;
 
 /// A subscriber and a publisher did not come together.
+///
+/// ```
+/// use std::{os::unix::net::UnixDatagram, time::Duration};
+/// use axon_shm::{ConnectError, Context, Subscriber, SubscriberOptions, qos::Qos};
+///
+/// // No publisher serves at the other end.
+/// let (ours, _theirs) = UnixDatagram::pair()?;
+/// let options = SubscriberOptions::new(Qos::default());
+/// let soon = Some(Duration::from_millis(1));
+/// let alone = Subscriber::connect(&Context::new()?, &ours, options, soon);
+/// assert!(matches!(alone, Err(ConnectError::Timeout)));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ConnectError {

@@ -33,6 +33,16 @@ const MANY: usize = 64;
 
 /// The memory, doorbell and identity that publishers and subscribers of a process share. Starts no
 /// thread. Clones are the same context; all methods may be called from any thread.
+///
+/// ```
+/// use axon_shm::{Context, Publisher, PublisherOptions, qos::Qos};
+///
+/// let context = Context::new()?;
+/// let options = PublisherOptions::new(Qos::default());
+/// let [left, right] = [Publisher::new(&context, options)?, Publisher::new(&context, options)?];
+/// assert_ne!(left.gid(), right.gid());
+/// # Ok::<(), axon_shm::ShmError>(())
+/// ```
 #[derive(Clone)]
 pub struct Context {
     inner: Arc<ContextInner>,

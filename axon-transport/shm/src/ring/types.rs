@@ -35,6 +35,17 @@ pub struct Grant {
 }
 
 /// What goes with a sample.
+///
+/// ```
+/// use std::time::SystemTime;
+/// use axon_shm::{Context, Meta, Publisher, PublisherOptions, qos::Qos};
+///
+/// let publisher = Publisher::new(&Context::new()?, PublisherOptions::new(Qos::default()))?;
+/// let meta = Meta::new(7, SystemTime::UNIX_EPOCH);
+/// publisher.publish_with(meta, b"hello")?;
+/// assert_eq!(meta.source_time(), SystemTime::UNIX_EPOCH);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Meta {
     /// The publisher's sequence number.
@@ -60,6 +71,18 @@ impl Meta {
 }
 
 /// A sample that was published.
+///
+/// ```
+/// use std::time::SystemTime;
+/// use axon_shm::{Context, Meta, Publisher, PublisherOptions, qos::Qos};
+///
+/// let publisher = Publisher::new(&Context::new()?, PublisherOptions::new(Qos::default()))?;
+/// let mut loan = publisher.loan(5)?;
+/// loan.copy_from_slice(b"hello");
+/// let published = loan.publish(Meta::new(1, SystemTime::now()))?;
+/// assert_eq!(published.position, None, "nobody reads");
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Published {

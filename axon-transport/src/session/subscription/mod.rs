@@ -36,12 +36,53 @@ use crate::{
 };
 
 /// Receives the samples of a topic. Thread-safe.
+///
+/// ```
+/// # use std::time::Duration;
+/// # use axon_transport::{
+/// #     EndpointSpec, Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// #     qos::Qos,
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// # let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default());
+/// let publisher = session.create_publisher(spec())?;
+/// let subscription = session.create_subscription(spec())?;
+/// assert!(publisher.wait_matched(1, Duration::from_secs(10)));
+/// publisher.publish(b"1.5 m/s")?;
+///
+/// let mut payload = Vec::new();
+/// subscription.recv(&mut payload, Some(Duration::from_secs(10)))?;
+/// assert_eq!(payload, b"1.5 m/s");
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub struct Subscription {
     pub(super) inner: Arc<SubscriptionInner>,
     pub(super) session: Session,
 }
 
 /// What is known of a sample besides its bytes.
+///
+/// ```
+/// # use std::time::Duration;
+/// # use axon_transport::{
+/// #     EndpointSpec, Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// #     qos::Qos,
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// # let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default());
+/// let publisher = session.create_publisher(spec())?;
+/// let subscription = session.create_subscription(spec())?;
+/// assert!(publisher.wait_matched(1, Duration::from_secs(10)));
+/// publisher.publish(b"1.5 m/s")?;
+///
+/// let info = subscription.recv(&mut Vec::new(), Some(Duration::from_secs(10)))?;
+/// assert_eq!((info.publisher, info.sequence, info.reception), (publisher.gid(), 1, 1));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct MessageInfo {
@@ -61,6 +102,29 @@ pub struct MessageInfo {
 
 /// The age of a sample when it was taken, and its publisher's lifespan. The monotonic clock tells both,
 /// so that neither a step of the wall clock nor that of another host counts.
+///
+/// ```
+/// # use std::time::Duration;
+/// # use axon_transport::{
+/// #     EndpointSpec, Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// #     qos::Qos,
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// let lifespan = Duration::from_secs(60);
+/// let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default().with_lifespan(lifespan));
+/// let publisher = session.create_publisher(spec())?;
+/// let subscription = session.create_subscription(spec())?;
+/// assert!(publisher.wait_matched(1, Duration::from_secs(10)));
+/// publisher.publish(b"1.5 m/s")?;
+///
+/// let info = subscription.recv(&mut Vec::new(), Some(Duration::from_secs(10)))?;
+/// let lifetime = info.lifetime.expect("the lifespan is finite");
+/// assert_eq!(lifetime.lifespan, lifespan);
+/// assert!(lifetime.age < lifespan);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Lifetime {

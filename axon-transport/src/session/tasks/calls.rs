@@ -27,6 +27,23 @@ use crate::{
 const BATCH: usize = 256;
 
 /// Why a call has no response.
+///
+/// ```
+/// # use std::time::Duration;
+/// use axon_transport::CallError;
+/// # use axon_transport::{
+/// #     EndpointSpec, Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// #     qos::Qos,
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// # let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default());
+/// let client = session.create_client(spec())?;
+/// let failed = client.call_blocking(b"how fast?", Some(Duration::from_secs(1)));
+/// assert!(matches!(failed, Err(CallError::Unavailable)));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum CallError {

@@ -80,6 +80,29 @@ impl Drop for Receiver<'_> {
 /// It goes on for as long as it is polled, whatever publishers come and go. It ends after an error, which no
 /// later poll could mend. After 32 messages without a pause it has its task polled again, so that others of
 /// the same thread are not kept waiting by a publisher that never rests.
+///
+/// ```
+/// # use axon_transport::{
+/// #     EndpointSpec, Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// #     qos::Qos,
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// # let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default());
+/// let subscription = session.create_subscription(spec())?;
+/// let mut messages = subscription.stream();
+/// let printing = async move {
+///     while let Some(message) = messages.next().await {
+///         let (info, payload) = message?;
+///         println!("{}: {payload:?}", info.sequence);
+///     }
+///     Ok::<(), axon_transport::RecvError>(())
+/// };
+/// // Any runtime runs it.
+/// # drop(printing);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub struct Messages<'a> {
     receiver: Receiver<'a>,
     in_a_row: u32,
