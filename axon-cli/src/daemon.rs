@@ -5,10 +5,10 @@ use std::{io::Read, process::ExitCode, thread};
 use axon_daemon::Start;
 use rustix::process::{Signal, getpid, kill_process};
 
-use crate::{cli, failure::Failure, logging};
+use crate::{cli, failure::CliError, logging};
 
 /// Runs `axon daemon`.
-pub(crate) fn run(args: &cli::Daemon) -> Result<ExitCode, Failure> {
+pub(crate) fn run(args: &cli::Daemon) -> Result<ExitCode, CliError> {
     logging::check()?;
     let start = match (args.spawned, args.detached) {
         (true, _) => Start::Spawned,

@@ -15,7 +15,7 @@ use axon_transport::{
 };
 use serde_json::json;
 
-use crate::{cli, failure::Failure, interrupt, logging, say::say, session, text};
+use crate::{cli, failure::CliError, interrupt, logging, say::say, session, text};
 
 /// Bytes of the payload that a line shows.
 const HEAD: usize = 16;
@@ -27,7 +27,7 @@ const DEPTH: u32 = 1_000;
 const AT_ONCE: Duration = Duration::from_secs(1);
 
 /// Runs `axon echo`.
-pub(crate) fn run(args: &cli::Echo) -> Result<(), Failure> {
+pub(crate) fn run(args: &cli::Echo) -> Result<(), CliError> {
     let config = logging::configure()?;
     let session = session::open(&config, "axon echo")?;
     let type_name = match &args.type_name {
@@ -74,7 +74,7 @@ fn print(
     subscription: &Subscription,
     interrupt: &GuardCondition,
     numbers: &mut Numbers,
-) -> Result<(), Failure> {
+) -> Result<(), CliError> {
     let mut payload = Vec::new();
     let mut left = args.count;
     let mut out = io::stdout().lock();
@@ -82,7 +82,7 @@ fn print(
         session.wait(|| subscription.has_data() || interrupt.is_triggered(), None);
         if interrupt.is_triggered() {
             return match left {
-                Some(left) => Err(Failure::failed(format_args!(
+                Some(left) => Err(CliError::failed(format_args!(
                     "interrupted: {left} messages of those asked for did not come"
                 ))),
                 None => Ok(()),

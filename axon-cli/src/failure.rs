@@ -8,14 +8,14 @@ use crate::say::say;
 
 /// Why a command ends without having done its work.
 #[derive(Debug)]
-pub(crate) enum Failure {
+pub(crate) enum CliError {
     /// A setting is unknown, obsolete or half-given: status 2, and this one line names it.
     Setting(String),
     /// Anything else: status 1.
     Failed(String),
 }
 
-impl Failure {
+impl CliError {
     /// A failure that is not a setting's.
     pub(crate) fn failed(reason: impl Display) -> Self {
         Self::Failed(reason.to_string())
@@ -37,13 +37,13 @@ impl Failure {
     }
 }
 
-impl From<ConfigError> for Failure {
+impl From<ConfigError> for CliError {
     fn from(error: ConfigError) -> Self {
         Self::Setting(error.to_string())
     }
 }
 
-impl From<std::io::Error> for Failure {
+impl From<std::io::Error> for CliError {
     fn from(error: std::io::Error) -> Self {
         Self::failed(error)
     }

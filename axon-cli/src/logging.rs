@@ -4,13 +4,13 @@ use axon_daemon::log;
 use axon_transport::config::Config;
 use tracing_subscriber::EnvFilter;
 
-use crate::failure::Failure;
+use crate::failure::CliError;
 
 /// Reads the configuration and sets logging up as it says.
 ///
 /// # Errors
 /// A setting that is unknown, obsolete or half-given.
-pub(crate) fn configure() -> Result<Config, Failure> {
+pub(crate) fn configure() -> Result<Config, CliError> {
     let config = check()?;
     log::start(&config);
     Ok(config)
@@ -20,11 +20,14 @@ pub(crate) fn configure() -> Result<Config, Failure> {
 ///
 /// # Errors
 /// As for [`configure`].
-pub(crate) fn check() -> Result<Config, Failure> {
+pub(crate) fn check() -> Result<Config, CliError> {
     let config = Config::from_env()?;
     EnvFilter::try_new(&config.log).map_err(|error| {
         let accepted = "a level such as info, or target=level pairs";
-        Failure::Setting(format!("AXON_LOG: read {:?} ({error}); accepted: {accepted}", config.log))
+        CliError::Setting(format!(
+            "AXON_LOG: read {:?} ({error}); accepted: {accepted}",
+            config.log
+        ))
     })?;
     Ok(config)
 }

@@ -13,7 +13,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::{
     cli::{self, Profile},
-    failure::Failure,
+    failure::CliError,
     log::{LogError, Message, Survey},
     logging,
     say::say,
@@ -54,11 +54,11 @@ pub(crate) struct Sent {
 }
 
 /// Runs `axon play`.
-pub(crate) fn run(args: &cli::Play) -> Result<(), Failure> {
+pub(crate) fn run(args: &cli::Play) -> Result<(), CliError> {
     let config = logging::configure()?;
     let survey =
         if args.incomplete { Survey::of_whole_part(&args.file) } else { Survey::of(&args.file) };
-    let survey = survey.map_err(Failure::failed)?;
+    let survey = survey.map_err(CliError::failed)?;
     if let Some(damage) = &survey.damage {
         let (messages, time) = (text::grouped(survey.messages), text::duration(survey.duration));
         let file = survey.path.display();
@@ -122,7 +122,7 @@ fn wait_acknowledged(publishers: &[Publisher], patience: Duration) -> u64 {
 }
 
 /// Why a replay is not known to have reached everybody, if so.
-fn unheard(left: u64, given_up: u64, missed: u64) -> Result<(), Failure> {
+fn unheard(left: u64, given_up: u64, missed: u64) -> Result<(), CliError> {
     let mut why = Vec::new();
     if left > 0 {
         let seconds = UNACKNOWLEDGED.as_secs();
@@ -141,7 +141,7 @@ fn unheard(left: u64, given_up: u64, missed: u64) -> Result<(), Failure> {
         return Ok(());
     }
     let why = why.join("; ");
-    Err(Failure::failed(format_args!("{why}. `axon status` on both hosts shows links and losses")))
+    Err(CliError::failed(format_args!("{why}. `axon status` on both hosts shows links and losses")))
 }
 
 /// A publisher for each topic of the log.
@@ -149,7 +149,7 @@ pub(crate) fn publishers(
     session: &Session,
     survey: &Survey,
     qos: Qos,
-) -> Result<Vec<Publisher>, Failure> {
+) -> Result<Vec<Publisher>, CliError> {
     let publisher = |topic: &crate::log::Topic| {
         let spec = EndpointSpec::new(&topic.name, &topic.type_name, qos);
         session.create_publisher(spec).map_err(session::failure)
@@ -177,11 +177,11 @@ pub(crate) fn replay(
     publishers: &[Publisher],
     (rate, readers): (f64, usize),
     mut progress: impl FnMut(Sent) -> std::io::Result<bool>,
-) -> Result<Sent, Failure> {
+) -> Result<Sent, CliError> {
     let mut sent = Sent::default();
     let mut pace = None;
     for message in read_ahead(survey)? {
-        let message = message.map_err(Failure::failed)?;
+        let message = message.map_err(CliError::failed)?;
         let pace = *pace.get_or_insert_with(|| Pace::new(message.time, rate));
         thread::sleep(pace.until(message.time, Instant::now()));
         // Before: a subscription that got the last message may leave with it.
@@ -192,7 +192,7 @@ pub(crate) fn replay(
                 Err(PublishError::Blocked { .. }) => sent.waits += 1,
                 Err(error) => {
                     let topic = &survey.topics[message.topic].name;
-                    return Err(Failure::failed(format_args!("{topic}: {error}")));
+                    return Err(CliError::failed(format_args!("{topic}: {error}")));
                 }
             }
             if !progress(sent)? {
@@ -213,8 +213,8 @@ pub(crate) fn replay(
 /// Reads and decompresses on a thread of its own, so that neither disturbs the pace.
 fn read_ahead(
     survey: &Survey,
-) -> Result<impl Iterator<Item = Result<Message, LogError>> + use<>, Failure> {
-    let messages = survey.messages().map_err(Failure::failed)?;
+) -> Result<impl Iterator<Item = Result<Message, LogError>> + use<>, CliError> {
+    let messages = survey.messages().map_err(CliError::failed)?;
     let (sender, receiver) = mpsc::sync_channel(READ_AHEAD);
     thread::spawn(move || {
         for message in messages {
@@ -278,7 +278,7 @@ mod tests {
             ((0, 0, 3), "3 messages found fewer"),
         ] {
             match unheard(counts.0, counts.1, counts.2) {
-                Err(Failure::Failed(text)) => assert!(text.contains(part), "{text}"),
+                Err(CliError::Failed(text)) => assert!(text.contains(part), "{text}"),
                 other => panic!("{other:?}"),
             }
         }

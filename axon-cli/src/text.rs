@@ -5,14 +5,14 @@ use std::fmt::Write as _;
 use axon_transport::internal::text::is_plain;
 
 /// A table of text: a header, rows, columns as wide as their widest cell.
-pub(crate) struct Table {
+pub(crate) struct TextTable {
     header: Vec<&'static str>,
     /// Whether a column is set to the right, as numbers are.
     right: Vec<bool>,
     rows: Vec<Vec<String>>,
 }
 
-impl Table {
+impl TextTable {
     /// An empty table; a header that starts with `>` sets its column to the right.
     pub(crate) fn new(header: &[&'static str]) -> Self {
         Self {
@@ -174,7 +174,7 @@ mod tests {
 
     #[test]
     fn a_cell_cannot_steer_the_terminal() {
-        let mut table = Table::new(&["topic", ">count"]);
+        let mut table = TextTable::new(&["topic", ">count"]);
         table.row(["\x1b[2Jgone\r\n".to_owned(), "7".to_owned()]);
         let text = table.render(2);
         assert!(!text.contains('\x1b') && !text.contains('\r'), "{text:?}");
@@ -193,7 +193,7 @@ mod tests {
 
     #[test]
     fn columns_line_up_and_a_short_row_is_filled() {
-        let mut table = Table::new(&["name", ">n"]);
+        let mut table = TextTable::new(&["name", ">n"]);
         table.row(["a".to_owned(), "1,234".to_owned()]);
         table.row(["longer".to_owned()]);
         let expected = "name        n\n------  -----\na       1,234\nlonger\n";

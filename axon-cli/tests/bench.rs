@@ -12,7 +12,7 @@ use std::{
     thread::{self, available_parallelism},
 };
 
-use common::{Running, axon, eventually};
+use common::{Running, Stderr, axon, eventually};
 use serde_json::Value;
 
 /// One for each way that AXON has with a sample: in its descriptor, copied, in place.
@@ -95,7 +95,7 @@ fn a_quick_run_writes_every_figure_there_is() {
         .output()
         .expect("it runs");
     let text = String::from_utf8(output.stdout).expect("text");
-    assert!(output.status.success(), "{text}\n{}", String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success(), "{text}\n{}", Stderr::of(&output.stderr));
 
     let document = fs::read(out.join("shm.json")).expect("a file");
     let document: Value = serde_json::from_slice(&document).expect("JSON");
@@ -209,7 +209,7 @@ fn it_ends_when_its_other_process_does() {
         .expect("it was there");
     eventually("it ends", || running.0.try_wait().expect("its status").is_some());
     let output = running.finish();
-    let why = String::from_utf8_lossy(&output.stderr);
+    let why = Stderr::of(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{why}");
     assert!(why.contains("ended"), "{why}");
     assert!(!dir.path().join("shm.json").exists());
@@ -220,7 +220,7 @@ fn a_size_that_cannot_be_measured_is_refused() {
     for wrong in ["7", "1k", "8,,9", "67108865"] {
         let output = axon([]).args(["bench", "shm", "--sizes", wrong]).output().expect("it runs");
         assert_eq!(output.status.code(), Some(2), "{wrong}");
-        assert!(String::from_utf8_lossy(&output.stderr).contains("number of bytes"), "{wrong}");
+        assert!(Stderr::of(&output.stderr).contains("number of bytes"), "{wrong}");
     }
 }
 
@@ -236,7 +236,7 @@ fn a_quick_run_of_sessions_compares_them_with_bare_shared_memory() {
         .output()
         .expect("it runs");
     let text = String::from_utf8(output.stdout).expect("text");
-    assert!(output.status.success(), "{text}\n{}", String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success(), "{text}\n{}", Stderr::of(&output.stderr));
     assert!(text.contains("session") && text.contains("CPU: bare"), "{text}");
     let document = fs::read(dir.path().join("session.json")).expect("a file");
     let document: Value = serde_json::from_slice(&document).expect("JSON");
@@ -276,7 +276,7 @@ fn a_quick_run_between_two_hosts_has_every_mode_and_size() {
         .output()
         .expect("it runs");
     let text = String::from_utf8(output.stdout).expect("text");
-    assert!(output.status.success(), "{text}\n{}", String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success(), "{text}\n{}", Stderr::of(&output.stderr));
     assert!(text.contains("QUIC qkd/messages10") && text.contains("KEEP_LAST"), "{text}");
     let document = fs::read(dir.path().join("net.json")).expect("a file");
     let document: Value = serde_json::from_slice(&document).expect("JSON");

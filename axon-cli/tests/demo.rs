@@ -5,7 +5,7 @@
 
 mod common;
 
-use common::axon;
+use common::{Stderr, axon};
 use serde_json::Value;
 
 #[test]
@@ -15,7 +15,7 @@ fn every_route_delivers_and_every_wrong_peer_is_refused() {
         .args(["demo", "--json", "--rate", "400"])
         .output()
         .expect("the demo starts");
-    let errors = String::from_utf8_lossy(&output.stderr);
+    let errors = Stderr::of(&output.stderr);
     let report: Value = serde_json::from_slice(&output.stdout)
         .unwrap_or_else(|e| panic!("no report: {e}; standard error:\n{errors}"));
     assert_eq!(report["passed"], true, "{report:#}\n{errors}");

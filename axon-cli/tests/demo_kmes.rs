@@ -10,7 +10,7 @@ use std::{
     process::{Child, Command, Stdio},
 };
 
-use common::axon;
+use common::{Stderr, axon};
 use etsi_qkd014::sim::Network;
 use serde_json::Value;
 
@@ -112,7 +112,7 @@ fn a_file_that_cannot_be_used_is_named_and_nothing_is_shown() {
             command.arg("--kme-env").arg(file);
         }
         let output = command.output().expect("the demo starts");
-        let errors = String::from_utf8_lossy(&output.stderr);
+        let errors = Stderr::of(&output.stderr);
         assert_eq!(output.status.code(), Some(2), "{errors}");
         assert!(errors.contains(named) && output.stdout.is_empty(), "{errors}");
     }
@@ -130,7 +130,7 @@ fn kmes_of_another_process_carry_every_route() {
         .arg(dir.path().join("sae-2.env"))
         .output()
         .expect("the demo starts");
-    let errors = String::from_utf8_lossy(&output.stderr);
+    let errors = Stderr::of(&output.stderr);
     let report: Value = serde_json::from_slice(&output.stdout)
         .unwrap_or_else(|e| panic!("no report: {e}; standard error:\n{errors}"));
     assert_eq!(report["passed"], true, "{report:#}\n{errors}");

@@ -7,7 +7,7 @@ mod common;
 use std::time::Duration;
 
 use axon_transport::{EndpointSpec, qos::Qos};
-use common::{Echoes, Host, LOG, Running, eventually};
+use common::{Echoes, Host, LOG, Running, Stderr, eventually};
 use rustix::process::{Pid, Signal, kill_process};
 
 #[test]
@@ -15,7 +15,7 @@ fn status_without_a_daemon_says_so_and_starts_none() {
     let host = Host::new();
     let output = host.run(&["status"]);
     assert_eq!(output.status.code(), Some(1));
-    let stderr = String::from_utf8_lossy(&output.stderr);
+    let stderr = Stderr::of(&output.stderr);
     assert!(stderr.contains("no daemon"), "{stderr}");
     assert!(host.status().is_none());
 }
@@ -26,7 +26,7 @@ fn play_of_what_is_no_log_fails_and_names_it() {
     for file in ["/nonexistent.mcap", concat!(env!("CARGO_MANIFEST_DIR"), "/Cargo.toml")] {
         let output = host.run(&["play", file]);
         assert_eq!(output.status.code(), Some(1));
-        assert!(String::from_utf8_lossy(&output.stderr).contains(file));
+        assert!(Stderr::of(&output.stderr).contains(file));
     }
     assert!(host.status().is_none(), "no daemon is started for a log that cannot be read");
 }
@@ -37,7 +37,8 @@ fn nothing_that_a_command_says_steers_a_terminal() {
     // Of a file's name, and of a setting.
     let output = host.run(&["play", "/no\u{1b}[2Jne\u{2066}\u{61c}.mcap"]);
     assert_eq!(output.status.code(), Some(1));
-    let stderr = String::from_utf8(output.stderr).expect("UTF-8");
+    assert!(str::from_utf8(&output.stderr).is_ok(), "UTF-8");
+    let stderr = Stderr::of(&output.stderr);
     assert!(stderr.contains("\\u{1b}[2Jne\\u{2066}\\u{61c}.mcap"), "{stderr}");
     assert!(stderr.chars().all(|c| c == '\n' || !c.is_control()), "{stderr:?}");
 }
@@ -56,13 +57,13 @@ fn play_of_a_damaged_log_publishes_nothing_unless_told_to_publish_its_whole_part
     let cut = log_without_its_end();
     let file = cut.path().to_str().expect("a path in UTF-8");
     let output = host.run(&["play", file, "--rate", "0"]);
-    let said = String::from_utf8_lossy(&output.stderr);
+    let said = Stderr::of(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(said.contains(file) && said.contains("--incomplete"), "{said}");
     assert!(host.status().is_none(), "no daemon is started for a log that is not played");
 
     let output = host.run(&["play", file, "--rate", "0", "--incomplete"]);
-    let said = String::from_utf8_lossy(&output.stderr);
+    let said = Stderr::of(&output.stderr);
     assert!(output.status.success(), "{said}");
     let number = |before: &str, after: &str| {
         let (_, rest) = said.split_once(before).unwrap_or_else(|| panic!("no {before:?}: {said}"));
@@ -98,7 +99,7 @@ fn names_of_another_session_steer_no_terminal() {
     publisher.publish(b"\x1b[2J").expect("published");
     let text: String = echo.lines().collect::<Vec<_>>().join("\n");
     let output = echo.finish();
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    let said = Stderr::of(&output.stderr);
     assert!(output.status.success(), "{said}");
     assert!(!text.is_empty() && !steers(&text) && !steers(&said), "{text:?} {said:?}");
     drop(daemon);
@@ -111,7 +112,7 @@ fn echo_prints_every_message_that_play_publishes() {
     let play = Running::start(host.axon(&["play", LOG, "--rate", "0", "--wait", "1"]));
     echoes.assert_whole();
     let play = play.finish();
-    assert!(play.status.success(), "{}", String::from_utf8_lossy(&play.stderr));
+    assert!(play.status.success(), "{}", Stderr::of(&play.stderr));
 }
 
 #[test]
@@ -150,7 +151,7 @@ fn echo_says_what_it_missed_whether_interrupted_or_no_longer_read() {
             kill_process(pid, Signal::CONT).expect("it runs");
         }
         let output = echo.finish();
-        let said = String::from_utf8_lossy(&output.stderr);
+        let said = Stderr::of(&output.stderr);
         assert!(said.contains("axon echo: missed "), "interrupted {interrupted}: {said}");
         assert!(output.status.success(), "{said}");
     }
@@ -184,6 +185,6 @@ fn the_daemon_in_the_foreground_is_the_one_that_status_shows_and_ends_on_sigterm
     }
     assert!(host.kill_daemon(Signal::TERM));
     let output = daemon.finish();
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success(), "{}", Stderr::of(&output.stderr));
     assert!(host.status().is_none());
 }

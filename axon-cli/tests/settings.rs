@@ -5,7 +5,7 @@
 
 mod common;
 
-use common::{LOG, axon};
+use common::{LOG, Stderr, axon};
 
 const COMMANDS: [&[&str]; 5] =
     [&["demo"], &["play", LOG], &["echo", "/scan"], &["trust", "list"], &["daemon"]];
@@ -22,7 +22,7 @@ fn a_key_is_made_and_looked_at_whatever_the_settings_are() {
         ("AXON_CLASSIC_KEY", "/nowhere/key"),
     ] {
         let made = axon([settings]).args(["trust", "keygen", key]).output().expect("runs");
-        assert!(made.status.success(), "{settings:?}: {}", String::from_utf8_lossy(&made.stderr));
+        assert!(made.status.success(), "{settings:?}: {}", Stderr::of(&made.stderr));
         std::fs::remove_file(key).expect("made");
         let scan = ["trust", "scan", "127.0.0.1:9", "--timeout", "1"];
         let looked = axon([settings]).args(scan).output().expect("runs");
@@ -35,7 +35,8 @@ fn assert_refused(args: &[&str], settings: &[(&str, &str)], variable: &str) {
     let path = dir.path().to_str().expect("UTF-8");
     let mut command = axon(settings.iter().copied());
     let output = command.env("AXON_RUNTIME_DIR", path).args(args).output().expect("runs");
-    let stderr = String::from_utf8(output.stderr).expect("text");
+    assert!(str::from_utf8(&output.stderr).is_ok(), "UTF-8");
+    let stderr = Stderr::of(&output.stderr);
     assert_eq!(output.status.code(), Some(2), "{args:?} under {settings:?}: {stderr}");
     assert_eq!(stderr.lines().count(), 1, "{args:?} under {settings:?}: {stderr:?}");
     assert!(stderr.contains(variable), "{args:?} under {settings:?}: {stderr}");
@@ -62,7 +63,7 @@ fn obsolete_and_unknown_variables_are_refused_by_every_command() {
 fn an_obsolete_key_is_not_repeated() {
     let mut command = axon([("AXON_ENCRYPTION_KEY", "hunter2hunter2")]);
     let output = command.arg("status").output().expect("runs");
-    assert!(!String::from_utf8_lossy(&output.stderr).contains("hunter2"));
+    assert!(!Stderr::of(&output.stderr).contains("hunter2"));
 }
 
 #[test]

@@ -79,7 +79,7 @@ fn said(output: &Output, variable: &str, words: &[&str]) -> String {
 }
 
 #[test]
-fn what_is_wrong_is_said_and_that_no_daemon_runs() {
+fn status_reports_wrong_settings_and_a_missing_daemon() {
     let dir = tempfile::tempdir().expect("temporary directory");
     let host = Host::new();
     for (settings, variable, words, code) in cases(dir.path()) {

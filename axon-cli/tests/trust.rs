@@ -183,7 +183,7 @@ fn a_line_that_cannot_be_used_is_named_with_its_file() {
 }
 
 #[test]
-fn what_is_no_key_is_named_and_not_repeated() {
+fn trust_list_names_a_bad_key_file_without_its_content() {
     let dir = tempfile::tempdir().expect("directory");
     let (file, key) = (dir.path().join("trust"), dir.path().join("host.key"));
     fs::write(&file, format!("arm {DIGEST}\n")).expect("writable");

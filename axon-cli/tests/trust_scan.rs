@@ -45,7 +45,7 @@ fn printed(output: &Output) -> String {
 }
 
 #[test]
-fn what_scan_prints_of_a_daemon_is_what_keygen_printed() {
+fn scan_prints_the_line_that_keygen_printed() {
     let dir = tempfile::tempdir().expect("directory");
     let path = |name: &str| dir.path().join(name).to_str().expect("UTF-8").to_owned();
     for algorithm in ["ml-dsa-65", "ed25519"] {

@@ -63,12 +63,12 @@ pub const MAX_PLAINTEXT_LEN: u64 = (1 << 36) - 32;
 /// let twin: Sealer = sealer.clone();
 /// # }
 /// ```
-pub struct Sealer<A = DefaultAead>(Box<State<A>>);
+pub struct Sealer<A = DefaultAead>(Box<SealState<A>>);
 
 type Nonce = [u8; NONCE_LEN];
 type Tag = [u8; TAG_LEN];
 
-struct State<A> {
+struct SealState<A> {
     aead: A,
     template: Template,
     key_id: KeyId,
@@ -158,7 +158,7 @@ impl<A: Aead> Sealer<A> {
         key: KmeKey,
         prefix: [u8; 8],
     ) -> Self {
-        Self(Box::new(State {
+        Self(Box::new(SealState {
             aead: key::aead(channel, &key_id, &key),
             template: Template::new(channel.sender(), &key_id, prefix),
             key_id,
@@ -227,7 +227,7 @@ impl<A: Aead> Sealer<A> {
 
     /// Ends the sealer, erases its key, and says what to tell the receiver.
     pub fn retire(self) -> Retirement {
-        let State { key_id, used, reliable, .. } = *self.0;
+        let SealState { key_id, used, reliable, .. } = *self.0;
         Retirement { key_id, used, reliable }
     }
 
@@ -264,7 +264,7 @@ impl<A> fmt::Debug for Sealer<A> {
 /// # }
 /// ```
 pub struct Slot<'a, A = DefaultAead> {
-    state: &'a mut State<A>,
+    state: &'a mut SealState<A>,
     delivery: Delivery,
 }
 

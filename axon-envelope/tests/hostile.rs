@@ -302,7 +302,7 @@ fn a_key_whose_sealing_failed_is_not_given_to_another_connection() {
 }
 
 #[test]
-fn what_a_failing_aead_leaves_behind_is_erased() {
+fn a_failing_aead_leaves_no_plaintext() {
     let mut opener = Opener::<Failing>::with_limits(channel(), Limits::default()).unwrap();
     opener.add_key(key_id("key"), key(1)).unwrap();
     let mut sealer = sealer("key", 1);

@@ -485,7 +485,7 @@ proptest! {
     }
 
     #[test]
-    fn what_the_parser_accepts_has_one_encoding(
+    fn each_parsed_header_has_one_encoding(
         sender in prop::collection::vec(any::<u8>(), 1..=255),
         id in prop::collection::vec(any::<u8>(), 1..=255),
         number in 0..6_u8,

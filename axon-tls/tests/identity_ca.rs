@@ -219,7 +219,7 @@ fn later_material_says_who_would_be_accepted_now() {
 }
 
 #[test]
-fn what_others_will_say_of_us_is_known_beforehand() {
+fn accepts_us_predicts_the_peers_verdict() {
     let ca = Ca::new();
     let us = ca.host(&["a"], &[], 1);
     assert!(ca.material(&us, Some(&ca.crl(9, 2100))).accepts_us().is_ok());

@@ -273,7 +273,7 @@ async fn peer_that_stops_in_the_handshake_is_an_error_or_can_be_given_up() {
 }
 
 #[tokio::test]
-async fn what_is_not_tls_is_refused() {
+async fn acceptor_refuses_a_plaintext_request() {
     let (mut near, far) = duplex(100_000);
     near.write_all(b"GET / HTTP/1.1\r\n\r\n").await.unwrap();
     let err = acceptor().accept(far).await.unwrap_err();

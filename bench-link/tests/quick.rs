@@ -1,7 +1,11 @@
 //! The program itself, over a path that loses a fifth of the packets, for a second each.
 
+#[path = "../../axon-transport/daemon/tests/support/excerpt.rs"]
+mod excerpt;
+
 use std::{fs, process::Command};
 
+use excerpt::excerpt;
 use serde_json::Value;
 
 /// What the program says where it may not make hosts.
@@ -22,13 +26,15 @@ fn figures(arguments: &[&str]) -> Option<Value> {
         eprintln!("skipped: hosts in network namespaces, {why}");
         return None;
     }
-    assert!(output.status.success(), "{said}{}", String::from_utf8_lossy(&output.stdout));
+    let shown = |name, bytes: &[u8]| excerpt(name, &String::from_utf8_lossy(bytes));
+    let shown = || [shown("stderr", &output.stderr), shown("stdout", &output.stdout)].join("\n");
+    assert!(output.status.success(), "{}", shown());
     Some(serde_json::from_str(&fs::read_to_string(file).unwrap()).unwrap())
 }
 
 /// A RELIABLE sample crosses a path that loses a fifth of all packets. How soon is not asserted.
 #[test]
-fn all_that_is_reliable_arrives_and_the_path_loses_what_it_is_told_to() {
+fn reliable_samples_arrive_over_a_lossy_path() {
     let Some(all) = figures(&["losses", "--losses", "20", "--seconds", "1"]) else { return };
     let rows = all["figures"]["losses"].as_array().unwrap();
     assert_eq!(rows.len(), 7);
@@ -53,5 +59,5 @@ fn a_loss_that_is_no_share_is_refused() {
     let output = command.args(["losses", "--losses", "100"]).output().unwrap();
     assert!(!output.status.success());
     let said = String::from_utf8_lossy(&output.stderr);
-    assert!(said.contains("from 0 to below 100"), "{said}");
+    assert!(said.contains("from 0 to below 100"), "{}", excerpt("stderr", &said));
 }

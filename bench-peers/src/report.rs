@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use crate::{
     Compared, KINDS, MEDIA, PACE, PACED, Results, STREAMS,
     harness::{Chart, Line, Rounds, Wake, page, words},
-    text::{self, Table},
+    text::{self, TextTable},
 };
 
 /// How figures are taken from rounds; in every output.
@@ -90,7 +90,7 @@ fn table<'a>(rows: impl Iterator<Item = &'a Compared>, cell: Cell) -> String {
             ">zenoh/AXON",
         ],
     };
-    let mut table = Table::new(headers);
+    let mut table = TextTable::new(headers);
     for compared in rows {
         let mut row = vec![words::size(compared.load.size)];
         for rounds in &compared.rounds {

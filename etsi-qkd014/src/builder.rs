@@ -25,9 +25,9 @@ const MAX_FILE: usize = 1 << 20;
 #[must_use]
 pub struct ClientBuilder {
     kme_url: Option<String>,
-    ca: Option<Source>,
-    sae_cert: Option<Source>,
-    sae_key: Option<Source>,
+    ca: Option<PemSource>,
+    sae_cert: Option<PemSource>,
+    sae_key: Option<PemSource>,
     identity: Identity,
     connect_timeout: Duration,
     limits: Limits,
@@ -43,7 +43,7 @@ pub(crate) struct Limits {
     pub(crate) quirks: Quirks,
 }
 
-enum Source {
+enum PemSource {
     Bytes(SecretSlice<u8>),
     File(PathBuf),
 }
@@ -79,25 +79,25 @@ impl ClientBuilder {
     /// The CA that must have issued the KME's certificate, PEM (one or several) or DER. No other
     /// is trusted.
     pub fn ca(mut self, pem_or_der: impl Into<Vec<u8>>) -> Self {
-        self.ca = Some(Source::Bytes(SecretSlice::from(pem_or_der.into())));
+        self.ca = Some(PemSource::Bytes(SecretSlice::from(pem_or_der.into())));
         self
     }
 
     /// [`ca`](Self::ca), read from a file by [`build`](Self::build).
     pub fn ca_file(mut self, path: impl Into<PathBuf>) -> Self {
-        self.ca = Some(Source::File(path.into()));
+        self.ca = Some(PemSource::File(path.into()));
         self
     }
 
     /// The SAE's certificate, PEM (with its intermediates, if any) or DER.
     pub fn sae_cert(mut self, pem_or_der: impl Into<Vec<u8>>) -> Self {
-        self.sae_cert = Some(Source::Bytes(SecretSlice::from(pem_or_der.into())));
+        self.sae_cert = Some(PemSource::Bytes(SecretSlice::from(pem_or_der.into())));
         self
     }
 
     /// [`sae_cert`](Self::sae_cert), read from a file by [`build`](Self::build).
     pub fn sae_cert_file(mut self, path: impl Into<PathBuf>) -> Self {
-        self.sae_cert = Some(Source::File(path.into()));
+        self.sae_cert = Some(PemSource::File(path.into()));
         self
     }
 
@@ -107,13 +107,13 @@ impl ClientBuilder {
     /// A `Vec<u8>` is taken as it is where its capacity is its length. Otherwise the allocator shrinks
     /// it, and may leave a copy behind: give a `Box<[u8]>` or a `SecretSlice` then.
     pub fn sae_key(mut self, pem_or_der: impl Into<SecretSlice<u8>>) -> Self {
-        self.sae_key = Some(Source::Bytes(pem_or_der.into()));
+        self.sae_key = Some(PemSource::Bytes(pem_or_der.into()));
         self
     }
 
     /// [`sae_key`](Self::sae_key), read from a file by [`build`](Self::build).
     pub fn sae_key_file(mut self, path: impl Into<PathBuf>) -> Self {
-        self.sae_key = Some(Source::File(path.into()));
+        self.sae_key = Some(PemSource::File(path.into()));
         self
     }
 
@@ -269,11 +269,11 @@ fn base_url(text: Option<String>) -> Result<(Url, String), Error> {
     Ok((url, kme))
 }
 
-fn read(source: Option<Source>, setting: &'static str) -> Result<SecretSlice<u8>, Error> {
+fn read(source: Option<PemSource>, setting: &'static str) -> Result<SecretSlice<u8>, Error> {
     let path = match source {
         None => return Err(config(setting, "is missing")),
-        Some(Source::Bytes(bytes)) => return Ok(bytes),
-        Some(Source::File(path)) => path,
+        Some(PemSource::Bytes(bytes)) => return Ok(bytes),
+        Some(PemSource::File(path)) => path,
     };
     let fail = |reason: String| config(setting, format!("{}: {reason}", path.display()));
     // What is no regular file, as a pipe from a password manager, says no length beforehand.

@@ -9,7 +9,7 @@ use reqwest::Url;
 use tokio::time::Instant;
 
 use crate::builder::Limits;
-use crate::exchange::{Body, Call, Failure, Prepared};
+use crate::exchange::{Body, Call, ExchangeFailure, Prepared};
 use crate::{ClientBuilder, DecKeys, EncKeys, Error, RetryPolicy, Status, parse};
 
 /// A client of one KME, acting as one SAE.
@@ -22,10 +22,10 @@ use crate::{ClientBuilder, DecKeys, EncKeys, Error, RetryPolicy, Status, parse};
 /// it: treat the keys of a dropped call as [consumed](Error::KeyPossiblyConsumed).
 #[derive(Clone)]
 pub struct Client {
-    inner: Arc<Inner>,
+    inner: Arc<ClientInner>,
 }
 
-struct Inner {
+struct ClientInner {
     http: reqwest::Client,
     base: Url,
     kme: String,
@@ -75,8 +75,8 @@ impl Client {
     /// ([`RetryPolicy::none`]): repeats within repeats would multiply.
     #[must_use]
     pub fn with_retry(&self, policy: RetryPolicy) -> Self {
-        let Inner { http, base, kme, connect_timeout, limits, key_sizes } = &*self.inner;
-        let inner = Inner {
+        let ClientInner { http, base, kme, connect_timeout, limits, key_sizes } = &*self.inner;
+        let inner = ClientInner {
             http: http.clone(),
             base: base.clone(),
             kme: kme.clone(),
@@ -95,7 +95,9 @@ impl Client {
         limits: Limits,
     ) -> Self {
         let key_sizes = Arc::default();
-        Self { inner: Arc::new(Inner { http, base, kme, connect_timeout, limits, key_sizes }) }
+        Self {
+            inner: Arc::new(ClientInner { http, base, kme, connect_timeout, limits, key_sizes }),
+        }
     }
 
     fn remember_key_size(&self, status: &Status) {
@@ -125,7 +127,7 @@ impl Client {
 
     /// Makes a call with its repeats.
     pub(crate) async fn call(&self, call: Call, prepared: &Prepared) -> Result<Body, Error> {
-        let Inner { http, kme, connect_timeout, limits, .. } = &*self.inner;
+        let ClientInner { http, kme, connect_timeout, limits, .. } = &*self.inner;
         // Durations, since a deadline may be set that no clock can tell.
         let began = Instant::now();
         let left = || limits.deadline.saturating_sub(began.elapsed());
@@ -134,7 +136,7 @@ impl Client {
         loop {
             let time = limits.timeout.min(left());
             let tried = prepared.attempt(http, kme, *connect_timeout, time, limits).await;
-            let Failure { error, ambiguous } = match tried {
+            let ExchangeFailure { error, ambiguous } = match tried {
                 Ok(body) => return Ok(body),
                 Err(failure) => failure,
             };

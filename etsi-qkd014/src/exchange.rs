@@ -45,13 +45,13 @@ pub(crate) struct Prepared {
     body: Option<Bytes>,
 }
 
-pub(crate) struct Failure {
+pub(crate) struct ExchangeFailure {
     pub(crate) error: Error,
     /// The KME may have served the request all the same.
     pub(crate) ambiguous: bool,
 }
 
-impl Failure {
+impl ExchangeFailure {
     fn clear(error: Error) -> Self {
         Self { error, ambiguous: false }
     }
@@ -78,7 +78,7 @@ impl Prepared {
         connect_timeout: Duration,
         time: Duration,
         limits: &Limits,
-    ) -> Result<Body, Failure> {
+    ) -> Result<Body, ExchangeFailure> {
         // Without the second header any coding would do (RFC 7231, 5.3.4).
         let mut request = http
             .request(self.method.clone(), self.url.clone())
@@ -89,7 +89,7 @@ impl Prepared {
         }
         let began = Instant::now();
         // Connecting has its own, shorter time: the request is taken to have left.
-        let late = || Failure::ambiguous(Error::Timeout { phase: "answer", after: time });
+        let late = || ExchangeFailure::ambiguous(Error::Timeout { phase: "answer", after: time });
         let response = timeout(time, request.send())
             .await
             .map_err(|_| late())?
@@ -103,17 +103,17 @@ impl Prepared {
 }
 
 /// A failure before there was an answer.
-fn send_failure(error: &reqwest::Error, kme: &str, connect_timeout: Duration) -> Failure {
+fn send_failure(error: &reqwest::Error, kme: &str, connect_timeout: Duration) -> ExchangeFailure {
     let connected = !error.is_connect();
     if let Some((refused_by, reason)) =
         tls::tls_error(error).and_then(|tls| tls::refusal(tls, connected))
     {
-        return Failure::clear(Error::Tls { kme: kme.to_owned(), refused_by, reason });
+        return ExchangeFailure::clear(Error::Tls { kme: kme.to_owned(), refused_by, reason });
     }
     if connected {
-        return Failure::ambiguous(Error::Interrupted { reason: innermost(error) });
+        return ExchangeFailure::ambiguous(Error::Interrupted { reason: innermost(error) });
     }
-    Failure::clear(if error.is_timeout() {
+    ExchangeFailure::clear(if error.is_timeout() {
         Error::Timeout { phase: "connect", after: connect_timeout }
     } else {
         Error::Unreachable { kme: kme.to_owned(), reason: innermost(error) }
@@ -129,16 +129,16 @@ fn innermost(error: &reqwest::Error) -> String {
     reason.to_string()
 }
 
-async fn receive(mut response: Response, limits: &Limits) -> Result<Body, Failure> {
+async fn receive(mut response: Response, limits: &Limits) -> Result<Body, ExchangeFailure> {
     let quirks = limits.quirks;
     if response.version() < Version::HTTP_11 && !quirks.contains(Quirks::HTTP_1_0) {
-        return Err(Failure::ambiguous(Error::Malformed {
+        return Err(ExchangeFailure::ambiguous(Error::Malformed {
             what: "HTTP version".to_owned(),
             reason: "is older than 1.1, clause 5.1 (quirk http-1.0 tolerates it)".to_owned(),
         }));
     }
     if !quirks.contains(Quirks::ANY_MEDIA_TYPE) && !is_json(&response) {
-        return Err(Failure::ambiguous(Error::Malformed {
+        return Err(ExchangeFailure::ambiguous(Error::Malformed {
             what: "Content-Type".to_owned(),
             reason: "is not application/json, clause 5.1 (quirk any-media-type tolerates it)"
                 .to_owned(),
@@ -146,12 +146,12 @@ async fn receive(mut response: Response, limits: &Limits) -> Result<Body, Failur
     }
     let coding = response.headers().get(CONTENT_ENCODING);
     if coding.is_some_and(|coding| !coding.as_bytes().eq_ignore_ascii_case(b"identity")) {
-        return Err(Failure::ambiguous(Error::Malformed {
+        return Err(ExchangeFailure::ambiguous(Error::Malformed {
             what: "Content-Encoding".to_owned(),
             reason: "is not identity, the only one that was asked for".to_owned(),
         }));
     }
-    read_body(&mut response, limits.max_body).await.map_err(Failure::ambiguous)
+    read_body(&mut response, limits.max_body).await.map_err(ExchangeFailure::ambiguous)
 }
 
 fn is_json(response: &Response) -> bool {
@@ -232,7 +232,7 @@ fn clear(chunk: Bytes) {
 }
 
 /// An answer of a status other than 200, which tells what happened whatever becomes of its body.
-async fn refused(mut response: Response, left: Duration) -> Failure {
+async fn refused(mut response: Response, left: Duration) -> ExchangeFailure {
     let status = response.status();
     let retry_after = response
         .headers()
@@ -244,11 +244,11 @@ async fn refused(mut response: Response, left: Duration) -> Failure {
     let parse::ErrorAnswer { message, details } =
         body.map(|body| parse::error_answer(&body)).unwrap_or_default();
     match status.as_u16() {
-        400 => Failure::clear(Error::BadRequest { message, details }),
-        401 => Failure::clear(Error::Unauthorized { message, details }),
-        503 => Failure::clear(Error::Unavailable { message, details, retry_after }),
+        400 => ExchangeFailure::clear(Error::BadRequest { message, details }),
+        401 => ExchangeFailure::clear(Error::Unauthorized { message, details }),
+        503 => ExchangeFailure::clear(Error::Unavailable { message, details, retry_after }),
         // A redirect or a refusal served nothing; a gateway's 502 or a KME's 500 may have.
-        code @ (300..=499) => Failure::clear(Error::Status { code, message }),
-        code => Failure::ambiguous(Error::Status { code, message }),
+        code @ (300..=499) => ExchangeFailure::clear(Error::Status { code, message }),
+        code => ExchangeFailure::ambiguous(Error::Status { code, message }),
     }
 }

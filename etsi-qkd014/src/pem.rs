@@ -75,7 +75,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_a_whole_section_is_refused() {
+    fn incomplete_pem_sections_are_refused() {
         for bad in [
             "",
             "-----BEGIN ",

@@ -125,7 +125,7 @@ async fn refusals_over_qukaydee() {
 }
 
 #[test]
-fn what_is_not_set_is_named() {
+fn missing_account_settings_are_named() {
     let none = Account::read(|_| None).unwrap_err();
     assert!(none.contains("QUKAYDEE_ACCT"), "{none}");
     let half = |name: &str| (name == "QUKAYDEE_ACCT").then(|| "1234".to_owned());

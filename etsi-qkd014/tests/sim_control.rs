@@ -52,7 +52,7 @@ async fn it_listens_on_loopback_only() {
 }
 
 #[tokio::test]
-async fn what_a_web_page_could_send_is_refused() {
+async fn requests_that_a_web_page_could_send_are_refused() {
     let (network, addr) = network().await;
     let good = request(addr, "PUT /faults/kme-a", r#"["cut"]"#);
     let host = format!("Host: {addr}");

@@ -20,7 +20,7 @@ impl Files for OneFile<'_> {
     fn facts(&self, path: &Path) -> io::Result<FileFacts> {
         let directory = path.extension().is_some_and(|extension| extension == "d");
         let kind = if directory { FileKind::Directory } else { FileKind::Regular };
-        Ok(FileFacts { kind, mode: 0o700 })
+        Ok(FileFacts::new(kind, 0o700))
     }
 
     fn readable(&self, _: &Path) -> io::Result<()> {

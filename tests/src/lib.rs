@@ -27,3 +27,11 @@ pub fn end_with_stdin() {
 #[cfg(doctest)]
 #[doc = include_str!("../../third_party/rustls-axon/README.md")]
 struct RustlsAxonReadme;
+
+#[cfg(doctest)]
+#[doc = include_str!("../../README.md")]
+struct RootReadme;
+
+#[cfg(doctest)]
+#[doc = include_str!("../../docs/configuration.md")]
+struct ConfigurationPage;

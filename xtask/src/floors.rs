@@ -477,7 +477,7 @@ More text with `roof`.
     }
 
     #[test]
-    fn what_the_root_hands_out_of_another_crate_is_no_room() {
+    fn re_exports_of_other_crates_are_no_rooms() {
         let root = "mod roof; mod left; mod right; mod ground; pub use other as named;
             pub use other::{ids, deep::Stone as Rock}; pub use roof::Top;";
         let text = "use crate::{ids::Gid, Rock, named::f};";

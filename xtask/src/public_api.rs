@@ -22,23 +22,31 @@ const CRATES: [(&str, &str); 6] = [
 const LISTING: &str = "public-api.txt";
 /// Set where cargo calls this program for rustdoc.
 const AS_RUSTDOC: &str = "XTASK_AS_RUSTDOC";
-/// The format of rustdoc's JSON that is read here, which changes with the compiler.
+/// The format of rustdoc's JSON that this program reads: that of Rust 1.95. CI checks the listings with that toolchain.
 const FORMAT: u64 = 57;
+
+/// What `cargo xtask public-api` does with the listings.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Mode {
+    /// Compares them with the code. Skips the comparison if this compiler's rustdoc writes another format.
+    Check,
+    /// Compares them with the code. Fails if this compiler's rustdoc writes another format.
+    Strict,
+    /// Writes them.
+    Write,
+}
 
 /// Compares the listings with the code, or writes them.
 ///
 /// # Errors
-/// The lines that are new or gone, by crate.
-pub(crate) fn check(root: &Path, write: bool) -> Result<String, String> {
+/// The lines that are new or gone, by crate; or, but for [`Mode::Check`], that rustdoc's format is not [`FORMAT`].
+pub(crate) fn check(root: &Path, mode: Mode) -> Result<String, String> {
     let json = document(root)?;
     let mut wrong = Vec::new();
     for (name, folder) in CRATES {
         let file = json.join(format!("{name}.json"));
         if let Some(other) = other_format(&file)? {
-            return Ok(format!(
-                "skipped: the public interfaces, since this compiler's rustdoc writes format {other} and {FORMAT} \
-                 is read here"
-            ));
+            return unreadable(other, mode);
         }
         let api = Builder::from_rustdoc_json(&file)
             .omit_blanket_impls(true)
@@ -48,14 +56,14 @@ pub(crate) fn check(root: &Path, write: bool) -> Result<String, String> {
             .map_err(|e| format!("{}: {e}", file.display()))?;
         let now: String = api.items().map(|item| format!("{item}\n")).collect();
         let listing = root.join(folder).join(LISTING);
-        if write {
+        if mode == Mode::Write {
             fs::write(&listing, now).map_err(|e| format!("{}: {e}", listing.display()))?;
         } else {
             let then = fs::read_to_string(&listing).unwrap_or_default();
             wrong.extend(differences(name, &then, &now));
         }
     }
-    if write {
+    if mode == Mode::Write {
         Ok(format!("{LISTING} of {} crates is written", CRATES.len()))
     } else if wrong.is_empty() {
         Ok(format!("the interfaces of {} crates are as {LISTING} says", CRATES.len()))
@@ -65,6 +73,15 @@ pub(crate) fn check(root: &Path, write: bool) -> Result<String, String> {
                 .to_owned(),
         );
         Err(wrong.join("\n"))
+    }
+}
+
+fn unreadable(format: u64, mode: Mode) -> Result<String, String> {
+    let reason =
+        format!("this compiler's rustdoc writes format {format}, and xtask reads format {FORMAT}");
+    match mode {
+        Mode::Check => Ok(format!("skipped: the public interfaces: {reason}")),
+        Mode::Strict | Mode::Write => Err(reason),
     }
 }
 
@@ -122,7 +139,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lines_that_came_and_went_are_told_apart() {
+    fn another_rustdoc_format_is_skipped_in_a_plain_check_only() {
+        assert!(unreadable(FORMAT + 1, Mode::Check).unwrap().starts_with("skipped: "));
+        for mode in [Mode::Strict, Mode::Write] {
+            let error = unreadable(FORMAT + 1, mode).unwrap_err();
+            assert!(error.contains(&format!("format {}", FORMAT + 1)), "{error}");
+        }
+    }
+
+    #[test]
+    fn differences_mark_removed_and_added_lines() {
         let told = differences(
             "a",
             "pub fn a::old()\npub fn a::kept()\n",

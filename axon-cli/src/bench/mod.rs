@@ -23,7 +23,7 @@ use self::{
     readers::{Cost, ReaderProcesses},
     run::Run,
 };
-use crate::{cli, failure::Failure};
+use crate::{cli, failure::CliError};
 
 /// Sizes of a quick run: inline, copied, in place.
 const QUICK_SIZES: [usize; 3] = [8, 4 << 10, 64 << 10];
@@ -80,7 +80,7 @@ struct Results {
 }
 
 /// Runs `axon bench shm`.
-pub(crate) fn shm(args: &cli::BenchShm) -> Result<(), Failure> {
+pub(crate) fn shm(args: &cli::BenchShm) -> Result<(), CliError> {
     let sizes = match (&args.sizes[..], args.quick) {
         ([], false) => &SIZES[..],
         ([], true) => &QUICK_SIZES[..],
@@ -88,7 +88,7 @@ pub(crate) fn shm(args: &cli::BenchShm) -> Result<(), Failure> {
     };
     let few = |few: &'static [usize]| if args.sizes.is_empty() { few } else { sizes };
     let results = measure(sizes, few(&FEW_SIZES), few(&READ_SIZES), args.quick);
-    let results = results.map_err(Failure::failed)?;
+    let results = results.map_err(CliError::failed)?;
     fs::create_dir_all(&args.out)?;
     let file = |name: &str| args.out.join(name);
     fs::write(file("shm.json"), report::json(&results))?;
@@ -100,13 +100,13 @@ pub(crate) fn shm(args: &cli::BenchShm) -> Result<(), Failure> {
 }
 
 /// Is the process that answers one that measures.
-pub(crate) fn answer() -> Result<(), Failure> {
-    harness::serve(&MEDIA).map_err(Failure::failed)
+pub(crate) fn answer() -> Result<(), CliError> {
+    harness::serve(&MEDIA).map_err(CliError::failed)
 }
 
 /// Is one of the readers that a publish is measured with.
-pub(crate) fn read() -> Result<(), Failure> {
-    readers::attend().map_err(Failure::failed)
+pub(crate) fn read() -> Result<(), CliError> {
+    readers::attend().map_err(CliError::failed)
 }
 
 fn measure(

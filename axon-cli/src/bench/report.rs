@@ -9,7 +9,7 @@ use super::{
     harness::{Ratio, Rounds, Wake, words},
     readers::{Cost, Published, READERS, Until},
 };
-use crate::text::{self, Table};
+use crate::text::{self, TextTable};
 
 /// How figures are taken from rounds; in every output.
 const REPORTED: &str = "Raw and AXON take turns. Times are one way (half a round trip): p50 of the \
@@ -59,7 +59,7 @@ pub(super) fn text(results: &Results) -> String {
 }
 
 fn latency_table<'a>(rows: impl Iterator<Item = &'a Compared>) -> String {
-    let mut table = Table::new(&[
+    let mut table = TextTable::new(&[
         ">size",
         ">raw p50",
         ">p99",
@@ -93,7 +93,7 @@ fn latency_table<'a>(rows: impl Iterator<Item = &'a Compared>) -> String {
 }
 
 fn paced_table(rows: &[Paced]) -> String {
-    let mut table = Table::new(&[
+    let mut table = TextTable::new(&[
         ">size",
         ">pace",
         ">epoll p50",
@@ -127,7 +127,7 @@ fn paced_table(rows: &[Paced]) -> String {
 }
 
 fn stream_table<'a>(rows: impl Iterator<Item = &'a Compared>) -> String {
-    let mut table = Table::new(&[
+    let mut table = TextTable::new(&[
         ">size",
         ">raw messages/s",
         ">bytes/s",
@@ -153,7 +153,7 @@ fn stream_table<'a>(rows: impl Iterator<Item = &'a Compared>) -> String {
 }
 
 fn publish_table<'a>(costs: impl Iterator<Item = &'a Cost>) -> String {
-    let mut table = Table::new(&[
+    let mut table = TextTable::new(&[
         ">size",
         ">readers",
         ">raw",

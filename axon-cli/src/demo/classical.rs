@@ -31,7 +31,7 @@ const ANSWER: Duration = Duration::from_secs(5);
 
 /// What came of the attempt.
 #[derive(Debug)]
-pub(crate) enum Outcome {
+pub(crate) enum ClassicalAttempt {
     /// The handshake completed.
     Connected,
     /// The peer ended the handshake.
@@ -51,7 +51,7 @@ pub(crate) async fn connect(
     groups: &[&'static dyn SupportedKxGroup],
     from: SocketAddr,
     to: SocketAddr,
-) -> Result<Outcome, String> {
+) -> Result<ClassicalAttempt, String> {
     let text = |error: &dyn std::fmt::Display| error.to_string();
     let tls = client(groups).map_err(|e| text(&e))?;
     let config = QuicClientConfig::try_from(tls).map_err(|e| text(&e))?;
@@ -62,14 +62,14 @@ pub(crate) async fn connect(
     match outcome.map_err(|_| "the daemon does not answer".to_owned())? {
         Ok(connection) => {
             connection.close(0_u32.into(), b"");
-            Ok(Outcome::Connected)
+            Ok(ClassicalAttempt::Connected)
         }
         Err(ConnectionError::ConnectionClosed(close)) => {
             // QUIC carries an alert in the low byte of a CRYPTO_ERROR, 0x0100 to 0x01ff (RFC 9001,
             // section 4.8).
             let code = u64::from(close.error_code);
             let alert = (code >> 8 == 1).then_some(code.to_be_bytes()[7]);
-            Ok(Outcome::Refused { alert, reason: close.to_string() })
+            Ok(ClassicalAttempt::Refused { alert, reason: close.to_string() })
         }
         Err(error) => Err(text(&error)),
     }
@@ -149,7 +149,7 @@ mod tests {
 
     use super::*;
 
-    async fn against_a_server(groups: &[&'static dyn SupportedKxGroup]) -> Outcome {
+    async fn against_a_server(groups: &[&'static dyn SupportedKxGroup]) -> ClassicalAttempt {
         let key = SigningKey::generate().expect("key");
         let config = hybrid_server(&Auth::None(key), Cipher::default(), ALPN).expect("server");
         let loopback = SocketAddr::from(([127, 0, 0, 1], 0));
@@ -169,8 +169,8 @@ mod tests {
     #[tokio::test]
     async fn the_groups_are_all_that_is_wrong_with_it() {
         let right = against_a_server(&[kx_group::X25519MLKEM768]).await;
-        assert!(matches!(right, Outcome::Connected), "{right:?}");
+        assert!(matches!(right, ClassicalAttempt::Connected), "{right:?}");
         let wrong = against_a_server(&CLASSICAL).await;
-        assert!(matches!(wrong, Outcome::Refused { alert: Some(40), .. }), "{wrong:?}");
+        assert!(matches!(wrong, ClassicalAttempt::Refused { alert: Some(40), .. }), "{wrong:?}");
     }
 }

@@ -85,7 +85,7 @@ mod tests {
         export AXON_SAE_CERT='/it'\\''s here/sae-a.crt'\nexport AXON_SAE_KEY='/certs/sae-a.key'\n";
 
     #[test]
-    fn what_a_shell_reads_is_read() {
+    fn env_file_parses_shell_quoting() {
         let read = parse(WHOLE).expect("a whole file");
         let values: Vec<_> = read.iter().map(|(_, value)| value.as_str()).collect();
         let cert = "/it's here/sae-a.crt";
@@ -94,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_understood_is_refused_and_named() {
+    fn env_file_errors_name_the_line_or_variable() {
         let with = |line: &str| parse(&format!("{WHOLE}{line}\n")).expect_err(line);
         for line in ["AXON_KME_ID", "AXON_KME_ID='a", "AXON_KME_ID=$HOME", "AXON_KME_ID=a b"] {
             assert!(with(line).contains("line 8 is not"), "{}", with(line));

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use serde::{Deserialize, Serialize};
 
-use super::tally::Outcome;
+use super::tally::RunTally;
 
 /// One line.
 #[derive(Debug, Serialize, Deserialize)]
@@ -25,7 +25,7 @@ pub(crate) enum Event {
         waits: u64,
     },
     /// A subscriber is done.
-    Outcome(Outcome),
+    Outcome(RunTally),
     /// It cannot go on.
     Failed {
         /// Why.

@@ -35,7 +35,7 @@ use self::{
 };
 use crate::{
     cli,
-    failure::Failure,
+    failure::CliError,
     log::{LogError, Survey},
     logging,
 };
@@ -73,13 +73,13 @@ pub(crate) enum DemoError {
 }
 
 /// Runs the demo. The exit status is 0 only when all was as it must be.
-pub(crate) fn run(args: &cli::Demo) -> Result<ExitCode, Failure> {
+pub(crate) fn run(args: &cli::Demo) -> Result<ExitCode, CliError> {
     logging::check()?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .enable_all()
         .build()
-        .map_err(Failure::failed)?;
+        .map_err(CliError::failed)?;
     let report = runtime.block_on(async {
         tokio::select! {
             report = show(args) => report,
@@ -87,16 +87,16 @@ pub(crate) fn run(args: &cli::Demo) -> Result<ExitCode, Failure> {
         }
     });
     let report = report.map_err(|error| match error {
-        setting @ DemoError::KmeEnv(_) => Failure::Setting(setting.to_string()),
-        other => Failure::failed(other),
+        setting @ DemoError::KmeEnv(_) => CliError::Setting(setting.to_string()),
+        other => CliError::failed(other),
     })?;
     let text = if args.json {
-        let json = serde_json::to_string_pretty(&report).map_err(Failure::failed)?;
+        let json = serde_json::to_string_pretty(&report).map_err(CliError::failed)?;
         crate::text::printable_json(&json) + "\n"
     } else {
         report.render()
     };
-    std::io::stdout().lock().write_all(text.as_bytes()).map_err(Failure::failed)?;
+    std::io::stdout().lock().write_all(text.as_bytes()).map_err(CliError::failed)?;
     Ok(if report.passed { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 

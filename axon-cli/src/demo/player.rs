@@ -9,7 +9,7 @@ use std::{
 use axon_transport::qos::Qos;
 
 use super::events::Event;
-use crate::{cli, failure::Failure, log::Survey, logging, play, session};
+use crate::{cli, failure::CliError, log::Survey, logging, play, session};
 
 /// How often it says how far it is.
 const REPORT: Duration = Duration::from_millis(200);
@@ -18,9 +18,9 @@ const REPORT: Duration = Duration::from_millis(200);
 const MATCH: Duration = Duration::from_secs(35);
 
 /// Runs the player and says its events on standard output.
-pub(crate) fn run(args: &cli::DemoPlayer) -> Result<(), Failure> {
+pub(crate) fn run(args: &cli::DemoPlayer) -> Result<(), CliError> {
     let config = logging::configure()?;
-    let survey = Survey::of(&args.file).map_err(Failure::failed)?;
+    let survey = Survey::of(&args.file).map_err(CliError::failed)?;
     let session = session::open(&config, "demo player")?;
     let publishers = play::publishers(&session, &survey, Qos::keep_all())?;
     if let Some(unmatched) = play::wait_matched(&publishers, args.wait, MATCH) {

@@ -4,8 +4,8 @@ use std::fmt::Write as _;
 
 use serde::Serialize;
 
-use super::{kmes::KeysHandedOut, route::Negotiated, tally::Outcome};
-use crate::text::{self, Table};
+use super::{kmes::KeysHandedOut, route::Negotiated, tally::RunTally};
+use crate::text::{self, TextTable};
 
 /// Everything that the demo found out.
 #[derive(Debug, Serialize)]
@@ -44,7 +44,7 @@ pub(crate) struct LogSummary {
 pub(crate) struct Row {
     route: &'static str,
     #[serde(flatten)]
-    outcome: Outcome,
+    outcome: RunTally,
     bytes_per_second: f64,
     publisher_waits: u64,
     #[serde(flatten)]
@@ -56,7 +56,7 @@ impl Row {
     /// A row of what a subscriber found and what the link agreed on.
     pub(crate) fn new(
         route: &'static str,
-        outcome: Outcome,
+        outcome: RunTally,
         publisher_waits: u64,
         negotiated: Option<Negotiated>,
         kme_keys: Option<KeysHandedOut>,
@@ -156,7 +156,7 @@ impl Report {
             log.seconds,
             pace(log.rate),
         );
-        let mut routes = Table::new(&[
+        let mut routes = TextTable::new(&[
             "route",
             ">messages",
             ">bytes",
@@ -204,9 +204,9 @@ mod tests {
         }
     }
 
-    fn row(change: impl FnOnce(&mut Outcome)) -> Row {
+    fn row(change: impl FnOnce(&mut RunTally)) -> Row {
         let mut outcome =
-            Outcome { expected: 4, messages: 4, bytes: 8, elapsed_ns: 8, ..Outcome::default() };
+            RunTally { expected: 4, messages: 4, bytes: 8, elapsed_ns: 8, ..RunTally::default() };
         change(&mut outcome);
         Row::new("shared memory", outcome, 0, None, None)
     }
@@ -218,13 +218,13 @@ mod tests {
 
     #[test]
     fn each_fault_fails_the_verdict_and_is_named() {
-        type Change = fn(&mut Outcome);
+        type Change = fn(&mut RunTally);
         let faults: [(Change, &str); 5] = [
             (|o| (o.lost, o.messages) = (1, 3), "1 lost"),
             (|o| o.out_of_order = 2, "2 out of order"),
             (|o| o.duplicates = 3, "3 twice"),
             (|o| o.different = 4, "4 different"),
-            (|o| *o = Outcome::default(), "nothing arrived"),
+            (|o| *o = RunTally::default(), "nothing arrived"),
         ];
         for (change, text) in faults {
             let report = Report::new(log(), vec![row(change)], vec![attempt(true)]);

@@ -14,7 +14,7 @@ use super::{
     process::Process,
     progress::Progress,
     report::Row,
-    tally::Outcome,
+    tally::RunTally,
 };
 
 /// Time that a process has to get ready; bootstrap over slow KMEs included.
@@ -151,7 +151,7 @@ async fn receive(
     subscriber: &mut Process,
     sent: &Cell<Option<Instant>>,
     progress: &Progress,
-) -> Result<Outcome, DemoError> {
+) -> Result<RunTally, DemoError> {
     let mut received = (0, Instant::now());
     loop {
         match tokio::time::timeout(SILENCE, subscriber.event()).await {

@@ -13,7 +13,7 @@ use super::{
     player::end_of_stdin,
     tally::{Arrival, Tally},
 };
-use crate::{cli, failure::Failure, log::Log, logging, session};
+use crate::{cli, failure::CliError, log::Log, logging, session};
 
 /// How often it says how far it is.
 const REPORT: Duration = Duration::from_millis(200);
@@ -22,9 +22,9 @@ const REPORT: Duration = Duration::from_millis(200);
 const LISTEN_ON: Duration = Duration::from_millis(300);
 
 /// Runs the subscriber and says its events on standard output.
-pub(crate) fn run(args: &cli::DemoSubscriber) -> Result<(), Failure> {
+pub(crate) fn run(args: &cli::DemoSubscriber) -> Result<(), CliError> {
     let config = logging::configure()?;
-    let log = Log::load(&args.file).map_err(Failure::failed)?;
+    let log = Log::load(&args.file).map_err(CliError::failed)?;
     let session = session::open(&config, "demo subscriber")?;
     let mut subscriptions = Vec::new();
     for topic in &log.survey.topics {

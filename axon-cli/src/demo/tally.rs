@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 /// The outcome of one subscriber's run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Outcome {
+pub(crate) struct RunTally {
     /// Messages of the log that should arrive.
     pub(crate) expected: u64,
     /// Messages of the log that arrived, each counted once.
@@ -29,7 +29,7 @@ pub(crate) struct Outcome {
     pub(crate) elapsed_ns: u64,
 }
 
-impl Outcome {
+impl RunTally {
     /// Whether the whole log arrived once, in order and unchanged.
     pub(crate) fn is_whole(&self) -> bool {
         let faults = [self.lost, self.out_of_order, self.duplicates, self.different];
@@ -64,7 +64,7 @@ pub(crate) struct Tally {
     latencies: Vec<u64>,
     first_published: Option<i64>,
     last_received: Option<i64>,
-    outcome: Outcome,
+    outcome: RunTally,
 }
 
 #[derive(Debug)]
@@ -88,7 +88,7 @@ impl Tally {
             latencies: Vec::with_capacity(expected),
             first_published: None,
             last_received: None,
-            outcome: Outcome { expected: expected as u64, ..Outcome::default() },
+            outcome: RunTally { expected: expected as u64, ..RunTally::default() },
         }
     }
 
@@ -136,7 +136,7 @@ impl Tally {
     }
 
     /// The outcome, now that nothing more is awaited.
-    pub(crate) fn finish(mut self) -> Outcome {
+    pub(crate) fn finish(mut self) -> RunTally {
         self.latencies.sort_unstable();
         self.outcome.lost = self.outcome.expected - self.outcome.messages;
         self.outcome.latency_p50_ns = percentile(&self.latencies, 50);
@@ -163,7 +163,7 @@ mod tests {
         vec![vec![b"a1".to_vec(), b"a2".to_vec(), b"a3".to_vec()], vec![b"b1".to_vec()]]
     }
 
-    fn run(arrivals: &[(usize, u64, &[u8])]) -> Outcome {
+    fn run(arrivals: &[(usize, u64, &[u8])]) -> RunTally {
         let mut tally = Tally::new(log());
         for (time, &(topic, sequence, payload)) in (0..).zip(arrivals) {
             let (published, received) = (1_000 * time, 1_000 * time + 10 * (time + 1));
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_log_does_not_hold_is_different_and_never_a_panic() {
+    fn messages_absent_from_the_log_count_as_different() {
         let outcome = run(&[(0, 0, b""), (0, 4, b"a4"), (0, u64::MAX, b""), (9, 1, b"")]);
         assert_eq!((outcome.different, outcome.messages, outcome.lost), (4, 0, 4));
     }

@@ -94,10 +94,10 @@ impl Visit<'_> {
         let from = SocketAddr::from(([127, 0, 0, 1], 0));
         let target = self.target(wrong.peer).await?;
         let told = match classical::connect(&classical::CLASSICAL, from, target).await {
-            Ok(classical::Outcome::Refused { alert, reason }) => {
+            Ok(classical::ClassicalAttempt::Refused { alert, reason }) => {
                 Some((alert == Some(HANDSHAKE_FAILURE), reason))
             }
-            Ok(classical::Outcome::Connected) => None,
+            Ok(classical::ClassicalAttempt::Connected) => None,
             Err(reason) => return Err(DemoError::Attempt { attempt: wrong.peer, reason }),
         };
         self.attempt(wrong, told, &before).await

@@ -12,28 +12,28 @@ use serde_json::Value;
 
 use crate::{
     cli,
-    failure::Failure,
+    failure::CliError,
     logging,
     say::say,
-    text::{self, Table, grouped},
+    text::{self, TextTable, grouped},
 };
 
 /// Runs `axon status`.
 ///
 /// # Errors
 /// A setting by which the daemon is found; or what it answers cannot be shown.
-pub(crate) fn run(args: &cli::Status) -> Result<ExitCode, Failure> {
+pub(crate) fn run(args: &cli::Status) -> Result<ExitCode, CliError> {
     // Whatever is wrong with this host's settings and files: a daemon that runs can be looked at.
     let wrong = match logging::configure() {
         Ok(config) => {
             if let Some(line) = config.unknown_variables() {
                 say(format_args!("axon: {line}"));
             }
-            axon_daemon::check(&config).map_err(Failure::failed).err()
+            axon_daemon::check(&config).map_err(CliError::failed).err()
         }
         Err(failure) => Some(failure),
     };
-    let status = wrong.as_ref().map(Failure::report);
+    let status = wrong.as_ref().map(CliError::report);
     let json = match DaemonPlace::from_env().map(|place| axon_transport::daemon_status_at(&place)) {
         Ok(Ok(json)) => json,
         Ok(Err(error)) => {
@@ -45,11 +45,11 @@ pub(crate) fn run(args: &cli::Status) -> Result<ExitCode, Failure> {
         Err(error) => return status.ok_or(error.into()),
     };
     let text = if args.json {
-        let value: Value = serde_json::from_str(&json).map_err(Failure::failed)?;
-        let json = serde_json::to_string_pretty(&value).map_err(Failure::failed)?;
+        let value: Value = serde_json::from_str(&json).map_err(CliError::failed)?;
+        let json = serde_json::to_string_pretty(&value).map_err(CliError::failed)?;
         text::printable_json(&json) + "\n"
     } else {
-        render(&serde_json::from_str(&json).map_err(Failure::failed)?)
+        render(&serde_json::from_str(&json).map_err(CliError::failed)?)
     };
     std::io::stdout().lock().write_all(text.as_bytes())?;
     Ok(ExitCode::SUCCESS)
@@ -109,16 +109,16 @@ fn discovery(status: &Status) -> String {
     format!("{}, looks for {}", looks.range, looks.hosts.join(", "))
 }
 
-fn settings(status: &Status) -> Table {
-    let mut table = Table::new(&["variable", "value"]);
+fn settings(status: &Status) -> TextTable {
+    let mut table = TextTable::new(&["variable", "value"]);
     for (name, value) in &status.settings {
         table.row([name.clone(), value.clone()]);
     }
     table
 }
 
-fn links(links: &[LinkStatus]) -> Table {
-    let mut table = Table::new(&[
+fn links(links: &[LinkStatus]) -> TextTable {
+    let mut table = TextTable::new(&[
         "host",
         "address",
         "SAE",
@@ -150,8 +150,8 @@ fn links(links: &[LinkStatus]) -> Table {
     table
 }
 
-fn routes_refused(links: &[LinkStatus]) -> Table {
-    let mut table = Table::new(&["host", "topic", "why"]);
+fn routes_refused(links: &[LinkStatus]) -> TextTable {
+    let mut table = TextTable::new(&["host", "topic", "why"]);
     for link in links {
         for (topic, why) in &link.routes_refused {
             table.row([link.host.clone(), topic.clone(), why.clone()]);
@@ -173,12 +173,12 @@ fn causes(dropped: &BTreeMap<String, u64>) -> String {
 
 /// The key supply comes as the gateway describes it: every value under its path.
 fn keys(out: &mut String, keys: &Value) {
-    let mut table = Table::new(&["of", ">value"]);
+    let mut table = TextTable::new(&["of", ">value"]);
     flatten(&mut table, "", keys);
     section(out, "Keys", "no key manager in this mode", table);
 }
 
-fn flatten(table: &mut Table, path: &str, value: &Value) {
+fn flatten(table: &mut TextTable, path: &str, value: &Value) {
     let under = |name: &str| {
         if path.is_empty() { name.to_owned() } else { format!("{path} {name}") }
     };
@@ -197,8 +197,8 @@ fn flatten(table: &mut Table, path: &str, value: &Value) {
     }
 }
 
-fn topics(status: &Status) -> Table {
-    let mut table = Table::new(&[
+fn topics(status: &Status) -> TextTable {
+    let mut table = TextTable::new(&[
         "topic",
         "type",
         ">publishers",
@@ -258,8 +258,8 @@ fn stalled(topic: &TopicStatus) -> String {
     if named.is_empty() { dash() } else { named.join(", ") }
 }
 
-fn sessions(status: &Status) -> Table {
-    let mut table = Table::new(&[">process", "name", "role", ">endpoints", "range", "memory"]);
+fn sessions(status: &Status) -> TextTable {
+    let mut table = TextTable::new(&[">process", "name", "role", ">endpoints", "range", "memory"]);
     for session in &status.sessions {
         let (pid, endpoints) = (session.pid.to_string(), session.endpoints.to_string());
         let (name, role) = (session.name.clone(), session.role.clone());
@@ -288,8 +288,8 @@ fn range(session: &SessionStatus, links: &[LinkStatus]) -> String {
     text
 }
 
-fn out_of_range(status: &Status) -> Table {
-    let mut table = Table::new(&["topic", "publisher", "subscription", "why"]);
+fn out_of_range(status: &Status) -> TextTable {
+    let mut table = TextTable::new(&["topic", "publisher", "subscription", "why"]);
     for topic in &status.topics {
         for pair in &topic.out_of_range {
             table.row([
@@ -304,8 +304,8 @@ fn out_of_range(status: &Status) -> Table {
 }
 
 /// The endpoints to or from which nothing flows since a route is refused.
-fn refused(status: &Status) -> Table {
-    let mut table = Table::new(&["topic", "endpoint", "other host", "why"]);
+fn refused(status: &Status) -> TextTable {
+    let mut table = TextTable::new(&["topic", "endpoint", "other host", "why"]);
     for topic in &status.topics {
         for waiting in &topic.refused {
             table.row([
@@ -332,8 +332,8 @@ fn memory(relay: Option<&RelayStatus>) -> String {
     )
 }
 
-fn refusals(status: &Status) -> Table {
-    let mut table = Table::new(&["when", "who", "what", "why"]);
+fn refusals(status: &Status) -> TextTable {
+    let mut table = TextTable::new(&["when", "who", "what", "why"]);
     for refusal in &status.refusals {
         let nanoseconds = i64::try_from(refusal.unix_ms).unwrap_or(0).saturating_mul(1_000_000);
         table.row([
@@ -361,7 +361,7 @@ fn facts(out: &mut String, facts: &[(&str, String)]) {
     }
 }
 
-fn section(out: &mut String, title: &str, none: &str, table: Table) {
+fn section(out: &mut String, title: &str, none: &str, table: TextTable) {
     heading(out, title);
     if table.is_empty() {
         let _ = writeln!(out, "  {none}");
@@ -464,7 +464,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_peer_calls_itself_cannot_steer_the_terminal() {
+    fn status_removes_control_characters_of_peer_names() {
         assert!(!render(&status()).contains('\x1b'));
     }
 

@@ -3,11 +3,11 @@
 use axon_transport::status::{LinkStatus, WaitingStatus};
 
 use super::dash;
-use crate::text::{self, Table, grouped};
+use crate::text::{self, TextTable, grouped};
 
 /// A row for each link.
-pub(super) fn paths(links: &[LinkStatus]) -> Table {
-    let mut table = Table::new(&[
+pub(super) fn paths(links: &[LinkStatus]) -> TextTable {
+    let mut table = TextTable::new(&[
         "host",
         ">rtt",
         ">shortest",

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use axon_tls::identity::KeyAlgorithm;
 use clap::{Args, Subcommand, ValueEnum};
 
-use super::target::Target;
+use super::target::HostTarget;
 
 pub(crate) const HELP: &str = "\
 Two hosts that know each other by their keys:
@@ -91,7 +91,7 @@ Exit status: 1 when no key was shown.";
 pub(crate) struct Scan {
     /// The host; without a port the sixteen of the ROS domain are tried
     #[arg(value_name = "HOST[:PORT]")]
-    pub(crate) target: Target,
+    pub(crate) target: HostTarget,
     /// What the line calls the host [default: as typed here]
     #[arg(long)]
     pub(crate) name: Option<String>,

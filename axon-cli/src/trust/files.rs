@@ -9,13 +9,13 @@ use std::{
 use axon_tls::identity::{SigningKey, TrustFile};
 use zeroize::Zeroizing;
 
-use crate::failure::Failure;
+use crate::failure::CliError;
 
 /// Larger than any key in PEM.
 const LARGEST_KEY: usize = 64 << 10;
 
 /// Reads a trust file. What is wrong with a line is said with its number.
-pub(super) fn trust(path: &Path) -> Result<TrustFile, Failure> {
+pub(super) fn trust(path: &Path) -> Result<TrustFile, CliError> {
     let mut bytes = Vec::new();
     let limit = TrustFile::MAX_LEN as u64 + 1;
     File::open(path)
@@ -30,7 +30,7 @@ pub(super) fn trust(path: &Path) -> Result<TrustFile, Failure> {
 }
 
 /// Reads a private key.
-pub(super) fn key(path: &Path) -> Result<SigningKey, Failure> {
+pub(super) fn key(path: &Path) -> Result<SigningKey, CliError> {
     // Of full size from the start: a buffer that grows leaves what it held behind.
     let mut bytes = Zeroizing::new(vec![0; LARGEST_KEY]);
     let len = File::open(path)
@@ -43,7 +43,7 @@ pub(super) fn key(path: &Path) -> Result<SigningKey, Failure> {
 }
 
 /// Why a file could not be opened or read, for a user who is new to this tool.
-pub(super) fn unread(path: &Path, error: &io::Error) -> Failure {
+pub(super) fn unread(path: &Path, error: &io::Error) -> CliError {
     match error.kind() {
         io::ErrorKind::NotFound => failed(path, &"there is no such file"),
         io::ErrorKind::PermissionDenied => failed(path, &"this user may not read it"),
@@ -53,12 +53,12 @@ pub(super) fn unread(path: &Path, error: &io::Error) -> Failure {
 }
 
 /// A failure of the file at `path`.
-pub(super) fn failed(path: &Path, reason: &dyn std::fmt::Display) -> Failure {
-    Failure::failed(format!("{}: {reason}", path.display()))
+pub(super) fn failed(path: &Path, reason: &dyn std::fmt::Display) -> CliError {
+    CliError::failed(format!("{}: {reason}", path.display()))
 }
 
-fn unusable(path: &Path, line: usize, reason: &str) -> Failure {
-    Failure::failed(format!("{}, line {line}: {reason}", path.display()))
+fn unusable(path: &Path, line: usize, reason: &str) -> CliError {
+    CliError::failed(format!("{}, line {line}: {reason}", path.display()))
 }
 
 fn fill(mut file: File, buffer: &mut [u8]) -> io::Result<usize> {

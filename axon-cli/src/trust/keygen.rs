@@ -10,13 +10,13 @@ use std::{
 use axon_tls::identity::SigningKey;
 
 use super::{cli, files::failed, line::line};
-use crate::failure::Failure;
+use crate::failure::CliError;
 
 /// Runs `axon trust keygen`.
-pub(super) fn run(args: &cli::Keygen) -> Result<(), Failure> {
+pub(super) fn run(args: &cli::Keygen) -> Result<(), CliError> {
     let name = args.name.clone().unwrap_or_else(node_name);
-    let pem = SigningKey::generate_pem_with(args.algorithm.into()).map_err(Failure::failed)?;
-    let key = SigningKey::from_pem(&pem).map_err(Failure::failed)?;
+    let pem = SigningKey::generate_pem_with(args.algorithm.into()).map_err(CliError::failed)?;
+    let key = SigningKey::from_pem(&pem).map_err(CliError::failed)?;
     // A name that no trust file can hold is refused before there is a file.
     let line = line(&name, key.spki_digest())?;
     create(&args.file, pem.as_bytes())?;
@@ -25,7 +25,7 @@ pub(super) fn run(args: &cli::Keygen) -> Result<(), Failure> {
 }
 
 /// Writes a file that did not exist, for its owner alone.
-fn create(path: &Path, content: &[u8]) -> Result<(), Failure> {
+fn create(path: &Path, content: &[u8]) -> Result<(), CliError> {
     let mut options = OpenOptions::new();
     options.write(true).create_new(true).mode(0o600);
     let file = options.open(path).map_err(|error| match error.kind() {

@@ -2,13 +2,13 @@
 
 use axon_tls::identity::{SpkiDigest, TrustFile};
 
-use crate::{failure::Failure, text::printable};
+use crate::{failure::CliError, text::printable};
 
 /// `NAME spki-sha256:BASE64`.
 ///
 /// # Errors
 /// A trust file would not give back this very name.
-pub(super) fn line(name: &str, key: SpkiDigest) -> Result<String, Failure> {
+pub(super) fn line(name: &str, key: SpkiDigest) -> Result<String, CliError> {
     let line = format!("{name} {key}");
     let read = TrustFile::parse(&line);
     let means_it = read.is_ok_and(|file| {
@@ -18,7 +18,7 @@ pub(super) fn line(name: &str, key: SpkiDigest) -> Result<String, Failure> {
     if means_it {
         return Ok(line);
     }
-    Err(Failure::Setting(format!(
+    Err(CliError::Setting(format!(
         "{:?} cannot be a name in a trust file: at most 255 printable ASCII characters, no space, \
          no #; choose one with --name",
         printable(name)
@@ -30,7 +30,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_would_not_be_read_back_is_refused() {
+    fn trust_line_refuses_unparsable_names() {
         let key = SpkiDigest([7; 32]);
         assert_eq!(line("arm-2", key).unwrap(), format!("arm-2 {key}"));
         let long = "x".repeat(256);

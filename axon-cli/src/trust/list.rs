@@ -7,14 +7,14 @@ use axon_transport::config::{ClassicConfig, Config, Security};
 
 use super::{cli, files};
 use crate::{
-    failure::Failure,
+    failure::CliError,
     logging,
     say::say,
-    text::{Table, printable},
+    text::{TextTable, printable},
 };
 
 /// Runs `axon trust list`.
-pub(super) fn run(args: &cli::List) -> Result<(), Failure> {
+pub(super) fn run(args: &cli::List) -> Result<(), CliError> {
     let (trust, key) = paths(args)?;
     let file = files::trust(&trust)?;
     let own = key.as_deref().map(files::key).transpose()?.map(|key| key.spki_digest());
@@ -24,7 +24,7 @@ pub(super) fn run(args: &cli::List) -> Result<(), Failure> {
 }
 
 /// The trust file, and our own key if there is one: as given, else as the settings say.
-fn paths(args: &cli::List) -> Result<(PathBuf, Option<PathBuf>), Failure> {
+fn paths(args: &cli::List) -> Result<(PathBuf, Option<PathBuf>), CliError> {
     if let Some(file) = &args.file {
         // A file is looked at before the settings are complete, too.
         let key = args.key.clone().or_else(|| match Config::from_env() {
@@ -41,7 +41,7 @@ fn paths(args: &cli::List) -> Result<(PathBuf, Option<PathBuf>), Failure> {
     let (trust, key) = configured.map_or((None, None), |classic| (classic.trust, classic.key));
     let missing = "AXON_CLASSIC_TRUST: not set, accepted: the path of a trust file, or give it as \
                    an argument";
-    let trust = trust.ok_or_else(|| Failure::Setting(missing.to_owned()))?;
+    let trust = trust.ok_or_else(|| CliError::Setting(missing.to_owned()))?;
     Ok((trust, args.key.clone().or(key)))
 }
 
@@ -53,7 +53,7 @@ fn classic(config: Config) -> Option<ClassicConfig> {
 }
 
 fn render(file: &TrustFile, own: Option<SpkiDigest>, now: SystemTime) -> String {
-    let mut table = Table::new(&["name", "key", "not after", "state"]);
+    let mut table = TextTable::new(&["name", "key", "not after", "state"]);
     for pin in file.pins() {
         let state = if pin.holds(now) { "valid" } else { "expired" };
         let mark = if own == Some(pin.key()) { ", this host" } else { "" };

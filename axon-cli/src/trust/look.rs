@@ -119,7 +119,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_has_no_key_to_pin_is_told_apart() {
+    async fn scan_explains_servers_without_a_key_to_pin() {
         let cipher = Cipher::default();
         for kex in [PskKex::PskKe, PskKex::PskDheKe] {
             let qkd = qkd_server(Arc::new(NoKeys), cipher, kex, ALPN).expect("server");

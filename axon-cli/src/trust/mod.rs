@@ -10,10 +10,10 @@ mod scan;
 mod target;
 
 use self::cli::Trust;
-use crate::failure::Failure;
+use crate::failure::CliError;
 
 /// Runs `axon trust`.
-pub(crate) fn run(args: &Trust) -> Result<(), Failure> {
+pub(crate) fn run(args: &Trust) -> Result<(), CliError> {
     match args {
         Trust::Keygen(args) => keygen::run(args),
         Trust::List(args) => list::run(args),

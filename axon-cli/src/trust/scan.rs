@@ -22,7 +22,7 @@ use super::{
     line::line,
     look::{self, look},
 };
-use crate::{failure::Failure, say::say, text::printable};
+use crate::{failure::CliError, say::say, text::printable};
 
 /// When one port has answered, the others have this long.
 const OTHERS: Duration = Duration::from_secs(1);
@@ -33,7 +33,7 @@ const NOTHING_VERIFIED: &str = "\
 # AXON_CLASSIC_KEY shows another key each time its daemon starts.";
 
 /// Runs `axon trust scan`.
-pub(super) fn run(args: &cli::Scan) -> Result<(), Failure> {
+pub(super) fn run(args: &cli::Scan) -> Result<(), CliError> {
     let name = args.name.as_deref().unwrap_or(&args.target.host);
     // Before anybody is asked.
     line(name, SpkiDigest([0; 32]))?;
@@ -44,10 +44,10 @@ pub(super) fn run(args: &cli::Scan) -> Result<(), Failure> {
     let (seen, asked) = runtime.block_on(async {
         let addresses = args.target.addresses(quic_ports(domain)).await.map_err(|error| {
             let host = printable(&args.target.host);
-            Failure::failed(format!("{host}: no address is known for this name ({error})"))
+            CliError::failed(format!("{host}: no address is known for this name ({error})"))
         })?;
         let seen = scan(&addresses, limit).await;
-        Ok::<_, Failure>((seen, addresses))
+        Ok::<_, CliError>((seen, addresses))
     })?;
 
     let found = Found::of(&seen);
@@ -56,7 +56,7 @@ pub(super) fn run(args: &cli::Scan) -> Result<(), Failure> {
     }
     if found.keys.is_empty() {
         let answered = !found.notes.is_empty();
-        return Err(Failure::failed(nobody(args, &asked, domain, answered)));
+        return Err(CliError::failed(nobody(args, &asked, domain, answered)));
     }
     let mut out = String::new();
     for (key, names) in &found.keys {
@@ -76,7 +76,7 @@ pub(super) fn run(args: &cli::Scan) -> Result<(), Failure> {
 }
 
 /// This host's own keys need not be set up to look at others, so no other setting is read.
-fn domain() -> Result<u32, Failure> {
+fn domain() -> Result<u32, CliError> {
     let env = std::env::vars_os().filter(|(name, _)| name == "ROS_DOMAIN_ID");
     Ok(Config::resolve(env, None, &OsFiles)?.domain)
 }

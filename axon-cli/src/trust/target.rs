@@ -7,12 +7,12 @@ const MAX_ADDRESSES: usize = 4;
 
 /// `HOST`, `HOST:PORT`, `[IPv6]` or `[IPv6]:PORT`.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Target {
+pub(crate) struct HostTarget {
     pub(super) host: String,
     pub(super) port: Option<u16>,
 }
 
-impl Target {
+impl HostTarget {
     /// The addresses at each of `ports`, or at the port that was typed.
     pub(super) async fn addresses(
         &self,
@@ -33,7 +33,7 @@ impl Target {
     }
 }
 
-impl FromStr for Target {
+impl FromStr for HostTarget {
     type Err = &'static str;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
@@ -80,10 +80,10 @@ mod tests {
             ("[::1]", "::1", None),
             ("[::1]:61300", "::1", Some(61300)),
         ] {
-            assert_eq!(text.parse(), Ok(Target { host: host.to_owned(), port }), "{text}");
+            assert_eq!(text.parse(), Ok(HostTarget { host: host.to_owned(), port }), "{text}");
         }
         for text in ["", ":1", "a:", "a:0", "a:65536", "a:x", "a:-1", "[::1", "[::1]1", "[]:1"] {
-            assert!(text.parse::<Target>().is_err(), "{text}");
+            assert!(text.parse::<HostTarget>().is_err(), "{text}");
         }
     }
 }

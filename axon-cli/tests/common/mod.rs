@@ -2,12 +2,46 @@
 
 #![allow(dead_code, reason = "each test program uses its part")]
 
+#[path = "../../../axon-transport/daemon/tests/support/excerpt.rs"]
+mod excerpt;
+
 use std::{
+    fmt,
     io::{BufRead, BufReader},
+    ops::Deref,
     process::{Child, ChildStdout, Command, Output, Stdio},
     sync::atomic::{AtomicU32, Ordering},
     time::{Duration, Instant},
 };
+
+/// What a program wrote to standard error. A failed assertion shows an excerpt of it.
+pub(crate) struct Stderr(String);
+
+impl Stderr {
+    pub(crate) fn of(bytes: &[u8]) -> Self {
+        Self(String::from_utf8_lossy(bytes).into_owned())
+    }
+}
+
+impl Deref for Stderr {
+    type Target = str;
+
+    fn deref(&self) -> &str {
+        &self.0
+    }
+}
+
+impl fmt::Display for Stderr {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&excerpt::excerpt("stderr", self))
+    }
+}
+
+impl fmt::Debug for Stderr {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&excerpt::excerpt("stderr", &format!("{:?}", self.0)))
+    }
+}
 
 /// The log that comes with the repository.
 pub(crate) const LOG: &str =

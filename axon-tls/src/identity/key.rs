@@ -138,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_key_is_refused() {
+    fn signing_key_refuses_invalid_pem_and_pkcs8() {
         assert!(SigningKey::from_pem("").is_err());
         assert!(SigningKey::from_pem("-----BEGIN PRIVATE KEY-----\nAAAA\n").is_err());
         assert!(SigningKey::from_pkcs8(&[0x30, 0x00]).is_err());

@@ -38,7 +38,7 @@ use crate::Error;
 pub enum Auth {
     /// Not at all: any peer is accepted, under the ephemeral raw public key that it shows.
     ///
-    /// **This stops who records the connection, and not who sits in the middle of it.**
+    /// **This protects against eavesdroppers, not against a man in the middle.**
     None(SigningKey),
     /// Raw public keys (RFC 7250) that both ends know beforehand.
     Pinned {

@@ -64,7 +64,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_no_pem_is_refused() {
+    fn private_key_refuses_invalid_pem() {
         let endless = format!("{BEGIN}\nAAAA\n");
         let encrypted =
             "-----BEGIN ENCRYPTED PRIVATE KEY-----\nAAAA\n-----END ENCRYPTED PRIVATE KEY-----";

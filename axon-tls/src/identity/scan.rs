@@ -84,7 +84,7 @@ impl Probe {
 
     fn new<const RAW_KEYS: bool>(alpn: &[u8]) -> Result<Self, crate::Error> {
         let shown = Arc::new(OnceLock::new());
-        let look = Look::<RAW_KEYS> {
+        let look = ScanVerifier::<RAW_KEYS> {
             shown: Arc::clone(&shown),
             algorithms: default_provider().signature_verification_algorithms,
         };
@@ -101,12 +101,12 @@ impl Probe {
 }
 
 #[derive(Debug)]
-struct Look<const RAW_KEYS: bool> {
+struct ScanVerifier<const RAW_KEYS: bool> {
     shown: Arc<OnceLock<Shown>>,
     algorithms: WebPkiSupportedAlgorithms,
 }
 
-impl<const RAW_KEYS: bool> Peers for Look<RAW_KEYS> {
+impl<const RAW_KEYS: bool> Peers for ScanVerifier<RAW_KEYS> {
     const RAW_KEYS: bool = RAW_KEYS;
 
     /// rustls asks this first and for the signature next, which is where it ends.

@@ -35,7 +35,8 @@ mod wire;
 pub use axon_shm::internal::ErasingHeap;
 pub use check::check;
 pub use control::{DaemonError, DaemonOptions, Start, log, main, run};
-pub use error::GatewayError;
+pub use error::{EndpointError, GatewayError};
+pub use keys::KmeError;
 
 /// What the other crates of AXON and its tests use of this one. It is not part of its interface, and changes
 /// with any release.

@@ -44,7 +44,7 @@ fn below<T>(work: impl FnOnce() -> T) -> T {
 }
 
 #[test]
-fn what_a_call_leaves_on_the_stack_is_found() {
+fn a_secret_left_on_the_stack_is_found() {
     /// From a seed that is nowhere as it is.
     fn secret() -> [u8; 32] {
         std::array::from_fn(|at| black_box(at as u8).wrapping_mul(151) ^ 0x5e)

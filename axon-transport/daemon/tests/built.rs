@@ -124,7 +124,7 @@ fn no_variable_influences_what_is_built_or_the_daemon_that_it_starts() {
 }
 
 #[test]
-fn what_is_given_on_top_of_the_environment_reaches_the_daemon_with_it() {
+fn builder_settings_over_the_environment_reach_the_daemon() {
     let host = Host::new().with("AXON_QUIC_CIPHER", "aes-256-gcm").with("ROS_DOMAIN_ID", "wrong");
     let mut player = host.play("on top");
     let built = player.hear();

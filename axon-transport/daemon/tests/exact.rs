@@ -81,7 +81,7 @@ fn switches() -> u64 {
 }
 
 #[test]
-fn what_a_session_makes_is_in_its_own_graph_at_once_whatever_becomes_of_the_daemon() {
+fn own_endpoints_are_in_the_graph_at_once_without_a_daemon() {
     use EndpointKind::{Client, Publisher, Server, Subscription};
     let host = Host::new();
     let mut daemon = host.daemon();

@@ -30,7 +30,7 @@ fn run(command: &mut Command) -> String {
 }
 
 #[test]
-fn those_of_one_process_need_no_daemon() {
+fn examples_of_one_process_need_no_daemon() {
     // Where no daemon could be started.
     let host = Host::new().with("AXON_DAEMON_PATH", "/dev/null");
     let printed = |name| run(&mut host.command(example(name)));

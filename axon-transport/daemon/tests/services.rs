@@ -357,7 +357,7 @@ fn a_callback_that_is_set_late_is_told_of_what_can_be_taken() {
 
 /// More than any ring has room for, to one that takes nothing meanwhile.
 #[test]
-fn who_keeps_the_newest_only_is_never_waited_for() {
+fn a_keep_last_service_never_blocks() {
     const MANY: u64 = 20_000;
     let host = Host::new();
     let _daemon = host.daemon();

@@ -174,7 +174,7 @@ fn depth_counts_over_all_publishers_and_skipping_is_not_loss() {
 }
 
 #[test]
-fn what_a_publisher_left_is_taken_after_its_end() {
+fn samples_of_an_ended_publisher_are_taken() {
     let session = alone();
     let subscription = session.create_subscription(spec(Qos::keep_all())).unwrap();
     let publisher = session.create_publisher(spec(Qos::keep_all())).unwrap();
@@ -402,7 +402,7 @@ fn a_forked_child_is_refused_by_whatever_it_asks_and_never_waits() {
 
 /// Threads that share everything and ask nobody.
 #[test]
-fn whatever_thread_creates_uses_and_ends_endpoints_in_whatever_order() {
+fn threads_create_use_and_end_endpoints_concurrently() {
     let session = alone();
     let guard = session.create_guard_condition();
     thread::scope(|scope| {

@@ -59,7 +59,7 @@ fn nothing_at_all_is_waited_for_until_the_time_is_over() {
 }
 
 #[test]
-fn all_that_is_ready_is_named_and_a_sample_that_stays_is_named_again() {
+fn wait_names_all_ready_items_and_repeats_untaken_samples() {
     let session = alone();
     let (publisher, subscription) = pair(&session, "/t");
     let (_silent, idle) = pair(&session, "/u");
@@ -79,7 +79,7 @@ fn all_that_is_ready_is_named_and_a_sample_that_stays_is_named_again() {
 }
 
 #[test]
-fn what_belongs_to_other_sessions_is_waited_for_too() {
+fn wait_includes_items_of_other_sessions() {
     let (session, others) = (alone(), [alone(), alone()]);
     let [one, two] = &others;
     let (foreign, own) = (one.create_guard_condition(), session.create_guard_condition());

@@ -15,7 +15,7 @@ use std::{
     os::{fd::OwnedFd, unix::net::UnixDatagram},
     process::{Command, Stdio},
     thread,
-    time::{Duration, SystemTime},
+    time::Duration,
 };
 
 use axon_shm::{Context, Publisher, PublisherOptions, Subscriber, SubscriberOptions, qos::Qos};
@@ -70,8 +70,7 @@ fn viewer() -> Result<(), Box<dyn Error>> {
         image.read_at(0, &mut corners[0]);
         image.read_at(image.len() - 1, &mut corners[1]);
         assert_eq!(corners[0], corners[1]);
-        let stamp = Duration::from_nanos(image.meta().source_timestamp.try_into()?);
-        longest = longest.max(SystemTime::UNIX_EPOCH.elapsed()?.saturating_sub(stamp));
+        longest = longest.max(image.meta().source_time().elapsed().unwrap_or_default());
     }
     let (received, skipped, lost) = (camera.received(), camera.skipped(), camera.lost());
     println!("{received} received, {skipped} skipped, {lost} lost; the latest after {longest:?}");

@@ -5,6 +5,15 @@ use std::{fmt, io};
 use crate::ids::{Gid, SessionId};
 
 /// A segment could not be made, checked or mapped.
+///
+/// ```
+/// use axon_shm::{Context, Publisher, PublisherOptions, ShmError, qos::Qos};
+///
+/// let options = PublisherOptions::new(Qos::default()).max_len(u64::MAX);
+/// let refused = Publisher::new(&Context::new()?, options);
+/// assert!(matches!(refused, Err(ShmError::TooLarge { .. })));
+/// # Ok::<(), ShmError>(())
+/// ```
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ShmError {
@@ -91,6 +100,16 @@ impl ShmError {
 }
 
 /// A sample was not published.
+///
+/// ```
+/// use axon_shm::{Context, PublishError, Publisher, PublisherOptions, qos::Qos};
+///
+/// let options = PublisherOptions::new(Qos::default()).max_len(4);
+/// let publisher = Publisher::new(&Context::new()?, options)?;
+/// let refused = publisher.publish(b"hello");
+/// assert_eq!(refused, Err(PublishError::TooLarge { len: 5, max: 4 }));
+/// # Ok::<(), axon_shm::ShmError>(())
+/// ```
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum PublishError {
@@ -162,7 +181,19 @@ pub enum PublishError {
 }
 
 /// A reader that pins samples which the publisher has given up.
+///
+/// ```
+/// use axon_shm::PublishError;
+///
+/// fn report(error: &PublishError) {
+///     if let PublishError::Pinned { keeper } = error {
+///         println!("process {:?} pins {} samples", keeper.process, keeper.samples);
+///     }
+/// }
+/// # report(&PublishError::Forked);
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct PinHolder {
     /// The reader's GID.
     pub reader: Gid,
@@ -188,6 +219,21 @@ fn held_by(keeper: Option<&PinHolder>) -> String {
 }
 
 /// A ring could not be read.
+///
+/// ```
+/// use axon_shm::{Sample, Subscriber, TakeError};
+///
+/// fn next(subscriber: &mut Subscriber) -> Option<Sample> {
+///     match subscriber.take() {
+///         Ok(sample) => sample,
+///         Err(TakeError::Forked) => panic!("a child of a fork has no subscribers"),
+///         Err(error) => {
+///             eprintln!("{error}");
+///             None
+///         }
+///     }
+/// }
+/// ```
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum TakeError {

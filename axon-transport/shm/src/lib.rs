@@ -57,7 +57,7 @@ pub mod internal {
             probe::{out_of_reach, probe},
         },
         os::{
-            clock::{monotonic, wall},
+            clock::{from_unix_nanos, monotonic, unix_nanos, wall},
             fork::ForkToken,
             heap::{ErasingHeap, erase_from_now_on, return_free_memory},
             inherited::{close_inherited, survive_file_size_limit},
@@ -80,7 +80,7 @@ pub mod internal {
             segment::SessionSegment,
             segment_message::{Segment, SegmentName, SegmentOpened},
         },
-        wake::{ForwardedWakeups, Look, Purpose},
+        wake::{ForwardedWakeups, Purpose, WakeCheck},
         writer::{MAX_GAP, Writer},
     };
 

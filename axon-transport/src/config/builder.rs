@@ -358,7 +358,7 @@ impl ConfigBuilder {
         self.set("AXON_LINK_MTU", bytes)
     }
 
-    /// What the graph of one peer may take, and its routes as much again, 1 to 1024 MiB. Default 16.
+    /// Memory for the graph of one peer, 1 to 1024 MiB. Its routes may take four times as much. Default 16.
     pub fn link_graph_mb(self, mib: u64) -> Self {
         self.set("AXON_LINK_GRAPH_MB", mib)
     }

@@ -27,11 +27,19 @@ pub trait Files {
 
 /// What `stat` says of a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct FileFacts {
-    /// What it is.
+    /// The kind of file.
     pub kind: FileKind,
     /// Permission bits.
     pub mode: u32,
+}
+
+impl FileFacts {
+    /// The facts of a file of this kind, with these permission bits.
+    pub fn new(kind: FileKind, mode: u32) -> Self {
+        Self { kind, mode }
+    }
 }
 
 /// What a path leads to.

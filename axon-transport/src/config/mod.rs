@@ -34,6 +34,8 @@ use sources::Given;
 
 pub use builder::ConfigBuilder;
 pub use error::ConfigError;
+// What `Config::resolve` reads files through, which the project's tests replace. Not part of the interface.
+#[doc(hidden)]
 pub use files::{FileFacts, FileKind, Files, OsFiles};
 pub use model::{
     ClassicAuth, ClassicConfig, Config, Congestion, DaemonPolicy, DiscoveryRange, KeyMode,

@@ -11,6 +11,7 @@ use super::{TopicPriority, TopicRule, daemon_env::DaemonEnv, topics};
 /// To change one, change the builder: neither validation nor the daemon that a session starts knows of a
 /// field that was assigned to.
 #[derive(Clone, Debug)]
+#[non_exhaustive]
 pub struct Config {
     /// How peers prove themselves and agree on keys.
     pub security: Security,
@@ -98,6 +99,7 @@ pub enum Security {
 
 /// Settings of `classic`.
 #[derive(Clone, Debug)]
+#[non_exhaustive]
 pub struct ClassicConfig {
     /// `AXON_CLASSIC_AUTH`.
     pub auth: ClassicAuth,
@@ -111,6 +113,13 @@ pub struct ClassicConfig {
     pub cert: Option<PathBuf>,
     /// `AXON_CLASSIC_CRL`.
     pub crl: Option<PathBuf>,
+}
+
+impl ClassicConfig {
+    /// These settings, without any file.
+    pub fn new(auth: ClassicAuth) -> Self {
+        Self { auth, key: None, trust: None, ca: None, cert: None, crl: None }
+    }
 }
 
 /// How a peer is known in `classic`.
@@ -309,6 +318,7 @@ impl DiscoveryRange {
 
 /// A static peer (`AXON_DAEMON_PEERS`).
 #[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct PeerAddress {
     /// Address or name.
     pub host: String,
@@ -318,6 +328,7 @@ pub struct PeerAddress {
 
 /// `[link]` of `axon.toml`.
 #[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct LinkConfig {
     /// How long a daemon outlives its last session.
     pub grace: Duration,
@@ -325,7 +336,7 @@ pub struct LinkConfig {
     pub stalled: Duration,
     /// Largest UDP payload that path discovery tries, in bytes.
     pub mtu: u16,
-    /// What the graph of one peer may take here, and its routes as much again, in bytes.
+    /// Memory for the graph of one peer, in bytes. Its routes may take four times as much.
     pub graph: usize,
     /// What the daemon does between two inputs.
     pub poll: LinkPoll,

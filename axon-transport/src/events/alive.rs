@@ -68,7 +68,7 @@ mod tests {
     }
 
     #[test]
-    fn who_was_alive_since_is_named_in_time_for_the_shortest_lease() {
+    fn alive_reports_within_the_shortest_lease() {
         let (mut alive, start) = (Alive::default(), Instant::now());
         assert_eq!(alive.left(start), None);
         assert!(alive.news(start, [(gid(1), 1)].into_iter()).is_empty(), "nobody has a lease");

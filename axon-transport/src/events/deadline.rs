@@ -3,7 +3,7 @@
 /// Watches one deadline. It runs from the first sample on: a writer that has never sent anything
 /// has missed nothing (DDS 1.4, 2.2.3.7: the deadline is an instance's, which the first sample makes).
 #[derive(Clone, Copy, Debug)]
-pub struct Deadline {
+pub(crate) struct Deadline {
     period: u64,
     /// When it runs out next.
     due: Option<u64>,
@@ -11,19 +11,19 @@ pub struct Deadline {
 
 impl Deadline {
     /// A deadline of `period` nanoseconds; 0 is taken for 1.
-    pub fn new(period: u64) -> Self {
+    pub(crate) fn new(period: u64) -> Self {
         Self { period: period.max(1), due: None }
     }
 
     /// A sample was sent, or came, at `at`. One that is older than what is known changes nothing.
-    pub fn sample(&mut self, at: u64) {
+    pub(crate) fn sample(&mut self, at: u64) {
         let due = at.saturating_add(self.period);
         self.due = Some(self.due.map_or(due, |known| known.max(due)));
     }
 
     /// How many deadlines have passed until `now`, since this was last asked: one for every period
     /// without a sample.
-    pub fn missed(&mut self, now: u64) -> u64 {
+    pub(crate) fn missed(&mut self, now: u64) -> u64 {
         let Some(due) = self.due.filter(|due| *due <= now) else { return 0 };
         let missed = (now - due) / self.period + 1;
         self.due = Some(due.saturating_add(missed.saturating_mul(self.period)));
@@ -31,7 +31,7 @@ impl Deadline {
     }
 
     /// When to ask again; `None` before the first sample.
-    pub fn due(&self) -> Option<u64> {
+    pub(crate) fn due(&self) -> Option<u64> {
         self.due
     }
 }

@@ -6,7 +6,7 @@ use crate::ids::Gid;
 
 /// One lease, as its owner watches it: a publisher its own.
 #[derive(Clone, Copy, Debug)]
-pub struct Lease {
+pub(crate) struct Lease {
     /// `None` never runs out.
     duration: Option<u64>,
     asserted: u64,
@@ -15,13 +15,13 @@ pub struct Lease {
 
 impl Lease {
     /// A lease of `duration` nanoseconds that is asserted at `now`.
-    pub fn new(duration: Option<u64>, now: u64) -> Self {
+    pub(crate) fn new(duration: Option<u64>, now: u64) -> Self {
         Self { duration: duration.map(|d| d.max(1)), asserted: now, alive: true }
     }
 
     /// It was asserted at `at`. Whether that brings it back to life: one that is known already does
     /// not.
-    pub fn assert(&mut self, at: u64) -> bool {
+    pub(crate) fn assert(&mut self, at: u64) -> bool {
         if at <= self.asserted {
             return false;
         }
@@ -30,7 +30,7 @@ impl Lease {
     }
 
     /// Whether it has run out by `now`, and had not when this was last asked.
-    pub fn ran_out(&mut self, now: u64) -> bool {
+    pub(crate) fn ran_out(&mut self, now: u64) -> bool {
         let over = self.due().is_some_and(|due| due <= now);
         if over {
             self.alive = false;
@@ -39,7 +39,7 @@ impl Lease {
     }
 
     /// When it runs out; `None` when it never does, or has.
-    pub fn due(&self) -> Option<u64> {
+    pub(crate) fn due(&self) -> Option<u64> {
         let due = self.asserted.saturating_add(self.duration?);
         self.alive.then_some(due)
     }
@@ -48,13 +48,13 @@ impl Lease {
 /// The publishers of a subscription, by whether they are alive. Each change is returned as what
 /// it adds to the numbers of those alive and of those not.
 #[derive(Clone, Debug, Default)]
-pub struct Liveness {
+pub(crate) struct Liveness {
     leases: HashMap<Gid, Lease>,
 }
 
 impl Liveness {
     /// A publisher was matched, with the lease that it offers.
-    pub fn matched(&mut self, publisher: Gid, lease: Option<u64>, now: u64) -> (i64, i64) {
+    pub(crate) fn matched(&mut self, publisher: Gid, lease: Option<u64>, now: u64) -> (i64, i64) {
         match self.leases.insert(publisher, Lease::new(lease, now)) {
             None => (1, 0),
             Some(before) if before.alive => (0, 0),
@@ -63,7 +63,7 @@ impl Liveness {
     }
 
     /// A publisher is gone.
-    pub fn unmatched(&mut self, publisher: &Gid) -> (i64, i64) {
+    pub(crate) fn unmatched(&mut self, publisher: &Gid) -> (i64, i64) {
         match self.leases.remove(publisher) {
             None => (0, 0),
             Some(lease) if lease.alive => (-1, 0),
@@ -72,24 +72,24 @@ impl Liveness {
     }
 
     /// A publisher asserted its liveliness at `at`.
-    pub fn assert(&mut self, publisher: &Gid, at: u64) -> (i64, i64) {
+    pub(crate) fn assert(&mut self, publisher: &Gid, at: u64) -> (i64, i64) {
         let revived = self.leases.get_mut(publisher).is_some_and(|lease| lease.assert(at));
         if revived { (1, -1) } else { (0, 0) }
     }
 
     /// The leases that ran out until `now`.
-    pub fn ran_out(&mut self, now: u64) -> (i64, i64) {
+    pub(crate) fn ran_out(&mut self, now: u64) -> (i64, i64) {
         let over = self.leases.values_mut().map(|lease| i64::from(lease.ran_out(now))).sum::<i64>();
         (-over, over)
     }
 
     /// Whether a lease has run out and was not asserted again.
-    pub fn any_dead(&self) -> bool {
+    pub(crate) fn any_dead(&self) -> bool {
         self.leases.values().any(|lease| !lease.alive)
     }
 
     /// When the next lease runs out.
-    pub fn due(&self) -> Option<u64> {
+    pub(crate) fn due(&self) -> Option<u64> {
         self.leases.values().filter_map(Lease::due).min()
     }
 }

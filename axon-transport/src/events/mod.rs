@@ -10,8 +10,7 @@ mod liveliness;
 mod status;
 
 pub(crate) use alive::Alive;
-pub use deadline::Deadline;
-pub use liveliness::{Lease, Liveness};
-pub use status::{
-    Counted, EventKind, EventStatus, IncompatibleQos, LivelinessChanged, Matched, Statuses,
-};
+pub(crate) use deadline::Deadline;
+pub(crate) use liveliness::{Lease, Liveness};
+pub(crate) use status::Statuses;
+pub use status::{Counted, EventKind, EventStatus, IncompatibleQos, LivelinessChanged, Matched};

@@ -82,6 +82,7 @@ pub struct Matched {
 
 /// Endpoints whose QoS does not go with this one's.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct IncompatibleQos {
     /// How many, ever.
     pub count: Counted,
@@ -91,6 +92,7 @@ pub struct IncompatibleQos {
 
 /// A subscription's publishers, by whether they are alive.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct LivelinessChanged {
     /// Alive now.
     pub alive: u64,
@@ -117,7 +119,7 @@ pub enum EventStatus {
 
 /// The statuses of one endpoint, publisher or subscription.
 #[derive(Clone, Debug)]
-pub struct Statuses {
+pub(crate) struct Statuses {
     publisher: bool,
     matched: Matched,
     liveliness: LivelinessChanged,
@@ -133,12 +135,12 @@ pub struct Statuses {
 
 impl Statuses {
     /// Those of a publisher.
-    pub fn of_publisher() -> Self {
+    pub(crate) fn of_publisher() -> Self {
         Self::new(true)
     }
 
     /// Those of a subscription.
-    pub fn of_subscription() -> Self {
+    pub(crate) fn of_subscription() -> Self {
         Self::new(false)
     }
 
@@ -158,13 +160,13 @@ impl Statuses {
 
     /// How often the event occurred since its status was last taken. A wait set is woken while
     /// this is not 0.
-    pub fn unread(&self, kind: EventKind) -> u64 {
+    pub(crate) fn unread(&self, kind: EventKind) -> u64 {
         self.unread[kind as usize]
     }
 
     /// The status, whose changes are counted anew from here. `None` when the endpoint has no such
     /// event.
-    pub fn take(&mut self, kind: EventKind) -> Option<EventStatus> {
+    pub(crate) fn take(&mut self, kind: EventKind) -> Option<EventStatus> {
         if kind.is_publishers() != self.publisher {
             return None;
         }
@@ -198,7 +200,7 @@ impl Statuses {
     }
 
     /// An endpoint was matched.
-    pub fn matched(&mut self) -> EventKind {
+    pub(crate) fn matched(&mut self) -> EventKind {
         self.matched.total += 1;
         self.matched.total_change += 1;
         self.matched.current += 1;
@@ -207,21 +209,21 @@ impl Statuses {
     }
 
     /// An endpoint that was matched is so no more.
-    pub fn unmatched(&mut self) -> EventKind {
+    pub(crate) fn unmatched(&mut self) -> EventKind {
         self.matched.current = self.matched.current.saturating_sub(1);
         self.matched.current_change -= 1;
         self.occurred(EventKind::PublicationMatched, EventKind::SubscriptionMatched, 1)
     }
 
     /// An endpoint was met whose QoS does not go with this one's.
-    pub fn incompatible_qos(&mut self, policy: Incompatible) -> EventKind {
+    pub(crate) fn incompatible_qos(&mut self, policy: Incompatible) -> EventKind {
         self.incompatible_qos.count.add(1);
         self.incompatible_qos.last_policy = Some(policy);
         self.occurred(EventKind::OfferedQosIncompatible, EventKind::RequestedQosIncompatible, 1)
     }
 
     /// An endpoint of the same topic was met whose type is another.
-    pub fn incompatible_type(&mut self) -> EventKind {
+    pub(crate) fn incompatible_type(&mut self) -> EventKind {
         self.incompatible_type.add(1);
         let (publisher, subscription) =
             (EventKind::PublisherIncompatibleType, EventKind::SubscriptionIncompatibleType);
@@ -229,7 +231,7 @@ impl Statuses {
     }
 
     /// Deadlines were missed; at least one.
-    pub fn deadlines_missed(&mut self, count: u64) -> EventKind {
+    pub(crate) fn deadlines_missed(&mut self, count: u64) -> EventKind {
         self.deadline.add(count);
         let (offered, requested) =
             (EventKind::OfferedDeadlineMissed, EventKind::RequestedDeadlineMissed);
@@ -237,30 +239,25 @@ impl Statuses {
     }
 
     /// A publisher's own lease ran out.
-    pub fn liveliness_lost(&mut self) -> EventKind {
+    pub(crate) fn liveliness_lost(&mut self) -> EventKind {
         self.lease.add(1);
         self.note(EventKind::LivelinessLost, 1)
     }
 
     /// A subscription lost samples; at least one.
-    pub fn lost(&mut self, count: u64) -> EventKind {
+    pub(crate) fn lost(&mut self, count: u64) -> EventKind {
         self.lost.add(count);
         self.note(EventKind::MessageLost, count)
     }
 
     /// A subscription's publishers are alive, or not, in these numbers.
-    pub fn liveliness_changed(&mut self, alive: i64, not_alive: i64) -> EventKind {
+    pub(crate) fn liveliness_changed(&mut self, alive: i64, not_alive: i64) -> EventKind {
         let status = &mut self.liveliness;
         status.alive = status.alive.saturating_add_signed(alive);
         status.not_alive = status.not_alive.saturating_add_signed(not_alive);
         status.alive_change += alive;
         status.not_alive_change += not_alive;
         self.note(EventKind::LivelinessChanged, 1)
-    }
-
-    /// Endpoints matched now.
-    pub fn current_matches(&self) -> u64 {
-        self.matched.current
     }
 
     fn occurred(

@@ -5,12 +5,12 @@ use std::ffi::c_void;
 use super::{
     callback::axon_callback_t,
     endpoint::{axon_endpoint_options_t, axon_gid_t, describe, end, matched, set_callback, spec},
-    error::{Failure, axon_ret_t},
+    error::{CallFailure, axon_ret_t},
     guarded,
     handle::{axon_client_t, axon_node_t, axon_sample_t, give, named},
     memory::{elements, present, present_if_wanted, store_if_wanted},
     qos::axon_qos_t,
-    subscription::{Place, SamplePlace, axon_message_info_t, axon_room_t},
+    subscription::{CopyTarget, SamplePlace, axon_message_info_t, axon_room_t},
     wait::duration,
 };
 
@@ -87,7 +87,7 @@ pub extern "C" fn axon_session_client_wait_available(
         if client.wait_available(duration(timeout)) {
             return Ok(());
         }
-        Err(Failure::timeout("the service is not available").of_endpoint(client.endpoint()))
+        Err(CallFailure::timeout("the service is not available").of_endpoint(client.endpoint()))
     })
 }
 
@@ -114,7 +114,7 @@ pub unsafe extern "C" fn axon_session_client_request(
         // SAFETY: the caller's word.
         let payload = unsafe { elements(data, len, "the request") }?;
         let sent = client.send_request(payload);
-        let number = sent.map_err(|e| Failure::from(e).of_endpoint(client.endpoint()))?;
+        let number = sent.map_err(|e| CallFailure::from(e).of_endpoint(client.endpoint()))?;
         // SAFETY: the caller's word.
         unsafe { store_if_wanted(sequence, number) }
     })
@@ -136,7 +136,7 @@ pub unsafe extern "C" fn axon_session_client_take(
     guarded(|| {
         let client = named(client)?;
         // SAFETY: the caller's word.
-        let place = unsafe { Place::new(room, user, info, taken) }?;
+        let place = unsafe { CopyTarget::new(room, user, info, taken) }?;
         place.put(|| client.take_response_sample(), client.endpoint())
     })
 }

@@ -4,7 +4,7 @@ use std::{ffi::c_void, os::raw::c_char};
 
 use super::{
     callback::{axon_callback_t, told},
-    error::Failure,
+    error::CallFailure,
     handle::{Handle, named, revoke},
     memory::{elements, present_if_wanted, store, store_if_wanted, text, value},
     qos::{axon_qos_t, store_qos},
@@ -65,7 +65,7 @@ pub struct axon_endpoint_options_t {
 /// `options` points to options whose pointers point to what they say.
 pub(super) unsafe fn spec(
     options: *const axon_endpoint_options_t,
-) -> Result<(EndpointSpec, QosRequest), Failure> {
+) -> Result<(EndpointSpec, QosRequest), CallFailure> {
     // SAFETY: the caller's word.
     let options = unsafe { value(options, "the pointer to the options") }?;
     // SAFETY: the caller's word.
@@ -77,7 +77,7 @@ pub(super) unsafe fn spec(
         let text = format_args!(
             "the type's hash has {hash_size} bytes, and may have {AXON_TYPE_HASH_SIZE}"
         );
-        return Err(Failure::argument(text).of(topic));
+        return Err(CallFailure::argument(text).of(topic));
     }
     // SAFETY: the caller's word.
     let hash = unsafe { elements(options.type_hash, hash_size, "the type's hash") }?;
@@ -144,7 +144,7 @@ pub(super) unsafe fn describe<H: Handle<Object: Object>>(
     handle: H,
     gid: *mut axon_gid_t,
     qos: *mut axon_qos_t,
-) -> Result<(), Failure> {
+) -> Result<(), CallFailure> {
     present_if_wanted(gid)?;
     present_if_wanted(qos)?;
     let object = named(handle)?;
@@ -162,7 +162,7 @@ pub(super) unsafe fn describe<H: Handle<Object: Object>>(
 pub(super) unsafe fn matched<H: Handle<Object: Object>>(
     handle: H,
     count: *mut usize,
-) -> Result<(), Failure> {
+) -> Result<(), CallFailure> {
     let matched = named(handle)?.count();
     // SAFETY: the caller's word.
     unsafe { store(count, matched, "the place of the number") }
@@ -173,16 +173,16 @@ pub(super) fn set_callback<H: Handle<Object: Taking>>(
     handle: H,
     callback: axon_callback_t,
     user: *const c_void,
-) -> Result<(), Failure> {
+) -> Result<(), CallFailure> {
     let object = named(handle)?;
     let set = object.set_on_new(told(callback, user));
-    set.map_err(|error| Failure::from(error).of_endpoint(object.endpoint()))?;
+    set.map_err(|error| CallFailure::from(error).of_endpoint(object.endpoint()))?;
     // One that was destroyed meanwhile has none.
     named(handle).map(drop)
 }
 
 /// Ends an endpoint that has a callback.
-pub(super) fn end<H: Handle<Object: Taking>>(handle: H) -> Result<(), Failure> {
+pub(super) fn end<H: Handle<Object: Taking>>(handle: H) -> Result<(), CallFailure> {
     // Another call may keep it for a while.
     revoke(handle)?.tell_no_more();
     Ok(())

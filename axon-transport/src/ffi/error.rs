@@ -47,12 +47,12 @@ thread_local! {
 
 /// A call that failed.
 #[derive(Debug)]
-pub(super) struct Failure {
+pub(super) struct CallFailure {
     code: axon_ret_t,
     text: String,
 }
 
-impl Failure {
+impl CallFailure {
     pub(super) fn new(code: axon_ret_t, text: impl Display) -> Self {
         Self { code, text: text.to_string() }
     }
@@ -101,7 +101,7 @@ impl Display for Named<'_> {
     }
 }
 
-impl From<SessionError> for Failure {
+impl From<SessionError> for CallFailure {
     fn from(error: SessionError) -> Self {
         let code = match &error {
             SessionError::Memory(ShmError::Forked) => AXON_RET_FORKED,
@@ -117,7 +117,7 @@ impl From<SessionError> for Failure {
     }
 }
 
-impl From<PublishError> for Failure {
+impl From<PublishError> for CallFailure {
     fn from(error: PublishError) -> Self {
         let code = match &error {
             PublishError::Blocked { .. } => AXON_RET_TIMEOUT,
@@ -145,7 +145,7 @@ mod tests {
 
     #[test]
     fn only_a_full_history_is_a_timeout_of_publish() {
-        let code = |error: PublishError| Failure::from(error).code;
+        let code = |error: PublishError| CallFailure::from(error).code;
         let reader = Gid([7; 16]);
         assert_eq!(code(PublishError::Blocked { reader }), AXON_RET_TIMEOUT);
         let short = PublishError::NoMemory { needed: 8, available: 0, keeper: None };

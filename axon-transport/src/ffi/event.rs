@@ -4,7 +4,7 @@ use std::ffi::c_void;
 
 use super::{
     callback::{axon_callback_t, told},
-    error::{Failure, axon_ret_t},
+    error::{CallFailure, axon_ret_t},
     guarded,
     handle::{axon_event_t, axon_publisher_t, axon_subscription_t, give, named, revoke},
     memory::{present, store},
@@ -158,8 +158,8 @@ unsafe fn give_event(
     kind: u32,
     of: &str,
     out: *mut axon_event_t,
-) -> Result<(), Failure> {
-    let none = || Failure::argument(format_args!("a {of} has no event {kind}"));
+) -> Result<(), CallFailure> {
+    let none = || CallFailure::argument(format_args!("a {of} has no event {kind}"));
     let event = event.ok_or_else(none)?;
     // SAFETY: the caller's word.
     unsafe { give(event, out) }

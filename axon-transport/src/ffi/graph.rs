@@ -7,7 +7,7 @@ use std::{
 
 use super::{
     endpoint::axon_gid_t,
-    error::{AXON_RET_NO_NODE, Failure, axon_ret_t},
+    error::{AXON_RET_NO_NODE, CallFailure, axon_ret_t},
     guarded,
     handle::{axon_session_t, named},
     memory::{store, text},
@@ -127,7 +127,7 @@ pub unsafe extern "C" fn axon_session_graph_names(
             let namespace = unsafe { text(namespace_, "the node's namespace") }?;
             graph.names_and_types_of(node, namespace, &kinds).ok_or_else(|| {
                 let text = format_args!("there is no node {node} in namespace {namespace}");
-                Failure::new(AXON_RET_NO_NODE, text)
+                CallFailure::new(AXON_RET_NO_NODE, text)
             })?
         };
         for (name, types) in names {
@@ -215,24 +215,25 @@ const KINDS: [(u32, EndpointKind); 4] = [
     (AXON_KIND_CLIENT, EndpointKind::Client),
 ];
 
-fn of_number(number: u32) -> Result<EndpointKind, Failure> {
+fn of_number(number: u32) -> Result<EndpointKind, CallFailure> {
     let found = KINDS.iter().find(|(of, _)| *of == number).map(|(_, kind)| *kind);
-    found.ok_or_else(|| Failure::argument(format_args!("there is no kind of endpoint {number}")))
+    found
+        .ok_or_else(|| CallFailure::argument(format_args!("there is no kind of endpoint {number}")))
 }
 
-fn of_sum(sum: u32) -> Result<Vec<EndpointKind>, Failure> {
+fn of_sum(sum: u32) -> Result<Vec<EndpointKind>, CallFailure> {
     let all = KINDS.iter().fold(0, |all, (of, _)| all | of);
     if sum == 0 || sum & !all != 0 {
-        return Err(Failure::argument(format_args!("{sum} is no sum of kinds of endpoints")));
+        return Err(CallFailure::argument(format_args!("{sum} is no sum of kinds of endpoints")));
     }
     Ok(KINDS.iter().filter(|(of, _)| sum & of != 0).map(|(_, kind)| *kind).collect())
 }
 
-fn no_visitor() -> Failure {
-    Failure::argument("the visitor is null")
+fn no_visitor() -> CallFailure {
+    CallFailure::argument("the visitor is null")
 }
 
 /// Names of the graph hold no 0: every one of them was checked when it came.
-fn string(text: &str) -> Result<CString, Failure> {
-    CString::new(text).map_err(|_| Failure::argument("a name in the graph holds a NUL"))
+fn string(text: &str) -> Result<CString, CallFailure> {
+    CString::new(text).map_err(|_| CallFailure::argument("a name in the graph holds a NUL"))
 }

@@ -8,10 +8,12 @@ use axon_shm::{
 };
 
 use super::{
-    error::{AXON_RET_BAD_ALLOC, AXON_RET_FORKED, AXON_RET_INVALID_HANDLE, Failure, axon_ret_t},
+    error::{
+        AXON_RET_BAD_ALLOC, AXON_RET_FORKED, AXON_RET_INVALID_HANDLE, CallFailure, axon_ret_t,
+    },
     loan::NamedLoan,
     memory::store,
-    table::{Process, Table, Unknown},
+    table::{HandleTable, Process, Unknown},
 };
 use crate::session::{
     Client, Event, GuardCondition, Node, Publisher, Server, Session, Subscription,
@@ -104,7 +106,7 @@ pub(super) trait Handle: Copy {
 
     fn id(self) -> u64;
     fn of(id: u64) -> Self;
-    fn table(tables: &Tables) -> &Table<Self::Object>;
+    fn table(tables: &Tables) -> &HandleTable<Self::Object>;
 }
 
 macro_rules! handles {
@@ -112,13 +114,13 @@ macro_rules! handles {
         /// What the handles of a process name.
         pub(super) struct Tables {
             process: Process,
-            $($table: Table<$object>,)+
+            $($table: HandleTable<$object>,)+
         }
 
         impl Tables {
             fn new(token: ForkToken) -> Self {
                 let process = Process::new(token.value());
-                Self { process, $($table: Table::new($number, process),)+ }
+                Self { process, $($table: HandleTable::new($number, process),)+ }
             }
         }
 
@@ -142,7 +144,7 @@ macro_rules! handles {
                 Self { id }
             }
 
-            fn table(tables: &Tables) -> &Table<$object> {
+            fn table(tables: &Tables) -> &HandleTable<$object> {
                 &tables.$table
             }
         })+
@@ -165,13 +167,13 @@ handles! {
 static TABLES: PerProcess<Tables> = PerProcess::new();
 
 /// This process's tables. A forked child begins with new ones.
-fn current() -> Result<&'static Made<Tables>, Failure> {
+fn current() -> Result<&'static Made<Tables>, CallFailure> {
     let none = |_: &'static Tables, _: &'static Tables| {};
-    TABLES.get(Tables::new, none).map_err(|error| Failure::new(AXON_RET_BAD_ALLOC, error))
+    TABLES.get(Tables::new, none).map_err(|error| CallFailure::new(AXON_RET_BAD_ALLOC, error))
 }
 
 /// What a handle names.
-pub(super) fn named<H: Handle>(handle: H) -> Result<Arc<H::Object>, Failure> {
+pub(super) fn named<H: Handle>(handle: H) -> Result<Arc<H::Object>, CallFailure> {
     let tables = current()?;
     let found = H::table(tables.value()).get(handle.id());
     #[cfg(test)]
@@ -183,22 +185,22 @@ pub(super) fn named<H: Handle>(handle: H) -> Result<Arc<H::Object>, Failure> {
 ///
 /// # Safety
 /// As [`store`].
-pub(super) unsafe fn give<H: Handle>(object: H::Object, out: *mut H) -> Result<(), Failure> {
+pub(super) unsafe fn give<H: Handle>(object: H::Object, out: *mut H) -> Result<(), CallFailure> {
     let id = H::table(current()?.value()).insert(object).ok_or_else(|| {
         let what = H::WHAT;
-        Failure::new(AXON_RET_BAD_ALLOC, format_args!("no {what} more: there are a million"))
+        CallFailure::new(AXON_RET_BAD_ALLOC, format_args!("no {what} more: there are a million"))
     })?;
     // SAFETY: the caller's word.
     unsafe { store(out, H::of(id), "the place of the handle") }
 }
 
 /// Gives a handle up: what it named ends when no call uses it any more.
-pub(super) fn revoke<H: Handle>(handle: H) -> Result<Arc<H::Object>, Failure> {
+pub(super) fn revoke<H: Handle>(handle: H) -> Result<Arc<H::Object>, CallFailure> {
     let tables = current()?;
     H::table(tables.value()).remove(handle.id()).map_err(|why| unknown(tables, handle, why))
 }
 
-/// Does something with what a handle names, as a signal handler may: see [`Table::visit`].
+/// Does something with what a handle names, as a signal handler may: see [`HandleTable::visit`].
 pub(super) fn visit<H: Handle>(
     handle: H,
     visit: impl FnOnce(&H::Object),
@@ -219,7 +221,7 @@ fn code(tables: &Made<Tables>, why: Unknown) -> axon_ret_t {
     }
 }
 
-fn unknown<H: Handle>(tables: &Made<Tables>, handle: H, why: Unknown) -> Failure {
+fn unknown<H: Handle>(tables: &Made<Tables>, handle: H, why: Unknown) -> CallFailure {
     let (id, what) = (handle.id(), H::WHAT);
     let code = code(tables, why);
     let text = match why {
@@ -236,5 +238,5 @@ fn unknown<H: Handle>(tables: &Made<Tables>, handle: H, why: Unknown) -> Failure
             format!("the handle {id:#x} names no {what}: it was destroyed")
         }
     };
-    Failure::new(code, text)
+    CallFailure::new(code, text)
 }

@@ -3,7 +3,7 @@
 use std::sync::{Mutex, PoisonError, Weak};
 
 use super::{
-    error::{AXON_RET_INVALID_HANDLE, Failure, axon_ret_t},
+    error::{AXON_RET_INVALID_HANDLE, CallFailure, axon_ret_t},
     guarded,
     handle::{axon_loan_t, axon_publisher_t, give, named, revoke},
     memory::{present, present_if_wanted, store, store_if_wanted},
@@ -44,7 +44,7 @@ pub unsafe extern "C" fn axon_session_publisher_loan(
         present(data, "the place of the pointer")?;
         let publisher = named(publisher)?;
         let lent = publisher.loan_owned(header, len);
-        let mut lent = lent.map_err(|e| Failure::from(e).of_endpoint(publisher.endpoint()))?;
+        let mut lent = lent.map_err(|e| CallFailure::from(e).of_endpoint(publisher.endpoint()))?;
         let at = lent.as_mut_ptr();
         let publisher = std::sync::Arc::downgrade(&publisher);
         let object = NamedLoan { len, loan: Mutex::new(Some(lent)), publisher };
@@ -72,16 +72,17 @@ pub unsafe extern "C" fn axon_session_loan_publish(
         let lent = named(loan)?.len;
         if len > lent {
             let text = format_args!("{len} bytes of a loan of {lent} cannot be published");
-            return Err(Failure::argument(text));
+            return Err(CallFailure::argument(text));
         }
         let object = revoke(loan)?;
         let memory = object.loan.lock().unwrap_or_else(PoisonError::into_inner).take();
-        let gone = |what| Failure::new(AXON_RET_INVALID_HANDLE, what);
+        let gone = |what| CallFailure::new(AXON_RET_INVALID_HANDLE, what);
         let publisher =
             object.publisher.upgrade().ok_or_else(|| gone("the loan's publisher is destroyed"))?;
         let memory = memory.ok_or_else(|| gone("the loan is over"))?;
         let published = memory.publish(len, time(source_timestamp));
-        let number = published.map_err(|e| Failure::from(e).of_endpoint(publisher.endpoint()))?;
+        let number =
+            published.map_err(|e| CallFailure::from(e).of_endpoint(publisher.endpoint()))?;
         // SAFETY: the caller's word.
         unsafe { store_if_wanted(sequence, number) }
     })

@@ -26,7 +26,7 @@ use tracing::{
 use self::queue::Waiting;
 use super::{
     callback::User,
-    error::{AXON_RET_BAD_ALLOC, AXON_RET_ERROR, Failure, axon_ret_t},
+    error::{AXON_RET_BAD_ALLOC, AXON_RET_ERROR, CallFailure, axon_ret_t},
     guarded,
 };
 
@@ -66,7 +66,7 @@ struct Log {
 /// The callback that is set, and the one that is being called.
 #[derive(Default)]
 struct CallbackSlot {
-    told: Option<Told>,
+    told: Option<LogCallback>,
     /// Rises with each that is set.
     version: u64,
     /// The version that is being called.
@@ -74,7 +74,7 @@ struct CallbackSlot {
 }
 
 #[derive(Clone, Copy)]
-struct Told {
+struct LogCallback {
     function: unsafe extern "C" fn(*const c_void, u32, *const c_char, *const c_char),
     user: User,
 }
@@ -99,15 +99,15 @@ pub unsafe extern "C" fn axon_session_log_set_callback(
     user: *const c_void,
 ) -> axon_ret_t {
     guarded(|| {
-        let log = Log::current().map_err(|error| Failure::new(AXON_RET_BAD_ALLOC, error))?;
+        let log = Log::current().map_err(|error| CallFailure::new(AXON_RET_BAD_ALLOC, error))?;
         if log.waiting.is_teller() {
-            return Err(Failure::new(AXON_RET_ERROR, "called from within a log callback"));
+            return Err(CallFailure::new(AXON_RET_ERROR, "called from within a log callback"));
         }
         if callback.is_some() && !Listener::stands() {
             let text = "another part of the program has a global subscriber of tracing";
-            return Err(Failure::new(AXON_RET_ERROR, text));
+            return Err(CallFailure::new(AXON_RET_ERROR, text));
         }
-        log.set(callback.map(|function| Told { function, user: User(user) }));
+        log.set(callback.map(|function| LogCallback { function, user: User(user) }));
         Ok(())
     })
 }
@@ -142,7 +142,7 @@ struct Line {
     text: String,
 }
 
-impl Told {
+impl LogCallback {
     fn is(&self, other: &Self) -> bool {
         std::ptr::fn_addr_eq(self.function, other.function) && self.user.0 == other.user.0
     }
@@ -153,7 +153,7 @@ impl Log {
         LOG.get(|_| Self::default(), |_, _| {}).map(Made::value)
     }
 
-    fn set(&self, told: Option<Told>) {
+    fn set(&self, told: Option<LogCallback>) {
         let mut slot = self.slot();
         let same = match (&slot.told, &told) {
             (Some(one), Some(other)) => one.is(other),

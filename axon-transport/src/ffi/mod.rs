@@ -71,10 +71,10 @@ pub extern "C" fn axon_session_abi() -> u32 {
 }
 
 /// Runs one call of the interface: nothing that panics in it reaches the caller.
-fn guarded(call: impl FnOnce() -> Result<(), Failure>) -> axon_ret_t {
+fn guarded(call: impl FnOnce() -> Result<(), CallFailure>) -> axon_ret_t {
     match catch_unwind(AssertUnwindSafe(call)) {
         Ok(Ok(())) => AXON_RET_OK,
         Ok(Err(failure)) => failure.note(),
-        Err(_) => Failure::new(AXON_RET_PANIC, "a panic was caught: a defect of AXON").note(),
+        Err(_) => CallFailure::new(AXON_RET_PANIC, "a panic was caught: a defect of AXON").note(),
     }
 }

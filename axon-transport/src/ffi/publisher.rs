@@ -2,7 +2,7 @@
 
 use super::{
     endpoint::{axon_endpoint_options_t, axon_gid_t, describe, matched, spec},
-    error::{Failure, axon_ret_t},
+    error::{CallFailure, axon_ret_t},
     guarded,
     handle::{axon_node_t, axon_publisher_t, give, named, revoke},
     memory::{elements, present, present_if_wanted, store, store_if_wanted},
@@ -94,7 +94,8 @@ pub unsafe extern "C" fn axon_session_publisher_publish(
             Some(time) => publisher.publish_at(from_unix_nanos(time), payload),
             None => publisher.publish(payload),
         };
-        let number = published.map_err(|e| Failure::from(e).of_endpoint(publisher.endpoint()))?;
+        let number =
+            published.map_err(|e| CallFailure::from(e).of_endpoint(publisher.endpoint()))?;
         // SAFETY: the caller's word.
         unsafe { store_if_wanted(sequence, number) }
     })
@@ -115,7 +116,8 @@ pub unsafe extern "C" fn axon_session_publisher_skip_unread(
         present(sequence, "the place of the number")?;
         let publisher = named(publisher)?;
         let skipped = publisher.skip_unread();
-        let skipped = skipped.map_err(|e| Failure::from(e).of_endpoint(publisher.endpoint()))?;
+        let skipped =
+            skipped.map_err(|e| CallFailure::from(e).of_endpoint(publisher.endpoint()))?;
         // SAFETY: the caller's word.
         unsafe { store(sequence, skipped.unwrap_or(0), "the place of the number") }
     })
@@ -148,7 +150,7 @@ pub extern "C" fn axon_session_publisher_wait_matched(
             return Ok(());
         }
         let text = format_args!("fewer than {count} subscriptions receive from it");
-        Err(Failure::timeout(text).of_endpoint(publisher.endpoint()))
+        Err(CallFailure::timeout(text).of_endpoint(publisher.endpoint()))
     })
 }
 
@@ -166,7 +168,7 @@ pub extern "C" fn axon_session_publisher_wait_acknowledged(
         if publisher.wait_acknowledged(duration(timeout)) {
             return Ok(());
         }
-        Err(Failure::timeout("a sample is not acknowledged").of_endpoint(publisher.endpoint()))
+        Err(CallFailure::timeout("a sample is not acknowledged").of_endpoint(publisher.endpoint()))
     })
 }
 
@@ -179,6 +181,6 @@ pub extern "C" fn axon_session_publisher_assert_liveliness(
     guarded(|| {
         let publisher = named(publisher)?;
         let asserted = publisher.assert_liveliness();
-        asserted.map_err(|e| Failure::from(e).of_endpoint(publisher.endpoint()))
+        asserted.map_err(|e| CallFailure::from(e).of_endpoint(publisher.endpoint()))
     })
 }

@@ -5,7 +5,7 @@ use std::{mem::MaybeUninit, os::raw::c_char, time::Duration};
 use axon_shm::internal::nanoseconds;
 
 use super::{
-    error::{Failure, axon_ret_t},
+    error::{CallFailure, axon_ret_t},
     guarded,
     memory::{elements_mut, present, store, store_if_wanted, value},
 };
@@ -95,9 +95,9 @@ pub const AXON_POLICY_LIVELINESS: u32 = 4;
 pub const AXON_POLICY_LIVELINESS_LEASE: u32 = 5;
 
 impl axon_qos_t {
-    pub(super) fn request(&self) -> Result<QosRequest, Failure> {
+    pub(super) fn request(&self) -> Result<QosRequest, CallFailure> {
         let wrong = |policy: &str, value: u32| {
-            Err(Failure::argument(format_args!("there is no {policy} {value}")))
+            Err(CallFailure::argument(format_args!("there is no {policy} {value}")))
         };
         let (default, best) = (Choice::SystemDefault, Choice::BestAvailable);
         let reliability = match self.reliability {
@@ -132,7 +132,7 @@ impl axon_qos_t {
         let lifespan = match self.lifespan {
             AXON_DURATION_DEFAULT | AXON_DURATION_INFINITE => None,
             AXON_DURATION_BEST_AVAILABLE => {
-                return Err(Failure::argument("there is no best available lifespan"));
+                return Err(CallFailure::argument("there is no best available lifespan"));
             }
             nanoseconds => Some(Duration::from_nanos(nanoseconds)),
         };
@@ -143,16 +143,16 @@ impl axon_qos_t {
             nanoseconds => Choice::Exactly(Some(Duration::from_nanos(nanoseconds))),
         };
         let (deadline, lease, depth) = (period(self.deadline), period(self.lease), self.depth);
-        Ok(QosRequest {
-            reliability,
-            durability,
-            history,
-            depth,
-            deadline,
-            lifespan,
-            liveliness,
-            lease,
-        })
+        let mut request = QosRequest::default();
+        request.reliability = reliability;
+        request.durability = durability;
+        request.history = history;
+        request.depth = depth;
+        request.deadline = deadline;
+        request.lifespan = lifespan;
+        request.liveliness = liveliness;
+        request.lease = lease;
+        Ok(request)
     }
 }
 
@@ -257,7 +257,7 @@ pub extern "C" fn axon_session_policy_name(policy: u32) -> *const c_char {
 ///
 /// # Safety
 /// `out` is null or points to room for a profile.
-pub(super) unsafe fn store_qos(out: *mut axon_qos_t, qos: &Qos) -> Result<(), Failure> {
+pub(super) unsafe fn store_qos(out: *mut axon_qos_t, qos: &Qos) -> Result<(), CallFailure> {
     // SAFETY: the caller's word.
     unsafe { store_if_wanted(out, axon_qos_t::from(qos)) }
 }

@@ -5,12 +5,12 @@ use std::ffi::c_void;
 use super::{
     callback::axon_callback_t,
     endpoint::{axon_endpoint_options_t, axon_gid_t, describe, end, matched, set_callback, spec},
-    error::{Failure, axon_ret_t},
+    error::{CallFailure, axon_ret_t},
     guarded,
     handle::{axon_node_t, axon_sample_t, axon_server_t, give, named},
     memory::{elements, present, value},
     qos::axon_qos_t,
-    subscription::{Place, SamplePlace, axon_message_info_t, axon_room_t},
+    subscription::{CopyTarget, SamplePlace, axon_message_info_t, axon_room_t},
 };
 use crate::ids::Gid;
 
@@ -91,7 +91,7 @@ pub unsafe extern "C" fn axon_session_server_take(
     guarded(|| {
         let server = named(server)?;
         // SAFETY: the caller's word.
-        let place = unsafe { Place::new(room, user, info, taken) }?;
+        let place = unsafe { CopyTarget::new(room, user, info, taken) }?;
         place.put(|| server.take_request_sample(), server.endpoint())
     })
 }
@@ -139,7 +139,7 @@ pub unsafe extern "C" fn axon_session_server_respond(
         // SAFETY: the caller's word.
         let payload = unsafe { elements(data, len, "the response") }?;
         let sent = server.send_response(Gid(client.bytes), sequence, payload);
-        sent.map_err(|e| Failure::from(e).of_endpoint(server.endpoint()))
+        sent.map_err(|e| CallFailure::from(e).of_endpoint(server.endpoint()))
     })
 }
 

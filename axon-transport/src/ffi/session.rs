@@ -4,7 +4,7 @@ use std::{ffi::OsString, os::raw::c_char, path::PathBuf};
 
 use super::{
     AXON_SESSION_ABI,
-    error::{AXON_RET_ABI, AXON_RET_CONFIG, Failure, axon_ret_t},
+    error::{AXON_RET_ABI, AXON_RET_CONFIG, CallFailure, axon_ret_t},
     guarded,
     handle::{axon_session_t, give, named, revoke},
     memory::{elements, present, store, text, value},
@@ -90,7 +90,7 @@ pub unsafe extern "C" fn axon_session_options_init(
     })
 }
 
-fn check_abi(abi: u32) -> Result<(), Failure> {
+fn check_abi(abi: u32) -> Result<(), CallFailure> {
     if abi == AXON_SESSION_ABI {
         return Ok(());
     }
@@ -98,7 +98,7 @@ fn check_abi(abi: u32) -> Result<(), Failure> {
         "the program was compiled against version {abi} of the interface, the library has \
          {AXON_SESSION_ABI}: compile it against this library's axon.h"
     );
-    Err(Failure::new(AXON_RET_ABI, text))
+    Err(CallFailure::new(AXON_RET_ABI, text))
 }
 
 /// Checks the settings as `axon_session_open` does, and opens nothing.
@@ -177,7 +177,7 @@ pub unsafe extern "C" fn axon_session_open(
 /// As for [`axon_session_open`].
 unsafe fn settings(
     options: *const axon_session_options_t,
-) -> Result<(Config, SessionOptions), Failure> {
+) -> Result<(Config, SessionOptions), CallFailure> {
     // SAFETY: the caller's word. All versions of it begin with their number.
     check_abi(unsafe { value(options.cast::<u32>(), "the pointer to the options") }?)?;
     // SAFETY: the caller's word. The caller has this version.
@@ -192,7 +192,7 @@ unsafe fn settings(
         AXON_DISCOVERY_LOCALHOST => Some("LOCALHOST"),
         AXON_DISCOVERY_SUBNET => Some("SUBNET"),
         AXON_DISCOVERY_SYSTEM_DEFAULT => Some("SYSTEM_DEFAULT"),
-        other => return Err(Failure::argument(format_args!("there is no discovery {other}"))),
+        other => return Err(CallFailure::argument(format_args!("there is no discovery {other}"))),
     };
     if let Some(range) = range {
         let (peers, count) = (options.static_peers, options.static_peer_count);
@@ -214,7 +214,7 @@ unsafe fn settings(
         Some(PathBuf::from(unsafe { text(options.daemon_path, "the daemon's path") }?))
     };
     let config = Config::from_env_with(overrides, daemon.as_deref())
-        .map_err(|error| Failure::new(AXON_RET_CONFIG, error))?;
+        .map_err(|error| CallFailure::new(AXON_RET_CONFIG, error))?;
     let name = if options.name.is_null() {
         ""
     } else {

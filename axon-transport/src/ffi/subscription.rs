@@ -7,7 +7,7 @@ use axon_shm::Sample;
 use super::{
     callback::axon_callback_t,
     endpoint::{axon_endpoint_options_t, axon_gid_t, describe, end, matched, set_callback, spec},
-    error::{AXON_RET_BAD_ALLOC, Failure, axon_ret_t},
+    error::{AXON_RET_BAD_ALLOC, CallFailure, axon_ret_t},
     guarded,
     handle::{axon_node_t, axon_sample_t, axon_subscription_t, give, named, revoke},
     memory::{present, present_if_wanted, store, store_if_wanted},
@@ -123,7 +123,7 @@ pub extern "C" fn axon_session_subscription_wait_matched(
             return Ok(());
         }
         let text = format_args!("it receives from fewer than {count} publishers");
-        Err(Failure::timeout(text).of_endpoint(subscription.endpoint()))
+        Err(CallFailure::timeout(text).of_endpoint(subscription.endpoint()))
     })
 }
 
@@ -148,7 +148,7 @@ pub unsafe extern "C" fn axon_session_subscription_take(
     guarded(|| {
         let subscription = named(subscription)?;
         // SAFETY: the caller's word.
-        let place = unsafe { Place::new(room, user, info, taken) }?;
+        let place = unsafe { CopyTarget::new(room, user, info, taken) }?;
         place.put(|| subscription.take_sample(), subscription.endpoint())
     })
 }
@@ -241,14 +241,14 @@ impl axon_message_info_t {
 }
 
 /// Where a message is to be copied.
-pub(super) struct Place {
+pub(super) struct CopyTarget {
     room: unsafe extern "C" fn(user: *mut c_void, len: usize) -> *mut u8,
     user: *mut c_void,
     info: *mut axon_message_info_t,
     taken: *mut u8,
 }
 
-impl Place {
+impl CopyTarget {
     /// # Safety
     /// As [`axon_session_subscription_take`] says, for as long as it stands.
     pub(super) unsafe fn new(
@@ -256,8 +256,9 @@ impl Place {
         user: *mut c_void,
         info: *mut axon_message_info_t,
         taken: *mut u8,
-    ) -> Result<Self, Failure> {
-        let room = room.ok_or_else(|| Failure::argument("the function that makes room is null"))?;
+    ) -> Result<Self, CallFailure> {
+        let room =
+            room.ok_or_else(|| CallFailure::argument("the function that makes room is null"))?;
         present(taken, "the place of the answer")?;
         present_if_wanted(info)?;
         Ok(Self { room, user, info, taken })
@@ -268,7 +269,7 @@ impl Place {
         self,
         take: impl FnOnce() -> Option<(MessageInfo, Sample)>,
         endpoint: &Endpoint,
-    ) -> Result<(), Failure> {
+    ) -> Result<(), CallFailure> {
         let message = take();
         let found = message.is_some();
         if let Some((info, sample)) = message {
@@ -277,7 +278,7 @@ impl Place {
             let at = unsafe { (self.room)(self.user, len) };
             if at.is_null() && len > 0 {
                 let text = format_args!("no room for a message of {len} bytes, which is lost");
-                return Err(Failure::new(AXON_RET_BAD_ALLOC, text).of_endpoint(endpoint));
+                return Err(CallFailure::new(AXON_RET_BAD_ALLOC, text).of_endpoint(endpoint));
             }
             if len > 0 {
                 let at = at.cast::<MaybeUninit<u8>>();
@@ -308,7 +309,7 @@ impl SamplePlace {
         self,
         take: impl FnOnce() -> Option<(MessageInfo, Sample)>,
         endpoint: &Endpoint,
-    ) -> Result<(), Failure> {
+    ) -> Result<(), CallFailure> {
         present(self.sample, "the place of the sample")?;
         present(self.data, "the place of the pointer")?;
         present(self.len, "the place of the length")?;

@@ -44,14 +44,14 @@ pub(super) enum Unknown {
 
 /// Objects of one kind, by handle. A look-up takes no lock but the place's own, which only the
 /// object's creation and destruction hold for writing.
-pub(super) struct Table<T> {
+pub(super) struct HandleTable<T> {
     kind: u8,
     process: Process,
-    blocks: [OnceLock<Box<[Place<T>]>>; BLOCKS],
+    blocks: [OnceLock<Box<[HandleSlot<T>]>>; BLOCKS],
     free: Mutex<Free>,
 }
 
-struct Place<T>(RwLock<Content<T>>);
+struct HandleSlot<T>(RwLock<Content<T>>);
 
 struct Content<T> {
     /// Of the object that is here, or of the next one.
@@ -66,7 +66,7 @@ struct Free {
     fresh: usize,
 }
 
-impl<T> Table<T> {
+impl<T> HandleTable<T> {
     pub(super) const fn new(kind: u8, process: Process) -> Self {
         assert!(kind < 1 << KIND);
         Self {
@@ -92,7 +92,7 @@ impl<T> Table<T> {
         };
         let (block, within) = split(index);
         let block = self.blocks[block].get_or_init(|| {
-            let vacant = || Place(RwLock::new(Content { generation: 1, object: None }));
+            let vacant = || HandleSlot(RwLock::new(Content { generation: 1, object: None }));
             std::iter::repeat_with(vacant).take(FIRST << block).collect()
         });
         let mut content = block[within].0.write().unwrap_or_else(PoisonError::into_inner);
@@ -142,7 +142,7 @@ impl<T> Table<T> {
     }
 
     /// A handle's place and generation.
-    fn place(&self, handle: u64) -> Result<(&Place<T>, u32), Unknown> {
+    fn place(&self, handle: u64) -> Result<(&HandleSlot<T>, u32), Unknown> {
         if handle == 0 {
             return Err(Unknown::Null);
         }
@@ -180,8 +180,8 @@ mod tests {
 
     use super::*;
 
-    fn table<T>() -> Table<T> {
-        Table::new(3, Process::new(7))
+    fn table<T>() -> HandleTable<T> {
+        HandleTable::new(3, Process::new(7))
     }
 
     fn place_of(handle: u64) -> u64 {
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn what_names_nothing_is_found_out() {
+    fn invalid_handles_are_refused_with_their_reason() {
         let table = table();
         let handle = table.insert("one").unwrap();
         let next_generation = handle + (1 << (PLACE + KIND + PROCESS));

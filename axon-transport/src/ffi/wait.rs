@@ -3,7 +3,7 @@
 use std::{sync::Arc, time::Duration};
 
 use super::{
-    error::{AXON_RET_OK, AXON_RET_TIMEOUT, Failure, axon_ret_t},
+    error::{AXON_RET_OK, AXON_RET_TIMEOUT, CallFailure, axon_ret_t},
     guarded,
     handle::{
         Handle, axon_client_t, axon_event_t, axon_guard_t, axon_server_t, axon_session_t,
@@ -124,7 +124,7 @@ pub unsafe extern "C" fn axon_session_wait(
         let ready = session.wait_watch(&watch, limit(timeout))?;
         arrays.keep(&ready);
         if ready.is_empty() {
-            return Err(Failure::timeout("nothing is ready"));
+            return Err(CallFailure::timeout("nothing is ready"));
         }
         Ok(())
     })
@@ -141,7 +141,7 @@ struct Arrays<'a> {
 impl<'a> Arrays<'a> {
     /// # Safety
     /// As [`axon_session_wait`].
-    unsafe fn new(set: &axon_wait_set_t) -> Result<Self, Failure> {
+    unsafe fn new(set: &axon_wait_set_t) -> Result<Self, CallFailure> {
         // SAFETY: the caller's word, here and below: nobody else uses the arrays.
         let subscriptions = unsafe {
             elements_mut(set.subscriptions, set.subscription_count, "the subscriptions")
@@ -183,7 +183,7 @@ fn keep<H: Handle>(
 }
 
 /// What the handles name that are not 0.
-fn all<H: Handle>(handles: &[H]) -> Result<Vec<Arc<H::Object>>, Failure> {
+fn all<H: Handle>(handles: &[H]) -> Result<Vec<Arc<H::Object>>, CallFailure> {
     handles.iter().filter(|handle| handle.id() != 0).map(|handle| named(*handle)).collect()
 }
 
@@ -202,7 +202,7 @@ pub(super) fn time(timestamp: i64) -> Option<i64> {
     (timestamp != AXON_TIME_NOW).then_some(timestamp)
 }
 
-impl Failure {
+impl CallFailure {
     pub(super) fn timeout(text: impl std::fmt::Display) -> Self {
         Self::new(AXON_RET_TIMEOUT, text)
     }

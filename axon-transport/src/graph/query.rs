@@ -6,6 +6,7 @@ use super::{EndpointKind, GraphEntry, GraphView};
 
 /// A node as the graph lists it. Two nodes may have the same name: it lists both.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[non_exhaustive]
 pub struct NodeName {
     /// Its namespace.
     pub namespace: String,
@@ -188,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn what_has_no_name_where_it_needs_one_is_not_sane() {
+    fn endpoints_with_missing_or_extra_names_are_not_sane() {
         let view = view();
         let node = view.endpoints[&Gid([1; 16])].endpoint.as_ref().clone();
         let talker = view.endpoints[&Gid([4; 16])].endpoint.as_ref().clone();

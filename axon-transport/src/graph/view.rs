@@ -7,6 +7,7 @@ use crate::ids::{DaemonId, Gid};
 
 /// Every node and endpoint that a session's daemon knows, here and on other hosts.
 #[derive(Clone, Debug, Default)]
+#[non_exhaustive]
 pub struct GraphView {
     /// The version that the daemon gave this state.
     pub version: u64,
@@ -16,6 +17,7 @@ pub struct GraphView {
 
 /// One endpoint of a [`GraphView`].
 #[derive(Clone, Debug)]
+#[non_exhaustive]
 pub struct GraphEntry {
     /// The endpoint.
     pub endpoint: Arc<Endpoint>,

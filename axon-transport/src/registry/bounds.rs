@@ -178,7 +178,7 @@ fn everything_is_told_anew_once_however_often_it_is_asked_for() {
 }
 
 #[test]
-fn what_waits_for_a_session_is_bounded_in_bytes() {
+fn a_sessions_queue_is_bounded_in_bytes() {
     let mut registry = registry(&[SessionRole::Application]);
     let part = Message::Status(StatusPart { part: 0, parts: 1, text: vec![0; 24 << 10] });
     for _ in 0..1000 {
@@ -366,7 +366,7 @@ fn the_segments_of_a_session_are_bounded_and_it_is_told() {
 }
 
 #[test]
-fn who_leaves_is_shown_to_nobody_and_read_to_its_end() {
+fn a_leaving_writer_is_hidden_and_read_to_its_end() {
     let mut registry = registry(&[SessionRole::Application; 3]);
     announce(&mut registry, 1, 1, EndpointKind::Publisher);
     announce(&mut registry, 2, 1, EndpointKind::Subscription);

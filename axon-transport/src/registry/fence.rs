@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn who_is_behind_has_to_be_told_everything_first() {
+    fn a_session_that_is_behind_delays_the_fences_answer() {
         let mut registry = registry();
         say(&mut registry, KEEPS);
         ask(&mut registry, 1);
@@ -232,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn who_ended_is_not_waited_for() {
+    fn an_ended_session_delays_no_fence() {
         let mut registry = registry();
         say(&mut registry, KEEPS);
         ask(&mut registry, 1);

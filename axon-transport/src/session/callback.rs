@@ -9,17 +9,43 @@ use std::{
 
 /// Told how often something happened since it was told last; at least once. It may be called on the
 /// session's control thread, but never by two threads at once, and must neither block nor panic.
+///
+/// ```
+/// # use std::time::Duration;
+/// use std::sync::{Arc, atomic::{AtomicU64, Ordering}};
+/// use axon_transport::OnNew;
+/// # use axon_transport::{
+/// #     EndpointSpec, Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// #     qos::Qos,
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// # let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default());
+/// let publisher = session.create_publisher(spec())?;
+/// let subscription = session.create_subscription(spec())?;
+/// assert!(publisher.wait_matched(1, Duration::from_secs(10)));
+/// let new = Arc::new(AtomicU64::new(0));
+/// let counter = new.clone();
+/// let callback: OnNew = Arc::new(move |count| {
+///     counter.fetch_add(count, Ordering::Relaxed);
+/// });
+/// publisher.publish(b"1.5 m/s")?;
+/// subscription.set_on_new_sample(Some(callback))?;
+/// assert_eq!(new.load(Ordering::Relaxed), 1);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub type OnNew = Arc<dyn Fn(u64) + Send + Sync>;
 
 /// What is to be told, and to whom.
 #[derive(Default)]
 pub(super) struct Callback {
-    state: Mutex<State>,
+    state: Mutex<CallbackState>,
     idle: Condvar,
 }
 
 #[derive(Default)]
-struct State {
+struct CallbackState {
     function: Option<OnNew>,
     untold: u64,
     /// The thread that is in a function. Another thread that has something to tell meanwhile leaves it to
@@ -82,7 +108,7 @@ impl Callback {
     }
 
     /// Has nobody told, and waits for the call that is under way on another thread.
-    fn vacate(&self) -> MutexGuard<'_, State> {
+    fn vacate(&self) -> MutexGuard<'_, CallbackState> {
         let me = thread::current().id();
         let mut state = self.lock();
         loop {
@@ -115,7 +141,7 @@ impl Callback {
         }
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
+    fn lock(&self) -> MutexGuard<'_, CallbackState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -156,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn what_happened_before_is_told_at_once_and_once() {
+    fn a_new_callback_receives_earlier_events_once() {
         let callback = Callback::default();
         callback.recount(2);
         callback.add(1);
@@ -218,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn what_happens_while_it_runs_it_is_told_afterwards_by_the_same_thread() {
+    fn events_during_a_callback_are_reported_after_it_by_the_same_thread() {
         let callback = Callback::default();
         let (function, entries, go, _) = gate();
         callback.set(Some(function));

@@ -73,7 +73,7 @@ impl Session {
         Ok(client)
     }
 
-    /// A node, which is in the graph until it is dropped.
+    /// Creates a node, which is in the graph until it is dropped.
     ///
     /// # Errors
     /// When the name is empty, or a name is out of bounds.
@@ -83,7 +83,7 @@ impl Session {
         namespace: &str,
         enclave: &str,
     ) -> Result<Node, SessionError> {
-        // What a node has no use for is as it is by default.
+        // Fields that nodes do not use keep their defaults.
         let spec = EndpointSpec {
             node: name.to_owned(),
             namespace: namespace.to_owned(),

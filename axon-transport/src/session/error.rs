@@ -12,6 +12,23 @@ use crate::{config::ConfigError, ids::SessionId, wire::session::CodecError};
 /// There is no variant for a session that is closed: an endpoint keeps its session open for as long as the
 /// endpoint lives, and a call that waits borrows the endpoint. A publisher that ends is no error either:
 /// another one may come.
+///
+/// ```
+/// # use std::time::Duration;
+/// use axon_transport::RecvError;
+/// # use axon_transport::{
+/// #     EndpointSpec, Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// #     qos::Qos,
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// # let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default());
+/// let subscription = session.create_subscription(spec())?;
+/// let nothing = subscription.recv(&mut Vec::new(), Some(Duration::from_millis(1)));
+/// assert_eq!(nothing.unwrap_err(), RecvError::TimedOut);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum RecvError {
@@ -41,6 +58,19 @@ impl RecvError {
 /// Why a session could not be opened or used.
 ///
 /// `Debug` says the same as `Display`: it is what a `main` prints that returns the error.
+///
+/// ```
+/// use axon_transport::SessionError;
+/// # use axon_transport::{
+/// #     Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// let refused = session.create_node("", "/", "/");
+/// assert!(matches!(refused, Err(SessionError::Node { .. })));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(thiserror::Error)]
 #[non_exhaustive]
 pub enum SessionError {

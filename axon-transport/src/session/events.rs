@@ -46,7 +46,7 @@ use crate::{
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 pub struct Event {
-    source: Source,
+    source: EventSource,
     kind: EventKind,
     pub(super) session: Session,
     /// Its own, which the endpoint knows from when it is first set.
@@ -55,12 +55,12 @@ pub struct Event {
 
 /// Whose event it is.
 #[derive(Clone)]
-pub(super) enum Source {
+pub(super) enum EventSource {
     Publisher(Arc<PublisherInner>),
     Subscription(Arc<SubscriptionInner>),
 }
 
-impl Source {
+impl EventSource {
     pub(super) fn events(&self) -> &EndpointEvents {
         match self {
             Self::Publisher(inner) => &inner.events,
@@ -110,8 +110,8 @@ impl Source {
 }
 
 impl Event {
-    pub(super) fn new(source: Source, kind: EventKind, session: Session) -> Option<Self> {
-        let publishers = matches!(source, Source::Publisher(_));
+    pub(super) fn new(source: EventSource, kind: EventKind, session: Session) -> Option<Self> {
+        let publishers = matches!(source, EventSource::Publisher(_));
         let callback = Arc::default();
         (kind.is_publishers() == publishers).then_some(Self { source, kind, session, callback })
     }
@@ -131,8 +131,8 @@ impl Event {
     pub fn take(&self) -> EventStatus {
         if self.session.is_forked() {
             let mut nothing = match self.source {
-                Source::Publisher(_) => Statuses::of_publisher(),
-                Source::Subscription(_) => Statuses::of_subscription(),
+                EventSource::Publisher(_) => Statuses::of_publisher(),
+                EventSource::Subscription(_) => Statuses::of_subscription(),
             };
             return nothing.take(self.kind).expect("checked when the event was made");
         }
@@ -161,7 +161,7 @@ impl Event {
     }
 
     /// What a wait set looks at.
-    pub(super) fn parts(&self) -> (&Source, EventKind) {
+    pub(super) fn parts(&self) -> (&EventSource, EventKind) {
         (&self.source, self.kind)
     }
 }
@@ -222,10 +222,10 @@ impl Moved {
 
 /// The events of one endpoint.
 pub(super) struct EndpointEvents {
-    inner: Mutex<Inner>,
+    inner: Mutex<EventsInner>,
 }
 
-struct Inner {
+struct EventsInner {
     statuses: Statuses,
     /// Of all handles of events that have one.
     callbacks: Vec<(EventKind, Arc<Callback>)>,
@@ -255,7 +255,7 @@ impl EndpointEvents {
     }
 
     fn new(statuses: Statuses, qos: &Qos, lease: Option<Lease>) -> Self {
-        let inner = Inner {
+        let inner = EventsInner {
             statuses,
             callbacks: Vec::new(),
             matched: Vec::new(),
@@ -330,7 +330,7 @@ impl EndpointEvents {
     fn rematch(
         &self,
         now: impl FnOnce() -> Vec<(Gid, Option<u64>)>,
-        liveness: impl FnOnce(&mut Inner, &Moved),
+        liveness: impl FnOnce(&mut EventsInner, &Moved),
     ) -> Changes {
         let mut changes = Changes::default();
         self.change(|inner| {
@@ -451,12 +451,13 @@ impl EndpointEvents {
     }
 
     /// Changes statuses and tells those who are to be told. Whether anything occurred.
-    fn change(&self, change: impl FnOnce(&mut Inner)) -> bool {
+    fn change(&self, change: impl FnOnce(&mut EventsInner)) -> bool {
         let mut told = Vec::new();
         let mut news = false;
         {
             let mut inner = self.lock();
-            let unread = |inner: &Inner| EventKind::ALL.map(|kind| inner.statuses.unread(kind));
+            let unread =
+                |inner: &EventsInner| EventKind::ALL.map(|kind| inner.statuses.unread(kind));
             let before = unread(&inner);
             change(&mut inner);
             for ((kind, before), after) in EventKind::ALL.iter().zip(before).zip(unread(&inner)) {
@@ -471,12 +472,12 @@ impl EndpointEvents {
         news
     }
 
-    fn lock(&self) -> MutexGuard<'_, Inner> {
+    fn lock(&self) -> MutexGuard<'_, EventsInner> {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl Inner {
+impl EventsInner {
     fn callbacks_of(&self, kind: EventKind) -> impl Iterator<Item = &Arc<Callback>> {
         self.callbacks.iter().filter(move |(of, _)| *of == kind).map(|(_, callback)| callback)
     }

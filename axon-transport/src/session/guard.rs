@@ -10,10 +10,29 @@ use std::{
 
 use axon_shm::internal::SessionSegment;
 
-use super::state::Shared;
+use super::state::SessionShared;
 
 /// A condition that stands from when it is triggered until a wait has seen it. Thread-safe; cheap to
 /// clone, and all clones are the same condition.
+///
+/// ```
+/// # use std::time::Duration;
+/// use axon_transport::Waitable;
+/// # use axon_transport::{
+/// #     Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// let stop = session.create_guard_condition();
+/// let clone = stop.clone();
+/// let other = std::thread::spawn(move || clone.trigger());
+/// let ready = session.wait_for(&[Waitable::GuardCondition(&stop)], Some(Duration::from_secs(10)))?;
+/// assert_eq!(ready[..], [0]);
+/// assert!(!stop.is_triggered(), "the wait resets it");
+/// # other.join().unwrap();
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone)]
 pub struct GuardCondition {
     inner: Arc<Guard>,
@@ -22,11 +41,11 @@ pub struct GuardCondition {
 pub(super) struct Guard {
     triggered: AtomicBool,
     segment: Arc<SessionSegment>,
-    session: Weak<Shared>,
+    session: Weak<SessionShared>,
 }
 
 impl GuardCondition {
-    pub(super) fn new(session: &Arc<Shared>) -> Self {
+    pub(super) fn new(session: &Arc<SessionShared>) -> Self {
         let (segment, session) = (session.segment.clone(), Arc::downgrade(session));
         Self { inner: Arc::new(Guard { triggered: AtomicBool::new(false), segment, session }) }
     }
@@ -61,7 +80,7 @@ impl Guard {
     }
 
     /// Its session, where that is open still.
-    pub(super) fn session(&self) -> Option<Arc<Shared>> {
+    pub(super) fn session(&self) -> Option<Arc<SessionShared>> {
         self.session.upgrade()
     }
 

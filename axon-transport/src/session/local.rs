@@ -10,7 +10,7 @@ use std::{
 
 use axon_shm::{ShmError, internal::descriptors::PassedFd};
 
-use super::state::Shared;
+use super::state::SessionShared;
 use crate::{
     graph::Endpoint,
     ids::{DaemonId, Gid, SessionId},
@@ -74,14 +74,14 @@ impl LocalRegistryState {
 
 impl Local {
     /// A registry of its own, where nobody else is and nothing is handed to anybody.
-    pub(super) fn alone(session: &Shared) -> Self {
+    pub(super) fn alone(session: &SessionShared) -> Self {
         Self::enter(Arc::default(), session, None)
     }
 
     /// Joins `local_registry`.
     pub(super) fn join(
         local_registry: Arc<LocalRegistry>,
-        session: &Shared,
+        session: &SessionShared,
     ) -> Result<Self, ShmError> {
         let handed = session.segment.descriptors()?;
         let handed = [handed.segment, handed.doorbell, handed.pidfd].map(Arc::new);
@@ -90,7 +90,7 @@ impl Local {
 
     fn enter(
         local_registry: Arc<LocalRegistry>,
-        session: &Shared,
+        session: &SessionShared,
         handed: Option<[Arc<PassedFd>; 3]>,
     ) -> Self {
         let (id, role, name) = (session.id, session.options.role, session.options.name.clone());

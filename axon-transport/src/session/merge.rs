@@ -232,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_reader_that_ends_has_left_another_has_too() {
+    fn samples_of_an_ended_reader_come_through_another() {
         let (mut merge, readers) = (merge(), Readers::default());
         readers.have(ONE, whole(1..=300));
         readers.have(OTHER, whole(1..=300));
@@ -246,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn what_comes_while_readers_are_asked_does_not_go_before_what_came_first() {
+    fn merge_keeps_the_order_of_concurrent_samples() {
         let (mut merge, readers) = (merge(), Readers::default());
         let asked = RefCell::new(0);
         // It is written after the first reader was asked, which has all of it.
@@ -287,7 +287,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_passed_before_is_not_given_on() {
+    fn merge_drops_samples_below_the_passed_number() {
         let (mut merge, readers) = (merge(), Readers::default());
         merge.pass(4);
         merge.pass(2);

@@ -54,7 +54,7 @@ pub use publisher::{Loan, Publisher};
 pub use remote_writer::{RemoteWriter, Written};
 pub use service::{Client, Server};
 pub use state::SessionEvent;
-pub(crate) use state::Shared;
+pub(crate) use state::SessionShared;
 pub use subscription::{Lifetime, MessageInfo, Subscription, TakeLimit, TrustedSubscription};
 pub use tasks::{CallError, Messages};
 pub use waiting::{Ready, Waitable};
@@ -90,7 +90,7 @@ pub struct Session {
 
 #[derive(Debug)]
 struct Handle {
-    shared: Arc<Shared>,
+    shared: Arc<SessionShared>,
     thread: Option<JoinHandle<()>>,
     /// What carries its samples, where it shares no memory.
     relay: Option<SessionRelay>,
@@ -147,7 +147,7 @@ impl Session {
         *slot = Some(Arc::new(listener));
     }
 
-    fn shared(&self) -> &Arc<Shared> {
+    fn shared(&self) -> &Arc<SessionShared> {
         &self.handle.shared
     }
 

@@ -11,7 +11,7 @@ use super::{
         control::{Control, Start},
     },
     local::LocalRegistry,
-    state::Shared,
+    state::SessionShared,
 };
 use crate::{
     config::{Config, DaemonPolicy},
@@ -93,7 +93,7 @@ impl Session {
         let system = |what| move |source: std::io::Error| SessionError::System { what, source };
         let wake = rustix::event::eventfd(0, flags)
             .map_err(|e| system("creating an eventfd")(e.into()))?;
-        let shared = Arc::new(Shared::new(config.clone(), options, segment, wake));
+        let shared = Arc::new(SessionShared::new(config.clone(), options, segment, wake));
         let control = Control::new(shared.clone(), start)?;
         let blocked = BlockedSignals::all();
         let thread = std::thread::Builder::new()

@@ -5,6 +5,19 @@ use std::{ffi::OsString, io, path::PathBuf, sync::Arc};
 use crate::{qos::Qos, session_key::SessionKey, wire::session::SessionRole};
 
 /// How a session is opened.
+///
+/// ```
+/// # use axon_transport::{
+/// #     Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// # drop(session);
+/// let options = SessionOptions::new("camera");
+/// let session = Session::open(&config, options)?;
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Debug)]
 pub struct SessionOptions {
     pub(super) name: String,
@@ -36,15 +49,33 @@ impl SessionOptions {
 
 /// A command that runs a daemon: it passes the flags `--spawned` and `--detached`, which are added
 /// after the arguments, on to `axon_daemon::Start::from_arguments`.
+///
+/// ```
+/// use axon_transport::{DaemonCommand, SessionOptions};
+///
+/// let daemon = DaemonCommand::new("/opt/axon/bin/axon", ["daemon"]);
+/// let options = SessionOptions::new("camera").daemon_command(daemon);
+/// # drop(options);
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct DaemonCommand {
     /// The program.
     pub program: PathBuf,
-    /// What goes before the flag.
+    /// The arguments before the flag.
     pub arguments: Vec<OsString>,
 }
 
 impl DaemonCommand {
+    /// A program, and the arguments before the flag.
+    pub fn new(
+        program: impl Into<PathBuf>,
+        arguments: impl IntoIterator<Item = impl Into<OsString>>,
+    ) -> Self {
+        let arguments = arguments.into_iter().map(Into::into).collect();
+        Self { program: program.into(), arguments }
+    }
+
     /// This very program, with arguments that make it the daemon.
     ///
     /// # Errors
@@ -52,10 +83,7 @@ impl DaemonCommand {
     pub fn current_executable(
         arguments: impl IntoIterator<Item = impl Into<OsString>>,
     ) -> io::Result<Self> {
-        Ok(Self {
-            program: std::env::current_exe()?,
-            arguments: arguments.into_iter().map(Into::into).collect(),
-        })
+        Ok(Self::new(std::env::current_exe()?, arguments))
     }
 }
 

@@ -13,9 +13,9 @@ use axon_shm::{
 };
 
 use super::{
-    events::Source,
+    events::EventSource,
     publisher::PublisherInner,
-    state::Shared,
+    state::SessionShared,
     subscription::{Accept, Numbers, SubscriptionInner},
 };
 use crate::{
@@ -24,7 +24,7 @@ use crate::{
     wire::session::EndpointRole,
 };
 
-impl Shared {
+impl SessionShared {
     /// Under this lock, the pairs of a session's own endpoints come and go with them.
     pub(super) fn lock_own_pairs(&self) -> MutexGuard<'_, ()> {
         self.own_pairs.lock().unwrap_or_else(PoisonError::into_inner)
@@ -38,7 +38,8 @@ impl Shared {
         let mut changed = Vec::new();
         for (writer, reader) in pairs {
             match self.join(&writer, &reader) {
-                Ok(()) => changed.extend([Source::Publisher(writer), Source::Subscription(reader)]),
+                Ok(()) => changed
+                    .extend([EventSource::Publisher(writer), EventSource::Subscription(reader)]),
                 Err(error) => {
                     let topic = &writer.endpoint.topic;
                     tracing::debug!(topic, %error, "two endpoints of a session do not meet at once");
@@ -105,9 +106,9 @@ impl Shared {
                 state.unindex(endpoint);
                 state.remove_dead(gid);
                 for other in state.topics.get(&endpoint.topic).into_iter().flatten() {
-                    others.extend(state.publishers.get(other).cloned().map(Source::Publisher));
+                    others.extend(state.publishers.get(other).cloned().map(EventSource::Publisher));
                     let reads = state.subscriptions.get(other).cloned();
-                    others.extend(reads.map(Source::Subscription));
+                    others.extend(reads.map(EventSource::Subscription));
                 }
             }
             None => state.remove_dead(gid),
@@ -116,8 +117,8 @@ impl Shared {
         others.retain(|other| {
             other.events().forget(gid);
             match other {
-                Source::Publisher(writer) => writer.detach(*gid),
-                Source::Subscription(reader) => reader.lock().end(gid),
+                EventSource::Publisher(writer) => writer.detach(*gid),
+                EventSource::Subscription(reader) => reader.lock().end(gid),
             }
         });
         drop(held);
@@ -126,7 +127,7 @@ impl Shared {
     }
 
     /// Counts the changes to the pairs of `endpoints`. The control thread tells the rest.
-    fn rematch(&self, endpoints: Vec<Source>) {
+    fn rematch(&self, endpoints: Vec<EventSource>) {
         let news = endpoints.into_iter().map(|endpoint| (endpoint.rematch(), endpoint));
         let news: Vec<_> = news.filter(|(changes, _)| !changes.is_empty()).collect();
         if news.is_empty() {

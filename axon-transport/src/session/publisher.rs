@@ -15,7 +15,7 @@ use axon_shm::{
 
 use super::{
     Session, clock,
-    events::{Changes, EndpointEvents, Event, Source},
+    events::{Changes, EndpointEvents, Event, EventSource},
     rings::Rings,
     state::Outgoing,
 };
@@ -28,6 +28,25 @@ use crate::{
 };
 
 /// Sends the samples of a topic. Thread-safe. When it is dropped, readers still take what it left.
+///
+/// ```
+/// # use std::time::Duration;
+/// # use axon_transport::{
+/// #     EndpointSpec, Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// #     qos::Qos,
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// # let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default());
+/// let publisher = session.create_publisher(spec())?;
+/// let subscription = session.create_subscription(spec())?;
+/// assert!(publisher.wait_matched(1, Duration::from_secs(10)));
+/// let sequence = publisher.publish(b"1.5 m/s")?;
+/// assert_eq!(sequence, 1);
+/// # drop(subscription);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub struct Publisher {
     pub(super) inner: Arc<PublisherInner>,
     pub(super) writer: Arc<Writer>,
@@ -126,7 +145,7 @@ impl Publisher {
 
     /// One of its events; `None` where `kind` is a subscription's.
     pub fn event(&self, kind: EventKind) -> Option<Event> {
-        Event::new(Source::Publisher(self.inner.clone()), kind, self.session.clone())
+        Event::new(EventSource::Publisher(self.inner.clone()), kind, self.session.clone())
     }
 
     /// Room for a sample of exactly `len` bytes, to serialize into: in shared memory where it is
@@ -192,6 +211,28 @@ impl Drop for Publisher {
 
 /// A sample that the application writes in place, from the front or as a slice. Dropping the loan without
 /// calling [`publish`](Self::publish) discards the sample.
+///
+/// ```
+/// # use std::time::Duration;
+/// # use axon_transport::{
+/// #     EndpointSpec, Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// #     qos::Qos,
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// # let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default());
+/// let publisher = session.create_publisher(spec())?;
+/// let subscription = session.create_subscription(spec())?;
+/// assert!(publisher.wait_matched(1, Duration::from_secs(10)));
+/// let mut loan = publisher.loan(100_000)?;
+/// loan.fill(7);
+/// loan.publish()?;
+///
+/// let (_info, sample) = subscription.take_sample().expect("it is there");
+/// assert_eq!(sample.len(), 100_000);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub struct Loan<'a> {
     loan: axon_shm::Loan<'a>,
     publisher: &'a PublisherInner,

@@ -21,6 +21,27 @@ use crate::{graph::Endpoint, ids::Gid};
 const PATIENCE: Duration = Duration::from_millis(100);
 
 /// Answers requests. Thread-safe.
+///
+/// ```
+/// # use std::time::Duration;
+/// # use axon_transport::{
+/// #     EndpointSpec, Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// #     qos::Qos,
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// # let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default());
+/// let server = session.create_server(spec())?;
+/// let client = session.create_client(spec())?;
+/// assert!(client.wait_available(Duration::from_secs(10)));
+/// client.send_request(b"how fast?")?;
+///
+/// let mut payload = Vec::new();
+/// let request = server.recv_request(&mut payload, Some(Duration::from_secs(10)))?;
+/// server.send_response(request.publisher, request.sequence, b"1.5 m/s")?;
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub struct Server {
     responses: Arc<PublisherInner>,
     rings: Arc<RingsByClient>,
@@ -315,7 +336,7 @@ fn await_both(writes: &PublisherInner, reads: &SubscriptionInner, session: &Sess
     });
 }
 
-/// Those with whom both directions stand.
+/// Endpoints that are attached in both directions.
 fn both(writes: &PublisherInner, reads: &SubscriptionInner, session: &Session) -> Vec<Gid> {
     if session.is_forked() {
         return Vec::new();
@@ -325,7 +346,7 @@ fn both(writes: &PublisherInner, reads: &SubscriptionInner, session: &Session) -
     gids
 }
 
-/// The same, with those who have ended and have left something that is still to come.
+/// Attached endpoints, including ended ones with pending data.
 fn attached(writes: &PublisherInner, reads: &SubscriptionInner, session: &Session) -> Vec<Gid> {
     let mut gids = both(writes, reads, session);
     if !session.is_forked() {

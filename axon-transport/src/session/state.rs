@@ -19,7 +19,7 @@ use axon_shm::{
 
 use super::{
     SessionOptions,
-    events::{Changes, Source},
+    events::{Changes, EventSource},
     guard::GuardCondition,
     pair_waits::PairWaits,
     publisher::PublisherInner,
@@ -35,6 +35,19 @@ use crate::{
 };
 
 /// Something that a session's owner may want to hear of.
+///
+/// ```
+/// use axon_transport::SessionEvent;
+///
+/// fn log(event: &SessionEvent) {
+///     match event {
+///         SessionEvent::DaemonLost => println!("the daemon is gone"),
+///         SessionEvent::DaemonFound(daemon) => println!("connected to daemon {daemon:?}"),
+///         other => println!("{other:?}"),
+///     }
+/// }
+/// # log(&SessionEvent::DaemonLost);
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum SessionEvent {
@@ -53,7 +66,7 @@ pub enum SessionEvent {
 
 type Listener = Arc<dyn Fn(&SessionEvent) + Send + Sync>;
 
-pub(crate) struct Shared {
+pub(crate) struct SessionShared {
     pub(crate) config: Config,
     pub(crate) options: SessionOptions,
     pub(crate) id: SessionId,
@@ -74,12 +87,12 @@ pub(crate) struct Shared {
     pub(super) own_pairs: Mutex<()>,
     /// For the clients of its servers.
     pub(super) room: Arc<ClientLimit>,
-    state: Mutex<State>,
+    state: Mutex<SessionState>,
     changed: Condvar,
 }
 
 #[derive(Default)]
-pub(super) struct State {
+pub(super) struct SessionState {
     pub(super) next_entity: u32,
     /// With what tells of changes of the graph.
     pub(super) nodes: HashMap<Gid, (Endpoint, GuardCondition)>,
@@ -88,24 +101,24 @@ pub(super) struct State {
     /// Applications' endpoints of both kinds by topic or service.
     pub(super) topics: HashMap<String, BTreeSet<Gid>>,
     pub(super) outgoing: VecDeque<Outgoing>,
-    /// Endpoints that are gone, until a daemon has said so to everybody.
+    /// Ended endpoints, until a daemon has announced their end.
     pub(super) tombstones: BTreeSet<Gid>,
     pub(super) graph: Arc<GraphView>,
-    /// Endpoints of its own that the daemon does not take, and why: nobody else ever hears of them.
+    /// Own endpoints that the daemon refused, and why. No other session learns of them.
     pub(super) refused: BTreeMap<Gid, String>,
     pub(super) daemon: Option<DaemonId>,
     pub(super) status: StatusAnswer,
-    /// When those who wait shall look again, whether or not anything comes.
+    /// Deadline at which waiters check again without an event.
     pub(super) again: Option<Instant>,
-    /// Pairs that came or went on other threads than the control thread, which has yet to tell.
-    pub(super) rematched: Vec<(Changes, Source)>,
-    /// The graph is another one than the control thread has told of.
+    /// Pairs that other threads matched or unmatched, for the control thread to report.
+    pub(super) rematched: Vec<(Changes, EventSource)>,
+    /// Whether the graph changed since the control thread last reported it.
     pub(super) regraphed: bool,
-    /// Counts what those who wait may want to look at.
+    /// Counts changes that may end a wait.
     pub(super) changes: u64,
 }
 
-impl State {
+impl SessionState {
     /// The nodes and endpoints of the session's application.
     pub(super) fn own(&self) -> impl Iterator<Item = &Endpoint> {
         let application = |role| role == EndpointRole::Application;
@@ -309,7 +322,7 @@ pub(super) enum StatusAnswer {
     Lost,
 }
 
-impl Shared {
+impl SessionShared {
     pub(super) fn new(
         config: Config,
         options: SessionOptions,
@@ -372,7 +385,7 @@ impl Shared {
         subscriptions.iter().for_each(|s| s.lock().lost_elsewhere(writer, samples, first));
     }
 
-    pub(super) fn state(&self) -> MutexGuard<'_, State> {
+    pub(super) fn state(&self) -> MutexGuard<'_, SessionState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -471,9 +484,9 @@ impl Shared {
     }
 }
 
-impl fmt::Debug for Shared {
+impl fmt::Debug for SessionShared {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Shared").field("id", &self.id).finish_non_exhaustive()
+        f.debug_struct("SessionShared").field("id", &self.id).finish_non_exhaustive()
     }
 }
 

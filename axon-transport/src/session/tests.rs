@@ -360,7 +360,7 @@ fn memory_that_was_given_up_while_the_session_was_behind_is_let_go() {
 }
 
 #[test]
-fn what_a_writer_left_is_asked_for_by_who_was_behind_and_taken() {
+fn a_reader_requests_the_memory_of_an_ended_writer() {
     let (session, daemon) = session();
     let far = Far::new(&daemon);
     let (subscription, _) = far.matched(&session, &daemon);

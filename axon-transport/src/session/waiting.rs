@@ -4,17 +4,40 @@ use std::{ops::Deref, sync::Arc, time::Duration};
 
 use axon_shm::{
     ShmError,
-    internal::{ForwardedWakeups, Look, SessionSegment},
+    internal::{ForwardedWakeups, SessionSegment, WakeCheck},
 };
 use smallvec::SmallVec;
 
 use super::{
-    Client, Event, GuardCondition, Server, Session, SessionError, Subscription, events::Source,
-    guard::Guard, state::Shared, subscription::SubscriptionInner,
+    Client, Event, GuardCondition, Server, Session, SessionError, Subscription,
+    events::EventSource, guard::Guard, state::SessionShared, subscription::SubscriptionInner,
 };
 use crate::events::EventKind;
 
 /// Something to wait for.
+///
+/// ```
+/// # use std::time::Duration;
+/// use axon_transport::Waitable;
+/// # use axon_transport::{
+/// #     EndpointSpec, Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// #     qos::Qos,
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// # let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default());
+/// let publisher = session.create_publisher(spec())?;
+/// let subscription = session.create_subscription(spec())?;
+/// assert!(publisher.wait_matched(1, Duration::from_secs(10)));
+/// let stop = session.create_guard_condition();
+/// publisher.publish(b"1.5 m/s")?;
+///
+/// let all = [Waitable::GuardCondition(&stop), Waitable::Subscription(&subscription)];
+/// let ready = session.wait_for(&all, Some(Duration::from_secs(10)))?;
+/// assert_eq!(ready[..], [1]);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Copy, Debug)]
 #[non_exhaustive]
 pub enum Waitable<'a> {
@@ -32,6 +55,21 @@ pub enum Waitable<'a> {
 
 /// What was found ready: its indices among all that was waited for, in order. A slice; no allocation
 /// where it is a few.
+///
+/// ```
+/// # use std::time::Duration;
+/// use axon_transport::{Ready, Waitable};
+/// # use axon_transport::{
+/// #     Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// let stop = session.create_guard_condition();
+/// let nothing: Ready = session.wait_for(&[Waitable::GuardCondition(&stop)], Some(Duration::ZERO))?;
+/// assert!(nothing.is_empty());
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Ready(SmallVec<[usize; FEW]>);
 
@@ -43,31 +81,35 @@ const FEW: usize = 8;
 enum Part<'a> {
     Data(&'a Arc<SubscriptionInner>),
     Guard(&'a Arc<Guard>),
-    Event(&'a Source, EventKind),
+    Event(&'a EventSource, EventKind),
 }
 
 /// The same, kept for others to look at.
 enum OwnedWaitable {
     Data(Arc<SubscriptionInner>),
     Guard(Arc<Guard>),
-    Event(Source, EventKind),
+    Event(EventSource, EventKind),
 }
 
 /// The objects that a thread waits for, without keeping them from ending.
 pub(crate) struct WeakWaitSet {
     parts: Vec<OwnedWaitable>,
     /// The sessions that it belongs to, but for the one that waits.
-    others: Vec<Arc<Shared>>,
+    others: Vec<Arc<SessionShared>>,
 }
 
 /// While another session is waited at, its control thread listens for it, and passes on what comes.
 struct ForeignWait<'a> {
-    other: &'a Shared,
+    other: &'a SessionShared,
     _forwarded: ForwardedWakeups<'a>,
 }
 
 impl<'a> ForeignWait<'a> {
-    fn new(other: &'a Shared, watch: &Arc<WeakWaitSet>, waits: &Shared) -> Result<Self, ShmError> {
+    fn new(
+        other: &'a SessionShared,
+        watch: &Arc<WeakWaitSet>,
+        waits: &SessionShared,
+    ) -> Result<Self, ShmError> {
         other.listen()?;
         Ok(Self { other, _forwarded: other.segment.forward_wakeups(watch.clone(), &waits.segment) })
     }
@@ -179,7 +221,7 @@ impl Session {
             ready = take();
             !ready.is_empty()
         };
-        self.segment().wait_for(look, &|| -> Arc<dyn Look> { watch() }, timeout);
+        self.segment().wait_for(look, &|| -> Arc<dyn WakeCheck> { watch() }, timeout);
         Ok(ready)
     }
 }
@@ -230,7 +272,7 @@ impl Waitable<'_> {
     }
 
     /// Its session, where that is open.
-    fn session(&self) -> Option<Arc<Shared>> {
+    fn session(&self) -> Option<Arc<SessionShared>> {
         let session = match self {
             Waitable::Subscription(subscription) => &subscription.session,
             Waitable::Server(server) => &server.session,
@@ -281,7 +323,7 @@ impl OwnedWaitable {
     }
 }
 
-impl Look for WeakWaitSet {
+impl WakeCheck for WeakWaitSet {
     fn ready(&self) -> bool {
         self.parts.iter().any(|kept| kept.part().may_be_ready())
     }

@@ -127,7 +127,7 @@ fn a_call_ends_with_the_last_of_its_servers() {
 }
 
 #[test]
-fn what_a_server_answered_before_it_ended_counts() {
+fn a_response_of_an_ended_server_completes_the_call() {
     let session = alone();
     let (server, client) = service(&session);
     let mut call = pin!(client.call(b"x"));

@@ -190,7 +190,7 @@ mod tests {
         }
 
         #[test]
-        fn what_was_encoded_comes_back(bytes: Vec<u8>) {
+        fn base64_survives_a_round_trip(bytes: Vec<u8>) {
             let text = format!("\"{}\"", STANDARD.encode(&bytes));
             let decoded = decode(&text).unwrap();
             prop_assert_eq!(decoded.expose_secret(), &bytes[..]);

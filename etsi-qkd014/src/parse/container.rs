@@ -4,7 +4,7 @@ use std::cmp::Ordering;
 
 use secrecy::ExposeSecret;
 
-use super::json::{Object, Place, text};
+use super::json::{Object, ObjectPlace, text};
 use super::{base64, malformed};
 use crate::{Error, Key, KeyContainer, Quirks};
 
@@ -66,7 +66,7 @@ pub(crate) fn key_container(
     Ok(KeyContainer { keys, extension })
 }
 
-fn key(place: Place, object: &mut Object<'_>, quirks: Quirks) -> Result<Key, Error> {
+fn key(place: ObjectPlace, object: &mut Object<'_>, quirks: Quirks) -> Result<Key, Error> {
     let key_id = object.need_string("key_ID")?;
     check_key_id(&key_id, place, quirks)?;
     let secret =
@@ -80,7 +80,7 @@ fn key(place: Place, object: &mut Object<'_>, quirks: Quirks) -> Result<Key, Err
     Ok(Key::new(key_id, secret, key_id_extension, extension))
 }
 
-fn check_key_id(id: &str, place: Place, quirks: Quirks) -> Result<(), Error> {
+fn check_key_id(id: &str, place: ObjectPlace, quirks: Quirks) -> Result<(), Error> {
     if is_uuid(id) {
         return Ok(());
     }

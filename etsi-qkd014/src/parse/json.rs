@@ -26,14 +26,14 @@ pub(super) fn text(body: &[u8]) -> Result<&str, Error> {
 
 /// Which object is read: put into words only where there is an error to tell.
 #[derive(Clone, Copy)]
-pub(super) enum Place {
+pub(super) enum ObjectPlace {
     /// The answer itself.
     Body,
     /// The item of `keys` with this index.
     Key(usize),
 }
 
-impl fmt::Display for Place {
+impl fmt::Display for ObjectPlace {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Body => f.write_str("body"),
@@ -45,12 +45,12 @@ impl fmt::Display for Place {
 type Member<'a> = (Cow<'a, str>, &'a RawValue);
 
 /// What is done with each object of `keys`.
-pub(super) type Each<'f, 'a> = dyn FnMut(Place, &mut Object<'a>) -> Result<(), Error> + 'f;
+pub(super) type Each<'f, 'a> = dyn FnMut(ObjectPlace, &mut Object<'a>) -> Result<(), Error> + 'f;
 
 /// One JSON object. Members are taken out by name; [`finish`](Object::finish) complains of what
 /// is left.
 pub(super) struct Object<'a> {
-    at: Place,
+    at: ObjectPlace,
     members: Vec<Member<'a>>,
     quirks: Quirks,
 }
@@ -70,14 +70,16 @@ impl<'a> Object<'a> {
         quirks: Quirks,
         each: &mut Each<'_, 'a>,
     ) -> Result<(Self, usize), Error> {
-        let mut keys = Keys { wanted, max, quirks, each, state: State::Absent };
+        let mut keys = Keys { wanted, max, quirks, each, state: KeysState::Absent };
         let read = Self::read(text, quirks, Some(&mut keys));
         match (keys.state, read) {
-            (State::Failed(failure), _) => Err(failure),
-            (State::Begun, Err(Error::Malformed { reason, .. })) => Err(malformed("keys", reason)),
+            (KeysState::Failed(failure), _) => Err(failure),
+            (KeysState::Begun, Err(Error::Malformed { reason, .. })) => {
+                Err(malformed("keys", reason))
+            }
             (_, Err(error)) => Err(error),
-            (State::Counted(count), Ok(object)) => Ok((object, count)),
-            (State::Absent | State::Begun, Ok(_)) => Err(malformed("keys", "is missing")),
+            (KeysState::Counted(count), Ok(object)) => Ok((object, count)),
+            (KeysState::Absent | KeysState::Begun, Ok(_)) => Err(malformed("keys", "is missing")),
         }
     }
 
@@ -88,10 +90,10 @@ impl<'a> Object<'a> {
             .deserialize(&mut deserializer)
             .and_then(|()| deserializer.end())
             .map_err(|e| malformed("body", why(&e, "what clause 6 describes")))?;
-        Self::new(members, Place::Body, quirks)
+        Self::new(members, ObjectPlace::Body, quirks)
     }
 
-    fn new(members: Vec<Member<'a>>, at: Place, quirks: Quirks) -> Result<Self, Error> {
+    fn new(members: Vec<Member<'a>>, at: ObjectPlace, quirks: Quirks) -> Result<Self, Error> {
         let object = Self { at, members, quirks };
         for (index, (name, _)) in object.members.iter().enumerate() {
             if object.members[..index].iter().any(|(before, _)| object.same(before, name)) {
@@ -108,7 +110,7 @@ impl<'a> Object<'a> {
         let plain = |c: u8| c.is_ascii_alphanumeric() || c == b'_';
         let shown = if name.len() <= 40 && name.bytes().all(plain) { name } else { "(a member)" };
         match self.at {
-            Place::Body => shown.to_owned(),
+            ObjectPlace::Body => shown.to_owned(),
             within => format!("{within}.{shown}"),
         }
     }
@@ -298,10 +300,10 @@ struct Keys<'f, 'a> {
     max: usize,
     quirks: Quirks,
     each: &'f mut Each<'f, 'a>,
-    state: State,
+    state: KeysState,
 }
 
-enum State {
+enum KeysState {
     Absent,
     Begun,
     Failed(Error),
@@ -311,7 +313,7 @@ enum State {
 impl Keys<'_, '_> {
     /// Ends the reading; what serde_json makes of it is not looked at.
     fn fail<E: serde::de::Error>(&mut self, failure: Error) -> E {
-        self.state = State::Failed(failure);
+        self.state = KeysState::Failed(failure);
         E::custom("see the failure")
     }
 }
@@ -320,10 +322,10 @@ impl<'a> DeserializeSeed<'a> for &mut Keys<'_, 'a> {
     type Value = ();
 
     fn deserialize<D: Deserializer<'a>>(self, deserializer: D) -> Result<(), D::Error> {
-        if !matches!(self.state, State::Absent) {
+        if !matches!(self.state, KeysState::Absent) {
             return Err(self.fail(malformed("keys", "is there twice")));
         }
-        self.state = State::Begun;
+        self.state = KeysState::Begun;
         deserializer.deserialize_seq(self)
     }
 }
@@ -342,10 +344,10 @@ impl<'a> Visitor<'a> for &mut Keys<'_, 'a> {
         while count < self.wanted {
             let next = Members { found: &mut members, keys: None };
             if seq.next_element_seed(next)?.is_none() {
-                self.state = State::Counted(count);
+                self.state = KeysState::Counted(count);
                 return Ok(());
             }
-            let place = Place::Key(count);
+            let place = ObjectPlace::Key(count);
             let read = Object::new(members, place, self.quirks).and_then(|mut object| {
                 (self.each)(place, &mut object)?;
                 Ok(object.members)
@@ -361,7 +363,7 @@ impl<'a> Visitor<'a> for &mut Keys<'_, 'a> {
                 return Err(self.fail(malformed("keys", reason)));
             }
         }
-        self.state = State::Counted(count);
+        self.state = KeysState::Counted(count);
         Ok(())
     }
 }

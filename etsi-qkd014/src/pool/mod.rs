@@ -56,24 +56,24 @@ pub struct KeyPool {
 
 /// Ends the pool with its last handle.
 struct Running {
-    shared: Arc<Shared>,
+    shared: Arc<PoolShared>,
     task: AbortHandle,
 }
 
 /// What the handles and the task have in common.
-struct Shared {
+struct PoolShared {
     peer: String,
     size: Option<u32>,
     ledger: Ledger,
     started: Instant,
-    state: Mutex<State>,
+    state: Mutex<PoolState>,
     /// Wakes the task.
     changed: Notify,
     /// Wakes those that wait for a key, one for each.
     arrived: Notify,
 }
 
-struct State {
+struct PoolState {
     core: Core<Key>,
     last_failure: Option<String>,
 }
@@ -157,12 +157,12 @@ impl KeyPoolBuilder {
         }
         let runtime = Handle::try_current()
             .map_err(|e| Error::Config { setting: "KeyPool", reason: e.to_string() })?;
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(PoolShared {
             peer,
             size,
             ledger,
             started: Instant::now(),
-            state: Mutex::new(State {
+            state: Mutex::new(PoolState {
                 core: Core::new(settings, task::jitter),
                 last_failure: None,
             }),
@@ -255,13 +255,13 @@ impl KeyPool {
     }
 }
 
-impl Shared {
+impl PoolShared {
     fn now(&self) -> Duration {
         self.started.elapsed()
     }
 
     /// Nothing in the state is left half changed by a panic.
-    fn state(&self) -> MutexGuard<'_, State> {
+    fn state(&self) -> MutexGuard<'_, PoolState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -7,7 +7,7 @@ use tokio::task::JoinSet;
 use tokio::time::sleep_until;
 
 use super::core::{Ask, FailureClass, Stock};
-use super::{LedgerError, Shared};
+use super::{LedgerError, PoolShared};
 use crate::{Client, Error, Key, Status, tls};
 
 /// Sleep where nothing is to come by itself.
@@ -38,7 +38,7 @@ pub(super) fn jitter() -> u8 {
 }
 
 /// Runs until it is aborted; calls in flight end with it.
-pub(super) async fn run(client: Client, shared: Arc<Shared>) {
+pub(super) async fn run(client: Client, shared: Arc<PoolShared>) {
     let mut calls = JoinSet::new();
     loop {
         let wake_at = {
@@ -62,14 +62,14 @@ pub(super) async fn run(client: Client, shared: Arc<Shared>) {
     }
 }
 
-async fn call(client: Client, shared: Arc<Shared>, ask: Ask) -> Ended {
+async fn call(client: Client, shared: Arc<PoolShared>, ask: Ask) -> Ended {
     match ask {
         Ask::Status => Ended::Status(client.status(&shared.peer).await),
         Ask::Keys(number) => Ended::Keys(number, draw(&client, &shared, number).await),
     }
 }
 
-async fn draw(client: &Client, shared: &Shared, number: u32) -> Result<Usable, NoKeys> {
+async fn draw(client: &Client, shared: &PoolShared, number: u32) -> Result<Usable, NoKeys> {
     let mut request = client.enc_keys(&shared.peer).number(number);
     if let Some(bits) = shared.size {
         request = request.size(bits);
@@ -97,7 +97,7 @@ async fn draw(client: &Client, shared: &Shared, number: u32) -> Result<Usable, N
     Ok(Usable { keys, repeated })
 }
 
-impl Shared {
+impl PoolShared {
     fn ended(&self, ended: Ended) {
         let now = self.now();
         let mut state = self.state();

@@ -11,7 +11,7 @@ use zeroize::Zeroizing;
 
 use super::fault::Fault;
 use super::http::{Answer, Request, percent_decode};
-use super::network::{KmeState, Shared};
+use super::network::{KmeState, NetworkShared};
 use super::plan::Method;
 use super::store::{Drawn, Refusal, uuid};
 
@@ -167,7 +167,7 @@ fn present<'de, D: Deserializer<'de>>(from: D) -> Result<Option<u64>, D::Error> 
 
 /// Answers one request of the SAE named by the client's certificate.
 pub(super) fn answer(
-    shared: &Shared,
+    shared: &NetworkShared,
     kme: &KmeState,
     caller: Option<&str>,
     request: &Request,
@@ -201,7 +201,7 @@ fn bad(message: impl Into<String>) -> Answer {
 }
 
 fn route(
-    shared: &Shared,
+    shared: &NetworkShared,
     kme: &KmeState,
     caller: Option<&str>,
     request: &Request,
@@ -312,11 +312,16 @@ fn dec_query(query: &str, strict: bool) -> Result<Vec<String>, Answer> {
     }
 }
 
-fn site_of(shared: &Shared, sae: &str) -> Result<usize, Answer> {
+fn site_of(shared: &NetworkShared, sae: &str) -> Result<usize, Answer> {
     shared.site_of(sae).ok_or_else(|| bad(format!("SAE {sae:?} is not known")))
 }
 
-fn status(shared: &Shared, kme: &KmeState, caller: &str, slave: &str) -> Result<Answer, Answer> {
+fn status(
+    shared: &NetworkShared,
+    kme: &KmeState,
+    caller: &str,
+    slave: &str,
+) -> Result<Answer, Answer> {
     let target = site_of(shared, slave)?;
     let limits = &shared.limits;
     let body = json!({
@@ -337,7 +342,7 @@ fn status(shared: &Shared, kme: &KmeState, caller: &str, slave: &str) -> Result<
 }
 
 fn enc_keys(
-    shared: &Shared,
+    shared: &NetworkShared,
     kme: &KmeState,
     caller: &str,
     slave: &str,
@@ -418,7 +423,7 @@ fn mandatory(extensions: &[serde_json::Map<String, Value>]) -> Result<(), Answer
 }
 
 fn dec_keys(
-    shared: &Shared,
+    shared: &NetworkShared,
     kme: &KmeState,
     caller: &str,
     master: &str,

@@ -146,7 +146,7 @@ impl NetworkBuilder {
         }
         let pki = pki.map_or_else(|| Pki::create(&layout), Ok)?;
         let initially = initially.unwrap_or(limits.max_stored);
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(NetworkShared {
             store: Mutex::new(Store::new(rate, limits.max_stored, initially).with_witness(witness)),
             layout: layout.clone(),
             limits,
@@ -195,7 +195,7 @@ pub struct Network {
     kmes: Vec<Kme>,
     saes: Vec<Sae>,
     pki: Pki,
-    shared: Arc<Shared>,
+    shared: Arc<NetworkShared>,
 }
 
 impl Network {
@@ -388,14 +388,14 @@ pub struct Counters {
 }
 
 /// What all KMEs of a network share.
-pub(super) struct Shared {
+pub(super) struct NetworkShared {
     store: Mutex<Store>,
     layout: Layout,
     pub(super) limits: Limits,
     pub(super) strict: bool,
 }
 
-impl Shared {
+impl NetworkShared {
     pub(super) fn store(&self) -> MutexGuard<'_, Store> {
         lock(&self.store)
     }

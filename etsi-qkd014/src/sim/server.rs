@@ -17,7 +17,7 @@ use super::api;
 use super::fault::Fault;
 use super::handshake::{self, Acceptors, linger, refuse, until_gone};
 use super::http::{self, Answer, NoRequest};
-use super::network::{KmeState, Shared};
+use super::network::{KmeState, NetworkShared};
 use crate::subject;
 
 /// Open connections of one KME.
@@ -33,7 +33,7 @@ const MAX_AHEAD: usize = 64 << 10;
 pub(super) async fn serve(
     listener: TcpListener,
     acceptors: Acceptors,
-    shared: Arc<Shared>,
+    shared: Arc<NetworkShared>,
     kme: Arc<KmeState>,
 ) {
     let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
@@ -132,7 +132,7 @@ async fn connection(
     stream: TcpStream,
     acceptor: &TlsAcceptor,
     known: &AtomicBool,
-    shared: &Shared,
+    shared: &NetworkShared,
     kme: &KmeState,
 ) -> std::io::Result<()> {
     stream.set_nodelay(true)?;

@@ -287,7 +287,7 @@ mod tests {
     }
 
     #[test]
-    fn what_has_been_given_leaves_nothing_behind() {
+    fn delivered_keys_leave_no_entries() {
         let mut store = Store::new(FillRate::Unlimited, 10, 10);
         let first = store.draw(&link(0, 1), 1, 32, 1, "m", &slaves(&["s"])).unwrap();
         // More than may wait, but none of them does.

@@ -140,7 +140,7 @@ async fn heads_are_bounded() {
 }
 
 #[tokio::test]
-async fn what_is_no_http_is_in_doubt() {
+async fn answers_that_are_no_http_are_ambiguous() {
     for answer in ["hello\r\n\r\n", "HTTP/9.9 200 OK\r\n\r\n", "HTTP/1.1 2000 OK\r\n\r\n", "\0", ""]
     {
         in_doubt(answer.into(), Then::Close).await;

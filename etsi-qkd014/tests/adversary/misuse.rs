@@ -92,7 +92,7 @@ async fn times_without_end_are_no_panic() {
 }
 
 #[tokio::test]
-async fn what_could_only_cost_keys_is_not_sent() {
+async fn requests_beyond_the_limits_are_not_sent() {
     let network = network().await;
     let client = |builder: ClientBuilder| builder.retry(RetryPolicy::none()).build().unwrap();
     let plain = client(network.client_builder("sae-a"));

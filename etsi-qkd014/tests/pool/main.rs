@@ -176,7 +176,7 @@ async fn a_kme_that_is_down_and_comes_back_serves_again() {
 }
 
 #[tokio::test]
-async fn what_cannot_be_asked_for_is_refused_at_once() {
+async fn pool_refuses_invalid_requests_at_build() {
     let network = two().start().await.unwrap();
     for builder in [
         KeyPool::builder(client(&network), ".."),

@@ -112,7 +112,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn who_tells_or_hears_a_process_that_ended_is_told_so() {
+    fn a_channel_to_an_ended_process_returns_an_error() {
         let (channel, other) = Channel::pair().unwrap();
         drop(other);
         assert_eq!(channel.tell(&"go on").unwrap_err().to_string(), ENDED);

@@ -28,7 +28,7 @@ pub(crate) use measure::{Effort, Ratio, Rounds, clock_cost};
 pub(crate) use other::{Other, spawn};
 pub(crate) use pair::Pair;
 pub(crate) use progress::Progress;
-pub(crate) use raw::{Raw, Shared, Sleeps};
+pub(crate) use raw::{Raw, SharedPages, Sleeps};
 pub(crate) use serve::{now_ns, serve};
 
 /// Whatever stops a measurement.

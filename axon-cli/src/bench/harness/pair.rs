@@ -10,8 +10,8 @@ use std::{
 use super::{
     Channel, Effort, End, Error, Load, Machine, Medium, Other, Result, Rounds, Side, Wake, cpu,
     machine,
-    raw::Shared,
-    serve::{BOARD, Hello, MOST_PACED, Order, carrying, named, noted, now_ns},
+    raw::SharedPages,
+    serve::{BOARD, BenchCommand, Hello, MOST_PACED, carrying, named, noted, now_ns},
     spawn,
 };
 
@@ -26,7 +26,7 @@ pub(crate) struct Pair<'a> {
     clock: f64,
     cpu: usize,
     cpus: Vec<usize>,
-    board: Shared,
+    board: SharedPages,
     other: Other,
 }
 
@@ -53,7 +53,7 @@ impl<'a> Pair<'a> {
     ) -> Result<Self> {
         let other = spawn(arguments)?;
         let [near, far] = machine.pinned;
-        let (board, fd) = Shared::create(BOARD)?;
+        let (board, fd) = SharedPages::create(BOARD)?;
         let cpus = machine.allowed.clone();
         other.channel().hand_over(&Hello { cpu: far, cpus: cpus.clone() }, &[fd.as_fd()])?;
         Ok(Self { media, effort, clock: machine.clock_ns, cpu: near, cpus, board, other })
@@ -63,7 +63,7 @@ impl<'a> Pair<'a> {
     pub(crate) fn latency(&self, load: &Load) -> Result<Vec<Rounds>> {
         self.by_turns(load, |of, count| {
             let cold = count / 16 + 1;
-            self.channel().tell(&Order::Answer { medium: of.index, count: cold + count })?;
+            self.channel().tell(&BenchCommand::Answer { medium: of.index, count: cold + count })?;
             let mut times = Vec::with_capacity(usize::try_from(count)?);
             for _ in 0..cold {
                 of.ping()?;
@@ -86,7 +86,7 @@ impl<'a> Pair<'a> {
             let window = load.window as u64;
             // All that was sent before has been taken: the other one said that it is done.
             let taken_before = credit.load(Ordering::Acquire);
-            self.channel().tell(&Order::Take { medium: of.index, count })?;
+            self.channel().tell(&BenchCommand::Take { medium: of.index, count })?;
             // From here on the other one is awake.
             self.channel().hear::<()>()?;
             let start = Instant::now();
@@ -113,7 +113,7 @@ impl<'a> Pair<'a> {
                         let count = self.effort.paced_messages.min(MOST_PACED);
                         let credit = self.board.word(0);
                         let taken_before = credit.load(Ordering::Acquire);
-                        channel.tell(&Order::Note { medium: of.index, count })?;
+                        channel.tell(&BenchCommand::Note { medium: of.index, count })?;
                         channel.hear::<()>()?;
                         let mut sent_at = Vec::new();
                         let mut due = Instant::now();
@@ -181,7 +181,7 @@ impl<'a> Pair<'a> {
     ) -> Result<Vec<Rounds>> {
         let channel = self.channel();
         machine::unpin(&self.cpus)?;
-        channel.tell(&Order::Open(*load))?;
+        channel.tell(&BenchCommand::Open(*load))?;
         let mut all = Vec::new();
         for (index, medium) in carrying(self.media, load).into_iter().enumerate() {
             let end = medium.open(load, Side::Near, channel);
@@ -191,11 +191,11 @@ impl<'a> Pair<'a> {
         }
         machine::pin(self.cpu)?;
         if load.wake == Wake::EventOneCpu {
-            channel.tell(&Order::Move(self.cpu))?;
+            channel.tell(&BenchCommand::Move(self.cpu))?;
             channel.hear::<()>()?;
         }
         let rounds = measure(all)?;
-        channel.tell(&Order::Close)?;
+        channel.tell(&BenchCommand::Close)?;
         channel.hear::<()>()?;
         Ok(rounds)
     }

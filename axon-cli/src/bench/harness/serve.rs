@@ -8,7 +8,7 @@ use rustix::{
 };
 use serde::{Deserialize, Serialize};
 
-use super::{Channel, End, Error, Load, Medium, Result, Side, cpu, machine, raw::Shared};
+use super::{Channel, End, Error, Load, Medium, Result, Side, cpu, machine, raw::SharedPages};
 
 /// Messages of a paced turn at most: each has a word of the board.
 pub(super) const MOST_PACED: u64 = 1024;
@@ -19,7 +19,7 @@ pub(super) const BOARD: usize = 8 * (1 + MOST_PACED as usize);
 /// What the process that measures has the other one do. Each turn is answered by the processor time
 /// that it took, in seconds.
 #[derive(Serialize, Deserialize)]
-pub(super) enum Order {
+pub(super) enum BenchCommand {
     Open(Load),
     /// Send each of so many messages back.
     Answer {
@@ -65,7 +65,7 @@ pub(crate) fn serve(all: &[&dyn Medium]) -> Result<()> {
     let channel = Channel::inherited()?;
     let (Hello { cpu, cpus }, fds) = channel.take_over()?;
     let [fd] = fds.try_into().map_err(|_| "another number of descriptors")?;
-    let board = Shared::map(&fd, BOARD)?;
+    let board = SharedPages::map(&fd, BOARD)?;
     // Each with the number of the last message.
     let mut ends: Vec<(Box<dyn End>, u64)> = Vec::new();
     let mut media = Vec::new();
@@ -77,7 +77,7 @@ pub(crate) fn serve(all: &[&dyn Medium]) -> Result<()> {
         let Ok(order) = channel.hear() else { return Ok(()) };
         let before = cpu::own();
         match order {
-            Order::Open(load) => {
+            BenchCommand::Open(load) => {
                 window = load.window as u64;
                 machine::unpin(&cpus)?;
                 media = carrying(all, &load);
@@ -88,7 +88,7 @@ pub(crate) fn serve(all: &[&dyn Medium]) -> Result<()> {
                 }
                 machine::pin(cpu)?;
             }
-            Order::Answer { medium, count } => {
+            BenchCommand::Answer { medium, count } => {
                 let (end, last) = &mut ends[medium];
                 for _ in 0..count {
                     let number = next(&mut **end, last).map_err(|e| named(media[medium], e))?;
@@ -96,7 +96,7 @@ pub(crate) fn serve(all: &[&dyn Medium]) -> Result<()> {
                 }
                 channel.tell(&(cpu::own() - before))?;
             }
-            Order::Take { medium, count } => {
+            BenchCommand::Take { medium, count } => {
                 let (end, last) = &mut ends[medium];
                 let word = board.word(0);
                 let taken = word.load(Ordering::Relaxed);
@@ -110,7 +110,7 @@ pub(crate) fn serve(all: &[&dyn Medium]) -> Result<()> {
                 }
                 channel.tell(&(cpu::own() - before))?;
             }
-            Order::Note { medium, count } => {
+            BenchCommand::Note { medium, count } => {
                 let (end, last) = &mut ends[medium];
                 let word = board.word(0);
                 let taken = word.load(Ordering::Relaxed);
@@ -123,11 +123,11 @@ pub(crate) fn serve(all: &[&dyn Medium]) -> Result<()> {
                 }
                 channel.tell(&(cpu::own() - before))?;
             }
-            Order::Move(cpu) => {
+            BenchCommand::Move(cpu) => {
                 machine::pin(cpu)?;
                 channel.tell(&())?;
             }
-            Order::Close => {
+            BenchCommand::Close => {
                 ends.clear();
                 channel.tell(&())?;
             }

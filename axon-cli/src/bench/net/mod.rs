@@ -24,7 +24,7 @@ use super::{
 use crate::{
     cli,
     demo::{kmes::Kmes, mode::Mode},
-    failure::Failure,
+    failure::CliError,
 };
 
 const SIZES: [usize; 6] = [64, 1 << 10, 4 << 10, 64 << 10, 1 << 20, 4 << 20];
@@ -60,7 +60,7 @@ struct Results {
 }
 
 /// Runs `axon bench net`.
-pub(crate) fn run(args: &cli::BenchNet) -> Result<(), Failure> {
+pub(crate) fn run(args: &cli::BenchNet) -> Result<(), CliError> {
     let sizes = match (&args.sizes[..], args.quick) {
         ([], false) => &SIZES[..],
         ([], true) => &QUICK_SIZES[..],
@@ -70,7 +70,7 @@ pub(crate) fn run(args: &cli::BenchNet) -> Result<(), Failure> {
         [] => &Mode::ALL[..],
         modes => modes,
     };
-    let results = measure(sizes, modes, args.quick).map_err(Failure::failed)?;
+    let results = measure(sizes, modes, args.quick).map_err(CliError::failed)?;
     fs::create_dir_all(&args.out)?;
     fs::write(args.out.join("net.json"), report::json(&results))?;
     let mut out = io::stdout().lock();
@@ -80,13 +80,13 @@ pub(crate) fn run(args: &cli::BenchNet) -> Result<(), Failure> {
 }
 
 /// Is the process that answers.
-pub(crate) fn answer() -> Result<(), Failure> {
-    harness::serve(&media(&Sessions(None))).map_err(Failure::failed)
+pub(crate) fn answer() -> Result<(), CliError> {
+    harness::serve(&media(&Sessions(None))).map_err(CliError::failed)
 }
 
 /// Is the process that reads streams.
-pub(crate) fn read() -> Result<(), Failure> {
-    stream::attend().map_err(Failure::failed)
+pub(crate) fn read() -> Result<(), CliError> {
+    stream::attend().map_err(CliError::failed)
 }
 
 /// The raw limit first.

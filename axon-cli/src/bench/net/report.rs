@@ -10,7 +10,7 @@ use crate::{
         budgets::{self, verdict},
         harness::words,
     },
-    text::{self, Table},
+    text::{self, TextTable},
 };
 
 /// How figures are taken; in every output.
@@ -36,7 +36,7 @@ pub(super) fn text(results: &Results) -> String {
 fn latency(measured: &Measured) -> String {
     let header =
         [">size", ">bare p50", ">p99", ">AXON p50", ">p99", ">CPU: bare", ">AXON", ">ratio of p50"];
-    let mut table = Table::new(&header);
+    let mut table = TextTable::new(&header);
     for row in &measured.latency {
         let times = [&row.bare, &row.axon].map(|rounds| {
             let all = rounds.all();
@@ -77,7 +77,7 @@ fn streams(measured: &Measured) -> String {
         ">KEEP_ALL by bare",
         "at most 1.25",
     ];
-    let mut table = Table::new(&header);
+    let mut table = TextTable::new(&header);
     for row in &measured.streams {
         let rate = |streamed: &Streamed| text::grouped(streamed.per_second() as u64);
         let sent = row.overtakes.sent as f64 / row.overtakes.seconds.max(1e-9);

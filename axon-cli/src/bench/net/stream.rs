@@ -53,7 +53,7 @@ impl Streamed {
 }
 
 #[derive(Serialize, Deserialize)]
-enum Order {
+enum StreamCommand {
     Bare { size: usize, threads: Threads },
     Read { settings: Settings, topic: String, flow: Flow },
 }
@@ -72,7 +72,7 @@ impl Reader {
     /// Over bare quinn.
     pub(super) fn bare(&self, size: usize, threads: Threads, length: Duration) -> Result<Streamed> {
         let channel = self.0.channel();
-        channel.tell(&Order::Bare { size, threads })?;
+        channel.tell(&StreamCommand::Bare { size, threads })?;
         let mut end = BareEnd::open(&load(size), Side::Near, channel, threads)?;
         channel.hear::<()>()?;
         let before = cpu::own();
@@ -95,7 +95,7 @@ impl Reader {
         let [near, far] = &hosts.settings;
         let channel = self.0.channel();
         let topic = format!("/stream/{size}/{flow:?}");
-        channel.tell(&Order::Read { settings: far.clone(), topic: topic.clone(), flow })?;
+        channel.tell(&StreamCommand::Read { settings: far.clone(), topic: topic.clone(), flow })?;
         let session = session(near)?;
         let publisher = session.create_publisher(spec(&topic, flow))?;
         if !publisher.wait_matched(1, PATIENCE) {
@@ -130,14 +130,16 @@ impl Reader {
 pub(super) fn attend() -> Result<()> {
     set_parent_process_death_signal(Some(Signal::KILL))?;
     let channel = Channel::inherited()?;
-    while let Ok(order) = channel.hear::<Order>() {
+    while let Ok(order) = channel.hear::<StreamCommand>() {
         let found = match order {
-            Order::Bare { size, threads } => {
+            StreamCommand::Bare { size, threads } => {
                 let mut end = BareEnd::open(&load(size), Side::Far, &channel, threads)?;
                 channel.tell(&())?;
                 count(|| end.receive())?
             }
-            Order::Read { settings, topic, flow } => read(&channel, &settings, &topic, flow)?,
+            StreamCommand::Read { settings, topic, flow } => {
+                read(&channel, &settings, &topic, flow)?
+            }
         };
         channel.tell(&found)?;
     }

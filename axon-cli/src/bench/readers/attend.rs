@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     super::harness::{Channel, Result, agree, cpu, now_ns, qos},
-    place::Place,
+    place::ReadersMemory,
 };
 
 /// A wait ends with the message that it is for.
@@ -23,7 +23,7 @@ const LONGEST_SLEEP: Option<Duration> = Some(Duration::from_secs(1));
 
 /// What the process that measures has a reader do.
 #[derive(Serialize, Deserialize)]
-pub(super) enum Order {
+pub(super) enum ReaderCommand {
     /// Map the memory that comes with it; its number among the readers.
     Share {
         size: usize,
@@ -52,18 +52,18 @@ pub(in crate::bench) fn attend() -> Result<()> {
     let mut shared = None;
     while let Ok((order, fds)) = channel.take_over() {
         match order {
-            Order::Share { size, index } => {
+            ReaderCommand::Share { size, index } => {
                 let [fd] = fds.try_into().map_err(|_| "another number of descriptors")?;
-                shared = Some((Place::map(&fd, size)?, index, vec![0; size]));
+                shared = Some((ReadersMemory::map(&fd, size)?, index, vec![0; size]));
                 channel.tell(&())?;
             }
-            Order::Connect => {
+            ReaderCommand::Connect => {
                 let [socket] = fds.try_into().map_err(|_| "another number of descriptors")?;
                 let options = SubscriberOptions::new(qos(1)?);
                 subscribers.push(Subscriber::connect(&context, &socket, options, None)?);
                 channel.tell(&())?;
             }
-            Order::Attend { source, told, messages, after } => {
+            ReaderCommand::Attend { source, told, messages, after } => {
                 let (place, index, bytes) = shared.as_mut().ok_or("nothing is shared")?;
                 let mut subscriber = source.map(|number| &mut subscribers[number]);
                 channel.tell(&())?;
@@ -90,7 +90,7 @@ pub(in crate::bench) fn attend() -> Result<()> {
                 }
                 channel.tell(&(cpu::own() - before))?;
             }
-            Order::Drop => {
+            ReaderCommand::Drop => {
                 subscribers.clear();
                 shared = None;
                 channel.tell(&())?;

@@ -15,8 +15,8 @@ use rustix::thread::futex;
 
 pub(super) use self::attend::attend;
 use self::{
-    attend::Order,
-    place::{Place, READERS_AT_MOST},
+    attend::ReaderCommand,
+    place::{READERS_AT_MOST, ReadersMemory},
 };
 use super::harness::{
     Channel, Effort, Machine, Other, Result, Rounds, cpu, now_ns, qos, spawn, stamp,
@@ -79,9 +79,9 @@ impl<'a> ReaderProcesses<'a> {
 
     /// Measures publishes of `size` bytes: for each of [`READERS`] told and woken, raw and AXON in turns.
     pub(super) fn measure(&self, size: usize, effort: Effort) -> Result<Vec<Cost>> {
-        let (place, fd) = Place::create(size)?;
+        let (place, fd) = ReadersMemory::create(size)?;
         for (index, reader) in self.readers.iter().enumerate() {
-            reader.channel().hand_over(&Order::Share { size, index }, &[fd.as_fd()])?;
+            reader.channel().hand_over(&ReaderCommand::Share { size, index }, &[fd.as_fd()])?;
             reader.channel().hear::<()>()?;
         }
         let context = Context::new()?;
@@ -91,7 +91,7 @@ impl<'a> ReaderProcesses<'a> {
             let publisher = Publisher::new(&context, options)?;
             for reader in &self.readers[..readers] {
                 let (ours, theirs) = Channel::pair()?;
-                reader.channel().hand_over(&Order::Connect, &[theirs.as_fd()])?;
+                reader.channel().hand_over(&ReaderCommand::Connect, &[theirs.as_fd()])?;
                 publisher.serve(&ours, None)?;
                 reader.channel().hear::<()>()?;
             }
@@ -124,7 +124,7 @@ impl<'a> ReaderProcesses<'a> {
             }
         }
         for reader in &self.readers {
-            reader.channel().tell(&Order::Drop)?;
+            reader.channel().tell(&ReaderCommand::Drop)?;
             reader.channel().hear::<()>()?;
         }
         Ok(costs)
@@ -141,7 +141,7 @@ struct Turn {
 
 struct Turns<'a> {
     processes: &'a ReaderProcesses<'a>,
-    place: Place,
+    place: ReadersMemory,
     bytes: Vec<u8>,
     /// By all media together.
     published: u32,
@@ -160,7 +160,7 @@ impl Turns<'_> {
         for (index, reader) in readers.iter().enumerate() {
             // A reader subscribes to those publishers only that have so many.
             let absent = READERS.iter().filter(|count| **count <= index).count();
-            reader.channel().tell(&Order::Attend {
+            reader.channel().tell(&ReaderCommand::Attend {
                 source: source.map(|(at, _)| at - absent),
                 told: until == Until::Told,
                 messages,

@@ -5,7 +5,7 @@ use std::{
     sync::atomic::{AtomicU32, AtomicU64},
 };
 
-use super::super::harness::{Result, Shared};
+use super::super::harness::{Result, SharedPages};
 
 /// Readers of which each has words of its own.
 pub(super) const READERS_AT_MOST: usize = 16;
@@ -16,17 +16,17 @@ const TOLD: usize = APART;
 const READ: usize = 2 * APART;
 const PAYLOAD: usize = 8192;
 
-pub(super) struct Place(Shared);
+pub(super) struct ReadersMemory(SharedPages);
 
-impl Place {
+impl ReadersMemory {
     /// New, for messages of `size` bytes, and the descriptor by which readers map it.
     pub(super) fn create(size: usize) -> Result<(Self, OwnedFd)> {
-        let (memory, fd) = Shared::create(PAYLOAD + size)?;
+        let (memory, fd) = SharedPages::create(PAYLOAD + size)?;
         Ok((Self(memory), fd))
     }
 
     pub(super) fn map(fd: &OwnedFd, size: usize) -> Result<Self> {
-        Ok(Self(Shared::map(fd, PAYLOAD + size)?))
+        Ok(Self(SharedPages::map(fd, PAYLOAD + size)?))
     }
 
     /// The number of the raw limit's last message, a futex.

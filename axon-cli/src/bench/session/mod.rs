@@ -11,13 +11,13 @@ use std::{
 
 use self::{
     medium::{Service, Sessions},
-    place::Place,
+    place::BenchHost,
 };
 use super::{
     harness::{self, Axon, Load, Medium, Motion, Pair, Progress, Rounds, Wake, words},
     run::Run,
 };
-use crate::{cli, failure::Failure};
+use crate::{cli, failure::CliError};
 
 const SIZES: [usize; 7] = [64, 1 << 10, 4 << 10, 64 << 10, 256 << 10, 1 << 20, 4 << 20];
 const QUICK_SIZES: [usize; 2] = [64, 64 << 10];
@@ -51,13 +51,13 @@ struct Results {
 }
 
 /// Runs `axon bench session`.
-pub(crate) fn run(args: &cli::BenchSession) -> Result<(), Failure> {
+pub(crate) fn run(args: &cli::BenchSession) -> Result<(), CliError> {
     let sizes = match (&args.sizes[..], args.quick) {
         ([], false) => &SIZES[..],
         ([], true) => &QUICK_SIZES[..],
         (sizes, _) => sizes,
     };
-    let results = measure(sizes, args.quick).map_err(Failure::failed)?;
+    let results = measure(sizes, args.quick).map_err(CliError::failed)?;
     fs::create_dir_all(&args.out)?;
     fs::write(args.out.join("session.json"), report::json(&results))?;
     let mut out = io::stdout().lock();
@@ -67,8 +67,8 @@ pub(crate) fn run(args: &cli::BenchSession) -> Result<(), Failure> {
 }
 
 /// Is the process that answers.
-pub(crate) fn answer() -> Result<(), Failure> {
-    harness::serve(&media(&Sessions(None), &Service(None))).map_err(Failure::failed)
+pub(crate) fn answer() -> Result<(), CliError> {
+    harness::serve(&media(&Sessions(None), &Service(None))).map_err(CliError::failed)
 }
 
 /// Bare shared memory first.
@@ -78,7 +78,7 @@ fn media<'a>(sessions: &'a Sessions, service: &'a Service) -> [&'a dyn Medium; 3
 
 fn measure(sizes: &[usize], quick: bool) -> harness::Result<Results> {
     let run = Run::start(quick)?;
-    let place = Place::start()?;
+    let place = BenchHost::start()?;
     let hosts = Some([place.settings(), place.settings()]);
     let (sessions, service) = (Sessions(hosts.clone()), Service(hosts));
     let media = media(&sessions, &service);

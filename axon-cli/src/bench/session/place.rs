@@ -23,13 +23,13 @@ pub(in crate::bench) const PATIENCE: Duration = Duration::from_secs(60);
 pub(in crate::bench) type Settings = Vec<(String, String)>;
 
 /// A host of the measurement's own: nobody else's daemon takes part.
-pub(super) struct Place {
+pub(super) struct BenchHost {
     _dir: tempfile::TempDir,
     settings: Settings,
     daemon: Child,
 }
 
-impl Place {
+impl BenchHost {
     pub(super) fn start() -> Result<Self> {
         let dir = tempfile::tempdir()?;
         let mut command = Command::new(env::current_exe()?);
@@ -65,7 +65,7 @@ impl Place {
     }
 }
 
-impl Drop for Place {
+impl Drop for BenchHost {
     fn drop(&mut self) {
         let _ = self.daemon.kill();
         let _ = self.daemon.wait();

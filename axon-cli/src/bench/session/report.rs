@@ -10,7 +10,7 @@ use crate::{
         budgets::verdict,
         harness::{Rounds, words},
     },
-    text::{self, Table},
+    text::{self, TextTable},
 };
 
 /// How figures are taken from rounds; in every output.
@@ -58,7 +58,7 @@ fn judged((ratio, budget): Judged) -> [String; 3] {
 }
 
 fn stream_table(rows: Vec<&Compared>) -> String {
-    let mut table = Table::new(&[
+    let mut table = TextTable::new(&[
         ">size",
         ">bare messages/s",
         ">session",
@@ -85,7 +85,7 @@ fn latency_table(rows: Vec<&Compared>) -> String {
     if rows.iter().any(|row| row.service.is_some()) {
         header.extend([">service", ">by session", ">budget", ""]);
     }
-    let mut table = Table::new(&header);
+    let mut table = TextTable::new(&header);
     for row in rows {
         let mut cells = vec![words::size(row.load.size)];
         let both = [&row.bare, &row.session];

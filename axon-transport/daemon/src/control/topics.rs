@@ -285,7 +285,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_others_count_is_summed_up_whatever_it_is_and_the_worst_are_listed() {
+    fn topic_sums_saturate_and_list_the_worst_endpoints() {
         let mut topic = TopicStatus::default();
         for number in 0..100 {
             let mut reader = ReaderStatus { lost: u64::MAX, ..ReaderStatus::default() };

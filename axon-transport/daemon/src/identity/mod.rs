@@ -19,7 +19,7 @@ use axon_transport::config::{ClassicAuth, ClassicConfig};
 
 use self::{
     load::Sources,
-    watch::{Look, Watch},
+    watch::{FilesChange, Watch},
 };
 use crate::error::GatewayError;
 
@@ -86,13 +86,13 @@ impl Identity {
     pub(crate) fn look(&self, now: Instant) -> bool {
         let mut watch = lock(&self.watch);
         match watch.look(now) {
-            Look::Same | Look::Changing => false,
-            Look::Restless => self.close(
+            FilesChange::Same | FilesChange::Changing => false,
+            FilesChange::Restless => self.close(
                 "the files of this host's identity keep changing, and are not used until they \
                  stand still"
                     .into(),
             ),
-            Look::Changed => {
+            FilesChange::Changed => {
                 let before = self.auth();
                 let loaded = self.sources.load(Some(&before)).and_then(|loaded| {
                     self.sources.still_names(loaded.auth(), &self.host).map(|()| loaded)

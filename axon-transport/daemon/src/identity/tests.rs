@@ -35,9 +35,9 @@ fn key() -> zeroize::Zeroizing<String> {
 }
 
 fn config(dir: &Path) -> ClassicConfig {
-    let auth = ClassicAuth::Pinned;
-    let [key, trust] = ["key", "trust"].map(|name| Some(dir.join(name)));
-    ClassicConfig { auth, key, trust, ca: None, cert: None, crl: None }
+    let mut config = ClassicConfig::new(ClassicAuth::Pinned);
+    [config.key, config.trust] = ["key", "trust"].map(|name| Some(dir.join(name)));
+    config
 }
 
 impl Host {
@@ -140,7 +140,7 @@ fn a_file_that_is_gone_lets_nobody_new_in_and_keeps_who_is_there() {
 }
 
 #[test]
-fn what_cannot_be_used_is_named_with_its_line() {
+fn trust_file_errors_name_the_line() {
     let mut host = Host::new(line(1));
     let trust = host.file("trust");
     let garbage = [line(1), "arm-2 spki-sha256:AAAA\n".into()].concat();
@@ -163,7 +163,7 @@ fn what_cannot_be_used_is_named_with_its_line() {
 }
 
 #[test]
-fn what_everybody_may_write_or_is_no_file_is_not_read() {
+fn world_writable_and_irregular_trust_files_are_refused() {
     let mut host = Host::new(line(1));
     let trust = host.file("trust");
     write(&trust, line(2), 0o646);
@@ -202,7 +202,7 @@ fn a_file_is_not_read_while_it_is_written() {
 }
 
 #[test]
-fn who_never_stops_writing_is_not_waited_for() {
+fn a_trust_file_that_keeps_changing_closes_the_identity() {
     let mut host = Host::new(line(1));
     let trust = host.file("trust");
     let mut closed = None;
@@ -275,15 +275,7 @@ fn a_file_that_cannot_be_used_at_the_start_is_named() {
 
 #[test]
 fn without_files_there_is_nothing_to_look_at() {
-    let none = ClassicConfig {
-        auth: ClassicAuth::None,
-        key: None,
-        trust: None,
-        ca: None,
-        cert: None,
-        crl: None,
-    };
-    let identity = Identity::load(&none, "node").unwrap();
+    let identity = Identity::load(&ClassicConfig::new(ClassicAuth::None), "node").unwrap();
     assert!(!identity.has_files());
     assert!(!identity.look(Instant::now()));
 }

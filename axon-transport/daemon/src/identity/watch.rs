@@ -9,7 +9,7 @@ const LONGEST_WRITE: Duration = Duration::from_secs(5);
 
 /// What a look at the files says.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) enum Look {
+pub(super) enum FilesChange {
     /// They are as they were read.
     Same,
     /// One is being written.
@@ -48,24 +48,24 @@ impl Watch {
 
     /// Looks, at least some time after the last look: two writes in one tick of the file system's
     /// clock leave one and the same stamp.
-    pub(super) fn look(&mut self, now: Instant) -> Look {
+    pub(super) fn look(&mut self, now: Instant) -> FilesChange {
         let seen = self.stamps();
         if self.read.as_ref() == Some(&seen) {
             self.seen = seen;
             self.restless_since = None;
-            return Look::Same;
+            return FilesChange::Same;
         }
         if seen == self.seen {
-            return Look::Changed;
+            return FilesChange::Changed;
         }
         self.seen = seen;
         if now.duration_since(*self.restless_since.get_or_insert(now)) < LONGEST_WRITE {
-            return Look::Changing;
+            return FilesChange::Changing;
         }
         // Whatever they become, they are to be read then.
         self.read = None;
         self.restless_since = Some(now);
-        Look::Restless
+        FilesChange::Restless
     }
 
     /// They were read after a look said `Changed`. Whether they stayed the same meanwhile: if not,

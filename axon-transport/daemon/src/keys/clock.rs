@@ -10,10 +10,10 @@ use std::{
 
 /// Monotonic time since it was made. Clones show the same time.
 #[derive(Clone, Debug)]
-pub struct Clock(Source);
+pub struct Clock(ClockSource);
 
 #[derive(Clone, Debug)]
-enum Source {
+enum ClockSource {
     Monotonic(Instant),
     /// Nanoseconds.
     Manual(Arc<AtomicU64>),
@@ -22,25 +22,25 @@ enum Source {
 impl Clock {
     /// The system's monotonic clock, zero now.
     pub fn start() -> Self {
-        Self(Source::Monotonic(Instant::now()))
+        Self(ClockSource::Monotonic(Instant::now()))
     }
 
     /// A clock for tests, zero until [`advance`](Self::advance)d.
     pub fn manual() -> Self {
-        Self(Source::Manual(Arc::default()))
+        Self(ClockSource::Manual(Arc::default()))
     }
 
     /// Time since the start.
     pub fn now(&self) -> Duration {
         match &self.0 {
-            Source::Monotonic(start) => start.elapsed(),
-            Source::Manual(nanos) => Duration::from_nanos(nanos.load(Ordering::Relaxed)),
+            ClockSource::Monotonic(start) => start.elapsed(),
+            ClockSource::Manual(nanos) => Duration::from_nanos(nanos.load(Ordering::Relaxed)),
         }
     }
 
     /// Moves a [`manual`](Self::manual) clock; the system's goes by itself.
     pub fn advance(&self, by: Duration) {
-        if let Source::Manual(nanos) = &self.0 {
+        if let ClockSource::Manual(nanos) = &self.0 {
             nanos.fetch_add(by.as_nanos().try_into().unwrap_or(u64::MAX), Ordering::Relaxed);
         }
     }

@@ -38,7 +38,7 @@ struct Batch {
 }
 
 /// How one key_ID ended.
-pub(super) type Outcome = (KeyId, Result<KmeKey, Failure>);
+pub(super) type FetchOutcome = (KeyId, Result<KmeKey, Failure>);
 
 impl Fetches {
     pub(super) fn new(master: &str, purpose: Purpose) -> Self {
@@ -67,7 +67,7 @@ impl Fetches {
     }
 
     /// What became of the keys that `answer` settles; none where they are asked for again.
-    pub(super) fn handle_answer(&mut self, now: Duration, answer: Answer) -> Vec<Outcome> {
+    pub(super) fn handle_answer(&mut self, now: Duration, answer: Answer) -> Vec<FetchOutcome> {
         let Request::Dec { key_ids, .. } = answer.request else { return Vec::new() };
         let Some(i) = self.in_flight.iter().position(|b| b.key_ids == key_ids) else {
             return Vec::new();
@@ -120,7 +120,7 @@ impl Fetches {
 }
 
 /// Each key_ID with its own key, whatever else the answer holds.
-fn given(asked: Vec<KeyId>, mut keys: Vec<(KeyId, KmeKey)>) -> Vec<Outcome> {
+fn given(asked: Vec<KeyId>, mut keys: Vec<(KeyId, KmeKey)>) -> Vec<FetchOutcome> {
     let outcome = |key_id: KeyId| match keys.iter().position(|(id, _)| *id == key_id) {
         Some(i) => (key_id, Ok(keys.swap_remove(i).1)),
         None => (key_id, Err(invalid("the KME's answer does not hold it"))),
@@ -128,7 +128,7 @@ fn given(asked: Vec<KeyId>, mut keys: Vec<(KeyId, KmeKey)>) -> Vec<Outcome> {
     asked.into_iter().map(outcome).collect()
 }
 
-fn failed(key_ids: Vec<KeyId>, failure: Failure) -> Vec<Outcome> {
+fn failed(key_ids: Vec<KeyId>, failure: Failure) -> Vec<FetchOutcome> {
     key_ids.into_iter().map(|key_id| (key_id, Err(failure.clone()))).collect()
 }
 

@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_used_is_known_to_the_next_daemon() {
+    fn used_keys_outlast_the_daemon() {
         let dir = tempfile::tempdir().unwrap();
         let first = UsedKeys::open(Some(dir.path()), 7);
         assert_eq!(first.record(&ids(&["a", "b", "A"])), [true, true, false]);
@@ -230,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn what_came_while_the_file_could_not_be_had_is_written_later() {
+    fn used_keys_are_written_once_the_file_is_free() {
         let dir = tempfile::tempdir().unwrap();
         let old = UsedKeys::open(Some(dir.path()), 0);
         old.record(&ids(&["a"]));

@@ -25,7 +25,7 @@ pub struct OutOfOrder {
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Step {
+enum OrderStep {
     Hello,
     /// qkd: the client's name is being proven.
     Proof,
@@ -40,39 +40,39 @@ pub struct Order {
     qkd: bool,
     /// Whether the peer is the one that elects.
     peer_elects: bool,
-    step: Step,
+    step: OrderStep,
     hello_seen: bool,
 }
 
 impl Order {
     /// The order for a fresh connection, in qkd or classic.
     pub fn new(side: Side, qkd: bool) -> Self {
-        Self { side, qkd, peer_elects: false, step: Step::Hello, hello_seen: false }
+        Self { side, qkd, peer_elects: false, step: OrderStep::Hello, hello_seen: false }
     }
 
     /// The peer's HELLO was checked; `peer_elects` when its daemon id is the lower one.
     pub fn hello_checked(&mut self, peer_elects: bool) {
         self.peer_elects = peer_elects;
-        self.step = if self.qkd { Step::Proof } else { Step::Election };
+        self.step = if self.qkd { OrderStep::Proof } else { OrderStep::Election };
     }
 
     /// Server: READY with the right proof came. Client: it sent READY.
     pub fn proven(&mut self) {
-        if self.step == Step::Proof {
-            self.step = Step::Election;
+        if self.step == OrderStep::Proof {
+            self.step = OrderStep::Election;
         }
     }
 
     /// This side elected the connection, or the peer's ELECTED was accepted.
     pub fn elected(&mut self) {
-        if self.step == Step::Election {
-            self.step = Step::Open;
+        if self.step == OrderStep::Election {
+            self.step = OrderStep::Open;
         }
     }
 
     /// Whether the link is open for graph, routes and data.
     pub fn is_open(&self) -> bool {
-        self.step == Step::Open
+        self.step == OrderStep::Open
     }
 
     /// Whether `message` may come now.
@@ -81,29 +81,30 @@ impl Order {
     /// [`OutOfOrder`]; the connection is then closed.
     pub fn accept(&mut self, message: &Message) -> Result<(), OutOfOrder> {
         let allowed = match (message, self.step) {
-            (Message::Hello(_), Step::Hello) => !std::mem::replace(&mut self.hello_seen, true),
+            (Message::Hello(_), OrderStep::Hello) => !std::mem::replace(&mut self.hello_seen, true),
             (Message::Hello(_), _) => false,
             // The server announces the key that proves the client's name.
-            (Message::Keys(KeyMessage::Announce(_)), Step::Proof) => self.side == Side::Client,
-            (Message::Keys(KeyMessage::Ready { .. } | KeyMessage::Failed { .. }), Step::Proof) => {
-                self.side == Side::Server
-            }
-            (Message::Elected(_), Step::Election) => self.peer_elects,
-            (Message::Keepalive, step) => step != Step::Hello,
+            (Message::Keys(KeyMessage::Announce(_)), OrderStep::Proof) => self.side == Side::Client,
+            (
+                Message::Keys(KeyMessage::Ready { .. } | KeyMessage::Failed { .. }),
+                OrderStep::Proof,
+            ) => self.side == Side::Server,
+            (Message::Elected(_), OrderStep::Election) => self.peer_elects,
+            (Message::Keepalive, step) => step != OrderStep::Hello,
             // Key announcements exist in qkd alone.
-            (Message::Keys(_), Step::Open) => self.qkd,
-            (Message::Elected(_), Step::Open) => false,
-            (_, Step::Open) => true,
+            (Message::Keys(_), OrderStep::Open) => self.qkd,
+            (Message::Elected(_), OrderStep::Open) => false,
+            (_, OrderStep::Open) => true,
             _ => false,
         };
         if allowed {
             return Ok(());
         }
         let when = match self.step {
-            Step::Hello => "before HELLO",
-            Step::Proof => "before the client's name is proven",
-            Step::Election => "before the link is elected",
-            Step::Open => "on an open link",
+            OrderStep::Hello => "before HELLO",
+            OrderStep::Proof => "before the client's name is proven",
+            OrderStep::Election => "before the link is elected",
+            OrderStep::Open => "on an open link",
         };
         Err(OutOfOrder { message: message.name(), when })
     }

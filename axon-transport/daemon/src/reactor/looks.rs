@@ -19,7 +19,7 @@ const PAUSE: (u32, u32) = (64, 4096);
 
 /// What the reactor does after a pass.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Look {
+pub(super) enum PollDecision {
     /// It sleeps.
     Not,
     /// It looks for so long, and then sleeps.
@@ -52,15 +52,15 @@ impl Looks {
     }
 
     /// What to do after a pass, which had work if it was `busy`.
-    pub(super) fn after_pass(&mut self, busy: bool) -> Look {
+    pub(super) fn after_pass(&mut self, busy: bool) -> PollDecision {
         match self.poll {
-            LinkPoll::Always => Look::On,
-            LinkPoll::Adaptive if busy && self.skipped == 0 => Look::For(LOOK),
+            LinkPoll::Always => PollDecision::On,
+            LinkPoll::Adaptive if busy && self.skipped == 0 => PollDecision::For(LOOK),
             LinkPoll::Adaptive => {
                 self.skipped = self.skipped.saturating_sub(u32::from(busy));
-                Look::Not
+                PollDecision::Not
             }
-            LinkPoll::Never => Look::Not,
+            LinkPoll::Never => PollDecision::Not,
         }
     }
 
@@ -90,7 +90,7 @@ mod tests {
     fn looks(looks: &mut Looks, passes: u32, comes: impl Fn(u32) -> bool) -> u32 {
         let mut made = 0;
         for pass in 0..passes {
-            if looks.after_pass(true) != Look::Not {
+            if looks.after_pass(true) != PollDecision::Not {
                 made += 1;
                 looks.handle_look(comes(pass));
             }
@@ -120,11 +120,11 @@ mod tests {
     #[test]
     fn a_pass_without_work_is_not_followed_by_a_look() {
         let mut adaptive = Looks::new(LinkPoll::Adaptive, 2);
-        assert_eq!(adaptive.after_pass(false), Look::Not);
-        assert_eq!(adaptive.after_pass(true), Look::For(LOOK));
+        assert_eq!(adaptive.after_pass(false), PollDecision::Not);
+        assert_eq!(adaptive.after_pass(true), PollDecision::For(LOOK));
         // Nor does it shorten a pause.
         looks(&mut adaptive, 13, |_| false);
-        assert!((0..1_000).all(|_| adaptive.after_pass(false) == Look::Not));
+        assert!((0..1_000).all(|_| adaptive.after_pass(false) == PollDecision::Not));
         assert_eq!(looks(&mut adaptive, PAUSE.0, |_| true), 0);
         assert_eq!(looks(&mut adaptive, 1, |_| true), 1);
     }
@@ -133,9 +133,9 @@ mod tests {
     fn always_and_never_are_what_they_say_and_one_processor_is_left_to_the_others() {
         for busy in [false, true] {
             let after = |poll, processors| Looks::new(poll, processors).after_pass(busy);
-            assert_eq!(after(LinkPoll::Always, 1), Look::On);
-            assert_eq!(after(LinkPoll::Never, 64), Look::Not);
-            assert_eq!(after(LinkPoll::Adaptive, 1), Look::Not);
+            assert_eq!(after(LinkPoll::Always, 1), PollDecision::On);
+            assert_eq!(after(LinkPoll::Never, 64), PollDecision::Not);
+            assert_eq!(after(LinkPoll::Adaptive, 1), PollDecision::Not);
         }
     }
 }

@@ -4,6 +4,7 @@
 //! and carries out its effects. The KME client has a thread of its own, and files are read and written on others.
 
 mod bind;
+mod control_outbox;
 mod finishing;
 mod inputs;
 mod key_reports;
@@ -15,7 +16,6 @@ mod rings;
 mod session;
 mod sockets;
 mod timer;
-mod told;
 
 pub(crate) use self::bind::bind_daemon;
 

@@ -19,15 +19,15 @@ use tokio::{
 };
 
 use super::{
+    control_outbox::ControlOutbox,
     finishing::Finishing,
     inputs::{Done, Input, Inputs},
     key_reports::KeyReports,
-    looks::{Look, Looks},
+    looks::{Looks, PollDecision},
     rings::ShmRings,
     session::{Notices, local_graph},
     sockets::{Datagram, Sockets},
     timer::Timer,
-    told::Told,
 };
 use crate::{
     bridge::{ToControl, ToGateway},
@@ -74,7 +74,7 @@ pub(super) struct Reactor {
     rings: Rc<ShmRings>,
     session: Session,
     notices: Arc<Notices>,
-    told: Told,
+    told: ControlOutbox,
     inputs: Inputs,
     kme: Option<(Kme, UsedKeys)>,
     /// Answers that the KME client gave at once.
@@ -109,7 +109,7 @@ impl Reactor {
             rings: parts.rings,
             session: parts.session,
             notices: parts.notices,
-            told: Told::new(parts.control),
+            told: ControlOutbox::new(parts.control),
             inputs,
             kme: parts.kme,
             answers: Vec::new(),
@@ -331,9 +331,11 @@ impl Reactor {
             return;
         }
         let end = match self.looks.after_pass(busy) {
-            Look::Not => return self.wait_until(until).await,
-            Look::For(time) => Some(until.map_or(now + time, |until| until.min(now + time))),
-            Look::On => until,
+            PollDecision::Not => return self.wait_until(until).await,
+            PollDecision::For(time) => {
+                Some(until.map_or(now + time, |until| until.min(now + time)))
+            }
+            PollDecision::On => until,
         };
         let found = self.look_until(end).await;
         self.looks.handle_look(found);

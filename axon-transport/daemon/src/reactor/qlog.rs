@@ -31,7 +31,7 @@ const QUEUE: usize = 256;
 /// Names of files begin and end with these.
 const NAME: (&str, &str) = ("axon-", ".sqlog");
 
-enum Order {
+enum QlogOrder {
     /// Open a file of this name for a connection.
     Open(u64, String),
     /// Append whole records.
@@ -42,7 +42,7 @@ enum Order {
 
 /// The files of one daemon.
 pub(super) struct QlogFiles {
-    orders: SyncSender<Order>,
+    orders: SyncSender<QlogOrder>,
     daemon: DaemonId,
     next: Cell<u64>,
 }
@@ -86,7 +86,7 @@ impl Qlogs for QlogFiles {
         // The oldest is the first in the order of names.
         let (begin, end) = NAME;
         let name = format!("{begin}{:014}-{daemon}-{number:08}-{role}{end}", unix_ms());
-        self.orders.try_send(Order::Open(number, name)).ok()?;
+        self.orders.try_send(QlogOrder::Open(number, name)).ok()?;
         Some(Box::new(Writer::new(number, self.orders.clone())))
     }
 }
@@ -94,7 +94,7 @@ impl Qlogs for QlogFiles {
 /// Collects the events of one connection.
 struct Writer {
     number: u64,
-    orders: SyncSender<Order>,
+    orders: SyncSender<QlogOrder>,
     buffer: Vec<u8>,
     /// Bytes of `buffer` that are whole records.
     whole: usize,
@@ -104,7 +104,7 @@ struct Writer {
 }
 
 impl Writer {
-    fn new(number: u64, orders: SyncSender<Order>) -> Self {
+    fn new(number: u64, orders: SyncSender<QlogOrder>) -> Self {
         Self { number, orders, buffer: Vec::new(), whole: 0, left: LONGEST, is_over: false }
     }
 
@@ -115,7 +115,7 @@ impl Writer {
         let rest = self.buffer.split_off(self.whole);
         let records = std::mem::replace(&mut self.buffer, rest);
         self.left -= std::mem::take(&mut self.whole);
-        self.is_over = self.orders.try_send(Order::Write(self.number, records)).is_err();
+        self.is_over = self.orders.try_send(QlogOrder::Write(self.number, records)).is_err();
     }
 }
 
@@ -150,7 +150,7 @@ impl Drop for Writer {
     fn drop(&mut self) {
         self.hand_on();
         // If the queue is full, the file closes for a later one.
-        let _ = self.orders.try_send(Order::Close(self.number));
+        let _ = self.orders.try_send(QlogOrder::Close(self.number));
     }
 }
 
@@ -168,11 +168,11 @@ impl Disk {
         Self { directory: directory.to_owned(), open: BTreeMap::new(), is_said: false }
     }
 
-    fn carry_out(&mut self, order: Order) {
+    fn carry_out(&mut self, order: QlogOrder) {
         let result = match order {
-            Order::Open(number, name) => self.open(number, &name),
-            Order::Write(number, records) => self.write(number, &records),
-            Order::Close(number) => {
+            QlogOrder::Open(number, name) => self.open(number, &name),
+            QlogOrder::Write(number, records) => self.write(number, &records),
+            QlogOrder::Close(number) => {
                 self.open.remove(&number);
                 Ok(())
             }
@@ -274,7 +274,7 @@ mod tests {
         (0..2 * LONGEST / record.len()).for_each(|_| writer.write_all(&record).unwrap());
         drop(writer);
         let written = taken.iter().map(|order| match order {
-            Order::Write(1, records) => records.len(),
+            QlogOrder::Write(1, records) => records.len(),
             _ => 0,
         });
         assert_eq!(written.sum::<usize>(), LONGEST / record.len() * record.len());
@@ -310,15 +310,15 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let mut disk = Disk::new(dir.path());
         let name = |number: u64| format!("{}{number:014}{}", NAME.0, NAME.1);
-        disk.carry_out(Order::Open(0, name(0)));
+        disk.carry_out(QlogOrder::Open(0, name(0)));
         for number in 1..2 * MOST as u64 {
-            disk.carry_out(Order::Open(number, name(number)));
-            disk.carry_out(Order::Close(number));
+            disk.carry_out(QlogOrder::Open(number, name(number)));
+            disk.carry_out(QlogOrder::Close(number));
         }
         assert!(names(dir.path()).contains(&name(0)));
         assert_eq!(names(dir.path()).len(), MOST);
         for number in 200..300 {
-            disk.carry_out(Order::Open(number, name(number)));
+            disk.carry_out(QlogOrder::Open(number, name(number)));
         }
         assert_eq!((disk.open.len(), names(dir.path()).len()), (MOST, MOST));
         assert!(disk.is_said && disk.open.contains_key(&0));
@@ -338,9 +338,9 @@ mod tests {
         let mut disk = Disk::new(dir.path());
         let full = OpenOptions::new().write(true).open("/dev/full").unwrap();
         disk.open.insert(1, ("full".to_owned(), full));
-        disk.carry_out(Order::Write(1, b"a record\n".to_vec()));
+        disk.carry_out(QlogOrder::Write(1, b"a record\n".to_vec()));
         assert!(disk.is_said && disk.open.is_empty(), "it is given up");
-        disk.carry_out(Order::Write(1, b"a record\n".to_vec()));
+        disk.carry_out(QlogOrder::Write(1, b"a record\n".to_vec()));
     }
 
     #[test]

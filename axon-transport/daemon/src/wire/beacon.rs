@@ -353,7 +353,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_datagram_is_refused_with_its_reason() {
+    fn invalid_datagrams_are_refused_with_a_reason() {
         let good = Datagram::Beacon(example()).encode();
         for cut in 0..good.len() {
             assert!(Datagram::decode(&good[..cut]).is_err(), "cut at {cut}");

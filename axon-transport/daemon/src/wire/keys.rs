@@ -338,7 +338,7 @@ mod tests {
         }
 
         #[test]
-        fn what_was_written_is_read(
+        fn key_messages_survive_a_round_trip(
             name in "[!-~]{1,128}", proof: [u8; 32], reason in "[a-z ]{0,128}",
             used in 0u16..1024, n in 1usize..17,
         ) {

@@ -142,7 +142,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 24, ..ProptestConfig::default() })]
 
     #[test]
-    fn whatever_comes_and_goes_the_statuses_say_so(
+    fn event_statuses_match_the_model(
         steps in prop::collection::vec(step(), 1..24),
     ) {
         let session = alone();

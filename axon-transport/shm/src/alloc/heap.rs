@@ -191,8 +191,8 @@ impl Heap {
         Ok(Part::new(segments.open(SegmentKind::Heap, bytes)?))
     }
 
-    /// Memory for a lane, which is always in the first segment: who is asked by a reader there has
-    /// no other yet.
+    /// Memory for a lane, always in the first segment. A reader's first request arrives there, before other
+    /// segments are mapped.
     pub(crate) fn allocate_lane(&self) -> Result<Object, ShmError> {
         let object = self.parts()[0].allocate_below(layout::SESSION_BYTES, layout::LANE)?;
         // As for `allocate`: another object may have been there.
@@ -284,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn what_fits_nowhere_is_refused() {
+    fn heap_refuses_an_allocation_beyond_its_limit() {
         let (segments, heap) = heap();
         let error = heap.allocate(&segments, HEAP_BYTES_MAX, Need::Now, |_| true).err();
         assert!(matches!(error, Some(ShmError::NoMemory { .. })), "{error:?}");

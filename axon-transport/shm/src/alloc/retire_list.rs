@@ -5,14 +5,14 @@ use std::ops::Range;
 
 use crate::{alloc::slots::Slots, ring::layout::Location};
 
-/// Which store has which bytes of which segments. One store at a time takes samples in; those that
-/// have been left are [vacated](Self::vacated) once the last of theirs has gone.
+/// Retired samples by segment. One store at a time takes new samples. A store that was left is
+/// [vacated](Self::vacated) once its last sample has been released.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct RetireList {
-    /// The one that takes samples in is the last of them.
+    /// The last one takes new samples, unless it was left.
     stores: Vec<Store>,
     retired: Vec<Retired>,
-    /// Places that were handed out and not published yet.
+    /// Loans that were not published yet.
     loans: u32,
 }
 
@@ -33,23 +33,23 @@ struct Retired {
 }
 
 impl RetireList {
-    /// The segment of this number, of which `range` is for samples, takes them in from now on.
+    /// Makes the segment of this number take new samples, in `range`.
     pub(crate) fn open(&mut self, number: u32, range: Range<u64>) {
         self.leave();
         self.stores.push(Store { number, slots: Slots::new(range, 16), left: false });
     }
 
-    /// No segment takes samples in, until another is opened.
+    /// Makes all segments refuse new samples until another one is opened.
     pub(crate) fn leave(&mut self) {
         self.stores.iter_mut().for_each(|store| store.left = true);
     }
 
-    /// The slots of the segment where something was lent.
+    /// The slots of the segment at a loan's location.
     pub(crate) fn slots(&mut self, at: Location) -> &mut Slots {
         slots(&mut self.stores, at)
     }
 
-    /// Bytes in use of the segment that takes samples in, and bytes that are backed by memory.
+    /// Bytes in use, and bytes backed by memory, of the segment that takes new samples.
     pub(crate) fn extent(&self) -> Option<(u64, u64)> {
         let store = self.stores.last().filter(|store| !store.left)?;
         Some((store.slots.used(), store.slots.backed()))
@@ -60,7 +60,7 @@ impl RetireList {
         self.stores.iter().map(|store| store.number)
     }
 
-    /// A place that nobody reads, where samples are taken in.
+    /// A free slot in the segment that takes new samples.
     pub(crate) fn take(&mut self, len: u64) -> Option<Location> {
         self.take_by(|slots| slots.take(len))
     }
@@ -71,17 +71,17 @@ impl RetireList {
         Some(Location { segment: store.number, offset })
     }
 
-    /// What was taken is free again: no reader has heard of it.
+    /// Returns an unpublished slot.
     pub(crate) fn put_back(&mut self, at: Location, len: u64) {
         slots(&mut self.stores, at).release(at.offset, len);
     }
 
-    /// There is no memory for what was taken.
+    /// Returns a slot that could not be backed by memory.
     pub(crate) fn release_unbacked(&mut self, at: Location, len: u64) {
         slots(&mut self.stores, at).release_unbacked(at.offset, len);
     }
 
-    /// A place that nobody reads, for a loan: in a segment that was left only if nowhere else.
+    /// A free slot for a loan, in a segment that was left only if there is none elsewhere.
     pub(crate) fn lend(&mut self, len: u64) -> Option<Location> {
         let at = self.take(len).or_else(|| {
             let mut left = self.stores.iter_mut().filter(|store| store.left);

@@ -63,12 +63,12 @@ impl OwnSegment {
 /// All of them.
 pub(crate) struct Segments {
     session: SessionId,
-    table: RwLock<Table>,
+    table: RwLock<SegmentTable>,
     listener: OnceLock<Listener>,
 }
 
 #[derive(Default)]
-struct Table {
+struct SegmentTable {
     live: BTreeMap<u32, Arc<OwnSegment>>,
     next: u32,
 }

@@ -15,11 +15,11 @@ use crate::alloc::{
     classes::{self, CLASSES},
 };
 
-/// How many of the next larger classes may help out: slots up to twice as large.
+/// Next larger classes whose free slots may be used: slots up to twice as large.
 const HELPERS: usize = 4;
-/// How many slots take turns.
+/// Slots that rotate.
 pub(crate) const TURNS: u32 = 4;
-/// Slots of up to so many bytes do. With larger ones the memory of all four is slower than the wait.
+/// Largest slot that rotates, in bytes. Above it, four buffers cost more than waiting.
 const TURNING: u64 = 512 << 10;
 
 /// The slots of one segment.
@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn what_could_not_be_backed_is_not_tried_before_what_is() {
+    fn backed_slots_are_taken_before_unbacked_ones() {
         let mut slots = slots(64 * MIB);
         let [low, high] = [(); 2].map(|()| take(&mut slots, 4 * MIB).unwrap());
         let unbacked = slots.take(MIB).unwrap();

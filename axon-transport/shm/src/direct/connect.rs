@@ -40,6 +40,19 @@ const MAX_DESCRIPTORS: usize = 4;
 const MAX_REASON: usize = 256;
 
 /// A subscriber and a publisher did not come together.
+///
+/// ```
+/// use std::{os::unix::net::UnixDatagram, time::Duration};
+/// use axon_shm::{ConnectError, Context, Subscriber, SubscriberOptions, qos::Qos};
+///
+/// // No publisher serves at the other end.
+/// let (ours, _theirs) = UnixDatagram::pair()?;
+/// let options = SubscriberOptions::new(Qos::default());
+/// let soon = Some(Duration::from_millis(1));
+/// let alone = Subscriber::connect(&Context::new()?, &ours, options, soon);
+/// assert!(matches!(alone, Err(ConnectError::Timeout)));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ConnectError {
@@ -113,9 +126,9 @@ pub(crate) struct Granted {
     pub(crate) ring: Location,
 }
 
-/// What became of a publisher's memory.
+/// A segment that the publisher opened or dropped.
 #[derive(Debug)]
-pub(crate) enum News {
+pub(crate) enum SegmentUpdate {
     Opened(SegmentOpened, PassedFd),
     Gone(SegmentName),
 }
@@ -275,15 +288,15 @@ impl<'a> Channel<'a> {
 
     /// The next segment that is handed over or given up. One for whose descriptor there is no room
     /// stays where it is. For one thread at a time.
-    pub(crate) fn take_news(&self) -> Result<News, ConnectError> {
+    pub(crate) fn take_news(&self) -> Result<SegmentUpdate, ConnectError> {
         loop {
             match self.receive_by(descriptors::receive_whole)? {
                 (Packet::Opened(opened), mut fds) => {
                     if let (Some(fd), true) = (fds.pop(), fds.is_empty()) {
-                        return Ok(News::Opened(opened, fd));
+                        return Ok(SegmentUpdate::Opened(opened, fd));
                     }
                 }
-                (Packet::Gone(gone), _) => return Ok(News::Gone(gone)),
+                (Packet::Gone(gone), _) => return Ok(SegmentUpdate::Gone(gone)),
                 (Packet::AttachRequest(_) | Packet::Granted(_) | Packet::Refused(_), _) => {}
             }
         }

@@ -13,7 +13,7 @@ use std::{
 
 use crate::{
     direct::{
-        connect::{Granted, News},
+        connect::{Granted, SegmentUpdate},
         segment_channels::SegmentChannels,
     },
     error::ShmError,
@@ -33,12 +33,22 @@ const MANY: usize = 64;
 
 /// The memory, doorbell and identity that publishers and subscribers of a process share. Starts no
 /// thread. Clones are the same context; all methods may be called from any thread.
+///
+/// ```
+/// use axon_shm::{Context, Publisher, PublisherOptions, qos::Qos};
+///
+/// let context = Context::new()?;
+/// let options = PublisherOptions::new(Qos::default());
+/// let [left, right] = [Publisher::new(&context, options)?, Publisher::new(&context, options)?];
+/// assert_ne!(left.gid(), right.gid());
+/// # Ok::<(), axon_shm::ShmError>(())
+/// ```
 #[derive(Clone)]
 pub struct Context {
-    inner: Arc<Inner>,
+    inner: Arc<ContextInner>,
 }
 
-struct Inner {
+struct ContextInner {
     session: Arc<SessionSegment>,
     entities: AtomicU32,
     /// The other contexts, each mapped once.
@@ -105,19 +115,20 @@ impl Context {
         let told = Arc::clone(&lines);
         session.on_segment(move |event| told.tell(event));
         let (unmapped, own) = (Mutex::default(), Mutex::default());
-        Self { inner: Arc::new(Inner { session, entities, peers, lines, unmapped, own }) }
+        Self { inner: Arc::new(ContextInner { session, entities, peers, lines, unmapped, own }) }
     }
 
     /// Another context says over its own line that it has opened a segment or given one up. What
     /// it says of others is not listened to.
-    pub(crate) fn hear(&self, from: &Arc<PeerSession>, news: News) {
-        let (News::Opened(SegmentOpened { session, .. }, _)
-        | News::Gone(SegmentName { session, .. })) = &news;
+    pub(crate) fn hear(&self, from: &Arc<PeerSession>, news: SegmentUpdate) {
+        let (SegmentUpdate::Opened(SegmentOpened { session, .. }, _)
+        | SegmentUpdate::Gone(SegmentName { session, .. })) = &news;
         if *session != from.id() {
             return;
         }
         match news {
-            News::Opened(opened, fd) => match from.add_segment(opened.segment.into(), &fd) {
+            SegmentUpdate::Opened(opened, fd) => match from.add_segment(opened.segment.into(), &fd)
+            {
                 // One that is refused shows when it is read.
                 Ok(()) | Err(ShmError::Refused { .. }) => {}
                 Err(_) => {
@@ -130,7 +141,7 @@ impl Context {
                     }
                 }
             },
-            News::Gone(gone) => {
+            SegmentUpdate::Gone(gone) => {
                 self.unmapped().retain(|(_, opened, _)| {
                     (opened.session, opened.segment.number) != (gone.session, gone.number)
                 });

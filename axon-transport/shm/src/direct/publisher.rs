@@ -24,6 +24,14 @@ use crate::{
 };
 
 /// What a [`Publisher`] is made for.
+///
+/// ```
+/// use axon_shm::{PublisherOptions, qos::Qos};
+///
+/// // Images of a fixed size: their memory is there before the first one.
+/// let images = PublisherOptions::new(Qos::sensor_data()).max_len(1 << 20).expected_len(1 << 20);
+/// # let _ = images;
+/// ```
 #[derive(Clone, Copy, Debug)]
 pub struct PublisherOptions {
     qos: Qos,
@@ -66,6 +74,25 @@ impl PublisherOptions {
 /// from any thread, at the same time too. When it is dropped, subscribers still take what it left;
 /// the memory of that comes back as other publishers of the context [reclaim](Self::reclaim_idle) theirs, or
 /// with the context.
+///
+/// ```
+/// # use std::{os::unix::net::UnixDatagram, thread, time::Duration};
+/// # use axon_shm::{Context, Publisher, PublisherOptions, Subscriber, SubscriberOptions, qos::Qos};
+/// # let context = Context::new()?;
+/// # let publisher = Publisher::new(&context, PublisherOptions::new(Qos::default()))?;
+/// # let (ours, theirs) = UnixDatagram::pair()?;
+/// # let options = SubscriberOptions::new(Qos::default());
+/// # let ten = Some(Duration::from_secs(10));
+/// # let mut subscriber = thread::scope(|scope| {
+/// #     let subscriber = scope.spawn(|| Subscriber::connect(&context, &theirs, options, ten));
+/// #     publisher.serve(&ours, ten).map(|_| ())?;
+/// #     subscriber.join().unwrap()
+/// # })?;
+/// publisher.publish(b"hello")?;
+/// let sample = subscriber.recv(ten)?.expect("a sample");
+/// assert_eq!(sample.len(), 5);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub struct Publisher {
     context: Context,
     qos: Qos,

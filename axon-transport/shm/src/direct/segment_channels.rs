@@ -31,19 +31,19 @@ const PAUSE: Duration = Duration::from_millis(10);
 /// All of a context's lines.
 pub(crate) struct SegmentChannels {
     session: SessionId,
-    state: Mutex<State>,
+    state: Mutex<ChannelsState>,
     /// Somebody has not been told all. A hint: what it is about is under the locks.
     behind: AtomicBool,
 }
 
 #[derive(Default)]
-struct State {
+struct ChannelsState {
     lines: Vec<SegmentChannel>,
-    /// When those that are behind were told last.
+    /// The last attempt to send to channels that are behind.
     tried: Option<Instant>,
 }
 
-/// A subscriber that is to be told of segments.
+/// The channel over which one subscriber is told of segments.
 struct SegmentChannel {
     reader: Gid,
     writer: Gid,
@@ -87,7 +87,7 @@ impl SegmentChannel {
         Ok(())
     }
 
-    /// Makes what it was told what there is.
+    /// Announces new segments and withdraws dropped ones.
     fn catch_up(&mut self, session: &SessionSegment, first: u32) -> Result<(), ConnectError> {
         let mut segments = session.further();
         segments.sort_by_key(|segment| (segment.number() != first, segment.number()));
@@ -101,20 +101,20 @@ impl SegmentChannel {
         Ok(())
     }
 
-    /// What it has to tell when it is gone. Other segments stay for as long as the context does.
+    /// Sample segments, which are withdrawn when the publisher drops them. Other segments stay as long as the context.
     fn samples(&self) -> impl Iterator<Item = &SegmentInfo> {
         self.told.iter().filter(|told| matches!(told.kind, SegmentKind::Samples(_)))
     }
 
-    /// Does not wait.
+    /// The channel, whose sends do not block.
     fn channel(&self) -> Channel<'_> {
         Channel::new(self.socket.as_fd(), Some(Duration::ZERO))
     }
 }
 
-impl State {
-    /// Has each line told something, and parts with those that are closed, or that have ended and
-    /// nothing left to tell. Whether all were told.
+impl ChannelsState {
+    /// Calls `tell` for each channel. Removes channels that are closed, and ended ones with nothing left to send.
+    /// Returns whether all were told.
     fn each(
         &mut self,
         mut tell: impl FnMut(&mut SegmentChannel) -> Result<(), ConnectError>,
@@ -226,13 +226,13 @@ impl SegmentChannels {
     }
 
     #[cold]
-    fn retry(&self, state: MutexGuard<'_, State>, session: &SessionSegment) {
+    fn retry(&self, state: MutexGuard<'_, ChannelsState>, session: &SessionSegment) {
         if state.tried.is_none_or(|tried| tried.elapsed() >= PAUSE) {
             self.catch_up(state, session);
         }
     }
 
-    fn catch_up(&self, mut state: MutexGuard<'_, State>, session: &SessionSegment) {
+    fn catch_up(&self, mut state: MutexGuard<'_, ChannelsState>, session: &SessionSegment) {
         state.tried = Some(Instant::now());
         // Before the looks at what there is. What comes after such a look finds the lock taken, and
         // by the lock of the segments' table stores its `true` after this.
@@ -245,7 +245,7 @@ impl SegmentChannels {
         }));
     }
 
-    /// A subscriber is gone.
+    /// Removes the channel of a subscriber that is gone.
     pub(crate) fn forget(&self, reader: Gid) {
         let gone = |line: &mut SegmentChannel| line.reader == reader;
         let told =
@@ -253,7 +253,7 @@ impl SegmentChannels {
         self.note(told);
     }
 
-    /// Nothing more is published to a subscriber, or by a publisher. What was, may still be read.
+    /// Stops new samples to a subscriber, or of a publisher. Published samples stay readable.
     pub(crate) fn end(&self, gid: Gid) {
         let told = self.lock().each(|line| {
             line.ended |= line.reader == gid || line.writer == gid;
@@ -262,7 +262,7 @@ impl SegmentChannels {
         self.note(told);
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
+    fn lock(&self) -> MutexGuard<'_, ChannelsState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

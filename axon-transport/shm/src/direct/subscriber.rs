@@ -29,6 +29,13 @@ const LONGEST_SLEEP: Duration = Duration::from_secs(1);
 const NEWS: u32 = 64;
 
 /// What a [`Subscriber`] asks for.
+///
+/// ```
+/// use axon_shm::{SubscriberOptions, qos::Qos};
+///
+/// let options = SubscriberOptions::new(Qos::sensor_data()).max_len(1 << 20);
+/// # let _ = options;
+/// ```
 #[derive(Clone, Copy, Debug)]
 pub struct SubscriberOptions {
     qos: Qos,

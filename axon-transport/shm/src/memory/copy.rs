@@ -194,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_copied_is_what_is_there_wherever_it_begins_and_ends() {
+    fn read_at_copies_exactly_the_range() {
         let (words, bytes) = words(5000);
         let lens = (0..40).chain(1000..1050).chain([4095, 4096]);
         for (at, len) in lens.flat_map(|len| (0..17).chain([900]).map(move |at| (at, len))) {
@@ -205,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn whatever_was_there_is_replaced() {
+    fn copy_out_replaces_the_buffers_content() {
         let longest = 512 << 10;
         let (words, bytes) = words(longest + 73);
         let mut out = vec![1; 3];
@@ -219,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_appended_stands_behind_what_was_there() {
+    fn append_keeps_the_buffers_content() {
         let (words, bytes) = words(5000);
         let mut out = Vec::new();
         for (at, len) in [(0, 9), (3, 0), (5, 1030), (8, 64)] {

@@ -26,7 +26,7 @@ use crate::{
         available,
         quota::{Quota, Share},
     },
-    os::{atfork::Place, fork::ForkToken},
+    os::{atfork::KeptAddress, fork::ForkToken},
 };
 
 /// Bytes that are committed at a time.
@@ -144,7 +144,7 @@ pub(crate) struct Map {
     bytes: usize,
     owner: ForkToken,
     /// Of a writable map.
-    place: Option<Place>,
+    place: Option<KeptAddress>,
     /// Of another session's memory.
     share: Option<Share>,
 }
@@ -218,7 +218,7 @@ impl Map {
             // SAFETY: as above; the map is not reached in a child (see `is_forked`).
             unsafe { madvise(base.as_ptr(), bytes, Advice::LinuxDontFork) }
                 .map_err(ShmError::system("keeping a segment from forks"))?;
-            map.place = Some(Place::keep(base, bytes)?);
+            map.place = Some(KeptAddress::keep(base, bytes)?);
         }
         let protection = match access {
             Access::Read => MprotectFlags::READ,

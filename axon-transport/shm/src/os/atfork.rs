@@ -41,9 +41,9 @@ const TAKEN: usize = 1;
 static ENTRIES: AtomicPtr<Entry> = AtomicPtr::new(ptr::null_mut());
 
 /// Keeps a map's place in children, until it is dropped.
-pub(crate) struct Place(&'static Entry);
+pub(crate) struct KeptAddress(&'static Entry);
 
-impl Place {
+impl KeptAddress {
     /// Of the map at `base`, which children do not get.
     pub(crate) fn keep(base: NonNull<c_void>, bytes: usize) -> Result<Self, ShmError> {
         static HANDLER: OnceLock<i32> = OnceLock::new();
@@ -64,7 +64,7 @@ impl Place {
     }
 }
 
-impl Drop for Place {
+impl Drop for KeptAddress {
     fn drop(&mut self) {
         // Pairs with the acquire exchange in `free_entry`: the next user's stores come after it.
         self.0.base.store(0, Ordering::Release);
@@ -104,7 +104,7 @@ extern "C" fn in_child() {
     let mut at: *const Entry = ENTRIES.load(Ordering::Acquire);
     // SAFETY: entries are never freed, and reached only once they are whole.
     while let Some(entry) = unsafe { at.as_ref() } {
-        // Pairs with the release store in `Place::keep`.
+        // Pairs with the release store in `KeptAddress::keep`.
         let base = entry.base.load(Ordering::Acquire);
         if base > TAKEN {
             let bytes = entry.bytes.load(Ordering::Relaxed);

@@ -70,12 +70,12 @@ struct Closer {
 /// The threads of a lane. One that finds nothing to do waits, and ends when another waits already.
 struct CloserPool {
     most: usize,
-    state: Mutex<State>,
+    state: Mutex<CloserState>,
     work: Condvar,
 }
 
 #[derive(Default)]
-struct State {
+struct CloserState {
     threads: usize,
     /// Those of them that wait.
     idle: usize,
@@ -152,7 +152,7 @@ impl CloserPool {
     }
 
     /// It is held for no longer than a push or pop takes, and by threads of this process only.
-    fn lock(&self) -> MutexGuard<'_, State> {
+    fn lock(&self) -> MutexGuard<'_, CloserState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

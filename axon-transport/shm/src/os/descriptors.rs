@@ -387,7 +387,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn what_closes_at_once_is_told_without_asking_its_file_system() {
+    fn memfds_and_files_are_closed_in_their_class() {
         let memfd = memfd_create("test", MemfdFlags::CLOEXEC).unwrap();
         let memfd = PassedFd::received(memfd);
         assert_eq!(memfd.lane(), None);

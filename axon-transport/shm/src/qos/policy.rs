@@ -58,6 +58,13 @@ pub enum Liveliness {
 }
 
 /// The quality of service that an endpoint offers or requests.
+///
+/// ```
+/// use axon_shm::qos::{Durability, Qos};
+///
+/// let map = Qos::default().with_depth(1).with_durability(Durability::TransientLocal);
+/// assert_eq!((map.depth, map.durability), (1, Durability::TransientLocal));
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode, Serialize)]
 #[cbor(map)]
 pub struct Qos {
@@ -115,5 +122,47 @@ impl Qos {
     /// ROS 2's sensor data profile: BEST_EFFORT, KEEP_LAST(5).
     pub fn sensor_data() -> Self {
         Self { reliability: Reliability::BestEffort, depth: 5, ..Self::default() }
+    }
+
+    /// With this reliability.
+    #[must_use]
+    pub fn with_reliability(self, reliability: Reliability) -> Self {
+        Self { reliability, ..self }
+    }
+
+    /// With this durability.
+    #[must_use]
+    pub fn with_durability(self, durability: Durability) -> Self {
+        Self { durability, ..self }
+    }
+
+    /// With this history.
+    #[must_use]
+    pub fn with_history(self, history: History) -> Self {
+        Self { history, ..self }
+    }
+
+    /// With this depth, for [`History::KeepLast`].
+    #[must_use]
+    pub fn with_depth(self, depth: u32) -> Self {
+        Self { depth, ..self }
+    }
+
+    /// With this deadline.
+    #[must_use]
+    pub fn with_deadline(self, deadline: Duration) -> Self {
+        Self { deadline: Some(deadline), ..self }
+    }
+
+    /// With this lifespan.
+    #[must_use]
+    pub fn with_lifespan(self, lifespan: Duration) -> Self {
+        Self { lifespan: Some(lifespan), ..self }
+    }
+
+    /// With this liveliness, and this lease.
+    #[must_use]
+    pub fn with_liveliness(self, liveliness: Liveliness, lease: Duration) -> Self {
+        Self { liveliness, lease: Some(lease), ..self }
     }
 }

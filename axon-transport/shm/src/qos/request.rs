@@ -43,6 +43,7 @@ impl<T> Choice<T> {
 /// assert_eq!(qos.durability, Durability::Volatile);
 /// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct QosRequest {
     /// Whether every sample must arrive.
     pub reliability: Choice<Reliability>,

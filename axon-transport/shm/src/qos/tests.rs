@@ -157,7 +157,7 @@ proptest! {
     }
 
     #[test]
-    fn what_is_asked_for_exactly_is_what_one_gets(mine in qos(), others in prop::collection::vec(qos(), 0..4)) {
+    fn an_exact_request_resolves_to_itself(mine in qos(), others in prop::collection::vec(qos(), 0..4)) {
         let request = QosRequest::from(mine);
         prop_assert_eq!(request.for_publisher(&others), mine);
         prop_assert_eq!(request.for_subscription(&others), mine);
@@ -201,7 +201,7 @@ proptest! {
 }
 
 #[test]
-fn what_is_left_open_is_the_default() {
+fn open_policies_resolve_to_the_default() {
     assert_eq!(QosRequest::default().for_publisher(&[Qos::sensor_data()]), Qos::default());
     assert_eq!(QosRequest::default().for_subscription(&[Qos::sensor_data()]), Qos::default());
     assert_eq!(QosRequest::best_available().for_service(), Qos::default());

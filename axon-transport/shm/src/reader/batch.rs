@@ -1,4 +1,4 @@
-//! Takes samples one behind the other into one buffer, and tells their publisher once.
+//! Takes several samples into one buffer, and tells their publisher once.
 
 use super::{ATTEMPTS, Reader};
 use crate::{error::TakeError, ring::types::Taken};
@@ -25,7 +25,7 @@ impl Reader {
                 break;
             }
             if before == 0 {
-                // Those that wait are most often alike. Where there is no memory for all, there may be for this one.
+                // Waiting samples usually have one length. If the memory for all is missing, that for this one may suffice.
                 let waiting = usize::try_from(self.unread()).unwrap_or(usize::MAX);
                 let _ = out.try_reserve_exact(len.saturating_mul(waiting).min(most).max(len));
             }

@@ -13,7 +13,7 @@ use crate::{
     reader::sample::Extract,
     ring::{
         layout::{self, Array, COPIED, COPIED_ALWAYS},
-        protocol::{self, Look, Place, Record, State, View},
+        protocol::{self, PayloadPlace, PositionState, Record, RecordRead, View},
     },
     session::peer::Found,
 };
@@ -74,25 +74,26 @@ impl Reader {
             let (cursor, depth) = (self.cursor, self.reads.depth);
             let view = descriptors.view(&self.attachment);
             match view.state(cursor) {
-                State::Ahead if cursor >= self.seen => return Ok(None),
-                State::Here => {
+                PositionState::Ahead if cursor >= self.seen => return Ok(None),
+                PositionState::Here => {
                     // One look tells whether more than the depth is unread, if that many can be.
                     let descriptors = (view.array.len() / layout::DESCRIPTOR_WORDS) as u64;
-                    let late = depth < descriptors && view.state(cursor + depth) != State::Ahead;
+                    let late =
+                        depth < descriptors && view.state(cursor + depth) != PositionState::Ahead;
                     let mut head = 0;
                     if late {
                         // The head may not say so yet, or never, if the publisher died.
                         head = if view.stands(cursor) { cursor + depth + 1 } else { 0 };
                     } else {
                         match view.look(cursor) {
-                            Look::Sample(record) => return Ok(Some(record)),
-                            Look::Lapped => {}
-                            Look::Corrupt(what) => return Err(Obstacle::Corrupt(what)),
+                            RecordRead::Sample(record) => return Ok(Some(record)),
+                            RecordRead::Lapped => {}
+                            RecordRead::Corrupt(what) => return Err(Obstacle::Corrupt(what)),
                         }
                     }
                     self.count(head)?;
                 }
-                State::Ahead | State::Gone => {
+                PositionState::Ahead | PositionState::Gone => {
                     let wrong = view.stands(cursor);
                     self.count(0)?;
                     if wrong && self.cursor == cursor {
@@ -188,9 +189,9 @@ impl Reader {
     /// Where the bytes of a record that stood are.
     fn locate(&mut self, record: &Record) -> Result<Bytes, Obstacle> {
         let (at, slot) = match record.place {
-            Place::Inline => return Ok(Bytes::Inline),
-            Place::Block(at) => (at, false),
-            Place::Slot(at) => (at, true),
+            PayloadPlace::Inline => return Ok(Bytes::Inline),
+            PayloadPlace::Block(at) => (at, false),
+            PayloadPlace::Slot(at) => (at, true),
         };
         let len = u64::from(record.len);
         if slot && len <= COPIED_ALWAYS || !slot && len > COPIED {

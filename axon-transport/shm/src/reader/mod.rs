@@ -24,7 +24,7 @@ use crate::{
     reader::sample::Sample,
     ring::{
         layout::{self, Location},
-        protocol::{self, MAX_POSITION, Record, State},
+        protocol::{self, MAX_POSITION, PositionState, Record},
         times::{Times, read},
         types::{Grant, Meta, Taken},
         window::{depth, holds},
@@ -77,18 +77,18 @@ pub struct ReaderOptions {
 pub struct Reader {
     reads: Reads,
     attachment: Arc<Attachment>,
-    /// Absent until they were looked for.
+    /// `None` until the first look-up.
     descriptors: Option<Descriptors>,
-    /// Segments that samples were in.
+    /// Maps of the segments that samples were in.
     maps: Vec<(u32, Weak<Map>)>,
     missing: Option<Missing>,
     /// Whether the publisher is known to be gone.
     ended: bool,
     cursor: u64,
-    /// Where what is taken is done with only once that is said. Apart: few readers have it, and what each
-    /// take looks at is together.
+    /// Samples that the caller releases explicitly. Boxed: few readers have any, and the fields that each take reads
+    /// stay together.
     under_way: Option<Box<UnderWay>>,
-    /// The head as it was seen last.
+    /// The head at the last look.
     seen: u64,
     received: u64,
     lost: u64,
@@ -210,12 +210,12 @@ impl Reader {
         };
         let view = descriptors.view(&self.attachment);
         match view.state(self.cursor) {
-            State::Ahead => self.cursor < self.seen,
-            State::Here => {
+            PositionState::Ahead => self.cursor < self.seen,
+            PositionState::Here => {
                 view.expect(self.cursor);
                 true
             }
-            State::Gone => true,
+            PositionState::Gone => true,
         }
     }
 

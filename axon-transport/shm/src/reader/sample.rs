@@ -223,6 +223,27 @@ impl fmt::Debug for Sample {
 }
 
 /// Reads a [`Sample`] from the front.
+///
+/// ```
+/// # use std::{os::unix::net::UnixDatagram, thread, time::Duration};
+/// # use axon_shm::{Context, Publisher, PublisherOptions, Subscriber, SubscriberOptions, qos::Qos};
+/// # let context = Context::new()?;
+/// # let publisher = Publisher::new(&context, PublisherOptions::new(Qos::default()))?;
+/// # let (ours, theirs) = UnixDatagram::pair()?;
+/// # let options = SubscriberOptions::new(Qos::default());
+/// # let ten = Some(Duration::from_secs(10));
+/// # let mut subscriber = thread::scope(|scope| {
+/// #     let subscriber = scope.spawn(|| Subscriber::connect(&context, &theirs, options, ten));
+/// #     publisher.serve(&ours, ten).map(|_| ())?;
+/// #     subscriber.join().unwrap()
+/// # })?;
+/// publisher.publish(b"hello")?;
+/// let sample = subscriber.recv(ten)?.expect("a sample");
+/// let mut text = String::new();
+/// std::io::Read::read_to_string(&mut sample.reader(), &mut text)?;
+/// assert_eq!(text, "hello");
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug)]
 pub struct SampleReader<'a> {
     sample: &'a Sample,

@@ -46,6 +46,27 @@ impl TrustPublishers {
 ///
 /// It keeps the sample from being overwritten, as the [`Sample`] does that it was made of. In a forked child it is
 /// empty.
+///
+/// ```
+/// # use std::{os::unix::net::UnixDatagram, thread, time::Duration};
+/// # use axon_shm::{Context, Publisher, PublisherOptions, Subscriber, SubscriberOptions, TrustPublishers, qos::Qos};
+/// # let context = Context::new()?;
+/// # let publisher = Publisher::new(&context, PublisherOptions::new(Qos::default()))?;
+/// # let (ours, theirs) = UnixDatagram::pair()?;
+/// # let options = SubscriberOptions::new(Qos::default());
+/// # let ten = Some(Duration::from_secs(10));
+/// # let mut subscriber = thread::scope(|scope| {
+/// #     let subscriber = scope.spawn(|| Subscriber::connect(&context, &theirs, options, ten));
+/// #     publisher.serve(&ours, ten).map(|_| ())?;
+/// #     subscriber.join().unwrap()
+/// # })?;
+/// publisher.publish(b"hello")?;
+/// let sample = subscriber.recv(ten)?.expect("a sample");
+/// // SAFETY: only this process publishes, and it forks no child.
+/// let slice = sample.into_slice(unsafe { TrustPublishers::new() });
+/// assert_eq!(&slice[..], b"hello");
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub struct SampleSlice {
     sample: Sample,
 }

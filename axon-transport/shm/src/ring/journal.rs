@@ -38,7 +38,7 @@ impl<W: Word> Journal<'_, W> {
     /// Publisher: a ring has a sample. [`settle`](crate::wake::settle) has to follow.
     #[inline]
     pub(crate) fn note(&self, ring: u32) {
-        // Pairs with the load in `Place::read`: who sees the count sees the sample.
+        // Pairs with the load in `JournalCursor::read`: who sees the count sees the sample.
         let place = self.noted.fetch_add(1, Site::NotedAdd.order());
         let at = place as usize & (self.entries.len() - 1);
         // An entry that is seen late is one that is missing.
@@ -46,20 +46,20 @@ impl<W: Word> Journal<'_, W> {
     }
 }
 
-/// How far a follower has read a journal.
+/// A follower's position in a journal.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Place(u64);
+pub(crate) struct JournalCursor(u64);
 
-/// What a follower has to look at.
+/// The rings that a follower has to look at.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum News {
+pub(crate) enum RingsToRead {
     /// The rings that were named.
     Named,
     /// All rings of the session.
     All,
 }
 
-impl Place {
+impl JournalCursor {
     /// The end of a journal. Look at all rings after it.
     pub(crate) fn end<W: Word>(journal: Journal<'_, W>) -> Self {
         // Pairs with the count in `note`.
@@ -72,12 +72,12 @@ impl Place {
         &mut self,
         journal: Journal<'_, W>,
         mut named: impl FnMut(u32),
-    ) -> News {
+    ) -> RingsToRead {
         let Self(end) = Self::end(journal);
         let from = std::mem::replace(&mut self.0, end);
         let count = end.wrapping_sub(from);
         if count > journal.entries.len() as u64 {
-            return News::All;
+            return RingsToRead::All;
         }
         for place in (0..count).map(|step| from.wrapping_add(step)) {
             let at = place as usize & (journal.entries.len() - 1);
@@ -85,11 +85,11 @@ impl Place {
             let found = journal.entries[at].load(Ordering::Relaxed);
             let ring = found as u32;
             if found != entry(place, ring) {
-                return News::All;
+                return RingsToRead::All;
             }
             named(ring);
         }
-        News::Named
+        RingsToRead::Named
     }
 }
 
@@ -110,7 +110,7 @@ mod tests {
             Journal { noted: &self.0, entries: &self.1 }
         }
 
-        fn read(&self, place: &mut Place) -> (News, Vec<u32>) {
+        fn read(&self, place: &mut JournalCursor) -> (RingsToRead, Vec<u32>) {
             let mut rings = Vec::new();
             (place.read(self.journal(), |ring| rings.push(ring)), rings)
         }
@@ -119,38 +119,38 @@ mod tests {
     #[test]
     fn a_follower_is_named_each_ring_that_was_noted_since_it_looked() {
         let words = Words::new();
-        let mut place = Place::end(words.journal());
+        let mut place = JournalCursor::end(words.journal());
         for round in 0..10 {
             words.journal().note(round);
             words.journal().note(7);
-            assert_eq!(words.read(&mut place), (News::Named, vec![round, 7]));
+            assert_eq!(words.read(&mut place), (RingsToRead::Named, vec![round, 7]));
         }
-        assert_eq!(words.read(&mut place), (News::Named, vec![]));
+        assert_eq!(words.read(&mut place), (RingsToRead::Named, vec![]));
     }
 
     #[test]
     fn a_follower_that_was_overtaken_looks_at_all_rings_once() {
         let words = Words::new();
-        let mut place = Place::end(words.journal());
+        let mut place = JournalCursor::end(words.journal());
         (0..5).for_each(|ring| words.journal().note(ring));
-        assert_eq!(words.read(&mut place).0, News::All);
+        assert_eq!(words.read(&mut place).0, RingsToRead::All);
         words.journal().note(9);
-        assert_eq!(words.read(&mut place), (News::Named, vec![9]));
+        assert_eq!(words.read(&mut place), (RingsToRead::Named, vec![9]));
     }
 
     #[test]
     fn an_entry_that_is_missing_or_forged_has_all_rings_looked_at() {
         let words = Words::new();
-        let mut place = Place::end(words.journal());
+        let mut place = JournalCursor::end(words.journal());
         // Counted, and not stored: also as the session writes it that counts back or far ahead.
         for noted in [1, 0, u64::MAX, 5] {
             words.0.store(noted, Ordering::Relaxed);
-            assert_eq!(words.read(&mut place).0, News::All, "{noted}");
+            assert_eq!(words.read(&mut place).0, RingsToRead::All, "{noted}");
         }
         words.1.iter().for_each(|word| word.store(u64::MAX, Ordering::Relaxed));
         words.0.store(6, Ordering::Relaxed);
-        assert_eq!(words.read(&mut place).0, News::All);
+        assert_eq!(words.read(&mut place).0, RingsToRead::All);
         words.journal().note(3);
-        assert_eq!(words.read(&mut place), (News::Named, vec![3]));
+        assert_eq!(words.read(&mut place), (RingsToRead::Named, vec![3]));
     }
 }

@@ -36,7 +36,7 @@ pub(crate) const MAX_POSITION: u64 = 1 << 62;
 
 /// Where a sample's bytes are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Place {
+pub(crate) enum PayloadPlace {
     /// In the descriptor.
     Inline,
     /// In memory that is written over as soon as the sample is given up.
@@ -45,7 +45,7 @@ pub(crate) enum Place {
     Slot(Location),
 }
 
-impl Place {
+impl PayloadPlace {
     fn word(self) -> (u32, u64) {
         match self {
             Self::Inline => (0, 0),
@@ -63,7 +63,7 @@ pub(crate) struct Record {
     /// 0 where the ring's lifespan is infinite.
     pub(crate) published: u64,
     pub(crate) len: u32,
-    pub(crate) place: Place,
+    pub(crate) place: PayloadPlace,
 }
 
 fn descriptor<W>(array: &[W], position: u64) -> &[W] {
@@ -117,8 +117,10 @@ pub(crate) fn publish<W: Word>(
         slot[PUBLISHED].store(record.published, Ordering::Relaxed);
     }
     match record.place {
-        Place::Inline => copy_in(&slot[DATA..PUBLISHED], inline),
-        Place::Block(_) | Place::Slot(_) => slot[DATA].store(offset, Ordering::Relaxed),
+        PayloadPlace::Inline => copy_in(&slot[DATA..PUBLISHED], inline),
+        PayloadPlace::Block(_) | PayloadPlace::Slot(_) => {
+            slot[DATA].store(offset, Ordering::Relaxed)
+        }
     }
     // Pairs with `state`: a reader that sees the stamp sees the sample.
     slot[STAMP].store(2 * position + 2, Site::StampStore.order());
@@ -176,7 +178,7 @@ pub(crate) fn bounds<W: Word>(ring: &[W]) -> Result<(u64, u64), &'static str> {
 
 /// Reader: how a position's descriptor looks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum State {
+pub(crate) enum PositionState {
     /// The position is not published yet.
     Ahead,
     /// It stands, or has just been given up.
@@ -187,7 +189,7 @@ pub(crate) enum State {
 
 /// Reader: what a look at a published position gave.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Look {
+pub(crate) enum RecordRead {
     Sample(Record),
     /// The publisher has reused the descriptor: look at the tail again.
     Lapped,
@@ -205,19 +207,19 @@ pub(crate) struct View<'a, W> {
 
 impl<'a, W: Word> View<'a, W> {
     #[inline]
-    pub(crate) fn state(&self, position: u64) -> State {
+    pub(crate) fn state(&self, position: u64) -> PositionState {
         let stamp = descriptor(self.array, position)[STAMP].load(Site::StampLoad.order());
         // Pairs with `publish`.
         match stamp.cmp(&(2 * position + 2)) {
-            std::cmp::Ordering::Less => State::Ahead,
-            std::cmp::Ordering::Equal => State::Here,
-            std::cmp::Ordering::Greater => State::Gone,
+            std::cmp::Ordering::Less => PositionState::Ahead,
+            std::cmp::Ordering::Equal => PositionState::Here,
+            std::cmp::Ordering::Greater => PositionState::Gone,
         }
     }
 
-    /// The record at `position`, whose descriptor is [here](State::Here). Where its bytes are has
+    /// The record at `position`, whose descriptor is [here](PositionState::Here). Where its bytes are has
     /// not been checked.
-    pub(crate) fn look(&self, position: u64) -> Look {
+    pub(crate) fn look(&self, position: u64) -> RecordRead {
         let slot = descriptor(self.array, position);
         let sequence = slot[SEQUENCE].load(Ordering::Relaxed);
         let timestamp = slot[TIMESTAMP].load(Ordering::Relaxed).cast_signed();
@@ -227,22 +229,22 @@ impl<'a, W: Word> View<'a, W> {
         let finite = self.ring[LIFESPAN].load(Ordering::Relaxed) != 0;
         let published = if finite { slot[PUBLISHED].load(Ordering::Relaxed) } else { 0 };
         if !self.stands(position) {
-            return Look::Lapped;
+            return RecordRead::Lapped;
         }
         let at = Location { segment: place >> 8, offset };
         let place = match place & 0xff {
             0 if len as usize > INLINE_WORDS * 8 => {
-                return Look::Corrupt("a sample in a descriptor is longer than that");
+                return RecordRead::Corrupt("a sample in a descriptor is longer than that");
             }
-            0 => Place::Inline,
-            1 => Place::Block(at),
-            2 => Place::Slot(at),
-            _ => return Look::Corrupt("a sample is in no known kind of place"),
+            0 => PayloadPlace::Inline,
+            1 => PayloadPlace::Block(at),
+            2 => PayloadPlace::Slot(at),
+            _ => return RecordRead::Corrupt("a sample is in no known kind of place"),
         };
-        Look::Sample(Record { sequence, timestamp, published, len, place })
+        RecordRead::Sample(Record { sequence, timestamp, published, len, place })
     }
 
-    /// Has the rest of a descriptor that is [here](State::Here) on its way from the publisher's core
+    /// Has the rest of a descriptor that is [here](PositionState::Here) on its way from the publisher's core
     /// while the caller gets ready to take it: what locks in between would have it wait.
     #[inline]
     pub(crate) fn expect(&self, position: u64) {

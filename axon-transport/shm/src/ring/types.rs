@@ -1,6 +1,12 @@
 //! The types that a writer and a reader of a ring exchange with each other and with their owners.
 
-use crate::{ids::Gid, qos::Qos};
+use std::time::SystemTime;
+
+use crate::{
+    ids::Gid,
+    os::clock::{from_unix_nanos, unix_nanos},
+    qos::Qos,
+};
 
 /// What a ring is made for.
 #[derive(Clone, Copy, Debug)]
@@ -29,6 +35,17 @@ pub struct Grant {
 }
 
 /// What goes with a sample.
+///
+/// ```
+/// use std::time::SystemTime;
+/// use axon_shm::{Context, Meta, Publisher, PublisherOptions, qos::Qos};
+///
+/// let publisher = Publisher::new(&Context::new()?, PublisherOptions::new(Qos::default()))?;
+/// let meta = Meta::new(7, SystemTime::UNIX_EPOCH);
+/// publisher.publish_with(meta, b"hello")?;
+/// assert_eq!(meta.source_time(), SystemTime::UNIX_EPOCH);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Meta {
     /// The publisher's sequence number.
@@ -41,8 +58,33 @@ pub struct Meta {
     pub published: u64,
 }
 
+impl Meta {
+    /// Of a sample that is published now, with this number and source time.
+    pub fn new(sequence: u64, source_time: SystemTime) -> Self {
+        Self { sequence, source_timestamp: unix_nanos(source_time), published: 0 }
+    }
+
+    /// The time of publication by the publisher's wall clock.
+    pub fn source_time(&self) -> SystemTime {
+        from_unix_nanos(self.source_timestamp)
+    }
+}
+
 /// A sample that was published.
+///
+/// ```
+/// use std::time::SystemTime;
+/// use axon_shm::{Context, Meta, Publisher, PublisherOptions, qos::Qos};
+///
+/// let publisher = Publisher::new(&Context::new()?, PublisherOptions::new(Qos::default()))?;
+/// let mut loan = publisher.loan(5)?;
+/// loan.copy_from_slice(b"hello");
+/// let published = loan.publish(Meta::new(1, SystemTime::now()))?;
+/// assert_eq!(published.position, None, "nobody reads");
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Published {
     /// Its position in the ring, counted from 0 without gaps. None where nobody reads: then only
     /// its number is used up.

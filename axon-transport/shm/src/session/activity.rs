@@ -17,7 +17,7 @@ use std::{
 
 use crate::{
     ids::Gid,
-    ring::journal::{Journal, News, Place},
+    ring::journal::{Journal, JournalCursor, RingsToRead},
     session::peer::PeerSession,
 };
 
@@ -29,11 +29,11 @@ const IN_TURN: usize = 2;
 pub(crate) struct Activity {
     /// Whether somebody takes what is found. Otherwise nothing is kept.
     followed: AtomicBool,
-    state: Mutex<State>,
+    state: Mutex<ActivityState>,
 }
 
 #[derive(Default)]
-struct State {
+struct ActivityState {
     /// By the address of the other session; 0 is this session itself.
     journals: HashMap<usize, Followed>,
     readers: Readers,
@@ -59,7 +59,7 @@ struct Readers {
 struct Followed {
     /// `None` is this session itself.
     peer: Option<Arc<PeerSession>>,
-    place: Place,
+    place: JournalCursor,
     /// By number.
     rings: HashMap<u32, Ring>,
 }
@@ -110,7 +110,11 @@ impl Activity {
         state.next += 1;
         let followed = state.journals.entry(journal).or_insert_with(|| {
             let words = peer.map_or(own, |peer| peer.journal());
-            Followed { peer: peer.cloned(), place: Place::end(words), rings: HashMap::new() }
+            Followed {
+                peer: peer.cloned(),
+                place: JournalCursor::end(words),
+                rings: HashMap::new(),
+            }
         });
         followed.rings.entry(ring).or_default().keys.insert(key);
         state.readers.all.insert(key, Watched { reader, writer, journal, ring, marked: false });
@@ -123,7 +127,7 @@ impl Activity {
     /// [`arm`](crate::wake::arm): what comes later rings.
     pub(crate) fn take(&self, own: Journal<'_, AtomicU64>, found: &mut Vec<(Gid, Gid)>) {
         let mut state = self.lock();
-        let State { journals, readers, looks, .. } = &mut *state;
+        let ActivityState { journals, readers, looks, .. } = &mut *state;
         *looks += 1;
         for Followed { peer, place, rings } in journals.values_mut() {
             let words = peer.as_ref().map_or(own, |peer| peer.journal());
@@ -135,7 +139,7 @@ impl Activity {
                 }
             });
             let changed = peer.as_ref().is_some_and(|peer| peer.take_changed());
-            if changed || news == News::All {
+            if changed || news == RingsToRead::All {
                 rings.values().flat_map(|ring| &ring.keys).for_each(|key| readers.mark(*key));
             }
         }
@@ -158,7 +162,7 @@ impl Activity {
         self.lock().readers.marks
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
+    fn lock(&self) -> MutexGuard<'_, ActivityState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -25,10 +25,10 @@ const FEW: usize = 64;
 
 /// The memory of a session's publishers that are gone.
 #[derive(Default)]
-pub(crate) struct Orphans(Mutex<State>);
+pub(crate) struct Orphans(Mutex<OrphansState>);
 
 #[derive(Default)]
-struct State {
+struct OrphansState {
     all: Vec<Orphan>,
     /// How often [`sweep_some`](Orphans::sweep_some) was called since all were looked at.
     calls: usize,
@@ -81,7 +81,7 @@ impl Orphans {
         self.lock().looks
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
+    fn lock(&self) -> MutexGuard<'_, OrphansState> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

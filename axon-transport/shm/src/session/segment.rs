@@ -31,7 +31,7 @@ use crate::{
         orphans::{Orphan, Orphans},
         peer::PeerDescriptors,
     },
-    wake::{Doorbell, ForwardedWakeups, Look, Purpose, WakeListener, due, waits},
+    wake::{Doorbell, ForwardedWakeups, Purpose, WakeCheck, WakeListener, due, waits},
 };
 
 /// The memory, doorbell and identity by which other sessions know this one.
@@ -241,7 +241,7 @@ impl SessionSegment {
     pub fn wait_for(
         &self,
         ready: impl FnMut() -> bool,
-        look: &dyn Fn() -> Arc<dyn Look>,
+        look: &dyn Fn() -> Arc<dyn WakeCheck>,
         timeout: Option<Duration>,
     ) -> bool {
         if self.is_forked() {
@@ -255,7 +255,7 @@ impl SessionSegment {
     /// be ready, until what this returns is dropped. Somebody must listen for the session meanwhile.
     pub fn forward_wakeups(
         &self,
-        look: Arc<dyn Look>,
+        look: Arc<dyn WakeCheck>,
         elsewhere: &Arc<SessionSegment>,
     ) -> ForwardedWakeups<'_> {
         self.doorbell.forward_wakeups(self.armed_words(), look, elsewhere.clone())

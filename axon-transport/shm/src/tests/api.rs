@@ -116,7 +116,7 @@ fn an_event_loop_is_told_of_samples() {
 }
 
 #[test]
-fn what_does_not_go_together_is_said_at_both_ends() {
+fn incompatible_qos_is_reported_at_both_ends() {
     let context = Context::new().unwrap();
     let offered = Qos { reliability: Reliability::BestEffort, ..Qos::default() };
     let requested = Qos { reliability: Reliability::Reliable, ..Qos::default() };
@@ -129,7 +129,7 @@ fn what_does_not_go_together_is_said_at_both_ends() {
 }
 
 #[test]
-fn what_another_end_may_do_wrong_is_refused() {
+fn misbehaving_peers_are_refused_at_connect() {
     let context = Context::new().unwrap();
     let publisher = publisher(&context, Qos::default());
     let options = SubscriberOptions::new(Qos::default());

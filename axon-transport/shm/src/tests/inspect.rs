@@ -19,7 +19,7 @@ fn lane(session: &SessionSegment, reader: &Reader) -> LaneCounts {
 }
 
 #[test]
-fn what_is_no_memory_is_not_read() {
+fn inspect_reads_no_invalid_memory() {
     let (end, _other) = std::io::pipe().unwrap();
     let at = Location { segment: 0, offset: 4096 };
     assert_eq!(RingCounts::read(end.as_fd(), at), None);
@@ -31,7 +31,7 @@ fn what_is_no_memory_is_not_read() {
 }
 
 #[test]
-fn who_takes_what_and_when_is_told() {
+fn inspect_reports_each_readers_progress() {
     let (ours, theirs) = (session(), session());
     let writer = writer(&ours, keep_last(8), MAX);
     assert_eq!(counts(&ours, &writer).window, 16);
@@ -87,7 +87,7 @@ fn memory_comes_and_goes_with_descriptors_and_blocks() {
 const MANY: u64 = 2048;
 
 #[test]
-fn what_goes_for_want_of_memory_though_late_joiners_were_to_get_it_is_counted() {
+fn history_dropped_for_lack_of_memory_is_counted() {
     let ours = session();
     let all =
         Qos { history: History::KeepAll, reliability: Reliability::Reliable, ..Qos::default() };
@@ -109,7 +109,7 @@ fn what_goes_for_want_of_memory_though_late_joiners_were_to_get_it_is_counted() 
 }
 
 #[test]
-fn what_every_reader_has_taken_goes_without_a_loss() {
+fn dropping_taken_samples_counts_no_loss() {
     let (ours, theirs) = (session(), session());
     let writer = writer(&ours, keep_last(1000), MAX);
     let mut reader = attach(&writer, &ours, &theirs, keep_last(1000));

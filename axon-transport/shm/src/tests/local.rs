@@ -68,7 +68,7 @@ fn loans_that_are_kept_end_in_an_error_and_come_back() {
 }
 
 #[test]
-fn what_is_too_long_is_refused() {
+fn samples_beyond_the_maximum_length_are_refused() {
     let a = session();
     let writer = writer(&a, keep_last(1), 0);
     let (len, max) = (MAX + 1, MAX);
@@ -148,7 +148,7 @@ fn a_reader_deeper_than_the_publisher_widens_its_window() {
 }
 
 #[test]
-fn what_the_budget_cannot_hold_is_counted_as_lost_exactly() {
+fn samples_beyond_the_budget_are_counted_as_lost() {
     let (a, b) = (session(), session());
     // Room for eight samples of 4 KiB in a window of 50.
     let writer = writer(&a, keep_last(50), 8 * 4096);
@@ -316,7 +316,7 @@ fn a_reader_that_left_and_comes_back_starts_anew() {
 }
 
 #[test]
-fn what_was_granted_to_who_had_the_lane_before_is_refused() {
+fn a_stale_lane_grant_is_refused() {
     let (a, b) = (session(), session());
     let writer = writer(&a, keep_last(1), 1 << 20);
     let reader = attach(&writer, &a, &b, keep_last(1));

@@ -274,7 +274,7 @@ fn a_sample_whose_memory_has_not_come_waits_for_it() {
 }
 
 #[test]
-fn what_is_expected_is_there_before_the_first_of_it() {
+fn memory_for_expected_samples_exists_before_the_first_one() {
     let (a, b) = (silent_session(), session());
     let gid = Gid::new(a.id(), 1);
     let options =
@@ -288,7 +288,7 @@ fn what_is_expected_is_there_before_the_first_of_it() {
 }
 
 #[test]
-fn what_nobody_reads_takes_a_number_and_nothing_else() {
+fn an_unread_sample_costs_a_number_and_no_memory() {
     let (a, b) = (session(), session());
     let publisher = writer(&a, keep_last(5), 1 << 20);
     for number in 1..=50 {
@@ -324,7 +324,7 @@ fn what_nobody_reads_takes_a_number_and_nothing_else() {
 }
 
 #[test]
-fn what_publishers_leave_is_used_again() {
+fn memory_of_ended_publishers_is_reused() {
     let a = session();
     for round in 0..2000 {
         let publisher = writer(&a, transient(keep_last(20)), 1 << 20);

@@ -18,7 +18,7 @@ fn caught_by(site: Site) -> &'static str {
             "tests::model::ring::a_reader_takes_whole_samples_or_none_while_it_is_overtaken"
         }
         HeadStore | HeadLoad => "tests::model::ring::the_head_is_never_ahead_of_the_stamps",
-        ArrayStore | ArrayLoad => "tests::model::growth::what_stands_stays_while_the_ring_grows",
+        ArrayStore | ArrayLoad => "tests::model::growth::samples_survive_the_growth_of_their_ring",
         MappedStore | MappedLoad => "tests::model::growth::a_segment_that_is_said_to_be_mapped_is",
         TailStore | TailLoad => "tests::model::ring::a_reader_never_sees_a_tail_above_the_head",
         CursorStore | CursorLoad => {

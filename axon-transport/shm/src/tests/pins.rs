@@ -83,7 +83,7 @@ fn small_samples_are_copies() {
 }
 
 #[test]
-fn who_expects_them_has_shorter_loans_in_place() {
+fn expected_long_samples_lower_the_limit_of_in_place_loans() {
     let (a, b) = (session(), session());
     let gid = Gid::new(a.id(), 1);
     let options =
@@ -112,7 +112,7 @@ fn who_expects_them_has_shorter_loans_in_place() {
 }
 
 #[test]
-fn what_follows_a_header_is_aligned_for_all_who_see_it() {
+fn bytes_after_a_header_are_aligned_for_writer_and_readers() {
     let (a, b) = (session(), session());
     let writer = writer(&a, keep_last(2), 0);
     let mut readers = [&a, &b].map(|session| attach(&writer, &a, session, keep_last(2)));
@@ -201,7 +201,7 @@ fn nothing_that_ends_ends_a_sample_in_use() {
 }
 
 #[test]
-fn what_is_dropped_is_forgotten() {
+fn a_dropped_sample_and_reader_release_their_pins() {
     let (a, b) = (session(), session());
     let writer = writer(&a, keep_last(1), 0);
     let mut reader = attach(&writer, &a, &b, keep_last(1));

@@ -268,7 +268,7 @@ fn the_largest_message_crosses_at_depth_one() {
 }
 
 #[test]
-fn what_a_keep_last_reader_did_not_get_is_counted_exactly() {
+fn missed_samples_of_a_keep_last_reader_are_counted() {
     let session = session();
     // Room for eight samples, of which the reader would like 20.
     let writer = large_writer(&session, keep_last(1), 8 * 1024);
@@ -341,7 +341,7 @@ fn retired(writer: &Writer) -> usize {
 }
 
 #[test]
-fn what_another_process_keeps_is_not_written_over() {
+fn samples_pinned_by_another_process_are_not_overwritten() {
     let session = session();
     let (other, writer) = keeper(&session);
     for round in 0..20 {

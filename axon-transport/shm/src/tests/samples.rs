@@ -161,7 +161,7 @@ fn a_loan_of_memory_that_is_given_up_can_still_be_published() {
 }
 
 #[test]
-fn what_all_have_taken_is_written_over_first() {
+fn samples_taken_by_all_readers_are_overwritten_first() {
     let (a, b) = (session(), session());
     let writer = writer(&a, keep_last(10), 64 << 20);
     let mut readers = [&a, &b].map(|session| attach(&writer, &a, session, keep_last(10)));

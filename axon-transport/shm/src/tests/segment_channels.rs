@@ -15,7 +15,7 @@ use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use super::*;
 use crate::{
     alloc::heap::Need,
-    direct::connect::{AttachRequest, Channel, Granted, News},
+    direct::connect::{AttachRequest, Channel, Granted, SegmentUpdate},
     os::descriptors::PassedFd,
     tests::api::{SOON, pair, publisher, together},
 };
@@ -97,7 +97,7 @@ fn a_subscriber_whose_segment_channel_was_full_is_told_later() {
 }
 
 #[test]
-fn what_was_given_up_does_not_pile_up_in_a_line_that_nobody_reads() {
+fn withdrawn_segments_do_not_fill_an_unread_channel() {
     let (here, there) = contexts();
     let publisher = publisher(&here, keep_last(1));
     let lane = there.session().allocate_lane().unwrap();
@@ -119,8 +119,8 @@ fn what_was_given_up_does_not_pile_up_in_a_line_that_nobody_reads() {
         while let Ok(news) = at_once(&line).take_news() {
             packets += 1;
             match news {
-                News::Opened(opened, _) => assert!(kept.insert(opened.segment.number)),
-                News::Gone(gone) => assert!(kept.remove(&gone.number)),
+                SegmentUpdate::Opened(opened, _) => assert!(kept.insert(opened.segment.number)),
+                SegmentUpdate::Gone(gone) => assert!(kept.remove(&gone.number)),
             }
         }
         (packets, kept.len())
@@ -267,7 +267,7 @@ fn a_peer_that_sends_without_pause_holds_nobody_up() {
 }
 
 #[test]
-fn who_comes_first_with_anothers_id_is_not_taken_for_it() {
+fn a_forged_session_id_does_not_replace_its_owner() {
     let (here, there) = contexts();
     let hostile = SessionSegment::create(there.id()).unwrap();
     let first = here.peer(there.id(), hostile.descriptors().unwrap()).unwrap();
@@ -280,7 +280,7 @@ fn who_comes_first_with_anothers_id_is_not_taken_for_it() {
 }
 
 #[test]
-fn who_answers_as_ourselves_is_believed_only_what_we_granted() {
+fn an_answer_in_our_name_needs_our_own_grant() {
     let (here, _) = contexts();
     let ring = writer(here.session(), keep_last(5), MAX);
     let (ours, theirs) = pair();
@@ -320,7 +320,7 @@ fn a_reader_with_our_session_id_is_served_only_if_we_ask() {
 }
 
 #[test]
-fn what_one_publisher_says_of_anothers_memory_is_not_listened_to() {
+fn a_publisher_cannot_withdraw_anothers_segments() {
     let (here, there) = contexts();
     let publisher = publisher(&here, keep_last(1));
     let mut subscriber = together(&publisher, &there, keep_last(1)).1.unwrap();

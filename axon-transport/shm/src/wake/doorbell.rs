@@ -32,28 +32,28 @@ pub(crate) const PURPOSES: [Purpose; 2] = [Purpose::Samples, Purpose::Room];
 /// The armed words, in the order of [`PURPOSES`].
 pub(crate) type Words<'a> = [&'a AtomicU64; 2];
 
-/// What another thread may ask for a waiter: whether there is what it waits for.
-pub trait Look: Send + Sync {
-    /// Must be quick, and must not wait for a thread that waits.
+/// A check that another thread may make for a waiter: whether its wait is over.
+pub trait WakeCheck: Send + Sync {
+    /// Whether the wait is over. Must be quick, and must not block on a thread that waits at a doorbell.
     fn ready(&self) -> bool;
 }
 
 /// A session of this process, at whose doorbell a thread may sleep.
 pub(crate) trait WakeListener: Send + Sync {
-    /// Makes the thread that listens there look again.
+    /// Makes the listening thread check again.
     fn wake_listener(&self);
 }
 
-/// Who of this process sleeps, and who of them listens for all.
+/// The threads of this process that sleep, and the one of them that listens for all.
 ///
-/// One waiter leads: it listens to the bell, and when it rang, wakes those of the others that may
-/// have something. These sleep until then. All tickets are given out under the lock, so the armed
+/// One waiter leads: it listens to the bell, and when it rang, wakes the other waiters whose wait may be over.
+/// The others sleep until then. All tickets are given out under the lock, so the armed
 /// words only rise and a ringer never mistakes a new ticket for one it has rung for.
 pub(crate) struct Doorbell {
     receiver: BellReceiver,
     waiters: Mutex<Waiters>,
     spin: Spin,
-    /// Where a leader that is to make way says that it has.
+    /// Signalled by a leader that has given up its lead on request.
     way: Condvar,
 }
 
@@ -89,7 +89,7 @@ enum Leader {
 /// A waiter that sleeps while another one listens.
 struct Follower {
     turn: Condvar,
-    look: Option<Arc<dyn Look>>,
+    look: Option<Arc<dyn WakeCheck>>,
     /// It sleeps at the session's doorbell.
     elsewhere: Option<Arc<dyn WakeListener>>,
 }
@@ -133,7 +133,7 @@ impl Doorbell {
         words: Words<'_>,
         purpose: Purpose,
         mut ready: impl FnMut() -> bool,
-        look: Option<&dyn Fn() -> Arc<dyn Look>>,
+        look: Option<&dyn Fn() -> Arc<dyn WakeCheck>>,
         others: &[BorrowedFd<'_>],
         timeout: Option<Duration>,
     ) -> bool {
@@ -198,7 +198,7 @@ impl Doorbell {
         &self,
         words: Words<'_>,
         armed_at: u64,
-        look: Option<&dyn Fn() -> Arc<dyn Look>>,
+        look: Option<&dyn Fn() -> Arc<dyn WakeCheck>>,
         others: &[BorrowedFd<'_>],
         left: Option<Duration>,
     ) {
@@ -225,7 +225,7 @@ impl Doorbell {
     fn follow(
         &self,
         mut waiters: MutexGuard<'_, Waiters>,
-        look: Option<Arc<dyn Look>>,
+        look: Option<Arc<dyn WakeCheck>>,
         left: Option<Duration>,
     ) {
         let follower = Arc::new(Follower { turn: Condvar::new(), look, elsewhere: None });
@@ -272,7 +272,7 @@ impl Doorbell {
     pub(crate) fn forward_wakeups<'a>(
         &'a self,
         words: Words<'a>,
-        look: Arc<dyn Look>,
+        look: Arc<dyn WakeCheck>,
         elsewhere: Arc<dyn WakeListener>,
     ) -> ForwardedWakeups<'a> {
         let waiting = Waiting::new(self, words, Purpose::Samples);

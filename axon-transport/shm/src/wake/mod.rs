@@ -15,5 +15,5 @@ mod tests;
 
 pub(crate) use bell::Bell;
 pub(crate) use doorbell::{Doorbell, PURPOSES, WakeListener};
-pub use doorbell::{ForwardedWakeups, Look, Purpose};
+pub use doorbell::{ForwardedWakeups, Purpose, WakeCheck};
 pub(crate) use ticket::{arm, disarm, due, settle, waits};

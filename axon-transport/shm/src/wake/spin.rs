@@ -95,7 +95,7 @@ mod tests {
 
     /// Both ends on one processor: nothing comes while one looks, and soon after one sleeps.
     #[test]
-    fn who_cannot_run_meanwhile_is_hardly_looked_out_for() {
+    fn spinning_stops_where_the_peer_cannot_run_meanwhile() {
         let spin = Spin::up_to(Duration::from_micros(1));
         let mut vain = 0;
         for _ in 0..10_000 {

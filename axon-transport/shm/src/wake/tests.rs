@@ -16,7 +16,7 @@ use rustix::{
     net::{RecvFlags, Shutdown, recv, shutdown},
 };
 
-use super::{Bell, Doorbell, Look, Purpose, arm, disarm, due, receiver::whole_millis, settle};
+use super::{Bell, Doorbell, Purpose, WakeCheck, arm, disarm, due, receiver::whole_millis, settle};
 use crate::{
     ids::SessionId,
     os::descriptors::{
@@ -194,7 +194,7 @@ fn handed_out(session: &SessionSegment) -> PassedFd {
 }
 
 #[test]
-fn who_rings_never_waits_whatever_is_done_to_the_bell() {
+fn ringing_never_blocks() {
     let session = SessionSegment::create(SessionId::random()).unwrap();
     let fd = handed_out(&session);
     let flags = fcntl_getfl(&fd).unwrap();
@@ -291,7 +291,7 @@ fn descriptors_in_a_bell_are_not_taken_and_keep_nobody_waiting() {
 }
 
 #[test]
-fn what_epoll_would_round_is_not_left_to_it() {
+fn epoll_gets_whole_milliseconds_only() {
     let whole = |time: Duration| whole_millis(Some(time)).unwrap();
     for short in [0, 1, 999, 200_000, 999_999] {
         assert!(whole(Duration::from_nanos(short)).is_zero(), "{short} ns");
@@ -325,7 +325,7 @@ struct Flag {
     asked: AtomicU64,
 }
 
-impl Look for Flag {
+impl WakeCheck for Flag {
     fn ready(&self) -> bool {
         self.asked.fetch_add(1, Ordering::AcqRel);
         self.up.load(Ordering::Acquire)
@@ -343,7 +343,7 @@ fn of_those_that_follow_the_right_one_is_woken() {
             .iter()
             .map(|flag| {
                 let session = &session;
-                let look = move || -> Arc<dyn Look> { flag.clone() };
+                let look = move || -> Arc<dyn WakeCheck> { flag.clone() };
                 scope.spawn(move || session.wait_for(|| flag.ready(), &look, Some(EVER)))
             })
             .collect();

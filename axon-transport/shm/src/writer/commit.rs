@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::{LOOKS, Numbering, Payload, State};
+use super::{LOOKS, Numbering, Payload, WriterState};
 use crate::{
     alloc::area::Area,
     error::PublishError,
@@ -14,7 +14,7 @@ use crate::{
     qos::Durability,
     ring::{
         layout::{self, COPIED, INLINE, Location},
-        protocol::{self, Place, Record},
+        protocol::{self, PayloadPlace, Record},
         types::{Meta, Published},
     },
     session::peer::PeerSession,
@@ -50,7 +50,7 @@ pub const MAX_GAP: u64 = 1 << 32;
 const MAX_FIRST: u64 = 1 << 48;
 
 /// Refuses a number from outside that would make readers count losses that cannot be.
-fn judge(state: &State, numbering: Numbering) -> Result<(), PublishError> {
+fn judge(state: &WriterState, numbering: Numbering) -> Result<(), PublishError> {
     let Numbering::Given(Meta { sequence, .. }) = numbering else { return Ok(()) };
     let last = state.last;
     let most = if last == 0 { MAX_FIRST } else { last.saturating_add(MAX_GAP) };
@@ -119,15 +119,17 @@ impl Writer {
             }
             self.make_place(state)?;
             let (extent, place) = match payload {
-                Payload::Bytes(bytes) if bytes.len() <= INLINE => (Extent::Inline, Place::Inline),
+                Payload::Bytes(bytes) if bytes.len() <= INLINE => {
+                    (Extent::Inline, PayloadPlace::Inline)
+                }
                 Payload::Bytes(bytes) => {
                     let block = self.copy_in(state, bytes)?;
-                    (Extent::Block(block), Place::Block(block.at))
+                    (Extent::Block(block), PayloadPlace::Block(block.at))
                 }
                 Payload::Written { at, lead, len: sample, lent } => {
                     let len = Area::rounded(lent as u64);
                     let first = Location { offset: at.offset + lead as u64, ..at };
-                    (Extent::Slot { at, len, sample: sample as u64 }, Place::Slot(first))
+                    (Extent::Slot { at, len, sample: sample as u64 }, PayloadPlace::Slot(first))
                 }
             };
             let meta = self.number(state, numbering);
@@ -163,12 +165,12 @@ impl Writer {
 
     /// Whether nobody will ever read what is published now.
     #[inline]
-    pub(super) fn is_unread(&self, state: &State) -> bool {
+    pub(super) fn is_unread(&self, state: &WriterState) -> bool {
         state.reader_set.is_empty() && self.options.qos.durability == Durability::Volatile
     }
 
     /// A sample that nobody reads.
-    pub(super) fn pass(&self, state: &mut State, numbering: Numbering) -> Meta {
+    pub(super) fn pass(&self, state: &mut WriterState, numbering: Numbering) -> Meta {
         let meta = self.number(state, numbering);
         self.count(state);
         // No sample to come asks for the memory of those that were in use.
@@ -177,7 +179,7 @@ impl Writer {
     }
 
     #[inline]
-    fn number(&self, state: &mut State, numbering: Numbering) -> Meta {
+    fn number(&self, state: &mut WriterState, numbering: Numbering) -> Meta {
         let meta = match numbering {
             Numbering::Given(meta) => meta,
             Numbering::Next(source_timestamp) => {
@@ -189,7 +191,7 @@ impl Writer {
     }
 
     #[inline]
-    fn count(&self, state: &mut State) {
+    fn count(&self, state: &mut WriterState) {
         state.published += 1;
         let published = &self.ring.words()[layout::ring::PUBLISHED];
         Word::store(published, state.published, Ordering::Relaxed);
@@ -197,10 +199,10 @@ impl Writer {
 
     fn show(
         &self,
-        state: &mut State,
+        state: &mut WriterState,
         meta: Meta,
         extent: Extent,
-        place: Place,
+        place: PayloadPlace,
         payload: Payload<'_>,
     ) -> u64 {
         let (len, inline) = match payload {
@@ -235,7 +237,7 @@ impl Writer {
     pub(super) fn retry_until<T>(
         &self,
         deadline: &mut PublishDeadline,
-        attempt: impl FnMut(&mut State) -> Result<T, Refusal>,
+        attempt: impl FnMut(&mut WriterState) -> Result<T, Refusal>,
     ) -> Result<T, PublishError> {
         let tried = self.try_for(deadline, attempt);
         if let Err(error) = &tried {
@@ -247,7 +249,7 @@ impl Writer {
     fn try_for<T>(
         &self,
         deadline: &mut PublishDeadline,
-        mut attempt: impl FnMut(&mut State) -> Result<T, Refusal>,
+        mut attempt: impl FnMut(&mut WriterState) -> Result<T, Refusal>,
     ) -> Result<T, PublishError> {
         for look in 0u32.. {
             let (short, laggards) = {
@@ -255,13 +257,13 @@ impl Writer {
                 let short = match attempt(&mut state) {
                     Ok(done) => return Ok(done),
                     Err(Refusal::Error(error)) => return Err(error),
-                    Err(Refusal::Kept(kept)) => {
+                    Err(Refusal::Pinned(kept)) => {
                         drop(state);
                         return Err(kept.into_error());
                     }
                     Err(Refusal::OldestInUse { short }) => short,
                 };
-                let State { history, reader_set, .. } = &mut *state;
+                let WriterState { history, reader_set, .. } = &mut *state;
                 (short, reader_set.laggards(history.tail(), history.head()))
             };
             let left = deadline.left();
@@ -286,14 +288,14 @@ impl Writer {
     fn await_room(&self, laggards: &[Arc<PeerSession>], left: Duration) {
         let ready = || {
             let mut state = self.lock();
-            let State { history, reader_set, .. } = &mut *state;
+            let WriterState { history, reader_set, .. } = &mut *state;
             reader_set.floors(history.head()).held > history.tail()
                 || laggards.iter().any(|peer| peer.is_dead())
         };
         let pidfds: Vec<_> = laggards.iter().map(|peer| peer.pidfd()).collect();
         self.session.wait_for_room(ready, &pidfds, left);
         let mut state = self.lock();
-        let State { history, reader_set, .. } = &mut *state;
+        let WriterState { history, reader_set, .. } = &mut *state;
         reader_set.mark_dead(history.head());
     }
 }

@@ -5,14 +5,14 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::{State, Writer};
+use super::{Writer, WriterState};
 use crate::{ids::Gid, session::peer::PeerSession};
 
 impl Writer {
     /// The number up to which all that was published has been handed to those who carry it elsewhere.
     pub fn delivered_up_to(&self) -> u64 {
         let mut state = self.lock();
-        let State { history, reader_set, .. } = &mut *state;
+        let WriterState { history, reader_set, .. } = &mut *state;
         let position = reader_set.delivered_up_to(history.head());
         state.number_before(position)
     }
@@ -28,7 +28,7 @@ impl Writer {
         loop {
             let (relays, absent) = {
                 let mut state = self.lock();
-                let State { history, reader_set, known_given_up, .. } = &mut *state;
+                let WriterState { history, reader_set, known_given_up, .. } = &mut *state;
                 reader_set.mark_dead(history.head());
                 // In this order: what is handed over since it was given up is counted by then.
                 let delivered_up_to = reader_set.delivered_up_to(published) >= published;
@@ -57,7 +57,7 @@ impl Writer {
             return 0;
         }
         let mut state = self.lock();
-        let State { history, reader_set, .. } = &mut *state;
+        let WriterState { history, reader_set, .. } = &mut *state;
         let head = history.head();
         reader_set.mark_dead(head);
         head.saturating_sub(reader_set.delivered_up_to(head))
@@ -69,7 +69,7 @@ impl Writer {
             return 0;
         }
         let mut state = self.lock();
-        let State { history, reader_set, .. } = &mut *state;
+        let WriterState { history, reader_set, .. } = &mut *state;
         reader_set.given_up(history.head())
     }
 
@@ -77,7 +77,7 @@ impl Writer {
     pub fn give_up(&self, reader: Gid, samples: u64) {
         if !self.is_forked() {
             let mut state = self.lock();
-            let State { history, reader_set, .. } = &mut *state;
+            let WriterState { history, reader_set, .. } = &mut *state;
             reader_set.give_up(reader, samples, history.head());
         }
     }
@@ -85,7 +85,7 @@ impl Writer {
     fn await_handover(&self, published: u64, relays: &[Arc<PeerSession>], left: Duration) {
         let ready = || {
             let mut state = self.lock();
-            let State { history, reader_set, known_given_up, .. } = &mut *state;
+            let WriterState { history, reader_set, known_given_up, .. } = &mut *state;
             reader_set.delivered_up_to(published) >= published
                 || reader_set.given_up(history.head()) != *known_given_up
                 || relays.iter().any(|peer| peer.is_dead())

@@ -298,7 +298,7 @@ mod tests {
     }
 
     #[test]
-    fn what_may_not_go_is_kept() {
+    fn history_keeps_samples_in_use() {
         let mut history = History::new(4, 0);
         for _ in 0..3 {
             history.make_place(|_| false).unwrap();

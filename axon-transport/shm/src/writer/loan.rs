@@ -8,12 +8,13 @@ use std::{
     ptr::NonNull,
     slice,
     sync::Arc,
+    time::SystemTime,
 };
 
 use crate::{
     alloc::segments::OwnSegment,
     error::PublishError,
-    os::clock::wall,
+    os::clock::{unix_nanos, wall},
     ring::{
         layout::{ALIGNED, Location},
         types::{Meta, Published},
@@ -117,17 +118,24 @@ impl<'a> Loan<'a> {
         self.publish_as(Numbering::Given(meta)).map(|(_, published)| published)
     }
 
-    /// As [`publish`](Self::publish), with the sequence number that follows the publisher's last,
-    /// which is returned.
+    /// Like [`publish`](Self::publish), with this source time. Returns the sample's sequence number, the one after the
+    /// publisher's last.
     ///
     /// # Errors
     /// As for [`publish`](Self::publish).
+    #[inline]
+    pub fn publish_at(self, source_time: SystemTime) -> Result<u64, PublishError> {
+        self.publish_next(unix_nanos(source_time))
+    }
+
+    /// Like [`publish_at`](Self::publish_at), with a source time in nanoseconds since the Unix epoch.
+    #[doc(hidden)]
     #[inline]
     pub fn publish_next(self, source_timestamp: i64) -> Result<u64, PublishError> {
         self.publish_as(Numbering::Next(source_timestamp)).map(|(sequence, _)| sequence)
     }
 
-    /// As [`publish_next`](Self::publish_next), stamped with the current time.
+    /// Like [`publish_at`](Self::publish_at), with the current time.
     ///
     /// # Errors
     /// As for [`publish`](Self::publish).

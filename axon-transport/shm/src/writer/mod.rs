@@ -119,10 +119,10 @@ pub struct Writer {
     pub(super) number: u32,
     /// The most descriptors.
     pub(super) limit: u64,
-    state: PiMutex<State>,
+    state: PiMutex<WriterState>,
 }
 
-pub(super) struct State {
+pub(super) struct WriterState {
     pub(super) history: History,
     pub(super) reader_set: ReaderSet,
     /// The descriptors.
@@ -148,7 +148,7 @@ fn most_descriptors(budget: u64) -> u64 {
     (budget / layout::DESCRIPTOR).max(layout::FIRST_DESCRIPTORS).next_power_of_two()
 }
 
-impl State {
+impl WriterState {
     /// The first position that stands whose sample has a higher number.
     fn position_after(&self, number: u64) -> u64 {
         let standing = self.history.tail()..self.history.head();
@@ -252,7 +252,7 @@ impl Writer {
             history.count_descriptors();
         }
         let reader_set = ReaderSet::new(qos, limit - 1, Pool::new(budget, max_message));
-        let state = State::new(reader_set, history, array);
+        let state = WriterState::new(reader_set, history, array);
         let writer = Self { options, session, ring, number, limit, state: PiMutex::new(state)? };
         writer.add_bytes(layout::RING + descriptors * layout::DESCRIPTOR);
         writer.show_window(&writer.lock());
@@ -306,7 +306,7 @@ impl Writer {
         let lane = reader.peer.lane(reader.lane)?;
         let mut state = self.lock();
         let resumed = terms.after.map(|after| state.position_after(after));
-        let State { reader_set, history, .. } = &mut *state;
+        let WriterState { reader_set, history, .. } = &mut *state;
         let (tail, head) = (history.tail(), history.head());
         let granted = reader_set.attach(reader, lane, tail, head, resumed, terms.carries);
         self.show_window(&state);
@@ -332,7 +332,7 @@ impl Writer {
         let mut state = self.lock();
         // A session of which this was the last part is unmapped after the lock, and not under it.
         let peers = state.reader_set.peers();
-        let State { reader_set, history, .. } = &mut *state;
+        let WriterState { reader_set, history, .. } = &mut *state;
         let changed = by(reader_set, history.head());
         self.show_window(&state);
         drop(state);
@@ -440,7 +440,7 @@ impl Writer {
         self.loan_behind(0, len)
     }
 
-    /// As [`loan`](Self::loan); aligned to 16 is what is behind the first `header` bytes.
+    /// Like [`loan`](Self::loan); the bytes after the header are 16-byte aligned.
     ///
     /// # Errors
     /// As [`publish`](Self::publish).
@@ -505,7 +505,7 @@ impl Writer {
     }
 
     #[inline]
-    pub(super) fn lock(&self) -> PiGuard<'_, State> {
+    pub(super) fn lock(&self) -> PiGuard<'_, WriterState> {
         self.state.lock()
     }
 }
@@ -516,10 +516,10 @@ impl Drop for Writer {
         if self.is_forked() {
             return;
         }
-        let State { mut history, array, reader_set, .. } = {
+        let WriterState { mut history, array, reader_set, .. } = {
             let mut state = self.lock();
             let nobody = ReaderSet::new(self.options.qos, 0, Pool::default());
-            let empty = State::new(nobody, History::new(1, 0), self.ring.clone());
+            let empty = WriterState::new(nobody, History::new(1, 0), self.ring.clone());
             std::mem::replace(&mut *state, empty)
         };
         // Readers drain what stands. After them nobody looks at any of it.

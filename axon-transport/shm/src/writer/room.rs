@@ -15,7 +15,7 @@ use crate::{
         protocol,
     },
     session::pin_lanes::PinningReader,
-    writer::{State, Writer, history::OldestInUse},
+    writer::{Writer, WriterState, history::OldestInUse},
 };
 
 /// Why an attempt to publish did not succeed.
@@ -26,19 +26,19 @@ pub(crate) enum Refusal {
         short: Option<PublishError>,
     },
     Error(PublishError),
-    /// Readers keep what memory there is.
-    Kept(Kept),
+    /// Readers pin the memory that samples could use.
+    Pinned(PinnedMemory),
 }
 
-/// Who keeps it.
-pub(crate) struct Kept {
+/// The reader that pins most of a publisher's memory.
+pub(crate) struct PinnedMemory {
     pub(crate) holder: PinningReader,
     pub(crate) samples: usize,
-    /// Why there is no more of it, where it is not that the segments are full.
+    /// Why no further memory is available, unless the segments are full.
     pub(crate) short: Option<PublishError>,
 }
 
-impl Kept {
+impl PinnedMemory {
     /// The error that the caller of a publish gets. Looks the process up, so not to be called under a
     /// lock.
     pub(crate) fn into_error(self) -> PublishError {
@@ -101,7 +101,7 @@ pub(crate) fn no_memory(error: ShmError) -> PublishError {
 
 impl Writer {
     /// Makes sure that the next position has a descriptor.
-    pub(crate) fn make_place(&self, state: &mut State) -> Result<(), Refusal> {
+    pub(crate) fn make_place(&self, state: &mut WriterState) -> Result<(), Refusal> {
         if state.history.is_full() {
             let floors = state.reader_set.floors(state.history.head());
             // What has been taken in is kept a little longer than the window asks for, so that the
@@ -146,7 +146,7 @@ impl Writer {
     ///
     /// # Errors
     /// There is no memory for them.
-    fn grow(&self, state: &mut State, need: Need) -> Result<(), ShmError> {
+    fn grow(&self, state: &mut WriterState, need: Need) -> Result<(), ShmError> {
         let descriptors = 2 * (state.history.capacity() + 1);
         if descriptors > self.limit {
             return Ok(());
@@ -174,7 +174,11 @@ impl Writer {
     }
 
     /// Copies at most [`COPIED`] bytes in for the next position, which has a descriptor.
-    pub(crate) fn copy_in(&self, state: &mut State, payload: &[u8]) -> Result<Block, Refusal> {
+    pub(crate) fn copy_in(
+        &self,
+        state: &mut WriterState,
+        payload: &[u8],
+    ) -> Result<Block, Refusal> {
         debug_assert!(payload.len() as u64 <= COPIED);
         let bytes = Area::rounded(payload.len() as u64);
         // Nobody asks without need how far readers are: they say so in cache lines of their own.
@@ -191,7 +195,7 @@ impl Writer {
     }
 
     /// A block for a sample, for which the oldest samples go if they have to.
-    fn block_with_room(&self, state: &mut State, bytes: u64) -> Result<Block, Refusal> {
+    fn block_with_room(&self, state: &mut WriterState, bytes: u64) -> Result<Block, Refusal> {
         let floors = state.reader_set.floors(state.history.head());
         let may_go = |position| position < floors.held;
         state.history.make_room(bytes, may_go)?;
@@ -219,7 +223,7 @@ impl Writer {
     }
 
     /// A new block of the session's memory.
-    fn block(&self, state: &mut State, bytes: u64) -> Result<Block, PublishError> {
+    fn block(&self, state: &mut WriterState, bytes: u64) -> Result<Block, PublishError> {
         if state.history.blocks().are_many() {
             self.give_blocks_back(state);
         }
@@ -235,7 +239,7 @@ impl Writer {
         Ok(object.block)
     }
 
-    fn give_blocks_back(&self, state: &mut State) {
+    fn give_blocks_back(&self, state: &mut WriterState) {
         // Others write there from now on.
         self.show_tail(state);
         for block in state.history.blocks().drain() {
@@ -245,7 +249,7 @@ impl Writer {
     }
 
     /// Tells readers what has been given up. Before any of it is written over.
-    pub(crate) fn show_tail(&self, state: &mut State) {
+    pub(crate) fn show_tail(&self, state: &mut WriterState) {
         if state.shown_tail != state.history.tail() {
             state.shown_tail = state.history.tail();
             protocol::retire(self.ring.words(), state.shown_tail);

@@ -21,10 +21,10 @@ use crate::{
     },
     session::pin_lanes::PinningReader,
     writer::{
-        LOOKS, State, Writer,
+        LOOKS, Writer, WriterState,
         history::OldestInUse,
         loan::LoanPlace,
-        room::{Kept, Refusal, no_memory},
+        room::{PinnedMemory, Refusal, no_memory},
     },
 };
 
@@ -105,7 +105,7 @@ impl Writer {
             return false;
         }
         let mut state = self.lock();
-        let State { history, reader_set, .. } = &mut *state;
+        let WriterState { history, reader_set, .. } = &mut *state;
         if history.pinned().segments().len() == 0 {
             return false;
         }
@@ -113,7 +113,7 @@ impl Writer {
         let floors = reader_set.floors(history.head());
         history.release_below(floors.retained.max(reader_set.consumed(history.head())));
         self.reclaim(&mut state);
-        let State { history, samples, .. } = &mut *state;
+        let WriterState { history, samples, .. } = &mut *state;
         if let (Some(open), Some((used, backed))) = (samples.as_mut(), history.pinned().extent())
             && open.retention.is_over(now, used, backed - SLOTS_AT)
         {
@@ -125,12 +125,12 @@ impl Writer {
     }
 
     /// Has a segment that takes samples in.
-    pub(crate) fn open_samples(&self, state: &mut State) -> Result<(), ShmError> {
+    pub(crate) fn open_samples(&self, state: &mut WriterState) -> Result<(), ShmError> {
         if state.samples.is_none() { self.open_another(state) } else { Ok(()) }
     }
 
     /// Has a new segment take samples in. What is in the last one stays there.
-    fn open_another(&self, state: &mut State) -> Result<(), ShmError> {
+    fn open_another(&self, state: &mut WriterState) -> Result<(), ShmError> {
         let options = self.options();
         let bytes = samples_bytes(options.budget, options.max_message, RECORDS as u64);
         let segment = self.session.open_samples(options.gid, bytes)?;
@@ -141,7 +141,7 @@ impl Writer {
     }
 
     /// Takes `bytes`, more than [`COPIED_ALWAYS`], that no reader reads.
-    pub(crate) fn lend(&self, state: &mut State, bytes: u64) -> Result<LoanPlace, Refusal> {
+    pub(crate) fn lend(&self, state: &mut WriterState, bytes: u64) -> Result<LoanPlace, Refusal> {
         debug_assert!(bytes > COPIED_ALWAYS);
         self.open_samples(state).map_err(no_memory)?;
         if let Some(place) = self.next_turn(state, bytes) {
@@ -222,7 +222,11 @@ impl Writer {
                 None if look < LOOKS => {}
                 holder => {
                     let holder = holder.unwrap_or(PinningReader { reader: self.gid(), peer: None });
-                    return Err(Refusal::Kept(Kept { holder, samples: kept.len(), short }));
+                    return Err(Refusal::Pinned(PinnedMemory {
+                        holder,
+                        samples: kept.len(),
+                        short,
+                    }));
                 }
             }
         }
@@ -231,8 +235,8 @@ impl Writer {
 
     /// A slot at hand, as long as slots take turns: to find out what readers have taken costs lines
     /// that they have just written to, and need not be done for each sample.
-    fn next_turn(&self, state: &mut State, bytes: u64) -> Option<LoanPlace> {
-        let State { history, samples: Some(samples), .. } = state else { return None };
+    fn next_turn(&self, state: &mut WriterState, bytes: u64) -> Option<LoanPlace> {
+        let WriterState { history, samples: Some(samples), .. } = state else { return None };
         let Some(turns) = samples.turns.checked_sub(1) else {
             samples.turns = TURNS - 1;
             return None;
@@ -247,7 +251,7 @@ impl Writer {
     /// backed and must not `grow`.
     fn place(
         &self,
-        state: &mut State,
+        state: &mut WriterState,
         bytes: u64,
         grow: bool,
     ) -> Result<Option<LoanPlace>, PublishError> {
@@ -260,12 +264,12 @@ impl Writer {
     /// What was lent, in memory that there is.
     fn settled(
         &self,
-        state: &mut State,
+        state: &mut WriterState,
         at: Location,
         bytes: u64,
         grow: bool,
     ) -> Result<Option<LoanPlace>, PublishError> {
-        let State { history, samples: Some(samples), .. } = state else { return Ok(None) };
+        let WriterState { history, samples: Some(samples), .. } = state else { return Ok(None) };
         let slots = history.pinned().slots(at);
         let end = slots.end(at.offset, bytes);
         let is_open = at.segment == samples.segment.number();
@@ -299,11 +303,11 @@ impl Writer {
     }
 
     /// Frees what was given up and is not read by anybody.
-    pub(crate) fn reclaim(&self, state: &mut State) {
+    pub(crate) fn reclaim(&self, state: &mut WriterState) {
         if state.history.pinned().retired().len() > 0 {
             self.show_tail(state);
             pins::about_to_scan::<AtomicU64>();
-            let State { history, reader_set, pinned, .. } = state;
+            let WriterState { history, reader_set, pinned, .. } = state;
             pinned.refresh(|pinned| reader_set.scan(pinned));
             history.pinned().reclaim(|position, len| pinned.keeps(position, len));
         }
@@ -311,7 +315,7 @@ impl Writer {
     }
 
     /// Gives segments up that were left and that nobody reads any more.
-    fn close_vacated(&self, state: &mut State) {
+    fn close_vacated(&self, state: &mut WriterState) {
         for number in state.history.pinned().vacated() {
             self.session.close_samples(number);
         }

@@ -10,7 +10,7 @@ use crate::{
     error::PublishError,
     ring::layout::ring::{BLOCKED, BYTES, NO_MEMORY, PINNED, WINDOW},
     sync::{Ordering, Word},
-    writer::{State, Writer},
+    writer::{Writer, WriterState},
 };
 
 impl Writer {
@@ -25,7 +25,7 @@ impl Writer {
     }
 
     /// The readers have changed.
-    pub(crate) fn show_window(&self, state: &State) {
+    pub(crate) fn show_window(&self, state: &WriterState) {
         self.update(WINDOW, |_| state.reader_set.window());
     }
 

@@ -72,7 +72,7 @@ fn without_origin(config: &Config) -> String {
 }
 
 #[test]
-fn what_is_built_is_what_the_environment_would_make_and_so_it_is_passed_on() {
+fn a_built_config_equals_that_of_its_environment() {
     let dir = tempfile::tempdir().unwrap();
     let key = dir.path().join("key");
     std::fs::write(&key, "").unwrap();
@@ -135,7 +135,7 @@ fn no_entry_becomes_two_entries_or_every_peer() {
 }
 
 #[test]
-fn what_the_environment_may_not_say_a_builder_may_not_either() {
+fn builder_refuses_what_the_environment_refuses() {
     let new = Config::builder;
     for (builder, name) in [
         (new().security_mode(SecurityMode::Qkd), "AXON_SAE_ID"),

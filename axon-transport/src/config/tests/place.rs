@@ -49,7 +49,7 @@ fn other_settings_may_be_wrong_and_a_file_may_be_anything() {
 }
 
 #[test]
-fn what_says_where_the_daemon_is_must_be_right() {
+fn daemon_place_refuses_wrong_settings() {
     for (name, value) in
         [("ROS_DOMAIN_ID", "-1"), ("AXON_RUNTIME_DIR", "x"), ("AXON_TRUSTED_UIDS", "me")]
     {

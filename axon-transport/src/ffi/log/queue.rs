@@ -22,12 +22,12 @@ const ROOM: usize = 256;
 /// What a process has said and its thread has not told yet.
 #[derive(Default)]
 pub(super) struct Waiting {
-    state: Mutex<State>,
+    state: Mutex<QueueState>,
     more: Condvar,
 }
 
 #[derive(Default)]
-struct State {
+struct QueueState {
     lines: VecDeque<Line>,
     /// How many more there would have been.
     lost: u64,
@@ -89,7 +89,7 @@ impl Waiting {
         }
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
+    fn lock(&self) -> MutexGuard<'_, QueueState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

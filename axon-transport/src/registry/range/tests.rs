@@ -262,7 +262,7 @@ fn pairs_and_graph_follow_a_link_that_comes_and_goes() {
 }
 
 #[test]
-fn what_another_host_says_of_its_session_is_followed() {
+fn a_hosts_range_for_its_own_session_is_followed() {
     let mut world = World::new(&[scope(Localhost, &[])]);
     world.own(1, 1, Subscription);
     world.stand_in(REMOTE);
@@ -325,7 +325,7 @@ fn a_publisher_counts_those_of_a_relay_that_it_meets() {
 }
 
 #[test]
-fn what_status_lists_of_pairs_out_of_range_is_bounded() {
+fn the_list_of_pairs_out_of_range_is_bounded() {
     let mut world = World::new(&[scope(Off, &[]), scope(Subnet, &[])]);
     for number in 1..=20 {
         world.own(1, number, Publisher);

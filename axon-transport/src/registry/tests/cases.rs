@@ -13,7 +13,7 @@ fn first(world: &World) -> SessionId {
 }
 
 #[test]
-fn what_no_session_does_is_a_violation() {
+fn forged_session_messages_are_violations() {
     let mut world = connected(2);
     let (own, other) = (first(&world), world.clients[&1].id);
     let registry = &mut world.registry;

@@ -483,7 +483,7 @@ proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::with_cases(256) })]
 
     #[test]
-    fn whatever_happens_everybody_ends_up_knowing(steps in prop::collection::vec(step(), 0..400)) {
+    fn all_sessions_converge_after_random_steps(steps in prop::collection::vec(step(), 0..400)) {
         let mut world = World::default();
         for step in steps {
             world.take(step);

@@ -17,7 +17,7 @@ use crate::{
     ids::SessionId,
     session::{
         SessionOptions,
-        daemon::spawn::{Outcome, spawn},
+        daemon::spawn::{SpawnOutcome, spawn},
         error::SessionError,
     },
     wire::session::{Hello, Message, PROTOCOL, SessionRole, Welcome},
@@ -93,8 +93,8 @@ impl<'a> Caller<'a> {
                     if turn.is_some() || Instant::now() >= until {
                         let command = self.options.daemon_command.as_ref();
                         match spawn(self.config, command, &|| self.cancelled())? {
-                            Outcome::Ready => continue,
-                            Outcome::Taken => {
+                            SpawnOutcome::Ready => continue,
+                            SpawnOutcome::Taken => {
                                 spawn_after = Instant::now() + AFTER;
                                 taken += 1;
                             }

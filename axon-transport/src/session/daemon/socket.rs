@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_said_is_heard_though_who_said_it_left_something_unread() {
+    fn messages_of_a_closed_peer_are_received_despite_its_unread_ones() {
         let (a, b) = pair();
         let message = Message::Resync.encode().unwrap();
         [&b, &a, &a].iter().for_each(|from| send(from, &message, &[]).unwrap());

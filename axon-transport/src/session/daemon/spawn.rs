@@ -37,7 +37,7 @@ const MAX_REPORT: usize = 8192;
 
 /// What a daemon reports.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Outcome {
+pub(crate) enum SpawnOutcome {
     /// It runs.
     Ready,
     /// Another one has the address.
@@ -49,7 +49,7 @@ pub(crate) fn spawn(
     config: &Config,
     command: Option<&DaemonCommand>,
     cancelled: &dyn Fn() -> bool,
-) -> Result<Outcome, SessionError> {
+) -> Result<SpawnOutcome, SessionError> {
     let DaemonCommand { program, arguments } = find(config, command)?;
     let failed = |text: String| SessionError::DaemonFailed { program: program.clone(), text };
     let is_elevated = is_elevated();
@@ -80,8 +80,8 @@ pub(crate) fn spawn(
     }
     let status = child.wait();
     match report.trim_end() {
-        "ready" => Ok(Outcome::Ready),
-        "taken" => Ok(Outcome::Taken),
+        "ready" => Ok(SpawnOutcome::Ready),
+        "taken" => Ok(SpawnOutcome::Taken),
         "" => Err(failed(match status {
             Ok(status) => format!("it said nothing ({status})"),
             Err(error) => error.to_string(),

@@ -68,6 +68,22 @@ impl Session {
 /// The status of the daemon of this user and domain. Starts none, and is answered whatever the
 /// security settings.
 ///
+/// ```
+/// # use axon_transport::config::Config;
+/// use axon_transport::{SessionError, daemon_status};
+///
+/// # let directory = std::env::temp_dir().join(format!("axon-example-{}", std::process::id()));
+/// # std::fs::create_dir_all(&directory)?;
+/// let config = Config::builder().runtime_dir(&directory).domain(231).build()?;
+/// match daemon_status(&config) {
+///     Ok(json) => println!("{json}"),
+///     Err(SessionError::NoDaemon { .. }) => println!("no daemon runs"),
+///     Err(error) => return Err(error.into()),
+/// }
+/// # std::fs::remove_dir_all(&directory)?;
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+///
 /// # Errors
 /// [`SessionError::NoDaemon`] when there is none.
 pub fn daemon_status(config: &Config) -> Result<String, SessionError> {
@@ -75,6 +91,13 @@ pub fn daemon_status(config: &Config) -> Result<String, SessionError> {
 }
 
 /// The same where no more is known than where that daemon is: other settings may be wrong.
+///
+/// ```no_run
+/// use axon_transport::{config::DaemonPlace, daemon_status_at};
+///
+/// println!("{}", daemon_status_at(&DaemonPlace::from_env()?)?);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 ///
 /// # Errors
 /// As [`daemon_status`].

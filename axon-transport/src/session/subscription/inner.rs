@@ -4,7 +4,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use axon_shm::{
     ShmError,
-    internal::{Grant, Lane, Location, Look, Peer, Reader, ReaderOptions, holds},
+    internal::{Grant, Lane, Location, Peer, Reader, ReaderOptions, WakeCheck, holds},
 };
 
 use super::matched_readers::MatchedReaders;
@@ -17,7 +17,7 @@ use crate::{
         callback::Callback,
         clock,
         events::{Changes, EndpointEvents},
-        state::Shared,
+        state::SessionShared,
         tasks::{Calls, Wakers},
     },
     wire::session::EndpointRole,
@@ -105,7 +105,7 @@ impl SubscriptionInner {
     pub(in crate::session) fn set_on_new_sample(
         &self,
         callback: Option<OnNew>,
-        shared: &Shared,
+        shared: &SessionShared,
     ) -> Result<(), ShmError> {
         let listens = callback.is_some();
         self.arrived.replace(callback, |untold| {
@@ -118,14 +118,14 @@ impl SubscriptionInner {
     }
 
     /// Nobody hears of samples any more, whatever is set from now on.
-    pub(in crate::session) fn tell_no_more(&self, shared: &Shared) {
+    pub(in crate::session) fn tell_no_more(&self, shared: &SessionShared) {
         self.arrived.end();
         // Only listening may fail, not ceasing to.
         let _ = self.listen(false, shared);
     }
 
     /// Has the control thread listen for its callback, or not any more.
-    fn listen(&self, whether: bool, shared: &Shared) -> Result<(), ShmError> {
+    fn listen(&self, whether: bool, shared: &SessionShared) -> Result<(), ShmError> {
         let mut listens = lock(&self.listens);
         match (*listens, whether) {
             (false, true) => shared.listen()?,
@@ -231,7 +231,7 @@ impl SubscriptionInner {
     }
 }
 
-impl Look for SubscriptionInner {
+impl WakeCheck for SubscriptionInner {
     fn ready(&self) -> bool {
         match self.matched_readers.try_lock() {
             Ok(matched_readers) => matched_readers.has_data(),

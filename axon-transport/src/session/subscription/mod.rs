@@ -14,7 +14,7 @@ use std::{
 
 use axon_shm::{
     Meta, Sample, ShmError, TakeError,
-    internal::{Look, Reader},
+    internal::{Reader, WakeCheck},
 };
 
 use self::matched_readers::MatchedReaders;
@@ -25,8 +25,8 @@ pub(super) use self::{
 pub use self::{taking::TakeLimit, trusted::TrustedSubscription};
 use super::{
     OnNew, RecvError, Session, SessionError, clock,
-    events::{Event, Source},
-    state::{Outgoing, Shared},
+    events::{Event, EventSource},
+    state::{Outgoing, SessionShared},
 };
 use crate::{
     events::EventKind,
@@ -36,12 +36,53 @@ use crate::{
 };
 
 /// Receives the samples of a topic. Thread-safe.
+///
+/// ```
+/// # use std::time::Duration;
+/// # use axon_transport::{
+/// #     EndpointSpec, Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// #     qos::Qos,
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// # let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default());
+/// let publisher = session.create_publisher(spec())?;
+/// let subscription = session.create_subscription(spec())?;
+/// assert!(publisher.wait_matched(1, Duration::from_secs(10)));
+/// publisher.publish(b"1.5 m/s")?;
+///
+/// let mut payload = Vec::new();
+/// subscription.recv(&mut payload, Some(Duration::from_secs(10)))?;
+/// assert_eq!(payload, b"1.5 m/s");
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub struct Subscription {
     pub(super) inner: Arc<SubscriptionInner>,
     pub(super) session: Session,
 }
 
 /// What is known of a sample besides its bytes.
+///
+/// ```
+/// # use std::time::Duration;
+/// # use axon_transport::{
+/// #     EndpointSpec, Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// #     qos::Qos,
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// # let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default());
+/// let publisher = session.create_publisher(spec())?;
+/// let subscription = session.create_subscription(spec())?;
+/// assert!(publisher.wait_matched(1, Duration::from_secs(10)));
+/// publisher.publish(b"1.5 m/s")?;
+///
+/// let info = subscription.recv(&mut Vec::new(), Some(Duration::from_secs(10)))?;
+/// assert_eq!((info.publisher, info.sequence, info.reception), (publisher.gid(), 1, 1));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct MessageInfo {
@@ -61,6 +102,29 @@ pub struct MessageInfo {
 
 /// The age of a sample when it was taken, and its publisher's lifespan. The monotonic clock tells both,
 /// so that neither a step of the wall clock nor that of another host counts.
+///
+/// ```
+/// # use std::time::Duration;
+/// # use axon_transport::{
+/// #     EndpointSpec, Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// #     qos::Qos,
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// let lifespan = Duration::from_secs(60);
+/// let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default().with_lifespan(lifespan));
+/// let publisher = session.create_publisher(spec())?;
+/// let subscription = session.create_subscription(spec())?;
+/// assert!(publisher.wait_matched(1, Duration::from_secs(10)));
+/// publisher.publish(b"1.5 m/s")?;
+///
+/// let info = subscription.recv(&mut Vec::new(), Some(Duration::from_secs(10)))?;
+/// let lifetime = info.lifetime.expect("the lifespan is finite");
+/// assert_eq!(lifetime.lifespan, lifespan);
+/// assert!(lifetime.age < lifespan);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Lifetime {
@@ -186,7 +250,7 @@ impl Subscription {
 
     /// One of its events; `None` where `kind` is a publisher's.
     pub fn event(&self, kind: EventKind) -> Option<Event> {
-        Event::new(Source::Subscription(self.inner.clone()), kind, self.session.clone())
+        Event::new(EventSource::Subscription(self.inner.clone()), kind, self.session.clone())
     }
 
     /// Samples taken.
@@ -211,7 +275,7 @@ impl Drop for Subscription {
 /// The oldest of what one may take, in place.
 pub(super) fn take_sample_from(
     inner: &SubscriptionInner,
-    shared: &Shared,
+    shared: &SessionShared,
 ) -> Option<(MessageInfo, Sample)> {
     let copy = shared.config.shm_copy;
     take_from(inner, shared, |reader| {
@@ -223,7 +287,7 @@ pub(super) fn take_sample_from(
 /// The oldest of what one may take.
 pub(super) fn take_from<T>(
     inner: &SubscriptionInner,
-    shared: &Shared,
+    shared: &SessionShared,
     take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
 ) -> Option<(MessageInfo, T)> {
     take_with(inner, shared, |matched_readers| matched_readers.take(take, inner))
@@ -232,7 +296,7 @@ pub(super) fn take_from<T>(
 /// The same as bytes, into `out`, which it replaces.
 pub(super) fn take_bytes_from(
     inner: &SubscriptionInner,
-    shared: &Shared,
+    shared: &SessionShared,
     out: &mut Vec<u8>,
 ) -> Option<MessageInfo> {
     let take = |reader: &mut Reader| Ok(reader.take(out)?.map(|taken| (taken.meta, ())));
@@ -273,7 +337,7 @@ pub(super) fn take_many_of(
 /// What `take` takes; `None` when there is nothing.
 fn take_with<T>(
     inner: &SubscriptionInner,
-    shared: &Shared,
+    shared: &SessionShared,
     take: impl FnOnce(&mut MatchedReaders) -> Option<T>,
 ) -> Option<T> {
     // A thread of the parent may have held the lock when this process was forked.
@@ -318,7 +382,7 @@ pub(super) fn recv_from<T>(
         let now = Instant::now();
         let waited = now.duration_since(*begun.get_or_insert(now));
         let left = timeout.map(|timeout| timeout.saturating_sub(waited));
-        let look = || -> Arc<dyn Look> { inner.clone() };
+        let look = || -> Arc<dyn WakeCheck> { inner.clone() };
         let over = left.is_some_and(|left| left.is_zero());
         if over || !session.segment().wait_for(|| inner.has_data(), &look, left) {
             return Err(RecvError::TimedOut);

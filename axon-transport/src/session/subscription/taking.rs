@@ -438,7 +438,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_writer_left_without_a_word_is_looked_at_when_it_is_over() {
+    fn unannounced_samples_of_an_ended_writer_are_read() {
         let session = SessionSegment::create(SessionId::random()).unwrap();
         session.follow();
         let [gid, writers @ ..] =

@@ -18,7 +18,7 @@ use crate::{
     ids::Gid,
     session::{
         Client, RecvError, clock,
-        state::Shared,
+        state::SessionShared,
         subscription::{SubscriptionInner, take_sample_from},
     },
 };
@@ -27,6 +27,23 @@ use crate::{
 const BATCH: usize = 256;
 
 /// Why a call has no response.
+///
+/// ```
+/// # use std::time::Duration;
+/// use axon_transport::CallError;
+/// # use axon_transport::{
+/// #     EndpointSpec, Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// #     qos::Qos,
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// # let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default());
+/// let client = session.create_client(spec())?;
+/// let failed = client.call_blocking(b"how fast?", Some(Duration::from_secs(1)));
+/// assert!(matches!(failed, Err(CallError::Unavailable)));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum CallError {
@@ -94,7 +111,7 @@ impl Calls {
     }
 
     /// Hands out the responses that came, and drops those that nobody waits for. Whether a call still waits.
-    pub(super) fn collect(&self, of: &SubscriptionInner, shared: &Shared) -> bool {
+    pub(super) fn collect(&self, of: &SubscriptionInner, shared: &SessionShared) -> bool {
         // The lock is held from the moment that a response leaves its ring until its call has it. A reader of
         // `calls` therefore finds the response either in the ring or in its call.
         let mut calls = self.lock();
@@ -153,7 +170,7 @@ fn fail_those_without_server(
 /// A call that is under way, until it is dropped.
 struct Calling<'a> {
     inner: &'a SubscriptionInner,
-    shared: &'a Shared,
+    shared: &'a SessionShared,
     number: u64,
     _listener: Listener<'a>,
 }

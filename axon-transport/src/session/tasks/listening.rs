@@ -7,7 +7,7 @@ use std::{
 
 use axon_shm::{ExternalLeader, ShmError, internal::SessionSegment};
 
-use crate::session::{error::RecvError, state::Shared};
+use crate::session::{error::RecvError, state::SessionShared};
 
 /// How long it still listens after the last task: most tasks wait again, and each end and begin costs several
 /// system calls.
@@ -16,11 +16,11 @@ const LINGER: Duration = Duration::from_secs(1);
 /// The leader by which the control thread listens, and the number of callbacks and tasks that need it.
 #[derive(Default)]
 pub(in crate::session) struct Listening {
-    state: Mutex<State>,
+    state: Mutex<ListeningState>,
 }
 
 #[derive(Default)]
-struct State {
+struct ListeningState {
     /// Subscriptions with a callback, and waits of other sessions. Each ring is answered for these.
     callbacks: usize,
     /// Futures that wait, and streams that may wait again. These arm a ticket when they wait.
@@ -100,12 +100,12 @@ impl Listening {
         (state.leader.clone(), state.until)
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
+    fn lock(&self) -> MutexGuard<'_, ListeningState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl State {
+impl ListeningState {
     /// Makes sure that there is a leader. Whether it is a new one.
     fn lead(&mut self, segment: &Arc<SessionSegment>) -> Result<bool, ShmError> {
         let new = self.leader.is_none();
@@ -128,11 +128,11 @@ impl State {
 
 /// Has the control thread listen for a task, until it is dropped.
 pub(super) struct Listener<'a> {
-    shared: &'a Shared,
+    shared: &'a SessionShared,
 }
 
 impl<'a> Listener<'a> {
-    pub(super) fn new(shared: &'a Shared) -> Result<Self, RecvError> {
+    pub(super) fn new(shared: &'a SessionShared) -> Result<Self, RecvError> {
         let begun = shared.listening.begin_task(&shared.segment);
         if begun.map_err(|error| RecvError::of_listening(&error))? {
             shared.wake();

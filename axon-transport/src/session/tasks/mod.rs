@@ -23,7 +23,7 @@ mod listening;
 mod receive;
 mod wakers;
 
-use super::{state::Shared, subscription::SubscriptionInner};
+use super::{state::SessionShared, subscription::SubscriptionInner};
 
 pub use calls::CallError;
 pub(in crate::session) use calls::Calls;
@@ -34,7 +34,7 @@ pub(in crate::session) use wakers::Wakers;
 impl SubscriptionInner {
     /// For the control thread: wakes the tasks for which something came. Whether some still wait, so that
     /// whatever comes next must ring.
-    pub(in crate::session) fn wake_tasks(&self, shared: &Shared) -> bool {
+    pub(in crate::session) fn wake_tasks(&self, shared: &SessionShared) -> bool {
         let calls = self.calls.collect(self, shared);
         let receivers = self.wakers.wake_if(|| self.has_data());
         calls || receivers

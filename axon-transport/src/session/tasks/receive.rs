@@ -13,7 +13,7 @@ use futures_core::{FusedStream, Stream};
 use super::listening::Listener;
 use crate::session::{
     MessageInfo, RecvError, Server, Subscription,
-    state::Shared,
+    state::SessionShared,
     subscription::{SubscriptionInner, take_bytes_from},
 };
 
@@ -23,14 +23,14 @@ const IN_A_ROW: u32 = 32;
 /// A task that waits at an endpoint.
 struct Receiver<'a> {
     inner: &'a SubscriptionInner,
-    shared: &'a Shared,
+    shared: &'a SessionShared,
     listener: Option<Listener<'a>>,
     /// Its number among the endpoint's wakers, once it has waited.
     id: Option<u64>,
 }
 
 impl<'a> Receiver<'a> {
-    fn new(inner: &'a SubscriptionInner, shared: &'a Shared) -> Self {
+    fn new(inner: &'a SubscriptionInner, shared: &'a SessionShared) -> Self {
         Self { inner, shared, listener: None, id: None }
     }
 
@@ -80,6 +80,29 @@ impl Drop for Receiver<'_> {
 /// It goes on for as long as it is polled, whatever publishers come and go. It ends after an error, which no
 /// later poll could mend. After 32 messages without a pause it has its task polled again, so that others of
 /// the same thread are not kept waiting by a publisher that never rests.
+///
+/// ```
+/// # use axon_transport::{
+/// #     EndpointSpec, Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// #     qos::Qos,
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// # let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default());
+/// let subscription = session.create_subscription(spec())?;
+/// let mut messages = subscription.stream();
+/// let printing = async move {
+///     while let Some(message) = messages.next().await {
+///         let (info, payload) = message?;
+///         println!("{}: {payload:?}", info.sequence);
+///     }
+///     Ok::<(), axon_transport::RecvError>(())
+/// };
+/// // Any runtime runs it.
+/// # drop(printing);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub struct Messages<'a> {
     receiver: Receiver<'a>,
     in_a_row: u32,
@@ -87,7 +110,7 @@ pub struct Messages<'a> {
 }
 
 impl<'a> Messages<'a> {
-    fn new(inner: &'a SubscriptionInner, shared: &'a Shared) -> Self {
+    fn new(inner: &'a SubscriptionInner, shared: &'a SessionShared) -> Self {
         Self { receiver: Receiver::new(inner, shared), in_a_row: 0, ended: false }
     }
 }
@@ -213,7 +236,7 @@ impl Server {
 
 async fn recv(
     inner: &SubscriptionInner,
-    shared: &Shared,
+    shared: &SessionShared,
 ) -> Result<(MessageInfo, Vec<u8>), RecvError> {
     let (mut receiver, mut bytes) = (Receiver::new(inner, shared), Vec::new());
     let take = |context: &mut Context<'_>| {

@@ -119,7 +119,7 @@ fn grant(far: &Far, introduction: &[OwnedFd], subscription: &Subscription, daemo
 }
 
 #[test]
-fn what_a_killed_daemon_did_not_hand_over_comes_once_through_the_next() {
+fn samples_not_handed_over_come_once_through_the_next_daemon() {
     a_daemon_is_killed_whose_memory(false);
 }
 

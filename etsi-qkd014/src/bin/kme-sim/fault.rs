@@ -8,7 +8,7 @@ use clap::{Args, Subcommand};
 use etsi_qkd014::sim::FaultPlan;
 use serde_json::Value;
 
-use crate::{Failure, Outcome, other, say};
+use crate::{CommandFailure, CommandResult, other, say};
 
 const TIME: Duration = Duration::from_secs(5);
 const MAX_ANSWER: u64 = 1 << 20;
@@ -52,7 +52,7 @@ enum Action {
     },
 }
 
-pub(crate) fn fault(arguments: &Arguments) -> Outcome {
+pub(crate) fn fault(arguments: &Arguments) -> CommandResult {
     let (method, path, plans) = match &arguments.action {
         Action::List => ("GET", "/faults".to_owned(), None),
         Action::Kmes => ("GET", "/kmes".to_owned(), None),
@@ -72,9 +72,9 @@ pub(crate) fn fault(arguments: &Arguments) -> Outcome {
 }
 
 /// The resource of a KME's faults. Its ID goes into a request line.
-fn of(kme: &str) -> Outcome<String> {
+fn of(kme: &str) -> CommandResult<String> {
     if kme.is_empty() || !kme.bytes().all(|c| c.is_ascii_alphanumeric() || b"-_.".contains(&c)) {
-        return Err(Failure::Usage(format!("{kme:?} is no KME's ID")));
+        return Err(CommandFailure::Usage(format!("{kme:?} is no KME's ID")));
     }
     Ok(format!("/faults/{kme}"))
 }

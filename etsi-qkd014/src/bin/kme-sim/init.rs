@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::Args;
 use etsi_qkd014::sim::{Layout, Pki, Site};
 
-use crate::{Failure, Outcome, layout_file, other, say};
+use crate::{CommandFailure, CommandResult, layout_file, other, say};
 
 /// Writes a throw-away CA and the certificates and keys of every KME and SAE into a directory, and
 /// prints the environment of each SAE.
@@ -20,7 +20,7 @@ pub(crate) struct Arguments {
     sites: Vec<Site>,
 }
 
-pub(crate) fn init(arguments: &Arguments) -> Outcome {
+pub(crate) fn init(arguments: &Arguments) -> CommandResult {
     let dir = &arguments.dir;
     let mut layout = Layout { sites: arguments.sites.clone() };
     if layout.sites.is_empty() {
@@ -28,7 +28,10 @@ pub(crate) fn init(arguments: &Arguments) -> Outcome {
         layout.sites = default.map(site).into_iter().collect::<Result<_, _>>().map_err(other)?;
     }
     if let Some(site) = layout.sites.iter().find(|site| site.bind.port() == 0) {
-        return Err(Failure::Usage(format!("{} needs a port: its URL is printed now", site.kme)));
+        return Err(CommandFailure::Usage(format!(
+            "{} needs a port: its URL is printed now",
+            site.kme
+        )));
     }
     let pki = Pki::create(&layout).map_err(other)?;
     pki.write(dir).map_err(other)?;

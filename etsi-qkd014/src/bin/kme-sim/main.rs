@@ -30,12 +30,12 @@ enum Command {
 }
 
 /// Why the program ends without success.
-enum Failure {
+enum CommandFailure {
     Usage(String),
     Other(String),
 }
 
-type Outcome<T = ()> = Result<T, Failure>;
+type CommandResult<T = ()> = Result<T, CommandFailure>;
 
 fn main() -> ExitCode {
     let outcome = match Arguments::parse().command {
@@ -46,11 +46,11 @@ fn main() -> ExitCode {
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
-        Err(Failure::Usage(why)) => {
+        Err(CommandFailure::Usage(why)) => {
             eprintln!("kme-sim: {why}; see kme-sim --help");
             ExitCode::from(2)
         }
-        Err(Failure::Other(why)) => {
+        Err(CommandFailure::Other(why)) => {
             eprintln!("kme-sim: {why}");
             ExitCode::FAILURE
         }
@@ -62,8 +62,8 @@ fn say(text: &str) {
     print!("{text}");
 }
 
-fn other(error: impl std::fmt::Display) -> Failure {
-    Failure::Other(error.to_string())
+fn other(error: impl std::fmt::Display) -> CommandFailure {
+    CommandFailure::Other(error.to_string())
 }
 
 /// Where `init` leaves the layout for `run`.

@@ -9,7 +9,7 @@ use std::time::Duration;
 use clap::Args;
 use etsi_qkd014::sim::{Control, Fault, FaultPlan, FillRate, Layout, Network, Pki};
 
-use crate::{Failure, Outcome, layout_file, other, say};
+use crate::{CommandFailure, CommandResult, layout_file, other, say};
 
 /// Serves the KMEs of a directory until it is interrupted.
 #[derive(Args)]
@@ -47,7 +47,7 @@ pub(crate) struct Arguments {
     control: Option<SocketAddr>,
 }
 
-pub(crate) fn run(arguments: Arguments) -> Outcome {
+pub(crate) fn run(arguments: Arguments) -> CommandResult {
     let file = layout_file(&arguments.dir);
     let text = fs::read_to_string(&file)
         .map_err(|e| other(format!("{}: {e}; make it with kme-sim init", file.display())))?;
@@ -55,13 +55,13 @@ pub(crate) fn run(arguments: Arguments) -> Outcome {
         serde_json::from_str(&text).map_err(|e| other(format!("{}: {e}", file.display())))?;
     let known = |id: &String| layout.sites.iter().any(|site| site.kme == *id);
     if let Some((id, _)) = arguments.faults.iter().find(|(id, _)| !known(id)) {
-        return Err(Failure::Usage(format!("--fault: there is no KME {id:?}")));
+        return Err(CommandFailure::Usage(format!("--fault: there is no KME {id:?}")));
     }
     let runtime = tokio::runtime::Runtime::new().map_err(other)?;
     runtime.block_on(serve(arguments, layout))
 }
 
-async fn serve(arguments: Arguments, layout: Layout) -> Outcome {
+async fn serve(arguments: Arguments, layout: Layout) -> CommandResult {
     let pki = Pki::load(&arguments.dir, &layout).map_err(other)?;
     let control = match arguments.control {
         Some(bind) => Some(Control::bind(bind).await.map_err(other)?),

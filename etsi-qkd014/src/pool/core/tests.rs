@@ -62,7 +62,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(512))]
 
     #[test]
-    fn whatever_happens_the_rules_hold(
+    fn the_pool_keeps_its_rules_under_random_events(
         events in proptest::collection::vec(event(), 0..200),
         batch in 0..12u32,
         calls in 0..6usize,

@@ -337,7 +337,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_ledger_is_left_as_it_is() {
+    fn a_file_that_is_no_ledger_stays_unchanged() {
         let (dir, path) = temp();
         for text in ["x", "someone's diary, which is a good deal longer than the header is"] {
             std::fs::write(&path, text).unwrap();

@@ -20,11 +20,11 @@ mod file;
 /// KMEs count their keys instead of naming them by UUIDs, each needs its own.
 #[derive(Clone)]
 pub struct Ledger {
-    inner: Arc<Mutex<Inner>>,
+    inner: Arc<Mutex<LedgerInner>>,
     in_file: bool,
 }
 
-enum Inner {
+enum LedgerInner {
     Memory(Memory),
     #[cfg(unix)]
     File(file::FileLedger),
@@ -94,7 +94,7 @@ impl Ledger {
     #[must_use]
     pub fn memory(capacity: usize) -> Self {
         let memory = Memory { capacity: capacity.max(1), ..Memory::default() };
-        Self { inner: Arc::new(Mutex::new(Inner::Memory(memory))), in_file: false }
+        Self { inner: Arc::new(Mutex::new(LedgerInner::Memory(memory))), in_file: false }
     }
 
     /// A ledger in a file, which is made (mode 0600) where there is none. It forgets nothing: 32
@@ -119,7 +119,7 @@ impl Ledger {
     #[cfg(unix)]
     pub fn file_of(path: impl Into<PathBuf>, capacity: usize) -> Result<Self, LedgerError> {
         let file = file::FileLedger::open(path.into(), capacity)?;
-        Ok(Self { inner: Arc::new(Mutex::new(Inner::File(file))), in_file: true })
+        Ok(Self { inner: Arc::new(Mutex::new(LedgerInner::File(file))), in_file: true })
     }
 
     /// Whether it remembers this key_ID. Records nothing, and does not block on a disk.
@@ -127,9 +127,9 @@ impl Ledger {
     pub fn contains(&self, key_id: &str) -> bool {
         let short = short(&sha(key_id));
         match &*self.inner.lock().unwrap_or_else(PoisonError::into_inner) {
-            Inner::Memory(memory) => memory.seen.contains(&short),
+            LedgerInner::Memory(memory) => memory.seen.contains(&short),
             #[cfg(unix)]
-            Inner::File(file) => file.contains(&short),
+            LedgerInner::File(file) => file.contains(&short),
         }
     }
 
@@ -145,9 +145,11 @@ impl Ledger {
     {
         let shas: Vec<Sha> = key_ids.into_iter().map(|id| sha(id.as_ref())).collect();
         match &mut *self.inner.lock().unwrap_or_else(PoisonError::into_inner) {
-            Inner::Memory(memory) => Ok(shas.iter().map(|sha| memory.insert(short(sha))).collect()),
+            LedgerInner::Memory(memory) => {
+                Ok(shas.iter().map(|sha| memory.insert(short(sha))).collect())
+            }
             #[cfg(unix)]
-            Inner::File(file) => file.record(&shas),
+            LedgerInner::File(file) => file.record(&shas),
         }
     }
 
@@ -155,9 +157,9 @@ impl Ledger {
     #[must_use]
     pub fn len(&self) -> usize {
         match &*self.inner.lock().unwrap_or_else(PoisonError::into_inner) {
-            Inner::Memory(memory) => memory.order.len(),
+            LedgerInner::Memory(memory) => memory.order.len(),
             #[cfg(unix)]
-            Inner::File(file) => file.len(),
+            LedgerInner::File(file) => file.len(),
         }
     }
 

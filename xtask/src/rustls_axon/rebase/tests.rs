@@ -9,7 +9,7 @@ use super::*;
 const OTHER: &str = "0.23.45";
 
 #[test]
-fn what_must_not_be_moved_to_is_refused_with_the_reason() {
+fn vulnerable_and_invalid_versions_are_refused() {
     for release in 13..=44 {
         let error = admit(&format!("0.23.{release}")).unwrap_err();
         assert!(error.contains("RUSTSEC-2026-0285"), "{error}");

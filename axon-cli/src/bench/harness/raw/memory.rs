@@ -19,12 +19,12 @@ use super::super::Result;
 ///
 /// Words are atomic. Bytes are plain: who copies them has to know from a word that the other
 /// process does not touch them meanwhile.
-pub(crate) struct Shared {
+pub(crate) struct SharedPages {
     base: NonNull<c_void>,
     len: usize,
 }
 
-impl Shared {
+impl SharedPages {
     /// New memory of `len` bytes, and the descriptor by which the other process maps it.
     pub(crate) fn create(len: usize) -> Result<(Self, OwnedFd)> {
         let fd = memfd_create("bench-raw", MemfdFlags::CLOEXEC)?;
@@ -84,7 +84,7 @@ impl Shared {
     }
 }
 
-impl Drop for Shared {
+impl Drop for SharedPages {
     fn drop(&mut self) {
         // SAFETY: the range is the mapping, and no borrow of it outlives `self`.
         let _ = unsafe { munmap(self.base.as_ptr(), self.len) };

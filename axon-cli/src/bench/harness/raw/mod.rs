@@ -8,7 +8,7 @@ use std::{
     sync::atomic::Ordering,
 };
 
-pub(crate) use memory::Shared;
+pub(crate) use memory::SharedPages;
 pub(crate) use sleep::Sleeps;
 use sleep::{Asleep, Bell, sleep, wake};
 
@@ -51,7 +51,7 @@ impl Medium for Raw {
         let len = PAYLOADS + 2 * slots * slot;
         let (memory, bells) = match side {
             Side::Near => {
-                let (memory, fd) = Shared::create(len)?;
+                let (memory, fd) = SharedPages::create(len)?;
                 let bells = [Bell::cast()?, Bell::cast()?];
                 let fds = [fd.as_fd(), bells[1].as_fd(), bells[0].as_fd()];
                 channel.hand_over(&(), &fds)?;
@@ -61,7 +61,7 @@ impl Medium for Raw {
                 let ((), fds) = channel.take_over()?;
                 let [fd, first, second] =
                     fds.try_into().map_err(|_| "another number of descriptors")?;
-                (Shared::map(&fd, len)?, [first, second])
+                (SharedPages::map(&fd, len)?, [first, second])
             }
         };
         let [out, into] = match side {
@@ -91,7 +91,7 @@ impl Medium for Raw {
 }
 
 struct RawEnd {
-    memory: Shared,
+    memory: SharedPages,
     load: Load,
     slot: usize,
     /// With one for all, a sender has to take each line back from the receiver's cache: up to 40 %

@@ -38,7 +38,7 @@ const MAX_LEFT: usize = 256;
 
 /// A publisher's samples: they cross once, whatever the number of subscriptions.
 #[derive(Default)]
-pub(super) struct Source {
+pub(super) struct RelayedSource {
     samples: Merge<Sample>,
     /// How much of its history has been asked for.
     history: Option<u32>,
@@ -46,7 +46,7 @@ pub(super) struct Source {
     pub(super) done: Option<u64>,
 }
 
-impl Source {
+impl RelayedSource {
     /// Has its publisher know what the session has, by way of all subscriptions.
     pub(super) fn acknowledge(&self, to: &BTreeMap<Gid, Subscription>, writer: &Gid) {
         let Some(done) = self.done else { return };
@@ -223,12 +223,13 @@ impl RelayedSession {
         }
     }
 
-    /// Takes what has gone by way of another subscription or server; whether there is more.
+    /// Skips samples that the session already received through another subscription or server. Returns whether more
+    /// remain.
     pub(super) fn pass_over(&mut self) -> bool {
         let mut more = self.calls.pass_over(|gid| self.writers.get(gid));
         for (writer, source) in &mut self.sources {
             more |= source.samples.pass_over(|reader| taken(&self.subscriptions, reader, writer));
-            // What was passed over just now the session has by way of another.
+            // The session already received skipped samples through another subscription.
             if source.samples.readers().nth(1).is_some() {
                 source.acknowledge(&self.subscriptions, writer);
             }
@@ -237,14 +238,14 @@ impl RelayedSession {
     }
 }
 
-/// How much a subscription asks for of what was published before it was there.
+/// The samples that a subscription requests from before its creation.
 fn history_of(qos: &Qos) -> Option<u32> {
     let depth = if qos.history == History::KeepAll { u32::MAX } else { qos.depth };
     (qos.durability == Durability::TransientLocal).then_some(depth)
 }
 
 pub(super) fn take(
-    source: &mut Source,
+    source: &mut RelayedSource,
     subscriptions: &BTreeMap<Gid, Subscription>,
     writer: &Gid,
 ) -> Option<OutboundSample<Sample>> {

@@ -44,7 +44,7 @@ use axon_transport::{
 };
 use rustix::io::Errno;
 
-use self::matching::{Source, take};
+use self::matching::{RelayedSource, take};
 use super::losses::Losses;
 
 /// Why samples of a writer that ended are lost.
@@ -174,7 +174,7 @@ struct RelayedSession {
     /// The others that each endpoint was said to be matched with.
     told: BTreeMap<Gid, BTreeSet<Gid>>,
     /// The publishers whose samples the session gets.
-    sources: BTreeMap<Gid, Source>,
+    sources: BTreeMap<Gid, RelayedSource>,
     /// What is asked of its servers.
     calls: Calls,
     /// The clients that its process has for each of its servers: whose responses may come.
@@ -446,13 +446,13 @@ impl RelayedSession {
         }
     }
 
-    /// The process has what stands for these clients of a server, whose responses they get by way of it.
+    /// The process holds stand-ins for these clients of a server. Their responses pass through it.
     fn callers(&mut self, matched: Matched) -> Result<(), End> {
         let Matched { gid, others } = matched;
         let others: BTreeSet<Gid> = others.into_iter().collect();
         match self.writers.get(&gid) {
             Some(RemoteWriter::Server(_)) => {}
-            // It was refused.
+            // The endpoint was refused.
             None if gid.is_of(&self.id) => return Ok(()),
             _ => return Err(End::Other(format!("{gid} is no server of its own"))),
         }

@@ -43,7 +43,7 @@ fn hear<T>(socket: &OwnedFd, mut pick: impl FnMut(Message) -> Option<T>) -> T {
 }
 
 #[test]
-fn what_the_control_plane_refuses_its_process_is_told_of() {
+fn a_relayed_process_receives_the_control_planes_refusal() {
     let ([process, far], [control, inside]) = (pair(), pair());
     let id = SessionId::random();
     let relay = DaemonRelay {

@@ -7,16 +7,16 @@ use axon_shm::ids::DaemonId;
 use super::{MOST_UNAUTHENTICATED, Peers, record::Record};
 use crate::discovery::{Action, AddressConfidence};
 
-/// Most records of daemons of which nothing is known but a beacon; the rest is kept for others.
+/// Most records of daemons that are known by a beacon alone. The remaining records are for other daemons.
 const MOST_HEARD: usize = 192;
-/// As many records are theirs whatever others there are.
+/// Records reserved for daemons that are known by a beacon alone.
 const LEAST_HEARD: usize = 64;
-/// Most hosts that are remembered because a link with them stood.
+/// Most hosts that are remembered for an earlier link.
 const MOST_MET: usize = 128;
 
 impl Peers {
-    /// Makes room for a record of `daemon`, if it has none. Of too many the host goes short that has
-    /// the most, and of its records the oldest.
+    /// Makes room for a record of `daemon`, if it has none. If there are too many, the oldest record of the host with
+    /// most records is dropped.
     pub(super) fn make_room(&mut self, daemon: DaemonId, from: IpAddr) {
         if self.records.contains_key(&daemon) {
             return;

@@ -39,7 +39,7 @@ use self::{
     bucket::Bucket,
     candidates::LocalAddresses,
     probing::Probes,
-    record::{Record, Source},
+    record::{DialAddress, Record},
 };
 use super::{Action, AddressConfidence, Interface};
 
@@ -223,7 +223,7 @@ impl Peers {
         self.listed = listed;
         let listed: Vec<IpAddr> = self.listed.iter().map(|(address, _)| *address).collect();
         for record in self.records.values_mut() {
-            let lists = |source: &Source| listed.contains(&source.address.ip());
+            let lists = |source: &DialAddress| listed.contains(&source.address.ip());
             record.listed = record.sources.iter().any(lists);
             for source in &mut record.sources {
                 let address = source.address.ip();

@@ -12,7 +12,7 @@ use std::{
 use axon_shm::ids::DaemonId;
 use rand::RngExt;
 
-use super::{Peers, record::Source};
+use super::{Peers, record::DialAddress};
 use crate::{
     discovery::{AddressConfidence, quic_ports},
     wire::beacon::Datagram,
@@ -34,7 +34,7 @@ pub(super) struct ProbeInFlight {
     at: Duration,
     nonce: [u8; 8],
     daemon: DaemonId,
-    source: Source,
+    source: DialAddress,
     /// It counts towards [`MOST_ASKED_OF_A_HOST`].
     counts: bool,
     /// Somebody answered: it is kept for [`ASKED_AGAIN`] alone.
@@ -53,7 +53,7 @@ impl Peers {
         standing: AddressConfidence,
     ) {
         let Some(record) = self.records.get_mut(&daemon) else { return };
-        let may_ask = |source: &Source| !source.asked && !source.answered && !source.proven;
+        let may_ask = |source: &DialAddress| !source.asked && !source.answered && !source.proven;
         let mut asked = Vec::new();
         for source in &mut record.sources {
             if source.standing() == standing && may_ask(source) {
@@ -73,7 +73,7 @@ impl Peers {
 
     /// Probes an address, unless too many probes are under way or somebody answered there just now.
     /// Whether an answer is awaited from there.
-    fn ask(&mut self, now: Duration, daemon: DaemonId, source: Source) -> bool {
+    fn ask(&mut self, now: Duration, daemon: DaemonId, source: DialAddress) -> bool {
         let to = source.address;
         // The answer says which daemon is there, whichever was asked for.
         let recent =
@@ -170,7 +170,7 @@ impl Peers {
             false => record.sources.iter().find(|source| source.address == from).cloned(),
         };
         let Some(source) = source else { return };
-        record.saw(Source { answered: true, leaving: None, ..source });
+        record.saw(DialAddress { answered: true, leaving: None, ..source });
         if !record.linked && record.leaving.take().is_some() {
             record.stayed = Some(now);
         }

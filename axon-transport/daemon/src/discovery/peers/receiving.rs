@@ -7,7 +7,7 @@ use axon_transport::config::DiscoveryRange;
 use rand::RngExt;
 use tracing::{debug, info};
 
-use super::{Arrival, Peers, record::Source};
+use super::{Arrival, Peers, record::DialAddress};
 use crate::{
     discovery::{Action, Mismatch},
     wire::{
@@ -95,7 +95,7 @@ impl Peers {
                 record.leaving = None;
                 let port = beacon.port;
                 let advertised = beacon.addresses.iter().map(|a| SocketAddr::new(*a, port));
-                record.saw(Source {
+                record.saw(DialAddress {
                     address: observed,
                     sae: beacon.sae,
                     advertised: advertised.collect(),
@@ -212,7 +212,7 @@ impl Peers {
             return;
         }
         let source = record.sources.iter().find(|source| source.address == address);
-        if let Some(standing) = source.map(Source::standing) {
+        if let Some(standing) = source.map(DialAddress::standing) {
             self.ask_whether_there(now, daemon, standing);
         }
     }

@@ -21,7 +21,7 @@ const BACKOFF_MOST: Duration = Duration::from_secs(8);
 
 /// An address at which a peer may be, and what was said of it from there.
 #[derive(Clone, Debug)]
-pub(super) struct Source {
+pub(super) struct DialAddress {
     /// With the port to dial.
     pub(super) address: SocketAddr,
     pub(super) sae: Option<String>,
@@ -38,7 +38,7 @@ pub(super) struct Source {
     pub(super) leaving: Option<Duration>,
 }
 
-impl Source {
+impl DialAddress {
     pub(super) fn standing(&self) -> AddressConfidence {
         match (self.proven, self.known, self.answered) {
             (true, _, _) => AddressConfidence::Proven,
@@ -54,7 +54,7 @@ impl Source {
 #[derive(Debug, Default)]
 pub(super) struct Record {
     /// Where beacons came from: by standing, and the latest first.
-    pub(super) sources: Vec<Source>,
+    pub(super) sources: Vec<DialAddress>,
     /// A beacon of it was acceptable; later ones that are not may be forged.
     pub(super) compatible: bool,
     /// We list it.
@@ -92,14 +92,14 @@ pub(super) struct Dial {
 
 impl Record {
     /// A beacon came from there; or the peer answered there.
-    pub(super) fn saw(&mut self, mut source: Source) {
+    pub(super) fn saw(&mut self, mut source: DialAddress) {
         if let Some(at) = self.sources.iter().position(|s| s.address == source.address) {
             let known = self.sources.remove(at);
             source.answered |= known.answered;
             source.known |= known.known;
             if known.proven {
                 // Who was linked has proven its name; a beacon proves nothing.
-                source = Source { proven: true, sae: known.sae, ..source };
+                source = DialAddress { proven: true, sae: known.sae, ..source };
             }
         }
         self.sources.insert(0, source);
@@ -115,7 +115,7 @@ impl Record {
         if let (true, Some(first)) = (self.compatible, self.sources.first())
             && !self.sources.iter().any(|source| source.proven)
         {
-            let source = Source { address, proven: true, known: true, ..first.clone() };
+            let source = DialAddress { address, proven: true, known: true, ..first.clone() };
             self.sources.insert(0, source);
         }
         for source in self.sources.iter_mut().filter(|source| source.address.ip() == address.ip()) {
@@ -126,7 +126,7 @@ impl Record {
 
     /// Puts the sources in order again. Those of one standing push out no others.
     pub(super) fn order(&mut self) {
-        self.sources.sort_by_key(Source::standing);
+        self.sources.sort_by_key(DialAddress::standing);
         let mut kept = [0; AddressConfidence::COUNT];
         self.sources.retain(|source| {
             let kept = &mut kept[source.standing() as usize];
@@ -137,13 +137,14 @@ impl Record {
 
     /// Those that were left, as a goodbye said and nobody there denied in time.
     pub(super) fn forget_unanswered(&mut self, now: Duration) {
-        let left = |source: &Source| source.leaving.is_some_and(|at| at + ANSWER_WITHIN <= now);
+        let left =
+            |source: &DialAddress| source.leaving.is_some_and(|at| at + ANSWER_WITHIN <= now);
         self.sources
             .retain(|source| !left(source) || source.standing() != AddressConfidence::Heard);
     }
 
     /// The addresses of this standing, the latest first.
-    pub(super) fn of(&self, standing: AddressConfidence) -> impl Iterator<Item = &Source> {
+    pub(super) fn of(&self, standing: AddressConfidence) -> impl Iterator<Item = &DialAddress> {
         self.sources.iter().filter(move |source| source.standing() == standing)
     }
 
@@ -159,7 +160,7 @@ impl Record {
 
     /// The best standing of any of its addresses.
     pub(super) fn standing(&self) -> AddressConfidence {
-        self.sources.first().map_or(AddressConfidence::Heard, Source::standing)
+        self.sources.first().map_or(AddressConfidence::Heard, DialAddress::standing)
     }
 
     /// Whether a dial to addresses of this standing would make sense.

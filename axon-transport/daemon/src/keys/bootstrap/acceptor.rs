@@ -19,7 +19,7 @@ use tokio::sync::Notify;
 
 use super::{
     Completion,
-    limits::{Buckets, IN_FLIGHT, KEPT, PER_SOURCE, ProofBackoff, Source},
+    limits::{Buckets, HandshakeSource, IN_FLIGHT, KEPT, PER_SOURCE, ProofBackoff},
     seen_set::{Fingerprint, SeenSet, fingerprint},
 };
 use crate::keys::{
@@ -103,18 +103,18 @@ impl fmt::Display for Lookup {
 /// Look-ups happen inside the TLS handshake, from whatever thread drives it, so all methods take
 /// `&self` and the time comes from a [`Clock`].
 #[derive(Clone)]
-pub struct Acceptor(Arc<Inner>);
+pub struct Acceptor(Arc<AcceptorInner>);
 
-struct Inner {
+struct AcceptorInner {
     sae_id: String,
     allowed: QkdPeers,
     cipher: Cipher,
     clock: Clock,
-    state: Mutex<State>,
+    state: Mutex<AcceptorState>,
     queued: Notify,
 }
 
-struct State {
+struct AcceptorState {
     cached: HashMap<String, VecDeque<Cached>>,
     /// Calls that are queued or in flight.
     pending: Vec<Pending>,
@@ -127,7 +127,7 @@ struct State {
     spent: SeenSet<Fingerprint>,
     buckets: Buckets,
     unproven: ProofBackoff,
-    known_sources: SeenSet<Source>,
+    known_sources: SeenSet<HandshakeSource>,
     known_saes: SeenSet<String>,
 }
 
@@ -146,7 +146,7 @@ impl Drop for Cached {
 struct Pending {
     identity: PskIdentity,
     key_id: KeyId,
-    source: Source,
+    source: HandshakeSource,
     known: bool,
     since: Duration,
     asked: bool,
@@ -155,12 +155,12 @@ struct Pending {
 impl Acceptor {
     /// For the host `sae_id`, which accepts `allowed`.
     pub fn new(sae_id: &str, allowed: QkdPeers, cipher: Cipher, clock: Clock) -> Self {
-        Self(Arc::new(Inner {
+        Self(Arc::new(AcceptorInner {
             sae_id: sae_id.to_owned(),
             allowed,
             cipher,
             clock,
-            state: Mutex::new(State {
+            state: Mutex::new(AcceptorState {
                 cached: HashMap::new(),
                 pending: Vec::new(),
                 missed: SeenSet::new(UNKNOWN),
@@ -344,7 +344,7 @@ impl Acceptor {
         if missed || state.unknown.contains(&seen) {
             return (Lookup::UnknownKeyId, None);
         }
-        let source = Source::from(source);
+        let source = HandshakeSource::from(source);
         let limited = state.limit(now, &inner.allowed, source, parsed.client_sae());
         let failure = state.failed.iter().position(|(f, _)| *f == seen);
         let failure = failure.and_then(|i| state.failed.remove(i));
@@ -359,7 +359,7 @@ impl Acceptor {
         (failure.map_or(Lookup::Fetching, |(_, why)| Lookup::KmeFailed(why)), None)
     }
 
-    fn state(&self) -> MutexGuard<'_, State> {
+    fn state(&self) -> MutexGuard<'_, AcceptorState> {
         // No operation leaves the state half-changed, so what a panicking thread held is sound.
         self.0.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -371,13 +371,13 @@ impl fmt::Debug for Acceptor {
     }
 }
 
-impl State {
+impl AcceptorState {
     /// Which bound forbids another call, if one does. Takes a token where none does.
     fn limit(
         &mut self,
         now: Duration,
         allowed: &QkdPeers,
-        source: Source,
+        source: HandshakeSource,
         sae: &str,
     ) -> Option<&'static str> {
         let known = self.known_sources.contains(&source);

@@ -92,12 +92,12 @@ pub struct Dialler {
 }
 
 struct Peer {
-    state: State,
+    state: DialState,
     /// Keys and calls that failed since the last success.
     failures: u32,
 }
 
-enum State {
+enum DialState {
     /// The next dial asks for a key, from this time on.
     Empty {
         not_before: Duration,
@@ -148,21 +148,21 @@ impl Dialler {
         }
         let peer = self.peers.entry(sae.to_owned()).or_insert_with(Peer::new);
         match &peer.state {
-            State::Empty { not_before, why } if *not_before > now => {
+            DialState::Empty { not_before, why } if *not_before > now => {
                 return Dial::Wait { until: Some(*not_before), why: why.clone() };
             }
-            State::Empty { .. } => peer.state = State::Wanted,
-            State::UnspentKey(held) if held.not_before > now => {
+            DialState::Empty { .. } => peer.state = DialState::Wanted,
+            DialState::UnspentKey(held) if held.not_before > now => {
                 return Dial::Wait {
                     until: Some(held.not_before),
                     why: format!("peer does not know key_ID {} yet", held.key_id),
                 };
             }
-            State::UnspentKey(held) => {
+            DialState::UnspentKey(held) => {
                 let psk = Arc::clone(&held.psk);
                 return Dial::Attempt(Attempt { key_id: held.key_id.clone(), psk });
             }
-            State::Wanted | State::Asked => {}
+            DialState::Wanted | DialState::Asked => {}
         }
         Dial::Wait { until: None, why: "waiting for the KME's enc_keys answer".to_owned() }
     }
@@ -171,7 +171,7 @@ impl Dialler {
     pub fn succeeded(&mut self, _now: Duration, sae: &str, key_id: &KeyId) -> Completion {
         let Some(peer) = self.peers.get_mut(sae) else { return Completion::Reused };
         match &peer.state {
-            State::UnspentKey(held) if held.key_id == *key_id => {
+            DialState::UnspentKey(held) if held.key_id == *key_id => {
                 *peer = Peer::new();
                 Completion::First
             }
@@ -182,7 +182,7 @@ impl Dialler {
     /// The peer holds another key under `key_id` (0x133). Returns whether the key is given up.
     pub fn mismatched(&mut self, now: Duration, sae: &str, key_id: &KeyId) -> bool {
         let held = self.peers.get_mut(sae).and_then(|peer| match &mut peer.state {
-            State::UnspentKey(held) if held.key_id == *key_id => Some(held),
+            DialState::UnspentKey(held) if held.key_id == *key_id => Some(held),
             _ => None,
         });
         let Some(held) = held else { return false };
@@ -191,7 +191,7 @@ impl Dialler {
         self.refused(now, sae, key_id);
         if given_up
             && let Some(peer) = self.peers.get_mut(sae)
-            && matches!(peer.state, State::UnspentKey(_))
+            && matches!(peer.state, DialState::UnspentKey(_))
         {
             peer.failed(now, format!("peer holds another key under key_ID {key_id}"));
         }
@@ -201,7 +201,7 @@ impl Dialler {
     /// The peer refused the key `key_id`: it is unknown to it (0x173).
     pub fn refused(&mut self, now: Duration, sae: &str, key_id: &KeyId) {
         let Some(peer) = self.peers.get_mut(sae) else { return };
-        let State::UnspentKey(held) = &mut peer.state else { return };
+        let DialState::UnspentKey(held) = &mut peer.state else { return };
         if held.key_id != *key_id {
             return;
         }
@@ -224,7 +224,7 @@ impl Dialler {
 
     /// Nothing came back about `key_id`. It stays; silence says nothing of the key.
     pub fn silent(&mut self, _now: Duration, sae: &str, key_id: &KeyId) {
-        if let Some(Peer { state: State::UnspentKey(held), .. }) = self.peers.get_mut(sae)
+        if let Some(Peer { state: DialState::UnspentKey(held), .. }) = self.peers.get_mut(sae)
             && held.key_id == *key_id
         {
             held.last_refusal = None;
@@ -234,12 +234,13 @@ impl Dialler {
     /// The next call to the KME, if any.
     pub fn poll_request(&mut self, now: Duration) -> Option<Request> {
         self.expire(now);
-        let asked = self.peers.values().filter(|p| matches!(p.state, State::Asked)).count();
+        let asked = self.peers.values().filter(|p| matches!(p.state, DialState::Asked)).count();
         if asked >= IN_FLIGHT {
             return None;
         }
-        let (sae, peer) = self.peers.iter_mut().find(|(_, p)| matches!(p.state, State::Wanted))?;
-        peer.state = State::Asked;
+        let (sae, peer) =
+            self.peers.iter_mut().find(|(_, p)| matches!(p.state, DialState::Wanted))?;
+        peer.state = DialState::Asked;
         Some(Request::Enc { slave: sae.clone(), number: 1, purpose: Purpose::Bootstrap })
     }
 
@@ -247,7 +248,7 @@ impl Dialler {
     pub fn handle_answer(&mut self, now: Duration, answer: Answer) {
         let Request::Enc { slave, .. } = answer.request else { return };
         let Some(peer) = self.peers.get_mut(&slave) else { return };
-        if !matches!(peer.state, State::Asked) {
+        if !matches!(peer.state, DialState::Asked) {
             return;
         }
         let key = match answer.outcome {
@@ -257,7 +258,7 @@ impl Dialler {
         };
         match derive(&key, &self.sae_id, &slave, self.cipher) {
             Ok(psk) => {
-                peer.state = State::UnspentKey(UnspentKey {
+                peer.state = DialState::UnspentKey(UnspentKey {
                     key_id: key.0,
                     psk: Arc::new(psk),
                     since: now,
@@ -275,7 +276,7 @@ impl Dialler {
     /// When to poll again without other cause: a key ends.
     pub fn poll_timeout(&self) -> Option<Duration> {
         let end = |p: &Peer| match &p.state {
-            State::UnspentKey(held) => Some(held.since + KEY_MAX_AGE),
+            DialState::UnspentKey(held) => Some(held.since + KEY_MAX_AGE),
             _ => None,
         };
         self.peers.values().filter_map(end).min()
@@ -283,8 +284,9 @@ impl Dialler {
 
     fn expire(&mut self, now: Duration) {
         for peer in self.peers.values_mut() {
-            if matches!(&peer.state, State::UnspentKey(held) if held.since + KEY_MAX_AGE <= now) {
-                peer.state = State::Empty { not_before: now, why: String::new() };
+            if matches!(&peer.state, DialState::UnspentKey(held) if held.since + KEY_MAX_AGE <= now)
+            {
+                peer.state = DialState::Empty { not_before: now, why: String::new() };
             }
         }
     }
@@ -295,7 +297,7 @@ impl Dialler {
             return true;
         }
         let idle =
-            |p: &Peer| matches!(p.state, State::Empty { not_before, .. } if not_before <= now);
+            |p: &Peer| matches!(p.state, DialState::Empty { not_before, .. } if not_before <= now);
         let Some(sae) = self.peers.iter().find(|(_, p)| idle(p)).map(|(sae, _)| sae.clone()) else {
             return false;
         };
@@ -306,7 +308,10 @@ impl Dialler {
 
 impl Peer {
     fn new() -> Self {
-        Self { state: State::Empty { not_before: Duration::ZERO, why: String::new() }, failures: 0 }
+        Self {
+            state: DialState::Empty { not_before: Duration::ZERO, why: String::new() },
+            failures: 0,
+        }
     }
 
     /// A call or a key failed: a held PSK is erased, also for attempts under way, and the KME is left
@@ -314,7 +319,7 @@ impl Peer {
     fn failed(&mut self, now: Duration, why: String) {
         let wait = Duration::from_secs(1 << self.failures.min(6)).min(BACK_OFF_MAX);
         self.failures += 1;
-        self.state = State::Empty { not_before: now + wait, why };
+        self.state = DialState::Empty { not_before: now + wait, why };
     }
 }
 

@@ -20,9 +20,9 @@ const BURST: f64 = 10.0;
 /// Where a handshake comes from. An IPv6 host has a whole /64 to choose from, so that counts as
 /// one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub(super) struct Source(IpAddr);
+pub(super) struct HandshakeSource(IpAddr);
 
-impl From<IpAddr> for Source {
+impl From<IpAddr> for HandshakeSource {
     fn from(address: IpAddr) -> Self {
         Self(match address.to_canonical() {
             IpAddr::V6(a) => {
@@ -43,7 +43,7 @@ const UNPROVEN: usize = 1024;
 
 /// Failed proofs by source and SAE: each one costs a key.
 #[derive(Default)]
-pub(super) struct ProofBackoff(HashMap<(Source, String), FailedProofs>);
+pub(super) struct ProofBackoff(HashMap<(HandshakeSource, String), FailedProofs>);
 
 struct FailedProofs {
     failed: u32,
@@ -52,7 +52,7 @@ struct FailedProofs {
 
 impl ProofBackoff {
     /// One more proof failed.
-    pub(super) fn failed(&mut self, now: Duration, source: Source, sae: &str) {
+    pub(super) fn failed(&mut self, now: Duration, source: HandshakeSource, sae: &str) {
         let key = (source, sae.to_owned());
         if self.0.len() >= UNPROVEN && !self.0.contains_key(&key) {
             let first = self.0.iter().min_by_key(|(_, tries)| tries.until).map(|(k, _)| k.clone());
@@ -68,7 +68,7 @@ impl ProofBackoff {
     }
 
     /// A proof succeeded: it makes up for one that failed.
-    pub(super) fn proven(&mut self, source: Source, sae: &str) {
+    pub(super) fn proven(&mut self, source: HandshakeSource, sae: &str) {
         let key = (source, sae.to_owned());
         if let Some(tries) = self.0.get_mut(&key) {
             tries.failed -= 1;
@@ -79,7 +79,7 @@ impl ProofBackoff {
     }
 
     /// Whether this one has to wait.
-    pub(super) fn waits(&self, now: Duration, source: Source, sae: &str) -> bool {
+    pub(super) fn waits(&self, now: Duration, source: HandshakeSource, sae: &str) -> bool {
         let tries = self.0.get(&(source, sae.to_owned()));
         tries.is_some_and(|tries| now < tries.until)
     }
@@ -154,7 +154,7 @@ mod tests {
     #[test]
     fn failed_proofs_are_spaced_out_for_their_source_alone_and_one_that_succeeds_makes_up_for_one()
     {
-        let source = |a: &str| Source::from(a.parse::<IpAddr>().unwrap());
+        let source = |a: &str| HandshakeSource::from(a.parse::<IpAddr>().unwrap());
         let (here, there) = (source("10.0.0.1"), source("10.0.0.2"));
         let mut unproven = ProofBackoff::default();
         let mut now = Duration::ZERO;
@@ -184,7 +184,7 @@ mod tests {
 
     #[test]
     fn an_ipv6_network_is_one_source() {
-        let source = |a: &str| Source::from(a.parse::<IpAddr>().unwrap());
+        let source = |a: &str| HandshakeSource::from(a.parse::<IpAddr>().unwrap());
         assert_eq!(source("2001:db8::1"), source("2001:db8::ffff:1:2:3"));
         assert_ne!(source("2001:db8::1"), source("2001:db8:0:1::1"));
         assert_ne!(source("10.0.0.1"), source("10.0.0.2"));

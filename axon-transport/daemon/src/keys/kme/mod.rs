@@ -91,9 +91,9 @@ pub enum KmeError {
 
 /// Takes requests. Clones share the KME; calls end when the last is dropped.
 #[derive(Clone)]
-pub struct Kme(Arc<Shared>);
+pub struct Kme(Arc<KmeShared>);
 
-struct Shared {
+struct KmeShared {
     caller: Arc<Caller>,
     links: mpsc::Sender<Job>,
     messages: mpsc::Sender<Job>,
@@ -137,7 +137,7 @@ impl Kme {
             sender
         };
         let (links, messages) = (serve(LINK_CALLS), serve(MESSAGE_CALLS));
-        Ok((Self(Arc::new(Shared { caller, links, messages })), Events(receiver)))
+        Ok((Self(Arc::new(KmeShared { caller, links, messages })), Events(receiver)))
     }
 
     /// Queues a request; its answer comes out of [`Events`]. Never blocks.

@@ -27,10 +27,10 @@ pub struct ClientProof {
     ready: Exporter,
     deadline: Duration,
     tries: u32,
-    step: Step,
+    step: ProofStep,
 }
 
-enum Step {
+enum ProofStep {
     Ask { not_before: Duration },
     Asked,
     Announce(KeyId, KmeKey),
@@ -106,31 +106,31 @@ impl ClientProof {
             ready: Arc::clone(exporters.ready()),
             deadline: now + DEADLINE,
             tries: TRIES,
-            step: Step::Ask { not_before: now },
+            step: ProofStep::Ask { not_before: now },
         }
     }
 
     /// The next call to the KME, if any.
     pub fn poll_request(&mut self, now: Duration) -> Option<Request> {
         match self.step {
-            Step::Ask { not_before } if not_before <= now => {}
+            ProofStep::Ask { not_before } if not_before <= now => {}
             _ => return None,
         }
-        self.step = Step::Asked;
+        self.step = ProofStep::Asked;
         self.tries -= 1;
         Some(Request::Enc { slave: self.client_sae.clone(), number: 1, purpose: Purpose::Proof })
     }
 
     /// The KME's answer to our request.
     pub fn handle_answer(&mut self, now: Duration, answer: Answer) {
-        if !matches!(self.step, Step::Asked) {
+        if !matches!(self.step, ProofStep::Asked) {
             return;
         }
         let invalid = |text: &str| Failure::new(FailureKind::Invalid, text);
         let failure = match answer.outcome {
             Ok(Fetched::Keys(mut keys)) => match keys.pop() {
                 Some((key_id, key)) if keys.is_empty() && announceable(&key_id).is_some() => {
-                    self.step = Step::Announce(key_id, key);
+                    self.step = ProofStep::Announce(key_id, key);
                     return;
                 }
                 _ => invalid("the KME did not give one key with a key_ID of at most 128 bytes"),
@@ -140,18 +140,18 @@ impl ClientProof {
         };
         let nothing_lost = failure.kind.is_transient() && failure.kind != FailureKind::Ambiguous;
         self.step = if nothing_lost && self.tries > 0 {
-            Step::Ask { not_before: now + PAUSE }
+            ProofStep::Ask { not_before: now + PAUSE }
         } else {
-            Step::Failed(ProofFailure::NoKey { sae: self.client_sae.clone(), failure })
+            ProofStep::Failed(ProofFailure::NoKey { sae: self.client_sae.clone(), failure })
         };
     }
 
     /// The ANNOUNCE, once.
     pub fn poll_message(&mut self) -> Option<KeyMessage> {
-        match std::mem::replace(&mut self.step, Step::Asked) {
-            Step::Announce(key_id, key) => {
+        match std::mem::replace(&mut self.step, ProofStep::Asked) {
+            ProofStep::Announce(key_id, key) => {
                 let announce = KeyMessage::Announce(vec![key_id.clone()]);
-                self.step = Step::Announced(key_id, key);
+                self.step = ProofStep::Announced(key_id, key);
                 Some(announce)
             }
             other => {
@@ -165,46 +165,52 @@ impl ClientProof {
     pub fn handle_message(&mut self, _now: Duration, message: &KeyMessage) {
         let sae = || self.client_sae.clone();
         let failure = match (&self.step, message) {
-            (Step::Failed(_), _) => return,
-            (Step::Announced(id, key), KeyMessage::Ready { key_id, proof }) if id == key_id => {
+            (ProofStep::Failed(_), _) => return,
+            (ProofStep::Announced(id, key), KeyMessage::Ready { key_id, proof })
+                if id == key_id =>
+            {
                 if proof::verify(key, id, &self.ready, proof) {
-                    let announced = std::mem::replace(&mut self.step, Step::Asked);
-                    if let Step::Announced(key_id, key) = announced {
-                        self.step = Step::Proven(key_id, key);
+                    let announced = std::mem::replace(&mut self.step, ProofStep::Asked);
+                    if let ProofStep::Announced(key_id, key) = announced {
+                        self.step = ProofStep::Proven(key_id, key);
                     }
                     return;
                 }
                 ProofFailure::WrongProof(sae())
             }
-            (Step::Announced(id, _), KeyMessage::Failed { key_id, reason }) if id == key_id => {
+            (ProofStep::Announced(id, _), KeyMessage::Failed { key_id, reason })
+                if id == key_id =>
+            {
                 ProofFailure::ClientHasNoKey { sae: sae(), reason: reason.clone() }
             }
             (_, other) => ProofFailure::Unexpected { sae: sae(), message: other.name() },
         };
-        self.step = Step::Failed(failure);
+        self.step = ProofStep::Failed(failure);
     }
 
     /// When to call [`handle_timeout`](Self::handle_timeout) and poll again without other cause.
     pub fn poll_timeout(&self) -> Option<Duration> {
         match &self.step {
-            Step::Proven(..) | Step::Failed(_) => None,
-            Step::Ask { not_before } => Some((*not_before).min(self.deadline)),
+            ProofStep::Proven(..) | ProofStep::Failed(_) => None,
+            ProofStep::Ask { not_before } => Some((*not_before).min(self.deadline)),
             _ => Some(self.deadline),
         }
     }
 
     /// Ends the proof when its time is over.
     pub fn handle_timeout(&mut self, now: Duration) {
-        if now >= self.deadline && !matches!(self.step, Step::Proven(..) | Step::Failed(_)) {
-            self.step = Step::Failed(ProofFailure::Timeout(self.client_sae.clone()));
+        if now >= self.deadline
+            && !matches!(self.step, ProofStep::Proven(..) | ProofStep::Failed(_))
+        {
+            self.step = ProofStep::Failed(ProofFailure::Timeout(self.client_sae.clone()));
         }
     }
 
     /// How far it is.
     pub fn state(&self) -> ProofState {
         match &self.step {
-            Step::Proven(..) => ProofState::Proven,
-            Step::Failed(failure) => ProofState::Failed(failure.clone()),
+            ProofStep::Proven(..) => ProofState::Proven,
+            ProofStep::Failed(failure) => ProofState::Failed(failure.clone()),
             _ => ProofState::Pending,
         }
     }
@@ -213,7 +219,7 @@ impl ClientProof {
     /// [`Sender::adopt`](crate::keys::Sender::adopt); in `session` it is spent by being dropped.
     pub fn into_key(self) -> Option<(KeyId, KmeKey)> {
         match self.step {
-            Step::Proven(key_id, key) => Some((key_id, key)),
+            ProofStep::Proven(key_id, key) => Some((key_id, key)),
             _ => None,
         }
     }

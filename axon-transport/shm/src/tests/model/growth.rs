@@ -9,8 +9,8 @@ use crate::{
     ring::{
         layout::{DESCRIPTOR_WORDS, LANE_WORDS, RING_WORDS},
         protocol::{
-            Look, Place, State, View, about_to_write, array, copy_descriptors, publish, replace,
-            retire,
+            PayloadPlace, PositionState, RecordRead, View, about_to_write, array, copy_descriptors,
+            publish, replace, retire,
         },
     },
     session::lane,
@@ -37,7 +37,7 @@ impl Growing {
 
     fn show(&self, which: usize, position: u64) {
         about_to_write::<AtomicU64>();
-        let record = record(position, Place::Inline);
+        let record = record(position, PayloadPlace::Inline);
         publish(&self.header, &self.arrays[which], position, &record, &[]);
     }
 
@@ -55,7 +55,7 @@ impl Growing {
 
 /// `ArrayStore`, `ArrayLoad`: what stands when the ring grows is found in either array.
 #[test]
-fn what_stands_stays_while_the_ring_grows() {
+fn samples_survive_the_growth_of_their_ring() {
     check(3, || {
         let ring = Growing::new();
         let publisher = {
@@ -67,12 +67,14 @@ fn what_stands_stays_while_the_ring_grows() {
         };
         for position in 0..2 {
             let view = ring.view();
-            assert_eq!(view.state(position), State::Here);
+            assert_eq!(view.state(position), PositionState::Here);
             match view.look(position) {
-                Look::Sample(found) => assert_eq!(found, record(position, Place::Inline)),
+                RecordRead::Sample(found) => {
+                    assert_eq!(found, record(position, PayloadPlace::Inline))
+                }
                 // It moved meanwhile.
-                Look::Lapped => {}
-                Look::Corrupt(what) => panic!("{what}"),
+                RecordRead::Lapped => {}
+                RecordRead::Corrupt(what) => panic!("{what}"),
             }
         }
         publisher.join().unwrap();
@@ -97,11 +99,11 @@ fn an_old_array_that_became_something_else_is_noticed() {
             })
         };
         let view = ring.view();
-        if view.state(0) == State::Here {
+        if view.state(0) == PositionState::Here {
             match view.look(0) {
-                Look::Sample(found) => assert_eq!(found, record(0, Place::Inline)),
-                Look::Lapped => {}
-                Look::Corrupt(what) => panic!("{what}"),
+                RecordRead::Sample(found) => assert_eq!(found, record(0, PayloadPlace::Inline)),
+                RecordRead::Lapped => {}
+                RecordRead::Corrupt(what) => panic!("{what}"),
             }
         }
         publisher.join().unwrap();
@@ -116,11 +118,12 @@ fn a_new_array_says_who_is_late_and_who_must_wait() {
         retire(&ring.header, 1);
         ring.show(0, 2);
         ring.grow(1, 3);
-        let states: Vec<State> = (0..6).map(|position| ring.view().state(position)).collect();
-        assert!(!matches!(states[0], State::Ahead), "given up, but not to come");
-        assert_eq!(states[1..3], [State::Here; 2]);
-        assert_eq!(states[3..], [State::Ahead; 3]);
-        assert_eq!(ring.view().look(0), Look::Lapped);
+        let states: Vec<PositionState> =
+            (0..6).map(|position| ring.view().state(position)).collect();
+        assert!(!matches!(states[0], PositionState::Ahead), "given up, but not to come");
+        assert_eq!(states[1..3], [PositionState::Here; 2]);
+        assert_eq!(states[3..], [PositionState::Ahead; 3]);
+        assert_eq!(ring.view().look(0), RecordRead::Lapped);
     });
 }
 

@@ -6,7 +6,7 @@ use loom::{
 };
 
 use crate::{
-    ring::journal::{Journal, News, Place},
+    ring::journal::{Journal, JournalCursor, RingsToRead},
     sync::{Ordering, Word},
     tests::model::{check, zeros},
     wake::{arm, due, settle},
@@ -52,7 +52,7 @@ impl Words {
 
     /// Sleeps and looks until there is a sample in each ring.
     fn follow(&self) {
-        let (mut place, mut found) = (Place::end(self.journal()), [false; 2]);
+        let (mut place, mut found) = (JournalCursor::end(self.journal()), [false; 2]);
         // As for a reader that has just come.
         let mut all = true;
         let mut ticket = 0;
@@ -60,7 +60,7 @@ impl Words {
             ticket += 1;
             arm(&*self.armed, ticket);
             let mut named = Vec::new();
-            all |= place.read(self.journal(), |ring| named.push(ring)) == News::All;
+            all |= place.read(self.journal(), |ring| named.push(ring)) == RingsToRead::All;
             for ring in 0..2 {
                 if all || named.contains(&ring) {
                     let sample = Word::load(&self.rings[ring as usize], Ordering::Relaxed);

@@ -44,7 +44,7 @@ fn a_lane_that_is_open_shows_the_cursor_of_its_reader() {
 /// `CursorStore`, `CursorLoad`: what was given up is counted once the cursor has passed it, and only for
 /// the publisher of whose samples it was.
 #[test]
-fn what_is_given_up_shows_before_the_cursor_that_passes_it() {
+fn given_up_samples_are_counted_before_the_cursor_passes() {
     check(3, || {
         let (lane, tenancy) = granted(0);
         let reader = {

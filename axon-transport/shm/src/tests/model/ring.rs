@@ -8,7 +8,9 @@ use loom::{
 use crate::{
     ring::{
         layout::Location,
-        protocol::{Look, Place, State, about_to_write, bounds, copy_in, retire},
+        protocol::{
+            PayloadPlace, PositionState, RecordRead, about_to_write, bounds, copy_in, retire,
+        },
     },
     session::lane,
     sync::{Ordering, Word},
@@ -17,8 +19,8 @@ use crate::{
 
 const DESCRIPTORS: u64 = 2;
 
-fn place(position: u64) -> Place {
-    Place::Block(Location { segment: 0, offset: position % 2 * 16 })
+fn place(position: u64) -> PayloadPlace {
+    PayloadPlace::Block(Location { segment: 0, offset: position % 2 * 16 })
 }
 
 /// Two words for every other sample.
@@ -36,9 +38,9 @@ fn write(ring: &Ring, blocks: &[AtomicU64], position: u64) {
 /// What a reader that stands at `cursor` finds there: whether a whole sample.
 fn read(ring: &Ring, blocks: &[AtomicU64], cursor: u64) -> bool {
     match ring.view().look(cursor) {
-        Look::Lapped => false,
-        Look::Corrupt(what) => panic!("{what}"),
-        Look::Sample(found) => {
+        RecordRead::Lapped => false,
+        RecordRead::Corrupt(what) => panic!("{what}"),
+        RecordRead::Sample(found) => {
             let payload: Vec<u64> = block(blocks, cursor)
                 .iter()
                 .map(|word| Word::load(word, Ordering::Relaxed))
@@ -76,13 +78,13 @@ fn a_reader_takes_whole_samples_or_none_while_it_is_overtaken() {
         let mut cursor = 0;
         for _ in 0..3 {
             match ring.view().state(cursor) {
-                State::Here if read(&ring, &blocks, cursor) => cursor += 1,
-                State::Here | State::Gone => {
+                PositionState::Here if read(&ring, &blocks, cursor) => cursor += 1,
+                PositionState::Here | PositionState::Gone => {
                     let (tail, head) = bounds(&ring.header).unwrap();
                     assert!(tail <= head);
                     cursor = cursor.max(tail);
                 }
-                State::Ahead => {}
+                PositionState::Ahead => {}
             }
         }
         publisher.join().unwrap();
@@ -100,7 +102,7 @@ fn the_head_is_never_ahead_of_the_stamps() {
         };
         let (_, head) = bounds(&ring.header).unwrap();
         for position in 0..head {
-            assert_eq!(ring.view().state(position), State::Here);
+            assert_eq!(ring.view().state(position), PositionState::Here);
         }
         publisher.join().unwrap();
     });
@@ -132,7 +134,7 @@ fn a_publisher_that_waits_for_the_cursor_overwrites_nothing_unread() {
             })
         };
         for position in 0..2 {
-            while ring.view().state(position) == State::Ahead {
+            while ring.view().state(position) == PositionState::Ahead {
                 thread::yield_now();
             }
             assert_eq!(cells[position as usize].get(), position + 1, "nothing unread was given up");

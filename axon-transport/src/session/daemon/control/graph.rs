@@ -11,7 +11,7 @@ use crate::{
     graph::{Endpoint, EndpointKind, GraphEntry, GraphView, Pairing, pairing},
     ids::Gid,
     session::{
-        events::{Changes, Source},
+        events::{Changes, EventSource},
         publisher::PublisherInner,
         state::SessionEvent,
         subscription::SubscriptionInner,
@@ -90,18 +90,18 @@ impl Control {
     /// is all of them each time.
     pub(super) fn tell_matched(&mut self) {
         let Rematching { writers, readers } = std::mem::take(&mut self.rematching);
-        let writers = writers.into_values().map(Source::Publisher);
-        for source in writers.chain(readers.into_values().map(Source::Subscription)) {
+        let writers = writers.into_values().map(EventSource::Publisher);
+        for source in writers.chain(readers.into_values().map(EventSource::Subscription)) {
             self.rematched(source.rematch(), &source);
         }
     }
 
-    fn rematched(&mut self, changes: Changes, source: &Source) {
+    fn rematched(&mut self, changes: Changes, source: &EventSource) {
         let own = source.endpoint();
         for other in changes.added {
             self.stands(&match source {
-                Source::Publisher(_) => Pair { reader: other, writer: own.gid },
-                Source::Subscription(_) => Pair { reader: own.gid, writer: other },
+                EventSource::Publisher(_) => Pair { reader: other, writer: own.gid },
+                EventSource::Subscription(_) => Pair { reader: own.gid, writer: other },
             });
         }
         self.note_timed(source);
@@ -245,10 +245,10 @@ impl Control {
         }
     }
 
-    fn report(&self, own: &Source, other: &Endpoint) {
+    fn report(&self, own: &EventSource, other: &Endpoint) {
         let verdict = match own {
-            Source::Publisher(writer) => pairing(&writer.endpoint, other),
-            Source::Subscription(reader) => pairing(other, &reader.endpoint),
+            EventSource::Publisher(writer) => pairing(&writer.endpoint, other),
+            EventSource::Subscription(reader) => pairing(other, &reader.endpoint),
         };
         let differs = !matches!(verdict, Pairing::Match | Pairing::Unrelated);
         if differs && own.events().incompatible(other.gid, verdict) {
@@ -257,18 +257,18 @@ impl Control {
     }
 
     /// The session's publishers and subscriptions of a topic.
-    fn own(&self, topic: &str) -> Vec<Source> {
+    fn own(&self, topic: &str) -> Vec<EventSource> {
         let state = self.shared.state();
         let mut own = Vec::new();
         for gid in state.topics.get(topic).into_iter().flatten() {
             let publisher = state.publishers.get(gid);
             if let Some(inner) = publisher.filter(|p| p.endpoint.kind == EndpointKind::Publisher) {
-                own.push(Source::Publisher(inner.clone()));
+                own.push(EventSource::Publisher(inner.clone()));
             }
             let subscription = state.subscriptions.get(gid);
             let is = |s: &&Arc<SubscriptionInner>| s.endpoint.kind == EndpointKind::Subscription;
             if let Some(inner) = subscription.filter(is) {
-                own.push(Source::Subscription(inner.clone()));
+                own.push(EventSource::Subscription(inner.clone()));
             }
         }
         own

@@ -88,11 +88,11 @@ impl Control {
         let search = move || {
             std::thread::sleep(first);
             let mut pause = MIN_PAUSE;
-            // Pairs with the release store in `Shared::stop`.
+            // Pairs with the release store in `SessionShared::stop`.
             while !shared.stopping.load(Ordering::Acquire) {
                 let caller = Caller {
                     segment: Some(&shared.segment),
-                    // Pairs with the release store in `Shared::stop`.
+                    // Pairs with the release store in `SessionShared::stop`.
                     cancel: Some(&|| shared.stopping.load(Ordering::Acquire)),
                     ..Caller::new(&shared.config, &shared.options, shared.id)
                 };

@@ -28,11 +28,11 @@ use crate::{
     session::{
         arrivals::Arrivals,
         error::SessionError,
-        events::Source,
+        events::EventSource,
         local::{Local, LocalRegistry},
         peers::Peers,
         publisher::PublisherInner,
-        state::{Outgoing, Shared},
+        state::{Outgoing, SessionShared},
         subscription::{Asking, SubscriptionInner},
     },
     wire::session::{Announce, EndpointRole, Gone, Message, Pair},
@@ -48,7 +48,7 @@ const FAREWELL: Duration = Duration::from_secs(1);
 const MAX_STANDS_FOR: usize = 1024;
 
 pub(in crate::session) struct Control {
-    shared: Arc<Shared>,
+    shared: Arc<SessionShared>,
     link: Link,
     reconnects: bool,
     peers: Peers,
@@ -86,7 +86,7 @@ pub(in crate::session) struct Control {
     /// The graph is another one than was last told.
     graph_changed: bool,
     /// Endpoints of whom somebody watches the time, unless they are to be looked for anew.
-    timed: Option<Vec<Source>>,
+    timed: Option<Vec<EventSource>>,
     /// When to look at them, by the monotonic clock.
     alarm: Option<u64>,
 }
@@ -118,7 +118,10 @@ enum Link {
 }
 
 impl Control {
-    pub(in crate::session) fn new(shared: Arc<Shared>, start: Start) -> Result<Self, SessionError> {
+    pub(in crate::session) fn new(
+        shared: Arc<SessionShared>,
+        start: Start,
+    ) -> Result<Self, SessionError> {
         let reconnects = matches!(start, Start::Daemon(_));
         shared.segment.is_watched();
         let peers = Peers::new(shared.segment.clone(), shared.memory.clone())
@@ -160,7 +163,7 @@ impl Control {
 
     pub(in crate::session) fn run(mut self) {
         let _ = self.shared.control.set(std::thread::current().id());
-        // Pairs with the release store in `Shared::stop`.
+        // Pairs with the release store in `SessionShared::stop`.
         while !self.shared.stopping.load(Ordering::Acquire) {
             self.try_reconnected();
             self.try_again();
@@ -252,7 +255,7 @@ impl Control {
                 }
                 Outgoing::Announce(gid) => {
                     if let Some(publisher) = state.publishers.get(&gid) {
-                        self.note_timed(&Source::Publisher(publisher.clone()));
+                        self.note_timed(&EventSource::Publisher(publisher.clone()));
                         let announce = Announce {
                             endpoint: publisher.endpoint.clone(),
                             role: publisher.role,
@@ -262,7 +265,7 @@ impl Control {
                         };
                         self.say(Message::Endpoint(announce));
                     } else if let Some(subscription) = state.subscriptions.get(&gid) {
-                        self.note_timed(&Source::Subscription(subscription.clone()));
+                        self.note_timed(&EventSource::Subscription(subscription.clone()));
                         let announce = Announce {
                             endpoint: subscription.endpoint.clone(),
                             role: subscription.role,

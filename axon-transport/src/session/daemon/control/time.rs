@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use super::Control;
-use crate::session::{clock, events::Source};
+use crate::session::{clock, events::EventSource};
 
 impl Control {
     pub(super) fn look_at_time(&mut self) {
@@ -50,8 +50,8 @@ impl Control {
     }
 
     /// An endpoint came, or its matches changed. If it has times to be looked at, those of all are found anew.
-    pub(super) fn note_timed(&mut self, source: &Source) {
-        let watched = |timed: &Vec<Source>| {
+    pub(super) fn note_timed(&mut self, source: &EventSource) {
+        let watched = |timed: &Vec<EventSource>| {
             timed.iter().any(|other| other.endpoint().gid == source.endpoint().gid)
         };
         if is_timed(source) || self.timed.as_ref().is_some_and(watched) {
@@ -59,22 +59,22 @@ impl Control {
         }
     }
 
-    fn find_timed(&self) -> Vec<Source> {
+    fn find_timed(&self) -> Vec<EventSource> {
         let (publishers, subscriptions) = self.endpoints();
-        let publishers = publishers.into_iter().map(Source::Publisher);
-        let all = publishers.chain(subscriptions.into_iter().map(Source::Subscription));
+        let publishers = publishers.into_iter().map(EventSource::Publisher);
+        let all = publishers.chain(subscriptions.into_iter().map(EventSource::Subscription));
         all.filter(is_timed).collect()
     }
 }
 
 /// Whether somebody watches its deadlines or leases.
-fn is_timed(source: &Source) -> bool {
+fn is_timed(source: &EventSource) -> bool {
     match source {
-        Source::Publisher(publisher) => {
+        EventSource::Publisher(publisher) => {
             let qos = &publisher.endpoint.qos;
             qos.deadline.is_some() || qos.lease.is_some()
         }
-        Source::Subscription(subscription) => {
+        EventSource::Subscription(subscription) => {
             subscription.endpoint.qos.deadline.is_some() || subscription.lock().offers_lease()
         }
     }

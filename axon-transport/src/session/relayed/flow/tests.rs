@@ -38,7 +38,7 @@ fn piece(number: u8, head: Option<SampleHeader>, len: usize) -> SampleFragment {
 }
 
 #[test]
-fn what_no_sender_does_is_refused() {
+fn invalid_fragments_are_refused() {
     let open = || {
         let mut incoming = incoming();
         incoming.open(channel(1), 0);
@@ -172,7 +172,7 @@ fn a_channel_without_its_receiver_sends_nothing() {
 }
 
 #[test]
-fn who_means_a_channel_that_was_closed_does_not_open_the_one_that_came_after() {
+fn credit_for_a_closed_channel_opens_no_later_one() {
     let mut outgoing = Outgoing::default();
     outgoing.open(channel(1), 1);
     outgoing.close(&channel(1));

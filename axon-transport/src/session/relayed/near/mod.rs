@@ -34,7 +34,7 @@ use crate::{
     ids::{DaemonId, Gid},
     registry::RelayCounters,
     session::{
-        Session, SessionError, Shared,
+        Session, SessionError, SessionShared,
         daemon::{connect::Connected, socket::SocketError},
         local::LocalRegistry,
     },
@@ -54,7 +54,7 @@ pub(crate) struct SessionRelay {
 /// What outlives a connection.
 struct Common {
     /// The session.
-    shared: Arc<Shared>,
+    shared: Arc<SessionShared>,
     local_registry: Arc<LocalRegistry>,
     /// Stands for the world outside.
     outside: Session,
@@ -67,7 +67,7 @@ struct Common {
 
 impl SessionRelay {
     pub(crate) fn start(
-        shared: Arc<Shared>,
+        shared: Arc<SessionShared>,
         local_registry: Arc<LocalRegistry>,
         outside: Session,
         connected: Connected,

@@ -10,7 +10,7 @@ use super::quirks::{self, Tolerated};
 use super::refusals::{message, nobody, not_served, refused};
 use super::report::{Report, Verdict};
 use super::wire::{Raw, Wire};
-use crate::{Outcome, other};
+use crate::{CommandResult, other};
 
 /// Keys drawn in one request, at most.
 const BATCH: u64 = 3;
@@ -22,7 +22,7 @@ pub(super) async fn refusals(
     status: &Status,
     wire: &Wire,
     report: &mut Report,
-) -> Outcome {
+) -> CommandResult {
     let url = master.method(slave, "enc_keys")?;
     let post = async |body: Value| wire.post(url.clone(), body.to_string()).await;
     let most = status.max_key_per_request;
@@ -101,7 +101,7 @@ pub(super) async fn delivery(
     status: &Status,
     wire: &Wire,
     report: &mut Report,
-) -> Outcome {
+) -> CommandResult {
     let bits = status.key_size;
     let number = u32::try_from(status.max_key_per_request.clamp(1, BATCH)).map_err(other)?;
     let expected = format!("enc_keys by GET: 1 key of {bits} bits");
@@ -209,7 +209,7 @@ async fn not_for_the_master(
     key: &Key,
     wire: &Wire,
     report: &mut Report,
-) -> Outcome {
+) -> CommandResult {
     let url = master.method(&master.sae, "dec_keys")?;
     let raw = wire.post(url, ids(std::slice::from_ref(key))).await;
     refused(report, "5.4", "dec_keys by an SAE that was not named: 401", &raw, &[401]);

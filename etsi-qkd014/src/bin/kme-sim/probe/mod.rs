@@ -14,12 +14,12 @@ use std::time::Duration;
 
 use clap::Args;
 
-use party::{Party, Source};
+use party::{Party, PartyFiles};
 use report::Report;
 use tls::{Auth, GROUPS, VERSIONS};
 use wire::Wire;
 
-use crate::{Failure, Outcome, other, say};
+use crate::{CommandFailure, CommandResult, other, say};
 
 /// Tries a KME, any KME, against the specification and prints a table: clause, what was expected,
 /// what came, verdict.
@@ -67,13 +67,13 @@ pub(crate) struct Arguments {
     timeout: u64,
 }
 
-pub(crate) fn probe(arguments: Arguments) -> Outcome {
+pub(crate) fn probe(arguments: Arguments) -> CommandResult {
     let timeout = Duration::from_secs(arguments.timeout);
     let slave_env = arguments.slave_env.as_deref();
     let slave = slave_env
         .map(|file| Party::from_env_file(file, &arguments.slave_sae, timeout))
         .transpose()?;
-    let master = Party::load(Source {
+    let master = Party::load(PartyFiles {
         url: arguments.url,
         sae: arguments.sae,
         kme_id: arguments.kme_id,
@@ -91,7 +91,10 @@ pub(crate) fn probe(arguments: Arguments) -> Outcome {
     if report.passed() {
         Ok(())
     } else {
-        Err(Failure::Other(format!("{} does not hold to all of the specification", master.url)))
+        Err(CommandFailure::Other(format!(
+            "{} does not hold to all of the specification",
+            master.url
+        )))
     }
 }
 
@@ -99,7 +102,7 @@ async fn all(
     (master, slave): (&Party, Option<&Party>),
     slave_sae: &str,
     consume: bool,
-) -> Outcome<Report> {
+) -> CommandResult<Report> {
     let mut report = Report::default();
     if !status::connection(master, slave_sae, &mut report).await? {
         return Ok(report);

@@ -9,7 +9,7 @@ use etsi_qkd014::{Client, Error, Quirks, RetryPolicy};
 use reqwest::Url;
 use zeroize::Zeroizing;
 
-use crate::{Outcome, other};
+use crate::{CommandResult, other};
 
 /// Certificates and environments larger than this are none.
 const MAX_FILE: u64 = 1 << 20;
@@ -26,7 +26,7 @@ pub(super) struct Party {
 }
 
 /// The files and names of a [`Party`].
-pub(super) struct Source {
+pub(super) struct PartyFiles {
     pub(super) url: String,
     pub(super) sae: String,
     pub(super) kme_id: Option<String>,
@@ -38,8 +38,8 @@ pub(super) struct Source {
 }
 
 impl Party {
-    pub(super) fn load(source: Source) -> Outcome<Self> {
-        let Source { url, sae, kme_id, kme_id_only, ca, cert, key, timeout } = source;
+    pub(super) fn load(source: PartyFiles) -> CommandResult<Self> {
+        let PartyFiles { url, sae, kme_id, kme_id_only, ca, cert, key, timeout } = source;
         let (ca, cert) = (read(&ca)?, read(&cert)?);
         let key = Zeroizing::new(read(&key)?);
         let party = Self { url, sae, kme_id, kme_id_only, ca, cert, key, timeout };
@@ -49,7 +49,7 @@ impl Party {
     }
 
     /// The SAE `sae` from a file of `export NAME='value'` lines, as `kme-sim init` prints them.
-    pub(super) fn from_env_file(file: &Path, sae: &str, timeout: Duration) -> Outcome<Self> {
+    pub(super) fn from_env_file(file: &Path, sae: &str, timeout: Duration) -> CommandResult<Self> {
         let wrong = |why: String| other(format!("{}: {why}", file.display()));
         let text = String::from_utf8(read(file)?).map_err(|_| wrong("is not UTF-8".into()))?;
         let mut env = environments(&text)
@@ -60,7 +60,7 @@ impl Party {
         let mut take = |name: &str| {
             env.remove(name).ok_or_else(|| wrong(format!("{name} is missing for {sae}")))
         };
-        Self::load(Source {
+        Self::load(PartyFiles {
             url: take("AXON_KME_URL")?,
             sae: sae.to_owned(),
             kme_id,
@@ -94,7 +94,7 @@ impl Party {
     }
 
     /// The URL of a method for an SAE.
-    pub(super) fn method(&self, sae: &str, method: &str) -> Outcome<Url> {
+    pub(super) fn method(&self, sae: &str, method: &str) -> CommandResult<Url> {
         let mut url = Url::parse(&self.url).map_err(other)?;
         url.path_segments_mut()
             .map_err(|()| other("the URL has no path"))?
@@ -104,7 +104,7 @@ impl Party {
     }
 }
 
-fn read(path: &Path) -> Outcome<Vec<u8>> {
+fn read(path: &Path) -> CommandResult<Vec<u8>> {
     let wrong = |why: String| other(format!("{}: {why}", path.display()));
     let length = fs::metadata(path).map_err(|e| wrong(e.to_string()))?.len();
     if length > MAX_FILE {

@@ -91,7 +91,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_no_quirk_helps_against_is_asked_once_or_reported() {
+    async fn errors_beyond_quirks_are_not_retried() {
         let mut calls = 0;
         let error = least(async |_| {
             calls += 1;

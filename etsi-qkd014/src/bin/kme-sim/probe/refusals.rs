@@ -5,7 +5,7 @@ use serde_json::Value;
 use super::party::Party;
 use super::report::{Report, Verdict};
 use super::wire::{Raw, Wire};
-use crate::Outcome;
+use crate::CommandResult;
 
 /// An ID that no KME has given to an SAE or key: it is new.
 pub(super) fn nobody() -> String {
@@ -27,7 +27,7 @@ pub(super) async fn refusals(
     slave: &str,
     wire: &Wire,
     report: &mut Report,
-) -> Outcome {
+) -> CommandResult {
     let raw = wire.get(party.method(&nobody(), "status")?).await;
     not_served(
         report,

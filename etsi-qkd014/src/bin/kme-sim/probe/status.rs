@@ -8,7 +8,7 @@ use super::quirks::{self, Tolerated};
 use super::report::{Report, Verdict};
 use super::tls::{self, Auth, GROUPS, VERSIONS};
 use super::wire::{Raw, Wire};
-use crate::Outcome;
+use crate::CommandResult;
 
 const IDS: [&str; 4] = ["source_KME_ID", "target_KME_ID", "master_SAE_ID", "slave_SAE_ID"];
 const NUMBERS: [&str; 7] = [
@@ -22,7 +22,11 @@ const NUMBERS: [&str; 7] = [
 ];
 
 /// Whether the KME can be talked to at all; everything else stands on it.
-pub(super) async fn connection(party: &Party, slave: &str, report: &mut Report) -> Outcome<bool> {
+pub(super) async fn connection(
+    party: &Party,
+    slave: &str,
+    report: &mut Report,
+) -> CommandResult<bool> {
     let expected = match &party.kme_id {
         Some(id) => format!("certificate of the CA given, KME ID {id:?}"),
         None => "certificate of the CA given, for the URL's host".to_owned(),
@@ -81,7 +85,7 @@ pub(super) async fn status(
     slave: &str,
     wire: &Wire,
     report: &mut Report,
-) -> Outcome<Option<Tolerated<Status>>> {
+) -> CommandResult<Option<Tolerated<Status>>> {
     let read = quirks::least(async |quirks| party.client(quirks)?.status(slave).await).await;
     let needed = read.as_ref().map(|read| read.needed.clone()).unwrap_or_default();
     match wire.get(party.method(slave, "status")?).await {

@@ -18,7 +18,7 @@ use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
 
 use super::party::Party;
-use crate::{Outcome, other};
+use crate::{CommandResult, other};
 
 /// With which certificate the probe comes.
 #[derive(Clone, Copy)]
@@ -43,7 +43,7 @@ pub(super) fn config(
     versions: &[&'static SupportedProtocolVersion],
     groups: &[&'static dyn SupportedKxGroup],
     auth: Auth,
-) -> Outcome<ClientConfig> {
+) -> CommandResult<ClientConfig> {
     let provider =
         Arc::new(CryptoProvider { kx_groups: groups.to_vec(), ..aws_lc_rs::default_provider() });
     let mut roots = RootCertStore::empty();
@@ -74,14 +74,14 @@ pub(super) fn config(
     Ok(config)
 }
 
-fn certificates(bytes: &[u8]) -> Outcome<Vec<CertificateDer<'static>>> {
+fn certificates(bytes: &[u8]) -> CommandResult<Vec<CertificateDer<'static>>> {
     if !is_pem(bytes) {
         return Ok(vec![bytes.to_vec().into()]);
     }
     CertificateDer::pem_slice_iter(bytes).collect::<Result<_, _>>().map_err(other)
 }
 
-fn private_key(bytes: &[u8]) -> Outcome<PrivateKeyDer<'static>> {
+fn private_key(bytes: &[u8]) -> CommandResult<PrivateKeyDer<'static>> {
     let read = if is_pem(bytes) {
         PrivateKeyDer::from_pem_slice(bytes).ok()
     } else {
@@ -95,7 +95,7 @@ fn is_pem(bytes: &[u8]) -> bool {
     bytes.windows(11).any(|window| window == b"-----BEGIN ")
 }
 
-fn stranger(sae: &str) -> Outcome<(CertificateDer<'static>, PrivateKeyDer<'static>)> {
+fn stranger(sae: &str) -> CommandResult<(CertificateDer<'static>, PrivateKeyDer<'static>)> {
     let key = rcgen::KeyPair::generate().map_err(other)?;
     let mut params = rcgen::CertificateParams::default();
     params.distinguished_name = rcgen::DistinguishedName::new();
@@ -163,7 +163,7 @@ impl ServerCertVerifier for Verifier {
 }
 
 /// A handshake; the group that it agreed on.
-pub(super) async fn handshake(party: &Party, config: ClientConfig) -> Outcome<String> {
+pub(super) async fn handshake(party: &Party, config: ClientConfig) -> CommandResult<String> {
     let url = Url::parse(&party.url).map_err(other)?;
     let host = url.host_str().ok_or_else(|| other("the URL has no host"))?;
     let name = host.trim_matches(['[', ']']).to_owned();
@@ -186,7 +186,7 @@ async fn tcp(url: &Url) -> std::io::Result<TcpStream> {
 }
 
 /// Offers TLS 1.1 and nothing newer; whether it was refused, and what came.
-pub(super) async fn old_version(party: &Party) -> Outcome<(bool, &'static str)> {
+pub(super) async fn old_version(party: &Party) -> CommandResult<(bool, &'static str)> {
     let url = Url::parse(&party.url).map_err(other)?;
     let exchange = async {
         let mut stream = tcp(&url).await?;

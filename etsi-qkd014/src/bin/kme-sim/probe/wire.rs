@@ -6,7 +6,7 @@ use serde_json::Value;
 use zeroize::Zeroizing;
 
 use super::party::Party;
-use crate::{Outcome, other};
+use crate::{CommandResult, other};
 
 /// Largest answer that is read.
 const MAX_BODY: usize = 1 << 20;
@@ -44,7 +44,7 @@ impl Raw {
 }
 
 impl Wire {
-    pub(super) fn new(party: &Party, tls: ClientConfig) -> Outcome<Self> {
+    pub(super) fn new(party: &Party, tls: ClientConfig) -> CommandResult<Self> {
         let http = reqwest::Client::builder()
             .tls_backend_preconfigured(tls)
             .https_only(true)

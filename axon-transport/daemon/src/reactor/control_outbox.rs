@@ -6,19 +6,19 @@ use tokio::sync::mpsc::{Sender, error::TrySendError};
 
 use crate::bridge::{CHANNEL, ToControl};
 
-/// Messages to the control plane, those that find the channel full among them.
-pub(super) struct Told {
+/// Messages to the control plane, including those that found the channel full.
+pub(super) struct ControlOutbox {
     control: Sender<ToControl>,
     waiting: VecDeque<ToControl>,
 }
 
-impl Told {
-    /// Nothing waits yet.
+impl ControlOutbox {
+    /// An empty outbox.
     pub(super) fn new(control: Sender<ToControl>) -> Self {
         Self { control, waiting: VecDeque::new() }
     }
 
-    /// Sends a message, or has it wait. Status, refusals and datagrams are dropped if the channel is full.
+    /// Sends a message, or queues it. Status, refusals and datagrams are dropped if the channel is full.
     pub(super) fn tell(&mut self, what: ToControl) {
         let droppable = matches!(
             what,
@@ -34,7 +34,7 @@ impl Told {
         }
     }
 
-    /// Whether so much waits that nothing more should be taken from the network.
+    /// Whether so many messages wait that the reactor should read nothing more from the network.
     pub(super) fn is_behind(&self) -> bool {
         self.waiting.len() >= CHANNEL
     }
@@ -69,7 +69,7 @@ mod tests {
     #[tokio::test]
     async fn messages_stay_in_order_and_status_is_dropped_when_the_channel_is_full() {
         let (sender, mut control) = mpsc::channel(1);
-        let mut told = Told::new(sender);
+        let mut told = ControlOutbox::new(sender);
         for draining in [true, false, true] {
             told.tell(ToControl::Draining(draining));
             told.tell(ToControl::Keys(serde_json::Value::Null));
