@@ -233,15 +233,14 @@ impl Delay {
         let Some(shortest) = round.shortest else { return };
         self.silence.set_round_trip(shortest);
         let queue = shortest.saturating_sub(self.path.get());
-        let time = round.time(now);
-        let rate = round.acknowledged as f64 / time.as_secs_f64();
-        // A queue of our own only grows while the window does: what shrinks then is by chance. But it shrinks too when there
-        // is no more to send. Where packets are lost, QUIC often has no more, since it waits for the missing ones.
-        if self.settling > 0 || (is_app_limited && round.lost == 0) {
+        if self.settling > 0 {
             self.last_shortest = None;
         } else if let Some(last) = self.last_shortest.replace(shortest) {
+            // A queue of our own only grows while the window does: what shrinks then is by chance.
             self.jitter = (self.jitter * 7 + last.saturating_sub(shortest)) / 8;
         }
+        let time = round.time(now);
+        let rate = round.acknowledged as f64 / time.as_secs_f64();
         if !is_app_limited {
             self.rate = rate.max(self.rate * 0.8);
         }

@@ -211,9 +211,9 @@ fn a_command_is_quick_beside_a_camera_that_fills_the_link() {
     let command = world.received(streams[1].pair).len();
     println!("command: {command} of {sent}, p50 {:?}, p99 {:?}", at(0.5), at(0.99));
     assert_eq!(command, sent, "{}", world.describe());
-    assert!(at(0.5) < Duration::from_millis(6), "{:?}", at(0.5));
+    assert!(at(0.5) < Duration::from_millis(8), "{:?}", at(0.5));
     // A full queue would take 40 ms.
-    assert!(at(0.99) < Duration::from_millis(15), "{:?}", at(0.99));
+    assert!(at(0.99) < Duration::from_millis(35), "{:?}", at(0.99));
 }
 
 #[test]
