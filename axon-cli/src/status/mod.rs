@@ -305,7 +305,7 @@ fn out_of_range(status: &Status) -> TextTable {
 
 /// The endpoints to or from which nothing flows since a route is refused.
 fn refused(status: &Status) -> TextTable {
-    let mut table = TextTable::new(&["topic", "endpoint", "other host", "why"]);
+    let mut table = TextTable::new(&["topic", "endpoint", "host", "why"]);
     for topic in &status.topics {
         for waiting in &topic.refused {
             table.row([

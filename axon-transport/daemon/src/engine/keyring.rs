@@ -197,6 +197,7 @@ impl Keyring {
     ) -> Result<(), SupplyError> {
         let number = self.attached(connection)?;
         self.touch(number);
+        self.peers[number].receiver.elect(connection);
         let sender = &mut self.peers[number].sender;
         // RETIREs that the previous connection still gets: a successor has not closed it yet. If a third
         // connection took its place before, nobody reads them.

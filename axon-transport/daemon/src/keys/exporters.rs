@@ -79,6 +79,7 @@ mod tests {
             sender.attach(now, 1, &exporters).unwrap();
             let mut receiver = Receiver::new("sae-a", "sae-b").unwrap();
             receiver.attach(now, 1, &exporters).unwrap();
+            receiver.elect(1);
             let proofs = (
                 ClientProof::new(now, "sae-a", &exporters),
                 ProofResponder::new("sae-b", &exporters),

@@ -28,8 +28,8 @@ pub struct Receiver {
     local: String,
     peer: String,
     links: HashMap<u64, Link>,
-    /// Connections that were attached so far.
-    attached: u64,
+    /// Connections that were elected so far.
+    elected: u64,
     /// Being fetched, with the connection that last announced it. The answer goes there.
     wanted: HashMap<KeyId, u64>,
     fetches: Fetches,
@@ -40,7 +40,7 @@ pub struct Receiver {
 }
 
 struct Link {
-    /// Its place in the order of connections.
+    /// Its place in the order in which connections were elected, which is the same on both hosts; 0 is none.
     order: u64,
     opener: Opener,
     ready: Exporter,
@@ -93,7 +93,7 @@ impl Receiver {
             local: local_sae.to_owned(),
             peer: peer_sae.to_owned(),
             links: HashMap::new(),
-            attached: 0,
+            elected: 0,
             wanted: HashMap::new(),
             fetches: Fetches::new(peer_sae, Purpose::Messages),
             kept: VecDeque::new(),
@@ -115,10 +115,17 @@ impl Receiver {
         self.detach(now, conn);
         let channel = Channel::new(&self.peer, &self.local, exporters.envelope())?;
         let opener = Opener::new(channel)?;
-        self.attached += 1;
-        let (order, ready) = (self.attached, Arc::clone(exporters.ready()));
-        self.links.insert(conn, Link { order, opener, ready });
+        let ready = Arc::clone(exporters.ready());
+        self.links.insert(conn, Link { order: 0, opener, ready });
         Ok(())
+    }
+
+    /// Both hosts use this connection from now on: the peer announces its keys there, and on no other one.
+    pub fn elect(&mut self, conn: u64) {
+        if let Some(link) = self.links.get_mut(&conn) {
+            self.elected += 1;
+            link.order = self.elected;
+        }
     }
 
     /// A connection is closed: nothing opens on it any more. Keys under which nothing was opened

@@ -94,6 +94,14 @@ struct Pair {
 }
 
 impl Pair {
+    /// Has the receiver's KME answer.
+    fn fetch(&mut self) {
+        while let Some(request) = self.receiver.poll_request(self.now) {
+            let answer = self.kmes.answer(request);
+            self.receiver.handle_answer(self.now, answer);
+        }
+    }
+
     fn new() -> Self {
         let mut pair = Self {
             now: ms(0),
@@ -113,6 +121,7 @@ impl Pair {
         self.conn += 1;
         let owed = self.sender.attach(self.now, self.conn, &exporters(self.conn)).unwrap();
         self.receiver.attach(self.now, self.conn, &exporters(self.conn)).unwrap();
+        self.receiver.elect(self.conn);
         for (conn, message) in owed {
             assert_eq!(conn, self.conn - 1, "owed where it was announced");
             self.receiver.handle_message(self.now, conn, &message).unwrap();

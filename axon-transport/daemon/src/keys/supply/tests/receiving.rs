@@ -2,7 +2,7 @@ use std::time::Duration;
 
 use axon_envelope::{Delivery, KeyId};
 
-use super::{Pair, id, ms, retire};
+use super::{Pair, exporters, id, ms, retire};
 use crate::keys::{
     KeyMessage,
     request::{Answer, Failure, FailureKind},
@@ -39,14 +39,38 @@ fn a_late_announcement_on_a_connection_before_takes_no_key_from_its_successor() 
         if !is_fetched {
             pair.receiver.handle_message(pair.now, 1, &announce).unwrap();
         }
-        while let Some(request) = pair.receiver.poll_request(pair.now) {
-            let answer = pair.kmes.answer(request);
-            pair.receiver.handle_answer(pair.now, answer);
-        }
+        pair.fetch();
         assert!(matches!(pair.receiver.poll_message(), Some((2, KeyMessage::Ready { .. }))));
         pair.receiver.handle_message(pair.now, 1, &announce).unwrap();
         assert!(pair.receiver.poll_message().is_none());
         assert!(pair.receiver.opener(2).unwrap().contains(key_id.as_bytes()), "{is_fetched}");
+    }
+}
+
+/// Two daemons that dial each other have two connections at a time. That which was opened first may be elected last.
+#[test]
+fn a_key_goes_to_the_connection_that_was_elected_last_in_whatever_order_they_were_opened() {
+    for is_fetched in [false, true] {
+        let mut pair = Pair::new();
+        let (key_id, _) = pair.kmes.issue();
+        for connection in [7, 8] {
+            pair.receiver.attach(pair.now, connection, &exporters(connection)).unwrap();
+        }
+        let announce = KeyMessage::Announce(vec![key_id.clone()]);
+        for connection in [8, 7] {
+            pair.receiver.elect(connection);
+            pair.receiver.handle_message(pair.now, connection, &announce).unwrap();
+            if is_fetched && connection == 8 {
+                pair.fetch();
+                assert!(matches!(pair.receiver.poll_message(), Some((8, _))));
+            }
+        }
+        pair.fetch();
+        assert!(matches!(pair.receiver.poll_message(), Some((7, KeyMessage::Ready { .. }))));
+        assert!(pair.receiver.opener(7).unwrap().contains(key_id.as_bytes()), "{is_fetched}");
+        // What was said on the connection before comes late.
+        pair.receiver.handle_message(pair.now, 8, &announce).unwrap();
+        assert!(pair.receiver.opener(7).unwrap().contains(key_id.as_bytes()), "{is_fetched}");
     }
 }
 
