@@ -20,9 +20,9 @@ const IDS: u8 = 4;
 const STREAMS: usize = 48;
 /// What it tries to send over each stream.
 const BYTES: usize = 8 << 20;
-/// What of it the daemon may hold: 64 MiB of messages that it reads, and in QUIC's windows 64 MiB of all links and 1 MiB
+/// What of it the daemon may hold: 64 MiB of long messages that it reads and 16 MiB of short ones, and in QUIC's windows 64 MiB of all links and 1 MiB
 /// of each.
-const STATED: usize = (64 + 64 + IDS as usize) << 20;
+const STATED: usize = (64 + 16 + 64 + IDS as usize) << 20;
 /// With what a debug build's allocator and quinn add to each packet that waits: a fifth.
 const BOUND: usize = STATED + STATED / 5;
 
@@ -136,8 +136,8 @@ fn short_messages_that_do_not_come_whole_are_bounded_over_all_ids_of_a_peer_and_
     let most = camera.memory("VmRSS").saturating_sub(before);
     let tried = SHORT_IDS as usize * PUBLISHERS as usize * (SAYS as usize - 1024);
     eprintln!("{} MiB of {} MiB in short messages", most >> 20, tried >> 20);
-    // 64 MiB of messages that are being read, and what the windows of the third link and of those after it let in.
-    let stated = (64 + 9 + 5 + 3 + 2) << 20;
+    // 16 MiB of short messages that are being read, and what the windows of the third link and of those after it let in.
+    let stated = (16 + 9 + 5 + 3 + 2) << 20;
     assert!(most < stated + stated / 5, "{most}");
     assert!(links.iter().all(|(link, ..)| link.connection.close_reason().is_none()));
     drop(streams);

@@ -33,8 +33,9 @@ const ROUTES_TO_GRAPH: usize = 4;
 /// Unread stream data of one identity, in bytes. Each of its links has
 /// [`LINK_WINDOW`](super::transport::LINK_WINDOW) more.
 const UNREAD: usize = 64 << 20;
-/// Messages of one identity that are being read, in bytes. One message may always be read.
-const MESSAGES: usize = 64 << 20;
+/// Messages of one identity that are being read, in bytes: long ones, of which one may always be read, and short ones,
+/// which therefore never wait for those.
+const MESSAGES: (usize, usize) = (64 << 20, 16 << 20);
 /// Control messages that wait for one identity to read them, in bytes.
 const UNSENT: usize = 128 << 20;
 /// Names and reasons of refused routes of one identity that are remembered for status, in bytes.
@@ -108,11 +109,6 @@ impl Meter {
         Some(Charge { meter: Rc::clone(self), amount })
     }
 
-    /// Charges `amount`, if it fits and leaves so much.
-    pub(crate) fn charge_beside(self: &Rc<Self>, amount: usize, leaves: usize) -> Option<Charge> {
-        if amount.saturating_add(leaves) > self.left() { None } else { self.charge(amount) }
-    }
-
     /// Raises a charge to half of what the others leave. Returns whether it grew.
     pub(crate) fn share(self: &Rc<Self>, charge: &mut Charge) -> bool {
         let others = self.held().saturating_sub(charge.amount);
@@ -173,6 +169,27 @@ impl Drop for Charge {
     }
 }
 
+/// Memory for messages that have not come whole, or wait for a reader, in bytes.
+#[derive(Clone, Debug)]
+pub(crate) struct MessageMemory {
+    /// For long messages.
+    pub(crate) long: Rc<Meter>,
+    /// For short ones.
+    pub(crate) short: Rc<Meter>,
+}
+
+impl MessageMemory {
+    /// Memory of these lengths.
+    pub(crate) fn new(long: usize, short: usize) -> Self {
+        Self { long: Meter::new(long), short: Meter::new(short) }
+    }
+
+    /// What was given back since the start. It changes when a message that found no room may find some.
+    pub(crate) fn released(&self) -> usize {
+        self.long.released().wrapping_add(self.short.released())
+    }
+}
+
 /// The account of one identity.
 #[derive(Debug)]
 pub(crate) struct Account {
@@ -189,7 +206,7 @@ pub(crate) struct Account {
     /// Stream data that it may send and that was not read.
     pub(crate) unread: Rc<Meter>,
     /// Memory for its messages that have not come whole, in bytes.
-    pub(crate) messages: Rc<Meter>,
+    pub(crate) messages: MessageMemory,
     /// Bytes of refused routes that are remembered.
     pub(crate) refusals: Rc<Meter>,
     /// Sessions that it proved to be its own.
@@ -210,7 +227,7 @@ impl Account {
             unsent: Meter::new(UNSENT),
             stand_ins: Meter::within(stand_ins, MAX_STAND_INS),
             unread: Meter::new(UNREAD),
-            messages: Meter::new(MESSAGES),
+            messages: MessageMemory::new(MESSAGES.0, MESSAGES.1),
             refusals: Meter::new(REFUSALS),
             sessions: Meter::new(MAX_PROVEN),
             writers: RefCell::default(),

@@ -57,7 +57,7 @@ use self::{
     inbound::Inbound,
     link::target::Target,
     links::{LinkEvent, LinkParts, Links},
-    outbound::{Outbound, OutboundEvent, budget::Budget},
+    outbound::{Outbound, OutboundEvent, ResponseNumbers, budget::Budget},
     peer::{Local, Peer, PeerParts, ROUTES_UNSAID, graph::GraphTaken, owners::Prover},
     peers::Peers,
     rings::Rings,
@@ -98,6 +98,7 @@ pub(crate) struct Engine {
     session_keys: Arc<SessionKeys>,
     session: [u8; 12],
     budget: Rc<Budget>,
+    responses: ResponseNumbers,
     epoch: Instant,
     epoch_nanos: u64,
     effects: Effects,
@@ -116,6 +117,7 @@ impl Engine {
         let (config, daemon, epoch) = (Arc::clone(&links.config), links.hello.daemon, links.epoch);
         Ok(Self {
             budget: Budget::new(config.reliable_queue),
+            responses: ResponseNumbers::default(),
             peers: Peers::new(Arc::clone(&config), rings, epoch),
             config,
             daemon,
@@ -308,12 +310,13 @@ impl Engine {
         let counters = Rc::<Counters>::default();
         let inbound = Inbound::new(
             Rc::clone(&counters),
-            Rc::clone(&account.messages),
+            account.messages.clone(),
             self.config.max_message,
             self.epoch_nanos,
         );
         let stalled = self.config.link.stalled;
-        let outbound = Outbound::new(self.budget.of_peer(), Rc::clone(&counters), stalled, now);
+        let (budget, responses) = (self.budget.of_peer(), self.responses.clone());
+        let outbound = Outbound::new(budget, Rc::clone(&counters), responses, stalled, now);
         let parts = PeerParts {
             daemon,
             link: number,

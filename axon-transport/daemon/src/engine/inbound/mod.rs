@@ -33,7 +33,11 @@ use self::{
     receipts::Receipts,
 };
 use crate::{
-    engine::{account::Meter, counters::Counters, stand_in::StandIn},
+    engine::{
+        account::{MessageMemory, Meter},
+        counters::Counters,
+        stand_in::StandIn,
+    },
     link::{CloseCode, Received},
 };
 
@@ -42,10 +46,6 @@ const ARRIVAL: Duration = Duration::from_secs(2);
 /// A message longer than this waits for memory before anything of it is read. A shorter one takes some where it does not
 /// come whole.
 const LONG: usize = 32 << 10;
-/// Of the memory for messages of an identity, in bytes: what long messages leave to short ones. A peer hands to QUIC no
-/// more than about its congestion window, and each short message as a whole, so that few of them are on their way at a
-/// time and none waits.
-const FOR_SHORT: usize = 16 << 20;
 /// Bytes of a stream that are read before others have their turn.
 const TURN: usize = 1 << 20;
 /// A stream whose ring was full tries again after this time, if no reader said that it made room.
@@ -118,7 +118,7 @@ pub(crate) struct Inbound {
     /// Where a short message is opened.
     envelope: Vec<u8>,
     counters: Rc<Counters>,
-    intake: Rc<Meter>,
+    intake: MessageMemory,
     max_message: u64,
     /// CLOCK_MONOTONIC, in nanoseconds, when the engine's time was zero.
     epoch_nanos: u64,
@@ -129,7 +129,7 @@ impl Inbound {
     /// Takes nothing yet. `intake` is the memory for messages.
     pub(crate) fn new(
         counters: Rc<Counters>,
-        intake: Rc<Meter>,
+        intake: MessageMemory,
         max_message: u64,
         epoch_nanos: u64,
     ) -> Self {

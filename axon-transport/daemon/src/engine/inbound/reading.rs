@@ -8,7 +8,7 @@ use axon_transport::internal::session::Written;
 use bytes::Bytes;
 
 use super::{
-    ARRIVAL, FOR_SHORT, FULL_RETRY, Inbound, Key, LONG, NO_ROUTE, TURN, Violation,
+    ARRIVAL, FULL_RETRY, Inbound, Key, LONG, NO_ROUTE, TURN, Violation,
     incoming::{HEADER, Incoming, Message, Piece, Step, StreamHeader},
 };
 use crate::{
@@ -133,8 +133,8 @@ impl Inbound {
             Step::Room(length) => {
                 if length > LONG {
                     // One message may always be read, however long.
-                    let most = length.min(self.intake.most().saturating_sub(FOR_SHORT));
-                    let Some(room) = self.intake.charge_beside(most, FOR_SHORT) else {
+                    let Some(room) = self.intake.long.charge(length.min(self.intake.long.most()))
+                    else {
                         self.without_room.add(key);
                         return Ok(wait(stream, Step::Room(length)));
                     };
@@ -146,7 +146,7 @@ impl Inbound {
             Step::Body(length) => {
                 // One that has come whole is held by nobody.
                 if stream.room.is_none() && !stream.has(length) {
-                    let room = self.intake.charge(length);
+                    let room = self.intake.short.charge(length);
                     let Some(room) = room.or_else(|| self.spare.charge(length)) else {
                         self.without_room.add(key);
                         return Ok(wait(stream, Step::Body(length)));
@@ -252,12 +252,12 @@ impl Inbound {
         let length = unpacked_length(&header, self.max_message).map_err(refused)?;
         let has = stream.room.as_ref().map_or(0, Charge::amount);
         let is_long = length > LONG;
-        let most = if is_long { self.intake.most().saturating_sub(FOR_SHORT) } else { length };
+        let most = if is_long { self.intake.long.most() } else { length };
         let more = length.min(most).saturating_sub(has);
         if more > 0 && stream.unpacked.is_none() {
             let room = match is_long {
-                true => self.intake.charge_beside(more, FOR_SHORT),
-                false => self.intake.charge(more).or_else(|| self.spare.charge(more)),
+                true => self.intake.long.charge(more),
+                false => self.intake.short.charge(more).or_else(|| self.spare.charge(more)),
             };
             let Some(room) = room else {
                 self.without_room.add(key);
@@ -307,7 +307,7 @@ impl Inbound {
     }
 
     /// Writes a message to its ring.
-    fn deliver(
+    pub(super) fn deliver(
         &mut self,
         key: Key,
         stream: &mut Incoming,
@@ -324,6 +324,10 @@ impl Inbound {
             }
             self.waiting.remove(&(until, key));
             self.counters.lost(&self.topic(header.route), "no_route", 1);
+            if header.acknowledged {
+                // The sender would keep it for as long as the link stands.
+                self.receipts.dropped((header.route, header.of), message.number, now);
+            }
             self.release(stream);
             return Next::Go;
         };

@@ -16,12 +16,12 @@ use quinn_proto::{Dir, Side, StreamId};
 
 use super::{
     Inbound, RouteIn,
-    incoming::{Incoming, Step, StreamHeader},
+    incoming::{Incoming, Message, Step, StreamHeader},
     reading::Next,
 };
 use crate::{
     engine::{
-        account::{Accounts, Meter},
+        account::{Accounts, MessageMemory},
         protection::Open,
         rings::{RingError, RingReader, RingWriter, Rings},
         short_header::{ShortHeaders, Told},
@@ -129,7 +129,8 @@ impl Way {
         });
         let account = Accounts::new(1 << 20).of("peer");
         let stand_in = StandIns::default().get(&One(Rc::clone(&ring)), &endpoint, &account, NOW);
-        let mut inbound = Inbound::new(Rc::default(), Meter::new(1 << 20), 1 << 20, 0);
+        let mut inbound =
+            Inbound::new(Rc::default(), MessageMemory::new(1 << 20, 1 << 20), 1 << 20, 0);
         let route = Route { kind, topic: TopicHash::new(0, "/t", "T").unwrap() };
         let mut into = RouteIn::new("/t".into(), route);
         into.writers.insert(PUBLISHER, stand_in.unwrap());
@@ -282,4 +283,18 @@ fn steps_read_samples_that_are_long_or_of_a_service() {
     let piece = way.messages(1..=2);
     assert!(matches!(way.read(piece.clone()), Ok(None)));
     assert_eq!(way.stream.chunk.len(), piece.len());
+}
+
+#[test]
+fn a_call_of_a_client_that_is_gone_is_acknowledged_as_dropped() {
+    let mut way = Way::new(Kind::Request, false, 1000);
+    let (header, _) = way.stream.header.as_mut().unwrap();
+    header.acknowledged = true;
+    let meta = way.inbound.meta(Told { sequence: 4, source_timestamp: 1000, age_ms: 5 }, NOW);
+    let message = Message { writer: Gid([9; 16]), number: 4, meta, payload: Bytes::new() };
+    let key = (1, StreamId::new(Side::Client, Dir::Uni, 0));
+    let next = way.inbound.deliver(key, &mut way.stream, message, NOW, NOW);
+    assert!(matches!(next, Next::Go));
+    let of = ReceivedOf { route: ROUTE, publisher: PUBLISHER, sequence: 4, dropped: 1 };
+    assert_eq!(way.acknowledged(), Some(of));
 }

@@ -33,7 +33,7 @@ use quinn_proto::{StreamId, VarInt};
 pub(crate) use self::{
     backlog::Backlog,
     schedule::{Class, FlowId, Priorities, Rank},
-    served::RouteOut,
+    served::{ResponseNumbers, RouteOut},
     source::Source,
 };
 use self::{
@@ -43,7 +43,7 @@ use self::{
     lending::Lending,
     nudges::Nudges,
     schedule::Schedule,
-    served::{FlowRoute, ResponseNumbers, Served},
+    served::{FlowRoute, Served},
     stall::Stalls,
     without::Without,
 };
@@ -106,6 +106,7 @@ impl Outbound {
     pub(crate) fn new(
         budget: Rc<Budget>,
         counters: Rc<Counters>,
+        responses: ResponseNumbers,
         stalled_after: Duration,
         now: Duration,
     ) -> Self {
@@ -127,7 +128,7 @@ impl Outbound {
             endings: Endings::default(),
             stalls: Stalls::new(stalled_after, now),
             nudges: Nudges::default(),
-            responses: ResponseNumbers::default(),
+            responses,
             events: Vec::new(),
         }
     }

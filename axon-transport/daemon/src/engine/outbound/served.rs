@@ -37,10 +37,10 @@ pub(super) struct FlowRoute {
     pub(super) responses: ResponseNumbers,
 }
 
-/// Numbers responses in the order in which they are taken. A flow that ends and begins again goes on with higher ones,
-/// so the peer takes none of its responses for one that it has.
+/// Numbers the responses of this daemon in the order in which they are taken. A flow that ends and begins again, or that of
+/// a link after the last one, goes on with higher ones, so no peer takes a response for one that it has.
 #[derive(Clone, Debug, Default)]
-pub(super) struct ResponseNumbers(Rc<Cell<u64>>);
+pub(crate) struct ResponseNumbers(Rc<Cell<u64>>);
 
 impl ResponseNumbers {
     /// The next number.

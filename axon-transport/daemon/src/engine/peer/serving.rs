@@ -273,7 +273,8 @@ impl Peer {
                 continue;
             }
             let kept = with.kept.borrow_mut().adopt(key, &spec, &self.identity);
-            let Some(place) = self.remote.account().relays.charge(1) else {
+            let (kept, place) = kept.unzip();
+            let Some(place) = place.or_else(|| self.remote.account().relays.charge(1)) else {
                 let why = "this host has as many relays as a peer may have, or all peers";
                 without = Some((why.to_owned(), Some(ASK_AGAIN)));
                 continue;

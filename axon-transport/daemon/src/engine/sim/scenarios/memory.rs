@@ -120,8 +120,8 @@ fn short_messages_that_have_not_all_come_are_bounded_over_all_ids_of_an_identity
     }
     let held = world.hosts[0].held_of_messages();
     let asked = 4 * PUBLISHERS as usize * COMES;
-    assert!(held <= 65 << 20, "{} MiB of {} MiB", held >> 20, asked >> 20);
-    assert!(held > 56 << 20, "as much as it may: {} MiB", held >> 20);
+    assert!(held <= 18 << 20, "{} MiB of {} MiB", held >> 20, asked >> 20);
+    assert!(held > 14 << 20, "as much as it may: {} MiB", held >> 20);
     assert!(world.raws[0].links.iter().all(|link| link.closed.is_none()), "{}", world.describe());
 }
 
@@ -158,7 +158,7 @@ fn messages_that_become_long_and_wait_for_a_reader_are_bounded() {
     }
     world.run_for(secs(2));
     let held = world.hosts[0].held_of_messages();
-    assert!((32 << 20..=64 << 20).contains(&held), "{} MiB", held >> 20);
+    assert!((32 << 20..=65 << 20).contains(&held), "{} MiB", held >> 20);
     assert!(world.raws[0].links[number].closed.is_none(), "{}", world.describe());
 }
 
@@ -185,6 +185,7 @@ fn all_arrive(seed: u64, publishers: usize, length: usize, rounds: u64) {
 #[test]
 fn messages_of_many_publishers_at_once_arrive_however_long_they_are() {
     all_arrive(81, 12, 8 << 20, 1);
+    all_arrive(83, 12, 16 << 20, 1);
     all_arrive(82, 2_200, 31 << 10, 1);
 }
 
