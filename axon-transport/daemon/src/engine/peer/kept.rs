@@ -35,10 +35,8 @@ struct Kept {
     spec: RelaySpec,
     reader: Rc<dyn RingReader>,
     until: Duration,
-    /// It counts among those that are kept,
-    _kept: Charge,
-    /// and still among the relays of the identity.
-    place: Charge,
+    /// It counts among those that are kept, and still among the relays of the identity.
+    _charges: [Charge; 2],
 }
 
 impl Default for KeptRelays {
@@ -65,33 +63,33 @@ impl KeptRelays {
         for (number, served) in &mut peer.served {
             for source in peer.outbound.take_kept(*number, room.left()) {
                 let Source::Relay(spec, reader) = source else { continue };
-                let Some(_kept) = room.charge(1) else { continue };
-                let place = served.relays.split(1);
+                let Some(place) = room.charge(1) else { continue };
+                let charges = [place, served.relays.split(1)];
                 let identity = peer.identity.clone();
                 let (key, until) = (served.key.clone(), now + PATIENCE);
-                self.all.push(Kept { identity, key, spec, reader, until, _kept, place });
+                self.all.push(Kept { identity, key, spec, reader, until, _charges: charges });
             }
         }
     }
 
     /// The relay that was kept, of a peer with this identity, for one of the subscriptions for which a new one is to
-    /// stand, and its place among the relays of the identity. It begins with what was not acknowledged.
+    /// stand. It begins with what was not acknowledged.
     pub(super) fn adopt(
         &mut self,
         key: &RouteKey,
         spec: &RelaySpec,
         identity: &str,
-    ) -> Option<(Rc<dyn RingReader>, Charge)> {
+    ) -> Option<Rc<dyn RingReader>> {
         let fits = |kept: &Kept| {
             let same = |gid| kept.spec.stands_for.contains(gid);
             let is_same_topic = kept.key == *key && kept.spec.is(spec);
             is_same_topic && kept.identity == identity && spec.stands_for.iter().any(same)
         };
         let at = self.all.iter().position(fits)?;
-        let Kept { reader, place, .. } = self.all.swap_remove(at);
+        let Kept { reader, .. } = self.all.swap_remove(at);
         reader.take_back();
         reader.set_stands_for(spec.stands_for.clone());
-        Some((reader, place))
+        Some(reader)
     }
 
     /// How many there are.

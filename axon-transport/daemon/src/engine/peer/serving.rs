@@ -272,14 +272,13 @@ impl Peer {
                 sources.push(Source::Relay(spec, reader));
                 continue;
             }
-            let kept = with.kept.borrow_mut().adopt(key, &spec, &self.identity);
-            let (kept, place) = kept.unzip();
-            let Some(place) = place.or_else(|| self.remote.account().relays.charge(1)) else {
+            // What was kept stays kept where there is no place for it.
+            let Some(place) = self.remote.account().relays.charge(1) else {
                 let why = "this host has as many relays as a peer may have, or all peers";
                 without = Some((why.to_owned(), Some(ASK_AGAIN)));
                 continue;
             };
-            let reader = match kept {
+            let reader = match with.kept.borrow_mut().adopt(key, &spec, &self.identity) {
                 Some(reader) => Ok((reader, true)),
                 None => {
                     let endpoint = EndpointSpec::new(&*key.topic, &*key.type_name, spec.qos)
