@@ -244,7 +244,7 @@ impl Peer {
         }
     }
 
-    /// The refused routes: which, by whom, and why.
+    /// Each refused route, with the host that refuses it and the reason.
     fn all_refused(&self) -> impl Iterator<Item = (&RouteKey, By, &str)> {
         let RefusedRoutes { unasked, unwanted, unserved, theirs, .. } = &self.refused;
         let unasked = unasked.iter().map(|(key, why)| (key, By::NotAsked, *why));
