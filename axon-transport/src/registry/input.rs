@@ -40,6 +40,7 @@ impl<F: Clone> Registry<F> {
         if self.sessions.len() >= MAX_SESSIONS {
             return Err(Violation::Sessions);
         }
+        self.left.forget(&id);
         self.sessions.insert(id, session_entry(role, name, pid, descriptors, scope));
         self.rescoped |= role == SessionRole::Application;
         if role != SessionRole::Tool {
@@ -61,7 +62,9 @@ impl<F: Clone> Registry<F> {
         while let Some(entry) = self.sessions.get_mut(id) {
             let before = self.pairs.len();
             let Some(gid) = entry.endpoints.pop_first() else {
-                self.sessions.remove(id);
+                if let Some(entry) = self.sessions.remove(id) {
+                    self.left.keep(*id, entry.segments);
+                }
                 self.ready.remove(id);
                 self.rescoped = true;
                 return false;

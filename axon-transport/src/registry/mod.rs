@@ -9,6 +9,7 @@ mod bounds;
 mod fence;
 mod graph;
 mod input;
+mod left;
 mod matching;
 mod output;
 mod range;
@@ -83,6 +84,8 @@ pub struct Registry<F> {
     refused: Vec<(SessionId, String)>,
     /// FENCEs that are not answered yet.
     fences: Vec<fence::FenceRequest>,
+    /// Memory of sessions that ended.
+    left: left::LeftMemory<F>,
 }
 
 /// A session as the registry knows it.
@@ -234,6 +237,7 @@ impl<F> Default for Registry<F> {
             ready: BTreeSet::new(),
             refused: Vec::new(),
             fences: Vec::new(),
+            left: left::LeftMemory::default(),
         }
     }
 }

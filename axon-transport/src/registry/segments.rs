@@ -85,7 +85,7 @@ impl<F: Clone> Registry<F> {
     /// A session misses a segment of another, which it reads from.
     pub(super) fn need_segment(&mut self, id: &SessionId, of: &SessionId, number: u32) {
         let known = self.sessions.get_mut(id).and_then(|entry| entry.known.get_mut(of));
-        let Some(known) = known else { return };
+        let Some(known) = known else { return self.hand_left(id, of, number) };
         known.segments.remove(&number);
         self.hand(id, of, number);
         if let Some(known) = self.sessions.get_mut(id).and_then(|entry| entry.known.get_mut(of))

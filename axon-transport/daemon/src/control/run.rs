@@ -66,6 +66,9 @@ impl Start {
 /// How long a daemon waits for its first session at least.
 const FIRST_SESSION: Duration = Duration::from_secs(10);
 
+/// Within what time sessions return that lost the daemon before: a process may be stopped for a while.
+const RETURN: Duration = Duration::from_secs(20);
+
 /// What a daemon runs with besides its configuration.
 #[derive(Debug)]
 pub struct DaemonOptions {
@@ -288,6 +291,7 @@ async fn serve(
     }
     let accepting = spawn_local(accept(control.clone(), listeners));
     let flushing = spawn_local(flush(control.clone(), remote.digests()));
+    spawn_local(keep_left_memory(control.clone()));
     options.report.ready();
     let told = tokio::select! {
         _ = terminate.recv() => Some("SIGTERM"),
@@ -314,6 +318,13 @@ async fn serve(
     let _ = flushing.await;
     remote.end().await;
     Ok(())
+}
+
+/// Keeps what sessions leave that end, until those that read it have come from the daemon before.
+async fn keep_left_memory(control: Rc<RefCell<Control>>) {
+    control.borrow_mut().registry.keep_left_memory(descriptors::share());
+    tokio::time::sleep(RETURN).await;
+    control.borrow_mut().registry.drop_left_memory();
 }
 
 /// Sends changes of the graph a moment after they happened, and tells discovery, whose beacons say

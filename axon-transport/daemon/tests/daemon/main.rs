@@ -3,6 +3,7 @@
 mod address;
 mod foreign;
 mod hostile;
+mod left;
 mod life;
 mod logging;
 #[path = "../support/skip.rs"]
@@ -76,6 +77,9 @@ fn child() {
         "nobody to start" => return life::nobody_to_start(),
         "streamless" => life::streamless(),
         "few descriptors" => return life::few_descriptors(),
+        "leaves a response" => return left::server(),
+        "leaves samples" => return left::publisher(),
+        "takes samples" => return left::taker(),
         _ => {}
     }
     let config = Config::from_env().unwrap();

@@ -419,7 +419,10 @@ impl Reader {
     /// Notes that the publisher is gone and that all of its memory was handed over, whether or not its
     /// process has ended: memory that does not come soon never will.
     pub fn end(&mut self) {
-        self.ended = true;
+        if !std::mem::replace(&mut self.ended, true) {
+            // The next take asks for it once more, and waits for the answer.
+            self.missing = None;
+        }
     }
 
     /// How many samples have come since the grant, whatever became of them.

@@ -3,7 +3,8 @@
 use std::{
     collections::BTreeSet,
     sync::{
-        atomic::Ordering,
+        Arc,
+        atomic::{AtomicBool, Ordering},
         mpsc::{TryRecvError, sync_channel},
     },
     time::{Duration, Instant},
@@ -11,7 +12,7 @@ use std::{
 
 use axon_shm::internal::descriptors::PassedFd;
 
-use super::{Control, Link};
+use super::{Control, Link, Search};
 use crate::{
     ids::Gid,
     session::{
@@ -85,15 +86,17 @@ impl Control {
         let shared = self.shared.clone();
         let (found, receiver) = sync_channel(1);
         let first = self.pause;
-        let search = move || {
+        let over = Arc::new(AtomicBool::new(false));
+        let search = Search { found: receiver, over: over.clone() };
+        // Pairs with the release store in `Search::drop`.
+        let is_over = move || over.load(Ordering::Acquire);
+        let run = move || {
             std::thread::sleep(first);
             let mut pause = MIN_PAUSE;
-            // Pairs with the release store in `SessionShared::stop`.
-            while !shared.stopping.load(Ordering::Acquire) {
+            while !is_over() {
                 let caller = Caller {
                     segment: Some(&shared.segment),
-                    // Pairs with the release store in `SessionShared::stop`.
-                    cancel: Some(&|| shared.stopping.load(Ordering::Acquire)),
+                    cancel: Some(&is_over),
                     ..Caller::new(&shared.config, &shared.options, shared.id)
                 };
                 match caller.connect() {
@@ -109,8 +112,8 @@ impl Control {
                 pause = (pause * 2).min(MAX_PAUSE);
             }
         };
-        match std::thread::Builder::new().name("axon-connect".into()).spawn(search) {
-            Ok(_) => Link::Reconnecting(receiver),
+        match std::thread::Builder::new().name("axon-connect".into()).spawn(run) {
+            Ok(_) => Link::Reconnecting(search),
             Err(error) => {
                 tracing::error!(%error, "no thread to look for a daemon with");
                 Link::Ended
@@ -119,8 +122,8 @@ impl Control {
     }
 
     pub(super) fn try_reconnected(&mut self) {
-        let Link::Reconnecting(receiver) = &self.link else { return };
-        match receiver.try_recv() {
+        let Link::Reconnecting(search) = &self.link else { return };
+        match search.found.try_recv() {
             Ok(connected) => self.connected(connected),
             Err(TryRecvError::Empty) => {}
             Err(TryRecvError::Disconnected) => self.link = Link::Ended,

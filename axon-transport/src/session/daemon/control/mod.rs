@@ -11,7 +11,11 @@ mod time;
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque},
     os::fd::{AsFd, BorrowedFd},
-    sync::{Arc, atomic::Ordering, mpsc::Receiver},
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+        mpsc::Receiver,
+    },
     time::{Duration, Instant},
 };
 
@@ -110,10 +114,24 @@ pub(in crate::session) enum Start {
     Alone,
 }
 
+/// The search for another daemon, on a thread of its own, which ends with this.
+struct Search {
+    found: Receiver<Connected>,
+    /// Whether it is to end.
+    over: Arc<AtomicBool>,
+}
+
+impl Drop for Search {
+    fn drop(&mut self) {
+        // Pairs with the acquire loads of the thread.
+        self.over.store(true, Ordering::Release);
+    }
+}
+
 enum Link {
     Socket(PassedFd),
     Local(Local),
-    Reconnecting(Receiver<Connected>),
+    Reconnecting(Search),
     Ended,
 }
 
@@ -184,6 +202,31 @@ impl Control {
         // of memory, in which readers may find the last samples, nobody else could tell.
         self.tell_segments();
         self.send_rest();
+        if self.find_last_daemon() {
+            self.send_rest();
+        }
+    }
+
+    /// Where the daemon was killed, waits for the next one for a moment if readers have not taken all that publishers
+    /// of this session left: it may be in memory that no daemon has told them of. Whether there is a next one, which is
+    /// to be told.
+    fn find_last_daemon(&mut self) -> bool {
+        let deadline = Instant::now() + FAREWELL;
+        while matches!(self.link, Link::Reconnecting(_)) && self.shared.segment.tidy() {
+            let left = deadline.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return false;
+            }
+            let nap = Timespec::try_from(left.min(Duration::from_millis(20))).ok();
+            let _ = poll(&mut [PollFd::new(&self.shared.wake, PollFlags::IN)], nap.as_ref());
+            let _ = rustix::io::read(&self.shared.wake, &mut [0; 8]);
+            self.try_reconnected();
+            if self.is_linked() {
+                self.collect();
+                return true;
+            }
+        }
+        false
     }
 
     /// Sends what is queued, and waits for a daemon whose socket is full.

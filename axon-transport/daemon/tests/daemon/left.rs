@@ -1,0 +1,104 @@
+//! What a process that ends leaves to its readers when the daemon was killed before it could pass the memory on.
+
+use std::time::Duration;
+
+use super::*;
+use crate::support::of_child;
+
+/// Samples that the publisher leaves, each longer than what it has memory ready for.
+const SAMPLES: u64 = 24;
+const LENGTH: usize = 300_000;
+
+fn sample(number: u64) -> Vec<u8> {
+    let mut bytes = vec![number as u8; LENGTH];
+    bytes[..8].copy_from_slice(&number.to_le_bytes());
+    bytes
+}
+
+/// A child: publishes once it is told to, and ends.
+pub(crate) fn publisher() {
+    let session = of_child("publisher");
+    let publisher = session.create_publisher(spec("/left")).unwrap();
+    assert!(publisher.wait_matched(1, PATIENCE));
+    say("matched");
+    wait_for_the_end();
+    for number in 1..=SAMPLES {
+        while let Err(error) = publisher.publish(&sample(number)) {
+            assert!(matches!(error, PublishError::Blocked { .. }), "{error}");
+        }
+    }
+}
+
+/// A child: takes what the publisher left, and says how many samples came and how many it counts as lost.
+pub(crate) fn taker() {
+    let session = of_child("taker");
+    let subscription = session.create_subscription(spec("/left")).unwrap();
+    assert!(subscription.wait_matched(1, PATIENCE));
+    say("matched");
+    let (mut bytes, mut came) = (Vec::new(), 0);
+    let patience = std::time::Instant::now() + PATIENCE;
+    while came + subscription.lost() < SAMPLES && std::time::Instant::now() < patience {
+        let Ok(info) = subscription.recv(&mut bytes, Some(Duration::from_secs(1))) else {
+            continue;
+        };
+        assert!(bytes == sample(info.sequence), "sample {} is whole", info.sequence);
+        came += 1;
+    }
+    say(format!("{came} came, {} lost", subscription.lost()));
+    wait_for_the_end();
+}
+
+/// A publisher and its reader, of whom the publisher ends after their daemon was killed.
+fn daemon_killed(reader_stops: bool) {
+    let host = Host::new();
+    let (mut publisher, mut taker) = (host.play("leaves samples"), host.play("takes samples"));
+    assert_eq!((publisher.hear(), taker.hear()), ("matched".into(), "matched".into()));
+    let daemon = host.status().unwrap().pid;
+    if reader_stops {
+        signal(taker.pid(), Signal::STOP);
+    }
+    signal(daemon, Signal::KILL);
+    publisher.finish();
+    if reader_stops {
+        std::thread::sleep(Duration::from_secs(2));
+        signal(taker.pid(), Signal::CONT);
+    }
+    assert_eq!(taker.hear(), format!("{SAMPLES} came, 0 lost"));
+    taker.finish();
+}
+
+/// A child: answers a call once it is told to, and ends.
+pub(crate) fn server() {
+    let session = of_child("server");
+    let server = session.create_server(spec("/left")).unwrap();
+    let request = server.recv_request(&mut Vec::new(), Some(PATIENCE)).unwrap();
+    say("called");
+    wait_for_the_end();
+    server.send_response(request.publisher, request.sequence, &sample(1)).unwrap();
+}
+
+#[test]
+fn a_client_gets_the_response_that_a_server_sent_after_the_daemon_was_killed_and_before_it_ended() {
+    let host = Host::new();
+    let mut server = host.play("leaves a response");
+    let session = Session::open(&host.config(), SessionOptions::new("client")).unwrap();
+    let client = session.create_client(spec("/left")).unwrap();
+    assert!(client.wait_available(PATIENCE));
+    client.send_request(b"question").unwrap();
+    assert_eq!(server.hear(), "called");
+    signal(host.status().unwrap().pid, Signal::KILL);
+    server.finish();
+    let mut response = Vec::new();
+    client.recv_response(&mut response, Some(PATIENCE)).expect("the response in time");
+    assert!(response == sample(1));
+}
+
+#[test]
+fn a_reader_gets_what_was_published_after_the_daemon_was_killed_though_the_publisher_ended() {
+    daemon_killed(false);
+}
+
+#[test]
+fn a_stopped_reader_gets_what_was_published_after_the_daemon_was_killed() {
+    daemon_killed(true);
+}

@@ -1,0 +1,184 @@
+//! Memory of sessions that ended soon after this daemon's start, while readers of theirs may not have come back yet.
+//!
+//! When a daemon is killed, a session may open a segment that no daemon passes on. The session tells the next daemon,
+//! and may end before its readers have come back and met it there. The registry keeps such a session's segments until
+//! [`Registry::drop_left_memory`], and hands them to a reader that asks.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use super::{Registry, SessionSegment};
+use crate::{
+    ids::SessionId,
+    wire::session::{Message, SegmentOpened},
+};
+
+/// The segments of sessions that ended.
+#[derive(Debug)]
+pub(super) struct LeftMemory<F> {
+    /// How many segments are kept at most, as many descriptors of the daemon's: none later.
+    most: usize,
+    /// In the order in which the sessions ended.
+    sessions: VecDeque<(SessionId, BTreeMap<u32, SessionSegment<F>>)>,
+}
+
+impl<F> Default for LeftMemory<F> {
+    fn default() -> Self {
+        Self { most: 0, sessions: VecDeque::new() }
+    }
+}
+
+impl<F: Clone> LeftMemory<F> {
+    /// A session ended.
+    pub(super) fn keep(&mut self, id: SessionId, segments: BTreeMap<u32, SessionSegment<F>>) {
+        if segments.is_empty() || segments.len() > self.most {
+            return;
+        }
+        self.forget(&id);
+        self.sessions.push_back((id, segments));
+        while self.sessions.iter().map(|(_, segments)| segments.len()).sum::<usize>() > self.most {
+            self.sessions.pop_front();
+        }
+    }
+
+    /// A session has come back.
+    pub(super) fn forget(&mut self, id: &SessionId) {
+        self.sessions.retain(|(left, _)| left != id);
+    }
+
+    fn segment(&self, of: &SessionId, number: u32) -> Option<SessionSegment<F>> {
+        let (_, segments) = self.sessions.iter().find(|(id, _)| id == of)?;
+        segments.get(&number).cloned()
+    }
+}
+
+impl<F: Clone> Registry<F> {
+    /// From now on keeps segments of sessions that end, `most` at a time, for readers that come back from an earlier
+    /// daemon.
+    pub fn keep_left_memory(&mut self, most: usize) {
+        self.left.most = most;
+    }
+
+    /// Readers of an earlier daemon have come back by now: gives up what sessions left.
+    pub fn drop_left_memory(&mut self) {
+        self.left = LeftMemory::default();
+    }
+
+    /// A session that this daemon has not introduced to `of` misses a segment of that session: it knows it from an
+    /// earlier daemon.
+    pub(super) fn hand_left(&mut self, id: &SessionId, of: &SessionId, number: u32) {
+        if self.left.most == 0 {
+            return;
+        }
+        let there = self.sessions.get(of).and_then(|entry| entry.segments.get(&number).cloned());
+        if let Some(SessionSegment { segment, descriptor }) =
+            there.or_else(|| self.left.segment(of, number))
+        {
+            let opened = SegmentOpened { session: *of, segment };
+            self.push(id, &Message::Segment(opened), vec![descriptor]);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::wire::session::{Segment, SegmentName, SessionRole};
+
+    const MOST: usize = 4;
+    const WRITER: u8 = 1;
+    const READER: u8 = 2;
+
+    fn id(number: u8) -> SessionId {
+        SessionId([number; 16])
+    }
+
+    /// Two sessions whose daemon was killed, and which have come to this one.
+    fn registry() -> Registry<&'static str> {
+        let mut registry = Registry::default();
+        registry.keep_left_memory(MOST);
+        [WRITER, READER].into_iter().for_each(|session| connect(&mut registry, session));
+        taken(&mut registry);
+        registry
+    }
+
+    fn connect(registry: &mut Registry<&'static str>, session: u8) {
+        let handed = Some(["segment", "doorbell", "pidfd"]);
+        let (role, name) = (SessionRole::Application, String::new());
+        registry.handle_connect(id(session), role, name, 1, handed, None).unwrap();
+    }
+
+    fn open(registry: &mut Registry<&'static str>, session: u8, number: u32) {
+        let opened =
+            SegmentOpened { session: id(session), segment: Segment { number, publisher: None } };
+        registry.handle_message(&id(session), Message::Segment(opened), vec!["map"]).unwrap();
+    }
+
+    fn need(registry: &mut Registry<&'static str>, number: u32) {
+        let need = Message::Need(SegmentName { session: id(WRITER), number });
+        registry.handle_message(&id(READER), need, vec![]).unwrap();
+    }
+
+    /// The segments that the reader was handed.
+    fn taken(registry: &mut Registry<&'static str>) -> Vec<u32> {
+        let packets = std::iter::from_fn(|| registry.poll_output(&id(READER)));
+        let segments =
+            packets.filter_map(|output| match Message::decode(&output.packet).unwrap() {
+                Message::Segment(opened) => {
+                    assert_eq!(output.descriptors, ["map"]);
+                    Some(opened.segment.number)
+                }
+                _ => None,
+            });
+        segments.collect()
+    }
+
+    #[test]
+    fn a_reader_that_comes_back_is_handed_what_a_session_left() {
+        let mut registry = registry();
+        open(&mut registry, WRITER, 1);
+        need(&mut registry, 1);
+        assert_eq!(taken(&mut registry), [1], "its session is there");
+        registry.handle_disconnect(&id(WRITER));
+        need(&mut registry, 1);
+        need(&mut registry, 2);
+        assert_eq!(taken(&mut registry), [1], "its session has ended");
+        registry.drop_left_memory();
+        need(&mut registry, 1);
+        assert_eq!(taken(&mut registry), [0; 0]);
+    }
+
+    #[test]
+    fn later_a_session_leaves_nothing_and_shows_nobody_its_memory() {
+        let mut registry = registry();
+        registry.drop_left_memory();
+        open(&mut registry, WRITER, 1);
+        need(&mut registry, 1);
+        registry.handle_disconnect(&id(WRITER));
+        need(&mut registry, 1);
+        assert_eq!(taken(&mut registry), [0; 0]);
+    }
+
+    #[test]
+    fn the_segments_of_the_session_that_ended_first_make_room() {
+        let mut registry = registry();
+        connect(&mut registry, 3);
+        open(&mut registry, WRITER, 1);
+        (0..MOST as u32).for_each(|number| open(&mut registry, 3, 1 + number));
+        registry.handle_disconnect(&id(WRITER));
+        need(&mut registry, 1);
+        assert_eq!(taken(&mut registry), [1]);
+        registry.handle_disconnect(&id(3));
+        need(&mut registry, 1);
+        assert_eq!(taken(&mut registry), [0; 0]);
+    }
+
+    #[test]
+    fn a_session_that_comes_back_and_gives_memory_up_has_left_none() {
+        let mut registry = registry();
+        open(&mut registry, WRITER, 1);
+        registry.handle_disconnect(&id(WRITER));
+        connect(&mut registry, WRITER);
+        need(&mut registry, 1);
+        assert_eq!(taken(&mut registry), [0; 0]);
+    }
+}
