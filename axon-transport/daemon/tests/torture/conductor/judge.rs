@@ -7,6 +7,10 @@ use super::{
     round::Gone,
 };
 
+/// How long before a reader gives up what it waits for a daemon may have been killed that could have handed it over, in
+/// milliseconds: it waits for ten seconds, and may be stopped for four.
+const DAEMON: u128 = 15_000;
+
 /// What happened to endpoints that are gone.
 #[derive(Default)]
 pub(super) struct Past {
@@ -14,6 +18,16 @@ pub(super) struct Past {
     pub(super) deaths: HashMap<String, u128>,
     /// Publishers that ended.
     pub(super) ended: Vec<Ended>,
+    /// When daemons were killed, in milliseconds since the epoch.
+    pub(super) daemons: Vec<u128>,
+}
+
+impl Past {
+    /// Whether a daemon was killed shortly before a reader gave something up.
+    fn lost_daemon(&self, given_up: u128) -> bool {
+        let shortly = given_up.saturating_sub(DAEMON)..=given_up;
+        self.daemons.iter().any(|killed| shortly.contains(killed))
+    }
 }
 
 /// A KEEP_ALL publisher that ended.
@@ -101,7 +115,8 @@ pub(super) fn come_to_rest(players: &mut [Player], past: &mut Past) -> u64 {
 }
 
 /// What did not come. KEEP_ALL subscriptions must not miss a sample of a publisher that lived, and must count those
-/// that they missed of one that was dead by then. Servers and clients must not miss a message of one that lived.
+/// that they missed of one that was dead by then. Servers and clients must not miss a message of one that lived. What a
+/// process left that ended by itself must come, too, unless a daemon was killed: it may have held the memory.
 pub(super) fn missed(players: &mut [Player], past: &Past) -> Gone {
     let deaths: HashMap<&str, u128> =
         past.deaths.iter().map(|(reader, at)| (session(reader), *at)).collect();
@@ -116,7 +131,8 @@ pub(super) fn missed(players: &mut [Player], past: &Past) -> Gone {
         for [partner, messages, at, what] in words.as_chunks::<4>().0 {
             let at: u128 = at.parse().expect("a time");
             let number: u64 = messages.parse().expect("a number");
-            let was_dead = deaths.get(session(partner)).is_some_and(|death| *death <= at);
+            let was_dead = deaths.get(session(partner)).is_some_and(|death| *death <= at)
+                || !living.contains(session(partner)) && past.lost_daemon(at);
             match *what {
                 "counted" if was_dead => gone.samples += number,
                 "request" | "response" if was_dead => gone.calls += number,

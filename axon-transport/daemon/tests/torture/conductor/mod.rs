@@ -181,7 +181,10 @@ impl Game<'_> {
         if self.kill_daemon_at.take_if(|at| *at <= now).is_some()
             && let Some(daemon) = self.host.daemon()
         {
-            self.done.daemons += u32::from(kill_process(daemon, Signal::KILL).is_ok());
+            if kill_process(daemon, Signal::KILL).is_ok() {
+                self.past.daemons.push(epoch());
+                self.done.daemons += 1;
+            }
             if matches!(self.plan, Plan::Stops) {
                 self.rough_until = now + COMING_BACK;
             }
