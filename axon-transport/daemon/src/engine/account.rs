@@ -193,6 +193,8 @@ impl MessageMemory {
 /// The account of one identity.
 #[derive(Debug)]
 pub(crate) struct Account {
+    /// Whose it is.
+    pub(crate) identity: Rc<str>,
     /// Bytes of its graph.
     pub(crate) graph: Rc<Meter>,
     /// Bytes of the routes that it asks for: on their own, so that one whose graph is full is served.
@@ -219,8 +221,9 @@ pub(crate) struct Account {
 }
 
 impl Account {
-    fn new(graph: usize, relays: &Rc<Meter>, stand_ins: &Rc<Meter>) -> Self {
+    fn new(identity: &str, graph: usize, relays: &Rc<Meter>, stand_ins: &Rc<Meter>) -> Self {
         Self {
+            identity: identity.into(),
             graph: Meter::new(graph),
             routes: Meter::new(ROUTES_TO_GRAPH.saturating_mul(graph)),
             relays: Meter::within(relays, MAX_RELAYS),
@@ -319,7 +322,7 @@ impl Accounts {
             return account;
         }
         self.open.retain(|_, account| account.strong_count() > 0);
-        let account = Rc::new(Account::new(self.graph, &self.relays, &self.stand_ins));
+        let account = Rc::new(Account::new(identity, self.graph, &self.relays, &self.stand_ins));
         self.open.insert(identity.to_owned(), Rc::downgrade(&account));
         account
     }

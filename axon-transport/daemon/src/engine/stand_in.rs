@@ -98,6 +98,8 @@ pub(crate) enum NoStandIn {
 struct Known {
     stand_in: Weak<StandIn>,
     numbers: Rc<Numbers>,
+    /// Whose it is.
+    identity: Rc<str>,
 }
 
 /// All stand-ins of this host.
@@ -110,8 +112,9 @@ pub(crate) struct StandIns {
 
 /// As many are known before those that are gone are forgotten.
 const KNOWN: usize = 64;
-/// Publishers that are gone and whose numbers are remembered: one that comes again goes on from there.
-const REMEMBERED: usize = 1 << 16;
+/// Publishers that are gone and whose numbers are remembered: one that comes again goes on from there. If there are more,
+/// each identity keeps as many of its newest as it would of equal shares.
+const REMEMBERED: usize = if cfg!(test) { 60 } else { 1 << 16 };
 
 impl StandIns {
     /// The stand-in for `remote`: the one that exists, or a new one that `account` pays for.
@@ -148,7 +151,9 @@ impl StandIns {
             forget(&mut known, now);
             self.clean_at.set(2 * known.len().max(KNOWN));
         }
-        known.insert(remote.gid, Known { stand_in: Rc::downgrade(&stand_in), numbers });
+        let identity = Rc::clone(&account.identity);
+        let stand_in_known = Known { stand_in: Rc::downgrade(&stand_in), numbers, identity };
+        known.insert(remote.gid, stand_in_known);
         Ok(stand_in)
     }
 }
@@ -158,10 +163,68 @@ fn forget(known: &mut HashMap<Gid, Known>, now: Duration) {
     let is_there = |known: &Known| known.stand_in.strong_count() > 0;
     let recent = |known: &Known| known.numbers.last() > 0 && now < known.numbers.at() + FORGOTTEN;
     known.retain(|_, known| is_there(known) || recent(known));
-    let gone = known.values().filter(|known| !is_there(known));
-    let mut gone: Vec<_> = gone.map(|known| known.numbers.at()).collect();
-    let Some(too_many) = gone.len().checked_sub(REMEMBERED + 1) else { return };
-    gone.sort_unstable();
-    let oldest = gone[too_many];
-    known.retain(|_, known| is_there(known) || known.numbers.at() > oldest);
+    let mut gone = HashMap::<_, Vec<_>>::new();
+    for (gid, known) in known.iter().filter(|(_, known)| !is_there(known)) {
+        gone.entry(Rc::clone(&known.identity)).or_default().push((known.numbers.at(), *gid));
+    }
+    let share = share(gone.values().map(Vec::len).collect(), REMEMBERED);
+    for mut of_identity in gone.into_values().filter(|gone| gone.len() > share) {
+        of_identity.sort_unstable();
+        let oldest = of_identity.len() - share;
+        of_identity[..oldest].iter().for_each(|(_, gid)| drop(known.remove(gid)));
+    }
+}
+
+/// The most that each may have so that all have `all` at most.
+fn share(mut wanted: Vec<usize>, all: usize) -> usize {
+    wanted.sort_unstable();
+    let (mut left, mut others) = (all, wanted.len());
+    for want in wanted {
+        if want > left / others {
+            return left / others;
+        }
+        left -= want;
+        others -= 1;
+    }
+    usize::MAX
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::account::Accounts;
+
+    #[test]
+    fn who_wants_less_than_an_equal_share_leaves_the_rest_to_the_others() {
+        assert_eq!(share(vec![], 60), usize::MAX);
+        assert_eq!(share(vec![10, 20, 30], 60), usize::MAX);
+        assert_eq!(share(vec![100], 60), 60);
+        assert_eq!(share(vec![10, 100, 100], 60), 25);
+        assert_eq!(share(vec![100; 100], 60), 0);
+    }
+
+    fn departed(identity: &Rc<str>, number: u8, at: u64) -> (Gid, Known) {
+        let numbers = Rc::new(Numbers::new(Duration::ZERO));
+        numbers.pass(1, Duration::from_secs(at));
+        let mut gid = Gid::default();
+        gid.0[0] = number;
+        (gid, Known { stand_in: Weak::new(), numbers, identity: Rc::clone(identity) })
+    }
+
+    #[test]
+    fn an_identity_whose_publishers_come_and_go_has_none_of_another_forgotten() {
+        let mut accounts = Accounts::new(1 << 20);
+        let [flood, quiet] = ["flood", "quiet"].map(|of| Rc::clone(&accounts.of(of).identity));
+        let mut known = HashMap::new();
+        known.extend((0..10).map(|number| departed(&quiet, number, 1)));
+        known.extend((10..210).map(|number| departed(&flood, number, u64::from(number))));
+        forget(&mut known, Duration::from_secs(300));
+        let mut left: Vec<u8> = known.keys().map(|gid| gid.0[0]).collect();
+        left.sort_unstable();
+        assert_eq!(
+            left,
+            (0..10).chain(160..210).collect::<Vec<_>>(),
+            "and the newest of the flood"
+        );
+    }
 }
