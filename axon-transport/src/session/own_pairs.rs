@@ -5,7 +5,10 @@
 //! for the same lane repeats its grant. If the thread cannot attach the pair at once, for example for lack of
 //! memory, the daemon's announcement attaches it later.
 
-use std::sync::{Arc, MutexGuard, PoisonError};
+use std::{
+    sync::{Arc, MutexGuard, PoisonError},
+    time::{Duration, Instant},
+};
 
 use axon_shm::{
     ShmError,
@@ -23,6 +26,9 @@ use crate::{
     ids::Gid,
     wire::session::EndpointRole,
 };
+
+/// How long a publisher that the application has dropped stays for readers that have not heard of their grant.
+const EXPECTED: Duration = Duration::from_secs(10);
 
 impl SessionShared {
     /// Under this lock, the pairs of a session's own endpoints come and go with them.
@@ -80,13 +86,50 @@ impl SessionShared {
         let mut matched_readers = reader.lock();
         let lane = matched_readers.lane_for(from, || self.segment.allocate_lane())?.lane;
         let reads = ReaderInfo { gid, lane, qos: reader.qos, peer: peer.clone(), stands_for: None };
-        let (grant, after, ring) = writer.attach(reads, Terms::default())?;
+        let (grant, after, ring) =
+            writer.attach(reads, Terms::default(), self.memory.connections())?;
         if let Accept::Map(lane) = matched_readers.accept(from, grant) {
             let max_message = self.config.max_message;
             let mapped = reader.map(from, peer, ring, lane, grant, max_message)?;
             matched_readers.add(mapped, Some(after), Numbers::None);
         }
         Ok(())
+    }
+
+    /// The application is done with an endpoint or a node. A publisher stays until readers that the next daemon has to tell
+    /// of their grant have it, or for [`EXPECTED`].
+    pub(super) fn leave(&self, gid: &Gid) {
+        let mut state = self.state();
+        let connection = state.daemon.map(|_| self.memory.connections());
+        if state.publishers.get(gid).is_some_and(|publisher| publisher.expects_readers(connection))
+        {
+            state.leaving.insert(*gid, Instant::now() + EXPECTED);
+            return;
+        }
+        drop(state);
+        self.part(gid);
+    }
+
+    /// Parts the publishers that stayed and are not needed any more; whether there are others.
+    pub(super) fn part_left(&self) -> bool {
+        let over: Vec<Gid> = {
+            let state = self.state();
+            if state.leaving.is_empty() {
+                return false;
+            }
+            let connection = state.daemon.map(|_| self.memory.connections());
+            let now = Instant::now();
+            let needed = |gid: &Gid| {
+                state.publishers.get(gid).is_some_and(|p| p.expects_readers(connection))
+            };
+            let over = state.leaving.iter().filter(|(gid, until)| **until <= now || !needed(gid));
+            over.map(|(gid, _)| *gid).collect()
+        };
+        over.iter().for_each(|gid| {
+            self.part(gid);
+            self.state().leaving.remove(gid);
+        });
+        !self.state().leaving.is_empty()
     }
 
     /// Takes an endpoint or a node out of what the session has, and parts it from the others there.

@@ -1,7 +1,7 @@
 //! A writer of a topic.
 
 use std::{
-    collections::BTreeSet,
+    collections::BTreeMap,
     fmt, io,
     ops::{Deref, DerefMut},
     sync::{Arc, Mutex, MutexGuard, PoisonError},
@@ -10,7 +10,7 @@ use std::{
 
 use axon_shm::{
     PublishError, ShmError,
-    internal::{Grant, Location, ReaderInfo, Terms, Writer, nanoseconds},
+    internal::{Grant, Location, ReaderInfo, Terms, Writer, holds, nanoseconds},
 };
 
 use super::{
@@ -21,7 +21,7 @@ use super::{
 };
 use crate::{
     events::EventKind,
-    graph::Endpoint,
+    graph::{Endpoint, EndpointKind},
     ids::Gid,
     qos::{Liveliness, Qos},
     wire::session::{EndpointRole, Fence},
@@ -313,8 +313,9 @@ pub(super) struct PublisherInner {
     asserts: bool,
     /// Its samples come from a process of this host that shares no memory.
     pub(super) relayed: bool,
-    /// Readers that were granted; a relay as itself.
-    attached: Mutex<BTreeSet<Gid>>,
+    /// Readers that were granted, a relay as itself, and by which of the session's
+    /// [connections](super::state::MemoryNews::connections).
+    attached: Mutex<BTreeMap<Gid, u64>>,
     sending: Mutex<Sending>,
 }
 
@@ -356,16 +357,31 @@ impl PublisherInner {
         self
     }
 
-    /// Serves a reader on its terms: what it is granted, the number in front of that, and in which ring.
+    /// Serves a reader, which asked by this connection, on its terms: what it is granted, the number in front of that,
+    /// and in which ring.
     pub(super) fn attach(
         &self,
         reader: ReaderInfo,
         terms: Terms,
+        connection: u64,
     ) -> Result<(Grant, u64, Location), ShmError> {
         let gid = reader.gid;
         let granted = self.rings.attach(reader, terms)?;
-        self.attached().insert(gid);
+        self.attached().insert(gid, connection);
         Ok(granted)
+    }
+
+    /// Whether a reader that it must not lose a sample for has not taken up its grant, which went to an earlier daemon
+    /// than that of this `connection`: nobody may have passed it on.
+    pub(super) fn expects_readers(&self, connection: Option<u64>) -> bool {
+        let Rings::Shared(writer) = &self.rings else { return false };
+        let keeps = self.endpoint.kind == EndpointKind::Publisher && holds(&self.endpoint.qos);
+        if !keeps || self.role != EndpointRole::Application {
+            return false;
+        }
+        let expected = writer.expected_readers();
+        let attached = self.attached();
+        expected.iter().filter_map(|reader| attached.get(reader)).any(|by| Some(*by) != connection)
     }
 
     /// Whether it was attached.
@@ -397,7 +413,12 @@ impl PublisherInner {
         self.sending.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub(super) fn attached(&self) -> MutexGuard<'_, BTreeSet<Gid>> {
+    /// The readers that were granted.
+    pub(super) fn granted(&self) -> Vec<Gid> {
+        self.attached().keys().copied().collect()
+    }
+
+    fn attached(&self) -> MutexGuard<'_, BTreeMap<Gid, u64>> {
         self.attached.lock().unwrap_or_else(PoisonError::into_inner)
     }
 

@@ -98,6 +98,8 @@ pub(super) struct SessionState {
     pub(super) nodes: HashMap<Gid, (Endpoint, GuardCondition)>,
     pub(super) publishers: HashMap<Gid, Arc<PublisherInner>>,
     pub(super) subscriptions: HashMap<Gid, Arc<SubscriptionInner>>,
+    /// Publishers that the application has dropped, and until when they stay at most.
+    pub(super) leaving: BTreeMap<Gid, Instant>,
     /// Applications' endpoints of both kinds by topic or service.
     pub(super) topics: HashMap<String, BTreeSet<Gid>>,
     pub(super) outgoing: VecDeque<Outgoing>,

@@ -51,6 +51,11 @@ impl Writer {
         }
     }
 
+    /// The attached readers that have not taken up their grant: it may not have come to them.
+    pub fn expected_readers(&self) -> Vec<Gid> {
+        if self.is_forked() { Vec::new() } else { self.lock().reader_set.expected() }
+    }
+
     /// Samples with which those who carry them elsewhere are not done.
     pub fn under_way(&self) -> u64 {
         if self.is_forked() {

@@ -481,6 +481,14 @@ impl ReaderSet {
         worst.into_iter().chain(absent).min().map(|(_, gid)| (gid, peers))
     }
 
+    /// The readers that have not taken up what they were granted.
+    pub(crate) fn expected(&self) -> Vec<Gid> {
+        let asked = |reader: &&Attached| {
+            !reader.dead && reader.tenancy.standing(reader.lane.words()) == LaneState::Asked
+        };
+        self.readers.iter().filter(asked).map(|reader| reader.info.gid).collect()
+    }
+
     /// There is one reader more. A publisher of hundreds gets them one by one, so that what stands is
     /// added to, and not found anew.
     fn joined(&mut self, info: &ReaderInfo) {

@@ -151,3 +151,68 @@ fn a_reader_that_is_attached_anew_goes_on_where_it_was_and_counts_what_is_missin
     assert_eq!(take(&subscription), Some(6));
     assert_eq!(subscription.lost(), 2);
 }
+
+/// A publisher whose reader an earlier daemon did not tell of its grant, and what becomes of it when the application has
+/// dropped it, or the whole session.
+fn a_grant_is_lost(session_ends: bool) {
+    let stage = Stage::new();
+    let (session, daemon) = stage.session();
+    let publisher =
+        session.create_publisher(EndpointSpec::new("/p", "test/Bytes", Qos::keep_all())).unwrap();
+    let endpoint = publisher.endpoint().clone();
+    let taker = Taker::new();
+    let lane = taker.session.allocate_lane().unwrap();
+    let granted = taker.ask(&endpoint, lane.location(), None, &daemon);
+    drop(daemon);
+    until("it is lost", || session.daemon().is_none());
+    publisher.publish(b"x").unwrap();
+    publisher.publish(b"x").unwrap();
+    drop(publisher);
+    let (ending, session) = if session_ends {
+        (Some(thread::spawn(move || drop(session))), None)
+    } else {
+        (None, Some(session))
+    };
+    let daemon = stage.daemon(2);
+    daemon.hear(|message| {
+        matches!(message, Message::Endpoint(announce) if announce.endpoint.gid == endpoint.gid)
+            .then_some(())
+    });
+    let again = taker.ask(&endpoint, lane.location(), None, &daemon);
+    let of = |granted: &Granted| (granted.generation, granted.first, granted.ring);
+    assert_eq!(of(&again), of(&granted), "the one that stands");
+    let mut taking = taker.take_up(&endpoint, lane, &again, &daemon);
+    assert_eq!([taking.take(&daemon), taking.take(&daemon)], [1, 2]);
+    if let Some(ending) = ending {
+        ending.join().unwrap();
+    } else if let Some(session) = &session {
+        let gone = || !session.shared().state().publishers.contains_key(&endpoint.gid);
+        until("it is gone", gone);
+    }
+    drop(session);
+}
+
+#[test]
+fn a_publisher_that_is_dropped_without_a_daemon_stays_for_a_reader_that_was_not_told_of_its_grant()
+{
+    a_grant_is_lost(false);
+}
+
+#[test]
+fn a_session_that_ends_without_a_daemon_stays_for_a_reader_that_was_not_told_of_its_grant() {
+    a_grant_is_lost(true);
+}
+
+#[test]
+fn a_publisher_that_is_dropped_goes_at_once_where_its_reader_has_taken_up_its_grant() {
+    let stage = Stage::new();
+    let (session, daemon) = stage.session();
+    let publisher =
+        session.create_publisher(EndpointSpec::new("/p", "test/Bytes", Qos::keep_all())).unwrap();
+    let gid = publisher.gid();
+    let _taking = Taker::new().attach(&publisher, None, &daemon);
+    drop(daemon);
+    until("it is lost", || session.daemon().is_none());
+    drop(publisher);
+    assert!(!session.shared().state().publishers.contains_key(&gid));
+}

@@ -2,7 +2,7 @@
 
 use axon_shm::{
     PublishError,
-    internal::{Reader, ReaderOptions},
+    internal::{Lane, Reader, ReaderOptions},
 };
 
 use super::*;
@@ -20,7 +20,7 @@ pub(super) struct Taking {
 
 impl Taking {
     /// The number of the next sample, whose memory the session may have told of meanwhile.
-    fn take(&mut self, daemon: &Daemon) -> u64 {
+    pub(super) fn take(&mut self, daemon: &Daemon) -> u64 {
         let mut taken = None;
         until("a sample", || {
             while let Ok(Received { message, descriptors }) =
@@ -39,7 +39,7 @@ impl Taking {
 
 /// A reader of another session, which takes when the test says so.
 pub(super) struct Taker {
-    session: Arc<SessionSegment>,
+    pub(super) session: Arc<SessionSegment>,
     pub(super) gid: Gid,
 }
 
@@ -57,13 +57,24 @@ impl Taker {
         stands_for: Option<Vec<Gid>>,
         daemon: &Daemon,
     ) -> Taking {
-        let (writer, qos) = (to.gid(), to.endpoint().qos);
         let lane = self.session.allocate_lane().unwrap();
+        let granted = self.ask(to.endpoint(), lane.location(), stands_for, daemon);
+        self.take_up(to.endpoint(), lane, &granted, daemon)
+    }
+
+    /// Asks for what a publisher grants.
+    pub(super) fn ask(
+        &self,
+        of: &Endpoint,
+        lane: Location,
+        stands_for: Option<Vec<Gid>>,
+        daemon: &Daemon,
+    ) -> Granted {
         let attach = Attach {
             reader: self.gid,
-            writer,
-            lane: lane.location(),
-            qos,
+            writer: of.gid,
+            lane,
+            qos: of.qos,
             session: self.session.id(),
             stands_for,
             segments: Vec::new(),
@@ -73,20 +84,30 @@ impl Taker {
         let PeerDescriptors { segment, doorbell, pidfd } = self.session.descriptors().unwrap();
         let descriptors = [segment.as_fd(), doorbell.as_fd(), pidfd.as_fd()];
         daemon.say(Message::Attach(attach), &descriptors);
-        let granted = daemon.hear(|message| match message {
+        daemon.hear(|message| match message {
             Message::Grant(granted) => Some(granted),
             _ => None,
-        });
-        let Granted { generation, first, ring, .. } = granted;
+        })
+    }
+
+    /// Takes up what it was granted.
+    pub(super) fn take_up(
+        &self,
+        of: &Endpoint,
+        lane: Lane,
+        granted: &Granted,
+        daemon: &Daemon,
+    ) -> Taking {
+        let Granted { generation, first, ring, .. } = *granted;
         let view = PeerSession::map(daemon.id, daemon.handed.try_clone().unwrap()).unwrap();
         let mut reader = Reader::map(ReaderOptions {
             reader: self.gid,
-            writer,
+            writer: of.gid,
             peer: Peer::Remote(view.clone()),
             ring,
             lane,
             grant: Grant { generation, first },
-            qos,
+            qos: of.qos,
             max_message: 1 << 20,
         })
         .unwrap();

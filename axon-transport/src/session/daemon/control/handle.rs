@@ -74,7 +74,7 @@ impl Control {
         self.spoken.retain(|pair| !gids.contains(&pair.reader) && !gids.contains(&pair.writer));
         let (publishers, subscriptions) = self.endpoints();
         for publisher in publishers {
-            let attached = publisher.attached().clone();
+            let attached = publisher.granted();
             let ended = attached.iter().filter(|gid| gids.contains(gid));
             let detached = ended.filter(|gid| publisher.detach(**gid));
             let writer = publisher.endpoint.gid;
@@ -139,7 +139,7 @@ impl Control {
         let is_over = |pair: &Pair| spoken.contains(pair) && !repeated.contains(pair);
         let (publishers, subscriptions) = self.endpoints();
         for publisher in publishers {
-            let (writer, attached) = (publisher.endpoint.gid, publisher.attached().clone());
+            let (writer, attached) = (publisher.endpoint.gid, publisher.granted());
             for reader in attached {
                 let pair = Pair { reader, writer };
                 if is_over(&pair) && !self.is_own_pair(&pair) && publisher.detach(reader) {
@@ -282,7 +282,8 @@ impl Control {
             let Attach { reader: gid, lane, qos, stands_for, after, carries, .. } = attach;
             let reader = ReaderInfo { gid, lane, qos, peer, stands_for };
             let terms = Terms { after, carries: carries == Some(true) };
-            publisher.attach(reader, terms).map_err(|e| e.to_string())
+            let connection = shared.memory.connections();
+            publisher.attach(reader, terms, connection).map_err(|e| e.to_string())
         });
         drop(own_pairs);
         match grant {

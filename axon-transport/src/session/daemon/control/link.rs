@@ -130,6 +130,11 @@ impl Control {
         }
     }
 
+    /// Whether there is a daemon, or may be one.
+    pub(super) fn is_served(&self) -> bool {
+        matches!(self.link, Link::Socket(_) | Link::Reconnecting(_))
+    }
+
     pub(super) fn is_linked(&self) -> bool {
         matches!(self.link, Link::Socket(_) | Link::Local(_))
     }

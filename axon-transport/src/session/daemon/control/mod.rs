@@ -181,8 +181,16 @@ impl Control {
 
     pub(in crate::session) fn run(mut self) {
         let _ = self.shared.control.set(std::thread::current().id());
-        // Pairs with the release store in `SessionShared::stop`.
-        while !self.shared.stopping.load(Ordering::Acquire) {
+        let mut farewell = None;
+        loop {
+            let others_left = self.shared.part_left();
+            // Pairs with the release store in `SessionShared::stop`.
+            if self.shared.stopping.load(Ordering::Acquire) {
+                let until = *farewell.get_or_insert_with(|| Instant::now() + FAREWELL);
+                if !others_left || !self.is_served() || until <= Instant::now() {
+                    break;
+                }
+            }
             self.try_reconnected();
             self.try_again();
             self.tell_rematched();
@@ -404,7 +412,8 @@ impl Control {
         // A socket without room becomes writable, but one that is short of descriptors in flight
         // does not say when that passes.
         let blocked = self.is_linked() && !(self.outbox.is_empty() && self.untold.is_empty());
-        let nap = blocked.then_some(Duration::from_millis(20));
+        let looks = blocked || !self.shared.state().leaving.is_empty();
+        let nap = looks.then_some(Duration::from_millis(20));
         let reclaim_idle = self.reclaim_idle.filter(|_| self.is_linked());
         let again = self.look_again();
         let due = reclaim_idle
