@@ -11,7 +11,10 @@ use std::{
 
 use axon_shm::internal::descriptors::PassedFd;
 
-use super::{Control, Link};
+use super::{
+    Control, Link, pause,
+    told::{ToldPairs, ToldSegments},
+};
 use crate::{
     ids::Gid,
     session::{
@@ -22,22 +25,13 @@ use crate::{
     wire::session::{Gone, Message},
 };
 
-/// Between attempts to find a daemon.
-const MIN_PAUSE: Duration = Duration::from_millis(100);
-const MAX_PAUSE: Duration = Duration::from_secs(2);
-/// A connection that lasted less was as good as refused.
-const BRIEF: Duration = Duration::from_secs(1);
-
 impl Control {
     pub(super) fn connected(&mut self, connected: Connected) {
         self.outbox.clear();
         self.building = None;
-        self.repeated = None;
-        self.spoken.clear();
-        self.told = false;
-        self.segments.clear();
-        self.untold.clear();
-        self.since = Instant::now();
+        self.pairs = ToldPairs::default();
+        self.segments = ToldSegments::default();
+        self.pause.handle_connected(Instant::now());
         self.retry = None;
         let daemon = connected.welcome.daemon;
         {
@@ -71,23 +65,18 @@ impl Control {
                 state.status = StatusAnswer::Lost;
             }
         }
-        self.pause = if self.since.elapsed() < BRIEF {
-            (self.pause * 2).clamp(MIN_PAUSE, MAX_PAUSE)
-        } else {
-            Duration::ZERO
-        };
-        self.link = if self.reconnects { self.reconnect() } else { Link::Ended };
+        let pause = self.pause.handle_lost(Instant::now());
+        self.link = if self.reconnects { self.reconnect(pause) } else { Link::Ended };
         self.shared.notify(Some(&SessionEvent::DaemonLost));
     }
 
-    /// Looks for a daemon on a thread of its own: meanwhile peers may die.
-    pub(super) fn reconnect(&self) -> Link {
+    /// Looks for a daemon after a pause, on a thread of its own: meanwhile peers may die.
+    fn reconnect(&self, first: Duration) -> Link {
         let shared = self.shared.clone();
         let (found, receiver) = sync_channel(1);
-        let first = self.pause;
         let search = move || {
             std::thread::sleep(first);
-            let mut pause = MIN_PAUSE;
+            let mut pause = pause::next(Duration::ZERO);
             // Pairs with the release store in `SessionShared::stop`.
             while !shared.stopping.load(Ordering::Acquire) {
                 let caller = Caller {
@@ -106,7 +95,7 @@ impl Control {
                     Err(error) => tracing::error!(%error, "no daemon took the session"),
                 }
                 std::thread::sleep(pause);
-                pause = (pause * 2).min(MAX_PAUSE);
+                pause = pause::next(pause);
             }
         };
         match std::thread::Builder::new().name("axon-connect".into()).spawn(search) {

@@ -6,10 +6,12 @@ mod handle;
 mod link;
 mod memory;
 mod pair_log;
+mod pause;
 mod time;
+mod told;
 
 use std::{
-    collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque},
+    collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
     os::fd::{AsFd, BorrowedFd},
     sync::{Arc, atomic::Ordering, mpsc::Receiver},
     time::{Duration, Instant},
@@ -18,6 +20,10 @@ use std::{
 use axon_shm::{ExternalLeader, ShmError, internal::descriptors::PassedFd};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
+use self::{
+    pause::ReconnectPause,
+    told::{ToldPairs, ToldSegments},
+};
 use super::{
     connect::Connected,
     socket::{self, SocketError},
@@ -35,7 +41,7 @@ use crate::{
         state::{Outgoing, SessionShared},
         subscription::{Asking, SubscriptionInner},
     },
-    wire::session::{Announce, EndpointRole, Gone, Message, Pair},
+    wire::session::{Announce, EndpointRole, Gone, Message},
 };
 
 /// Packets handled before queued ones are sent: neither direction starves the other.
@@ -56,25 +62,15 @@ pub(in crate::session) struct Control {
     buffer: Vec<u8>,
     /// A whole graph of which parts are still to come.
     building: Option<GraphView>,
-    /// Pairs that the daemon repeated since it began to tell everything anew.
-    repeated: Option<HashSet<Pair>>,
-    /// Pairs that the daemon of this connection has told of. What it never told of stands by the word
-    /// of an earlier one, and this one may know nothing of it yet: a stopped process has not come back.
-    spoken: HashSet<Pair>,
-    /// Whether this connection has brought a whole graph already.
-    told: bool,
+    /// The pairs that the daemon of this connection told of.
+    pairs: ToldPairs,
     /// When to look after the memory of large samples, while there is any.
     reclaim_idle: Option<Instant>,
     /// The segments of our memory that this connection was told of.
-    segments: BTreeSet<u32>,
-    /// Those that it could not be told of, for want of descriptors.
-    untold: BTreeSet<u32>,
+    segments: ToldSegments,
     /// Publishers that have no memory ready for their next large sample.
     low: BTreeSet<Gid>,
-    /// When this connection was made, and how long the search for the next one waits first: one
-    /// that does not last is not to be had at once again, at the cost of everybody else.
-    since: Instant,
-    pause: Duration,
+    pause: ReconnectPause,
     /// This process had no descriptors left: when it asks to be told everything anew.
     retry: Option<Instant>,
     arrivals: Arrivals,
@@ -134,15 +130,11 @@ impl Control {
             outbox: VecDeque::new(),
             buffer: Vec::new(),
             building: None,
-            repeated: None,
-            spoken: HashSet::new(),
-            told: false,
+            pairs: ToldPairs::default(),
             reclaim_idle: None,
-            segments: BTreeSet::new(),
-            untold: BTreeSet::new(),
+            segments: ToldSegments::default(),
             low: BTreeSet::new(),
-            since: Instant::now(),
-            pause: Duration::ZERO,
+            pause: ReconnectPause::new(Instant::now()),
             retry: None,
             arrivals: Arrivals::default(),
             topics: HashMap::new(),
@@ -247,7 +239,7 @@ impl Control {
                 }
                 Outgoing::Fence(fence) => {
                     self.tell_segments();
-                    if self.untold.is_empty() {
+                    if self.segments.are_complete() {
                         self.outbox.push_back((Message::Fence(fence), Vec::new()));
                     } else {
                         fences.insert(fence.writer, Outgoing::Fence(fence));
@@ -360,7 +352,7 @@ impl Control {
         }
         // A socket without room becomes writable, but one that is short of descriptors in flight
         // does not say when that passes.
-        let blocked = self.is_linked() && !(self.outbox.is_empty() && self.untold.is_empty());
+        let blocked = self.is_linked() && !(self.outbox.is_empty() && self.segments.are_complete());
         let nap = blocked.then_some(Duration::from_millis(20));
         let reclaim_idle = self.reclaim_idle.filter(|_| self.is_linked());
         let again = self.look_again();
