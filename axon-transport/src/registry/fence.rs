@@ -5,17 +5,15 @@
 //! memory. A reader can read that memory after the daemon was killed, but only if the daemon had sent it the
 //! descriptors of the memory, and its grant.
 
-use axon_shm::internal::holds;
-
-use super::{Registry, SessionEntry, Violation};
+use super::sessions::Sessions;
 use crate::{
     ids::{Gid, SessionId},
-    wire::session::{Fence, Message, Pair},
+    wire::session::Fence,
 };
 
 /// A FENCE that is not answered yet.
 #[derive(Debug)]
-pub(super) struct FenceRequest {
+struct FenceRequest {
     /// Who asked.
     by: SessionId,
     fence: Fence,
@@ -24,86 +22,43 @@ pub(super) struct FenceRequest {
     readers: Vec<(SessionId, Option<u64>)>,
 }
 
-impl<F: Clone> Registry<F> {
-    /// A session asks. A later question about the same publisher takes the place of an earlier one.
-    pub(super) fn fence(&mut self, id: &SessionId, fence: Fence) -> Result<(), Violation> {
-        match self.endpoints.get(&fence.writer) {
-            Some(writer) if writer.session == *id => {}
-            Some(_) => return Err(Violation::NotItsOwn(fence.writer)),
-            // It was refused.
-            None => return Ok(()),
-        }
-        let readers = self.keeping_readers(&fence.writer).into_iter();
-        let readers = readers.map(|reader| {
-            let last = self.sessions.get(&reader).filter(|entry| !entry.is_told_anew());
-            (reader, last.map(|entry| entry.last_queued))
-        });
-        let asked = FenceRequest { by: *id, fence, readers: readers.collect() };
-        self.fences.retain(|earlier| earlier.fence.writer != fence.writer);
-        self.fences.push(asked);
-        self.answer_fences();
-        Ok(())
+/// The FENCEs that are not answered yet, at most one for each publisher.
+#[derive(Debug, Default)]
+pub(super) struct Fences(Vec<FenceRequest>);
+
+impl Fences {
+    pub(super) fn is_empty(&self) -> bool {
+        self.0.is_empty()
     }
 
-    /// Answers those of which everything was sent by now. Has to be called when packets were sent, and
-    /// when sessions ended.
-    pub fn answer_fences(&mut self) {
-        if self.fences.is_empty() {
-            return;
-        }
-        let mut asked = std::mem::take(&mut self.fences);
-        for fence in &mut asked {
-            fence.readers.retain_mut(|(reader, last)| !self.was_sent(reader, last));
-        }
-        let (answered, waiting) = asked.into_iter().partition(|asked| asked.readers.is_empty());
-        self.fences = waiting;
-        for FenceRequest { by, fence, .. } in answered {
-            self.push(&by, &Message::Fence(fence), Vec::new());
-        }
-    }
-
-    /// Whether there are any that wait for packets to be sent.
-    pub fn has_fences(&self) -> bool {
-        !self.fences.is_empty()
+    /// Session `by` asks about the readers of its publisher. A later question about the same publisher takes the place
+    /// of an earlier one.
+    pub(super) fn ask<F>(
+        &mut self,
+        by: SessionId,
+        fence: Fence,
+        readers: Vec<SessionId>,
+        sessions: &Sessions<F>,
+    ) {
+        let mark = |id: &SessionId| sessions.get(id).and_then(|entry| entry.outbox.mark());
+        let readers = readers.into_iter().map(|reader| (reader, mark(&reader))).collect();
+        self.forget(&fence.writer);
+        self.0.push(FenceRequest { by, fence, readers });
     }
 
     /// A publisher is gone, and with it what was asked about it.
-    pub(super) fn forget_fence(&mut self, writer: &Gid) {
-        self.fences.retain(|asked| asked.fence.writer != *writer);
+    pub(super) fn forget(&mut self, writer: &Gid) {
+        self.0.retain(|asked| asked.fence.writer != *writer);
     }
 
-    /// Whether a session was sent all up to the packet of that number, or has ended.
-    fn was_sent(&self, id: &SessionId, last: &mut Option<u64>) -> bool {
-        let Some(entry) = self.sessions.get(id) else { return true };
-        if entry.is_told_anew() {
-            *last = None;
-            return false;
-        }
-        let last = *last.get_or_insert(entry.last_queued);
-        entry.queue.front().is_none_or(|next| next.number > last)
-    }
-
-    /// The sessions that read what a publisher writes, and whose reader and publisher both lose nothing.
-    fn keeping_readers(&self, writer: &Gid) -> Vec<SessionId> {
-        let Some(local) = self.endpoints.get(writer).filter(|w| holds(&w.endpoint.qos)) else {
-            return Vec::new();
+    /// Takes those of which everything was sent by now. A session that has ended delays none.
+    pub(super) fn take_answered<F>(&mut self, sessions: &Sessions<F>) -> Vec<(SessionId, Fence)> {
+        let waits = |(reader, mark): &mut (SessionId, Option<u64>)| {
+            sessions.get(reader).is_some_and(|entry| !entry.outbox.was_sent(mark))
         };
-        let pairs = self.prospective_pairs(&local.endpoint).into_iter();
-        let pairs = pairs.filter(|pair: &Pair| pair.writer == *writer);
-        let readers = pairs.filter(|pair| self.pairs.contains_key(pair));
-        let readers = readers.filter_map(|pair| self.endpoints.get(&pair.reader));
-        let keeping = readers.filter(|reader| holds(&reader.endpoint.qos));
-        let mut sessions: Vec<SessionId> = keeping.map(|reader| reader.session).collect();
-        sessions.sort_unstable();
-        sessions.dedup();
-        sessions
-    }
-}
-
-impl<F> SessionEntry<F> {
-    /// Whether it is told everything from the beginning, or is about to be.
-    fn is_told_anew(&self) -> bool {
-        self.behind || self.resync || self.telling.is_some()
+        self.0.iter_mut().for_each(|asked| asked.readers.retain_mut(waits));
+        let answered = self.0.extract_if(.., |asked| asked.readers.is_empty());
+        answered.map(|asked| (asked.by, asked.fence)).collect()
     }
 }
 
@@ -115,8 +70,10 @@ mod tests {
     use crate::{
         graph::{Endpoint, EndpointKind},
         qos::Qos,
-        registry::MAX_QUEUE,
-        wire::session::{Announce, EndpointRole, Gone, Segment, SegmentOpened, SessionRole},
+        registry::{MAX_QUEUE, Registry, Violation},
+        wire::session::{
+            Announce, EndpointRole, Gone, Message, Segment, SegmentOpened, SessionRole,
+        },
     };
 
     const WRITER: u8 = 1;
@@ -208,7 +165,8 @@ mod tests {
         let segment = Segment { number: 1, publisher: None };
         let opened = Message::Segment(SegmentOpened { session: id(WRITER), segment });
         registry.push(&id(KEEPS), &opened, vec!["map"]);
-        assert!(registry.take_back(&id(KEEPS), &id(WRITER), 1));
+        let entry = registry.sessions.get_mut(&id(KEEPS)).unwrap();
+        assert!(entry.outbox.take_back(&id(WRITER), 1));
         registry.answer_fences();
         assert_eq!(answers(&mut registry), [0; 0]);
         take(&mut registry, KEEPS);

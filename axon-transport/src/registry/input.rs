@@ -2,18 +2,18 @@
 
 use std::collections::BTreeSet;
 
+use axon_shm::internal::holds;
+
 use super::{
-    LocalEndpoint, MAX_ALL_PAIRS, MAX_PAIRS, MAX_SESSIONS, MAX_TOMBSTONES, PairProgress, Registry,
-    SessionEntry, Violation,
-    output::{PAIRS_TOGETHER, session_entry},
-    relayed::MAX_REASON,
+    Registry, Violation, endpoints::LocalEndpoint, output::PAIRS_TOGETHER, relayed::MAX_REASON,
+    sessions::SessionEntry,
 };
 use crate::{
-    graph::{Endpoint, EndpointKind, LIMITS, Scope, writes},
+    graph::{EndpointKind, LIMITS, Scope, writes},
     ids::{Gid, SessionId},
     text,
     wire::session::{
-        Announce, Attach, EndpointRole, GivenUp, Granted, Leaving, Message, Pair, Refused,
+        Announce, Attach, EndpointRole, Fence, GivenUp, Granted, Leaving, Message, Pair, Refused,
         SessionRole, Unmatch,
     },
 };
@@ -37,15 +37,8 @@ impl<F: Clone> Registry<F> {
         scope: Option<Scope>,
     ) -> Result<(), Violation> {
         self.handle_disconnect(&id);
-        if self.sessions.len() >= MAX_SESSIONS {
-            return Err(Violation::Sessions);
-        }
-        self.left.forget(&id);
-        self.sessions.insert(id, session_entry(role, name, pid, descriptors, scope));
+        self.sessions.insert(id, SessionEntry::new(role, name, pid, descriptors, scope))?;
         self.rescoped |= role == SessionRole::Application;
-        if role != SessionRole::Tool {
-            self.mark_behind(&id);
-        }
         Ok(())
     }
 
@@ -57,15 +50,12 @@ impl<F: Clone> Registry<F> {
     /// As [`handle_disconnect`](Self::handle_disconnect), a part of it; whether there is more to do. The rest of
     /// the session is told nothing any more.
     pub fn handle_disconnect_in_parts(&mut self, id: &SessionId) -> bool {
-        self.mark_behind(id);
+        self.sessions.fall_behind(id);
         let mut pairs = 0;
         while let Some(entry) = self.sessions.get_mut(id) {
             let before = self.pairs.len();
             let Some(gid) = entry.endpoints.pop_first() else {
-                if let Some(entry) = self.sessions.remove(id) {
-                    self.left.keep(*id, entry.segments);
-                }
-                self.ready.remove(id);
+                self.sessions.remove(id);
                 self.rescoped = true;
                 return false;
             };
@@ -97,13 +87,16 @@ impl<F: Clone> Registry<F> {
             Message::Unknown(_) => Ok(()),
             _ if tool => Err(Violation::Unexpected),
             Message::Endpoint(announce) => self.announce(id, announce),
-            Message::Segment(opened) => self.open_segment(id, opened.segment, descriptors),
+            Message::Segment(opened) => {
+                let owns = |id: &SessionId, gid: &Gid| self.endpoints.session_of(gid) == Some(*id);
+                self.sessions.open_segment(id, opened.segment, descriptors, owns)
+            }
             Message::SegmentGone(gone) => {
-                self.close_segment(id, gone.number);
+                self.sessions.close_segment(id, gone.number);
                 Ok(())
             }
             Message::Need(need) => {
-                self.need_segment(id, &need.session, need.number);
+                self.sessions.need_segment(id, &need.session, need.number);
                 Ok(())
             }
             Message::EndpointGone(gone) => self.gone(id, gone.gid),
@@ -116,10 +109,7 @@ impl<F: Clone> Registry<F> {
             Message::Unmatch(unmatch) => self.fail(id, unmatch),
             Message::Resync => {
                 // Everything costs much more to tell than to ask for.
-                if let Some(entry) = self.sessions.get_mut(id) {
-                    entry.resync = true;
-                    self.ready.insert(*id);
-                }
+                self.sessions.request_resync(id);
                 Ok(())
             }
             _ => Err(Violation::Unexpected),
@@ -152,12 +142,11 @@ impl<F: Clone> Registry<F> {
         if !may {
             return Err(Violation::NotItsOwn(gid));
         }
-        if let Some(known) = self.endpoints.get_mut(&gid) {
+        if let Some(known) = self.endpoints.get(&gid) {
             if known.session != *id || known.role != role {
                 return Err(Violation::NotItsOwn(gid));
             }
-            if known.stands_for != stands_for {
-                known.stands_for = stands_for;
+            if self.endpoints.set_stands_for(&gid, stands_for) {
                 self.rematch(&gid);
             }
             return Ok(());
@@ -167,11 +156,12 @@ impl<F: Clone> Registry<F> {
         } else if entry.endpoints.len() >= most_endpoints(entry.role) {
             Some("too many endpoints in one session")
         } else {
-            self.too_many_pairs(entry, &endpoint)
+            let new = self.endpoints.prospective_pairs(&endpoint).len();
+            self.pairs.refusal(id, new, entry.role == SessionRole::Gateway)
         };
         if let Some(why) = refusal {
             let refused = Refused::of(&endpoint, why);
-            self.note_refused(id, &refused.text);
+            self.sessions.note_refused(id, &refused.text);
             self.push(id, &Message::Refused(refused), Vec::new());
             return Ok(());
         }
@@ -181,43 +171,11 @@ impl<F: Clone> Registry<F> {
         if role == EndpointRole::Application {
             self.graph_add_local(&endpoint);
         }
-        let local =
-            LocalEndpoint { session: *id, endpoint, role, stands_for, only, ring, leaving: false };
-        self.index(&local);
-        self.endpoints.insert(gid, local);
+        let leaving = false;
+        let local = LocalEndpoint { session: *id, endpoint, role, stands_for, only, ring, leaving };
+        self.endpoints.insert(local);
         self.match_endpoint(&gid);
         Ok(())
-    }
-
-    /// Why the pairs of a new endpoint are more than there may be.
-    fn too_many_pairs(&self, of: &SessionEntry<F>, endpoint: &Endpoint) -> Option<&'static str> {
-        let new = self.prospects(endpoint);
-        if of.role != SessionRole::Gateway && of.pairs + new > MAX_PAIRS {
-            Some("its session would have too many pairs of publishers and subscriptions")
-        } else if self.pairs.len() + new > MAX_ALL_PAIRS {
-            Some("there would be too many pairs of publishers and subscriptions")
-        } else {
-            None
-        }
-    }
-
-    /// Whether the daemon holds `most` descriptors of a session's memory.
-    pub fn holds_as_many_as(&self, id: &SessionId, most: usize) -> bool {
-        self.sessions.get(id).is_some_and(|entry| entry.segments.len() >= most)
-    }
-
-    /// Keeps the first refusal of a session for the status; it is told all of them.
-    pub(super) fn note_refused(&mut self, id: &SessionId, text: &str) {
-        if let Some(entry) = self.sessions.get_mut(id)
-            && !std::mem::replace(&mut entry.refused, true)
-        {
-            self.refused.push((*id, text.to_owned()));
-        }
-    }
-
-    /// The refused endpoints since the last call, the first of each session.
-    pub fn take_refused(&mut self) -> Vec<(SessionId, String)> {
-        std::mem::take(&mut self.refused)
     }
 
     fn gone(&mut self, id: &SessionId, gid: Gid) -> Result<(), Violation> {
@@ -232,11 +190,7 @@ impl<F: Clone> Registry<F> {
             // It ended while there was no daemon. Its peers may still be attached to it, and those
             // that have not come back yet have to hear of it too.
             None if gid.is_of(id) => {
-                if self.tombstones.len() == MAX_TOMBSTONES {
-                    self.tombstones.pop_front();
-                }
-                self.tombstones.push_back(gid);
-                self.graph_end(gid);
+                self.changes.bury(gid);
                 Ok(())
             }
             // A stand-in that was refused, or that another one took the place of.
@@ -250,22 +204,24 @@ impl<F: Clone> Registry<F> {
     fn leave(&mut self, id: &SessionId, leave: Leaving) -> Result<(), Violation> {
         let Leaving { gid, leaving } = leave;
         // It may have been refused.
-        let Some(local) = self.endpoints.get_mut(&gid) else { return Ok(()) };
+        let Some(local) = self.endpoints.get(&gid) else { return Ok(()) };
         if local.session != *id || !writes(local.endpoint.kind) {
             return Err(Violation::NotItsOwn(gid));
         }
-        if std::mem::replace(&mut local.leaving, leaving) == leaving {
+        let shown = (local.role == EndpointRole::Application).then(|| local.endpoint.clone());
+        if !self.endpoints.set_leaving(&gid, leaving) {
             return Ok(());
         }
-        if local.role == EndpointRole::Application {
-            let endpoint = local.endpoint.clone();
+        if let Some(endpoint) = shown {
             if leaving {
-                self.graph_remove(gid, true);
+                self.changes.remove(gid, true);
             } else {
                 self.graph_add_local(&endpoint);
             }
         }
-        for reader in self.readers_of(&gid) {
+        let readers = self.endpoints.get(&gid).into_iter().flat_map(|w| self.readers_of(w));
+        let readers: BTreeSet<SessionId> = readers.map(|reader| reader.session).collect();
+        for reader in readers {
             self.push(&reader, &Message::Leaving(leave), Vec::new());
         }
         if !leaving {
@@ -274,28 +230,34 @@ impl<F: Clone> Registry<F> {
         Ok(())
     }
 
-    /// The sessions that read what an endpoint writes.
-    fn readers_of(&self, writer: &Gid) -> BTreeSet<SessionId> {
-        let Some(local) = self.endpoints.get(writer) else { return BTreeSet::new() };
-        let pairs = self.prospective_pairs(&local.endpoint).into_iter();
-        let pairs = pairs.filter(|p| p.writer == *writer && self.pairs.contains_key(p));
-        pairs.filter_map(|pair| Some(self.endpoints.get(&pair.reader)?.session)).collect()
+    /// The readers of what an endpoint writes.
+    fn readers_of(&self, writer: &LocalEndpoint) -> impl Iterator<Item = &LocalEndpoint> {
+        let pairs = self.pairs.existing(self.endpoints.prospective_pairs(&writer.endpoint));
+        let pairs = pairs.filter(|pair| pair.writer == writer.endpoint.gid);
+        pairs.filter_map(|pair| self.endpoints.get(&pair.reader))
+    }
+
+    /// A session asks whether those that may lose nothing were sent all about its publisher.
+    fn fence(&mut self, id: &SessionId, fence: Fence) -> Result<(), Violation> {
+        // It may have been refused.
+        let Some(writer) = self.endpoints.get(&fence.writer) else { return Ok(()) };
+        if writer.session != *id {
+            return Err(Violation::NotItsOwn(fence.writer));
+        }
+        let readers = self.readers_of(writer).filter(|_| holds(&writer.endpoint.qos));
+        let keeping = readers.filter(|reader| holds(&reader.endpoint.qos));
+        let keeping: BTreeSet<SessionId> = keeping.map(|reader| reader.session).collect();
+        self.fences.ask(*id, fence, keeping.into_iter().collect(), &self.sessions);
+        self.answer_fences();
+        Ok(())
     }
 
     fn attach(&mut self, id: &SessionId, attach: Attach) -> Result<(), Violation> {
-        if self.endpoints.get(&attach.reader).is_some_and(|r| r.session != *id) {
+        if self.endpoints.is_of_another(&attach.reader, id) {
             return Err(Violation::NotItsOwn(attach.reader));
         }
         let pair = Pair { reader: attach.reader, writer: attach.writer };
-        // The pair may have ended while the message was on its way.
-        let Some(asked) = self.pairs.get_mut(&pair) else { return Ok(()) };
-        let attach = Some(Attach { session: *id, segments: Vec::new(), ..attach });
-        // A repetition is not passed on: each session that should know has been told, is about to be,
-        // or is behind. Sessions that are told everything anew would otherwise set each other back
-        // without end.
-        let of = |attach: &Option<Attach>| attach.clone().map(|a| Attach { after: None, ..a });
-        if of(&asked.attach) != of(&attach) {
-            *asked = PairProgress { attach, stands_for: None, grant: None, by: asked.by };
+        if self.pairs.attach(Attach { session: *id, segments: Vec::new(), ..attach }) {
             self.forward_attach(&pair);
         }
         Ok(())
@@ -303,32 +265,23 @@ impl<F: Clone> Registry<F> {
 
     /// Tells the writer's session what the reader asked.
     pub(super) fn forward_attach(&mut self, pair: &Pair) {
-        let Some(attach) = self.pairs.get(pair).and_then(|p| p.attach.as_ref()) else { return };
-        let Some(writer) = self.endpoints.get(&pair.writer) else { return };
-        let (mut attach, to) = (attach.clone(), writer.session);
+        let Some(mut attach) = self.pairs.attach_of(pair).cloned() else { return };
+        let Some(to) = self.endpoints.session_of(&pair.writer) else { return };
         attach.stands_for = self.stands_for(pair);
-        if let Some(asked) = self.pairs.get_mut(pair) {
-            asked.stands_for.clone_from(&attach.stands_for);
-        }
+        self.pairs.set_told(pair, attach.stands_for.as_ref());
         let (of, lane) = (attach.session, attach.lane.segment);
-        let mut descriptors = self.introduce(&to, &of, pair);
+        let mut descriptors = self.sessions.introduce(&to, &of, pair);
         // The publisher looks at nothing but the lane.
-        attach.segments = self.hand_over(&to, &of, [lane], &mut descriptors);
+        attach.segments = self.sessions.hand_over(&to, &of, [lane], &mut descriptors);
         self.push(&to, &Message::Attach(attach), descriptors);
     }
 
     fn grant(&mut self, id: &SessionId, grant: Granted) -> Result<(), Violation> {
-        if self.endpoints.get(&grant.writer).is_some_and(|w| w.session != *id) {
+        if self.endpoints.is_of_another(&grant.writer, id) {
             return Err(Violation::NotItsOwn(grant.writer));
         }
         let pair = Pair { reader: grant.reader, writer: grant.writer };
-        let Some(asked) = self.pairs.get_mut(&pair).filter(|p| p.attach.is_some()) else {
-            return Ok(());
-        };
-        let grant = Some(Granted { session: *id, segments: Vec::new(), ..grant });
-        let of = |grant: &Option<Granted>| grant.clone().map(|g| Granted { after: None, ..g });
-        if of(&asked.grant) != of(&grant) {
-            asked.grant = grant;
+        if self.pairs.grant(Granted { session: *id, segments: Vec::new(), ..grant }) {
             self.forward_grant(&pair);
         }
         Ok(())
@@ -336,23 +289,20 @@ impl<F: Clone> Registry<F> {
 
     /// Tells the reader's session what the writer granted. Whether there was something to tell.
     pub(super) fn forward_grant(&mut self, pair: &Pair) -> bool {
-        let Some(mut grant) = self.pairs.get(pair).and_then(|p| p.grant.clone()) else {
-            return false;
-        };
-        let (Some(reader), true) =
-            (self.endpoints.get(&pair.reader), self.endpoints.contains_key(&pair.writer))
+        let Some(mut grant) = self.pairs.grant_of(pair).cloned() else { return false };
+        let (Some(to), Some(writer)) =
+            (self.endpoints.session_of(&pair.reader), self.endpoints.get(&pair.writer))
         else {
             return false;
         };
-        let (to, of) = (reader.session, grant.session);
-        let leaving = self.endpoints.get(&pair.writer).is_some_and(|writer| writer.leaving);
-        let mut descriptors = self.introduce(&to, &of, pair);
+        let (of, leaving) = (grant.session, writer.leaving);
+        let mut descriptors = self.sessions.introduce(&to, &of, pair);
         // The ring's own first: those that do not fit follow.
-        let numbers = self.segments_for(&of, &pair.writer);
+        let numbers = self.sessions.segments_for(&of, &pair.writer);
         let numbers = [grant.ring.segment].into_iter().chain(numbers);
-        grant.segments = self.hand_over(&to, &of, numbers, &mut descriptors);
+        grant.segments = self.sessions.hand_over(&to, &of, numbers, &mut descriptors);
         self.push(&to, &Message::Grant(grant), descriptors);
-        self.hand_over_rest(&to, &of, &pair.writer);
+        self.sessions.hand_over_rest(&to, &of, &pair.writer);
         if leaving {
             let leaving = Message::Leaving(Leaving { gid: pair.writer, leaving });
             self.push(&to, &leaving, Vec::new());
@@ -363,9 +313,9 @@ impl<F: Clone> Registry<F> {
     /// A session cannot map what one of its endpoints needs of another's session.
     fn fail(&mut self, id: &SessionId, unmatch: Unmatch) -> Result<(), Violation> {
         let Unmatch { reader, writer, reason } = unmatch;
-        let owns = |gid: &Gid| self.endpoints.get(gid).is_some_and(|e| e.session == *id);
+        let owns = |gid: &Gid| self.endpoints.session_of(gid) == Some(*id);
         let pair = Pair { reader, writer };
-        if !self.pairs.contains_key(&pair) {
+        if !self.pairs.contains(&pair) {
             return Ok(());
         }
         let reads = owns(&reader);
@@ -378,24 +328,23 @@ impl<F: Clone> Registry<F> {
             "topic {topic:?}: reader {reader} and publisher {writer} do not meet: {reason}. \
              AXON_SHM=off for the process of one of them has samples pass through the daemon"
         );
-        self.note_refused(id, &text);
+        self.sessions.note_refused(id, &text);
         // A writer may be asked again.
         if reads { self.detach(id, pair) } else { Ok(()) }
     }
 
     fn detach(&mut self, id: &SessionId, pair: Pair) -> Result<(), Violation> {
-        if self.endpoints.get(&pair.reader).is_some_and(|r| r.session != *id) {
+        if self.endpoints.is_of_another(&pair.reader, id) {
             return Err(Violation::NotItsOwn(pair.reader));
         }
-        if !self.remove_pair(&pair) {
+        if !self.pairs.remove(&pair) {
             return Ok(());
         }
-        if let Some(to) = self.endpoints.get(&pair.writer).map(|w| w.session)
+        if let Some(to) = self.endpoints.session_of(&pair.writer)
             && to != *id
         {
-            self.forget(&to, id, &pair);
+            self.sessions.part(&pair, &to, id);
             self.push(&to, &Message::Detach(pair), Vec::new());
-            self.forget(id, &to, &pair);
         }
         let Pair { reader, writer } = pair;
         let reason = "detached".to_owned();
@@ -410,51 +359,15 @@ impl<F: Clone> Registry<F> {
         if relay.is_some_and(|relay| relay.session != *id) {
             return Err(Violation::NotItsOwn(reader));
         }
-        let to = self.endpoints.get(&writer).map(|writer| writer.session);
-        if let (Some(to), true) =
-            (to, relay.is_some() && self.pairs.contains_key(&Pair { reader, writer }))
-        {
+        let read = relay.is_some() && self.pairs.contains(&Pair { reader, writer });
+        if let (Some(to), true) = (self.endpoints.session_of(&writer), read) {
             self.push(&to, &Message::GivenUp(given_up), Vec::new());
         }
         Ok(())
-    }
-
-    /// The descriptors of `of` when `to` holds none yet, and notes that it does for `pair`.
-    fn introduce(&mut self, to: &SessionId, of: &SessionId, pair: &Pair) -> Vec<F> {
-        if to == of {
-            return Vec::new();
-        }
-        let Some(descriptors) = self.sessions.get(of).and_then(|s| s.descriptors.clone()) else {
-            return Vec::new();
-        };
-        let Some(entry) = self.sessions.get_mut(to) else { return Vec::new() };
-        let held = &mut entry.known.entry(*of).or_default().pairs;
-        let first = held.is_empty();
-        held.insert(*pair);
-        if first { descriptors.into() } else { Vec::new() }
-    }
-
-    /// `at` is about to be told that `pair`, for which it held `of`'s descriptors, is over.
-    pub(super) fn forget(&mut self, at: &SessionId, of: &SessionId, pair: &Pair) {
-        if let Some(entry) = self.sessions.get_mut(at)
-            && let Some(held) = entry.known.get_mut(of)
-        {
-            held.pairs.remove(pair);
-            if held.pairs.is_empty() {
-                entry.known.remove(of);
-            }
-        }
     }
 }
 
 /// Endpoints of one session. The gateway's are those that it has for its peers, for which it has bounds of its own.
 fn most_endpoints(role: SessionRole) -> usize {
     if role == SessionRole::Gateway { GATEWAYS * LIMITS.endpoints } else { LIMITS.endpoints }
-}
-
-impl<F> SessionEntry<F> {
-    /// Packets that wait for it.
-    pub fn queued(&self) -> usize {
-        self.queue.len()
-    }
 }

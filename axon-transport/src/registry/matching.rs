@@ -1,43 +1,32 @@
-//! Decides which endpoints match, and stores the pairs.
+//! Makes and ends pairs, as endpoints come and go and as their ranges change, and tells their sessions.
 
-use super::{LocalEndpoint, Members, PairProgress, Registry, Topic};
+use std::collections::{BTreeSet, HashSet};
+
+use super::{
+    Registry,
+    endpoints::{LocalEndpoint, Topic},
+};
 use crate::{
-    graph::{Endpoint, EndpointKind, Pairing, pairing, reads, writes},
+    graph::{OutOfRange, Pairing, RemoteEndpoint, pairing},
     ids::{Gid, SessionId},
     wire::session::{EndpointRole, Message, Pair, Unmatch},
 };
 
 impl<F: Clone> Registry<F> {
-    pub(super) fn index(&mut self, local: &LocalEndpoint) {
-        let members = self.topics.entry(topic(&local.endpoint)).or_default();
-        if writes(local.endpoint.kind) {
-            members.writers.insert(local.endpoint.gid);
-        }
-        if reads(local.endpoint.kind) {
-            members.readers.insert(local.endpoint.gid);
-        }
-    }
-
     /// Pairs a new endpoint with what is there.
     pub(super) fn match_endpoint(&mut self, gid: &Gid) {
         let Some(local) = self.endpoints.get(gid) else { return };
-        let Some(members) = self.topics.get(&topic(&local.endpoint)) else { return };
-        let pairs = members.pairs_of(gid, local.endpoint.kind);
-        for pair in pairs {
+        for pair in self.endpoints.prospective_pairs(&local.endpoint) {
             let (Some(w), Some(r)) =
                 (self.endpoints.get(&pair.writer), self.endpoints.get(&pair.reader))
             else {
                 continue;
             };
-            let reads = r.only.is_none_or(|only| only == pair.writer);
-            if !reads || !roles_match(w.role, r.role) || w.leaving || r.leaving {
-                continue;
-            }
-            // One that has come back.
-            if self.pairs.contains_key(&pair) {
-                continue;
-            }
-            if self.apart(w, r).is_some() {
+            // One that has come back is a pair still.
+            if !w.may_be_read_by(r)
+                || self.pairs.contains(&pair)
+                || self.ranges().apart(w, r).is_some()
+            {
                 continue;
             }
             let (to_writer, to_reader) = (w.session, r.session);
@@ -48,13 +37,7 @@ impl<F: Clone> Registry<F> {
             match pairing(&w.endpoint, &r.endpoint) {
                 Pairing::Match => {
                     let by = if pair.writer == *gid { to_writer } else { to_reader };
-                    self.pairs.insert(
-                        pair,
-                        PairProgress { by, attach: None, stands_for: None, grant: None },
-                    );
-                    if let Some(entry) = self.sessions.get_mut(&by) {
-                        entry.pairs += 1;
-                    }
+                    self.pairs.insert(pair, by);
                     self.push(&to_reader, &Message::Match(pair), Vec::new());
                 }
                 Pairing::IncompatibleQos(policy) => {
@@ -71,62 +54,84 @@ impl<F: Clone> Registry<F> {
 
     /// Forgets an endpoint, which its session's entry no longer lists.
     pub(super) fn remove_endpoint(&mut self, gid: &Gid, reason: &str) {
-        let Some(local) = self.endpoints.remove(gid) else { return };
-        self.forget_fence(gid);
-        let topic = topic(&local.endpoint);
-        let mut pairs = Vec::new();
-        if let Some(members) = self.topics.get_mut(&topic) {
-            members.writers.remove(gid);
-            members.readers.remove(gid);
-            pairs = members.pairs_of(gid, local.endpoint.kind);
-            if members.writers.is_empty() && members.readers.is_empty() {
-                self.topics.remove(&topic);
-            }
-        }
+        let Some((local, pairs)) = self.endpoints.remove(gid) else { return };
+        self.fences.forget(gid);
         for pair in pairs {
-            if !self.remove_pair(&pair) {
+            if !self.pairs.remove(&pair) {
                 continue;
             }
             let other = if pair.writer == *gid { pair.reader } else { pair.writer };
-            let Some(other) = self.endpoints.get(&other).map(|e| e.session) else { continue };
+            let Some(other) = self.endpoints.session_of(&other) else { continue };
             let (to_writer, to_reader) =
                 if pair.writer == *gid { (local.session, other) } else { (other, local.session) };
-            self.forget(&to_writer, &to_reader, &pair);
-            self.forget(&to_reader, &to_writer, &pair);
+            self.sessions.part(&pair, &to_writer, &to_reader);
             self.unmatch(&pair, to_writer, to_reader, reason);
         }
         if local.role == EndpointRole::Application {
-            self.graph_end(*gid);
+            self.changes.end(*gid);
         }
     }
 
-    /// How many pairs an endpoint would make at most.
-    pub(super) fn prospects(&self, endpoint: &Endpoint) -> usize {
-        self.prospective_pairs(endpoint).len()
+    /// Endpoints of another host came, or their range changed: what stands for them is matched anew.
+    pub(super) fn rematch_remote(&mut self, endpoints: &[RemoteEndpoint]) {
+        let gids: HashSet<Gid> = endpoints.iter().map(|remote| remote.endpoint.gid).collect();
+        let topics: BTreeSet<_> =
+            endpoints.iter().map(|remote| Topic::of(&remote.endpoint)).collect();
+        let stands = |local: &LocalEndpoint| match local.role {
+            EndpointRole::StandIn => gids.contains(&local.endpoint.gid),
+            EndpointRole::Relay => local.stands_for.iter().any(|gid| gids.contains(gid)),
+            EndpointRole::Application => false,
+        };
+        let members = topics.iter().filter_map(|topic| self.endpoints.members(topic));
+        let members = members.flat_map(|m| m.writers.iter().chain(&m.readers));
+        let touched: BTreeSet<Gid> =
+            members.filter(|gid| self.endpoints.get(gid).is_some_and(stands)).copied().collect();
+        touched.iter().for_each(|gid| self.rematch(gid));
     }
 
-    /// The pairs that an endpoint would make at most.
-    pub(super) fn prospective_pairs(&self, endpoint: &Endpoint) -> Vec<Pair> {
-        let members = self.topics.get(&topic(endpoint));
-        members.map(|all| all.pairs_of(&endpoint.gid, endpoint.kind)).unwrap_or_default()
-    }
-
-    /// Whether there was such a pair.
-    pub(super) fn remove_pair(&mut self, pair: &Pair) -> bool {
-        let Some(asked) = self.pairs.remove(pair) else { return false };
-        if let Some(entry) = self.sessions.get_mut(&asked.by) {
-            entry.pairs -= 1;
+    /// Ends the pairs of an endpoint that are out of range now, and makes those that are in range.
+    pub(super) fn rematch(&mut self, gid: &Gid) {
+        let Some(local) = self.endpoints.get(gid) else { return };
+        let pairs = self.endpoints.prospective_pairs(&local.endpoint);
+        let pairs: Vec<Pair> = self.pairs.existing(pairs).collect();
+        for pair in pairs {
+            let (Some(w), Some(r)) =
+                (self.endpoints.get(&pair.writer), self.endpoints.get(&pair.reader))
+            else {
+                continue;
+            };
+            let (to_writer, to_reader) = (w.session, r.session);
+            match self.ranges().apart(w, r) {
+                // A host that is silent is not in the graph. The gateway ends its endpoints here when it is gone.
+                Some(OutOfRange::Unknown) => {}
+                Some(why) => {
+                    self.pairs.remove(&pair);
+                    self.sessions.part(&pair, &to_writer, &to_reader);
+                    self.unmatch(&pair, to_writer, to_reader, &why.to_string());
+                }
+                None => self.retell_stands_for(&pair),
+            }
         }
-        true
+        self.match_endpoint(gid);
     }
 
-    pub(super) fn unmatch(
-        &mut self,
-        pair: &Pair,
-        to_writer: SessionId,
-        to_reader: SessionId,
-        reason: &str,
-    ) {
+    /// Tells a writer which subscriptions its relay stands for, if they changed.
+    fn retell_stands_for(&mut self, pair: &Pair) {
+        if self.pairs.attach_of(pair).is_some()
+            && self.stands_for(pair).as_ref() != self.pairs.told(pair)
+        {
+            self.forward_attach(pair);
+        }
+    }
+
+    /// The subscriptions that a pair's reader stands for and that the writer's session may see.
+    pub(super) fn stands_for(&self, pair: &Pair) -> Option<Vec<Gid>> {
+        let all = self.pairs.attach_of(pair)?.stands_for.clone()?;
+        let writer = self.endpoints.get(&pair.writer);
+        Some(writer.map(|writer| self.ranges().seen_by(writer, all)).unwrap_or_default())
+    }
+
+    fn unmatch(&mut self, pair: &Pair, to_writer: SessionId, to_reader: SessionId, reason: &str) {
         let Pair { reader, writer } = *pair;
         let message = Message::Unmatch(Unmatch { reader, writer, reason: reason.to_owned() });
         self.push(&to_reader, &message, Vec::new());
@@ -134,31 +139,4 @@ impl<F: Clone> Registry<F> {
             self.push(&to_writer, &message, Vec::new());
         }
     }
-}
-
-impl Members {
-    /// The pairs that an endpoint of this kind makes with the others, if they go together.
-    fn pairs_of(&self, gid: &Gid, kind: EndpointKind) -> Vec<Pair> {
-        let mut pairs = Vec::new();
-        if writes(kind) {
-            let readers = self.readers.iter().filter(|reader| *reader != gid);
-            pairs.extend(readers.map(|&reader| Pair { reader, writer: *gid }));
-        }
-        if reads(kind) {
-            let writers = self.writers.iter().filter(|writer| *writer != gid);
-            pairs.extend(writers.map(|&writer| Pair { reader: *gid, writer }));
-        }
-        pairs
-    }
-}
-
-/// A relay carries local samples away and a stand-in brings remote ones here, one of a service does
-/// both; two of them together would send a sample back to where it came from.
-fn roles_match(writer: EndpointRole, reader: EndpointRole) -> bool {
-    writer == EndpointRole::Application
-        || (writer == EndpointRole::StandIn && reader == EndpointRole::Application)
-}
-
-pub(super) fn topic(endpoint: &Endpoint) -> Topic {
-    Topic(endpoint.topic.clone(), endpoint.type_name.clone())
 }

@@ -6,33 +6,42 @@
 
 #[cfg(test)]
 mod bounds;
+mod changes;
+mod endpoints;
 mod fence;
-mod graph;
 mod input;
-mod left;
 mod matching;
 mod output;
+mod pairs;
 mod range;
 mod relayed;
-mod segments;
+mod remote;
+mod sessions;
 #[cfg(test)]
 mod tests;
 
-use std::{
-    collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque},
-    sync::{Arc, Weak},
+use std::{collections::BTreeSet, sync::Arc};
+
+pub use self::{
+    changes::parts,
+    endpoints::LocalEndpoint,
+    range::OutOfRangePair,
+    relayed::RelayCounters,
+    sessions::{Output, OwnMemory, SessionEntry, SessionSegment},
 };
-
-use axon_shm::internal::Location;
-pub use graph::parts;
-pub use output::Output;
-pub use range::OutOfRangePair;
-pub use relayed::RelayCounters;
-
+use self::{
+    changes::{GraphChanges, WholeGraphs},
+    endpoints::Endpoints,
+    fence::Fences,
+    pairs::Pairs,
+    range::Ranges,
+    remote::{Heard, RemoteEndpoints},
+    sessions::Sessions,
+};
 use crate::{
     graph::{Endpoint, RemoteEndpoint, Scope},
     ids::{DaemonId, Gid, SessionId},
-    wire::session::{Attach, EndpointRole, Granted, Pair, Segment, SessionRole},
+    wire::session::{Attach, EndpointRole, SessionRole},
 };
 
 /// Packets that may wait for one session before it is told everything anew instead.
@@ -55,146 +64,18 @@ pub const MAX_OF_PROCESS: usize = 256;
 /// Remembered GIDs of endpoints that ended while there was no daemon to tell.
 const MAX_TOMBSTONES: usize = 4096;
 
-/// Packets that live as long as a session has yet to be sent them.
-type SharedPackets = Vec<Weak<[u8]>>;
-
 /// The state of the control plane.
 #[derive(Debug)]
 pub struct Registry<F> {
-    sessions: BTreeMap<SessionId, SessionEntry<F>>,
-    endpoints: HashMap<Gid, LocalEndpoint>,
-    topics: HashMap<Topic, Members>,
-    pairs: BTreeMap<Pair, PairProgress>,
-    remote: BTreeMap<DaemonId, BTreeMap<Gid, RemoteEndpoint>>,
-    tombstones: VecDeque<Gid>,
-    version: u64,
-    added: BTreeMap<Gid, Item>,
-    /// Whether each was this host's own.
-    removed: BTreeMap<Gid, bool>,
-    /// Those of them that were this host's own.
-    ended: BTreeSet<Gid>,
-    /// Endpoints of this host whose session lists other peers than the gateway was told.
-    regraded: BTreeSet<Gid>,
+    sessions: Sessions<F>,
+    endpoints: Endpoints,
+    pairs: Pairs,
+    remote: RemoteEndpoints,
+    changes: GraphChanges,
+    whole: WholeGraphs,
+    fences: Fences,
     /// Applications' sessions came or went.
     rescoped: bool,
-    /// The packets of the whole graph as each view was told it last, and the version of it.
-    whole: (u64, BTreeMap<range::GraphFilter, SharedPackets>),
-    ready: BTreeSet<SessionId>,
-    /// The first endpoint of each session that was refused, and why.
-    refused: Vec<(SessionId, String)>,
-    /// FENCEs that are not answered yet.
-    fences: Vec<fence::FenceRequest>,
-    /// Memory of sessions that ended.
-    left: left::LeftMemory<F>,
-}
-
-/// A session as the registry knows it.
-#[derive(Debug)]
-pub struct SessionEntry<F> {
-    /// What kind it is.
-    pub role: SessionRole,
-    /// Its process's name.
-    pub name: String,
-    /// Its process.
-    pub pid: u32,
-    /// How far it is discovered; `None` of the gateway, and of all in a registry within a process.
-    pub scope: Option<Scope>,
-    /// Daemons of the linked peers that it lists.
-    pub lists: BTreeSet<DaemonId>,
-    /// Its endpoints.
-    pub endpoints: BTreeSet<Gid>,
-    /// Segment, doorbell and pidfd; a tool has none, nor has a session that nobody can meet.
-    pub descriptors: Option<[F; 3]>,
-    /// The segments of its memory besides the first, by number.
-    pub segments: BTreeMap<u32, SessionSegment<F>>,
-    /// Other sessions whose descriptors it holds.
-    known: HashMap<SessionId, SentSegments>,
-    queue: VecDeque<Output<F>>,
-    /// The number of the last packet that was queued.
-    last_queued: u64,
-    queue_limit: usize,
-    queued_bytes: usize,
-    bytes_limit: usize,
-    behind: bool,
-    /// It asked to be told everything anew, and is once it has taken what waits for it.
-    resync: bool,
-    /// Its endpoints whose pairs it is still to be told of, while it is told everything.
-    telling: Option<Vec<Gid>>,
-    /// The pairs that its announcements made.
-    pairs: usize,
-    /// What it asked about, and the next part of it.
-    status: Option<(Arc<[u8]>, u32)>,
-    /// An endpoint of its was refused.
-    refused: bool,
-    /// It was told that no more segments of its memory are taken.
-    short: bool,
-    /// What is shown of its relay, where it is relayed. Pairs within it are its own process's.
-    pub relay: Option<Arc<RelayCounters>>,
-}
-
-/// A segment of a session's memory.
-#[derive(Clone, Debug)]
-pub struct SessionSegment<F> {
-    /// What it is.
-    pub segment: Segment,
-    /// Its descriptor.
-    pub descriptor: F,
-}
-
-/// What a session holds of another.
-#[derive(Debug, Default)]
-struct SentSegments {
-    /// The pairs for which it does.
-    pairs: HashSet<Pair>,
-    /// The numbers of the segments that it was handed.
-    segments: BTreeSet<u32>,
-    /// Those of them for which it asked: it may have had them before.
-    asked: BTreeSet<u32>,
-}
-
-/// An endpoint of a session here.
-#[derive(Debug)]
-pub struct LocalEndpoint {
-    /// Whose it is.
-    pub session: SessionId,
-    /// The endpoint.
-    pub endpoint: Endpoint,
-    /// Whether it stands for itself or for others.
-    pub role: EndpointRole,
-    /// A relay's remote subscriptions.
-    pub stands_for: Vec<Gid>,
-    /// The only writer that a relay reads, where it is not all.
-    pub only: Option<Gid>,
-    /// Where a writer's ring is.
-    pub ring: Option<Location>,
-    /// It has ended, but what it has written is not all in its ring yet.
-    pub leaving: bool,
-}
-
-/// How far a pair has come.
-#[derive(Debug)]
-struct PairProgress {
-    /// The session that announced the second of the two.
-    by: SessionId,
-    /// What its reader asked.
-    attach: Option<Attach>,
-    /// The subscriptions that the reader stands for, as last sent to the writer.
-    stands_for: Option<Vec<Gid>>,
-    /// What its writer answered.
-    grant: Option<Granted>,
-}
-
-/// An endpoint that is new in the graph, and its daemon where that is another host's.
-type Item = (Arc<Endpoint>, Option<DaemonId>);
-
-/// A topic's or service's name and type.
-#[derive(Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
-struct Topic(String, String);
-
-#[derive(Debug, Default)]
-struct Members {
-    writers: BTreeSet<Gid>,
-    readers: BTreeSet<Gid>,
 }
 
 /// What a session did that no session does. It is disconnected.
@@ -221,23 +102,14 @@ pub enum Violation {
 impl<F> Default for Registry<F> {
     fn default() -> Self {
         Self {
-            sessions: BTreeMap::new(),
-            endpoints: HashMap::new(),
-            topics: HashMap::new(),
-            pairs: BTreeMap::new(),
-            remote: BTreeMap::new(),
-            tombstones: VecDeque::new(),
-            version: 0,
-            added: BTreeMap::new(),
-            removed: BTreeMap::new(),
-            ended: BTreeSet::new(),
-            regraded: BTreeSet::new(),
+            sessions: Sessions::default(),
+            endpoints: Endpoints::default(),
+            pairs: Pairs::default(),
+            remote: RemoteEndpoints::default(),
+            changes: GraphChanges::default(),
+            whole: WholeGraphs::default(),
+            fences: Fences::default(),
             rescoped: false,
-            whole: (0, BTreeMap::new()),
-            ready: BTreeSet::new(),
-            refused: Vec::new(),
-            fences: Vec::new(),
-            left: left::LeftMemory::default(),
         }
     }
 }
@@ -262,33 +134,150 @@ impl<F: Clone> Registry<F> {
 
     /// How many are.
     pub fn relayed(&self) -> usize {
-        self.sessions.values().filter(|s| s.relay.is_some()).count()
+        self.sessions.iter().filter(|(_, s)| s.relay.is_some()).count()
     }
 
     /// Whether there is an application's session.
     pub fn is_needed(&self) -> bool {
-        self.sessions.values().any(|s| s.role == SessionRole::Application)
+        self.sessions.iter().any(|(_, s)| s.role == SessionRole::Application)
+    }
+
+    /// Whether the daemon holds `most` descriptors of a session's memory.
+    pub fn holds_as_many_as(&self, id: &SessionId, most: usize) -> bool {
+        self.sessions.get(id).is_some_and(|entry| entry.segments.len() >= most)
+    }
+
+    /// A segment of a session's memory is not taken, since `there_are` as many as may be. The session
+    /// goes on, and is told once until it gives another one up.
+    pub fn refuse_segment(&mut self, id: &SessionId, there_are: &str) {
+        self.sessions.refuse_segment(id, there_are);
+    }
+
+    /// From now on keeps segments of sessions that end, `most` at a time, for readers that come back from an earlier
+    /// daemon. What is kept is given up.
+    pub fn keep_left_memory(&mut self, most: usize) {
+        self.sessions.keep_left_memory(most);
+    }
+
+    /// The refused endpoints since the last call, the first of each session.
+    pub fn take_refused(&mut self) -> Vec<(SessionId, String)> {
+        self.sessions.take_refused()
     }
 
     /// The endpoints of sessions here.
     pub fn endpoints(&self) -> impl Iterator<Item = &LocalEndpoint> {
-        self.endpoints.values()
+        self.endpoints.iter()
     }
 
     /// The endpoints on other hosts.
     pub fn remote_endpoints(&self) -> impl Iterator<Item = (&DaemonId, &Endpoint)> {
-        self.remote
-            .iter()
-            .flat_map(|(daemon, all)| all.values().map(move |e| (daemon, &*e.endpoint)))
+        self.remote.iter().map(|(daemon, remote)| (daemon, &*remote.endpoint))
     }
 
     /// The pairs whose reader has asked its writer.
     pub fn attached(&self) -> impl Iterator<Item = &Attach> {
-        self.pairs.values().filter_map(|asked| asked.attach.as_ref())
+        self.pairs.attached()
     }
 
     /// The version that the next [`flush`](Self::flush) will exceed.
     pub fn version(&self) -> u64 {
-        self.version
+        self.changes.version()
+    }
+
+    /// A number that stands for the endpoints of applications here: another one, most likely, when
+    /// they change.
+    pub fn digest(&self) -> u64 {
+        self.endpoints.digest()
+    }
+
+    /// Whether applications' sessions came or went since the last call.
+    pub fn take_rescoped(&mut self) -> bool {
+        std::mem::take(&mut self.rescoped)
+    }
+
+    /// The scopes of applications' sessions.
+    pub fn scopes(&self) -> impl Iterator<Item = &Scope> {
+        let all = self.sessions.iter().map(|(_, entry)| entry);
+        let applications = all.filter(|entry| entry.role == SessionRole::Application);
+        applications.filter_map(|entry| entry.scope.as_ref())
+    }
+
+    /// Pairs that would be matched but for the ranges of their sessions: at most `most`, of at most
+    /// `looked_at` that are looked at.
+    pub fn kept_apart(&self, most: usize, looked_at: usize) -> Vec<OutOfRangePair> {
+        self.ranges().kept_apart(most, looked_at)
+    }
+
+    /// Links, or the addresses of static peers, changed: `listed` tells which linked peers a list of
+    /// static peers names. Pairs that are out of range now end, and those that are in range are made.
+    pub fn relist(&mut self, listed: impl Fn(&[String]) -> BTreeSet<DaemonId>) {
+        for id in self.sessions.relist(listed) {
+            let own = self.sessions.get(&id).map(|entry| entry.endpoints.clone());
+            for gid in own.unwrap_or_default() {
+                self.changes.regrade(gid);
+                self.rematch(&gid);
+            }
+        }
+    }
+
+    /// What another host's daemon has: `reset` forgets what it had.
+    ///
+    /// Endpoints that are out of bounds, or whose GID another host or a session here has, are
+    /// left out.
+    pub fn remote_graph(
+        &mut self,
+        daemon: DaemonId,
+        reset: bool,
+        added: impl IntoIterator<Item = impl Into<RemoteEndpoint>>,
+        removed: Vec<Gid>,
+    ) {
+        if reset {
+            self.remote_gone(&daemon);
+        }
+        // What stands for them is matched anew.
+        let mut changed = Vec::new();
+        for gid in removed {
+            if let Some(gone) = self.remote.remove(&daemon, &gid) {
+                self.changes.remove(gid, false);
+                changed.push(gone);
+            }
+        }
+        for remote in added {
+            let remote: RemoteEndpoint = remote.into();
+            let gid = remote.endpoint.gid;
+            if self.endpoints.get(&gid).is_some_and(|e| e.role != EndpointRole::StandIn) {
+                continue;
+            }
+            let Some(heard) = self.remote.insert(daemon, &remote) else { continue };
+            if heard == Heard::Range {
+                // Sessions that saw it may not see it any more.
+                self.changes.remove(gid, false);
+            }
+            if heard != Heard::Known {
+                changed.push(remote.clone());
+            }
+            self.changes.add(remote.endpoint, Some(daemon));
+        }
+        self.rematch_remote(&changed);
+    }
+
+    /// Another host's daemon is gone, and its endpoints with it.
+    pub fn remote_gone(&mut self, daemon: &DaemonId) {
+        for gid in self.remote.remove_host(daemon) {
+            self.changes.remove(gid, false);
+        }
+    }
+
+    /// A session's word about its own GID outweighs another host's.
+    fn graph_add_local(&mut self, endpoint: &Endpoint) {
+        if self.remote.disown(&endpoint.gid) {
+            self.changes.remove(endpoint.gid, false);
+        }
+        self.changes.add(Arc::new(endpoint.clone()), None);
+    }
+
+    fn ranges(&self) -> Ranges<'_, F> {
+        let Self { sessions, endpoints, remote, .. } = self;
+        Ranges { sessions, endpoints, remote }
     }
 }

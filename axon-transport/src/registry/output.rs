@@ -1,32 +1,19 @@
-//! Queues the messages to sessions.
+//! Tells sessions: the changes of the graph, and everything anew.
 
-use std::{
-    collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
-    sync::Arc,
+use std::{collections::BTreeSet, sync::Arc};
+
+use super::{
+    Registry,
+    changes::packets,
+    sessions::{Due, Output},
 };
-
-use super::{MAX_QUEUE, MAX_QUEUE_BYTES, Registry, STATUS_SLICE, SessionEntry};
 use crate::{
-    graph::Scope,
     ids::SessionId,
-    wire::session::{Graph, Message, SessionRole, StatusPart},
+    wire::session::{Graph, Message},
 };
 
 /// Pairs of which a session is told at a time, and the rest of those of one endpoint.
 pub(super) const PAIRS_TOGETHER: usize = 256;
-
-/// A packet for a session.
-#[derive(Clone, Debug)]
-pub struct Output<F> {
-    /// Its bytes.
-    pub packet: Arc<[u8]>,
-    /// What goes with it.
-    pub descriptors: Vec<F>,
-    /// The session's segment that it hands over and nothing else.
-    pub(super) segment: Option<(SessionId, u32)>,
-    /// Which it is of the packets that were queued for its session; 0 before it is.
-    pub(super) number: u64,
-}
 
 impl<F: Clone> Registry<F> {
     /// The next packet for a session; `None` when there is none.
@@ -36,125 +23,93 @@ impl<F: Clone> Registry<F> {
     /// it does not hear again is over. It is told a part at a time, when it has taken what waits for it:
     /// so the parts and what changes in between come in the order in which they were so.
     pub fn poll_output(&mut self, id: &SessionId) -> Option<Output<F>> {
-        let entry = self.sessions.get_mut(id)?;
-        if entry.queue.is_empty() {
-            if entry.telling.is_some() {
-                self.tell_pairs(id);
-            } else if entry.behind || entry.resync {
-                self.tell_everything(id);
-            }
+        match self.sessions.get(id)?.outbox.due() {
+            Some(Due::Pairs) => self.tell_pairs(id),
+            Some(Due::Everything) => self.tell_everything(id),
+            None => {}
         }
-        let entry = self.sessions.get_mut(id)?;
-        let output = entry.queue.pop_front();
-        entry.queued_bytes -= output.as_ref().map_or(0, |output| output.packet.len());
-        if entry.queue.is_empty() && entry.telling.is_none() {
-            entry.queue_limit = MAX_QUEUE;
-            entry.bytes_limit = MAX_QUEUE_BYTES;
-        }
-        output.or_else(|| next_part(&mut entry.status))
+        self.sessions.pop(id)
     }
 
     /// Tells a session the status, part by part, as it takes them. It need not fit the queue: a
     /// large system's is of many megabytes.
     pub fn tell_status(&mut self, id: &SessionId, text: Arc<[u8]>) {
-        if let Some(entry) = self.sessions.get_mut(id) {
-            entry.status = Some((text, 0));
-            self.ready.insert(*id);
-        }
+        self.sessions.tell_status(id, text);
     }
 
     /// Tells a session that asks once more the same status from its beginning; whether one is
     /// being told to it.
     pub fn repeat_status(&mut self, id: &SessionId) -> bool {
-        let entry = self.sessions.get_mut(id);
-        let status = entry.and_then(|entry| entry.status.as_mut());
-        status.is_some_and(|(_, next)| {
-            *next = 0;
-            true
-        })
+        self.sessions.repeat_status(id)
     }
 
     /// Puts a packet back that could not be sent.
     pub fn return_output(&mut self, id: &SessionId, output: Output<F>) {
-        let Some(entry) = self.sessions.get_mut(id) else { return };
-        if Message::is_status(&output.packet) {
-            if let Some((_, next)) = &mut entry.status {
-                *next = next.saturating_sub(1);
-            }
-        } else {
-            entry.queued_bytes += output.packet.len();
-            entry.queue.push_front(output);
-        }
+        self.sessions.put_back(id, output);
     }
 
     /// Sessions that got something to be told since the last call.
     pub fn take_ready(&mut self) -> BTreeSet<SessionId> {
-        std::mem::take(&mut self.ready)
+        self.sessions.take_ready()
     }
 
     /// Queues a message for one session.
     pub fn push(&mut self, to: &SessionId, message: &Message, descriptors: Vec<F>) {
-        // It is told everything anew.
-        if self.sessions.get(to).is_none_or(|entry| entry.behind) {
-            return;
-        }
-        let Some(packet) = encode(message) else { return };
-        let segment = match message {
-            Message::Segment(opened) => Some((opened.session, opened.segment.number)),
-            _ => None,
-        };
-        self.push_packet(to, Output { packet, descriptors, segment, number: 0 });
+        self.sessions.push(to, message, descriptors);
     }
 
-    pub(super) fn push_shared(&mut self, to: &[SessionId], message: &Message) {
-        if let Some(packet) = encode(message) {
-            self.push_encoded(to, &packet);
+    /// Answers the FENCEs of which everything was sent by now. Has to be called when packets were sent, and
+    /// when sessions ended.
+    pub fn answer_fences(&mut self) {
+        for (by, fence) in self.fences.take_answered(&self.sessions) {
+            self.push(&by, &Message::Fence(fence), Vec::new());
         }
     }
 
-    pub(super) fn push_encoded(&mut self, to: &[SessionId], packet: &Arc<[u8]>) {
-        for id in to {
-            let (packet, descriptors) = (Arc::clone(packet), Vec::new());
-            self.push_packet(id, Output { packet, descriptors, segment: None, number: 0 });
+    /// Whether there are any that wait for packets to be sent.
+    pub fn has_fences(&self) -> bool {
+        !self.fences.is_empty()
+    }
+
+    /// Whether [`flush`](Self::flush) has something to do.
+    pub fn needs_flush(&self) -> bool {
+        !self.changes.is_empty()
+    }
+
+    /// Queues what changed in the graph since the last call. Called a few milliseconds after a
+    /// change, so that a node that starts with twenty endpoints costs each session one packet.
+    pub fn flush(&mut self) {
+        let Some(change) = self.changes.take() else { return };
+        let version = self.changes.version();
+        let (all, own) = (change.removed(), change.own_removed());
+        for (view, sessions) in self.ranges().views() {
+            // The gateway itself reported the endpoints of other hosts.
+            let removed = if view.is_gateway() { &own } else { &all };
+            let regraded = change.regraded.iter().filter(|_| view.is_gateway());
+            let regraded = regraded.filter(|gid| !change.added.contains_key(*gid));
+            let again = regraded.filter_map(|gid| self.endpoints.get(gid));
+            let again = again.filter(|local| local.is_shown()).map(|local| (&local.endpoint, None));
+            let added = change.added.values().map(|(endpoint, daemon)| (&**endpoint, *daemon));
+            let ranges = self.ranges();
+            let shown = added.chain(again).filter_map(|(e, d)| ranges.shown_in(&view, e, d));
+            let shown: Vec<_> = shown.collect();
+            if shown.is_empty() && removed.is_empty() {
+                continue;
+            }
+            let (telling, rest): (Vec<_>, Vec<_>) =
+                sessions.into_iter().partition(|id| self.is_being_told(id));
+            // One that is being told everything takes a change as a part of the whole.
+            for (sessions, open) in [(rest, false), (telling, true)] {
+                let shown = shown.iter().cloned().take_while(|_| !sessions.is_empty());
+                for packet in packets(version, false, shown, removed, &change.ended, open) {
+                    self.sessions.push_encoded(&sessions, &packet);
+                }
+            }
         }
     }
 
-    fn push_packet(&mut self, to: &SessionId, output: Output<F>) {
-        let Some(entry) = self.sessions.get_mut(to) else { return };
-        if entry.behind {
-            return;
-        }
-        if entry.queue.len() >= entry.queue_limit || entry.queued_bytes >= entry.bytes_limit {
-            self.mark_behind(to);
-            return;
-        }
-        entry.queued_bytes += output.packet.len();
-        entry.last_queued += 1;
-        entry.queue.push_back(Output { number: entry.last_queued, ..output });
-        self.ready.insert(*to);
-    }
-
-    /// Takes back what hands a segment over and waits for a session still. Whether there was any.
-    pub(super) fn take_back(&mut self, to: &SessionId, of: &SessionId, number: u32) -> bool {
-        let Some(entry) = self.sessions.get_mut(to) else { return false };
-        let before = entry.queue.len();
-        entry.queue.retain(|output| output.segment != Some((*of, number)));
-        let taken = entry.queue.len() < before;
-        if taken {
-            entry.queued_bytes = entry.queue.iter().map(|output| output.packet.len()).sum();
-        }
-        taken
-    }
-
-    pub(super) fn mark_behind(&mut self, id: &SessionId) {
-        if let Some(entry) = self.sessions.get_mut(id) {
-            // There is no graph that a tool could be behind with.
-            entry.behind = entry.role != SessionRole::Tool;
-            entry.telling = None;
-            entry.queue.clear();
-            entry.queued_bytes = 0;
-            self.ready.insert(*id);
-        }
+    fn is_being_told(&self, id: &SessionId) -> bool {
+        self.sessions.get(id).is_some_and(|entry| entry.outbox.is_being_told())
     }
 
     fn tell_everything(&mut self, id: &SessionId) {
@@ -162,33 +117,45 @@ impl<F: Clone> Registry<F> {
         self.flush();
         let packets = self.whole_graph(id);
         let Some(entry) = self.sessions.get_mut(id) else { return };
-        entry.behind = false;
-        entry.resync = false;
-        entry.known.clear();
-        entry.telling = Some(entry.endpoints.iter().copied().collect());
-        entry.queue_limit = usize::MAX;
-        entry.bytes_limit = usize::MAX;
+        entry.held.clear();
+        entry.outbox.begin_telling(entry.endpoints.iter().copied().collect());
         for packet in packets {
-            self.push_encoded(&[*id], &packet);
+            self.sessions.push_encoded(&[*id], &packet);
         }
         self.limit_queue(id);
+    }
+
+    /// The whole graph as a session is shown it, open-ended: the last part says that more follows.
+    /// Sessions of one view share its packets while they are of the same version.
+    pub(super) fn whole_graph(&mut self, id: &SessionId) -> Vec<Arc<[u8]>> {
+        let (view, version) = (self.ranges().view(id), self.changes.version());
+        if let Some(made) = self.whole.get(version, &view) {
+            return made;
+        }
+        let local = self.endpoints.shown().map(|local| (&local.endpoint, None));
+        let remote = self.remote_endpoints().map(|(daemon, e)| (e, Some(*daemon)));
+        let ranges = self.ranges();
+        let shown = local.chain(remote).filter_map(|(e, d)| ranges.shown_in(&view, e, d));
+        let tombstones = self.changes.tombstones();
+        let ended = tombstones.iter().copied().collect();
+        let made = packets(version, true, shown, &tombstones, &ended, true);
+        if !view.is_gateway() {
+            self.whole.put(view, &made);
+        }
+        made
     }
 
     /// Tells a session of pairs of its endpoints, some at a time, and at last that this is the whole.
     fn tell_pairs(&mut self, id: &SessionId) {
         let Some(entry) = self.sessions.get_mut(id) else { return };
-        entry.queue_limit = usize::MAX;
-        entry.bytes_limit = usize::MAX;
+        entry.outbox.lift_limit();
         let mut told = 0;
         while told < PAIRS_TOGETHER {
             let Some(entry) = self.sessions.get_mut(id) else { return };
-            let Some(gid) = entry.telling.as_mut().and_then(Vec::pop) else {
-                entry.telling = None;
-                return self.tell_end(id);
-            };
+            let Some(gid) = entry.outbox.next_endpoint() else { return self.tell_end(id) };
             let Some(local) = self.endpoints.get(&gid) else { continue };
-            let mut pairs = self.prospective_pairs(&local.endpoint);
-            pairs.retain(|pair| self.pairs.contains_key(pair));
+            let pairs = self.endpoints.prospective_pairs(&local.endpoint);
+            let pairs: Vec<_> = self.pairs.existing(pairs).collect();
             told += pairs.len();
             for pair in pairs {
                 // A reader that is not served yet asks again; one that is learns how.
@@ -204,77 +171,15 @@ impl<F: Clone> Registry<F> {
     }
 
     fn tell_end(&mut self, id: &SessionId) {
-        let (added, removed) = (Vec::new(), Vec::new());
-        let end =
-            Graph { version: self.version, whole: false, added, removed, more: false, ended: None };
+        let (added, removed, version) = (Vec::new(), Vec::new(), self.changes.version());
+        let end = Graph { version, whole: false, added, removed, more: false, ended: None };
         self.push(id, &Message::Graph(end), Vec::new());
         self.limit_queue(id);
     }
 
-    /// As much as usual may wait besides what waits now.
     fn limit_queue(&mut self, id: &SessionId) {
         if let Some(entry) = self.sessions.get_mut(id) {
-            entry.queue_limit = entry.queue.len() + MAX_QUEUE;
-            entry.bytes_limit = entry.queued_bytes + MAX_QUEUE_BYTES;
-        }
-    }
-}
-
-/// The next part of a status, of which one without text has one, too.
-fn next_part<F>(status: &mut Option<(Arc<[u8]>, u32)>) -> Option<Output<F>> {
-    let (text, next) = status.as_mut()?;
-    let parts = u32::try_from(text.len().div_ceil(STATUS_SLICE).max(1)).ok()?;
-    if *next == parts {
-        *status = None;
-        return None;
-    }
-    let from = *next as usize * STATUS_SLICE;
-    let slice = &text[from..text.len().min(from + STATUS_SLICE)];
-    let part = Message::Status(StatusPart { part: *next, parts, text: slice.to_vec() });
-    *next += 1;
-    Some(Output { packet: encode(&part)?, descriptors: Vec::new(), segment: None, number: 0 })
-}
-
-pub(super) fn session_entry<F>(
-    role: SessionRole,
-    name: String,
-    pid: u32,
-    descriptors: Option<[F; 3]>,
-    scope: Option<Scope>,
-) -> SessionEntry<F> {
-    SessionEntry {
-        role,
-        name,
-        pid,
-        scope,
-        lists: BTreeSet::new(),
-        endpoints: BTreeSet::new(),
-        descriptors,
-        segments: BTreeMap::new(),
-        known: HashMap::new(),
-        queue: VecDeque::new(),
-        last_queued: 0,
-        queue_limit: MAX_QUEUE,
-        queued_bytes: 0,
-        bytes_limit: MAX_QUEUE_BYTES,
-        behind: false,
-        resync: false,
-        telling: None,
-        pairs: 0,
-        status: None,
-        refused: false,
-        short: false,
-        relay: None,
-    }
-}
-
-pub(super) fn encode(message: &Message) -> Option<Arc<[u8]>> {
-    match message.encode() {
-        Ok(packet) => Some(packet.into()),
-        Err(error) => {
-            // Everything that is stored is small enough to be passed on.
-            tracing::error!(%error, "a control message could not be encoded");
-            None
+            entry.outbox.limit();
         }
     }
 }

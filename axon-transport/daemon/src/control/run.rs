@@ -324,7 +324,7 @@ async fn serve(
 async fn keep_left_memory(control: Rc<RefCell<Control>>) {
     control.borrow_mut().registry.keep_left_memory(descriptors::share());
     tokio::time::sleep(RETURN).await;
-    control.borrow_mut().registry.drop_left_memory();
+    control.borrow_mut().registry.keep_left_memory(0);
 }
 
 /// Sends changes of the graph a moment after they happened, and tells discovery, whose beacons say

@@ -155,7 +155,7 @@ fn entry<'a>(
 
 fn writer(session: &Session, local: &LocalEndpoint, counts: &RingCounts) -> WriterStatus {
     let gid = local.endpoint.gid;
-    let own = session.segments.values().filter(|s| s.segment.publisher == Some(gid));
+    let own = session.segments.iter().filter(|s| s.segment.publisher == Some(gid));
     let own = own.map(|segment| inspect::committed(segment.descriptor.as_fd()));
     let own = own.fold(0, u64::saturating_add);
     WriterStatus {
@@ -268,7 +268,7 @@ fn ring<'a>(registry: &'a Sessions, local: &LocalEndpoint) -> Option<(&'a Sessio
 fn memory(session: &Session, at: Location) -> Option<BorrowedFd<'_>> {
     match (at.segment, &session.descriptors) {
         (0, Some([first, ..])) => Some(first.as_fd()),
-        (number, _) => session.segments.get(&number).map(|segment| segment.descriptor.as_fd()),
+        (number, _) => session.segments.get(number).map(|segment| segment.descriptor.as_fd()),
     }
 }
 

@@ -305,7 +305,7 @@ fn an_unread_sample_costs_a_number_and_no_memory() {
         loan.fill(1);
         assert_eq!(loan.publish_next(7), Ok(number));
     }
-    let words = publisher.ring.words();
+    let words = publisher.header.words();
     assert_eq!(words[layout::ring::HEAD].load(Relaxed), 0);
     assert_eq!(words[layout::ring::PUBLISHED].load(Relaxed), 99);
     let mut reader = attach(&publisher, &a, &b, keep_last(5));

@@ -13,15 +13,15 @@ use crate::{
     os::clock::monotonic,
     qos::Durability,
     ring::{
-        layout::{self, COPIED, INLINE, Location},
+        layout::{COPIED, INLINE, Location},
         protocol::{self, PayloadPlace, Record},
         types::{Meta, Published},
     },
     session::peer::PeerSession,
-    sync::{Ordering, Word},
     wake::{Purpose, settle},
     writer::{
         Writer,
+        header::Dropped,
         history::Extent,
         loan::{Lender, Loan, LoanPlace},
         room::Refusal,
@@ -41,20 +41,6 @@ pub(crate) enum Bells {
 pub(crate) struct PublishDeadline {
     whole: Duration,
     end: Option<Instant>,
-}
-
-/// Samples that a publisher elsewhere may be ahead of the last one of its here: more than an hour of
-/// outage at a million samples a second.
-pub const MAX_GAP: u64 = 1 << 32;
-/// Samples that it may have published before the first one that comes here.
-const MAX_FIRST: u64 = 1 << 48;
-
-/// Refuses a number from outside that would make readers count losses that cannot be.
-fn judge(state: &WriterState, numbering: Numbering) -> Result<(), PublishError> {
-    let Numbering::Given(Meta { sequence, .. }) = numbering else { return Ok(()) };
-    let last = state.last;
-    let most = if last == 0 { MAX_FIRST } else { last.saturating_add(MAX_GAP) };
-    if sequence > most { Err(PublishError::Sequence { sequence, last }) } else { Ok(()) }
 }
 
 impl PublishDeadline {
@@ -83,7 +69,7 @@ impl Writer {
             return self.commit(numbering, Payload::Bytes(payload), deadline, bells);
         }
         let lent: Result<LoanPlace, Meta> = self.retry_until(&mut deadline, |state| {
-            judge(state, numbering)?;
+            state.numbers.judge(numbering)?;
             if self.is_unread(state) {
                 return Ok(Err(self.pass(state, numbering)));
             }
@@ -113,7 +99,7 @@ impl Writer {
             return Err(PublishError::Forked);
         }
         let (meta, position, waiting) = self.retry_until(&mut deadline, |state| {
-            judge(state, numbering)?;
+            state.numbers.judge(numbering)?;
             if self.is_unread(state) {
                 return Ok((self.pass(state, numbering), None, None));
             }
@@ -132,7 +118,7 @@ impl Writer {
                     (Extent::Slot { at, len, sample: sample as u64 }, PayloadPlace::Slot(first))
                 }
             };
-            let meta = self.number(state, numbering);
+            let meta = state.numbers.number(numbering);
             let position = self.show(state, meta, extent, place, payload);
             if state.reader_set.has_followers() {
                 self.session.journal().note(self.number);
@@ -171,30 +157,11 @@ impl Writer {
 
     /// A sample that nobody reads.
     pub(super) fn pass(&self, state: &mut WriterState, numbering: Numbering) -> Meta {
-        let meta = self.number(state, numbering);
-        self.count(state);
+        let meta = state.numbers.number(numbering);
+        self.header.show_published(state.numbers.count());
         // No sample to come asks for the memory of those that were in use.
         self.reclaim(state);
         meta
-    }
-
-    #[inline]
-    fn number(&self, state: &mut WriterState, numbering: Numbering) -> Meta {
-        let meta = match numbering {
-            Numbering::Given(meta) => meta,
-            Numbering::Next(source_timestamp) => {
-                Meta { sequence: state.last.saturating_add(1), source_timestamp, published: 0 }
-            }
-        };
-        state.last = meta.sequence;
-        meta
-    }
-
-    #[inline]
-    fn count(&self, state: &mut WriterState) {
-        state.published += 1;
-        let published = &self.ring.words()[layout::ring::PUBLISHED];
-        Word::store(published, state.published, Ordering::Relaxed);
     }
 
     fn show(
@@ -209,7 +176,7 @@ impl Writer {
             Payload::Bytes(bytes) => (bytes.len(), bytes),
             Payload::Written { len, .. } => (len, &[][..]),
         };
-        self.count(state);
+        self.header.show_published(state.numbers.count());
         let position = state.history.push(extent);
         let record = Record {
             sequence: meta.sequence,
@@ -219,7 +186,7 @@ impl Writer {
             place,
         };
         protocol::about_to_write::<AtomicU64>();
-        protocol::publish(self.ring.words(), state.array.words(), position, &record, inline);
+        protocol::publish(self.header.words(), state.array.words(), position, &record, inline);
         position
     }
 
@@ -244,6 +211,14 @@ impl Writer {
             self.count_failure(error, deadline.whole);
         }
         tried
+    }
+
+    #[cold]
+    fn count_failure(&self, error: &PublishError, deadline: Duration) {
+        if let Some(dropped) = Dropped::by(error, deadline) {
+            let _lock = self.lock();
+            self.header.count(dropped);
+        }
     }
 
     fn try_for<T>(

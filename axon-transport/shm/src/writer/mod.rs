@@ -3,18 +3,23 @@
 pub(crate) mod absent;
 mod commit;
 mod delivery;
+mod header;
 pub(crate) mod history;
 pub(crate) mod loan;
+mod numbers;
 pub(crate) mod reader_set;
 pub(crate) mod room;
 pub(crate) mod samples;
-mod tally;
-mod times;
+mod state;
 
 use std::{sync::Arc, time::Duration};
 
-pub use self::commit::MAX_GAP;
-pub(super) use self::commit::{Bells, PublishDeadline};
+pub use self::numbers::MAX_GAP;
+pub(super) use self::{
+    commit::{Bells, PublishDeadline},
+    numbers::Numbering,
+    state::WriterState,
+};
 
 use crate::{
     alloc::{
@@ -29,22 +34,20 @@ use crate::{
     ring::{
         layout::{self, ALIGNED, Array, COPIED, COPIED_ALWAYS, Location},
         protocol,
-        times::offer,
+        times::{Times, offer},
         types::{Grant, Meta, Published, RingOptions},
         window::keeps_all,
     },
     session::{
         orphans::Orphan,
-        pin_lanes::Pinned,
         reader_info::{ReaderInfo, Terms},
         segment::SessionSegment,
     },
     writer::{
+        header::RingHeader,
         history::History,
         loan::{Lender, Loan},
         reader_set::ReaderSet,
-        room::Maps,
-        samples::Samples,
     },
 };
 
@@ -113,8 +116,7 @@ const DESCRIPTORS_KEEP_ALL: u64 = 1 << 13;
 pub struct Writer {
     options: RingOptions,
     pub(super) session: Arc<SessionSegment>,
-    /// The ring's header.
-    pub(super) ring: Object,
+    pub(super) header: RingHeader,
     /// Its number in the session's journal.
     pub(super) number: u32,
     /// The most descriptors.
@@ -122,78 +124,9 @@ pub struct Writer {
     state: PiMutex<WriterState>,
 }
 
-pub(super) struct WriterState {
-    pub(super) history: History,
-    pub(super) reader_set: ReaderSet,
-    /// The descriptors.
-    pub(super) array: Object,
-    /// The segments that blocks are in.
-    pub(super) maps: Maps,
-    /// Where the next samples go that readers pin, once there has been one.
-    pub(super) samples: Option<Samples>,
-    /// The tail as readers see it.
-    pub(super) shown_tail: u64,
-    /// What was found pinned, kept for its memory.
-    pub(super) pinned: Pinned,
-    /// The last sample's sequence number.
-    last: u64,
-    /// Of the samples that relays gave up: those of which a wait said so.
-    known_given_up: u64,
-    /// Samples published, read or not.
-    published: u64,
-}
-
 /// The descriptors that a ring needs which keeps what fits in `budget`: a sample takes one at least.
 fn most_descriptors(budget: u64) -> u64 {
     (budget / layout::DESCRIPTOR).max(layout::FIRST_DESCRIPTORS).next_power_of_two()
-}
-
-impl WriterState {
-    /// The first position that stands whose sample has a higher number.
-    fn position_after(&self, number: u64) -> u64 {
-        let standing = self.history.tail()..self.history.head();
-        let later = |position: &u64| protocol::number(self.array.words(), *position) > number;
-        standing.rev().take_while(later).last().unwrap_or(self.history.head())
-    }
-
-    /// Below this position every reader has taken what it wanted, and nobody asks for it again.
-    pub(super) fn consumed(&self) -> u64 {
-        self.reader_set.consumed(self.history.head())
-    }
-
-    /// The number of the last sample in front of a position.
-    pub(super) fn number_before(&self, position: u64) -> u64 {
-        let stands = position >= self.history.tail() && position < self.history.head();
-        if stands {
-            protocol::number(self.array.words(), position).saturating_sub(1)
-        } else {
-            self.last
-        }
-    }
-
-    fn new(reader_set: ReaderSet, history: History, array: Object) -> Self {
-        Self {
-            history,
-            reader_set,
-            array,
-            maps: Maps::default(),
-            samples: None,
-            shown_tail: 0,
-            pinned: Pinned::default(),
-            last: 0,
-            known_given_up: 0,
-            published: 0,
-        }
-    }
-}
-
-/// How samples are numbered.
-#[derive(Clone, Copy)]
-pub(super) enum Numbering {
-    /// As given.
-    Given(Meta),
-    /// One up from the last, with this source timestamp.
-    Next(i64),
 }
 
 /// A sample's bytes on their way into a ring.
@@ -253,9 +186,10 @@ impl Writer {
         }
         let reader_set = ReaderSet::new(qos, limit - 1, Pool::new(budget, max_message));
         let state = WriterState::new(reader_set, history, array);
-        let writer = Self { options, session, ring, number, limit, state: PiMutex::new(state)? };
-        writer.add_bytes(layout::RING + descriptors * layout::DESCRIPTOR);
-        writer.show_window(&writer.lock());
+        let (header, state) = (RingHeader::new(ring), PiMutex::new(state)?);
+        let writer = Self { options, session, header, number, limit, state };
+        writer.header.add_bytes(layout::RING + descriptors * layout::DESCRIPTOR);
+        writer.header.show_window(writer.lock().reader_set.window());
         if expected > COPIED_ALWAYS {
             writer.open_samples(&mut writer.lock())?;
         }
@@ -282,7 +216,7 @@ impl Writer {
     /// Where the ring is in its session's memory, for readers.
     #[inline]
     pub fn location(&self) -> Location {
-        self.ring.block.at
+        self.header.block().at
     }
 
     /// Adds a reader, or answers with the grant that stands when it is attached by the same lane.
@@ -309,7 +243,7 @@ impl Writer {
         let WriterState { reader_set, history, .. } = &mut *state;
         let (tail, head) = (history.tail(), history.head());
         let granted = reader_set.attach(reader, lane, tail, head, resumed, terms.carries);
-        self.show_window(&state);
+        self.header.show_window(state.reader_set.window());
         granted.map(|grant| (grant, state.number_before(grant.first)))
     }
 
@@ -334,7 +268,7 @@ impl Writer {
         let peers = state.reader_set.peers();
         let WriterState { reader_set, history, .. } = &mut *state;
         let changed = by(reader_set, history.head());
-        self.show_window(&state);
+        self.header.show_window(state.reader_set.window());
         drop(state);
         drop(peers);
         changed
@@ -429,6 +363,27 @@ impl Writer {
             .map(|(sequence, _)| sequence)
     }
 
+    /// Says that a sample was published at `now`.
+    #[inline]
+    pub fn note_sample(&self, now: u64) {
+        if !self.is_forked() {
+            self.header.note_sample(now);
+        }
+    }
+
+    /// Says that the publisher is alive.
+    #[inline]
+    pub fn assert(&self, now: u64) {
+        if !self.is_forked() {
+            self.header.assert(now);
+        }
+    }
+
+    /// What its readers see.
+    pub fn times(&self) -> Times {
+        if self.is_forked() { Times::default() } else { self.header.times() }
+    }
+
     /// Lends `len` bytes to be written and then published: of shared memory where it is more than
     /// 4 KiB, or 512 bytes if so many are [expected](RingOptions::expected). May wait as
     /// [`publish`](Self::publish) does.
@@ -519,11 +474,11 @@ impl Drop for Writer {
         let WriterState { mut history, array, reader_set, .. } = {
             let mut state = self.lock();
             let nobody = ReaderSet::new(self.options.qos, 0, Pool::default());
-            let empty = WriterState::new(nobody, History::new(1, 0), self.ring.clone());
+            let empty = WriterState::new(nobody, History::new(1, 0), self.header.object());
             std::mem::replace(&mut *state, empty)
         };
         // Readers drain what stands. After them nobody looks at any of it.
-        let mut blocks = vec![self.ring.block, array.block];
+        let mut blocks = vec![*self.header.block(), array.block];
         blocks.extend(history.all_blocks());
         let samples = history.pinned().segments().collect();
         self.session.adopt(Orphan { pin_lanes: reader_set.into_pin_lanes(), blocks, samples });

@@ -15,7 +15,7 @@ use crate::{
         protocol,
     },
     session::pin_lanes::PinningReader,
-    writer::{Writer, WriterState, history::OldestInUse},
+    writer::{Writer, WriterState, header::Dropped, history::OldestInUse},
 };
 
 /// Why an attempt to publish did not succeed.
@@ -130,7 +130,7 @@ impl Writer {
             let made = history.make_place(|position| position < floors.held);
             made.map_err(|OldestInUse| Refusal::OldestInUse { short })?;
             if is_lost {
-                self.count_short();
+                self.header.count(Dropped::NoMemory);
             }
         }
         if !state.history.has_room_for_descriptor() {
@@ -161,11 +161,11 @@ impl Writer {
         let (tail, head) = (history.tail(), history.head());
         protocol::copy_descriptors(state.array.words(), array.words(), tail, head);
         let word = Array { at: array.block.at, descriptors }.word();
-        protocol::replace(self.ring.words(), word);
+        protocol::replace(self.header.words(), word);
         history.grow();
         let old = std::mem::replace(&mut state.array, array);
-        self.add_bytes(bytes);
-        self.subtract_bytes(old.block.len);
+        self.header.add_bytes(bytes);
+        self.header.subtract_bytes(old.block.len);
         self.session.release(old.block);
         if 2 * descriptors <= self.limit {
             self.session.foresee(2 * bytes);
@@ -210,7 +210,7 @@ impl Writer {
                     let was_kept = tail >= floors.retained && tail >= state.consumed();
                     match state.history.shrink(may_go) {
                         Ok(false) => return Err(error.into()),
-                        Ok(true) if was_kept => self.count_short(),
+                        Ok(true) if was_kept => self.header.count(Dropped::NoMemory),
                         Ok(true) => {}
                         Err(OldestInUse) => {
                             return Err(Refusal::OldestInUse { short: Some(error) });
@@ -235,7 +235,7 @@ impl Writer {
             .map_err(no_memory)?
             .expect("there is always one that will do");
         state.maps.add(&object);
-        self.add_bytes(object.block.len);
+        self.header.add_bytes(object.block.len);
         Ok(object.block)
     }
 
@@ -243,7 +243,7 @@ impl Writer {
         // Others write there from now on.
         self.show_tail(state);
         for block in state.history.blocks().drain() {
-            self.subtract_bytes(block.len);
+            self.header.subtract_bytes(block.len);
             self.session.release(block);
         }
     }
@@ -252,7 +252,7 @@ impl Writer {
     pub(crate) fn show_tail(&self, state: &mut WriterState) {
         if state.shown_tail != state.history.tail() {
             state.shown_tail = state.history.tail();
-            protocol::retire(self.ring.words(), state.shown_tail);
+            protocol::retire(self.header.words(), state.shown_tail);
         }
     }
 }

@@ -22,6 +22,7 @@ use crate::{
     session::pin_lanes::PinningReader,
     writer::{
         LOOKS, Writer, WriterState,
+        header::Dropped,
         history::OldestInUse,
         loan::LoanPlace,
         room::{PinnedMemory, Refusal, no_memory},
@@ -203,7 +204,7 @@ impl Writer {
                 match history.shrink(may_go) {
                     Ok(true) => {
                         if short.is_some() {
-                            self.count_short();
+                            self.header.count(Dropped::NoMemory);
                         }
                         continue;
                     }

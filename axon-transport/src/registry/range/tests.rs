@@ -1,11 +1,14 @@
 //! Tests pairs and the graph with sessions of different ranges.
 
+use std::collections::BTreeSet;
+
 use axon_shm::internal::Location;
 
 use super::*;
 use crate::{
-    graph::{Endpoint, EndpointKind},
+    graph::{Endpoint, EndpointKind, EndpointRange, RemoteEndpoint},
     qos::Qos,
+    registry::Registry,
     wire::session::{Announce, Attach, Granted, Message},
 };
 

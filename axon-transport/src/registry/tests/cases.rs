@@ -196,7 +196,7 @@ fn a_detached_pair_is_over_at_both_ends() {
     world.settle();
     for client in world.clients.values() {
         assert!(client.attached.is_empty() && client.held.is_empty());
-        assert!(world.registry.session(&client.id).unwrap().known.is_empty());
+        assert!(world.registry.session(&client.id).unwrap().held.pairs().is_empty());
     }
 }
 

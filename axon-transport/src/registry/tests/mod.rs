@@ -6,6 +6,7 @@ mod cases;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 
+use axon_shm::internal::Location;
 use proptest::prelude::*;
 
 use super::*;
@@ -13,7 +14,7 @@ use crate::{
     graph::EndpointKind,
     qos::{Qos, Reliability, compatible},
     wire::session::{
-        Announce, Gone, Granted, Message, Segment, SegmentName, SegmentOpened, Unmatch,
+        Announce, Gone, Granted, Message, Pair, Segment, SegmentName, SegmentOpened, Unmatch,
     },
 };
 
@@ -342,7 +343,7 @@ impl World {
                     if writes { EndpointKind::Publisher } else { EndpointKind::Subscription };
                 let reliability =
                     if reliable { Reliability::Reliable } else { Reliability::BestEffort };
-                let new = endpoint(gid, kind, topic, Qos { reliability, ..Qos::default() });
+                let new = endpoint(gid, kind, topic, Qos::default().with_reliability(reliability));
                 client.endpoints.insert(gid, new.clone());
                 client.outgoing.push((announce(new), vec![]));
             }
@@ -445,17 +446,15 @@ impl World {
             let expected = pairs.remove(&client.id).unwrap_or_default();
             assert_eq!(client.attached, expected, "the pairs of {}", client.id);
             let entry = self.registry.session(&client.id).unwrap();
-            let known: HashMap<_, _> =
-                entry.known.iter().map(|(of, known)| (*of, known.pairs.clone())).collect();
-            assert_eq!(known, client.held, "what {} holds", client.id);
+            assert_eq!(entry.held.pairs(), client.held, "what {} holds", client.id);
             for pair in client.attached.iter().filter(|p| client.endpoints.contains_key(&p.reader))
             {
                 self.check_mapped(client, pair);
             }
         }
-        assert_eq!(self.registry.endpoints.len(), all.len());
-        assert!(self.registry.topics.values().all(|m| m.writers.len() + m.readers.len() > 0));
-        assert_eq!(self.registry.sessions.len(), self.clients.len());
+        assert_eq!(self.registry.endpoints.iter().count(), all.len());
+        assert!(self.registry.endpoints.topics().all(|m| m.writers.len() + m.readers.len() > 0));
+        assert_eq!(self.registry.sessions.iter().count(), self.clients.len());
     }
 }
 
@@ -487,8 +486,8 @@ proptest! {
         let mut world = World::default();
         for step in steps {
             world.take(step);
-            for entry in world.registry.sessions.values() {
-                prop_assert!(entry.queue.len() <= entry.queue_limit);
+            for (_, entry) in world.registry.sessions.iter() {
+                entry.outbox.check();
             }
         }
         world.settle();

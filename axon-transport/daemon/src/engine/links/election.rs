@@ -6,7 +6,11 @@ use quinn_proto::{Dir, StreamEvent, VarInt};
 
 use super::{
     LinkEvent, LinkReport, Links, chain,
-    link::{LinkPeer, Phase, Silence},
+    link::{
+        LinkPeer, Phase,
+        age::{Age, Due},
+    },
+    silence::Silence,
 };
 use crate::{
     engine::{
@@ -73,7 +77,7 @@ impl Links {
         let replaced = replaces.is_some()
             && current.is_some_and(|current| current.elected.map(|e| e.link) == replaces);
         // The peer may have given up the link that is silent here.
-        let successor = replaced || current.is_some_and(|peer| peer.silence.gone.is_some());
+        let successor = replaced || current.is_some_and(|peer| peer.silence.is_gone());
         let candidate = Candidate { side, successor };
         let we_elect = ours < daemon;
         if we_elect && current.is_some_and(|c| !keep(ours, daemon, c.candidate, candidate)) {
@@ -99,13 +103,12 @@ impl Links {
             seals: sealing.is_some(),
             sealing,
             elected: None,
-            renew_at: None,
-            until: None,
+            age: Age::default(),
             since_unix_ms: axon_transport::status::unix_ms(),
             unread: account.unread.nothing(),
             account,
             chain,
-            silence: Silence::new(now),
+            silence: Silence::new(side, now),
         });
         if we_elect {
             let elected = Elected { link: rand::random(), election: self.next_election };
@@ -172,8 +175,7 @@ impl Links {
         let Some(peer) = &mut link.peer else { return };
         peer.elected = Some(elected);
         if let Some(age) = age {
-            peer.until = Some(now + age);
-            peer.renew_at = (side == Side::Client).then(|| now + renewal_at(age));
+            peer.age = Age::new(age, side == Side::Client, now);
         }
         link.phase = Phase::Open;
         if let Some(connection) = self.connections.get_mut(number) {
@@ -232,22 +234,15 @@ impl Links {
 
     /// A successor is dialled, or the link is at its end.
     pub(super) fn open_timeout(&mut self, number: u64, now: Duration) {
-        let Some(peer) = self.table.peer(number) else {
-            return;
-        };
-        if peer.until.is_some_and(|until| until <= now) {
-            let text = "AXON_QKD_SESSION_MAX_AGE is reached and no successor came";
-            self.close_connection(number, CloseCode::KeySupply, text, now);
-            return self.end_link(number, text, None, now);
-        }
-        if peer.renew_at.is_some_and(|renew| renew <= now) {
-            let age = self.keyring.as_ref().map(|keyring| keyring.config.session_max_age);
-            // Should the dial fail, the next one is due before the key's age is reached.
-            let again = age.unwrap_or_default().mul_f64(0.04).max(Duration::from_secs(1));
-            if let Some(peer) = self.table.peer_mut(number) {
-                peer.renew_at = Some(now + again);
+        let Some(peer) = self.table.peer_mut(number) else { return };
+        match peer.age.handle_timeout(now) {
+            Some(Due::End) => {
+                let text = "AXON_QKD_SESSION_MAX_AGE is reached and no successor came";
+                self.close_connection(number, CloseCode::KeySupply, text, now);
+                return self.end_link(number, text, None, now);
             }
-            self.dial_successor(number, now);
+            Some(Due::Renew) => self.dial_successor(number, now),
+            None => {}
         }
         self.probe(number, now);
     }
@@ -284,10 +279,4 @@ impl Links {
             self.violation(number, CloseCode::NotAllowed, &why, now);
         }
     }
-}
-
-/// When the successor of a link is dialled: a tenth of its age before the end, but at least ten seconds where that is
-/// no more than half of it, since the KMEs may be slow.
-fn renewal_at(age: Duration) -> Duration {
-    age - (age / 10).max(Duration::from_secs(10)).min(age / 2)
 }

@@ -6,15 +6,14 @@ use axon_shm::ids::DaemonId;
 
 use super::{
     LinkEvent, Links,
-    link::{Leaving, Link, Phase},
+    link::{
+        Link, Phase,
+        hand_over::{Leaving, Step, UnderWay},
+    },
+    silence::Traffic,
 };
-use crate::{
-    engine::links::silence::Traffic,
-    link::{CloseCode, LinkClosed},
-};
+use crate::link::{CloseCode, LinkClosed};
 
-/// The peer is waited for so long at a time.
-const HAND_OVER: Duration = Duration::from_secs(5);
 /// Superseded links of one identity. The oldest closes for another one.
 const MAX_LEAVING: usize = 8;
 const SUPERSEDED: &str = "a successor took over";
@@ -26,14 +25,10 @@ impl Links {
         let stats = self.connections.get(old)?.quic.stats();
         let link = self.table.get_mut(old)?;
         let peer = link.peer.as_mut()?;
-        peer.silence.silent &= !Traffic::from(&stats).answered_since(peer.silence.traffic);
-        peer.silence.probing = None;
-        let silent = peer.silence.silent;
-        let until = peer.until.map(|until| until.max(now + HAND_OVER));
+        let silent = peer.silence.handle_superseded(Traffic::from(&stats));
         let succeeded = ours > peer.summary.hello.daemon;
         let (who, elected) = (peer.summary.who.clone(), peer.elected);
-        link.phase =
-            Phase::Leaving(Leaving { until, succeeded, ended: false, closed: false, wait: None });
+        link.phase = Phase::Leaving(Leaving::new(peer.age.until(), succeeded, now));
         self.nonces.retain(|_, number| *number != old);
         tracing::debug!(link = old, silent, "the link is superseded");
         let of_identity = self.table.leaving().filter(|(_, peer)| peer.summary.who.is(&who));
@@ -58,7 +53,7 @@ impl Links {
     pub(super) fn succeeded(&mut self, daemon: DaemonId) {
         for (_, link) in self.leaving_of(daemon) {
             if let Phase::Leaving(leaving) = &mut link.phase {
-                leaving.succeeded = true;
+                leaving.handle_succeeded();
             }
         }
     }
@@ -70,7 +65,7 @@ impl Links {
             if elected.is_some_and(|elected| elected.link == closed.link)
                 && let Phase::Leaving(leaving) = &mut link.phase
             {
-                leaving.closed = true;
+                leaving.handle_closed();
             }
         }
     }
@@ -84,7 +79,7 @@ impl Links {
     /// The peer's control stream of a superseded link ended.
     pub(super) fn leaving_ended(&mut self, number: u64) {
         if let Some(Link { phase: Phase::Leaving(leaving), .. }) = self.table.get_mut(number) {
-            leaving.ended = true;
+            leaving.handle_ended();
         }
     }
 
@@ -105,26 +100,18 @@ impl Links {
         else {
             return;
         };
-        let silent = link.peer.as_ref().is_some_and(|peer| peer.silence.silent);
+        let silent = link.peer.as_ref().is_some_and(|peer| peer.silence.is_silent());
         let Phase::Leaving(leaving) = &mut link.phase else { return };
-        if leaving.closed || (silent && leaving.succeeded) {
-            return self.close_leaving(number, now);
-        }
         // The control stream is one of them.
         let sent = connection.quic.streams().send_streams() <= 1;
-        if silent || !leaving.succeeded || !(sent || leaving.wait.is_some()) {
-            return;
+        match leaving.handle_progress(UnderWay { silent, sent, reading }, now) {
+            Step::Wait => {}
+            Step::Finish => {
+                connection.control.finish();
+                self.connections.touch(number);
+            }
+            Step::Close => self.close_leaving(number, now),
         }
-        connection.control.finish();
-        let wait = *leaving.wait.get_or_insert(now + HAND_OVER);
-        let over = reading == 0 && (leaving.ended || now >= wait);
-        if over {
-            return self.close_leaving(number, now);
-        }
-        if now >= wait {
-            leaving.wait = Some(now + HAND_OVER);
-        }
-        self.connections.touch(number);
     }
 
     /// The time of a superseded link is over.
@@ -132,7 +119,7 @@ impl Links {
         let Some(Link { phase: Phase::Leaving(leaving), .. }) = self.table.get(number) else {
             return;
         };
-        if leaving.until.is_some_and(|until| until <= now) {
+        if leaving.is_over(now) {
             self.close_leaving(number, now);
         }
     }

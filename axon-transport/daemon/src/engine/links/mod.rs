@@ -40,7 +40,7 @@ use self::{
     dials::Dials,
     events::Outbox,
     link::{Link, Phase, Summary},
-    silence::frames_came,
+    silence::{Nonce, frames_came},
     table::Table,
 };
 use super::{
@@ -81,7 +81,7 @@ pub(super) struct Links {
     /// Connections whose control stream has more, once the events that came are handled.
     later: Vec<u64>,
     /// The silent links that are probed, by the nonces of the probes.
-    nonces: HashMap<[u8; 8], u64>,
+    nonces: HashMap<Nonce, u64>,
     outbox: Outbox,
     /// When links are looked at for silence and trust.
     next_second: Duration,
@@ -398,7 +398,7 @@ impl Links {
     /// The status of a link.
     pub(super) fn status(&self, number: u64) -> Option<LinkStatus> {
         let (connection, peer) = (self.connections.get(number)?, self.table.peer(number)?);
-        let mut status = who::link(&peer.summary, peer.since_unix_ms);
+        let mut status = peer.summary.status(peer.since_unix_ms);
         connection.fill(&mut status);
         Some(status)
     }

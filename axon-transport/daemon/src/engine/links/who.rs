@@ -1,4 +1,4 @@
-//! Who a peer is, and the status of a link.
+//! Who a peer is.
 
 use std::{fmt, net::SocketAddr};
 
@@ -6,9 +6,7 @@ use axon_tls::{
     Negotiated,
     identity::{Auth, SpkiDigest},
 };
-use axon_transport::status::LinkStatus;
 
-use super::link::Summary;
 use crate::link::Hello;
 
 /// As whom a peer proved itself.
@@ -59,6 +57,15 @@ impl Who {
         }
     }
 
+    /// The host's name as status shows it: the name that was proven, or else what the host `calls_itself`.
+    pub(super) fn host_name(&self, calls_itself: &str) -> String {
+        match self {
+            // What it calls itself is nobody's word but its own.
+            Self::Pinned(name, _) => name.clone(),
+            _ => calls_itself.to_owned(),
+        }
+    }
+
     /// Tells whether two daemons are on the same host, by what they proved; with nothing proven the
     /// address.
     pub(crate) fn host_identity(&self, address: SocketAddr) -> String {
@@ -80,25 +87,6 @@ impl fmt::Display for Who {
             Self::Somebody(Some(key)) => write!(f, "UNAUTHENTICATED (key {key})"),
             Self::Somebody(None) => f.write_str("UNAUTHENTICATED"),
         }
-    }
-}
-
-/// The status of a link, as far as its beginning says it.
-pub(crate) fn link(summary: &Summary, since_unix_ms: u64) -> LinkStatus {
-    LinkStatus {
-        peer: summary.hello.daemon.to_string(),
-        host: match &summary.who {
-            // What it calls itself is nobody's word but its own.
-            Who::Pinned(name, _) => name.clone(),
-            _ => summary.hello.host.clone(),
-        },
-        sae: summary.hello.sae.clone(),
-        state: "connected".into(),
-        key_exchange: summary.negotiated.key_exchange.to_string(),
-        cipher: summary.negotiated.cipher.name().into(),
-        authenticated_as: summary.who.to_string(),
-        since_unix_ms,
-        ..LinkStatus::default()
     }
 }
 

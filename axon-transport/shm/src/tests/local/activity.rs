@@ -137,7 +137,7 @@ fn a_journal_that_its_session_scribbles_over_costs_a_look_at_its_rings_alone() {
 fn a_session_that_numbers_all_of_its_rings_alike_has_each_of_them_looked_at_once() {
     let (of, from) = (session(), session());
     from.follow();
-    let number = |writer: &Writer| writer.ring.words()[layout::ring::NUMBER].store(7, Relaxed);
+    let number = |writer: &Writer| writer.header.words()[layout::ring::NUMBER].store(7, Relaxed);
     let topics = topics_with(&of, &from, 1..101, true, number);
     active(&from);
     for _ in 0..3 {

@@ -1,10 +1,6 @@
 //! The graph that the session shows, and the matches of its own endpoints.
 
-use std::{
-    collections::{BTreeSet, HashSet},
-    sync::Arc,
-    time::Instant,
-};
+use std::{collections::BTreeSet, sync::Arc, time::Instant};
 
 use super::{Control, Rematching};
 use crate::{
@@ -27,10 +23,7 @@ impl Control {
             self.topics.clear();
             self.arrivals.restart();
             self.peers.recount();
-            // A daemon that tells everything to a session it knew repeats every pair that it told it
-            // of. A new daemon learns of the pairs from their two sides, one by one.
-            self.repeated = self.told.then(HashSet::new);
-            self.told = true;
+            self.pairs.begin_whole();
         }
         let over = graph.ended.unwrap_or_default();
         {
@@ -64,10 +57,10 @@ impl Control {
         }
         self.endpoints_over(&over);
         if !graph.more {
-            let repeated = self.repeated.take();
-            let told = repeated.is_some();
-            if let Some(repeated) = repeated {
-                self.drop_unrepeated(repeated);
+            let unrepeated = self.pairs.end_whole();
+            let told = unrepeated.is_some();
+            if let Some(unrepeated) = unrepeated {
+                self.drop_pairs(&unrepeated);
                 // An answer may have been among what was too much for this session.
                 self.shared.memory.begins_anew();
             }

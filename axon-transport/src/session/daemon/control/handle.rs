@@ -31,7 +31,7 @@ impl Control {
             Message::Attach(attach) => self.attach(attach, descriptors),
             Message::Grant(grant) => self.grant(grant, descriptors),
             Message::Detach(pair) => {
-                self.spoken.remove(&pair);
+                self.pairs.remove(&pair);
                 self.peers.release(&pair);
                 self.detach_reader(&pair);
             }
@@ -71,7 +71,7 @@ impl Control {
         }
         // Thousands may end at a time, and be attached to one each.
         let gids: HashSet<Gid> = gids.iter().copied().collect();
-        self.spoken.retain(|pair| !gids.contains(&pair.reader) && !gids.contains(&pair.writer));
+        self.pairs.remove_endpoints(&gids);
         let (publishers, subscriptions) = self.endpoints();
         for publisher in publishers {
             let attached = publisher.granted();
@@ -134,15 +134,13 @@ impl Control {
 
     /// What the daemon told of and did not say again is over: it was unmatched while the session was
     /// too slow to be told.
-    pub(super) fn drop_unrepeated(&mut self, repeated: HashSet<Pair>) {
-        let spoken = std::mem::take(&mut self.spoken);
-        let is_over = |pair: &Pair| spoken.contains(pair) && !repeated.contains(pair);
+    pub(super) fn drop_pairs(&mut self, over: &HashSet<Pair>) {
         let (publishers, subscriptions) = self.endpoints();
         for publisher in publishers {
             let (writer, attached) = (publisher.endpoint.gid, publisher.granted());
             for reader in attached {
                 let pair = Pair { reader, writer };
-                if is_over(&pair) && !self.is_own_pair(&pair) && publisher.detach(reader) {
+                if over.contains(&pair) && !self.is_own_pair(&pair) && publisher.detach(reader) {
                     pair_log::over(&pair, "the daemon did not repeat it to the writer");
                     self.writer_changed(&publisher);
                 }
@@ -155,7 +153,7 @@ impl Control {
                 .writers()
                 .into_iter()
                 .map(|writer| Pair { reader, writer })
-                .filter(|pair| is_over(pair) && !self.is_own_pair(pair))
+                .filter(|pair| over.contains(pair) && !self.is_own_pair(pair))
                 .map(|pair| pair.writer);
             let gone =
                 gone.collect::<Vec<_>>().into_iter().filter(|writer| matched_readers.end(writer));
@@ -168,15 +166,6 @@ impl Control {
             if news > 0 {
                 self.reader_changed(&subscription);
             }
-        }
-        self.spoken = repeated;
-    }
-
-    /// The daemon says that a pair stands, or is to.
-    fn told_of(&mut self, pair: Pair) {
-        self.spoken.insert(pair);
-        if let Some(repeated) = &mut self.repeated {
-            repeated.insert(pair);
         }
     }
 
@@ -202,7 +191,7 @@ impl Control {
     }
 
     fn matched(&mut self, pair: Pair) {
-        self.told_of(pair);
+        self.pairs.tell(pair);
         self.ask(&pair);
     }
 
@@ -263,7 +252,7 @@ impl Control {
 
     fn attach(&mut self, attach: Attach, descriptors: Vec<PassedFd>) {
         let pair = Pair { reader: attach.reader, writer: attach.writer };
-        self.told_of(pair);
+        self.pairs.tell(pair);
         // Counted whether or not it comes to anything, as the daemon does.
         let peer = self.hold(attach.session, pair, descriptors, &attach.segments);
         let shared = self.shared.clone();
@@ -326,7 +315,7 @@ impl Control {
         let Granted { reader, writer, generation, first, session, ring, segments, .. } = granted;
         let Granted { after, relayed, .. } = granted;
         let pair = Pair { reader, writer };
-        self.told_of(pair);
+        self.pairs.tell(pair);
         // In a packet that is full not all of them were named.
         let all = descriptors.len() < MAX_DESCRIPTORS;
         let peer = self.hold(session, pair, descriptors, &segments);
@@ -446,7 +435,7 @@ impl Control {
     fn unmatch(&mut self, unmatch: &Unmatch) {
         let Unmatch { reader, writer, reason } = unmatch;
         let pair = Pair { reader: *reader, writer: *writer };
-        self.spoken.remove(&pair);
+        self.pairs.remove(&pair);
         self.peers.release(&pair);
         self.detach_reader(&pair);
         let subscription = self.shared.state().subscriptions.get(reader).cloned();

@@ -1,44 +1,30 @@
 //! The connection to a daemon, and the search for a new daemon.
 
-use std::{
-    collections::BTreeSet,
-    sync::{
-        Arc,
-        atomic::{AtomicBool, Ordering},
-        mpsc::{TryRecvError, sync_channel},
-    },
-    time::{Duration, Instant},
-};
+use std::{collections::BTreeSet, sync::mpsc::TryRecvError, time::Instant};
 
 use axon_shm::internal::descriptors::PassedFd;
 
-use super::{Control, Link, Search};
+use super::{
+    Control, Link,
+    search::Search,
+    told::{ToldPairs, ToldSegments},
+};
 use crate::{
     ids::Gid,
     session::{
-        daemon::connect::{Caller, Connected},
-        error::SessionError,
+        daemon::connect::Connected,
         state::{Outgoing, SegmentChange, SessionEvent, StatusAnswer},
     },
     wire::session::{Gone, Message},
 };
 
-/// Between attempts to find a daemon.
-const MIN_PAUSE: Duration = Duration::from_millis(100);
-const MAX_PAUSE: Duration = Duration::from_secs(2);
-/// A connection that lasted less was as good as refused.
-const BRIEF: Duration = Duration::from_secs(1);
-
 impl Control {
     pub(super) fn connected(&mut self, connected: Connected) {
         self.outbox.clear();
         self.building = None;
-        self.repeated = None;
-        self.spoken.clear();
-        self.told = false;
-        self.segments.clear();
-        self.untold.clear();
-        self.since = Instant::now();
+        self.pairs = ToldPairs::default();
+        self.segments = ToldSegments::default();
+        self.pause.handle_connected(Instant::now());
         self.retry = None;
         let daemon = connected.welcome.daemon;
         {
@@ -72,58 +58,15 @@ impl Control {
                 state.status = StatusAnswer::Lost;
             }
         }
-        self.pause = if self.since.elapsed() < BRIEF {
-            (self.pause * 2).clamp(MIN_PAUSE, MAX_PAUSE)
-        } else {
-            Duration::ZERO
-        };
-        self.link = if self.reconnects { self.reconnect() } else { Link::Ended };
+        let pause = self.pause.handle_lost(Instant::now());
+        let search = self.reconnects.then(|| Search::begin(self.shared.clone(), pause)).flatten();
+        self.link = search.map_or(Link::Ended, Link::Reconnecting);
         self.shared.notify(Some(&SessionEvent::DaemonLost));
-    }
-
-    /// Looks for a daemon on a thread of its own: meanwhile peers may die.
-    pub(super) fn reconnect(&self) -> Link {
-        let shared = self.shared.clone();
-        let (found, receiver) = sync_channel(1);
-        let first = self.pause;
-        let over = Arc::new(AtomicBool::new(false));
-        let search = Search { found: receiver, over: over.clone() };
-        // Pairs with the release store in `Search::drop`.
-        let is_over = move || over.load(Ordering::Acquire);
-        let run = move || {
-            std::thread::sleep(first);
-            let mut pause = MIN_PAUSE;
-            while !is_over() {
-                let caller = Caller {
-                    segment: Some(&shared.segment),
-                    cancel: Some(&is_over),
-                    ..Caller::new(&shared.config, &shared.options, shared.id)
-                };
-                match caller.connect() {
-                    Ok(connected) => {
-                        let _ = found.send(connected);
-                        shared.wake();
-                        return;
-                    }
-                    Err(SessionError::NoDaemon { .. }) => {}
-                    Err(error) => tracing::error!(%error, "no daemon took the session"),
-                }
-                std::thread::sleep(pause);
-                pause = (pause * 2).min(MAX_PAUSE);
-            }
-        };
-        match std::thread::Builder::new().name("axon-connect".into()).spawn(run) {
-            Ok(_) => Link::Reconnecting(search),
-            Err(error) => {
-                tracing::error!(%error, "no thread to look for a daemon with");
-                Link::Ended
-            }
-        }
     }
 
     pub(super) fn try_reconnected(&mut self) {
         let Link::Reconnecting(search) = &self.link else { return };
-        match search.found.try_recv() {
+        match search.try_found() {
             Ok(connected) => self.connected(connected),
             Err(TryRecvError::Empty) => {}
             Err(TryRecvError::Disconnected) => self.link = Link::Ended,

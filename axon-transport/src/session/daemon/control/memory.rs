@@ -14,7 +14,7 @@ const TEND: Duration = Duration::from_secs(1);
 impl Control {
     /// Takes what changed in the session's memory, and what its readers lack of others'.
     pub(super) fn tell_segments(&mut self) {
-        for number in self.untold.clone() {
+        for number in self.segments.untold() {
             self.tell_segment(SegmentChange::Opened(number));
         }
         for change in self.shared.memory.take() {
@@ -26,20 +26,17 @@ impl Control {
         let session = self.shared.id;
         match change {
             // Found here and noted there.
-            SegmentChange::Opened(number) if self.segments.contains(&number) => {}
+            SegmentChange::Opened(number) if self.segments.is_told(number) => {}
             SegmentChange::Opened(number) => match self.shared.segment.segment(number) {
                 Ok(Some((info, descriptor))) => {
-                    self.segments.insert(number);
-                    self.untold.remove(&number);
+                    self.segments.tell(number);
                     let opened = SegmentOpened { session, segment: info.into() };
                     self.outbox.push_back((Message::Segment(opened), vec![descriptor.into()]));
                 }
                 // It is gone again.
-                Ok(None) => {
-                    self.untold.remove(&number);
-                }
+                Ok(None) => self.segments.remove(number),
                 Err(error) => {
-                    if self.untold.insert(number) {
+                    if self.segments.fail(number) {
                         tracing::error!(
                             %error,
                             "no free file descriptor: new samples stay invisible to other processes until one is free"
@@ -48,8 +45,7 @@ impl Control {
                 }
             },
             SegmentChange::Gone(number) => {
-                self.segments.remove(&number);
-                self.untold.remove(&number);
+                self.segments.remove(number);
                 let gone = SegmentName { session, number };
                 self.outbox.push_back((Message::SegmentGone(gone), Vec::new()));
             }

@@ -6,22 +6,26 @@ mod handle;
 mod link;
 mod memory;
 mod pair_log;
+mod pause;
+mod search;
 mod time;
+mod told;
 
 use std::{
-    collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque},
+    collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
     os::fd::{AsFd, BorrowedFd},
-    sync::{
-        Arc,
-        atomic::{AtomicBool, Ordering},
-        mpsc::Receiver,
-    },
+    sync::{Arc, atomic::Ordering},
     time::{Duration, Instant},
 };
 
 use axon_shm::{ExternalLeader, ShmError, internal::descriptors::PassedFd};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
+use self::{
+    pause::ReconnectPause,
+    search::Search,
+    told::{ToldPairs, ToldSegments},
+};
 use super::{
     connect::Connected,
     socket::{self, SocketError},
@@ -39,7 +43,7 @@ use crate::{
         state::{Outgoing, SessionShared},
         subscription::{Asking, SubscriptionInner},
     },
-    wire::session::{Announce, EndpointRole, Gone, Message, Pair},
+    wire::session::{Announce, EndpointRole, Gone, Message},
 };
 
 /// Packets handled before queued ones are sent: neither direction starves the other.
@@ -60,25 +64,15 @@ pub(in crate::session) struct Control {
     buffer: Vec<u8>,
     /// A whole graph of which parts are still to come.
     building: Option<GraphView>,
-    /// Pairs that the daemon repeated since it began to tell everything anew.
-    repeated: Option<HashSet<Pair>>,
-    /// Pairs that the daemon of this connection has told of. What it never told of stands by the word
-    /// of an earlier one, and this one may know nothing of it yet: a stopped process has not come back.
-    spoken: HashSet<Pair>,
-    /// Whether this connection has brought a whole graph already.
-    told: bool,
+    /// The pairs that the daemon of this connection told of.
+    pairs: ToldPairs,
     /// When to look after the memory of large samples, while there is any.
     reclaim_idle: Option<Instant>,
     /// The segments of our memory that this connection was told of.
-    segments: BTreeSet<u32>,
-    /// Those that it could not be told of, for want of descriptors.
-    untold: BTreeSet<u32>,
+    segments: ToldSegments,
     /// Publishers that have no memory ready for their next large sample.
     low: BTreeSet<Gid>,
-    /// When this connection was made, and how long the search for the next one waits first: one
-    /// that does not last is not to be had at once again, at the cost of everybody else.
-    since: Instant,
-    pause: Duration,
+    pause: ReconnectPause,
     /// This process had no descriptors left: when it asks to be told everything anew.
     retry: Option<Instant>,
     arrivals: Arrivals,
@@ -114,20 +108,6 @@ pub(in crate::session) enum Start {
     Alone,
 }
 
-/// The search for another daemon, on a thread of its own, which ends with this.
-struct Search {
-    found: Receiver<Connected>,
-    /// Whether it is to end.
-    over: Arc<AtomicBool>,
-}
-
-impl Drop for Search {
-    fn drop(&mut self) {
-        // Pairs with the acquire loads of the thread.
-        self.over.store(true, Ordering::Release);
-    }
-}
-
 enum Link {
     Socket(PassedFd),
     Local(Local),
@@ -152,15 +132,11 @@ impl Control {
             outbox: VecDeque::new(),
             buffer: Vec::new(),
             building: None,
-            repeated: None,
-            spoken: HashSet::new(),
-            told: false,
+            pairs: ToldPairs::default(),
             reclaim_idle: None,
-            segments: BTreeSet::new(),
-            untold: BTreeSet::new(),
+            segments: ToldSegments::default(),
             low: BTreeSet::new(),
-            since: Instant::now(),
-            pause: Duration::ZERO,
+            pause: ReconnectPause::new(Instant::now()),
             retry: None,
             arrivals: Arrivals::default(),
             topics: HashMap::new(),
@@ -298,7 +274,7 @@ impl Control {
                 }
                 Outgoing::Fence(fence) => {
                     self.tell_segments();
-                    if self.untold.is_empty() {
+                    if self.segments.are_complete() {
                         self.outbox.push_back((Message::Fence(fence), Vec::new()));
                     } else {
                         fences.insert(fence.writer, Outgoing::Fence(fence));
@@ -411,7 +387,7 @@ impl Control {
         }
         // A socket without room becomes writable, but one that is short of descriptors in flight
         // does not say when that passes.
-        let blocked = self.is_linked() && !(self.outbox.is_empty() && self.untold.is_empty());
+        let blocked = self.is_linked() && !(self.outbox.is_empty() && self.segments.are_complete());
         let looks = blocked || !self.shared.state().leaving.is_empty();
         let nap = looks.then_some(Duration::from_millis(20));
         let reclaim_idle = self.reclaim_idle.filter(|_| self.is_linked());

@@ -34,7 +34,7 @@ const AGAIN_AT_MOST: Duration = Duration::from_secs(8);
 
 /// What went over a connection, as far as silence is concerned.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Traffic {
+pub(in crate::engine::links) struct Traffic {
     /// Frames that came. Datagrams would count that anybody sends; what is not authentic, or comes twice, has no frame.
     came: u64,
     /// Acknowledgements among what came.
@@ -57,6 +57,11 @@ impl Traffic {
         Self { came: frames_came(stats), acknowledged: stats.frame_rx.acks, asked }
     }
 
+    #[cfg(test)]
+    pub(super) fn of(came: u64, acknowledged: u64, asked: u64) -> Self {
+        Self { came, acknowledged, asked }
+    }
+
     /// Whether the peer acknowledged something since `before`: QUIC repeats at once what it has not got.
     pub(crate) fn answered_since(self, before: Self) -> bool {
         self.acknowledged != before.acknowledged
@@ -75,7 +80,7 @@ impl Traffic {
 }
 
 /// Frames of the peer that show that it lives: in each of its packets is one of them.
-pub(crate) fn frames_came(stats: &quinn_proto::ConnectionStats) -> u64 {
+pub(in crate::engine::links) fn frames_came(stats: &quinn_proto::ConnectionStats) -> u64 {
     let came = stats.frame_rx;
     let data = came.stream + came.datagram + came.crypto + came.reset_stream + came.stop_sending;
     let limits =
@@ -94,7 +99,7 @@ pub(crate) fn frames_came(stats: &quinn_proto::ConnectionStats) -> u64 {
 
 /// What to do for a silent link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Step {
+pub(in crate::engine::links) enum Step {
     /// Send a probe.
     Probe,
     /// Dial a successor: the path works.
@@ -104,7 +109,7 @@ pub(crate) enum Step {
 /// Decides when a silent link is probed and when it is replaced. A state machine as `docs/architecture.md`
 /// describes them; `now` is the time since the link was found silent.
 #[derive(Debug)]
-pub(crate) struct Prober {
+pub(in crate::engine::links) struct Prober {
     side: Side,
     next: Step,
     due: Duration,

@@ -1,35 +1,41 @@
 //! Memory of sessions that ended soon after this daemon's start, while readers of theirs may not have come back yet.
 //!
 //! When a daemon is killed, a session may open a segment that no daemon passes on. The session tells the next daemon,
-//! and may end before its readers have come back and met it there. The registry keeps such a session's segments until
-//! [`Registry::drop_left_memory`], and hands them to a reader that asks.
+//! and may end before its readers have come back and met it there. A new daemon keeps such a session's segments for a
+//! while, and hands them to readers that ask.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::VecDeque;
 
-use super::{Registry, SessionSegment};
-use crate::{
-    ids::SessionId,
-    wire::session::{Message, SegmentOpened},
-};
+use super::memory::{OwnMemory, SessionSegment};
+use crate::ids::SessionId;
 
 /// The segments of sessions that ended.
 #[derive(Debug)]
 pub(super) struct LeftMemory<F> {
-    /// How many segments are kept at most, as many descriptors of the daemon's: none later.
+    /// How many segments are kept at most, as many descriptors of the daemon's.
     most: usize,
     /// In the order in which the sessions ended.
-    sessions: VecDeque<(SessionId, BTreeMap<u32, SessionSegment<F>>)>,
+    sessions: VecDeque<(SessionId, OwnMemory<F>)>,
 }
 
 impl<F> Default for LeftMemory<F> {
     fn default() -> Self {
-        Self { most: 0, sessions: VecDeque::new() }
+        Self::new(0)
     }
 }
 
-impl<F: Clone> LeftMemory<F> {
+impl<F> LeftMemory<F> {
+    /// Keeps `most` segments.
+    pub(super) fn new(most: usize) -> Self {
+        Self { most, sessions: VecDeque::new() }
+    }
+
+    pub(super) fn is_kept(&self) -> bool {
+        self.most > 0
+    }
+
     /// A session ended.
-    pub(super) fn keep(&mut self, id: SessionId, segments: BTreeMap<u32, SessionSegment<F>>) {
+    pub(super) fn keep(&mut self, id: SessionId, segments: OwnMemory<F>) {
         if segments.is_empty() || segments.len() > self.most {
             return;
         }
@@ -45,44 +51,19 @@ impl<F: Clone> LeftMemory<F> {
         self.sessions.retain(|(left, _)| left != id);
     }
 
-    fn segment(&self, of: &SessionId, number: u32) -> Option<SessionSegment<F>> {
+    pub(super) fn segment(&self, of: &SessionId, number: u32) -> Option<&SessionSegment<F>> {
         let (_, segments) = self.sessions.iter().find(|(id, _)| id == of)?;
-        segments.get(&number).cloned()
-    }
-}
-
-impl<F: Clone> Registry<F> {
-    /// From now on keeps segments of sessions that end, `most` at a time, for readers that come back from an earlier
-    /// daemon.
-    pub fn keep_left_memory(&mut self, most: usize) {
-        self.left.most = most;
-    }
-
-    /// Readers of an earlier daemon have come back by now: gives up what sessions left.
-    pub fn drop_left_memory(&mut self) {
-        self.left = LeftMemory::default();
-    }
-
-    /// A session that this daemon has not introduced to `of` misses a segment of that session: it knows it from an
-    /// earlier daemon.
-    pub(super) fn hand_left(&mut self, id: &SessionId, of: &SessionId, number: u32) {
-        if self.left.most == 0 {
-            return;
-        }
-        let there = self.sessions.get(of).and_then(|entry| entry.segments.get(&number).cloned());
-        if let Some(SessionSegment { segment, descriptor }) =
-            there.or_else(|| self.left.segment(of, number))
-        {
-            let opened = SegmentOpened { session: *of, segment };
-            self.push(id, &Message::Segment(opened), vec![descriptor]);
-        }
+        segments.get(number)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::wire::session::{Segment, SegmentName, SessionRole};
+    use crate::{
+        registry::Registry,
+        wire::session::{Message, Segment, SegmentName, SegmentOpened, SessionRole},
+    };
 
     const MOST: usize = 4;
     const WRITER: u8 = 1;
@@ -142,7 +123,7 @@ mod tests {
         need(&mut registry, 1);
         need(&mut registry, 2);
         assert_eq!(taken(&mut registry), [1], "its session has ended");
-        registry.drop_left_memory();
+        registry.keep_left_memory(0);
         need(&mut registry, 1);
         assert_eq!(taken(&mut registry), [0; 0]);
     }
@@ -150,7 +131,7 @@ mod tests {
     #[test]
     fn later_a_session_leaves_nothing_and_shows_nobody_its_memory() {
         let mut registry = registry();
-        registry.drop_left_memory();
+        registry.keep_left_memory(0);
         open(&mut registry, WRITER, 1);
         need(&mut registry, 1);
         registry.handle_disconnect(&id(WRITER));

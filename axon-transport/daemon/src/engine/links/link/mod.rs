@@ -1,19 +1,20 @@
 //! One link: a connection with the state that it has as a link.
 
+pub(super) mod age;
+pub(super) mod hand_over;
+
 use std::{rc::Rc, sync::Arc, time::Duration};
 
 use axon_tls::Negotiated;
+use axon_transport::status::LinkStatus;
 use rustls_pki_types::CertificateDer;
 
+use self::{age::Age, hand_over::Leaving};
 use crate::{
     engine::{
         account::{Account, Charge},
         link::opening::{Opening, Sealing},
-        links::{
-            admission::Place,
-            silence::{Prober, Traffic},
-            who::Who,
-        },
+        links::{admission::Place, silence::Silence, who::Who},
     },
     keys::Resolver,
     link::{Candidate, Elected, Hello, Order, Side},
@@ -31,21 +32,6 @@ pub(super) enum Phase {
     Open,
     /// A successor took over: it delivers what is under way.
     Leaving(Leaving),
-}
-
-/// A link that a successor took over from.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Leaving {
-    /// When it ends at the latest, in qkd.
-    pub(super) until: Option<Duration>,
-    /// The peer sends over the successor.
-    pub(super) succeeded: bool,
-    /// The peer's control stream ended.
-    pub(super) ended: bool,
-    /// The peer said that it closed the link.
-    pub(super) closed: bool,
-    /// When the peer's patience with this side's streams is looked at again.
-    pub(super) wait: Option<Duration>,
 }
 
 /// A link.
@@ -73,6 +59,23 @@ pub(crate) struct Summary {
     pub(crate) who: Who,
 }
 
+impl Summary {
+    /// The status of a link, as far as its beginning says it.
+    pub(super) fn status(&self, since_unix_ms: u64) -> LinkStatus {
+        LinkStatus {
+            peer: self.hello.daemon.to_string(),
+            host: self.who.host_name(&self.hello.host),
+            sae: self.hello.sae.clone(),
+            state: "connected".into(),
+            key_exchange: self.negotiated.key_exchange.to_string(),
+            cipher: self.negotiated.cipher.name().into(),
+            authenticated_as: self.who.to_string(),
+            since_unix_ms,
+            ..LinkStatus::default()
+        }
+    }
+}
+
 /// The peer of a link.
 pub(super) struct LinkPeer {
     pub(super) summary: Summary,
@@ -83,9 +86,7 @@ pub(super) struct LinkPeer {
     /// Whether messages are sealed one by one.
     pub(super) seals: bool,
     pub(super) elected: Option<Elected>,
-    /// In qkd: when a successor is dialled, and when the link ends.
-    pub(super) renew_at: Option<Duration>,
-    pub(super) until: Option<Duration>,
+    pub(super) age: Age,
     pub(super) since_unix_ms: u64,
     pub(super) account: Rc<Account>,
     /// Unread stream data that the peer may send.
@@ -93,39 +94,6 @@ pub(super) struct LinkPeer {
     /// The certificates that it showed.
     pub(super) chain: Vec<CertificateDer<'static>>,
     pub(super) silence: Silence,
-}
-
-/// Whether the peer answers.
-pub(super) struct Silence {
-    /// What came and went at the last look.
-    pub(super) traffic: Traffic,
-    /// What had gone when the last datagram came.
-    pub(super) heard: Traffic,
-    /// Probes of the path, while the link is silent.
-    pub(super) probing: Option<Probing>,
-    /// A successor was dialled since it is silent, and nothing was acknowledged since.
-    pub(super) silent: bool,
-    /// When the last datagram came.
-    pub(super) heard_at: Duration,
-    /// What had come and gone when the peer was taken for gone, while it is.
-    pub(super) gone: Option<Traffic>,
-}
-
-/// Probes of the path of a silent link.
-pub(super) struct Probing {
-    pub(super) prober: Prober,
-    pub(super) nonce: [u8; 8],
-    /// When the probing began.
-    pub(super) begun: Duration,
-    /// The traffic before.
-    pub(super) traffic: Traffic,
-}
-
-impl Silence {
-    pub(super) fn new(now: Duration) -> Self {
-        let (traffic, heard) = (Traffic::default(), Traffic::default());
-        Self { traffic, heard, probing: None, silent: false, heard_at: now, gone: None }
-    }
 }
 
 impl Link {
@@ -148,14 +116,12 @@ impl Link {
             Phase::Opening(opening) => opening.poll_timeout(),
             Phase::Electing(until) => Some(*until),
             Phase::Open => None,
-            Phase::Leaving(leaving) => [leaving.until, leaving.wait].into_iter().flatten().min(),
+            Phase::Leaving(leaving) => leaving.poll_timeout(),
         };
         let peer = self.peer.as_ref();
-        let ends = peer.into_iter().filter(|_| matches!(self.phase, Phase::Open));
-        let ends = ends.flat_map(|peer| [peer.renew_at, peer.until]).flatten().min();
-        let probing = peer.and_then(|peer| peer.silence.probing.as_ref());
-        let probe = probing.and_then(|p| Some(p.begun + p.prober.poll_timeout()?));
-        [phase, ends, probe].into_iter().flatten().min()
+        let age = peer.filter(|_| self.is_open()).and_then(|peer| peer.age.poll_timeout());
+        let probe = peer.and_then(|peer| peer.silence.poll_timeout());
+        [phase, age, probe].into_iter().flatten().min()
     }
 
     /// Whether data may come over it: it is, or was, elected.

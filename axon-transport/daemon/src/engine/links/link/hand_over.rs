@@ -1,0 +1,161 @@
+//! How far a link is whose successor took over.
+
+use std::time::Duration;
+
+/// The peer is waited for so long at a time.
+const HAND_OVER: Duration = Duration::from_secs(5);
+
+/// How far a link is whose successor took over.
+///
+/// It closes once all has arrived in both directions: this side's streams are sent, and the peer, which sends over the
+/// successor, has ended its control stream or had patience with this side for long enough. If it is silent, or the peer
+/// closed it, nothing more arrives.
+#[derive(Clone, Copy, Debug)]
+pub(in crate::engine::links) struct Leaving {
+    /// When it ends at the latest, in qkd.
+    until: Option<Duration>,
+    /// The peer sends over the successor.
+    succeeded: bool,
+    /// The peer's control stream ended.
+    ended: bool,
+    /// The peer said that it closed the link.
+    closed: bool,
+    /// When the peer's patience with this side's streams is looked at again.
+    wait: Option<Duration>,
+}
+
+/// What goes over a superseded link.
+#[derive(Clone, Copy, Debug)]
+pub(in crate::engine::links) struct UnderWay {
+    /// The peer does not answer over it.
+    pub(in crate::engine::links) silent: bool,
+    /// Whether all of this side's streams but the control stream are sent.
+    pub(in crate::engine::links) sent: bool,
+    /// The peer's streams that are being read.
+    pub(in crate::engine::links) reading: usize,
+}
+
+/// What to do with a superseded link.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(in crate::engine::links) enum Step {
+    Wait,
+    /// End this side's control stream.
+    Finish,
+    /// All has arrived.
+    Close,
+}
+
+impl Leaving {
+    /// A successor took over. The link's keys may be used `until` a time.
+    pub(in crate::engine::links) fn new(
+        until: Option<Duration>,
+        succeeded: bool,
+        now: Duration,
+    ) -> Self {
+        let until = until.map(|until| until.max(now + HAND_OVER));
+        Self { until, succeeded, ended: false, closed: false, wait: None }
+    }
+
+    pub(in crate::engine::links) fn poll_timeout(&self) -> Option<Duration> {
+        [self.until, self.wait].into_iter().flatten().min()
+    }
+
+    pub(in crate::engine::links) fn is_over(&self, now: Duration) -> bool {
+        self.until.is_some_and(|until| until <= now)
+    }
+
+    /// The peer sends over the successor.
+    pub(in crate::engine::links) fn handle_succeeded(&mut self) {
+        self.succeeded = true;
+    }
+
+    /// The peer says that it closed the link, whose packets do not arrive.
+    pub(in crate::engine::links) fn handle_closed(&mut self) {
+        self.closed = true;
+    }
+
+    /// The peer's control stream ended.
+    pub(in crate::engine::links) fn handle_ended(&mut self) {
+        self.ended = true;
+    }
+
+    pub(in crate::engine::links) fn handle_progress(
+        &mut self,
+        under_way: UnderWay,
+        now: Duration,
+    ) -> Step {
+        let UnderWay { silent, sent, reading } = under_way;
+        if self.closed || (silent && self.succeeded) {
+            return Step::Close;
+        }
+        if silent || !self.succeeded || !(sent || self.wait.is_some()) {
+            return Step::Wait;
+        }
+        let wait = *self.wait.get_or_insert(now + HAND_OVER);
+        if reading == 0 && (self.ended || now >= wait) {
+            return Step::Close;
+        }
+        if now >= wait {
+            self.wait = Some(now + HAND_OVER);
+        }
+        Step::Finish
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const NOW: Duration = Duration::from_secs(1000);
+    const BUSY: UnderWay = UnderWay { silent: false, sent: false, reading: 1 };
+    const SENT: UnderWay = UnderWay { sent: true, ..BUSY };
+    const READ: UnderWay = UnderWay { reading: 0, ..SENT };
+    const SILENT: UnderWay = UnderWay { silent: true, ..BUSY };
+
+    #[test]
+    fn it_closes_when_both_sides_have_sent_and_read_everything() {
+        let mut leaving = Leaving::new(None, false, NOW);
+        assert_eq!(leaving.handle_progress(READ, NOW), Step::Wait, "the peer sends over it still");
+        leaving.handle_succeeded();
+        assert_eq!(leaving.handle_progress(BUSY, NOW), Step::Wait);
+        assert_eq!(leaving.handle_progress(SENT, NOW), Step::Finish);
+        assert_eq!(leaving.handle_progress(READ, NOW), Step::Finish, "the peer's streams go on");
+        leaving.handle_ended();
+        assert_eq!(leaving.handle_progress(SENT, NOW), Step::Finish);
+        assert_eq!(leaving.handle_progress(READ, NOW), Step::Close);
+    }
+
+    #[test]
+    fn a_peer_that_ends_no_control_stream_is_waited_for_some_seconds_at_a_time() {
+        let mut leaving = Leaving::new(None, true, NOW);
+        assert_eq!(leaving.handle_progress(SENT, NOW), Step::Finish);
+        assert_eq!(leaving.poll_timeout(), Some(NOW + HAND_OVER));
+        // A stream is being read when the time is over: as long again.
+        let later = NOW + HAND_OVER;
+        assert_eq!(leaving.handle_progress(SENT, later), Step::Finish);
+        assert_eq!(leaving.poll_timeout(), Some(later + HAND_OVER));
+        assert_eq!(leaving.handle_progress(READ, later), Step::Finish);
+        assert_eq!(leaving.handle_progress(READ, later + HAND_OVER), Step::Close);
+    }
+
+    #[test]
+    fn a_silent_link_closes_once_the_peer_sends_over_the_successor() {
+        let mut leaving = Leaving::new(None, false, NOW);
+        assert_eq!(leaving.handle_progress(SILENT, NOW), Step::Wait);
+        leaving.handle_succeeded();
+        assert_eq!(leaving.handle_progress(SILENT, NOW), Step::Close);
+        let mut closed = Leaving::new(None, false, NOW);
+        closed.handle_closed();
+        assert_eq!(closed.handle_progress(BUSY, NOW), Step::Close, "the peer said so");
+    }
+
+    #[test]
+    fn a_link_whose_keys_age_has_time_for_a_hand_over_and_no_more() {
+        let late = Leaving::new(Some(NOW), true, NOW);
+        assert!(!late.is_over(NOW) && late.is_over(NOW + HAND_OVER));
+        let until = NOW + 2 * HAND_OVER;
+        let early = Leaving::new(Some(until), true, NOW);
+        assert_eq!(early.poll_timeout(), Some(until));
+        assert!(!Leaving::new(None, true, NOW).is_over(Duration::MAX));
+    }
+}

@@ -1,0 +1,247 @@
+//! Whether the peer of one link answers.
+
+use std::time::Duration;
+
+use super::prober::{Prober, Step, Traffic};
+use crate::link::Side;
+
+/// A link over which nothing came for so long is probed, even if nothing was asked: two of QUIC's keep-alives are lost.
+const UNHEARD: Duration = Duration::from_secs(10);
+/// A peer that is silent for so long is taken for gone. Its link stands until QUIC gives it up.
+const GONE: Duration = Duration::from_secs(20);
+
+/// Whether a peer answers over its link. A state machine as `docs/architecture.md` describes them.
+///
+/// A link is *unheard* while nothing comes, *probed* once something was asked and nothing came for a second, *silent*
+/// once a successor was dialled, and its peer is *gone* after a longer time. An acknowledgement ends all of that.
+#[derive(Debug)]
+pub(in crate::engine::links) struct Silence {
+    side: Side,
+    /// What came and went at the last look.
+    traffic: Traffic,
+    /// What had gone when the last datagram came.
+    heard: Traffic,
+    /// When the last datagram came.
+    heard_at: Duration,
+    /// Probes of the path, while the link is silent.
+    probing: Option<Probing>,
+    /// A successor was dialled since it is silent, and nothing was acknowledged since.
+    silent: bool,
+    /// What had come and gone when the peer was taken for gone, while it is.
+    gone: Option<Traffic>,
+}
+
+/// Probes of the path of a silent link.
+#[derive(Debug)]
+struct Probing {
+    prober: Prober,
+    nonce: Nonce,
+    /// When the probing began.
+    begun: Duration,
+    /// The traffic before.
+    traffic: Traffic,
+}
+
+/// What a probe says and its echo repeats.
+pub(in crate::engine::links) type Nonce = [u8; 8];
+
+/// What a look at a link found.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Look {
+    /// The peer is taken for gone from now on.
+    pub(super) gone: bool,
+    /// The link's path is probed from now on.
+    pub(super) probed: bool,
+}
+
+/// What to do for a link that is probed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Action {
+    /// Send a probe.
+    Probe(Nonce),
+    /// The peer answers: no echo of this is waited for.
+    Answered(Nonce),
+    /// Dial a successor.
+    Replace,
+}
+
+impl Silence {
+    pub(in crate::engine::links) fn new(side: Side, now: Duration) -> Self {
+        let (traffic, heard) = (Traffic::default(), Traffic::default());
+        Self { side, traffic, heard, heard_at: now, probing: None, silent: false, gone: None }
+    }
+
+    /// Whether the peer is taken for gone.
+    pub(in crate::engine::links) fn is_gone(&self) -> bool {
+        self.gone.is_some()
+    }
+
+    /// Whether a successor was dialled since nothing is acknowledged.
+    pub(in crate::engine::links) fn is_silent(&self) -> bool {
+        self.silent
+    }
+
+    /// Notes what had gone over the link when a datagram came. What is sent later has no answer yet. QUIC does not
+    /// always send it again: its probes may ask for an acknowledgement alone. Returns whether a peer that was gone is
+    /// back.
+    pub(super) fn handle_heard(&mut self, traffic: Traffic, now: Duration) -> bool {
+        if !traffic.has_come_since(self.heard) {
+            return false;
+        }
+        (self.heard, self.heard_at) = (traffic, now);
+        // What comes over a path that works one way alone brings no peer back.
+        self.gone.take_if(|gone| traffic.answered_since(*gone)).is_some()
+    }
+
+    /// Looks once a second at what came and went. Probes begin if something went out and nothing came since the last
+    /// look; they say what `nonce` returns.
+    pub(super) fn handle_second(
+        &mut self,
+        traffic: Traffic,
+        nonce: impl FnOnce() -> Nonce,
+        now: Duration,
+    ) -> Look {
+        let before = std::mem::replace(&mut self.traffic, traffic);
+        // It is no longer silent: what is under way arrives.
+        self.silent &= !traffic.answered_since(before);
+        let unheard = now.saturating_sub(self.heard_at);
+        let gone = unheard >= GONE && self.gone.is_none();
+        if gone {
+            self.gone = Some(traffic);
+        }
+        let silent = traffic.is_silent(before, self.heard) || unheard >= UNHEARD;
+        let probed = silent && self.probing.is_none();
+        if probed {
+            let (prober, nonce) = (Prober::new(self.side), nonce());
+            self.probing = Some(Probing { prober, nonce, begun: now, traffic });
+        }
+        Look { gone, probed }
+    }
+
+    /// A probe was answered.
+    pub(super) fn handle_echo(&mut self, now: Duration) {
+        if let Some(probing) = &mut self.probing
+            && probing.prober.awaits_echo()
+        {
+            probing.prober.handle_echo(now.saturating_sub(probing.begun));
+        }
+    }
+
+    /// A successor took over the link. Returns whether the link is silent.
+    pub(in crate::engine::links) fn handle_superseded(&mut self, traffic: Traffic) -> bool {
+        self.silent &= !traffic.answered_since(self.traffic);
+        self.probing = None;
+        self.silent
+    }
+
+    pub(in crate::engine::links) fn poll_timeout(&self) -> Option<Duration> {
+        let probing = self.probing.as_ref()?;
+        Some(probing.begun + probing.prober.poll_timeout()?)
+    }
+
+    pub(super) fn handle_timeout(&mut self, traffic: Traffic, now: Duration) -> Option<Action> {
+        let probing = self.probing.as_mut()?;
+        if traffic.answered_since(probing.traffic) {
+            let nonce = probing.nonce;
+            self.probing = None;
+            return Some(Action::Answered(nonce));
+        }
+        match probing.prober.handle_timeout(now.saturating_sub(probing.begun))? {
+            Step::Probe => Some(Action::Probe(probing.nonce)),
+            Step::Replace => {
+                self.silent = true;
+                Some(Action::Replace)
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const START: Duration = Duration::from_secs(1000);
+    const NONCE: Nonce = [7; 8];
+
+    fn second(number: u64) -> Duration {
+        START + Duration::from_secs(number)
+    }
+
+    /// What had come, been acknowledged and been asked.
+    fn traffic(came: u64, acknowledged: u64, asked: u64) -> Traffic {
+        Traffic::of(came, acknowledged, asked)
+    }
+
+    #[test]
+    fn a_link_that_is_asked_nothing_is_not_silent() {
+        let mut silence = Silence::new(Side::Client, START);
+        assert!(!silence.handle_heard(traffic(1, 1, 1), START));
+        for number in 1..10 {
+            assert_eq!(
+                silence.handle_second(traffic(1, 1, 1), || NONCE, second(number)),
+                Look::default()
+            );
+        }
+        assert_eq!(silence.poll_timeout(), None);
+        let look = silence.handle_second(traffic(1, 1, 1), || NONCE, second(10));
+        assert_eq!(look, Look { gone: false, probed: true }, "keep-alives are lost");
+    }
+
+    #[test]
+    fn a_question_without_an_answer_is_probed_and_an_echo_brings_a_successor() {
+        let mut silence = Silence::new(Side::Client, START);
+        silence.handle_heard(traffic(1, 1, 1), START);
+        silence.handle_second(traffic(1, 1, 1), || NONCE, second(1));
+        let look = silence.handle_second(traffic(1, 1, 2), || NONCE, second(2));
+        assert_eq!(look, Look { gone: false, probed: true });
+        assert_eq!(silence.handle_second(traffic(1, 1, 2), || [9; 8], second(3)), Look::default());
+        let asked = traffic(1, 1, 2);
+        assert_eq!(silence.handle_timeout(asked, second(3)), Some(Action::Probe(NONCE)));
+        silence.handle_echo(second(3));
+        let due = silence.poll_timeout().unwrap();
+        assert_eq!(silence.handle_timeout(asked, due), Some(Action::Replace));
+        assert!(silence.is_silent());
+        // An acknowledgement ends it.
+        let answered = traffic(2, 2, 2);
+        assert_eq!(silence.handle_timeout(answered, due), Some(Action::Answered(NONCE)));
+        assert_eq!((silence.poll_timeout(), silence.handle_timeout(answered, due)), (None, None));
+        silence.handle_second(answered, || NONCE, second(5));
+        assert!(!silence.is_silent());
+    }
+
+    #[test]
+    fn an_echo_of_no_probe_changes_nothing() {
+        let mut silence = Silence::new(Side::Server, START);
+        silence.handle_echo(START);
+        silence.handle_second(traffic(0, 0, 1), || NONCE, second(1));
+        let due = silence.poll_timeout();
+        silence.handle_echo(second(1));
+        assert_eq!(silence.poll_timeout(), due);
+    }
+
+    #[test]
+    fn a_peer_is_gone_after_a_time_and_back_with_an_acknowledgement() {
+        let mut silence = Silence::new(Side::Client, START);
+        let before = (1..20).map(|n| silence.handle_second(traffic(0, 0, 1), || NONCE, second(n)));
+        assert!(before.collect::<Vec<_>>().iter().all(|look| !look.gone));
+        assert!(silence.handle_second(traffic(0, 0, 1), || NONCE, second(20)).gone);
+        assert!(!silence.handle_second(traffic(0, 0, 1), || NONCE, second(21)).gone, "once");
+        assert!(!silence.handle_heard(traffic(1, 0, 1), second(22)), "the path works one way");
+        assert!(silence.is_gone());
+        assert!(silence.handle_heard(traffic(2, 1, 1), second(23)));
+        assert!(!silence.is_gone());
+    }
+
+    #[test]
+    fn a_superseded_link_is_probed_no_more() {
+        let mut silence = Silence::new(Side::Client, START);
+        silence.handle_second(traffic(0, 0, 1), || NONCE, second(1));
+        silence.handle_timeout(traffic(0, 0, 1), second(1));
+        silence.handle_echo(second(1));
+        let due = silence.poll_timeout().unwrap();
+        assert_eq!(silence.handle_timeout(traffic(0, 0, 1), due), Some(Action::Replace));
+        assert!(silence.handle_superseded(traffic(0, 0, 1)));
+        assert_eq!(silence.poll_timeout(), None);
+        assert!(!silence.handle_superseded(traffic(1, 1, 1)), "it answers after all");
+    }
+}

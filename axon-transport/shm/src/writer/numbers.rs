@@ -1,0 +1,103 @@
+//! The numbers of a publisher's samples.
+
+use crate::{error::PublishError, ring::types::Meta};
+
+/// Samples that a publisher elsewhere may be ahead of the last one of its here: more than an hour of
+/// outage at a million samples a second.
+pub const MAX_GAP: u64 = 1 << 32;
+/// Samples that it may have published before the first one that comes here.
+const MAX_FIRST: u64 = 1 << 48;
+
+/// How samples are numbered.
+#[derive(Clone, Copy)]
+pub(crate) enum Numbering {
+    /// As given.
+    Given(Meta),
+    /// One up from the last, with this source timestamp.
+    Next(i64),
+}
+
+/// The last sample's number, and how many there were.
+#[derive(Debug, Default)]
+pub(crate) struct Numbers {
+    /// The last sample's sequence number.
+    last: u64,
+    /// Samples published, read or not.
+    published: u64,
+}
+
+impl Numbers {
+    /// The last sample's sequence number.
+    pub(super) fn last(&self) -> u64 {
+        self.last
+    }
+
+    /// Refuses a number from outside that would make readers count losses that cannot be.
+    pub(super) fn judge(&self, numbering: Numbering) -> Result<(), PublishError> {
+        let Numbering::Given(Meta { sequence, .. }) = numbering else { return Ok(()) };
+        let last = self.last;
+        let most = if last == 0 { MAX_FIRST } else { last.saturating_add(MAX_GAP) };
+        if sequence > most { Err(PublishError::Sequence { sequence, last }) } else { Ok(()) }
+    }
+
+    /// Numbers a sample.
+    #[inline]
+    pub(super) fn number(&mut self, numbering: Numbering) -> Meta {
+        let meta = match numbering {
+            Numbering::Given(meta) => meta,
+            Numbering::Next(source_timestamp) => {
+                Meta { sequence: self.last.saturating_add(1), source_timestamp, published: 0 }
+            }
+        };
+        self.last = meta.sequence;
+        meta
+    }
+
+    /// Counts a sample that is published now, read or not. Returns how many there were.
+    #[inline]
+    pub(super) fn count(&mut self) -> u64 {
+        self.published += 1;
+        self.published
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn given(sequence: u64) -> Numbering {
+        Numbering::Given(Meta { sequence, source_timestamp: 7, published: 8 })
+    }
+
+    #[test]
+    fn samples_are_numbered_from_one_or_as_given() {
+        let mut numbers = Numbers::default();
+        assert_eq!(numbers.number(Numbering::Next(5)).sequence, 1);
+        let meta = numbers.number(given(40));
+        assert_eq!((meta.sequence, meta.source_timestamp, meta.published), (40, 7, 8));
+        assert_eq!(numbers.number(Numbering::Next(5)).sequence, 41);
+        assert_eq!(numbers.last(), 41);
+        assert_eq!(
+            (numbers.count(), numbers.count()),
+            (1, 2),
+            "not what is numbered, but published"
+        );
+    }
+
+    #[test]
+    fn a_number_that_no_publisher_can_have_reached_is_refused() {
+        let mut numbers = Numbers::default();
+        assert!(numbers.judge(given(MAX_FIRST)).is_ok());
+        assert!(numbers.judge(given(MAX_FIRST + 1)).is_err());
+        numbers.number(given(10));
+        assert!(numbers.judge(given(10 + MAX_GAP)).is_ok());
+        assert!(matches!(
+            numbers.judge(given(11 + MAX_GAP)),
+            Err(PublishError::Sequence { last: 10, .. })
+        ));
+        numbers.number(given(u64::MAX));
+        assert!(numbers.judge(given(u64::MAX)).is_ok());
+        assert!(numbers.judge(Numbering::Next(0)).is_ok());
+        assert_eq!(numbers.number(Numbering::Next(0)).sequence, u64::MAX);
+    }
+}

@@ -1,0 +1,63 @@
+//! What a publisher's lock protects.
+
+use super::{
+    history::History, numbers::Numbers, reader_set::ReaderSet, room::Maps, samples::Samples,
+};
+use crate::{alloc::heap::Object, ring::protocol, session::pin_lanes::Pinned};
+
+/// The samples that stand, their readers and their memory.
+pub(crate) struct WriterState {
+    pub(crate) history: History,
+    pub(crate) reader_set: ReaderSet,
+    /// The descriptors.
+    pub(super) array: Object,
+    /// The segments that blocks are in.
+    pub(super) maps: Maps,
+    /// Where the next samples go that readers pin, once there has been one.
+    pub(super) samples: Option<Samples>,
+    /// The tail as readers see it.
+    pub(super) shown_tail: u64,
+    /// What was found pinned, kept for its memory.
+    pub(super) pinned: Pinned,
+    pub(super) numbers: Numbers,
+    /// Of the samples that relays gave up: those of which a wait said so.
+    pub(super) known_given_up: u64,
+}
+
+impl WriterState {
+    pub(super) fn new(reader_set: ReaderSet, history: History, array: Object) -> Self {
+        Self {
+            history,
+            reader_set,
+            array,
+            maps: Maps::default(),
+            samples: None,
+            shown_tail: 0,
+            pinned: Pinned::default(),
+            numbers: Numbers::default(),
+            known_given_up: 0,
+        }
+    }
+
+    /// The first position that stands whose sample has a higher number.
+    pub(super) fn position_after(&self, number: u64) -> u64 {
+        let standing = self.history.tail()..self.history.head();
+        let later = |position: &u64| protocol::number(self.array.words(), *position) > number;
+        standing.rev().take_while(later).last().unwrap_or(self.history.head())
+    }
+
+    /// Below this position every reader has taken what it wanted, and nobody asks for it again.
+    pub(super) fn consumed(&self) -> u64 {
+        self.reader_set.consumed(self.history.head())
+    }
+
+    /// The number of the last sample in front of a position.
+    pub(super) fn number_before(&self, position: u64) -> u64 {
+        let stands = position >= self.history.tail() && position < self.history.head();
+        if stands {
+            protocol::number(self.array.words(), position).saturating_sub(1)
+        } else {
+            self.numbers.last()
+        }
+    }
+}

@@ -1,0 +1,470 @@
+//! The sessions, the packets that wait for each, and the memory of others that each holds.
+//!
+//! A session that reads from another session receives its segments with objects, and the segments with samples of
+//! the publishers that it reads from. It receives existing segments with the message that introduces the two
+//! sessions, and later segments when they are opened. If a segment is missing nevertheless, the session asks for it.
+
+mod left;
+mod memory;
+mod outbox;
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    sync::Arc,
+};
+
+pub(super) use self::outbox::Due;
+use self::{
+    left::LeftMemory,
+    memory::{HeldMemory, NotTaken},
+    outbox::{Outbox, Pushed},
+};
+pub use self::{
+    memory::{OwnMemory, SessionSegment},
+    outbox::Output,
+};
+use super::{MAX_SESSIONS, RelayCounters, Violation};
+use crate::{
+    config::DiscoveryRange,
+    graph::{EndpointRange, RangeToHost, Scope},
+    ids::{DaemonId, Gid, SessionId},
+    wire::session::{
+        MAX_DESCRIPTORS, Message, Pair, Refused, Segment, SegmentName, SegmentOpened, SessionRole,
+    },
+};
+
+/// A session as the registry knows it.
+#[derive(Debug)]
+pub struct SessionEntry<F> {
+    /// What kind it is.
+    pub role: SessionRole,
+    /// Its process's name.
+    pub name: String,
+    /// Its process.
+    pub pid: u32,
+    /// How far it is discovered; `None` of the gateway, and of all in a registry within a process.
+    pub scope: Option<Scope>,
+    /// Daemons of the linked peers that it lists.
+    pub lists: BTreeSet<DaemonId>,
+    /// Its endpoints.
+    pub endpoints: BTreeSet<Gid>,
+    /// Segment, doorbell and pidfd; a tool has none, nor has a session that nobody can meet.
+    pub descriptors: Option<[F; 3]>,
+    /// The segments of its memory besides the first.
+    pub segments: OwnMemory<F>,
+    /// What is shown of its relay, where it is relayed. Pairs within it are its own process's.
+    pub relay: Option<Arc<RelayCounters>>,
+    /// What waits for it.
+    pub(super) outbox: Outbox<F>,
+    /// The memory of other sessions whose descriptors it holds.
+    pub(super) held: HeldMemory,
+    /// An endpoint of its was refused.
+    refused: bool,
+}
+
+impl<F> SessionEntry<F> {
+    pub(super) fn new(
+        role: SessionRole,
+        name: String,
+        pid: u32,
+        descriptors: Option<[F; 3]>,
+        scope: Option<Scope>,
+    ) -> Self {
+        Self {
+            role,
+            name,
+            pid,
+            scope,
+            lists: BTreeSet::new(),
+            endpoints: BTreeSet::new(),
+            descriptors,
+            segments: OwnMemory::default(),
+            relay: None,
+            // There is no graph that a tool could be behind with.
+            outbox: Outbox::new(role != SessionRole::Tool),
+            held: HeldMemory::default(),
+            refused: false,
+        }
+    }
+
+    /// Packets that wait for it.
+    pub fn queued(&self) -> usize {
+        self.outbox.len()
+    }
+
+    /// Its range, and the daemons of linked peers that it lists; `None` where ranges do not apply.
+    pub(super) fn reach(&self) -> Option<EndpointRange> {
+        let scope = self.scope.as_ref()?;
+        Some(EndpointRange { range: scope.range, lists: self.lists.iter().copied().collect() })
+    }
+
+    pub(super) fn toward(&self, peer: &DaemonId) -> Option<RangeToHost> {
+        let scope = self.scope.as_ref()?;
+        Some(RangeToHost { range: scope.range, lists: self.lists.contains(peer) })
+    }
+
+    pub(super) fn is_off(&self) -> bool {
+        self.scope.as_ref().is_some_and(|scope| scope.range == DiscoveryRange::Off)
+    }
+}
+
+/// All sessions.
+#[derive(Debug)]
+pub(super) struct Sessions<F> {
+    entries: BTreeMap<SessionId, SessionEntry<F>>,
+    /// Those that got something to be told.
+    ready: BTreeSet<SessionId>,
+    /// The first endpoint of each session that was refused, and why.
+    refused: Vec<(SessionId, String)>,
+    /// Memory of those that ended.
+    left: LeftMemory<F>,
+}
+
+impl<F> Default for Sessions<F> {
+    fn default() -> Self {
+        Self {
+            entries: BTreeMap::new(),
+            ready: BTreeSet::new(),
+            refused: Vec::new(),
+            left: LeftMemory::default(),
+        }
+    }
+}
+
+impl<F> Sessions<F> {
+    pub(super) fn iter(&self) -> impl Iterator<Item = (&SessionId, &SessionEntry<F>)> {
+        self.entries.iter()
+    }
+
+    pub(super) fn get(&self, id: &SessionId) -> Option<&SessionEntry<F>> {
+        self.entries.get(id)
+    }
+
+    pub(super) fn get_mut(&mut self, id: &SessionId) -> Option<&mut SessionEntry<F>> {
+        self.entries.get_mut(id)
+    }
+
+    /// A session came. It is told everything.
+    ///
+    /// # Errors
+    /// When there are too many.
+    pub(super) fn insert(
+        &mut self,
+        id: SessionId,
+        entry: SessionEntry<F>,
+    ) -> Result<(), Violation> {
+        if self.entries.len() >= MAX_SESSIONS {
+            return Err(Violation::Sessions);
+        }
+        let tool = entry.role == SessionRole::Tool;
+        self.left.forget(&id);
+        self.entries.insert(id, entry);
+        if !tool {
+            self.fall_behind(&id);
+        }
+        Ok(())
+    }
+
+    pub(super) fn remove(&mut self, id: &SessionId) {
+        if let Some(entry) = self.entries.remove(id) {
+            self.left.keep(*id, entry.segments);
+        }
+        self.ready.remove(id);
+    }
+
+    /// From now on keeps segments of sessions that end, `most` at a time.
+    pub(super) fn keep_left_memory(&mut self, most: usize) {
+        self.left = LeftMemory::new(most);
+    }
+
+    /// Sessions that got something to be told since the last call.
+    pub(super) fn take_ready(&mut self) -> BTreeSet<SessionId> {
+        std::mem::take(&mut self.ready)
+    }
+
+    /// Drops what waits for a session; it is told everything anew.
+    pub(super) fn fall_behind(&mut self, id: &SessionId) {
+        if let Some(entry) = self.entries.get_mut(id) {
+            entry.outbox.fall_behind();
+            self.ready.insert(*id);
+        }
+    }
+
+    /// A session asked to be told everything anew, or is shown another part of the graph now.
+    pub(super) fn request_resync(&mut self, id: &SessionId) {
+        if let Some(entry) = self.entries.get_mut(id) {
+            entry.outbox.request_resync();
+            self.ready.insert(*id);
+        }
+    }
+
+    /// Links changed: `listed` tells which linked peers a list of static peers names. Returns the sessions that list
+    /// other peers now.
+    pub(super) fn relist(
+        &mut self,
+        listed: impl Fn(&[String]) -> BTreeSet<DaemonId>,
+    ) -> Vec<SessionId> {
+        let mut changed = Vec::new();
+        for (id, entry) in &mut self.entries {
+            let Some(scope) = &entry.scope else { continue };
+            let now = if scope.static_peers.is_empty() {
+                BTreeSet::new()
+            } else {
+                listed(&scope.static_peers)
+            };
+            if entry.lists != now {
+                entry.lists = now;
+                changed.push(*id);
+            }
+        }
+        // What they are shown of the graph is another part.
+        changed.iter().for_each(|id| self.request_resync(id));
+        changed
+    }
+
+    /// Keeps the first refusal of a session for the status; it is told all of them.
+    pub(super) fn note_refused(&mut self, id: &SessionId, text: &str) {
+        if let Some(entry) = self.entries.get_mut(id)
+            && !std::mem::replace(&mut entry.refused, true)
+        {
+            self.refused.push((*id, text.to_owned()));
+        }
+    }
+
+    /// The refusals since the last call, the first of each session.
+    pub(super) fn take_refused(&mut self) -> Vec<(SessionId, String)> {
+        std::mem::take(&mut self.refused)
+    }
+
+    /// Queues a message for one session.
+    pub(super) fn push(&mut self, to: &SessionId, message: &Message, descriptors: Vec<F>) {
+        // It is told everything anew.
+        if self.entries.get(to).is_none_or(|entry| entry.outbox.is_behind()) {
+            return;
+        }
+        if let Some(output) = Output::of(message, descriptors) {
+            self.push_output(to, output);
+        }
+    }
+
+    /// Queues a packet for several sessions, which share its memory.
+    pub(super) fn push_encoded(&mut self, to: &[SessionId], packet: &Arc<[u8]>) {
+        for id in to {
+            self.push_output(id, Output::plain(Arc::clone(packet)));
+        }
+    }
+
+    fn push_output(&mut self, to: &SessionId, output: Output<F>) {
+        let Some(entry) = self.entries.get_mut(to) else { return };
+        match entry.outbox.push(output) {
+            Pushed::Queued => {
+                self.ready.insert(*to);
+            }
+            Pushed::Full => self.fall_behind(to),
+            Pushed::Behind => {}
+        }
+    }
+
+    /// The next packet that waits for a session.
+    pub(super) fn pop(&mut self, id: &SessionId) -> Option<Output<F>> {
+        self.entries.get_mut(id)?.outbox.pop()
+    }
+
+    pub(super) fn put_back(&mut self, id: &SessionId, output: Output<F>) {
+        if let Some(entry) = self.entries.get_mut(id) {
+            entry.outbox.put_back(output);
+        }
+    }
+
+    pub(super) fn tell_status(&mut self, id: &SessionId, text: Arc<[u8]>) {
+        if let Some(entry) = self.entries.get_mut(id) {
+            entry.outbox.tell_status(text);
+            self.ready.insert(*id);
+        }
+    }
+
+    pub(super) fn repeat_status(&mut self, id: &SessionId) -> bool {
+        self.entries.get_mut(id).is_some_and(|entry| entry.outbox.repeat_status())
+    }
+}
+
+impl<F: Clone> Sessions<F> {
+    /// A session has one segment more. `owns` tells whether an endpoint is of a session.
+    pub(super) fn open_segment(
+        &mut self,
+        id: &SessionId,
+        segment: Segment,
+        mut descriptors: Vec<F>,
+        owns: impl Fn(&SessionId, &Gid) -> bool,
+    ) -> Result<(), Violation> {
+        let (Some(descriptor), true) = (descriptors.pop(), descriptors.is_empty()) else {
+            return Err(Violation::Descriptors(descriptors.len()));
+        };
+        let Some(entry) = self.entries.get_mut(id) else { return Ok(()) };
+        let number = segment.number;
+        match entry.segments.open(segment, descriptor) {
+            Ok(()) => {}
+            Err(NotTaken::Number) => return Err(Violation::Segments(number)),
+            Err(NotTaken::Full) => {
+                self.refuse_segment(id, &format!("a session has {}", super::MAX_SEGMENTS));
+                return Ok(());
+            }
+        }
+        let reads = |reader: &SessionId, entry: &SessionEntry<F>| {
+            let mut pairs = entry.held.pairs_with(id).filter(|pair| owns(reader, &pair.reader));
+            pairs.any(|pair| segment.publisher.is_none_or(|publisher| publisher == pair.writer))
+        };
+        let readers = self.entries.iter().filter(|(reader, entry)| reads(reader, entry));
+        let readers: Vec<SessionId> = readers.map(|(reader, _)| *reader).collect();
+        for reader in readers {
+            self.hand(&reader, id, number);
+        }
+        Ok(())
+    }
+
+    /// A segment of a session's memory is not taken, since `there_are` as many as may be. The session
+    /// goes on, and is told once until it gives another one up.
+    pub(super) fn refuse_segment(&mut self, id: &SessionId, there_are: &str) {
+        let Some(entry) = self.entries.get_mut(id) else { return };
+        if !entry.segments.note_short() {
+            return;
+        }
+        let text = format!(
+            "more memory of it: {there_are}. Other processes do not see the samples in it: have \
+             fewer publishers of samples over 4 KiB in one process"
+        );
+        self.note_refused(id, &text);
+        self.push(id, &Message::Refused(Refused::because(text)), Vec::new());
+    }
+
+    /// A session has given a segment up.
+    pub(super) fn close_segment(&mut self, id: &SessionId, number: u32) {
+        if !self.entries.get_mut(id).is_some_and(|entry| entry.segments.close(number)) {
+            return;
+        }
+        let mut told = Vec::new();
+        for (reader, entry) in &mut self.entries {
+            let Some(asked) = entry.held.close(id, number) else { continue };
+            // A session that has not taken it, as that of a stopped process, need not hear of it, nor keep its memory.
+            // One that asked for it may have it from before, and then keeps it until it hears.
+            if !entry.outbox.take_back(id, number) || asked {
+                told.push(*reader);
+            }
+        }
+        let gone = Message::SegmentGone(SegmentName { session: *id, number });
+        if let Some(packet) = encode(&gone) {
+            self.push_encoded(&told, &packet);
+        }
+    }
+
+    /// A session misses a segment of another, which it reads from.
+    pub(super) fn need_segment(&mut self, id: &SessionId, of: &SessionId, number: u32) {
+        if !self.entries.get_mut(id).is_some_and(|entry| entry.held.miss(of, number)) {
+            return self.hand_left(id, of, number);
+        }
+        self.hand(id, of, number);
+        if let Some(entry) = self.entries.get_mut(id) {
+            entry.held.note_asked(of, number);
+        }
+    }
+
+    /// A session that this daemon has not introduced to `of` misses a segment of that session: it knows it from an
+    /// earlier daemon.
+    fn hand_left(&mut self, id: &SessionId, of: &SessionId, number: u32) {
+        if !self.left.is_kept() {
+            return;
+        }
+        let there = self.entries.get(of).and_then(|entry| entry.segments.get(number));
+        let Some(SessionSegment { segment, descriptor }) =
+            there.or_else(|| self.left.segment(of, number)).cloned()
+        else {
+            return;
+        };
+        let opened = SegmentOpened { session: *of, segment };
+        self.push(id, &Message::Segment(opened), vec![descriptor]);
+    }
+
+    /// The segments of session `of` in which a reader of `writer` looks.
+    pub(super) fn segments_for(&self, of: &SessionId, writer: &Gid) -> Vec<u32> {
+        self.entries.get(of).map(|entry| entry.segments.numbers_for(writer)).unwrap_or_default()
+    }
+
+    /// Adds the descriptors of those segments that `to` lacks, as many as go into one packet.
+    pub(super) fn hand_over(
+        &mut self,
+        to: &SessionId,
+        of: &SessionId,
+        numbers: impl IntoIterator<Item = u32>,
+        descriptors: &mut Vec<F>,
+    ) -> Vec<Segment> {
+        let mut handed = Vec::new();
+        for number in numbers {
+            if descriptors.len() == MAX_DESCRIPTORS {
+                break;
+            }
+            if let Some(SessionSegment { segment, descriptor }) = self.lacking(to, of, number) {
+                handed.push(segment);
+                descriptors.push(descriptor);
+            }
+        }
+        handed
+    }
+
+    /// Hands over those that did not go into the packet.
+    pub(super) fn hand_over_rest(&mut self, to: &SessionId, of: &SessionId, writer: &Gid) {
+        for number in self.segments_for(of, writer) {
+            self.hand(to, of, number);
+        }
+    }
+
+    fn hand(&mut self, to: &SessionId, of: &SessionId, number: u32) {
+        if let Some(SessionSegment { segment, descriptor }) = self.lacking(to, of, number) {
+            let opened = SegmentOpened { session: *of, segment };
+            self.push(to, &Message::Segment(opened), vec![descriptor]);
+        }
+    }
+
+    /// A segment of `of` that `to` was not handed, and now is.
+    fn lacking(
+        &mut self,
+        to: &SessionId,
+        of: &SessionId,
+        number: u32,
+    ) -> Option<SessionSegment<F>> {
+        let segment = self.entries.get(of)?.segments.get(number)?.clone();
+        self.entries.get_mut(to)?.held.hand(of, number).then_some(segment)
+    }
+
+    /// The descriptors of `of` when `to` holds none yet, and notes that it does for `pair`.
+    pub(super) fn introduce(&mut self, to: &SessionId, of: &SessionId, pair: &Pair) -> Vec<F> {
+        if to == of {
+            return Vec::new();
+        }
+        let Some(descriptors) = self.entries.get(of).and_then(|s| s.descriptors.clone()) else {
+            return Vec::new();
+        };
+        let Some(entry) = self.entries.get_mut(to) else { return Vec::new() };
+        if entry.held.introduce(*of, *pair) { descriptors.into() } else { Vec::new() }
+    }
+
+    /// Two sessions are about to be told that `pair`, for which they held each other's descriptors, is over.
+    pub(super) fn part(&mut self, pair: &Pair, one: &SessionId, other: &SessionId) {
+        for (at, of) in [(one, other), (other, one)] {
+            if let Some(entry) = self.entries.get_mut(at) {
+                entry.held.forget(of, pair);
+            }
+        }
+    }
+}
+
+/// The packet of a message.
+pub(super) fn encode(message: &Message) -> Option<Arc<[u8]>> {
+    match message.encode() {
+        Ok(packet) => Some(packet.into()),
+        Err(error) => {
+            // Everything that is stored is small enough to be passed on.
+            tracing::error!(%error, "a control message could not be encoded");
+            None
+        }
+    }
+}
