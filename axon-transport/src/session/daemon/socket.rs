@@ -4,12 +4,14 @@ use std::{
     io::IoSlice,
     mem::MaybeUninit,
     os::fd::{AsFd, BorrowedFd},
+    time::Instant,
 };
 
 use axon_shm::internal::descriptors::{self, Packet, PassedFd};
 use rustix::{
+    event::{PollFd, PollFlags, Timespec, poll},
     io::Errno,
-    net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg},
+    net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, Shutdown, sendmsg, shutdown},
 };
 
 use crate::wire::session::{CodecError, MAX_DESCRIPTORS, MAX_PACKET, Message};
@@ -113,6 +115,30 @@ pub fn receive(socket: impl AsFd, buffer: &mut Vec<u8>) -> Result<Received, Sock
     Ok(Received { message: Message::decode(&buffer[..bytes])?, descriptors })
 }
 
+/// Says that nothing more comes, and waits until the other end closes. Whether it had read everything by then; also true
+/// where it has not closed at the `deadline`.
+pub fn finish(socket: impl AsFd, deadline: Instant) -> bool {
+    if shutdown(&socket, Shutdown::Write).is_err() {
+        return false;
+    }
+    let mut buffer = vec![0; MAX_PACKET + 1];
+    loop {
+        match descriptors::receive(&socket, &mut buffer) {
+            Ok(Packet { bytes: 0, .. }) => return true,
+            Ok(_) | Err(Errno::INTR) => {}
+            Err(Errno::AGAIN) => {
+                let left = deadline.saturating_duration_since(Instant::now());
+                let timeout = Timespec::try_from(left).ok();
+                let mut fds = [PollFd::new(&socket, PollFlags::IN)];
+                if left.is_zero() || poll(&mut fds, timeout.as_ref()) == Ok(0) {
+                    return true;
+                }
+            }
+            Err(_) => return false,
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use std::os::fd::OwnedFd;
@@ -174,5 +200,28 @@ mod tests {
             assert_eq!(receive(&b, &mut Vec::new()).unwrap().message, Message::Resync);
         }
         assert!(matches!(receive(&b, &mut Vec::new()), Err(SocketError::Closed)));
+    }
+
+    #[test]
+    fn one_that_finishes_knows_whether_the_other_end_has_read_everything() {
+        let message = Message::Resync.encode().unwrap();
+        let ever = || Instant::now() + std::time::Duration::from_secs(60);
+        let (a, b) = pair();
+        send(&a, &message, &[]).unwrap();
+        send(&b, &message, &[]).unwrap();
+        let reader = std::thread::spawn(move || {
+            while !matches!(receive(&b, &mut Vec::new()), Err(SocketError::Closed)) {}
+        });
+        assert!(finish(&a, ever()));
+        reader.join().unwrap();
+
+        let (a, b) = pair();
+        send(&a, &message, &[]).unwrap();
+        drop(b);
+        assert!(!finish(&a, ever()), "it closed with a packet unread");
+
+        let (a, b) = pair();
+        assert!(finish(&a, Instant::now()), "it may read it yet");
+        drop(b);
     }
 }

@@ -184,18 +184,33 @@ impl Control {
         }
         // What was queued last, such as ENDPOINT_GONE, is said by the end of the connection. Only
         // of memory, in which readers may find the last samples, nobody else could tell.
-        self.tell_segments();
-        self.send_rest();
-        if self.find_last_daemon() {
+        let deadline = Instant::now() + FAREWELL;
+        loop {
+            self.tell_segments();
             self.send_rest();
+            let has_left = self.shared.segment.tidy();
+            if !has_left || self.was_heard(deadline) || !self.find_next_daemon(deadline) {
+                return;
+            }
         }
     }
 
-    /// Where the daemon was killed, waits for the next one for a moment if readers have not taken all that publishers
-    /// of this session left: it may be in memory that no daemon has told them of. Whether there is a next one, which is
-    /// to be told.
-    fn find_last_daemon(&mut self) -> bool {
-        let deadline = Instant::now() + FAREWELL;
+    /// Ends the connection. Whether there is nobody who could hear more: false where the daemon was killed and may not
+    /// have read all.
+    fn was_heard(&mut self, deadline: Instant) -> bool {
+        match &self.link {
+            Link::Socket(socket) if socket::finish(socket, deadline) => true,
+            Link::Socket(_) => {
+                self.lost(&SocketError::Closed);
+                false
+            }
+            Link::Reconnecting(_) => false,
+            Link::Local(_) | Link::Ended => true,
+        }
+    }
+
+    /// Waits for the next daemon, to tell it of the memory that readers have yet to be sent. Whether there is one.
+    fn find_next_daemon(&mut self, deadline: Instant) -> bool {
         while matches!(self.link, Link::Reconnecting(_)) && self.shared.segment.tidy() {
             let left = deadline.saturating_duration_since(Instant::now());
             if left.is_zero() {
@@ -205,12 +220,11 @@ impl Control {
             let _ = poll(&mut [PollFd::new(&self.shared.wake, PollFlags::IN)], nap.as_ref());
             let _ = rustix::io::read(&self.shared.wake, &mut [0; 8]);
             self.try_reconnected();
-            if self.is_linked() {
-                self.collect();
-                return true;
-            }
         }
-        false
+        if self.is_linked() {
+            self.collect();
+        }
+        self.is_linked()
     }
 
     /// Sends what is queued, and waits for a daemon whose socket is full.
