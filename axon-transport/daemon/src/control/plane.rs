@@ -174,22 +174,6 @@ impl Control {
         self.draining || self.registry.is_needed()
     }
 
-    /// Answers a session that asks for the status. One that asks again before it has taken the
-    /// answer gets the same one from its beginning.
-    pub(super) fn send_status(&mut self, id: &SessionId) {
-        if self.registry.repeat_status(id) {
-            return;
-        }
-        let text = match serde_json::to_vec(&super::report::status(self)) {
-            Ok(text) => text,
-            Err(error) => {
-                tracing::error!(%error, "the status cannot be written");
-                Vec::new()
-            }
-        };
-        self.registry.tell_status(id, text.into());
-    }
-
     pub(super) fn refused(&mut self, peer: String, what: String, reason: String) {
         tracing::warn!(peer, what, reason, "refused");
         // The same peer refused for the same cause again is the same news.

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use axon_shm::ids::SessionId;
 use axon_transport::{
     config::{KeyMode, Security},
     internal::wire::session::{PROTOCOL, SessionRole},
@@ -11,7 +12,23 @@ use axon_transport::{
 use super::{plane::Control, topics::topics};
 use crate::discovery::Wanted;
 
-pub(super) fn status(control: &Control) -> Status {
+/// Answers a session that asks for the status. One that asks again before it has taken the
+/// answer gets the same one from its beginning.
+pub(super) fn send_status(control: &mut Control, id: &SessionId) {
+    if control.registry.repeat_status(id) {
+        return;
+    }
+    let text = match serde_json::to_vec(&status(control)) {
+        Ok(text) => text,
+        Err(error) => {
+            tracing::error!(%error, "the status cannot be written");
+            Vec::new()
+        }
+    };
+    control.registry.tell_status(id, text.into());
+}
+
+fn status(control: &Control) -> Status {
     let config = &control.config;
     let settings: BTreeMap<String, String> = control.admission.settings().iter().cloned().collect();
     let setting = |name: &str| settings.get(name).cloned();
