@@ -7,7 +7,7 @@ use std::{
     os::fd::OwnedFd,
     rc::Rc,
     sync::Arc,
-    time::Instant,
+    time::{Instant, SystemTime},
 };
 
 use axon_shm::{
@@ -20,7 +20,7 @@ use axon_transport::{
         registry::Registry,
         session::{daemon::address::Address, relayed::Pool},
     },
-    status::{LinkStatus, RefusalStatus, TrafficStatus, unix_ms},
+    status::{LinkStatus, RefusalStatus, TrafficStatus},
 };
 use tokio::sync::{Notify, watch};
 
@@ -181,7 +181,7 @@ impl Control {
         if self.refusals.len() == REFUSALS {
             self.refusals.pop_front();
         }
-        self.refusals.push_back(RefusalStatus { unix_ms: unix_ms(), peer, what, reason });
+        self.refusals.push_back(RefusalStatus::new(SystemTime::now(), peer, what, reason));
     }
 
     /// What the gateway says, but for what concerns discovery alone.
