@@ -222,7 +222,7 @@ impl<S: Content> Outgoing<S> {
                 None if *credit < OVERHEAD => continue,
                 None => {
                     cost = OVERHEAD;
-                    let Meta { sequence, source_timestamp, published } = sample.meta;
+                    let Meta { sequence, source_timestamp, published, .. } = sample.meta;
                     // No sample is longer than AXON_MAX_MESSAGE_MB allows, which is below 4 GiB.
                     let length = u32::try_from(sample.content.len()).unwrap_or(u32::MAX);
                     let lost = sample.lost;
@@ -429,7 +429,7 @@ impl Incoming {
             return Ok(None);
         }
         let SampleHeader { sequence, source_timestamp, lost, published, .. } = head;
-        let meta = Meta { sequence, source_timestamp, published };
+        let meta = Meta::at_nanos(sequence, source_timestamp).with_published(published);
         Ok(Some(InboundSample { channel: name, meta, lost, payload }))
     }
 
