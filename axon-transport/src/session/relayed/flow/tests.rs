@@ -1,10 +1,14 @@
 //! Tests both ends without a socket in between.
 
-use std::collections::{HashMap, VecDeque};
+use std::{
+    collections::{HashMap, VecDeque},
+    sync::Arc,
+};
 
 use proptest::prelude::*;
 
-use super::*;
+use super::{incoming::LONG, *};
+use crate::wire::session::{SampleFragment, SampleHeader};
 
 const MAX: u64 = 1 << 20;
 
