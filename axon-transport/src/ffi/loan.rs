@@ -8,7 +8,7 @@ use super::{
     handle::{axon_loan_t, axon_publisher_t, give, named, revoke},
     memory::{present, present_if_wanted, store, store_if_wanted},
     named_loan::NamedLoan,
-    wait::time,
+    publisher::time,
 };
 
 /// Lends `len` bytes to be written and then published: in shared memory where they are more than

@@ -25,14 +25,14 @@ macro_rules! unit {
         pub(super) mod $name {
             use super::*;
 
-            pub(in super::super) fn serialize<S: Serializer>(
+            pub(crate) fn serialize<S: Serializer>(
                 time: &Duration,
                 to: S,
             ) -> Result<S::Ok, S::Error> {
                 $to(*time).serialize(to)
             }
 
-            pub(in super::super) fn deserialize<'de, D: Deserializer<'de>>(
+            pub(crate) fn deserialize<'de, D: Deserializer<'de>>(
                 from: D,
             ) -> Result<Duration, D::Error> {
                 u64::deserialize(from).map($from)
@@ -59,14 +59,14 @@ unit!(
 pub(super) mod optional_millis {
     use super::*;
 
-    pub(in super::super) fn serialize<S: Serializer>(
+    pub(crate) fn serialize<S: Serializer>(
         time: &Option<Duration>,
         to: S,
     ) -> Result<S::Ok, S::Error> {
         time.map(|time| saturated(time.as_millis())).serialize(to)
     }
 
-    pub(in super::super) fn deserialize<'de, D: Deserializer<'de>>(
+    pub(crate) fn deserialize<'de, D: Deserializer<'de>>(
         from: D,
     ) -> Result<Option<Duration>, D::Error> {
         Ok(Option::<u64>::deserialize(from)?.map(Duration::from_millis))
@@ -77,16 +77,11 @@ pub(super) mod optional_millis {
 pub(super) mod unix_millis {
     use super::*;
 
-    pub(in super::super) fn serialize<S: Serializer>(
-        time: &SystemTime,
-        to: S,
-    ) -> Result<S::Ok, S::Error> {
+    pub(crate) fn serialize<S: Serializer>(time: &SystemTime, to: S) -> Result<S::Ok, S::Error> {
         unix_ms(*time).serialize(to)
     }
 
-    pub(in super::super) fn deserialize<'de, D: Deserializer<'de>>(
-        from: D,
-    ) -> Result<SystemTime, D::Error> {
+    pub(crate) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<SystemTime, D::Error> {
         u64::deserialize(from).map(from_unix_ms)
     }
 }
@@ -95,14 +90,14 @@ pub(super) mod unix_millis {
 pub(super) mod optional_unix_millis {
     use super::*;
 
-    pub(in super::super) fn serialize<S: Serializer>(
+    pub(crate) fn serialize<S: Serializer>(
         time: &Option<SystemTime>,
         to: S,
     ) -> Result<S::Ok, S::Error> {
         time.map_or(0, unix_ms).serialize(to)
     }
 
-    pub(in super::super) fn deserialize<'de, D: Deserializer<'de>>(
+    pub(crate) fn deserialize<'de, D: Deserializer<'de>>(
         from: D,
     ) -> Result<Option<SystemTime>, D::Error> {
         let millis = u64::deserialize(from)?;
