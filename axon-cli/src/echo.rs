@@ -131,7 +131,7 @@ fn qos_of(session: &Session, topic: &str) -> Qos {
             && endpoint.qos.reliability == Reliability::BestEffort
     });
     let reliability = if best_effort { Reliability::BestEffort } else { Reliability::Reliable };
-    Qos { reliability, depth: DEPTH, ..Qos::default() }
+    Qos::default().with_reliability(reliability).with_depth(DEPTH)
 }
 
 fn as_text(info: &MessageInfo, payload: &[u8]) -> String {

@@ -1,18 +1,27 @@
 //! The daemon's status: the JSON for `axon status`.
+//!
+//! The daemon alone fills these structures. Whoever makes one, as a test, begins with its default.
 
-use std::{collections::BTreeMap, time::SystemTime};
+mod times;
+
+use std::{
+    collections::BTreeMap,
+    time::{Duration, SystemTime},
+};
 
 use serde::{Deserialize, Serialize};
 
 /// The whole status.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct Status {
     /// The daemon's id, in hexadecimal; new at each start.
     pub daemon: String,
     /// Its process.
     pub pid: u32,
-    /// Seconds since its start.
-    pub uptime_s: u64,
+    /// The time since its start; whole seconds in JSON.
+    #[serde(rename = "uptime_s", with = "times::seconds")]
+    pub uptime: Duration,
     /// The session protocol's version.
     pub protocol: u32,
     /// This crate's version.
@@ -60,6 +69,7 @@ pub struct Status {
 
 /// What discovery does at present.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct DiscoveryStatus {
     /// The widest range of any session; `SUBNET` alone uses multicast.
     pub range: String,
@@ -69,6 +79,7 @@ pub struct DiscoveryStatus {
 
 /// Control packets, which carry no samples.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct TrafficStatus {
     /// From sessions.
     pub packets_in: u64,
@@ -79,7 +90,8 @@ pub struct TrafficStatus {
 }
 
 /// A session.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct SessionStatus {
     /// Its process.
     pub pid: u32,
@@ -109,7 +121,8 @@ pub struct SessionStatus {
 }
 
 /// What passes through the daemon for a session that shares no memory.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct RelayStatus {
     /// Why memory is not shared.
     pub reason: String,
@@ -128,6 +141,7 @@ pub struct RelayStatus {
 
 /// A topic.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct TopicStatus {
     /// Its name.
     pub topic: String,
@@ -181,6 +195,7 @@ pub struct TopicStatus {
 
 /// An endpoint that waits for a route which one of two hosts refuses.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct RefusedRouteStatus {
     /// Its GID.
     pub endpoint: String,
@@ -192,6 +207,7 @@ pub struct RefusedRouteStatus {
 
 /// A pair that the discovery ranges of its sessions keep apart.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct OutOfRangeStatus {
     /// The GID of the publisher, or of the endpoint of a service.
     pub writer: String,
@@ -203,6 +219,7 @@ pub struct OutOfRangeStatus {
 
 /// A publisher's ring.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct WriterStatus {
     /// The publisher's process.
     pub pid: u32,
@@ -229,6 +246,7 @@ pub struct WriterStatus {
 
 /// A reader's share of one writer's samples.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct ReaderStatus {
     /// The reader's process.
     pub pid: u32,
@@ -248,9 +266,10 @@ pub struct ReaderStatus {
     pub lost: u64,
     /// Samples passed over because more recent ones filled its depth: no loss.
     pub skipped: u64,
-    /// How long ago the oldest sample that it has not taken was published, in milliseconds, by the
-    /// clocks of both hosts where the publisher is on another one. `null` when it has taken all.
-    pub waiting_ms: Option<u64>,
+    /// How long ago the oldest sample that it has not taken was published, by the
+    /// clocks of both hosts where the publisher is on another one. Milliseconds in JSON; `null` when it has taken all.
+    #[serde(default, rename = "waiting_ms", with = "times::optional_millis")]
+    pub waiting: Option<Duration>,
     /// Whether its process is stopped, by a signal or a debugger.
     pub stopped: bool,
 }
@@ -258,12 +277,13 @@ pub struct ReaderStatus {
 impl ReaderStatus {
     /// Whether it has not taken a sample that has been there for a second.
     pub fn is_stalled(&self) -> bool {
-        self.waiting_ms.is_some_and(|waiting| waiting >= 1000)
+        self.waiting.is_some_and(|waiting| waiting >= Duration::from_secs(1))
     }
 }
 
 /// A link to another host's daemon.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct LinkStatus {
     /// The peer's daemon id, in hexadecimal.
     pub peer: String,
@@ -281,13 +301,15 @@ pub struct LinkStatus {
     pub cipher: String,
     /// How and as whom the peer proved itself.
     pub authenticated_as: String,
-    /// Milliseconds since the Unix epoch at which it was established.
-    pub since_unix_ms: u64,
-    /// Round-trip time in microseconds.
-    pub rtt_us: u64,
-    /// Shortest round-trip time so far, in microseconds.
-    #[serde(default)]
-    pub rtt_min_us: u64,
+    /// When it was established; milliseconds since the Unix epoch in JSON, or 0.
+    #[serde(rename = "since_unix_ms", with = "times::optional_unix_millis")]
+    pub since: Option<SystemTime>,
+    /// Round-trip time; microseconds in JSON.
+    #[serde(rename = "rtt_us", with = "times::micros")]
+    pub rtt: Duration,
+    /// Shortest round-trip time so far; microseconds in JSON.
+    #[serde(default, rename = "rtt_min_us", with = "times::micros")]
+    pub rtt_min: Duration,
     /// Congestion window in bytes.
     #[serde(default)]
     pub congestion_window: u64,
@@ -322,9 +344,9 @@ pub struct LinkStatus {
     /// The same by class, and control messages.
     #[serde(default)]
     pub waiting: WaitingStatus,
-    /// Milliseconds that the oldest of them has waited.
-    #[serde(default)]
-    pub waiting_ms: u64,
+    /// How long the oldest of them has waited; milliseconds in JSON.
+    #[serde(default, rename = "waiting_ms", with = "times::millis")]
+    pub oldest_waits: Duration,
     /// Samples received.
     pub samples_in: u64,
     /// Samples sent.
@@ -356,6 +378,7 @@ pub struct LinkStatus {
 /// eighth turn. A flow counts as a whole for the class of its next sample. BEST_EFFORT and KEEP_ALL samples wait in their
 /// publisher's ring: those that the daemon has not taken from there do not count.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct WaitingStatus {
     /// Control messages.
     pub control: u64,
@@ -371,9 +394,11 @@ pub struct WaitingStatus {
 
 /// Somebody who was refused.
 #[derive(Clone, Debug, Serialize, Deserialize)]
+#[non_exhaustive]
 pub struct RefusalStatus {
-    /// Milliseconds since the Unix epoch.
-    pub unix_ms: u64,
+    /// When; milliseconds since the Unix epoch in JSON.
+    #[serde(rename = "unix_ms", with = "times::unix_millis")]
+    pub at: SystemTime,
     /// Who.
     pub peer: String,
     /// What was refused, or the variable that differs.
@@ -382,9 +407,75 @@ pub struct RefusalStatus {
     pub reason: String,
 }
 
+impl RefusalStatus {
+    /// `peer` was refused, at this time.
+    pub fn new(at: SystemTime, peer: String, what: String, reason: String) -> Self {
+        Self { at, peer, what, reason }
+    }
+}
+
 /// Now, in milliseconds since the Unix epoch.
 pub fn unix_ms() -> u64 {
-    SystemTime::now()
-        .duration_since(SystemTime::UNIX_EPOCH)
-        .map_or(0, |d| u64::try_from(d.as_millis()).unwrap_or(u64::MAX))
+    times::unix_ms(SystemTime::now())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The names, order and units of what `axon status --json` prints are read by programs.
+    #[test]
+    fn the_json_of_a_status_is_as_programs_know_it() {
+        let reader = concat!(
+            r#"{"pid":41,"reader":"aa","writer":"bb","relay":false,"depth":10,"unread":3,"received":4,"lost":5,"#,
+            r#""skipped":6,"waiting_ms":1234,"stopped":true}"#
+        );
+        let read: ReaderStatus = serde_json::from_str(reader).unwrap();
+        assert_eq!(read.waiting, Some(Duration::from_millis(1234)));
+        assert!(read.is_stalled());
+        assert_eq!(serde_json::to_string(&read).unwrap(), reader);
+
+        let link = concat!(
+            r#"{"peer":"cc","host":"robot-2","sae":null,"address":"192.0.2.1:61348","state":"connected","#,
+            r#""key_exchange":"X25519MLKEM768","cipher":"c","authenticated_as":"UNAUTHENTICATED","#,
+            r#""since_unix_ms":1700000000123,"rtt_us":1500,"rtt_min_us":740,"congestion_window":1,"#,
+            r#""packets_sent":2,"packets_lost":3,"bytes_lost":4,"ecn_marks_in":5,"ecn_marks_out":6,"#,
+            r#""congestion_events":7,"mtu":1452,"mtu_black_holes":8,"waiting_bytes":9,"#,
+            r#""waiting":{"control":1,"services":2,"small_reliable":3,"small_best_effort":4,"bulk":5},"#,
+            r#""waiting_ms":88,"samples_in":10,"samples_out":11,"bytes_in":12,"bytes_out":13,"#,
+            r#""dropped":{"no_key":1},"routes_refused":{},"more_routes_refused":0,"endpoints":14,"#,
+            r#""endpoints_left_out":15,"graph_bytes":16}"#
+        );
+        let read: LinkStatus = serde_json::from_str(link).unwrap();
+        let since = SystemTime::UNIX_EPOCH + Duration::from_millis(1_700_000_000_123);
+        assert_eq!((read.since, read.rtt_min), (Some(since), Duration::from_micros(740)));
+        assert_eq!(read.oldest_waits, Duration::from_millis(88));
+        assert_eq!(serde_json::to_string(&read).unwrap(), link);
+
+        let refusal = r#"{"unix_ms":18446744073709551615,"peer":"p","what":"w","reason":"r"}"#;
+        let read: RefusalStatus = serde_json::from_str(refusal).unwrap();
+        assert_eq!(serde_json::to_string(&read).unwrap(), refusal);
+    }
+
+    #[test]
+    fn times_are_whole_numbers_of_their_unit() {
+        let status = Status { uptime: Duration::from_millis(90_999), ..Status::default() };
+        let json = serde_json::to_value(&status).unwrap();
+        assert_eq!(json["uptime_s"], 90);
+        let mut link = LinkStatus::default();
+        assert_eq!(serde_json::to_value(&link).unwrap()["since_unix_ms"], 0);
+        link.rtt = Duration::from_nanos(1_999);
+        link.oldest_waits = Duration::MAX;
+        let json = serde_json::to_value(&link).unwrap();
+        assert_eq!((&json["rtt_us"], &json["waiting_ms"]), (&1.into(), &u64::MAX.into()));
+    }
+
+    /// An earlier daemon says nothing of what it does not know.
+    #[test]
+    fn what_a_status_lacks_has_its_default() {
+        let reader = r#"{"pid":41,"reader":"aa","writer":"bb","relay":false,"depth":null,"unread":0,
+            "received":0,"lost":0,"skipped":0,"stopped":false}"#;
+        let read: ReaderStatus = serde_json::from_str(reader).unwrap();
+        assert_eq!(read.waiting, None);
+    }
 }

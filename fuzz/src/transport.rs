@@ -166,21 +166,7 @@ pub fn beacon_seeds() -> Vec<Vec<u8>> {
 }
 
 fn endpoint() -> Endpoint {
-    Endpoint {
-        gid: Gid([7; 16]),
-        kind: EndpointKind::Publisher,
-        topic: "/scan".into(),
-        type_name: "sensor_msgs/msg/LaserScan".into(),
-        type_hash: vec![1, 2, 3],
-        qos: Qos {
-            deadline: Some(Duration::from_nanos(5)),
-            lifespan: Some(Duration::from_nanos(6)),
-            ..Qos::keep_all()
-        },
-        node: "lidar".into(),
-        namespace: "/".into(),
-        enclave: String::new(),
-    }
+    Endpoint::new(Gid([7; 16]), EndpointKind::Publisher, "/scan", "sensor_msgs/msg/LaserScan").with_qos(Qos::keep_all().with_deadline(Duration::from_nanos(5)).with_lifespan(Duration::from_nanos(6))).with_type_hash(vec![1, 2, 3]).with_node("lidar", "/")
 }
 
 /// Every message of the control stream, one of them large enough to be compressed.

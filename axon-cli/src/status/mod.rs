@@ -2,10 +2,13 @@
 
 mod paths;
 
-use std::{collections::BTreeMap, fmt::Write as _, io::Write as _, process::ExitCode};
+use std::{
+    collections::BTreeMap, fmt::Write as _, io::Write as _, process::ExitCode, time::Duration,
+};
 
 use axon_transport::{
     config::DaemonPlace,
+    internal::session::unix_nanos,
     status::{LinkStatus, RelayStatus, SessionStatus, Status, TopicStatus},
 };
 use serde_json::Value;
@@ -59,7 +62,7 @@ pub(crate) fn run(args: &cli::Status) -> Result<ExitCode, CliError> {
 fn render(status: &Status) -> String {
     let mut out = String::new();
     heading(&mut out, "Daemon");
-    let uptime = text::duration(status.uptime_s.saturating_mul(1_000_000_000));
+    let uptime = text::duration(nanoseconds(status.uptime));
     let port = status.port.map_or_else(|| "none".to_owned(), |port| port.to_string());
     facts(
         &mut out,
@@ -141,7 +144,7 @@ fn links(links: &[LinkStatus]) -> TextTable {
             link.key_exchange.clone(),
             link.cipher.clone(),
             link.authenticated_as.clone(),
-            text::duration(link.rtt_us.saturating_mul(1_000)),
+            text::duration(nanoseconds(link.rtt)),
             traffic(link.samples_in, link.bytes_in),
             traffic(link.samples_out, link.bytes_out),
             causes(&link.dropped),
@@ -244,14 +247,14 @@ fn depth(topic: &TopicStatus) -> String {
 
 /// Processes with a reader that leaves samples lie, and for how long the oldest has lain.
 fn stalled(topic: &TopicStatus) -> String {
-    let mut longest: BTreeMap<u32, (u64, bool)> = BTreeMap::new();
+    let mut longest: BTreeMap<u32, (Duration, bool)> = BTreeMap::new();
     for reader in topic.readers.iter().filter(|reader| reader.is_stalled()) {
         let entry = longest.entry(reader.pid).or_default();
-        *entry = (entry.0.max(reader.waiting_ms.unwrap_or(0)), reader.stopped);
+        *entry = (entry.0.max(reader.waiting.unwrap_or_default()), reader.stopped);
     }
     let named = longest.into_iter().map(|(pid, (waiting, stopped))| {
         let stopped = if stopped { "stopped, " } else { "" };
-        let waiting = text::duration(waiting.saturating_mul(1_000_000));
+        let waiting = text::duration(nanoseconds(waiting));
         format!("pid {pid} ({stopped}{waiting})")
     });
     let named: Vec<String> = named.collect();
@@ -335,9 +338,8 @@ fn memory(relay: Option<&RelayStatus>) -> String {
 fn refusals(status: &Status) -> TextTable {
     let mut table = TextTable::new(&["when", "who", "what", "why"]);
     for refusal in &status.refusals {
-        let nanoseconds = i64::try_from(refusal.unix_ms).unwrap_or(0).saturating_mul(1_000_000);
         table.row([
-            text::instant(nanoseconds),
+            text::instant(unix_nanos(refusal.at)),
             refusal.peer.clone(),
             refusal.what.clone(),
             refusal.reason.clone(),
@@ -370,148 +372,10 @@ fn section(out: &mut String, title: &str, none: &str, table: TextTable) {
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use axon_transport::status::{
-        DiscoveryStatus, OutOfRangeStatus, ReaderStatus, RefusalStatus, RefusedRouteStatus,
-        TrafficStatus, WriterStatus,
-    };
-    use serde_json::json;
-
-    use axon_transport::status::WaitingStatus;
-
-    use super::*;
-
-    fn status() -> Status {
-        Status {
-            daemon: "00ff".to_owned(),
-            pid: 7,
-            uptime_s: 90,
-            protocol: 1,
-            version: "0.1.0".to_owned(),
-            domain: 3,
-            settings: BTreeMap::from([("AXON_SECURITY_MODE".to_owned(), "qkd".to_owned())]),
-            mode: "qkd".to_owned(),
-            key_mode: Some("messages10".to_owned()),
-            kex: Some("psk_ke".to_owned()),
-            cipher: "chacha20-poly1305".to_owned(),
-            sae: Some("sae-a".to_owned()),
-            socket: "@axon/0/3/1".to_owned(),
-            runtime_dir: None,
-            port: Some(61_348),
-            gateway: "running".to_owned(),
-            discovery: DiscoveryStatus {
-                range: "SUBNET".to_owned(),
-                hosts: vec!["robot-2".to_owned()],
-            },
-            traffic: TrafficStatus::default(),
-            sessions: vec![SessionStatus {
-                pid: 9,
-                name: "talker".to_owned(),
-                role: "application".to_owned(),
-                endpoints: 1,
-                queued: 0,
-                range: Some("LOCALHOST".to_owned()),
-                range_stated: true,
-                static_peers: vec!["robot-2".to_owned()],
-                lists: Vec::new(),
-                relay: None,
-            }],
-            topics: vec![TopicStatus {
-                topic: "/scan".to_owned(),
-                bytes_committed: 3 << 20,
-                dropped: BTreeMap::from([("overwritten".to_owned(), 5)]),
-                writers: vec![
-                    WriterStatus { depth: Some(10), ..WriterStatus::default() },
-                    WriterStatus::default(),
-                ],
-                out_of_range: vec![OutOfRangeStatus {
-                    writer: "aa".to_owned(),
-                    reader: "bb".to_owned(),
-                    reason: "the range is LOCALHOST".to_owned(),
-                }],
-                refused: vec![RefusedRouteStatus {
-                    endpoint: "cc".to_owned(),
-                    host: "robot-3".to_owned(),
-                    reason: "refused by the peer: no room".to_owned(),
-                }],
-                readers: vec![reader(41, Some(12_000), true), reader(42, Some(999), true)],
-                ..TopicStatus::default()
-            }],
-            links: vec![LinkStatus {
-                host: "evil\x1b[2J".to_owned(),
-                dropped: BTreeMap::from([("no_key".to_owned(), 1_000), ("other".to_owned(), 0)]),
-                rtt_min_us: 740,
-                packets_lost: 7_654,
-                bytes_lost: 9_100_000,
-                ecn_marks_out: 321,
-                waiting: WaitingStatus { control: 17, bulk: 4_500_000, ..WaitingStatus::default() },
-                waiting_ms: 88,
-                ..LinkStatus::default()
-            }],
-            keys: json!({"kme": {"enc": {"calls": 12}}, "peers": [{"ready": 4}]}),
-            refusals: vec![RefusalStatus {
-                unix_ms: u64::MAX,
-                peer: "sae-x".to_owned(),
-                what: "handshake".to_owned(),
-                reason: "wrong PSK".to_owned(),
-            }],
-        }
-    }
-
-    fn reader(pid: u32, waiting_ms: Option<u64>, stopped: bool) -> ReaderStatus {
-        ReaderStatus { pid, waiting_ms, stopped, ..ReaderStatus::default() }
-    }
-
-    #[test]
-    fn status_removes_control_characters_of_peer_names() {
-        assert!(!render(&status()).contains('\x1b'));
-    }
-
-    #[test]
-    fn every_part_is_shown() {
-        let text = render(&status());
-        for part in [
-            "qkd (messages10, psk_ke, chacha20-poly1305), SAE sae-a",
-            "AXON_SECURITY_MODE",
-            "1,000 no_key",
-            "740 us",
-            "7,654 (9.10 MB)",
-            "321",
-            "17 B control, 4.50 MB bulk",
-            "88.0 ms",
-            "kme enc calls",
-            "peers 1 ready",
-            "/scan",
-            "10 to all",
-            "3.15 MB",
-            "5 overwritten",
-            "pid 41 (stopped, 12.0 s)",
-            "wrong PSK",
-            "SUBNET, looks for robot-2",
-            "LOCALHOST, lists robot-2; linked: none",
-            "the range is LOCALHOST",
-            "refused by the peer: no room",
-        ] {
-            assert!(text.contains(part), "{part:?} is missing in:\n{text}");
-        }
-        assert!(!text.contains("pid 42"), "what has just come is no sign of a stall:\n{text}");
-        assert!(!text.contains("other"), "a cause that never happened is not shown:\n{text}");
-    }
-
-    #[test]
-    fn a_session_says_whether_it_shares_memory() {
-        assert_eq!(memory(None), "shared");
-        let relay = RelayStatus {
-            reason: "AXON_SHM is off".to_owned(),
-            samples_in: 1,
-            bytes_in: 2048,
-            samples_out: 0,
-            bytes_out: 0,
-            lost: 3,
-        };
-        let text = memory(Some(&relay));
-        assert!(text.starts_with("relayed: AXON_SHM is off; in 1 ("), "{text}");
-        assert!(text.ends_with("lost 3"), "{text}");
-    }
+/// For the writer of durations, which takes no longer ones than of some centuries.
+fn nanoseconds(time: Duration) -> u64 {
+    u64::try_from(time.as_nanos()).unwrap_or(u64::MAX)
 }
+
+#[cfg(test)]
+mod tests;

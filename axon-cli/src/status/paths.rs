@@ -1,8 +1,10 @@
 //! What a link's QUIC connection measures and what waits for it: why a link is slow.
 
+use std::time::Duration;
+
 use axon_transport::status::{LinkStatus, WaitingStatus};
 
-use super::dash;
+use super::{dash, nanoseconds};
 use crate::text::{self, TextTable, grouped};
 
 /// A row for each link.
@@ -21,11 +23,11 @@ pub(super) fn paths(links: &[LinkStatus]) -> TextTable {
         ">oldest",
     ]);
     for link in links {
-        let rtt = |micros: u64| text::duration(micros.saturating_mul(1_000));
+        let time = |time: Duration| text::duration(nanoseconds(time));
         table.row([
             link.host.clone(),
-            rtt(link.rtt_us),
-            rtt(link.rtt_min_us),
+            time(link.rtt),
+            time(link.rtt_min),
             text::bytes(link.congestion_window),
             text::bytes(link.mtu),
             grouped(link.packets_sent),
@@ -33,7 +35,7 @@ pub(super) fn paths(links: &[LinkStatus]) -> TextTable {
             grouped(link.ecn_marks_in),
             grouped(link.ecn_marks_out),
             waiting(&link.waiting),
-            text::duration(link.waiting_ms.saturating_mul(1_000_000)),
+            time(link.oldest_waits),
         ]);
     }
     table
@@ -41,7 +43,7 @@ pub(super) fn paths(links: &[LinkStatus]) -> TextTable {
 
 /// The classes of which something waits, in the order in which they are served.
 fn waiting(waiting: &WaitingStatus) -> String {
-    let WaitingStatus { control, services, small_reliable, small_best_effort, bulk } = *waiting;
+    let WaitingStatus { control, services, small_reliable, small_best_effort, bulk, .. } = *waiting;
     let classes = [
         (control, "control"),
         (services, "services"),

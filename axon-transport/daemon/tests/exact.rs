@@ -45,7 +45,7 @@ fn child() {
         }
         "leased" => {
             let lease = Some(Duration::from_millis(300));
-            let qos = Qos { lease, ..Qos::default() };
+            let qos = Qos::default().with_lease(lease);
             let publisher = session.create_publisher(EndpointSpec::new("/t", "T", qos)).unwrap();
             assert!(publisher.wait_matched(1, PATIENCE));
             say("matched");

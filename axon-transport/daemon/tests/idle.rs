@@ -34,7 +34,7 @@ fn spec(topic: &str) -> EndpointSpec {
 fn child() {
     let Ok(part) = std::env::var("PLAY") else { return };
     let lease = (part == "leased").then_some(LEASE);
-    let leased = || spec("/a").qos(Qos { lease, ..Qos::default() });
+    let leased = || spec("/a").qos(Qos::default().with_lease(lease));
     let session = Session::open(&Config::from_env().unwrap(), SessionOptions::new(&*part)).unwrap();
     let _node = session.create_node("idle", "/", "/").unwrap();
     let talker = session.create_publisher(leased()).unwrap();

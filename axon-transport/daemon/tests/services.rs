@@ -32,7 +32,7 @@ fn spec() -> EndpointSpec {
 /// Of what nobody took an endpoint of this keeps so much; without a depth all of it.
 fn keeping(depth: Option<u32>) -> EndpointSpec {
     let qos = match depth {
-        Some(depth) => Qos { history: History::KeepLast, depth, ..Qos::default() },
+        Some(depth) => Qos::default().with_history(History::KeepLast).with_depth(depth),
         None => Qos::keep_all(),
     };
     spec().qos(qos)

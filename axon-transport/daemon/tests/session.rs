@@ -56,7 +56,7 @@ fn an_endpoint_out_of_bounds_is_refused() {
     let nameless = EndpointSpec::new("", "test/Bytes", Qos::default());
     let refused = session.create_publisher(nameless).unwrap_err();
     assert!(matches!(refused, SessionError::Endpoint { .. }));
-    let bottomless = spec(Qos { depth: 0, ..Qos::default() });
+    let bottomless = spec(Qos::default().with_depth(0));
     assert!(session.create_subscription(bottomless).is_err());
 }
 
@@ -161,8 +161,7 @@ fn publishers_are_merged_by_source_timestamp() {
 fn depth_counts_over_all_publishers_and_skipping_is_not_loss() {
     let session = alone();
     let publishers = publishers(&session, 3, Qos::default());
-    let subscription =
-        session.create_subscription(spec(Qos { depth: 4, ..Qos::default() })).unwrap();
+    let subscription = session.create_subscription(spec(Qos::default().with_depth(4))).unwrap();
     assert!(subscription.wait_matched(3, PATIENCE));
     for time in 0..9 {
         publishers[usize::try_from(time).unwrap() % 3]

@@ -39,7 +39,7 @@ const MORE: usize = 300;
 const SOON: Duration = Duration::from_secs(4);
 
 fn spec(topic: &str) -> EndpointSpec {
-    EndpointSpec::new(topic, "test/Bytes", Qos { depth: 1, ..Qos::default() })
+    EndpointSpec::new(topic, "test/Bytes", Qos::default().with_depth(1))
 }
 
 /// Not a test of its own: what the other processes do.

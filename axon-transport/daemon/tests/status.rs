@@ -20,7 +20,7 @@ fn spec(topic: &str, qos: Qos) -> EndpointSpec {
 }
 
 fn best_effort(depth: u32) -> Qos {
-    Qos { reliability: Reliability::BestEffort, depth, ..Qos::default() }
+    Qos::default().with_reliability(Reliability::BestEffort).with_depth(depth)
 }
 
 /// Not a test of its own: what the other processes do.

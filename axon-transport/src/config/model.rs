@@ -135,6 +135,7 @@ pub enum ClassicAuth {
 
 /// Settings of `qkd`.
 #[derive(Clone, Debug)]
+#[non_exhaustive]
 pub struct QkdConfig {
     /// `AXON_QKD_KEY_MODE`.
     pub key_mode: KeyMode,
@@ -165,6 +166,32 @@ pub struct QkdConfig {
 }
 
 impl QkdConfig {
+    /// Settings with a default for each that is not given here. Only [`Config::builder`] checks them.
+    pub fn new(
+        sae_id: impl Into<String>,
+        peers: QkdPeers,
+        kme_url: impl Into<String>,
+        kme_ca: impl Into<PathBuf>,
+        sae_cert: impl Into<PathBuf>,
+        sae_key: impl Into<PathBuf>,
+    ) -> Self {
+        Self {
+            key_mode: KeyMode::Messages10,
+            kex: QkdKex::PskKe,
+            peers,
+            session_max_age: Duration::from_secs(3600),
+            kme_url: kme_url.into(),
+            kme_ca: kme_ca.into(),
+            kme_id: None,
+            sae_id: sae_id.into(),
+            sae_cert: sae_cert.into(),
+            sae_key: sae_key.into(),
+            kme_quirks: Vec::new(),
+            kme_connect_timeout: Duration::from_secs(2),
+            kme_answer_timeout: Duration::from_secs(3),
+        }
+    }
+
     /// The quirk of a KME whose certificate does not name the host in its URL, as one without a
     /// subjectAltName: the host's name is not checked, and [`kme_id`](Self::kme_id) alone tells the KME
     /// from other holders of a certificate from [`kme_ca`](Self::kme_ca). Not valid without that ID.

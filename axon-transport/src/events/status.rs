@@ -60,6 +60,7 @@ impl EventKind {
 
 /// How often something happened.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Counted {
     /// In all.
     pub total: u64,
@@ -67,8 +68,16 @@ pub struct Counted {
     pub change: u64,
 }
 
+impl Counted {
+    /// So often in all, and since the status was last taken.
+    pub fn new(total: u64, change: u64) -> Self {
+        Self { total, change }
+    }
+}
+
 /// Endpoints that were and are matched.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Matched {
     /// Matched ever.
     pub total: u64,
@@ -78,6 +87,13 @@ pub struct Matched {
     pub current: u64,
     /// The difference to when the status was last taken.
     pub current_change: i64,
+}
+
+impl Matched {
+    /// So many ever and now, each with the difference to when the status was last taken.
+    pub fn new(total: u64, total_change: u64, current: u64, current_change: i64) -> Self {
+        Self { total, total_change, current, current_change }
+    }
 }
 
 /// Endpoints whose QoS does not go with this one's.

@@ -11,8 +11,8 @@ use super::{
     error::{
         AXON_RET_BAD_ALLOC, AXON_RET_FORKED, AXON_RET_INVALID_HANDLE, CallFailure, axon_ret_t,
     },
-    loan::NamedLoan,
     memory::store,
+    named_loan::NamedLoan,
     table::{HandleTable, Process, Unknown},
 };
 use crate::session::{

@@ -1,23 +1,15 @@
 //! The C functions of loans: memory that the program writes before it publishes the sample.
 
-use std::sync::{Mutex, PoisonError, Weak};
+use std::sync::{Mutex, PoisonError};
 
 use super::{
     error::{AXON_RET_INVALID_HANDLE, CallFailure, axon_ret_t},
     guarded,
     handle::{axon_loan_t, axon_publisher_t, give, named, revoke},
     memory::{present, present_if_wanted, store, store_if_wanted},
-    wait::time,
+    named_loan::NamedLoan,
+    publisher::time,
 };
-use crate::session::{OwnedLoan, Publisher};
-
-/// What a loan's handle names.
-pub(super) struct NamedLoan {
-    len: usize,
-    loan: Mutex<Option<OwnedLoan>>,
-    /// It must be there for the loan to be published.
-    publisher: Weak<Publisher>,
-}
 
 /// Lends `len` bytes to be written and then published: in shared memory where they are more than
 /// 4 KiB, or more than 512 bytes if the publisher was created to expect so many, so that nothing is

@@ -29,6 +29,7 @@ mod handle;
 mod loan;
 mod log;
 mod memory;
+mod named_loan;
 mod node;
 mod publisher;
 mod qos;

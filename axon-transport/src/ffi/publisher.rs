@@ -7,12 +7,17 @@ use super::{
     handle::{axon_node_t, axon_publisher_t, give, named, revoke},
     memory::{elements, present, present_if_wanted, store, store_if_wanted},
     qos::axon_qos_t,
-    wait::{duration, time},
+    wait::duration,
 };
 use crate::{graph::EndpointKind, qos::Qos, session::from_unix_nanos};
 
 /// The time at which the call is made, as a sample's source timestamp.
 pub const AXON_TIME_NOW: i64 = i64::MIN;
+
+/// A point in time of the caller's; `None` is now.
+pub(super) fn time(timestamp: i64) -> Option<i64> {
+    (timestamp != AXON_TIME_NOW).then_some(timestamp)
+}
 
 /// A publisher of a node. When it returns, the publisher is matched with those subscriptions that the
 /// graph shows, unless they take longer than 50 ms.

@@ -10,7 +10,6 @@ use super::{
         axon_subscription_t, give, named, revoke, visit,
     },
     memory::{elements_mut, present, value},
-    publisher::AXON_TIME_NOW,
 };
 use crate::session::Waitable;
 
@@ -195,11 +194,6 @@ fn limit(nanoseconds: i64) -> Option<Duration> {
 /// A timeout where there must be one: for ever is some hundred years.
 pub(super) fn duration(nanoseconds: i64) -> Duration {
     limit(nanoseconds).unwrap_or(Duration::from_nanos(i64::MAX as u64))
-}
-
-/// A point in time of the caller's; `None` is now.
-pub(super) fn time(timestamp: i64) -> Option<i64> {
-    (timestamp != AXON_TIME_NOW).then_some(timestamp)
 }
 
 impl CallFailure {

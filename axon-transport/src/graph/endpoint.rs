@@ -30,6 +30,7 @@ pub enum EndpointKind {
 /// An endpoint as sessions, daemons and peers describe it to each other.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode, Serialize)]
 #[cbor(map)]
+#[non_exhaustive]
 pub struct Endpoint {
     /// Its identity.
     #[n(0)]
@@ -78,6 +79,50 @@ pub const LIMITS: Limits = Limits { name: 512, type_hash: 64, endpoints: 65_536 
 const ENTRY: usize = size_of::<Endpoint>() + 128;
 
 impl Endpoint {
+    /// An endpoint of a topic or service and a type, with the default QoS, without a type hash and of no node.
+    pub fn new(
+        gid: Gid,
+        kind: EndpointKind,
+        topic: impl Into<String>,
+        type_name: impl Into<String>,
+    ) -> Self {
+        Self {
+            gid,
+            kind,
+            topic: topic.into(),
+            type_name: type_name.into(),
+            type_hash: Vec::new(),
+            qos: Qos::default(),
+            node: String::new(),
+            namespace: String::new(),
+            enclave: String::new(),
+        }
+    }
+
+    /// With this QoS.
+    #[must_use]
+    pub fn with_qos(self, qos: Qos) -> Self {
+        Self { qos, ..self }
+    }
+
+    /// With this hash of its type.
+    #[must_use]
+    pub fn with_type_hash(self, type_hash: Vec<u8>) -> Self {
+        Self { type_hash, ..self }
+    }
+
+    /// Of this node in this namespace.
+    #[must_use]
+    pub fn with_node(self, node: impl Into<String>, namespace: impl Into<String>) -> Self {
+        Self { node: node.into(), namespace: namespace.into(), ..self }
+    }
+
+    /// In this security enclave: for a node.
+    #[must_use]
+    pub fn with_enclave(self, enclave: impl Into<String>) -> Self {
+        Self { enclave: enclave.into(), ..self }
+    }
+
     /// Bytes that count for it where memory is bounded: its names and what keeps it.
     pub fn bytes(&self) -> usize {
         let names = [&self.topic, &self.type_name, &self.node, &self.namespace, &self.enclave];
@@ -103,16 +148,6 @@ impl Endpoint {
 impl Endpoint {
     /// An endpoint of the topic `/t` and the type `T`, with the default QoS and of no node.
     pub(crate) fn example(gid: Gid, kind: EndpointKind) -> Self {
-        Self {
-            gid,
-            kind,
-            topic: "/t".into(),
-            type_name: "T".into(),
-            type_hash: Vec::new(),
-            qos: Qos::default(),
-            node: String::new(),
-            namespace: String::new(),
-            enclave: String::new(),
-        }
+        Self::new(gid, kind, "/t", "T")
     }
 }

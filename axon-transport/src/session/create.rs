@@ -132,5 +132,5 @@ impl Session {
 
 /// What a client or server of this profile asks of those that it reads: nothing is lost but for its depth.
 fn unread(qos: &Qos) -> Qos {
-    Qos { history: qos.history, depth: qos.depth, ..Qos::keep_all() }
+    Qos::keep_all().with_history(qos.history).with_depth(qos.depth)
 }

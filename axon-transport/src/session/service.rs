@@ -147,7 +147,7 @@ impl Server {
             self.session.wait_changed(PATIENCE, settled);
         }
         let Some(ring) = ring() else { return Ok(()) };
-        let meta = Meta { sequence, source_timestamp: clock::wall(), published: 0 };
+        let meta = Meta::at_nanos(sequence, clock::wall());
         ring.publish(meta, payload).map(drop)
     }
 

@@ -155,7 +155,7 @@ impl Far {
     }
 
     fn publish(&self, sequence: u64, payload: &[u8]) {
-        let meta = Meta { sequence, source_timestamp: 0, published: 0 };
+        let meta = Meta::at_nanos(sequence, 0);
         self.writer.publish(meta, payload).unwrap();
     }
 
@@ -404,7 +404,7 @@ fn memory_that_a_writer_did_not_leave_is_given_up_with_what_is_in_it() {
 #[test]
 fn a_daemon_cannot_have_a_session_read_its_own_samples_as_rings_and_lanes() {
     let (session, daemon) = session();
-    let latched = Qos { durability: Durability::TransientLocal, ..Qos::default() };
+    let latched = Qos::default().with_durability(Durability::TransientLocal);
     let publisher =
         session.create_publisher(EndpointSpec::new("/t", "test/Bytes", latched)).unwrap();
     // Of those that it makes itself, the daemon has no part in the pair.
@@ -479,7 +479,7 @@ fn memory_that_could_not_be_handed_over_for_want_of_descriptors_is_later() {
         return;
     }
     let (session, daemon) = session();
-    let latched = Qos { durability: Durability::TransientLocal, ..Qos::default() };
+    let latched = Qos::default().with_durability(Durability::TransientLocal);
     let publisher =
         session.create_publisher(EndpointSpec::new("/p", "test/Bytes", latched)).unwrap();
     let subscription = subscription(&session);

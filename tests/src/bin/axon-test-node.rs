@@ -55,7 +55,7 @@ fn spec(topic: &str) -> EndpointSpec {
 }
 
 fn alive(session: &Session, stdin: &Receiver<u8>, topic: &str) -> Result<(), Box<dyn Error>> {
-    let qos = Qos { lease: Some(Duration::from_millis(500)), ..Qos::default() };
+    let qos = Qos::default().with_lease(Duration::from_millis(500));
     let _publisher = session.create_publisher(EndpointSpec::new(topic, "test/Bytes", qos))?;
     Word::Ready.say()?;
     while stdin.recv().is_ok() {}

@@ -1,5 +1,7 @@
 //! KMEs that give the two hosts different keys under one key_ID.
 
+use std::time::Duration;
+
 use axon_tests::Sizes;
 use etsi_qkd014::sim::{Fault, FaultPlan, Method};
 
@@ -28,7 +30,7 @@ fn a_failed_proof_retires_that_key_on_both_hosts_and_nothing_else() {
     let mut there = b.subscribe(Sizes::Small);
     let mut publisher = a.publish(Sizes::Small, 1, None);
     there.wait_taken(SOME);
-    let since = [&a, &b].map(|host| host.link().since_unix_ms);
+    let since = [&a, &b].map(|host| host.link().since);
     let retired = counter(&b, SAE[0], "receiving", "retired");
 
     kmes.plan(1, FaultPlan::new(Fault::WrongKey).times(1).on(Method::DecKeys));
@@ -42,7 +44,7 @@ fn a_failed_proof_retires_that_key_on_both_hosts_and_nothing_else() {
     let tally = there.tally();
     assert_eq!((tally.taken, tally.missing, tally.lost), (sent, 0, 0), "{tally:?}");
     for (host, since) in [&a, &b].into_iter().zip(since) {
-        assert_eq!(host.link().since_unix_ms, since, "the link stood");
+        assert_eq!(host.link().since, since, "the link stood");
         assert!(host.status().refusals.is_empty(), "{:?}", host.status().refusals);
     }
     assert_eq!(counter(&a, SAE[1], "sending", "disagreed"), 1);
@@ -64,8 +66,8 @@ fn kmes_that_disagree_about_the_first_keys_cost_few_of_them() {
     };
     until("a host names the KMEs", || named(&a, 0) || named(&b, 1));
     let before = kmes.calls();
-    let start = [&a, &b].map(|host| host.status().uptime_s);
-    until("ten seconds pass", || a.status().uptime_s >= start[0] + 10);
+    let start = [&a, &b].map(|host| host.status().uptime);
+    until("ten seconds pass", || a.status().uptime >= start[0] + Duration::from_secs(10));
     // Eight for each dial, which are ever further apart, and the status of two pools.
     let calls = kmes.calls() - before;
     assert!(calls <= 60, "{calls} calls in ten seconds");

@@ -73,33 +73,22 @@ impl Elector {
 
     /// Says a whole graph: the subscription for which routes are asked.
     fn say_subscription(&self, met: &mut Met) {
-        let subscription = Endpoint {
-            gid: SUBSCRIPTION,
-            kind: EndpointKind::Subscription,
-            topic: TOPIC.into(),
-            type_name: TYPE.into(),
-            type_hash: Vec::new(),
-            qos: Qos::default(),
-            node: "one".into(),
-            namespace: "/".into(),
-            enclave: String::new(),
-        };
+        let subscription = Endpoint::new(SUBSCRIPTION, EndpointKind::Subscription, TOPIC, TYPE)
+            .with_node("one", "/");
         let graph = Graph { version: 1, added: vec![subscription], ..Graph::default() };
         self.stranger.say(met, &Message::Graph(graph));
     }
 
     /// Says a whole graph of 600 publishers in two parts; the last is of the topic.
     fn say_graph(&self, met: &mut Met, version: u64) {
-        let publisher = |number: u16| Endpoint {
-            gid: Gid(std::array::from_fn(|at| [9, (number >> 8) as u8, number as u8][at.min(2)])),
-            kind: EndpointKind::Publisher,
-            topic: if number == 599 { TOPIC.into() } else { format!("/other_{number}") },
-            type_name: TYPE.into(),
-            type_hash: Vec::new(),
-            qos: Qos::default(),
-            node: "many".into(),
-            namespace: "/".into(),
-            enclave: String::new(),
+        let publisher = |number: u16| {
+            Endpoint::new(
+                Gid(std::array::from_fn(|at| [9, (number >> 8) as u8, number as u8][at.min(2)])),
+                EndpointKind::Publisher,
+                if number == 599 { TOPIC.into() } else { format!("/other_{number}") },
+                TYPE,
+            )
+            .with_node("many", "/")
         };
         for (part, more) in [(0..300, true), (300..600, false)] {
             let version = version + u64::from(!more);

@@ -75,7 +75,7 @@ fn matches_are_counted_on_both_hosts() {
     let publisher = here.create_publisher(spec()).unwrap();
     let publication = publisher.event(EventKind::PublicationMatched).unwrap();
     let first = there.create_subscription(spec()).unwrap();
-    let one = Matched { total: 1, total_change: 1, current: 1, current_change: 1 };
+    let one = Matched::new(1, 1, 1, 1);
     let subscribed = first.event(EventKind::SubscriptionMatched).unwrap();
     for (session, event) in [(&here, &publication), (&there, &subscribed)] {
         occurs(session, event);
@@ -83,11 +83,11 @@ fn matches_are_counted_on_both_hosts() {
     }
     let second = there.create_subscription(spec()).unwrap();
     occurs(&here, &publication);
-    let two = Matched { total: 2, current: 2, ..one };
+    let two = Matched::new(2, 1, 2, 1);
     assert_eq!(matches(&publication), two);
     drop(first);
     occurs(&here, &publication);
-    let left = Matched { total: 2, total_change: 0, current: 1, current_change: -1 };
+    let left = Matched::new(2, 0, 1, -1);
     assert_eq!(matches(&publication), left);
     assert_eq!(publisher.matched(), [second.gid()]);
     let subscribed = second.event(EventKind::SubscriptionMatched).unwrap();
@@ -95,7 +95,7 @@ fn matches_are_counted_on_both_hosts() {
     assert_eq!(matches(&subscribed), one);
     drop(publisher);
     occurs(&there, &subscribed);
-    let none = Matched { total: 1, total_change: 0, current: 0, current_change: -1 };
+    let none = Matched::new(1, 0, 0, -1);
     assert_eq!(matches(&subscribed), none);
 }
 
@@ -106,11 +106,11 @@ fn each_policy_that_falls_short_is_reported_on_both_hosts() {
     let least = Qos::sensor_data();
     let manual = Liveliness::ManualByTopic;
     for (policy, requested) in [
-        (Incompatible::Reliability, Qos { reliability: Reliability::Reliable, ..least }),
-        (Incompatible::Durability, Qos { durability: Durability::TransientLocal, ..least }),
-        (Incompatible::Deadline, Qos { deadline: Some(3600 * SECOND), ..least }),
-        (Incompatible::Liveliness, Qos { liveliness: manual, ..least }),
-        (Incompatible::LivelinessLease, Qos { lease: Some(3600 * SECOND), ..least }),
+        (Incompatible::Reliability, least.with_reliability(Reliability::Reliable)),
+        (Incompatible::Durability, least.with_durability(Durability::TransientLocal)),
+        (Incompatible::Deadline, least.with_deadline(3600 * SECOND)),
+        (Incompatible::Liveliness, least.with_liveliness(manual, least.lease)),
+        (Incompatible::LivelinessLease, least.with_lease(3600 * SECOND)),
     ] {
         let spec = |qos| EndpointSpec::new(format!("/{policy}"), "test/Bytes", qos);
         let publisher = here.create_publisher(spec(least)).unwrap();
@@ -121,7 +121,7 @@ fn each_policy_that_falls_short_is_reported_on_both_hosts() {
             for (session, event, total) in [(&here, &offers, total), (&there, &requests, 1)] {
                 occurs(session, event);
                 let EventStatus::IncompatibleQos(status) = event.take() else { unreachable!() };
-                assert_eq!(status.count, Counted { total, change: 1 });
+                assert_eq!(status.count, Counted::new(total, 1));
                 assert_eq!(status.last_policy, Some(policy));
             }
             assert!(publisher.matched().is_empty() && subscription.matched().is_empty());
@@ -143,7 +143,7 @@ fn another_type_is_reported_on_both_hosts() {
         let requests = subscription.event(EventKind::SubscriptionIncompatibleType).unwrap();
         for (session, event, total) in [(&here, &offers, total), (&there, &requests, 1)] {
             occurs(session, event);
-            assert_eq!(counted(event), Counted { total, change: 1 });
+            assert_eq!(counted(event), Counted::new(total, 1));
         }
         assert!(publisher.matched().is_empty() && subscription.matched().is_empty());
     }
@@ -154,7 +154,7 @@ fn every_sample_is_taken_or_counted_as_lost_elsewhere() {
     let ring = || classic(&[("AXON_RING_BUFFER_SIZE_MB", "1")]);
     let [a, b] = Plan::new([ring(), ring()]).start();
     let (here, there) = (a.session("publisher"), b.session("subscription"));
-    let qos = Qos { reliability: Reliability::BestEffort, ..Qos::keep_all() };
+    let qos = Qos::keep_all().with_reliability(Reliability::BestEffort);
     let (publisher, subscription) = matched(&here, &there, qos);
     let lost = subscription.event(EventKind::MessageLost).unwrap();
     // What is lost is missed from the first one on that came.
@@ -188,7 +188,7 @@ fn every_sample_is_taken_or_counted_as_lost_elsewhere() {
 fn a_deadline_is_missed_on_both_hosts() {
     let [a, b] = hosts();
     let (here, there) = (a.session("publisher"), b.session("subscription"));
-    let qos = Qos { deadline: Some(SECOND / 10), ..Qos::default() };
+    let qos = Qos::default().with_deadline(SECOND / 10);
     let (publisher, subscription) = matched(&here, &there, qos);
     publisher.publish(b"the only one").unwrap();
     assert!(subscription.recv(&mut Vec::new(), Some(PATIENCE)).is_ok());
@@ -200,10 +200,8 @@ fn a_deadline_is_missed_on_both_hosts() {
 fn what_is_older_than_its_lifespan_is_not_taken_elsewhere() {
     let [a, b] = hosts();
     let (here, there) = (a.session("publisher"), b.session("subscription"));
-    let lasts = |seconds| Qos {
-        lifespan: Some(seconds * SECOND),
-        durability: Durability::TransientLocal,
-        ..Qos::default()
+    let lasts = |seconds| {
+        Qos::default().with_durability(Durability::TransientLocal).with_lifespan(seconds * SECOND)
     };
     // By the clock of its host it is of 1970: the clock does not matter.
     let (publisher, subscription) = matched(&here, &there, lasts(3600));
@@ -233,7 +231,7 @@ fn who_says_without_a_sample_that_it_is_alive_is_so_elsewhere() {
     let [a, b] = hosts();
     let (here, there) = (a.session("publisher"), b.session("subscription"));
     let liveliness = Liveliness::ManualByTopic;
-    let qos = Qos { liveliness, lease: Some(SECOND / 2), ..Qos::default() };
+    let qos = Qos::default().with_liveliness(liveliness, SECOND / 2);
     let (publisher, subscription) = matched(&here, &there, qos);
     let liveliness = subscription.event(EventKind::LivelinessChanged).unwrap();
     let lost = publisher.event(EventKind::LivelinessLost).unwrap();
@@ -264,7 +262,7 @@ fn a_process_that_is_stopped_is_not_alive_elsewhere() {
     let [a, b] = hosts();
     let there = b.session("subscription");
     let mut node = a.node(&["alive", "/timed"]);
-    let qos = Qos { lease: Some(SECOND / 2), ..Qos::default() };
+    let qos = Qos::default().with_lease(SECOND / 2);
     let spec = EndpointSpec::new("/timed", "test/Bytes", qos);
     let subscription = there.create_subscription(spec).unwrap();
     node.wait_ready();

@@ -198,13 +198,13 @@ fn link_through_forged(plan: impl Fn([Settings; 2]) -> Plan) {
         link(what, &mut hosts, &name, 3 * u64::from(a_second), sent);
         // What is forged takes nothing from a link that stands.
         forger.wait_for(u64::from(a_second));
-        let since = hosts[0].link().since_unix_ms;
+        let since = hosts[0].link().since;
         let (begin, before) = (Instant::now(), hosts.each_ref().map(processor_time));
         forger.wait_for(2 * u64::from(a_second));
         let spent = [0, 1].map(|host| processor_time(&hosts[host]) - before[host]);
         let share = spent.map(|spent| spent.as_secs_f64() / begin.elapsed().as_secs_f64());
         eprintln!("{what}: the daemons take {share:.3?} of a processor");
-        assert_eq!(hosts[0].link().since_unix_ms, since, "{what}");
+        assert_eq!(hosts[0].link().since, since, "{what}");
         drop(forger);
     }
     let mut hosts = plan(none()).prepare();

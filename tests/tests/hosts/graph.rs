@@ -53,30 +53,17 @@ impl Witness {
 
 /// Unlike any default in each of its policies.
 fn odd() -> Qos {
-    Qos {
-        reliability: Reliability::BestEffort,
-        durability: Durability::TransientLocal,
-        history: History::KeepLast,
-        depth: 7,
-        deadline: Some(Duration::from_nanos(3_600_000_000_001)),
-        lifespan: Some(Duration::from_nanos(5_000_000_003)),
-        liveliness: Liveliness::ManualByTopic,
-        lease: Some(Duration::from_nanos(7_200_000_000_005)),
-    }
+    Qos::default()
+        .with_reliability(Reliability::BestEffort)
+        .with_durability(Durability::TransientLocal)
+        .with_depth(7)
+        .with_deadline(Duration::from_nanos(3_600_000_000_001))
+        .with_lifespan(Duration::from_nanos(5_000_000_003))
+        .with_liveliness(Liveliness::ManualByTopic, Duration::from_nanos(7_200_000_000_005))
 }
 
 fn named(gid: Gid, node: &str, namespace: &str, enclave: &str) -> Endpoint {
-    Endpoint {
-        gid,
-        kind: EndpointKind::Node,
-        topic: String::new(),
-        type_name: String::new(),
-        type_hash: Vec::new(),
-        qos: Qos::default(),
-        node: node.into(),
-        namespace: namespace.into(),
-        enclave: enclave.into(),
-    }
+    Endpoint::new(gid, EndpointKind::Node, "", "").with_node(node, namespace).with_enclave(enclave)
 }
 
 #[test]
@@ -104,20 +91,21 @@ fn every_field_of_what_is_on_one_host_is_in_the_others_graph_for_as_long_as_it_i
     let right = session.create_node("right", "/front/low", "/").unwrap();
     appears(&mut expected, named(right.gid(), "right", "/front/low", "/"));
 
-    let all = Qos { history: History::KeepAll, depth: 3, ..odd() };
-    let few = Qos { depth: 4, ..Qos::default() };
+    let all = odd().with_history(History::KeepAll).with_depth(3);
+    let few = Qos::default().with_depth(4);
     let spec = |topic: &str, hash: u8, qos| {
         EndpointSpec::new(topic, format!("test/Of{hash}"), qos).type_hash(vec![hash; 32])
     };
-    let of = |node: &Node, gid, kind, topic: &str, hash: u8, qos| Endpoint {
-        gid,
-        kind,
-        topic: topic.into(),
-        type_name: format!("test/Of{hash}"),
-        type_hash: vec![hash; 32],
-        qos,
-        enclave: String::new(),
-        ..named(gid, node.name(), node.namespace(), "")
+    let of = |node: &Node, gid, kind, topic: &str, hash: u8, qos| {
+        let mut endpoint = named(gid, node.name(), node.namespace(), "");
+        endpoint.gid = gid;
+        endpoint.kind = kind;
+        endpoint.topic = topic.into();
+        endpoint.type_name = format!("test/Of{hash}");
+        endpoint.type_hash = vec![hash; 32];
+        endpoint.qos = qos;
+        endpoint.enclave = String::new();
+        endpoint
     };
     let publisher = left.create_publisher(spec("/a", 1, odd())).unwrap();
     let kind = EndpointKind::Publisher;
@@ -131,12 +119,13 @@ fn every_field_of_what_is_on_one_host_is_in_the_others_graph_for_as_long_as_it_i
     appears(&mut expected, of(&right, client.gid(), EndpointKind::Client, "/d", 4, odd()));
     // One of no node, of a type that nobody knows more of.
     let bare = session.create_publisher(EndpointSpec::new("/e", "", Qos::default())).unwrap();
-    let unknown = Endpoint {
-        type_name: String::new(),
-        type_hash: Vec::new(),
-        node: String::new(),
-        namespace: String::new(),
-        ..of(&left, bare.gid(), EndpointKind::Publisher, "/e", 5, Qos::default())
+    let unknown = {
+        let mut endpoint = of(&left, bare.gid(), EndpointKind::Publisher, "/e", 5, Qos::default());
+        endpoint.type_name = String::new();
+        endpoint.type_hash = Vec::new();
+        endpoint.node = String::new();
+        endpoint.namespace = String::new();
+        endpoint
     };
     appears(&mut expected, unknown);
 

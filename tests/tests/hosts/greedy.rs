@@ -107,17 +107,13 @@ impl Camera {
 
 fn long(session: SessionId, number: u32) -> Endpoint {
     let name = |kind: &str| format!("/{kind}_{number}_{}", "n".repeat(500 - 20));
-    Endpoint {
-        gid: Gid::new(session, number),
-        kind: EndpointKind::Publisher,
-        topic: format!("{:0<500}", name("topic")),
-        type_name: format!("{:0<500}", name("type")),
-        type_hash: Vec::new(),
-        qos: Qos::default(),
-        node: format!("{:0<500}", name("node")),
-        namespace: format!("{:0<500}", name("space")),
-        enclave: String::new(),
-    }
+    Endpoint::new(
+        Gid::new(session, number),
+        EndpointKind::Publisher,
+        format!("{:0<500}", name("topic")),
+        format!("{:0<500}", name("type")),
+    )
+    .with_node(format!("{:0<500}", name("node")), format!("{:0<500}", name("space")))
 }
 
 fn subscribe(route: u32, topic: String, subscribers: Vec<Subscriber>) -> Message {
@@ -144,12 +140,13 @@ impl<F: Fn()> Drop for OnDrop<F> {
 
 fn short(session: SessionId, number: u32, topic: &str) -> Endpoint {
     let (topic, name) = (topic.to_owned(), String::new);
-    Endpoint {
-        topic,
-        type_name: "t".into(),
-        node: name(),
-        namespace: name(),
-        ..long(session, number)
+    {
+        let mut endpoint = long(session, number);
+        endpoint.topic = topic;
+        endpoint.type_name = "t".into();
+        endpoint.node = name();
+        endpoint.namespace = name();
+        endpoint
     }
 }
 

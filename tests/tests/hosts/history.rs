@@ -12,7 +12,7 @@ use super::{
 };
 
 fn spec() -> EndpointSpec {
-    let qos = Qos { durability: Durability::TransientLocal, ..Qos::keep_all() };
+    let qos = Qos::keep_all().with_durability(Durability::TransientLocal);
     EndpointSpec::new("/history", "test/Bytes", qos)
 }
 

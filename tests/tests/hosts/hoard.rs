@@ -33,16 +33,10 @@ pub(crate) fn published(camera: &Camera, met: &mut Met, of: Gid) -> u32 {
 
 /// Announces publishers of a topic, and waits until they are subscribed to: the route.
 fn all_published(camera: &Camera, met: &mut Met, topic: &str, all: &[Gid]) -> u32 {
-    let publisher = |gid: &Gid| Endpoint {
-        gid: *gid,
-        kind: EndpointKind::Publisher,
-        topic: topic.into(),
-        type_name: TYPE.into(),
-        type_hash: Vec::new(),
-        qos: Qos::keep_all(),
-        node: "hoard".into(),
-        namespace: "/".into(),
-        enclave: String::new(),
+    let publisher = |gid: &Gid| {
+        Endpoint::new(*gid, EndpointKind::Publisher, topic, TYPE)
+            .with_qos(Qos::keep_all())
+            .with_node("hoard", "/")
     };
     let added = all.iter().map(publisher).collect();
     let graph = Graph { version: 1, added, ..Graph::default() };

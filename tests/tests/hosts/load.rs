@@ -96,7 +96,7 @@ fn survivors(queue_mb: &str) -> usize {
     let ring = ("AXON_RING_BUFFER_SIZE_MB", "8");
     let settings = classic(&[("AXON_RELIABLE_QUEUE_MB", queue_mb), ring]);
     let hosts = Plan::new([settings, classic(&[])]).start();
-    let newest = Qos { depth: 1000, ..Qos::default() };
+    let newest = Qos::default().with_depth(1000);
     let (publisher, subscription) = across(&hosts, "/newest", newest);
     let daemon = hosts[1].status().pid;
     signal(daemon, Signal::STOP);

@@ -221,15 +221,15 @@ fn kinds_of_subscriptions_for_which_a_topic_has_no_relay_are_told_to_both_hosts(
     const TOPIC: &str = "/kinds";
     let hosts = Plan::new([classic(&[]), classic(&[])]).start();
     let (here, there) = (hosts[0].session("publisher"), hosts[1].session("subscriptions"));
-    let all = Qos { durability: Durability::TransientLocal, ..Qos::default() };
+    let all = Qos::default().with_durability(Durability::TransientLocal);
     let publisher = here.create_publisher(EndpointSpec::new(TOPIC, TYPE, all)).unwrap();
     let mut subscriptions = Vec::new();
     for reliability in [Reliability::Reliable, Reliability::BestEffort] {
         for durability in [Durability::Volatile, Durability::TransientLocal] {
             for history in [Some(1), Some(17), Some(257), Some(4_097), None] {
                 let base =
-                    history.map_or_else(Qos::keep_all, |depth| Qos { depth, ..Qos::default() });
-                let qos = Qos { reliability, durability, ..base };
+                    history.map_or_else(Qos::keep_all, |depth| Qos::default().with_depth(depth));
+                let qos = base.with_reliability(reliability).with_durability(durability);
                 let spec = EndpointSpec::new(TOPIC, TYPE, qos);
                 subscriptions.push(there.create_subscription(spec).unwrap());
             }

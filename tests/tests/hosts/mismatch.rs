@@ -59,7 +59,7 @@ fn pinned_against_anybody() {
 fn another_domain_is_none_of_our_business() {
     let plan = Plan { other_domain: true, ..Plan::new([classic(&[]), classic(&[])]) };
     let hosts = plan.start();
-    let wait = || hosts.iter().all(|host| host.status().uptime_s >= 4);
+    let wait = || hosts.iter().all(|host| host.status().uptime.as_secs() >= 4);
     until("both had time to find each other", wait);
     thread::sleep(Duration::from_millis(100));
     for host in &hosts {

@@ -86,7 +86,7 @@ fn a_reliable_subscription_gets_all_that_a_best_effort_one_before_it_may_miss() 
     const BURST: u64 = 8;
     let hosts = hosts();
     let topic = "/lossy_first";
-    let lossy = Qos { depth: 1, ..Qos::sensor_data() };
+    let lossy = Qos::sensor_data().with_depth(1);
     let (publisher, there, _first) = crossing(&hosts, topic, lossy);
     for qos in [Qos::default(), Qos::keep_all()] {
         let next = join(&publisher, &there, topic, qos);
@@ -117,7 +117,7 @@ fn nobody_loses_anything_because_somebody_else_asks_for_more() {
     let hosts = hosts();
     let (here, there) = (hosts[0].session("publisher"), hosts[1].session("subscriptions"));
     let publisher = here.create_publisher(spec("/deeper", Qos::keep_all())).unwrap();
-    let all = |depth| spec("/deeper", Qos { depth, ..Qos::keep_all() });
+    let all = |depth| spec("/deeper", Qos::keep_all().with_depth(depth));
     let first = there.create_subscription(all(1)).unwrap();
     let gid = first.gid();
     assert!(publisher.wait_matched(1, PATIENCE) && first.wait_matched(1, PATIENCE));

@@ -68,7 +68,7 @@ fn all_came(case: &str, hosts: &[Host; 2], numbers: &[u64], last: u64) {
 #[test]
 fn a_burst_within_the_depth_outlasts_a_cut() {
     let (hosts, wire) = wired([classic(&[]), classic(&[])]);
-    let (publisher, subscription) = across(&hosts, Qos { depth: 1024, ..Qos::default() });
+    let (publisher, subscription) = across(&hosts, Qos::default().with_depth(1024));
     wire.cut();
     publish(&publisher, 1024, 4096, Duration::ZERO);
     thread::sleep(Duration::from_secs(3));
@@ -107,7 +107,7 @@ fn what_a_keep_all_publisher_leaves_in_a_cut_link_arrives() {
 
 #[test]
 fn what_a_keep_last_publisher_leaves_in_a_cut_link_arrives() {
-    what_a_publisher_leaves_in_a_cut_link_arrives(Qos { depth: 100, ..Qos::default() });
+    what_a_publisher_leaves_in_a_cut_link_arrives(Qos::default().with_depth(100));
 }
 
 #[test]

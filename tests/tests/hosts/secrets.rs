@@ -155,7 +155,7 @@ fn in_session(kex: &str) {
     there.wait_taken(1);
     let mut links = BTreeSet::new();
     until("there was a third link", || {
-        links.extend(b.status().links.first().map(|link| link.since_unix_ms));
+        links.extend(b.status().links.first().map(|link| link.since));
         links.len() >= 3
     });
     wait_erased(&kmes, &hosts, [&publisher, &there], || links.len() as u64);

@@ -1,5 +1,7 @@
 //! What status says of a link that is slow, and why it is.
 
+use std::time::Duration;
+
 use axon_tests::Sizes;
 use axon_transport::{
     qos::Qos,
@@ -16,7 +18,7 @@ use super::{
 
 /// RELIABLE, and so many samples are kept. What a KEEP_ALL publisher cannot send waits in its own ring.
 fn keeping(depth: u32) -> Qos {
-    Qos { depth, ..Qos::default() }
+    Qos::default().with_depth(depth)
 }
 
 /// Waits until the status of the one link shows something.
@@ -38,16 +40,16 @@ fn what_waits_is_shown_by_class_and_with_the_age_of_the_oldest() {
     let (long, read_long) = across(&hosts, "/long", keeping(LONGS));
     let (short, read_short) = across(&hosts, "/short", keeping(SHORTS));
     let idle = shown(&hosts[0], "nothing waits", |link| link.waiting_bytes == 0);
-    assert_eq!((idle.waiting, idle.waiting_ms), (WaitingStatus::default(), 0));
+    assert_eq!((idle.waiting, idle.oldest_waits), (WaitingStatus::default(), Duration::ZERO));
     assert!(idle.mtu >= 1200 && idle.congestion_window > 0, "{idle:?}");
-    assert!(0 < idle.rtt_min_us && idle.packets_sent > 0, "{idle:?}");
+    assert!(!idle.rtt_min.is_zero() && idle.packets_sent > 0, "{idle:?}");
     wire.cut();
     for (publisher, size, count) in [(&long, 1 << 20, LONGS), (&short, 4096, SHORTS)] {
         let sample = vec![0x5a; size];
         (0..count).for_each(|_| assert!(publisher.publish(&sample).is_ok()));
     }
     let full = shown(&hosts[0], "both wait", |link| {
-        link.waiting.bulk > 0 && link.waiting.small_reliable > 0 && link.waiting_ms > 0
+        link.waiting.bulk > 0 && link.waiting.small_reliable > 0 && !link.oldest_waits.is_zero()
     });
     let WaitingStatus { services, small_reliable, small_best_effort, bulk, .. } = full.waiting;
     assert_eq!(full.waiting_bytes, small_reliable + bulk, "{full:?}");
@@ -59,7 +61,7 @@ fn what_waits_is_shown_by_class_and_with_the_age_of_the_oldest() {
         while subscription.recv(&mut bytes, Some(PATIENCE)).unwrap().sequence < u64::from(count) {}
     }
     let idle = shown(&hosts[0], "nothing waits", |link| link.waiting_bytes == 0);
-    assert_eq!((idle.waiting, idle.waiting_ms), (WaitingStatus::default(), 0));
+    assert_eq!((idle.waiting, idle.oldest_waits), (WaitingStatus::default(), Duration::ZERO));
 }
 
 #[test]

@@ -36,17 +36,8 @@ fn numbered(session: Gid, number: u32) -> Gid {
 
 /// The endpoint that a session will make as its `number`th, as the squatter announces it.
 fn claim(session: Gid, number: u32) -> Endpoint {
-    Endpoint {
-        gid: numbered(session, number),
-        kind: EndpointKind::Publisher,
-        topic: TOPIC.into(),
-        type_name: TYPE.into(),
-        type_hash: Vec::new(),
-        qos: Qos::default(),
-        node: "squatter".into(),
-        namespace: "/".into(),
-        enclave: String::new(),
-    }
+    Endpoint::new(numbered(session, number), EndpointKind::Publisher, TOPIC, TYPE)
+        .with_node("squatter", "/")
 }
 
 /// The node of an endpoint, as this session sees it.

@@ -27,17 +27,9 @@ const TYPE: &str = "test/Bytes";
 const SUBSCRIPTION: Gid = Gid([7; 16]);
 
 fn subscribe(stranger: &Stranger, met: &mut Met) {
-    let subscription = Endpoint {
-        gid: SUBSCRIPTION,
-        kind: EndpointKind::Subscription,
-        topic: TOPIC.into(),
-        type_name: TYPE.into(),
-        type_hash: Vec::new(),
-        qos: Qos::keep_all(),
-        node: "idle".into(),
-        namespace: "/".into(),
-        enclave: String::new(),
-    };
+    let subscription = Endpoint::new(SUBSCRIPTION, EndpointKind::Subscription, TOPIC, TYPE)
+        .with_qos(Qos::keep_all())
+        .with_node("idle", "/");
     let graph = Graph { version: 1, added: vec![subscription], ..Graph::default() };
     stranger.say(met, &Message::Graph(graph));
     let subscribe = Subscribe {

@@ -71,7 +71,7 @@ impl Medium for Axon {
 /// The default profile, with a history of `window` samples at least.
 pub(crate) fn qos(window: usize) -> Result<Qos> {
     let qos = Qos::default();
-    Ok(Qos { depth: qos.depth.max(u32::try_from(window)?), ..qos })
+    Ok(qos.with_depth(qos.depth.max(u32::try_from(window)?)))
 }
 
 struct AxonEnd {

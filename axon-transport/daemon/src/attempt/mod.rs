@@ -169,17 +169,8 @@ impl Link {
         topic: &str,
         type_name: &str,
     ) -> Result<(), Refusal> {
-        let endpoint = Endpoint {
-            gid: publisher,
-            kind: EndpointKind::Publisher,
-            topic: topic.into(),
-            type_name: type_name.into(),
-            type_hash: Vec::new(),
-            qos: Qos::keep_all(),
-            node: String::new(),
-            namespace: String::new(),
-            enclave: String::new(),
-        };
+        let endpoint = Endpoint::new(publisher, EndpointKind::Publisher, topic, type_name)
+            .with_qos(Qos::keep_all());
         let graph = Graph { version: 1, before: 0, added: vec![endpoint], ..Graph::default() };
         let mut binding = Binding::default();
         self.connection

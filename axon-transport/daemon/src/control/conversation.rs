@@ -21,6 +21,7 @@ use tokio::{io::unix::AsyncFd, sync::Notify};
 
 use super::{
     plane::Control,
+    report::send_status,
     turns::{PART, Turn},
 };
 
@@ -206,7 +207,7 @@ fn receive_some(
     let queued = |c: &Control| c.registry.session(id).map_or(0, SessionEntry::queued);
     while begin.elapsed() < PART && queued(control) < unread {
         match receive(socket.get_ref(), buffer) {
-            Ok(Received { message: Message::StatusRequest, .. }) => control.send_status(id),
+            Ok(Received { message: Message::StatusRequest, .. }) => send_status(control, id),
             // The one thing that is handed over after HELLO, and the only one that the daemon reads:
             // reading anything else may block.
             Ok(Received { descriptors, .. }) if !descriptors.iter().all(PassedFd::is_memfd) => {
@@ -259,4 +260,15 @@ async fn ended(death: Option<&AsyncFd<PassedFd>>) {
         Some(pidfd) => drop(pidfd.readable().await),
         None => std::future::pending().await,
     }
+}
+
+/// Says something to somebody new, whose socket has room; whether it was said.
+pub(super) fn say(
+    socket: &AsyncFd<PassedFd>,
+    message: Message,
+    descriptors: &[BorrowedFd<'_>],
+) -> bool {
+    let packet = message.encode();
+    let sent = packet.map(|packet| socket::send(socket.get_ref(), &packet, descriptors));
+    matches!(sent, Ok(Ok(())))
 }

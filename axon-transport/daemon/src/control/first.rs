@@ -12,7 +12,10 @@ use axon_transport::internal::{
 use tokio::io::unix::AsyncFd;
 use zeroize::Zeroize;
 
-use super::{admission::unshared, conversation::receive, listen::say};
+use super::{
+    admission::unshared,
+    conversation::{receive, say},
+};
 
 /// Messages of unknown types that may come before HELLO.
 const UNKNOWN: u32 = 8;

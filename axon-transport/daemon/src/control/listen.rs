@@ -22,7 +22,6 @@ use axon_transport::{
         SessionKey,
         graph::Scope,
         registry::{MAX_OF_PROCESS, RelayCounters, SessionEntry},
-        session::daemon::socket,
         text,
         wire::session::{Hello, Message, PROTOCOL, Refused, Welcome},
     },
@@ -31,7 +30,7 @@ use rustix::net::{AddressFamily, SocketFlags, SocketType, accept_with, socketpai
 use tokio::{io::unix::AsyncFd, sync::Notify, task::spawn_local, time::timeout};
 
 use super::{
-    conversation::converse,
+    conversation::{converse, say},
     first::{First, first},
     pending::{PendingConnections, Stranger},
     plane::Control,
@@ -158,17 +157,6 @@ pub(super) async fn serve(
             tokio::task::yield_now().await;
         }
     }
-}
-
-/// Says something to somebody new, whose socket has room; whether it was said.
-pub(super) fn say(
-    socket: &AsyncFd<PassedFd>,
-    message: Message,
-    descriptors: &[BorrowedFd<'_>],
-) -> bool {
-    let packet = message.encode();
-    let sent = packet.map(|packet| socket::send(socket.get_ref(), &packet, descriptors));
-    matches!(sent, Ok(Ok(())))
 }
 
 /// Refuses somebody, and shows it.

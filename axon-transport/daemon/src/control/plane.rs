@@ -7,7 +7,7 @@ use std::{
     os::fd::OwnedFd,
     rc::Rc,
     sync::Arc,
-    time::Instant,
+    time::{Instant, SystemTime},
 };
 
 use axon_shm::{
@@ -20,7 +20,7 @@ use axon_transport::{
         registry::Registry,
         session::{daemon::address::Address, relayed::Pool},
     },
-    status::{LinkStatus, RefusalStatus, TrafficStatus, unix_ms},
+    status::{LinkStatus, RefusalStatus, TrafficStatus},
 };
 use tokio::sync::{Notify, watch};
 
@@ -174,22 +174,6 @@ impl Control {
         self.draining || self.registry.is_needed()
     }
 
-    /// Answers a session that asks for the status. One that asks again before it has taken the
-    /// answer gets the same one from its beginning.
-    pub(super) fn send_status(&mut self, id: &SessionId) {
-        if self.registry.repeat_status(id) {
-            return;
-        }
-        let text = match serde_json::to_vec(&super::report::status(self)) {
-            Ok(text) => text,
-            Err(error) => {
-                tracing::error!(%error, "the status cannot be written");
-                Vec::new()
-            }
-        };
-        self.registry.tell_status(id, text.into());
-    }
-
     pub(super) fn refused(&mut self, peer: String, what: String, reason: String) {
         tracing::warn!(peer, what, reason, "refused");
         // The same peer refused for the same cause again is the same news.
@@ -197,7 +181,7 @@ impl Control {
         if self.refusals.len() == REFUSALS {
             self.refusals.pop_front();
         }
-        self.refusals.push_back(RefusalStatus { unix_ms: unix_ms(), peer, what, reason });
+        self.refusals.push_back(RefusalStatus::new(SystemTime::now(), peer, what, reason));
     }
 
     /// What the gateway says, but for what concerns discovery alone.

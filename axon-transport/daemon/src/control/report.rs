@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use axon_shm::ids::SessionId;
 use axon_transport::{
     config::{KeyMode, Security},
     internal::wire::session::{PROTOCOL, SessionRole},
@@ -11,7 +12,23 @@ use axon_transport::{
 use super::{plane::Control, topics::topics};
 use crate::discovery::Wanted;
 
-pub(super) fn status(control: &Control) -> Status {
+/// Answers a session that asks for the status. One that asks again before it has taken the
+/// answer gets the same one from its beginning.
+pub(super) fn send_status(control: &mut Control, id: &SessionId) {
+    if control.registry.repeat_status(id) {
+        return;
+    }
+    let text = match serde_json::to_vec(&status(control)) {
+        Ok(text) => text,
+        Err(error) => {
+            tracing::error!(%error, "the status cannot be written");
+            Vec::new()
+        }
+    };
+    control.registry.tell_status(id, text.into());
+}
+
+fn status(control: &Control) -> Status {
     let config = &control.config;
     let settings: BTreeMap<String, String> = control.admission.settings().iter().cloned().collect();
     let setting = |name: &str| settings.get(name).cloned();
@@ -26,48 +43,53 @@ pub(super) fn status(control: &Control) -> Status {
         }
     };
     let sessions = control.registry.sessions().filter(|(_, s)| s.role != SessionRole::Tool);
-    let sessions = sessions.map(|(_, s)| SessionStatus {
-        pid: s.pid,
-        name: s.name.clone(),
-        role: if s.role == SessionRole::Gateway { "gateway" } else { "application" }.into(),
-        endpoints: s.endpoints.len(),
-        queued: s.queued(),
-        range: s.scope.as_ref().map(|scope| scope.range.name().to_owned()),
-        range_stated: s.scope.as_ref().is_some_and(|scope| scope.stated),
-        static_peers: s.scope.as_ref().map_or_else(Vec::new, |scope| scope.static_peers.clone()),
-        lists: s.lists.iter().map(ToString::to_string).collect(),
-        relay: s.relay.as_deref().map(axon_transport::internal::registry::RelayCounters::show),
+    let sessions = sessions.map(|(_, s)| {
+        let mut session = SessionStatus::default();
+        session.pid = s.pid;
+        session.name = s.name.clone();
+        session.role =
+            if s.role == SessionRole::Gateway { "gateway" } else { "application" }.into();
+        session.endpoints = s.endpoints.len();
+        session.queued = s.queued();
+        session.range = s.scope.as_ref().map(|scope| scope.range.name().to_owned());
+        session.range_stated = s.scope.as_ref().is_some_and(|scope| scope.stated);
+        session.static_peers =
+            s.scope.as_ref().map_or_else(Vec::new, |scope| scope.static_peers.clone());
+        session.lists = s.lists.iter().map(ToString::to_string).collect();
+        session.relay =
+            s.relay.as_deref().map(axon_transport::internal::registry::RelayCounters::show);
+        session
     });
     let refused = control.refused_routes.iter().filter_map(|(peer, routes)| {
         let link = control.links.get(peer)?;
         Some((link.host.as_str(), routes.as_slice()))
     });
     let refused: Vec<_> = refused.collect();
-    Status {
-        daemon: control.id.to_string(),
-        pid: std::process::id(),
-        uptime_s: control.started.elapsed().as_secs(),
-        protocol: PROTOCOL,
-        version: env!("CARGO_PKG_VERSION").into(),
-        domain: config.domain,
-        mode: mode.into(),
-        key_mode,
-        kex: setting("AXON_QKD_KEX"),
-        cipher: setting("AXON_QUIC_CIPHER").unwrap_or_default(),
-        sae,
-        socket: control.address.to_string(),
-        runtime_dir: config.runtime_dir.as_ref().map(|dir| dir.display().to_string()),
-        port: control.port,
-        gateway: control.gateway.clone(),
-        discovery: discovery(&control.wanted.borrow()),
-        traffic: control.traffic,
-        sessions: sessions.collect(),
-        topics: topics(&control.registry, &control.lost.all(), &refused),
-        links: control.links.values().cloned().collect(),
-        keys: control.keys.clone(),
-        refusals: control.refusals.iter().cloned().collect(),
-        settings,
-    }
+    let mut status = Status::default();
+    status.daemon = control.id.to_string();
+    status.pid = std::process::id();
+    status.uptime = control.started.elapsed();
+    status.protocol = PROTOCOL;
+    status.version = env!("CARGO_PKG_VERSION").into();
+    status.domain = config.domain;
+    status.mode = mode.into();
+    status.key_mode = key_mode;
+    status.kex = setting("AXON_QKD_KEX");
+    status.cipher = setting("AXON_QUIC_CIPHER").unwrap_or_default();
+    status.sae = sae;
+    status.socket = control.address.to_string();
+    status.runtime_dir = config.runtime_dir.as_ref().map(|dir| dir.display().to_string());
+    status.port = control.port;
+    status.gateway = control.gateway.clone();
+    status.discovery = discovery(&control.wanted.borrow());
+    status.traffic = control.traffic;
+    status.sessions = sessions.collect();
+    status.topics = topics(&control.registry, &control.lost.all(), &refused);
+    status.links = control.links.values().cloned().collect();
+    status.keys = control.keys.clone();
+    status.refusals = control.refusals.iter().cloned().collect();
+    status.settings = settings;
+    status
 }
 
 fn discovery(wanted: &Wanted) -> DiscoveryStatus {
@@ -76,8 +98,8 @@ fn discovery(wanted: &Wanted) -> DiscoveryStatus {
         Some(port) => format!("{host}:{port}"),
         None => host.clone(),
     };
-    DiscoveryStatus {
-        range: wanted.range.name().to_owned(),
-        hosts: wanted.hosts.iter().map(host).collect(),
-    }
+    let mut discovery = DiscoveryStatus::default();
+    discovery.range = wanted.range.name().to_owned();
+    discovery.hosts = wanted.hosts.iter().map(host).collect();
+    discovery
 }

@@ -92,11 +92,11 @@ pub(super) fn topics(
     }
     for apart in registry.kept_apart(KEPT_APART, LOOKED_AT) {
         if let Some(topic) = topics.get_mut(&(apart.topic, apart.type_name)) {
-            topic.out_of_range.push(OutOfRangeStatus {
-                writer: apart.pair.writer.to_string(),
-                reader: apart.pair.reader.to_string(),
-                reason: apart.why.to_string(),
-            });
+            let mut pair = OutOfRangeStatus::default();
+            pair.writer = apart.pair.writer.to_string();
+            pair.reader = apart.pair.reader.to_string();
+            pair.reason = apart.why.to_string();
+            topic.out_of_range.push(pair);
         }
     }
     show_refused(registry, &mut topics, refused);
@@ -104,7 +104,9 @@ pub(super) fn topics(
     for (name, causes) in lost {
         let known = topics.iter().position(|topic| topic.topic == *name);
         let index = known.unwrap_or_else(|| {
-            topics.push(TopicStatus { topic: name.clone(), ..TopicStatus::default() });
+            let mut topic = TopicStatus::default();
+            topic.topic = name.clone();
+            topics.push(topic);
             topics.len() - 1
         });
         for (cause, samples) in causes {
@@ -133,10 +135,12 @@ fn show_refused(
         let Some(gids) = waiting.get(&(*waits, &**topic, &**type_name)) else { continue };
         let Some(shown) = topics.get_mut(&(topic.clone(), type_name.clone())) else { continue };
         let room = LISTED.saturating_sub(shown.refused.len());
-        shown.refused.extend(gids.iter().take(room).map(|gid| RefusedRouteStatus {
-            endpoint: gid.to_string(),
-            host: (*peer).to_owned(),
-            reason: reason.clone(),
+        shown.refused.extend(gids.iter().take(room).map(|gid| {
+            let mut route = RefusedRouteStatus::default();
+            route.endpoint = gid.to_string();
+            route.host = (*peer).to_owned();
+            route.reason = reason.clone();
+            route
         }));
     }
 }
@@ -145,11 +149,11 @@ fn entry<'a>(
     topics: &'a mut BTreeMap<(String, String), TopicStatus>,
     endpoint: &Endpoint,
 ) -> &'a mut TopicStatus {
-    let (topic, type_name) = (endpoint.topic.clone(), endpoint.type_name.clone());
-    topics.entry((topic.clone(), type_name.clone())).or_insert_with(|| TopicStatus {
-        topic,
-        type_name,
-        ..TopicStatus::default()
+    let (name, type_name) = (endpoint.topic.clone(), endpoint.type_name.clone());
+    topics.entry((name.clone(), type_name.clone())).or_insert_with(|| {
+        let mut topic = TopicStatus::default();
+        (topic.topic, topic.type_name) = (name, type_name);
+        topic
     })
 }
 
@@ -158,18 +162,18 @@ fn writer(session: &Session, local: &LocalEndpoint, counts: &RingCounts) -> Writ
     let own = session.segments.iter().filter(|s| s.segment.publisher == Some(gid));
     let own = own.map(|segment| inspect::committed(segment.descriptor.as_fd()));
     let own = own.fold(0, u64::saturating_add);
-    WriterStatus {
-        pid: session.pid,
-        writer: gid.to_string(),
-        stand_in: local.role == EndpointRole::StandIn,
-        depth: depth(&local.endpoint.qos),
-        window: counts.window,
-        bytes_committed: own.saturating_add(counts.bytes),
-        published: counts.published,
-        blocked: counts.blocked,
-        no_memory: counts.no_memory,
-        pinned: counts.pinned,
-    }
+    let mut writer = WriterStatus::default();
+    writer.pid = session.pid;
+    writer.writer = gid.to_string();
+    writer.stand_in = local.role == EndpointRole::StandIn;
+    writer.depth = depth(&local.endpoint.qos);
+    writer.window = counts.window;
+    writer.bytes_committed = own.saturating_add(counts.bytes);
+    writer.published = counts.published;
+    writer.blocked = counts.blocked;
+    writer.no_memory = counts.no_memory;
+    writer.pinned = counts.pinned;
+    writer
 }
 
 fn reader(
@@ -187,19 +191,18 @@ fn reader(
         Some(SystemTime::now().duration_since(since).unwrap_or_default())
     });
     let depth = depth(&local.endpoint.qos);
-    ReaderStatus {
-        pid: session.pid,
-        reader: attach.reader.to_string(),
-        writer: attach.writer.to_string(),
-        relay: local.role == EndpointRole::Relay,
-        depth,
-        unread: unread.min(depth.map_or(u64::MAX, u64::from)),
-        received: lane.received,
-        lost: lane.lost,
-        skipped: lane.skipped,
-        waiting_ms: waiting.map(|age| u64::try_from(age.as_millis()).unwrap_or(u64::MAX)),
-        stopped: false,
-    }
+    let mut reader = ReaderStatus::default();
+    reader.pid = session.pid;
+    reader.reader = attach.reader.to_string();
+    reader.writer = attach.writer.to_string();
+    reader.relay = local.role == EndpointRole::Relay;
+    reader.depth = depth;
+    reader.unread = unread.min(depth.map_or(u64::MAX, u64::from));
+    reader.received = lane.received;
+    reader.lost = lane.lost;
+    reader.skipped = lane.skipped;
+    reader.waiting = waiting;
+    reader
 }
 
 /// Samples that stand and that the reader has not taken.
@@ -237,7 +240,7 @@ fn summed_up(mut topic: TopicStatus) -> TopicStatus {
         drop("no_memory", writer.no_memory);
         drop("pinned", writer.pinned);
     }
-    let worst_first = |reader: &ReaderStatus| Reverse((reader.waiting_ms, reader.lost));
+    let worst_first = |reader: &ReaderStatus| Reverse((reader.waiting, reader.lost));
     topic.readers.sort_by_key(worst_first);
     topic.more_readers = topic.readers.len().saturating_sub(LISTED);
     topic.readers.truncate(LISTED);
@@ -288,11 +291,13 @@ mod tests {
     fn topic_sums_saturate_and_list_the_worst_endpoints() {
         let mut topic = TopicStatus::default();
         for number in 0..100 {
-            let mut reader = ReaderStatus { lost: u64::MAX, ..ReaderStatus::default() };
-            reader.waiting_ms = (number % 2 == 0).then_some(number);
+            let mut reader = ReaderStatus::default();
+            reader.lost = u64::MAX;
+            reader.waiting = (number % 2 == 0).then(|| Duration::from_millis(number));
             topic.readers.push(reader);
-            let bytes_committed = u64::MAX - number;
-            let writer = WriterStatus { bytes_committed, blocked: u64::MAX, ..Default::default() };
+            let mut writer = WriterStatus::default();
+            writer.bytes_committed = u64::MAX - number;
+            writer.blocked = u64::MAX;
             topic.writers.push(writer);
         }
         let topic = summed_up(topic);
@@ -300,8 +305,8 @@ mod tests {
         assert!(topic.dropped.values().all(|count| *count == u64::MAX));
         assert_eq!((topic.readers.len(), topic.more_readers), (LISTED, 36));
         assert_eq!((topic.writers.len(), topic.more_writers), (LISTED, 36));
-        assert_eq!(topic.readers[0].waiting_ms, Some(98));
-        assert!(topic.readers[..50].iter().all(|reader| reader.waiting_ms.is_some()));
+        assert_eq!(topic.readers[0].waiting, Some(Duration::from_millis(98)));
+        assert!(topic.readers[..50].iter().all(|reader| reader.waiting.is_some()));
         assert_eq!(topic.writers[0].bytes_committed, u64::MAX);
     }
 }

@@ -76,10 +76,9 @@ impl Connection {
     /// Adds what QUIC measures to the link's status.
     pub(super) fn fill(&self, status: &mut LinkStatus) {
         let path = self.quic.stats().path;
-        let micros = |time: Duration| u64::try_from(time.as_micros()).unwrap_or(u64::MAX);
         status.address = self.quic.remote_address().to_string();
-        status.rtt_us = micros(self.quic.rtt());
-        status.rtt_min_us = micros(self.quic.min_rtt());
+        status.rtt = self.quic.rtt();
+        status.rtt_min = self.quic.min_rtt();
         status.congestion_window = path.cwnd;
         status.congestion_events = path.congestion_events;
         status.packets_sent = path.sent_packets;

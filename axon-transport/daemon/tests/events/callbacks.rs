@@ -63,14 +63,12 @@ fn scene(kind: EventKind, pair: &Pair) -> Scene<'_> {
         }
     };
     if kind.is_publishers() {
-        let timed = Qos { deadline: Some(50 * MILLI), ..plain() };
+        let timed = plain().with_deadline(50 * MILLI);
         let manual = Liveliness::ManualByTopic;
         let own = match kind {
             EventKind::OfferedQosIncompatible => offered,
             EventKind::OfferedDeadlineMissed => timed,
-            EventKind::LivelinessLost => {
-                Qos { liveliness: manual, lease: Some(50 * MILLI), ..plain() }
-            }
+            EventKind::LivelinessLost => plain().with_liveliness(manual, 50 * MILLI),
             _ => plain(),
         };
         let publisher = Arc::new(here.create_publisher(spec(own)).unwrap());
@@ -99,7 +97,7 @@ fn scene(kind: EventKind, pair: &Pair) -> Scene<'_> {
         let event = publisher.event(kind).unwrap();
         return Scene { event, session: here, cause, _cast: Box::new(publisher) };
     }
-    let timed = Qos { deadline: Some(50 * MILLI), ..plain() };
+    let timed = plain().with_deadline(50 * MILLI);
     let (_cast, event, cause): (Box<dyn Any>, _, Cause<'_>) = match kind {
         EventKind::MessageLost | EventKind::RequestedDeadlineMissed => {
             let qos = if kind == EventKind::MessageLost { lossy() } else { timed };

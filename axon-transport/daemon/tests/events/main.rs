@@ -94,7 +94,7 @@ fn matches_are_counted_at_both_ends_with_what_changed() {
         assert_eq!(matched(&publication), Matched::default());
         let first = pair.there.create_subscription(spec(Qos::default())).unwrap();
         let subscribed = of_subscription(&first, EventKind::SubscriptionMatched);
-        let one = Matched { total: 1, total_change: 1, current: 1, current_change: 1 };
+        let one = Matched::new(1, 1, 1, 1);
         for (session, event) in [(&pair.here, &publication), (&pair.there, &subscribed)] {
             await_event(session, event);
             assert_eq!(matched(event), one);
@@ -114,7 +114,7 @@ fn matches_are_counted_at_both_ends_with_what_changed() {
         assert_eq!(matched(&subscribed), one);
         drop(publisher);
         await_event(&pair.there, &subscribed);
-        let none = Matched { total_change: 0, current: 0, current_change: -1, ..one };
+        let none = Matched::new(1, 0, 0, -1);
         assert_eq!(matched(&subscribed), none);
         assert!(second.matched().is_empty());
     }
@@ -147,15 +147,11 @@ fn less() -> [(Incompatible, Qos, Qos); 5] {
     let longer = Some(7_200_000 * MILLI);
     let manual = Liveliness::ManualByTopic;
     [
-        (Incompatible::Reliability, least, Qos { reliability: Reliability::Reliable, ..least }),
-        (Incompatible::Durability, least, Qos { durability: Durability::TransientLocal, ..least }),
-        (Incompatible::Deadline, least, Qos { deadline: period, ..least }),
-        (Incompatible::Liveliness, least, Qos { liveliness: manual, ..least }),
-        (
-            Incompatible::LivelinessLease,
-            Qos { lease: longer, ..least },
-            Qos { lease: period, ..least },
-        ),
+        (Incompatible::Reliability, least, least.with_reliability(Reliability::Reliable)),
+        (Incompatible::Durability, least, least.with_durability(Durability::TransientLocal)),
+        (Incompatible::Deadline, least, least.with_deadline(period)),
+        (Incompatible::Liveliness, least, least.with_liveliness(manual, least.lease)),
+        (Incompatible::LivelinessLease, least.with_lease(longer), least.with_lease(period)),
     ]
 }
 
@@ -175,7 +171,7 @@ fn incompatible_profiles_are_reported_at_both_ends_with_the_policy() {
                 {
                     await_event(session, end);
                     let EventStatus::IncompatibleQos(status) = end.take() else { panic!() };
-                    assert_eq!(status.count, Counted { total, change: 1 });
+                    assert_eq!(status.count, Counted::new(total, 1));
                     assert_eq!(status.last_policy, Some(policy));
                 }
                 assert!(subscription.matched().is_empty() && publisher.matched().is_empty());
@@ -196,8 +192,8 @@ fn another_type_under_the_same_name_is_reported_at_both_ends() {
             let requested = of_subscription(&subscription, EventKind::SubscriptionIncompatibleType);
             await_event(&pair.here, &offered);
             await_event(&pair.there, &requested);
-            assert_eq!(counted(&offered), Counted { total, change: 1 });
-            assert_eq!(counted(&requested), Counted { total: 1, change: 1 });
+            assert_eq!(counted(&offered), Counted::new(total, 1));
+            assert_eq!(counted(&requested), Counted::new(1, 1));
             assert!(publisher.matched().is_empty());
         }
         let unknown = pair.there.create_subscription(spec(Qos::default())).unwrap();
@@ -227,7 +223,7 @@ fn every_lost_sample_is_counted_whether_or_not_somebody_takes() {
 
 /// Keeps what there is room for, and waits for nobody.
 fn lossy() -> Qos {
-    Qos { reliability: Reliability::BestEffort, ..Qos::keep_all() }
+    Qos::keep_all().with_reliability(Reliability::BestEffort)
 }
 
 /// More samples than a ring has room for.
@@ -242,7 +238,7 @@ fn flood(publisher: &Publisher) {
 #[test]
 fn deadlines_are_missed_at_both_ends_from_the_first_sample_on() {
     for pair in Pair::all() {
-        let timed = Qos { deadline: Some(20 * MILLI), ..Qos::default() };
+        let timed = Qos::default().with_deadline(20 * MILLI);
         let (publisher, subscription) = pair.matched(timed, timed);
         let ends = [
             (&pair.here, of_publisher(&publisher, EventKind::OfferedDeadlineMissed)),
@@ -270,13 +266,13 @@ fn deadlines_are_missed_at_both_ends_from_the_first_sample_on() {
 fn a_lease_that_is_not_asserted_runs_out_and_comes_back() {
     for pair in Pair::all() {
         let (liveliness, lease) = (Liveliness::ManualByTopic, Some(50 * MILLI));
-        let manual = Qos { liveliness, lease, ..Qos::default() };
+        let manual = Qos::default().with_liveliness(liveliness, lease);
         // One that asks for no lease is told all the same.
         let (publisher, subscription) = pair.matched(manual, Qos::default());
         let changed = of_subscription(&subscription, EventKind::LivelinessChanged);
         let lost = of_publisher(&publisher, EventKind::LivelinessLost);
         await_event(&pair.here, &lost);
-        assert_eq!(counted(&lost), Counted { total: 1, change: 1 });
+        assert_eq!(counted(&lost), Counted::new(1, 1));
         until("it counts as not alive", || {
             await_event(&pair.there, &changed);
             let status = liveliness_of(&changed);
@@ -310,7 +306,7 @@ fn a_lease_that_is_not_asserted_runs_out_and_comes_back() {
 #[test]
 fn a_sample_older_than_its_lifespan_is_not_delivered() {
     let session = alone();
-    let mortal = |lifespan| Qos { lifespan: Some(lifespan), ..Qos::default() };
+    let mortal = |lifespan| Qos::default().with_lifespan(lifespan);
     let short = session.create_publisher(spec(mortal(Duration::from_nanos(1)))).unwrap();
     let long = session.create_publisher(spec(mortal(3_600_000 * MILLI))).unwrap();
     let immortal = session.create_publisher(spec(Qos::default())).unwrap();

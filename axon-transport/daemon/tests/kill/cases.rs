@@ -22,7 +22,7 @@ impl Case {
 }
 
 fn last(depth: u32) -> Qos {
-    Qos { history: History::KeepLast, depth, ..Qos::default() }
+    Qos::default().with_history(History::KeepLast).with_depth(depth)
 }
 
 fn case(
@@ -33,14 +33,14 @@ fn case(
     len: usize,
 ) -> Case {
     let publisher = if reader.history == History::KeepAll { Qos::keep_all() } else { last(1) };
-    let publisher = Qos { durability: reader.durability, ..publisher };
+    let publisher = publisher.with_durability(reader.durability);
     let (pinned, around, long) = (0, Nothing, false);
     Case { name, operation, publisher, reader, before, len, taken, pinned, around, long }
 }
 
 pub(crate) fn cases() -> Vec<Case> {
     let all = Qos::keep_all();
-    let latched = |depth| Qos { durability: Durability::TransientLocal, ..last(depth) };
+    let latched = |depth| last(depth).with_durability(Durability::TransientLocal);
     vec![
         case("create a ring", Create, last(4), (0, 0), 0),
         case("attach a reader", Attach, last(4), (0, 0), 40),

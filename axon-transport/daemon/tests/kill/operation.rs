@@ -99,7 +99,7 @@ pub(crate) fn writer(session: &Arc<SessionSegment>, qos: Qos) -> Writer {
 }
 
 pub(crate) fn meta(sequence: u64) -> Meta {
-    Meta { sequence, source_timestamp: sequence.cast_signed() * 7 - 3, published: 0 }
+    Meta::at_nanos(sequence, sequence.cast_signed() * 7 - 3)
 }
 
 /// Bytes that differ by sequence number and place.

@@ -150,11 +150,9 @@ pub(crate) fn play(part: &str) {
             let group = std::env::var("GROUP").unwrap();
             group::join(Path::new(&group)).unwrap();
             let context = Context::new().unwrap();
-            let options = PublisherOptions::new(Qos {
-                depth: 1000,
-                durability: Durability::TransientLocal,
-                ..Qos::default()
-            });
+            let options = PublisherOptions::new(
+                Qos::default().with_durability(Durability::TransientLocal).with_depth(1000),
+            );
             let options = options.budget(1 << 30).max_len(128 << 20);
             let publisher = Publisher::new(&context, options).unwrap();
             // Fewer samples of this size are kept than are wanted.

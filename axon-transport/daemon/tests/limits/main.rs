@@ -37,13 +37,13 @@ fn spec(topic: &str) -> EndpointSpec {
 
 /// What is published before anybody listens is kept.
 fn latched(topic: &str) -> EndpointSpec {
-    let qos = Qos { durability: Durability::TransientLocal, ..Qos::keep_all() };
+    let qos = Qos::keep_all().with_durability(Durability::TransientLocal);
     EndpointSpec::new(topic, "test/Bytes", qos)
 }
 
 /// Of samples that are read in place, the newest are kept for readers that come later.
 fn image() -> EndpointSpec {
-    let qos = Qos { durability: Durability::TransientLocal, ..Qos::default() };
+    let qos = Qos::default().with_durability(Durability::TransientLocal);
     EndpointSpec::new("/image", "test/Bytes", qos)
 }
 

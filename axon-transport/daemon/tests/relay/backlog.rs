@@ -24,7 +24,7 @@ fn who_takes_no_responses_holds_its_own_back_and_nobody_elses() {
 #[test]
 fn who_keeps_the_newest_only_gets_them_and_holds_nobody_back() {
     const MANY: u64 = 500;
-    let newest = Qos { depth: 3, ..Qos::default() };
+    let newest = Qos::default().with_depth(3);
     with_both_ends(|here, there| {
         let server = here.create_server(service().qos(newest)).unwrap();
         let client = there.create_client(service().qos(newest)).unwrap();

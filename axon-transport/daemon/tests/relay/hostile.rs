@@ -69,17 +69,7 @@ pub(super) fn by_hand(host: &Host, hello: Hello) -> OwnedFd {
 }
 
 fn announce(gid: Gid, kind: EndpointKind, role: EndpointRole) -> Message {
-    let endpoint = Endpoint {
-        gid,
-        kind,
-        topic: "/t".into(),
-        type_name: "test/Bytes".into(),
-        type_hash: Vec::new(),
-        qos: Qos::keep_all(),
-        node: String::new(),
-        namespace: String::new(),
-        enclave: String::new(),
-    };
+    let endpoint = Endpoint::new(gid, kind, "/t", "test/Bytes").with_qos(Qos::keep_all());
     let (stands_for, ring, only) = (Vec::new(), None, None);
     Message::Endpoint(Announce { endpoint, role, stands_for, ring, only })
 }

@@ -15,7 +15,7 @@ fn replace(host: &Host, daemon: &mut Option<Kept>) {
 }
 
 fn depth_four(reliability: Reliability) -> Qos {
-    Qos { reliability, depth: 4, ..Qos::default() }
+    Qos::default().with_reliability(reliability).with_depth(4)
 }
 
 /// Has the daemon end in good order, and starts the next.
@@ -354,7 +354,7 @@ fn what_a_killed_daemon_loses_of_keep_last_and_best_effort_is_counted() {
             let from = session(&host, "from", from_shares);
             let to = session(&host, "to", to_shares);
             let publisher = from.create_publisher(spec("/t", depth_four(reliability))).unwrap();
-            let keeps = Qos { reliability, ..Qos::keep_all() };
+            let keeps = Qos::keep_all().with_reliability(reliability);
             let subscription = to.create_subscription(spec("/t", keeps)).unwrap();
             await_pair(&publisher, &subscription);
             // Before its first sample a subscription does not know what there was.
@@ -378,7 +378,7 @@ fn what_a_killed_daemon_loses_of_keep_last_and_best_effort_is_counted() {
 
 #[test]
 fn a_late_joiner_gets_the_history_from_the_next_daemon() {
-    let all = Qos { durability: Durability::TransientLocal, ..Qos::keep_all() };
+    let all = Qos::keep_all().with_durability(Durability::TransientLocal);
     for (from_shares, to_shares) in ENDS {
         let host = host();
         let mut daemon = Some(host.daemon());

@@ -53,11 +53,11 @@ fn spec(topic: &str, qos: Qos) -> EndpointSpec {
 }
 
 fn best_effort(depth: u32) -> Qos {
-    Qos { reliability: Reliability::BestEffort, depth, ..Qos::default() }
+    Qos::default().with_reliability(Reliability::BestEffort).with_depth(depth)
 }
 
 fn latched(depth: u32) -> Qos {
-    Qos { durability: Durability::TransientLocal, depth, ..Qos::default() }
+    Qos::default().with_durability(Durability::TransientLocal).with_depth(depth)
 }
 
 /// Who shares memory with its daemon, of the two ends of what is tested.
@@ -304,7 +304,7 @@ fn best_effort_waits_for_nobody_and_what_is_lost_is_counted() {
     let _daemon = host.daemon();
     for (from, to) in ENDS {
         let (from, to) = (session(&host, "from", from), session(&host, "to", to));
-        let keeps = Qos { history: History::KeepAll, ..best_effort(1) };
+        let keeps = best_effort(1).with_history(History::KeepAll);
         let publisher = from.create_publisher(spec("/t", best_effort(4))).unwrap();
         let slow = to.create_subscription(spec("/t", keeps)).unwrap();
         await_pair(&publisher, &slow);
@@ -413,7 +413,7 @@ fn a_relay_passes_over_no_more_than_each_publisher_does() {
     let host = host();
     let _daemon = host.daemon();
     let (from, to) = (session(&host, "from", false), session(&host, "to", true));
-    let keeps = Qos { history: History::KeepAll, ..best_effort(1) };
+    let keeps = best_effort(1).with_history(History::KeepAll);
     let subscription = to.create_subscription(spec("/t", keeps)).unwrap();
     let little = from.create_publisher(spec("/t", best_effort(1))).unwrap();
     await_pair(&little, &subscription);

@@ -38,7 +38,12 @@ fn show(socket: &OwnedFd, own: &Endpoint, kind: EndpointKind) -> Gid {
 }
 
 fn show_as(socket: &OwnedFd, gid: Gid, own: &Endpoint, kind: EndpointKind) -> Gid {
-    let endpoint = Endpoint { gid, kind, ..own.clone() };
+    let endpoint = {
+        let mut endpoint = own.clone();
+        endpoint.gid = gid;
+        endpoint.kind = kind;
+        endpoint
+    };
     let added = vec![GraphItem { endpoint, daemon: None, reach: None }];
     let (removed, ended) = (Vec::new(), None);
     let graph = Graph { version: 1, whole: false, added, removed, more: false, ended };

@@ -31,7 +31,7 @@ fn alive(event: &Event) -> (u64, u64) {
 #[test]
 fn deadlines_are_missed_at_both_ends_of_a_relay() {
     with_both_ends(|from, to| {
-        let timed = Qos { deadline: Some(50 * MILLI), ..Qos::default() };
+        let timed = Qos::default().with_deadline(50 * MILLI);
         let (publisher, subscription) = connect(from, to, "/t", timed);
         let offered = publisher.event(EventKind::OfferedDeadlineMissed).unwrap();
         let requested = subscription.event(EventKind::RequestedDeadlineMissed).unwrap();
@@ -47,11 +47,7 @@ fn deadlines_are_missed_at_both_ends_of_a_relay() {
 #[test]
 fn a_lease_runs_out_beyond_a_relay_and_a_sample_renews_it() {
     with_both_ends(|from, to| {
-        let manual = Qos {
-            liveliness: Liveliness::ManualByTopic,
-            lease: Some(100 * MILLI),
-            ..Qos::default()
-        };
+        let manual = Qos::default().with_liveliness(Liveliness::ManualByTopic, 100 * MILLI);
         let (publisher, subscription) = connect(from, to, "/t", manual);
         let changed = subscription.event(EventKind::LivelinessChanged).unwrap();
         until("it counts as not alive", || alive(&changed) == (0, 1));
@@ -69,7 +65,7 @@ fn a_lease_runs_out_beyond_a_relay_and_a_sample_renews_it() {
 fn who_says_without_a_sample_that_it_is_alive_is_so_beyond_a_relay() {
     with_both_ends(|from, to| {
         let liveliness = Liveliness::ManualByTopic;
-        let manual = Qos { liveliness, lease: Some(200 * MILLI), ..Qos::default() };
+        let manual = Qos::default().with_liveliness(liveliness, 200 * MILLI);
         let (publisher, subscription) = connect(from, to, "/t", manual);
         let changed = subscription.event(EventKind::LivelinessChanged).unwrap();
         until("it counts as not alive", || alive(&changed) == (0, 1));
@@ -106,13 +102,13 @@ fn a_process_that_is_stopped_is_not_alive_beyond_a_relay() {
 
 /// The lease of a process that lives as long as it runs.
 pub(crate) fn automatic_lease() -> Qos {
-    Qos { lease: Some(400 * MILLI), ..Qos::default() }
+    Qos::default().with_lease(400 * MILLI)
 }
 
 #[test]
 fn a_sample_that_outlived_its_lifespan_is_not_delivered_beyond_a_relay() {
     with_both_ends(|from, to| {
-        let mortal = |lifespan| Qos { lifespan: Some(lifespan), ..Qos::default() };
+        let mortal = |lifespan| Qos::default().with_lifespan(lifespan);
         // The wall clock does not matter: by it this one is of 1970.
         let (publisher, subscription) = connect(from, to, "/long", mortal(3_600_000 * MILLI));
         publisher.publish_at(from_unix_nanos(1_000_000_000), b"new").unwrap();

@@ -64,8 +64,8 @@ pub(super) fn play_node(processes: usize) {
     let node = session.create_node(&name, "/", "/").unwrap();
     let spec =
         |topic: String, kind: &str, qos| EndpointSpec::new(topic, kind, qos).type_hash(vec![7; 32]);
-    let deep = Qos { depth: 1000, ..Qos::default() };
-    let latched = Qos { durability: Durability::TransientLocal, ..deep };
+    let deep = Qos::default().with_depth(1000);
+    let latched = deep.with_durability(Durability::TransientLocal);
     let _log = node.create_publisher(spec("/rosout".into(), "rcl_interfaces/msg/Log", latched));
     let services: Vec<_> = SERVICES
         .map(|service| {

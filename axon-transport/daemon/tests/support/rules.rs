@@ -56,24 +56,25 @@ impl Profile {
     /// As an endpoint is made with it.
     pub(crate) fn qos(&self) -> Qos {
         let period = |seconds: Option<u64>| seconds.map(Duration::from_secs);
-        Qos {
-            reliability: if self.reliable {
-                Reliability::Reliable
-            } else {
-                Reliability::BestEffort
-            },
-            durability: if self.transient_local {
-                Durability::TransientLocal
-            } else {
-                Durability::Volatile
-            },
-            history: if self.depth.is_some() { History::KeepLast } else { History::KeepAll },
-            depth: self.depth.unwrap_or(1),
-            deadline: period(self.deadline),
-            lifespan: period(self.lifespan),
-            liveliness: if self.manual { Liveliness::ManualByTopic } else { Liveliness::Automatic },
-            lease: period(self.lease),
-        }
+        let liveliness =
+            if self.manual { Liveliness::ManualByTopic } else { Liveliness::Automatic };
+        let qos = match self.depth {
+            Some(depth) => Qos::default().with_depth(depth),
+            None => Qos::keep_all().with_depth(1),
+        };
+        qos.with_reliability(if self.reliable {
+            Reliability::Reliable
+        } else {
+            Reliability::BestEffort
+        })
+        .with_durability(if self.transient_local {
+            Durability::TransientLocal
+        } else {
+            Durability::Volatile
+        })
+        .with_deadline(period(self.deadline))
+        .with_lifespan(period(self.lifespan))
+        .with_liveliness(liveliness, period(self.lease))
     }
 
     /// As an endpoint says it is. `None` where it is nothing that [`qos`](Self::qos) makes.

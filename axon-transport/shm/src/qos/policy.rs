@@ -67,6 +67,7 @@ pub enum Liveliness {
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode, Serialize)]
 #[cbor(map)]
+#[non_exhaustive]
 pub struct Qos {
     /// Whether every sample must arrive.
     #[n(0)]
@@ -148,21 +149,31 @@ impl Qos {
         Self { depth, ..self }
     }
 
-    /// With this deadline.
+    /// With this deadline, or none.
     #[must_use]
-    pub fn with_deadline(self, deadline: Duration) -> Self {
-        Self { deadline: Some(deadline), ..self }
+    pub fn with_deadline(self, deadline: impl Into<Option<Duration>>) -> Self {
+        Self { deadline: deadline.into(), ..self }
     }
 
-    /// With this lifespan.
+    /// With this lifespan, or an infinite one.
     #[must_use]
-    pub fn with_lifespan(self, lifespan: Duration) -> Self {
-        Self { lifespan: Some(lifespan), ..self }
+    pub fn with_lifespan(self, lifespan: impl Into<Option<Duration>>) -> Self {
+        Self { lifespan: lifespan.into(), ..self }
     }
 
-    /// With this liveliness, and this lease.
+    /// With this liveliness, and this lease, or an infinite one.
     #[must_use]
-    pub fn with_liveliness(self, liveliness: Liveliness, lease: Duration) -> Self {
-        Self { liveliness, lease: Some(lease), ..self }
+    pub fn with_liveliness(
+        self,
+        liveliness: Liveliness,
+        lease: impl Into<Option<Duration>>,
+    ) -> Self {
+        Self { liveliness, lease: lease.into(), ..self }
+    }
+
+    /// With this lease, or an infinite one.
+    #[must_use]
+    pub fn with_lease(self, lease: impl Into<Option<Duration>>) -> Self {
+        Self { lease: lease.into(), ..self }
     }
 }

@@ -47,6 +47,7 @@ pub struct Grant {
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub struct Meta {
     /// The publisher's sequence number.
     pub sequence: u64,
@@ -61,7 +62,18 @@ pub struct Meta {
 impl Meta {
     /// Of a sample that is published now, with this number and source time.
     pub fn new(sequence: u64, source_time: SystemTime) -> Self {
-        Self { sequence, source_timestamp: unix_nanos(source_time), published: 0 }
+        Self::at_nanos(sequence, unix_nanos(source_time))
+    }
+
+    /// As [`new`](Self::new), with the source time in nanoseconds since the Unix epoch.
+    pub fn at_nanos(sequence: u64, source_timestamp: i64) -> Self {
+        Self { sequence, source_timestamp, published: 0 }
+    }
+
+    /// With the time of publication in nanoseconds of this host's CLOCK_MONOTONIC.
+    #[must_use]
+    pub fn with_published(self, published: u64) -> Self {
+        Self { published, ..self }
     }
 
     /// The time of publication by the publisher's wall clock.

@@ -107,7 +107,7 @@ const DESCRIPTORS_KEEP_ALL: u64 = 1 << 13;
 ///     max_message: 1 << 20,
 /// })?;
 ///
-/// writer.publish(Meta { sequence: 1, source_timestamp: 0, published: 0 }, b"hello")?;
+/// writer.publish(Meta::at_nanos(1, 0), b"hello")?;
 /// let mut payload = Vec::new();
 /// let taken = reader.take(&mut payload)?.expect("a sample");
 /// assert_eq!((taken.meta.sequence, &payload[..]), (1, &b"hello"[..]));

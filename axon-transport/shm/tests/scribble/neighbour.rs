@@ -109,7 +109,7 @@ fn take_hostile(context: &Context, place: &Path, counts: &Counts) {
     loop {
         let socket = meet(place, "take", true);
         let depth = 1 + u32::try_from(counts.taken.load(Relaxed) % 20).expect("less than twenty");
-        let qos = if depth > 16 { Qos::keep_all() } else { Qos { depth, ..Qos::default() } };
+        let qos = if depth > 16 { Qos::keep_all() } else { Qos::default().with_depth(depth) };
         let options = SubscriberOptions::new(qos).max_len(LONGEST);
         let Ok(mut subscriber) = Subscriber::connect(context, &socket, options, ROUND) else {
             continue;

@@ -474,9 +474,7 @@ mod tests {
         for writer in writers {
             let (publisher, reader) = reading(&session, writer, gid);
             matched_readers.add(reader, None, Numbers::All);
-            let say = |sequence| {
-                publisher.publish(Meta { sequence, source_timestamp: 0, published: 0 }, b"sample")
-            };
+            let say = |sequence| publisher.publish(Meta::at_nanos(sequence, 0), b"sample");
             say(1).unwrap();
             // So many cannot have been lost.
             let refused = PublishError::Sequence { sequence: u64::MAX, last: 1 };

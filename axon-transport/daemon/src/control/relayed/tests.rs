@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use axon_shm::{ids::DaemonId, qos::Qos};
+use axon_shm::ids::DaemonId;
 use axon_transport::config::OsFiles;
 use rustix::{
     event::{PollFd, PollFlags, poll},
@@ -72,17 +72,8 @@ fn a_relayed_process_receives_the_control_planes_refusal() {
     ];
     for (number, kind) in (1..).zip(all) {
         let named = |name: &str| if kind == EndpointKind::Node { "" } else { name }.to_owned();
-        let endpoint = Endpoint {
-            gid: Gid::new(id, number),
-            kind,
-            topic: named("/t"),
-            type_name: named("T"),
-            type_hash: Vec::new(),
-            qos: Qos::default(),
-            node: "n".into(),
-            namespace: String::new(),
-            enclave: String::new(),
-        };
+        let endpoint = Endpoint::new(Gid::new(id, number), kind, named("/t"), named("T"))
+            .with_node("n", String::new());
         let (gid, role) = (endpoint.gid, EndpointRole::Application);
         let (stands_for, ring, only) = (Vec::new(), None, None);
         say(&process, &Message::Endpoint(Announce { endpoint, role, stands_for, ring, only }));

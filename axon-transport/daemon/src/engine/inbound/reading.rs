@@ -292,11 +292,8 @@ impl Inbound {
 
     /// What the ring gets to know of a sample.
     pub(super) fn meta(&self, told: Told, now: Duration) -> Meta {
-        Meta {
-            sequence: told.sequence,
-            source_timestamp: told.source_timestamp,
-            published: self.published(told.age_ms, now),
-        }
+        Meta::at_nanos(told.sequence, told.source_timestamp)
+            .with_published(self.published(told.age_ms, now))
     }
 
     /// When a sample of this age was published, in nanoseconds of this host's CLOCK_MONOTONIC.

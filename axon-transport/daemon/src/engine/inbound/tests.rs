@@ -110,17 +110,8 @@ struct Way {
 
 impl Way {
     fn new(kind: Kind, short: bool, room: usize) -> Self {
-        let endpoint = Endpoint {
-            gid: PUBLISHER,
-            kind: EndpointKind::Publisher,
-            topic: "/t".into(),
-            type_name: "T".into(),
-            type_hash: Vec::new(),
-            qos: Qos::keep_all(),
-            node: String::new(),
-            namespace: String::new(),
-            enclave: String::new(),
-        };
+        let endpoint =
+            Endpoint::new(PUBLISHER, EndpointKind::Publisher, "/t", "T").with_qos(Qos::keep_all());
         let ring = Rc::new(Ring {
             endpoint: endpoint.clone(),
             room: Cell::new(room),

@@ -2,7 +2,7 @@
 
 use axon_envelope::{Delivery, Kind, Route, TopicHash};
 use axon_tls::qkd::{PskIdentity, PskResolver};
-use axon_transport::config::{QkdKex, QkdPeers};
+use axon_transport::config::QkdPeers;
 
 use super::*;
 use crate::keys::{Failure, FailureKind, Fetched, Lookup, NoKey, Purpose};
@@ -20,21 +20,10 @@ pub(crate) fn s(secs: u64) -> Duration {
 /// The settings of SAE `sae`, which links with every other SAE.
 pub(crate) fn config(sae: &str, key_mode: KeyMode) -> Config {
     let mut config = Config::default();
-    config.security = Security::Qkd(QkdConfig {
-        key_mode,
-        kex: QkdKex::PskKe,
-        peers: QkdPeers::Any,
-        session_max_age: s(3600),
-        kme_url: format!("https://kme-of-{sae}"),
-        kme_ca: "ca".into(),
-        kme_id: None,
-        sae_id: sae.to_owned(),
-        sae_cert: "cert".into(),
-        sae_key: "key".into(),
-        kme_quirks: Vec::new(),
-        kme_connect_timeout: s(3),
-        kme_answer_timeout: s(3),
-    });
+    let kme = format!("https://kme-of-{sae}");
+    let mut qkd = QkdConfig::new(sae, QkdPeers::Any, kme, "ca", "cert", "key");
+    (qkd.key_mode, qkd.kme_connect_timeout, qkd.kme_answer_timeout) = (key_mode, s(3), s(3));
+    config.security = Security::Qkd(qkd);
     config
 }
 

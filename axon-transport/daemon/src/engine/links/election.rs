@@ -1,6 +1,10 @@
 //! Which of several connections with a peer becomes its link, and when a link is renewed.
 
-use std::{net::IpAddr, rc::Rc, time::Duration};
+use std::{
+    net::IpAddr,
+    rc::Rc,
+    time::{Duration, SystemTime},
+};
 
 use quinn_proto::{Dir, StreamEvent, VarInt};
 
@@ -104,7 +108,7 @@ impl Links {
             sealing,
             elected: None,
             age: Age::default(),
-            since_unix_ms: axon_transport::status::unix_ms(),
+            since: SystemTime::now(),
             unread: account.unread.nothing(),
             account,
             chain,

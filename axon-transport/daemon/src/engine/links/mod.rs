@@ -398,7 +398,7 @@ impl Links {
     /// The status of a link.
     pub(super) fn status(&self, number: u64) -> Option<LinkStatus> {
         let (connection, peer) = (self.connections.get(number)?, self.table.peer(number)?);
-        let mut status = peer.summary.status(peer.since_unix_ms);
+        let mut status = peer.summary.status(peer.since);
         connection.fill(&mut status);
         Some(status)
     }

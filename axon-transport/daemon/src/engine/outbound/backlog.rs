@@ -24,7 +24,7 @@ impl Backlog {
         status.waiting.small_reliable = of(Class::SmallReliable);
         status.waiting.small_best_effort = of(Class::SmallBestEffort);
         status.waiting.bulk = of(Class::Bulk);
-        let waited = self.oldest.map_or(Duration::ZERO, |oldest| now.saturating_sub(oldest));
-        status.waiting_ms = u64::try_from(waited.as_millis()).unwrap_or(u64::MAX);
+        status.oldest_waits =
+            self.oldest.map_or(Duration::ZERO, |oldest| now.saturating_sub(oldest));
     }
 }

@@ -39,11 +39,12 @@ pub(crate) use self::{
 use self::{
     budget::Budget,
     ending::Endings,
-    flow::{Done, Flow, Pause},
+    flow::{Flow, Pause},
     lending::Lending,
     nudges::Nudges,
     schedule::Schedule,
     served::{FlowRoute, Served},
+    source::Done,
     stall::Stalls,
     without::Without,
 };

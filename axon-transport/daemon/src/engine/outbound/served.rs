@@ -6,7 +6,10 @@ use axon_envelope::{Kind, Route};
 use axon_shm::ids::Gid;
 use axon_transport::config::TopicPriority;
 
-use super::{flow::Done, schedule::FlowId, source::Source};
+use super::{
+    schedule::FlowId,
+    source::{Done, Source},
+};
 
 /// A route that the peer asked for.
 pub(crate) struct RouteOut {

@@ -15,6 +15,15 @@ use crate::engine::{
     stand_in::StandIn,
 };
 
+/// Samples that one flow sent, dropped, or has done with since they were taken up last.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Done {
+    /// The sources may forget the samples up to this number.
+    pub(super) sequence: Option<u64>,
+    /// Samples among them that will never reach the peer.
+    pub(super) given_up: u64,
+}
+
 /// One sample, however long.
 const ONE: TakeLimit = TakeLimit { samples: 1, bytes: 0 };
 

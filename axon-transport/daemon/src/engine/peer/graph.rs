@@ -333,23 +333,12 @@ fn named(endpoint: &Endpoint) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use axon_shm::qos::Qos;
     use axon_transport::internal::SessionKey;
 
     use crate::{engine::account::Accounts, owner::prove};
 
     fn endpoint(number: u8, name: &str) -> Endpoint {
-        Endpoint {
-            gid: Gid([number; 16]),
-            kind: EndpointKind::Publisher,
-            topic: name.into(),
-            type_name: "T".into(),
-            type_hash: Vec::new(),
-            qos: Qos::default(),
-            node: "n".into(),
-            namespace: "/".into(),
-            enclave: String::new(),
-        }
+        Endpoint::new(Gid([number; 16]), EndpointKind::Publisher, name, "T").with_node("n", "/")
     }
 
     fn graph(before: u64, added: Vec<Endpoint>, removed: Vec<Gid>, more: bool) -> Graph {
@@ -378,7 +367,18 @@ mod tests {
         let key = SessionKey::generate().unwrap();
         let (own, from) = (Gid::new(key.id(), 1), DaemonId([7; 16]));
         let [first, second] = [[1; 32], [2; 32]];
-        let all = || graph(0, vec![Endpoint { gid: own, ..endpoint(1, "/t") }], vec![], false);
+        let all = || {
+            graph(
+                0,
+                vec![{
+                    let mut endpoint = endpoint(1, "/t");
+                    endpoint.gid = own;
+                    endpoint
+                }],
+                vec![],
+                false,
+            )
+        };
         remote.prove(&[prove(&key, &first, from).unwrap()], &first, from);
         remote.take(all());
         assert_eq!((remote.left_out(), changes(&mut remote).0.len()), (0, 1));
@@ -463,8 +463,11 @@ mod tests {
         remote.prove(&[prove(&own, &binding, here).unwrap()], &binding, here);
         // The proof of another host, for another connection.
         remote.prove(&[prove(&others, &[8; 32], here).unwrap()], &binding, here);
-        let of =
-            |key: &SessionKey, topic| Endpoint { gid: Gid::new(key.id(), 1), ..endpoint(0, topic) };
+        let of = |key: &SessionKey, topic| {
+            let mut endpoint = endpoint(0, topic);
+            endpoint.gid = Gid::new(key.id(), 1);
+            endpoint
+        };
         for before in [0, 1] {
             let added = vec![of(&others, "/squatted"), of(&own, "/t")];
             remote.take(graph(before, added, vec![], false));

@@ -138,7 +138,7 @@ impl RelaySpec {
 
     /// How what it sends is queued.
     pub(crate) fn queued(&self) -> Qos {
-        Qos { depth: self.depth, ..self.qos }
+        self.qos.with_depth(self.depth)
     }
 }
 
@@ -156,13 +156,11 @@ pub(crate) fn relays(subscribers: &[Subscriber], hash: impl Fn(&Gid) -> Vec<u8>)
         let (offered, type_hash) = (subscriber.qos, hash(&subscriber.gid));
         let keeps_all = offered.history == History::KeepAll;
         // Deadline, lifespan and liveliness are judged where the subscription lives.
-        let qos = Qos {
-            reliability: offered.reliability,
-            durability: offered.durability,
-            history: offered.history,
-            depth: if keeps_all { Qos::keep_all().depth } else { class(offered.depth) },
-            ..Qos::default()
-        };
+        let qos = Qos::default()
+            .with_reliability(offered.reliability)
+            .with_durability(offered.durability)
+            .with_history(offered.history)
+            .with_depth(if keeps_all { Qos::keep_all().depth } else { class(offered.depth) });
         let key = (
             qos.reliability == Reliability::BestEffort,
             !keeps_all,
@@ -205,17 +203,7 @@ mod tests {
     use axon_transport::config::DiscoveryRange;
 
     fn endpoint(number: u8, kind: EndpointKind, topic: &str, qos: Qos) -> Endpoint {
-        Endpoint {
-            gid: Gid([number; 16]),
-            kind,
-            topic: topic.into(),
-            type_name: "t".into(),
-            type_hash: vec![],
-            qos,
-            node: String::new(),
-            namespace: String::new(),
-            enclave: String::new(),
-        }
+        Endpoint::new(Gid([number; 16]), kind, topic, "t").with_qos(qos)
     }
 
     fn wanted(local: &[Endpoint], remote: &[Endpoint]) -> BTreeMap<RouteKey, Wanted> {
@@ -253,15 +241,27 @@ mod tests {
             endpoint(2, Subscription, "/b", q),
             endpoint(3, Subscription, "/c", Qos::sensor_data()),
             endpoint(4, Publisher, "/d", q),
-            Endpoint { type_hash: vec![1], ..endpoint(5, Subscription, "/e", q) },
+            {
+                let mut endpoint = endpoint(5, Subscription, "/e", q);
+                endpoint.type_hash = vec![1];
+                endpoint
+            },
         ];
         let remote = [
             endpoint(11, Publisher, "/a", q),
             endpoint(12, Publisher, "/b", Qos::sensor_data()),
             endpoint(13, Publisher, "/c", Qos::sensor_data()),
             endpoint(14, Subscription, "/d", q),
-            Endpoint { type_name: "other".into(), ..endpoint(15, Publisher, "/a", q) },
-            Endpoint { type_hash: vec![2], ..endpoint(16, Publisher, "/e", q) },
+            {
+                let mut endpoint = endpoint(15, Publisher, "/a", q);
+                endpoint.type_name = "other".into();
+                endpoint
+            },
+            {
+                let mut endpoint = endpoint(16, Publisher, "/e", q);
+                endpoint.type_hash = vec![2];
+                endpoint
+            },
         ];
         let routes = wanted(&local, &remote);
         let topics: Vec<_> = routes.keys().map(|k| k.topic.as_str()).collect();
@@ -297,8 +297,8 @@ mod tests {
 
     #[test]
     fn a_mixed_route_has_a_relay_per_group_that_asks_for_most_first() {
-        let latched = Qos { durability: Durability::TransientLocal, ..Qos::default() };
-        let deep = Qos { depth: 17, ..Qos::default() };
+        let latched = Qos::default().with_durability(Durability::TransientLocal);
+        let deep = Qos::default().with_depth(17);
         let qos = [Qos::sensor_data(), Qos::default(), latched, deep, Qos::keep_all()];
         let subscribers: Vec<_> = (0..).zip(qos).map(|(n, qos)| subscriber(n, qos)).collect();
         let specs = relays(&subscribers, |_| Vec::new());
@@ -310,7 +310,7 @@ mod tests {
     #[test]
     fn who_stands_for_a_subscription_is_the_same_whoever_else_there_is() {
         let of = |depths: &[u32]| {
-            let qos = |depth| Qos { depth, ..Qos::default() };
+            let qos = |depth| Qos::default().with_depth(depth);
             let all = (0..).zip(depths).map(|(n, depth)| subscriber(n, qos(*depth)));
             relays(&all.collect::<Vec<_>>(), |_| Vec::new())
         };

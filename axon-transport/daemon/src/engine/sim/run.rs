@@ -72,9 +72,7 @@ fn qos(qos: ScriptQos) -> Qos {
         ScriptQos::BestEffort => Qos::sensor_data(),
         ScriptQos::ReliableKeepLast => Qos::default(),
         ScriptQos::ReliableKeepAll => Qos::keep_all(),
-        ScriptQos::TransientLocal => {
-            Qos { durability: Durability::TransientLocal, ..Qos::default() }
-        }
+        ScriptQos::TransientLocal => Qos::default().with_durability(Durability::TransientLocal),
     }
 }
 

@@ -127,7 +127,7 @@ fn best_effort_overload(load: f64, depth: u32) -> (f64, Duration) {
     let mut world = World::new(7, 2, classic);
     let rate = super::network::Rate::new(54_000_000 / 8, millis(50));
     world.network.set_default_path(Path { delay: millis(1), rate: Some(rate), ..Path::default() });
-    let pair = world.pair(0, 1, "/camera", Qos { depth, ..Qos::sensor_data() });
+    let pair = world.pair(0, 1, "/camera", Qos::sensor_data().with_depth(depth));
     world.until(secs(10), World::is_whole);
     world.run_for(secs(1));
     let length = 512 << 10;
@@ -266,7 +266,7 @@ fn keep_last_that_is_behind_is_fresh() {
     let rate = super::network::Rate::new(54_000_000 / 8, millis(50));
     let path = Path { delay: millis(1), rate: Some(rate), ..Path::default() };
     world.network.set_default_path(path);
-    let pair = world.pair(0, 1, "/camera", Qos { depth: 1, ..Qos::default() });
+    let pair = world.pair(0, 1, "/camera", Qos::default().with_depth(1));
     world.until(secs(10), World::is_whole);
     world.run_for(secs(1));
     // 126 Mbit/s of 512 KiB samples.

@@ -3,7 +3,7 @@
 use std::{path::Path, time::Duration};
 
 use axon_envelope::KeyId;
-use axon_transport::config::{KeyMode, QkdConfig, QkdKex, QkdPeers};
+use axon_transport::config::{QkdConfig, QkdPeers};
 use etsi_qkd014::sim::{Fault, Network};
 use secrecy::ExposeSecret;
 
@@ -25,21 +25,18 @@ fn config(network: &Network, sae: &str, dir: &Path) -> QkdConfig {
     network.write_files(dir).unwrap();
     let env: std::collections::HashMap<_, _> =
         network.sae(sae).unwrap().env(dir).into_iter().collect();
-    QkdConfig {
-        key_mode: KeyMode::Messages10,
-        kex: QkdKex::PskKe,
-        peers: QkdPeers::Any,
-        session_max_age: Duration::from_secs(3600),
-        kme_url: env["AXON_KME_URL"].clone(),
-        kme_ca: env["AXON_KME_CA"].clone().into(),
-        kme_id: env.get("AXON_KME_ID").cloned(),
-        sae_id: env["AXON_SAE_ID"].clone(),
-        sae_cert: env["AXON_SAE_CERT"].clone().into(),
-        sae_key: env["AXON_SAE_KEY"].clone().into(),
-        kme_quirks: Vec::new(),
-        kme_connect_timeout: LONG,
-        kme_answer_timeout: LONG,
-    }
+    let of = |name: &str| env[name].clone();
+    let mut config = QkdConfig::new(
+        of("AXON_SAE_ID"),
+        QkdPeers::Any,
+        of("AXON_KME_URL"),
+        of("AXON_KME_CA"),
+        of("AXON_SAE_CERT"),
+        of("AXON_SAE_KEY"),
+    );
+    config.kme_id = env.get("AXON_KME_ID").cloned();
+    (config.kme_connect_timeout, config.kme_answer_timeout) = (LONG, LONG);
+    config
 }
 
 fn enc(number: u32) -> Request {
@@ -230,7 +227,8 @@ async fn silent_kme_is_given_up_after_the_answer_limit_of_the_settings() {
     let sim = network.kme("kme-a").unwrap();
     for seconds in [3, 7] {
         let limit = Duration::from_secs(seconds);
-        let settings = QkdConfig { kme_answer_timeout: limit, ..settings.clone() };
+        let mut settings = settings.clone();
+        settings.kme_answer_timeout = limit;
         let (kme, mut events) = Kme::start(&settings, UsedKeys::in_memory()).unwrap();
         // There is a connection: time would pass while one is made.
         kme.probe("sae-b").await.unwrap();
@@ -257,8 +255,8 @@ async fn kme_that_takes_no_connection_is_given_up_after_the_connect_limit_of_the
     let kme_url = format!("https://{}", listener.local_addr().unwrap());
     for seconds in [2, 5] {
         let limit = Duration::from_secs(seconds);
-        let (kme_connect_timeout, kme_url) = (limit, kme_url.clone());
-        let settings = QkdConfig { kme_connect_timeout, kme_url, ..settings.clone() };
+        let mut settings = settings.clone();
+        (settings.kme_connect_timeout, settings.kme_url) = (limit, kme_url.clone());
         let (kme, _events) = Kme::start(&settings, UsedKeys::in_memory()).unwrap();
         tokio::time::pause();
         let begun = tokio::time::Instant::now();
@@ -336,7 +334,8 @@ async fn files_that_are_no_such_files_are_refused_at_once() {
     for (path, expected) in
         [(&pipe, "not a regular file"), (&large, "larger than 64 KiB"), (&open, "chmod 600")]
     {
-        let config = QkdConfig { sae_key: path.clone(), ..config.clone() };
+        let mut config = config.clone();
+        config.sae_key = path.clone();
         let (sender, answer) = std::sync::mpsc::channel();
         std::thread::spawn(move || sender.send(Kme::check(&config)));
         let refused = answer.recv_timeout(LONG).expect("is refused at once").unwrap_err();

@@ -43,7 +43,7 @@ pub(crate) fn elected() -> Message {
 
 /// HELLO first.
 pub(crate) fn messages() -> Vec<Message> {
-    let qos = Qos { lifespan: Some(std::time::Duration::from_nanos(7)), ..Qos::keep_all() };
+    let qos = Qos::keep_all().with_lifespan(std::time::Duration::from_nanos(7));
     vec![
         Message::Hello(Hello {
             replaces: Some([3; 16]),

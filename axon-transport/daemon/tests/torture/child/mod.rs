@@ -104,7 +104,7 @@ pub(crate) fn run(seed: u64) {
             Err(error) => assert!(start.elapsed() < PATIENCE, "{error}"),
         }
     };
-    let qos = [Qos::keep_all(), Qos { depth: 4, ..Qos::default() }];
+    let qos = [Qos::keep_all(), Qos::default().with_depth(4)];
     let topics = ["/all", "/last"];
     let streams = [0, 1].map(|n| {
         let publisher = session.create_publisher(spec(topics[n], qos[n])).expect("memory");

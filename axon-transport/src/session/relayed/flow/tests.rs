@@ -1,10 +1,14 @@
 //! Tests both ends without a socket in between.
 
-use std::collections::{HashMap, VecDeque};
+use std::{
+    collections::{HashMap, VecDeque},
+    sync::Arc,
+};
 
 use proptest::prelude::*;
 
-use super::*;
+use super::{incoming::LONG, *};
+use crate::wire::session::{SampleFragment, SampleHeader};
 
 const MAX: u64 = 1 << 20;
 
@@ -23,7 +27,7 @@ fn incoming() -> Incoming {
 }
 
 fn departing(sequence: u64, len: usize) -> OutboundSample<Vec<u8>> {
-    let meta = Meta { sequence, source_timestamp: -(sequence as i64), published: sequence * 5 };
+    let meta = Meta::at_nanos(sequence, -(sequence as i64)).with_published(sequence * 5);
     let content = (0..len).map(|at| (at as u64 * 31 + sequence) as u8).collect();
     OutboundSample { meta, lost: sequence, content }
 }

@@ -227,12 +227,9 @@ impl RelayConnection<'_> {
 fn requested(offered: &Qos) -> Qos {
     let newest =
         offered.reliability == Reliability::BestEffort && offered.history == History::KeepLast;
-    Qos {
-        history: if newest { History::KeepLast } else { History::KeepAll },
-        deadline: None,
-        lifespan: None,
-        liveliness: Liveliness::Automatic,
-        lease: None,
-        ..*offered
-    }
+    offered
+        .with_history(if newest { History::KeepLast } else { History::KeepAll })
+        .with_deadline(None)
+        .with_lifespan(None)
+        .with_liveliness(Liveliness::Automatic, None)
 }

@@ -3,7 +3,11 @@
 pub(super) mod age;
 pub(super) mod hand_over;
 
-use std::{rc::Rc, sync::Arc, time::Duration};
+use std::{
+    rc::Rc,
+    sync::Arc,
+    time::{Duration, SystemTime},
+};
 
 use axon_tls::Negotiated;
 use axon_transport::status::LinkStatus;
@@ -61,18 +65,17 @@ pub(crate) struct Summary {
 
 impl Summary {
     /// The status of a link, as far as its beginning says it.
-    pub(super) fn status(&self, since_unix_ms: u64) -> LinkStatus {
-        LinkStatus {
-            peer: self.hello.daemon.to_string(),
-            host: self.who.host_name(&self.hello.host),
-            sae: self.hello.sae.clone(),
-            state: "connected".into(),
-            key_exchange: self.negotiated.key_exchange.to_string(),
-            cipher: self.negotiated.cipher.name().into(),
-            authenticated_as: self.who.to_string(),
-            since_unix_ms,
-            ..LinkStatus::default()
-        }
+    pub(super) fn status(&self, since: SystemTime) -> LinkStatus {
+        let mut link = LinkStatus::default();
+        link.peer = self.hello.daemon.to_string();
+        link.host = self.who.host_name(&self.hello.host);
+        link.sae = self.hello.sae.clone();
+        link.state = "connected".into();
+        link.key_exchange = self.negotiated.key_exchange.to_string();
+        link.cipher = self.negotiated.cipher.name().into();
+        link.authenticated_as = self.who.to_string();
+        link.since = Some(since);
+        link
     }
 }
 
@@ -87,7 +90,7 @@ pub(super) struct LinkPeer {
     pub(super) seals: bool,
     pub(super) elected: Option<Elected>,
     pub(super) age: Age,
-    pub(super) since_unix_ms: u64,
+    pub(super) since: SystemTime,
     pub(super) account: Rc<Account>,
     /// Unread stream data that the peer may send.
     pub(super) unread: Charge,

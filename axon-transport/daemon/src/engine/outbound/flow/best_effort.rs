@@ -10,7 +10,7 @@ use axon_transport::config::TopicPriority;
 use bytes::Bytes;
 use quinn_proto::{Connection, Dir, StreamId, VarInt, WriteError};
 
-use super::{Done, Pause};
+use super::Pause;
 use crate::{
     engine::{
         connection::Carrier,
@@ -20,6 +20,7 @@ use crate::{
         outbound::{
             queue::Queue,
             schedule::{Class, Rank},
+            source::Done,
         },
     },
     link::CloseCode,

@@ -24,7 +24,7 @@ use super::{
     queue::Queue,
     schedule::{Class, Rank},
     served::FlowRoute,
-    source::Source,
+    source::{Done, Source},
 };
 use crate::{
     engine::{
@@ -59,15 +59,6 @@ pub(super) enum Pause {
     NoStream,
     /// There is no key for the next message.
     NoKey,
-}
-
-/// Samples that one flow sent, dropped, or has done with since they were taken up last.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) struct Done {
-    /// The sources may forget the samples up to this number.
-    pub(super) sequence: Option<u64>,
-    /// Samples among them that will never reach the peer.
-    pub(super) given_up: u64,
 }
 
 /// One flow.

@@ -176,7 +176,7 @@ impl Way {
 }
 
 fn keep_last(depth: u32) -> Qos {
-    Qos { depth, ..Qos::default() }
+    Qos::default().with_depth(depth)
 }
 
 /// A KEEP_LAST flow that had samples waiting for longer than a burst lasts. One sample was sent.
@@ -247,7 +247,7 @@ fn a_burst_of_a_publisher_that_never_rests_ends() {
 
 #[test]
 fn best_effort_that_is_behind_looks_at_no_more_than_its_depth() {
-    let mut way = Way::new(Qos { depth: 5, ..Qos::sensor_data() });
+    let mut way = Way::new(Qos::sensor_data().with_depth(5));
     way.ring.publish(1, 1 << 20);
     assert_eq!(way.fill(at(0)), 1);
     way.ring.publish(1000, 1 << 20);
@@ -264,9 +264,7 @@ fn best_effort_that_is_behind_looks_at_no_more_than_its_depth() {
 #[test]
 fn samples_of_which_the_queue_keeps_a_few_are_taken_a_few_at_a_time() {
     // A sample that waits holds the memory of all that were taken with it.
-    for (qos, sent_before) in
-        [(keep_last(3), true), (Qos { depth: 3, ..Qos::sensor_data() }, false)]
-    {
+    for (qos, sent_before) in [(keep_last(3), true), (Qos::sensor_data().with_depth(3), false)] {
         let mut way = Way::new(qos);
         way.ring.publish(1, 10);
         way.fill(at(0));

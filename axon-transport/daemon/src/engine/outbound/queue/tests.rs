@@ -14,7 +14,7 @@ fn sample(sequence: u64, length: usize, now: Duration) -> Sample {
 }
 
 fn keep_last(depth: u32) -> Qos {
-    Qos { depth, ..Qos::default() }
+    Qos::default().with_depth(depth)
 }
 
 fn dropped(offered: Offered) -> u64 {
@@ -147,7 +147,7 @@ fn a_link_that_ended_has_its_samples_sent_again_in_order() {
 #[test]
 fn best_effort_keeps_its_depth_and_drops_what_would_be_late() {
     let budget = Budget::new(256 * MIB);
-    let qos = Qos { depth: 3, ..Qos::sensor_data() };
+    let qos = Qos::sensor_data().with_depth(3);
     let mut queue = Queue::new(&qos, budget.of_peer());
     for sequence in 1..=5 {
         dropped(queue.offer(sample(sequence, 1, at(10 * sequence)), at(10 * sequence)));
@@ -163,7 +163,7 @@ fn best_effort_keeps_its_depth_and_drops_what_would_be_late() {
 #[test]
 fn a_best_effort_sample_with_a_lifespan_is_late_at_its_end_and_not_before() {
     let budget = Budget::new(256 * MIB);
-    let mut queue = Queue::new(&Qos { depth: 3, ..Qos::sensor_data() }, budget.of_peer());
+    let mut queue = Queue::new(&Qos::sensor_data().with_depth(3), budget.of_peer());
     for sequence in 1..=3 {
         let mut sample = sample(sequence, 1, at(0));
         sample.info.lifetime = Some(Lifetime::new(at(50), at(1000)));

@@ -122,17 +122,9 @@ impl SimRings {
     fn endpoint(&self, kind: EndpointKind, topic: &str, qos: Qos) -> Endpoint {
         let mut state = self.state.borrow_mut();
         state.next += 1;
-        Endpoint {
-            gid: Gid::new(self.session, state.next),
-            kind,
-            topic: topic.into(),
-            type_name: "T".into(),
-            type_hash: Vec::new(),
-            qos,
-            node: "node".into(),
-            namespace: "/".into(),
-            enclave: String::new(),
-        }
+        Endpoint::new(Gid::new(self.session, state.next), kind, topic, "T")
+            .with_qos(qos)
+            .with_node("node", "/")
     }
 
     /// Creates a publisher.

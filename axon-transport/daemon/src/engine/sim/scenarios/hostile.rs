@@ -88,17 +88,9 @@ fn of_raw(number: u8) -> Gid {
 
 /// A graph of one publisher.
 fn publishes(topic: &str, gid: Gid, qos: Qos) -> Message {
-    let endpoint = Endpoint {
-        gid,
-        kind: EndpointKind::Publisher,
-        topic: topic.into(),
-        type_name: "T".into(),
-        type_hash: Vec::new(),
-        qos,
-        node: "node".into(),
-        namespace: "/".into(),
-        enclave: String::new(),
-    };
+    let endpoint = Endpoint::new(gid, EndpointKind::Publisher, topic, "T")
+        .with_qos(qos)
+        .with_node("node", "/");
     Message::Graph(Graph { version: 1, added: vec![endpoint], ..Graph::default() })
 }
 

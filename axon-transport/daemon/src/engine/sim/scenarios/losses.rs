@@ -22,7 +22,7 @@ fn attached(seed: u64, qos: Qos, path: Path) -> (World, Pair) {
 
 #[test]
 fn a_live_sample_behind_many_expired_ones_is_sent_without_another_ring() {
-    for qos in [Qos::keep_all(), Qos { depth: 256, ..Qos::default() }] {
+    for qos in [Qos::keep_all(), Qos::default().with_depth(256)] {
         let (mut world, pair) = attached(60, qos, Path::default());
         let (host, publisher) = pair.publisher;
         // More than a take passes over, twice and a half.
@@ -48,7 +48,7 @@ fn each_sample_that_does_not_arrive_is_counted_once() {
     let slow = Rate::new(2_000_000, millis(50));
     let slow = Path { delay: millis(2), rate: Some(slow), ..Path::default() };
     let lossy = Path { loss: 0.1, ..slow.clone() };
-    let depth = |depth, qos| Qos { depth, ..qos };
+    let depth = |depth, qos: Qos| qos.with_depth(depth);
     let all = [
         (depth(1, Qos::default()), &slow, 20_000),
         (depth(5, Qos::default()), &lossy, 20_000),
@@ -78,7 +78,7 @@ fn each_sample_that_does_not_arrive_is_counted_once() {
 /// A burst that the depth holds, published into a link that is cut for so long. `rings` says whether the engine hears of
 /// each sample or of the last alone. Returns the samples that arrived.
 fn burst_into_a_cut(cut: Duration, rings: bool) -> (u64, u64) {
-    let qos = Qos { depth: 1024, ..Qos::default() };
+    let qos = Qos::default().with_depth(1024);
     let (mut world, pair) = attached(70, qos, Path { delay: millis(2), ..Path::default() });
     let broken = world.network.partition(&[0], None);
     let (host, publisher) = pair.publisher;

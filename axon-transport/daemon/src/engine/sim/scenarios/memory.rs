@@ -54,17 +54,7 @@ fn gid(id: u8, number: u32) -> Gid {
 }
 
 fn endpoint(kind: EndpointKind, gid: Gid, topic: &str) -> Endpoint {
-    Endpoint {
-        gid,
-        kind,
-        topic: topic.into(),
-        type_name: "T".into(),
-        type_hash: Vec::new(),
-        qos: Qos::keep_all(),
-        node: "node".into(),
-        namespace: "/".into(),
-        enclave: String::new(),
-    }
+    Endpoint::new(gid, kind, topic, "T").with_qos(Qos::keep_all()).with_node("node", "/")
 }
 
 /// Announces so many publishers of a topic.

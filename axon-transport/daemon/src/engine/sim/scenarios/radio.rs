@@ -192,7 +192,7 @@ fn a_path_of_long_packets_is_used() {
 #[test]
 fn a_command_is_quick_beside_a_camera_that_fills_the_link() {
     let mut world = hosts(Congestion::Auto, radio(54, 0.0));
-    let camera = Qos { depth: 1, ..Qos::default() };
+    let camera = Qos::default().with_depth(1);
     let frame = Duration::from_micros(33_333);
     let camera = Stream::new(&mut world, "/camera", camera, 830_000, frame);
     let every = Duration::from_millis(10);
@@ -219,7 +219,7 @@ fn a_command_is_quick_beside_a_camera_that_fills_the_link() {
 #[test]
 fn a_link_that_becomes_slow_is_fresh_again_within_two_seconds() {
     let mut world = hosts(Congestion::Auto, radio(54, 0.0));
-    let qos = Qos { depth: 1, ..Qos::default() };
+    let qos = Qos::default().with_depth(1);
     let every = Duration::from_micros(33_333);
     let stream = Stream::new(&mut world, "/scan", qos, 64_000, every);
     world.until(secs(20), World::is_whole);
@@ -278,7 +278,7 @@ fn shares(row: &Row, path: Path, time: Duration) -> ([f64; 2], f64, Duration) {
 }
 
 fn rows() -> [Row; 4] {
-    let depth = |depth| Qos { depth, ..Qos::default() };
+    let depth = |depth| Qos::default().with_depth(depth);
     [
         Row { name: "1 KB, RELIABLE", qos: depth(10), length: 1_000, within: [100, 300] },
         Row { name: "64 KB, RELIABLE", qos: depth(10), length: 64_000, within: [100, 300] },
@@ -353,7 +353,7 @@ fn publishers_that_fill_a_link_have_equal_shares_whatever_their_samples_are() {
 /// numbers of those that arrive.
 fn bursts_of_images(lifespan: Option<Duration>) -> Vec<u64> {
     let mut world = hosts(Congestion::Auto, radio(54, 0.0));
-    let qos = Qos { depth: 8, lifespan, ..Qos::sensor_data() };
+    let qos = Qos::sensor_data().with_depth(8).with_lifespan(lifespan);
     let pair = world.pair(0, 1, "/image", qos);
     world.until(secs(20), World::is_whole);
     world.run_for(secs(1));
@@ -371,7 +371,7 @@ fn bursts_of_images(lifespan: Option<Duration>) -> Vec<u64> {
 fn a_best_effort_sample_that_takes_long_crosses_an_idle_link() {
     for lifespan in [None, Some(secs(5))] {
         let mut world = hosts(Congestion::Auto, radio(54, 0.0));
-        let qos = Qos { lifespan, ..Qos::sensor_data() };
+        let qos = Qos::sensor_data().with_lifespan(lifespan);
         let pair = world.pair(0, 1, "/image", qos);
         world.until(secs(20), World::is_whole);
         world.run_for(secs(1));

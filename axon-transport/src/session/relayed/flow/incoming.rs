@@ -1,0 +1,275 @@
+//! The receiving end: puts samples together of pieces, and grants the credit for more.
+
+use std::{
+    collections::{HashMap, VecDeque},
+    sync::{
+        Arc,
+        atomic::{AtomicU64, Ordering},
+    },
+};
+
+use axon_shm::Meta;
+
+use super::{Channel, OVERHEAD, WINDOW};
+use crate::wire::session::{Credit, SampleFragment, SampleHeader};
+
+/// Bytes beyond the windows of its channels that one session's arriving samples may take, but for one
+/// that is long.
+const SESSION: u64 = 64 << 20;
+/// Bytes beyond its window above which a sample is long: there is one at a time, so that those which
+/// are not read leave room for others.
+pub(super) const LONG: u64 = SESSION / 8;
+
+/// A sample that has come whole.
+#[derive(Debug, PartialEq, Eq)]
+pub struct InboundSample {
+    /// On which channel.
+    pub channel: Channel,
+    /// Its number and time.
+    pub meta: Meta,
+    /// Samples of its publisher that were lost since the one before.
+    pub lost: u64,
+    /// Its bytes.
+    pub payload: Vec<u8>,
+}
+
+impl InboundSample {
+    fn cost(&self) -> u64 {
+        OVERHEAD + self.payload.len() as u64
+    }
+}
+
+/// What no sender does. The connection is closed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum Violation {
+    /// A sample longer than any may be.
+    #[error("a sample of {0} bytes, which is more than AXON_MAX_MESSAGE_MB allows")]
+    TooLarge(u32),
+    /// More bytes than there was credit for.
+    #[error("more bytes of samples than it was given credit for")]
+    Overrun,
+    /// A piece that does not follow the one before.
+    #[error("a piece of a sample that does not follow the one before")]
+    OutOfPlace,
+}
+
+/// The memory that the arriving samples of all of a daemon's relayed sessions share.
+#[derive(Debug)]
+pub struct Pool {
+    held: AtomicU64,
+    limit: u64,
+}
+
+impl Pool {
+    /// A pool of `limit` bytes.
+    pub fn new(limit: u64) -> Arc<Self> {
+        Arc::new(Self { held: AtomicU64::new(0), limit })
+    }
+
+    /// Bytes that are taken.
+    pub fn held(&self) -> u64 {
+        self.held.load(Ordering::Relaxed)
+    }
+
+    /// One sample may always: what is larger than the pool must pass, too.
+    fn take(&self, bytes: u64) -> bool {
+        let fits = |held: u64| {
+            (held == 0 || held + bytes <= self.limit).then(|| held.saturating_add(bytes))
+        };
+        // Relaxed: the count guards nothing but itself.
+        self.held.fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits).is_ok()
+    }
+
+    fn give(&self, bytes: u64) {
+        self.held.fetch_sub(bytes, Ordering::Relaxed);
+    }
+}
+
+/// The receiving end.
+#[derive(Debug)]
+pub struct Incoming {
+    channels: HashMap<Channel, Receiving>,
+    max_message: u64,
+    /// Channels whose sample is longer than their window, until there is room.
+    waiting: VecDeque<Channel>,
+    /// Bytes that were granted beyond the windows to samples that are not long.
+    reserved: u64,
+    /// The channel of the one that is, and what it was granted.
+    long: Option<(Channel, u64)>,
+    pool: Arc<Pool>,
+    is_short: bool,
+}
+
+#[derive(Debug, Default)]
+struct Receiving {
+    /// Bytes that came and have not gone to where they belong.
+    held: u64,
+    /// Bytes granted beyond the window, for these samples.
+    granted: u64,
+    partial: Option<Partial>,
+}
+
+#[derive(Debug)]
+struct Partial {
+    head: SampleHeader,
+    payload: Vec<u8>,
+}
+
+impl Incoming {
+    /// An end that takes samples of at most `max_message` bytes, and memory beyond its windows out of
+    /// `pool`.
+    pub fn new(max_message: u64, pool: Arc<Pool>) -> Self {
+        let (channels, waiting) = (HashMap::new(), VecDeque::new());
+        Self { channels, max_message, waiting, reserved: 0, long: None, pool, is_short: false }
+    }
+
+    /// Opens a channel, unless it is open: what its sender, of which so many MATCHED were heard, is to
+    /// be told.
+    pub fn open(&mut self, channel: Channel, heard: u64) -> Option<Credit> {
+        if self.channels.contains_key(&channel) {
+            return None;
+        }
+        self.channels.insert(channel, Receiving::default());
+        Some(channel.credit(WINDOW, Some(heard)))
+    }
+
+    /// Closes those channels that `keep` does not want, and forgets what came on them.
+    pub fn retain(&mut self, keep: impl Fn(&Channel) -> bool) {
+        let closed = self.channels.extract_if(|name, _| !keep(name));
+        for (name, channel) in closed.collect::<Vec<_>>() {
+            self.release(name, channel.granted);
+        }
+        let channels = &self.channels;
+        self.waiting.retain(|channel| channels.contains_key(channel));
+    }
+
+    /// The channels of which a sample has come in part.
+    pub fn partial(&self) -> impl Iterator<Item = &Channel> {
+        let partial = self.channels.iter().filter(|(_, channel)| channel.partial.is_some());
+        partial.map(|(name, _)| name)
+    }
+
+    /// Takes a piece; the sample, if it was the last.
+    ///
+    /// # Errors
+    /// [`Violation`].
+    pub fn piece(&mut self, piece: SampleFragment) -> Result<Option<InboundSample>, Violation> {
+        let SampleFragment { publisher, head, bytes, client } = piece;
+        let name = Channel { writer: publisher, client };
+        // Of a channel that was closed meanwhile.
+        let Some(channel) = self.channels.get_mut(&name) else { return Ok(None) };
+        let opens = head.is_some();
+        let partial = match (head, channel.partial.take()) {
+            (Some(head), None) if u64::from(head.length) > self.max_message => {
+                return Err(Violation::TooLarge(head.length));
+            }
+            (Some(head), None) => Partial { head, payload: Vec::new() },
+            (None, Some(partial)) if !bytes.is_empty() => partial,
+            _ => return Err(Violation::OutOfPlace),
+        };
+        let length = partial.head.length as usize;
+        if bytes.len() > length - partial.payload.len() {
+            return Err(Violation::OutOfPlace);
+        }
+        channel.held += bytes.len() as u64 + if opens { OVERHEAD } else { 0 };
+        if channel.held > WINDOW + channel.granted {
+            return Err(Violation::Overrun);
+        }
+        let Partial { head, mut payload } = partial;
+        // Grows with what really arrives.
+        payload.extend_from_slice(&bytes);
+        if payload.len() < length {
+            channel.partial = Some(Partial { head, payload });
+            if opens && extra(length) > 0 {
+                self.waiting.push_back(name);
+            }
+            return Ok(None);
+        }
+        let SampleHeader { sequence, source_timestamp, lost, published, .. } = head;
+        let meta = Meta::at_nanos(sequence, source_timestamp).with_published(published);
+        Ok(Some(InboundSample { channel: name, meta, lost, payload }))
+    }
+
+    /// Grants credit to each waiting channel whose sample fits what the session may buffer. A channel whose
+    /// sample does not fit holds up no other one.
+    pub fn grants(&mut self) -> Vec<Credit> {
+        let mut granted = Vec::new();
+        self.is_short = false;
+        for name in std::mem::take(&mut self.waiting) {
+            let partial = self.channels.get(&name).and_then(|channel| channel.partial.as_ref());
+            let Some(more) = partial.map(|partial| extra(partial.head.length as usize)) else {
+                continue;
+            };
+            if self.reserve(name, more) {
+                self.channels.entry(name).or_default().granted += more;
+                granted.push(name.credit(more, None));
+            } else {
+                self.waiting.push_back(name);
+            }
+        }
+        granted
+    }
+
+    fn reserve(&mut self, name: Channel, bytes: u64) -> bool {
+        let is_long = bytes > LONG;
+        let fits = if is_long { self.long.is_none() } else { self.reserved + bytes <= SESSION };
+        if !fits {
+            return false;
+        }
+        if !self.pool.take(bytes) {
+            self.is_short = true;
+            return false;
+        }
+        if is_long {
+            self.long = Some((name, bytes));
+        } else {
+            self.reserved += bytes;
+        }
+        true
+    }
+
+    /// Whether somebody waits for room that other sessions have.
+    pub fn is_short(&self) -> bool {
+        self.is_short
+    }
+
+    /// A sample has gone to where it belongs, or nowhere: what its sender is given back.
+    pub fn done(&mut self, sample: &InboundSample) -> Option<Credit> {
+        let name = sample.channel;
+        let channel = self.channels.get_mut(&name)?;
+        let (cost, more) = (sample.cost(), extra(sample.payload.len()));
+        channel.held = channel.held.saturating_sub(cost);
+        // One that was not asked for can have come within the window, by the grant for another.
+        let more = more.min(channel.granted);
+        channel.granted -= more;
+        self.release(name, more);
+        Some(Credit { done: Some(sample.meta.sequence), ..name.credit(cost - more, None) })
+    }
+
+    fn release(&mut self, of: Channel, bytes: u64) {
+        let mut rest = bytes;
+        if let Some((name, long)) = &mut self.long
+            && *name == of
+        {
+            let most = rest.min(*long);
+            (*long, rest) = (*long - most, rest - most);
+            if *long == 0 {
+                self.long = None;
+            }
+        }
+        self.reserved -= rest;
+        self.pool.give(bytes);
+    }
+}
+
+impl Drop for Incoming {
+    fn drop(&mut self) {
+        self.pool.give(self.reserved + self.long.map_or(0, |(_, bytes)| bytes));
+    }
+}
+
+/// What a sample takes beyond its channel's window.
+fn extra(length: usize) -> u64 {
+    (OVERHEAD + length as u64).saturating_sub(WINDOW)
+}
