@@ -68,7 +68,12 @@ impl<F: Clone> Registry<F> {
             self.unmatch(&pair, to_writer, to_reader, reason);
         }
         if local.role == EndpointRole::Application {
-            self.changes.end(*gid);
+            // Readers that an earlier daemon matched with it may not have come back yet.
+            if self.sessions.keeps_left_memory() {
+                self.changes.bury(*gid);
+            } else {
+                self.changes.end(*gid);
+            }
         }
     }
 

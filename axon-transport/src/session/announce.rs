@@ -184,7 +184,7 @@ impl Session {
         if self.is_forked() {
             return;
         }
-        self.shared().leave(gid);
+        self.shared().part(gid);
         self.shared().wake();
     }
 

@@ -1,5 +1,6 @@
 //! Pairs of endpoints within one session. The thread that creates the second endpoint attaches them, and
-//! the thread that drops the first one detaches them, before the call returns.
+//! the thread that drops the first one detaches them, before the call returns. A publisher may stay longer for readers of
+//! other sessions.
 //!
 //! The daemon announces such a pair like any other, when the pair is already attached. A writer that is asked again
 //! for the same lane repeats its grant. If the thread cannot attach the pair at once, for example for lack of
@@ -27,8 +28,8 @@ use crate::{
     wire::session::EndpointRole,
 };
 
-/// How long a publisher that the application has dropped stays for readers that have not heard of their grant.
-const EXPECTED: Duration = Duration::from_secs(10);
+/// How long a publisher that the application has dropped stays for readers that have not taken up their grant.
+const EXPECTED: Duration = Duration::from_secs(if cfg!(test) { 3600 } else { 10 });
 
 impl SessionShared {
     /// Under this lock, the pairs of a session's own endpoints come and go with them.
@@ -86,8 +87,7 @@ impl SessionShared {
         let mut matched_readers = reader.lock();
         let lane = matched_readers.lane_for(from, || self.segment.allocate_lane())?.lane;
         let reads = ReaderInfo { gid, lane, qos: reader.qos, peer: peer.clone(), stands_for: None };
-        let (grant, after, ring) =
-            writer.attach(reads, Terms::default(), self.memory.connections())?;
+        let (grant, after, ring) = writer.attach(reads, Terms::default())?;
         if let Accept::Map(lane) = matched_readers.accept(from, grant) {
             let max_message = self.config.max_message;
             let mapped = reader.map(from, peer, ring, lane, grant, max_message)?;
@@ -96,48 +96,20 @@ impl SessionShared {
         Ok(())
     }
 
-    /// The application is done with an endpoint or a node. A publisher stays until readers that the next daemon has to tell
-    /// of their grant have it, or for [`EXPECTED`].
-    pub(super) fn leave(&self, gid: &Gid) {
-        let mut state = self.state();
-        let connection = state.daemon.map(|_| self.memory.connections());
-        if state.publishers.get(gid).is_some_and(|publisher| publisher.expects_readers(connection))
-        {
-            state.leaving.insert(*gid, Instant::now() + EXPECTED);
-            return;
-        }
-        drop(state);
-        self.part(gid);
-    }
-
-    /// Parts the publishers that stayed and are not needed any more; whether there are others.
-    pub(super) fn part_left(&self) -> bool {
-        let over: Vec<Gid> = {
-            let state = self.state();
-            if state.leaving.is_empty() {
-                return false;
-            }
-            let connection = state.daemon.map(|_| self.memory.connections());
-            let now = Instant::now();
-            let needed = |gid: &Gid| {
-                state.publishers.get(gid).is_some_and(|p| p.expects_readers(connection))
-            };
-            let over = state.leaving.iter().filter(|(gid, until)| **until <= now || !needed(gid));
-            over.map(|(gid, _)| *gid).collect()
-        };
-        over.iter().for_each(|gid| {
-            self.part(gid);
-            self.state().leaving.remove(gid);
-        });
-        !self.state().leaving.is_empty()
-    }
-
-    /// Takes an endpoint or a node out of what the session has, and parts it from the others there.
+    /// The application is done with an endpoint or a node: parts it from the others of the session, and takes it out of
+    /// what the session has. A publisher stays for readers that have not taken up their grant, unseen here, for
+    /// [`EXPECTED`] at most.
     pub(super) fn part(&self, gid: &Gid) {
         let held = self.lock_own_pairs();
         let mut state = self.state();
         let node = state.nodes.remove(gid);
-        let publisher = state.publishers.remove(gid);
+        let stays = state.publishers.get(gid).is_some_and(|publisher| publisher.expects_readers());
+        let publisher = if stays {
+            state.leaving.insert(*gid, Instant::now() + EXPECTED);
+            state.publishers.get(gid).cloned()
+        } else {
+            state.publishers.remove(gid)
+        };
         let subscription = state.subscriptions.remove(gid);
         let writes = publisher.as_ref().map(|p| (&p.endpoint, p.role));
         let reads = subscription.as_ref().map(|s| (&s.endpoint, s.role));
@@ -147,7 +119,11 @@ impl SessionShared {
             Some((_, EndpointRole::StandIn | EndpointRole::Relay)) => state.tell_gone(gid),
             Some((endpoint, EndpointRole::Application)) => {
                 state.unindex(endpoint);
-                state.remove_dead(gid);
+                if stays {
+                    state.hide(gid);
+                } else {
+                    state.remove_dead(gid);
+                }
                 for other in state.topics.get(&endpoint.topic).into_iter().flatten() {
                     others.extend(state.publishers.get(other).cloned().map(EventSource::Publisher));
                     let reads = state.subscriptions.get(other).cloned();
@@ -167,6 +143,30 @@ impl SessionShared {
         drop(held);
         drop((node, publisher, subscription));
         self.rematch(others);
+    }
+
+    /// Lets go of the publishers that stayed and are not needed any more, or of all; whether there are others.
+    pub(super) fn part_leaving(&self, all: bool) -> bool {
+        let mut state = self.state();
+        if state.leaving.is_empty() {
+            return false;
+        }
+        let now = Instant::now();
+        let is_over = |(gid, until): &(&Gid, &Instant)| {
+            let publisher = state.publishers.get(*gid);
+            all || **until <= now || !publisher.is_some_and(|p| p.expects_readers())
+        };
+        let over: Vec<Gid> = state.leaving.iter().filter(is_over).map(|(gid, _)| *gid).collect();
+        let mut parted = Vec::new();
+        for gid in over {
+            state.leaving.remove(&gid);
+            parted.extend(state.publishers.remove(&gid));
+            state.remove_dead(&gid);
+        }
+        let others = !state.leaving.is_empty();
+        drop(state);
+        drop(parted);
+        others
     }
 
     /// Counts the changes to the pairs of `endpoints`. The control thread tells the rest.

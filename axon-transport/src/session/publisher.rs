@@ -1,7 +1,7 @@
 //! A writer of a topic.
 
 use std::{
-    collections::BTreeMap,
+    collections::BTreeSet,
     fmt, io,
     ops::{Deref, DerefMut},
     sync::{Arc, Mutex, MutexGuard, PoisonError},
@@ -313,9 +313,8 @@ pub(super) struct PublisherInner {
     asserts: bool,
     /// Its samples come from a process of this host that shares no memory.
     pub(super) relayed: bool,
-    /// Readers that were granted, a relay as itself, and by which of the session's
-    /// [connections](super::state::MemoryNews::connections).
-    attached: Mutex<BTreeMap<Gid, u64>>,
+    /// Readers that were granted; a relay as itself.
+    attached: Mutex<BTreeSet<Gid>>,
     sending: Mutex<Sending>,
 }
 
@@ -357,31 +356,26 @@ impl PublisherInner {
         self
     }
 
-    /// Serves a reader, which asked by this connection, on its terms: what it is granted, the number in front of that,
-    /// and in which ring.
+    /// Serves a reader on its terms: what it is granted, the number in front of that, and in which ring.
     pub(super) fn attach(
         &self,
         reader: ReaderInfo,
         terms: Terms,
-        connection: u64,
     ) -> Result<(Grant, u64, Location), ShmError> {
         let gid = reader.gid;
         let granted = self.rings.attach(reader, terms)?;
-        self.attached().insert(gid, connection);
+        self.attached().insert(gid);
         Ok(granted)
     }
 
-    /// Whether a reader that it must not lose a sample for has not taken up its grant, which went to an earlier daemon
-    /// than that of this `connection`: nobody may have passed it on.
-    pub(super) fn expects_readers(&self, connection: Option<u64>) -> bool {
+    /// Whether it has samples for a reader that has not taken up its grant and must not lose one: a daemon that was
+    /// killed may not have passed the grant on.
+    pub(super) fn expects_readers(&self) -> bool {
         let Rings::Shared(writer) = &self.rings else { return false };
-        let keeps = self.endpoint.kind == EndpointKind::Publisher && holds(&self.endpoint.qos);
-        if !keeps || self.role != EndpointRole::Application {
-            return false;
-        }
-        let expected = writer.expected_readers();
-        let attached = self.attached();
-        expected.iter().filter_map(|reader| attached.get(reader)).any(|by| Some(*by) != connection)
+        self.endpoint.kind == EndpointKind::Publisher
+            && self.role == EndpointRole::Application
+            && holds(&self.endpoint.qos)
+            && writer.expects_readers()
     }
 
     /// Whether it was attached.
@@ -415,10 +409,10 @@ impl PublisherInner {
 
     /// The readers that were granted.
     pub(super) fn granted(&self) -> Vec<Gid> {
-        self.attached().keys().copied().collect()
+        self.attached().iter().copied().collect()
     }
 
-    fn attached(&self) -> MutexGuard<'_, BTreeMap<Gid, u64>> {
+    fn attached(&self) -> MutexGuard<'_, BTreeSet<Gid>> {
         self.attached.lock().unwrap_or_else(PoisonError::into_inner)
     }
 

@@ -125,7 +125,10 @@ impl SessionState {
     pub(super) fn own(&self) -> impl Iterator<Item = &Endpoint> {
         let application = |role| role == EndpointRole::Application;
         let nodes = self.nodes.values().map(|(node, _)| node);
-        let publishers = self.publishers.values().filter(move |p| application(p.role));
+        let publishers = self
+            .publishers
+            .values()
+            .filter(move |p| application(p.role) && !self.leaving.contains_key(&p.endpoint.gid));
         let subscriptions = self.subscriptions.values().filter(move |s| application(s.role));
         nodes
             .chain(publishers.map(|publisher| &publisher.endpoint))
@@ -164,7 +167,7 @@ impl SessionState {
         own.iter().for_each(|own| self.show(own));
     }
 
-    fn hide(&mut self, gid: &Gid) {
+    pub(super) fn hide(&mut self, gid: &Gid) {
         if self.graph.endpoints.contains_key(gid) {
             Arc::make_mut(&mut self.graph).endpoints.remove(gid);
             self.regraphed = true;
@@ -474,6 +477,10 @@ impl SessionShared {
         self.changed.notify_all();
         guards.iter().for_each(GuardCondition::trigger);
         let Some(event) = event else { return };
+        // Who waits for the control thread's end may hold what a listener waits for. Relaxed: it is no more than that.
+        if self.stopping.load(Ordering::Relaxed) {
+            return;
+        }
         if matches!(event, SessionEvent::Matched(_)) {
             // A writer that died between its last sample and the doorbell leaves that sample to be
             // found by who sleeps for samples.

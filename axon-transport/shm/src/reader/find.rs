@@ -285,7 +285,8 @@ impl Reader {
     /// Whether a segment that has not come will not come any more.
     pub(super) fn is_over(&self, missing: &Missing) -> bool {
         let waited = missing.since.elapsed();
-        self.ended && waited >= MISSING || waited >= MISSING_DEAD && self.writer_dead()
+        // It asks a second time in between.
+        self.ended && waited >= 2 * MISSING || waited >= MISSING_DEAD && self.writer_dead()
     }
 
     /// All that is published is lost, and nothing else will be.

@@ -15,6 +15,8 @@ use crate::{
 pub(crate) struct Orphan {
     /// Those who may be reading it.
     pub(crate) pin_lanes: PinLanes,
+    /// Below this position are its samples.
+    pub(crate) head: u64,
     pub(crate) blocks: Vec<Block>,
     /// The numbers of the segments of its large samples.
     pub(crate) samples: Vec<u32>,
@@ -74,6 +76,11 @@ impl Orphans {
             false
         });
         !orphans.is_empty()
+    }
+
+    /// Whether readers in other sessions have yet to take samples.
+    pub(crate) fn are_unread(&self) -> bool {
+        self.lock().all.iter().any(|orphan| orphan.pin_lanes.lag_behind(orphan.head))
     }
 
     #[cfg(test)]

@@ -182,6 +182,17 @@ impl PinLanes {
         self.all.is_empty()
     }
 
+    /// Whether a reader in another session has yet to take a sample below this position, or to take up its grant.
+    pub(crate) fn lag_behind(&self, head: u64) -> bool {
+        self.all.iter().filter(|held| held.peer.is_some() && !held.is_dead()).any(|held| match held
+            .standing()
+        {
+            LaneState::Open => held.tenancy.cursor(held.words()).is_some_and(|at| at < head),
+            LaneState::Asked => true,
+            LaneState::Left => false,
+        })
+    }
+
     #[cfg(test)]
     pub(crate) fn len(&self) -> usize {
         self.all.len()

@@ -149,6 +149,11 @@ impl SessionSegment {
         !self.is_forked() && self.orphans.sweep(&self.heap, &self.segments)
     }
 
+    /// Whether readers of other sessions have yet to take samples of publishers that are gone.
+    pub fn has_unread(&self) -> bool {
+        !self.is_forked() && self.orphans.are_unread()
+    }
+
     /// How many publishers that are gone were looked at since the start.
     #[cfg(test)]
     pub(crate) fn looks_at_orphans(&self) -> usize {

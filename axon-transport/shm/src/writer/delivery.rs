@@ -51,9 +51,14 @@ impl Writer {
         }
     }
 
-    /// The attached readers that have not taken up their grant: it may not have come to them.
-    pub fn expected_readers(&self) -> Vec<Gid> {
-        if self.is_forked() { Vec::new() } else { self.lock().reader_set.expected() }
+    /// Whether a KEEP_ALL reader of another session has not taken up its grant, which may not have come to it, though
+    /// there are samples for it.
+    pub fn expects_readers(&self) -> bool {
+        if self.is_forked() {
+            return false;
+        }
+        let state = self.lock();
+        state.reader_set.expects_readers(state.history.head())
     }
 
     /// Samples with which those who carry them elsewhere are not done.

@@ -481,6 +481,7 @@ impl Drop for Writer {
         let mut blocks = vec![*self.header.block(), array.block];
         blocks.extend(history.all_blocks());
         let samples = history.pinned().segments().collect();
-        self.session.adopt(Orphan { pin_lanes: reader_set.into_pin_lanes(), blocks, samples });
+        let (pin_lanes, head) = (reader_set.into_pin_lanes(), history.head());
+        self.session.adopt(Orphan { pin_lanes, head, blocks, samples });
     }
 }

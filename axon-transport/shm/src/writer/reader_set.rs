@@ -481,12 +481,14 @@ impl ReaderSet {
         worst.into_iter().chain(absent).min().map(|(_, gid)| (gid, peers))
     }
 
-    /// The readers that have not taken up what they were granted.
-    pub(crate) fn expected(&self) -> Vec<Gid> {
-        let asked = |reader: &&Attached| {
-            !reader.dead && reader.tenancy.standing(reader.lane.words()) == LaneState::Asked
-        };
-        self.readers.iter().filter(asked).map(|reader| reader.info.gid).collect()
+    /// Whether a KEEP_ALL reader of another session has not taken up its grant, though there are samples for it.
+    pub(crate) fn expects_readers(&self, head: u64) -> bool {
+        self.readers.iter().any(|reader| {
+            reader.info.peer.remote().is_some_and(|peer| !peer.is_dead())
+                && holds(&reader.info.qos)
+                && reader.grant.first < head
+                && reader.tenancy.standing(reader.lane.words()) == LaneState::Asked
+        })
     }
 
     /// There is one reader more. A publisher of hundreds gets them one by one, so that what stands is

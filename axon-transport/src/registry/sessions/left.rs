@@ -59,10 +59,16 @@ impl<F> LeftMemory<F> {
 
 #[cfg(test)]
 mod tests {
+    use axon_shm::internal::Location;
+
     use super::*;
     use crate::{
+        graph::{Endpoint, EndpointKind},
+        ids::Gid,
         registry::Registry,
-        wire::session::{Message, Segment, SegmentName, SegmentOpened, SessionRole},
+        wire::session::{
+            Announce, EndpointRole, Message, Segment, SegmentName, SegmentOpened, SessionRole,
+        },
     };
 
     const MOST: usize = 4;
@@ -161,5 +167,25 @@ mod tests {
         connect(&mut registry, WRITER);
         need(&mut registry, 1);
         assert_eq!(taken(&mut registry), [0; 0]);
+    }
+
+    #[test]
+    fn a_reader_that_comes_back_late_hears_of_the_end_of_what_it_reads() {
+        let mut registry = registry();
+        let gid = Gid::new(id(WRITER), 1);
+        let endpoint = Endpoint::example(gid, EndpointKind::Publisher);
+        let (role, ring) = (EndpointRole::Application, Some(Location { segment: 0, offset: 4096 }));
+        let announce = Announce { endpoint, role, stands_for: Vec::new(), ring, only: None };
+        registry.handle_message(&id(WRITER), Message::Endpoint(announce), vec![]).unwrap();
+        registry.flush();
+        registry.handle_disconnect(&id(WRITER));
+        registry.flush();
+        connect(&mut registry, 3);
+        let packets = std::iter::from_fn(|| registry.poll_output(&id(3)));
+        let ended = packets.filter_map(|output| match Message::decode(&output.packet).unwrap() {
+            Message::Graph(graph) => graph.ended,
+            _ => None,
+        });
+        assert_eq!(ended.flatten().collect::<Vec<_>>(), [gid]);
     }
 }

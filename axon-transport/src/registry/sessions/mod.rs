@@ -177,6 +177,11 @@ impl<F> Sessions<F> {
         self.left = LeftMemory::new(most);
     }
 
+    /// Whether segments of sessions that end are kept.
+    pub(super) fn keeps_left_memory(&self) -> bool {
+        self.left.is_kept()
+    }
+
     /// Sessions that got something to be told since the last call.
     pub(super) fn take_ready(&mut self) -> BTreeSet<SessionId> {
         std::mem::take(&mut self.ready)
@@ -371,7 +376,7 @@ impl<F: Clone> Sessions<F> {
     /// A session that this daemon has not introduced to `of` misses a segment of that session: it knows it from an
     /// earlier daemon.
     fn hand_left(&mut self, id: &SessionId, of: &SessionId, number: u32) {
-        if !self.left.is_kept() {
+        if !self.keeps_left_memory() {
             return;
         }
         let there = self.entries.get(of).and_then(|entry| entry.segments.get(number));

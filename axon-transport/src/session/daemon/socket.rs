@@ -125,16 +125,14 @@ pub fn finish(socket: impl AsFd, deadline: Instant) -> bool {
     loop {
         match descriptors::receive(&socket, &mut buffer) {
             Ok(Packet { bytes: 0, .. }) => return true,
-            Ok(_) | Err(Errno::INTR) => {}
-            Err(Errno::AGAIN) => {
-                let left = deadline.saturating_duration_since(Instant::now());
-                let timeout = Timespec::try_from(left).ok();
-                let mut fds = [PollFd::new(&socket, PollFlags::IN)];
-                if left.is_zero() || poll(&mut fds, timeout.as_ref()) == Ok(0) {
-                    return true;
-                }
-            }
+            Ok(_) | Err(Errno::INTR | Errno::AGAIN) => {}
             Err(_) => return false,
+        }
+        let left = deadline.saturating_duration_since(Instant::now());
+        let timeout = Timespec::try_from(left).ok();
+        let mut fds = [PollFd::new(&socket, PollFlags::IN)];
+        if left.is_zero() || poll(&mut fds, timeout.as_ref()) == Ok(0) {
+            return true;
         }
     }
 }

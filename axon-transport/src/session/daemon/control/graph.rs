@@ -144,7 +144,9 @@ impl Control {
         if own {
             let state = self.shared.state();
             // It may have ended since it was announced: the daemon will say so.
-            if state.tombstones.contains(&endpoint.gid) || state.refused.contains_key(&endpoint.gid)
+            if state.tombstones.contains(&endpoint.gid)
+                || state.leaving.contains_key(&endpoint.gid)
+                || state.refused.contains_key(&endpoint.gid)
             {
                 return;
             }

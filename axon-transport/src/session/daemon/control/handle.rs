@@ -271,8 +271,7 @@ impl Control {
             let Attach { reader: gid, lane, qos, stands_for, after, carries, .. } = attach;
             let reader = ReaderInfo { gid, lane, qos, peer, stands_for };
             let terms = Terms { after, carries: carries == Some(true) };
-            let connection = shared.memory.connections();
-            publisher.attach(reader, terms, connection).map_err(|e| e.to_string())
+            publisher.attach(reader, terms).map_err(|e| e.to_string())
         });
         drop(own_pairs);
         match grant {

@@ -52,6 +52,8 @@ const BATCH: usize = 64;
 const RETRY: Duration = Duration::from_secs(2);
 /// How long a session that ends waits for a daemon whose socket is full.
 const FAREWELL: Duration = Duration::from_secs(1);
+/// How long a session that ends stays for readers that have not taken up what its publishers granted.
+const STAY: Duration = Duration::from_secs(if cfg!(test) { 60 } else { 1 });
 /// A relay stands for at most this many remote subscriptions by name; one packet holds no more.
 const MAX_STANDS_FOR: usize = 1024;
 
@@ -157,13 +159,13 @@ impl Control {
 
     pub(in crate::session) fn run(mut self) {
         let _ = self.shared.control.set(std::thread::current().id());
-        let mut farewell = None;
+        let mut farewell = None::<Instant>;
         loop {
-            let others_left = self.shared.part_left();
+            let others_stay = self.shared.part_leaving(false);
             // Pairs with the release store in `SessionShared::stop`.
             if self.shared.stopping.load(Ordering::Acquire) {
-                let until = *farewell.get_or_insert_with(|| Instant::now() + FAREWELL);
-                if !others_left || !self.is_served() || until <= Instant::now() {
+                let until = *farewell.get_or_insert_with(|| Instant::now() + STAY);
+                if !others_stay || !self.is_served() || until <= Instant::now() {
                     break;
                 }
             }
@@ -182,14 +184,16 @@ impl Control {
             self.remove_dead();
             self.reclaim_idle();
         }
+        self.shared.part_leaving(true);
         // What was queued last, such as ENDPOINT_GONE, is said by the end of the connection. Only
         // of memory, in which readers may find the last samples, nobody else could tell.
         let deadline = Instant::now() + FAREWELL;
         loop {
+            self.shared.segment.tidy();
             self.tell_segments();
-            self.send_rest();
-            let has_left = self.shared.segment.tidy();
-            if !has_left || self.was_heard(deadline) || !self.find_next_daemon(deadline) {
+            self.send_rest(deadline);
+            let unread = self.shared.segment.has_unread();
+            if !unread || self.was_heard(deadline) || !self.find_next_daemon(deadline) {
                 return;
             }
         }
@@ -211,7 +215,7 @@ impl Control {
 
     /// Waits for the next daemon, to tell it of the memory that readers have yet to be sent. Whether there is one.
     fn find_next_daemon(&mut self, deadline: Instant) -> bool {
-        while matches!(self.link, Link::Reconnecting(_)) && self.shared.segment.tidy() {
+        while matches!(self.link, Link::Reconnecting(_)) && self.shared.segment.has_unread() {
             let left = deadline.saturating_duration_since(Instant::now());
             if left.is_zero() {
                 return false;
@@ -228,8 +232,7 @@ impl Control {
     }
 
     /// Sends what is queued, and waits for a daemon whose socket is full.
-    fn send_rest(&mut self) {
-        let deadline = Instant::now() + FAREWELL;
+    fn send_rest(&mut self, deadline: Instant) {
         let mut writable = false;
         loop {
             let queued = self.outbox.len();
