@@ -166,7 +166,14 @@ pub fn beacon_seeds() -> Vec<Vec<u8>> {
 }
 
 fn endpoint() -> Endpoint {
-    Endpoint::new(Gid([7; 16]), EndpointKind::Publisher, "/scan", "sensor_msgs/msg/LaserScan").with_qos(Qos::keep_all().with_deadline(Duration::from_nanos(5)).with_lifespan(Duration::from_nanos(6))).with_type_hash(vec![1, 2, 3]).with_node("lidar", "/")
+    Endpoint::new(Gid([7; 16]), EndpointKind::Publisher, "/scan", "sensor_msgs/msg/LaserScan")
+        .with_qos(
+            Qos::keep_all()
+                .with_deadline(Duration::from_nanos(5))
+                .with_lifespan(Duration::from_nanos(6)),
+        )
+        .with_type_hash(vec![1, 2, 3])
+        .with_node("lidar", "/")
 }
 
 /// Every message of the control stream, one of them large enough to be compressed.
@@ -250,7 +257,7 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
 /// One sample in one piece, one on each of three channels at a time in several, and one longer than a
 /// channel's window.
 pub fn relay_pieces_seeds() -> Vec<Vec<u8>> {
-    use session::{SampleHeader, Message, SampleFragment};
+    use session::{Message, SampleFragment, SampleHeader};
     let piece = |channel: usize, length: Option<u32>, bytes: usize| {
         let head = length.map(|length| SampleHeader {
             length,
@@ -293,9 +300,9 @@ pub fn connect_packet_seeds() -> Vec<Vec<u8>> {
 /// Every message of the session socket.
 pub fn session_message_seeds() -> Vec<Vec<u8>> {
     use session::{
-        Announce, Asserted, Attach, Credit, EndpointRole, Gone, Granted, Graph, GraphItem, SampleHeader,
-        Hello, Matched, Message, PROTOCOL, Pair, SampleFragment, Refused, Segment, SegmentName,
-        SegmentOpened, SessionRole, StatusPart, Unmatch, Welcome,
+        Announce, Asserted, Attach, Credit, EndpointRole, Gone, Granted, Graph, GraphItem, Hello,
+        Matched, Message, PROTOCOL, Pair, Refused, SampleFragment, SampleHeader, Segment,
+        SegmentName, SegmentOpened, SessionRole, StatusPart, Unmatch, Welcome,
     };
     let (reader, writer) = (Gid([1; 16]), Gid([2; 16]));
     let place = Location { segment: 3, offset: 4096 };
