@@ -457,7 +457,7 @@ impl Links {
             self.seconds = self.seconds.wrapping_add(1);
             self.close_untrusted(self.seconds.is_multiple_of(60), now);
             self.look_for_silence(now);
-            self.widen_all();
+            self.widen_all(now);
         }
     }
 

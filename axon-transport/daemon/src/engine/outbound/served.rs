@@ -6,7 +6,11 @@ use axon_envelope::{Kind, Route};
 use axon_shm::ids::Gid;
 use axon_transport::config::TopicPriority;
 
-use super::{flow::Done, schedule::FlowId, source::Source};
+use super::{
+    flow::{Done, PeerCredit},
+    schedule::FlowId,
+    source::Source,
+};
 
 /// A route that the peer asked for.
 pub(crate) struct RouteOut {
@@ -35,6 +39,7 @@ pub(super) struct FlowRoute {
     pub(super) acknowledged: bool,
     pub(super) short_headers: bool,
     pub(super) responses: ResponseNumbers,
+    pub(super) credit: Rc<PeerCredit>,
 }
 
 /// Numbers the responses of this daemon in the order in which they are taken. A flow that ends and begins again, or that of
