@@ -145,6 +145,11 @@ impl Engine {
         self.links.handle_datagram(endpoint, from, local, ecn, bytes, now);
     }
 
+    /// Whether datagrams of discovery are held, since many came.
+    pub(crate) fn holds_discovery(&self) -> bool {
+        self.links.holds_discovery()
+    }
+
     /// Handles an order of the control plane.
     pub(crate) fn handle_order(&mut self, order: ToGateway, now: Duration) {
         match order {

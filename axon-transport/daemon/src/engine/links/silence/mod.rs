@@ -9,7 +9,7 @@ use bytes::BytesMut;
 use self::prober::Step;
 pub(super) use self::prober::{Prober, Traffic, frames_came};
 use crate::{
-    engine::links::{LinkEvent, LinkReport, Links, link::Probing},
+    engine::links::{LinkEvent, Links, link::Probing},
     wire::beacon::Datagram,
 };
 
@@ -38,7 +38,9 @@ impl Links {
             }
             return;
         }
-        self.outbox.report(LinkReport::Datagram { from, bytes: bytes.to_vec() });
+        let Self { admission, connections, inbox, .. } = self;
+        let known = || admission.is_listed(from.ip()) || connections.has(from.ip());
+        inbox.add(from, &bytes, known, now);
     }
 
     /// Notes what had gone over a link when a datagram came. What is sent later has no answer yet. QUIC does not always
