@@ -246,6 +246,7 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
         Message::RouteReady(link::RouteReady { route: 1, publishers: vec![gid] }),
         Message::Keepalive,
         Message::LinkClosed(link::LinkClosed { link: [3; 16] }),
+        Message::Intake(link::Intake { unread: 33 << 20, messages: 64 << 20 }),
         Message::Keys(KeyMessage::Announce(vec![key_id.clone(), KeyId::new("k2").unwrap()])),
         Message::Keys(KeyMessage::Ready { key_id: key_id.clone(), proof: [8; 32] }),
         Message::Keys(KeyMessage::Failed { key_id: key_id.clone(), reason: "unknown".into() }),

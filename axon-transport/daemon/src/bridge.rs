@@ -17,7 +17,10 @@ use axon_transport::{
 };
 use tokio::sync::mpsc;
 
-use crate::{discovery::AddressConfidence, owner::SessionKeys};
+use crate::{
+    discovery::{AddressConfidence, Datagrams},
+    owner::SessionKeys,
+};
 
 /// What either channel holds.
 pub const CHANNEL: usize = 1024;
@@ -104,13 +107,8 @@ pub enum ToControl {
         /// Why it may be there, as the order said it.
         standing: AddressConfidence,
     },
-    /// A discovery datagram that arrived at the QUIC port.
-    Datagram {
-        /// Its sender.
-        from: SocketAddr,
-        /// Its content.
-        bytes: Vec<u8>,
-    },
+    /// Discovery datagrams that arrived at the QUIC port.
+    Datagrams(Datagrams),
     /// Somebody was refused, by this host or by the other.
     Refusal {
         /// The other: a daemon id, SAE ID or address.

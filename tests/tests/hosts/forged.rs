@@ -40,6 +40,8 @@ type Name = Arc<Mutex<Option<DaemonId>>>;
 enum Forged {
     /// Beacons of daemons that there are not.
     MadeUp(u8),
+    /// The same, each from an address of its own.
+    Scattered(u8),
     /// Beacons of a real daemon, from addresses where it is not.
     Beacons(u8, Name),
     /// Goodbyes of a real daemon, from its address, that of host B.
@@ -52,7 +54,7 @@ impl Forged {
         let mut id = [if number.is_multiple_of(2) { 0x11 } else { 0xee }; 16];
         id[1..9].copy_from_slice(&number.to_be_bytes());
         let (auth, daemon) = match self {
-            Self::MadeUp(auth) => (*auth, DaemonId(id)),
+            Self::MadeUp(auth) | Self::Scattered(auth) => (*auth, DaemonId(id)),
             Self::Beacons(auth, name) => (*auth, (*name.lock().unwrap())?),
             Self::Goodbyes(name) => {
                 let daemon = (*name.lock().unwrap())?;
@@ -82,9 +84,11 @@ impl Forger {
         let elsewhere = elsewhere.filter(|address| !own.contains(address));
         let addresses: Vec<_> = match forged {
             Forged::Goodbyes(_) => vec![own[1]],
+            // The hosts' own are in other networks.
+            Forged::Scattered(_) => Vec::new(),
             Forged::MadeUp(_) | Forged::Beacons(..) => elsewhere.collect(),
         };
-        let bind = |address: &Ipv4Addr| UdpSocket::bind((*address, 0)).unwrap();
+        let bind = move |address: &Ipv4Addr| UdpSocket::bind((*address, 0)).unwrap();
         let sources: Vec<_> = addresses.iter().map(bind).collect();
         let domain = hosts[0].domain();
         let port = 61_300 + 16 * domain as u16;
@@ -96,7 +100,12 @@ impl Forger {
             // Relaxed: nothing else is told by it.
             while !until.load(Ordering::Relaxed) {
                 let number = count.fetch_add(1, Ordering::Relaxed);
-                let source = &sources[number as usize % sources.len()];
+                let scattered = sources.is_empty().then(|| {
+                    let [.., c, d] = (number as u16).to_be_bytes();
+                    bind(&Ipv4Addr::new(a, 200 + b % 50, c, d))
+                });
+                let at = number as usize % sources.len().max(1);
+                let source = scattered.as_ref().unwrap_or_else(|| &sources[at]);
                 let address = source.local_addr().unwrap();
                 if let Some(datagram) = forged.datagram(domain, number, address) {
                     for target in targets {
@@ -180,6 +189,7 @@ fn link_through_forged(plan: impl Fn([Settings; 2]) -> Plan) {
         ("300 a second of made-up daemons, pinned", pins(), 300, Forged::MadeUp(1)),
         ("5,000 a second of made-up daemons, none", none(), 5_000, Forged::MadeUp(0)),
         ("5,000 a second of made-up daemons, pinned", pins(), 5_000, Forged::MadeUp(1)),
+        ("5,000 a second, each of its own address, none", none(), 5_000, Forged::Scattered(0)),
         ("20 a second in a host's name, none", none(), 20, Forged::Beacons(0, name())),
         ("5,000 a second in a host's name, none", none(), 5_000, Forged::Beacons(0, name())),
         ("5,000 a second in a host's name, pinned", pins(), 5_000, Forged::Beacons(1, name())),
@@ -190,7 +200,7 @@ fn link_through_forged(plan: impl Fn([Settings; 2]) -> Plan) {
         let forger = Forger::new(&hosts, forged.clone(), a_second);
         forger.wait_for(u64::from(a_second));
         let name = match &forged {
-            Forged::MadeUp(_) => Name::default(),
+            Forged::MadeUp(_) | Forged::Scattered(_) => Name::default(),
             Forged::Beacons(_, name) | Forged::Goodbyes(name) => Arc::clone(name),
         };
         // As many as come in three seconds.

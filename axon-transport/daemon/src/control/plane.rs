@@ -222,7 +222,7 @@ impl Control {
             ToControl::Keys(keys) => self.keys = keys,
             ToControl::Lost { topic, cause, samples } => self.lost.add(&topic, cause, samples),
             ToControl::Draining(draining) => self.draining = draining,
-            ToControl::DialFailed { .. } | ToControl::Datagram { .. } | ToControl::Finished => {}
+            ToControl::DialFailed { .. } | ToControl::Datagrams(_) | ToControl::Finished => {}
         }
         self.settle();
     }

@@ -148,7 +148,7 @@ impl Remote {
             _ => {}
         }
         match event {
-            ToControl::Datagram { from, bytes } => self.tell(Event::Datagram { from, bytes }),
+            ToControl::Datagrams(datagrams) => self.tell(Event::Datagrams(datagrams)),
             other => control.borrow_mut().gateway_says(other),
         }
     }
@@ -176,7 +176,8 @@ impl Remote {
                 self.order(ToGateway::Listed(self.listed.clone()));
                 control.borrow_mut().named(names);
             }
-            Action::Gone { daemon } => tracing::debug!(%daemon, "a peer is gone"),
+            // In a flood of beacons a thousand times a second.
+            Action::Gone { daemon } => tracing::trace!(%daemon, "a peer is gone"),
         }
     }
 
@@ -251,7 +252,7 @@ impl Discovery {
     fn tell(&self, event: Event) {
         // Anybody can send datagrams: they leave room for what the gateway says of links.
         let crowded = self.events.capacity() < CHANNEL / 4;
-        if matches!(event, Event::Datagram { .. }) && crowded {
+        if matches!(event, Event::Datagrams(_)) && crowded {
             return;
         }
         if self.events.try_send(event).is_err() {

@@ -16,6 +16,7 @@ use std::{
 use axon_shm::ids::DaemonId;
 
 mod confidence;
+mod datagrams;
 mod interfaces;
 mod peers;
 mod run;
@@ -25,8 +26,9 @@ mod tests;
 mod wanted;
 
 pub(crate) use confidence::AddressConfidence;
+pub(crate) use datagrams::Datagrams;
 pub(crate) use interfaces::{Interface, interfaces};
-pub(crate) use peers::{Arrival, Local, Output, Peers};
+pub(crate) use peers::{Arrival, Bucket, Local, Output, Peers};
 pub(crate) use run::{Event, run};
 pub(crate) use wanted::Wanted;
 

@@ -17,8 +17,8 @@ use tokio::{
 use tracing::{debug, warn};
 
 use super::{
-    Action, AddressConfidence, Arrival, Local, Output, Peers, Wanted, interfaces,
-    socket::SharedSocket,
+    Action, AddressConfidence, Arrival, Bucket, Datagrams, Local, Output, Peers, Wanted,
+    interfaces, socket::SharedSocket,
 };
 
 /// How often interfaces are looked at.
@@ -28,6 +28,12 @@ const NAMES_EVERY: Duration = Duration::from_secs(30);
 const NAME_TIMEOUT: Duration = Duration::from_secs(5);
 /// Most datagrams that are looked at before what came of them is done.
 const TOGETHER: usize = 64;
+/// The same at the shared port: more than its buffer holds.
+const TOGETHER_SHARED: usize = 512;
+/// Datagrams at the shared port that are looked at as they come, at once and each second. Of others those of this time
+/// are looked at together.
+const AT_ONCE: (u32, u32) = (32, 16);
+const REST: Duration = Duration::from_millis(20);
 /// Most addresses of one name.
 const MOST_OF_A_NAME: usize = 4;
 
@@ -35,13 +41,8 @@ const MOST_OF_A_NAME: usize = 4;
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub(crate) enum Event {
-    /// A datagram came to the QUIC port whose first byte [is discovery's](super::is_discovery).
-    Datagram {
-        /// Where from.
-        from: SocketAddr,
-        /// All of it.
-        bytes: Vec<u8>,
-    },
+    /// Datagrams came to the QUIC port whose first byte [is discovery's](super::is_discovery).
+    Datagrams(Datagrams),
     /// The QUIC port is bound. Discovery says nothing before.
     QuicPort(u16),
     /// A link stands, whichever side dialled it.
@@ -88,6 +89,8 @@ pub(crate) async fn run(
     let mut lookups = JoinSet::new();
     let mut hosts = BTreeSet::new();
     let mut range = DiscoveryRange::Off;
+    // Until when datagrams stay at the shared port, so that those of a flood are looked at together.
+    let mut rest: Option<Instant> = None;
     wanted.mark_changed();
 
     loop {
@@ -104,14 +107,15 @@ pub(crate) async fn run(
                 }
                 None => break,
             },
-            datagram = receive(shell.socket.as_ref()) => match datagram {
-                Ok((from, bytes)) => shell.heard(from, &bytes),
+            datagram = receive(shell.socket.as_ref()), if rest.is_none() => match datagram {
+                Ok((from, bytes)) => rest = shell.heard(from, &bytes).then(|| Instant::now() + REST),
                 Err(error) => {
                     debug!(%error, "the shared discovery port fails, opening it anew");
                     shell.socket = None;
                 }
             },
             () = sleep_until_some(wakeup) => {}
+            () = sleep_until_some(rest), if rest.is_some() => rest = None,
             Ok(()) = wanted.changed() => {
                 let now = wanted.borrow_and_update().clone();
                 range = now.range;
@@ -149,6 +153,8 @@ struct DiscoveryIo {
     start: Instant,
     peers: Peers,
     socket: Option<SharedSocket>,
+    /// What may be looked at there at once.
+    at_once: Bucket,
     /// Whether the shared port is used at all.
     multicast: bool,
     domain: u32,
@@ -166,6 +172,7 @@ impl DiscoveryIo {
             start: Instant::now(),
             peers: Peers::new(Local::of(config, daemon), rand::random()),
             socket: None,
+            at_once: Bucket::new(AT_ONCE.0, AT_ONCE.1),
             multicast: false,
             domain: config.domain,
             bind: config.bind_addrs.clone(),
@@ -203,22 +210,28 @@ impl DiscoveryIo {
         let _ = self.actions.try_send(Action::Named(names));
     }
 
-    /// A datagram came to the shared port: it is looked at, with those that wait there.
-    fn heard(&mut self, from: SocketAddr, bytes: &[u8]) {
+    /// A datagram came to the shared port: it is looked at, with those that wait there. Returns whether these were so
+    /// many that others may wait.
+    fn heard(&mut self, from: SocketAddr, bytes: &[u8]) -> bool {
         let now = self.start.elapsed();
         self.peers.handle_datagram(now, from, Arrival::Shared, bytes);
-        for _ in 1..TOGETHER {
+        let mut at_once = self.at_once.take(now);
+        for _ in 1..TOGETHER_SHARED {
             let next = self.socket.as_ref().and_then(SharedSocket::try_receive);
-            let Some((from, bytes)) = next else { return };
+            let Some((from, bytes)) = next else { break };
             self.peers.handle_datagram(now, from, Arrival::Shared, &bytes);
+            at_once &= self.at_once.take(now);
         }
+        !at_once
     }
 
     fn event(&mut self, event: Event) {
         let now = self.start.elapsed();
         match event {
-            Event::Datagram { from, bytes } => {
-                self.peers.handle_datagram(now, from, Arrival::Quic, &bytes);
+            Event::Datagrams(datagrams) => {
+                for (from, bytes) in datagrams.iter() {
+                    self.peers.handle_datagram(now, from, Arrival::Quic, bytes);
+                }
             }
             Event::QuicPort(port) => self.peers.set_port(now, port),
             Event::LinkUp { daemon, address } => self.peers.handle_link_up(now, daemon, address),

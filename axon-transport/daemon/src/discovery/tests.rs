@@ -81,8 +81,9 @@ async fn carry(
             received = quic.recv_from(&mut buffer) => {
                 if let (Ok((length, from)), Some(events)) = (received, events.upgrade()) {
                     assert!(is_discovery(buffer[0]));
-                    let bytes = buffer[..length].to_vec();
-                    let _ = events.try_send(Event::Datagram { from, bytes });
+                    let mut datagrams = Datagrams::default();
+                    datagrams.push(from, &buffer[..length]);
+                    let _ = events.try_send(Event::Datagrams(datagrams));
                 }
             }
         }
@@ -184,8 +185,9 @@ async fn actions_nobody_takes_hold_nothing_up() {
     });
     for n in 0..100_u8 {
         events.send(Event::QuicPort(64_000 + u16::from(n))).await.unwrap();
-        let noise = Event::Datagram { from: ([127, 0, 0, 1], 9).into(), bytes: vec![n; 9] };
-        events.send(noise).await.unwrap();
+        let mut noise = Datagrams::default();
+        noise.push(([127, 0, 0, 1], 9).into(), &[n; 9]);
+        events.send(Event::Datagrams(noise)).await.unwrap();
     }
     drop(events);
     timeout(PATIENCE, task).await.unwrap().unwrap();

@@ -35,7 +35,7 @@ const ROUTES_TO_GRAPH: usize = 4;
 const UNREAD: usize = 64 << 20;
 /// Messages of one identity that are being read, in bytes: long ones, of which one may always be read, and short ones,
 /// which therefore never wait for those.
-const MESSAGES: (usize, usize) = (64 << 20, 16 << 20);
+pub(crate) const MESSAGES: (usize, usize) = (64 << 20, 16 << 20);
 /// Control messages that wait for one identity to read them, in bytes.
 const UNSENT: usize = 128 << 20;
 /// Names and reasons of refused routes of one identity that are remembered for status, in bytes.
@@ -276,6 +276,8 @@ pub(crate) fn cost(message: &Message) -> u32 {
             graph.added.len() + graph.removed.len() + toward
         }
         Message::Subscribe(subscribe) => 7 + subscribe.subscribers.len() + subscribe.last.len(),
+        // Flows that wait are tried again.
+        Message::Intake(_) => 63,
         Message::Unsubscribe(_) | Message::RouteRefused(_) | Message::RouteUnasked(_) => 7,
         Message::Asserted(asserted) => asserted.publishers.len() / 8,
         Message::Owners(owners) => 7 * owners.proofs.len(),

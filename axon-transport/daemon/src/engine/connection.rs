@@ -105,6 +105,7 @@ impl Connection {
             flow: 0,
             priorities: Priorities::default(),
             lender: None,
+            closed_from: None,
             taken: 0,
             window,
             bulk,
@@ -166,6 +167,8 @@ pub(crate) struct Carrier<'a> {
     pub(super) priorities: Priorities,
     /// The rank as which the flow sends, where that is another one than its own.
     pub(super) lender: Option<Rank>,
+    /// The place of the highest rank of which flows wait for credit.
+    pub(super) closed_from: Option<usize>,
     /// Bytes that QUIC took in this pass.
     pub(super) taken: u64,
     window: u64,
@@ -189,6 +192,11 @@ impl Carrier<'_> {
     /// The rank as which a flow of this rank writes.
     pub(super) fn rank(&self, own: Rank) -> Rank {
         self.lender.unwrap_or(own)
+    }
+
+    /// Whether a flow of this rank may use credit: none of its rank or a higher one waits for some.
+    pub(super) fn is_open_to(&self, own: Rank) -> bool {
+        self.closed_from.is_none_or(|place| self.rank(own).place() < place)
     }
 
     /// Lets QUIC take what it may hold while a flow of this rank writes.

@@ -73,7 +73,7 @@ impl Effects {
                 self.tell(ToControl::DialFailed { daemon, standing });
             }
             LinkReport::Up { daemon, address } => self.tell(ToControl::LinkUp { daemon, address }),
-            LinkReport::Datagram { from, bytes } => self.tell(ToControl::Datagram { from, bytes }),
+            LinkReport::Datagrams(datagrams) => self.tell(ToControl::Datagrams(datagrams)),
         }
     }
 

@@ -145,6 +145,11 @@ impl Engine {
         self.links.handle_datagram(endpoint, from, local, ecn, bytes, now);
     }
 
+    /// Whether datagrams of discovery are held, since many came.
+    pub(crate) fn holds_discovery(&self) -> bool {
+        self.links.holds_discovery()
+    }
+
     /// Handles an order of the control plane.
     pub(crate) fn handle_order(&mut self, order: ToGateway, now: Duration) {
         match order {
@@ -438,8 +443,25 @@ impl Engine {
         }
     }
 
+    /// Names the peers that have more long messages in flight than they may: their links may stand still.
+    fn report_excess(&mut self) {
+        for peer in self.peers.values_mut() {
+            let Some(most) = self.links.window_credit(peer.link) else { continue };
+            let Some(bytes) = peer.inbound.find_excess(peer.link, most) else { continue };
+            let text = self.links.peer_text(peer.link);
+            let reason = format!(
+                "it has {bytes} bytes of long messages in flight that wait for memory, {most} are allowed: its link may \
+                 stand still until it gives them up"
+            );
+            tracing::warn!(peer = text, reason, "a peer sends too many long messages at a time");
+            let what = "long messages".to_owned();
+            self.effects.tell(ToControl::Refusal { peer: text, what, reason });
+        }
+    }
+
     /// Reports losses and the status of each link.
     fn report(&mut self, now: Duration) {
+        self.report_excess();
         let mut reports = Vec::new();
         for (_, peer) in self.peers.iter() {
             let text = self.links.peer_text(peer.link);

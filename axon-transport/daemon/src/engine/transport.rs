@@ -24,11 +24,20 @@ pub(crate) const STREAMS_OPEN: u32 = 4096;
 
 const SEND_WINDOW: u64 = 16 << 20;
 
-const STREAM_WINDOW: (u64, u64) = (1 << 20, 4 << 20);
+/// The least and the greatest window of one stream.
+pub(crate) const STREAM_WINDOW: (u64, u64) = (1 << 20, 4 << 20);
 
 /// What a link may have under way before it is elected, and each link has then beside its share of what
 /// its peer may have.
 pub(crate) const LINK_WINDOW: u32 = 1 << 20;
+
+/// The part of a connection's window that long samples leave to others: a quarter.
+const RESERVED: u64 = 4;
+
+/// Bytes of long samples that a peer may have in flight where so many may be unread.
+pub(crate) fn window_credit(unread: u64) -> u64 {
+    unread - unread / RESERVED
+}
 
 /// The key of stateless resets. quinn-proto takes aws-lc's own type only while no crate in the program
 /// enables its feature `ring`.

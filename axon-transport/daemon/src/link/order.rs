@@ -128,6 +128,7 @@ impl Message {
             Self::RouteUnasked(_) => "ROUTE_UNASKED",
             Self::Owners(_) => "OWNERS",
             Self::LinkClosed(_) => "LINK_CLOSED",
+            Self::Intake(_) => "INTAKE",
             Self::Keys(m) => m.name(),
         }
     }

@@ -25,7 +25,7 @@ impl ControlOutbox {
             ToControl::Link(..)
                 | ToControl::Keys(_)
                 | ToControl::Refusal { .. }
-                | ToControl::Datagram { .. }
+                | ToControl::Datagrams(_)
         );
         if !self.waiting.is_empty() {
             self.waiting.extend((!droppable).then_some(what));

@@ -31,6 +31,7 @@ use super::{
 };
 use crate::{
     bridge::{ToControl, ToGateway},
+    discovery::is_discovery,
     engine::{Effect, Engine},
     error::GatewayError,
     identity::Identity,
@@ -43,6 +44,8 @@ const SENDS: usize = 64;
 const LOOK: Duration = Duration::from_millis(250);
 /// How long the last packets of closed connections may take.
 const GOODBYE: Duration = Duration::from_millis(500);
+/// In a flood of discovery datagrams the thread sleeps so long and takes in what came meanwhile.
+const REST: Duration = Duration::from_millis(2);
 /// Freed memory is given back to the system after this time.
 const RETURN: Duration = Duration::from_secs(1);
 
@@ -81,6 +84,8 @@ pub(super) struct Reactor {
     answers: Vec<Event>,
     report_done: mpsc::UnboundedSender<Done>,
     buffer: Vec<u8>,
+    /// The last datagrams were a flood of discovery's, and nothing else.
+    is_flooded: bool,
     /// Packets may be left that the last pass did not send.
     has_packets: bool,
     finishing: Option<Finishing>,
@@ -115,6 +120,7 @@ impl Reactor {
             answers: Vec::new(),
             report_done,
             buffer: Vec::new(),
+            is_flooded: false,
             has_packets: false,
             finishing: None,
             shutdown: false,
@@ -192,11 +198,14 @@ impl Reactor {
     fn take_in(&mut self, now: Duration) -> bool {
         let mut busy = false;
         if !self.told.is_behind() {
-            let engine = &mut self.engine;
-            busy |= self.sockets.receive(|datagram| {
+            let (engine, mut of_quic) = (&mut self.engine, false);
+            let any = self.sockets.receive(|datagram| {
                 let Datagram { socket, from, local, ecn, bytes } = datagram;
+                of_quic |= !bytes.first().is_some_and(|first| is_discovery(*first));
                 engine.handle_datagram(socket, from, local, ecn, bytes, now);
             });
+            self.is_flooded = any && !of_quic && engine.holds_discovery();
+            busy |= any && !self.is_flooded;
         }
         for input in self.inputs.take() {
             busy = true;
@@ -318,6 +327,10 @@ impl Reactor {
 
     /// Waits until there is something to do. The pass before had work if it was `busy`.
     async fn wait(&mut self, busy: bool) {
+        if std::mem::take(&mut self.is_flooded) && !busy {
+            // Not a wait for inputs: each datagram would end it.
+            std::thread::sleep(REST);
+        }
         let now = self.now();
         let finishing = self.finishing.as_ref().map(Finishing::poll_timeout);
         let keys = self.kme.as_ref().and_then(|_| self.key_reports.poll_timeout());

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 /// A token bucket: `burst` at once, then `per_second`.
 #[derive(Debug)]
-pub(super) struct Bucket {
+pub(crate) struct Bucket {
     burst: f64,
     per_second: f64,
     tokens: f64,
@@ -12,13 +12,13 @@ pub(super) struct Bucket {
 }
 
 impl Bucket {
-    pub(super) fn new(burst: u32, per_second: u32) -> Self {
+    pub(crate) fn new(burst: u32, per_second: u32) -> Self {
         let burst = f64::from(burst);
         Self { burst, per_second: f64::from(per_second), tokens: burst, filled: Duration::ZERO }
     }
 
     /// Takes a token, if there is one.
-    pub(super) fn take(&mut self, now: Duration) -> bool {
+    pub(crate) fn take(&mut self, now: Duration) -> bool {
         let passed = now.saturating_sub(self.filled);
         self.filled = self.filled.max(now);
         self.tokens = (self.tokens + passed.as_secs_f64() * self.per_second).min(self.burst);

@@ -72,7 +72,7 @@ impl Peers {
             due |= record.dials[standing as usize].due.is_some_and(|due| due <= now);
         }
         if due {
-            self.dial_due(now);
+            self.dials_due = Some(now);
         }
     }
 

@@ -1,6 +1,6 @@
 //! Chooses which peer records are dropped when there are too many.
 
-use std::{collections::BTreeMap, net::IpAddr, time::Duration};
+use std::{cmp::Reverse, collections::BTreeMap, net::IpAddr, time::Duration};
 
 use axon_shm::ids::DaemonId;
 
@@ -14,6 +14,33 @@ const LEAST_HEARD: usize = 64;
 /// Most hosts that are remembered for an earlier link.
 const MOST_MET: usize = 128;
 
+/// Records that are chosen at a time to be dropped.
+const CHOSEN: usize = 16;
+
+/// Records that are dropped for new ones. To choose one takes a look at all, so some are chosen at a time.
+#[derive(Debug, Default)]
+pub(super) struct Victims {
+    /// The last one goes first. Each with when it was last heard of.
+    chosen: Vec<(DaemonId, Duration)>,
+    /// Whether they are known by beacons alone.
+    heard: bool,
+    /// How many records there were.
+    records: usize,
+}
+
+/// The records of one host.
+#[derive(Default)]
+struct OfHost {
+    records: usize,
+    /// Those that may be dropped, the oldest last.
+    candidates: Vec<(Reverse<Duration>, DaemonId)>,
+}
+
+/// Whether a daemon is known by beacons alone.
+fn is_heard(record: &Record) -> bool {
+    record.standing() == AddressConfidence::Heard
+}
+
 impl Peers {
     /// Makes room for a record of `daemon`, if it has none. If there are too many, the oldest record of the host with
     /// most records is dropped.
@@ -21,29 +48,83 @@ impl Peers {
         if self.records.contains_key(&daemon) {
             return;
         }
+        // Without so many there is room for each.
+        if self.records.len() < MOST_HEARD {
+            return;
+        }
+        // In a flood they are as full as when victims were chosen.
+        let known = self.knows(from);
+        if !known
+            && self.records.len() >= self.victims.records
+            && let Some(victim) = self.chosen_victim()
+        {
+            return self.forget(victim);
+        }
         let unlinked = || self.records.values().filter(|record| !record.linked);
-        let of_heard = |record: &Record| record.standing() == AddressConfidence::Heard;
-        let (all, heard) = (unlinked().count(), unlinked().filter(|r| of_heard(r)).count());
+        let (all, heard) = unlinked()
+            .fold((0, 0), |(all, heard), record| (all + 1, heard + usize::from(is_heard(record))));
         let full = all >= MOST_UNAUTHENTICATED;
-        let crowded = heard >= MOST_HEARD && !self.knows(from);
+        let crowded = heard >= MOST_HEARD && !known;
         if !full && !crowded {
             return;
         }
         let heard_goes = crowded || heard > LEAST_HEARD;
-        let mut of_host: BTreeMap<Option<IpAddr>, usize> = BTreeMap::new();
-        for record in self.records.values() {
-            *of_host.entry(record.host()).or_default() += 1;
-        }
-        let candidates = self.records.iter().filter(|(_, record)| record.may_be_forgotten());
-        let candidates = candidates.filter(|(_, record)| of_heard(record) == heard_goes);
-        let victim = candidates.min_by_key(|(_, record)| {
-            let records = of_host.get(&record.host()).copied().unwrap_or_default();
-            // One whose peer was heard from goes last, whatever was forged under its address.
-            (record.has_answered(), std::cmp::Reverse(records), record.last_seen)
-        });
-        if let Some(victim) = victim.map(|(id, _)| *id) {
+        if let Some(victim) = self.next_victim(heard_goes) {
             self.forget(victim);
         }
+    }
+
+    /// The record that goes next.
+    fn next_victim(&mut self, heard_goes: bool) -> Option<DaemonId> {
+        self.choose_victims(heard_goes);
+        if let Some(victim) = self.chosen_victim() {
+            return Some(victim);
+        }
+        // One whose peer was heard from goes last, whatever was forged under its address.
+        let answered = self.records.iter().filter(|(_, record)| {
+            record.may_be_forgotten() && is_heard(record) == heard_goes && record.has_answered()
+        });
+        answered.min_by_key(|(_, record)| record.last_seen).map(|(id, _)| *id)
+    }
+
+    /// The next of the victims that were chosen, unless something was heard of it since.
+    fn chosen_victim(&mut self) -> Option<DaemonId> {
+        while let Some((victim, seen)) = self.victims.chosen.pop() {
+            let still = |record: &Record| {
+                record.last_seen == seen
+                    && record.may_be_forgotten()
+                    && !record.has_answered()
+                    && is_heard(record) == self.victims.heard
+            };
+            if self.records.get(&victim).is_some_and(still) {
+                return Some(victim);
+            }
+        }
+        None
+    }
+
+    fn choose_victims(&mut self, heard_goes: bool) {
+        let mut hosts: BTreeMap<Option<IpAddr>, OfHost> = BTreeMap::new();
+        for (id, record) in &self.records {
+            let host = hosts.entry(record.host()).or_default();
+            host.records += 1;
+            if record.may_be_forgotten() && is_heard(record) == heard_goes && !record.has_answered()
+            {
+                host.candidates.push((Reverse(record.last_seen), *id));
+            }
+        }
+        hosts.values_mut().for_each(|host| host.candidates.sort_unstable());
+        let mut chosen = Vec::with_capacity(CHOSEN);
+        while chosen.len() < CHOSEN {
+            let most = |host: &&mut OfHost| (host.records, host.candidates.last().copied());
+            let hosts = hosts.values_mut().filter(|host| !host.candidates.is_empty());
+            let Some(host) = hosts.max_by_key(most) else { break };
+            host.records -= 1;
+            let oldest = host.candidates.pop();
+            chosen.extend(oldest.map(|(seen, id)| (id, seen.0)));
+        }
+        chosen.reverse();
+        self.victims = Victims { chosen, heard: heard_goes, records: self.records.len() };
     }
 
     /// Whether a peer at this address is listed, or one stood linked there.

@@ -34,10 +34,10 @@ use rand::{RngExt, SeedableRng, rngs::StdRng};
 
 #[cfg(test)]
 use self::dialling::MOST_IN_FLIGHT;
-pub(crate) use self::local::Local;
+pub(crate) use self::{bucket::Bucket, local::Local};
 use self::{
-    bucket::Bucket,
     candidates::LocalAddresses,
+    eviction::Victims,
     probing::Probes,
     record::{DialAddress, Record},
 };
@@ -72,6 +72,7 @@ pub(crate) struct Peers {
     local: Local,
     here: LocalAddresses,
     records: BTreeMap<DaemonId, Record>,
+    victims: Victims,
     /// Addresses of listed peers, with a port where one was given.
     listed: Vec<(IpAddr, Option<u16>)>,
     port: Option<u16>,
@@ -90,6 +91,8 @@ pub(crate) struct Peers {
     probes: Bucket,
     known_probes: Bucket,
     asked: Probes,
+    /// When a dial became due since they were looked at.
+    dials_due: Option<Duration>,
     /// Where links stood, the latest last.
     met: VecDeque<IpAddr>,
     reports: Bucket,
@@ -105,6 +108,7 @@ impl Peers {
             local,
             here,
             records: BTreeMap::new(),
+            victims: Victims::default(),
             listed: Vec::new(),
             port: None,
             graph: 0,
@@ -119,6 +123,7 @@ impl Peers {
             probes: Bucket::new(1024, 1024),
             known_probes: Bucket::new(1024, 1024),
             asked: Probes::new(),
+            dials_due: None,
             met: VecDeque::new(),
             reports: Bucket::new(32, 1),
             random: StdRng::seed_from_u64(seed),
@@ -128,6 +133,10 @@ impl Peers {
 
     /// The next thing to do; ask until it says `None`.
     pub(crate) fn poll_output(&mut self) -> Option<Output> {
+        // Once for all datagrams that came together.
+        if let Some(now) = self.dials_due.take() {
+            self.dial_due(now);
+        }
         self.outputs.pop_front()
     }
 

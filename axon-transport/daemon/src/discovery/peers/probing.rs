@@ -76,9 +76,8 @@ impl Peers {
     fn ask(&mut self, now: Duration, daemon: DaemonId, source: DialAddress) -> bool {
         let to = source.address;
         // The answer says which daemon is there, whichever was asked for.
-        let recent =
-            |asked: &ProbeInFlight| asked.source.address == to && asked.at + ASKED_AGAIN > now;
-        if let Some(recent) = self.asked.iter().rfind(|asked| recent(asked)) {
+        let mut recent = self.asked.iter().rev().take_while(|asked| asked.at + ASKED_AGAIN > now);
+        if let Some(recent) = recent.find(|asked| asked.source.address == to) {
             return !recent.answered;
         }
         let counts = !(source.known && self.expects(to));

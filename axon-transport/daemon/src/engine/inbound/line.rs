@@ -37,6 +37,11 @@ impl Line {
         self.order.is_empty()
     }
 
+    /// The streams in line.
+    pub(super) fn iter(&self) -> impl Iterator<Item = &Key> {
+        self.order.iter()
+    }
+
     /// How many are in line.
     #[cfg(test)]
     pub(super) fn len(&self) -> usize {

@@ -37,6 +37,7 @@ use crate::{
         account::{MessageMemory, Meter},
         counters::Counters,
         stand_in::StandIn,
+        transport::STREAM_WINDOW,
     },
     link::{CloseCode, Received},
 };
@@ -110,6 +111,8 @@ pub(crate) struct Inbound {
     spare: Rc<Meter>,
     /// When streams try again whose ring was full: the reader that it waited for may be gone.
     full_retry: Option<Duration>,
+    /// The link whose peer was found to have more long messages in flight than it may.
+    exceeded: Option<u64>,
     /// What the memory for messages had given back when it was looked at last.
     released: usize,
     receipts: Receipts,
@@ -143,6 +146,7 @@ impl Inbound {
             without_room: Line::default(),
             spare: Meter::new(LONG),
             full_retry: None,
+            exceeded: None,
             released: intake.released(),
             receipts: Receipts::default(),
             written: None,
@@ -202,6 +206,25 @@ impl Inbound {
         for key in self.without_room.take() {
             self.make_ready(key);
         }
+    }
+
+    /// Returns how many bytes of this link's long messages wait for memory, if the peer may not have so many in flight.
+    /// Says so once for each link.
+    pub(crate) fn find_excess(&mut self, link: u64, most: u64) -> Option<u64> {
+        if self.without_room.is_empty() || self.exceeded == Some(link) {
+            return None;
+        }
+        let streams = self.without_room.iter().filter(|key| key.0 == link);
+        let lengths = streams.filter_map(|key| match self.streams.get(key)?.step {
+            Step::Room(length) => Some((length as u64).min(STREAM_WINDOW.1)),
+            _ => None,
+        });
+        let waits: u64 = lengths.sum();
+        if waits <= most {
+            return None;
+        }
+        self.exceeded = Some(link);
+        Some(waits)
     }
 
     /// Whether a stream waits for room in a ring.

@@ -71,6 +71,12 @@ impl Connections {
         Some(self.get(number)?.quic.remote_address())
     }
 
+    /// Whether there is one to this address.
+    pub(super) fn has(&self, address: IpAddr) -> bool {
+        let address = address.to_canonical();
+        self.all.values().any(|c| c.quic.remote_address().ip().to_canonical() == address)
+    }
+
     /// The numbers of all.
     pub(super) fn numbers(&self) -> Vec<u64> {
         self.all.keys().copied().collect()

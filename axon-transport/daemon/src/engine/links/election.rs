@@ -18,6 +18,7 @@ use super::{
 };
 use crate::{
     engine::{
+        account::MESSAGES,
         link::{
             failure::peer_text,
             opening::{Opened, Sealing},
@@ -25,9 +26,9 @@ use crate::{
         },
         links::{link::Summary, who::Who},
         refusal::Refusal,
-        transport::{LINK_WINDOW, STREAMS_OPEN},
+        transport::{LINK_WINDOW, STREAMS_OPEN, window_credit},
     },
-    link::{Candidate, CloseCode, Elected, Message, Side, keep},
+    link::{Candidate, CloseCode, Elected, Intake, Message, Side, keep},
 };
 
 /// The peer elects one of its connections within this time.
@@ -205,6 +206,7 @@ impl Links {
         {
             tracing::error!(peer = %daemon, %error, "no message keys for this link");
         }
+        self.tell_intake(number, now);
         self.dials.opened(number);
         self.table.put_in_use(daemon, number);
         let closed = current.and_then(|old| self.hand_over(old, now));
@@ -217,23 +219,39 @@ impl Links {
         self.connections.touch(number);
     }
 
-    /// Lets the peer send more that is not read, as far as its identity has room.
-    pub(super) fn widen(&mut self, number: u64) {
+    /// Lets the peer send more that is not read, as far as its identity has room. Returns whether it may.
+    fn widen(&mut self, number: u64) -> bool {
         let (Some(connection), Some(peer)) =
             (self.connections.get_mut(number), self.table.peer_mut(number))
         else {
-            return;
+            return false;
         };
-        if peer.account.unread.share(&mut peer.unread) {
-            let share = u32::try_from(peer.unread.amount()).unwrap_or(u32::MAX);
-            let window = VarInt::from_u32(LINK_WINDOW.saturating_add(share));
-            connection.quic.set_receive_window(window);
-            self.connections.touch(number);
+        if !peer.account.unread.share(&mut peer.unread) {
+            return false;
         }
+        connection.quic.set_receive_window(VarInt::from_u32(window(peer)));
+        self.connections.touch(number);
+        true
     }
 
-    pub(super) fn widen_all(&mut self) {
-        self.table.open().into_iter().for_each(|number| self.widen(number));
+    /// Tells the peer how much it may have in flight.
+    fn tell_intake(&mut self, number: u64, now: Duration) {
+        let Some(peer) = self.table.peer(number) else { return };
+        let (unread, messages) = (window(peer).into(), MESSAGES.0 as u64);
+        self.send(number, &Message::Intake(Intake { unread, messages }), now);
+    }
+
+    /// Bytes of long samples that the peer may have in flight over a link.
+    pub(in crate::engine) fn window_credit(&self, number: u64) -> Option<u64> {
+        Some(window_credit(window(self.table.peer(number)?).into()))
+    }
+
+    pub(super) fn widen_all(&mut self, now: Duration) {
+        for number in self.table.open() {
+            if self.widen(number) {
+                self.tell_intake(number, now);
+            }
+        }
     }
 
     /// A successor is dialled, or the link is at its end.
@@ -283,4 +301,9 @@ impl Links {
             self.violation(number, CloseCode::NotAllowed, &why, now);
         }
     }
+}
+
+/// The connection window of a peer's link.
+fn window(peer: &LinkPeer) -> u32 {
+    LINK_WINDOW.saturating_add(u32::try_from(peer.unread.amount()).unwrap_or(u32::MAX))
 }

@@ -6,7 +6,7 @@ use axon_shm::ids::DaemonId;
 use quinn_proto::StreamEvent;
 
 use crate::{
-    discovery::AddressConfidence,
+    discovery::{AddressConfidence, Datagrams},
     engine::refusal::Refusal,
     link::{LinkClosed, Message},
 };
@@ -54,8 +54,8 @@ pub(in crate::engine) enum LinkReport {
     DialFailed { daemon: DaemonId, standing: AddressConfidence },
     /// A link of this daemon is up at this address.
     Up { daemon: DaemonId, address: SocketAddr },
-    /// A datagram of discovery.
-    Datagram { from: SocketAddr, bytes: Vec<u8> },
+    /// Datagrams of discovery.
+    Datagrams(Datagrams),
 }
 
 /// Events and reports that were not taken yet, in order.

@@ -10,6 +10,7 @@ mod events;
 mod explained;
 #[cfg(test)]
 mod held;
+mod inbox;
 mod keys;
 mod leaving;
 mod link;
@@ -39,6 +40,7 @@ use self::{
     connections::Connections,
     dials::Dials,
     events::Outbox,
+    inbox::DiscoveryInbox,
     link::{Link, Phase, Summary},
     silence::{Nonce, frames_came},
     table::Table,
@@ -82,6 +84,7 @@ pub(super) struct Links {
     later: Vec<u64>,
     /// The silent links that are probed, by the nonces of the probes.
     nonces: HashMap<Nonce, u64>,
+    inbox: DiscoveryInbox,
     outbox: Outbox,
     /// When links are looked at for silence and trust.
     next_second: Duration,
@@ -134,6 +137,7 @@ impl Links {
             lost: VecDeque::new(),
             later: Vec::new(),
             nonces: HashMap::new(),
+            inbox: DiscoveryInbox::new(),
             outbox: Outbox::default(),
             next_second: Duration::from_secs(1),
             seconds: 0,
@@ -174,6 +178,11 @@ impl Links {
         }
     }
 
+    /// Whether datagrams of discovery are held, since many came.
+    pub(super) fn holds_discovery(&self) -> bool {
+        self.inbox.is_holding()
+    }
+
     /// Has a connection looked at in this pass.
     pub(super) fn touch(&mut self, number: u64) {
         self.connections.touch(number);
@@ -205,6 +214,9 @@ impl Links {
             self.connections.touch(number);
         }
         self.go_on_dialling(now);
+        if let Some(datagrams) = self.inbox.take(now) {
+            self.outbox.report(LinkReport::Datagrams(datagrams));
+        }
         while let Some(number) = self.connections.poll_dirty() {
             self.drive(number, now);
         }
@@ -438,6 +450,7 @@ impl Links {
             self.dials.poll_timeout(),
             keys,
             second,
+            self.inbox.poll_timeout(),
         ];
         parts.into_iter().flatten().min()
     }
@@ -457,7 +470,7 @@ impl Links {
             self.seconds = self.seconds.wrapping_add(1);
             self.close_untrusted(self.seconds.is_multiple_of(60), now);
             self.look_for_silence(now);
-            self.widen_all();
+            self.widen_all(now);
         }
     }
 

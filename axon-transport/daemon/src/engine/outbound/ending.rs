@@ -64,7 +64,7 @@ impl Outbound {
             let id = self.routes.get(&number).and_then(|served| served.flows.get(of));
             let flow = id.and_then(|id| self.flows[*id].as_ref());
             let progress = flow.map_or((0, 0), super::Flow::progress);
-            if progress != ending.progress {
+            if progress != ending.progress || flow.is_some_and(super::Flow::waits_for_others) {
                 *ending = Ending { progress, since: now, ..*ending };
             }
             if now.saturating_sub(ending.since) >= PATIENCE {

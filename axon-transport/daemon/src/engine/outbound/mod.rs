@@ -39,7 +39,7 @@ pub(crate) use self::{
 use self::{
     budget::Budget,
     ending::Endings,
-    flow::{Flow, Pause},
+    flow::{CreditQueue, Flow, Pause, PeerCredit},
     lending::Lending,
     nudges::Nudges,
     schedule::Schedule,
@@ -51,7 +51,7 @@ use self::{
 use super::{congestion::let_probe_through, connection::Carrier};
 use crate::{
     engine::counters::Counters,
-    link::{CloseCode, ReceivedOf},
+    link::{CloseCode, Intake, ReceivedOf},
 };
 
 /// Flows look again after this time at a link that has no keys.
@@ -89,6 +89,9 @@ pub(crate) struct Outbound {
     counters: Rc<Counters>,
     timers: BTreeSet<(Duration, FlowId)>,
     without: Without,
+    credit: Rc<PeerCredit>,
+    /// The flows that wait for credit.
+    for_credit: CreditQueue,
     /// Streams may have become idle since a flow found none.
     frees_streams: bool,
     /// Streams of flows that ended, and whether a sample is cut off there.
@@ -121,6 +124,8 @@ impl Outbound {
             lending: Lending::default(),
             without: Without::new(&budget),
             budget,
+            credit: PeerCredit::new(),
+            for_credit: CreditQueue::default(),
             counters,
             timers: BTreeSet::new(),
             frees_streams: false,
@@ -145,6 +150,7 @@ impl Outbound {
             acknowledged: route.acknowledged,
             short_headers: route.short_headers,
             responses: self.responses.clone(),
+            credit: Rc::clone(&self.credit),
         };
         self.routes.entry(number).or_insert_with(|| {
             self.priorities.add(shared.priority);
@@ -262,6 +268,7 @@ impl Outbound {
         self.ended.extend(flow.take_streams());
         self.timers.remove(&(flow.timer.unwrap_or_default(), id));
         self.without.forget(id);
+        self.for_credit.forget(id);
         self.busy.remove(&id);
         self.nudges.forget(id);
         self.stalls.forget(id);
@@ -278,7 +285,9 @@ impl Outbound {
             end(carrier.quic, stream, is_cut);
         }
         self.retry_held();
+        self.retry_for_credit();
         carrier.priorities = self.priorities;
+        carrier.closed_from = self.for_credit.closed_from();
         let mut blocked = None;
         while let Some(id) = self.schedule.pop(|at| self.lending.borrows(at)) {
             let Some(flow) = &mut self.flows[id] else { continue };
@@ -288,7 +297,11 @@ impl Outbound {
             carrier.flow = id;
             let (before, taken) = (flow.timer, carrier.taken);
             let mut done = Done::default();
-            let pause = flow.write(&served.sources, carrier, &self.counters, &mut done, now);
+            let pause = match flow.waits_for_credit && !carrier.is_open_to(rank) {
+                true => Pause::NoCredit,
+                false => flow.write(&served.sources, carrier, &self.counters, &mut done, now),
+            };
+            flow.waits_for_credit = pause == Pause::NoCredit;
             served.done(flow.of, done);
             if carrier.loses && carrier.taken > taken {
                 self.nudges.handle_sent(id, carrier.quic.rtt(), now);
@@ -322,6 +335,18 @@ impl Outbound {
                 Pause::NoKey => {
                     self.without.key(id, now);
                 }
+                Pause::NoCredit => {
+                    flow.blocked = true;
+                    flow.take_burst(&served.sources, &self.counters, now);
+                    self.for_credit.add(id, rank.place());
+                    carrier.closed_from = self.for_credit.closed_from();
+                    self.lending.handle_blocked(rank);
+                }
+            }
+            // Flows that gave credit back in this pass may be the last ones that use any.
+            if self.schedule.is_empty() {
+                self.retry_for_credit();
+                carrier.closed_from = self.for_credit.closed_from();
             }
         }
         if std::mem::take(&mut self.frees_streams) {
@@ -335,6 +360,28 @@ impl Outbound {
         for id in self.without.take_for_room(&self.budget) {
             self.schedule(id);
         }
+    }
+
+    /// Tries the flows again that found no credit, if there is more now.
+    fn retry_for_credit(&mut self) {
+        if !self.for_credit.is_due(&self.credit) {
+            return;
+        }
+        for id in self.for_credit.take(&self.credit).into_iter().rev() {
+            let Some(flow) = &mut self.flows[id] else { continue };
+            flow.blocked = false;
+            if flow.scheduled.is_none()
+                && let Some(rank) = flow.rank()
+            {
+                flow.scheduled = Some(rank);
+                self.schedule.push_first(id, rank);
+            }
+        }
+    }
+
+    /// The peer says how much it takes in over this link.
+    pub(crate) fn set_intake(&mut self, intake: &Intake) {
+        self.credit.set(Some(intake));
     }
 
     /// QUIC takes more of this flow's stream.
@@ -421,6 +468,7 @@ impl Outbound {
                 self.schedule(id);
             }
         }
+        self.credit.set(None);
         self.handle_streams_available();
         self.handle_keys();
     }
@@ -557,7 +605,10 @@ impl Outbound {
 
     /// Whether there is anything to hand to QUIC.
     pub(crate) fn has_work(&self) -> bool {
-        !self.schedule.is_empty() || !self.ended.is_empty() || self.frees_streams
+        !self.schedule.is_empty()
+            || !self.ended.is_empty()
+            || self.frees_streams
+            || self.for_credit.is_due(&self.credit)
     }
 }
 

@@ -12,7 +12,7 @@ use std::{collections::VecDeque, rc::Rc, time::Duration};
 use axon_envelope::Delivery;
 use axon_shm::qos::{History, Qos, Reliability};
 
-use super::{budget::Budget, burst::Burst};
+use super::{budget::Budget, burst::Burst, flow::Credit};
 use crate::engine::rings::Sample;
 
 /// What became of a sample that was offered.
@@ -63,6 +63,8 @@ pub(super) struct Queue {
     /// Bytes of all samples, waiting and sent.
     bytes: usize,
     sent_bytes: usize,
+    /// At least the length of the longest sample among those that were sent.
+    longest_sent: usize,
     /// The highest number that was ever sent.
     newest_sent: u64,
     burst: Burst,
@@ -78,6 +80,7 @@ impl Queue {
             sent: VecDeque::new(),
             bytes: 0,
             sent_bytes: 0,
+            longest_sent: 0,
             newest_sent: 0,
             burst: Burst::default(),
         }
@@ -220,9 +223,24 @@ impl Queue {
         }
         let sample = self.waiting.pop_front()?;
         self.newest_sent = self.newest_sent.max(sample.info.sequence);
+        self.longest_sent = self.longest_sent().max(size);
         self.sent_bytes += size;
         self.sent.push_back(sample);
         self.sent.back()
+    }
+
+    /// The credit that the samples use that were sent and are not acknowledged.
+    pub(super) fn credit(&self) -> Credit {
+        Credit::of(self.sent_bytes, self.longest_sent())
+    }
+
+    /// The credit that they will use if this sample is sent, too.
+    pub(super) fn credit_with(&self, next: &Sample) -> Credit {
+        Credit::of(self.sent_bytes + next.size(), self.longest_sent().max(next.size()))
+    }
+
+    fn longest_sent(&self) -> usize {
+        if self.sent.is_empty() { 0 } else { self.longest_sent }
     }
 
     /// Takes back the sample that was sent last: it could not be sealed.

@@ -11,7 +11,7 @@ use axon_transport::config::TopicPriority;
 pub(crate) type FlowId = usize;
 
 /// A sample of at most so many bytes is small.
-const SMALL: usize = 4096;
+pub(super) const SMALL: usize = 4096;
 /// Classes, and ranks.
 const CLASSES: usize = 4;
 pub(super) const RANKS: usize = 3 * CLASSES;
@@ -65,7 +65,7 @@ impl Rank {
     }
 
     /// Its place among all ranks, the first one to go being 0.
-    pub(super) fn place(self) -> usize {
+    pub(in crate::engine) fn place(self) -> usize {
         (TopicPriority::High as usize - self.priority as usize) * CLASSES + self.class as usize
     }
 }
@@ -101,6 +101,11 @@ impl Schedule {
     /// Adds a flow behind the others of its rank. The caller adds no flow twice.
     pub(super) fn push(&mut self, flow: FlowId, rank: Rank) {
         self.ranks[rank.place()].push_back(flow);
+    }
+
+    /// Adds a flow before the others of its rank.
+    pub(super) fn push_first(&mut self, flow: FlowId, rank: Rank) {
+        self.ranks[rank.place()].push_front(flow);
     }
 
     /// The next flow. Ranks that `borrows` says, by their place, go before all others.

@@ -7,6 +7,7 @@ use axon_shm::ids::Gid;
 use axon_transport::config::TopicPriority;
 
 use super::{
+    flow::PeerCredit,
     schedule::FlowId,
     source::{Done, Source},
 };
@@ -38,6 +39,7 @@ pub(super) struct FlowRoute {
     pub(super) acknowledged: bool,
     pub(super) short_headers: bool,
     pub(super) responses: ResponseNumbers,
+    pub(super) credit: Rc<PeerCredit>,
 }
 
 /// Numbers the responses of this daemon in the order in which they are taken. A flow that ends and begins again, or that of

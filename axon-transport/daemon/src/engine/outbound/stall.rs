@@ -69,7 +69,9 @@ impl Outbound {
             }
             let at = flow.progress();
             let progress = match before.get(id) {
-                Some(progress) if progress.at == at && !silent => *progress,
+                Some(progress) if progress.at == at && !silent && !flow.waits_for_others() => {
+                    *progress
+                }
                 _ => Progress { at, since: now },
             };
             if now.saturating_sub(progress.since) >= self.stalls.limit {

@@ -274,6 +274,7 @@ impl Peer {
                 self.stirred |= of_service && self.services_changed();
             }
             Message::Asserted(asserted) => self.handle_asserted(&asserted),
+            Message::Intake(intake) => self.outbound.set_intake(&intake),
             Message::Received(received) => self.outbound.handle_received(&received.flows),
             Message::RouteRefused(refused) => self.handle_route_refused(refused, now),
             Message::RouteUnasked(unasked) => self.handle_route_unasked(unasked),

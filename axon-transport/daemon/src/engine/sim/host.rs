@@ -391,12 +391,14 @@ impl Host {
                 *self.lost.entry((topic, cause)).or_default() += samples;
             }
             // As the control plane answers a probe; beacons there are none.
-            ToControl::Datagram { from, bytes } => {
-                if let (Ok(Datagram::Probe { nonce, .. }), Some(engine)) =
-                    (Datagram::decode(&bytes), &mut self.engine)
-                {
-                    let bytes = Datagram::Echo { daemon: self.daemon, nonce }.encode();
-                    engine.handle_order(ToGateway::SendDatagram { to: from, bytes }, now);
+            ToControl::Datagrams(datagrams) => {
+                for (to, bytes) in datagrams.iter() {
+                    if let (Ok(Datagram::Probe { nonce, .. }), Some(engine)) =
+                        (Datagram::decode(bytes), &mut self.engine)
+                    {
+                        let bytes = Datagram::Echo { daemon: self.daemon, nonce }.encode();
+                        engine.handle_order(ToGateway::SendDatagram { to, bytes }, now);
+                    }
                 }
             }
             ToControl::Link(status, _) => {

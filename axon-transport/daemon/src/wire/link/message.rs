@@ -273,6 +273,18 @@ pub struct RouteUnasked {
     pub reason: Option<String>,
 }
 
+/// What the sender of this message takes in over this link at a time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Intake {
+    /// Bytes that it has not read: the connection's window.
+    #[n(0)]
+    pub unread: u64,
+    /// Bytes of messages longer than 32 KiB that have not come whole or wait for a reader.
+    #[n(1)]
+    pub messages: u64,
+}
+
 /// That sessions are the sender's. Said before GRAPH, once on each connection.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
@@ -326,6 +338,8 @@ pub enum Message {
     Owners(Owners),
     /// A silent link that this one succeeds is closed.
     LinkClosed(LinkClosed),
+    /// This is how much I take in.
+    Intake(Intake),
     /// About keys.
     Keys(KeyMessage),
 }
@@ -348,6 +362,7 @@ impl Message {
             Self::Owners(m) => (12, to_map(m)),
             Self::LinkClosed(m) => (13, to_map(m)),
             Self::RouteUnasked(m) => (14, to_map(m)),
+            Self::Intake(m) => (15, to_map(m)),
             Self::Keys(m) => {
                 let mut map = Vec::new();
                 m.encode(&mut map);
@@ -358,7 +373,7 @@ impl Message {
 
     /// Whether [`decode`](Self::decode) knows this type.
     pub(super) fn is_known(kind: u8) -> bool {
-        matches!(kind, 1..=14 | 16..=19)
+        matches!(kind, 1..=19)
     }
 
     /// The message of type `kind`, `None` for an unknown type.
@@ -378,6 +393,7 @@ impl Message {
             12 => Self::Owners(from_map(kind, map)?),
             13 => Self::LinkClosed(from_map(kind, map)?),
             14 => Self::RouteUnasked(from_map(kind, map)?),
+            15 => Self::Intake(from_map(kind, map)?),
             16..=19 => Self::Keys(
                 KeyMessage::decode(kind, map)
                     .map_err(|e| FrameError::Malformed { kind, reason: e.to_string() })?,
@@ -436,6 +452,7 @@ impl Message {
             | Self::GraphResync(_)
             | Self::Unsubscribe(_)
             | Self::Keepalive
+            | Self::Intake(_)
             | Self::LinkClosed(_) => Ok(()),
             // Their decoder bounds them.
             Self::Keys(_) => Ok(()),

@@ -87,6 +87,7 @@ pub(crate) fn messages() -> Vec<Message> {
         Message::Asserted(Asserted { publishers: vec![Gid([7; 16]), Gid([8; 16])] }),
         Message::Owners(Owners { proofs: vec![Proof { key: [1; 32], signature: [2; 64] }; 2] }),
         Message::LinkClosed(LinkClosed { link: [3; 16] }),
+        Message::Intake(Intake { unread: 33 << 20, messages: 64 << 20 }),
         Message::Keys(KeyMessage::Announce(vec![key_id("k1"), key_id("k2")])),
         Message::Keys(KeyMessage::Ready { key_id: key_id("k1"), proof: [8; 32] }),
         Message::Keys(KeyMessage::Failed { key_id: key_id("k2"), reason: "unknown".into() }),

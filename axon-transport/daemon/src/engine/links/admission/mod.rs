@@ -33,6 +33,11 @@ impl Admission {
         self.listed = addresses;
     }
 
+    /// Whether this is the address of a listed peer.
+    pub(super) fn is_listed(&self, address: IpAddr) -> bool {
+        self.listed.contains(&address.to_canonical())
+    }
+
     /// A place for a handshake from this address.
     pub(super) fn enter(&self, address: IpAddr) -> Option<Place> {
         self.handshakes.enter(address, self.listed.contains(&address.to_canonical()))

@@ -13,7 +13,7 @@ pub(super) use self::{
     watch::{Nonce, Silence},
 };
 use crate::{
-    engine::links::{LinkEvent, LinkReport, Links},
+    engine::links::{LinkEvent, Links},
     wire::beacon::Datagram,
 };
 
@@ -35,7 +35,9 @@ impl Links {
             }
             return;
         }
-        self.outbox.report(LinkReport::Datagram { from, bytes: bytes.to_vec() });
+        let Self { admission, connections, inbox, .. } = self;
+        let known = || admission.is_listed(from.ip()) || connections.has(from.ip());
+        inbox.add(from, &bytes, known, now);
     }
 
     /// Notes what had gone over a link when a datagram came.

@@ -10,7 +10,10 @@ use axon_transport::config::TopicPriority;
 use bytes::Bytes;
 use quinn_proto::{Connection, Dir, StreamId, VarInt, WriteError};
 
-use super::Pause;
+use super::{
+    Pause,
+    credit::{Credit, CreditShare},
+};
 use crate::{
     engine::{
         connection::Carrier,
@@ -19,7 +22,7 @@ use crate::{
         inbound::StreamHeader,
         outbound::{
             queue::Queue,
-            schedule::{Class, Rank},
+            schedule::{Class, Rank, SMALL},
             source::Done,
         },
     },
@@ -42,7 +45,7 @@ struct Writing {
 }
 
 /// A sample on its way.
-#[derive(Clone, Copy, Debug)]
+#[derive(Debug)]
 struct UnderWay {
     stream: StreamId,
     priority: i32,
@@ -52,6 +55,8 @@ struct UnderWay {
     begun: Duration,
     /// When it is given up.
     deadline: Duration,
+    /// The credit that it uses.
+    _credit: CreditShare,
 }
 
 /// The best-effort samples of one flow.
@@ -84,6 +89,7 @@ impl BestEffort {
     pub(super) fn write(
         &mut self,
         (of_route, short, topic): ((u32, Gid, Route, TopicPriority), bool, &Arc<str>),
+        mut credit: CreditShare,
         queue: &mut Queue,
         frames: &mut Frames,
         carrier: &mut Carrier<'_>,
@@ -101,8 +107,11 @@ impl BestEffort {
                 return Some(Pause::Blocked);
             }
             counters.lost(topic, "late", queue.drop_late(LIFE, self.took, now));
-            if queue.peek().is_none() {
-                return Some(Pause::Empty);
+            let Some(next) = queue.peek() else { return Some(Pause::Empty) };
+            let (length, uses) = (next.payload.len(), Credit::of(next.size(), next.size()));
+            let own = Rank { priority, class: Class::of(false, false, length) };
+            if length > SMALL && !(carrier.is_open_to(own) && credit.may_use(uses)) {
+                return Some(Pause::NoCredit);
             }
             let Some(stream) = carrier.quic.streams().open(Dir::Uni) else {
                 return Some(Pause::NoStream);
@@ -127,8 +136,10 @@ impl BestEffort {
             carrier.streams.insert(stream, carrier.flow);
             let left = sample.lifespan_left(now).unwrap_or(LONGEST).min(LONGEST);
             let bytes = pending.iter().map(|piece| piece.len() as u64).sum();
+            credit.set(uses);
+            let (begun, deadline) = (now, now + left);
             let sample =
-                UnderWay { stream, priority, bytes, payload, begun: now, deadline: now + left };
+                UnderWay { stream, priority, bytes, payload, begun, deadline, _credit: credit };
             self.writing = Some(Writing { stream, pending, sample });
         }
         let Writing { stream, pending, sample } = self.writing.as_mut()?;
@@ -140,8 +151,7 @@ impl BestEffort {
                 carrier.taken += taken.bytes as u64;
                 if pending.is_empty() {
                     let _ = quic.finish();
-                    self.under_way.push_back(*sample);
-                    self.writing = None;
+                    self.under_way.extend(self.writing.take().map(|writing| writing.sample));
                 }
                 None
             }

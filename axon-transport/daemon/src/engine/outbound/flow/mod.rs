@@ -3,6 +3,7 @@
 
 mod batch;
 mod best_effort;
+mod credit;
 mod taking;
 #[cfg(test)]
 mod tests;
@@ -14,15 +15,17 @@ use axon_shm::{ids::Gid, qos::Qos};
 use axon_transport::config::TopicPriority;
 use quinn_proto::{Dir, StreamId, VarInt, WriteError};
 
+pub(super) use self::credit::{Credit, CreditQueue, PeerCredit};
 use self::{
     batch::{Batch, Sealed},
     best_effort::BestEffort,
+    credit::{ALWAYS, CreditShare},
     taking::Taking,
 };
 use super::{
     budget::Budget,
     queue::Queue,
-    schedule::{Class, Rank},
+    schedule::{Class, Rank, SMALL},
     served::FlowRoute,
     source::{Done, Source},
 };
@@ -59,6 +62,8 @@ pub(super) enum Pause {
     NoStream,
     /// There is no key for the next message.
     NoKey,
+    /// The peer does not take in the next sample before others.
+    NoCredit,
 }
 
 /// One flow.
@@ -93,11 +98,15 @@ pub(super) struct Flow {
     pub(super) scheduled: Option<Rank>,
     /// Whether QUIC said that it takes no more.
     pub(super) blocked: bool,
+    /// Whether the peer did not take in its next sample when it had its last turn.
+    pub(super) waits_for_credit: bool,
     /// When [`handle_timeout`](Self::handle_timeout) is due, if it is.
     pub(super) timer: Option<Duration>,
     acknowledged_samples: u64,
     /// Bytes that QUIC took.
     taken_bytes: u64,
+    /// The credit that the samples use that were sent over the stream.
+    credit: CreditShare,
 }
 
 impl Flow {
@@ -117,6 +126,7 @@ impl Flow {
             acknowledged,
             short_headers,
             ref responses,
+            ref credit,
         } = *of_route;
         // Each response has a number that rises, so that the peer can acknowledge it and drop a second copy.
         let numbers = (acknowledged && route.kind == Kind::Response).then(|| responses.clone());
@@ -140,9 +150,11 @@ impl Flow {
             active_at: now,
             scheduled: None,
             blocked: false,
+            waits_for_credit: false,
             timer: None,
             acknowledged_samples: 0,
             taken_bytes: 0,
+            credit: credit.share(),
         }
     }
 
@@ -298,7 +310,12 @@ impl Flow {
         now: Duration,
     ) -> Option<Pause> {
         if self.batch.is_empty() {
-            match self.seal(carrier, now) {
+            if !self.has_credit(carrier) {
+                return Some(Pause::NoCredit);
+            }
+            let sealed = self.seal(carrier, now);
+            self.credit.set(self.queue.credit());
+            match sealed {
                 Ok(0) => return Some(Pause::Empty),
                 Ok(_) => {}
                 Err(NoKey::Detached) => return Some(Pause::Blocked),
@@ -353,6 +370,17 @@ impl Flow {
         }
     }
 
+    /// Whether the peer takes in the next sample now. Some small ones are sent whatever the peer holds.
+    fn has_credit(&self, carrier: &Carrier<'_>) -> bool {
+        let Some(next) = self.queue.peek() else { return true };
+        let credit = self.queue.credit_with(next);
+        let length = next.payload.len();
+        let is_small = length <= SMALL && credit.window <= ALWAYS;
+        let class = Class::of(self.route.kind != Kind::Topic, true, length);
+        let rank = Rank { priority: self.priority, class };
+        is_small || (carrier.is_open_to(rank) && self.credit.may_use(credit))
+    }
+
     fn set_priority(&mut self, rank: Rank, stream: StreamId, carrier: &mut Carrier<'_>) {
         self.stream_priority = rank.of_stream();
         let _ = carrier.quic.send_stream(stream).set_priority(self.stream_priority);
@@ -380,6 +408,7 @@ impl Flow {
         });
         if !self.acknowledged {
             self.queue.written(whole);
+            self.credit.set(self.queue.credit());
         }
         if self.timer.is_none() {
             self.timer = Some(now + STREAM_IDLE);
@@ -398,6 +427,9 @@ impl Flow {
             self.frames.reserve(self.queue.waiting_bytes().min(TOGETHER + COPIED));
         }
         while bytes < TOGETHER {
+            if samples > 0 && !self.has_credit(carrier) {
+                break;
+            }
             let Some(sample) = self.queue.send() else { break };
             let (sequence, payload) = (sample.info.sequence, sample.payload.len());
             let (delivery, headers) = (Delivery::Reliable, self.headers.as_mut());
@@ -425,6 +457,7 @@ impl Flow {
         self.stream = None;
         self.batch.clear();
         let (given_up, newest) = self.queue.give_up_sent();
+        self.credit.set(self.queue.credit());
         counters.lost(&self.topic, "no_route", given_up);
         done.sequence = done.sequence.max(newest);
         done.given_up += given_up;
@@ -434,6 +467,7 @@ impl Flow {
     fn rewind(&mut self) {
         self.batch.clear();
         self.queue.rewind();
+        self.credit.set(self.queue.credit());
     }
 
     /// A new link carries the flow: what the old one did not deliver goes first.
@@ -463,9 +497,16 @@ impl Flow {
         (self.acknowledged_samples, self.taken_bytes / PART)
     }
 
+    /// Whether it waits for other flows: none of its samples is in flight, and the peer takes in theirs first. Then it is
+    /// no fault of its own that it makes no progress.
+    pub(super) fn waits_for_others(&self) -> bool {
+        self.waits_for_credit && !self.queue.has_sent() && self.best_effort.is_idle()
+    }
+
     /// The peer has the samples up to this number, and dropped some of them.
     pub(super) fn acknowledge(&mut self, sequence: u64, dropped: u64) -> Option<Done> {
         let (samples, newest) = self.queue.acknowledge(sequence);
+        self.credit.set(self.queue.credit());
         self.acknowledged_samples += samples;
         newest.map(|sequence| Done { sequence: Some(sequence), given_up: samples.min(dropped) })
     }
@@ -488,6 +529,7 @@ impl Flow {
         let before = carrier.taken;
         let pause = self.best_effort.write(
             (of, self.short_headers, &self.topic),
+            self.credit.sibling(),
             &mut self.queue,
             &mut self.frames,
             carrier,

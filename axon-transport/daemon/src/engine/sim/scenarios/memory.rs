@@ -33,7 +33,7 @@ const COMES: usize = 31 << 10;
 const SAYS: u32 = 32 << 10;
 
 /// A peer of this number dials under a daemon id. Returns its link once it is elected.
-fn linked_as(world: &mut World, peer: usize, id: u8) -> usize {
+pub(super) fn linked_as(world: &mut World, peer: usize, id: u8) -> usize {
     let to = world.hosts[0].address;
     let number = world.with_raw(peer, |raw, now| raw.dial(to, now));
     world.until(secs(5), |world| world.raws[peer].links[number].connected);
@@ -46,7 +46,7 @@ fn linked_as(world: &mut World, peer: usize, id: u8) -> usize {
 }
 
 /// The GID of an endpoint that a daemon id announces.
-fn gid(id: u8, number: u32) -> Gid {
+pub(super) fn gid(id: u8, number: u32) -> Gid {
     let mut gid = [0; 16];
     gid[..12].copy_from_slice(&FOREIGN);
     gid[12..].copy_from_slice(&(u32::from(id) << 16 | number).to_be_bytes());
@@ -58,7 +58,7 @@ fn endpoint(kind: EndpointKind, gid: Gid, topic: &str) -> Endpoint {
 }
 
 /// Announces so many publishers of a topic.
-fn publishes(world: &mut World, link: usize, id: u8, topic: &str, count: u32) {
+pub(super) fn publishes(world: &mut World, link: usize, id: u8, topic: &str, count: u32) {
     let publisher = |n| endpoint(EndpointKind::Publisher, gid(id, n), topic);
     let added = (0..count).map(publisher).collect();
     let graph = Message::Graph(Graph { version: 1, added, ..Graph::default() });
@@ -66,7 +66,7 @@ fn publishes(world: &mut World, link: usize, id: u8, topic: &str, count: u32) {
 }
 
 /// Waits until the host asked for a topic. Returns the number of its route.
-fn asked(world: &mut World, link: usize, topic: &str) -> u32 {
+pub(super) fn asked(world: &mut World, link: usize, topic: &str) -> u32 {
     let route = |world: &World| {
         world.raws[0].links[link].messages.iter().find_map(|message| match message {
             Message::Subscribe(subscribe) if subscribe.topic == topic => Some(subscribe.route),

@@ -3,6 +3,7 @@
 mod cuts;
 mod hostile;
 mod kills;
+mod long;
 mod losses;
 mod memory;
 mod moves;

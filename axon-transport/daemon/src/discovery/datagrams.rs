@@ -1,0 +1,35 @@
+//! Datagrams that are passed on together.
+
+use std::net::SocketAddr;
+
+/// Datagrams, in the order in which they came.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Datagrams {
+    bytes: Vec<u8>,
+    /// The sender of each, and where it ends.
+    all: Vec<(SocketAddr, usize)>,
+}
+
+impl Datagrams {
+    /// Adds one.
+    pub fn push(&mut self, from: SocketAddr, bytes: &[u8]) {
+        self.bytes.extend_from_slice(bytes);
+        self.all.push((from, self.bytes.len()));
+    }
+
+    /// How many there are.
+    pub fn len(&self) -> usize {
+        self.all.len()
+    }
+
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.all.is_empty()
+    }
+
+    /// The sender and the content of each.
+    pub fn iter(&self) -> impl Iterator<Item = (SocketAddr, &[u8])> {
+        let begins = std::iter::once(0).chain(self.all.iter().map(|(_, end)| *end));
+        self.all.iter().zip(begins).map(|((from, end), begin)| (*from, &self.bytes[begin..*end]))
+    }
+}

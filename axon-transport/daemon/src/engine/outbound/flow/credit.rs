@@ -1,0 +1,268 @@
+//! The credit for long samples towards one peer: what may be in flight at a time.
+//!
+//! A receiver reads no more of a long message while it has no memory for it. The bytes that wait there use up QUIC's
+//! connection window. If they use up all of it, the rest of the messages that do have memory cannot come, and the link
+//! stands still. So the samples in flight never use up the window, even if the receiver reads none of them, and the
+//! receiver has memory for all of them.
+
+use std::{
+    cell::Cell,
+    collections::{HashMap, VecDeque},
+    rc::Rc,
+};
+
+use crate::{
+    engine::outbound::schedule::{FlowId, RANKS},
+    engine::transport::{LINK_WINDOW, STREAM_WINDOW, window_credit},
+    link::Intake,
+};
+
+/// What a peer has that does not say it: as much as the second link of an identity has, and all memory for messages.
+const UNSAID: Intake = Intake { unread: (LINK_WINDOW as u64) + (16 << 20), messages: 64 << 20 };
+/// The part of the credit that counts as little: a quarter.
+const LITTLE: u64 = 4;
+/// A sample longer than this needs memory for messages. The receiver counts from 32 KiB on, header and seal included.
+const LONG: usize = 31 << 10;
+/// Memory that the receiver counts for header and seal.
+const OVERHEAD: u64 = 1 << 10;
+/// Small samples of one flow may be in flight up to so many bytes, whatever the credit.
+pub(in crate::engine::outbound) const ALWAYS: u64 = 256 << 10;
+
+/// The part of the credit that samples in flight use.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(in crate::engine::outbound) struct Credit {
+    /// Bytes of the connection window.
+    pub(in crate::engine::outbound) window: u64,
+    /// Bytes of memory for messages.
+    memory: u64,
+}
+
+impl Credit {
+    /// What samples of one stream use: `bytes` in all, the longest of `longest` bytes.
+    pub(in crate::engine::outbound) fn of(bytes: usize, longest: usize) -> Self {
+        let memory = if longest > LONG { longest as u64 + OVERHEAD } else { 0 };
+        Self { window: (bytes as u64).min(STREAM_WINDOW.1), memory }
+    }
+}
+
+/// The credit of one peer.
+#[derive(Debug)]
+pub(in crate::engine::outbound) struct PeerCredit {
+    most: Cell<Credit>,
+    used: Cell<Credit>,
+    /// Counts the changes after which a flow that had too little may have enough.
+    grown: Cell<u64>,
+}
+
+/// The credit that one flow, or one best-effort sample, uses. Dropping it gives the credit back.
+#[derive(Debug)]
+pub(in crate::engine::outbound) struct CreditShare {
+    of: Rc<PeerCredit>,
+    used: Credit,
+}
+
+impl PeerCredit {
+    /// The credit at a peer that has not said how much it has.
+    pub(in crate::engine::outbound) fn new() -> Rc<Self> {
+        Rc::new(Self {
+            most: Cell::new(limit(&UNSAID)),
+            used: Cell::default(),
+            grown: Cell::new(0),
+        })
+    }
+
+    /// The peer said what it has; `None`: it has not said it over this link.
+    pub(in crate::engine::outbound) fn set(&self, intake: Option<&Intake>) {
+        self.most.set(limit(intake.unwrap_or(&UNSAID)));
+        self.grown.set(self.grown.get() + 1);
+    }
+
+    /// An unused share.
+    pub(in crate::engine::outbound) fn share(self: &Rc<Self>) -> CreditShare {
+        CreditShare { of: Rc::clone(self), used: Credit::default() }
+    }
+
+    fn change(&self, before: Credit, after: Credit) {
+        let used = self.used.get();
+        self.used.set(Credit {
+            window: used.window - before.window + after.window,
+            memory: used.memory - before.memory + after.memory,
+        });
+        if after.window < before.window || after.memory < before.memory {
+            self.grown.set(self.grown.get() + 1);
+        }
+    }
+}
+
+impl CreditShare {
+    /// Another share of the same peer, unused.
+    pub(in crate::engine::outbound) fn sibling(&self) -> Self {
+        self.of.share()
+    }
+
+    /// Whether it may use this much. It may use any amount while the others use little: one sample may always be in
+    /// flight, however long it is.
+    pub(in crate::engine::outbound) fn may_use(&self, after: Credit) -> bool {
+        let (most, all) = (self.of.most.get(), self.of.used.get());
+        let others =
+            Credit { window: all.window - self.used.window, memory: all.memory - self.used.memory };
+        let fits = |others: u64, after: u64, most: u64| {
+            others <= most / LITTLE || others.saturating_add(after) <= most
+        };
+        fits(others.window, after.window, most.window)
+            && (after.memory == 0 || fits(others.memory, after.memory, most.memory))
+    }
+
+    /// Uses this much from now on.
+    pub(in crate::engine::outbound) fn set(&mut self, used: Credit) {
+        self.of.change(self.used, used);
+        self.used = used;
+    }
+}
+
+impl Drop for CreditShare {
+    fn drop(&mut self) {
+        self.set(Credit::default());
+    }
+}
+
+/// What samples in flight may use at a peer that has this much.
+fn limit(intake: &Intake) -> Credit {
+    Credit { window: window_credit(intake.unread), memory: intake.messages }
+}
+
+/// Flows that wait for credit, in order. A flow that came later does not overtake one of its own rank or a higher one,
+/// so a long sample is not kept out by shorter ones.
+#[derive(Debug, Default)]
+pub(in crate::engine::outbound) struct CreditQueue {
+    order: VecDeque<FlowId>,
+    /// The place of the rank of each.
+    places: HashMap<FlowId, usize>,
+    /// How many wait at each place.
+    at_place: [usize; RANKS],
+    /// What `grown` was when the flows were taken out last.
+    seen: u64,
+    /// A flow left the queue: those behind it may have enough.
+    left: bool,
+}
+
+impl CreditQueue {
+    /// A flow of a rank at this place waits.
+    pub(in crate::engine::outbound) fn add(&mut self, flow: FlowId, place: usize) {
+        if self.places.insert(flow, place).map(|before| self.at_place[before] -= 1).is_none() {
+            self.order.push_back(flow);
+        }
+        self.at_place[place] += 1;
+    }
+
+    /// A flow is gone.
+    pub(in crate::engine::outbound) fn forget(&mut self, flow: FlowId) {
+        if let Some(place) = self.places.remove(&flow) {
+            self.at_place[place] -= 1;
+            self.order.retain(|other| *other != flow);
+            self.left = true;
+        }
+    }
+
+    /// Whether flows that wait may have enough now.
+    pub(in crate::engine::outbound) fn is_due(&self, credit: &PeerCredit) -> bool {
+        !self.order.is_empty() && (self.left || self.seen != credit.grown.get())
+    }
+
+    /// Takes out all flows, in order.
+    pub(in crate::engine::outbound) fn take(&mut self, credit: &PeerCredit) -> VecDeque<FlowId> {
+        (self.seen, self.left) = (credit.grown.get(), false);
+        self.places.clear();
+        self.at_place = [0; RANKS];
+        std::mem::take(&mut self.order)
+    }
+
+    /// The place of the highest rank that waits. Flows of this rank and of lower ones wait, too.
+    pub(in crate::engine::outbound) fn closed_from(&self) -> Option<usize> {
+        self.at_place.iter().position(|flows| *flows > 0)
+    }
+
+    /// How many flows wait.
+    #[cfg(test)]
+    pub(in crate::engine::outbound) fn len(&self) -> usize {
+        self.order.len()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn credit(unread: u64, messages: u64) -> Rc<PeerCredit> {
+        let credit = PeerCredit::new();
+        credit.set(Some(&Intake { unread, messages }));
+        credit
+    }
+
+    #[test]
+    fn samples_in_flight_use_at_most_three_quarters_of_the_window() {
+        let credit = credit(32 << 20, u64::MAX);
+        let mut shares: Vec<_> = (0..7).map(|_| credit.share()).collect();
+        let sample = Credit::of(16 << 20, 16 << 20);
+        assert_eq!(sample.window, 4 << 20, "as much as the window of a stream");
+        for share in &mut shares[..6] {
+            assert!(share.may_use(sample));
+            share.set(sample);
+        }
+        assert!(!shares[6].may_use(sample));
+        assert!(shares[6].may_use(Credit::default()));
+        assert!(shares[5].may_use(Credit::of(20 << 20, 16 << 20)), "its stream has no more");
+        shares.remove(0);
+        assert!(shares[5].may_use(sample));
+    }
+
+    #[test]
+    fn samples_in_flight_use_no_more_memory_than_there_is() {
+        let credit = credit(u64::from(u32::MAX), 64 << 20);
+        let [mut one, mut two] = [credit.share(), credit.share()];
+        one.set(Credit::of(60 << 20, 60 << 20));
+        assert!(!two.may_use(Credit::of(8 << 20, 8 << 20)));
+        assert!(two.may_use(Credit::of(8 << 20, 16 << 10)), "short ones need none");
+        drop(one);
+        let longest = Credit::of(256 << 20, 256 << 20);
+        assert!(two.may_use(longest), "one is always in flight");
+        two.set(longest);
+        assert!(two.may_use(longest));
+        assert!(!credit.share().may_use(Credit::of(40 << 10, 40 << 10)));
+    }
+
+    #[test]
+    fn a_peer_that_says_little_is_sent_one_sample_at_a_time() {
+        for intake in [Intake { unread: 0, messages: 0 }, Intake { unread: 1, messages: u64::MAX }]
+        {
+            let credit = PeerCredit::new();
+            credit.set(Some(&intake));
+            let (mut one, two) = (credit.share(), credit.share());
+            let sample = Credit::of(1 << 20, 1 << 20);
+            assert!(one.may_use(sample));
+            one.set(sample);
+            assert!(!two.may_use(sample));
+        }
+    }
+
+    #[test]
+    fn flows_that_wait_keep_their_order_and_are_due_when_credit_comes_back() {
+        let credit = credit(32 << 20, 64 << 20);
+        let mut queue = CreditQueue::default();
+        let mut share = credit.share();
+        share.set(Credit::of(1 << 20, 1 << 20));
+        queue.take(&credit);
+        [(3, 7), (1, 5), (2, 7), (3, 7)].iter().for_each(|(flow, place)| queue.add(*flow, *place));
+        assert_eq!((queue.len(), queue.closed_from()), (3, Some(5)));
+        assert!(!queue.is_due(&credit));
+        share.set(Credit::default());
+        assert!(queue.is_due(&credit));
+        assert_eq!(queue.take(&credit), [3, 1, 2]);
+        assert!(!queue.is_due(&credit) && queue.closed_from().is_none());
+        queue.add(1, 5);
+        queue.add(2, 7);
+        assert!(!queue.is_due(&credit));
+        queue.forget(1);
+        assert!(queue.is_due(&credit), "the next one is first now");
+    }
+}
