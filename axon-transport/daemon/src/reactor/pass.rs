@@ -199,12 +199,12 @@ impl Reactor {
         let mut busy = false;
         if !self.told.is_behind() {
             let (engine, mut of_quic) = (&mut self.engine, false);
-            let any = self.sockets.receive(|datagram| {
+            let (any, drained) = self.sockets.receive(|datagram| {
                 let Datagram { socket, from, local, ecn, bytes } = datagram;
                 of_quic |= !bytes.first().is_some_and(|first| is_discovery(*first));
                 engine.handle_datagram(socket, from, local, ecn, bytes, now);
             });
-            self.is_flooded = any && !of_quic && engine.holds_discovery();
+            self.is_flooded = any && drained && !of_quic && engine.holds_discovery();
             busy |= any && !self.is_flooded;
         }
         for input in self.inputs.take() {
@@ -328,8 +328,10 @@ impl Reactor {
     /// Waits until there is something to do. The pass before had work if it was `busy`.
     async fn wait(&mut self, busy: bool) {
         if std::mem::take(&mut self.is_flooded) && !busy {
-            // Not a wait for inputs: each datagram would end it.
-            std::thread::sleep(REST);
+            // Not a wait for inputs: each datagram would end it. But for what is due.
+            let now = self.now();
+            let due = self.engine.poll_timeout(now).map_or(REST, |due| due.saturating_sub(now));
+            std::thread::sleep(REST.min(due));
         }
         let now = self.now();
         let finishing = self.finishing.as_ref().map(Finishing::poll_timeout);

@@ -80,17 +80,18 @@ impl Sockets {
         self.all.iter().map(|socket| socket.address).collect()
     }
 
-    /// Receives datagrams that have arrived, up to a bound. Returns whether there was any.
-    pub(super) fn receive(&mut self, mut each: impl FnMut(Datagram)) -> bool {
-        let mut any = false;
+    /// Receives datagrams that have arrived, up to a bound. Returns whether there was any, and whether there are no more.
+    pub(super) fn receive(&mut self, mut each: impl FnMut(Datagram)) -> (bool, bool) {
+        let (mut any, mut drained) = (false, true);
         for (index, socket) in self.all.iter().enumerate() {
-            for _ in 0..CALLS {
+            for call in 1..=CALLS {
                 let mut metas = [RecvMeta::default(); MESSAGES];
                 let received = socket.receive(&mut self.buffer, &mut metas);
                 if received == 0 {
                     break;
                 }
                 any = true;
+                drained &= call < CALLS;
                 for (meta, message) in metas[..received].iter().zip(self.buffer.chunks(MESSAGE)) {
                     let mut bytes = BytesMut::from(&message[..meta.len]);
                     while !bytes.is_empty() {
@@ -106,7 +107,7 @@ impl Sockets {
                 }
             }
         }
-        any
+        (any, drained)
     }
 
     /// Datagrams that may be sent together.

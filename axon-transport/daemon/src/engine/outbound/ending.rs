@@ -48,6 +48,7 @@ impl Outbound {
             return;
         }
         self.endings.next = Some(now + LOOK);
+        let starves = self.stalls.starves(now);
         let mut over = Vec::new();
         for (of, ending) in &mut self.endings.publishers {
             if !self.routes.contains_key(&ending.route) {
@@ -64,7 +65,8 @@ impl Outbound {
             let id = self.routes.get(&number).and_then(|served| served.flows.get(of));
             let flow = id.and_then(|id| self.flows[*id].as_ref());
             let progress = flow.map_or((0, 0), super::Flow::progress);
-            if progress != ending.progress || flow.is_some_and(super::Flow::waits_for_others) {
+            let waits = !starves && flow.is_some_and(super::Flow::waits_for_others);
+            if progress != ending.progress || waits {
                 *ending = Ending { progress, since: now, ..*ending };
             }
             if now.saturating_sub(ending.since) >= PATIENCE {

@@ -221,6 +221,10 @@ impl Outbound {
     /// acknowledged are given up. Returns how many.
     pub(crate) fn give_up_route(&mut self, number: u32) -> u64 {
         let given_up = self.routes.get(&number).map_or(0, Served::give_up);
+        let flows = self.routes.get(&number).into_iter().flat_map(|served| served.flows.values());
+        for id in flows {
+            self.flows[*id].iter_mut().for_each(Flow::give_up);
+        }
         self.end_route(number);
         given_up
     }
@@ -338,7 +342,8 @@ impl Outbound {
                 Pause::NoCredit => {
                     flow.blocked = true;
                     flow.take_burst(&served.sources, &self.counters, now);
-                    self.for_credit.add(id, rank.place());
+                    // What it took from its rings may have another rank.
+                    self.for_credit.add(id, flow.rank().unwrap_or(rank).place());
                     carrier.closed_from = self.for_credit.closed_from();
                     self.lending.handle_blocked(rank);
                 }
@@ -370,6 +375,8 @@ impl Outbound {
         for id in self.for_credit.take(&self.credit).into_iter().rev() {
             let Some(flow) = &mut self.flows[id] else { continue };
             flow.blocked = false;
+            // Its samples may have been acknowledged meanwhile.
+            flow.waits_for_credit &= flow.rank().is_some();
             if flow.scheduled.is_none()
                 && let Some(rank) = flow.rank()
             {

@@ -1,4 +1,5 @@
-//! Finds routes that the peer asked for and does not read.
+//! Finds routes that the peer asked for and does not read. A flow that waits for the credit of others is excused, as long
+//! as credit comes back. If none does, those who use it are judged, KEEP_ALL or not.
 
 use std::{collections::HashMap, time::Duration};
 
@@ -19,6 +20,8 @@ pub(super) struct Stalls {
     flows: HashMap<FlowId, Progress>,
     /// Frames of the peer, and when there was a new one.
     heard: (u64, Duration),
+    /// How often credit came back, and when it did last or nobody waited for any.
+    returned: (u64, Duration),
     next: Duration,
 }
 
@@ -30,12 +33,18 @@ struct Progress {
 
 impl Stalls {
     pub(super) fn new(limit: Duration, now: Duration) -> Self {
-        Self { limit, flows: HashMap::new(), heard: (0, now), next: now + LOOK }
+        Self { limit, flows: HashMap::new(), heard: (0, now), returned: (0, now), next: now + LOOK }
     }
 
     /// A flow is gone. Its number is another's next.
     pub(super) fn forget(&mut self, flow: FlowId) {
         self.flows.remove(&flow);
+    }
+
+    /// Whether flows have waited for credit for the limit, and none came back. Then no flow that waits is excused any
+    /// more, and those that use credit are judged, too.
+    pub(super) fn starves(&self, now: Duration) -> bool {
+        now.saturating_sub(self.returned.1) >= self.limit
     }
 
     /// When to look again.
@@ -55,12 +64,18 @@ impl Outbound {
             self.stalls.heard = (heard, now);
         }
         let silent = now.saturating_sub(self.stalls.heard.1) >= SILENT;
+        let returned = self.credit.returned();
+        if silent || returned != self.stalls.returned.0 || self.for_credit.is_empty() {
+            self.stalls.returned = (returned, now);
+        }
+        let starves = self.stalls.starves(now);
         let before = std::mem::take(&mut self.stalls.flows);
         let mut quiet = Vec::new();
         for id in &self.busy {
             let Some(flow) = &self.flows[*id] else { continue };
             let Some(served) = self.routes.get_mut(&flow.route_number) else { continue };
-            if !served.holds(&flow.of) {
+            let is_judged = served.holds(&flow.of) || starves && flow.uses_credit();
+            if !is_judged {
                 quiet.extend(flow.is_quiet().then_some(*id));
                 continue;
             }
@@ -69,7 +84,9 @@ impl Outbound {
             }
             let at = flow.progress();
             let progress = match before.get(id) {
-                Some(progress) if progress.at == at && !silent && !flow.waits_for_others() => {
+                Some(progress)
+                    if progress.at == at && !silent && (starves || !flow.waits_for_others()) =>
+                {
                     *progress
                 }
                 _ => Progress { at, since: now },

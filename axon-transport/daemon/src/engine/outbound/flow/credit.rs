@@ -21,6 +21,8 @@ use crate::{
 const UNSAID: Intake = Intake { unread: (LINK_WINDOW as u64) + (16 << 20), messages: 64 << 20 };
 /// The part of the credit that counts as little: a quarter.
 const LITTLE: u64 = 4;
+/// No peer has less: with nothing, a sample of one publisher would keep out those of all others.
+const LEAST: u64 = 1 << 20;
 /// A sample longer than this needs memory for messages. The receiver counts from 32 KiB on, header and seal included.
 const LONG: usize = 31 << 10;
 /// Memory that the receiver counts for header and seal.
@@ -52,6 +54,8 @@ pub(in crate::engine::outbound) struct PeerCredit {
     used: Cell<Credit>,
     /// Counts the changes after which a flow that had too little may have enough.
     grown: Cell<u64>,
+    /// Counts how often some came back.
+    returned: Cell<u64>,
 }
 
 /// The credit that one flow, or one best-effort sample, uses. Dropping it gives the credit back.
@@ -68,13 +72,22 @@ impl PeerCredit {
             most: Cell::new(limit(&UNSAID)),
             used: Cell::default(),
             grown: Cell::new(0),
+            returned: Cell::new(0),
         })
     }
 
     /// The peer said what it has; `None`: it has not said it over this link.
     pub(in crate::engine::outbound) fn set(&self, intake: Option<&Intake>) {
-        self.most.set(limit(intake.unwrap_or(&UNSAID)));
-        self.grown.set(self.grown.get() + 1);
+        let most = limit(intake.unwrap_or(&UNSAID));
+        let before = self.most.replace(most);
+        if most.window > before.window || most.memory > before.memory {
+            self.grown.set(self.grown.get() + 1);
+        }
+    }
+
+    /// How often credit came back. While it does not, the peer takes nothing in.
+    pub(in crate::engine::outbound) fn returned(&self) -> u64 {
+        self.returned.get()
     }
 
     /// An unused share.
@@ -90,11 +103,17 @@ impl PeerCredit {
         });
         if after.window < before.window || after.memory < before.memory {
             self.grown.set(self.grown.get() + 1);
+            self.returned.set(self.returned.get() + 1);
         }
     }
 }
 
 impl CreditShare {
+    /// Whether it uses any.
+    pub(in crate::engine::outbound) fn is_used(&self) -> bool {
+        self.used != Credit::default()
+    }
+
     /// Another share of the same peer, unused.
     pub(in crate::engine::outbound) fn sibling(&self) -> Self {
         self.of.share()
@@ -126,9 +145,10 @@ impl Drop for CreditShare {
     }
 }
 
-/// What samples in flight may use at a peer that has this much.
+/// What samples in flight may use at a peer that has this much. One that says nearly nothing is taken to have [`LEAST`].
 fn limit(intake: &Intake) -> Credit {
-    Credit { window: window_credit(intake.unread), memory: intake.messages }
+    let (unread, memory) = (intake.unread.max(LEAST), intake.messages.max(LEAST));
+    Credit { window: window_credit(unread), memory }
 }
 
 /// Flows that wait for credit, in order. A flow that came later does not overtake one of its own rank or a higher one,
@@ -180,6 +200,11 @@ impl CreditQueue {
     /// The place of the highest rank that waits. Flows of this rank and of lower ones wait, too.
     pub(in crate::engine::outbound) fn closed_from(&self) -> Option<usize> {
         self.at_place.iter().position(|flows| *flows > 0)
+    }
+
+    /// Whether no flow waits.
+    pub(in crate::engine::outbound) fn is_empty(&self) -> bool {
+        self.order.is_empty()
     }
 
     /// How many flows wait.
@@ -238,7 +263,7 @@ mod tests {
             let credit = PeerCredit::new();
             credit.set(Some(&intake));
             let (mut one, two) = (credit.share(), credit.share());
-            let sample = Credit::of(1 << 20, 1 << 20);
+            let sample = Credit::of(1 << 21, 1 << 21);
             assert!(one.may_use(sample));
             one.set(sample);
             assert!(!two.may_use(sample));

@@ -100,6 +100,8 @@ pub(super) struct Flow {
     pub(super) blocked: bool,
     /// Whether the peer did not take in its next sample when it had its last turn.
     pub(super) waits_for_credit: bool,
+    /// Its samples were given up.
+    is_given_up: bool,
     /// When [`handle_timeout`](Self::handle_timeout) is due, if it is.
     pub(super) timer: Option<Duration>,
     acknowledged_samples: u64,
@@ -151,6 +153,7 @@ impl Flow {
             scheduled: None,
             blocked: false,
             waits_for_credit: false,
+            is_given_up: false,
             timer: None,
             acknowledged_samples: 0,
             taken_bytes: 0,
@@ -489,7 +492,19 @@ impl Flow {
     /// The streams that carry it, which end with it, and whether a sample is cut off there.
     pub(super) fn take_streams(&mut self) -> impl Iterator<Item = (StreamId, bool)> + use<> {
         let cut = self.best_effort.take_cut().map(|stream| (stream, true));
-        self.stream.take().map(|stream| (stream, false)).into_iter().chain(cut)
+        let is_cut = self.is_given_up;
+        self.stream.take().map(|stream| (stream, is_cut)).into_iter().chain(cut)
+    }
+
+    /// Its samples that are not acknowledged are given up: its stream is cut off, so that what the peer has not read of it
+    /// uses up no window any more.
+    pub(super) fn give_up(&mut self) {
+        self.is_given_up = self.queue.has_sent();
+    }
+
+    /// Whether samples of it are in flight for which others may have to wait.
+    pub(super) fn uses_credit(&self) -> bool {
+        self.credit.is_used()
     }
 
     /// Samples that the peer acknowledged, and how often QUIC took a quarter of a MiB.
