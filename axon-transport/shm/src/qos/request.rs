@@ -34,7 +34,7 @@ impl<T> Choice<T> {
 /// ```
 /// use axon_shm::qos::{Durability, Qos, QosRequest, Reliability};
 ///
-/// let latched = Qos { durability: Durability::TransientLocal, ..Qos::default() };
+/// let latched = Qos::default().with_durability(Durability::TransientLocal);
 /// let qos = QosRequest::best_available().for_subscription(&[latched]);
 /// assert_eq!(qos.durability, Durability::TransientLocal);
 /// // One publisher that offers less, and the subscription asks for less, to match both.
