@@ -1,6 +1,6 @@
 //! The daemon's status: the JSON for `axon status`.
 //!
-//! The daemon alone fills these structures. Whoever makes one, as a test, begins with its default.
+//! The daemon alone fills these structures. A test that needs one starts from its default.
 
 mod times;
 

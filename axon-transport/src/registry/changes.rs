@@ -25,7 +25,8 @@ pub(super) type Item = (Arc<Endpoint>, Option<DaemonId>);
 pub(super) struct GraphChanges {
     version: u64,
     pending: GraphChange,
-    /// GIDs of endpoints that ended while there was no daemon to tell. A session that is told everything hears of them.
+    /// GIDs of endpoints that ended while there was no daemon to tell, or while this daemon was new. A session that is
+    /// told everything hears of them.
     tombstones: VecDeque<Gid>,
 }
 
@@ -35,7 +36,7 @@ pub(super) struct GraphChange {
     pub(super) added: BTreeMap<Gid, Item>,
     /// Whether each was this host's own.
     removed: BTreeMap<Gid, bool>,
-    /// Those of them that were this host's own and ended: whoever is attached to them lets go.
+    /// Endpoints of this host that ended. Sessions detach from them.
     pub(super) ended: BTreeSet<Gid>,
     /// Endpoints of this host whose session lists other peers than the gateway was told.
     pub(super) regraded: BTreeSet<Gid>,
@@ -81,8 +82,8 @@ impl GraphChanges {
         self.pending.ended.insert(gid);
     }
 
-    /// An endpoint of this host ended while there was no daemon. Sessions that have not come back yet have to hear of
-    /// it, too.
+    /// An endpoint of this host ended while there was no daemon, or while this daemon was new. Sessions that have not come
+    /// back yet have to hear of it, too.
     pub(super) fn bury(&mut self, gid: Gid) {
         if self.tombstones.len() == MAX_TOMBSTONES {
             self.tombstones.pop_front();
@@ -109,7 +110,7 @@ impl GraphChanges {
         Some(std::mem::take(&mut self.pending))
     }
 
-    /// The endpoints that ended while there was no daemon.
+    /// The endpoints of whose end sessions that come back have to hear.
     pub(super) fn tombstones(&self) -> Vec<Gid> {
         self.tombstones.iter().copied().collect()
     }

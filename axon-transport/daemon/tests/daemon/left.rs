@@ -48,7 +48,7 @@ pub(crate) fn taker() {
     wait_for_the_end();
 }
 
-/// A publisher and its reader, of whom the publisher ends after their daemon was killed.
+/// Kills the daemon of a publisher and its reader. Then the publisher publishes and ends.
 fn daemon_killed(reader_stops: bool) {
     let host = Host::new();
     let (mut publisher, mut taker) = (host.play("leaves samples"), host.play("takes samples"));

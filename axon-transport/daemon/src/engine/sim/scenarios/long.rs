@@ -2,11 +2,11 @@
 
 use std::time::Duration;
 
-use axon_shm::{ids::DaemonId, qos::Qos};
+use axon_shm::qos::Qos;
 use axon_transport::config::Config;
 use bytes::Bytes;
 
-use super::memory::{asked, gid, linked_as, publishes};
+use super::memory::{gid, raw_publishers};
 use crate::engine::{
     inbound::StreamHeader,
     sim::{
@@ -181,14 +181,7 @@ fn publishers_and_readers_that_end_within_long_messages_keep_no_others_out() {
 #[test]
 fn a_peer_with_more_long_messages_in_flight_than_it_may_is_named_and_bounded() {
     const MANY: u32 = 200;
-    let mut world = World::new(87, 1, |_| Config::default());
-    world.add_raw(Config::default(), DaemonId([0xff; 16]));
-    // A reader that takes nothing.
-    world.hosts[0].rings.create_subscription("/t", Qos::keep_all(), Some(0));
-    world.hosts[0].touch_graph();
-    let number = linked_as(&mut world, 0, 0xf0);
-    publishes(&mut world, number, 0xf0, "/t", MANY);
-    let route = asked(&mut world, number, "/t");
+    let (mut world, number, route) = raw_publishers(87, MANY);
     let body = Bytes::from(vec![0x5a; 300 << 10]);
     for publisher in 0..MANY {
         world.with_raw(0, |raw, _| {

@@ -33,7 +33,7 @@ const COMES: usize = 31 << 10;
 const SAYS: u32 = 32 << 10;
 
 /// A peer of this number dials under a daemon id. Returns its link once it is elected.
-pub(super) fn linked_as(world: &mut World, peer: usize, id: u8) -> usize {
+fn linked_as(world: &mut World, peer: usize, id: u8) -> usize {
     let to = world.hosts[0].address;
     let number = world.with_raw(peer, |raw, now| raw.dial(to, now));
     world.until(secs(5), |world| world.raws[peer].links[number].connected);
@@ -58,7 +58,7 @@ fn endpoint(kind: EndpointKind, gid: Gid, topic: &str) -> Endpoint {
 }
 
 /// Announces so many publishers of a topic.
-pub(super) fn publishes(world: &mut World, link: usize, id: u8, topic: &str, count: u32) {
+fn publishes(world: &mut World, link: usize, id: u8, topic: &str, count: u32) {
     let publisher = |n| endpoint(EndpointKind::Publisher, gid(id, n), topic);
     let added = (0..count).map(publisher).collect();
     let graph = Message::Graph(Graph { version: 1, added, ..Graph::default() });
@@ -66,7 +66,7 @@ pub(super) fn publishes(world: &mut World, link: usize, id: u8, topic: &str, cou
 }
 
 /// Waits until the host asked for a topic. Returns the number of its route.
-pub(super) fn asked(world: &mut World, link: usize, topic: &str) -> u32 {
+fn asked(world: &mut World, link: usize, topic: &str) -> u32 {
     let route = |world: &World| {
         world.raws[0].links[link].messages.iter().find_map(|message| match message {
             Message::Subscribe(subscribe) if subscribe.topic == topic => Some(subscribe.route),
@@ -115,18 +115,24 @@ fn short_messages_that_have_not_all_come_are_bounded_over_all_ids_of_an_identity
     assert!(world.raws[0].links.iter().all(|link| link.closed.is_none()), "{}", world.describe());
 }
 
+/// A host with a reader that takes nothing, and a hand-driven peer that publishes for it: the world, the peer's link, and
+/// the route.
+pub(super) fn raw_publishers(seed: u64, publishers: u32) -> (World, usize, u32) {
+    let mut world = World::new(seed, 1, |_| Config::default());
+    world.add_raw(Config::default(), DaemonId([0xff; 16]));
+    world.hosts[0].rings.create_subscription("/t", Qos::keep_all(), Some(0));
+    world.hosts[0].touch_graph();
+    let number = linked_as(&mut world, 0, 0xf0);
+    publishes(&mut world, number, 0xf0, "/t", publishers);
+    let route = asked(&mut world, number, "/t");
+    (world, number, route)
+}
+
 #[test]
 fn messages_that_become_long_and_wait_for_a_reader_are_bounded() {
     const LENGTH: usize = 8 << 20;
     const MANY: u32 = 40;
-    let mut world = World::new(86, 1, |_| Config::default());
-    world.add_raw(Config::default(), DaemonId([0xff; 16]));
-    // A reader that takes nothing.
-    world.hosts[0].rings.create_subscription("/t", Qos::keep_all(), Some(0));
-    world.hosts[0].touch_graph();
-    let number = linked_as(&mut world, 0, 0xf0);
-    publishes(&mut world, number, 0xf0, "/t", MANY);
-    let route = asked(&mut world, number, "/t");
+    let (mut world, number, route) = raw_publishers(86, MANY);
     let packed = zstd::bulk::compress(&vec![0; LENGTH], 1).unwrap();
     for publisher in 0..MANY {
         let of = gid(0xf0, publisher);
