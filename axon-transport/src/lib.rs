@@ -1,6 +1,7 @@
 #![doc = include_str!("../README.md")]
 #![deny(unsafe_code)]
 
+pub mod access;
 pub mod config;
 pub mod events;
 mod ffi;

@@ -297,6 +297,11 @@ impl ConfigBuilder {
         self.list("AXON_TRUSTED_UIDS", uids)
     }
 
+    /// The file of access rules. Default none: everything is allowed.
+    pub fn access_file(self, file: impl AsRef<Path>) -> Self {
+        self.path("AXON_ACCESS_FILE", file)
+    }
+
     /// What the daemon logs: levels or `target=level`, separated by commas. Default `warn`.
     pub fn log(self, filter: impl Into<String>) -> Self {
         self.set("AXON_LOG", filter.into())

@@ -2,7 +2,7 @@
 
 use std::fmt::{self, Write as _};
 
-use crate::text::is_plain;
+use crate::{access::AccessError, text::is_plain};
 
 /// A setting that was refused: which one, what was read, what is accepted.
 ///
@@ -24,6 +24,8 @@ enum Read {
     Withheld,
     /// The name itself is wrong.
     Name,
+    /// Something in a file that holds more than settings, at this place.
+    Place(String),
 }
 
 impl ConfigError {
@@ -49,6 +51,12 @@ impl ConfigError {
         self
     }
 
+    /// Access rules that cannot be used.
+    pub(super) fn rules(variable: &str, error: &AccessError) -> Self {
+        let place = format!("line {}, column {}", error.line, error.column);
+        Self::new(variable, Read::Place(place), &*error.what)
+    }
+
     fn new(variable: &str, read: Read, accepted: impl Into<String>) -> Self {
         Self { variable: variable.to_owned(), place: None, read, accepted: accepted.into() }
     }
@@ -63,7 +71,7 @@ impl ConfigError {
     pub fn read(&self) -> Option<&str> {
         match &self.read {
             Read::Value(text) => Some(text),
-            Read::Missing | Read::Withheld | Read::Name => None,
+            Read::Missing | Read::Withheld | Read::Name | Read::Place(_) => None,
         }
     }
 
@@ -84,6 +92,8 @@ impl fmt::Display for ConfigError {
             Read::Missing => f.write_str(": not set")?,
             Read::Withheld => f.write_str(": set (value not shown)")?,
             Read::Name => f.write_str(": unknown name")?,
+            // What is accepted there is a sentence of its own.
+            Read::Place(at) => return write!(f, ": {at}: {}", OneLine(&self.accepted)),
         }
         write!(f, ", accepted: {}", OneLine(&self.accepted))
     }

@@ -35,6 +35,7 @@ use sources::Given;
 pub use builder::ConfigBuilder;
 pub use error::ConfigError;
 // What `Config::resolve` reads files through, which the project's tests replace. Not part of the interface.
+pub use crate::access::TopicPattern;
 #[doc(hidden)]
 pub use files::{FileFacts, FileKind, Files, OsFiles};
 pub use model::{
@@ -44,7 +45,7 @@ pub use model::{
 };
 pub use place::DaemonPlace;
 pub use summary::security_settings;
-pub use topics::{TopicPattern, TopicPriority, TopicRule};
+pub use topics::{TopicPriority, TopicRule};
 
 impl Config {
     /// The configuration of this process: its environment, and the `axon.toml` that `AXON_CONFIG`

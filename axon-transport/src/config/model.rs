@@ -5,6 +5,7 @@ use std::{net::IpAddr, path::PathBuf, time::Duration};
 use minicbor::{Decode, Encode};
 
 use super::{TopicPriority, TopicRule, daemon_env::DaemonEnv, topics};
+use crate::access::AccessRules;
 
 /// Everything that the environment and `axon.toml`, or a [`ConfigBuilder`](super::ConfigBuilder), decide.
 ///
@@ -52,6 +53,10 @@ pub struct Config {
     pub trusted_uids: Vec<u32>,
     /// `AXON_LOG`: a tracing filter.
     pub log: String,
+    /// Who may do what: the rules of `AXON_ACCESS_FILE`, or those of `axon.toml`.
+    pub access: AccessRules,
+    /// Where those rules are; `None` where there are none.
+    pub access_file: Option<PathBuf>,
     /// `[link]` of `axon.toml`.
     pub link: LinkConfig,
     /// `[[topic]]` of `axon.toml`. The first entry that a name fits counts.

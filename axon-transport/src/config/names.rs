@@ -37,6 +37,7 @@ pub(super) const SETTINGS: &[&str] = &[
     "AXON_SHM",
     "AXON_SHM_COPY",
     TRUSTED_UIDS,
+    ACCESS_FILE,
     "AXON_LOG",
 ];
 
@@ -63,6 +64,7 @@ pub(super) const PATHS: &[&str] = &[
     "AXON_KME_CA",
     "AXON_SAE_CERT",
     "AXON_SAE_KEY",
+    ACCESS_FILE,
 ];
 
 /// Where a daemon keeps files, always an absolute path.
@@ -70,6 +72,9 @@ pub(super) const RUNTIME_DIR: &str = "AXON_RUNTIME_DIR";
 
 /// Where the daemon writes QUIC's events, always an absolute path.
 pub(super) const QLOG: &str = "AXON_LINK_QLOG";
+
+/// A file of access rules.
+pub(super) const ACCESS_FILE: &str = "AXON_ACCESS_FILE";
 
 /// Users who are let in.
 pub(super) const TRUSTED_UIDS: &str = "AXON_TRUSTED_UIDS";

@@ -15,6 +15,7 @@ use super::{
     sources::{Given, Sources},
     values::{self, Use, Values},
 };
+use crate::access::AccessRules;
 
 const MIB: u64 = 1 << 20;
 /// Longest path of a unix socket on Linux, in bytes, without the closing zero.
@@ -56,6 +57,7 @@ pub(super) fn resolve(
             Security::Qkd(qkd(&values)?)
         }
     };
+    let (access, access_file) = access(&values, &security)?;
     let ciphers = [QuicCipher::ChaCha20Poly1305, QuicCipher::Aes256Gcm].map(|c| (c.name(), c));
     let policies = [DaemonPolicy::Spawn, DaemonPolicy::Require, DaemonPolicy::Off];
     let policies = policies.map(|policy| (policy.name(), policy));
@@ -91,6 +93,8 @@ pub(super) fn resolve(
         shm: values.choice("AXON_SHM", &[("on", true), ("off", false)])?.unwrap_or(true),
         shm_copy: values.choice("AXON_SHM_COPY", &[("0", false), ("1", true)])?.unwrap_or(false),
         trusted_uids: values.uids(names::TRUSTED_UIDS)?,
+        access,
+        access_file,
         log: values.log_filter("AXON_LOG")?.unwrap_or_else(|| "warn".to_owned()),
         link: link(&values)?,
         topics: sources.topics.clone(),
@@ -113,6 +117,42 @@ fn refuse_all(
             format!("this setting with AXON_SECURITY_MODE={mode} only; set that, or remove this"),
         )),
     }
+}
+
+/// The access rules, and the file that they are in.
+fn access(
+    values: &Values<'_, impl Files>,
+    security: &Security,
+) -> Result<(AccessRules, Option<PathBuf>), ConfigError> {
+    const NAME: &str = names::ACCESS_FILE;
+    let inline = &values.sources.access;
+    let (rules, file) = match values.file(NAME, Use::Public)? {
+        Some(_) if !inline.is_empty() => {
+            let accepted = "rules in one place: in this file, or in axon.toml without this setting";
+            return Err(values.refuse(NAME, accepted));
+        }
+        Some(path) => {
+            let shown = path.to_string_lossy();
+            let wrong = |what: String| ConfigError::value(NAME, &shown, what);
+            let bytes = values.files.read(&path);
+            let bytes = bytes.map_err(|e| wrong(format!("a file that can be read ({e})")))?;
+            let text = String::from_utf8(bytes).map_err(|_| wrong("a file in UTF-8".into()))?;
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            let rules = AccessRules::parse(&text, &name);
+            let rules = rules.map_err(|error| ConfigError::rules(NAME, &error).at(&*shown))?;
+            (rules, Some(path))
+        }
+        None if inline.is_empty() => (AccessRules::default(), None),
+        None => (inline.clone(), values.sources.file.as_deref().cloned()),
+    };
+    let unnamed = matches!(security, Security::Classic(c) if c.auth == ClassicAuth::None);
+    if let Some(peer) = rules.named_host().filter(|_| unnamed) {
+        let accepted = "*, local, uid: and a number, or address: and an address: with \
+                        AXON_CLASSIC_AUTH=none no host proves a name. Pin the hosts, or name addresses";
+        let place = file.as_ref().map_or(String::new(), |file| file.display().to_string());
+        return Err(ConfigError::value("peer", &peer, accepted).at(place));
+    }
+    Ok((rules, file))
 }
 
 fn required<T>(value: Option<T>, name: &str, accepted: &str) -> Result<T, ConfigError> {

@@ -12,6 +12,7 @@ use super::{
     files::{FileKind, Files},
     names, topics,
 };
+use crate::access::AccessRules;
 
 /// One setting as text, before anything is known about its value.
 #[derive(Clone, Debug)]
@@ -44,6 +45,8 @@ pub(super) struct Sources {
     pub(super) link: toml::Table,
     /// `[[topic]]` of the file.
     pub(super) topics: Vec<TopicRule>,
+    /// The access rules of the file.
+    pub(super) access: AccessRules,
     pub(super) file: Option<Rc<PathBuf>>,
 }
 
@@ -205,6 +208,9 @@ impl Sources {
                 self.link = link;
                 continue;
             }
+            if AccessRules::is_key(&key) {
+                continue;
+            }
             if key == "topic" {
                 self.topics = topics::rules(value, &shown)?;
                 continue;
@@ -236,6 +242,10 @@ impl Sources {
         }
         for (name, setting) in from_file {
             self.settings.entry(name).or_insert(setting);
+        }
+        if self.only.is_none() {
+            self.access = AccessRules::parse_within(&text, &path)
+                .map_err(|error| ConfigError::rules(names::CONFIG, &error).at(shown))?;
         }
         self.file = Some(path);
         Ok(())

@@ -38,6 +38,10 @@ pub fn security_settings(config: &Config) -> Result<Vec<(String, String)>, Confi
         }
     }
     settings.add("AXON_QUIC_CIPHER", config.cipher.name());
+    // Its content may change, and the daemon reads it again.
+    if let Some(file) = &config.access_file {
+        settings.add("AXON_ACCESS_FILE", &file.to_string_lossy());
+    }
     Ok(settings.0)
 }
 

@@ -1,13 +1,10 @@
 //! `[[topic]]` of `axon.toml`: what the daemon does for topics of some names.
 
-use std::fmt;
-
 use super::ConfigError;
+use crate::access::TopicPattern;
 
 /// As many entries as a file may have. A topic is compared with each of them when it is matched.
 const MOST: usize = 1024;
-/// The longest pattern, in bytes.
-const LONGEST: usize = 1024;
 /// The names of the priorities.
 const PRIORITIES: [(&str, TopicPriority); 3] =
     [("high", TopicPriority::High), ("normal", TopicPriority::Normal), ("low", TopicPriority::Low)];
@@ -39,87 +36,6 @@ pub enum TopicPriority {
     Normal,
     /// Before all others, whatever the length of the samples.
     High,
-}
-
-/// Names of topics: `*` stands for any characters but `/`, and `**` as a whole segment for any number of segments, none
-/// included.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct TopicPattern(String);
-
-impl TopicPattern {
-    /// A pattern.
-    ///
-    /// # Errors
-    /// The text is no pattern; the error says what is one.
-    pub fn new(text: &str) -> Result<Self, &'static str> {
-        if text.len() > LONGEST {
-            return Err("at most 1,024 bytes");
-        }
-        let Some(segments) = text.strip_prefix('/') else {
-            return Err("a name that begins with /");
-        };
-        if segments.split('/').any(str::is_empty) {
-            return Err("a name without an empty segment");
-        }
-        if segments.split('/').any(|segment| segment.contains("**") && segment != "**") {
-            return Err("** as a whole segment, as in /camera/**");
-        }
-        Ok(Self(text.to_owned()))
-    }
-
-    /// Whether a name fits.
-    pub fn fits(&self, name: &str) -> bool {
-        let pattern: Vec<_> = self.0.split('/').collect();
-        let name: Vec<_> = name.split('/').collect();
-        fits(
-            &pattern,
-            &name,
-            |segment| *segment == "**",
-            |segment, name| segment_fits(segment, name),
-        )
-    }
-}
-
-impl fmt::Display for TopicPattern {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.0)
-    }
-}
-
-/// Whether a segment of a name fits one of a pattern.
-fn segment_fits(pattern: &str, name: &str) -> bool {
-    fits(pattern.as_bytes(), name.as_bytes(), |byte| *byte == b'*', |byte, other| byte == other)
-}
-
-/// Whether `items` fit `pattern`, in which an item that `is_any` stands for any number of items. It tries the shortest
-/// run for each such item and lengthens the last one alone: so the time is the product of the lengths at most.
-fn fits<P, T>(
-    pattern: &[P],
-    items: &[T],
-    is_any: impl Fn(&P) -> bool,
-    is_one: impl Fn(&P, &T) -> bool,
-) -> bool {
-    let (mut at, mut item) = (0, 0);
-    // Behind the last item of the pattern that stands for any, and the items that it was tried with.
-    let mut retry: Option<(usize, usize)> = None;
-    while item < items.len() {
-        match pattern.get(at) {
-            Some(any) if is_any(any) => {
-                at += 1;
-                retry = Some((at, item));
-            }
-            Some(one) if is_one(one, &items[item]) => {
-                at += 1;
-                item += 1;
-            }
-            _ => {
-                let Some((behind, tried)) = &mut retry else { return false };
-                *tried += 1;
-                (at, item) = (*behind, *tried);
-            }
-        }
-    }
-    pattern[at..].iter().all(is_any)
 }
 
 /// Reads `[[topic]]`.
@@ -171,75 +87,4 @@ fn rule(entry: toml::Value, place: &str) -> Result<TopicRule, ConfigError> {
 pub(super) fn priority(rules: &[TopicRule], name: &str) -> TopicPriority {
     let first = rules.iter().find(|rule| rule.name.fits(name));
     first.map_or(TopicPriority::Normal, |rule| rule.priority)
-}
-
-#[cfg(test)]
-mod tests {
-    use proptest::prelude::*;
-
-    use super::*;
-
-    fn pattern(text: &str) -> TopicPattern {
-        TopicPattern::new(text).unwrap()
-    }
-
-    #[test]
-    fn a_pattern_fits_whole_names() {
-        for (text, name, expected) in [
-            ("/cmd_vel", "/cmd_vel", true),
-            ("/cmd_vel", "/cmd_vel/raw", false),
-            ("/cmd_vel", "/robot/cmd_vel", false),
-            ("/*/cmd_vel", "/robot/cmd_vel", true),
-            ("/*/cmd_vel", "/cmd_vel", false),
-            ("/*/cmd_vel", "/a/b/cmd_vel", false),
-            ("/**/cmd_vel", "/a/b/cmd_vel", true),
-            ("/**/cmd_vel", "/cmd_vel", true),
-            ("/camera/**", "/camera", true),
-            ("/camera/**", "/camera/left/image", true),
-            ("/camera/**", "/cameras", false),
-            ("/**", "/anything/at/all", true),
-            ("/cam*/im*ge", "/camera_2/image", true),
-            ("/cam*/im*ge", "/camera_2/images", false),
-            ("/a*b*c", "/abcbc", true),
-            ("/a*b*c", "/abcb", false),
-            ("/**/a/**/b", "/x/a/y/a/b", true),
-            ("/**/a/**/b", "/x/a/y/a/b/c", false),
-        ] {
-            assert_eq!(pattern(text).fits(name), expected, "{text} {name}");
-        }
-    }
-
-    #[test]
-    fn what_is_no_pattern_is_refused() {
-        let long = format!("/{}", "a".repeat(LONGEST));
-        for text in ["", "cmd_vel", "/", "/a//b", "/a/", "/a**", "/a/***", &long] {
-            TopicPattern::new(text).unwrap_err();
-        }
-    }
-
-    #[test]
-    fn a_pattern_of_many_stars_takes_no_long_time() {
-        let many = pattern(&format!("/{}b", "*a".repeat(500)));
-        assert!(!many.fits(&format!("/{}", "a".repeat(100_000))));
-        let many = pattern(&format!("/{}b", "**/a/".repeat(200)));
-        assert!(!many.fits(&"/a".repeat(50_000)));
-    }
-
-    /// The definition, in exponential time.
-    fn model(pattern: &[u8], name: &[u8]) -> bool {
-        match (pattern.first(), name.first()) {
-            (None, None) => true,
-            (Some(b'*'), _) if model(&pattern[1..], name) => true,
-            (Some(b'*'), Some(_)) => model(pattern, &name[1..]),
-            (Some(one), Some(other)) => one == other && model(&pattern[1..], &name[1..]),
-            _ => false,
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn a_segment_fits_as_the_definition_says(text in "[ab*]{0,8}", name in "[ab]{0,8}") {
-            prop_assert_eq!(segment_fits(&text, &name), model(text.as_bytes(), name.as_bytes()));
-        }
-    }
 }

@@ -34,6 +34,7 @@ fn all_of_qkd() -> ConfigBuilder {
         .shm(false)
         .shm_copy(true)
         .trusted_uids([0, 1_000])
+        .access_file("/f/access.toml")
         .log("info")
         .config("/dev/null")
         .domain(232)
@@ -77,7 +78,9 @@ fn a_built_config_equals_that_of_its_environment() {
     let key = dir.path().join("key");
     std::fs::write(&key, "").unwrap();
     std::fs::set_permissions(&key, std::os::unix::fs::PermissionsExt::from_mode(0o600)).unwrap();
-    let built = all_of_qkd().sae_key(&key).build().unwrap();
+    let access = dir.path().join("access.toml");
+    std::fs::write(&access, "[[allow]]\npeer = \"sae-b\"\npublish = \"/cmd_vel\"").unwrap();
+    let built = all_of_qkd().sae_key(&key).access_file(&access).build().unwrap();
     assert!(!built.daemon_env.inherits);
     let environment = built.daemon_env.variables.clone().into_iter();
     let environment: Vec<_> = environment.filter_map(|(n, value)| Some((n, value?))).collect();
@@ -97,6 +100,8 @@ fn a_built_config_equals_that_of_its_environment() {
     assert_eq!(built.link.congestion, Congestion::Cubic);
     assert_eq!((built.domain, built.static_peers.len()), (232, 2));
     assert_eq!(built.range, DiscoveryRange::Localhost);
+    let peer = crate::access::Party::Name("sae-b");
+    assert!(!built.access.check(peer, crate::access::Verb::Publish, "/scan").allowed());
 }
 
 #[test]

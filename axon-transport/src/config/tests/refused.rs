@@ -203,6 +203,7 @@ fn bad_values_are_refused_by_name() {
         (&[], "AXON_SHM", &["0", "no", "OFF"]),
         (&[], "AXON_SHM_COPY", &["2", "true", "yes"]),
         (&[], "AXON_TRUSTED_UIDS", &["root", "-1", "4294967296", "1;;2"]),
+        (PINNED, "AXON_ACCESS_FILE", &["/f/none", "/f", "/f/anyone-writes", "/f/ca.pem"]),
         (&[], "AXON_LOG", &["loud", "axon=", "=info", "info,"]),
         (&[], "AXON_CONFIG", &["/f/none", "/f"]),
         (&[], "ROS_DOMAIN_ID", &["233", "-1", "x", "4294967296", " 1"]),
@@ -320,4 +321,38 @@ fn files_that_are_not_a_configuration_are_refused() {
     assert!(error.accepted().contains("o-w"), "{error}");
     disk.0.insert(path.into(), (0o644, vec![0xff]));
     assert!(Config::resolve([], Some(path), &disk).is_err());
+}
+
+#[test]
+fn rules_that_cannot_be_used_are_refused_with_their_place() {
+    let mut disk = Disk::new();
+    let base = "[[allow]]\npeer = \"base\"\npublish = \"/x\"";
+    disk.put("/f/good.toml", 0o644, base);
+    disk.put("/f/bad.toml", 0o644, "[[allow]]\npeer = \"base\"\npublish = \"x\"");
+    disk.put("/f/axon.toml", 0o644, base);
+    disk.put("/f/bad-axon.toml", 0o644, "[[deny]]\npeer = 3");
+    disk.put("/f/address.toml", 0o644, "[[allow]]\npeer = [\"local\", \"address:10.*\", \"*\"]");
+    let resolve = |env: &[(&str, &str)]| {
+        let env = env.iter().map(|(name, value)| (name.into(), value.into()));
+        Config::resolve(env, None, &disk).map_err(|error| error.to_string())
+    };
+    let pinned = |more: &[(&'static str, &'static str)]| resolve(&[PINNED, more].concat());
+    let good = pinned(&[("AXON_ACCESS_FILE", "/f/good.toml")]).unwrap();
+    assert_eq!(good.access_file.as_deref(), Some(Path::new("/f/good.toml")));
+    assert_eq!(good.access.file(), Some("good.toml"));
+    let inline = pinned(&[("AXON_CONFIG", "/f/axon.toml")]).unwrap();
+    assert_eq!(inline.access_file.as_deref(), Some(Path::new("/f/axon.toml")));
+    let error = pinned(&[("AXON_ACCESS_FILE", "/f/bad.toml")]).unwrap_err();
+    assert!(
+        error.starts_with("AXON_ACCESS_FILE (/f/bad.toml): line 3, column 11: publish"),
+        "{error}"
+    );
+    let error = pinned(&[("AXON_CONFIG", "/f/bad-axon.toml")]).unwrap_err();
+    assert!(error.starts_with("AXON_CONFIG (/f/bad-axon.toml): line 2, column 8: peer"), "{error}");
+    let both = pinned(&[("AXON_CONFIG", "/f/axon.toml"), ("AXON_ACCESS_FILE", "/f/good.toml")]);
+    assert!(both.unwrap_err().contains("rules in one place"));
+    // Where nobody proves a name, a rule for a name would protect nothing.
+    let error = resolve(&[("AXON_ACCESS_FILE", "/f/good.toml")]).unwrap_err();
+    assert!(error.contains("\"base\"") && error.contains("AXON_CLASSIC_AUTH=none"), "{error}");
+    resolve(&[("AXON_ACCESS_FILE", "/f/address.toml")]).unwrap();
 }

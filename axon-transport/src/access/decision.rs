@@ -1,0 +1,55 @@
+//! What the rules say, and which of them says it.
+
+use std::{fmt, sync::Arc};
+
+/// Whether a party may do something, and why.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Decision(pub(super) Reason);
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Reason {
+    /// There are no rules.
+    NoRules,
+    /// No `[[allow]]` names the party, and no `[[deny]]` is against it.
+    Open { file: Arc<str> },
+    /// An `[[allow]]` names it and what it does.
+    Allowed { file: Arc<str>, line: u32 },
+    /// A `[[deny]]` does.
+    Denied { file: Arc<str>, line: u32 },
+    /// An `[[allow]]` names it, and none names what it does.
+    NotAllowed { file: Arc<str> },
+    /// `default = "deny"`, and no `[[allow]]` names the party.
+    Default { file: Arc<str> },
+}
+
+impl Decision {
+    /// Whether it may.
+    pub fn allowed(&self) -> bool {
+        matches!(self.0, Reason::NoRules | Reason::Open { .. } | Reason::Allowed { .. })
+    }
+
+    /// The line of the rule that decides, counted from 1; `None` where no single rule does.
+    pub fn line(&self) -> Option<u32> {
+        match self.0 {
+            Reason::Allowed { line, .. } | Reason::Denied { line, .. } => Some(line),
+            _ => None,
+        }
+    }
+}
+
+impl fmt::Display for Decision {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match &self.0 {
+            Reason::NoRules => f.write_str("allowed: there are no access rules"),
+            Reason::Open { file } => write!(f, "allowed: no rule of {file} is against it"),
+            Reason::Allowed { file, line } => write!(f, "allowed by line {line} of {file}"),
+            Reason::Denied { file, line } => write!(f, "denied by line {line} of {file}"),
+            Reason::NotAllowed { file } => {
+                write!(f, "denied: no [[allow]] of {file} lets it")
+            }
+            Reason::Default { file } => {
+                write!(f, "denied: default = \"deny\" in {file}, and no [[allow]] names it")
+            }
+        }
+    }
+}

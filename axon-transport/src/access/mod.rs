@@ -1,0 +1,47 @@
+//! Access rules: which peer may publish, subscribe, serve, call and see what.
+//!
+//! A *party* is another host, by the name that it proved, or another user of this host. A rule is about what a
+//! party does here. Each daemon applies its own rules, so that either side alone protects itself. Rules come from
+//! `[[allow]]` and `[[deny]]` in `axon.toml` or in the file that `AXON_ACCESS_FILE` names; `docs/access-control.md`
+//! describes them.
+//!
+//! ```
+//! use axon_transport::access::{AccessRules, Party, Verb};
+//!
+//! let rules = AccessRules::parse(
+//!     r#"
+//!     [[allow]]
+//!     peer = "base"
+//!     publish = "/cmd_vel"
+//!     subscribe = ["/scan", "/camera/**"]
+//!     "#,
+//!     "access.toml",
+//! )?;
+//! let base = Party::Name("base");
+//! assert!(rules.check(base, Verb::Publish, "/cmd_vel").allowed());
+//! let denied = rules.check(base, Verb::Publish, "/scan");
+//! assert_eq!(denied.to_string(), "denied: no [[allow]] of access.toml lets it");
+//! // A rule names the base station alone: nothing changes for others.
+//! assert!(rules.check(Party::Name("laptop"), Verb::Publish, "/scan").allowed());
+//! # Ok::<(), axon_transport::access::AccessError>(())
+//! ```
+
+#![forbid(unsafe_code)]
+
+mod decision;
+mod parse;
+mod party;
+mod pattern;
+mod pattern_set;
+mod permissions;
+mod ros;
+mod rules;
+#[cfg(test)]
+mod tests;
+
+pub use decision::Decision;
+pub use parse::AccessError;
+pub use party::Party;
+pub use pattern::TopicPattern;
+pub use permissions::Permissions;
+pub use rules::{AccessRules, Expectation, Verb};

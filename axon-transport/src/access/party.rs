@@ -1,0 +1,95 @@
+//! Whom a rule is about.
+
+use std::{fmt, net::IpAddr};
+
+use super::pattern::segment_fits;
+
+/// Another host or another user, as rules know it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Party<'a> {
+    /// A host that proved to have this name: that of its pin, or its SAE ID.
+    Name(&'a str),
+    /// A host whose certificate has this name. Upper and lower case are the same.
+    Certificate(&'a str),
+    /// A host that proved nothing, at this address.
+    Address(IpAddr),
+    /// A user of this host that is not the daemon's.
+    User(u32),
+}
+
+impl fmt::Display for Party<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Name(name) | Self::Certificate(name) => f.write_str(name),
+            Self::Address(address) => write!(f, "address:{address}"),
+            Self::User(uid) => write!(f, "uid:{uid}"),
+        }
+    }
+}
+
+impl<'a> Party<'a> {
+    /// The party that a text names as rules do: `uid:1001`, `address:10.0.0.7`, or a name.
+    ///
+    /// # Errors
+    /// The text is none of these; the error says what is accepted.
+    pub fn parse(text: &'a str) -> Result<Self, &'static str> {
+        match (text.strip_prefix("uid:"), text.strip_prefix("address:")) {
+            (Some(uid), _) => uid.parse().map(Self::User).map_err(|_| "uid: and a number"),
+            (_, Some(ip)) => ip.parse().map(Self::Address).map_err(|_| "address: and an address"),
+            _ if text.is_empty() => Err("a name"),
+            _ if text == "local" => Err("uid: and a number, for a user of this host"),
+            _ => Ok(Self::Name(text)),
+        }
+    }
+}
+
+/// One entry of `peer`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum PartyPattern {
+    /// `*`: every host and every other user.
+    All,
+    /// `local`: every other user of this host.
+    Users,
+    /// `uid:1001`.
+    User(u32),
+    /// `address:10.0.0.*`.
+    Address(String),
+    /// A name, in which `*` stands for any characters.
+    Name(String),
+}
+
+impl PartyPattern {
+    /// # Errors
+    /// What would be one.
+    pub(super) fn parse(text: &str) -> Result<Self, &'static str> {
+        if text.is_empty() || text.len() > 255 || text.trim() != text {
+            return Err(
+                "a name of 1 to 255 bytes without outer spaces, in which * stands for any \
+                        characters, or local, or uid: and a number, or address: and an address",
+            );
+        }
+        Ok(match (text, text.strip_prefix("uid:"), text.strip_prefix("address:")) {
+            ("*", ..) => Self::All,
+            ("local", ..) => Self::Users,
+            (_, Some(uid), _) => Self::User(uid.parse().map_err(|_| "uid: and a number")?),
+            (_, _, Some(address)) => Self::Address(address.to_owned()),
+            _ => Self::Name(text.to_owned()),
+        })
+    }
+
+    pub(super) fn fits(&self, party: Party<'_>) -> bool {
+        match (self, party) {
+            (Self::All, _) | (Self::Users, Party::User(_)) => true,
+            (Self::User(own), Party::User(uid)) => *own == uid,
+            (Self::Address(pattern), Party::Address(ip)) => {
+                segment_fits(pattern, &ip.to_canonical().to_string())
+            }
+            (Self::Name(pattern), Party::Name(name)) => segment_fits(pattern, name),
+            (Self::Name(pattern), Party::Certificate(name)) => {
+                segment_fits(&pattern.to_ascii_lowercase(), &name.to_ascii_lowercase())
+            }
+            _ => false,
+        }
+    }
+}

@@ -1,0 +1,155 @@
+//! Many patterns at once, so that the time for a name does not grow with their number.
+
+use std::collections::HashMap;
+
+use super::pattern::{TopicPattern, segment_fits};
+
+/// Patterns, each with the line that it stands in, as a tree of their segments.
+#[derive(Debug)]
+pub(super) struct PatternSet {
+    /// The first is the root.
+    nodes: Vec<Node>,
+}
+
+#[derive(Debug, Default)]
+struct Node {
+    /// The next segment, where it is plain text.
+    literal: HashMap<Box<str>, usize>,
+    /// The next segment, where it has a `*`.
+    starred: Vec<(Box<str>, usize)>,
+    /// The next segment, where it is `**`.
+    any: Option<usize>,
+    /// It is behind `**`, which takes any number of segments.
+    stays: bool,
+    /// The first line whose pattern ends here.
+    line: Option<u32>,
+}
+
+impl Default for PatternSet {
+    fn default() -> Self {
+        Self { nodes: vec![Node::default()] }
+    }
+}
+
+impl PatternSet {
+    pub(super) fn insert(&mut self, pattern: &TopicPattern, line: u32) {
+        let mut at = 0;
+        for segment in pattern.segments() {
+            at = self.child(at, segment);
+        }
+        let first = &mut self.nodes[at].line;
+        *first = Some(first.map_or(line, |first| first.min(line)));
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.nodes.len() == 1
+    }
+
+    /// The node of a segment behind a node.
+    fn child(&mut self, at: usize, segment: &str) -> usize {
+        let node = &self.nodes[at];
+        let known = match segment {
+            "**" => node.any,
+            _ if segment.contains('*') => {
+                node.starred.iter().find(|(known, _)| **known == *segment).map(|(_, next)| *next)
+            }
+            _ => node.literal.get(segment).copied(),
+        };
+        if let Some(known) = known {
+            return known;
+        }
+        let next = self.nodes.len();
+        self.nodes.push(Node { stays: segment == "**", ..Node::default() });
+        let node = &mut self.nodes[at];
+        match segment {
+            "**" => node.any = Some(next),
+            _ if segment.contains('*') => node.starred.push((segment.into(), next)),
+            _ => drop(node.literal.insert(segment.into(), next)),
+        }
+        next
+    }
+
+    /// The first line with a pattern that a name fits.
+    pub(super) fn first_fit(&self, name: &str) -> Option<u32> {
+        if self.is_empty() {
+            return None;
+        }
+        let (mut at, mut next) = (Vec::new(), Vec::new());
+        self.enter(&mut at, 0);
+        for segment in name.split('/') {
+            for node in at.drain(..) {
+                let Node { literal, starred, stays, .. } = &self.nodes[node];
+                if *stays {
+                    self.enter(&mut next, node);
+                }
+                if let Some(child) = literal.get(segment) {
+                    self.enter(&mut next, *child);
+                }
+                for (_, child) in starred.iter().filter(|(star, _)| segment_fits(star, segment)) {
+                    self.enter(&mut next, *child);
+                }
+            }
+            std::mem::swap(&mut at, &mut next);
+            if at.is_empty() {
+                return None;
+            }
+        }
+        at.iter().filter_map(|node| self.nodes[*node].line).min()
+    }
+
+    /// A node is reached, and with it the one behind a `**` that takes no segment.
+    fn enter(&self, at: &mut Vec<usize>, node: usize) {
+        let mut reached = Some(node);
+        while let Some(node) = reached.filter(|node| !at.contains(node)) {
+            at.push(node);
+            reached = self.nodes[node].any;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn segments() -> impl Strategy<Value = String> {
+        let segment =
+            prop_oneof![Just("**"), Just("*"), Just("a"), Just("b"), Just("a*"), Just("*b")];
+        prop::collection::vec(segment, 1..5).prop_map(|all| format!("/{}", all.join("/")))
+    }
+
+    fn names() -> impl Strategy<Value = String> {
+        let segment = prop_oneof![Just("a"), Just("b"), Just("ab"), Just("")];
+        let absolute =
+            prop::collection::vec(segment, 1..6).prop_map(|all| format!("/{}", all.join("/")));
+        prop_oneof![absolute, Just(String::new()), Just("a".to_owned()), Just("/".to_owned())]
+    }
+
+    proptest! {
+        #[test]
+        fn the_first_line_that_fits_is_that_of_patterns_tried_one_by_one(
+            patterns in prop::collection::vec(segments(), 0..12),
+            all in prop::bool::weighted(0.1),
+            name in names(),
+        ) {
+            let mut patterns: Vec<_> =
+                patterns.iter().map(|text| TopicPattern::new(text).unwrap()).collect();
+            patterns.extend(all.then(|| TopicPattern::new("**").unwrap()));
+            let mut set = PatternSet::default();
+            for (line, pattern) in (1..).zip(&patterns) {
+                set.insert(pattern, line);
+            }
+            let expected = (1..).zip(&patterns).find(|(_, pattern)| pattern.fits(&name));
+            prop_assert_eq!(set.first_fit(&name), expected.map(|(line, _)| line));
+        }
+    }
+
+    #[test]
+    fn many_patterns_that_all_fit_take_no_long_time() {
+        let mut set = PatternSet::default();
+        let text = format!("/{}b", "**/*a*/".repeat(140));
+        set.insert(&TopicPattern::new(&text).unwrap(), 1);
+        assert_eq!(set.first_fit(&"/aaaaaaaa".repeat(10_000)), None);
+    }
+}

@@ -1,0 +1,75 @@
+//! The rules that concern one party, compiled.
+
+use std::sync::Arc;
+
+use super::{Decision, Verb, decision::Reason, pattern_set::PatternSet};
+
+/// What one party may do. Cheap to clone; the time of a decision does not grow with the number of rules.
+#[derive(Clone, Debug, Default)]
+pub struct Permissions(Option<Arc<Compiled>>);
+
+#[derive(Debug)]
+pub(super) struct Compiled {
+    pub(super) file: Arc<str>,
+    pub(super) allow: VerbPatterns,
+    pub(super) deny: VerbPatterns,
+    pub(super) otherwise: Otherwise,
+}
+
+/// What counts where no pattern fits.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Otherwise {
+    /// No `[[allow]]` names the party.
+    Allow,
+    /// One does.
+    NotAllowed,
+    /// None does, and the default is to deny.
+    DenyByDefault,
+}
+
+/// Patterns by verb.
+#[derive(Debug, Default)]
+pub(super) struct VerbPatterns([PatternSet; Verb::ALL.len()]);
+
+impl VerbPatterns {
+    pub(super) fn of(&self, verb: Verb) -> &PatternSet {
+        &self.0[verb as usize]
+    }
+
+    pub(super) fn of_mut(&mut self, verb: Verb) -> &mut PatternSet {
+        &mut self.0[verb as usize]
+    }
+}
+
+impl Permissions {
+    pub(super) fn new(compiled: Compiled) -> Self {
+        Self(Some(Arc::new(compiled)))
+    }
+
+    /// Whether there are no rules.
+    pub fn are_unlimited(&self) -> bool {
+        self.0.is_none()
+    }
+
+    /// Whether the party may do this with the topic, service or node of this full name.
+    pub fn allows(&self, verb: Verb, name: &str) -> bool {
+        self.are_unlimited() || self.check(verb, name).allowed()
+    }
+
+    /// The same, with the rule that decides.
+    pub fn check(&self, verb: Verb, name: &str) -> Decision {
+        let Some(rules) = &self.0 else { return Decision(Reason::NoRules) };
+        let file = || Arc::clone(&rules.file);
+        if let Some(line) = rules.deny.of(verb).first_fit(name) {
+            return Decision(Reason::Denied { file: file(), line });
+        }
+        if let Some(line) = rules.allow.of(verb).first_fit(name) {
+            return Decision(Reason::Allowed { file: file(), line });
+        }
+        Decision(match rules.otherwise {
+            Otherwise::Allow => Reason::Open { file: file() },
+            Otherwise::NotAllowed => Reason::NotAllowed { file: file() },
+            Otherwise::DenyByDefault => Reason::Default { file: file() },
+        })
+    }
+}

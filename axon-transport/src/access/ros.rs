@@ -1,0 +1,63 @@
+//! The names that ROS 2 gives to the parts of actions, to the services of parameters and to those of lifecycle nodes.
+
+use super::{TopicPattern, Verb};
+
+/// Services of an action, behind its name.
+const ACTION_SERVICES: [&str; 3] =
+    ["_action/send_goal", "_action/cancel_goal", "_action/get_result"];
+/// Topics of an action, behind its name.
+const ACTION_TOPICS: [&str; 2] = ["_action/feedback", "_action/status"];
+/// Services of a node's parameters, behind its name.
+const PARAMETER_SERVICES: [&str; 6] = [
+    "describe_parameters",
+    "get_parameter_types",
+    "get_parameters",
+    "list_parameters",
+    "set_parameters",
+    "set_parameters_atomically",
+];
+/// The topic on which nodes tell of changes.
+const PARAMETER_EVENTS: &str = "/parameter_events";
+/// Services of a lifecycle node, behind its name.
+const LIFECYCLE_SERVICES: [&str; 5] = [
+    "change_state",
+    "get_available_states",
+    "get_available_transitions",
+    "get_state",
+    "get_transition_graph",
+];
+/// The topic of a lifecycle node, behind its name.
+const LIFECYCLE_TOPIC: &str = "transition_event";
+
+fn below<'a>(
+    name: &'a TopicPattern,
+    verb: Verb,
+    rests: &'static [&'static str],
+) -> impl Iterator<Item = (Verb, TopicPattern)> + 'a {
+    rests.iter().map(move |rest| (verb, name.below(rest)))
+}
+
+/// What the client of an action does.
+pub(super) fn act(name: &TopicPattern) -> Vec<(Verb, TopicPattern)> {
+    let services = below(name, Verb::Call, &ACTION_SERVICES);
+    services.chain(below(name, Verb::Subscribe, &ACTION_TOPICS)).collect()
+}
+
+/// What the server of a service does, and that of an action.
+pub(super) fn serve(name: &TopicPattern) -> Vec<(Verb, TopicPattern)> {
+    let services = below(name, Verb::Serve, &ACTION_SERVICES);
+    let topics = below(name, Verb::Publish, &ACTION_TOPICS);
+    [(Verb::Serve, name.clone())].into_iter().chain(services).chain(topics).collect()
+}
+
+/// What a tool does that reads and sets the parameters of a node.
+pub(super) fn parameters(node: &TopicPattern) -> Vec<(Verb, TopicPattern)> {
+    let events = TopicPattern::new(PARAMETER_EVENTS).map(|events| (Verb::Subscribe, events));
+    below(node, Verb::Call, &PARAMETER_SERVICES).chain(events).collect()
+}
+
+/// What a manager of lifecycle nodes does.
+pub(super) fn lifecycle(node: &TopicPattern) -> Vec<(Verb, TopicPattern)> {
+    let services = below(node, Verb::Call, &LIFECYCLE_SERVICES);
+    services.chain(below(node, Verb::Subscribe, &[LIFECYCLE_TOPIC])).collect()
+}

@@ -1,0 +1,150 @@
+//! The rules of one file.
+
+use std::{fmt, sync::Arc};
+
+use super::{
+    Decision, Party, Permissions, TopicPattern,
+    party::PartyPattern,
+    permissions::{Compiled, Otherwise, VerbPatterns},
+};
+
+/// What a party does with a topic, a service or a node.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Verb {
+    /// It publishes samples of a topic here.
+    Publish,
+    /// It gets samples of a topic from here.
+    Subscribe,
+    /// It answers requests of clients here.
+    Serve,
+    /// It sends requests to servers here.
+    Call,
+    /// It is shown the endpoints and nodes of this name. Who may publish, subscribe, serve or call sees the endpoints
+    /// that this needs.
+    See,
+}
+
+impl Verb {
+    /// Each verb.
+    pub const ALL: [Self; 5] = [Self::Publish, Self::Subscribe, Self::Serve, Self::Call, Self::See];
+
+    /// As rules spell it.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Publish => "publish",
+            Self::Subscribe => "subscribe",
+            Self::Serve => "serve",
+            Self::Call => "call",
+            Self::See => "see",
+        }
+    }
+}
+
+impl fmt::Display for Verb {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// The access rules of a daemon; by default none, and everything is allowed.
+#[derive(Clone, Debug, Default)]
+pub struct AccessRules(pub(super) Option<Arc<RuleFile>>);
+
+#[derive(Debug)]
+pub(super) struct RuleFile {
+    /// How decisions name the file.
+    pub(super) file: Arc<str>,
+    pub(super) denies_by_default: bool,
+    pub(super) allow: Vec<Rule>,
+    pub(super) deny: Vec<Rule>,
+    pub(super) expectations: Vec<Expectation>,
+}
+
+/// One `[[allow]]` or `[[deny]]`.
+#[derive(Debug)]
+pub(super) struct Rule {
+    pub(super) peers: Vec<PartyPattern>,
+    /// What it says, and the line that says it.
+    pub(super) says: Vec<(Verb, TopicPattern, u32)>,
+}
+
+/// One `[[expect]]`: what somebody who wrote rules expects of them.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Expectation {
+    /// The party, as [`Party::parse`] reads it.
+    pub peer: String,
+    /// What it does.
+    pub verb: Verb,
+    /// With what.
+    pub name: String,
+    /// Whether it should be allowed.
+    pub allowed: bool,
+    /// The line that says so.
+    pub line: u32,
+}
+
+impl Rule {
+    fn names(&self, party: Party<'_>) -> bool {
+        self.peers.iter().any(|peer| peer.fits(party))
+    }
+}
+
+impl AccessRules {
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_none()
+    }
+
+    /// How decisions name the file; `None` where there are no rules.
+    pub fn file(&self) -> Option<&str> {
+        self.0.as_ref().map(|rules| &*rules.file)
+    }
+
+    /// What the rules let one party do. It takes the time of reading all rules once.
+    pub fn permissions(&self, party: Party<'_>) -> Permissions {
+        let Some(rules) = &self.0 else { return Permissions::default() };
+        let (mut allow, mut deny) = (VerbPatterns::default(), VerbPatterns::default());
+        let mut is_named = false;
+        for rule in rules.allow.iter().filter(|rule| rule.names(party)) {
+            is_named = true;
+            insert(&mut allow, rule);
+        }
+        for rule in rules.deny.iter().filter(|rule| rule.names(party)) {
+            insert(&mut deny, rule);
+        }
+        let otherwise = match (is_named, rules.denies_by_default) {
+            (true, _) => Otherwise::NotAllowed,
+            (false, true) => Otherwise::DenyByDefault,
+            (false, false) => Otherwise::Allow,
+        };
+        Permissions::new(Compiled { file: Arc::clone(&rules.file), allow, deny, otherwise })
+    }
+
+    /// Whether a party may do this with the topic, service or node of this full name, and which rule decides. To ask
+    /// more than once about one party, take its [`permissions`](Self::permissions).
+    pub fn check(&self, party: Party<'_>, verb: Verb, name: &str) -> Decision {
+        self.permissions(party).check(verb, name)
+    }
+
+    /// The `[[expect]]` of the file.
+    pub fn expectations(&self) -> &[Expectation] {
+        self.0.as_ref().map_or(&[], |rules| &rules.expectations)
+    }
+
+    /// The name of a host that a rule speaks of, where one does: hosts that prove nothing have no names.
+    pub(crate) fn named_host(&self) -> Option<String> {
+        let rules = self.0.as_ref()?;
+        let mut peers = rules.allow.iter().chain(&rules.deny).flat_map(|rule| &rule.peers);
+        peers.find_map(|peer| match peer {
+            PartyPattern::Name(name) => Some(name.clone()),
+            _ => None,
+        })
+    }
+}
+
+fn insert(patterns: &mut VerbPatterns, rule: &Rule) {
+    for (verb, pattern, line) in &rule.says {
+        patterns.of_mut(*verb).insert(pattern, *line);
+    }
+}

@@ -1,0 +1,231 @@
+use proptest::prelude::*;
+
+use super::*;
+
+fn rules(text: &str) -> AccessRules {
+    AccessRules::parse(text, "access.toml").unwrap()
+}
+
+fn error(text: &str) -> AccessError {
+    AccessRules::parse(text, "access.toml").unwrap_err()
+}
+
+/// The example of the issue that asked for rules: a robot's.
+const ROBOT: &str = r#"
+[[allow]]
+peer = ["base", "sae-base", "operator-*"]
+publish = ["/cmd_vel", "/robot/**"]
+call = ["/robot/*/set_mode"]
+subscribe = ["/scan", "/tf", "/tf_static", "/camera/**"]
+
+[[allow]]
+peer = "local"
+subscribe = "/**"
+
+[[deny]]
+peer = "operator-guest"
+publish = "/cmd_vel"
+"#;
+
+#[test]
+fn a_robot_lets_its_base_station_drive_it_and_its_guest_look_on() {
+    let rules = rules(ROBOT);
+    let check = |party, verb, name| rules.check(party, verb, name).to_string();
+    let base = Party::Name("base");
+    assert_eq!(check(base, Verb::Publish, "/cmd_vel"), "allowed by line 4 of access.toml");
+    assert_eq!(check(base, Verb::Call, "/robot/arm/set_mode"), "allowed by line 5 of access.toml");
+    let none = "denied: no [[allow]] of access.toml lets it";
+    assert_eq!(check(base, Verb::Call, "/robot/arm/left/set_mode"), none);
+    assert_eq!(check(base, Verb::Subscribe, "/cmd_vel"), none);
+    let guest = Party::Name("operator-guest");
+    assert_eq!(check(guest, Verb::Publish, "/cmd_vel"), "denied by line 14 of access.toml");
+    assert!(rules.check(guest, Verb::Subscribe, "/scan").allowed());
+    let user = Party::User(1001);
+    assert!(rules.check(user, Verb::Subscribe, "/anything").allowed());
+    assert_eq!(check(user, Verb::Publish, "/anything"), none);
+    let other = check(Party::Name("stranger"), Verb::Publish, "/cmd_vel");
+    assert_eq!(other, "allowed: no rule of access.toml is against it");
+    let closed = format!("default = \"deny\"\n{ROBOT}");
+    let closed = AccessRules::parse(&closed, "access.toml").unwrap();
+    let other = closed.check(Party::Name("stranger"), Verb::Publish, "/cmd_vel");
+    let by_default = "denied: default = \"deny\" in access.toml, and no [[allow]] names it";
+    assert_eq!((other.to_string(), other.line()), (by_default.to_owned(), None));
+}
+
+#[test]
+fn without_rules_all_is_allowed_and_an_empty_file_of_rules_denies_nothing() {
+    assert!(AccessRules::default().permissions(Party::User(1)).are_unlimited());
+    let empty = rules("");
+    assert!(!empty.is_empty() && empty.check(Party::Name("a"), Verb::See, "/x").allowed());
+    let closed = rules("default = \"deny\"");
+    for verb in Verb::ALL {
+        assert!(!closed.check(Party::Name("a"), verb, "/x").allowed());
+    }
+}
+
+#[test]
+fn one_line_lets_a_peer_use_an_action_or_serve_it_or_set_parameters() {
+    let rules = rules(
+        r#"
+        [[allow]]
+        peer = "client"
+        act = "/dock"
+        parameters = ["/robot/**"]
+        lifecycle = true
+        [[allow]]
+        peer = "server"
+        serve = "/dock"
+        "#,
+    );
+    let all = |party, verb: Verb, names: &[&str]| {
+        names.iter().all(|name| rules.check(Party::Name(party), verb, name).allowed())
+    };
+    let services = ["send_goal", "cancel_goal", "get_result"].map(|s| format!("/dock/_action/{s}"));
+    let services = services.each_ref().map(String::as_str);
+    let topics = ["/dock/_action/feedback", "/dock/_action/status"];
+    assert!(all("client", Verb::Call, &services) && all("client", Verb::Subscribe, &topics));
+    assert!(all("server", Verb::Serve, &services) && all("server", Verb::Publish, &topics));
+    assert!(all("server", Verb::Serve, &["/dock"]));
+    assert!(!all("client", Verb::Publish, &topics) && !all("client", Verb::Serve, &services));
+    assert!(!all("client", Verb::Call, &["/other/_action/send_goal"]));
+    assert!(all("client", Verb::Call, &["/robot/arm/set_parameters", "/robot/get_parameters"]));
+    assert!(!all("client", Verb::Call, &["/other/set_parameters"]));
+    assert!(all("client", Verb::Subscribe, &["/parameter_events", "/any/transition_event"]));
+    assert!(all("client", Verb::Call, &["/any/change_state"]));
+}
+
+#[test]
+fn names_of_other_kinds_do_not_fit() {
+    let rules = rules(
+        r#"
+        default = "deny"
+        [[allow]]
+        peer = ["uid:1001", "address:10.0.0.*", "Base.Example", "local*"]
+        see = "**"
+        "#,
+    );
+    let sees = |party| rules.check(party, Verb::See, "/x").allowed();
+    assert!(sees(Party::User(1001)) && !sees(Party::User(1002)));
+    assert!(!sees(Party::Name("uid:1001")) && !sees(Party::Name("address:10.0.0.1")));
+    assert!(sees(Party::Address([10, 0, 0, 7].into())));
+    assert!(sees(Party::Address("::ffff:10.0.0.7".parse().unwrap())));
+    assert!(!sees(Party::Address([10, 0, 1, 7].into())));
+    assert!(sees(Party::Certificate("base.example")) && sees(Party::Name("Base.Example")));
+    assert!(!sees(Party::Name("base.example")), "another pin");
+    assert!(sees(Party::Name("localhost")), "a host may have a name that begins with local");
+    assert!(sees(Party::Name("local")) && !sees(Party::User(7)), "local* is a host's name");
+}
+
+#[test]
+fn what_is_wrong_is_said_with_line_and_column() {
+    for (text, line, column, what) in [
+        ("[[allow]]\npublish = \"/x\"", 1, 1, "[[allow]] without peer"),
+        ("[[allow]]\npeer = \"a\"\npublsh = \"/x\"", 3, 1, "unknown key \"publsh\""),
+        ("[[allow]]\npeer = \"a\"\npublish = [\"/x\", \"y\"]", 3, 18, "publish \"y\""),
+        ("[[allow]]\npeer = \"a\"\npublish = [\"/x\", 3]", 3, 18, "an array of strings"),
+        ("[[allow]]\npeer = \"a\"\npublish = []", 3, 11, "an array of strings"),
+        ("[[allow]]\npeer = \"uid:root\"", 2, 8, "uid: and a number"),
+        ("[[allow]]\npeer = \"\"", 2, 8, "1 to 255 bytes"),
+        ("[[deny]]\npeer = \"a\"", 1, 1, "denies nothing"),
+        ("[[deny]]\npeer = \"a\"\nparameters = false", 1, 1, "denies nothing"),
+        ("default = \"no\"", 1, 11, "\"allow\" or \"deny\""),
+        ("[allow]\npeer = \"a\"", 1, 1, "write [[allow]]"),
+        ("allow = [3]", 1, 10, "write [[allow]]"),
+        ("[[alow]]\npeer = \"a\"", 1, 3, "unknown key \"alow\""),
+        ("# é\n[[deny]]\npeer = \"é\" x", 3, 12, ""),
+        ("[[expect]]\npeer = \"a\"\npublish = \"/x\"", 1, 1, "[[expect]] has"),
+        ("[[expect]]\npeer = \"local\"\npublish = \"/x\"\nallowed = true", 2, 8, "uid:"),
+    ] {
+        let error = error(text);
+        assert_eq!((error.line, error.column), (line, column), "{text} {error}");
+        assert!(error.to_string().contains(what), "{text} {error}");
+    }
+}
+
+#[test]
+fn hostile_files_are_refused_in_bounded_time() {
+    error(&"[[allow]]\npeer = \"a\"\n".repeat(5000));
+    let names = (0..30_000).map(|n| format!("\"/n{n}\"")).collect::<Vec<_>>().join(",");
+    let text = format!("[[allow]]\npeer = \"a\"\nserve = [{names}]");
+    assert!(error(&text).what.contains("65536 patterns"));
+    error(&format!("[[allow]]\npeer = \"{}\"", "a".repeat(256)));
+    error(&format!("[[allow]]\npeer = \"a\"\nsee = \"/{}\"", "a".repeat(1024)));
+    error("[[allow]]\npeer = \"a\"\nsee = \"/\u{0}");
+}
+
+#[test]
+fn hostile_names_are_judged_as_they_are_written() {
+    let rules =
+        rules("default = \"deny\"\n[[allow]]\npeer = \"a\"\npublish = [\"/robot/*/x\", \"/ä/**\"]");
+    let may = |name: &str| rules.check(Party::Name("a"), Verb::Publish, name).allowed();
+    assert!(may("/robot/arm/x") && may("/ä") && may("/ä/b/c"));
+    // The same letter, written in another way, is another name.
+    assert!(!may("/a\u{308}/b"));
+    for name in ["", "/", "//", "robot/arm/x", "/robot/arm/x/", "/robot/a/b/x", "/robot/arm/x\0"] {
+        assert!(!may(name), "{name:?}");
+    }
+    assert!(!may(&format!("/robot/{}", "a/".repeat(32_768))));
+    assert!(may(&format!("/robot/{}/x", "a".repeat(65_536))));
+}
+
+/// A rule as the model has it: whether it denies, whom it names, and what.
+type ModelRule = (bool, &'static str, Verb, &'static str);
+
+/// The definition: a `[[deny]]` wins; else an `[[allow]]`; else what no rule names is allowed, but to parties that an
+/// `[[allow]]` names, and where the default is to deny.
+fn model(rules: &[ModelRule], deny: bool, party: &str, verb: Verb, name: &str) -> bool {
+    let fits = |pattern: &str, text: &str| match pattern.strip_suffix('*') {
+        Some(start) => text.starts_with(start),
+        None => pattern == text,
+    };
+    let names = |rule: &&ModelRule| fits(rule.1, party);
+    let says = |rule: &&ModelRule| {
+        rule.2 == verb
+            && (rule.3 == name || rule.3 == "/**" || rule.3 == "/a/**" && fits("/a*", name))
+    };
+    let named: Vec<_> = rules.iter().filter(names).collect();
+    if named.iter().any(|rule| rule.0 && says(rule)) {
+        return false;
+    }
+    if named.iter().any(|rule| !rule.0 && says(rule)) {
+        return true;
+    }
+    !deny && named.iter().all(|rule| rule.0)
+}
+
+proptest! {
+    #[test]
+    fn decisions_are_those_of_the_definition(
+        all in prop::collection::vec(
+            (any::<bool>(), 0..4_usize, 0..5_usize, 0..4_usize),
+            0..10,
+        ),
+        deny in any::<bool>(),
+    ) {
+        const PEERS: [&str; 4] = ["base", "op*", "op-1", "*"];
+        const NAMES: [&str; 4] = ["/a", "/a/b", "/a/**", "/**"];
+        let all: Vec<ModelRule> = all
+            .into_iter()
+            .map(|(deny, peer, verb, name)| (deny, PEERS[peer], Verb::ALL[verb], NAMES[name]))
+            .collect();
+        let mut text = if deny { "default = \"deny\"\n" } else { "" }.to_owned();
+        for (deny, peer, verb, name) in &all {
+            let header = if *deny { "deny" } else { "allow" };
+            text += &format!("[[{header}]]\npeer = \"{peer}\"\n{verb} = \"{name}\"\n");
+        }
+        let rules = rules(&text);
+        for party in ["base", "op-1", "op-2", "x"] {
+            let permissions = rules.permissions(Party::Name(party));
+            // What serves an action publishes its feedback: other names than these.
+            for (verb, name) in Verb::ALL.into_iter().flat_map(|v| ["/a", "/a/b", "/b"].map(|n| (v, n))) {
+                let expected = model(&all, deny, party, verb, name);
+                prop_assert_eq!(permissions.allows(verb, name), expected, "{} {} {}\n{}", party, verb, name, text);
+            }
+        }
+    }
+
+    #[test]
+    fn no_text_makes_the_reader_panic(text in "(\\[\\[(allow|deny|expect)\\]\\]|peer|see|=|\"|/|\\*|\n|[a-z]){0,40}") {
+        let _ = AccessRules::parse(&text, "access.toml");
+    }
+}
