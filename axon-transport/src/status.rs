@@ -363,6 +363,12 @@ pub struct LinkStatus {
     /// How many more there are.
     #[serde(default)]
     pub more_routes_refused: usize,
+    /// What access rules deny, here to the peer and there to this host: the first 64.
+    #[serde(default)]
+    pub denied: BTreeMap<String, String>,
+    /// How many more there are.
+    #[serde(default)]
+    pub more_denied: usize,
     /// Endpoints and nodes of the peer that are known here.
     #[serde(default)]
     pub endpoints: u64,
@@ -443,7 +449,7 @@ mod tests {
             r#""congestion_events":7,"mtu":1452,"mtu_black_holes":8,"waiting_bytes":9,"#,
             r#""waiting":{"control":1,"services":2,"small_reliable":3,"small_best_effort":4,"bulk":5},"#,
             r#""waiting_ms":88,"samples_in":10,"samples_out":11,"bytes_in":12,"bytes_out":13,"#,
-            r#""dropped":{"no_key":1},"routes_refused":{},"more_routes_refused":0,"endpoints":14,"#,
+            r#""dropped":{"no_key":1},"routes_refused":{},"more_routes_refused":0,"denied":{},"more_denied":0,"endpoints":14,"#,
             r#""endpoints_left_out":15,"graph_bytes":16}"#
         );
         let read: LinkStatus = serde_json::from_str(link).unwrap();

@@ -13,7 +13,8 @@ use std::{
 
 use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::{
-    config::Config, graph::EndpointKind, internal::graph::RemoteEndpoint, status::LinkStatus,
+    access::AccessRules, config::Config, graph::EndpointKind, internal::graph::RemoteEndpoint,
+    status::LinkStatus,
 };
 use tokio::sync::mpsc;
 
@@ -50,8 +51,8 @@ pub struct GatewayParts {
 pub struct RefusedRoute {
     /// Its topic or service.
     pub topic: String,
-    /// Its type.
-    pub type_name: String,
+    /// Its type; `None`: any.
+    pub type_name: Option<String>,
     /// The endpoints of this host that wait for it.
     pub waits: EndpointKind,
     /// Who refuses it, and why.
@@ -159,6 +160,8 @@ pub enum ToGateway {
         /// What.
         bytes: Vec<u8>,
     },
+    /// These access rules count from now on.
+    Access(AccessRules),
     /// These addresses are those of listed peers from now on.
     Listed(BTreeSet<IpAddr>),
     /// Say when what waits to be sent has arrived: the daemon is to end.

@@ -128,20 +128,23 @@ fn show_refused(
     let mut waiting: HashMap<_, Vec<_>> = HashMap::new();
     for local in registry.endpoints().filter(|e| e.role == EndpointRole::Application) {
         let Endpoint { kind, topic, type_name, gid, .. } = &local.endpoint;
-        waiting.entry((*kind, &**topic, &**type_name)).or_default().push(*gid);
+        waiting.entry((*kind, &**topic)).or_default().push((&**type_name, *gid));
     }
     for (peer, route) in refused.iter().flat_map(|(peer, all)| all.iter().map(move |r| (peer, r))) {
         let RefusedRoute { topic, type_name, waits, reason } = route;
-        let Some(gids) = waiting.get(&(*waits, &**topic, &**type_name)) else { continue };
-        let Some(shown) = topics.get_mut(&(topic.clone(), type_name.clone())) else { continue };
-        let room = LISTED.saturating_sub(shown.refused.len());
-        shown.refused.extend(gids.iter().take(room).map(|gid| {
-            let mut route = RefusedRouteStatus::default();
-            route.endpoint = gid.to_string();
-            route.host = (*peer).to_owned();
-            route.reason = reason.clone();
-            route
-        }));
+        let waiting = waiting.get(&(*waits, &**topic)).into_iter().flatten();
+        let same = |of: &str| type_name.as_ref().is_none_or(|type_name| *type_name == of);
+        for (type_name, gid) in waiting.filter(|(type_name, _)| same(type_name)) {
+            let key = (topic.clone(), (*type_name).to_owned());
+            let Some(shown) = topics.get_mut(&key) else { continue };
+            if shown.refused.len() < LISTED {
+                let mut route = RefusedRouteStatus::default();
+                route.endpoint = gid.to_string();
+                route.host = (*peer).to_owned();
+                route.reason = reason.clone();
+                shown.refused.push(route);
+            }
+        }
     }
 }
 

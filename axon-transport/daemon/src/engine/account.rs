@@ -279,6 +279,7 @@ pub(crate) fn cost(message: &Message) -> u32 {
         // Flows that wait are tried again.
         Message::Intake(_) => 63,
         Message::Unsubscribe(_) | Message::RouteRefused(_) | Message::RouteUnasked(_) => 7,
+        Message::Denied(uses) => 7 * (uses.denied.len() + uses.lifted.len()),
         Message::Asserted(asserted) => asserted.publishers.len() / 8,
         Message::Owners(owners) => 7 * owners.proofs.len(),
         Message::Received(received) => received.flows.len() / LOOKED_UP,

@@ -3,7 +3,7 @@
 use std::{rc::Rc, time::Duration};
 
 use axon_shm::ids::{DaemonId, Gid};
-use axon_transport::internal::graph::RemoteEndpoint;
+use axon_transport::{access::AccessRules, internal::graph::RemoteEndpoint};
 
 use super::{Engine, peer::graph::GraphChange};
 use crate::{
@@ -31,6 +31,22 @@ impl Engine {
             let took = ENDPOINT * u32::try_from(endpoints).unwrap_or(u32::MAX);
             account.turns.borrow_mut().over(self.epoch + now, self.epoch + now + took);
         }
+    }
+
+    /// Other access rules count from now on. What they deny ends before any other input is handled: no peer can delay
+    /// that.
+    pub(super) fn set_access(&mut self, rules: AccessRules, now: Duration) {
+        self.access = rules;
+        let peers: Vec<_> = self.peers.iter().map(|(daemon, peer)| (daemon, peer.link)).collect();
+        for (daemon, link) in peers {
+            let Some(permissions) = self.links.permissions(link, &self.access) else { continue };
+            if let Some(peer) = self.peers.get_mut(daemon) {
+                peer.set_permissions(permissions);
+                peer.stirred = false;
+            }
+            self.follow_graph(daemon, now);
+        }
+        self.effects.tell_draining(self.peers.are_draining());
     }
 
     /// Follows the changes of a peer's graph. Returns how many endpoints it has.

@@ -46,7 +46,7 @@ use std::{
 };
 
 use axon_shm::ids::DaemonId;
-use axon_transport::{config::Config, status::LinkStatus};
+use axon_transport::{access::AccessRules, config::Config, status::LinkStatus};
 use bytes::BytesMut;
 use quinn_proto::{Dir, EcnCodepoint, StreamEvent, Transmit};
 
@@ -93,6 +93,7 @@ pub(crate) struct EngineParts {
 pub(crate) struct Engine {
     config: Arc<Config>,
     daemon: DaemonId,
+    access: AccessRules,
     links: Links,
     peers: Peers,
     session_keys: Arc<SessionKeys>,
@@ -119,6 +120,7 @@ impl Engine {
             budget: Budget::new(config.reliable_queue),
             responses: ResponseNumbers::default(),
             peers: Peers::new(Arc::clone(&config), rings, epoch),
+            access: config.access.clone(),
             config,
             daemon,
             links: Links::new(links)?,
@@ -159,6 +161,7 @@ impl Engine {
                 self.links.dial(target, now);
             }
             ToGateway::SendDatagram { to, bytes } => self.links.send_datagram(to, bytes),
+            ToGateway::Access(rules) => self.set_access(rules, now),
             ToGateway::Listed(addresses) => self.links.set_listed(addresses),
             // The owner looks at `backlog`.
             ToGateway::Finish | ToGateway::Shutdown => {}
@@ -310,6 +313,7 @@ impl Engine {
         };
         let identity = self.links.identity(number).unwrap_or_default();
         let serves = summary.hello.routes.map_or(ROUTES_UNSAID, |routes| routes as usize);
+        let Some(permissions) = self.links.permissions(number, &self.access) else { return };
         let needed = self.links.credentials.authenticates();
         let prover = Prover::new(&self.session_keys, self.daemon, needed, binding);
         let counters = Rc::<Counters>::default();
@@ -328,6 +332,7 @@ impl Engine {
             identity,
             account,
             prover,
+            permissions,
             counters,
             inbound,
             outbound,

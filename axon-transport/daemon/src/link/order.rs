@@ -129,6 +129,7 @@ impl Message {
             Self::Owners(_) => "OWNERS",
             Self::LinkClosed(_) => "LINK_CLOSED",
             Self::Intake(_) => "INTAKE",
+            Self::Denied(_) => "DENIED",
             Self::Keys(m) => m.name(),
         }
     }

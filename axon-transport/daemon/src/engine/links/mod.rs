@@ -28,7 +28,11 @@ use std::{
 };
 
 use axon_shm::ids::DaemonId;
-use axon_transport::{config::Config, status::LinkStatus};
+use axon_transport::{
+    access::{AccessRules, Permissions},
+    config::Config,
+    status::LinkStatus,
+};
 use bytes::BytesMut;
 use quinn_proto::{
     ConnectionError, Dir, EcnCodepoint, Event, StreamEvent, Transmit, TransportConfig,
@@ -405,6 +409,12 @@ impl Links {
     pub(super) fn identity(&self, number: u64) -> Option<String> {
         let address = self.connections.get(number)?.quic.remote_address();
         Some(self.summary(number)?.who.host_identity(address))
+    }
+
+    /// What access rules let the peer of a link do. No peer, no right.
+    pub(super) fn permissions(&self, number: u64, rules: &AccessRules) -> Option<Permissions> {
+        let address = self.connections.get(number)?.quic.remote_address();
+        Some(rules.permissions(self.summary(number)?.who.party(address)))
     }
 
     /// The status of a link.

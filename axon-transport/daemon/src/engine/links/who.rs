@@ -7,6 +7,8 @@ use axon_tls::{
     identity::{Auth, SpkiDigest},
 };
 
+use axon_transport::access::Party;
+
 use crate::link::Hello;
 
 /// As whom a peer proved itself.
@@ -63,6 +65,15 @@ impl Who {
             // What it calls itself is nobody's word but its own.
             Self::Pinned(name, _) => name.clone(),
             _ => calls_itself.to_owned(),
+        }
+    }
+
+    /// The peer as access rules know it, at the address of its link.
+    pub(crate) fn party(&self, address: SocketAddr) -> Party<'_> {
+        match self {
+            Self::Sae(name) | Self::Pinned(name, _) => Party::Name(name),
+            Self::Host(name, _) => Party::Certificate(name),
+            Self::Somebody(_) => Party::Address(address.ip().to_canonical()),
         }
     }
 

@@ -8,12 +8,13 @@ use std::{
 
 use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::{
+    access::Permissions,
     config::DiscoveryRange,
     graph::{Endpoint, EndpointKind},
     internal::graph::{LIMITS, RangeToHost, RemoteEndpoint},
 };
 
-use super::owners::Proven;
+use super::{access::verb_of, owners::Proven};
 use crate::{
     engine::account::{Account, Charge},
     link::Graph,
@@ -46,6 +47,8 @@ pub(crate) enum GraphTaken {
 #[derive(Clone, Debug)]
 struct Held {
     remote: RemoteEndpoint,
+    /// Access rules deny it: for all others on this host it is not there.
+    denied: bool,
     _charge: Rc<Charge>,
 }
 
@@ -63,6 +66,7 @@ struct Refused {
 pub(crate) struct Remote {
     account: Rc<Account>,
     proven: Proven,
+    permissions: Permissions,
     all: BTreeMap<Gid, Held>,
     version: u64,
     /// What came of a whole graph so far.
@@ -77,12 +81,13 @@ pub(crate) struct Remote {
 }
 
 impl Remote {
-    /// That of a peer which must prove its sessions, if `proofs`.
-    pub(crate) fn new(account: Rc<Account>, proofs: bool) -> Self {
+    /// That of a peer which must prove its sessions, if `proofs`, and which may do what the permissions say.
+    pub(crate) fn new(account: Rc<Account>, proofs: bool, permissions: Permissions) -> Self {
         let proven = Proven::new(proofs, Rc::clone(&account.sessions));
         Self {
             account,
             proven,
+            permissions,
             all: BTreeMap::new(),
             version: 0,
             gathered: None,
@@ -224,7 +229,8 @@ impl Remote {
             && let Some(charge) = self.account.graph.charge(bytes)
         {
             let remote = RemoteEndpoint { endpoint: Arc::new(endpoint), toward };
-            return Some(Held { remote, _charge: Rc::new(charge) });
+            let denied = !is_permitted(&self.permissions, &remote.endpoint);
+            return Some(Held { remote, denied, _charge: Rc::new(charge) });
         }
         self.left_out += 1;
         if self.refused.is_none() {
@@ -251,7 +257,7 @@ impl Remote {
         let reset = std::mem::replace(&mut self.fresh, false);
         let (mut added, mut removed) = (Vec::new(), Vec::new());
         for gid in std::mem::take(&mut self.changed) {
-            match self.all.get(&gid) {
+            match self.all.get(&gid).filter(|held| !held.denied) {
                 Some(held) => added.push(held.remote.clone()),
                 None => removed.push(gid),
             }
@@ -296,14 +302,30 @@ impl Remote {
         self.all.get(gid).map(|held| &*held.remote.endpoint)
     }
 
+    /// Other access rules count.
+    pub(crate) fn set_permissions(&mut self, permissions: Permissions) {
+        self.permissions = permissions;
+        for (gid, held) in self.all.iter_mut().chain(self.gathered.iter_mut().flatten()) {
+            let denied = !is_permitted(&self.permissions, &held.remote.endpoint);
+            if std::mem::replace(&mut held.denied, denied) != denied {
+                self.changed.insert(*gid);
+            }
+        }
+    }
+
+    /// Endpoints that access rules deny.
+    pub(crate) fn denied(&self) -> impl Iterator<Item = &Endpoint> {
+        self.all.values().filter(|held| held.denied).map(|held| &*held.remote.endpoint)
+    }
+
     /// Whether it has this endpoint, as was found in [`changes`](Self::changes).
     pub(crate) fn has(&self, gid: &Gid) -> bool {
         self.all.contains_key(gid) && !self.changed.contains(gid)
     }
 
-    /// All endpoints.
+    /// The endpoints that access rules permit.
     pub(crate) fn endpoints(&self) -> impl Iterator<Item = &RemoteEndpoint> {
-        self.all.values().map(|held| &held.remote)
+        self.all.values().filter(|held| !held.denied).map(|held| &held.remote)
     }
 
     /// These endpoints are another daemon's.
@@ -312,6 +334,10 @@ impl Remote {
             self.all.remove(gid);
         }
     }
+}
+
+fn is_permitted(permissions: &Permissions, endpoint: &Endpoint) -> bool {
+    verb_of(endpoint.kind).is_none_or(|verb| permissions.allows(verb, &endpoint.topic))
 }
 
 fn short(name: &str) -> String {
@@ -363,7 +389,7 @@ mod tests {
     #[test]
     fn what_was_proved_on_one_connection_counts_for_nothing_on_the_next() {
         let account = Accounts::new(10 * one()).of("a");
-        let mut remote = Remote::new(account, true);
+        let mut remote = Remote::new(account, true, Permissions::default());
         let key = SessionKey::generate().unwrap();
         let (own, from) = (Gid::new(key.id(), 1), DaemonId([7; 16]));
         let [first, second] = [[1; 32], [2; 32]];
@@ -396,8 +422,10 @@ mod tests {
     #[test]
     fn what_there_is_no_room_for_is_left_out_by_name_and_the_rest_counts() {
         let account = Accounts::new(2 * one()).of("a");
-        let (mut remote, mut other) =
-            (Remote::new(Rc::clone(&account), false), Remote::new(Rc::clone(&account), false));
+        let (mut remote, mut other) = (
+            Remote::new(Rc::clone(&account), false, Permissions::default()),
+            Remote::new(Rc::clone(&account), false, Permissions::default()),
+        );
         assert_eq!(
             remote.take(graph(0, vec![endpoint(1, "/t")], vec![], false)),
             GraphTaken::Changed { whole: true }
@@ -420,7 +448,7 @@ mod tests {
     #[test]
     fn a_whole_graph_that_is_said_again_takes_no_more_and_changes_nothing() {
         let account = Accounts::new(3 * one()).of("a");
-        let mut remote = Remote::new(Rc::clone(&account), false);
+        let mut remote = Remote::new(Rc::clone(&account), false, Permissions::default());
         let all = || (1..=3).map(|n| endpoint(n, "/t")).collect::<Vec<_>>();
         remote.take(graph(0, all(), vec![], false));
         assert_eq!(changes(&mut remote), (vec![1, 2, 3], vec![]));
@@ -438,7 +466,7 @@ mod tests {
 
     #[test]
     fn the_newest_state_of_an_endpoint_counts_once() {
-        let mut remote = Remote::new(Accounts::new(1 << 20).of("a"), false);
+        let mut remote = Remote::new(Accounts::new(1 << 20).of("a"), false, Permissions::default());
         remote.take(graph(0, vec![endpoint(1, "/t")], vec![], false));
         changes(&mut remote);
         for before in (1..100).step_by(2) {
@@ -459,7 +487,7 @@ mod tests {
     fn an_endpoint_of_a_session_that_is_not_proven_is_left_out_and_one_that_is_counts() {
         let (own, others) = (SessionKey::generate().unwrap(), SessionKey::generate().unwrap());
         let (binding, here) = ([7; 32], DaemonId([1; 16]));
-        let mut remote = Remote::new(Accounts::new(1 << 20).of("a"), true);
+        let mut remote = Remote::new(Accounts::new(1 << 20).of("a"), true, Permissions::default());
         remote.prove(&[prove(&own, &binding, here).unwrap()], &binding, here);
         // The proof of another host, for another connection.
         remote.prove(&[prove(&others, &[8; 32], here).unwrap()], &binding, here);

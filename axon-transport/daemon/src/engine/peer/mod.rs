@@ -1,5 +1,6 @@
 //! A peer: its graph, the routes in both directions, and the samples that cross.
 
+mod access;
 mod asking;
 pub(super) mod graph;
 pub(super) mod kept;
@@ -11,7 +12,7 @@ pub(super) mod stalls;
 
 use std::{
     cell::RefCell,
-    collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
+    collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque},
     rc::Rc,
     sync::Arc,
     time::{Duration, Instant},
@@ -20,6 +21,7 @@ use std::{
 use axon_envelope::Kind;
 use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::{
+    access::{Permissions, Verb},
     config::{Config, DiscoveryRange},
     graph::{Endpoint, EndpointKind},
     internal::{
@@ -31,6 +33,7 @@ use axon_transport::{
 
 pub(crate) use self::serving::{MAX_ROUTES, StalledRoute};
 use self::{
+    access::PeerAccess,
     asking::{Asked, Attaching},
     refused::RefusedRoutes,
     serving::Served,
@@ -67,6 +70,15 @@ const POLL: Duration = Duration::from_millis(5);
 const POLL_EACH: Duration = Duration::from_micros(4);
 /// Routes of a peer whose HELLO does not say how many it serves.
 pub(crate) const ROUTES_UNSAID: usize = 1024;
+
+/// What a peer does that reads a route of this kind.
+fn reader_of(kind: Kind) -> Verb {
+    match kind {
+        Kind::Topic => Verb::Subscribe,
+        Kind::Request => Verb::Serve,
+        Kind::Response => Verb::Call,
+    }
+}
 
 /// The time until the next look at so many pairs.
 fn poll_after(pairs: usize) -> Duration {
@@ -112,6 +124,8 @@ pub(crate) struct Peer {
     /// Its graph.
     pub(super) remote: Remote,
     prover: Prover,
+    /// What it may do here.
+    access: PeerAccess,
     /// Endpoints of it were ignored, since another peer had them.
     pub(super) displaced: bool,
     /// The graph that it was sent.
@@ -161,6 +175,8 @@ pub(crate) struct PeerParts {
     pub(crate) account: Rc<Account>,
     /// Proves that sessions are of this host.
     pub(crate) prover: Prover,
+    /// What it may do here.
+    pub(crate) permissions: Permissions,
     /// Counts its samples.
     pub(crate) counters: Rc<Counters>,
     /// Samples from it.
@@ -180,6 +196,7 @@ impl Peer {
             identity,
             account,
             prover,
+            permissions,
             counters,
             inbound,
             outbound,
@@ -191,7 +208,8 @@ impl Peer {
             identity,
             counters,
             refused: RefusedRoutes::new(Rc::clone(&account.refusals)),
-            remote: Remote::new(account, prover.is_needed()),
+            access: PeerAccess::new(permissions.clone(), Rc::clone(&account.refusals)),
+            remote: Remote::new(account, prover.is_needed(), permissions),
             prover,
             displaced: false,
             sent: BTreeMap::new(),
@@ -232,6 +250,8 @@ impl Peer {
         let asks: Vec<_> = self.asked.iter().map(|(key, asked)| asked.message(key)).collect();
         asks.into_iter().for_each(|message| self.say(message));
         self.say_unasked_again();
+        let denied = self.access.succeed();
+        denied.into_iter().for_each(|message| self.say(message));
         for served in self.served.values_mut() {
             served.repeated = false;
         }
@@ -277,6 +297,10 @@ impl Peer {
             Message::Intake(intake) => self.outbound.set_intake(&intake),
             Message::Received(received) => self.outbound.handle_received(&received.flows),
             Message::RouteRefused(refused) => self.handle_route_refused(refused, now),
+            Message::Denied(denied) => {
+                let allowed = self.access.handle_denied(self.daemon, denied);
+                self.ask_for_allowed(&allowed);
+            }
             Message::RouteUnasked(unasked) => self.handle_route_unasked(unasked),
             Message::RouteReady(ready) => {
                 self.handle_route_ready(ready.route);
@@ -300,7 +324,49 @@ impl Peer {
             };
             shown.then(|| (*gid, RemoteEndpoint { endpoint: Arc::clone(endpoint), toward }))
         });
-        shown.collect()
+        self.permitted(shown.collect())
+    }
+
+    /// What access rules let the peer see of these.
+    fn permitted(&self, mut all: BTreeMap<Gid, RemoteEndpoint>) -> BTreeMap<Gid, RemoteEndpoint> {
+        if self.access.permissions().are_unlimited() {
+            return all;
+        }
+        let is_node = |endpoint: &Endpoint| endpoint.kind == EndpointKind::Node;
+        all.retain(|_, e| is_node(&e.endpoint) || self.access.shows(&e.endpoint));
+        let nodes: HashSet<_> = all
+            .values()
+            .filter(|e| !is_node(&e.endpoint))
+            .map(|e| (e.endpoint.namespace.clone(), e.endpoint.node.clone()))
+            .collect();
+        all.retain(|_, RemoteEndpoint { endpoint, .. }| {
+            let name = (endpoint.namespace.clone(), endpoint.node.clone());
+            !is_node(endpoint) || self.access.shows_node(endpoint, nodes.contains(&name))
+        });
+        all
+    }
+
+    /// Other access rules count. What they deny ends at once; the graphs follow.
+    pub(super) fn set_permissions(&mut self, permissions: Permissions) {
+        self.access.set_permissions(permissions.clone());
+        self.remote.set_permissions(permissions);
+        let ending = std::mem::take(&mut self.ending);
+        self.ending = self.permitted(ending);
+        let denied = |served: &Served| {
+            let why = self.access.denial(reader_of(served.key.kind), &served.key.topic)?;
+            Some((served.key.clone(), why))
+        };
+        let ended = self.served.iter().filter_map(|(route, s)| Some((*route, denied(s)?)));
+        for (route, (key, why)) in ended.collect::<Vec<_>>() {
+            self.unserve(route);
+            self.refuse(route, &key, why, None);
+        }
+    }
+
+    /// Tells the peer which of its endpoints access rules deny, if that changed.
+    fn tell_denied(&mut self) {
+        let messages = self.access.set_denied(self.daemon, self.remote.denied());
+        messages.into_iter().for_each(|message| self.say(message));
     }
 
     /// The graph of this host changed: the peer is told, and routes follow.
@@ -418,6 +484,7 @@ impl Peer {
 
     /// The peer's graph changed, and this host follows.
     pub(super) fn handle_remote_graph(&mut self, with: &Surroundings<'_>, now: Duration) {
+        self.tell_denied();
         // Sessions there may list this host now, or no longer.
         self.send_graph(with.local, false);
         self.update(with, now);
@@ -492,6 +559,7 @@ impl Peer {
     pub(super) fn fill(&self, status: &mut LinkStatus, now: Duration) {
         self.counters.fill(status);
         self.show_refused(status);
+        self.access.fill(status);
         self.outbound.backlog().fill(status, now);
         status.endpoints = self.remote.len() as u64;
         status.endpoints_left_out = self.remote.left_out();

@@ -9,7 +9,11 @@ use std::{
 use axon_envelope::Kind;
 use axon_transport::{graph::EndpointKind, internal::log_limit::LogLimit, status::LinkStatus};
 
-use super::{Peer, serving::kind_of};
+use super::{
+    Peer,
+    access::{Use, verb_of},
+    serving::kind_of,
+};
 use crate::{
     bridge::RefusedRoute,
     engine::{
@@ -217,6 +221,21 @@ impl Peer {
         self.refused.unserved(key, reason, again);
     }
 
+    /// The peer lets this host do what it denied: routes that wait for it are asked for again.
+    pub(super) fn ask_for_allowed(&mut self, uses: &[Use]) {
+        let keys = self.refused.unserved.keys();
+        let allowed = |key: &&RouteKey| {
+            let verb = verb_of(By::Peer.waits(key.kind));
+            uses.iter().any(|(used, name)| Some(*used) == verb && *name == key.topic)
+        };
+        let keys: Vec<_> = keys.filter(allowed).cloned().collect();
+        for key in keys {
+            if let Some(asked) = self.asked.get(&key) {
+                self.say(asked.message(&key));
+            }
+        }
+    }
+
     /// The peer serves a route.
     pub(super) fn handle_route_ready(&mut self, route: u32) {
         if let Some(key) = self.numbers.get(&route) {
@@ -273,11 +292,11 @@ impl Peer {
         let refused = self.all_refused().take(AT_ENDPOINTS);
         let refused = refused.map(|(key, by, why)| RefusedRoute {
             topic: key.topic.clone(),
-            type_name: key.type_name.clone(),
+            type_name: Some(key.type_name.clone()),
             waits: by.waits(key.kind),
             reason: format!("{}: {why}", by.text()),
         });
-        refused.collect()
+        refused.chain(self.access.refused_routes()).collect()
     }
 }
 
@@ -317,7 +336,7 @@ impl By {
 }
 
 /// A reason of the peer, as it is shown.
-fn shown(reason: &str) -> String {
+pub(super) fn shown(reason: &str) -> String {
     reason.chars().filter(|c| !c.is_control()).take(REASON).collect()
 }
 

@@ -6,7 +6,7 @@ use axon_envelope::{Kind, Route, TopicHash};
 use axon_shm::ids::Gid;
 use axon_transport::EndpointSpec;
 
-use super::{Peer, Surroundings, poll_after};
+use super::{Peer, Surroundings, poll_after, reader_of};
 use crate::{
     engine::{
         account::Charge,
@@ -110,6 +110,11 @@ impl Peer {
             }
         };
         self.served_as.remove(&key);
+        if let Some(why) = self.access.denial(reader_of(kind), &key.topic) {
+            self.outbound.end_route(number);
+            self.refuse(number, &key, why, None);
+            return Ok(());
+        }
         if let Some(left) = with.stalls.borrow().left(&self.identity, &key, with.instant(now)) {
             self.outbound.end_route(number);
             self.refuse(number, &key, "it was not read".into(), Some(left));

@@ -285,6 +285,36 @@ pub struct Intake {
     pub messages: u64,
 }
 
+/// What the receiver may not do at the sender's host, of what the sender knows from the receiver's graph.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Denied {
+    /// What is denied now.
+    #[n(0)]
+    pub denied: Vec<DeniedUse>,
+    /// What was denied and is not any more, or is of no endpoint of the receiver any more. The reasons are empty.
+    #[n(1)]
+    pub lifted: Vec<DeniedUse>,
+}
+
+/// One use of a topic or service that an access rule denies.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(array)]
+pub struct DeniedUse {
+    /// 0 publish, 1 subscribe, 2 serve, 3 call.
+    #[n(0)]
+    pub verb: u8,
+    /// Topic or service.
+    #[n(1)]
+    pub name: String,
+    /// Which rule decides, for people.
+    #[n(2)]
+    pub reason: String,
+}
+
+/// Uses in one message, at most.
+pub const MAX_DENIED: usize = 512;
+
 /// That sessions are the sender's. Said before GRAPH, once on each connection.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
@@ -340,6 +370,8 @@ pub enum Message {
     LinkClosed(LinkClosed),
     /// This is how much I take in.
     Intake(Intake),
+    /// These are things that you may not do here.
+    Denied(Denied),
     /// About keys.
     Keys(KeyMessage),
 }
@@ -363,6 +395,7 @@ impl Message {
             Self::LinkClosed(m) => (13, to_map(m)),
             Self::RouteUnasked(m) => (14, to_map(m)),
             Self::Intake(m) => (15, to_map(m)),
+            Self::Denied(m) => (20, to_map(m)),
             Self::Keys(m) => {
                 let mut map = Vec::new();
                 m.encode(&mut map);
@@ -373,7 +406,7 @@ impl Message {
 
     /// Whether [`decode`](Self::decode) knows this type.
     pub(super) fn is_known(kind: u8) -> bool {
-        matches!(kind, 1..=19)
+        matches!(kind, 1..=20)
     }
 
     /// The message of type `kind`, `None` for an unknown type.
@@ -398,6 +431,7 @@ impl Message {
                 KeyMessage::decode(kind, map)
                     .map_err(|e| FrameError::Malformed { kind, reason: e.to_string() })?,
             ),
+            20 => Self::Denied(from_map(kind, map)?),
             _ => return Ok(None),
         };
         match message.bounds() {
@@ -437,6 +471,16 @@ impl Message {
                     && m.kind <= 2
                     && m.reason.as_ref().is_none_or(|reason| reason.len() <= MAX_REASON),
                 "a route is out of bounds",
+            ),
+            Self::Denied(Denied { denied, lifted }) => ok(
+                denied.len() <= MAX_DENIED
+                    && lifted.len() <= MAX_DENIED
+                    && denied.iter().chain(lifted).all(|denied| {
+                        denied.verb <= 3
+                            && denied.name.len() <= LIMITS.name
+                            && denied.reason.len() <= MAX_REASON
+                    }),
+                "a denied use is out of bounds",
             ),
             Self::Owners(m) => ok(m.proofs.len() <= MAX_PROOFS, "too many proofs"),
             Self::Subscribe(m) => ok(

@@ -88,6 +88,10 @@ pub(crate) fn messages() -> Vec<Message> {
         Message::Owners(Owners { proofs: vec![Proof { key: [1; 32], signature: [2; 64] }; 2] }),
         Message::LinkClosed(LinkClosed { link: [3; 16] }),
         Message::Intake(Intake { unread: 33 << 20, messages: 64 << 20 }),
+        Message::Denied(Denied {
+            denied: vec![DeniedUse { verb: 0, name: "/cmd_vel".into(), reason: "line 4".into() }],
+            lifted: vec![DeniedUse { verb: 3, name: "/dock".into(), reason: String::new() }],
+        }),
         Message::Keys(KeyMessage::Announce(vec![key_id("k1"), key_id("k2")])),
         Message::Keys(KeyMessage::Ready { key_id: key_id("k1"), proof: [8; 32] }),
         Message::Keys(KeyMessage::Failed { key_id: key_id("k2"), reason: "unknown".into() }),

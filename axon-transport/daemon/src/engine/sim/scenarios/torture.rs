@@ -120,6 +120,7 @@ impl Torture {
             Message::Unsubscribe(m) => m.route = route,
             Message::RouteRefused(m) => m.route = route,
             Message::RouteUnasked(m) => (m.topic, m.type_name) = ("/t".into(), "T".into()),
+            Message::Denied(m) => m.denied.iter_mut().for_each(|denied| denied.name = "/t".into()),
             Message::RouteReady(m) => (m.route, m.publishers) = (route, vec![gid]),
             Message::Asserted(m) => m.publishers = vec![gid],
             Message::GraphResync(m) => m.version = number,

@@ -1,0 +1,214 @@
+//! What access rules let a peer do here, and what both hosts know to be denied.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    rc::Rc,
+    time::Instant,
+};
+
+use axon_shm::ids::DaemonId;
+use axon_transport::{
+    access::{Permissions, Verb},
+    graph::{Endpoint, EndpointKind},
+    internal::log_limit::LogLimit,
+    status::LinkStatus,
+};
+
+use super::refused::shown;
+use crate::{
+    bridge::RefusedRoute,
+    engine::account::{Charge, Meter},
+    link::{Denied, DeniedUse, MAX_DENIED, Message},
+};
+
+/// Uses that status lists.
+const LISTED: usize = 64;
+/// Uses that status shows at the endpoints that wait for them.
+const AT_ENDPOINTS: usize = 1024;
+/// Bytes that count for a denied use besides its name and reason.
+const ENTRY: usize = 200;
+
+/// What somebody does with a topic or service.
+pub(super) type Use = (Verb, String);
+
+/// The verbs that need an endpoint, as DENIED numbers them.
+const VERBS: [Verb; 4] = [Verb::Publish, Verb::Subscribe, Verb::Serve, Verb::Call];
+
+/// What the host of an endpoint does with its topic; `None` of a node.
+pub(super) fn verb_of(kind: EndpointKind) -> Option<Verb> {
+    Some(match kind {
+        EndpointKind::Publisher => Verb::Publish,
+        EndpointKind::Subscription => Verb::Subscribe,
+        EndpointKind::Server => Verb::Serve,
+        EndpointKind::Client => Verb::Call,
+        EndpointKind::Node => return None,
+    })
+}
+
+/// The endpoints that are there for a verb.
+fn kind_of(verb: Verb) -> EndpointKind {
+    match verb {
+        Verb::Publish => EndpointKind::Publisher,
+        Verb::Subscribe => EndpointKind::Subscription,
+        Verb::Serve => EndpointKind::Server,
+        Verb::Call => EndpointKind::Client,
+        Verb::See => EndpointKind::Node,
+    }
+}
+
+/// The other end of a pair.
+fn other_end(verb: Verb) -> Verb {
+    match verb {
+        Verb::Publish => Verb::Subscribe,
+        Verb::Subscribe => Verb::Publish,
+        Verb::Serve => Verb::Call,
+        Verb::Call => Verb::Serve,
+        Verb::See => Verb::See,
+    }
+}
+
+/// The rules about one peer.
+pub(super) struct PeerAccess {
+    permissions: Permissions,
+    /// Uses by endpoints of the peer that are denied here. The peer was told.
+    here: BTreeMap<Use, String>,
+    /// Uses by endpoints of this host that the peer's host denies, with what remembers them.
+    there: BTreeMap<Use, (String, Charge)>,
+    /// What may be remembered, of all daemon ids of the peer's identity.
+    room: Rc<Meter>,
+    logged: LogLimit,
+}
+
+impl PeerAccess {
+    pub(super) fn new(permissions: Permissions, room: Rc<Meter>) -> Self {
+        let (here, there) = (BTreeMap::new(), BTreeMap::new());
+        Self { permissions, here, there, room, logged: LogLimit::default() }
+    }
+
+    pub(super) fn permissions(&self) -> &Permissions {
+        &self.permissions
+    }
+
+    pub(super) fn set_permissions(&mut self, permissions: Permissions) {
+        self.permissions = permissions;
+    }
+
+    /// Why the peer may not do this, if it may not.
+    pub(super) fn denial(&self, verb: Verb, name: &str) -> Option<String> {
+        if self.permissions.are_unlimited() {
+            return None;
+        }
+        let decision = self.permissions.check(verb, name);
+        (!decision.allowed()).then(|| decision.to_string())
+    }
+
+    /// Whether the peer is shown an endpoint of this host that is no node: one that it may see, or that it needs for
+    /// what it may do.
+    pub(super) fn shows(&self, endpoint: &Endpoint) -> bool {
+        let needs = verb_of(endpoint.kind).map(other_end);
+        self.permissions.allows(Verb::See, &endpoint.topic)
+            || needs.is_some_and(|verb| self.permissions.allows(verb, &endpoint.topic))
+    }
+
+    /// Whether the peer is shown a node of this host, of which it sees other endpoints, if it `sees_more`.
+    pub(super) fn shows_node(&self, node: &Endpoint, sees_more: bool) -> bool {
+        let namespace = node.namespace.strip_suffix('/').unwrap_or(&node.namespace);
+        sees_more || self.permissions.allows(Verb::See, &format!("{namespace}/{}", node.node))
+    }
+
+    /// These endpoints of the peer are denied now. Returns what the peer is told.
+    pub(super) fn set_denied<'a>(
+        &mut self,
+        peer: DaemonId,
+        endpoints: impl Iterator<Item = &'a Endpoint>,
+    ) -> Vec<Message> {
+        let uses = endpoints.filter_map(|e| Some((verb_of(e.kind)?, e.topic.as_str())));
+        let uses: BTreeSet<_> = uses.collect();
+        let now: BTreeMap<Use, String> = uses
+            .into_iter()
+            .map(|(verb, name)| {
+                let reason = self.permissions.check(verb, name).to_string();
+                ((verb, name.to_owned()), reason)
+            })
+            .collect();
+        if now == self.here {
+            return Vec::new();
+        }
+        let before = std::mem::replace(&mut self.here, now);
+        let new = |(used, reason): &(&Use, &String)| before.get(*used) != Some(*reason);
+        let denied: Vec<_> = self.here.iter().filter(new).map(|(u, why)| message(u, why)).collect();
+        if let Some(first) = denied.first()
+            && let Some(uses) = self.logged.count(Instant::now())
+        {
+            let (verb, name) = (VERBS[usize::from(first.verb)].name(), &first.name);
+            tracing::warn!(%peer, verb, name, why = first.reason, uses,
+                "a peer's endpoints are denied by access rules; `axon status` names them");
+        }
+        let lifted = before.keys().filter(|used| !self.here.contains_key(*used));
+        parts(denied, lifted.map(|used| message(used, "")).collect())
+    }
+
+    /// Another connection takes over: what was said and not heard is said again, by both sides.
+    pub(super) fn succeed(&mut self) -> Vec<Message> {
+        self.there.clear();
+        parts(self.here.iter().map(|(used, why)| message(used, why)).collect(), Vec::new())
+    }
+
+    /// The peer tells what is denied there. Returns what is not any more.
+    pub(super) fn handle_denied(&mut self, peer: DaemonId, denied: Denied) -> Vec<Use> {
+        let used = |of: DeniedUse| (VERBS[usize::from(of.verb.min(3))], of.name);
+        for mut denied in denied.denied {
+            let reason = shown(&std::mem::take(&mut denied.reason));
+            let used = used(denied);
+            if let Some(uses) = self.logged.count(Instant::now()) {
+                let (verb, name) = (used.0.name(), &used.1);
+                tracing::warn!(%peer, verb, name, why = reason, uses,
+                    "access rules of a peer deny endpoints of this host; `axon status` names them");
+            }
+            self.there.remove(&used);
+            let charge = self.room.charge(ENTRY + used.1.len() + reason.len());
+            self.there.extend(charge.map(|charge| (used, (reason, charge))));
+        }
+        let lifted = denied.lifted.into_iter().map(used);
+        lifted.inspect(|used| drop(self.there.remove(used))).collect()
+    }
+
+    /// Each denied use, by whom, and why.
+    fn all(&self) -> impl Iterator<Item = (&Use, &'static str, &str)> {
+        let here = self.here.iter().map(|(used, why)| (used, "here", &**why));
+        here.chain(self.there.iter().map(|(used, (why, _))| (used, "by the peer", &**why)))
+    }
+
+    /// Names the denied uses in the link's status.
+    pub(super) fn fill(&self, status: &mut LinkStatus) {
+        for ((verb, name), by, why) in self.all().take(LISTED) {
+            let whose = if by == "here" { "the peer's" } else { "ours" };
+            status.denied.insert(format!("{verb} {name} ({whose})"), format!("{by}: {why}"));
+        }
+        status.more_denied = (self.here.len() + self.there.len()).saturating_sub(LISTED);
+    }
+
+    /// The same for the status of this host's endpoints that wait.
+    pub(super) fn refused_routes(&self) -> Vec<RefusedRoute> {
+        let all = self.all().take(AT_ENDPOINTS).map(|((verb, name), by, why)| RefusedRoute {
+            topic: name.clone(),
+            type_name: None,
+            waits: kind_of(if by == "here" { other_end(*verb) } else { *verb }),
+            reason: format!("{by}: {why}"),
+        });
+        all.collect()
+    }
+}
+
+fn message((verb, name): &Use, reason: &str) -> DeniedUse {
+    let number = VERBS.iter().position(|known| known == verb).unwrap_or_default();
+    DeniedUse { verb: number as u8, name: name.clone(), reason: reason.to_owned() }
+}
+
+fn parts(denied: Vec<DeniedUse>, lifted: Vec<DeniedUse>) -> Vec<Message> {
+    let part = |denied: &[DeniedUse], lifted: &[DeniedUse]| {
+        Message::Denied(Denied { denied: denied.to_vec(), lifted: lifted.to_vec() })
+    };
+    let lifted = lifted.chunks(MAX_DENIED).map(|lifted| part(&[], lifted));
+    lifted.chain(denied.chunks(MAX_DENIED).map(|denied| part(denied, &[]))).collect()
+}
