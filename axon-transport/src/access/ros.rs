@@ -53,11 +53,13 @@ pub(super) fn serve(name: &TopicPattern) -> Vec<(Verb, TopicPattern)> {
 /// What a tool does that reads and sets the parameters of a node.
 pub(super) fn parameters(node: &TopicPattern) -> Vec<(Verb, TopicPattern)> {
     let events = TopicPattern::new(PARAMETER_EVENTS).map(|events| (Verb::Subscribe, events));
-    below(node, Verb::Call, &PARAMETER_SERVICES).chain(events).collect()
+    let services = below(node, Verb::Call, &PARAMETER_SERVICES);
+    services.chain(events).chain([(Verb::See, node.clone())]).collect()
 }
 
 /// What a manager of lifecycle nodes does.
 pub(super) fn lifecycle(node: &TopicPattern) -> Vec<(Verb, TopicPattern)> {
     let services = below(node, Verb::Call, &LIFECYCLE_SERVICES);
-    services.chain(below(node, Verb::Subscribe, &[LIFECYCLE_TOPIC])).collect()
+    let topic = below(node, Verb::Subscribe, &[LIFECYCLE_TOPIC]);
+    services.chain(topic).chain([(Verb::See, node.clone())]).collect()
 }

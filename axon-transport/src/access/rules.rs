@@ -19,7 +19,7 @@ pub enum Verb {
     Serve,
     /// It sends requests to servers here.
     Call,
-    /// It is shown the endpoints and nodes of this name. Who may publish, subscribe, serve or call sees the endpoints
+    /// It is shown the nodes of this name, and the endpoints of topics and services of this name. Who may publish, subscribe, serve or call sees the endpoints
     /// that this needs.
     See,
 }

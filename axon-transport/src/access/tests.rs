@@ -92,6 +92,7 @@ fn one_line_lets_a_peer_use_an_action_or_serve_it_or_set_parameters() {
     assert!(!all("client", Verb::Call, &["/other/set_parameters"]));
     assert!(all("client", Verb::Subscribe, &["/parameter_events", "/any/transition_event"]));
     assert!(all("client", Verb::Call, &["/any/change_state"]));
+    assert!(all("client", Verb::See, &["/robot/arm", "/any"]));
 }
 
 #[test]

@@ -2,12 +2,14 @@
 //!
 //! Plain data in, data out; the daemon and the gateway move it.
 
+pub(crate) mod access;
 pub(crate) mod endpoint;
 pub(crate) mod pairing;
 mod query;
 pub(crate) mod range;
 pub(crate) mod view;
 
+pub(crate) use access::{permits, shows, verb_of};
 pub(crate) use endpoint::LIMITS;
 pub use endpoint::{Endpoint, EndpointKind};
 pub(crate) use pairing::{Pairing, pairing, reads, writes};

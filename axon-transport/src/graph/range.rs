@@ -90,7 +90,7 @@ impl From<Endpoint> for RemoteEndpoint {
     }
 }
 
-/// Why the ranges of two sessions keep their endpoints apart.
+/// Why the ranges of two sessions, or access rules, keep their endpoints apart.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum OutOfRange {
     /// One of the sessions is OFF.
@@ -102,6 +102,11 @@ pub enum OutOfRange {
          host: name that host's address in ROS_STATIC_PEERS of one of them"
     )]
     Localhost,
+    /// An access rule denies one of the endpoints to its user.
+    #[error(
+        "an access rule denies one of the endpoints to its user; the refusals in `axon status` name it"
+    )]
+    Denied,
     /// The other host has not described the endpoint.
     #[error("the other host has not described the endpoint")]
     Unknown,

@@ -25,6 +25,8 @@ pub struct LocalEndpoint {
     pub only: Option<Gid>,
     /// Where a writer's ring is.
     pub ring: Option<Location>,
+    /// Access rules deny it to the user whose session has it: it is in no pair with other sessions and in no graph.
+    pub denied: bool,
     /// It has ended, but what it has written is not all in its ring yet.
     pub leaving: bool,
 }
@@ -32,7 +34,7 @@ pub struct LocalEndpoint {
 impl LocalEndpoint {
     /// Whether it is an application's that is in the graph.
     pub(super) fn is_shown(&self) -> bool {
-        self.role == EndpointRole::Application && !self.leaving
+        self.role == EndpointRole::Application && !self.leaving && !self.denied
     }
 
     /// Whether one writer and one reader may be a pair, whatever their ranges, types and QoS.
@@ -96,6 +98,12 @@ impl Endpoints {
 
     pub(super) fn get(&self, gid: &Gid) -> Option<&LocalEndpoint> {
         self.all.get(gid)
+    }
+
+    /// Access rules deny an endpoint, or do not any more. Returns whether that is new.
+    pub(super) fn set_denied(&mut self, gid: &Gid, denied: bool) -> bool {
+        let local = self.all.get_mut(gid);
+        local.is_some_and(|local| std::mem::replace(&mut local.denied, denied) != denied)
     }
 
     /// The session that an endpoint is of.
@@ -190,8 +198,9 @@ mod tests {
     fn local(number: u32, kind: EndpointKind, role: EndpointRole) -> LocalEndpoint {
         let session = SessionId([1; 16]);
         let endpoint = Endpoint::example(Gid::new(session, number), kind);
-        let (stands_for, only, ring, leaving) = (Vec::new(), None, None, false);
-        LocalEndpoint { session, endpoint, role, stands_for, only, ring, leaving }
+        let (stands_for, only, ring) = (Vec::new(), None, None);
+        let (denied, leaving) = (false, false);
+        LocalEndpoint { session, endpoint, role, stands_for, only, ring, denied, leaving }
     }
 
     fn application(number: u32, kind: EndpointKind) -> LocalEndpoint {

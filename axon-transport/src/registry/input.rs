@@ -168,11 +168,13 @@ impl<F: Clone> Registry<F> {
         if let Some(entry) = self.sessions.get_mut(id) {
             entry.endpoints.insert(gid);
         }
-        if role == EndpointRole::Application {
+        let denied = self.deny(id, role, &endpoint);
+        if role == EndpointRole::Application && !denied {
             self.graph_add_local(&endpoint);
         }
-        let leaving = false;
-        let local = LocalEndpoint { session: *id, endpoint, role, stands_for, only, ring, leaving };
+        let (session, leaving) = (*id, false);
+        let local =
+            LocalEndpoint { session, endpoint, role, stands_for, only, ring, denied, leaving };
         self.endpoints.insert(local);
         self.match_endpoint(&gid);
         Ok(())
@@ -208,7 +210,8 @@ impl<F: Clone> Registry<F> {
         if local.session != *id || !writes(local.endpoint.kind) {
             return Err(Violation::NotItsOwn(gid));
         }
-        let shown = (local.role == EndpointRole::Application).then(|| local.endpoint.clone());
+        let shown = local.role == EndpointRole::Application && !local.denied;
+        let shown = shown.then(|| local.endpoint.clone());
         if !self.endpoints.set_leaving(&gid, leaving) {
             return Ok(());
         }

@@ -19,6 +19,7 @@ mod remote;
 mod sessions;
 #[cfg(test)]
 mod tests;
+mod users;
 
 use std::{collections::BTreeSet, sync::Arc};
 
@@ -37,6 +38,7 @@ use self::{
     range::Ranges,
     remote::{Heard, RemoteEndpoints},
     sessions::Sessions,
+    users::Users,
 };
 use crate::{
     graph::{Endpoint, RemoteEndpoint, Scope},
@@ -74,6 +76,7 @@ pub struct Registry<F> {
     changes: GraphChanges,
     whole: WholeGraphs,
     fences: Fences,
+    users: Users,
     /// Applications' sessions came or went.
     rescoped: bool,
 }
@@ -109,6 +112,7 @@ impl<F> Default for Registry<F> {
             changes: GraphChanges::default(),
             whole: WholeGraphs::default(),
             fences: Fences::default(),
+            users: Users::default(),
             rescoped: false,
         }
     }
@@ -277,7 +281,7 @@ impl<F: Clone> Registry<F> {
     }
 
     fn ranges(&self) -> Ranges<'_, F> {
-        let Self { sessions, endpoints, remote, .. } = self;
-        Ranges { sessions, endpoints, remote }
+        let Self { sessions, endpoints, remote, users, .. } = self;
+        Ranges { sessions, endpoints, remote, users }
     }
 }

@@ -12,6 +12,7 @@ use super::{
     endpoints::{Endpoints, LocalEndpoint, Topic},
     remote::RemoteEndpoints,
     sessions::{SessionEntry, Sessions},
+    users::Users,
 };
 use crate::{
     config::DiscoveryRange,
@@ -28,6 +29,8 @@ pub(super) struct GraphFilter {
     /// A session that sees no other.
     alone: Option<SessionId>,
     gateway: bool,
+    /// Another user of this host, where access rules say what it sees.
+    user: Option<u32>,
 }
 
 /// A pair that would be matched but for the ranges of its sessions.
@@ -54,6 +57,7 @@ pub(super) struct Ranges<'a, F> {
     pub(super) sessions: &'a Sessions<F>,
     pub(super) endpoints: &'a Endpoints,
     pub(super) remote: &'a RemoteEndpoints,
+    pub(super) users: &'a Users,
 }
 
 impl<F> Ranges<'_, F> {
@@ -74,6 +78,9 @@ impl<F> Ranges<'_, F> {
     pub(super) fn apart(&self, w: &LocalEndpoint, r: &LocalEndpoint) -> Option<OutOfRange> {
         if w.session == r.session {
             return None;
+        }
+        if w.denied || r.denied {
+            return Some(OutOfRange::Denied);
         }
         match (w.role, r.role) {
             (EndpointRole::Application, EndpointRole::Application) => {
@@ -111,6 +118,7 @@ impl<F> Ranges<'_, F> {
             alone: entry.is_some_and(SessionEntry::is_off).then_some(*id),
             scope: reach.map(|reach| (reach.range, reach.lists)),
             gateway: entry.is_some_and(|entry| entry.role == SessionRole::Gateway),
+            user: entry.and_then(|entry| entry.user).filter(|_| self.users.have_rules()),
         }
     }
 
@@ -124,8 +132,12 @@ impl<F> Ranges<'_, F> {
     ) -> Option<GraphItem> {
         let gid = &endpoint.gid;
         let Some(daemon) = daemon else {
-            let owner = self.endpoints.get(gid)?.session;
+            let local = self.endpoints.get(gid)?;
+            let owner = local.session;
             let entry = self.sessions.get(&owner)?;
+            if local.denied || !self.users.shows(view.user, entry.user, endpoint) {
+                return None;
+            }
             let hidden = view.alone.is_some() || entry.is_off();
             if hidden && view.alone != Some(owner) {
                 return None;
@@ -134,6 +146,9 @@ impl<F> Ranges<'_, F> {
             return Some(GraphItem { endpoint: endpoint.clone(), daemon: None, reach });
         };
         if view.gateway {
+            return None;
+        }
+        if !self.users.shows(view.user, None, endpoint) {
             return None;
         }
         if let Some((range, lists)) = &view.scope {
@@ -160,7 +175,8 @@ impl<F> Ranges<'_, F> {
     /// Pairs that would be matched but for the ranges of their sessions: at most `most`, of at most
     /// `looked_at` that are looked at.
     pub(super) fn kept_apart(&self, most: usize, looked_at: usize) -> Vec<OutOfRangePair> {
-        let limited = self.scopes().any(|scope| scope.range != DiscoveryRange::Subnet);
+        let limited = self.scopes().any(|scope| scope.range != DiscoveryRange::Subnet)
+            || self.users.have_rules();
         let own =
             |gid: &Gid| self.endpoints.get(gid).filter(|e| e.role == EndpointRole::Application);
         let here = self.endpoints.topics().filter(|_| limited).flat_map(|members| {

@@ -36,6 +36,11 @@ impl Admission {
         uid == self.uid || self.config.trusted_uids.contains(&uid)
     }
 
+    /// Whether it is another user than the daemon's.
+    pub(super) fn is_another(&self, uid: u32) -> bool {
+        uid != self.uid
+    }
+
     /// Checks a HELLO, and hands out its descriptors. `inside` is the daemon's own gateway.
     pub(super) fn check(
         &mut self,

@@ -104,7 +104,7 @@ pub(super) enum InternalPeer {
     /// The gateway's.
     Gateway,
     /// That of a relayed session of process `pid`.
-    Relay { pid: u32, tally: Arc<RelayCounters>, key: Option<Arc<SessionKey>> },
+    Relay { pid: u32, uid: u32, tally: Arc<RelayCounters>, key: Option<Arc<SessionKey>> },
 }
 
 /// Serves one connection to its end. It is a `stranger` until it said HELLO.
@@ -216,7 +216,8 @@ fn relay(
     };
     let tally = Arc::new(RelayCounters::new(&reason));
     tracing::info!(name = hello.name, pid = peer.pid, reason, "a session is relayed");
-    let inside = InternalPeer::Relay { pid: peer.pid, tally: Arc::clone(&tally), key };
+    let inside =
+        InternalPeer::Relay { pid: peer.pid, uid: peer.uid, tally: Arc::clone(&tally), key };
     spawn_local(serve(control.clone(), ours.into(), inside, None));
     let far = DaemonRelay {
         socket: socket.into_inner(),
@@ -303,6 +304,11 @@ fn admit(
     {
         refuse(control, socket, &name, peer, Refused::because(violation.to_string()));
         return None;
+    }
+    // What another user may do, the access rules say.
+    let uid = if let InternalPeer::Relay { uid, .. } = inside { *uid } else { peer.uid };
+    if control.admission.is_another(uid) {
+        control.registry.set_user(&session, uid);
     }
     control.relist();
     if let InternalPeer::Relay { tally, key: of_process, .. } = inside {

@@ -77,12 +77,14 @@ pub(super) struct Control {
 
 impl Control {
     pub(super) fn new(config: Arc<Config>, settings: Vec<(String, String)>) -> Self {
+        let mut registry = Registry::default();
+        registry.set_access(config.access.clone());
         Self {
             admission: Admission::new(Arc::clone(&config), settings),
             id: DaemonId::random(),
             started: Instant::now(),
             address: Address::of(&config),
-            registry: Registry::default(),
+            registry,
             links: BTreeMap::new(),
             refused_routes: BTreeMap::new(),
             refusals: VecDeque::new(),

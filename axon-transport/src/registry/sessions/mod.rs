@@ -42,6 +42,8 @@ pub struct SessionEntry<F> {
     pub name: String,
     /// Its process.
     pub pid: u32,
+    /// Its user, where that is another than the daemon's.
+    pub user: Option<u32>,
     /// How far it is discovered; `None` of the gateway, and of all in a registry within a process.
     pub scope: Option<Scope>,
     /// Daemons of the linked peers that it lists.
@@ -74,6 +76,7 @@ impl<F> SessionEntry<F> {
             role,
             name,
             pid,
+            user: None,
             scope,
             lists: BTreeSet::new(),
             endpoints: BTreeSet::new(),

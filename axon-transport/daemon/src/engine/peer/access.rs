@@ -10,7 +10,10 @@ use axon_shm::ids::DaemonId;
 use axon_transport::{
     access::{Permissions, Verb},
     graph::{Endpoint, EndpointKind},
-    internal::log_limit::LogLimit,
+    internal::{
+        graph::{other_end, verb_of},
+        log_limit::LogLimit,
+    },
     status::LinkStatus,
 };
 
@@ -34,17 +37,6 @@ pub(super) type Use = (Verb, String);
 /// The verbs that need an endpoint, as DENIED numbers them.
 const VERBS: [Verb; 4] = [Verb::Publish, Verb::Subscribe, Verb::Serve, Verb::Call];
 
-/// What the host of an endpoint does with its topic; `None` of a node.
-pub(super) fn verb_of(kind: EndpointKind) -> Option<Verb> {
-    Some(match kind {
-        EndpointKind::Publisher => Verb::Publish,
-        EndpointKind::Subscription => Verb::Subscribe,
-        EndpointKind::Server => Verb::Serve,
-        EndpointKind::Client => Verb::Call,
-        EndpointKind::Node => return None,
-    })
-}
-
 /// The endpoints that are there for a verb.
 fn kind_of(verb: Verb) -> EndpointKind {
     match verb {
@@ -53,17 +45,6 @@ fn kind_of(verb: Verb) -> EndpointKind {
         Verb::Serve => EndpointKind::Server,
         Verb::Call => EndpointKind::Client,
         Verb::See => EndpointKind::Node,
-    }
-}
-
-/// The other end of a pair.
-fn other_end(verb: Verb) -> Verb {
-    match verb {
-        Verb::Publish => Verb::Subscribe,
-        Verb::Subscribe => Verb::Publish,
-        Verb::Serve => Verb::Call,
-        Verb::Call => Verb::Serve,
-        Verb::See => Verb::See,
     }
 }
 
@@ -100,20 +81,6 @@ impl PeerAccess {
         }
         let decision = self.permissions.check(verb, name);
         (!decision.allowed()).then(|| decision.to_string())
-    }
-
-    /// Whether the peer is shown an endpoint of this host that is no node: one that it may see, or that it needs for
-    /// what it may do.
-    pub(super) fn shows(&self, endpoint: &Endpoint) -> bool {
-        let needs = verb_of(endpoint.kind).map(other_end);
-        self.permissions.allows(Verb::See, &endpoint.topic)
-            || needs.is_some_and(|verb| self.permissions.allows(verb, &endpoint.topic))
-    }
-
-    /// Whether the peer is shown a node of this host, of which it sees other endpoints, if it `sees_more`.
-    pub(super) fn shows_node(&self, node: &Endpoint, sees_more: bool) -> bool {
-        let namespace = node.namespace.strip_suffix('/').unwrap_or(&node.namespace);
-        sees_more || self.permissions.allows(Verb::See, &format!("{namespace}/{}", node.node))
     }
 
     /// These endpoints of the peer are denied now. Returns what the peer is told.

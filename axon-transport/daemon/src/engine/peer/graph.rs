@@ -11,10 +11,10 @@ use axon_transport::{
     access::Permissions,
     config::DiscoveryRange,
     graph::{Endpoint, EndpointKind},
-    internal::graph::{LIMITS, RangeToHost, RemoteEndpoint},
+    internal::graph::{LIMITS, RangeToHost, RemoteEndpoint, permits},
 };
 
-use super::{access::verb_of, owners::Proven};
+use super::owners::Proven;
 use crate::{
     engine::account::{Account, Charge},
     link::Graph,
@@ -229,7 +229,7 @@ impl Remote {
             && let Some(charge) = self.account.graph.charge(bytes)
         {
             let remote = RemoteEndpoint { endpoint: Arc::new(endpoint), toward };
-            let denied = !is_permitted(&self.permissions, &remote.endpoint);
+            let denied = !permits(&self.permissions, &remote.endpoint);
             return Some(Held { remote, denied, _charge: Rc::new(charge) });
         }
         self.left_out += 1;
@@ -306,7 +306,7 @@ impl Remote {
     pub(crate) fn set_permissions(&mut self, permissions: Permissions) {
         self.permissions = permissions;
         for (gid, held) in self.all.iter_mut().chain(self.gathered.iter_mut().flatten()) {
-            let denied = !is_permitted(&self.permissions, &held.remote.endpoint);
+            let denied = !permits(&self.permissions, &held.remote.endpoint);
             if std::mem::replace(&mut held.denied, denied) != denied {
                 self.changed.insert(*gid);
             }
@@ -334,10 +334,6 @@ impl Remote {
             self.all.remove(gid);
         }
     }
-}
-
-fn is_permitted(permissions: &Permissions, endpoint: &Endpoint) -> bool {
-    verb_of(endpoint.kind).is_none_or(|verb| permissions.allows(verb, &endpoint.topic))
 }
 
 fn short(name: &str) -> String {

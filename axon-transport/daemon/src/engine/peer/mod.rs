@@ -12,7 +12,7 @@ pub(super) mod stalls;
 
 use std::{
     cell::RefCell,
-    collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque},
+    collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
     rc::Rc,
     sync::Arc,
     time::{Duration, Instant},
@@ -26,7 +26,7 @@ use axon_transport::{
     graph::{Endpoint, EndpointKind},
     internal::{
         events::Alive,
-        graph::{EndpointRange, RangeToHost, RemoteEndpoint},
+        graph::{EndpointRange, RangeToHost, RemoteEndpoint, shows},
     },
     status::LinkStatus,
 };
@@ -329,20 +329,7 @@ impl Peer {
 
     /// What access rules let the peer see of these.
     fn permitted(&self, mut all: BTreeMap<Gid, RemoteEndpoint>) -> BTreeMap<Gid, RemoteEndpoint> {
-        if self.access.permissions().are_unlimited() {
-            return all;
-        }
-        let is_node = |endpoint: &Endpoint| endpoint.kind == EndpointKind::Node;
-        all.retain(|_, e| is_node(&e.endpoint) || self.access.shows(&e.endpoint));
-        let nodes: HashSet<_> = all
-            .values()
-            .filter(|e| !is_node(&e.endpoint))
-            .map(|e| (e.endpoint.namespace.clone(), e.endpoint.node.clone()))
-            .collect();
-        all.retain(|_, RemoteEndpoint { endpoint, .. }| {
-            let name = (endpoint.namespace.clone(), endpoint.node.clone());
-            !is_node(endpoint) || self.access.shows_node(endpoint, nodes.contains(&name))
-        });
+        all.retain(|_, e| shows(self.access.permissions(), &e.endpoint));
         all
     }
 

@@ -7,13 +7,13 @@ use std::{
 };
 
 use axon_envelope::Kind;
-use axon_transport::{graph::EndpointKind, internal::log_limit::LogLimit, status::LinkStatus};
-
-use super::{
-    Peer,
-    access::{Use, verb_of},
-    serving::kind_of,
+use axon_transport::{
+    graph::EndpointKind,
+    internal::{graph::verb_of, log_limit::LogLimit},
+    status::LinkStatus,
 };
+
+use super::{Peer, access::Use, serving::kind_of};
 use crate::{
     bridge::RefusedRoute,
     engine::{

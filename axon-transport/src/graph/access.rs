@@ -1,0 +1,103 @@
+//! What access rules say of endpoints. The gateway asks for those of other hosts, the registry for those of other users.
+
+use super::{Endpoint, EndpointKind};
+use crate::access::{Permissions, Verb};
+
+/// What the owner of an endpoint does with its topic or service; `None` of a node.
+pub fn verb_of(kind: EndpointKind) -> Option<Verb> {
+    Some(match kind {
+        EndpointKind::Publisher => Verb::Publish,
+        EndpointKind::Subscription => Verb::Subscribe,
+        EndpointKind::Server => Verb::Serve,
+        EndpointKind::Client => Verb::Call,
+        EndpointKind::Node => return None,
+    })
+}
+
+/// What the owner of an endpoint on the other side of a pair does.
+pub fn other_end(verb: Verb) -> Verb {
+    match verb {
+        Verb::Publish => Verb::Subscribe,
+        Verb::Subscribe => Verb::Publish,
+        Verb::Serve => Verb::Call,
+        Verb::Call => Verb::Serve,
+        Verb::See => Verb::See,
+    }
+}
+
+/// Whether a party may have this endpoint.
+pub fn permits(party: &Permissions, endpoint: &Endpoint) -> bool {
+    party.are_unlimited()
+        || verb_of(endpoint.kind).is_none_or(|verb| party.allows(verb, &endpoint.topic))
+}
+
+/// Whether a party is shown this endpoint of somebody else: one that it may see, or that it needs for what it may do. A
+/// node is seen by its full name.
+pub fn shows(party: &Permissions, endpoint: &Endpoint) -> bool {
+    if party.are_unlimited() {
+        return true;
+    }
+    match verb_of(endpoint.kind) {
+        Some(verb) => {
+            party.allows(Verb::See, &endpoint.topic)
+                || party.allows(other_end(verb), &endpoint.topic)
+        }
+        None => {
+            let namespace = endpoint.namespace.strip_suffix('/').unwrap_or(&endpoint.namespace);
+            party.allows(Verb::See, &format!("{namespace}/{}", endpoint.node))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{
+        access::{AccessRules, Party},
+        ids::Gid,
+    };
+
+    #[test]
+    fn an_endpoint_is_shown_to_who_may_see_it_or_needs_it() {
+        let rules = "[[allow]]\npeer = \"a\"\npublish = \"/in\"\nsubscribe = \"/out\"\nserve = \"/s\"\n\
+                     call = \"/c\"\nsee = [\"/seen\", \"/ns/node\", \"/root\"]";
+        let party = AccessRules::parse(rules, "f").unwrap().permissions(Party::Name("a"));
+        use EndpointKind::{Client, Node, Publisher, Server, Subscription};
+        let of = |kind, topic: &str| {
+            let mut endpoint = Endpoint::example(Gid([1; 16]), kind);
+            endpoint.topic = topic.into();
+            endpoint
+        };
+        for (kind, topic, has, sees) in [
+            (Publisher, "/in", true, false),
+            (Subscription, "/in", false, true),
+            (Publisher, "/out", false, true),
+            (Subscription, "/out", true, false),
+            (Server, "/s", true, false),
+            (Client, "/s", false, true),
+            (Server, "/c", false, true),
+            (Client, "/c", true, false),
+            (Publisher, "/seen", false, true),
+            (Subscription, "/other", false, false),
+        ] {
+            let endpoint = of(kind, topic);
+            assert_eq!(
+                (permits(&party, &endpoint), shows(&party, &endpoint)),
+                (has, sees),
+                "{kind:?} {topic}"
+            );
+        }
+        for (namespace, node, sees) in [
+            ("/ns", "node", true),
+            ("/ns", "other", false),
+            ("/", "root", true),
+            ("/ns/", "node", true),
+        ] {
+            let node = of(Node, "").with_node(node, namespace);
+            assert!(permits(&party, &node), "it does nothing by itself");
+            assert_eq!(shows(&party, &node), sees, "{node:?}");
+        }
+        let nobody = Permissions::default();
+        assert!(permits(&nobody, &of(Publisher, "/x")) && shows(&nobody, &of(Node, "")));
+    }
+}
