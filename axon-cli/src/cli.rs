@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
-use crate::{demo::mode::Mode, trust::cli::Trust};
+use crate::{acl::cli::Acl, demo::mode::Mode, trust::cli::Trust};
 
 const ABOUT: &str = "Robot data between processes over shared memory and between hosts over QUIC, \
                      under post-quantum or quantum-distributed keys";
@@ -16,6 +16,7 @@ Start here:
   axon echo /scan               look at what arrives, here or on another host
   axon status                   the daemon's peers, links, keys and refusals
   axon trust keygen host.key    a key for this host, for peers to pin
+  axon acl check --peer base --publish /cmd_vel   who may do what, by the access rules
   axon bench shm                what shared memory costs on this machine
 
 Settings come from the environment (AXON_SECURITY_MODE, AXON_DAEMON_PEERS, ...) and from the file \
@@ -53,6 +54,12 @@ pub(crate) enum Command {
     /// Make this host's key, and look at the keys of others
     #[command(subcommand, after_help = crate::trust::cli::HELP)]
     Trust(Trust),
+    /// Say who may do what here, by the access rules
+    #[command(subcommand, after_help = crate::acl::cli::HELP)]
+    Acl(Acl),
+    /// Have the daemon read its access rules, peers and log filter again
+    #[command(after_help = RELOAD_HELP)]
+    Reload,
     /// Run the daemon in the foreground
     #[command(after_help = DAEMON_HELP)]
     Daemon(Daemon),
@@ -215,6 +222,17 @@ pub(crate) struct Status {
     #[arg(long)]
     pub(crate) json: bool,
 }
+
+const RELOAD_HELP: &str = "\
+The daemon reads its own environment and files: AXON_CONFIG, AXON_ACCESS_FILE and the files that they \
+name. Access rules, AXON_DAEMON_PEERS, AXON_TRUSTED_UIDS and AXON_LOG count at once; what needs a \
+restart is named. Where something is wrong nothing changes. SIGHUP does the same, and the log says \
+what came of it.
+
+Examples:
+  axon reload
+
+Exit status: 1 when there is no daemon, 2 when its settings are wrong.";
 
 const DAEMON_HELP: &str = "\
 The same as axon_daemon. The first session on a host starts it, so this is for service managers, \

@@ -5,6 +5,7 @@
 // `say` writes there, and does not panic where that fails.
 #![warn(clippy::print_stderr)]
 
+mod acl;
 mod bench;
 mod cli;
 mod daemon;
@@ -15,6 +16,7 @@ mod interrupt;
 mod log;
 mod logging;
 mod play;
+mod reload;
 mod say;
 mod session;
 mod status;
@@ -39,6 +41,8 @@ fn main() -> ExitCode {
         Command::Echo(args) => echo::run(args).map(done),
         Command::Status(args) => status::run(args),
         Command::Trust(args) => trust::run(args).map(done),
+        Command::Acl(args) => acl::run(args),
+        Command::Reload => reload::run(),
         Command::Daemon(args) => daemon::run(args),
         Command::Bench(Bench::Shm(args)) => bench::shm(args).map(done),
         Command::Bench(Bench::Session(args)) => bench::session::run(args).map(done),

@@ -425,6 +425,18 @@ pub fn unix_ms() -> u64 {
     times::unix_ms(SystemTime::now())
 }
 
+/// What came of reading a daemon's settings again.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
+pub struct ReloadReport {
+    /// Settings that have another value now.
+    pub changed: Vec<String>,
+    /// Settings that differ from those in force and count only once the daemon is started again.
+    pub needs_restart: Vec<String>,
+    /// What is wrong with the settings. Nothing was changed.
+    pub error: Option<String>,
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

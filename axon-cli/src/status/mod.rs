@@ -85,6 +85,9 @@ fn render(status: &Status) -> String {
     if status.links.iter().any(|link| !link.routes_refused.is_empty()) {
         section(&mut out, "Routes refused", "none", routes_refused(&status.links));
     }
+    if status.links.iter().any(|link| !link.denied.is_empty()) {
+        section(&mut out, "Denied by access rules", "none", denied(&status.links));
+    }
     keys(&mut out, &status.keys);
     section(&mut out, "Topics", "none", topics(status));
     section(&mut out, "Out of range", "no pair", out_of_range(status));
@@ -161,6 +164,20 @@ fn routes_refused(links: &[LinkStatus]) -> TextTable {
         }
         if link.more_routes_refused > 0 {
             let more = format!("and {} more", grouped(link.more_routes_refused as u64));
+            table.row([link.host.clone(), more, dash()]);
+        }
+    }
+    table
+}
+
+fn denied(links: &[LinkStatus]) -> TextTable {
+    let mut table = TextTable::new(&["host", "use", "why"]);
+    for link in links {
+        for (what, why) in &link.denied {
+            table.row([link.host.clone(), what.clone(), why.clone()]);
+        }
+        if link.more_denied > 0 {
+            let more = format!("and {} more", grouped(link.more_denied as u64));
             table.row([link.host.clone(), more, dash()]);
         }
     }

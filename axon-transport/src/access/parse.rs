@@ -1,6 +1,6 @@
 //! Reads rules from TOML. Each error has its line and column.
 
-use std::{ops::Range, path::Path, sync::Arc};
+use std::{ops::Range, sync::Arc};
 
 use toml::{
     Spanned,
@@ -49,9 +49,8 @@ impl AccessRules {
     ///
     /// # Errors
     /// The first thing that is wrong with a rule.
-    pub(crate) fn parse_within(text: &str, file: &Path) -> Result<Self, AccessError> {
-        let file = file.file_name().unwrap_or_default().to_string_lossy();
-        Reader::new(text, &file).read(false)
+    pub fn parse_among_settings(text: &str, file: &str) -> Result<Self, AccessError> {
+        Reader::new(text, file).read(false)
     }
 
     /// Whether a key at the top of an `axon.toml` is of rules.

@@ -244,7 +244,8 @@ impl Sources {
             self.settings.entry(name).or_insert(setting);
         }
         if self.only.is_none() {
-            self.access = AccessRules::parse_within(&text, &path)
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            self.access = AccessRules::parse_among_settings(&text, &name)
                 .map_err(|error| ConfigError::rules(names::CONFIG, &error).at(shown))?;
         }
         self.file = Some(path);

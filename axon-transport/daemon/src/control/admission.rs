@@ -26,6 +26,15 @@ impl Admission {
         Self { uid, config, settings }
     }
 
+    /// The settings that may change while the daemon runs have changed.
+    pub(super) fn set_config(&mut self, config: &Arc<Config>) {
+        const ACCESS: &str = "AXON_ACCESS_FILE";
+        self.config = Arc::clone(config);
+        self.settings.retain(|(name, _)| name != ACCESS);
+        let file = config.access_file.as_ref().map(|file| file.to_string_lossy().into_owned());
+        self.settings.extend(file.map(|file| (ACCESS.to_owned(), file)));
+    }
+
     /// The settings that the last session was compared with.
     pub(super) fn settings(&self) -> &[(String, String)] {
         &self.settings

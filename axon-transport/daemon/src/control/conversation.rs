@@ -208,6 +208,7 @@ fn receive_some(
     while begin.elapsed() < PART && queued(control) < unread {
         match receive(socket.get_ref(), buffer) {
             Ok(Received { message: Message::StatusRequest, .. }) => send_status(control, id),
+            Ok(Received { message: Message::Reload, .. }) => control.ask_reload(id),
             // The one thing that is handed over after HELLO, and the only one that the daemon reads:
             // reading anything else may block.
             Ok(Received { descriptors, .. }) if !descriptors.iter().all(PassedFd::is_memfd) => {

@@ -15,6 +15,7 @@ mod losses;
 mod pending;
 mod plane;
 mod relayed;
+mod reload;
 mod remote;
 mod report;
 mod run;

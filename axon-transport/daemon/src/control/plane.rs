@@ -15,6 +15,7 @@ use axon_shm::{
     internal::{descriptors::PassedFd, probe},
 };
 use axon_transport::{
+    access::AccessRules,
     config::Config,
     internal::{
         registry::Registry,
@@ -60,6 +61,11 @@ pub(super) struct Control {
     pub(super) probe: Option<OwnedFd>,
     /// Packets that were exchanged with sessions.
     pub(super) traffic: TrafficStatus,
+    /// The access rules in force, for the gateway.
+    pub(super) access: watch::Sender<AccessRules>,
+    /// Wakes the task that reads the settings again, and the sessions that asked for it.
+    pub(super) reload: Rc<Notify>,
+    pub(super) reload_asked: Vec<SessionId>,
     /// The range and the hosts of discovery: what the widest session needs.
     pub(super) wanted: watch::Sender<Wanted>,
     /// The addresses that names of static peers have.
@@ -101,6 +107,9 @@ impl Control {
                 )
                 .ok(),
             traffic: TrafficStatus::default(),
+            access: watch::Sender::new(config.access.clone()),
+            reload: Rc::default(),
+            reload_asked: Vec::new(),
             wanted: watch::Sender::new(Wanted::of(&config, [])),
             names: BTreeMap::new(),
             linked: BTreeMap::new(),
@@ -160,15 +169,19 @@ impl Control {
             }
         }
         if self.registry.take_rescoped() {
-            let wanted = Wanted::of(&self.config, self.registry.scopes());
-            self.wanted
-                .send_if_modified(|known| std::mem::replace(known, wanted.clone()) != wanted);
+            self.look_for_hosts();
         }
         self.changed.notify_one();
         let needed = self.is_needed();
         if std::mem::replace(&mut self.needed, needed) != needed {
             self.need.notify_one();
         }
+    }
+
+    /// Tells discovery which hosts to look for now.
+    pub(super) fn look_for_hosts(&self) {
+        let wanted = Wanted::of(&self.config, self.registry.scopes());
+        self.wanted.send_if_modified(|known| std::mem::replace(known, wanted.clone()) != wanted);
     }
 
     /// Whether there is an application, or something on its way to another host.

@@ -4,9 +4,11 @@
 use std::{cell::RefCell, collections::BTreeSet, net::IpAddr, rc::Rc, sync::Arc, time::Duration};
 
 use axon_shm::ids::DaemonId;
+use axon_transport::access::AccessRules;
 use tokio::{
-    sync::mpsc,
+    sync::{mpsc, watch},
     task::{JoinHandle, spawn_local},
+    time::Instant,
 };
 
 use super::{
@@ -38,6 +40,9 @@ pub(super) struct Remote {
     listed: BTreeSet<IpAddr>,
     /// The gateway has nothing on its way any more, or it does not get on.
     finished: bool,
+    /// The access rules in force, and when to tell the gateway of them again.
+    access: watch::Receiver<AccessRules>,
+    access_due: Option<Instant>,
 }
 
 struct Discovery {
@@ -63,6 +68,8 @@ impl Remote {
             linked: BTreeSet::new(),
             listed: BTreeSet::new(),
             finished: false,
+            access: control.borrow().access.subscribe(),
+            access_due: None,
         };
         let Some(entry) = entry else { return Ok(remote) };
         let mut running = Running::start(control, entry).map_err(|e| e.to_string())?;
@@ -115,6 +122,8 @@ impl Remote {
                         }
                     }
                 },
+                Ok(()) = self.access.changed() => self.order_access(),
+                () = due(self.access_due) => self.order_access(),
                 action = wanted(self.discovery.as_mut()) => match action {
                     Some(action) => self.action(control, action),
                     None => {
@@ -125,6 +134,14 @@ impl Remote {
                 },
             }
         }
+    }
+
+    /// Gives the gateway the access rules in force. An order that finds the channel full is given again.
+    fn order_access(&mut self) {
+        let rules = self.access.borrow_and_update().clone();
+        // One that is started later begins with them.
+        let missed = self.running.is_some() && !self.order(ToGateway::Access(rules));
+        self.access_due = missed.then(|| Instant::now() + BUSY);
     }
 
     fn event(&mut self, control: &Rc<RefCell<Control>>, event: ToControl) {
@@ -266,6 +283,14 @@ async fn said(running: Option<&mut Running>) -> Result<ToControl, String> {
     match running {
         Some(running) => running.next().await,
         None => Err("it has no thread".to_owned()),
+    }
+}
+
+/// Ends at a time, if there is one.
+async fn due(at: Option<Instant>) {
+    match at {
+        Some(at) => tokio::time::sleep_until(at).await,
+        None => std::future::pending().await,
     }
 }
 

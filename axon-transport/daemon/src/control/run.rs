@@ -30,6 +30,7 @@ use super::{
     listen::accept,
     log,
     plane::Control,
+    reload::reload,
     remote::{GATEWAY, Remote},
 };
 use crate::discovery::Event;
@@ -276,10 +277,13 @@ async fn serve(
     listeners: Vec<OwnedFd>,
     mut options: DaemonOptions,
 ) -> Result<(), DaemonError> {
-    let signals =
-        signal(SignalKind::terminate()).and_then(|t| Ok((t, signal(SignalKind::interrupt())?)));
-    let (mut terminate, mut interrupt) =
-        signals.map_err(|source| DaemonError::System { what: "watching signals", source })?;
+    let signals = || {
+        let [terminate, interrupt, hangup] =
+            [SignalKind::terminate(), SignalKind::interrupt(), SignalKind::hangup()].map(signal);
+        Ok((terminate?, interrupt?, hangup?))
+    };
+    let (mut terminate, mut interrupt, hangup) =
+        signals().map_err(|source| DaemonError::System { what: "watching signals", source })?;
     let mut remote = match Remote::start(&control, options.gateway).await {
         Ok(remote) => remote,
         Err(text) => {
@@ -294,6 +298,7 @@ async fn serve(
     let accepting = spawn_local(accept(control.clone(), listeners));
     let flushing = spawn_local(flush(control.clone(), remote.digests()));
     spawn_local(keep_left_memory(control.clone()));
+    spawn_local(reload(control.clone(), hangup));
     options.report.ready();
     let told = tokio::select! {
         _ = terminate.recv() => Some("SIGTERM"),

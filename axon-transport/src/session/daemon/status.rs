@@ -22,6 +22,7 @@ use crate::{
         error::SessionError,
         state::{Outgoing, StatusAnswer, StatusText},
     },
+    status::ReloadReport,
     wire::session::{Message, SessionRole},
 };
 
@@ -106,19 +107,39 @@ pub fn daemon_status_at(place: &DaemonPlace) -> Result<String, SessionError> {
     let options = SessionOptions::new("status").role(SessionRole::Tool);
     let connected = Caller::new(&config, &options, SessionId::random()).connect()?;
     let address = Address::of(&config).to_string();
-    status_text(ask(&connected.socket, &address, ANSWER)?)
+    status_text(ask(&connected.socket, &Message::StatusRequest, &address, ANSWER)?)
+}
+
+/// Has the daemon of this user and domain read again those of its settings that may change while it runs: access rules,
+/// peers, trusted users and the log filter, from its own environment and files. Where something is wrong with them, nothing
+/// changes, and the report says what.
+///
+/// # Errors
+/// As [`daemon_status`]. A daemon of an earlier version does not answer.
+pub fn daemon_reload_at(place: &DaemonPlace) -> Result<ReloadReport, SessionError> {
+    let config = Config { daemon: DaemonPolicy::Require, ..place.config() };
+    let options = SessionOptions::new("reload").role(SessionRole::Tool);
+    let connected = Caller::new(&config, &options, SessionId::random()).connect()?;
+    let address = Address::of(&config).to_string();
+    let text = status_text(ask(&connected.socket, &Message::Reload, &address, ANSWER)?)?;
+    serde_json::from_str(&text).map_err(|e| SessionError::Protocol(format!("reload: {e}")))
 }
 
 fn status_text(bytes: Vec<u8>) -> Result<String, SessionError> {
     String::from_utf8(bytes).map_err(|e| SessionError::Protocol(format!("status: {e}")))
 }
 
-/// The text of the status.
-fn ask(socket: &OwnedFd, address: &str, patience: Duration) -> Result<Vec<u8>, SessionError> {
+/// The text that answers a question.
+fn ask(
+    socket: &OwnedFd,
+    question: &Message,
+    address: &str,
+    patience: Duration,
+) -> Result<Vec<u8>, SessionError> {
     let silent = || SessionError::Silent { address: address.to_owned() };
     let protocol = |e: SocketError| SessionError::Protocol(e.to_string());
     let deadline = Instant::now() + patience;
-    socket::send(socket, &Message::StatusRequest.encode()?, &[]).map_err(protocol)?;
+    socket::send(socket, &question.encode()?, &[]).map_err(protocol)?;
     let (mut text, mut buffer) = (StatusText::default(), Vec::new());
     loop {
         match socket::receive(socket, &mut buffer) {

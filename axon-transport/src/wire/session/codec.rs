@@ -63,6 +63,7 @@ impl Message {
             Self::SampleFragment(m) => (25, minicbor::to_vec(m)),
             Self::Credit(m) => (26, minicbor::to_vec(m)),
             Self::Asserted(m) => (27, minicbor::to_vec(m)),
+            Self::Reload => (28, minicbor::to_vec(Empty {})),
             Self::Unknown(kind) => (*kind, minicbor::to_vec(Empty {})),
         };
         // Encoding into a Vec has no way to fail.
@@ -115,6 +116,7 @@ impl Message {
             25 => Self::SampleFragment(map(kind, body)?),
             26 => Self::Credit(map(kind, body)?),
             27 => Self::Asserted(map(kind, body)?),
+            28 => map::<Empty>(kind, body).map(|_| Self::Reload)?,
             _ => Self::Unknown(kind),
         })
     }

@@ -466,6 +466,8 @@ pub enum Message {
     Detach(Pair),
     Unmatch(Unmatch),
     StatusRequest,
+    /// Read the settings that may change while the daemon runs. Answered as a STATUS_REQUEST is.
+    Reload,
     Status(StatusPart),
     Resync,
     Segment(SegmentOpened),

@@ -93,6 +93,7 @@ fn messages() -> Vec<Message> {
         Message::Detach(Pair { reader, writer }),
         Message::Unmatch(Unmatch { reader, writer, reason: "gone".into() }),
         Message::StatusRequest,
+        Message::Reload,
         Message::Status(StatusPart { part: 0, parts: 1, text: b"{}".to_vec() }),
         Message::Resync,
         Message::Segment(SegmentOpened {

@@ -6,7 +6,7 @@
 mod output;
 mod throttle;
 
-use std::{fmt, time::Instant};
+use std::{fmt, sync::OnceLock, time::Instant};
 
 use axon_transport::{config::Config, internal::text::is_plain};
 use tracing::{Event, Level, Subscriber, callsite};
@@ -27,16 +27,31 @@ use self::throttle::Throttle;
 pub fn start(config: &Config) {
     // A program that checks its configuration refuses a wrong filter; warnings are shown without one.
     let filter = EnvFilter::try_new(&config.log).unwrap_or_else(|_| EnvFilter::new("warn"));
-    let set = tracing_subscriber::fmt()
+    let lines = tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(|| output::Output)
         // What cannot be written is dropped; the default prints that to standard error, and panics
         // where that fails as well.
         .log_internal_errors(false)
         .event_format(Lines { format: Format::default(), throttle: Throttle::default() })
-        .try_init();
+        .with_filter_reloading();
+    let filter = lines.reload_handle();
+    let set = lines.try_init();
     if set.is_err() {
-        tracing::debug!("logging was set up before");
+        return tracing::debug!("logging was set up before");
+    }
+    let _ = SET_FILTER.set(Box::new(move |new| drop(filter.reload(new))));
+}
+
+/// Changes the filter of the subscriber that [`start`] set.
+type SetFilter = Box<dyn Fn(EnvFilter) + Send + Sync>;
+
+static SET_FILTER: OnceLock<SetFilter> = OnceLock::new();
+
+/// Filters by this `AXON_LOG` from now on.
+pub(super) fn set_filter(text: &str) {
+    if let (Some(set), Ok(filter)) = (SET_FILTER.get(), EnvFilter::try_new(text)) {
+        set(filter);
     }
 }
 

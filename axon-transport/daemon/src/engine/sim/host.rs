@@ -11,6 +11,7 @@ use std::{
 
 use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::{
+    access::AccessRules,
     config::{Config, DiscoveryRange},
     internal::graph::{EndpointRange, RemoteEndpoint},
     status::LinkStatus,
@@ -69,6 +70,8 @@ pub(super) struct Host {
     records: Vec<(u64, String)>,
     used: BTreeSet<String>,
     graph_changed: bool,
+    /// Access rules that came.
+    rules: Option<AccessRules>,
     rings_rang: bool,
     /// When the host has something to do, while nothing changed since that was asked.
     due: Cell<Option<Option<Duration>>>,
@@ -106,6 +109,7 @@ impl Host {
             records: Vec::new(),
             used: BTreeSet::new(),
             graph_changed: false,
+            rules: None,
             rings_rang: false,
             due: Cell::new(None),
             dialled: VecDeque::new(),
@@ -264,6 +268,12 @@ impl Host {
         self.graph_changed = true;
     }
 
+    /// Other access rules count from now on.
+    pub(super) fn set_access(&mut self, rules: &str) {
+        self.due.set(None);
+        self.rules = Some(AccessRules::parse(rules, "access.toml").unwrap());
+    }
+
     /// A ring rang.
     pub(super) fn ring(&mut self) {
         self.due.set(None);
@@ -302,8 +312,10 @@ impl Host {
 
     fn look_when_due(&self, now: Duration) -> Option<Duration> {
         let engine = self.engine.as_ref()?;
-        let ready =
-            (self.graph_changed || self.rings_rang || !self.records.is_empty()).then_some(now);
+        let ready = {
+            let came = self.graph_changed || self.rings_rang || self.rules.is_some();
+            (came || !self.records.is_empty()).then_some(now)
+        };
         let dials = self.peers.iter().filter(|(daemon, _)| !self.linked.contains(daemon));
         let dials = dials.filter_map(|(_, wanted)| wanted.dial_at).min();
         [engine.poll_timeout(now), ready, dials].into_iter().flatten().min()
@@ -318,6 +330,9 @@ impl Host {
             let endpoints = self.rings.endpoints().into_iter();
             let local = endpoints.map(|e| (e.gid, (e, range.clone()))).collect();
             engine.handle_local_graph(local, now);
+        }
+        if let Some(rules) = self.rules.take() {
+            engine.handle_order(ToGateway::Access(rules), now);
         }
         if std::mem::take(&mut self.rings_rang) {
             engine.handle_rings(now);

@@ -30,19 +30,19 @@ pub(super) const LOWEST: DaemonId = DaemonId([0; 16]);
 pub(super) const HIGHEST: DaemonId = DaemonId([0xff; 16]);
 
 /// A world of so many honest hosts, all linked, and one raw peer.
-fn world(seed: u64, hosts: usize, daemon: DaemonId) -> World {
+pub(super) fn world(seed: u64, hosts: usize, daemon: DaemonId) -> World {
     let mut world = World::new(seed, hosts, |_| Config::default());
     world.add_raw(Config::default(), daemon);
     world.until(secs(5), World::is_whole);
     world
 }
 
-fn link(world: &World, link: usize) -> &RawLink {
+pub(super) fn link(world: &World, link: usize) -> &RawLink {
     &world.raws[0].links[link]
 }
 
 /// Dials a host and completes the TLS handshake.
-fn dial(world: &mut World, host: usize) -> usize {
+pub(super) fn dial(world: &mut World, host: usize) -> usize {
     let to = world.hosts[host].address;
     let dialled = world.with_raw(0, |raw, now| raw.dial(to, now));
     world.until(secs(5), |world| link(world, dialled).connected);
@@ -50,7 +50,7 @@ fn dial(world: &mut World, host: usize) -> usize {
 }
 
 /// Says HELLO, and waits for the other side's.
-fn greet(world: &mut World, of: usize, replaces: Option<[u8; 16]>) {
+pub(super) fn greet(world: &mut World, of: usize, replaces: Option<[u8; 16]>) {
     world.with_raw(0, |raw, _| {
         let hello = Hello { replaces, ..raw.hello() };
         raw.links[of].say(&Message::Hello(hello));
@@ -58,15 +58,15 @@ fn greet(world: &mut World, of: usize, replaces: Option<[u8; 16]>) {
     world.until(secs(5), |world| link(world, of).is_greeted());
 }
 
-fn say(world: &mut World, on: usize, message: &Message) {
+pub(super) fn say(world: &mut World, on: usize, message: &Message) {
     world.with_raw(0, |raw, _| raw.links[on].say(message));
 }
 
-fn elect(election: u64) -> Message {
+pub(super) fn elect(election: u64) -> Message {
     Message::Elected(Elected { link: [election as u8; 16], election })
 }
 
-fn subscribe(route: u32, topic: &str, qos: Qos) -> Message {
+pub(super) fn subscribe(route: u32, topic: &str, qos: Qos) -> Message {
     Message::Subscribe(Subscribe {
         route,
         topic: topic.into(),
@@ -80,14 +80,14 @@ fn subscribe(route: u32, topic: &str, qos: Qos) -> Message {
 }
 
 /// The GID of an endpoint of the raw peer.
-fn of_raw(number: u8) -> Gid {
+pub(super) fn of_raw(number: u8) -> Gid {
     let mut gid = [number; 16];
     gid[..12].copy_from_slice(&FOREIGN);
     Gid(gid)
 }
 
 /// A graph of one publisher.
-fn publishes(topic: &str, gid: Gid, qos: Qos) -> Message {
+pub(super) fn publishes(topic: &str, gid: Gid, qos: Qos) -> Message {
     let endpoint = Endpoint::new(gid, EndpointKind::Publisher, topic, "T")
         .with_qos(qos)
         .with_node("node", "/");
@@ -107,7 +107,12 @@ fn asked(world: &mut World, on: usize, topic: &str) -> u32 {
 }
 
 /// A data stream with some samples of a publisher.
-fn samples(route: u32, topic: &str, gid: Gid, numbers: impl IntoIterator<Item = u64>) -> Vec<u8> {
+pub(super) fn samples(
+    route: u32,
+    topic: &str,
+    gid: Gid,
+    numbers: impl IntoIterator<Item = u64>,
+) -> Vec<u8> {
     let mut bytes = StreamHeader::plain(route, gid).encode().to_vec();
     let hash = TopicHash::new(0, topic, "T").unwrap();
     let mut frames = Frames::default();

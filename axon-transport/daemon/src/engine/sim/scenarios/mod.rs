@@ -1,5 +1,6 @@
 //! Scenarios with many cases. `cargo test` runs a sample of them, `cargo xtask simulate --scenarios` all.
 
+mod access;
 mod cuts;
 mod hostile;
 mod kills;

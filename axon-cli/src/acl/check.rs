@@ -1,0 +1,87 @@
+//! `axon acl check`: whether a peer may do something, and which rule decides.
+
+use std::{io::Write as _, process::ExitCode};
+
+use axon_transport::{
+    access::{Party, Verb},
+    config::DaemonPlace,
+    internal::graph::other_end,
+    status::Status,
+};
+
+use super::cli;
+use crate::{
+    failure::CliError,
+    text::{TextTable, printable},
+};
+
+/// Runs `axon acl check`.
+pub(super) fn run(args: &cli::Check) -> Result<ExitCode, CliError> {
+    let rules = super::rules(args.file.as_deref())?;
+    let wrong = |what| CliError::Setting(format!("--peer {:?}: accepted: {what}", args.peer));
+    let permissions = rules.permissions(Party::parse(&args.peer).map_err(wrong)?);
+    let status = if args.file.is_none() { status() } else { None };
+    let mut table = TextTable::new(&["it would", "here", "there"]);
+    let mut allowed = true;
+    for (verb, name) in args.what.uses() {
+        let decision = permissions.check(verb, &name);
+        allowed &= decision.allowed();
+        let there = status.as_ref().map_or_else(
+            || "not asked".to_owned(),
+            |status| there(status, &args.peer, other_end(verb), &name),
+        );
+        table.row([printable(&format!("{verb} {name}")), decision.to_string(), printable(&there)]);
+    }
+    std::io::stdout().lock().write_all(table.render(0).as_bytes())?;
+    Ok(if allowed { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+/// The status of the daemon, where one runs.
+fn status() -> Option<Status> {
+    let place = DaemonPlace::from_env().ok()?;
+    serde_json::from_str(&axon_transport::daemon_status_at(&place).ok()?).ok()
+}
+
+/// What the peer's rules say of this host's end of the pair, as far as the peer has said it.
+fn there(status: &Status, peer: &str, verb: Verb, name: &str) -> String {
+    let of_peer = |link: &&axon_transport::status::LinkStatus| {
+        link.sae.as_deref() == Some(peer) || link.host == peer
+    };
+    let Some(link) = status.links.iter().find(of_peer) else {
+        return "not linked".to_owned();
+    };
+    if let Some(why) = link.denied.get(&format!("{verb} {name} (ours)")) {
+        return why.strip_prefix("by the peer: ").unwrap_or(why).to_owned();
+    }
+    // The peer speaks of endpoints that there are.
+    let ours = status.topics.iter().filter(|topic| topic.topic == name).any(|topic| match verb {
+        Verb::Publish => topic.publishers > 0,
+        Verb::Subscribe => topic.subscriptions > 0,
+        _ => false,
+    });
+    if ours { "allowed" } else { "not known: this host has no such endpoint" }.to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use axon_transport::status::{LinkStatus, TopicStatus};
+
+    use super::*;
+
+    #[test]
+    fn what_the_peer_said_of_an_endpoint_is_shown_and_nothing_else_is_claimed() {
+        let mut link = LinkStatus::default();
+        link.host = "base".into();
+        let why = "by the peer: denied by line 3 of access.toml";
+        link.denied.insert("publish /scan (ours)".into(), why.into());
+        let mut topic = TopicStatus::default();
+        (topic.topic, topic.publishers) = ("/odom".into(), 1);
+        let mut status = Status::default();
+        (status.links, status.topics) = (vec![link], vec![topic]);
+        let there = |peer, verb, name| there(&status, peer, verb, name);
+        assert_eq!(there("base", Verb::Publish, "/scan"), "denied by line 3 of access.toml");
+        assert_eq!(there("base", Verb::Publish, "/odom"), "allowed");
+        assert!(there("base", Verb::Subscribe, "/odom").starts_with("not known"));
+        assert_eq!(there("arm", Verb::Publish, "/scan"), "not linked");
+    }
+}

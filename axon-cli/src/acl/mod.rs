@@ -1,0 +1,36 @@
+//! `axon acl`: who may do what, by the access rules of this host.
+
+mod check;
+pub(crate) mod cli;
+mod test;
+
+use std::{path::Path, process::ExitCode};
+
+use axon_transport::access::AccessRules;
+
+use self::cli::Acl;
+use crate::{failure::CliError, logging};
+
+/// Runs `axon acl`.
+pub(crate) fn run(args: &Acl) -> Result<ExitCode, CliError> {
+    match args {
+        Acl::Check(args) => check::run(args),
+        Acl::Test(args) => test::run(args),
+    }
+}
+
+/// The rules of a file, or those that the settings name.
+fn rules(file: Option<&Path>) -> Result<AccessRules, CliError> {
+    let Some(path) = file else { return Ok(logging::check()?.access) };
+    let shown = path.display();
+    let text = std::fs::read_to_string(path)
+        .map_err(|error| CliError::Setting(format!("{shown}: {error}")))?;
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    // It has other settings beside its rules.
+    let rules = if name == "axon.toml" {
+        AccessRules::parse_among_settings(&text, &name)
+    } else {
+        AccessRules::parse(&text, &name)
+    };
+    rules.map_err(|error| CliError::Setting(error.to_string()))
+}

@@ -1,0 +1,173 @@
+//! Reads the settings again that may change while the daemon runs: on SIGHUP, and when `axon reload` asks for it.
+//!
+//! Where something is wrong with them, nothing changes.
+
+use std::{cell::RefCell, rc::Rc, sync::Arc};
+
+use axon_shm::ids::SessionId;
+use axon_transport::{
+    config::{Config, ConfigError},
+    status::ReloadReport,
+};
+use tokio::signal::unix::Signal;
+
+use super::{log, plane::Control};
+
+/// Reads the settings whenever SIGHUP comes or a session asks.
+pub(super) async fn reload(control: Rc<RefCell<Control>>, mut hangup: Signal) {
+    loop {
+        let asked = Rc::clone(&control.borrow().reload);
+        tokio::select! {
+            _ = hangup.recv() => {}
+            () = asked.notified() => {}
+        }
+        // Who asks from here on is answered by the next reading.
+        let asking = std::mem::take(&mut control.borrow_mut().reload_asked);
+        // It reads files, and a file system may hang.
+        let read = tokio::task::spawn_blocking(Config::from_env).await;
+        let Ok(read) = read else { continue };
+        let report = control.borrow_mut().take_settings(read);
+        log_report(&report);
+        let mut control = control.borrow_mut();
+        for id in asking {
+            control.answer_reload(&id, &report);
+        }
+        control.settle();
+    }
+}
+
+fn log_report(report: &ReloadReport) {
+    match &report.error {
+        Some(error) => tracing::error!(error, "the settings were read again, and are not used"),
+        None => tracing::info!(
+            changed = report.changed.join(", "),
+            needs_restart = report.needs_restart.join(", "),
+            "the settings were read again"
+        ),
+    }
+}
+
+impl Control {
+    /// A session asks for the settings to be read again. Other users may not.
+    pub(super) fn ask_reload(&mut self, id: &SessionId) {
+        let user = self.registry.session(id).and_then(|entry| entry.user);
+        if let Some(user) = user {
+            let mut report = ReloadReport::default();
+            report.error = Some(format!("user {user} may not change the settings of this daemon"));
+            return self.answer_reload(id, &report);
+        }
+        self.reload_asked.push(*id);
+        self.reload.notify_one();
+    }
+
+    fn answer_reload(&mut self, id: &SessionId, report: &ReloadReport) {
+        let text = serde_json::to_vec(report).unwrap_or_default();
+        self.registry.tell_status(id, text.into());
+    }
+
+    /// Takes what may change of settings that were read.
+    fn take_settings(&mut self, read: Result<Config, ConfigError>) -> ReloadReport {
+        let mut report = ReloadReport::default();
+        let new = match read {
+            Ok(new) => new,
+            Err(error) => {
+                report.error = Some(error.to_string());
+                return report;
+            }
+        };
+        let old = Arc::clone(&self.config);
+        report.needs_restart = differing(&fixed(&old), &fixed(&new));
+        report.changed = differing(&variable(&old), &variable(&new));
+        if !report.changed.is_empty() {
+            let mut config = Config::clone(&old);
+            config.access = new.access;
+            config.access_file = new.access_file;
+            config.daemon_peers = new.daemon_peers;
+            config.trusted_uids = new.trusted_uids;
+            config.log = new.log;
+            self.set_config(config);
+        }
+        report
+    }
+
+    fn set_config(&mut self, config: Config) {
+        log::set_filter(&config.log);
+        self.config = Arc::new(config);
+        self.admission.set_config(&self.config);
+        self.registry.set_access(self.config.access.clone());
+        self.access.send_replace(self.config.access.clone());
+        self.look_for_hosts();
+    }
+}
+
+/// Settings by name, as text that differs where they do.
+type Named = Vec<(&'static str, String)>;
+
+fn variable(config: &Config) -> Named {
+    vec![
+        ("access rules", format!("{:?} {:?}", config.access_file, config.access)),
+        ("AXON_DAEMON_PEERS", format!("{:?}", config.daemon_peers)),
+        ("AXON_TRUSTED_UIDS", format!("{:?}", config.trusted_uids)),
+        ("AXON_LOG", config.log.clone()),
+    ]
+}
+
+fn fixed(config: &Config) -> Named {
+    vec![
+        ("security", format!("{:?}", config.security)),
+        ("AXON_QUIC_CIPHER", config.cipher.name().to_owned()),
+        ("ROS_DOMAIN_ID", config.domain.to_string()),
+        ("AXON_BIND_ADDRS", format!("{:?}", config.bind_addrs)),
+        ("AXON_ADVERTISE_ADDRS", format!("{:?}", config.advertise_addrs)),
+        ("AXON_MAX_MESSAGE_MB", config.max_message.to_string()),
+        ("AXON_RELIABLE_QUEUE_MB", config.reliable_queue.to_string()),
+        ("[link]", format!("{:?}", config.link)),
+        ("[[topic]]", format!("{:?}", config.topics)),
+    ]
+}
+
+fn differing(old: &Named, new: &Named) -> Vec<String> {
+    let pairs = old.iter().zip(new).filter(|(old, new)| old.1 != new.1);
+    pairs.map(|((name, _), _)| (*name).to_owned()).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use axon_transport::access::{Party, Verb};
+
+    fn control(config: Config) -> Control {
+        Control::new(Arc::new(config), vec![("AXON_QUIC_CIPHER".into(), "x".into())])
+    }
+
+    #[test]
+    fn what_may_change_changes_and_what_may_not_is_named() {
+        let mut control = control(Config::default());
+        let mut seen = control.access.subscribe();
+        let mut new = Config::builder().daemon_peers(["10.0.0.7"]).domain(3).build().unwrap();
+        new.link.mtu = 9000;
+        let rules = "[[allow]]\npeer = \"uid:7\"\npublish = \"/x\"";
+        new.access = axon_transport::access::AccessRules::parse(rules, "f").unwrap();
+        let report = control.take_settings(Ok(new.clone()));
+        assert_eq!(report.changed, ["access rules", "AXON_DAEMON_PEERS"]);
+        assert_eq!(report.needs_restart, ["ROS_DOMAIN_ID", "[link]"]);
+        assert_eq!((control.config.domain, control.config.link.mtu), (0, 1452));
+        let denied = |rules: &axon_transport::access::AccessRules| {
+            !rules.check(Party::User(7), Verb::Publish, "/y").allowed()
+        };
+        assert!(seen.has_changed().unwrap() && denied(&seen.borrow_and_update()));
+        assert!(control.wanted.borrow().hosts.iter().any(|(host, _)| host == "10.0.0.7"));
+        // The same once more is no change.
+        assert_eq!(control.take_settings(Ok(new)).changed, Vec::<String>::new());
+        assert!(!seen.has_changed().unwrap());
+    }
+
+    #[test]
+    fn wrong_settings_change_nothing_and_say_why() {
+        let mut control = control(Config::builder().daemon_peers(["a"]).build().unwrap());
+        let error = Config::builder().domain(999).build().unwrap_err();
+        let report = control.take_settings(Err(error));
+        assert!(report.error.unwrap().contains("ROS_DOMAIN_ID"));
+        assert_eq!(control.config.daemon_peers.len(), 1);
+    }
+}

@@ -1,0 +1,208 @@
+//! Access rules between hosts: what either side denies does not cross, whatever the other side does.
+
+use axon_shm::{
+    ids::Gid,
+    qos::{Durability, Qos},
+};
+use axon_transport::{access::AccessRules, config::Config, status::LinkStatus};
+
+use super::hostile::{LOWEST, dial, elect, greet, of_raw, publishes, samples, say, subscribe};
+use crate::{
+    engine::sim::{
+        tests::{millis, secs},
+        world::{Pair, World},
+    },
+    link::Message,
+};
+
+fn rules(text: &str) -> AccessRules {
+    AccessRules::parse(text, "access.toml").unwrap()
+}
+
+/// Two hosts, of which one has these rules.
+fn hosts(with_rules: usize, text: &str) -> World {
+    World::new(23, 2, |host| {
+        let mut config = Config::default();
+        if host == with_rules {
+            config.access = rules(text);
+        }
+        config
+    })
+}
+
+fn link(world: &World, host: usize) -> &LinkStatus {
+    world.hosts[host].status.values().next().unwrap()
+}
+
+/// What a host shows as denied, as one text.
+fn denied(world: &World, host: usize) -> String {
+    format!("{:?}", link(world, host).denied)
+}
+
+/// Whether a host was told of an endpoint of the other one.
+fn is_shown(world: &World, host: usize, (_, gid): (usize, Gid)) -> bool {
+    world.hosts[host].graph.values().any(|all| all.contains_key(&gid))
+}
+
+fn arrives(world: &mut World, pair: Pair) -> bool {
+    let before = world.received(pair).len();
+    assert!(world.publish(pair, 10));
+    world.run_for(millis(900));
+    world.received(pair).len() > before
+}
+
+fn latched() -> Qos {
+    Qos::keep_all().with_durability(Durability::TransientLocal)
+}
+
+#[test]
+fn a_topic_does_not_cross_where_either_host_denies_it() {
+    for (with_rules, text, whose, verb) in [
+        (1, "[[deny]]\npeer = \"*\"\npublish = \"/cmd_vel\"", "the peer's", "publish"),
+        (1, "[[allow]]\npeer = \"address:*\"\npublish = \"/scan\"", "the peer's", "publish"),
+        (0, "[[deny]]\npeer = \"*\"\nsubscribe = \"/cmd_vel\"", "the peer's", "subscribe"),
+        (
+            0,
+            "default = \"deny\"\n[[allow]]\npeer = \"*\"\nsubscribe = \"/sc*\"",
+            "the peer's",
+            "subscribe",
+        ),
+    ] {
+        let mut world = hosts(with_rules, text);
+        let [wrong, right] = ["/cmd_vel", "/scan"].map(|topic| world.pair(0, 1, topic, latched()));
+        // Published before they are linked: history is a way in, too.
+        assert!(world.publish(wrong, 10) && world.publish(right, 10));
+        world.until(secs(20), |world| world.received(right).len() == 1);
+        assert!(arrives(&mut world, right), "{text}");
+        assert!(!arrives(&mut world, wrong), "{text}");
+        assert!(world.received(wrong).is_empty());
+        // Neither sees more of the other than it may.
+        assert!(is_shown(&world, 1, right.publisher) && is_shown(&world, 0, right.subscription));
+        let hidden = if with_rules == 1 { (1, wrong.publisher) } else { (0, wrong.subscription) };
+        assert!(!is_shown(&world, hidden.0, hidden.1), "{text}");
+        // What a peer may not do and may not see is not in its graph either; a [[deny]] alone leaves it to be seen.
+        let other_end = [wrong.publisher, wrong.subscription][with_rules];
+        assert_eq!(is_shown(&world, 1 - with_rules, other_end), !text.contains("allow"), "{text}");
+        world.run_for(secs(2));
+        let (here, there) = (denied(&world, with_rules), denied(&world, 1 - with_rules));
+        assert!(here.contains(&format!("\"{verb} /cmd_vel ({whose})\": \"here: denied")), "{here}");
+        assert!(
+            there.contains(&format!("\"{verb} /cmd_vel (ours)\": \"by the peer: denied")),
+            "{there}"
+        );
+        assert!(here.contains("access.toml") && there.contains("access.toml"), "{here} {there}");
+        assert!(!here.contains("/scan") && !there.contains("/scan"));
+    }
+}
+
+#[test]
+fn rules_that_change_end_a_flow_and_begin_it_again_without_a_gap_in_what_is_allowed() {
+    let closed = "[[allow]]\npeer = \"*\"\npublish = \"/other\"\nsubscribe = \"/other\"";
+    for host in [0, 1] {
+        let mut world = hosts(2, "");
+        let [log, other] = ["/log", "/other"].map(|topic| world.pair(0, 1, topic, Qos::keep_all()));
+        world.until(secs(20), World::is_whole);
+        world.run_for(secs(1));
+        assert!(arrives(&mut world, log) && arrives(&mut world, other));
+        for _ in 0..3 {
+            world.hosts[host].set_access(closed);
+            world.run_for(millis(100));
+            assert!(!arrives(&mut world, log), "closed at {host}");
+            assert!(arrives(&mut world, other));
+            world.run_for(secs(2));
+            assert!(denied(&world, 1 - host).contains("/log"), "{}", denied(&world, 1 - host));
+            world.hosts[host].set_access("");
+            world.run_for(secs(3));
+            assert!(arrives(&mut world, log), "open at {host}: {}", world.describe());
+            assert!(arrives(&mut world, other));
+            assert!(
+                link(&world, host).denied.is_empty() && link(&world, 1 - host).denied.is_empty()
+            );
+        }
+        let came = world.received(other);
+        assert!(came.windows(2).all(|two| two[1] == two[0] + 1), "{came:?}");
+    }
+}
+
+#[test]
+fn rules_that_change_a_hundred_times_under_load_lose_nothing_of_what_they_allow() {
+    let mut world = hosts(2, "");
+    let pairs = [0, 1].map(|from| {
+        ["/log", "/other"].map(|topic| world.pair(from, 1 - from, topic, Qos::keep_all()))
+    });
+    world.until(secs(20), World::is_whole);
+    world.run_for(secs(1));
+    for round in 0..100 {
+        let text = ["", "[[deny]]\npeer = \"*\"\npublish = \"/log\""][round % 2];
+        world.hosts[round / 2 % 2].set_access(text);
+        for [log, other] in pairs {
+            world.publish(log, 1000);
+            assert!(world.publish(other, 1000));
+        }
+        world.run_for(millis(7));
+    }
+    world.hosts.iter_mut().for_each(|host| host.set_access(""));
+    world.run_for(secs(5));
+    for [log, other] in pairs {
+        let came = world.received(other);
+        assert_eq!(came.len(), 100, "{came:?}");
+        assert!(arrives(&mut world, log), "{}", world.describe());
+    }
+}
+
+#[test]
+fn a_peer_that_ignores_rules_gets_nothing_and_brings_nothing() {
+    let deny = "[[deny]]\npeer = \"*\"\npublish = \"/in\"\nsubscribe = \"/out\"\n\
+                see = [\"/in\", \"/out\"]";
+    let mut world = hosts(0, deny);
+    world.add_raw(Config::default(), LOWEST);
+    let qos = latched();
+    let publisher = world.hosts[0].rings.create_publisher("/out", qos);
+    let subscription = world.hosts[0].rings.create_subscription("/in", qos, None);
+    world.hosts[0].touch_graph();
+    world.hosts[0].rings.publish(publisher, 10);
+    world.until(secs(10), World::is_whole);
+    let on = dial(&mut world, 0);
+    greet(&mut world, on, None);
+    say(&mut world, on, &elect(1));
+    world.run_for(millis(200));
+    let liar = of_raw(7);
+    say(&mut world, on, &publishes("/in", liar, qos));
+    // It does not wait to be told what there is.
+    say(&mut world, on, &subscribe(3, "/out", qos));
+    world.run_for(secs(1));
+    // Nor to be asked, and it guesses the number of a route.
+    for route in 1..5 {
+        let bytes = samples(route, "/in", liar, 1..=3);
+        world.with_raw(0, |raw, _| raw.links[on].open(bytes.clone()));
+    }
+    world.hosts[0].rings.publish(publisher, 10);
+    world.hosts[0].ring();
+    world.run_for(secs(3));
+    let heard = &world.raws[0].links[on].messages;
+    let refused = heard.iter().find_map(|message| match message {
+        Message::RouteRefused(refused) if refused.route == 3 => Some(&refused.reason),
+        _ => None,
+    });
+    assert_eq!(refused.unwrap(), "denied by line 4 of access.toml");
+    let told = heard.iter().find_map(|message| match message {
+        Message::Denied(denied) => Some(denied.denied.clone()),
+        _ => None,
+    });
+    let told = told.unwrap();
+    assert_eq!((told.len(), told[0].verb, &*told[0].name), (1, 0, "/in"));
+    for message in heard {
+        match message {
+            Message::Graph(graph) => {
+                let topics: Vec<_> = graph.added.iter().map(|e| e.topic.as_str()).collect();
+                assert!(!topics.contains(&"/out") && !topics.contains(&"/in"), "{topics:?}");
+            }
+            Message::Subscribe(subscribe) => panic!("asked for {subscribe:?}"),
+            Message::RouteReady(ready) => panic!("served {ready:?}"),
+            _ => {}
+        }
+    }
+    assert!(world.raws[0].links[on].opened.is_empty(), "no sample was sent");
+    assert!(world.hosts[0].rings.received(subscription, liar).is_empty());
+    assert!(!is_shown(&world, 0, (0, liar)));
+}
