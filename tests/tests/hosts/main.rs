@@ -1,6 +1,7 @@
 //! Two hosts as real processes on loopback addresses: a daemon each, applications of their own, and
 //! in qkd a KME each, simulated in the test's process.
 
+mod access;
 mod cut;
 mod delivery;
 mod disagree;
