@@ -4,7 +4,7 @@ use std::{
     ffi::OsString,
     fs,
     net::Ipv4Addr,
-    os::unix::fs::PermissionsExt,
+    os::unix::{fs::PermissionsExt, process::CommandExt},
     path::Path,
     process::{Command, Stdio},
     sync::atomic::{AtomicU32, Ordering},
@@ -294,6 +294,13 @@ impl Host {
     pub(crate) fn node_with(&self, settings: &[(&str, &str)], arguments: &[&str]) -> Node {
         let mut command = self.command(env!("CARGO_BIN_EXE_axon-test-node"));
         command.args(arguments).envs(settings.iter().copied());
+        Node::start(command)
+    }
+
+    /// A process of another user, which runs a program that it can read.
+    pub(crate) fn node_of(&self, program: &Path, uid: u32, arguments: &[&str]) -> Node {
+        let mut command = self.command(program.to_str().unwrap());
+        command.args(arguments).uid(uid).gid(uid);
         Node::start(command)
     }
 

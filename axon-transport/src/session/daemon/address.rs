@@ -9,7 +9,7 @@ use std::{
     fs::{DirBuilder, File, OpenOptions},
     os::{
         fd::OwnedFd,
-        unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt},
+        unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt},
     },
     path::{Path, PathBuf},
     time::Duration,
@@ -41,6 +41,8 @@ struct SocketFiles {
     socket: PathBuf,
     /// Locked by the daemon as long as it lives.
     lock: PathBuf,
+    /// Whether other users may connect. The daemon closes the connections of those that it does not trust.
+    shared: bool,
 }
 
 /// Sockets that listen (close-on-exec and non-blocking), and what keeps them ours.
@@ -111,6 +113,7 @@ impl Address {
         let place = |dir: &Path, stem: String| SocketFiles {
             socket: dir.join(format!("{stem}.sock")),
             lock: dir.join(format!("{stem}.lock")),
+            shared: !config.trusted_uids.is_empty(),
         };
         match &config.runtime_dir {
             Some(dir) if config.socket_in_runtime_dir => {
@@ -242,7 +245,7 @@ impl Address {
 impl SocketFiles {
     /// Listens there, once the lock is had.
     fn bind(&self) -> Result<(OwnedFd, File), AddressError> {
-        let Self { socket, lock } = self;
+        let Self { socket, lock, shared } = self;
         if let Some(dir) = socket.parent() {
             private_directory(dir)?;
         }
@@ -264,7 +267,13 @@ impl SocketFiles {
         {
             return Err(directory(socket, &e));
         }
-        Ok((listen_at(&path_name(socket)?)?, file))
+        let listener = listen_at(&path_name(socket)?)?;
+        if *shared {
+            // Who connects needs the right to write, and the umask takes that from others.
+            let mode = std::fs::Permissions::from_mode(0o666);
+            std::fs::set_permissions(socket, mode).map_err(|e| directory(socket, &e))?;
+        }
+        Ok((listener, file))
     }
 }
 
