@@ -123,7 +123,7 @@ fn test_names_each_expectation_that_is_not_met() {
 #[test]
 fn reload_without_a_daemon_says_so_and_one_with_wrong_settings_keeps_its_own() {
     let dir = tempfile::tempdir().expect("directory");
-    let file = written(dir.path(), "access.toml", "");
+    let file = written(dir.path(), "access.toml", "default = \"allow\"");
     let run_dir = dir.path().join("run");
     let settings = [
         ("AXON_ACCESS_FILE", &*file),

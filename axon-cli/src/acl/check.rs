@@ -3,15 +3,16 @@
 use std::{io::Write as _, process::ExitCode};
 
 use axon_transport::{
-    access::{Party, Verb},
-    config::DaemonPlace,
+    access::Verb,
+    config::{Config, DaemonPlace},
     internal::graph::other_end,
-    status::Status,
+    status::{LinkStatus, Status},
 };
 
 use super::cli;
 use crate::{
     failure::CliError,
+    say::say,
     text::{TextTable, printable},
 };
 
@@ -19,8 +20,11 @@ use crate::{
 pub(super) fn run(args: &cli::Check) -> Result<ExitCode, CliError> {
     let rules = super::rules(args.file.as_deref())?;
     let wrong = |what| CliError::Setting(format!("--peer {:?}: accepted: {what}", args.peer));
-    let permissions = rules.permissions(Party::parse(&args.peer).map_err(wrong)?);
+    let permissions = rules.permissions(super::party(&args.peer).map_err(wrong)?);
     let status = if args.file.is_none() { status() } else { None };
+    if let Some(status) = &status {
+        warn_of_other_rules(status);
+    }
     let mut table = TextTable::new(&["it would", "here", "there"]);
     let mut allowed = true;
     for (verb, name) in args.what.uses() {
@@ -42,10 +46,25 @@ fn status() -> Option<Status> {
     serde_json::from_str(&axon_transport::daemon_status_at(&place).ok()?).ok()
 }
 
+/// The daemon may have been started with other settings than this process.
+fn warn_of_other_rules(status: &Status) {
+    let daemon = status.settings.get("AXON_ACCESS_FILE").map_or("none", String::as_str);
+    let own = Config::from_env().ok().and_then(|config| config.access_file);
+    let own = own.map_or_else(|| "none".to_owned(), |file| file.display().to_string());
+    if own != daemon {
+        say(format_args!(
+            "axon: AXON_ACCESS_FILE is {own} here and {daemon} in the daemon that runs: the answer is about \
+             the rules here"
+        ));
+    }
+}
+
 /// What the peer's rules say of this host's end of the pair, as far as the peer has said it.
 fn there(status: &Status, peer: &str, verb: Verb, name: &str) -> String {
-    let of_peer = |link: &&axon_transport::status::LinkStatus| {
-        link.sae.as_deref() == Some(peer) || link.host == peer
+    // In qkd the host's name is what the peer calls itself.
+    let of_peer = |link: &&LinkStatus| match &link.sae {
+        Some(sae) => sae == peer,
+        None => link.host == peer && !link.authenticated_as.starts_with("UNAUTHENTICATED"),
     };
     let Some(link) = status.links.iter().find(of_peer) else {
         return "not linked".to_owned();
@@ -53,18 +72,26 @@ fn there(status: &Status, peer: &str, verb: Verb, name: &str) -> String {
     if let Some(why) = link.denied.get(&format!("{verb} {name} (ours)")) {
         return why.strip_prefix("by the peer: ").unwrap_or(why).to_owned();
     }
+    if link.more_denied > 0 {
+        return "not known: more is denied than status lists".to_owned();
+    }
     // The peer speaks of endpoints that there are.
     let ours = status.topics.iter().filter(|topic| topic.topic == name).any(|topic| match verb {
         Verb::Publish => topic.publishers > 0,
         Verb::Subscribe => topic.subscriptions > 0,
         _ => false,
     });
-    if ours { "allowed" } else { "not known: this host has no such endpoint" }.to_owned()
+    let text = match (ours, verb) {
+        (true, _) => "no denial was heard",
+        (false, Verb::Serve | Verb::Call) => "no denial was heard of a service",
+        (false, _) => "not known: this host has no such endpoint",
+    };
+    text.to_owned()
 }
 
 #[cfg(test)]
 mod tests {
-    use axon_transport::status::{LinkStatus, TopicStatus};
+    use axon_transport::status::TopicStatus;
 
     use super::*;
 
@@ -80,7 +107,7 @@ mod tests {
         (status.links, status.topics) = (vec![link], vec![topic]);
         let there = |peer, verb, name| there(&status, peer, verb, name);
         assert_eq!(there("base", Verb::Publish, "/scan"), "denied by line 3 of access.toml");
-        assert_eq!(there("base", Verb::Publish, "/odom"), "allowed");
+        assert_eq!(there("base", Verb::Publish, "/odom"), "no denial was heard");
         assert!(there("base", Verb::Subscribe, "/odom").starts_with("not known"));
         assert_eq!(there("arm", Verb::Publish, "/scan"), "not linked");
     }

@@ -6,7 +6,10 @@ mod test;
 
 use std::{path::Path, process::ExitCode};
 
-use axon_transport::access::AccessRules;
+use axon_transport::{
+    access::{AccessRules, Party},
+    config::{ClassicAuth, Config, Security},
+};
 
 use self::cli::Acl;
 use crate::{failure::CliError, logging};
@@ -17,6 +20,17 @@ pub(crate) fn run(args: &Acl) -> Result<ExitCode, CliError> {
         Acl::Check(args) => check::run(args),
         Acl::Test(args) => test::run(args),
     }
+}
+
+/// The party that a name stands for: with certificates upper and lower case are the same.
+fn party(name: &str) -> Result<Party<'_>, &'static str> {
+    let with_certificates = Config::from_env().is_ok_and(
+        |config| matches!(config.security, Security::Classic(c) if c.auth == ClassicAuth::Ca),
+    );
+    Party::parse(name).map(|party| match party {
+        Party::Name(name) if with_certificates => Party::Certificate(name),
+        other => other,
+    })
 }
 
 /// The rules of a file, or those that the settings name.

@@ -2,8 +2,6 @@
 
 use std::{io::Write as _, process::ExitCode};
 
-use axon_transport::access::Party;
-
 use super::cli;
 use crate::{
     failure::CliError,
@@ -21,7 +19,7 @@ pub(super) fn run(args: &cli::Test) -> Result<ExitCode, CliError> {
     let mut table = TextTable::new(&[">line", "peer", "would", "expected", "is"]);
     let mut unmet = 0;
     for expected in expectations {
-        let peer = Party::parse(&expected.peer).map_err(CliError::failed)?;
+        let peer = super::party(&expected.peer).map_err(CliError::failed)?;
         let decision = rules.check(peer, expected.verb, &expected.name);
         if decision.allowed() != expected.allowed {
             unmet += 1;

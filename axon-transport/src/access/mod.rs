@@ -41,6 +41,7 @@ mod tests;
 
 pub use decision::Decision;
 pub use parse::AccessError;
+pub(crate) use party::HostPattern;
 pub use party::Party;
 pub use pattern::TopicPattern;
 pub use permissions::Permissions;

@@ -84,9 +84,11 @@ impl<'t> Reader<'t> {
             deny: Vec::new(),
             expectations: Vec::new(),
         };
-        let mut found = alone;
+        let mut found = false;
         for (key, value) in table.get_ref() {
-            match &**key.get_ref() {
+            let key_name = &**key.get_ref();
+            found |= ["default", "allow", "deny"].contains(&key_name);
+            match key_name {
                 "default" => {
                     file.denies_by_default = match value.get_ref().as_str() {
                         Some("deny") => true,
@@ -105,9 +107,13 @@ impl<'t> Reader<'t> {
                     let what = format!("unknown key {other:?}; accepted: {}", KEYS.join(", "));
                     return Err(self.wrong(key.span(), what));
                 }
-                _ => continue,
+                _ => {}
             }
-            found = true;
+        }
+        // A file that is being written is empty for a moment: that must not let everything in.
+        if alone && !found {
+            let what = "no rules; accepted: default, [[allow]], [[deny]]; to allow all, write default = \"allow\"";
+            return Err(self.wrong(0..0, what));
         }
         Ok(AccessRules(found.then(|| Arc::new(file))))
     }

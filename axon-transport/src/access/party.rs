@@ -73,9 +73,18 @@ impl PartyPattern {
             ("*", ..) => Self::All,
             ("local", ..) => Self::Users,
             (_, Some(uid), _) => Self::User(uid.parse().map_err(|_| "uid: and a number")?),
-            (_, _, Some(address)) => Self::Address(address.to_owned()),
+            (_, _, Some(address)) => Self::Address(address_pattern(address)?),
             _ => Self::Name(text.to_owned()),
         })
+    }
+
+    /// Whether it speaks of a host by the name that the host proves, or by its address: only one of them can be known.
+    pub(super) fn host(&self) -> Option<HostPattern<'_>> {
+        match self {
+            Self::Name(name) => Some(HostPattern::Name(name)),
+            Self::Address(address) => Some(HostPattern::Address(address)),
+            _ => None,
+        }
     }
 
     pub(super) fn fits(&self, party: Party<'_>) -> bool {
@@ -91,5 +100,25 @@ impl PartyPattern {
             }
             _ => false,
         }
+    }
+}
+
+/// How a rule speaks of a host.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum HostPattern<'a> {
+    /// By the name that it proves.
+    Name(&'a str),
+    /// By its address, where it proves none.
+    Address(&'a str),
+}
+
+/// An address in the form that addresses are compared in, or one in which `*` stands for any characters.
+fn address_pattern(text: &str) -> Result<String, &'static str> {
+    const ACCEPTED: &str = "address: and an address, in which * stands for any characters";
+    let is_part = |c: char| c.is_ascii_hexdigit() || ".:*".contains(c);
+    match text.parse::<IpAddr>() {
+        Ok(address) => Ok(address.to_canonical().to_string()),
+        Err(_) if text.contains('*') && text.chars().all(is_part) => Ok(text.to_ascii_lowercase()),
+        Err(_) => Err(ACCEPTED),
     }
 }

@@ -56,7 +56,12 @@ impl Permissions {
         self.are_unlimited() || self.check(verb, name).allowed()
     }
 
-    /// The same, with the rule that decides.
+    /// Whether a `[[deny]]` names this.
+    pub(crate) fn denies(&self, verb: Verb, name: &str) -> bool {
+        self.0.as_ref().is_some_and(|rules| rules.deny.of(verb).first_fit(name).is_some())
+    }
+
+    /// As [`allows`](Self::allows), with the rule that decides.
     pub fn check(&self, verb: Verb, name: &str) -> Decision {
         let Some(rules) = &self.0 else { return Decision(Reason::NoRules) };
         let file = || Arc::clone(&rules.file);

@@ -4,7 +4,7 @@ use std::{fmt, sync::Arc};
 
 use super::{
     Decision, Party, Permissions, TopicPattern,
-    party::PartyPattern,
+    party::{HostPattern, PartyPattern},
     permissions::{Compiled, Otherwise, VerbPatterns},
 };
 
@@ -132,14 +132,10 @@ impl AccessRules {
         self.0.as_ref().map_or(&[], |rules| &rules.expectations)
     }
 
-    /// The name of a host that a rule speaks of, where one does: hosts that prove nothing have no names.
-    pub(crate) fn named_host(&self) -> Option<String> {
-        let rules = self.0.as_ref()?;
-        let mut peers = rules.allow.iter().chain(&rules.deny).flat_map(|rule| &rule.peers);
-        peers.find_map(|peer| match peer {
-            PartyPattern::Name(name) => Some(name.clone()),
-            _ => None,
-        })
+    /// The hosts that rules speak of.
+    pub(crate) fn hosts(&self) -> impl Iterator<Item = HostPattern<'_>> {
+        let rules = self.0.iter().flat_map(|rules| rules.allow.iter().chain(&rules.deny));
+        rules.flat_map(|rule| &rule.peers).filter_map(PartyPattern::host)
     }
 }
 

@@ -53,10 +53,13 @@ fn a_robot_lets_its_base_station_drive_it_and_its_guest_look_on() {
 }
 
 #[test]
-fn without_rules_all_is_allowed_and_an_empty_file_of_rules_denies_nothing() {
+fn without_rules_all_is_allowed_and_a_file_without_any_is_refused() {
     assert!(AccessRules::default().permissions(Party::User(1)).are_unlimited());
-    let empty = rules("");
-    assert!(!empty.is_empty() && empty.check(Party::Name("a"), Verb::See, "/x").allowed());
+    for text in ["", "# nothing", "[[expect]]\npeer = \"a\"\nsee = \"/x\"\nallowed = true"] {
+        assert!(error(text).what.contains("no rules"), "{text}");
+    }
+    let open = rules("default = \"allow\"");
+    assert!(!open.is_empty() && open.check(Party::Name("a"), Verb::See, "/x").allowed());
     let closed = rules("default = \"deny\"");
     for verb in Verb::ALL {
         assert!(!closed.check(Party::Name("a"), verb, "/x").allowed());
@@ -111,6 +114,12 @@ fn names_of_other_kinds_do_not_fit() {
     assert!(sees(Party::Address([10, 0, 0, 7].into())));
     assert!(sees(Party::Address("::ffff:10.0.0.7".parse().unwrap())));
     assert!(!sees(Party::Address([10, 0, 1, 7].into())));
+    let other = "default = \"deny\"\n[[allow]]\npeer = [\"address:FE80::1\", \"address:::ffff:10.1.1.1\"]\nsee = \"**\"";
+    let other = AccessRules::parse(other, "f").unwrap();
+    for address in ["fe80::1", "10.1.1.1"] {
+        let party = Party::Address(address.parse().unwrap());
+        assert!(other.check(party, Verb::See, "/x").allowed(), "{address}");
+    }
     assert!(sees(Party::Certificate("base.example")) && sees(Party::Name("Base.Example")));
     assert!(!sees(Party::Name("base.example")), "another pin");
     assert!(sees(Party::Name("localhost")), "a host may have a name that begins with local");
@@ -135,6 +144,9 @@ fn what_is_wrong_is_said_with_line_and_column() {
         ("[[alow]]\npeer = \"a\"", 1, 3, "unknown key \"alow\""),
         ("# é\n[[deny]]\npeer = \"é\" x", 3, 12, ""),
         ("[[expect]]\npeer = \"a\"\npublish = \"/x\"", 1, 1, "[[expect]] has"),
+        ("[[allow]]\npeer = \"address:10.0.0.0/24\"", 2, 8, "address"),
+        ("[[allow]]\npeer = \"address:base\"", 2, 8, "address"),
+        ("[[allow]]\npeer = \"address:10.0.0.*/24\"", 2, 8, "address"),
         ("[[expect]]\npeer = \"local\"\npublish = \"/x\"\nallowed = true", 2, 8, "uid:"),
     ] {
         let error = error(text);

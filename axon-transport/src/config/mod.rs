@@ -160,6 +160,19 @@ impl Config {
     }
 }
 
+/// The settings of the environment that name files by a relative path, with absolute ones: a daemon leaves its directory.
+#[doc(hidden)]
+pub fn absolute_paths() -> Vec<(&'static str, Option<OsString>)> {
+    let Ok(directory) = std::env::current_dir() else { return Vec::new() };
+    let relative = names::PATHS.iter().filter_map(|name| {
+        let value = std::env::var_os(name).filter(|value| !value.is_empty())?;
+        Path::new(&value)
+            .is_relative()
+            .then(|| (*name, Some(directory.join(value).into_os_string())))
+    });
+    relative.collect()
+}
+
 const DAEMON_PATH: &str = "AXON_DAEMON_PATH";
 
 /// The environment, without what a program with more rights than its caller must not take from it.

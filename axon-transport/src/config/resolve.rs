@@ -15,7 +15,7 @@ use super::{
     sources::{Given, Sources},
     values::{self, Use, Values},
 };
-use crate::access::AccessRules;
+use crate::access::{AccessRules, HostPattern};
 
 const MIB: u64 = 1 << 20;
 /// Longest path of a unix socket on Linux, in bytes, without the closing zero.
@@ -146,9 +146,20 @@ fn access(
         None => (inline.clone(), values.sources.file.as_deref().cloned()),
     };
     let unnamed = matches!(security, Security::Classic(c) if c.auth == ClassicAuth::None);
-    if let Some(peer) = rules.named_host().filter(|_| unnamed) {
-        let accepted = "*, local, uid: and a number, or address: and an address: with \
-                        AXON_CLASSIC_AUTH=none no host proves a name. Pin the hosts, or name addresses";
+    // A rule that can fit nobody would protect nothing.
+    let dead = rules.hosts().find_map(|host| match host {
+        HostPattern::Name(name) if unnamed => Some((
+            name.to_owned(),
+            "*, local, uid: and a number, or address: and an address: with AXON_CLASSIC_AUTH=none no host \
+             proves a name. Pin the hosts, or name addresses",
+        )),
+        HostPattern::Address(address) if !unnamed => Some((
+            format!("address:{address}"),
+            "names: hosts prove theirs in this mode, and rules know them by these alone",
+        )),
+        _ => None,
+    });
+    if let Some((peer, accepted)) = dead {
         let place = file.as_ref().map_or(String::new(), |file| file.display().to_string());
         return Err(ConfigError::value("peer", &peer, accepted).at(place));
     }

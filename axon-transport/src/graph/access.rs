@@ -39,8 +39,9 @@ pub fn shows(party: &Permissions, endpoint: &Endpoint) -> bool {
     }
     match verb_of(endpoint.kind) {
         Some(verb) => {
-            party.allows(Verb::See, &endpoint.topic)
-                || party.allows(other_end(verb), &endpoint.topic)
+            !party.denies(Verb::See, &endpoint.topic)
+                && (party.allows(Verb::See, &endpoint.topic)
+                    || party.allows(other_end(verb), &endpoint.topic))
         }
         None => {
             let namespace = endpoint.namespace.strip_suffix('/').unwrap_or(&endpoint.namespace);
@@ -97,6 +98,9 @@ mod tests {
             assert!(permits(&party, &node), "it does nothing by itself");
             assert_eq!(shows(&party, &node), sees, "{node:?}");
         }
+        let hidden = "[[deny]]\npeer = \"a\"\nsee = \"/secret\"";
+        let hidden = AccessRules::parse(hidden, "f").unwrap().permissions(Party::Name("a"));
+        assert!(!shows(&hidden, &of(Publisher, "/secret")) && shows(&hidden, &of(Publisher, "/x")));
         let nobody = Permissions::default();
         assert!(permits(&nobody, &of(Publisher, "/x")) && shows(&nobody, &of(Node, "")));
     }

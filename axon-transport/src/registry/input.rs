@@ -168,7 +168,11 @@ impl<F: Clone> Registry<F> {
         if let Some(entry) = self.sessions.get_mut(id) {
             entry.endpoints.insert(gid);
         }
-        let denied = self.deny(id, role, &endpoint);
+        let denial = self.denial(id, role, &endpoint);
+        if let Some(why) = &denial {
+            self.note_denied(id, &endpoint, why);
+        }
+        let denied = denial.is_some();
         if role == EndpointRole::Application && !denied {
             self.graph_add_local(&endpoint);
         }

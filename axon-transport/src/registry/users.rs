@@ -12,7 +12,7 @@ use crate::{
     access::{AccessRules, Party, Permissions},
     graph::{Endpoint, permits, shows, verb_of},
     ids::{Gid, SessionId},
-    wire::session::{EndpointRole, Message, Refused},
+    wire::session::{EndpointRole, Refused},
 };
 
 /// The rules, compiled for each user who has a session, or had one.
@@ -70,6 +70,9 @@ impl<F: Clone> Registry<F> {
         let of_users: Vec<_> = of_users.map(|(id, entry)| (*id, entry.endpoints.clone())).collect();
         for (id, endpoints) in of_users {
             self.sessions.request_resync(&id);
+            if let Some(entry) = self.sessions.get_mut(&id) {
+                entry.refused = false;
+            }
             endpoints.iter().for_each(|gid| self.judge(&id, gid));
         }
     }
@@ -78,9 +81,12 @@ impl<F: Clone> Registry<F> {
     fn judge(&mut self, id: &SessionId, gid: &Gid) {
         let Some(local) = self.endpoints.get(gid) else { return };
         let (endpoint, role, was_shown) = (local.endpoint.clone(), local.role, local.is_shown());
-        let denied = self.deny(id, role, &endpoint);
-        if !self.endpoints.set_denied(gid, denied) {
+        let denial = self.denial(id, role, &endpoint);
+        if !self.endpoints.set_denied(gid, denial.is_some()) {
             return;
+        }
+        if let Some(why) = denial {
+            self.note_denied(id, &endpoint, &why);
         }
         match (was_shown, self.endpoints.get(gid).is_some_and(|local| local.is_shown())) {
             (true, false) => self.changes.remove(*gid, true),
@@ -90,14 +96,21 @@ impl<F: Clone> Registry<F> {
         self.rematch(gid);
     }
 
-    /// Whether access rules deny an endpoint. Its session and the status are told why.
-    pub(super) fn deny(&mut self, id: &SessionId, role: EndpointRole, endpoint: &Endpoint) -> bool {
+    /// Why access rules deny an endpoint to its user, if they do.
+    pub(super) fn denial(
+        &self,
+        id: &SessionId,
+        role: EndpointRole,
+        endpoint: &Endpoint,
+    ) -> Option<String> {
         let user = self.sessions.get(id).and_then(|entry| entry.user);
-        let user = user.filter(|_| role == EndpointRole::Application);
-        let Some(why) = self.users.denial(user, endpoint) else { return false };
-        let refused = Refused::of(endpoint, &why);
+        self.users.denial(user.filter(|_| role == EndpointRole::Application), endpoint)
+    }
+
+    /// Has the status and the log say that an endpoint is denied. Its session is not told: for a session REFUSED is for
+    /// good, and other rules may allow the endpoint.
+    pub(super) fn note_denied(&mut self, id: &SessionId, endpoint: &Endpoint, why: &str) {
+        let refused = Refused::of(endpoint, why);
         self.sessions.note_refused(id, &refused.text);
-        self.push(id, &Message::Refused(refused), Vec::new());
-        true
     }
 }

@@ -63,7 +63,7 @@ impl Hosts {
         let [mut robot, base] = Plan::new(settings).prepare();
         let rules = robot.dir.path().join("access.toml");
         robot.set("AXON_ACCESS_FILE", rules.to_str().unwrap());
-        fs::write(&rules, "").unwrap();
+        fs::write(&rules, "default = \"allow\"").unwrap();
         let place = DaemonPlace::from(&robot.config());
         let mut hosts = Self { robot, base, peer, rules, place, _keys: keys };
         hosts.write(ROBOT);
@@ -244,6 +244,27 @@ fn rules_that_change_under_load_lose_nothing_of_what_they_allow() {
         }
         receiving.join().unwrap();
     });
+    meet(&drives, &drive);
+}
+
+#[test]
+fn a_pin_under_another_name_has_the_rights_of_that_name() {
+    let keys = tempfile::tempdir().unwrap();
+    let trust = keys.path().join("host-0.trust");
+    let settings = pinned(keys.path(), [[false, true], [true, false]]);
+    let hosts = Hosts::start(settings, "host-1", keys);
+    let (here, there) = (hosts.robot.session("robot"), hosts.base.session("base"));
+    let (drive, drives) = (subscription(&here, "/cmd_vel"), publisher(&there, "/cmd_vel"));
+    meet(&drives, &drive);
+    let pins = fs::read_to_string(&trust).unwrap();
+    fs::write(&trust, pins.replace("host-1 ", "guest ")).unwrap();
+    until("the link under the old name ends, and the new name may not publish", || {
+        drive.matched().is_empty()
+            && hosts.robot.status().links.iter().any(|link| {
+                link.host == "guest" && link.denied.contains_key("publish /cmd_vel (the peer's)")
+            })
+    });
+    fs::write(&trust, pins).unwrap();
     meet(&drives, &drive);
 }
 

@@ -80,6 +80,11 @@ impl Admission {
             self.read_files_again();
             self.compare(&hello.settings)?;
         }
+        // A pair hands over memory in which the samples of other topics are as well.
+        if hello.relay.is_none() && self.is_another(peer.uid) && !self.config.access.is_empty() {
+            let text = "access rules are in force, and its user is another than the daemon's";
+            return Err(unshared(text.into()));
+        }
         let count = descriptors.len();
         if hello.relay.is_some() {
             return match count {
@@ -171,6 +176,7 @@ mod tests {
 
     use super::*;
     use axon_shm::ids::SessionId;
+    use axon_transport::access::AccessRules;
 
     fn admission() -> Admission {
         let settings = [("AXON_SECURITY_MODE", "qkd"), ("AXON_SAE_ID", "alice")]
@@ -249,6 +255,24 @@ mod tests {
         let cipher = other.iter_mut().find(|(name, _)| name == "AXON_QUIC_CIPHER").unwrap();
         cipher.1 = "aes-256-gcm".into();
         assert!(why(other).contains("AXON_QUIC_CIPHER"));
+    }
+
+    #[test]
+    fn another_user_shares_no_memory_where_there_are_rules() {
+        let check = |rules: &str, uid| {
+            let mut admission = admission();
+            let mut config = Config::clone(&admission.config);
+            config.access = AccessRules::parse(rules, "f").unwrap();
+            admission.config = Arc::new(config);
+            let peer = PeerProcess { uid, pid: std::process::id() };
+            admission.check(&hello(), Vec::new(), peer, false).unwrap_err().text
+        };
+        let rules = "default = \"allow\"";
+        assert!(check(rules, 1001).contains("access rules are in force"));
+        assert!(check(rules, 1000).contains("0 descriptors"), "the own user shares memory");
+        let relayed = Hello { relay: Some("why".into()), ..hello() };
+        let peer = PeerProcess { uid: 1001, pid: std::process::id() };
+        assert!(admission().check(&relayed, Vec::new(), peer, false).unwrap().is_none());
     }
 
     #[test]

@@ -148,6 +148,15 @@ impl Control {
         more
     }
 
+    /// Ends a session at once. Its task closes the connection.
+    pub(super) fn disconnect(&mut self, id: &SessionId) {
+        if let Some(bell) = self.wakers.remove(id) {
+            bell.notify_one();
+        }
+        self.registry.handle_disconnect(id);
+        self.keys_of_sessions.remove(id);
+    }
+
     /// Whether `bell` is still that of the session's task.
     pub(super) fn is_current(&self, id: &SessionId, bell: &Rc<Notify>) -> bool {
         self.wakers.get(id).is_some_and(|current| Rc::ptr_eq(current, bell))

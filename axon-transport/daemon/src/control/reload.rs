@@ -2,19 +2,46 @@
 //!
 //! Where something is wrong with them, nothing changes.
 
-use std::{cell::RefCell, rc::Rc, sync::Arc};
+use std::{cell::RefCell, ffi::OsString, rc::Rc, sync::Arc};
 
 use axon_shm::ids::SessionId;
 use axon_transport::{
-    config::{Config, ConfigError},
+    config::{Config, ConfigError, absolute_paths},
     status::ReloadReport,
 };
 use tokio::signal::unix::Signal;
 
 use super::{log, plane::Control};
 
-/// Reads the settings whenever SIGHUP comes or a session asks.
-pub(super) async fn reload(control: Rc<RefCell<Control>>, mut hangup: Signal) {
+/// The environment that a daemon read its settings from.
+#[derive(Clone, Debug)]
+pub(super) struct SettingsSource {
+    /// Settings that name files, as absolute paths.
+    paths: Vec<(&'static str, Option<OsString>)>,
+}
+
+impl SettingsSource {
+    /// That of this process, whose current directory relative paths begin in.
+    pub(super) fn environment() -> Self {
+        Self { paths: absolute_paths() }
+    }
+
+    /// Reads them.
+    ///
+    /// # Errors
+    /// A setting that is wrong.
+    pub(super) fn read(&self) -> Result<Config, ConfigError> {
+        Config::from_env_with(self.paths.iter().cloned(), None)
+    }
+}
+
+/// Reads the settings whenever SIGHUP comes or a session asks. A daemon that was given its configuration by a program
+/// has no `source`.
+pub(super) async fn reload(
+    control: Rc<RefCell<Control>>,
+    mut hangup: Signal,
+    source: Option<SettingsSource>,
+) {
     loop {
         let asked = Rc::clone(&control.borrow().reload);
         tokio::select! {
@@ -24,9 +51,19 @@ pub(super) async fn reload(control: Rc<RefCell<Control>>, mut hangup: Signal) {
         // Who asks from here on is answered by the next reading.
         let asking = std::mem::take(&mut control.borrow_mut().reload_asked);
         // It reads files, and a file system may hang.
-        let read = tokio::task::spawn_blocking(Config::from_env).await;
-        let Ok(read) = read else { continue };
-        let report = control.borrow_mut().take_settings(read);
+        let report = match source.clone() {
+            Some(source) => {
+                let read = tokio::task::spawn_blocking(move || source.read()).await;
+                let Ok(read) = read else { continue };
+                control.borrow_mut().take_settings(read)
+            }
+            None => {
+                let mut report = ReloadReport::default();
+                let why = "a program gave this daemon its settings: they cannot be read again";
+                report.error = Some(why.into());
+                report
+            }
+        };
         log_report(&report);
         let mut control = control.borrow_mut();
         for id in asking {
@@ -38,7 +75,9 @@ pub(super) async fn reload(control: Rc<RefCell<Control>>, mut hangup: Signal) {
 
 fn log_report(report: &ReloadReport) {
     match &report.error {
-        Some(error) => tracing::error!(error, "the settings were read again, and are not used"),
+        Some(error) => {
+            tracing::error!(error, "could not read the settings again; the old ones stay in force")
+        }
         None => tracing::info!(
             changed = report.changed.join(", "),
             needs_restart = report.needs_restart.join(", "),
@@ -94,9 +133,27 @@ impl Control {
         log::set_filter(&config.log);
         self.config = Arc::new(config);
         self.admission.set_config(&self.config);
+        self.end_excluded();
         self.registry.set_access(self.config.access.clone());
         self.access.send_replace(self.config.access.clone());
         self.look_for_hosts();
+    }
+}
+
+impl Control {
+    /// Ends the sessions of users who are not trusted any more, and those that share memory and would not be let in with
+    /// it now.
+    fn end_excluded(&mut self) {
+        let has_rules = !self.config.access.is_empty();
+        let excluded = self.registry.sessions().filter_map(|(id, entry)| {
+            let user = entry.user?;
+            let shares = entry.relay.is_none() && entry.descriptors.is_some();
+            (!self.admission.trusts(user) || has_rules && shares).then_some((*id, user))
+        });
+        for (id, user) in excluded.collect::<Vec<_>>() {
+            tracing::warn!(session = %id, user, "a session of another user was ended: the settings changed");
+            self.disconnect(&id);
+        }
     }
 }
 

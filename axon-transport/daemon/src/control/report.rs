@@ -18,7 +18,13 @@ pub(super) fn send_status(control: &mut Control, id: &SessionId) {
     if control.registry.repeat_status(id) {
         return;
     }
-    let text = match serde_json::to_vec(&status(control)) {
+    let mut status = status(control);
+    // It shows all topics, sessions and peers.
+    let user = control.registry.session(id).and_then(|entry| entry.user);
+    if user.is_some() && !control.config.access.is_empty() {
+        status = without_details(&status);
+    }
+    let text = match serde_json::to_vec(&status) {
         Ok(text) => text,
         Err(error) => {
             tracing::error!(%error, "the status cannot be written");
@@ -90,6 +96,19 @@ fn status(control: &Control) -> Status {
     status.refusals = control.refusals.iter().cloned().collect();
     status.settings = settings;
     status
+}
+
+/// What another user of the host may know of a daemon that has access rules.
+fn without_details(status: &Status) -> Status {
+    let mut public = Status::default();
+    public.daemon = status.daemon.clone();
+    public.pid = status.pid;
+    public.uptime = status.uptime;
+    public.protocol = status.protocol;
+    public.version = status.version.clone();
+    public.domain = status.domain;
+    public.gateway = status.gateway.clone();
+    public
 }
 
 fn discovery(wanted: &Wanted) -> DiscoveryStatus {

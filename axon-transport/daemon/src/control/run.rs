@@ -30,7 +30,7 @@ use super::{
     listen::accept,
     log,
     plane::Control,
-    reload::reload,
+    reload::{SettingsSource, reload},
     remote::{GATEWAY, Remote},
 };
 use crate::discovery::Event;
@@ -80,6 +80,8 @@ pub struct DaemonOptions {
     /// The gateway to other hosts. Without one, the daemon serves this host alone.
     gateway: Option<GatewayEntry>,
     stays: bool,
+    /// Where the settings are from, to be read again.
+    settings: Option<SettingsSource>,
 }
 
 impl DaemonOptions {
@@ -101,7 +103,7 @@ impl DaemonOptions {
 
 impl Default for DaemonOptions {
     fn default() -> Self {
-        Self { report: Report::none(), gateway: GATEWAY, stays: false }
+        Self { report: Report::none(), gateway: GATEWAY, stays: false, settings: None }
     }
 }
 
@@ -160,7 +162,9 @@ pub fn main(start: Start) -> ExitCode {
     } else {
         Report::none()
     };
-    let config = match Config::from_env() {
+    // Before the process leaves the directory that relative paths begin in.
+    let settings = SettingsSource::environment();
+    let config = match settings.read() {
         Ok(config) => config,
         Err(error) => return fail(&mut report, &error.to_string(), 2),
     };
@@ -171,7 +175,8 @@ pub fn main(start: Start) -> ExitCode {
     if let Some(line) = config.unknown_variables() {
         tracing::warn!("{line}");
     }
-    let options = DaemonOptions { report, stays: !detached, ..DaemonOptions::default() };
+    let settings = Some(settings);
+    let options = DaemonOptions { report, stays: !detached, settings, ..DaemonOptions::default() };
     match run(config, options) {
         Ok(()) => ExitCode::SUCCESS,
         // Losing the race to start is how all but one end.
@@ -298,7 +303,7 @@ async fn serve(
     let accepting = spawn_local(accept(control.clone(), listeners));
     let flushing = spawn_local(flush(control.clone(), remote.digests()));
     spawn_local(keep_left_memory(control.clone()));
-    spawn_local(reload(control.clone(), hangup));
+    spawn_local(reload(control.clone(), hangup, options.settings.take()));
     options.report.ready();
     let told = tokio::select! {
         _ = terminate.recv() => Some("SIGTERM"),

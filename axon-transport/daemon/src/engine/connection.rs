@@ -1,6 +1,6 @@
 //! One QUIC connection and its control stream.
 
-use std::{collections::HashMap, time::Duration};
+use std::{collections::HashMap, net::SocketAddr, time::Duration};
 
 use axon_transport::status::LinkStatus;
 use quinn_proto::{ConnectionHandle, StreamId};
@@ -35,6 +35,8 @@ pub(crate) struct Connection {
     pub(super) endpoint: usize,
     /// Its name at the endpoint.
     pub(super) handle: ConnectionHandle,
+    /// Where the peer was when the connection began: there it received what the handshake needs.
+    pub(super) began_at: SocketAddr,
     /// The connection.
     pub(super) quic: quinn_proto::Connection,
     /// Its control stream.
@@ -62,6 +64,7 @@ impl Connection {
         Self {
             endpoint,
             handle,
+            began_at: quic.remote_address(),
             quic,
             control: Control::default(),
             flows: HashMap::new(),

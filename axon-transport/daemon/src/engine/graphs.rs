@@ -39,6 +39,7 @@ impl Engine {
         self.access = rules;
         let peers: Vec<_> = self.peers.iter().map(|(daemon, peer)| (daemon, peer.link)).collect();
         for (daemon, link) in peers {
+            // A link that is gone is about to be reported as down.
             let Some(permissions) = self.links.permissions(link, &self.access) else { continue };
             if let Some(peer) = self.peers.get_mut(daemon) {
                 peer.set_permissions(permissions);

@@ -297,9 +297,12 @@ impl Engine {
     /// A link of a peer is elected, the first or a successor.
     fn link_up(&mut self, number: u64, daemon: DaemonId, old: Option<u64>, now: Duration) {
         let binding = self.links.binding(number);
+        let Some(permissions) = self.links.permissions(number, &self.access) else { return };
         if let Some(old) = old.filter(|_| self.peers.get(daemon).is_some()) {
             let old = self.links.connection(old).map(|connection| &mut connection.quic);
             self.peers.with(daemon, |peer, with| {
+                // Before anything is said of this host's graph.
+                peer.set_permissions(permissions);
                 peer.succeed(number, binding, with.local);
                 peer.outbound.succeed(old);
             });
@@ -313,7 +316,6 @@ impl Engine {
         };
         let identity = self.links.identity(number).unwrap_or_default();
         let serves = summary.hello.routes.map_or(ROUTES_UNSAID, |routes| routes as usize);
-        let Some(permissions) = self.links.permissions(number, &self.access) else { return };
         let needed = self.links.credentials.authenticates();
         let prover = Prover::new(&self.session_keys, self.daemon, needed, binding);
         let counters = Rc::<Counters>::default();

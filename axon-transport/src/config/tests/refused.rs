@@ -355,4 +355,6 @@ fn rules_that_cannot_be_used_are_refused_with_their_place() {
     let error = resolve(&[("AXON_ACCESS_FILE", "/f/good.toml")]).unwrap_err();
     assert!(error.contains("\"base\"") && error.contains("AXON_CLASSIC_AUTH=none"), "{error}");
     resolve(&[("AXON_ACCESS_FILE", "/f/address.toml")]).unwrap();
+    let error = pinned(&[("AXON_ACCESS_FILE", "/f/address.toml")]).unwrap_err();
+    assert!(error.contains("\"address:10.*\""), "{error}");
 }

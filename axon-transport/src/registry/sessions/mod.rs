@@ -61,7 +61,7 @@ pub struct SessionEntry<F> {
     /// The memory of other sessions whose descriptors it holds.
     pub(super) held: HeldMemory,
     /// An endpoint of its was refused.
-    refused: bool,
+    pub(super) refused: bool,
 }
 
 impl<F> SessionEntry<F> {

@@ -295,6 +295,7 @@ impl Links {
             let Some(peer) = &link.peer else { continue };
             let chain = certificates.then_some(&peer.chain[..]);
             let why = self.credentials.distrust(&peer.summary.negotiated, link.side, chain);
+            let why = why.or_else(|| peer.summary.who.renamed(self.credentials.auth().as_ref()));
             untrusted.extend(why.map(|why| (number, why)));
         }
         for (number, why) in untrusted {

@@ -411,9 +411,10 @@ impl Links {
         Some(self.summary(number)?.who.host_identity(address))
     }
 
-    /// What access rules let the peer of a link do. No peer, no right.
+    /// What access rules let the peer of a link do. The address of one that proved nothing is that at which the
+    /// handshake took place: any later one may be spoofed.
     pub(super) fn permissions(&self, number: u64, rules: &AccessRules) -> Option<Permissions> {
-        let address = self.connections.get(number)?.quic.remote_address();
+        let address = self.connections.get(number)?.began_at;
         Some(rules.permissions(self.summary(number)?.who.party(address)))
     }
 

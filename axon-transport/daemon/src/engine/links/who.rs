@@ -68,6 +68,15 @@ impl Who {
         }
     }
 
+    /// Why a peer that proved a pinned name is not that peer any more: its key is pinned under another one now.
+    pub(super) fn renamed(&self, auth: Option<&Auth>) -> Option<String> {
+        let (Self::Pinned(name, key), Some(Auth::Pinned { trust, .. })) = (self, auth) else {
+            return None;
+        };
+        let now = trust.name_of(key).filter(|now| now != name)?;
+        Some(format!("its key is pinned in AXON_CLASSIC_TRUST as {now} now, not as {name}"))
+    }
+
     /// The peer as access rules know it, at the address of its link.
     pub(crate) fn party(&self, address: SocketAddr) -> Party<'_> {
         match self {

@@ -28,6 +28,8 @@ use crate::{
 const LISTED: usize = 64;
 /// Uses that status shows at the endpoints that wait for them.
 const AT_ENDPOINTS: usize = 1024;
+/// Uses of a peer that are remembered and told.
+const MOST: usize = 1024;
 /// Bytes that count for a denied use besides its name and reason.
 const ENTRY: usize = 200;
 
@@ -90,8 +92,14 @@ impl PeerAccess {
         endpoints: impl Iterator<Item = &'a Endpoint>,
     ) -> Vec<Message> {
         let uses = endpoints.filter_map(|e| Some((verb_of(e.kind)?, e.topic.as_str())));
-        let uses: BTreeSet<_> = uses.collect();
-        let now: BTreeMap<Use, String> = uses
+        let mut first = BTreeSet::new();
+        for used in uses {
+            if first.len() == MOST {
+                break;
+            }
+            first.insert(used);
+        }
+        let now: BTreeMap<Use, String> = first
             .into_iter()
             .map(|(verb, name)| {
                 let reason = self.permissions.check(verb, name).to_string();
@@ -137,13 +145,13 @@ impl PeerAccess {
             self.there.extend(charge.map(|charge| (used, (reason, charge))));
         }
         let lifted = denied.lifted.into_iter().map(used);
-        lifted.inspect(|used| drop(self.there.remove(used))).collect()
+        lifted.filter(|used| self.there.remove(used).is_some()).collect()
     }
 
     /// Each denied use, by whom, and why.
     fn all(&self) -> impl Iterator<Item = (&Use, &'static str, &str)> {
-        let here = self.here.iter().map(|(used, why)| (used, "here", &**why));
-        here.chain(self.there.iter().map(|(used, (why, _))| (used, "by the peer", &**why)))
+        let there = self.there.iter().map(|(used, (why, _))| (used, "by the peer", &**why));
+        there.chain(self.here.iter().map(|(used, why)| (used, "here", &**why)))
     }
 
     /// Names the denied uses in the link's status.

@@ -320,7 +320,8 @@ impl Remote {
 
     /// Whether it has this endpoint, as was found in [`changes`](Self::changes).
     pub(crate) fn has(&self, gid: &Gid) -> bool {
-        self.all.contains_key(gid) && !self.changed.contains(gid)
+        let held = self.all.get(gid).is_some_and(|held| !held.denied);
+        held && !self.changed.contains(gid)
     }
 
     /// The endpoints that access rules permit.

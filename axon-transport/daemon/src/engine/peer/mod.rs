@@ -36,7 +36,7 @@ use self::{
     access::PeerAccess,
     asking::{Asked, Attaching},
     refused::RefusedRoutes,
-    serving::Served,
+    serving::{DENIED_AGAIN, Served},
 };
 use super::{
     inbound::Inbound,
@@ -346,7 +346,7 @@ impl Peer {
         let ended = self.served.iter().filter_map(|(route, s)| Some((*route, denied(s)?)));
         for (route, (key, why)) in ended.collect::<Vec<_>>() {
             self.unserve(route);
-            self.refuse(route, &key, why, None);
+            self.refuse(route, &key, why, Some(DENIED_AGAIN));
         }
     }
 

@@ -20,6 +20,8 @@ use crate::{
 const READY_TIMEOUT: Duration = Duration::from_secs(2);
 /// A peer that lacks relays may ask for them again after this time.
 const ASK_AGAIN: Duration = Duration::from_secs(10);
+/// A peer whose route access rules deny asks for it again after this time, if DENIED does not tell it when.
+pub(super) const DENIED_AGAIN: Duration = Duration::from_secs(30);
 /// Memory of a route, in bytes, beside the names and subscribers of which it holds three copies.
 const ROUTE: usize = 2048;
 const COPIES: usize = 3;
@@ -112,7 +114,7 @@ impl Peer {
         self.served_as.remove(&key);
         if let Some(why) = self.access.denial(reader_of(kind), &key.topic) {
             self.outbound.end_route(number);
-            self.refuse(number, &key, why, None);
+            self.refuse(number, &key, why, Some(DENIED_AGAIN));
             return Ok(());
         }
         if let Some(left) = with.stalls.borrow().left(&self.identity, &key, with.instant(now)) {

@@ -15,6 +15,9 @@ use crate::{
     link::Message,
 };
 
+/// Rules that deny nothing.
+const OPEN: &str = "default = \"allow\"";
+
 fn rules(text: &str) -> AccessRules {
     AccessRules::parse(text, "access.toml").unwrap()
 }
@@ -99,7 +102,7 @@ fn a_topic_does_not_cross_where_either_host_denies_it() {
 fn rules_that_change_end_a_flow_and_begin_it_again_without_a_gap_in_what_is_allowed() {
     let closed = "[[allow]]\npeer = \"*\"\npublish = \"/other\"\nsubscribe = \"/other\"";
     for host in [0, 1] {
-        let mut world = hosts(2, "");
+        let mut world = hosts(2, OPEN);
         let [log, other] = ["/log", "/other"].map(|topic| world.pair(0, 1, topic, Qos::keep_all()));
         world.until(secs(20), World::is_whole);
         world.run_for(secs(1));
@@ -111,7 +114,7 @@ fn rules_that_change_end_a_flow_and_begin_it_again_without_a_gap_in_what_is_allo
             assert!(arrives(&mut world, other));
             world.run_for(secs(2));
             assert!(denied(&world, 1 - host).contains("/log"), "{}", denied(&world, 1 - host));
-            world.hosts[host].set_access("");
+            world.hosts[host].set_access(OPEN);
             world.run_for(secs(3));
             assert!(arrives(&mut world, log), "open at {host}: {}", world.describe());
             assert!(arrives(&mut world, other));
@@ -126,14 +129,14 @@ fn rules_that_change_end_a_flow_and_begin_it_again_without_a_gap_in_what_is_allo
 
 #[test]
 fn rules_that_change_a_hundred_times_under_load_lose_nothing_of_what_they_allow() {
-    let mut world = hosts(2, "");
+    let mut world = hosts(2, OPEN);
     let pairs = [0, 1].map(|from| {
         ["/log", "/other"].map(|topic| world.pair(from, 1 - from, topic, Qos::keep_all()))
     });
     world.until(secs(20), World::is_whole);
     world.run_for(secs(1));
     for round in 0..100 {
-        let text = ["", "[[deny]]\npeer = \"*\"\npublish = \"/log\""][round % 2];
+        let text = [OPEN, "[[deny]]\npeer = \"*\"\npublish = \"/log\""][round % 2];
         world.hosts[round / 2 % 2].set_access(text);
         for [log, other] in pairs {
             world.publish(log, 1000);
@@ -141,7 +144,7 @@ fn rules_that_change_a_hundred_times_under_load_lose_nothing_of_what_they_allow(
         }
         world.run_for(millis(7));
     }
-    world.hosts.iter_mut().for_each(|host| host.set_access(""));
+    world.hosts.iter_mut().for_each(|host| host.set_access(OPEN));
     world.run_for(secs(5));
     for [log, other] in pairs {
         let came = world.received(other);
