@@ -94,8 +94,6 @@ pub(super) struct Flow {
     best_effort: BestEffort,
     /// When it last handed something to QUIC.
     active_at: Duration,
-    /// The rank under which the scheduler has it.
-    pub(super) scheduled: Option<Rank>,
     /// Whether QUIC said that it takes no more.
     pub(super) blocked: bool,
     /// Whether the peer did not take in its next sample when it had its last turn.
@@ -150,7 +148,6 @@ impl Flow {
             batch: Batch::default(),
             best_effort: BestEffort::default(),
             active_at: now,
-            scheduled: None,
             blocked: false,
             waits_for_credit: false,
             is_given_up: false,
@@ -246,7 +243,7 @@ impl Flow {
         self.queue.oldest()
     }
 
-    fn fill(&mut self, sources: &[Source], counters: &Counters, now: Duration) -> u32 {
+    pub(super) fn fill(&mut self, sources: &[Source], counters: &Counters, now: Duration) -> u32 {
         self.taking.fill(sources, &mut self.queue, &self.topic, counters, now)
     }
 
