@@ -156,7 +156,7 @@ impl Outbound {
 
     /// Samples of a publisher, or client, wait.
     fn take_in(&mut self, number: u32, of: Gid, now: Duration) {
-        let Some(id) = self.table.find_or_insert(number, of, &self.budget, now) else { return };
+        let Some(id) = self.table.find_or_insert(number, of, &self.budget) else { return };
         let Some((flow, served)) = self.table.get_mut(id) else { return };
         flow.handle_samples();
         flow.take_burst(&served.sources, &self.counters, now);
@@ -233,7 +233,7 @@ impl Outbound {
                 false => flow.write(&served.sources, carrier, &self.counters, &mut done, now),
             };
             flow.waits_for_credit = pause == Pause::NoCredit;
-            served.done(flow.of, done);
+            served.done(flow.info.of, done);
             let taken = carrier.taken - before;
             if carrier.loses && taken > 0 {
                 self.nudges.handle_sent(turn.flow, carrier.quic.rtt(), now);
@@ -307,7 +307,7 @@ impl Outbound {
         let mut done = Done::default();
         flow.handle_stopped(stream, quic, &self.counters, &mut done);
         flow.blocked = false;
-        served.done(flow.of, done);
+        served.done(flow.info.of, done);
         self.schedule(id);
     }
 
@@ -379,8 +379,8 @@ impl Outbound {
                 None => flow.timer = Some(now + NO_CARRIER),
             }
             // The publisher of an idle flow may be gone.
-            if flow.timer.is_none() && flow.is_idle() && !served.reads(&flow.of) {
-                let (number, of) = (flow.route_number, flow.of);
+            if flow.timer.is_none() && flow.is_idle() && !served.reads(&flow.info.of) {
+                let (number, of) = (flow.info.route_number, flow.info.of);
                 let gone = self.table.remove(number, &of);
                 self.forget(gone);
             }

@@ -160,5 +160,5 @@ pub(super) fn route(number: u32, priority: TopicPriority) -> FlowRoute {
 /// A flow without sources, of the publisher with this number, over route 1.
 pub(super) fn flow(publisher: u8) -> Flow {
     let (route, budget) = (route(1, TopicPriority::Normal), Budget::new(1 << 20).of_peer());
-    Flow::new(Gid([publisher; 16]), &route, &Qos::default(), &budget, Duration::ZERO)
+    Flow::new(Gid([publisher; 16]), &route, &Qos::default(), &budget)
 }

@@ -218,7 +218,7 @@ mod tests {
         assert!(flows.get(0).is_none() && flows.are_quiet());
         assert_eq!((flows.poll_timeout(), flows.ids()), (Some(at(20)), vec![1]));
         assert_eq!(flows.insert(flow(7)), 0);
-        assert_eq!(flows.get(0).unwrap().of, flow(7).of);
+        assert_eq!(flows.get(0).unwrap().info.of, flow(7).info.of);
         assert_eq!((flows.poll_timeout(), flows.are_quiet()), (Some(at(20)), true));
         assert_eq!(flows.insert(flow(8)), 2);
     }

@@ -3,7 +3,7 @@
 mod flows;
 mod routes;
 
-use std::{collections::HashMap, rc::Rc, sync::Arc, time::Duration};
+use std::{collections::HashMap, rc::Rc, sync::Arc};
 
 use axon_shm::{ids::Gid, qos::Qos};
 
@@ -36,7 +36,7 @@ impl FlowTable {
     /// A flow with its route.
     pub(super) fn get_mut(&mut self, id: FlowId) -> Option<(&mut Flow, &Served)> {
         let flow = self.flows.get_mut(id)?;
-        let served = self.routes.get(flow.route_number)?;
+        let served = self.routes.get(flow.info.route_number)?;
         Some((flow, served))
     }
 
@@ -51,14 +51,13 @@ impl FlowTable {
         number: u32,
         of: Gid,
         budget: &Rc<Budget>,
-        now: Duration,
     ) -> Option<FlowId> {
         let served = self.routes.get_mut(number)?;
         if let Some(id) = served.flows.get(&of) {
             return Some(*id);
         }
         let qos = served.source_of(&of).map_or_else(Qos::keep_all, Source::qos);
-        let mut flow = Flow::new(of, &served.shared, &qos, budget, now);
+        let mut flow = Flow::new(of, &served.shared, &qos, budget);
         flow.set_sources(&served.sources, served.seen.get(&of).copied());
         let id = self.flows.insert(flow);
         served.flows.insert(of, id);
@@ -139,13 +138,13 @@ impl FlowTable {
     /// The flows with samples that are not acknowledged.
     pub(super) fn busy(&self) -> impl Iterator<Item = BusyFlow> {
         self.flows.busy().filter_map(|(id, flow)| {
-            let served = self.routes.get(flow.route_number)?;
+            let served = self.routes.get(flow.info.route_number)?;
             Some(BusyFlow {
                 id,
-                route: flow.route_number,
+                route: flow.info.route_number,
                 is_stalled: served.stalled,
                 progress: flow.progress(),
-                is_held_back: served.holds(&flow.of),
+                is_held_back: served.holds(&flow.info.of),
                 uses_credit: flow.uses_credit(),
                 waits_for_others: flow.waits_for_others(),
                 is_quiet: flow.is_quiet(),
@@ -157,7 +156,7 @@ impl FlowTable {
     pub(super) fn count_overwritten(&mut self, counters: &Counters) {
         self.flows.for_each_busy(|flow| {
             if flow.rank().is_some()
-                && let Some(served) = self.routes.get(flow.route_number)
+                && let Some(served) = self.routes.get(flow.info.route_number)
             {
                 flow.count_overwritten(&served.sources, counters);
             }
@@ -208,6 +207,8 @@ impl FlowTable {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use axon_transport::config::TopicPriority;
 
     use super::*;
@@ -239,7 +240,7 @@ mod tests {
         }
 
         fn flow(&mut self, publisher: u8) -> FlowId {
-            self.table.find_or_insert(1, gid(publisher), &self.budget, NOW).unwrap()
+            self.table.find_or_insert(1, gid(publisher), &self.budget).unwrap()
         }
 
         /// The flow takes all samples from its ring, as a burst.
@@ -261,7 +262,7 @@ mod tests {
         let mut of = Fixture::new(Qos::default());
         assert_eq!((of.flow(11), of.flow(12), of.flow(11)), (0, 1, 0));
         assert_eq!((of.table.find(1, &gid(12)), of.table.find(1, &gid(13))), (Some(1), None));
-        assert_eq!(of.table.find_or_insert(2, gid(11), &of.budget, NOW), None, "no such route");
+        assert_eq!(of.table.find_or_insert(2, gid(11), &of.budget), None, "no such route");
         assert_eq!((of.table.remove(1, &gid(11)), of.table.remove(1, &gid(11))), (Some(0), None));
         assert_eq!((of.table.find(1, &gid(11)), of.flow(13)), (None, 0));
     }
