@@ -4,6 +4,7 @@ use std::{collections::HashMap, net::SocketAddr, time::Duration};
 
 use axon_transport::status::LinkStatus;
 use quinn_proto::{ConnectionHandle, StreamId};
+use rustls_pki_types::CertificateDer;
 
 use super::{
     control::Control,
@@ -11,6 +12,7 @@ use super::{
     outbound::{Class, FlowId, Priorities, Rank},
     protection::Seal,
 };
+use crate::owner::{Binding, EXPORTER};
 
 /// Bulk that QUIC holds at most. Below that it is the congestion window and a little more: as much as may be on the
 /// way, and what leaves before the next pass. All else waits in the flows, where a newer sample can replace it.
@@ -74,6 +76,20 @@ impl Connection {
             deadline: None,
             ecn_marks: 0,
         }
+    }
+
+    /// The certificates, or the raw public key, that the peer showed.
+    pub(super) fn peer_chain(&self) -> Vec<CertificateDer<'static>> {
+        let shown = self.quic.crypto_session().peer_identity();
+        shown.and_then(|shown| shown.downcast().ok()).map(|shown| *shown).unwrap_or_default()
+    }
+
+    /// Bytes that both ends of the connection share and no other connection has.
+    pub(super) fn binding(&self) -> Option<Binding> {
+        let mut binding = [0; 32];
+        let session = self.quic.crypto_session();
+        session.export_keying_material(&mut binding, EXPORTER, b"").ok()?;
+        Some(binding)
     }
 
     /// Adds what QUIC measures to the link's status.

@@ -1,10 +1,13 @@
 //! What the engine has its owner do, in order.
 
-use std::collections::VecDeque;
+use std::{collections::VecDeque, sync::Arc};
+
+use axon_shm::ids::DaemonId;
 
 use super::{
     counters::{self, Loss},
     links::LinkReport,
+    peer::StalledRoute,
     refusal::{Refusal, RefusedBy},
 };
 use crate::{
@@ -65,6 +68,41 @@ impl Effects {
         }
     }
 
+    /// The last link of a peer is over. Logs the samples that the peer did not acknowledge, by topic, and tells the
+    /// control plane what was `counted` as lost.
+    pub(super) fn tell_link_over(
+        &mut self,
+        daemon: DaemonId,
+        peer: &str,
+        unacknowledged: &[(Arc<str>, u64)],
+        counted: Vec<Loss>,
+    ) {
+        for (topic, samples) in unacknowledged {
+            tracing::warn!(topic = &**topic, peer = %daemon, samples,
+                "the link ended before the peer acknowledged them: samples may be lost");
+        }
+        self.tell_lost(peer, counted);
+    }
+
+    /// Logs, and tells the control plane, that a relay was kept for a peer that did not come back.
+    pub(super) fn tell_relay_given_up(&mut self, topic: String, samples: u64) {
+        tracing::warn!(
+            topic,
+            samples,
+            "a peer's daemon was restarted and did not ask for the topic again: samples are lost"
+        );
+        self.tell(ToControl::Lost { topic, cause: "link_ended", samples });
+    }
+
+    /// Logs, and tells the control plane, that a peer does not read a route that it asked for.
+    pub(super) fn tell_stalled(&mut self, peer: String, stalled: StalledRoute) {
+        let StalledRoute { topic, reason, samples } = stalled;
+        tracing::warn!(topic, samples, "samples are lost: a peer does not read the topic");
+        let what = format!("topic {topic}");
+        self.tell(ToControl::Refusal { peer, what, reason });
+        self.tell(ToControl::Lost { topic, cause: "stalled", samples });
+    }
+
     /// Passes on what the links report.
     pub(super) fn tell_report(&mut self, report: LinkReport) {
         match report {
@@ -95,5 +133,51 @@ impl Effects {
     /// The next effect.
     pub(super) fn poll(&mut self) -> Option<Effect> {
         self.waiting.pop_front()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What the control plane is told.
+    fn told(effects: &mut Effects) -> Vec<String> {
+        let effects = std::iter::from_fn(|| effects.poll());
+        let told = effects.map(|effect| match effect {
+            Effect::Tell(ToControl::Lost { topic, cause, samples }) => {
+                format!("{topic}: {samples} {cause}")
+            }
+            Effect::Tell(ToControl::Refusal { peer, what, reason }) => {
+                format!("{peer}, {what}: {reason}")
+            }
+            Effect::Tell(ToControl::Draining(draining)) => format!("draining: {draining}"),
+            other => panic!("{other:?}"),
+        });
+        told.collect()
+    }
+
+    #[test]
+    fn draining_is_told_when_it_changes() {
+        let mut effects = Effects::default();
+        [false, true, true, false].into_iter().for_each(|draining| effects.tell_draining(draining));
+        assert_eq!(told(&mut effects), ["draining: true", "draining: false"]);
+    }
+
+    #[test]
+    fn a_loss_is_told_once_however_it_came_about() {
+        let mut effects = Effects::default();
+        let unacknowledged = [("/t".into(), 2)];
+        let counted = vec![Loss { topic: "/t".into(), cause: "link_ended", samples: 2 }];
+        effects.tell_link_over(DaemonId([1; 16]), "peer", &unacknowledged, counted);
+        effects.tell_relay_given_up("/u".into(), 3);
+        assert_eq!(told(&mut effects), ["/t: 2 link_ended", "/u: 3 link_ended"]);
+    }
+
+    #[test]
+    fn a_route_that_stalls_is_a_refusal_and_a_loss() {
+        let mut effects = Effects::default();
+        let stalled = StalledRoute { topic: "/t".into(), reason: "why".into(), samples: 4 };
+        effects.tell_stalled("peer".into(), stalled);
+        assert_eq!(told(&mut effects), ["peer, topic /t: why", "/t: 4 stalled"]);
     }
 }

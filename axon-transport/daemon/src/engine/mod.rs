@@ -25,10 +25,12 @@ mod numbers;
 pub(crate) mod outbound;
 mod pace;
 pub(crate) mod peer;
+mod peer_factory;
 mod peers;
 pub(crate) mod protection;
 pub(crate) mod qlog;
 pub(crate) mod refusal;
+mod reports;
 pub(crate) mod rings;
 pub(crate) mod short_header;
 #[cfg(test)]
@@ -46,20 +48,20 @@ use std::{
 };
 
 use axon_shm::ids::DaemonId;
-use axon_transport::{access::AccessRules, config::Config, status::LinkStatus};
+use axon_transport::access::AccessRules;
 use bytes::BytesMut;
 use quinn_proto::{Dir, EcnCodepoint, StreamEvent, Transmit};
 
 pub(crate) use self::effects::Effect;
 use self::{
-    counters::Counters,
     effects::Effects,
-    inbound::Inbound,
     link::target::Target,
     links::{LinkEvent, LinkParts, Links},
-    outbound::{Outbound, OutboundEvent, ResponseNumbers, budget::Budget},
-    peer::{Local, Peer, PeerParts, ROUTES_UNSAID, graph::GraphTaken, owners::Prover},
+    outbound::OutboundEvent,
+    peer::{Local, Peer, graph::GraphTaken},
+    peer_factory::{FirstLink, PeerFactory},
     peers::Peers,
+    reports::Reports,
     rings::Rings,
 };
 use crate::{
@@ -70,8 +72,6 @@ use crate::{
     owner::SessionKeys,
 };
 
-/// Between two reports of the links' status.
-const REPORT: Duration = Duration::from_secs(1);
 /// Bytes of streams that one pass reads. The rest has the next pass, after timers and packets that came meanwhile.
 const READ: usize = 8 << 20;
 
@@ -91,21 +91,16 @@ pub(crate) struct EngineParts {
 
 /// The engine of one daemon.
 pub(crate) struct Engine {
-    config: Arc<Config>,
-    daemon: DaemonId,
     access: AccessRules,
     links: Links,
     peers: Peers,
-    session_keys: Arc<SessionKeys>,
+    factory: PeerFactory,
     session: [u8; 12],
-    budget: Rc<Budget>,
-    responses: ResponseNumbers,
     epoch: Instant,
-    epoch_nanos: u64,
     effects: Effects,
     /// A peer let go of endpoints that another one may have claimed.
     freed: bool,
-    next_report: Duration,
+    reports: Reports,
 }
 
 impl Engine {
@@ -117,20 +112,15 @@ impl Engine {
         let EngineParts { links, rings, session_keys, session, epoch_nanos } = parts;
         let (config, daemon, epoch) = (Arc::clone(&links.config), links.hello.daemon, links.epoch);
         Ok(Self {
-            budget: Budget::new(config.reliable_queue),
-            responses: ResponseNumbers::default(),
             peers: Peers::new(Arc::clone(&config), rings, epoch),
             access: config.access.clone(),
-            config,
-            daemon,
+            factory: PeerFactory::new(config, daemon, session_keys, epoch_nanos),
             links: Links::new(links)?,
-            session_keys,
             session,
             epoch,
-            epoch_nanos,
             effects: Effects::default(),
             freed: false,
-            next_report: REPORT,
+            reports: Reports::new(),
         })
     }
 
@@ -238,7 +228,7 @@ impl Engine {
                     closed.into_iter().for_each(|closed| peer.say(Message::LinkClosed(closed)));
                     peer.send_graph(with.local, true);
                 });
-                self.next_report = now;
+                self.reports.hurry(now);
                 // Streams that the peer opened before this host knew it: QUIC told of them once.
                 let opened = StreamEvent::Opened { dir: Dir::Uni };
                 self.handle_stream(number, daemon, opened, now);
@@ -290,7 +280,7 @@ impl Engine {
             tracing::info!(peer = %daemon, "the peer is back");
             peer.remote.tell_anew();
             peer.stirred = true;
-            self.next_report = now;
+            self.reports.hurry(now);
         }
     }
 
@@ -314,33 +304,17 @@ impl Engine {
         else {
             return;
         };
-        let identity = self.links.identity(number).unwrap_or_default();
-        let serves = summary.hello.routes.map_or(ROUTES_UNSAID, |routes| routes as usize);
-        let needed = self.links.credentials.authenticates();
-        let prover = Prover::new(&self.session_keys, self.daemon, needed, binding);
-        let counters = Rc::<Counters>::default();
-        let inbound = Inbound::new(
-            Rc::clone(&counters),
-            account.messages.clone(),
-            self.config.max_message,
-            self.epoch_nanos,
-        );
-        let stalled = self.config.link.stalled;
-        let (budget, responses) = (self.budget.of_peer(), self.responses.clone());
-        let outbound = Outbound::new(budget, Rc::clone(&counters), responses, stalled, now);
-        let parts = PeerParts {
+        let link = FirstLink {
+            number,
             daemon,
-            link: number,
-            identity,
+            identity: self.links.identity(number).unwrap_or_default(),
             account,
-            prover,
             permissions,
-            counters,
-            inbound,
-            outbound,
-            serves,
+            binding,
+            routes: summary.hello.routes,
+            needs_proofs: self.links.credentials.authenticates(),
         };
-        self.peers.insert(daemon, Peer::new(parts));
+        self.peers.insert(daemon, self.factory.make(link, now));
     }
 
     fn handle_message(&mut self, number: u64, daemon: DaemonId, message: Message, now: Duration) {
@@ -428,11 +402,7 @@ impl Engine {
                 };
                 let Some(peer) = self.peers.get(daemon) else { return };
                 peer.counters.dropped("stalled", stalled.samples);
-                let (topic, samples) = (stalled.topic, stalled.samples);
-                tracing::warn!(topic, samples, "samples are lost: a peer does not read the topic");
-                let (peer, what) = (self.links.peer_text(peer.link), format!("topic {topic}"));
-                self.effects.tell(ToControl::Refusal { peer, what, reason: stalled.reason });
-                self.effects.tell(ToControl::Lost { topic, cause: "stalled", samples });
+                self.effects.tell_stalled(self.links.peer_text(peer.link), stalled);
             }
         }
     }
@@ -450,49 +420,9 @@ impl Engine {
         }
     }
 
-    /// Names the peers that have more long messages in flight than they may: their links may stand still.
-    fn report_excess(&mut self) {
-        for peer in self.peers.values_mut() {
-            let Some(most) = self.links.window_credit(peer.link) else { continue };
-            let Some(bytes) = peer.inbound.find_excess(peer.link, most) else { continue };
-            let text = self.links.peer_text(peer.link);
-            let reason = format!(
-                "it has {bytes} bytes of long messages in flight that wait for memory, {most} are allowed: its link may \
-                 stand still until it gives them up"
-            );
-            tracing::warn!(peer = text, reason, "a peer sends too many long messages at a time");
-            let what = "long messages".to_owned();
-            self.effects.tell(ToControl::Refusal { peer: text, what, reason });
-        }
-    }
-
-    /// Reports losses and the status of each link.
-    fn report(&mut self, now: Duration) {
-        self.report_excess();
-        let mut reports = Vec::new();
-        for (_, peer) in self.peers.iter() {
-            let text = self.links.peer_text(peer.link);
-            let status = if peer.silent { None } else { self.link_status(peer, now) };
-            let status = status.map(|status| (Box::new(status), peer.refused_routes()));
-            reports.push((text, peer.counters.take_lost(), status));
-        }
-        for (peer, losses, status) in reports {
-            self.effects.tell_lost(&peer, losses);
-            if let Some((status, refused)) = status {
-                self.effects.tell(ToControl::Link(status, refused));
-            }
-        }
-    }
-
-    fn link_status(&self, peer: &Peer, now: Duration) -> Option<LinkStatus> {
-        let mut status = self.links.status(peer.link)?;
-        peer.fill(&mut status, now);
-        Some(status)
-    }
-
     /// When [`handle_timeout`](Self::handle_timeout) is due.
     pub(crate) fn poll_timeout(&self, now: Duration) -> Option<Duration> {
-        let report = (!self.peers.is_empty()).then_some(self.next_report);
+        let report = (!self.peers.is_empty()).then(|| self.reports.poll_timeout());
         // What the last packets of a pass brought about.
         let work = self.links.has_work().then_some(now);
         let parts = [self.links.poll_timeout(), self.peers.poll_timeout(now), report, work];
@@ -513,11 +443,10 @@ impl Engine {
             peer.outbound.handle_timeout(carrier.as_mut(), heard, now);
             self.links.touch(peer.link);
         }
-        if now >= self.next_report {
-            self.next_report = now + REPORT;
+        if self.reports.take_due(now) {
             self.resync();
             self.peers.values_mut().for_each(|peer| peer.outbound.count_overwritten());
-            self.report(now);
+            reports::report(&mut self.peers, &self.links, &mut self.effects, now);
         }
     }
 
@@ -538,7 +467,7 @@ impl Engine {
 
     /// Samples that wait for peers, in bytes, and how many bytes have left the queues since the start.
     pub(crate) fn backlog(&self) -> (usize, usize) {
-        (self.budget.taken(), self.budget.released())
+        self.factory.backlog()
     }
 
     /// The keys for status, with counters of the KME and the ledger.
@@ -566,22 +495,15 @@ impl Engine {
 
     /// Counts and logs the samples that the last link of a peer did not carry.
     fn count_lost(&mut self, daemon: DaemonId, text: &str, peer: &mut Peer) {
-        for (topic, samples) in peer.outbound.link_over() {
-            tracing::warn!(topic = &*topic, peer = %daemon, samples,
-                "the link ended before the peer acknowledged them: samples may be lost");
-        }
-        self.effects.tell_lost(text, peer.counters.take_lost());
+        let unacknowledged = peer.outbound.link_over();
+        let counted = peer.counters.take_lost();
+        self.effects.tell_link_over(daemon, text, &unacknowledged, counted);
     }
 
     /// Counts and logs what kept relays hold whose peers did not come back by this time.
     fn give_up_relays(&mut self, now: Duration) {
         for (topic, samples) in self.peers.give_up_relays(now) {
-            tracing::warn!(
-                topic,
-                samples,
-                "a peer's daemon was restarted and did not ask for the topic again: samples are lost"
-            );
-            self.effects.tell(ToControl::Lost { topic, cause: "link_ended", samples });
+            self.effects.tell_relay_given_up(topic, samples);
         }
     }
 

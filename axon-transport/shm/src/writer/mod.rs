@@ -1,6 +1,7 @@
 //! The publishing end of a ring.
 
 pub(crate) mod absent;
+mod attached;
 mod commit;
 mod delivery;
 mod header;

@@ -12,13 +12,13 @@ use crate::{
         window::{BURST, depth, holds, keeps_all, wanted},
     },
     session::{
-        lane::{self, LaneId, LaneState, LaneView},
+        lane::LaneView,
         peer::{Peer, PeerSession},
         pin_lanes::{PinLanes, Pinned, PinningReader},
         reader_info::ReaderInfo,
     },
     wake::Purpose,
-    writer::absent::Absences,
+    writer::{absent::Absences, attached::Attached},
 };
 
 /// The readers of one ring.
@@ -43,23 +43,6 @@ pub(crate) struct ReaderSet {
     given_up: u64,
 }
 
-struct Attached {
-    info: ReaderInfo,
-    lane: LaneView,
-    tenancy: LaneId,
-    grant: Grant,
-    /// Carries samples to another process.
-    carries: bool,
-    dead: bool,
-    /// Of a relay: the furthest position that it was seen to be done with, and how many samples it said
-    /// that it gave up.
-    done: u64,
-    given_up: u64,
-    /// How many its session said so far that it gave up, and how many its lane says.
-    told: u64,
-    shown: u64,
-}
-
 /// Positions from which on samples are wanted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Floors {
@@ -68,73 +51,6 @@ pub(crate) struct Floors {
     /// Never given up: a RELIABLE, KEEP_ALL publisher's for its like in other sessions, and what is
     /// within the depth of those that read requests or responses there.
     pub(crate) held: u64,
-}
-
-impl Attached {
-    /// The next position that the reader takes, as it says; `None` when it has left.
-    fn position(&self) -> Option<u64> {
-        let lane = self.lane.words();
-        match self.tenancy.standing(lane) {
-            // It may have left between the two looks, and then it holds nothing.
-            LaneState::Open => self.tenancy.cursor(lane),
-            LaneState::Asked => Some(self.grant.first),
-            LaneState::Left => None,
-        }
-    }
-
-    /// The same within what it may say, and up to `head`: which may be one of before it was attached.
-    fn cursor(&self, head: u64) -> Option<u64> {
-        self.position().map(|cursor| cursor.max(self.grant.first).min(head))
-    }
-
-    /// Whether it takes samples elsewhere: to another host, or to or from a process that shares no memory.
-    fn is_carrier(&self) -> bool {
-        self.carries || self.info.is_relay()
-    }
-
-    /// Of a carrier: below this it is done. One that read for itself and has left wants nothing; what a
-    /// relay leaves is given up by the daemon's word only.
-    fn delivered(&mut self, head: u64) -> Option<u64> {
-        match &self.info.stands_for {
-            Some(_) => Some(self.done_with(head)),
-            None => self.cursor(head),
-        }
-    }
-
-    /// Of a relay: up to where it is done. One that has left is where it was seen last, until the daemon
-    /// says that it ended, or what it gave up.
-    fn done_with(&mut self, head: u64) -> u64 {
-        let position = self.position().filter(|position| *position < u64::MAX);
-        // In this order. What was seen of the cursor counts with what was given up below it.
-        if let (Some(position), true) = (position, self.look_for_given_up()) {
-            self.done = self.done.max(position);
-        }
-        self.done.min(head)
-    }
-
-    /// Notes what its lane says that it gave up; whether the lane still says that of this reader.
-    fn look_for_given_up(&mut self) -> bool {
-        let shown = self.tenancy.given_up(self.lane.words());
-        self.shown = self.shown.max(shown.unwrap_or_default());
-        shown.is_some()
-    }
-
-    /// How many samples it gave up that were not counted, by its lane and by what its session said: both
-    /// say the same, one of them later. Never more than were published since it came.
-    fn newly_given_up(&mut self, head: u64) -> u64 {
-        self.look_for_given_up();
-        let said = self.shown.max(self.told);
-        let since = head.saturating_sub(self.grant.first);
-        let new = said.min(since).saturating_sub(self.given_up);
-        self.given_up += new;
-        new
-    }
-
-    /// The oldest position that it wants: KEEP_LAST passes over what is beyond its depth.
-    fn floor(&self, head: u64) -> Option<u64> {
-        let within = head.saturating_sub(depth(&self.info.qos));
-        self.cursor(head).map(|cursor| cursor.max(within))
-    }
 }
 
 impl ReaderSet {
@@ -263,18 +179,7 @@ impl ReaderSet {
         self.detach(info.gid, head);
         self.joined(&info);
         self.absent.end(&info.gid, &stands_for);
-        self.readers.push(Attached {
-            info,
-            lane,
-            tenancy,
-            grant,
-            carries,
-            dead: false,
-            done: first,
-            given_up: 0,
-            told: 0,
-            shown: 0,
-        });
+        self.readers.push(Attached::new(info, lane, tenancy, grant, carries));
         Ok(grant)
     }
 
@@ -286,10 +191,7 @@ impl ReaderSet {
     /// Whether all readers have got one of the publisher's segments of this number or a later one:
     /// most likely that one, too.
     pub(crate) fn has_mapped(&self, number: u32) -> bool {
-        self.readers.iter().filter(|reader| !reader.dead).all(|reader| {
-            reader.info.peer.remote().is_none()
-                || lane::mapped(reader.lane.words()) >= u64::from(number)
-        })
+        self.readers.iter().filter(|reader| !reader.dead).all(|reader| reader.has_mapped(number))
     }
 
     /// The lanes of those that may be reading still.
@@ -353,8 +255,7 @@ impl ReaderSet {
                 let stood_for = reader.info.stands_for.clone().unwrap_or_default();
                 self.absent.add(reader.info.gid, stood_for, position);
             } else {
-                let left = head.saturating_sub(position).saturating_sub(reader.given_up);
-                self.given_up = self.given_up.saturating_add(left);
+                self.given_up = self.given_up.saturating_add(reader.left_above(position, head));
             }
         }
     }
@@ -364,9 +265,7 @@ impl ReaderSet {
     pub(crate) fn give_up(&mut self, reader: Gid, samples: u64, head: u64) {
         let known = self.readers.iter_mut().find(|known| known.info.gid == reader);
         if let Some(known) = known.filter(|known| !known.dead) {
-            let since = head.saturating_sub(known.grant.first);
-            known.told = known.told.saturating_add(samples).min(since);
-            self.given_up = self.given_up.saturating_add(known.newly_given_up(head));
+            self.given_up = self.given_up.saturating_add(known.give_up(samples, head));
         }
     }
 
@@ -483,12 +382,7 @@ impl ReaderSet {
 
     /// Whether a KEEP_ALL reader of another session has not taken up its grant, though there are samples for it.
     pub(crate) fn expects_readers(&self, head: u64) -> bool {
-        self.readers.iter().any(|reader| {
-            reader.info.peer.remote().is_some_and(|peer| !peer.is_dead())
-                && holds(&reader.info.qos)
-                && reader.grant.first < head
-                && reader.tenancy.standing(reader.lane.words()) == LaneState::Asked
-        })
+        self.readers.iter().any(|reader| reader.is_expected(head))
     }
 
     /// There is one reader more. A publisher of hundreds gets them one by one, so that what stands is

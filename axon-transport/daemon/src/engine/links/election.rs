@@ -9,7 +9,7 @@ use std::{
 use quinn_proto::{Dir, StreamEvent, VarInt};
 
 use super::{
-    LinkEvent, LinkReport, Links, chain,
+    LinkEvent, LinkReport, Links,
     link::{
         LinkPeer, Phase,
         age::{Age, Due},
@@ -50,7 +50,7 @@ impl Links {
         let (side, address) = (link.side, connection.quic.remote_address());
         let replaces = if side == Side::Server { hello.replaces } else { link.replaces };
         let (daemon, ours) = (hello.daemon, self.hello.daemon);
-        let chain = chain(&connection.quic);
+        let chain = connection.peer_chain();
         if let Some(why) = self.credentials.distrust(&negotiated, side, Some(&chain)) {
             return self.turn_away(number, &hello, why, now);
         }

@@ -13,8 +13,9 @@ use crate::{
 impl Links {
     /// Ends the links whose connection was lost. Returns whether there were any.
     pub(in crate::engine) fn end_lost(&mut self, now: Duration) -> bool {
-        let any = !self.lost.is_empty();
-        while let Some((number, reason)) = self.lost.pop_front() {
+        let mut any = false;
+        while let Some((number, reason)) = self.unfinished.poll_lost() {
+            any = true;
             self.handle_lost(number, &reason, now);
             self.connections.touch(number);
         }

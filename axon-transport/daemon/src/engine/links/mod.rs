@@ -17,10 +17,11 @@ mod link;
 mod opening;
 mod silence;
 mod table;
+mod unfinished;
 mod who;
 
 use std::{
-    collections::{BTreeSet, HashMap, VecDeque},
+    collections::{BTreeSet, HashMap},
     net::{IpAddr, SocketAddr},
     rc::Rc,
     sync::Arc,
@@ -34,9 +35,7 @@ use axon_transport::{
     status::LinkStatus,
 };
 use bytes::BytesMut;
-use quinn_proto::{
-    ConnectionError, Dir, EcnCodepoint, Event, StreamEvent, Transmit, TransportConfig,
-};
+use quinn_proto::{Dir, EcnCodepoint, Event, StreamEvent, Transmit, TransportConfig};
 
 pub(super) use self::events::{LinkEvent, LinkReport};
 use self::{
@@ -46,8 +45,9 @@ use self::{
     events::Outbox,
     inbox::DiscoveryInbox,
     link::{Link, Phase, Summary},
-    silence::{Nonce, frames_came},
+    silence::{Looks, Nonce, frames_came},
     table::Table,
+    unfinished::Unfinished,
 };
 use super::{
     connection::Connection, control::ControlError, credentials::Credentials, endpoints::Endpoints,
@@ -63,7 +63,7 @@ use crate::{
     },
     error::GatewayError,
     link::{CloseCode, FrameError, Hello, Message, Side},
-    owner::{Binding, EXPORTER},
+    owner::Binding,
 };
 
 /// All links.
@@ -82,17 +82,12 @@ pub(super) struct Links {
     next_election: u64,
     /// Whether the daemon ends: no link begins any more.
     closing: bool,
-    /// Links whose connection was lost, and that are not read to the end.
-    lost: VecDeque<(u64, ConnectionError)>,
-    /// Connections whose control stream has more, once the events that came are handled.
-    later: Vec<u64>,
+    unfinished: Unfinished,
     /// The silent links that are probed, by the nonces of the probes.
     nonces: HashMap<Nonce, u64>,
     inbox: DiscoveryInbox,
     outbox: Outbox,
-    /// When links are looked at for silence and trust.
-    next_second: Duration,
-    seconds: u32,
+    looks: Looks,
 }
 
 /// The parts of [`Links`] that the daemon, or a simulation, makes.
@@ -138,13 +133,11 @@ impl Links {
             admission: Admission::new(),
             next_election: 1,
             closing: false,
-            lost: VecDeque::new(),
-            later: Vec::new(),
+            unfinished: Unfinished::default(),
             nonces: HashMap::new(),
             inbox: DiscoveryInbox::new(),
             outbox: Outbox::default(),
-            next_second: Duration::from_secs(1),
-            seconds: 0,
+            looks: Looks::new(),
         })
     }
 
@@ -214,7 +207,7 @@ impl Links {
 
     /// Looks at the connections with something to do. Their events follow.
     pub(super) fn settle(&mut self, now: Duration) {
-        for number in std::mem::take(&mut self.later) {
+        for number in self.unfinished.take_unread() {
             self.connections.touch(number);
         }
         self.go_on_dialling(now);
@@ -236,7 +229,9 @@ impl Links {
                 Some(Event::ConnectionLost { reason }) => {
                     self.read_control(number, now);
                     match self.table.get(number) {
-                        Some(Link { peer: Some(_), .. }) => self.lost.push_back((number, reason)),
+                        Some(Link { peer: Some(_), .. }) => {
+                            self.unfinished.add_lost(number, reason)
+                        }
                         _ => self.handle_lost(number, &reason, now),
                     }
                 }
@@ -247,8 +242,7 @@ impl Links {
         }
         self.read_control(number, now);
         self.note_heard(number, now);
-        let stays = self.lost.iter().any(|(lost, _)| *lost == number);
-        self.connections.note(number, stays);
+        self.connections.note(number, self.unfinished.is_lost(number));
     }
 
     fn handle_stream(&mut self, number: u64, event: StreamEvent) {
@@ -306,7 +300,7 @@ impl Links {
             }
             // A message is handled before the next is decoded, so that a peer fills no queue here.
             if self.outbox.has_events() {
-                return self.later.push(number);
+                return self.unfinished.add_unread(number);
             }
         }
     }
@@ -440,10 +434,7 @@ impl Links {
 
     /// Bytes that both ends of a connection share and no other connection has.
     pub(super) fn binding(&self, number: u64) -> Option<Binding> {
-        let mut binding = [0; 32];
-        let session = self.connections.get(number)?.quic.crypto_session();
-        session.export_keying_material(&mut binding, EXPORTER, b"").ok()?;
-        Some(binding)
+        self.connections.get(number)?.binding()
     }
 
     /// The link in use of a peer.
@@ -454,13 +445,13 @@ impl Links {
     /// When [`handle_timeout`](Self::handle_timeout) is due.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         let keys = self.keyring.as_ref().map(Keyring::poll_timeout);
-        let second = (!self.table.is_empty()).then_some(self.next_second);
+        let look = (!self.table.is_empty()).then(|| self.looks.poll_timeout());
         let parts = [
             self.connections.poll_timeout(),
             self.table.poll_timeout(),
             self.dials.poll_timeout(),
             keys,
-            second,
+            look,
             self.inbox.poll_timeout(),
         ];
         parts.into_iter().flatten().min()
@@ -476,10 +467,8 @@ impl Links {
         }
         self.dials.handle_timeout(now);
         self.table.due(now).into_iter().for_each(|number| self.link_timeout(number, now));
-        if now >= self.next_second {
-            self.next_second = now + Duration::from_secs(1);
-            self.seconds = self.seconds.wrapping_add(1);
-            self.close_untrusted(self.seconds.is_multiple_of(60), now);
+        if let Some(look) = self.looks.take_due(now) {
+            self.close_untrusted(look.at_certificates, now);
             self.look_for_silence(now);
             self.widen_all(now);
         }
@@ -514,7 +503,7 @@ impl Links {
 
     /// Whether [`settle`](Self::settle) has something to do.
     pub(super) fn has_work(&self) -> bool {
-        self.connections.has_work() || !self.later.is_empty() || self.outbox.has_events()
+        self.connections.has_work() || self.unfinished.has_unread() || self.outbox.has_events()
     }
 
     /// The next packets. `buffer` is cleared and filled.
@@ -526,10 +515,4 @@ impl Links {
     ) -> Option<(usize, Transmit)> {
         self.connections.poll_transmit(max_datagrams, buffer, self.instant(now))
     }
-}
-
-/// The certificates, or the raw public key, that the peer of a connection showed.
-fn chain(quic: &quinn_proto::Connection) -> Vec<rustls_pki_types::CertificateDer<'static>> {
-    let shown = quic.crypto_session().peer_identity().and_then(|shown| shown.downcast().ok());
-    shown.map(|shown| *shown).unwrap_or_default()
 }

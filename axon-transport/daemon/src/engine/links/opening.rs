@@ -6,7 +6,7 @@ use axon_tls::quic::from_handshake_data;
 use quinn_proto::{Dir, Incoming};
 
 use super::{
-    LinkReport, Links, chain,
+    LinkReport, Links,
     dials::Dial,
     explained::explained,
     link::{Link, Phase},
@@ -125,7 +125,7 @@ impl Links {
             remote: connection.quic.remote_address(),
             negotiated: session.handshake_data().and_then(from_handshake_data),
             exporters: exporters.ok(),
-            chain: chain(&connection.quic),
+            chain: connection.peer_chain(),
             dialled,
         };
         if link.side == Side::Client

@@ -63,7 +63,7 @@ impl Budget {
     }
 
     /// Takes these bytes even if they are not free: one sample may always wait.
-    pub(super) fn overtake(&self, bytes: usize) {
+    pub(in crate::engine) fn overtake(&self, bytes: usize) {
         self.taken.set(self.taken.get() + bytes);
         if let Some(parent) = &self.parent {
             parent.overtake(bytes);
@@ -71,7 +71,7 @@ impl Budget {
     }
 
     /// Gives bytes back.
-    pub(super) fn release(&self, bytes: usize) {
+    pub(in crate::engine) fn release(&self, bytes: usize) {
         self.taken.set(self.taken.get() - bytes);
         self.released.set(self.released.get().wrapping_add(bytes));
         if let Some(parent) = &self.parent {

@@ -1,7 +1,7 @@
 //! Which flow sends next. Plain data: it knows flows by number, and no QUIC types.
 //!
 //! A higher rank goes first: the priority of the topic, and within a priority the class. Within a rank flows take turns.
-//! What keeps a rank from starving is [`lending`](super::lending).
+//! What keeps a rank from starving is [`turns`](super::turns).
 
 use std::collections::VecDeque;
 
@@ -91,33 +91,59 @@ impl Priorities {
     }
 }
 
-/// The flows that have something to send.
+/// The flows that have something to send. Each is in the queue of one rank, under which it was added.
 #[derive(Debug, Default)]
 pub(super) struct Schedule {
     ranks: [VecDeque<FlowId>; RANKS],
+    /// The rank of each flow, by its number.
+    rank_of: Vec<Option<Rank>>,
 }
 
 impl Schedule {
-    /// Adds a flow behind the others of its rank. The caller adds no flow twice.
+    /// Whether it has a flow.
+    pub(super) fn contains(&self, flow: FlowId) -> bool {
+        self.rank_of.get(flow).is_some_and(Option::is_some)
+    }
+
+    /// Adds a flow behind the others of its rank. One that it has keeps its place.
     pub(super) fn push(&mut self, flow: FlowId, rank: Rank) {
-        self.ranks[rank.place()].push_back(flow);
+        if self.note(flow, rank) {
+            self.ranks[rank.place()].push_back(flow);
+        }
     }
 
-    /// Adds a flow before the others of its rank.
+    /// Adds a flow before the others of its rank. One that it has keeps its place.
     pub(super) fn push_first(&mut self, flow: FlowId, rank: Rank) {
-        self.ranks[rank.place()].push_front(flow);
+        if self.note(flow, rank) {
+            self.ranks[rank.place()].push_front(flow);
+        }
     }
 
-    /// The next flow. Ranks that `borrows` says, by their place, go before all others.
-    pub(super) fn pop(&mut self, borrows: impl Fn(usize) -> bool) -> Option<FlowId> {
+    fn note(&mut self, flow: FlowId, rank: Rank) -> bool {
+        if flow >= self.rank_of.len() {
+            self.rank_of.resize(flow + 1, None);
+        }
+        let is_new = self.rank_of[flow].is_none();
+        if is_new {
+            self.rank_of[flow] = Some(rank);
+        }
+        is_new
+    }
+
+    /// The next flow, with the rank under which it was added. Ranks that `borrows` says, by their place, go before all
+    /// others.
+    pub(super) fn pop(&mut self, borrows: impl Fn(usize) -> bool) -> Option<(FlowId, Rank)> {
         let borrowers = self.ranks.iter_mut().enumerate().filter(|(at, _)| borrows(*at));
         let borrower = borrowers.map(|(_, rank)| rank).find_map(VecDeque::pop_front);
-        borrower.or_else(|| self.ranks.iter_mut().find_map(VecDeque::pop_front))
+        let flow = borrower.or_else(|| self.ranks.iter_mut().find_map(VecDeque::pop_front))?;
+        Some((flow, self.rank_of[flow].take()?))
     }
 
     /// Removes a flow that is gone.
     pub(super) fn remove(&mut self, flow: FlowId) {
-        self.ranks.iter_mut().for_each(|rank| rank.retain(|other| *other != flow));
+        if let Some(rank) = self.rank_of.get_mut(flow).and_then(Option::take) {
+            self.ranks[rank.place()].retain(|other| *other != flow);
+        }
     }
 
     /// Whether no flow has anything to send.
@@ -134,6 +160,10 @@ mod tests {
         Rank { priority: TopicPriority::Normal, class }
     }
 
+    fn next(schedule: &mut Schedule) -> Option<FlowId> {
+        schedule.pop(|_| false).map(|(flow, _)| flow)
+    }
+
     #[test]
     fn a_higher_rank_goes_first_and_flows_of_a_rank_take_turns() {
         let mut schedule = Schedule::default();
@@ -145,7 +175,7 @@ mod tests {
         schedule.push(5, normal(Class::Service));
         schedule.push(6, of(TopicPriority::Low, Class::Service));
         schedule.push(7, of(TopicPriority::High, Class::Bulk));
-        let order: Vec<_> = std::iter::from_fn(|| schedule.pop(|_| false)).collect();
+        let order: Vec<_> = std::iter::from_fn(|| next(&mut schedule)).collect();
         assert_eq!(order, [7, 5, 3, 4, 2, 1, 6]);
         assert!(schedule.is_empty());
     }
@@ -156,8 +186,8 @@ mod tests {
         schedule.push(1, normal(Class::SmallReliable));
         schedule.push(2, normal(Class::Bulk));
         let bulk = normal(Class::Bulk).place();
-        assert_eq!(schedule.pop(|at| at == bulk), Some(2));
-        assert_eq!(schedule.pop(|at| at == bulk), Some(1));
+        assert_eq!(schedule.pop(|at| at == bulk), Some((2, normal(Class::Bulk))));
+        assert_eq!(schedule.pop(|at| at == bulk), Some((1, normal(Class::SmallReliable))));
     }
 
     #[test]
@@ -166,8 +196,23 @@ mod tests {
         schedule.push(1, normal(Class::Bulk));
         schedule.push(2, normal(Class::Bulk));
         schedule.remove(1);
-        assert_eq!(schedule.pop(|_| false), Some(2));
-        assert_eq!(schedule.pop(|_| false), None);
+        schedule.remove(3);
+        assert_eq!((next(&mut schedule), next(&mut schedule)), (Some(2), None));
+    }
+
+    #[test]
+    fn a_flow_has_one_place_until_its_turn() {
+        let mut schedule = Schedule::default();
+        schedule.push(1, normal(Class::Bulk));
+        schedule.push(2, normal(Class::Bulk));
+        schedule.push(2, normal(Class::Service));
+        schedule.push_first(2, normal(Class::Service));
+        assert!(schedule.contains(2) && !schedule.contains(3));
+        assert_eq!((next(&mut schedule), next(&mut schedule)), (Some(1), Some(2)));
+        assert!(!schedule.contains(2) && schedule.is_empty());
+        schedule.push(1, normal(Class::Bulk));
+        schedule.push_first(2, normal(Class::Bulk));
+        assert_eq!(next(&mut schedule), Some(2), "its turn is over");
     }
 
     #[test]

@@ -1,9 +1,12 @@
 //! A route that the peer asked for, and what its sources are told.
 
-use std::{cell::Cell, collections::HashMap, rc::Rc, sync::Arc};
+use std::{cell::Cell, collections::HashMap, rc::Rc, sync::Arc, time::Duration};
 
 use axon_envelope::{Kind, Route};
-use axon_shm::ids::Gid;
+use axon_shm::{
+    ids::Gid,
+    qos::{History, Reliability},
+};
 use axon_transport::config::TopicPriority;
 
 use super::{
@@ -66,9 +69,51 @@ pub(super) struct Served {
 }
 
 impl Served {
+    /// A route without sources.
+    pub(super) fn new(shared: FlowRoute) -> Self {
+        Self {
+            shared,
+            stalled: false,
+            sources: Vec::new(),
+            seen: HashMap::new(),
+            flows: HashMap::new(),
+        }
+    }
+
     /// Whether it is of a service.
     pub(super) fn is_service(&self) -> bool {
         self.shared.route.kind != Kind::Topic
+    }
+
+    /// The first source that reads this publisher or client.
+    pub(super) fn source_of(&self, of: &Gid) -> Option<&Source> {
+        self.sources.iter().find(|source| source.reads(of))
+    }
+
+    /// Whether a source reads this publisher or client.
+    pub(super) fn reads(&self, of: &Gid) -> bool {
+        self.source_of(of).is_some()
+    }
+
+    /// Whether samples of this publisher count until they are acknowledged.
+    pub(super) fn is_reliable(&self, of: &Gid) -> bool {
+        self.source_of(of).is_some_and(|s| s.qos().reliability == Reliability::Reliable)
+    }
+
+    /// Whether a KEEP_ALL relay holds a publisher back.
+    pub(super) fn holds(&self, of: &Gid) -> bool {
+        let keeping = |source: &Source| source.qos().history == History::KeepAll;
+        self.sources.iter().any(|source| keeping(source) && source.has_unacknowledged(of))
+    }
+
+    /// The publishers, or clients, that have samples to take, each once.
+    pub(super) fn with_data(&self) -> Vec<Gid> {
+        let mut waiting: Vec<Gid> = self.sources.iter().flat_map(Source::with_data).collect();
+        if self.sources.len() > 1 {
+            waiting.sort_unstable();
+            waiting.dedup();
+        }
+        waiting
     }
 
     /// Tells the sources up to which number they may forget the samples of a publisher.
@@ -91,6 +136,15 @@ impl Served {
             *known = samples.max(*known);
         }
         most
+    }
+
+    /// Gives up all samples of a publisher that ended.
+    pub(super) fn give_up_ended(&self, of: &Gid) {
+        for source in self.sources.iter().filter(|source| source.reads(of)) {
+            // Nothing more is sent of it.
+            while source.take_of(of, Duration::ZERO).is_some() {}
+            source.acknowledge_of(of, u64::MAX);
+        }
     }
 
     /// Tells the publishers which samples will not reach the peer. Returns how many.

@@ -3,9 +3,7 @@
 
 use std::{collections::HashMap, time::Duration};
 
-use axon_shm::{ids::Gid, qos::History};
-
-use super::{FlowId, Outbound, OutboundEvent, Served, Source};
+use super::schedule::FlowId;
 
 /// Between two looks.
 const LOOK: Duration = Duration::from_secs(1);
@@ -31,6 +29,44 @@ struct Progress {
     since: Duration,
 }
 
+/// What the peer did so far.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct PeerActivity {
+    /// Frames that came over the link.
+    pub(super) heard: u64,
+    /// How often credit came back.
+    pub(super) returned: u64,
+    /// Whether a flow waits for credit.
+    pub(super) is_awaited: bool,
+}
+
+/// A flow with samples that are not acknowledged.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct BusyFlow {
+    pub(super) id: FlowId,
+    pub(super) route: u32,
+    /// Whether its route is known to be stalled.
+    pub(super) is_stalled: bool,
+    pub(super) progress: (u64, u64),
+    /// Whether a KEEP_ALL relay holds its publisher back.
+    pub(super) is_held_back: bool,
+    /// Whether it uses credit for which others may have to wait.
+    pub(super) uses_credit: bool,
+    /// Whether it waits for others: none of its samples is in flight.
+    pub(super) waits_for_others: bool,
+    /// Whether nothing of it waits, or is not acknowledged.
+    pub(super) is_quiet: bool,
+}
+
+/// What a look found.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub(super) struct Found {
+    /// Routes that made no progress for the limit.
+    pub(super) stalled: Vec<u32>,
+    /// Flows that are busy no more.
+    pub(super) quiet: Vec<FlowId>,
+}
+
 impl Stalls {
     pub(super) fn new(limit: Duration, now: Duration) -> Self {
         Self { limit, flows: HashMap::new(), heard: (0, now), returned: (0, now), next: now + LOOK }
@@ -41,82 +77,164 @@ impl Stalls {
         self.flows.remove(&flow);
     }
 
+    /// Samples wait, and none did before: nobody looked while there was nothing.
+    pub(super) fn handle_first(&mut self, now: Duration) {
+        self.next = self.next.max(now + LOOK);
+    }
+
     /// Whether flows have waited for credit for the limit, and none came back. Then no flow that waits is excused any
     /// more, and those that use credit are judged, too.
     pub(super) fn starves(&self, now: Duration) -> bool {
         now.saturating_sub(self.returned.1) >= self.limit
     }
 
-    /// When to look again.
-    pub(super) fn poll_timeout(&self) -> Option<Duration> {
-        Some(self.next)
+    /// When to look again, while flows are busy.
+    pub(super) fn poll_timeout(&self) -> Duration {
+        self.next
     }
-}
 
-impl Outbound {
-    /// Reports the routes that made no progress for the limit.
-    pub(super) fn look_at_stalls(&mut self, heard: u64, now: Duration) {
-        if now < self.stalls.next {
-            return;
+    /// Looks at the busy flows, if that is due.
+    pub(super) fn handle_timeout(
+        &mut self,
+        peer: PeerActivity,
+        busy: impl Iterator<Item = BusyFlow>,
+        now: Duration,
+    ) -> Found {
+        let mut found = Found::default();
+        if now < self.next {
+            return found;
         }
-        self.stalls.next = now + LOOK;
-        if heard != self.stalls.heard.0 {
-            self.stalls.heard = (heard, now);
+        self.next = now + LOOK;
+        if peer.heard != self.heard.0 {
+            self.heard = (peer.heard, now);
         }
-        let silent = now.saturating_sub(self.stalls.heard.1) >= SILENT;
-        let returned = self.credit.returned();
-        if silent || returned != self.stalls.returned.0 || self.for_credit.is_empty() {
-            self.stalls.returned = (returned, now);
+        let silent = now.saturating_sub(self.heard.1) >= SILENT;
+        if silent || peer.returned != self.returned.0 || !peer.is_awaited {
+            self.returned = (peer.returned, now);
         }
-        let starves = self.stalls.starves(now);
-        let before = std::mem::take(&mut self.stalls.flows);
-        let mut quiet = Vec::new();
-        for id in &self.busy {
-            let Some(flow) = &self.flows[*id] else { continue };
-            let Some(served) = self.routes.get_mut(&flow.route_number) else { continue };
-            let is_judged = served.holds(&flow.of) || starves && flow.uses_credit();
+        let starves = self.starves(now);
+        let before = std::mem::take(&mut self.flows);
+        for flow in busy {
+            let is_judged = flow.is_held_back || starves && flow.uses_credit;
             if !is_judged {
-                quiet.extend(flow.is_quiet().then_some(*id));
+                found.quiet.extend(flow.is_quiet.then_some(flow.id));
                 continue;
             }
-            if served.stalled {
+            if flow.is_stalled || found.stalled.contains(&flow.route) {
                 continue;
             }
-            let at = flow.progress();
-            let progress = match before.get(id) {
+            let progress = match before.get(&flow.id) {
                 Some(progress)
-                    if progress.at == at && !silent && (starves || !flow.waits_for_others()) =>
+                    if progress.at == flow.progress
+                        && !silent
+                        && (starves || !flow.waits_for_others) =>
                 {
                     *progress
                 }
-                _ => Progress { at, since: now },
+                _ => Progress { at: flow.progress, since: now },
             };
-            if now.saturating_sub(progress.since) >= self.stalls.limit {
-                served.stalled = true;
-                self.events.push(OutboundEvent::Stalled(flow.route_number));
+            if now.saturating_sub(progress.since) >= self.limit {
+                found.stalled.push(flow.route);
                 continue;
             }
-            self.stalls.flows.insert(*id, progress);
+            self.flows.insert(flow.id, progress);
         }
-        for id in quiet {
-            self.busy.remove(&id);
-        }
-    }
-
-    /// Samples of a flow wait.
-    pub(super) fn note_busy(&mut self, id: FlowId, now: Duration) {
-        if self.busy.is_empty() {
-            // Nobody looked while there was nothing.
-            self.stalls.next = self.stalls.next.max(now + LOOK);
-        }
-        self.busy.insert(id);
+        found
     }
 }
 
-impl Served {
-    /// Whether a KEEP_ALL relay holds a publisher back.
-    fn holds(&self, of: &Gid) -> bool {
-        let keeping = |source: &Source| source.qos().history == History::KeepAll;
-        self.sources.iter().any(|source| keeping(source) && source.has_unacknowledged(of))
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LIMIT: Duration = Duration::from_secs(10);
+    const FLOW: BusyFlow = BusyFlow {
+        id: 3,
+        route: 1,
+        is_stalled: false,
+        progress: (0, 0),
+        is_held_back: true,
+        uses_credit: false,
+        waits_for_others: false,
+        is_quiet: false,
+    };
+
+    /// Looks for a minute at flows of a peer that is heard. Returns what was found first, and when.
+    fn look(
+        is_awaited: bool,
+        busy: impl Fn(Duration) -> Vec<BusyFlow>,
+        heard: impl Fn(Duration) -> u64,
+    ) -> Option<(Duration, Found)> {
+        let mut stalls = Stalls::new(LIMIT, Duration::ZERO);
+        while stalls.poll_timeout() < Duration::from_secs(60) {
+            let now = stalls.poll_timeout();
+            let peer = PeerActivity { heard: heard(now), returned: 0, is_awaited };
+            let found = stalls.handle_timeout(peer, busy(now).into_iter(), now);
+            if found != Found::default() {
+                return Some((now, found));
+            }
+        }
+        None
+    }
+
+    fn secs(now: Duration) -> u64 {
+        now.as_secs()
+    }
+
+    #[test]
+    fn a_route_without_progress_is_stalled_after_the_limit_and_told_of_once() {
+        let found = Found { stalled: vec![1], quiet: Vec::new() };
+        let two = [FLOW, BusyFlow { id: 4, ..FLOW }];
+        assert_eq!(look(false, |_| two.into(), secs), Some((LOOK + LIMIT, found)));
+        assert_eq!(look(false, |_| vec![BusyFlow { is_stalled: true, ..FLOW }], secs), None);
+    }
+
+    #[test]
+    fn progress_a_silent_peer_and_waiting_for_others_excuse() {
+        let progress = |now: Duration| vec![BusyFlow { progress: (now.as_secs() / 9, 0), ..FLOW }];
+        assert_eq!(look(false, progress, secs), None);
+        assert_eq!(look(false, |_| vec![FLOW], |_| 0), None, "the link is at fault");
+        let waits = BusyFlow { waits_for_others: true, ..FLOW };
+        assert_eq!(look(false, |_| vec![waits], secs), None);
+    }
+
+    #[test]
+    fn a_flow_that_waits_for_credit_is_judged_once_none_comes_back() {
+        let waits = BusyFlow { waits_for_others: true, ..FLOW };
+        let (at, found) = look(true, |_| vec![waits], secs).unwrap();
+        assert_eq!((at, found.stalled), (2 * LIMIT - LOOK, vec![1]), "from its last excuse on");
+        let uses = BusyFlow { is_held_back: false, uses_credit: true, ..FLOW };
+        let (at, found) = look(true, |_| vec![uses], secs).unwrap();
+        assert_eq!((at, found.stalled), (2 * LIMIT, vec![1]), "from when it is judged on");
+        assert_eq!(look(false, |_| vec![uses], secs), None);
+    }
+
+    #[test]
+    fn a_quiet_flow_is_busy_no_more_unless_it_is_judged() {
+        let quiet = BusyFlow { is_held_back: false, is_quiet: true, ..FLOW };
+        let found = Found { stalled: Vec::new(), quiet: vec![3] };
+        assert_eq!(look(false, |_| vec![quiet], secs), Some((LOOK, found)));
+        let (_, found) = look(false, |_| vec![BusyFlow { is_quiet: true, ..FLOW }], secs).unwrap();
+        assert!(found.quiet.is_empty(), "it is judged");
+    }
+
+    #[test]
+    fn a_number_that_was_forgotten_is_judged_anew() {
+        let mut stalls = Stalls::new(LIMIT, Duration::ZERO);
+        let peer = |heard| PeerActivity { heard, returned: 0, is_awaited: false };
+        stalls.handle_timeout(peer(1), [FLOW].into_iter(), LOOK);
+        stalls.forget(FLOW.id);
+        let found = stalls.handle_timeout(peer(2), [FLOW].into_iter(), LOOK + LIMIT);
+        assert_eq!(found, Found::default());
+    }
+
+    #[test]
+    fn nobody_looks_for_a_second_after_the_first_sample() {
+        let mut stalls = Stalls::new(LIMIT, Duration::ZERO);
+        let now = Duration::from_secs(100);
+        stalls.handle_first(now);
+        assert_eq!(stalls.poll_timeout(), now + LOOK);
+        stalls.handle_first(Duration::ZERO);
+        assert_eq!(stalls.poll_timeout(), now + LOOK);
     }
 }

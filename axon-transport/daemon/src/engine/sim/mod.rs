@@ -4,10 +4,12 @@
 //! fault happens when, [`trace`] tells whether two runs were the same, and [`rng`] gives each part its own generator.
 //! [`rings`] models a host's rings, [`host`] a host with its engine, and [`world`] all hosts and the clock. [`run`] runs
 //! a script in a world. [`raw`] is a peer without an engine, and [`held`] checks that memory is bounded.
+//! [`pair`] is less than all that: two QUIC connections alone.
 
 mod held;
 mod host;
 pub(crate) mod network;
+pub(crate) mod pair;
 mod raw;
 mod rings;
 pub(crate) mod rng;

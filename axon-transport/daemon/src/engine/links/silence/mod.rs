@@ -1,5 +1,6 @@
 //! Links that do not answer: their path is probed, and a successor is dialled once it works.
 
+mod looks;
 mod prober;
 mod watch;
 
@@ -9,6 +10,7 @@ use bytes::BytesMut;
 
 use self::watch::Action;
 pub(super) use self::{
+    looks::Looks,
     prober::{Traffic, frames_came},
     watch::{Nonce, Silence},
 };

@@ -4,27 +4,21 @@
 
 use std::{collections::VecDeque, sync::Arc, time::Duration};
 
-use axon_envelope::{Delivery, Route};
-use axon_shm::ids::Gid;
-use axon_transport::config::TopicPriority;
+use axon_envelope::Delivery;
 use bytes::Bytes;
 use quinn_proto::{Connection, Dir, StreamId, VarInt, WriteError};
 
 use super::{
     Pause,
     credit::{Credit, CreditShare},
+    info::FlowInfo,
 };
 use crate::{
     engine::{
         connection::Carrier,
         counters::Counters,
         frames::Frames,
-        inbound::StreamHeader,
-        outbound::{
-            queue::Queue,
-            schedule::{Class, Rank, SMALL},
-            source::Done,
-        },
+        outbound::{queue::Queue, schedule::SMALL, source::Done},
     },
     link::CloseCode,
 };
@@ -88,7 +82,7 @@ impl BestEffort {
     #[expect(clippy::too_many_arguments, reason = "the parts of a flow, borrowed one by one")]
     pub(super) fn write(
         &mut self,
-        (of_route, short, topic): ((u32, Gid, Route, TopicPriority), bool, &Arc<str>),
+        info: &FlowInfo,
         mut credit: CreditShare,
         queue: &mut Queue,
         frames: &mut Frames,
@@ -97,20 +91,16 @@ impl BestEffort {
         done: &mut Done,
         now: Duration,
     ) -> Option<Pause> {
-        let (number, of, route, priority) = of_route;
-        let lender = carrier.lender;
-        let rank =
-            |payload| lender.unwrap_or(Rank { priority, class: Class::of(false, false, payload) });
         if self.writing.is_none() {
             let under_way: u64 = self.under_way.iter().map(|sample| sample.bytes).sum();
             if self.under_way.len() >= ALWAYS && under_way >= carrier.window() {
                 return Some(Pause::Blocked);
             }
-            counters.lost(topic, "late", queue.drop_late(LIFE, self.took, now));
+            counters.lost(&info.topic, "late", queue.drop_late(LIFE, self.took, now));
             let Some(next) = queue.peek() else { return Some(Pause::Empty) };
             let (length, uses) = (next.payload.len(), Credit::of(next.size(), next.size()));
-            let own = Rank { priority, class: Class::of(false, false, length) };
-            if length > SMALL && !(carrier.is_open_to(own) && credit.may_use(uses)) {
+            let is_open = carrier.is_open_to(info.best_effort_rank(length));
+            if length > SMALL && !(is_open && credit.may_use(uses)) {
                 return Some(Pause::NoCredit);
             }
             let Some(stream) = carrier.quic.streams().open(Dir::Uni) else {
@@ -119,19 +109,19 @@ impl BestEffort {
             let Some(sample) = queue.pop_best_effort() else { return Some(Pause::Empty) };
             let (sequence, payload) = (sample.info.sequence, sample.payload.len());
             done.sequence = done.sequence.max(Some(sequence));
-            let mut headers = carrier.seal.short_headers().filter(|_| short);
+            let mut headers = carrier.seal.short_headers().filter(|_| info.short_headers);
             let short = headers.is_some();
             let (delivery, headers) = (Delivery::BestEffort, headers.as_mut());
-            if carrier.seal.write(&sample, route, delivery, headers, frames, now).is_err() {
-                counters.lost(topic, "no_key", 1);
+            if carrier.seal.write(&sample, info.route, delivery, headers, frames, now).is_err() {
+                counters.lost(&info.topic, "no_key", 1);
                 let _ = carrier.quic.send_stream(stream).reset(goodbye());
                 return None;
             }
             let mut pending = VecDeque::from(frames.take());
-            let (reliable, acknowledged) = (false, false);
-            let header = StreamHeader { reliable, short, acknowledged, route: number, of };
+            let header = info.best_effort_header(short);
             pending.push_front(Bytes::copy_from_slice(&header.encode()));
-            let priority = rank(payload).of_stream() - i32::from(!self.under_way.is_empty());
+            let rank = carrier.rank(info.best_effort_rank(payload));
+            let priority = rank.of_stream() - i32::from(!self.under_way.is_empty());
             let _ = carrier.quic.send_stream(stream).set_priority(priority);
             carrier.streams.insert(stream, carrier.flow);
             let left = sample.lifespan_left(now).unwrap_or(LONGEST).min(LONGEST);
@@ -143,7 +133,7 @@ impl BestEffort {
             self.writing = Some(Writing { stream, pending, sample });
         }
         let Writing { stream, pending, sample } = self.writing.as_mut()?;
-        carrier.limit(rank(sample.payload));
+        carrier.limit(carrier.rank(info.best_effort_rank(sample.payload)));
         let mut quic = carrier.quic.send_stream(*stream);
         match quic.write_chunks(pending.make_contiguous()) {
             Ok(taken) => {
@@ -158,7 +148,7 @@ impl BestEffort {
             Err(WriteError::Blocked) => Some(Pause::Blocked),
             Err(WriteError::Stopped(_) | WriteError::ClosedStream) => {
                 let _ = quic.reset(goodbye());
-                counters.lost(topic, "no_route", 1);
+                counters.lost(&info.topic, "no_route", 1);
                 self.writing = None;
                 None
             }

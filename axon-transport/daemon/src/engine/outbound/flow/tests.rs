@@ -1,128 +1,18 @@
-use std::{
-    cell::{Cell, RefCell},
-    collections::{HashMap, VecDeque},
-    rc::Rc,
-    sync::Arc,
-    time::Duration,
-};
+use std::{rc::Rc, sync::Arc, time::Duration};
 
 use axon_envelope::Kind;
 use axon_shm::{ids::Gid, qos::Qos};
-use axon_transport::{MessageInfo, internal::session::TakeLimit};
-use bytes::Bytes;
 
 use super::taking::Taking;
 use crate::engine::{
     counters::Counters,
-    outbound::{budget::Budget, queue::Queue, source::Source},
-    peer::routes::RelaySpec,
-    rings::RingReader,
+    outbound::{budget::Budget, model::Ring, queue::Queue, source::Source},
 };
 
 const PUBLISHER: Gid = Gid([1; 16]);
 
 fn at(millis: u64) -> Duration {
     Duration::from_millis(millis)
-}
-
-/// The ring of one publisher. It keeps every sample.
-#[derive(Default)]
-struct Ring {
-    samples: RefCell<VecDeque<(u64, usize)>>,
-    published: Cell<u64>,
-    copied: Cell<u64>,
-    lost: Cell<u64>,
-    /// The most samples that were taken together.
-    most_together: Cell<usize>,
-    /// How many samples are published when one is copied, and how often.
-    meanwhile: Cell<(u64, u64)>,
-}
-
-impl Ring {
-    fn publish(&self, samples: u64, length: usize) {
-        for _ in 0..samples {
-            self.published.set(self.published.get() + 1);
-            self.samples.borrow_mut().push_back((self.published.get(), length));
-        }
-    }
-}
-
-impl RingReader for Ring {
-    fn gid(&self) -> Gid {
-        Gid([2; 16])
-    }
-
-    fn with_data(&self) -> Vec<Gid> {
-        self.matched()
-    }
-
-    fn has_data_of(&self, publisher: &Gid) -> bool {
-        self.reads(publisher) && !self.samples.borrow().is_empty()
-    }
-
-    fn reads(&self, publisher: &Gid) -> bool {
-        *publisher == PUBLISHER
-    }
-
-    fn matched(&self) -> Vec<Gid> {
-        vec![PUBLISHER]
-    }
-
-    fn take_many(
-        &self,
-        publisher: &Gid,
-        most: TakeLimit,
-        each: &mut dyn FnMut(MessageInfo, Bytes),
-    ) -> usize {
-        let (mut taken, mut bytes) = (0, 0);
-        while taken < most.samples {
-            let next = self.samples.borrow().front().copied();
-            let fits = |length| taken == 0 || bytes + length <= most.bytes;
-            let Some((number, length)) = next.filter(|(_, length)| fits(*length)) else { break };
-            self.samples.borrow_mut().pop_front();
-            self.copied.set(self.copied.get() + 1);
-            (taken, bytes) = (taken + 1, bytes + length);
-            let (samples, times) = self.meanwhile.get();
-            if times > 0 {
-                self.meanwhile.set((samples, times - 1));
-                self.publish(samples, length);
-            }
-            each(MessageInfo::of(*publisher, number), vec![0; length].into());
-        }
-        self.most_together.set(taken.max(self.most_together.get()));
-        taken
-    }
-
-    fn retry_of(&self, _publisher: &Gid) -> Option<Duration> {
-        (!self.samples.borrow().is_empty()).then_some(Duration::ZERO)
-    }
-
-    fn skip_of(&self, _publisher: &Gid, depth: u64) {
-        let mut samples = self.samples.borrow_mut();
-        let stale = samples.len().saturating_sub(depth as usize);
-        samples.drain(..stale);
-        self.lost.set(self.lost.get() + stale as u64);
-    }
-
-    fn lost_of(&self, _publisher: &Gid) -> u64 {
-        self.lost.get()
-    }
-
-    fn acknowledge_of(&self, _publisher: &Gid, _sequence: u64) {}
-
-    fn take_back(&self) {}
-
-    fn unacknowledged(&self) -> HashMap<Gid, u64> {
-        HashMap::new()
-    }
-
-    fn give_up(&self, _publisher: Gid, _samples: u64) {}
-
-    fn assertions(&self) -> Vec<(Gid, u64)> {
-        Vec::new()
-    }
-
-    fn set_stands_for(&self, _gids: Vec<Gid>) {}
 }
 
 /// The way of one publisher's samples from its ring to QUIC.
@@ -137,10 +27,8 @@ struct Way {
 
 impl Way {
     fn new(qos: Qos) -> Self {
-        let ring = Rc::new(Ring::default());
-        let spec =
-            RelaySpec { qos, depth: qos.depth, type_hash: Vec::new(), stands_for: Vec::new() };
-        let sources = vec![Source::Relay(spec, Rc::clone(&ring) as Rc<dyn RingReader>)];
+        let ring = Ring::new(Gid([2; 16]), PUBLISHER);
+        let sources = vec![ring.source(qos)];
         let mut taking = Taking::new(PUBLISHER, Kind::Topic, None);
         taking.set_sources(&sources, None);
         Self {

@@ -2,7 +2,7 @@
 //! link by itself would starve all below it. For each eight bytes that a rank sends, each rank that waits below it may
 //! send one as if it were of the same rank.
 
-use super::schedule::{RANKS, Rank};
+use crate::engine::outbound::schedule::{RANKS, Rank};
 
 /// A rank that waits is lent a byte for so many of a higher one.
 const SHARE: i64 = 8;

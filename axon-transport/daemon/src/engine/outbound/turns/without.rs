@@ -2,7 +2,7 @@
 
 use std::{collections::BTreeSet, time::Duration};
 
-use super::{budget::Budget, schedule::FlowId};
+use crate::engine::outbound::{budget::Budget, schedule::FlowId};
 
 /// A flow without a key looks again after this time, if nobody told it of one.
 const KEY_RETRY: Duration = Duration::from_millis(250);

@@ -1,0 +1,70 @@
+//! When all links are looked at: for silence each second, at their certificates each minute.
+
+use std::time::Duration;
+
+/// Between two looks.
+const EVERY: Duration = Duration::from_secs(1);
+/// Looks from one that checks certificates to the next.
+const MINUTE: u32 = 60;
+
+/// What a look is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(in crate::engine::links) struct Look {
+    /// Whether certificates are checked, too: that costs signatures.
+    pub(in crate::engine::links) at_certificates: bool,
+}
+
+/// When the next look is due.
+#[derive(Debug)]
+pub(in crate::engine::links) struct Looks {
+    next: Duration,
+    passed: u32,
+}
+
+impl Looks {
+    /// The first look is due a second after the engine's start.
+    pub(in crate::engine::links) fn new() -> Self {
+        Self { next: EVERY, passed: 0 }
+    }
+
+    /// When the next look is due, while there are links.
+    pub(in crate::engine::links) fn poll_timeout(&self) -> Duration {
+        self.next
+    }
+
+    /// The look that is due, if one is.
+    pub(in crate::engine::links) fn take_due(&mut self, now: Duration) -> Option<Look> {
+        if now < self.next {
+            return None;
+        }
+        self.next = now + EVERY;
+        self.passed = self.passed.wrapping_add(1);
+        Some(Look { at_certificates: self.passed.is_multiple_of(MINUTE) })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_second_has_a_look_and_each_minute_one_at_certificates() {
+        let mut looks = Looks::new();
+        let mut at_certificates = Vec::new();
+        for second in 1..=120 {
+            assert_eq!(looks.poll_timeout(), Duration::from_secs(second));
+            assert_eq!(looks.take_due(looks.poll_timeout() - Duration::from_nanos(1)), None);
+            let look = looks.take_due(looks.poll_timeout()).unwrap();
+            at_certificates.extend(look.at_certificates.then_some(second));
+        }
+        assert_eq!(at_certificates, [60, 120]);
+    }
+
+    #[test]
+    fn looks_that_were_missed_are_not_made_up_for() {
+        let mut looks = Looks::new();
+        let now = Duration::from_secs(100);
+        assert_eq!(looks.take_due(now), Some(Look { at_certificates: false }));
+        assert_eq!((looks.take_due(now), looks.poll_timeout()), (None, now + EVERY));
+    }
+}

@@ -1,0 +1,75 @@
+//! The connections that a pass did not finish: control streams with more to read, and lost connections whose links end
+//! once all that came over them is read.
+
+use std::collections::VecDeque;
+
+use quinn_proto::ConnectionError;
+
+/// Connections, by the numbers of their links.
+#[derive(Default)]
+pub(super) struct Unfinished {
+    /// Their control streams have more, once the events that came are handled.
+    unread: Vec<u64>,
+    /// They are lost, and their links stand.
+    lost: VecDeque<(u64, ConnectionError)>,
+}
+
+impl Unfinished {
+    /// The control stream of a connection has more.
+    pub(super) fn add_unread(&mut self, number: u64) {
+        self.unread.push(number);
+    }
+
+    /// Whether there are control streams with more.
+    pub(super) fn has_unread(&self) -> bool {
+        !self.unread.is_empty()
+    }
+
+    /// Takes the connections whose control streams have more.
+    pub(super) fn take_unread(&mut self) -> Vec<u64> {
+        std::mem::take(&mut self.unread)
+    }
+
+    /// A connection was lost.
+    pub(super) fn add_lost(&mut self, number: u64, reason: ConnectionError) {
+        self.lost.push_back((number, reason));
+    }
+
+    /// Whether a connection is lost, and its link stands.
+    pub(super) fn is_lost(&self, number: u64) -> bool {
+        self.lost.iter().any(|(lost, _)| *lost == number)
+    }
+
+    /// Takes the next connection that was lost, and why.
+    pub(super) fn poll_lost(&mut self) -> Option<(u64, ConnectionError)> {
+        self.lost.pop_front()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lost_connections_end_in_order_and_stand_until_then() {
+        let mut unfinished = Unfinished::default();
+        unfinished.add_lost(3, ConnectionError::TimedOut);
+        unfinished.add_lost(1, ConnectionError::Reset);
+        assert!(unfinished.is_lost(3) && unfinished.is_lost(1) && !unfinished.is_lost(2));
+        assert_eq!(unfinished.poll_lost(), Some((3, ConnectionError::TimedOut)));
+        assert!(!unfinished.is_lost(3) && unfinished.is_lost(1));
+        assert_eq!(unfinished.poll_lost(), Some((1, ConnectionError::Reset)));
+        assert_eq!(unfinished.poll_lost(), None);
+    }
+
+    #[test]
+    fn unread_streams_are_taken_once() {
+        let mut unfinished = Unfinished::default();
+        unfinished.add_lost(7, ConnectionError::Reset);
+        assert!(!unfinished.has_unread(), "a lost connection is another matter");
+        [5, 2].into_iter().for_each(|number| unfinished.add_unread(number));
+        assert!(unfinished.has_unread());
+        assert_eq!(unfinished.take_unread(), [5, 2]);
+        assert!(!unfinished.has_unread() && unfinished.take_unread().is_empty());
+    }
+}

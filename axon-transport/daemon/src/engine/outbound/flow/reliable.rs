@@ -1,0 +1,329 @@
+//! Sends the RELIABLE samples of one flow over one stream, in batches that are sealed together.
+
+#[cfg(test)]
+mod tests;
+
+use std::time::Duration;
+
+use axon_envelope::Delivery;
+use quinn_proto::{Connection, Dir, StreamId, VarInt, WriteError};
+
+use super::{
+    Pause,
+    batch::{Batch, Sealed},
+    credit::{ALWAYS, CreditShare},
+    info::FlowInfo,
+};
+use crate::{
+    engine::{
+        connection::Carrier,
+        counters::Counters,
+        frames::Frames,
+        outbound::{
+            queue::Queue,
+            schedule::{Rank, SMALL},
+            source::Done,
+        },
+        short_header::ShortHeaders,
+    },
+    keys::NoKey,
+    link::CloseCode,
+};
+
+/// Bytes of samples that are sealed and written together.
+pub(super) const TOGETHER: usize = 64 << 10;
+/// A sample of at most so many bytes is copied to its neighbours.
+const COPIED: usize = 4096;
+/// Bytes that count as progress of a long sample.
+const PART: u64 = 256 << 10;
+/// A stream that sent nothing for so long is finished.
+pub(super) const STREAM_IDLE: Duration = Duration::from_secs(30);
+
+/// The stream of a flow's RELIABLE samples, and the batch that QUIC takes from. The samples themselves stay in the flow's
+/// queue until they are acknowledged or, where the peer acknowledges none, with QUIC.
+#[derive(Debug)]
+pub(super) struct ReliableStream {
+    stream: Option<StreamId>,
+    /// The headers of the stream, or of the one that the pending batch will open, if they are short.
+    headers: Option<ShortHeaders>,
+    /// The priority that QUIC knows of the stream.
+    priority: i32,
+    batch: Batch,
+    /// The credit that the samples use that were sent over the stream.
+    credit: CreditShare,
+    /// When the stream was opened, or handed something to QUIC last.
+    active_at: Duration,
+    /// Bytes that QUIC took.
+    taken_bytes: u64,
+}
+
+impl ReliableStream {
+    /// No stream is open.
+    pub(super) fn new(credit: CreditShare) -> Self {
+        Self {
+            stream: None,
+            headers: None,
+            priority: 0,
+            batch: Batch::default(),
+            credit,
+            active_at: Duration::ZERO,
+            taken_bytes: 0,
+        }
+    }
+
+    /// Whether the stream is open.
+    pub(super) fn is_open(&self) -> bool {
+        self.stream.is_some()
+    }
+
+    /// Whether this is its stream.
+    pub(super) fn is(&self, stream: StreamId) -> bool {
+        self.stream == Some(stream)
+    }
+
+    /// Whether QUIC has not taken all of a batch.
+    pub(super) fn is_writing(&self) -> bool {
+        !self.batch.is_empty()
+    }
+
+    /// Bytes of the batch that QUIC has not taken.
+    pub(super) fn left(&self) -> usize {
+        self.batch.left()
+    }
+
+    /// The credit that its samples use.
+    pub(super) fn credit(&self) -> &CreditShare {
+        &self.credit
+    }
+
+    /// How often QUIC took a quarter of a MiB.
+    pub(super) fn parts(&self) -> u64 {
+        self.taken_bytes / PART
+    }
+
+    /// Writes the pending batch, or seals the next one. `None`: go on.
+    #[expect(clippy::too_many_arguments, reason = "the parts of a flow, borrowed one by one")]
+    pub(super) fn write(
+        &mut self,
+        info: &FlowInfo,
+        queue: &mut Queue,
+        frames: &mut Frames,
+        carrier: &mut Carrier<'_>,
+        counters: &Counters,
+        done: &mut Done,
+        now: Duration,
+    ) -> Option<Pause> {
+        if self.batch.is_empty() {
+            if !self.has_credit(info, queue, carrier) {
+                return Some(Pause::NoCredit);
+            }
+            let sealed = self.seal(info, queue, frames, carrier, now);
+            self.note_sent(queue);
+            match sealed {
+                Ok(0) => return Some(Pause::Empty),
+                Ok(_) => {}
+                Err(NoKey::Detached) => return Some(Pause::Blocked),
+                Err(_) => return Some(Pause::NoKey),
+            }
+        }
+        let stream = match self.stream {
+            Some(stream) => stream,
+            None => {
+                let Some(id) = carrier.quic.streams().open(Dir::Uni) else {
+                    return Some(Pause::NoStream);
+                };
+                self.batch.put_before(&info.reliable_header(self.headers.is_some()).encode());
+                carrier.streams.insert(id, carrier.flow);
+                (self.priority, self.active_at) = (0, now);
+                *self.stream.insert(id)
+            }
+        };
+        let reliable = queue.delivery() == Delivery::Reliable;
+        let rank = carrier.rank(info.rank(reliable, self.batch.left()));
+        if rank.of_stream() > self.priority {
+            self.set_priority(rank, stream, carrier);
+        }
+        carrier.limit(rank);
+        match carrier.quic.send_stream(stream).write_chunks(self.batch.chunks()) {
+            Ok(taken) => {
+                // What the stream was lent leaves before its priority sinks.
+                if rank.of_stream() < self.priority {
+                    self.set_priority(rank, stream, carrier);
+                }
+                self.batch.drop_chunks(taken.chunks);
+                carrier.taken += taken.bytes as u64;
+                self.handle_taken(taken.bytes as u64, info, queue, counters, done, now);
+                None
+            }
+            Err(WriteError::Blocked) => Some(Pause::Blocked),
+            Err(WriteError::Stopped(_)) => {
+                self.stop(info, queue, counters, done);
+                None
+            }
+            Err(WriteError::ClosedStream) => {
+                self.stream = None;
+                self.rewind(queue);
+                None
+            }
+        }
+    }
+
+    /// Whether the peer takes in the next sample now. Some small ones are sent whatever the peer holds.
+    fn has_credit(&self, info: &FlowInfo, queue: &Queue, carrier: &Carrier<'_>) -> bool {
+        let Some(next) = queue.peek() else { return true };
+        let credit = queue.credit_with(next);
+        let length = next.payload.len();
+        let is_small = length <= SMALL && credit.window <= ALWAYS;
+        is_small || (carrier.is_open_to(info.rank(true, length)) && self.credit.may_use(credit))
+    }
+
+    fn set_priority(&mut self, rank: Rank, stream: StreamId, carrier: &mut Carrier<'_>) {
+        self.priority = rank.of_stream();
+        let _ = carrier.quic.send_stream(stream).set_priority(self.priority);
+    }
+
+    /// QUIC took so many bytes of the batch.
+    fn handle_taken(
+        &mut self,
+        bytes: u64,
+        info: &FlowInfo,
+        queue: &mut Queue,
+        counters: &Counters,
+        done: &mut Done,
+        now: Duration,
+    ) {
+        self.taken_bytes += bytes;
+        self.active_at = now;
+        let mut whole = 0;
+        self.batch.handle_taken(bytes, |sealed| {
+            counters.sent(sealed.payload);
+            if !info.acknowledged {
+                done.sequence = done.sequence.max(Some(sealed.sequence));
+            }
+            whole += 1;
+        });
+        if !info.acknowledged {
+            queue.written(whole);
+            self.note_sent(queue);
+        }
+    }
+
+    /// Seals a batch of waiting samples. Returns how many.
+    fn seal(
+        &mut self,
+        info: &FlowInfo,
+        queue: &mut Queue,
+        frames: &mut Frames,
+        carrier: &mut Carrier<'_>,
+        now: Duration,
+    ) -> Result<usize, NoKey> {
+        let (mut bytes, mut samples, mut end) = (0, 0, 0);
+        self.batch.clear();
+        if self.stream.is_none() {
+            self.headers = carrier.seal.short_headers().filter(|_| info.short_headers);
+        }
+        if queue.peek().is_some_and(|next| next.payload.len() <= COPIED) {
+            // A sample takes more in the queue than its header does in the batch.
+            frames.reserve(queue.waiting_bytes().min(TOGETHER + COPIED));
+        }
+        while bytes < TOGETHER {
+            if samples > 0 && !self.has_credit(info, queue, carrier) {
+                break;
+            }
+            let Some(sample) = queue.send() else { break };
+            let (sequence, payload) = (sample.info.sequence, sample.payload.len());
+            let (delivery, headers) = (Delivery::Reliable, self.headers.as_mut());
+            if let Err(why) = carrier.seal.write(sample, info.route, delivery, headers, frames, now)
+            {
+                queue.take_back();
+                if samples == 0 {
+                    return Err(why);
+                }
+                break;
+            }
+            end = frames.len() as u64;
+            bytes += payload;
+            samples += 1;
+            self.batch.add(Sealed { sequence, payload, end });
+        }
+        debug_assert!(samples == 0 || end > 0, "a sealed message has bytes");
+        self.batch.set_chunks(frames.take());
+        Ok(samples)
+    }
+
+    /// The samples that were sent and are not acknowledged changed: they use credit.
+    pub(super) fn note_sent(&mut self, queue: &Queue) {
+        self.credit.set(queue.credit());
+    }
+
+    /// The peer stopped the stream.
+    pub(super) fn handle_stopped(
+        &mut self,
+        quic: &mut Connection,
+        info: &FlowInfo,
+        queue: &mut Queue,
+        counters: &Counters,
+        done: &mut Done,
+    ) {
+        if let Some(stream) = self.stream {
+            let code = VarInt::from_u32(CloseCode::Goodbye.code());
+            let _ = quic.send_stream(stream).reset(code);
+        }
+        self.stop(info, queue, counters, done);
+    }
+
+    /// The peer takes no more of this route: the samples that it was sent are given up.
+    fn stop(&mut self, info: &FlowInfo, queue: &mut Queue, counters: &Counters, done: &mut Done) {
+        self.stream = None;
+        self.batch.clear();
+        let (given_up, newest) = queue.give_up_sent();
+        self.note_sent(queue);
+        counters.lost(&info.topic, "no_route", given_up);
+        done.sequence = done.sequence.max(newest);
+        done.given_up += given_up;
+    }
+
+    /// Sends all samples again that are not acknowledged, or not entirely with QUIC.
+    pub(super) fn rewind(&mut self, queue: &mut Queue) {
+        self.batch.clear();
+        queue.rewind();
+        self.note_sent(queue);
+    }
+
+    /// A new link carries the flow: what the old one did not deliver goes first.
+    pub(super) fn leave(&mut self, old: Option<&mut Connection>, queue: &mut Queue) {
+        if let (Some(stream), Some(old)) = (self.stream.take(), old) {
+            // A message that is cut off at the end of its stream is none.
+            let _ = old.send_stream(stream).finish();
+        }
+        self.rewind(queue);
+    }
+
+    /// Takes its stream, which ends with the flow.
+    pub(super) fn take(&mut self) -> Option<StreamId> {
+        self.stream.take()
+    }
+
+    /// The stream carries nothing more.
+    pub(super) fn finish(&mut self, carrier: &mut Carrier<'_>) {
+        if let Some(stream) = self.stream.take() {
+            let _ = carrier.quic.send_stream(stream).finish();
+        }
+    }
+
+    /// Finishes a stream that has been idle. Returns when to look again at one that is open.
+    pub(super) fn handle_timeout(
+        &mut self,
+        queue: &Queue,
+        carrier: &mut Carrier<'_>,
+        now: Duration,
+    ) -> Option<Duration> {
+        self.stream?;
+        let idle_at = self.active_at + STREAM_IDLE;
+        if now >= idle_at && queue.is_empty() && self.batch.is_empty() {
+            self.finish(carrier);
+            return None;
+        }
+        Some(idle_at.max(now + Duration::from_secs(1)))
+    }
+}

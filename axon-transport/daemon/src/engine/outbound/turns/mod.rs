@@ -1,0 +1,328 @@
+//! Which flow sends next, and what the flows that cannot send wait for: QUIC, a stream, a key, room or credit.
+
+mod lending;
+mod without;
+
+use std::{rc::Rc, time::Duration};
+
+use self::{lending::Lending, without::Without};
+use super::{
+    budget::Budget,
+    flow::{CreditQueue, Flow, Pause, PeerCredit},
+    schedule::{FlowId, Rank, Schedule},
+    table::Flows,
+};
+
+/// The turn of one flow.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Turn {
+    pub(super) flow: FlowId,
+    /// The rank under which it has the turn.
+    pub(super) rank: Rank,
+    /// The rank as which it sends, if that is another one.
+    pub(super) lender: Option<Rank>,
+}
+
+/// The turns of the flows towards one peer.
+pub(super) struct Turns {
+    schedule: Schedule,
+    lending: Lending,
+    without: Without,
+    credit: Rc<PeerCredit>,
+    /// The flows that wait for credit.
+    for_credit: CreditQueue,
+    budget: Rc<Budget>,
+    /// Streams may have become idle since a flow found none.
+    frees_streams: bool,
+}
+
+impl Turns {
+    /// No flow has a turn.
+    pub(super) fn new(budget: Rc<Budget>) -> Self {
+        Self {
+            schedule: Schedule::default(),
+            lending: Lending::default(),
+            without: Without::new(&budget),
+            credit: PeerCredit::new(),
+            for_credit: CreditQueue::default(),
+            budget,
+            frees_streams: false,
+        }
+    }
+
+    /// The peer's credit.
+    pub(super) fn credit(&self) -> &Rc<PeerCredit> {
+        &self.credit
+    }
+
+    /// Whether a flow waits for credit.
+    pub(super) fn wait_for_credit(&self) -> bool {
+        !self.for_credit.is_empty()
+    }
+
+    /// The place of the highest rank of which flows wait for credit.
+    pub(super) fn closed_from(&self) -> Option<usize> {
+        self.for_credit.closed_from()
+    }
+
+    /// Gives a flow a turn, if it has something to send and QUIC may take it.
+    pub(super) fn add(&mut self, id: FlowId, flow: &Flow) {
+        if !self.schedule.contains(id)
+            && !flow.blocked
+            && let Some(rank) = flow.rank()
+        {
+            self.schedule.push(id, rank);
+        }
+    }
+
+    /// A flow is gone. Its number is another's next.
+    pub(super) fn forget(&mut self, id: FlowId) {
+        self.schedule.remove(id);
+        self.without.forget(id);
+        self.for_credit.forget(id);
+    }
+
+    /// Tries the flows again that found no room or no credit, if there is more now.
+    pub(super) fn retry(&mut self, flows: &mut Flows) {
+        let held = self.without.take_for_room(&self.budget);
+        self.add_all(held, flows);
+        self.retry_for_credit(flows);
+    }
+
+    fn add_all(&mut self, ids: impl IntoIterator<Item = FlowId>, flows: &Flows) {
+        for id in ids {
+            if let Some(flow) = flows.get(id) {
+                self.add(id, flow);
+            }
+        }
+    }
+
+    fn retry_for_credit(&mut self, flows: &mut Flows) {
+        if !self.for_credit.is_due(&self.credit) {
+            return;
+        }
+        for id in self.for_credit.take(&self.credit).into_iter().rev() {
+            let Some(flow) = flows.get_mut(id) else { continue };
+            flow.blocked = false;
+            let rank = flow.rank();
+            // Its samples may have been acknowledged meanwhile.
+            flow.waits_for_credit &= rank.is_some();
+            if let Some(rank) = rank {
+                self.schedule.push_first(id, rank);
+            }
+        }
+    }
+
+    /// The next turn.
+    pub(super) fn next(&mut self) -> Option<Turn> {
+        let (flow, rank) = self.schedule.pop(|at| self.lending.borrows(at))?;
+        Some(Turn { flow, rank, lender: self.lending.borrow(rank) })
+    }
+
+    /// A flow handed so many bytes to QUIC in its turn.
+    pub(super) fn handle_sent(&mut self, turn: Turn, bytes: u64) {
+        match (bytes, turn.lender) {
+            (0, _) => {}
+            (bytes, Some(_)) => self.lending.handle_borrowed(turn.rank, bytes),
+            (bytes, None) => self.lending.handle_sent(turn.rank, bytes),
+        }
+    }
+
+    /// A flow found no room for a sample in its turn.
+    pub(super) fn handle_held(&mut self, turn: Turn) {
+        self.without.room(turn.flow);
+    }
+
+    /// A turn is over. Flows that gave credit back in this pass may be the last ones that use any: those that wait for
+    /// it are tried again if there is no other turn.
+    pub(super) fn handle_over(
+        &mut self,
+        turn: Turn,
+        pause: Pause,
+        flows: &mut Flows,
+        now: Duration,
+    ) {
+        match pause {
+            Pause::Turn => self.add_all([turn.flow], flows),
+            Pause::Empty => {}
+            Pause::Blocked => self.lending.handle_blocked(turn.rank),
+            Pause::NoStream => {
+                self.without.stream(turn.flow);
+                self.frees_streams = true;
+            }
+            Pause::NoKey => self.without.key(turn.flow, now),
+            Pause::NoCredit => {
+                // What the flow took from its rings may have another rank.
+                let rank = flows.get(turn.flow).and_then(Flow::rank).unwrap_or(turn.rank);
+                self.for_credit.add(turn.flow, rank.place());
+                self.lending.handle_blocked(turn.rank);
+            }
+        }
+        if self.schedule.is_empty() {
+            self.retry_for_credit(flows);
+        }
+    }
+
+    /// The peer acknowledged samples: streams may have become idle.
+    pub(super) fn handle_acknowledged(&mut self) {
+        self.frees_streams |= self.without.waits_for_stream() > 0;
+    }
+
+    /// How many idle streams are to be finished now, so that flows that wait for one get theirs.
+    pub(super) fn take_wanted_streams(&mut self) -> usize {
+        match std::mem::take(&mut self.frees_streams) {
+            true => self.without.waits_for_stream(),
+            false => 0,
+        }
+    }
+
+    /// The peer allows more streams.
+    pub(super) fn handle_streams_available(&mut self, flows: &Flows) {
+        let waiting = self.without.take_for_stream();
+        self.add_all(waiting, flows);
+    }
+
+    /// There may be keys for messages.
+    pub(super) fn handle_keys(&mut self, flows: &Flows) {
+        let waiting = self.without.take_for_key();
+        self.add_all(waiting, flows);
+    }
+
+    /// When flows without a key look for one again.
+    pub(super) fn poll_timeout(&self) -> Option<Duration> {
+        self.without.poll_timeout()
+    }
+
+    /// Has the flows without a key look for one again, if that is due.
+    pub(super) fn handle_timeout(&mut self, flows: &Flows, now: Duration) {
+        if self.poll_timeout().is_some_and(|due| due <= now) {
+            self.handle_keys(flows);
+        }
+    }
+
+    /// Whether a pass has something to do.
+    pub(super) fn has_work(&self) -> bool {
+        !self.schedule.is_empty() || self.frees_streams || self.for_credit.is_due(&self.credit)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::outbound::{flow::Credit, model::flow};
+
+    const NOW: Duration = Duration::from_secs(1);
+
+    /// So many flows, each of which has something to send, and their turns.
+    fn turns(count: usize) -> (Turns, Flows) {
+        let mut flows = Flows::default();
+        let mut turns = Turns::new(Budget::new(1 << 20).of_peer());
+        for number in 0..count {
+            let id = flows.insert(flow(number as u8));
+            flows.get_mut(id).unwrap().handle_samples();
+            turns.add(id, flows.get(id).unwrap());
+        }
+        (turns, flows)
+    }
+
+    fn next(turns: &mut Turns) -> Option<FlowId> {
+        turns.next().map(|turn| turn.flow)
+    }
+
+    /// The next flow pauses so, and loses its turn.
+    fn pause(turns: &mut Turns, flows: &mut Flows, pause: Pause) -> FlowId {
+        let turn = turns.next().unwrap();
+        turns.handle_over(turn, pause, flows, NOW);
+        turn.flow
+    }
+
+    #[test]
+    fn a_flow_whose_turn_is_over_goes_on_after_the_others() {
+        let (mut turns, mut flows) = turns(2);
+        assert_eq!(pause(&mut turns, &mut flows, Pause::Turn), 0);
+        assert_eq!(pause(&mut turns, &mut flows, Pause::Empty), 1);
+        assert_eq!((next(&mut turns), next(&mut turns)), (Some(0), None));
+        assert!(!turns.has_work());
+    }
+
+    #[test]
+    fn a_flow_that_is_blocked_or_has_nothing_gets_no_turn() {
+        let (mut turns, mut flows) = turns(1);
+        next(&mut turns);
+        flows.get_mut(0).unwrap().blocked = true;
+        turns.add(0, flows.get(0).unwrap());
+        turns.add(1, &flow(1));
+        assert_eq!(next(&mut turns), None);
+        flows.get_mut(0).unwrap().blocked = false;
+        turns.add(0, flows.get(0).unwrap());
+        assert_eq!(next(&mut turns), Some(0));
+    }
+
+    #[test]
+    fn flows_go_on_once_what_they_lack_is_there() {
+        let (mut turns, mut flows) = turns(2);
+        assert_eq!(pause(&mut turns, &mut flows, Pause::NoStream), 0);
+        assert_eq!(pause(&mut turns, &mut flows, Pause::NoKey), 1);
+        turns.handle_timeout(&flows, NOW);
+        assert_eq!(next(&mut turns), None, "not at once");
+        turns.handle_streams_available(&flows);
+        assert_eq!((next(&mut turns), next(&mut turns)), (Some(0), None));
+        turns.handle_timeout(&flows, turns.poll_timeout().unwrap());
+        assert_eq!((next(&mut turns), next(&mut turns)), (Some(1), None));
+        assert_eq!(turns.poll_timeout(), None);
+    }
+
+    #[test]
+    fn idle_streams_are_wanted_while_a_flow_has_none() {
+        let (mut turns, mut flows) = turns(1);
+        turns.handle_acknowledged();
+        assert!(turns.take_wanted_streams() == 0, "no flow waits for one");
+        pause(&mut turns, &mut flows, Pause::NoStream);
+        assert!(turns.has_work());
+        assert_eq!((turns.take_wanted_streams(), turns.take_wanted_streams()), (1, 0));
+        turns.handle_acknowledged();
+        assert_eq!(turns.take_wanted_streams(), 1);
+    }
+
+    #[test]
+    fn flows_without_credit_keep_their_order_and_are_first_when_some_comes_back() {
+        let (mut turns, mut flows) = turns(4);
+        for id in 0..3 {
+            flows.get_mut(id).unwrap().blocked = true;
+            assert_eq!(pause(&mut turns, &mut flows, Pause::NoCredit), id);
+        }
+        assert!(turns.wait_for_credit() && turns.closed_from().is_some());
+        turns.forget(1);
+        let mut share = turns.credit().share();
+        share.set(Credit::of(1, 1));
+        drop(share);
+        turns.retry(&mut flows);
+        assert!(!turns.wait_for_credit() && turns.closed_from().is_none());
+        assert!(!flows.get(0).unwrap().blocked);
+        let order: Vec<_> = std::iter::from_fn(|| next(&mut turns)).collect();
+        assert_eq!(order, [0, 2, 3]);
+    }
+
+    #[test]
+    fn credit_that_the_last_turn_gave_back_is_used_in_the_same_pass() {
+        let (mut turns, mut flows) = turns(2);
+        pause(&mut turns, &mut flows, Pause::NoCredit);
+        let mut share = turns.credit().share();
+        share.set(Credit::of(1, 1));
+        let turn = turns.next().unwrap();
+        drop(share);
+        turns.handle_over(turn, Pause::Empty, &mut flows, NOW);
+        assert_eq!(next(&mut turns), Some(0));
+    }
+
+    #[test]
+    fn a_flow_that_is_gone_has_no_turn_and_waits_for_nothing() {
+        let (mut turns, mut flows) = turns(3);
+        pause(&mut turns, &mut flows, Pause::NoStream);
+        pause(&mut turns, &mut flows, Pause::NoKey);
+        (0..3).for_each(|id| turns.forget(id));
+        turns.handle_streams_available(&flows);
+        turns.handle_keys(&flows);
+        assert_eq!(next(&mut turns), None);
+    }
+}

@@ -1,0 +1,89 @@
+//! Reports of the links' status and losses for the control plane, once a second and when a link changed.
+
+use std::time::Duration;
+
+use super::{effects::Effects, links::Links, peers::Peers};
+use crate::bridge::ToControl;
+
+/// Between two reports.
+const EVERY: Duration = Duration::from_secs(1);
+
+/// When the next report is due.
+#[derive(Debug)]
+pub(super) struct Reports {
+    next: Duration,
+}
+
+impl Reports {
+    /// The first report is due a second after the engine's start.
+    pub(super) fn new() -> Self {
+        Self { next: EVERY }
+    }
+
+    /// A link changed: the next report is due now.
+    pub(super) fn hurry(&mut self, now: Duration) {
+        self.next = now;
+    }
+
+    /// When the next report is due, while there are peers.
+    pub(super) fn poll_timeout(&self) -> Duration {
+        self.next
+    }
+
+    /// Whether a report is due. The next one is due a second later.
+    pub(super) fn take_due(&mut self, now: Duration) -> bool {
+        let is_due = now >= self.next;
+        if is_due {
+            self.next = now + EVERY;
+        }
+        is_due
+    }
+}
+
+/// Reports losses and the status of each link.
+pub(super) fn report(peers: &mut Peers, links: &Links, effects: &mut Effects, now: Duration) {
+    report_excess(peers, links, effects);
+    for (_, peer) in peers.iter() {
+        effects.tell_lost(&links.peer_text(peer.link), peer.counters.take_lost());
+        if !peer.silent
+            && let Some(mut status) = links.status(peer.link)
+        {
+            peer.fill(&mut status, now);
+            effects.tell(ToControl::Link(Box::new(status), peer.refused_routes()));
+        }
+    }
+}
+
+/// Names the peers that have more long messages in flight than they may: their links may stand still.
+fn report_excess(peers: &mut Peers, links: &Links, effects: &mut Effects) {
+    for peer in peers.values_mut() {
+        let Some(most) = links.window_credit(peer.link) else { continue };
+        let Some(bytes) = peer.inbound.find_excess(peer.link, most) else { continue };
+        let text = links.peer_text(peer.link);
+        let reason = format!(
+            "it has {bytes} bytes of long messages in flight that wait for memory, {most} are allowed: its link may \
+             stand still until it gives them up"
+        );
+        tracing::warn!(peer = text, reason, "a peer sends too many long messages at a time");
+        let what = "long messages".to_owned();
+        effects.tell(ToControl::Refusal { peer: text, what, reason });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn reports_are_a_second_apart_unless_a_link_changes() {
+        let (mut reports, half) = (Reports::new(), EVERY / 2);
+        assert!(!reports.take_due(half));
+        assert!(reports.take_due(EVERY + half), "late is not never");
+        assert_eq!(reports.poll_timeout(), 2 * EVERY + half);
+        assert!(!reports.take_due(2 * EVERY));
+        reports.hurry(2 * EVERY);
+        assert_eq!(reports.poll_timeout(), 2 * EVERY);
+        assert!(reports.take_due(2 * EVERY) && !reports.take_due(2 * EVERY));
+        assert_eq!(reports.poll_timeout(), 3 * EVERY);
+    }
+}
