@@ -59,10 +59,10 @@ fn check_says_which_line_decides_and_its_status_says_whether_it_may() {
         (
             ["--peer", "base", "--publish", "/scan"],
             1,
-            "denied: no [[allow]] of access.toml lets it",
+            "denied: no [[allow]] in access.toml permits this",
         ),
         (["--peer", "base", "--act", "/dock"], 0, "allowed by line 4 of access.toml"),
-        (["--peer", "arm", "--call", "/reboot"], 0, "no rule of access.toml is against it"),
+        (["--peer", "arm", "--call", "/reboot"], 0, "no rule in access.toml denies this"),
         (["--peer", "uid:x", "--see", "/n"], 2, "uid: and a number"),
         (["--peer", "local", "--see", "/n"], 2, "uid: and a number, for a user"),
     ] {

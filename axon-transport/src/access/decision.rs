@@ -1,4 +1,4 @@
-//! What the rules say, and which of them says it.
+//! The outcome of the rules, and the rule that it comes from.
 
 use std::{fmt, sync::Arc};
 
@@ -41,14 +41,14 @@ impl fmt::Display for Decision {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match &self.0 {
             Reason::NoRules => f.write_str("allowed: there are no access rules"),
-            Reason::Open { file } => write!(f, "allowed: no rule of {file} is against it"),
+            Reason::Open { file } => write!(f, "allowed: no rule in {file} denies this"),
             Reason::Allowed { file, line } => write!(f, "allowed by line {line} of {file}"),
             Reason::Denied { file, line } => write!(f, "denied by line {line} of {file}"),
             Reason::NotAllowed { file } => {
-                write!(f, "denied: no [[allow]] of {file} lets it")
+                write!(f, "denied: no [[allow]] in {file} permits this")
             }
             Reason::Default { file } => {
-                write!(f, "denied: default = \"deny\" in {file}, and no [[allow]] names it")
+                write!(f, "denied: default = \"deny\" in {file}, and no [[allow]] names the peer")
             }
         }
     }

@@ -20,7 +20,7 @@
 //! let base = Party::Name("base");
 //! assert!(rules.check(base, Verb::Publish, "/cmd_vel").allowed());
 //! let denied = rules.check(base, Verb::Publish, "/scan");
-//! assert_eq!(denied.to_string(), "denied: no [[allow]] of access.toml lets it");
+//! assert_eq!(denied.to_string(), "denied: no [[allow]] in access.toml permits this");
 //! // A rule names the base station alone: nothing changes for others.
 //! assert!(rules.check(Party::Name("laptop"), Verb::Publish, "/scan").allowed());
 //! # Ok::<(), axon_transport::access::AccessError>(())

@@ -1,4 +1,4 @@
-//! Whom a rule is about.
+//! The parties that rules name: other hosts, and other users of this host.
 
 use std::{fmt, net::IpAddr};
 

@@ -19,8 +19,8 @@ pub enum Verb {
     Serve,
     /// It sends requests to servers here.
     Call,
-    /// It is shown the nodes of this name, and the endpoints of topics and services of this name. Who may publish, subscribe, serve or call sees the endpoints
-    /// that this needs.
+    /// It is shown the nodes of this name, and the endpoints of topics and services of this name. A party that may
+    /// publish, subscribe, serve or call is shown the endpoints that it needs for that.
     See,
 }
 
@@ -68,7 +68,7 @@ pub(super) struct Rule {
     pub(super) says: Vec<(Verb, TopicPattern, u32)>,
 }
 
-/// One `[[expect]]`: what somebody who wrote rules expects of them.
+/// One `[[expect]]`: the decision that the author of the rules expects.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Expectation {

@@ -34,7 +34,7 @@ fn a_robot_lets_its_base_station_drive_it_and_its_guest_look_on() {
     let base = Party::Name("base");
     assert_eq!(check(base, Verb::Publish, "/cmd_vel"), "allowed by line 4 of access.toml");
     assert_eq!(check(base, Verb::Call, "/robot/arm/set_mode"), "allowed by line 5 of access.toml");
-    let none = "denied: no [[allow]] of access.toml lets it";
+    let none = "denied: no [[allow]] in access.toml permits this";
     assert_eq!(check(base, Verb::Call, "/robot/arm/left/set_mode"), none);
     assert_eq!(check(base, Verb::Subscribe, "/cmd_vel"), none);
     let guest = Party::Name("operator-guest");
@@ -44,11 +44,11 @@ fn a_robot_lets_its_base_station_drive_it_and_its_guest_look_on() {
     assert!(rules.check(user, Verb::Subscribe, "/anything").allowed());
     assert_eq!(check(user, Verb::Publish, "/anything"), none);
     let other = check(Party::Name("stranger"), Verb::Publish, "/cmd_vel");
-    assert_eq!(other, "allowed: no rule of access.toml is against it");
+    assert_eq!(other, "allowed: no rule in access.toml denies this");
     let closed = format!("default = \"deny\"\n{ROBOT}");
     let closed = AccessRules::parse(&closed, "access.toml").unwrap();
     let other = closed.check(Party::Name("stranger"), Verb::Publish, "/cmd_vel");
-    let by_default = "denied: default = \"deny\" in access.toml, and no [[allow]] names it";
+    let by_default = "denied: default = \"deny\" in access.toml, and no [[allow]] names the peer";
     assert_eq!((other.to_string(), other.line()), (by_default.to_owned(), None));
 }
 
@@ -221,7 +221,7 @@ proptest! {
             .into_iter()
             .map(|(deny, peer, verb, name)| (deny, PEERS[peer], Verb::ALL[verb], NAMES[name]))
             .collect();
-        let mut text = if deny { "default = \"deny\"\n" } else { "" }.to_owned();
+        let mut text = format!("default = \"{}\"\n", if deny { "deny" } else { "allow" });
         for (deny, peer, verb, name) in &all {
             let header = if *deny { "deny" } else { "allow" };
             text += &format!("[[{header}]]\npeer = \"{peer}\"\n{verb} = \"{name}\"\n");

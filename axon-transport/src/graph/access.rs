@@ -31,8 +31,8 @@ pub fn permits(party: &Permissions, endpoint: &Endpoint) -> bool {
         || verb_of(endpoint.kind).is_none_or(|verb| party.allows(verb, &endpoint.topic))
 }
 
-/// Whether a party is shown this endpoint of somebody else: one that it may see, or that it needs for what it may do. A
-/// node is seen by its full name.
+/// Whether a party is shown this endpoint of another party: it may see the topic, or needs the endpoint for its own. For
+/// a node the full name counts.
 pub fn shows(party: &Permissions, endpoint: &Endpoint) -> bool {
     if party.are_unlimited() {
         return true;

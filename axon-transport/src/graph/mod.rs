@@ -7,6 +7,7 @@ pub(crate) mod endpoint;
 pub(crate) mod pairing;
 mod query;
 pub(crate) mod range;
+mod users;
 pub(crate) mod view;
 
 pub(crate) use access::{permits, shows, verb_of};
@@ -17,4 +18,5 @@ pub use query::{NamesAndTypes, NodeName, SERVICE_KINDS, TOPIC_KINDS};
 pub(crate) use range::{
     EndpointRange, OutOfRange, RangeToHost, RemoteEndpoint, Scope, out_of_range,
 };
+pub(crate) use users::Users;
 pub use view::{GraphEntry, GraphView};

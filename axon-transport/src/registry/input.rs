@@ -9,6 +9,7 @@ use super::{
     sessions::SessionEntry,
 };
 use crate::{
+    access::AccessRules,
     graph::{EndpointKind, LIMITS, Scope, writes},
     ids::{Gid, SessionId},
     text,
@@ -40,6 +41,28 @@ impl<F: Clone> Registry<F> {
         self.sessions.insert(id, SessionEntry::new(role, name, pid, descriptors, scope))?;
         self.rescoped |= role == SessionRole::Application;
         Ok(())
+    }
+
+    /// A session is of another user than the daemon's. Has to be called before it has endpoints.
+    pub fn set_user(&mut self, id: &SessionId, user: u32) {
+        self.users.add(user);
+        if let Some(entry) = self.sessions.get_mut(id) {
+            entry.user = Some(user);
+        }
+    }
+
+    /// These access rules count from now on. Pairs that they do not allow end, and those that they allow are made.
+    pub fn set_access(&mut self, rules: AccessRules) {
+        self.users.set_rules(rules);
+        let of_users = self.sessions.iter().filter(|(_, entry)| entry.user.is_some());
+        let of_users: Vec<_> = of_users.map(|(id, entry)| (*id, entry.endpoints.clone())).collect();
+        for (id, endpoints) in of_users {
+            self.sessions.request_resync(&id);
+            if let Some(entry) = self.sessions.get_mut(&id) {
+                entry.refused = false;
+            }
+            endpoints.iter().for_each(|gid| self.judge(&id, gid));
+        }
     }
 
     /// A session that is gone, and its endpoints with it.

@@ -1,4 +1,5 @@
-//! Makes and ends pairs, as endpoints come and go and as their ranges change, and tells their sessions.
+//! Makes and ends pairs, as endpoints come and go and as their ranges and the access rules change, and tells their
+//! sessions.
 
 use std::collections::{BTreeSet, HashSet};
 
@@ -7,9 +8,9 @@ use super::{
     endpoints::{LocalEndpoint, Topic},
 };
 use crate::{
-    graph::{OutOfRange, Pairing, RemoteEndpoint, pairing},
+    graph::{Endpoint, OutOfRange, Pairing, RemoteEndpoint, pairing},
     ids::{Gid, SessionId},
-    wire::session::{EndpointRole, Message, Pair, Unmatch},
+    wire::session::{EndpointRole, Message, Pair, Refused, Unmatch},
 };
 
 impl<F: Clone> Registry<F> {
@@ -50,6 +51,43 @@ impl<F: Clone> Registry<F> {
                 Pairing::Unrelated => {}
             }
         }
+    }
+
+    /// Judges an endpoint anew.
+    pub(super) fn judge(&mut self, id: &SessionId, gid: &Gid) {
+        let Some(local) = self.endpoints.get(gid) else { return };
+        let (endpoint, role, was_shown) = (local.endpoint.clone(), local.role, local.is_shown());
+        let denial = self.denial(id, role, &endpoint);
+        if !self.endpoints.set_denied(gid, denial.is_some()) {
+            return;
+        }
+        if let Some(why) = denial {
+            self.note_denied(id, &endpoint, &why);
+        }
+        match (was_shown, self.endpoints.get(gid).is_some_and(|local| local.is_shown())) {
+            (true, false) => self.changes.remove(*gid, true),
+            (false, true) => self.graph_add_local(&endpoint),
+            _ => {}
+        }
+        self.rematch(gid);
+    }
+
+    /// Why access rules deny an endpoint to its user, if they do.
+    pub(super) fn denial(
+        &self,
+        id: &SessionId,
+        role: EndpointRole,
+        endpoint: &Endpoint,
+    ) -> Option<String> {
+        let user = self.sessions.get(id).and_then(|entry| entry.user);
+        self.users.denial(user.filter(|_| role == EndpointRole::Application), endpoint)
+    }
+
+    /// Has the status and the log say that an endpoint is denied. Its session is not told: for a session REFUSED is for
+    /// good, and other rules may allow the endpoint.
+    pub(super) fn note_denied(&mut self, id: &SessionId, endpoint: &Endpoint, why: &str) {
+        let refused = Refused::of(endpoint, why);
+        self.sessions.note_refused(id, &refused.text);
     }
 
     /// Forgets an endpoint, which its session's entry no longer lists.

@@ -19,7 +19,6 @@ mod remote;
 mod sessions;
 #[cfg(test)]
 mod tests;
-mod users;
 
 use std::{collections::BTreeSet, sync::Arc};
 
@@ -38,10 +37,9 @@ use self::{
     range::Ranges,
     remote::{Heard, RemoteEndpoints},
     sessions::Sessions,
-    users::Users,
 };
 use crate::{
-    graph::{Endpoint, RemoteEndpoint, Scope},
+    graph::{Endpoint, RemoteEndpoint, Scope, Users},
     ids::{DaemonId, Gid, SessionId},
     wire::session::{Attach, EndpointRole, SessionRole},
 };

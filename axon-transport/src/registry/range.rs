@@ -12,11 +12,10 @@ use super::{
     endpoints::{Endpoints, LocalEndpoint, Topic},
     remote::RemoteEndpoints,
     sessions::{SessionEntry, Sessions},
-    users::Users,
 };
 use crate::{
     config::DiscoveryRange,
-    graph::{Endpoint, OutOfRange, Pairing, RangeToHost, Scope, out_of_range, pairing},
+    graph::{Endpoint, OutOfRange, Pairing, RangeToHost, Scope, Users, out_of_range, pairing},
     ids::{DaemonId, Gid, SessionId},
     wire::session::{EndpointRole, GraphItem, Pair, SessionRole},
 };

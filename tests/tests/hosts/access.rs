@@ -162,7 +162,7 @@ fn the_wrong_topic_never_arrives_and_the_right_one_does_in_each_mode() {
                 Hosts::shows(
                     &hosts.robot,
                     "publish /brake (the peer's)",
-                    "no [[allow]] of access.toml",
+                    "no [[allow]] in access.toml",
                 ) && Hosts::shows(&hosts.base, "publish /brake (ours)", "by the peer: denied")
                     && Hosts::shows(&hosts.base, "subscribe /secret (ours)", "access.toml")
                     && Hosts::shows(&hosts.base, "call /reboot (ours)", "access.toml")
@@ -318,7 +318,7 @@ fn another_user_of_the_host_publishes_what_rules_allow_it_and_nothing_else() {
         allowed.recv(&mut bytes, Some(PATIENCE)).expect("a sample of the other user");
     }
     robot.wait_refusal("the daemon says which rule denies", |refusal| {
-        refusal.contains("\"/denied\": denied: no [[allow]] of access.toml lets it")
+        refusal.contains("\"/denied\": denied: no [[allow]] in access.toml permits this")
     });
     assert!(!denied.has_data() && denied.matched().is_empty());
     assert!(

@@ -19,7 +19,6 @@ mod reload;
 mod remote;
 mod report;
 mod run;
-mod topics;
 mod turns;
 
 pub use gateway::GatewayEntry;

@@ -48,7 +48,7 @@ pub(super) async fn reload(
             _ = hangup.recv() => {}
             () = asked.notified() => {}
         }
-        // Who asks from here on is answered by the next reading.
+        // Sessions that ask from here on are answered by the next reading.
         let asking = std::mem::take(&mut control.borrow_mut().reload_asked);
         // It reads files, and a file system may hang.
         let report = match source.clone() {

@@ -139,7 +139,7 @@ impl Remote {
     /// Gives the gateway the access rules in force. An order that finds the channel full is given again.
     fn order_access(&mut self) {
         let rules = self.access.borrow_and_update().clone();
-        // One that is started later begins with them.
+        // A gateway that is started later begins with them.
         let missed = self.running.is_some() && !self.order(ToGateway::Access(rules));
         self.access_due = missed.then(|| Instant::now() + BUSY);
     }

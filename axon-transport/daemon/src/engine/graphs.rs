@@ -33,8 +33,8 @@ impl Engine {
         }
     }
 
-    /// Other access rules count from now on. What they deny ends before any other input is handled: no peer can delay
-    /// that.
+    /// Replaces the access rules. Pairs that they deny end before the engine handles any other input, so that no peer can
+    /// delay it.
     pub(super) fn set_access(&mut self, rules: AccessRules, now: Duration) {
         self.access = rules;
         let peers: Vec<_> = self.peers.iter().map(|(daemon, peer)| (daemon, peer.link)).collect();

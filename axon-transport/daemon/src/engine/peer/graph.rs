@@ -302,7 +302,7 @@ impl Remote {
         self.all.get(gid).map(|held| &*held.remote.endpoint)
     }
 
-    /// Other access rules count.
+    /// Replaces the access rules, and judges each endpoint by them.
     pub(crate) fn set_permissions(&mut self, permissions: Permissions) {
         self.permissions = permissions;
         for (gid, held) in self.all.iter_mut().chain(self.gathered.iter_mut().flatten()) {

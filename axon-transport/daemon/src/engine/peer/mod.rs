@@ -333,7 +333,7 @@ impl Peer {
         all
     }
 
-    /// Other access rules count. What they deny ends at once; the graphs follow.
+    /// Replaces the access rules. Routes that they deny end at once; the graphs follow.
     pub(super) fn set_permissions(&mut self, permissions: Permissions) {
         self.access.set_permissions(permissions.clone());
         self.remote.set_permissions(permissions);

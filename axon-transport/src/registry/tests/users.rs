@@ -4,11 +4,12 @@ use std::collections::BTreeSet;
 
 use axon_shm::internal::Location;
 
-use super::*;
 use crate::{
-    graph::{EndpointKind, RemoteEndpoint},
-    ids::DaemonId,
-    wire::session::{Announce, Message, Pair, SessionRole},
+    access::AccessRules,
+    graph::{Endpoint, EndpointKind, RemoteEndpoint},
+    ids::{DaemonId, Gid, SessionId},
+    registry::Registry,
+    wire::session::{Announce, EndpointRole, Message, Pair, SessionRole},
 };
 
 use EndpointKind::{Node, Publisher, Subscription};

@@ -28,8 +28,8 @@ use axon_transport::{
     status::{OutOfRangeStatus, ReaderStatus, RefusedRouteStatus, TopicStatus, WriterStatus},
 };
 
-use super::losses::ByTopic;
 use crate::bridge::RefusedRoute;
+use crate::control::losses::ByTopic;
 
 /// Publishers, readers, and endpoints whose routes are refused, of a topic that the status lists.
 const LISTED: usize = 64;

@@ -1,5 +1,7 @@
 //! Builds the daemon's [`Status`] from the state of the control plane.
 
+mod topics;
+
 use std::collections::BTreeMap;
 
 use axon_shm::ids::SessionId;
@@ -9,7 +11,8 @@ use axon_transport::{
     status::{DiscoveryStatus, SessionStatus, Status},
 };
 
-use super::{plane::Control, topics::topics};
+use self::topics::topics;
+use super::plane::Control;
 use crate::discovery::Wanted;
 
 /// Answers a session that asks for the status. One that asks again before it has taken the

@@ -1,0 +1,47 @@
+//! What access rules let other users of this host do.
+//!
+//! The sessions of the daemon's own user are not restricted: a process with that user's rights can do anything to them.
+
+use std::collections::HashMap;
+
+use super::{Endpoint, permits, shows, verb_of};
+use crate::access::{AccessRules, Party, Permissions};
+
+/// The rules, compiled for each user who has a session, or had one.
+#[derive(Debug, Default)]
+pub(crate) struct Users {
+    rules: AccessRules,
+    permissions: HashMap<u32, Permissions>,
+}
+
+impl Users {
+    pub(crate) fn have_rules(&self) -> bool {
+        !self.rules.is_empty()
+    }
+
+    pub(crate) fn add(&mut self, user: u32) {
+        let rules = &self.rules;
+        self.permissions.entry(user).or_insert_with(|| rules.permissions(Party::User(user)));
+    }
+
+    pub(crate) fn set_rules(&mut self, rules: AccessRules) {
+        for (user, permissions) in &mut self.permissions {
+            *permissions = rules.permissions(Party::User(*user));
+        }
+        self.rules = rules;
+    }
+
+    /// Why a user may not have an endpoint, if it may not.
+    pub(crate) fn denial(&self, user: Option<u32>, endpoint: &Endpoint) -> Option<String> {
+        let permissions = self.permissions.get(&user?)?;
+        let verb = verb_of(endpoint.kind)?;
+        let denied = !permits(permissions, endpoint);
+        denied.then(|| permissions.check(verb, &endpoint.topic).to_string())
+    }
+
+    /// Whether `user` is shown an endpoint of a session of user `of`.
+    pub(crate) fn shows(&self, user: Option<u32>, of: Option<u32>, endpoint: &Endpoint) -> bool {
+        let permissions = user.and_then(|user| self.permissions.get(&user));
+        user == of || permissions.is_none_or(|permissions| shows(permissions, endpoint))
+    }
+}
