@@ -14,7 +14,7 @@ use crate::{
     text,
     wire::session::{
         Announce, Attach, EndpointRole, Fence, GivenUp, Granted, Leaving, Message, Pair, Refused,
-        SessionRole, Unmatch,
+        SessionRole, Unmatch, Unmet,
     },
 };
 
@@ -106,6 +106,7 @@ impl<F: Clone> Registry<F> {
             Message::Detach(pair) => self.detach(id, pair),
             Message::GivenUp(given_up) => self.give_up(id, given_up),
             Message::Fence(fence) => self.fence(id, fence),
+            Message::Unmet(unmet) => self.unmet(id, unmet),
             Message::Unmatch(unmatch) => self.fail(id, unmatch),
             Message::Resync => {
                 // Everything costs much more to tell than to ask for.
@@ -249,6 +250,15 @@ impl<F: Clone> Registry<F> {
         let keeping: BTreeSet<SessionId> = keeping.map(|reader| reader.session).collect();
         self.fences.ask(*id, fence, keeping.into_iter().collect(), &self.sessions);
         self.answer_fences();
+        Ok(())
+    }
+
+    /// A publisher ends, and one of its readers never took up what it was granted.
+    fn unmet(&mut self, id: &SessionId, unmet: Unmet) -> Result<(), Violation> {
+        if !unmet.writer.is_of(id) {
+            return Err(Violation::NotItsOwn(unmet.writer));
+        }
+        self.sessions.tell_unmet(unmet);
         Ok(())
     }
 

@@ -63,6 +63,9 @@ pub const MAX_SESSIONS: usize = 4096;
 pub const MAX_OF_PROCESS: usize = 256;
 /// Remembered GIDs of endpoints that ended while there was no daemon to tell.
 const MAX_TOMBSTONES: usize = 4096;
+/// Pairs of a publisher that ended and a reader that never learned of its grant, kept for readers whose sessions are not
+/// here.
+const MAX_UNMET: usize = if cfg!(test) { 4 } else { 4096 };
 
 /// The state of the control plane.
 #[derive(Debug)]

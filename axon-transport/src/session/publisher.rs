@@ -378,6 +378,14 @@ impl PublisherInner {
             && writer.expects_readers()
     }
 
+    /// The readers of other sessions that have not taken up their grant, and how many samples there are for each.
+    pub(super) fn unmet(&self) -> Vec<(Gid, u64)> {
+        let Rings::Shared(writer) = &self.rings else { return Vec::new() };
+        let counted =
+            self.endpoint.kind == EndpointKind::Publisher && self.role == EndpointRole::Application;
+        if counted { writer.unmet() } else { Vec::new() }
+    }
+
     /// Whether it was attached.
     pub(super) fn detach(&self, reader: Gid) -> bool {
         self.attached().remove(&reader);

@@ -61,6 +61,15 @@ impl Writer {
         state.reader_set.expects_readers(state.history.head())
     }
 
+    /// The readers of other sessions that have not taken up their grant, and how many samples there are for each.
+    pub fn unmet(&self) -> Vec<(Gid, u64)> {
+        if self.is_forked() {
+            return Vec::new();
+        }
+        let state = self.lock();
+        state.reader_set.unmet(state.history.head())
+    }
+
     /// Samples with which those who carry them elsewhere are not done.
     pub fn under_way(&self) -> u64 {
         if self.is_forked() {

@@ -483,9 +483,21 @@ impl ReaderSet {
 
     /// Whether a KEEP_ALL reader of another session has not taken up its grant, though there are samples for it.
     pub(crate) fn expects_readers(&self, head: u64) -> bool {
-        self.readers.iter().any(|reader| {
+        self.asking(head).any(|reader| holds(&reader.info.qos))
+    }
+
+    /// The readers of other sessions that have not taken up their grant, and how many samples there are for each: of a
+    /// KEEP_LAST one no more than its depth. What readers carry elsewhere is counted there.
+    pub(crate) fn unmet(&self, head: u64) -> Vec<(Gid, u64)> {
+        let readers = self.asking(head).filter(|reader| !reader.is_carrier());
+        let samples = |reader: &Attached| (head - reader.grant.first).min(depth(&reader.info.qos));
+        readers.map(|reader| (reader.info.gid, samples(reader))).collect()
+    }
+
+    /// The readers of other sessions that live and have not taken up their grant, though there are samples for them.
+    fn asking(&self, head: u64) -> impl Iterator<Item = &Attached> {
+        self.readers.iter().filter(move |reader| {
             reader.info.peer.remote().is_some_and(|peer| !peer.is_dead())
-                && holds(&reader.info.qos)
                 && reader.grant.first < head
                 && reader.tenancy.standing(reader.lane.words()) == LaneState::Asked
         })

@@ -1,5 +1,6 @@
-//! Memory of sessions that ended soon after this daemon's start, while readers of theirs may not have come back yet.
+//! What sessions left to readers that have not come to this daemon yet: memory, and what their readers lost.
 //!
+//! Memory is of sessions that ended soon after this daemon's start, while readers of theirs may not have come back yet.
 //! When a daemon is killed, a session may open a segment that no daemon passes on. The session tells the next daemon,
 //! and may end before its readers have come back and met it there. A new daemon keeps such a session's segments for a
 //! while, and hands them to readers that ask.
@@ -7,7 +8,7 @@
 use std::collections::VecDeque;
 
 use super::memory::{OwnMemory, SessionSegment};
-use crate::ids::SessionId;
+use crate::{ids::SessionId, registry::MAX_UNMET, wire::session::Unmet};
 
 /// The segments of sessions that ended.
 #[derive(Debug)]
@@ -54,6 +55,37 @@ impl<F> LeftMemory<F> {
     pub(super) fn segment(&self, of: &SessionId, number: u32) -> Option<&SessionSegment<F>> {
         let (_, segments) = self.sessions.iter().find(|(id, _)| id == of)?;
         segments.get(number)
+    }
+}
+
+/// Pairs of a publisher that ended and a reader that never learned of its grant, whose session is not here. Its process may be stopped, and may have ended.
+#[derive(Debug, Default)]
+pub(super) struct UnmetPairs {
+    pairs: VecDeque<Unmet>,
+    full: bool,
+}
+
+impl UnmetPairs {
+    /// Keeps a pair for its reader. A session may say so again.
+    pub(super) fn keep(&mut self, unmet: Unmet) {
+        self.pairs.retain(|kept| (kept.reader, kept.writer) != (unmet.reader, unmet.writer));
+        if self.pairs.len() == MAX_UNMET {
+            self.pairs.pop_front();
+            if !std::mem::replace(&mut self.full, true) {
+                tracing::warn!(
+                    "publishers ended before more than {MAX_UNMET} readers were told of them: the oldest \
+                     of these readers do not count what they lost, should their processes go on"
+                );
+            }
+        }
+        self.pairs.push_back(unmet);
+    }
+
+    /// Takes those of a session's readers.
+    pub(super) fn take(&mut self, session: &SessionId) -> Vec<Unmet> {
+        let (taken, rest) = self.pairs.drain(..).partition(|unmet| unmet.reader.is_of(session));
+        self.pairs = rest;
+        Vec::from(taken)
     }
 }
 

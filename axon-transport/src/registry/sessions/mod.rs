@@ -15,7 +15,7 @@ use std::{
 
 pub(super) use self::outbox::Due;
 use self::{
-    left::LeftMemory,
+    left::{LeftMemory, UnmetPairs},
     memory::{HeldMemory, NotTaken},
     outbox::{Outbox, Pushed},
 };
@@ -30,6 +30,7 @@ use crate::{
     ids::{DaemonId, Gid, SessionId},
     wire::session::{
         MAX_DESCRIPTORS, Message, Pair, Refused, Segment, SegmentName, SegmentOpened, SessionRole,
+        Unmet,
     },
 };
 
@@ -118,6 +119,8 @@ pub(super) struct Sessions<F> {
     refused: Vec<(SessionId, String)>,
     /// Memory of those that ended.
     left: LeftMemory<F>,
+    /// What readers lost whose sessions are not here.
+    unmet: UnmetPairs,
 }
 
 impl<F> Default for Sessions<F> {
@@ -127,6 +130,7 @@ impl<F> Default for Sessions<F> {
             ready: BTreeSet::new(),
             refused: Vec::new(),
             left: LeftMemory::default(),
+            unmet: UnmetPairs::default(),
         }
     }
 }
@@ -161,6 +165,7 @@ impl<F> Sessions<F> {
         self.entries.insert(id, entry);
         if !tool {
             self.fall_behind(&id);
+            self.unmet.take(&id).into_iter().for_each(|unmet| self.tell_unmet(unmet));
         }
         Ok(())
     }
@@ -168,6 +173,8 @@ impl<F> Sessions<F> {
     pub(super) fn remove(&mut self, id: &SessionId) {
         if let Some(entry) = self.entries.remove(id) {
             self.left.keep(*id, entry.segments);
+            // It may come back.
+            entry.outbox.unmet().for_each(|unmet| self.unmet.keep(unmet));
         }
         self.ready.remove(id);
     }
@@ -249,6 +256,20 @@ impl<F> Sessions<F> {
         }
         if let Some(output) = Output::of(message, descriptors) {
             self.push_output(to, output);
+        }
+    }
+
+    /// Tells a reader's session of a pair that was never made. If it is not here, it is told when it comes.
+    pub(super) fn tell_unmet(&mut self, unmet: Unmet) {
+        // GIDs begin as their session's id does.
+        let mut ends = [SessionId([0; 16]), SessionId([u8::MAX; 16])];
+        ends.iter_mut().for_each(|id| id.0[..12].copy_from_slice(&unmet.reader.0[..12]));
+        let [first, last] = ends;
+        let Some((id, entry)) = self.entries.range_mut(first..=last).next() else {
+            return self.unmet.keep(unmet);
+        };
+        if entry.outbox.push_unmet(unmet) {
+            self.ready.insert(*id);
         }
     }
 

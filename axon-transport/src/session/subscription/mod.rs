@@ -4,6 +4,7 @@ mod inner;
 mod matched_readers;
 mod taking;
 mod trusted;
+mod unmet;
 
 use std::{
     fmt,
