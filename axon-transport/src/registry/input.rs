@@ -51,6 +51,7 @@ impl<F: Clone> Registry<F> {
     /// the session is told nothing any more.
     pub fn handle_disconnect_in_parts(&mut self, id: &SessionId) -> bool {
         self.sessions.fall_behind(id);
+        self.sessions.hand_over_pledges(id);
         let mut pairs = 0;
         while let Some(entry) = self.sessions.get_mut(id) {
             let before = self.pairs.len();
@@ -59,6 +60,7 @@ impl<F: Clone> Registry<F> {
                 self.rescoped = true;
                 return false;
             };
+            self.hand_over_grants(id, &gid);
             self.remove_endpoint(&gid, "its session ended");
             pairs += 1 + before - self.pairs.len();
             if pairs >= PAIRS_TOGETHER {
@@ -66,6 +68,21 @@ impl<F: Clone> Registry<F> {
             }
         }
         false
+    }
+
+    /// The session of a publisher ends: those of its readers that would not hear of its grants are handed them.
+    fn hand_over_grants(&mut self, id: &SessionId, gid: &Gid) {
+        let Some(writer) = self.endpoints.get(gid) else { return };
+        if writer.endpoint.kind != EndpointKind::Publisher || !writer.endpoint.gid.is_of(id) {
+            return;
+        }
+        let pairs = self.pairs.existing(self.endpoints.prospective_pairs(&writer.endpoint));
+        let granted = pairs.filter_map(|pair| self.pairs.grant_of(&pair)).filter(|granted| {
+            let reader = self.endpoints.session_of(&granted.reader);
+            reader.is_some_and(|reader| self.sessions.is_told_anew(&reader))
+        });
+        let granted: Vec<Granted> = granted.cloned().collect();
+        granted.into_iter().for_each(|granted| self.sessions.hand_over_grant(id, granted));
     }
 
     /// A message of a session.
@@ -180,6 +197,9 @@ impl<F: Clone> Registry<F> {
     }
 
     fn gone(&mut self, id: &SessionId, gid: Gid) -> Result<(), Violation> {
+        if gid.is_of(id) {
+            self.sessions.forget_pledges(&gid);
+        }
         match self.endpoints.get(&gid) {
             Some(local) if local.session == *id => {
                 if let Some(entry) = self.sessions.get_mut(id) {
@@ -291,7 +311,12 @@ impl<F: Clone> Registry<F> {
             return Err(Violation::NotItsOwn(grant.writer));
         }
         let pair = Pair { reader: grant.reader, writer: grant.writer };
-        if self.pairs.grant(Granted { session: *id, segments: Vec::new(), ..grant }) {
+        let grant = Granted { session: *id, segments: Vec::new(), ..grant };
+        if self.pairs.attach_of(&pair).is_none() && grant.writer.is_of(id) {
+            // The reader has not come back from an earlier daemon.
+            self.sessions.pledge(grant);
+        } else if self.pairs.grant(grant) {
+            self.sessions.forget_pledge(&pair);
             self.forward_grant(&pair);
         }
         Ok(())

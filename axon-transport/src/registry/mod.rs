@@ -66,6 +66,10 @@ const MAX_TOMBSTONES: usize = 4096;
 /// Pairs of a publisher that ended and a reader that never learned of its grant, kept for readers whose sessions are not
 /// here.
 const MAX_UNMET: usize = if cfg!(test) { 4 } else { 4096 };
+/// Remembered grants of an earlier daemon's time to readers that are not here.
+const MAX_PLEDGES: usize = 256;
+/// Grants of publishers that were killed, with their rings, kept for readers whose sessions are not here.
+const MAX_LEFT: usize = if cfg!(test) { 2 } else { 64 };
 
 /// The state of the control plane.
 #[derive(Debug)]

@@ -83,6 +83,7 @@ fn child() {
         "takes samples" => return left::taker(),
         "ends its publisher" => return unmet::publisher(),
         "ends with its publisher" => return unmet::process(),
+        "is killed" => return unmet::killed(),
         "takes what is unmet" => return unmet::taker(),
         _ => {}
     }

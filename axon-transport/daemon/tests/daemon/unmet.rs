@@ -1,4 +1,4 @@
-//! A reader that was stopped, and that never came to a publisher that had counted it: what it lost is counted.
+//! A reader that was stopped, and that never heard of a publisher that had counted it: what it lost is counted.
 
 use std::time::{Duration, Instant};
 
@@ -10,29 +10,48 @@ const SAMPLES: u64 = 24;
 /// How long a publisher that was dropped stays for a reader, and more.
 const PUBLISHER_STAYS: Duration = Duration::from_secs(12);
 
-/// A child: publishes once it is told to, and ends its publisher, or all of it.
-fn publish_and_end(process: bool) {
+/// How a publisher ends.
+#[derive(PartialEq)]
+enum End {
+    Publisher,
+    Process,
+    Killed,
+}
+
+/// A child: publishes once it has a reader, and ends its publisher, or all of it, or waits to be killed.
+fn publish_and(end: &End) {
     let session = of_child("publisher");
     let publisher = session.create_publisher(spec("/unmet")).unwrap();
     say("created");
     assert!(publisher.wait_matched(1, PATIENCE));
     say("matched");
     (1..=SAMPLES).for_each(|number| publish(&publisher, number));
+    if *end == End::Killed {
+        // The next daemon has heard all that there is to hear of it.
+        until("a daemon answers", || session.status_json().is_ok());
+        say("published");
+        wait_for_the_end();
+    }
     drop(publisher);
-    if !process {
+    if *end == End::Publisher {
         say("ended");
         wait_for_the_end();
     }
 }
 
+/// A child: waits to be killed.
+pub(crate) fn killed() {
+    publish_and(&End::Killed);
+}
+
 /// A child: ends its publisher and lives.
 pub(crate) fn publisher() {
-    publish_and_end(false);
+    publish_and(&End::Publisher);
 }
 
 /// A child: ends with its publisher.
 pub(crate) fn process() {
-    publish_and_end(true);
+    publish_and(&End::Process);
 }
 
 /// A child: says how many samples came, and how many it counts as lost, once it knows of all of them.
@@ -92,4 +111,12 @@ fn a_reader_that_is_stopped_for_longer_than_a_dropped_publisher_stays_counts_wha
 #[test]
 fn a_reader_that_is_stopped_for_longer_than_a_process_that_ends_stays_counts_what_it_lost() {
     publisher_of_a_stopped_reader("ends with its publisher", Player::finish);
+}
+
+#[test]
+fn a_stopped_reader_knows_what_there_was_of_a_publisher_whose_process_was_killed() {
+    publisher_of_a_stopped_reader("is killed", |mut publisher| {
+        assert_eq!(publisher.hear(), "published");
+        signal(publisher.pid(), Signal::KILL);
+    });
 }

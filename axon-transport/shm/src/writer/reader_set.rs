@@ -494,6 +494,12 @@ impl ReaderSet {
         readers.map(|reader| (reader.info.gid, samples(reader))).collect()
     }
 
+    /// What was granted to readers of other sessions that have not taken it up, and carry samples nowhere.
+    pub(crate) fn pledged(&self) -> Vec<(Gid, Grant)> {
+        let readers = self.asking(u64::MAX).filter(|reader| !reader.is_carrier());
+        readers.map(|reader| (reader.info.gid, reader.grant)).collect()
+    }
+
     /// The readers of other sessions that live and have not taken up their grant, though there are samples for them.
     fn asking(&self, head: u64) -> impl Iterator<Item = &Attached> {
         self.readers.iter().filter(move |reader| {

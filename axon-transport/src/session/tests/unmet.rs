@@ -113,3 +113,46 @@ fn a_reader_counts_what_it_lost_once_and_only_where_its_grant_never_came() {
     followed::done(&daemon, &met);
     assert_eq!(unmet.lost(), 7, "nobody lost 2^64 samples");
 }
+
+#[test]
+fn each_daemon_is_told_what_was_granted_to_a_reader_that_has_not_come() {
+    let stage = Stage::new();
+    let (session, daemon) = stage.session();
+    let (publisher, reader, _asked) = granted_in_vain(&session, &daemon, Qos::keep_all());
+    let writer = publisher.gid();
+    let _taking = Taker::new().attach(&publisher, None, &daemon);
+    drop(daemon);
+    let daemon = stage.daemon(2);
+    let granted = daemon.hear(|message| match message {
+        Message::Grant(granted) => Some(granted),
+        _ => None,
+    });
+    assert_eq!((granted.reader, granted.writer, granted.first), (reader, writer, 0));
+    drop(publisher);
+    session.shared().part_leaving(true);
+    session.shared().wake();
+    let next = daemon.hear(|message| match &message {
+        Message::Grant(_) | Message::Unmet(_) => Some(message),
+        _ => None,
+    });
+    assert_eq!(next, Message::Unmet(Unmet { reader, writer, samples: 5 }), "one grant");
+}
+
+#[test]
+fn a_reader_takes_what_a_publisher_left_that_is_gone_as_it_is_granted() {
+    let (session, daemon) = session();
+    let far = Far::new(&daemon);
+    let subscription = subscription(&session);
+    daemon.say(Message::Match(far.pair(&subscription)), &[]);
+    let granted = far.grant(&daemon.hear_attach());
+    far.publish(1, b"x");
+    far.publish(2, b"x");
+    let introduction = far.introduction();
+    let introduction: Vec<_> = introduction.iter().map(AsFd::as_fd).collect();
+    daemon.say(Message::Grant(granted), &introduction);
+    let Pair { reader, writer } = far.pair(&subscription);
+    daemon.say(Message::Unmatch(Unmatch { reader, writer, reason: "gone".into() }), &[]);
+    until("the first came", || take(&subscription) == Some(1));
+    assert_eq!((take(&subscription), subscription.lost()), (Some(2), 0));
+    until("it is gone", || subscription.matched().is_empty());
+}
