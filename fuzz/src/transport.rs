@@ -303,7 +303,7 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
     use session::{
         Announce, Asserted, Attach, Credit, EndpointRole, Gone, Granted, Graph, GraphItem, Hello,
         Matched, Message, PROTOCOL, Pair, Refused, SampleFragment, SampleHeader, Segment,
-        SegmentName, SegmentOpened, SessionRole, StatusPart, Unmatch, Welcome,
+        SegmentName, SegmentOpened, SessionRole, StatusPart, Unmatch, Unmet, Welcome,
     };
     let (reader, writer) = (Gid([1; 16]), Gid([2; 16]));
     let place = Location { segment: 3, offset: 4096 };
@@ -377,6 +377,7 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
         Message::Segment(SegmentOpened { session, segment }),
         Message::SegmentGone(SegmentName { session, number: 3 }),
         Message::Need(SegmentName { session, number: 3 }),
+        Message::Unmet(Unmet { reader, writer, samples: 12 }),
         Message::Matched(Matched { gid: reader, others: vec![writer] }),
         Message::SampleFragment(SampleFragment {
             publisher: writer,

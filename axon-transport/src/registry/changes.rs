@@ -5,7 +5,7 @@ use std::{
     sync::{Arc, Weak},
 };
 
-use super::{MAX_TOMBSTONES, range::GraphFilter, sessions::encode};
+use super::{limits::MAX_TOMBSTONES, range::GraphFilter, sessions::encode};
 use crate::{
     graph::Endpoint,
     ids::{DaemonId, Gid},

@@ -15,7 +15,7 @@ use crate::{
     text,
     wire::session::{
         Announce, Attach, EndpointRole, Fence, GivenUp, Granted, Leaving, Message, Pair, Refused,
-        SessionRole, Unmatch,
+        SessionRole, Unmatch, Unmet,
     },
 };
 
@@ -74,6 +74,7 @@ impl<F: Clone> Registry<F> {
     /// the session is told nothing any more.
     pub fn handle_disconnect_in_parts(&mut self, id: &SessionId) -> bool {
         self.sessions.fall_behind(id);
+        self.sessions.hand_over_pledges(id);
         let mut pairs = 0;
         while let Some(entry) = self.sessions.get_mut(id) {
             let before = self.pairs.len();
@@ -82,6 +83,7 @@ impl<F: Clone> Registry<F> {
                 self.rescoped = true;
                 return false;
             };
+            self.hand_over_grants(id, &gid);
             self.remove_endpoint(&gid, "its session ended");
             pairs += 1 + before - self.pairs.len();
             if pairs >= PAIRS_TOGETHER {
@@ -89,6 +91,21 @@ impl<F: Clone> Registry<F> {
             }
         }
         false
+    }
+
+    /// The session of a publisher ends: those of its readers that would not hear of its grants are handed them.
+    fn hand_over_grants(&mut self, id: &SessionId, gid: &Gid) {
+        let Some(writer) = self.endpoints.get(gid) else { return };
+        if writer.endpoint.kind != EndpointKind::Publisher || !writer.endpoint.gid.is_of(id) {
+            return;
+        }
+        let pairs = self.pairs.existing(self.endpoints.prospective_pairs(&writer.endpoint));
+        let granted = pairs.filter_map(|pair| self.pairs.grant_of(&pair)).filter(|granted| {
+            let reader = self.endpoints.session_of(&granted.reader);
+            reader.is_some_and(|reader| self.sessions.is_told_anew(&reader))
+        });
+        let granted: Vec<Granted> = granted.cloned().collect();
+        granted.into_iter().for_each(|granted| self.sessions.hand_over_grant(id, granted));
     }
 
     /// A message of a session.
@@ -129,6 +146,7 @@ impl<F: Clone> Registry<F> {
             Message::Detach(pair) => self.detach(id, pair),
             Message::GivenUp(given_up) => self.give_up(id, given_up),
             Message::Fence(fence) => self.fence(id, fence),
+            Message::Unmet(unmet) => self.unmet(id, unmet),
             Message::Unmatch(unmatch) => self.fail(id, unmatch),
             Message::Resync => {
                 // Everything costs much more to tell than to ask for.
@@ -208,6 +226,9 @@ impl<F: Clone> Registry<F> {
     }
 
     fn gone(&mut self, id: &SessionId, gid: Gid) -> Result<(), Violation> {
+        if gid.is_of(id) {
+            self.sessions.forget_pledges(&gid);
+        }
         match self.endpoints.get(&gid) {
             Some(local) if local.session == *id => {
                 if let Some(entry) = self.sessions.get_mut(id) {
@@ -282,6 +303,15 @@ impl<F: Clone> Registry<F> {
         Ok(())
     }
 
+    /// A publisher ends, and one of its readers never took up what it was granted.
+    fn unmet(&mut self, id: &SessionId, unmet: Unmet) -> Result<(), Violation> {
+        if !unmet.writer.is_of(id) {
+            return Err(Violation::NotItsOwn(unmet.writer));
+        }
+        self.sessions.tell_unmet(unmet);
+        Ok(())
+    }
+
     fn attach(&mut self, id: &SessionId, attach: Attach) -> Result<(), Violation> {
         if self.endpoints.is_of_another(&attach.reader, id) {
             return Err(Violation::NotItsOwn(attach.reader));
@@ -311,7 +341,12 @@ impl<F: Clone> Registry<F> {
             return Err(Violation::NotItsOwn(grant.writer));
         }
         let pair = Pair { reader: grant.reader, writer: grant.writer };
-        if self.pairs.grant(Granted { session: *id, segments: Vec::new(), ..grant }) {
+        let grant = Granted { session: *id, segments: Vec::new(), ..grant };
+        if self.pairs.attach_of(&pair).is_none() && grant.writer.is_of(id) {
+            // The reader has not come back from an earlier daemon.
+            self.sessions.pledge(grant);
+        } else if self.pairs.grant(grant) {
+            self.sessions.forget_pledge(&pair);
             self.forward_grant(&pair);
         }
         Ok(())

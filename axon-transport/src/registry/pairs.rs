@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, HashMap};
 
-use super::{MAX_ALL_PAIRS, MAX_PAIRS};
+use super::limits::{MAX_ALL_PAIRS, MAX_PAIRS};
 use crate::{
     ids::{Gid, SessionId},
     wire::session::{Attach, Granted, Pair},

@@ -33,6 +33,7 @@ mod subscription;
 mod tasks;
 #[cfg(test)]
 mod tests;
+mod unmet;
 mod waiting;
 
 use std::{

@@ -108,7 +108,9 @@ impl SessionShared {
             state.leaving.insert(*gid, Instant::now() + EXPECTED);
             state.publishers.get(gid).cloned()
         } else {
-            state.publishers.remove(gid)
+            let publisher = state.publishers.remove(gid);
+            publisher.iter().for_each(|publisher| state.leave_unmet(publisher));
+            publisher
         };
         let subscription = state.subscriptions.remove(gid);
         let writes = publisher.as_ref().map(|p| (&p.endpoint, p.role));
@@ -160,7 +162,9 @@ impl SessionShared {
         let mut parted = Vec::new();
         for gid in over {
             state.leaving.remove(&gid);
-            parted.extend(state.publishers.remove(&gid));
+            let publisher = state.publishers.remove(&gid);
+            publisher.iter().for_each(|publisher| state.leave_unmet(publisher));
+            parted.extend(publisher);
             state.remove_dead(&gid);
         }
         let others = !state.leaving.is_empty();

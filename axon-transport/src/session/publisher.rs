@@ -22,9 +22,9 @@ use super::{
 use crate::{
     events::EventKind,
     graph::{Endpoint, EndpointKind},
-    ids::Gid,
+    ids::{Gid, SessionId},
     qos::{Liveliness, Qos},
-    wire::session::{EndpointRole, Fence},
+    wire::session::{EndpointRole, Fence, Granted},
 };
 
 /// Sends the samples of a topic. Thread-safe. When it is dropped, readers still take what it left.
@@ -376,6 +376,35 @@ impl PublisherInner {
             && self.role == EndpointRole::Application
             && holds(&self.endpoint.qos)
             && writer.expects_readers()
+    }
+
+    /// The readers of other sessions that have not taken up their grant, and how many samples there are for each.
+    pub(super) fn unmet(&self) -> Vec<(Gid, u64)> {
+        let Rings::Shared(writer) = &self.rings else { return Vec::new() };
+        let counted =
+            self.endpoint.kind == EndpointKind::Publisher && self.role == EndpointRole::Application;
+        if counted { writer.unmet() } else { Vec::new() }
+    }
+
+    /// What it granted to readers of other sessions that have not taken it up, said once more.
+    pub(super) fn pledged(&self, session: SessionId) -> Vec<Granted> {
+        let counted = self.endpoint.kind == EndpointKind::Publisher
+            && self.role == EndpointRole::Application
+            && !self.relayed;
+        let Some(writer) = self.rings.shared().filter(|_| counted) else { return Vec::new() };
+        let ring = writer.location();
+        let granted = |(reader, Grant { generation, first }, after)| Granted {
+            reader,
+            writer: self.endpoint.gid,
+            generation,
+            first,
+            session,
+            ring,
+            segments: Vec::new(),
+            after: Some(after),
+            relayed: None,
+        };
+        writer.pledged().into_iter().map(granted).collect()
     }
 
     /// Whether it was attached.

@@ -26,12 +26,13 @@ use super::{
     rings::ClientLimit,
     subscription::SubscriptionInner,
     tasks::Listening,
+    unmet::UnmetPairs,
 };
 use crate::{
     config::Config,
     graph::{Endpoint, GraphEntry, GraphView},
     ids::{DaemonId, Gid, SessionId},
-    wire::session::{EndpointRole, Fence, Gone, Message, StatusPart},
+    wire::session::{EndpointRole, Fence, Gone, Message, StatusPart, Unmet},
 };
 
 /// Something that a session's owner may want to hear of.
@@ -100,6 +101,8 @@ pub(super) struct SessionState {
     pub(super) subscriptions: HashMap<Gid, Arc<SubscriptionInner>>,
     /// Publishers that the application has dropped, and until when they stay at most.
     pub(super) leaving: BTreeMap<Gid, Instant>,
+    /// Readers that never took up what publishers granted that have ended.
+    pub(super) unmet: UnmetPairs,
     /// Applications' endpoints of both kinds by topic or service.
     pub(super) topics: HashMap<String, BTreeSet<Gid>>,
     pub(super) outgoing: VecDeque<Outgoing>,
@@ -189,6 +192,20 @@ impl SessionState {
     pub(super) fn tell_gone(&mut self, gid: &Gid) {
         let gone = Message::EndpointGone(Gone { gid: *gid });
         self.outgoing.push_back(Outgoing::Message(Box::new(gone)));
+    }
+
+    /// A publisher ends. Has to be called before the daemon is told so.
+    pub(super) fn leave_unmet(&mut self, publisher: &PublisherInner) {
+        let writer = publisher.endpoint.gid;
+        for (reader, samples) in publisher.unmet() {
+            let unmet = Unmet { reader, writer, samples };
+            self.unmet.remember(unmet);
+            self.tell_unmet(unmet);
+        }
+    }
+
+    pub(super) fn tell_unmet(&mut self, unmet: Unmet) {
+        self.outgoing.push_back(Outgoing::Message(Box::new(Message::Unmet(unmet))));
     }
 
     pub(super) fn unindex(&mut self, endpoint: &Endpoint) {

@@ -4,6 +4,7 @@
 mod followed;
 mod handed;
 mod played;
+mod unmet;
 
 use std::{
     env, fs,

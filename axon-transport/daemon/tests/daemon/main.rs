@@ -10,6 +10,7 @@ mod logging;
 mod skip;
 #[path = "../support/mod.rs"]
 mod support;
+mod unmet;
 
 use std::{
     io::Write,
@@ -80,6 +81,10 @@ fn child() {
         "leaves a response" => return left::server(),
         "leaves samples" => return left::publisher(),
         "takes samples" => return left::taker(),
+        "ends its publisher" => return unmet::publisher(),
+        "ends with its publisher" => return unmet::process(),
+        "is killed" => return unmet::killed(),
+        "takes what is unmet" => return unmet::taker(),
         _ => {}
     }
     let config = Config::from_env().unwrap();

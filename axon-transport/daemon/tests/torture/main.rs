@@ -6,10 +6,10 @@
 //! Samples are of 0 bytes to 25 MB and carry their number and a pattern of it. Some are published through loans that
 //! are held while other samples go out; readers hold some. What must hold: every sample is whole; a KEEP_ALL
 //! subscription misses none of a publisher that lives, repeats none of any, takes all of one that ended, and what it
-//! misses of one that was killed, or that ended around a daemon's kill, it counts; every call is seen once by each
-//! server, and answered once by each that lives; no process fails or stands still; the memory they hold together stays
-//! below a ceiling. At the end the disturbances cease, every process must come to have the last sample of every other,
-//! and every call its answers.
+//! misses of one that was killed, or that ended around a daemon's kill, it counts, that of a publisher included which
+//! it was never told of; every call is seen once by each server, and answered once by each that lives; no process fails
+//! or stands still; the memory they hold together stays below a ceiling. At the end the disturbances cease, every
+//! process must come to have the last sample of every other, and every call its answers.
 //! When something is missing, both processes print the history of the pair.
 //!
 //! There are two plans. `Brief`: eight processes, stopped for some tenths of a second, often. `Stops`:

@@ -42,6 +42,19 @@ impl PairLog {
         eprintln!("--- process {}, {gid}:\n{lines}", std::process::id());
     }
 
+    /// How many samples the library counted as lost of publishers that ended before this process was told of their grant
+    /// to `reader`, in all or of `writer` alone; `None` if there were none.
+    pub(crate) fn unmet(&self, reader: &str, writer: Option<&str>) -> Option<u64> {
+        let reader = format!("reader={reader} ");
+        let writer = writer.map(|writer| format!("writer={writer} ")).unwrap_or_default();
+        let lines = self.lines();
+        let lines = lines.iter().filter(|line| line.contains("axon_transport::pairs: unmet "));
+        let lines = lines.filter(|line| line.contains(&reader) && line.contains(&writer));
+        let samples = lines.filter_map(|line| line.trim_end().rsplit_once("samples="));
+        let samples = samples.map(|(_, number)| number.parse::<u64>().expect("a number"));
+        samples.reduce(|sum, number| sum + number)
+    }
+
     fn lines(&self) -> MutexGuard<'_, VecDeque<String>> {
         self.0.lock().expect("no panic")
     }

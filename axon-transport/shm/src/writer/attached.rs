@@ -1,10 +1,7 @@
 //! One reader that is attached to a ring, and how far it is.
 
 use crate::{
-    ring::{
-        types::Grant,
-        window::{depth, holds},
-    },
+    ring::{types::Grant, window::depth},
     session::{
         lane::{self, LaneId, LaneState, LaneView},
         reader_info::ReaderInfo,
@@ -149,11 +146,9 @@ impl Attached {
         self.info.peer.remote().is_none() || lane::mapped(self.lane.words()) >= u64::from(number)
     }
 
-    /// Whether it is a KEEP_ALL reader of another session that has not taken up its grant, though there are samples for
-    /// it.
-    pub(super) fn is_expected(&self, head: u64) -> bool {
+    /// Whether its session is another one that lives and has not taken up the grant, though there are samples for it.
+    pub(super) fn is_asking(&self, head: u64) -> bool {
         self.info.peer.remote().is_some_and(|peer| !peer.is_dead())
-            && holds(&self.info.qos)
             && self.grant.first < head
             && self.tenancy.standing(self.lane.words()) == LaneState::Asked
     }

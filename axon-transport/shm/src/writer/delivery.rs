@@ -6,7 +6,7 @@ use std::{
 };
 
 use super::{Writer, WriterState};
-use crate::{ids::Gid, session::peer::PeerSession};
+use crate::{ids::Gid, ring::types::Grant, session::peer::PeerSession};
 
 impl Writer {
     /// The number up to which all that was published has been handed to those who carry it elsewhere.
@@ -59,6 +59,25 @@ impl Writer {
         }
         let state = self.lock();
         state.reader_set.expects_readers(state.history.head())
+    }
+
+    /// The readers of other sessions that have not taken up their grant, and how many samples there are for each.
+    pub fn unmet(&self) -> Vec<(Gid, u64)> {
+        if self.is_forked() {
+            return Vec::new();
+        }
+        let state = self.lock();
+        state.reader_set.unmet(state.history.head())
+    }
+
+    /// What was granted to readers of other sessions that have not taken it up, and the number in front of it.
+    pub fn pledged(&self) -> Vec<(Gid, Grant, u64)> {
+        if self.is_forked() {
+            return Vec::new();
+        }
+        let state = self.lock();
+        let pledged = state.reader_set.pledged().into_iter();
+        pledged.map(|(gid, grant)| (gid, grant, state.number_before(grant.first))).collect()
     }
 
     /// Samples with which those who carry them elsewhere are not done.

@@ -382,7 +382,26 @@ impl ReaderSet {
 
     /// Whether a KEEP_ALL reader of another session has not taken up its grant, though there are samples for it.
     pub(crate) fn expects_readers(&self, head: u64) -> bool {
-        self.readers.iter().any(|reader| reader.is_expected(head))
+        self.asking(head).any(|reader| holds(&reader.info.qos))
+    }
+
+    /// The readers of other sessions that have not taken up their grant, and how many samples there are for each: of a
+    /// KEEP_LAST one no more than its depth. What readers carry elsewhere is counted there.
+    pub(crate) fn unmet(&self, head: u64) -> Vec<(Gid, u64)> {
+        let readers = self.asking(head).filter(|reader| !reader.is_carrier());
+        let samples = |reader: &Attached| (head - reader.grant.first).min(depth(&reader.info.qos));
+        readers.map(|reader| (reader.info.gid, samples(reader))).collect()
+    }
+
+    /// What was granted to readers of other sessions that have not taken it up, and carry samples nowhere.
+    pub(crate) fn pledged(&self) -> Vec<(Gid, Grant)> {
+        let readers = self.asking(u64::MAX).filter(|reader| !reader.is_carrier());
+        readers.map(|reader| (reader.info.gid, reader.grant)).collect()
+    }
+
+    /// The readers of other sessions that live and have not taken up their grant, though there are samples for them.
+    fn asking(&self, head: u64) -> impl Iterator<Item = &Attached> {
+        self.readers.iter().filter(move |reader| reader.is_asking(head))
     }
 
     /// There is one reader more. A publisher of hundreds gets them one by one, so that what stands is

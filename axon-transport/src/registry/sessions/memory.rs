@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 
 use crate::{
     ids::{Gid, SessionId},
-    registry::MAX_SEGMENTS,
+    registry::limits::MAX_SEGMENTS,
     wire::session::{Pair, Segment},
 };
 

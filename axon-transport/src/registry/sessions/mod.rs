@@ -15,7 +15,7 @@ use std::{
 
 pub(super) use self::outbox::Due;
 use self::{
-    left::LeftMemory,
+    left::{LeftMemory, LeftNews, Pledges},
     memory::{HeldMemory, NotTaken},
     outbox::{Outbox, Pushed},
 };
@@ -23,13 +23,17 @@ pub use self::{
     memory::{OwnMemory, SessionSegment},
     outbox::Output,
 };
-use super::{MAX_SESSIONS, RelayCounters, Violation};
+use super::{
+    limits::{MAX_SEGMENTS, MAX_SESSIONS, Violation},
+    relayed::RelayCounters,
+};
 use crate::{
     config::DiscoveryRange,
     graph::{EndpointRange, RangeToHost, Scope},
     ids::{DaemonId, Gid, SessionId},
     wire::session::{
-        MAX_DESCRIPTORS, Message, Pair, Refused, Segment, SegmentName, SegmentOpened, SessionRole,
+        Granted, MAX_DESCRIPTORS, Message, Pair, Refused, Segment, SegmentName, SegmentOpened,
+        SessionRole, Unmatch, Unmet,
     },
 };
 
@@ -121,6 +125,9 @@ pub(super) struct Sessions<F> {
     refused: Vec<(SessionId, String)>,
     /// Memory of those that ended.
     left: LeftMemory<F>,
+    /// What is for readers whose sessions are not here.
+    news: LeftNews<F>,
+    pledges: Pledges,
 }
 
 impl<F> Default for Sessions<F> {
@@ -130,6 +137,8 @@ impl<F> Default for Sessions<F> {
             ready: BTreeSet::new(),
             refused: Vec::new(),
             left: LeftMemory::default(),
+            news: LeftNews::default(),
+            pledges: Pledges::default(),
         }
     }
 }
@@ -164,6 +173,7 @@ impl<F> Sessions<F> {
         self.entries.insert(id, entry);
         if !tool {
             self.fall_behind(&id);
+            self.news.take(&id).into_iter().for_each(|output| self.push_kept(output));
         }
         Ok(())
     }
@@ -171,6 +181,8 @@ impl<F> Sessions<F> {
     pub(super) fn remove(&mut self, id: &SessionId) {
         if let Some(entry) = self.entries.remove(id) {
             self.left.keep(*id, entry.segments);
+            // It may come back.
+            entry.outbox.into_kept().for_each(|output| self.news.keep(output));
         }
         self.ready.remove(id);
     }
@@ -255,6 +267,49 @@ impl<F> Sessions<F> {
         }
     }
 
+    /// Tells a reader's session of a pair that was never made. If it is not here, it is told when it comes.
+    pub(super) fn tell_unmet(&mut self, unmet: Unmet) {
+        self.forget_pledge(&Pair { reader: unmet.reader, writer: unmet.writer });
+        let output = Output::kept(&Message::Unmet(unmet), Vec::new(), unmet.reader);
+        output.into_iter().for_each(|output| self.push_kept(output));
+    }
+
+    fn push_kept(&mut self, output: Output<F>) {
+        let Some(reader) = output.kept_for else { return };
+        let to = self.session_of(&reader);
+        match to.and_then(|id| Some((id, self.entries.get_mut(&id)?))) {
+            None => self.news.keep(output),
+            Some((id, entry)) => {
+                if entry.outbox.push_kept(output) {
+                    self.ready.insert(id);
+                }
+            }
+        }
+    }
+
+    /// The session of an endpoint that need not have been announced: GIDs begin as their session's id does.
+    fn session_of(&self, gid: &Gid) -> Option<SessionId> {
+        let mut ends = [SessionId([0; 16]), SessionId([u8::MAX; 16])];
+        ends.iter_mut().for_each(|id| id.0[..12].copy_from_slice(&gid.0[..12]));
+        let [first, last] = ends;
+        self.entries.range(first..=last).next().map(|(id, _)| *id)
+    }
+
+    /// A publisher granted this by way of an earlier daemon.
+    pub(super) fn pledge(&mut self, granted: Granted) {
+        self.pledges.note(granted);
+    }
+
+    /// A reader is granted something else, or was told that it gets nothing.
+    pub(super) fn forget_pledge(&mut self, pair: &Pair) {
+        self.pledges.forget(|of| (of.reader, of.writer) == (pair.reader, pair.writer));
+    }
+
+    /// A publisher has ended, and said what its readers lost.
+    pub(super) fn forget_pledges(&mut self, writer: &Gid) {
+        self.pledges.forget(|granted| granted.writer == *writer);
+    }
+
     /// Queues a packet for several sessions, which share its memory.
     pub(super) fn push_encoded(&mut self, to: &[SessionId], packet: &Arc<[u8]>) {
         for id in to {
@@ -314,7 +369,7 @@ impl<F: Clone> Sessions<F> {
             Ok(()) => {}
             Err(NotTaken::Number) => return Err(Violation::Segments(number)),
             Err(NotTaken::Full) => {
-                self.refuse_segment(id, &format!("a session has {}", super::MAX_SEGMENTS));
+                self.refuse_segment(id, &format!("a session has {}", MAX_SEGMENTS));
                 return Ok(());
             }
         }
@@ -343,6 +398,38 @@ impl<F: Clone> Sessions<F> {
         );
         self.note_refused(id, &text);
         self.push(id, &Message::Refused(Refused::because(text)), Vec::new());
+    }
+
+    /// A session ends. Hands what it pledged to the readers, who find in the rings what there was for them: all of what
+    /// is in the session's own segments, and the number of what is not. Called before its pairs end.
+    pub(super) fn hand_over_pledges(&mut self, id: &SessionId) {
+        let pledged = self.pledges.take(id);
+        pledged.into_iter().for_each(|granted| self.hand_over_grant(id, granted));
+    }
+
+    /// Hands what a session that ends granted to a reader, and its ring.
+    pub(super) fn hand_over_grant(&mut self, id: &SessionId, granted: Granted) {
+        let Some(entry) = self.entries.get(id) else { return };
+        let Some(descriptors) = entry.descriptors.clone() else { return };
+        let mut descriptors = Vec::from(descriptors);
+        let own = entry.segments.iter().filter(|of| of.segment.publisher.is_none());
+        let (ring, others): (Vec<_>, Vec<_>) =
+            own.partition(|of| of.segment.number == granted.ring.segment);
+        let own = ring.into_iter().chain(others).take(MAX_DESCRIPTORS - descriptors.len());
+        let (segments, maps): (Vec<_>, Vec<_>) =
+            own.map(|of| (of.segment, of.descriptor.clone())).unzip();
+        descriptors.extend(maps);
+        let Granted { reader, writer, .. } = granted;
+        let grant = Message::Grant(Granted { segments, ..granted });
+        let end = Unmatch { reader, writer, reason: "its session ended".to_owned() };
+        let grant = Output::kept(&grant, descriptors, reader);
+        let end = Output::kept(&Message::Unmatch(end), Vec::new(), reader);
+        grant.into_iter().chain(end).for_each(|output| self.push_kept(output));
+    }
+
+    /// Whether a reader's session is told everything anew, and so not what was granted before.
+    pub(super) fn is_told_anew(&self, id: &SessionId) -> bool {
+        self.entries.get(id).is_some_and(|entry| entry.outbox.mark().is_none())
     }
 
     /// A session has given a segment up.

@@ -5,9 +5,12 @@ use std::{collections::VecDeque, sync::Arc};
 use super::encode;
 use crate::{
     ids::{Gid, SessionId},
-    registry::{MAX_QUEUE, MAX_QUEUE_BYTES, STATUS_SLICE},
+    registry::limits::{MAX_QUEUE, MAX_QUEUE_BYTES, STATUS_SLICE},
     wire::session::{Message, StatusPart},
 };
+
+/// Packets that stay for their readers that may wait for one session.
+const MAX_WAITING_KEPT: usize = 1024;
 
 /// A packet for a session.
 #[derive(Clone, Debug)]
@@ -18,6 +21,8 @@ pub struct Output<F> {
     pub descriptors: Vec<F>,
     /// The session's segment that it hands over and nothing else.
     segment: Option<(SessionId, u32)>,
+    /// The reader of the session's that it is for, where the session would not hear of it when it is told everything anew.
+    pub(super) kept_for: Option<Gid>,
     /// Which it is of the packets that were queued for its session; 0 before it is.
     number: u64,
 }
@@ -29,12 +34,17 @@ impl<F> Output<F> {
             Message::Segment(opened) => Some((opened.session, opened.segment.number)),
             _ => None,
         };
-        Some(Self { packet: encode(message)?, descriptors, segment, number: 0 })
+        Some(Self { packet: encode(message)?, descriptors, segment, kept_for: None, number: 0 })
+    }
+
+    /// A packet that stays for its reader whatever becomes of the session's queue.
+    pub(super) fn kept(message: &Message, descriptors: Vec<F>, reader: Gid) -> Option<Self> {
+        Some(Self { kept_for: Some(reader), ..Self::of(message, descriptors)? })
     }
 
     /// A packet without descriptors.
     pub(super) fn plain(packet: Arc<[u8]>) -> Self {
-        Self { packet, descriptors: Vec::new(), segment: None, number: 0 }
+        Self { packet, descriptors: Vec::new(), segment: None, kept_for: None, number: 0 }
     }
 }
 
@@ -59,11 +69,14 @@ pub(super) enum Pushed {
 
 /// The packets for one session, in order, within bounds of their number and bytes.
 ///
-/// A session that does not take its packets in time falls *behind*: its queue is dropped, nothing is queued for it, and
-/// it is told everything anew once it reads again. While it is told everything the bounds grow with what it has to hear.
+/// A session that does not take its packets in time falls *behind*: its queue is dropped but for what it would not hear
+/// again ([`push_kept`](Self::push_kept)), nothing else is queued for it, and it is told everything anew once it reads
+/// again. While it is told everything the bounds grow with what it has to hear.
 #[derive(Debug)]
 pub(in crate::registry) struct Outbox<F> {
     queue: VecDeque<Output<F>>,
+    /// How many of them stay whatever becomes of the rest. They have a bound of their own.
+    kept: usize,
     /// The number of the last packet that was queued.
     last_queued: u64,
     max_packets: usize,
@@ -85,6 +98,7 @@ impl<F> Outbox<F> {
     pub(super) fn new(hears_graph: bool) -> Self {
         Self {
             queue: VecDeque::new(),
+            kept: 0,
             last_queued: 0,
             max_packets: MAX_QUEUE,
             bytes: 0,
@@ -122,13 +136,36 @@ impl<F> Outbox<F> {
         if self.behind {
             return Pushed::Behind;
         }
-        if self.queue.len() >= self.max_packets || self.bytes >= self.max_bytes {
+        if self.queue.len() - self.kept >= self.max_packets || self.bytes >= self.max_bytes {
             return Pushed::Full;
         }
         self.bytes += output.packet.len();
         self.last_queued += 1;
         self.queue.push_back(Output { number: self.last_queued, ..output });
         Pushed::Queued
+    }
+
+    /// Queues what the session would not hear of otherwise: it stays if the session falls behind. Returns whether it was
+    /// queued.
+    pub(super) fn push_kept(&mut self, output: Output<F>) -> bool {
+        if self.kept == MAX_WAITING_KEPT {
+            tracing::warn!(
+                reader = ?output.kept_for,
+                "a reader does not count what it lost: its process has yet to hear of {MAX_WAITING_KEPT} \
+                 publishers that ended"
+            );
+            return false;
+        }
+        self.kept += 1;
+        self.bytes += output.packet.len();
+        self.last_queued += 1;
+        self.queue.push_back(Output { number: self.last_queued, ..output });
+        true
+    }
+
+    /// Takes what stays for its readers, of a session that is gone.
+    pub(super) fn into_kept(self) -> impl Iterator<Item = Output<F>> {
+        self.queue.into_iter().filter(|output| output.kept_for.is_some())
     }
 
     /// What has to be queued before the next [`pop`](Self::pop).
@@ -146,6 +183,7 @@ impl<F> Outbox<F> {
     pub(super) fn pop(&mut self) -> Option<Output<F>> {
         let output = self.queue.pop_front();
         self.bytes -= output.as_ref().map_or(0, |output| output.packet.len());
+        self.kept -= usize::from(output.as_ref().is_some_and(|output| output.kept_for.is_some()));
         if self.queue.is_empty() && self.telling.is_none() {
             self.max_packets = MAX_QUEUE;
             self.max_bytes = MAX_QUEUE_BYTES;
@@ -161,6 +199,7 @@ impl<F> Outbox<F> {
             }
         } else {
             self.bytes += output.packet.len();
+            self.kept += usize::from(output.kept_for.is_some());
             self.queue.push_front(output);
         }
     }
@@ -180,8 +219,8 @@ impl<F> Outbox<F> {
     pub(super) fn fall_behind(&mut self) {
         self.behind = self.hears_graph;
         self.telling = None;
-        self.queue.clear();
-        self.bytes = 0;
+        self.queue.retain(|output| output.kept_for.is_some());
+        self.bytes = self.queue.iter().map(|output| output.packet.len()).sum();
     }
 
     /// The session is told everything anew once it has taken what waits.
@@ -269,7 +308,9 @@ impl<F> Outbox<F> {
 impl<F> Outbox<F> {
     /// Checks the bounds and the sum, and returns the bytes that wait.
     pub(in crate::registry) fn check(&self) -> usize {
-        assert!(self.queue.len() <= self.max_packets);
+        let kept = self.queue.iter().filter(|output| output.kept_for.is_some());
+        assert_eq!(self.kept, kept.count());
+        assert!(self.queue.len() - self.kept <= self.max_packets);
         assert_eq!(self.bytes, self.queue.iter().map(|output| output.packet.len()).sum::<usize>());
         let mut numbers = self.queue.iter().map(|output| output.number);
         assert!(numbers.clone().is_sorted() && numbers.all(|number| number <= self.last_queued));

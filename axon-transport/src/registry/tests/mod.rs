@@ -3,6 +3,7 @@
 //! session's descriptors exactly when it holds none.
 
 mod cases;
+mod unmet;
 mod users;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};

@@ -4,6 +4,7 @@ mod inner;
 mod matched_readers;
 mod taking;
 mod trusted;
+mod unmet;
 
 use std::{
     fmt,
@@ -212,7 +213,8 @@ impl Subscription {
         self.session.wait_changed(timeout, || self.matched().len() >= count)
     }
 
-    /// Samples that were overwritten before they were taken.
+    /// Samples that were lost: overwritten before they were taken, missing in memory that is gone, or published for this
+    /// subscription by a publisher that ended before this process was told of it.
     pub fn lost(&self) -> u64 {
         if self.session.is_forked() {
             return 0;

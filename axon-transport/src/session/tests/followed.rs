@@ -11,14 +11,14 @@ use crate::{
 };
 
 /// Where the test plays one daemon after another.
-struct Stage {
+pub(super) struct Stage {
     listener: OwnedFd,
     config: Config,
     _dir: tempfile::TempDir,
 }
 
 impl Stage {
-    fn new() -> Self {
+    pub(super) fn new() -> Self {
         let dir = tempfile::tempdir().unwrap();
         let run = dir.path().join("run").into_os_string();
         let env = [("AXON_RUNTIME_DIR".into(), run), ("AXON_DAEMON".into(), "require".into())];
@@ -29,7 +29,7 @@ impl Stage {
     }
 
     /// The next daemon, once a session has come to it.
-    fn daemon(&self, number: u8) -> Daemon {
+    pub(super) fn daemon(&self, number: u8) -> Daemon {
         let mut fds = [PollFd::new(&self.listener, PollFlags::IN)];
         assert_eq!(poll(&mut fds, Some(&EVER.try_into().unwrap())), Ok(1), "nobody comes");
         let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
@@ -57,7 +57,7 @@ impl Stage {
         daemon
     }
 
-    fn session(&self) -> (Session, Daemon) {
+    pub(super) fn session(&self) -> (Session, Daemon) {
         let config = self.config.clone();
         let opening = thread::spawn(move || Session::open(&config, SessionOptions::new("t")));
         let daemon = self.daemon(1);
@@ -66,7 +66,7 @@ impl Stage {
 }
 
 /// Waits until the session has done what it was told: it asks for a pair that it is told of last.
-fn done(daemon: &Daemon, asking: &Subscription) {
+pub(super) fn done(daemon: &Daemon, asking: &Subscription) {
     let writer = Gid::new(SessionId::random(), 1);
     daemon.say(Message::Match(Pair { reader: asking.gid(), writer }), &[]);
     daemon.hear(|message| {

@@ -450,6 +450,22 @@ pub struct Fence {
     pub number: u64,
 }
 
+/// A publisher has ended, and a reader never took up what it was granted: the reader counts the samples as lost. A reader
+/// that did take it up counts for itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct Unmet {
+    /// The reader.
+    #[n(0)]
+    pub reader: Gid,
+    /// The publisher.
+    #[n(1)]
+    pub writer: Gid,
+    /// How many there were for the reader, of which it would have taken no more than its depth.
+    #[n(2)]
+    pub samples: u64,
+}
+
 /// A message of the session socket.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[allow(missing_docs)]
@@ -476,6 +492,7 @@ pub enum Message {
     Leaving(Leaving),
     GivenUp(GivenUp),
     Fence(Fence),
+    Unmet(Unmet),
     Matched(Matched),
     SampleFragment(SampleFragment),
     Credit(Credit),

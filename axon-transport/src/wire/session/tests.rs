@@ -104,6 +104,7 @@ fn messages() -> Vec<Message> {
         Message::Need(SegmentName { session, number: 9 }),
         Message::Leaving(Leaving { gid: writer, leaving: true }),
         Message::Fence(Fence { writer, number: 12 }),
+        Message::Unmet(Unmet { reader, writer, samples: 13 }),
         Message::Matched(Matched { gid: reader, others: vec![writer] }),
         Message::SampleFragment(SampleFragment {
             publisher: writer,

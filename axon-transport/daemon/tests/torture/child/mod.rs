@@ -32,6 +32,8 @@ const PATIENCE: Duration = Duration::from_secs(120);
 
 struct Child {
     session: Session,
+    /// The GID of the subscription that must miss nothing.
+    gapless: String,
     /// KEEP_ALL and KEEP_LAST.
     streams: [Mutex<Stream>; 2],
     quiet: AtomicBool,
@@ -116,6 +118,7 @@ pub(crate) fn run(seed: u64) {
     let client = session.create_client(spec("/call", Qos::keep_all())).expect("memory");
     let child = Child {
         session,
+        gapless: hex(subscriptions[0].gid()),
         streams,
         quiet: AtomicBool::new(false),
         over: AtomicBool::new(false),
@@ -126,7 +129,7 @@ pub(crate) fn run(seed: u64) {
         misses: Mutex::default(),
         pair_log,
     };
-    say(&hex(subscriptions[0].gid()));
+    say(&child.gapless);
     thread::scope(|scope| {
         scope.spawn(|| child.publish_all(&mut Random(seed)));
         let [all, last] = &subscriptions;
@@ -188,7 +191,19 @@ impl Child {
                         let last = self.last.lock().expect("no panic");
                         last.iter().any(|(g, last)| hex(*g) == gid && *last == number)
                     };
-                    if !self.session.wait(reached, Some(PATIENCE)) {
+                    let unmet = || self.pair_log.unmet(&self.gapless, Some(&gid));
+                    let done = || reached() || unmet().is_some();
+                    let came = self.session.wait(done, Some(PATIENCE));
+                    // All that it left was lost to the subscription, or nothing.
+                    if let Some(samples) = unmet() {
+                        let taken = self.last.lock().expect("no panic");
+                        let taken = taken.keys().any(|publisher| hex(*publisher) == gid);
+                        assert!(!taken, "{gid}: samples were taken of a publisher that was unmet");
+                        assert!((1..=number).contains(&samples), "{samples} of {number}");
+                        say("counted");
+                        continue;
+                    }
+                    if !came {
                         self.pair_log.print(&gid);
                         let last = self.last.lock().expect("no panic");
                         let last = last.iter().find(|(g, _)| hex(**g) == gid);

@@ -50,9 +50,12 @@ impl Child {
                 let missed = info.sequence - before - 1;
                 if gapless && missed > 0 {
                     all_missed += missed;
-                    let counted = all_missed <= subscription.lost();
+                    // What was lost with publishers that were unmet left no gap.
+                    let unmet = self.pair_log.unmet(&self.gapless, None).unwrap_or(0);
+                    let lost = subscription.lost().saturating_sub(unmet);
+                    let counted = all_missed <= lost;
                     // Each miss that is not counted is told of once.
-                    all_missed = all_missed.min(subscription.lost());
+                    all_missed = all_missed.min(lost);
                     // A publisher does not wait for subscriptions of its own session.
                     if !info.publisher.is_of(&self.session.id()) {
                         self.missed(Kind::Sample { counted }, &info, missed);

@@ -11,6 +11,11 @@ use super::{
 /// milliseconds: it waits for ten seconds, and may be stopped for four.
 const DAEMON: u128 = 15_000;
 
+/// How long before its end a process may have had no daemon to tell what its readers lost: it waits for two seconds, and
+/// says that it ends some time before it does. And how long after it the daemon may have been killed that it told, before
+/// the readers were: they may be stopped for four seconds, and then have to come to that daemon.
+const UNTOLD: [u128; 2] = [5_000, 15_000];
+
 /// What happened to endpoints that are gone.
 #[derive(Default)]
 pub(super) struct Past {
@@ -18,6 +23,8 @@ pub(super) struct Past {
     pub(super) deaths: HashMap<String, u128>,
     /// Publishers that ended.
     pub(super) ended: Vec<Ended>,
+    /// When processes ended, by their session, in milliseconds since the epoch.
+    pub(super) ends: HashMap<String, u128>,
     /// When daemons were killed, in milliseconds since the epoch.
     pub(super) daemons: Vec<u128>,
 }
@@ -27,6 +34,19 @@ impl Past {
     fn lost_daemon(&self, given_up: u128) -> bool {
         let shortly = given_up.saturating_sub(DAEMON)..=given_up;
         self.daemons.iter().any(|killed| shortly.contains(killed))
+    }
+
+    /// A process ends now.
+    pub(super) fn process_ends(&mut self, gid: &str, now: u128) {
+        self.ends.insert(session(gid).to_owned(), now);
+    }
+
+    /// Whether nobody was left to tell a reader what it lost of a publisher: its process has ended, and so has the one
+    /// daemon that it told, or there was none that it could tell. As long as the process lives it tells every daemon.
+    fn left_nobody(&self, publisher: &str) -> bool {
+        let Some(end) = self.ends.get(session(publisher)) else { return false };
+        let around = end.saturating_sub(UNTOLD[0])..=end + UNTOLD[1];
+        self.daemons.iter().any(|killed| around.contains(killed))
     }
 }
 
@@ -39,6 +59,10 @@ pub(super) struct Ended {
 }
 
 impl Ended {
+    pub(super) fn gid(&self) -> &str {
+        &self.gid
+    }
+
     /// What a process says of it.
     pub(super) fn parse(line: &str) -> Self {
         let mut words = line.split_ascii_whitespace().map(str::to_owned);
@@ -57,8 +81,8 @@ fn session(gid: &str) -> &str {
 ///
 /// Returns how many pairs of a reader and a publisher that ended never came about, though the publisher counted the
 /// reader: the daemon between them was killed before the reader was told, and the publisher ended before the next one
-/// matched them.
-pub(super) fn come_to_rest(players: &mut [Player], past: &mut Past) -> u64 {
+/// matched them. Of the first the reader counts the samples as lost. Of the others nobody could tell it.
+pub(super) fn come_to_rest(players: &mut [Player], past: &mut Past) -> [u64; 2] {
     for player in players.iter_mut() {
         player.resume();
     }
@@ -88,21 +112,30 @@ pub(super) fn come_to_rest(players: &mut [Player], past: &mut Past) -> u64 {
     // What a process left is gone with it if it was killed later.
     let killed: HashSet<&str> = past.deaths.keys().map(|reader| session(reader)).collect();
     past.ended.retain(|ended| !killed.contains(session(&ended.gid)));
-    let mut unmet = 0;
+    let (mut unmet, mut wrong) = ([0; 2], Vec::new());
     for player in players.iter_mut() {
         let reader = player.reader();
         for Ended { gid, last, readers } in &past.ended {
             if readers.contains(&reader) && session(gid) != session(&reader) {
                 match player.ask(&format!("expect {gid} {last}")).as_str() {
                     "there" => {}
+                    "counted" => unmet[0] += 1,
+                    "never" if past.left_nobody(gid) => unmet[1] += 1,
                     answer => {
                         assert_eq!(answer, "never");
-                        unmet += 1;
+                        let ended = past.ends.get(session(gid));
+                        wrong.push(format!("{reader} of {gid}, whose process ended: {ended:?}"));
                     }
                 }
             }
         }
     }
+    assert!(
+        wrong.is_empty(),
+        "publishers that ended were neither met nor counted as lost:\n{}\ndaemons killed: {:?}",
+        wrong.join("\n"),
+        past.daemons
+    );
     for (of, last) in &lasts {
         for (index, player) in players.iter_mut().enumerate() {
             // A publisher does not wait for subscriptions of its own session.

@@ -124,8 +124,8 @@ pub(crate) fn run(plan: Plan, time: Duration, seed: u64, namespaces: &Namespaces
     assert!(most > 0, "no shared memory was found");
     let Game { mut players, done, mut past, leaving, host, .. } = game.without_leaving();
     drop(leaving);
-    let unmet = come_to_rest(&mut players, &mut past);
-    let gone = Gone { unmet, ..missed(&mut players, &past) };
+    let [unmet, untold] = come_to_rest(&mut players, &mut past);
+    let gone = Gone { unmet, untold, ..missed(&mut players, &past) };
     let mut counts = [0; 3];
     for player in &mut players {
         let answer = player.ask("count");
@@ -219,7 +219,11 @@ impl Game<'_> {
             let Some(ending) = player.ending else { continue };
             let Some(line) = player.heard() else { continue };
             player.ending = None;
-            self.past.ended.push(Ended::parse(&line));
+            let ended = Ended::parse(&line);
+            if ending == Ending::Process {
+                self.past.process_ends(ended.gid(), epoch());
+            }
+            self.past.ended.push(ended);
             self.done.ends += 1;
             if ending == Ending::Process {
                 player.resume();

@@ -38,14 +38,16 @@ pub(super) struct Gone {
     pub(super) samples: u64,
     /// Calls of or to processes that were killed, or ended.
     pub(super) calls: u64,
-    /// Pairs with a publisher that ended that never came about.
+    /// Pairs with a publisher that ended that never came about: the reader counts what it lost.
     pub(super) unmet: u64,
+    /// The same of which nobody was left to tell the reader.
+    pub(super) untold: u64,
 }
 
 impl Round {
     pub(crate) fn heading() -> String {
         format!(
-            "{:>6} {:>6} {:>8} {:>6} {:>6} {:>6} {:>8} {:>6} {:>10} {:>9} {:>9} {:>14} {:>11} {:>6} {:>6} {:>6}",
+            "{:>6} {:>6} {:>8} {:>6} {:>6} {:>6} {:>8} {:>6} {:>10} {:>9} {:>9} {:>14} {:>11} {:>6} {:>6} {:>6} {:>6}",
             "plan",
             "seed",
             "seconds",
@@ -60,6 +62,7 @@ impl Round {
             "gone with dead",
             "calls gone",
             "unmet",
+            "untold",
             "MiB",
             "most"
         )
@@ -70,14 +73,14 @@ impl fmt::Display for Round {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { plan, seed, time, done, published, taken, answers, gone, most } = self;
         let Done { namespaced, kills, stops, daemons, ends } = done;
-        let Gone { samples, calls, unmet } = gone;
+        let Gone { samples, calls, unmet, untold } = gone;
         let (seconds, most) = (time.as_secs_f64(), most >> 20);
         let (plan, limit) = (format!("{plan:?}"), plan.processes() as u64 * CEILING_MB);
         write!(
             f,
             "{plan:>6} {seed:>6} {seconds:>8.1} {namespaced:>6} {kills:>6} {stops:>6} {daemons:>8} \
-             {ends:>6} {published:>10} {taken:>9} {answers:>9} {samples:>14} {calls:>11} {unmet:>6} {most:>6} \
-             {limit:>6}"
+             {ends:>6} {published:>10} {taken:>9} {answers:>9} {samples:>14} {calls:>11} {unmet:>6} {untold:>6} \
+             {most:>6} {limit:>6}"
         )
     }
 }

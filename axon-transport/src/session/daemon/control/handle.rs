@@ -19,7 +19,7 @@ use crate::{
     },
     wire::session::{
         Attach, Fence, GivenUp, Granted, Leaving, MAX_DESCRIPTORS, Message, Pair, Refused, Segment,
-        SegmentName, SegmentOpened, Unmatch,
+        SegmentName, SegmentOpened, Unmatch, Unmet,
     },
 };
 
@@ -37,6 +37,7 @@ impl Control {
             }
             Message::Unmatch(unmatch) => self.unmatch(&unmatch),
             Message::Leaving(leaving) => self.leave(leaving),
+            Message::Unmet(unmet) => self.unmet(unmet),
             Message::GivenUp(given_up) => self.give_up(given_up),
             Message::Fence(fence) => self.fence(fence),
             Message::Segment(opened) => self.segment(&opened, &descriptors),
@@ -109,6 +110,22 @@ impl Control {
             if subscription.lock().leave(&gid, leaving) {
                 self.reader_changed(&subscription);
             }
+        }
+    }
+
+    /// A publisher ended before this session was told what it granted to one of its readers.
+    fn unmet(&self, Unmet { reader, writer, samples }: Unmet) {
+        let subscription = self.shared.state().subscriptions.get(&reader).cloned();
+        let Some(subscription) = subscription else { return };
+        if subscription.lock().count_unmet(&writer, samples) {
+            pair_log::unmet(&Pair { reader, writer }, samples);
+            let topic = &subscription.endpoint.topic;
+            tracing::warn!(
+                topic, %writer, samples,
+                "samples are lost: their publisher ended before this process was told of it"
+            );
+            // Those who wait for losses.
+            self.shared.segment.notify();
         }
     }
 

@@ -36,6 +36,15 @@ impl Control {
             let gids: BTreeSet<Gid> = state.nodes.keys().chain(endpoints).copied().collect();
             let gone: Vec<Gid> = state.tombstones.iter().copied().collect();
             state.outgoing.extend(gids.into_iter().map(Outgoing::Announce));
+            // Behind the announcements, and the memory that they name.
+            let pledged: Vec<_> =
+                state.publishers.values().flat_map(|p| p.pledged(self.shared.id)).collect();
+            let pledged =
+                pledged.into_iter().map(|g| Outgoing::Message(Box::new(Message::Grant(g))));
+            state.outgoing.extend(pledged);
+            // Before their ends.
+            let unmet: Vec<_> = state.unmet.iter().collect();
+            unmet.into_iter().for_each(|unmet| state.tell_unmet(unmet));
             let gone = gone.into_iter().map(|gid| Message::EndpointGone(Gone { gid }));
             state.outgoing.extend(gone.map(|m| Outgoing::Message(Box::new(m))));
         }

@@ -186,15 +186,38 @@ impl Control {
         }
         self.shared.part_leaving(true);
         // What was queued last, such as ENDPOINT_GONE, is said by the end of the connection. Only
-        // of memory, in which readers may find the last samples, nobody else could tell.
+        // of memory, in which readers may find the last samples, nobody else could tell, nor of what
+        // readers lost.
         let deadline = Instant::now() + FAREWELL;
         loop {
             self.shared.segment.tidy();
             self.tell_segments();
+            self.tell_unmet();
             self.send_rest(deadline);
-            let unread = self.shared.segment.has_unread();
-            if !unread || self.was_heard(deadline) || !self.find_next_daemon(deadline) {
+            let heard = !self.leaves_news() || self.was_heard(deadline);
+            if heard || !self.find_next_daemon(deadline) {
                 return;
+            }
+        }
+    }
+
+    /// Whether readers have yet to be sent memory, or told what they lost.
+    fn leaves_news(&self) -> bool {
+        self.shared.segment.has_unread() || !self.shared.state().unmet.is_empty()
+    }
+
+    /// Queues what the daemon has yet to hear of readers that never took up their grant.
+    fn tell_unmet(&mut self) {
+        if !self.is_linked() {
+            return;
+        }
+        let mut state = self.shared.state();
+        for outgoing in std::mem::take(&mut state.outgoing) {
+            match outgoing {
+                Outgoing::Message(message) if matches!(*message, Message::Unmet(_)) => {
+                    self.outbox.push_back((*message, Vec::new()));
+                }
+                other => state.outgoing.push_back(other),
             }
         }
     }
@@ -213,9 +236,10 @@ impl Control {
         }
     }
 
-    /// Waits for the next daemon, to tell it of the memory that readers have yet to be sent. Whether there is one.
+    /// Waits for the next daemon, to tell it of the memory that readers have yet to be sent, and of what they lost.
+    /// Whether there is one.
     fn find_next_daemon(&mut self, deadline: Instant) -> bool {
-        while matches!(self.link, Link::Reconnecting(_)) && self.shared.segment.has_unread() {
+        while matches!(self.link, Link::Reconnecting(_)) && self.leaves_news() {
             let left = deadline.saturating_duration_since(Instant::now());
             if left.is_zero() {
                 return false;

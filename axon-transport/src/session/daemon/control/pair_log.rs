@@ -24,6 +24,12 @@ pub(super) fn forgotten(pair: &Pair) {
     tracing::debug!(target: TARGET, %reader, %writer, "the writer had forgotten the reader");
 }
 
+/// Reader: the writer has ended, and what it granted never came.
+pub(super) fn unmet(pair: &Pair, samples: u64) {
+    let Pair { reader, writer } = pair;
+    tracing::debug!(target: TARGET, %reader, %writer, samples, "unmet");
+}
+
 /// Either end lets go of the other.
 pub(super) fn over(pair: &Pair, why: &str) {
     let Pair { reader, writer } = pair;

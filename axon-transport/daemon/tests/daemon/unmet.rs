@@ -1,0 +1,122 @@
+//! A reader that was stopped, and that never heard of a publisher that had counted it: what it lost is counted.
+
+use std::time::{Duration, Instant};
+
+use super::*;
+use crate::support::of_child;
+
+/// Samples that the publisher leaves.
+const SAMPLES: u64 = 24;
+/// How long a publisher that was dropped stays for a reader, and more.
+const PUBLISHER_STAYS: Duration = Duration::from_secs(12);
+
+/// How a publisher ends.
+#[derive(PartialEq)]
+enum End {
+    Publisher,
+    Process,
+    Killed,
+}
+
+/// A child: publishes once it has a reader, and ends its publisher, or all of it, or waits to be killed.
+fn publish_and(end: &End) {
+    let session = of_child("publisher");
+    let publisher = session.create_publisher(spec("/unmet")).unwrap();
+    say("created");
+    assert!(publisher.wait_matched(1, PATIENCE));
+    say("matched");
+    (1..=SAMPLES).for_each(|number| publish(&publisher, number));
+    if *end == End::Killed {
+        // The next daemon has heard all that there is to hear of it.
+        until("a daemon answers", || session.status_json().is_ok());
+        say("published");
+        wait_for_the_end();
+    }
+    drop(publisher);
+    if *end == End::Publisher {
+        say("ended");
+        wait_for_the_end();
+    }
+}
+
+/// A child: waits to be killed.
+pub(crate) fn killed() {
+    publish_and(&End::Killed);
+}
+
+/// A child: ends its publisher and lives.
+pub(crate) fn publisher() {
+    publish_and(&End::Publisher);
+}
+
+/// A child: ends with its publisher.
+pub(crate) fn process() {
+    publish_and(&End::Process);
+}
+
+/// A child: says how many samples came, and how many it counts as lost, once it knows of all of them.
+pub(crate) fn taker() {
+    let session = of_child("taker");
+    let subscription = session.create_subscription(spec("/unmet")).unwrap();
+    say("created");
+    let (mut bytes, mut came) = (Vec::new(), 0);
+    let patience = Instant::now() + PATIENCE;
+    while came + subscription.lost() < SAMPLES && Instant::now() < patience {
+        let Ok(info) = subscription.recv(&mut bytes, Some(Duration::from_millis(100))) else {
+            continue;
+        };
+        assert_eq!(bytes, info.sequence.to_le_bytes());
+        came += 1;
+    }
+    say(format!("{came} came, {} lost", subscription.lost()));
+    wait_for_the_end();
+}
+
+/// The daemon is killed between the question of a reader, which is stopped then, and the publisher's answer.
+fn publisher_of_a_stopped_reader(part: &str, meanwhile: impl FnOnce(Player)) {
+    let host = Host::new();
+    let mut publisher = host.play(part);
+    assert_eq!(publisher.hear(), "created");
+    until("the daemon knows it", || !host.status().unwrap().topics.is_empty());
+    signal(publisher.pid(), Signal::STOP);
+    let mut taker = host.play("takes what is unmet");
+    assert_eq!(taker.hear(), "created");
+    let asked = |status: Status| status.topics.iter().any(|topic| !topic.readers.is_empty());
+    until("the reader has asked", || asked(host.status().unwrap()));
+    signal(taker.pid(), Signal::STOP);
+    signal(host.status().unwrap().pid, Signal::KILL);
+    signal(publisher.pid(), Signal::CONT);
+    assert_eq!(publisher.hear(), "matched");
+    meanwhile(publisher);
+    signal(taker.pid(), Signal::CONT);
+    let said = taker.hear();
+    let (came, lost) = said.split_once(" came, ").unwrap();
+    let lost = lost.strip_suffix(" lost").unwrap();
+    let sum = came.parse::<u64>().unwrap() + lost.parse::<u64>().unwrap();
+    assert_eq!(sum, SAMPLES, "{said}");
+    taker.finish();
+}
+
+#[test]
+fn a_reader_that_is_stopped_for_longer_than_a_dropped_publisher_stays_counts_what_it_lost() {
+    let mut ended = None;
+    publisher_of_a_stopped_reader("ends its publisher", |mut publisher| {
+        assert_eq!(publisher.hear(), "ended");
+        std::thread::sleep(PUBLISHER_STAYS);
+        ended = Some(publisher);
+    });
+    ended.unwrap().finish();
+}
+
+#[test]
+fn a_reader_that_is_stopped_for_longer_than_a_process_that_ends_stays_counts_what_it_lost() {
+    publisher_of_a_stopped_reader("ends with its publisher", Player::finish);
+}
+
+#[test]
+fn a_stopped_reader_knows_what_there_was_of_a_publisher_whose_process_was_killed() {
+    publisher_of_a_stopped_reader("is killed", |mut publisher| {
+        assert_eq!(publisher.hear(), "published");
+        signal(publisher.pid(), Signal::KILL);
+    });
+}

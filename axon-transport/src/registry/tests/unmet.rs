@@ -1,0 +1,246 @@
+//! Readers that never learned of the grant of a publisher that ended.
+
+use axon_shm::internal::Location;
+
+use crate::{
+    graph::{Endpoint, EndpointKind},
+    ids::{Gid, SessionId},
+    qos::Qos,
+    registry::{
+        MAX_QUEUE, Registry, Violation,
+        limits::{MAX_LEFT, MAX_UNMET},
+    },
+    wire::session::{
+        Announce, Attach, EndpointRole, Gone, Granted, Message, Segment, SegmentOpened,
+        SessionRole, Unmet,
+    },
+};
+
+const WRITER: u8 = 1;
+const READER: u8 = 2;
+
+fn id(number: u8) -> SessionId {
+    SessionId([number; 16])
+}
+
+fn unmet(samples: u64) -> Unmet {
+    Unmet { reader: Gid::new(id(READER), 1), writer: Gid::new(id(WRITER), 1), samples }
+}
+
+fn connect(registry: &mut Registry<&'static str>, session: u8) {
+    let handed = Some(["segment", "doorbell", "pidfd"]);
+    let (role, name) = (SessionRole::Application, String::new());
+    registry.handle_connect(id(session), role, name, 1, handed, None).unwrap();
+}
+
+fn registry(sessions: &[u8]) -> Registry<&'static str> {
+    let mut registry = Registry::default();
+    sessions.iter().for_each(|session| connect(&mut registry, *session));
+    sessions.iter().for_each(|session| drop(taken(&mut registry, *session)));
+    registry
+}
+
+fn say(registry: &mut Registry<&'static str>, message: Message) {
+    registry.handle_message(&id(WRITER), message, vec![]).unwrap();
+}
+
+/// The publisher is announced.
+fn announce(registry: &mut Registry<&'static str>) {
+    let endpoint = Endpoint::example(unmet(0).writer, EndpointKind::Publisher);
+    let (role, stands_for) = (EndpointRole::Application, Vec::new());
+    let ring = Some(Location { segment: 0, offset: 4096 });
+    let announce = Announce { endpoint, role, stands_for, ring, only: None };
+    say(registry, Message::Endpoint(announce));
+}
+
+fn taken(registry: &mut Registry<&'static str>, session: u8) -> Vec<Message> {
+    let taken = std::iter::from_fn(|| registry.poll_output(&id(session)));
+    taken.map(|output| Message::decode(&output.packet).unwrap()).collect()
+}
+
+/// What the reader's session is told of unmet pairs.
+fn told(registry: &mut Registry<&'static str>) -> Vec<u64> {
+    let samples = taken(registry, READER).into_iter().filter_map(|message| match message {
+        Message::Unmet(unmet) => Some(unmet.samples),
+        _ => None,
+    });
+    samples.collect()
+}
+
+#[test]
+fn a_reader_hears_of_it_once_whether_its_session_is_here_or_comes_later() {
+    let mut registry = registry(&[WRITER, READER]);
+    say(&mut registry, Message::Unmet(unmet(3)));
+    assert_eq!(told(&mut registry), [3]);
+
+    registry.handle_disconnect(&id(READER));
+    say(&mut registry, Message::Unmet(unmet(5)));
+    say(&mut registry, Message::Unmet(unmet(5)));
+    registry.handle_disconnect(&id(WRITER));
+    connect(&mut registry, READER);
+    assert_eq!(told(&mut registry), [5], "its session has ended");
+    assert_eq!(told(&mut registry), [0; 0]);
+}
+
+#[test]
+fn a_reader_hears_of_it_before_it_hears_that_the_publisher_ended() {
+    let mut registry = registry(&[WRITER]);
+    let writer = unmet(3).writer;
+    registry.keep_left_memory(1);
+    announce(&mut registry);
+    say(&mut registry, Message::Unmet(unmet(3)));
+    say(&mut registry, Message::EndpointGone(Gone { gid: writer }));
+    registry.flush();
+    connect(&mut registry, READER);
+    let told = taken(&mut registry, READER);
+    let ends = |m: &Message| matches!(m, Message::Graph(g) if g.ended.as_ref().is_some_and(|e| e.contains(&writer)));
+    let at = |is: &dyn Fn(&Message) -> bool| told.iter().position(is).expect("it was told");
+    assert!(at(&|m| *m == Message::Unmet(unmet(3))) < at(&ends));
+}
+
+#[test]
+fn a_session_that_is_told_everything_anew_hears_of_it_all_the_same() {
+    let mut registry = registry(&[WRITER, READER]);
+    say(&mut registry, Message::Unmet(unmet(3)));
+    for _ in 0..=MAX_QUEUE {
+        registry.push(&id(READER), &Message::Resync, Vec::new());
+    }
+    // Its queue was dropped.
+    let other = Gid::new(id(WRITER), 2);
+    say(&mut registry, Message::Unmet(Unmet { writer: other, ..unmet(4) }));
+    assert_eq!(told(&mut registry), [3, 4]);
+
+    say(&mut registry, Message::Unmet(unmet(5)));
+    registry.handle_disconnect(&id(READER));
+    connect(&mut registry, READER);
+    assert_eq!(told(&mut registry), [5], "its connection broke");
+}
+
+#[test]
+fn the_oldest_pair_is_forgotten_beyond_the_bound() {
+    let mut registry = registry(&[WRITER]);
+    for number in 0..=MAX_UNMET as u32 {
+        let writer = Gid::new(id(WRITER), 1 + number);
+        say(&mut registry, Message::Unmet(Unmet { writer, ..unmet(number.into()) }));
+    }
+    connect(&mut registry, READER);
+    assert_eq!(told(&mut registry), [1, 2, 3, 4]);
+}
+
+#[test]
+fn nobody_speaks_for_the_publishers_of_another_session() {
+    let mut registry = registry(&[WRITER, READER]);
+    let refused = registry.handle_message(&id(READER), Message::Unmet(unmet(3)), vec![]);
+    assert_eq!(refused, Err(Violation::NotItsOwn(unmet(3).writer)));
+}
+
+fn grant(reader: Gid, writer: Gid) -> Granted {
+    let (session, ring) = (id(WRITER), Location { segment: 1, offset: 4096 });
+    let (segments, after, relayed) = (Vec::new(), Some(3), None);
+    Granted { reader, writer, generation: 7, first: 3, session, ring, segments, after, relayed }
+}
+
+/// What the reader's session is told of grants, with what descriptors, and whether it hears that the pair is over.
+fn handed(registry: &mut Registry<&'static str>) -> Vec<(Granted, Vec<&'static str>)> {
+    let packets: Vec<_> = std::iter::from_fn(|| registry.poll_output(&id(READER))).collect();
+    let mut handed = Vec::new();
+    for output in packets {
+        match Message::decode(&output.packet).unwrap() {
+            Message::Grant(granted) => handed.push((granted, output.descriptors)),
+            Message::Unmatch(end) => {
+                let over =
+                    |(of, _): &(Granted, _)| (of.reader, of.writer) == (end.reader, end.writer);
+                assert!(handed.iter().any(over), "it is over before it was granted");
+            }
+            _ => {}
+        }
+    }
+    handed
+}
+
+/// The publisher has come from an earlier daemon, which did not pass its grant on.
+fn pledged(sessions: &[u8]) -> Registry<&'static str> {
+    let mut registry = registry(sessions);
+    let segment = Segment { number: 1, publisher: None };
+    let opened = Message::Segment(SegmentOpened { session: id(WRITER), segment });
+    registry.handle_message(&id(WRITER), opened, vec!["heap"]).unwrap();
+    announce(&mut registry);
+    say(&mut registry, Message::Grant(grant(unmet(0).reader, unmet(0).writer)));
+    registry
+}
+
+#[test]
+fn a_reader_is_handed_the_ring_of_a_publisher_whose_process_was_killed_before_it_came() {
+    let segments = vec![Segment { number: 1, publisher: None }];
+    let expected = Granted { segments, ..grant(unmet(0).reader, unmet(0).writer) };
+    let descriptors = vec!["segment", "doorbell", "pidfd", "heap"];
+    for comes_before in [false, true] {
+        let mut registry = pledged(&[WRITER]);
+        if comes_before {
+            connect(&mut registry, READER);
+            assert_eq!(handed(&mut registry), []);
+        }
+        registry.handle_disconnect(&id(WRITER));
+        if !comes_before {
+            connect(&mut registry, READER);
+        }
+        assert_eq!(handed(&mut registry), [(expected.clone(), descriptors.clone())]);
+        assert_eq!(handed(&mut registry), []);
+    }
+}
+
+#[test]
+fn a_publisher_that_ended_by_itself_has_said_what_its_readers_lost() {
+    let mut registry = pledged(&[WRITER]);
+    say(&mut registry, Message::Unmet(unmet(3)));
+    registry.handle_disconnect(&id(WRITER));
+    connect(&mut registry, READER);
+    assert_eq!(told(&mut registry), [3]);
+
+    let mut registry = pledged(&[WRITER]);
+    // Its reader has taken up the grant meanwhile.
+    say(&mut registry, Message::EndpointGone(Gone { gid: unmet(0).writer }));
+    registry.handle_disconnect(&id(WRITER));
+    connect(&mut registry, READER);
+    assert_eq!(handed(&mut registry), []);
+}
+
+#[test]
+fn a_grant_that_a_session_did_not_take_in_time_comes_though_the_publisher_is_killed() {
+    let mut registry = registry(&[WRITER, READER]);
+    announce(&mut registry);
+    let Unmet { reader, writer, .. } = unmet(0);
+    let endpoint = Endpoint::example(reader, EndpointKind::Subscription);
+    let (role, stands_for) = (EndpointRole::Application, Vec::new());
+    let announce = Announce { endpoint, role, stands_for, ring: None, only: None };
+    registry.handle_message(&id(READER), Message::Endpoint(announce), vec![]).unwrap();
+    let (lane, session) = (Location { segment: 0, offset: 64 }, id(READER));
+    let (stands_for, segments, after, carries) = (None, Vec::new(), None, None);
+    let qos = Qos::default();
+    let attach =
+        Attach { reader, writer, lane, qos, session, stands_for, segments, after, carries };
+    registry.handle_message(&id(READER), Message::Attach(attach), vec![]).unwrap();
+    say(&mut registry, Message::Grant(grant(reader, writer)));
+    for _ in 0..=MAX_QUEUE {
+        registry.push(&id(READER), &Message::Resync, Vec::new());
+    }
+    registry.handle_disconnect(&id(WRITER));
+    assert_eq!(handed(&mut registry).len(), 1);
+}
+
+#[test]
+fn the_oldest_of_the_rings_that_wait_for_their_readers_is_given_up_beyond_the_bound() {
+    let mut registry = registry(&[WRITER]);
+    let reader = unmet(0).reader;
+    let writers: Vec<Gid> = (0..=MAX_LEFT as u32).map(|n| Gid::new(id(WRITER), 1 + n)).collect();
+    writers.iter().for_each(|writer| say(&mut registry, Message::Grant(grant(reader, *writer))));
+    registry.handle_disconnect(&id(WRITER));
+    connect(&mut registry, READER);
+    let packets: Vec<_> = std::iter::from_fn(|| registry.poll_output(&id(READER))).collect();
+    let packets = packets.iter().map(|output| Message::decode(&output.packet).unwrap());
+    let granted = packets.filter_map(|message| match message {
+        Message::Grant(granted) => Some(granted.writer),
+        _ => None,
+    });
+    assert_eq!(granted.collect::<Vec<_>>(), writers[1..]);
+}
