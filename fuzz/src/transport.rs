@@ -247,6 +247,14 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
         Message::Keepalive,
         Message::LinkClosed(link::LinkClosed { link: [3; 16] }),
         Message::Intake(link::Intake { unread: 33 << 20, messages: 64 << 20 }),
+        Message::Denied(link::Denied {
+            denied: vec![link::DeniedUse {
+                verb: 0,
+                name: "/cmd_vel".into(),
+                reason: "denied by line 4 of access.toml".into(),
+            }],
+            lifted: vec![link::DeniedUse { verb: 3, name: "/dock".into(), reason: String::new() }],
+        }),
         Message::Keys(KeyMessage::Announce(vec![key_id.clone(), KeyId::new("k2").unwrap()])),
         Message::Keys(KeyMessage::Ready { key_id: key_id.clone(), proof: [8; 32] }),
         Message::Keys(KeyMessage::Failed { key_id: key_id.clone(), reason: "unknown".into() }),
