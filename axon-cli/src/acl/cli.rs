@@ -16,6 +16,7 @@ A robot that only its base station may drive, in access.toml:
   axon acl check access.toml --peer base --publish /cmd_vel
   axon acl test access.toml                the [[expect]] in it
   export AXON_ACCESS_FILE=$PWD/access.toml
+  axon acl import permissions.xml --peer base > access.toml     from SROS2
   axon reload                              a daemon that runs takes the rules as they are now";
 
 /// `axon acl`.
@@ -27,6 +28,9 @@ pub(crate) enum Acl {
     /// Compare the rules of a file with the expectations written beside them
     #[command(after_help = TEST_HELP)]
     Test(Test),
+    /// Write the rules that say what SROS2's permissions or policy of an enclave say
+    #[command(after_help = IMPORT_HELP)]
+    Import(Import),
 }
 
 const CHECK_HELP: &str = "\
@@ -117,4 +121,29 @@ pub(crate) struct Test {
     /// The file with the rules and the expectations
     #[arg(value_name = "FILE")]
     pub(crate) file: PathBuf,
+}
+
+const IMPORT_HELP: &str = "\
+The rules go to standard output, and what they cannot say to standard error and into comments: \
+\"allows more\" and \"allows less\" compare the rules with the document. Signatures are not \
+verified, and dates and domains have no rules here.
+
+Examples:
+  axon acl import permissions.xml --peer base > access.toml
+  axon acl import policy.xml --enclave /talker_listener/talker --peer base
+
+Exit status: 0 when rules were written, 1 when the document cannot be read, 2 when NAME is no name.";
+
+/// `axon acl import`.
+#[derive(Args, Debug)]
+pub(crate) struct Import {
+    /// permissions.xml of an enclave (not the signed .p7s), or the policy that SROS2 makes it of
+    #[arg(value_name = "FILE")]
+    pub(crate) file: PathBuf,
+    /// The host or user that the rules are for, as it stands in peer
+    #[arg(long, value_name = "NAME")]
+    pub(crate) peer: String,
+    /// The enclave whose rules are taken, where the document has more than one
+    #[arg(long, value_name = "PATH")]
+    pub(crate) enclave: Option<String>,
 }

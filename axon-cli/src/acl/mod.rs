@@ -2,7 +2,9 @@
 
 mod check;
 pub(crate) mod cli;
+mod import;
 mod test;
+mod write;
 
 use std::{path::Path, process::ExitCode};
 
@@ -19,6 +21,7 @@ pub(crate) fn run(args: &Acl) -> Result<ExitCode, CliError> {
     match args {
         Acl::Check(args) => check::run(args),
         Acl::Test(args) => test::run(args),
+        Acl::Import(args) => import::run(args),
     }
 }
 

@@ -1,0 +1,185 @@
+//! What a grant says of topics of DDS, as rules for topics, services and actions.
+
+use std::collections::BTreeMap;
+
+use axon_transport::access::TopicPattern;
+
+use super::{
+    document::{Does, Grant, Says},
+    names::{Part, parts},
+    notes::{Effect, Notes},
+};
+use crate::acl::write::{Names, Uses};
+
+/// The topic on which ROS 2 tells which nodes there are.
+const GRAPH: &str = "ros_discovery_info";
+
+/// The rules of a grant.
+#[derive(Debug)]
+pub(super) struct Rules {
+    /// `None` where the grant allows by default.
+    pub(super) allow: Option<Uses>,
+    pub(super) deny: Uses,
+}
+
+/// Patterns of one part and direction, and the line of each.
+#[derive(Debug, Default)]
+struct Patterns {
+    lines: BTreeMap<String, u32>,
+    /// Those with a star.
+    starred: Vec<TopicPattern>,
+}
+
+impl Patterns {
+    fn insert(&mut self, pattern: String, line: u32) {
+        if pattern.contains('*') && !self.lines.contains_key(&pattern) {
+            self.starred.extend(TopicPattern::new(&pattern));
+        }
+        self.lines.entry(pattern).or_insert(line);
+    }
+
+    /// Whether each name that a pattern fits is in these, as far as that can be told.
+    fn cover(&self, pattern: &str) -> bool {
+        self.lines.contains_key(pattern)
+            || self.lines.contains_key("/**")
+            || !pattern.contains('*') && self.starred.iter().any(|starred| starred.fits(pattern))
+    }
+
+    /// Whether some name may be in these and fit a pattern.
+    fn overlap(&self, pattern: &str) -> bool {
+        if !pattern.contains('*') {
+            return self.cover(pattern);
+        }
+        let Ok(parsed) = TopicPattern::new(pattern) else { return true };
+        let before = |text: &str| text.split('*').next().unwrap_or_default().to_owned();
+        let start = before(pattern);
+        self.lines.keys().any(|other| match other.contains('*') {
+            true => {
+                let other = before(other);
+                other.starts_with(&start) || start.starts_with(&other)
+            }
+            false => parsed.fits(other),
+        })
+    }
+
+    fn names(&self) -> Names {
+        self.lines.keys().cloned().collect()
+    }
+}
+
+/// All patterns of allowing, or of denying.
+type Sets = BTreeMap<(Does, Part), Patterns>;
+
+/// The rules that say the same. What they cannot say is in `notes`.
+pub(super) fn convert(grant: &Grant, notes: &mut Notes) -> Rules {
+    let (mut allowed, mut denied) = (Sets::new(), Sets::new());
+    let mut see = Names::new();
+    for says in &grant.says {
+        if says.expression == GRAPH {
+            graph(says, &mut see, notes);
+            continue;
+        }
+        let parts = match parts(&says.expression) {
+            Ok(parts) => parts,
+            Err(why) => {
+                let effect = if says.allows { Effect::Less } else { Effect::More };
+                notes.add(effect, says.line, format!("left out {:?}: {why}", says.expression));
+                continue;
+            }
+        };
+        if says.allows && says.does == Does::Subscribe && parts.len() > 1 {
+            see.insert("**".into());
+        }
+        for (part, pattern) in
+            parts.into_iter().flat_map(|(part, all)| all.into_iter().map(move |one| (part, one)))
+        {
+            let key = (says.does, part);
+            if says.allows {
+                allowed.entry(key).or_default().insert(pattern, says.line);
+                continue;
+            }
+            if allowed.get(&key).is_some_and(|before| before.overlap(&pattern)) {
+                let what = "a denial behind a rule that allows some of the same: in DDS the first rule that fits \
+                            decides, here the denial does";
+                notes.add(Effect::Less, says.line, what);
+            }
+            denied.entry(key).or_default().insert(pattern, says.line);
+        }
+    }
+    let mut deny = uses(&mut denied, false, notes);
+    deny.collapse_actions();
+    if !deny.is_empty() {
+        let what = "what is denied is denied to all enclaves of the host";
+        notes.add(Effect::Less, 0, what);
+    }
+    let allow = (!grant.allows_by_default).then(|| {
+        let mut allow = uses(&mut allowed, true, notes);
+        allow.see = see;
+        allow.collapse_actions();
+        allow.collapse_parameters();
+        allow
+    });
+    Rules { allow, deny }
+}
+
+/// A rule for the graph, which AXON has no topic for.
+fn graph(says: &Says, see: &mut Names, notes: &mut Notes) {
+    match (says.allows, says.does) {
+        (true, Does::Subscribe) => {
+            see.insert("**".into());
+            let what = "ros_discovery_info: written as see = \"**\", for all nodes of the graph";
+            notes.add(Effect::None, says.line, what);
+        }
+        (true, Does::Publish) => {
+            let what =
+                "ros_discovery_info: a peer tells of its endpoints as far as it may use them";
+            notes.add(Effect::None, says.line, what);
+        }
+        (false, _) => {
+            let what = "left out ros_discovery_info: AXON has no topic for the graph; see rules say what is shown";
+            notes.add(Effect::More, says.line, what);
+        }
+    }
+}
+
+fn uses(sets: &mut Sets, allows: bool, notes: &mut Notes) -> Uses {
+    let mut take = |does, part| sets.remove(&(does, part)).unwrap_or_default();
+    let (requests, replies) =
+        (take(Does::Publish, Part::Request), take(Does::Subscribe, Part::Reply));
+    let call = pair("a call", &requests, &replies, allows, notes);
+    let (requests, replies) =
+        (take(Does::Subscribe, Part::Request), take(Does::Publish, Part::Reply));
+    let serve = pair("a server", &requests, &replies, allows, notes);
+    Uses {
+        publish: take(Does::Publish, Part::Topic).names(),
+        subscribe: take(Does::Subscribe, Part::Topic).names(),
+        serve,
+        call,
+        ..Uses::default()
+    }
+}
+
+/// The services of which requests and responses are both there. Of what is denied either half is enough.
+fn pair(
+    what: &str,
+    requests: &Patterns,
+    replies: &Patterns,
+    allows: bool,
+    notes: &mut Notes,
+) -> Names {
+    let mut names = Names::new();
+    for (all, others, half) in [(requests, replies, "requests"), (replies, requests, "responses")] {
+        for (pattern, &line) in &all.lines {
+            let whole = others.cover(pattern);
+            if !whole {
+                let done = if allows { "left out" } else { "the whole is denied" };
+                let what = format!("{pattern:?}: of {what} it names the {half} alone: {done}");
+                notes.add(Effect::Less, line, what);
+            }
+            if whole || !allows {
+                names.insert(pattern.clone());
+            }
+        }
+    }
+    names
+}

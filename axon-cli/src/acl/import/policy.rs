@@ -1,0 +1,120 @@
+//! SROS2's policy, from which it makes the permissions of enclaves. Its denials come first there: they win, as here.
+
+use roxmltree::Node;
+
+use super::{
+    document::{Does, Grant, Says, allows, choose, unknown},
+    notes::{Effect, Notes},
+    xml::{Lines, elements, text},
+};
+
+const ACTION_SERVICES: [&str; 3] =
+    ["_action/cancel_goal", "_action/get_result", "_action/send_goal"];
+const ACTION_TOPICS: [&str; 2] = ["_action/feedback", "_action/status"];
+
+/// Reads the profiles of an enclave from the element `policy`.
+///
+/// # Errors
+/// There is no such enclave, or other files are needed.
+pub(super) fn read(
+    root: Node<'_, '_>,
+    enclave: Option<&str>,
+    lines: &Lines,
+    notes: &mut Notes,
+) -> Result<Grant, String> {
+    if root.descendants().any(|node| node.is_element() && node.tag_name().name() == "include") {
+        return Err(
+            "it includes other files: resolve them first, as xmllint --xinclude does".into()
+        );
+    }
+    let enclaves = elements(root).filter(|node| node.has_tag_name("enclaves"));
+    let enclaves = enclaves.flat_map(elements).filter(|node| node.has_tag_name("enclave"));
+    let path = |node: Node<'_, '_>| node.attribute("path").map(str::to_owned).into_iter().collect();
+    let (node, enclave) =
+        choose(enclaves.map(|one| (one, path(one))).collect(), "enclave", enclave)?;
+    let what = format!(
+        "{enclave:?} is an enclave; identity here is a host's or a user's, and all its processes may do this"
+    );
+    notes.add(Effect::More, lines.of(node), what);
+    let mut read = Grant { enclave, says: Vec::new(), allows_by_default: false };
+    for profiles in elements(node) {
+        for profile in elements(profiles) {
+            match (profiles.tag_name().name(), profile.tag_name().name()) {
+                ("profiles", "profile") => self::profile(profile, &mut read, lines, notes)?,
+                _ => unknown(profile, lines, Effect::None, notes),
+            }
+        }
+    }
+    // SROS2 writes all denials before all else, and the first rule that fits decides.
+    read.says.sort_by_key(|says| says.allows);
+    Ok(read)
+}
+
+fn profile(
+    profile: Node<'_, '_>,
+    read: &mut Grant,
+    lines: &Lines,
+    notes: &mut Notes,
+) -> Result<(), String> {
+    let namespace = profile.attribute("ns").unwrap_or("/");
+    let node = profile.attribute("node").unwrap_or_default();
+    for group in elements(profile) {
+        let (kind, line) = (group.tag_name().name(), lines.of(group));
+        if !["topics", "services", "actions"].contains(&kind) {
+            unknown(group, lines, Effect::None, notes);
+            continue;
+        }
+        for attribute in group.attributes() {
+            let expand: fn(&str) -> Vec<(Does, String)> = match (kind, attribute.name()) {
+                ("topics", "publish") => |name| vec![topic(Does::Publish, name)],
+                ("topics", "subscribe") => |name| vec![topic(Does::Subscribe, name)],
+                ("services", "request") => |name| service(Does::Publish, name).into(),
+                ("services", "reply") => |name| service(Does::Subscribe, name).into(),
+                ("actions", "call") => |name| action(Does::Publish, Does::Subscribe, name),
+                ("actions", "execute") => |name| action(Does::Subscribe, Does::Publish, name),
+                // It says where an included file was.
+                (_, "base") => continue,
+                (_, other) => return Err(format!("line {line}: {kind} has no {other}")),
+            };
+            let allows = allows(attribute.value(), line)?;
+            for entry in elements(group) {
+                if !kind.strip_suffix('s').is_some_and(|one| entry.has_tag_name(one)) {
+                    let effect = if allows { Effect::Less } else { Effect::More };
+                    unknown(entry, lines, effect, notes);
+                    continue;
+                }
+                let line = lines.of(entry);
+                for (does, expression) in expand(&full(&text(entry), namespace, node)) {
+                    read.push(Says { allows, does, expression, line })?;
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The full name of a topic, service or action that a node calls so.
+fn full(name: &str, namespace: &str, node: &str) -> String {
+    let namespace = namespace.strip_suffix('/').unwrap_or(namespace);
+    match name.strip_prefix('~') {
+        _ if name.starts_with('/') => name.to_owned(),
+        Some(rest) => format!("{namespace}/{node}{rest}"),
+        None => format!("{namespace}/{name}"),
+    }
+}
+
+fn topic(does: Does, name: &str) -> (Does, String) {
+    (does, format!("rt{name}"))
+}
+
+/// A client publishes requests, and a server subscribes to them.
+fn service(requests: Does, name: &str) -> [(Does, String); 2] {
+    let replies = if requests == Does::Publish { Does::Subscribe } else { Does::Publish };
+    [(requests, format!("rq{name}Request")), (replies, format!("rr{name}Reply"))]
+}
+
+fn action(requests: Does, topics: Does, name: &str) -> Vec<(Does, String)> {
+    let services = ACTION_SERVICES.map(|part| service(requests, &format!("{name}/{part}")));
+    let topics = ACTION_TOPICS.map(|part| topic(topics, &format!("{name}/{part}")));
+    services.into_iter().flatten().chain(topics).collect()
+}

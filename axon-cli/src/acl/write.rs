@@ -1,0 +1,190 @@
+//! Rules as text: names escaped, and the parts of actions and parameters in one line each.
+
+use std::{collections::BTreeSet, fmt::Write as _};
+
+use axon_transport::access::{AccessRules, TopicPattern};
+
+/// Services of an action, behind its name.
+const ACTION_SERVICES: [&str; 3] =
+    ["/_action/send_goal", "/_action/cancel_goal", "/_action/get_result"];
+/// Topics of an action, behind its name.
+const ACTION_TOPICS: [&str; 2] = ["/_action/feedback", "/_action/status"];
+/// Services of a node's parameters, behind its name.
+const PARAMETER_SERVICES: [&str; 6] = [
+    "/describe_parameters",
+    "/get_parameter_types",
+    "/get_parameters",
+    "/list_parameters",
+    "/set_parameters",
+    "/set_parameters_atomically",
+];
+const PARAMETER_EVENTS: &str = "/parameter_events";
+
+/// Patterns of names, sorted.
+pub(super) type Names = BTreeSet<String>;
+
+/// What one `[[allow]]` or `[[deny]]` says.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub(super) struct Uses {
+    pub(super) publish: Names,
+    pub(super) subscribe: Names,
+    pub(super) serve: Names,
+    pub(super) call: Names,
+    pub(super) act: Names,
+    pub(super) see: Names,
+    pub(super) parameters: Names,
+}
+
+impl Uses {
+    pub(super) fn is_empty(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// Writes an action whose parts are all there as one name.
+    pub(super) fn collapse_actions(&mut self) {
+        for action in complete(&self.call, &ACTION_SERVICES) {
+            if has_all(&self.subscribe, &action, &ACTION_TOPICS) {
+                remove_all(&mut self.call, &action, &ACTION_SERVICES);
+                remove_all(&mut self.subscribe, &action, &ACTION_TOPICS);
+                self.act.insert(action);
+            }
+        }
+        for action in complete(&self.serve, &ACTION_SERVICES) {
+            if has_all(&self.publish, &action, &ACTION_TOPICS) {
+                remove_all(&mut self.serve, &action, &ACTION_SERVICES);
+                remove_all(&mut self.publish, &action, &ACTION_TOPICS);
+                self.serve.insert(action);
+            }
+        }
+    }
+
+    /// Writes a node whose parameter services are all called as one name. `parameters` means the topic of changes as
+    /// well.
+    pub(super) fn collapse_parameters(&mut self) {
+        let all = |name: &String| name == "/**" || name == "**" || name == PARAMETER_EVENTS;
+        if !self.subscribe.iter().any(all) {
+            return;
+        }
+        for node in complete(&self.call, &PARAMETER_SERVICES) {
+            remove_all(&mut self.call, &node, &PARAMETER_SERVICES);
+            self.subscribe.remove(PARAMETER_EVENTS);
+            self.parameters.insert(node);
+        }
+    }
+
+    /// The rule as TOML. `header` is `allow` or `deny`.
+    pub(super) fn toml(&self, header: &str, peer: &str) -> String {
+        let mut text = format!("[[{header}]]\npeer = {}\n", quoted(peer));
+        for (key, names) in [
+            ("publish", &self.publish),
+            ("subscribe", &self.subscribe),
+            ("serve", &self.serve),
+            ("call", &self.call),
+            ("act", &self.act),
+            ("parameters", &self.parameters),
+            ("see", &self.see),
+        ] {
+            let names: Vec<_> = names.iter().map(|name| quoted(name)).collect();
+            let _ = match &names[..] {
+                [] => Ok(()),
+                [one] => writeln!(text, "{key} = {one}"),
+                all => writeln!(text, "{key} = [\n  {},\n]", all.join(",\n  ")),
+            };
+        }
+        text
+    }
+}
+
+/// The names that `parts[0]` follows in `names`, where all other parts are there, too.
+fn complete(names: &Names, parts: &[&str]) -> Vec<String> {
+    let bases = names.iter().filter_map(|name| name.strip_suffix(parts[0]));
+    let whole = bases.filter(|base| TopicPattern::new(base).is_ok() && has_all(names, base, parts));
+    whole.map(str::to_owned).collect()
+}
+
+fn has_all(names: &Names, base: &str, parts: &[&str]) -> bool {
+    parts.iter().all(|part| names.contains(&format!("{base}{part}")))
+}
+
+fn remove_all(names: &mut Names, base: &str, parts: &[&str]) {
+    for part in parts {
+        names.remove(&format!("{base}{part}"));
+    }
+}
+
+/// A string of TOML. What is not a plain character of ASCII is escaped.
+pub(super) fn quoted(text: &str) -> String {
+    let mut out = String::from("\"");
+    for c in text.chars() {
+        match c {
+            '"' | '\\' => out.extend(['\\', c]),
+            ' '..='~' => out.push(c),
+            _ => drop(write!(out, "\\U{:08X}", u32::from(c))),
+        }
+    }
+    out.push('"');
+    out
+}
+
+/// Whether the text can be used as a file of rules.
+///
+/// # Errors
+/// Why it cannot.
+pub(super) fn verify(text: &str) -> Result<AccessRules, String> {
+    AccessRules::parse(text, "the rules to write").map_err(|error| error.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn names(all: &[&str]) -> Names {
+        all.iter().map(|&name| name.to_owned()).collect()
+    }
+
+    fn parts(base: &str, parts: &[&str]) -> Names {
+        parts.iter().map(|part| format!("{base}{part}")).collect()
+    }
+
+    #[test]
+    fn whole_actions_are_one_name_and_incomplete_ones_are_left_as_they_are() {
+        let mut uses = Uses {
+            call: parts("/dock", &ACTION_SERVICES),
+            subscribe: parts("/dock", &ACTION_TOPICS),
+            serve: parts("/go", &ACTION_SERVICES),
+            publish: parts("/go", &ACTION_TOPICS[..1]),
+            ..Uses::default()
+        };
+        uses.collapse_actions();
+        assert_eq!(uses.act, names(&["/dock"]));
+        assert!(uses.call.is_empty() && uses.subscribe.is_empty());
+        assert_eq!((uses.serve.len(), uses.publish.len()), (3, 1));
+    }
+
+    #[test]
+    fn parameters_are_one_name_where_their_topic_is_subscribed_to() {
+        let call = parts("/arm", &PARAMETER_SERVICES);
+        let mut uses = Uses { call, ..Uses::default() };
+        uses.collapse_parameters();
+        assert_eq!(uses.call.len(), 6);
+        uses.subscribe = names(&[PARAMETER_EVENTS]);
+        uses.collapse_parameters();
+        assert_eq!(
+            (uses.parameters, uses.call, uses.subscribe.len()),
+            (names(&["/arm"]), names(&[]), 0)
+        );
+    }
+
+    #[test]
+    fn each_name_comes_back_as_it_was() {
+        for name in ["/a\"b", "/a\\", "/a\n[[deny]]", "/\u{7f}\u{202e}\u{1f916}", "/'''", "/a#b"] {
+            let uses = Uses { publish: names(&[name]), ..Uses::default() };
+            let text = uses.toml("allow", "base");
+            let rules = verify(&text).unwrap();
+            let base = axon_transport::access::Party::Name("base");
+            let publish = axon_transport::access::Verb::Publish;
+            assert!(rules.check(base, publish, name).allowed(), "{text}");
+            assert!(!rules.check(base, publish, "/other").allowed(), "{text}");
+        }
+    }
+}
