@@ -289,7 +289,7 @@ impl Drop for NodeOfOthers {
 #[test]
 fn another_user_of_the_host_publishes_what_rules_allow_it_and_nothing_else() {
     if !rustix::process::geteuid().is_root() {
-        println!("skipped: only root can be two users");
+        eprintln!("skipped: only root can be two users");
         return;
     }
     const NOBODY: u32 = 65534;
@@ -329,7 +329,7 @@ fn another_user_of_the_host_publishes_what_rules_allow_it_and_nothing_else() {
             .all(|e| e.endpoint.topic != "/denied" || e.endpoint.gid == denied.gid())
     );
     // The rules change, and with them the pairs.
-    fs::write(&rules, format!("[[allow]]\npeer = \"local\"\npublish = \"/denied\"")).unwrap();
+    fs::write(&rules, "[[allow]]\npeer = \"local\"\npublish = \"/denied\"").unwrap();
     daemon_reload_at(&DaemonPlace::from(&robot.config())).unwrap();
     denied.recv(&mut bytes, Some(PATIENCE)).expect("a sample that is allowed now");
     drop((denied_node, allowed_node));
