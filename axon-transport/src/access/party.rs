@@ -38,6 +38,8 @@ impl<'a> Party<'a> {
             (Some(uid), _) => uid.parse().map(Self::User).map_err(|_| "uid: and a number"),
             (_, Some(ip)) => ip.parse().map(Self::Address).map_err(|_| "address: and an address"),
             _ if text.is_empty() => Err("a name"),
+            _ if text.contains('*') => Err("one name, without *"),
+            _ if is_keyword_in_disguise(text) => Err(KEYWORDS),
             _ if text == "local" => Err("uid: and a number, for a user of this host"),
             _ => Ok(Self::Name(text)),
         }
@@ -68,6 +70,9 @@ impl PartyPattern {
                 "a name of 1 to 255 bytes without outer spaces, in which * stands for any \
                         characters, or local, or uid: and a number, or address: and an address",
             );
+        }
+        if is_keyword_in_disguise(text) {
+            return Err(KEYWORDS);
         }
         Ok(match (text, text.strip_prefix("uid:"), text.strip_prefix("address:")) {
             ("*", ..) => Self::All,
@@ -101,6 +106,15 @@ impl PartyPattern {
             _ => false,
         }
     }
+}
+
+const KEYWORDS: &str = "local, uid: and address: in lower case";
+
+/// Whether a text would be a keyword in lower case, and is read as a host's name as it stands.
+fn is_keyword_in_disguise(text: &str) -> bool {
+    let lower = text.to_ascii_lowercase();
+    let begins = |keyword| lower.starts_with(keyword) && !text.starts_with(keyword);
+    begins("uid:") || begins("address:") || lower == "local" && text != "local"
 }
 
 /// How a rule speaks of a host.

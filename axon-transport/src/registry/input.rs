@@ -46,9 +46,7 @@ impl<F: Clone> Registry<F> {
     /// A session is of another user than the daemon's. Has to be called before it has endpoints.
     pub fn set_user(&mut self, id: &SessionId, user: u32) {
         self.users.add(user);
-        if let Some(entry) = self.sessions.get_mut(id) {
-            entry.user = Some(user);
-        }
+        self.sessions.set_user(id, user);
     }
 
     /// These access rules count from now on. Pairs that they do not allow end, and those that they allow are made.

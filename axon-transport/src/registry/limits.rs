@@ -27,7 +27,7 @@ pub(super) const MAX_UNMET: usize = if cfg!(test) { 4 } else { 4096 };
 /// Remembered grants of an earlier daemon's time to readers that are not here.
 pub(super) const MAX_PLEDGES: usize = 256;
 /// Grants of publishers that were killed, with their rings, kept for readers whose sessions are not here.
-pub(super) const MAX_LEFT: usize = if cfg!(test) { 2 } else { 64 };
+pub(super) const MAX_LEFT: usize = if cfg!(test) { 2 } else { 16 };
 
 /// What a session did that no session does. It is disconnected.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]

@@ -12,6 +12,9 @@ use axon_transport::{
     },
 };
 
+/// The setting that says where access rules are.
+const ACCESS_FILE: &str = "AXON_ACCESS_FILE";
+
 /// What a daemon compares sessions with.
 #[derive(Debug)]
 pub(super) struct Admission {
@@ -28,11 +31,10 @@ impl Admission {
 
     /// The settings that may change while the daemon runs have changed.
     pub(super) fn set_config(&mut self, config: &Arc<Config>) {
-        const ACCESS: &str = "AXON_ACCESS_FILE";
         self.config = Arc::clone(config);
-        self.settings.retain(|(name, _)| name != ACCESS);
+        self.settings.retain(|(name, _)| name != ACCESS_FILE);
         let file = config.access_file.as_ref().map(|file| file.to_string_lossy().into_owned());
-        self.settings.extend(file.map(|file| (ACCESS.to_owned(), file)));
+        self.settings.extend(file.map(|file| (ACCESS_FILE.to_owned(), file)));
     }
 
     /// The settings that the last session was compared with.
@@ -43,6 +45,12 @@ impl Admission {
     /// Whether a process of this user may speak at all.
     pub(super) fn trusts(&self, uid: u32) -> bool {
         uid == self.uid || self.config.trusted_uids.contains(&uid)
+    }
+
+    /// As [`trusts`](Self::trusts), for a session that is about to be admitted.
+    pub(super) fn still_trusts(&self, uid: u32) -> Result<(), Box<Refused>> {
+        let text = || format!("user {uid} is not trusted (AXON_TRUSTED_UIDS of the daemon)");
+        if self.trusts(uid) { Ok(()) } else { Err(plain(text())) }
     }
 
     /// Whether it is another user than the daemon's.
@@ -141,6 +149,10 @@ impl Admission {
         };
         let names = self.settings.iter().chain(theirs).map(|(name, _)| name);
         for name in names {
+            // A session without rules is not less protected where there are some.
+            if name == ACCESS_FILE && find(theirs, name) == "unset" {
+                continue;
+            }
             let (session, daemon) = (find(theirs, name), find(&self.settings, name));
             if session != daemon {
                 return Err(differs(name, &session, &daemon));
@@ -222,6 +234,16 @@ mod tests {
         extra.settings.push(("AXON_KME_ID".into(), "k".into()));
         assert_eq!(refusal(&extra).variable, "AXON_KME_ID");
         assert_eq!(refusal(&extra).theirs, "unset");
+
+        let rules = ("AXON_ACCESS_FILE".to_owned(), "/a".to_owned());
+        let mut with_rules = hello();
+        with_rules.settings.push(rules.clone());
+        assert_eq!(refusal(&with_rules).variable, rules.0, "the daemon has none");
+        let mut daemon = admission();
+        daemon.settings.push(rules);
+        let peer = PeerProcess { uid: 1000, pid: std::process::id() };
+        let refused = daemon.check(&hello(), Vec::new(), peer, false).unwrap_err();
+        assert!(refused.text.contains("0 descriptors"), "a session without rules is let in");
 
         assert_eq!(refusal(&Hello { domain: 4, ..hello() }).variable, "ROS_DOMAIN_ID");
     }

@@ -194,7 +194,9 @@ fn relay(
         let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
         socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None)
     };
-    let checked = its_own.and_then(|()| state.admission.check(&hello, descriptors, peer, false));
+    let checked = its_own
+        .and_then(|()| state.admission.still_trusts(peer.uid))
+        .and_then(|()| state.admission.check(&hello, descriptors, peer, false));
     let checked = match checked {
         Err(refused) => Err(*refused),
         Ok(_)
@@ -270,7 +272,11 @@ fn admit(
     let control = &mut *control.borrow_mut();
     let gateway = matches!(inside, InternalPeer::Gateway);
     let admission = &mut control.admission;
-    let checked = its_own.and_then(|()| admission.check(&hello, descriptors, peer, gateway));
+    // The settings may have changed since the connection was accepted.
+    let uid = if let InternalPeer::Relay { uid, .. } = inside { *uid } else { peer.uid };
+    let checked = its_own
+        .and_then(|()| admission.still_trusts(uid))
+        .and_then(|()| admission.check(&hello, descriptors, peer, gateway));
     let handed = match checked {
         Ok(handed) => handed,
         Err(refused) => {
@@ -306,7 +312,6 @@ fn admit(
         return None;
     }
     // What another user may do, the access rules say.
-    let uid = if let InternalPeer::Relay { uid, .. } = inside { *uid } else { peer.uid };
     if control.admission.is_another(uid) {
         control.registry.set_user(&session, uid);
     }

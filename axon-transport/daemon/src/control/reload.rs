@@ -116,6 +116,10 @@ impl Control {
         };
         let old = Arc::clone(&self.config);
         report.needs_restart = differing(&fixed(&old), &fixed(&new));
+        if let Some(error) = unfit(&old, &new) {
+            report.error = Some(error.to_owned());
+            return report;
+        }
         report.changed = differing(&variable(&old), &variable(&new));
         if !report.changed.is_empty() {
             let mut config = Config::clone(&old);
@@ -155,6 +159,20 @@ impl Control {
             self.disconnect(&id);
         }
     }
+}
+
+/// Why settings that were read are not taken, though each of them is valid.
+fn unfit(old: &Config, new: &Config) -> Option<&'static str> {
+    // Rules are checked against the mode that they are read with.
+    if format!("{:?}", old.security) != format!("{:?}", new.security) {
+        return Some(
+            "the settings of security differ from those in force: start the daemon again to change them",
+        );
+    }
+    // A file that is being written, or replaced, is empty or absent for a moment.
+    (!old.access.is_empty() && new.access.is_empty()).then_some(
+        "there are no access rules any more; to allow all, write default = \"allow\", or start the daemon again",
+    )
 }
 
 /// Settings by name, as text that differs where they do.
@@ -214,6 +232,15 @@ mod tests {
         };
         assert!(seen.has_changed().unwrap() && denied(&seen.borrow_and_update()));
         assert!(control.wanted.borrow().hosts.iter().any(|(host, _)| host == "10.0.0.7"));
+        // Rules that are gone do not let everything in.
+        let report =
+            control.take_settings(Ok(Config { access: Default::default(), ..new.clone() }));
+        assert!(report.error.unwrap().contains("no access rules any more"));
+        assert!(denied(&control.config.access) && !seen.has_changed().unwrap());
+        let key = tempfile::NamedTempFile::new().unwrap();
+        let pinned = Config::builder().classic_key(key.path()).classic_trust(key.path());
+        let report = control.take_settings(Ok(pinned.build().unwrap()));
+        assert!(report.error.unwrap().contains("security differ"));
         // The same once more is no change.
         assert_eq!(control.take_settings(Ok(new)).changed, Vec::<String>::new());
         assert!(!seen.has_changed().unwrap());

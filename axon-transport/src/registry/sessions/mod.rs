@@ -267,6 +267,16 @@ impl<F> Sessions<F> {
         }
     }
 
+    /// A session turns out to be of another user than the daemon's. It is told nothing that is kept for readers of the
+    /// same session id.
+    pub(super) fn set_user(&mut self, id: &SessionId, user: u32) {
+        if let Some(entry) = self.entries.get_mut(id) {
+            entry.user = Some(user);
+            let kept = entry.outbox.take_kept();
+            kept.into_iter().for_each(|output| self.news.keep(output));
+        }
+    }
+
     /// Tells a reader's session of a pair that was never made. If it is not here, it is told when it comes.
     pub(super) fn tell_unmet(&mut self, unmet: Unmet) {
         self.forget_pledge(&Pair { reader: unmet.reader, writer: unmet.writer });
@@ -277,7 +287,10 @@ impl<F> Sessions<F> {
     fn push_kept(&mut self, output: Output<F>) {
         let Some(reader) = output.kept_for else { return };
         let to = self.session_of(&reader);
-        match to.and_then(|id| Some((id, self.entries.get_mut(&id)?))) {
+        // With some of them memory is handed over. An id proves nothing: a tool, or another user, may claim a reader's.
+        let takes =
+            |entry: &&mut SessionEntry<F>| entry.role != SessionRole::Tool && entry.user.is_none();
+        match to.and_then(|id| Some((id, self.entries.get_mut(&id).filter(takes)?))) {
             None => self.news.keep(output),
             Some((id, entry)) => {
                 if entry.outbox.push_kept(output) {
@@ -409,7 +422,8 @@ impl<F: Clone> Sessions<F> {
 
     /// Hands what a session that ends granted to a reader, and its ring.
     pub(super) fn hand_over_grant(&mut self, id: &SessionId, granted: Granted) {
-        let Some(entry) = self.entries.get(id) else { return };
+        // What another user may give to readers here, the access rules say, and these may have changed.
+        let Some(entry) = self.entries.get(id).filter(|entry| entry.user.is_none()) else { return };
         let Some(descriptors) = entry.descriptors.clone() else { return };
         let mut descriptors = Vec::from(descriptors);
         let own = entry.segments.iter().filter(|of| of.segment.publisher.is_none());

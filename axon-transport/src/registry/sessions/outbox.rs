@@ -163,6 +163,18 @@ impl<F> Outbox<F> {
         true
     }
 
+    /// Takes back what stays for its readers.
+    pub(super) fn take_kept(&mut self) -> Vec<Output<F>> {
+        let is_kept = |output: &Output<F>| output.kept_for.is_some();
+        let (taken, rest): (VecDeque<_>, _) =
+            std::mem::take(&mut self.queue).into_iter().partition(is_kept);
+        self.queue = rest;
+        let taken = Vec::<Output<F>>::from(taken);
+        self.kept -= taken.len();
+        self.bytes -= taken.iter().map(|output| output.packet.len()).sum::<usize>();
+        taken
+    }
+
     /// Takes what stays for its readers, of a session that is gone.
     pub(super) fn into_kept(self) -> impl Iterator<Item = Output<F>> {
         self.queue.into_iter().filter(|output| output.kept_for.is_some())

@@ -244,3 +244,39 @@ fn the_oldest_of_the_rings_that_wait_for_their_readers_is_given_up_beyond_the_bo
     });
     assert_eq!(granted.collect::<Vec<_>>(), writers[1..]);
 }
+
+#[test]
+fn memory_is_handed_to_no_tool_and_no_other_user_that_claims_the_id_of_a_reader() {
+    type Claims = fn(&mut Registry<&'static str>);
+    let tool: Claims = |registry| {
+        let role = SessionRole::Tool;
+        registry.handle_connect(id(READER), role, String::new(), 1, None, None).unwrap();
+    };
+    let user: Claims = |registry| {
+        connect(registry, READER);
+        registry.set_user(&id(READER), 1001);
+    };
+    for claim in [tool, user] {
+        for claimed_before in [false, true] {
+            let mut registry = pledged(&[WRITER]);
+            if claimed_before {
+                claim(&mut registry);
+            }
+            registry.handle_disconnect(&id(WRITER));
+            if !claimed_before {
+                claim(&mut registry);
+            }
+            assert_eq!(handed(&mut registry), [], "claimed before: {claimed_before}");
+            // The reader itself gets it, once it comes.
+            registry.handle_disconnect(&id(READER));
+            connect(&mut registry, READER);
+            assert_eq!(handed(&mut registry).len(), 1, "claimed before: {claimed_before}");
+        }
+    }
+    // Nor is memory of another user handed on.
+    let mut registry = pledged(&[WRITER]);
+    registry.set_user(&id(WRITER), 1001);
+    registry.handle_disconnect(&id(WRITER));
+    connect(&mut registry, READER);
+    assert_eq!(handed(&mut registry), []);
+}

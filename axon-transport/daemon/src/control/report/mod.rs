@@ -18,13 +18,15 @@ use crate::discovery::Wanted;
 /// Answers a session that asks for the status. One that asks again before it has taken the
 /// answer gets the same one from its beginning.
 pub(super) fn send_status(control: &mut Control, id: &SessionId) {
-    if control.registry.repeat_status(id) {
+    // Another user may have begun to read a status before there were rules.
+    let user = control.registry.session(id).and_then(|entry| entry.user);
+    let limited = user.is_some() && !control.config.access.is_empty();
+    if !limited && control.registry.repeat_status(id) {
         return;
     }
     let mut status = status(control);
     // It shows all topics, sessions and peers.
-    let user = control.registry.session(id).and_then(|entry| entry.user);
-    if user.is_some() && !control.config.access.is_empty() {
+    if limited {
         status = without_details(&status);
     }
     let text = match serde_json::to_vec(&status) {

@@ -92,14 +92,20 @@ impl PeerAccess {
         endpoints: impl Iterator<Item = &'a Endpoint>,
     ) -> Vec<Message> {
         let uses = endpoints.filter_map(|e| Some((verb_of(e.kind)?, e.topic.as_str())));
-        let mut first = BTreeSet::new();
+        // Those that the peer was told of stay: it would take one that is not named any more for allowed.
+        let told: BTreeSet<_> =
+            self.here.keys().map(|(verb, name)| (*verb, name.as_str())).collect();
+        let (mut now, mut new) = (BTreeSet::new(), BTreeSet::new());
         for used in uses {
-            if first.len() == MOST {
-                break;
+            if told.contains(&used) {
+                now.insert(used);
+            } else if new.len() < MOST {
+                new.insert(used);
             }
-            first.insert(used);
         }
-        let now: BTreeMap<Use, String> = first
+        let room = MOST.saturating_sub(now.len());
+        now.extend(new.into_iter().take(room));
+        let now: BTreeMap<Use, String> = now
             .into_iter()
             .map(|(verb, name)| {
                 let reason = self.permissions.check(verb, name).to_string();
