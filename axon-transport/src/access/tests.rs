@@ -28,7 +28,7 @@ publish = "/cmd_vel"
 "#;
 
 #[test]
-fn a_robot_lets_its_base_station_drive_it_and_its_guest_look_on() {
+fn the_example_lets_the_base_publish_and_the_guest_subscribe() {
     let rules = rules(ROBOT);
     let check = |party, verb, name| rules.check(party, verb, name).to_string();
     let base = Party::Name("base");
@@ -99,7 +99,7 @@ fn one_line_lets_a_peer_use_an_action_or_serve_it_or_set_parameters() {
 }
 
 #[test]
-fn names_of_other_kinds_do_not_fit() {
+fn a_pattern_of_one_kind_fits_no_party_of_another() {
     let rules = rules(
         r#"
         default = "deny"
@@ -127,7 +127,7 @@ fn names_of_other_kinds_do_not_fit() {
 }
 
 #[test]
-fn what_is_wrong_is_said_with_line_and_column() {
+fn each_error_names_its_line_and_column() {
     for (text, line, column, what) in [
         ("[[allow]]\npublish = \"/x\"", 1, 1, "[[allow]] without peer"),
         ("[[allow]]\npeer = \"a\"\npublsh = \"/x\"", 3, 1, "unknown key \"publsh\""),

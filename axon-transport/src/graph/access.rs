@@ -59,7 +59,7 @@ mod tests {
     };
 
     #[test]
-    fn an_endpoint_is_shown_to_who_may_see_it_or_needs_it() {
+    fn a_party_is_shown_endpoints_that_it_may_see_or_needs() {
         let rules = "[[allow]]\npeer = \"a\"\npublish = \"/in\"\nsubscribe = \"/out\"\nserve = \"/s\"\n\
                      call = \"/c\"\nsee = [\"/seen\", \"/ns/node\", \"/root\"]";
         let party = AccessRules::parse(rules, "f").unwrap().permissions(Party::Name("a"));

@@ -154,7 +154,7 @@ fn rules_that_change_a_hundred_times_under_load_lose_nothing_of_what_they_allow(
 }
 
 #[test]
-fn a_peer_that_ignores_rules_gets_nothing_and_brings_nothing() {
+fn a_peer_that_ignores_rules_receives_and_delivers_nothing() {
     let deny = "[[deny]]\npeer = \"*\"\npublish = \"/in\"\nsubscribe = \"/out\"\n\
                 see = [\"/in\", \"/out\"]";
     let mut world = hosts(0, deny);
