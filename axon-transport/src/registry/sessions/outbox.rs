@@ -22,7 +22,7 @@ pub struct Output<F> {
     /// The session's segment that it hands over and nothing else.
     segment: Option<(SessionId, u32)>,
     /// The reader of the session's that it is for, where the session would not hear of it when it is told everything anew.
-    pub(super) kept_for: Option<Gid>,
+    pub(in crate::registry) kept_for: Option<Gid>,
     /// Which it is of the packets that were queued for its session; 0 before it is.
     number: u64,
 }

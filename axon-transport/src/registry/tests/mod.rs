@@ -70,7 +70,8 @@ struct Client {
 }
 
 impl Client {
-    fn hold(&mut self, of: SessionId, pair: Pair, came: &[Label], segments: &[Segment]) {
+    fn hold(&mut self, of: SessionId, pair: Pair, output: &Output<Label>, segments: &[Segment]) {
+        let came = &output.descriptors;
         let (came, maps) = came.split_at(came.len() - segments.len());
         for (segment, label) in segments.iter().zip(maps) {
             self.map(of, segment, label);
@@ -80,7 +81,8 @@ impl Client {
             return;
         }
         let pairs = self.held.entry(of).or_default();
-        if pairs.is_empty() {
+        // The grant of a session that has ended is kept for its reader, and comes with all that the reader may lack.
+        if pairs.is_empty() || output.kept_for.is_some() {
             assert_eq!(came, handed(of), "descriptors that are needed");
         } else {
             assert!(came.is_empty(), "descriptors that are held already");
@@ -156,7 +158,7 @@ impl Client {
                 if let Some(repeated) = &mut self.repeated {
                     repeated.insert(pair);
                 }
-                self.hold(attach.session, pair, fds, &attach.segments);
+                self.hold(attach.session, pair, output, &attach.segments);
                 if self.endpoints.contains_key(&pair.writer) {
                     self.attached.insert(pair);
                     let Pair { reader, writer } = pair;
@@ -180,7 +182,7 @@ impl Client {
                 if let Some(repeated) = &mut self.repeated {
                     repeated.insert(pair);
                 }
-                self.hold(grant.session, pair, fds, &grant.segments);
+                self.hold(grant.session, pair, output, &grant.segments);
                 if self.endpoints.contains_key(&pair.reader) {
                     self.attached.insert(pair);
                 }
