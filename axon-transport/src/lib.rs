@@ -31,6 +31,12 @@ pub use session::{
 pub mod internal {
     pub use crate::session_key::{OWNER, SessionKey, session_id};
 
+    /// The names that ROS 2 gives to the parts of actions and to the services of parameters.
+    pub mod access {
+        pub use crate::access::ros::{
+            ACTION_SERVICES, ACTION_TOPICS, PARAMETER_EVENTS, PARAMETER_SERVICES,
+        };
+    }
     /// What `include/axon.h` declares, for crates that make libraries of it.
     pub mod ffi {
         pub use crate::ffi::*;

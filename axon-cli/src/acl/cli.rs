@@ -2,7 +2,10 @@
 
 use std::path::PathBuf;
 
-use axon_transport::access::Verb;
+use axon_transport::{
+    access::Verb,
+    internal::access::{ACTION_SERVICES, ACTION_TOPICS},
+};
 use clap::{Args, Subcommand};
 
 pub(crate) const HELP: &str = "\
@@ -94,9 +97,9 @@ impl What {
         ];
         let mut uses: Vec<_> = simple.into_iter().flatten().collect();
         for action in self.act.iter() {
-            let part = |verb| move |part: &str| (verb, format!("{action}/_action/{part}"));
-            uses.extend(["send_goal", "cancel_goal", "get_result"].map(part(Verb::Call)));
-            uses.extend(["feedback", "status"].map(part(Verb::Subscribe)));
+            let part = |verb| move |part: &str| (verb, format!("{action}/{part}"));
+            uses.extend(ACTION_SERVICES.map(part(Verb::Call)));
+            uses.extend(ACTION_TOPICS.map(part(Verb::Subscribe)));
         }
         uses
     }

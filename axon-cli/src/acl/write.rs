@@ -2,23 +2,10 @@
 
 use std::{collections::BTreeSet, fmt::Write as _};
 
-use axon_transport::access::{AccessRules, TopicPattern};
-
-/// Services of an action, behind its name.
-const ACTION_SERVICES: [&str; 3] =
-    ["/_action/send_goal", "/_action/cancel_goal", "/_action/get_result"];
-/// Topics of an action, behind its name.
-const ACTION_TOPICS: [&str; 2] = ["/_action/feedback", "/_action/status"];
-/// Services of a node's parameters, behind its name.
-const PARAMETER_SERVICES: [&str; 6] = [
-    "/describe_parameters",
-    "/get_parameter_types",
-    "/get_parameters",
-    "/list_parameters",
-    "/set_parameters",
-    "/set_parameters_atomically",
-];
-const PARAMETER_EVENTS: &str = "/parameter_events";
+use axon_transport::{
+    access::{AccessRules, TopicPattern},
+    internal::access::{ACTION_SERVICES, ACTION_TOPICS, PARAMETER_EVENTS, PARAMETER_SERVICES},
+};
 
 /// Patterns of names, sorted.
 pub(super) type Names = BTreeSet<String>;
@@ -97,18 +84,18 @@ impl Uses {
 
 /// The names that `parts[0]` follows in `names`, where all other parts are there, too.
 fn complete(names: &Names, parts: &[&str]) -> Vec<String> {
-    let bases = names.iter().filter_map(|name| name.strip_suffix(parts[0]));
+    let bases = names.iter().filter_map(|name| name.strip_suffix(parts[0])?.strip_suffix('/'));
     let whole = bases.filter(|base| TopicPattern::new(base).is_ok() && has_all(names, base, parts));
     whole.map(str::to_owned).collect()
 }
 
 fn has_all(names: &Names, base: &str, parts: &[&str]) -> bool {
-    parts.iter().all(|part| names.contains(&format!("{base}{part}")))
+    parts.iter().all(|part| names.contains(&format!("{base}/{part}")))
 }
 
 fn remove_all(names: &mut Names, base: &str, parts: &[&str]) {
     for part in parts {
-        names.remove(&format!("{base}{part}"));
+        names.remove(&format!("{base}/{part}"));
     }
 }
 
@@ -143,7 +130,7 @@ mod tests {
     }
 
     fn parts(base: &str, parts: &[&str]) -> Names {
-        parts.iter().map(|part| format!("{base}{part}")).collect()
+        parts.iter().map(|part| format!("{base}/{part}")).collect()
     }
 
     #[test]

@@ -157,13 +157,23 @@ fn links(links: &[LinkStatus]) -> TextTable {
 }
 
 fn routes_refused(links: &[LinkStatus]) -> TextTable {
-    let mut table = TextTable::new(&["host", "topic", "why"]);
+    reasons(links, "topic", |link| (&link.routes_refused, link.more_routes_refused))
+}
+
+/// A row for each name and reason of each link, and one for those that a link does not list.
+fn reasons<'a>(
+    links: &'a [LinkStatus],
+    column: &'static str,
+    of: impl Fn(&'a LinkStatus) -> (&'a BTreeMap<String, String>, usize),
+) -> TextTable {
+    let mut table = TextTable::new(&["host", column, "why"]);
     for link in links {
-        for (topic, why) in &link.routes_refused {
-            table.row([link.host.clone(), topic.clone(), why.clone()]);
+        let (listed, more) = of(link);
+        for (name, why) in listed {
+            table.row([link.host.clone(), name.clone(), why.clone()]);
         }
-        if link.more_routes_refused > 0 {
-            let more = format!("and {} more", grouped(link.more_routes_refused as u64));
+        if more > 0 {
+            let more = format!("and {} more", grouped(more as u64));
             table.row([link.host.clone(), more, dash()]);
         }
     }
@@ -171,17 +181,7 @@ fn routes_refused(links: &[LinkStatus]) -> TextTable {
 }
 
 fn denied(links: &[LinkStatus]) -> TextTable {
-    let mut table = TextTable::new(&["host", "use", "why"]);
-    for link in links {
-        for (what, why) in &link.denied {
-            table.row([link.host.clone(), what.clone(), why.clone()]);
-        }
-        if link.more_denied > 0 {
-            let more = format!("and {} more", grouped(link.more_denied as u64));
-            table.row([link.host.clone(), more, dash()]);
-        }
-    }
-    table
+    reasons(links, "use", |link| (&link.denied, link.more_denied))
 }
 
 fn causes(dropped: &BTreeMap<String, u64>) -> String {

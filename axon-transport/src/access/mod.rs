@@ -34,7 +34,7 @@ mod party;
 mod pattern;
 mod pattern_set;
 mod permissions;
-mod ros;
+pub(crate) mod ros;
 mod rules;
 #[cfg(test)]
 mod tests;

@@ -3,12 +3,12 @@
 use super::{TopicPattern, Verb};
 
 /// Services of an action, behind its name.
-const ACTION_SERVICES: [&str; 3] =
+pub const ACTION_SERVICES: [&str; 3] =
     ["_action/send_goal", "_action/cancel_goal", "_action/get_result"];
 /// Topics of an action, behind its name.
-const ACTION_TOPICS: [&str; 2] = ["_action/feedback", "_action/status"];
+pub const ACTION_TOPICS: [&str; 2] = ["_action/feedback", "_action/status"];
 /// Services of a node's parameters, behind its name.
-const PARAMETER_SERVICES: [&str; 6] = [
+pub const PARAMETER_SERVICES: [&str; 6] = [
     "describe_parameters",
     "get_parameter_types",
     "get_parameters",
@@ -17,7 +17,7 @@ const PARAMETER_SERVICES: [&str; 6] = [
     "set_parameters_atomically",
 ];
 /// The topic on which nodes tell of changes.
-const PARAMETER_EVENTS: &str = "/parameter_events";
+pub const PARAMETER_EVENTS: &str = "/parameter_events";
 /// Services of a lifecycle node, behind its name.
 const LIFECYCLE_SERVICES: [&str; 5] = [
     "change_state",

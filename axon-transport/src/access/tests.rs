@@ -184,7 +184,7 @@ fn hostile_names_are_judged_as_they_are_written() {
     assert!(may(&format!("/robot/{}/x", "a".repeat(65_536))));
 }
 
-/// A rule as the model has it: whether it denies, whom it names, and what.
+/// A rule of the model: whether it denies, the peers, the verb and the names.
 type ModelRule = (bool, &'static str, Verb, &'static str);
 
 /// The definition: a `[[deny]]` wins; else an `[[allow]]`; else what no rule names is allowed, but to parties that an

@@ -46,7 +46,7 @@ pub(super) fn read(
             _ => unknown(element, lines, Effect::None, notes),
         }
     }
-    let what = "the signature (permissions.p7s) was not verified: whoever can write the rules decides here";
+    let what = "the signature (permissions.p7s) was not verified: the rights of the rules file decide who may change the rules";
     notes.add(Effect::None, 0, what);
     let what = "governance.xml is not read: AXON encrypts and authenticates between all hosts, or AXON_SECURITY_MODE \
                 says otherwise";

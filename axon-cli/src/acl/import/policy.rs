@@ -1,5 +1,6 @@
 //! SROS2's policy, from which it makes the permissions of enclaves. Its denials come first there: they win, as here.
 
+use axon_transport::internal::access::{ACTION_SERVICES, ACTION_TOPICS};
 use roxmltree::Node;
 
 use super::{
@@ -7,10 +8,6 @@ use super::{
     notes::{Effect, Notes},
     xml::{Lines, elements, text},
 };
-
-const ACTION_SERVICES: [&str; 3] =
-    ["_action/cancel_goal", "_action/get_result", "_action/send_goal"];
-const ACTION_TOPICS: [&str; 2] = ["_action/feedback", "_action/status"];
 
 /// Reads the profiles of an enclave from the element `policy`.
 ///

@@ -154,7 +154,7 @@ impl PeerAccess {
         lifted.filter(|used| self.there.remove(used).is_some()).collect()
     }
 
-    /// Each denied use, by whom, and why.
+    /// Each denied use, the host that denies it, and the reason.
     fn all(&self) -> impl Iterator<Item = (&Use, &'static str, &str)> {
         let there = self.there.iter().map(|(used, (why, _))| (used, "by the peer", &**why));
         there.chain(self.here.iter().map(|(used, why)| (used, "here", &**why)))

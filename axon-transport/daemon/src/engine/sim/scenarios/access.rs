@@ -172,10 +172,10 @@ fn a_peer_that_ignores_rules_receives_and_delivers_nothing() {
     world.run_for(millis(200));
     let liar = of_raw(7);
     say(&mut world, on, &publishes("/in", liar, qos));
-    // It does not wait to be told what there is.
+    // It subscribes to a topic that this host has not shown to it.
     say(&mut world, on, &subscribe(3, "/out", qos));
     world.run_for(secs(1));
-    // Nor to be asked, and it guesses the number of a route.
+    // It sends samples that this host did not ask for, and guesses the number of the route.
     for route in 1..5 {
         let bytes = samples(route, "/in", liar, 1..=3);
         world.with_raw(0, |raw, _| raw.links[on].open(bytes.clone()));
