@@ -2,7 +2,7 @@
 //!
 //! A *party* is another host, by the name that it proved, or another user of this host. A rule is about what a
 //! party does here. Each daemon applies its own rules, so that either side alone protects itself. Rules come from
-//! `[[allow]]` and `[[deny]]` in `axon.toml` or in the file that `AXON_ACCESS_FILE` names; `docs/access-control.md`
+//! `[[allow]]`, `[[deny]]` and `[[limit]]` in `axon.toml` or in the file that `AXON_ACCESS_FILE` names; `docs/access-control.md`
 //! describes them.
 //!
 //! ```
@@ -29,7 +29,8 @@
 #![forbid(unsafe_code)]
 
 mod decision;
-mod parse;
+mod limit;
+pub(crate) mod parse;
 mod party;
 mod pattern;
 mod pattern_set;
@@ -40,6 +41,7 @@ mod rules;
 mod tests;
 
 pub use decision::Decision;
+pub use limit::{Over, PlacedLimit, RateLimit};
 pub use parse::AccessError;
 pub(crate) use party::HostPattern;
 pub use party::Party;

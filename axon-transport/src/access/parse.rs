@@ -1,5 +1,7 @@
 //! Reads rules from TOML. Each error has its line and column.
 
+pub(crate) mod limit;
+
 use std::{ops::Range, sync::Arc};
 
 use toml::{
@@ -19,7 +21,7 @@ const MOST: usize = 4096;
 /// As many patterns and names as its rules may have together, those of actions and parameters counted one by one.
 const MOST_PATTERNS: usize = 65_536;
 /// The keys of a file that are rules. All others are settings of `axon.toml`.
-const KEYS: [&str; 4] = ["default", "allow", "deny", "expect"];
+const KEYS: [&str; 5] = ["default", "allow", "deny", "limit", "expect"];
 
 /// Rules that cannot be used: what is wrong, and where.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -84,7 +86,7 @@ impl<'t> Reader<'t> {
             deny: Vec::new(),
             expectations: Vec::new(),
         };
-        let mut found = false;
+        let (mut limits, mut found) = (Vec::new(), false);
         for (key, value) in table.get_ref() {
             let key_name = &**key.get_ref();
             found |= ["default", "allow", "deny"].contains(&key_name);
@@ -102,6 +104,7 @@ impl<'t> Reader<'t> {
                 }
                 "allow" => file.allow = self.rules(value, "[[allow]]")?,
                 "deny" => file.deny = self.rules(value, "[[deny]]")?,
+                "limit" => limits = self.limits(value)?,
                 "expect" => file.expectations = self.expectations(value)?,
                 other if alone => {
                     let what = format!("unknown key {other:?}; accepted: {}", KEYS.join(", "));
@@ -111,11 +114,13 @@ impl<'t> Reader<'t> {
             }
         }
         // A file that is being written is empty for a moment: that must not let everything in.
-        if alone && !found {
-            let what = "no rules; accepted: default, [[allow]], [[deny]]; to allow all, write default = \"allow\"";
+        if alone && !found && limits.is_empty() {
+            let what = "no rules; accepted: default, [[allow]], [[deny]], [[limit]]; to allow all, write \
+                        default = \"allow\"";
             return Err(self.wrong(0..0, what));
         }
-        Ok(AccessRules(found.then(|| Arc::new(file))))
+        let limits = limits.into_iter().map(Arc::new).collect();
+        Ok(AccessRules { rules: found.then(|| Arc::new(file)), limits })
     }
 
     fn wrong(&self, span: Range<usize>, what: impl Into<String>) -> AccessError {
@@ -171,6 +176,15 @@ impl<'t> Reader<'t> {
         }
     }
 
+    fn count_patterns(&mut self, more: usize, at: &Value<'_>) -> Result<(), AccessError> {
+        self.patterns += more;
+        if self.patterns > MOST_PATTERNS {
+            let what = format!("at most {MOST_PATTERNS} patterns in all rules");
+            return Err(self.wrong(at.span(), what));
+        }
+        Ok(())
+    }
+
     fn rules(&mut self, value: &Value<'_>, header: &str) -> Result<Vec<Rule>, AccessError> {
         let tables = self.tables(value, header)?;
         tables.into_iter().map(|(table, span)| self.rule(table, span, header)).collect()
@@ -222,11 +236,7 @@ impl<'t> Reader<'t> {
                     |what| self.wrong(value.span(), format!("{key} {text:?}; accepted: {what}"));
                 let pattern = TopicPattern::new(text).map_err(wrong)?;
                 let (expanded, line) = (expand(&pattern), self.line(value));
-                self.patterns += expanded.len();
-                if self.patterns > MOST_PATTERNS {
-                    let what = format!("at most {MOST_PATTERNS} patterns in all rules");
-                    return Err(self.wrong(value.span(), what));
-                }
+                self.count_patterns(expanded.len(), value)?;
                 rule.says.extend(expanded.into_iter().map(|(verb, name)| (verb, name, line)));
             }
         }

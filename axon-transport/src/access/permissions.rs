@@ -2,11 +2,16 @@
 
 use std::sync::Arc;
 
-use super::{Decision, Verb, decision::Reason, pattern_set::PatternSet};
+use super::{
+    Decision, PlacedLimit, Verb, decision::Reason, limit::LimitRule, pattern_set::PatternSet,
+};
 
 /// What one party may do. Cheap to clone; the time of a decision does not grow with the number of rules.
 #[derive(Clone, Debug, Default)]
-pub struct Permissions(Option<Arc<Compiled>>);
+pub struct Permissions {
+    rules: Option<Arc<Compiled>>,
+    limits: Arc<[Arc<LimitRule>]>,
+}
 
 #[derive(Debug)]
 pub(super) struct Compiled {
@@ -42,13 +47,19 @@ impl VerbPatterns {
 }
 
 impl Permissions {
-    pub(super) fn new(compiled: Compiled) -> Self {
-        Self(Some(Arc::new(compiled)))
+    pub(super) fn new(rules: Option<Compiled>, limits: Arc<[Arc<LimitRule>]>) -> Self {
+        Self { rules: rules.map(Arc::new), limits }
     }
 
-    /// Whether there are no rules.
+    /// Whether there are no rules that allow or deny anything.
     pub fn are_unlimited(&self) -> bool {
-        self.0.is_none()
+        self.rules.is_none()
+    }
+
+    /// The limits that count when the party does this with a topic or service of this full name. Each of them counts.
+    pub fn limits(&self, verb: Verb, name: &str) -> impl Iterator<Item = &PlacedLimit> {
+        let fit = self.limits.iter().filter(move |limit| limit.fits(verb, name));
+        fit.map(|limit| &limit.limit)
     }
 
     /// Whether the party may do this with the topic, service or node of this full name.
@@ -58,12 +69,12 @@ impl Permissions {
 
     /// Whether a `[[deny]]` names this.
     pub(crate) fn denies(&self, verb: Verb, name: &str) -> bool {
-        self.0.as_ref().is_some_and(|rules| rules.deny.of(verb).first_fit(name).is_some())
+        self.rules.as_ref().is_some_and(|rules| rules.deny.of(verb).first_fit(name).is_some())
     }
 
     /// As [`allows`](Self::allows), with the rule that decides.
     pub fn check(&self, verb: Verb, name: &str) -> Decision {
-        let Some(rules) = &self.0 else { return Decision(Reason::NoRules) };
+        let Some(rules) = &self.rules else { return Decision(Reason::NoRules) };
         let file = || Arc::clone(&rules.file);
         if let Some(line) = rules.deny.of(verb).first_fit(name) {
             return Decision(Reason::Denied { file: file(), line });

@@ -4,6 +4,7 @@ use std::{fmt, sync::Arc};
 
 use super::{
     Decision, Party, Permissions, TopicPattern,
+    limit::LimitRule,
     party::{HostPattern, PartyPattern},
     permissions::{Compiled, Otherwise, VerbPatterns},
 };
@@ -48,7 +49,10 @@ impl fmt::Display for Verb {
 
 /// The access rules of a daemon; by default none, and everything is allowed.
 #[derive(Clone, Debug, Default)]
-pub struct AccessRules(pub(super) Option<Arc<RuleFile>>);
+pub struct AccessRules {
+    pub(super) rules: Option<Arc<RuleFile>>,
+    pub(super) limits: Arc<[Arc<LimitRule>]>,
+}
 
 #[derive(Debug)]
 pub(super) struct RuleFile {
@@ -91,19 +95,26 @@ impl Rule {
 }
 
 impl AccessRules {
-    /// Whether there are none.
+    /// Whether there are none that allow or deny anything. There may be [limits](Self::limits_anything).
     pub fn is_empty(&self) -> bool {
-        self.0.is_none()
+        self.rules.is_none()
+    }
+
+    /// Whether there is a `[[limit]]`.
+    pub fn limits_anything(&self) -> bool {
+        !self.limits.is_empty()
     }
 
     /// How decisions name the file; `None` where there are no rules.
     pub fn file(&self) -> Option<&str> {
-        self.0.as_ref().map(|rules| &*rules.file)
+        let limited = || self.limits.first().map(|limit| &*limit.limit.file);
+        self.rules.as_ref().map(|rules| &*rules.file).or_else(limited)
     }
 
     /// What the rules let one party do. It takes the time of reading all rules once.
     pub fn permissions(&self, party: Party<'_>) -> Permissions {
-        let Some(rules) = &self.0 else { return Permissions::default() };
+        let limits = self.limits.iter().filter(|limit| limit.names(party)).cloned().collect();
+        let Some(rules) = &self.rules else { return Permissions::new(None, limits) };
         let (mut allow, mut deny) = (VerbPatterns::default(), VerbPatterns::default());
         let mut is_named = false;
         for rule in rules.allow.iter().filter(|rule| rule.names(party)) {
@@ -118,7 +129,8 @@ impl AccessRules {
             (false, true) => Otherwise::DenyByDefault,
             (false, false) => Otherwise::Allow,
         };
-        Permissions::new(Compiled { file: Arc::clone(&rules.file), allow, deny, otherwise })
+        let compiled = Compiled { file: Arc::clone(&rules.file), allow, deny, otherwise };
+        Permissions::new(Some(compiled), limits)
     }
 
     /// Whether a party may do this with the topic, service or node of this full name, and which rule decides. To ask
@@ -129,13 +141,14 @@ impl AccessRules {
 
     /// The `[[expect]]` of the file.
     pub fn expectations(&self) -> &[Expectation] {
-        self.0.as_ref().map_or(&[], |rules| &rules.expectations)
+        self.rules.as_ref().map_or(&[], |rules| &rules.expectations)
     }
 
     /// The hosts that rules speak of.
     pub(crate) fn hosts(&self) -> impl Iterator<Item = HostPattern<'_>> {
-        let rules = self.0.iter().flat_map(|rules| rules.allow.iter().chain(&rules.deny));
-        rules.flat_map(|rule| &rule.peers).filter_map(PartyPattern::host)
+        let rules = self.rules.iter().flat_map(|rules| rules.allow.iter().chain(&rules.deny));
+        let limits = self.limits.iter().flat_map(|limit| &limit.peers);
+        rules.flat_map(|rule| &rule.peers).chain(limits).filter_map(PartyPattern::host)
     }
 }
 

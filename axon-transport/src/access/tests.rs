@@ -2,6 +2,8 @@ use proptest::prelude::*;
 
 use super::*;
 
+mod limits;
+
 fn rules(text: &str) -> AccessRules {
     AccessRules::parse(text, "access.toml").unwrap()
 }
@@ -241,7 +243,7 @@ proptest! {
     }
 
     #[test]
-    fn no_text_makes_the_reader_panic(text in "(\\[\\[(allow|deny|expect)\\]\\]|peer|see|=|\"|/|\\*|\n|[a-z]){0,40}") {
+    fn no_text_makes_the_reader_panic(text in "(\\[\\[(allow|deny|limit|expect)\\]\\]|peer|see|=|\"|/|\\*|\n|[a-z]){0,40}") {
         let _ = AccessRules::parse(&text, "access.toml");
     }
 }

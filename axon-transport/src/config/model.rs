@@ -5,7 +5,7 @@ use std::{net::IpAddr, path::PathBuf, time::Duration};
 use minicbor::{Decode, Encode};
 
 use super::{TopicPriority, TopicRule, daemon_env::DaemonEnv, topics};
-use crate::access::AccessRules;
+use crate::access::{AccessRules, RateLimit};
 
 /// Everything that the environment and `axon.toml`, or a [`ConfigBuilder`](super::ConfigBuilder), decide.
 ///
@@ -70,7 +70,12 @@ pub struct Config {
 impl Config {
     /// The priority of a topic or service between hosts, by its name.
     pub fn topic_priority(&self, name: &str) -> TopicPriority {
-        topics::priority(&self.topics, name)
+        topics::first(&self.topics, name).map_or(TopicPriority::Normal, |rule| rule.priority)
+    }
+
+    /// The limit that `max_hz` sets for the samples of a topic to each other host.
+    pub fn topic_limit(&self, name: &str) -> Option<RateLimit> {
+        topics::first(&self.topics, name)?.limit()
     }
 }
 

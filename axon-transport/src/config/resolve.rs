@@ -127,7 +127,7 @@ fn access(
     const NAME: &str = names::ACCESS_FILE;
     let inline = &values.sources.access;
     let (rules, file) = match values.file(NAME, Use::Public)? {
-        Some(_) if !inline.is_empty() => {
+        Some(_) if inline.file().is_some() => {
             let accepted = "rules in one place: in this file, or in axon.toml without this setting";
             return Err(values.refuse(NAME, accepted));
         }
@@ -142,7 +142,7 @@ fn access(
             let rules = rules.map_err(|error| ConfigError::rules(NAME, &error).at(&*shown))?;
             (rules, Some(path))
         }
-        None if inline.is_empty() => (AccessRules::default(), None),
+        None if inline.file().is_none() => (AccessRules::default(), None),
         None => (inline.clone(), values.sources.file.as_deref().cloned()),
     };
     let unnamed = matches!(security, Security::Classic(c) if c.auth == ClassicAuth::None);

@@ -1,7 +1,7 @@
 //! `[[topic]]` of `axon.toml`: what the daemon does for topics of some names.
 
 use super::ConfigError;
-use crate::access::TopicPattern;
+use crate::access::{RateLimit, TopicPattern, parse::limit::rate};
 
 /// As many entries as a file may have. A topic is compared with each of them when it is matched.
 const MOST: usize = 1024;
@@ -10,19 +10,28 @@ const PRIORITIES: [(&str, TopicPriority); 3] =
     [("high", TopicPriority::High), ("normal", TopicPriority::Normal), ("low", TopicPriority::Low)];
 
 /// What the daemon does for the topics and services whose names fit a pattern.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 #[non_exhaustive]
 pub struct TopicRule {
     /// Which topics and services.
     pub name: TopicPattern,
     /// What goes first between hosts.
     pub priority: TopicPriority,
+    /// Samples a second of each topic that go to each other host at most: the newest, and the rest is dropped.
+    pub max_hz: Option<f64>,
 }
 
 impl TopicRule {
     /// The topics and services whose names fit have this priority.
     pub const fn new(name: TopicPattern, priority: TopicPriority) -> Self {
-        Self { name, priority }
+        Self { name, priority, max_hz: None }
+    }
+
+    /// Of each topic so many samples a second go to each other host at most.
+    #[must_use]
+    pub const fn max_hz(mut self, samples: f64) -> Self {
+        self.max_hz = Some(samples);
+        self
     }
 }
 
@@ -55,7 +64,7 @@ fn rule(entry: toml::Value, place: &str) -> Result<TopicRule, ConfigError> {
     let toml::Value::Table(entry) = entry else {
         return Err(ConfigError::name("topic", "entries that begin with [[topic]]").at(place));
     };
-    let (mut name, mut priority) = (None, TopicPriority::Normal);
+    let (mut name, mut priority, mut max_hz) = (None, TopicPriority::Normal, None);
     for (key, value) in entry {
         let read = value.as_str().unwrap_or_else(|| value.type_str());
         match key.as_str() {
@@ -73,18 +82,33 @@ fn rule(entry: toml::Value, place: &str) -> Result<TopicRule, ConfigError> {
                 let wrong = || ConfigError::value("topic.priority", read, accepted()).at(place);
                 priority = known.map(|(_, priority)| *priority).ok_or_else(wrong)?;
             }
+            "max_hz" => {
+                let read = match value {
+                    toml::Value::Integer(number) => number.to_string(),
+                    toml::Value::Float(number) => number.to_string(),
+                    other => other.type_str().to_owned(),
+                };
+                let wrong = |what| ConfigError::value("topic.max_hz", &read, what).at(place);
+                max_hz = Some(rate(&read).map_err(wrong)?);
+            }
             _ => {
                 let name = format!("topic.{key}");
-                return Err(ConfigError::name(&name, "name, priority").at(place));
+                return Err(ConfigError::name(&name, "name, priority, max_hz").at(place));
             }
         }
     }
     let missing = || ConfigError::missing("topic.name", "a topic's name, or a pattern").at(place);
-    Ok(TopicRule { name: name.ok_or_else(missing)?, priority })
+    Ok(TopicRule { name: name.ok_or_else(missing)?, priority, max_hz })
 }
 
-/// The priority of a topic or service: that of the first entry that its name fits.
-pub(super) fn priority(rules: &[TopicRule], name: &str) -> TopicPriority {
-    let first = rules.iter().find(|rule| rule.name.fits(name));
-    first.map_or(TopicPriority::Normal, |rule| rule.priority)
+/// The first entry that the name of a topic or service fits.
+pub(super) fn first<'r>(rules: &'r [TopicRule], name: &str) -> Option<&'r TopicRule> {
+    rules.iter().find(|rule| rule.name.fits(name))
+}
+
+impl TopicRule {
+    /// What [`max_hz`](Self::max_hz) limits.
+    pub(super) fn limit(&self) -> Option<RateLimit> {
+        self.max_hz.map(RateLimit::of_rate)
+    }
 }

@@ -454,9 +454,12 @@ fn the_first_entry_of_a_topic_counts() {
 
         [[topic]]
         name = "/tf"
+        max_hz = 12.5
         "#,
     )
     .unwrap();
+    let limits = ["/tf", "/scan"].map(|name| config.topic_limit(name).map(|l| l.to_string()));
+    assert_eq!(limits, [Some("12.5 a second, drop-oldest".to_owned()), None]);
     for (name, priority) in [
         ("/camera/front/image", TopicPriority::High),
         ("/camera/rear/image", TopicPriority::Low),

@@ -306,6 +306,9 @@ fn files_that_are_not_a_configuration_are_refused() {
         ("[[topic]]\nname = '/a'\npriority = 'highest'", "topic.priority"),
         ("[[topic]]\nname = '/a'\npriority = 1", "topic.priority"),
         ("[[topic]]\nname = '/a'\nmax = 1", "topic.max"),
+        ("[[topic]]\nname = '/a'\nmax_hz = 0", "topic.max_hz"),
+        ("[[topic]]\nname = '/a'\nmax_hz = '10'", "topic.max_hz"),
+        ("[[topic]]\nname = '/a'\nmax_hz = inf", "topic.max_hz"),
         ("[linc]\nmtu = 1500", "AXON_LINC"),
     ] {
         let error = with_file(&[], text).unwrap_err();
@@ -328,6 +331,7 @@ fn rules_that_cannot_be_used_are_refused_with_their_place() {
     let mut disk = Disk::new();
     let base = "[[allow]]\npeer = \"base\"\npublish = \"/x\"";
     disk.put("/f/good.toml", 0o644, base);
+    disk.put("/f/limit.toml", 0o644, "[[limit]]\npeer = \"base\"\nrate = 1");
     disk.put("/f/bad.toml", 0o644, "[[allow]]\npeer = \"base\"\npublish = \"x\"");
     disk.put("/f/axon.toml", 0o644, base);
     disk.put("/f/bad-axon.toml", 0o644, "[[deny]]\npeer = 3");
@@ -340,6 +344,12 @@ fn rules_that_cannot_be_used_are_refused_with_their_place() {
     let good = pinned(&[("AXON_ACCESS_FILE", "/f/good.toml")]).unwrap();
     assert_eq!(good.access_file.as_deref(), Some(Path::new("/f/good.toml")));
     assert_eq!(good.access.file(), Some("good.toml"));
+    let limited = pinned(&[("AXON_ACCESS_FILE", "/f/limit.toml")]).unwrap();
+    assert!(limited.access.is_empty() && limited.access.limits_anything());
+    let both = [("AXON_ACCESS_FILE", "/f/good.toml"), ("AXON_CONFIG", "/f/limit.toml")];
+    assert!(pinned(&both).unwrap_err().contains("rules in one place"));
+    let unnamed = resolve(&[("AXON_ACCESS_FILE", "/f/limit.toml")]).unwrap_err();
+    assert!(unnamed.contains("no host proves a name"), "{unnamed}");
     let inline = pinned(&[("AXON_CONFIG", "/f/axon.toml")]).unwrap();
     assert_eq!(inline.access_file.as_deref(), Some(Path::new("/f/axon.toml")));
     let error = pinned(&[("AXON_ACCESS_FILE", "/f/bad.toml")]).unwrap_err();

@@ -1,0 +1,87 @@
+use super::*;
+
+fn limits(rules: &AccessRules, party: Party<'_>, verb: Verb, name: &str) -> Vec<String> {
+    rules.permissions(party).limits(verb, name).map(PlacedLimit::to_string).collect()
+}
+
+#[test]
+fn the_example_limits_what_cameras_send_and_get() {
+    let rules = rules(
+        r#"
+[[limit]]
+peer = "*"
+topic = "/camera/**"
+rate = 30          # messages a second, leaky bucket
+bytes = "4 MB/s"
+burst = 5
+over = "drop-oldest"   # drop-newest, hold (KEEP_ALL alone)
+"#,
+    );
+    let shown = ["line 2 of access.toml: 30 a second, 4 MB/s, 5 at once, drop-oldest"];
+    for party in [Party::Name("base"), Party::Address([10, 0, 0, 1].into())] {
+        for verb in [Verb::Publish, Verb::Subscribe] {
+            assert_eq!(limits(&rules, party, verb, "/camera/left"), shown);
+            assert!(limits(&rules, party, verb, "/scan").is_empty());
+        }
+        assert!(limits(&rules, party, Verb::Call, "/camera/left").is_empty());
+        assert!(rules.check(party, Verb::Publish, "/camera/left").allowed());
+    }
+    assert!(rules.is_empty() && rules.limits_anything(), "nothing is denied");
+    assert_eq!(rules.file(), Some("access.toml"));
+}
+
+#[test]
+fn each_limit_that_names_the_peer_and_the_use_counts() {
+    let rules = rules(
+        "[[limit]]\npeer = \"guest-*\"\nbytes = \"1 MB/s\"\n\
+         [[limit]]\npeer = [\"guest-1\", \"base\"]\nsubscribe = [\"/a\", \"/b/*\"]\nrate = 0.5\n\
+         [[limit]]\npeer = \"base\"\ncall = \"/set\"\nrate = 2\nover = \"hold\"",
+    );
+    let lines = |party, verb, name| -> Vec<_> {
+        let permissions = rules.permissions(Party::Name(party));
+        permissions.limits(verb, name).map(|limit| limit.line).collect()
+    };
+    assert_eq!(lines("guest-1", Verb::Subscribe, "/b/x"), [1, 4]);
+    assert_eq!(lines("guest-1", Verb::Publish, "/b/x"), [1]);
+    assert_eq!(lines("guest-2", Verb::Subscribe, "/a"), [1]);
+    assert_eq!(lines("base", Verb::Subscribe, "/a"), [4]);
+    assert_eq!(lines("base", Verb::Call, "/set"), [8]);
+    let of_all = rules.permissions(Party::Name("guest-2"));
+    let of_all = of_all.limits(Verb::Subscribe, "/a").next().unwrap().limit.clone();
+    assert!(of_all.together, "without topics it is about all of them together");
+}
+
+#[test]
+fn each_wrong_limit_is_refused_with_its_line_and_column() {
+    for (text, at, says) in [
+        ("limit = 3", (1, 9), "write [[limit]]"),
+        ("[[limit]]", (1, 1), "without peer"),
+        ("[[limit]]\nrate = 1", (1, 1), "without peer"),
+        ("[[limit]]\npeer = \"*\"", (1, 1), "without rate and bytes"),
+        ("[[limit]]\npeer = \"*\"\nrate = 0", (3, 8), "from 0.01 to 1000000"),
+        ("[[limit]]\npeer = \"*\"\nrate = -1.5", (3, 8), "from 0.01"),
+        ("[[limit]]\npeer = \"*\"\nrate = inf", (3, 8), "from 0.01"),
+        ("[[limit]]\npeer = \"*\"\nrate = \"30\"", (3, 8), "a number"),
+        ("[[limit]]\npeer = \"*\"\nbytes = 4", (3, 9), "such as \"4 MB/s\""),
+        ("[[limit]]\npeer = \"*\"\nbytes = \"4 MB\"", (3, 9), "MB/s"),
+        ("[[limit]]\npeer = \"*\"\nrate = 1\nburst = 0", (4, 9), "from 1 to 100000"),
+        ("[[limit]]\npeer = \"*\"\nrate = 1\nburst = 1.5", (4, 9), "whole number"),
+        ("[[limit]]\npeer = \"*\"\nrate = 1\nover = \"drop\"", (4, 8), "drop-oldest"),
+        ("[[limit]]\npeer = \"*\"\nrate = 1\nover = 1", (4, 8), "a string"),
+        ("[[limit]]\npeer = \"*\"\nrate = 1\ntogether = 1", (4, 12), "true, false"),
+        ("[[limit]]\npeer = \"local\"\nrate = 1", (2, 8), "within a host"),
+        ("[[limit]]\npeer = \"uid:3\"\nrate = 1", (2, 8), "within a host"),
+        ("[[limit]]\npeer = \"*\"\nrate = 1\ntopic = \"a\"", (4, 9), "topic \"a\""),
+        ("[[limit]]\npeer = \"*\"\nrate = 1\ncall = \"/a\"", (1, 1), "over = \"hold\""),
+        (
+            "[[limit]]\npeer = \"*\"\nrate = 1\ncall = \"/a\"\ntopic = \"/b\"\nover = \"hold\"",
+            (1, 1),
+            "no topic",
+        ),
+        ("[[limit]]\npeer = \"*\"\nserve = \"/a\"", (3, 1), "unknown key"),
+    ] {
+        let AccessError { line, column, what, .. } = error(text);
+        assert_eq!((line, column), at, "{text}: {what}");
+        assert!(what.contains(says), "{text}: {what}");
+    }
+}
