@@ -2,6 +2,7 @@
 //!
 //! The daemon alone fills these structures. A test that needs one starts from its default.
 
+mod limit;
 mod times;
 
 use std::{
@@ -10,6 +11,8 @@ use std::{
 };
 
 use serde::{Deserialize, Serialize};
+
+pub use self::limit::LimitStatus;
 
 /// The whole status.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -369,6 +372,12 @@ pub struct LinkStatus {
     /// How many more there are.
     #[serde(default)]
     pub more_denied: usize,
+    /// The limits in force between this host and the peer's identity: the first 64, those that dropped most first.
+    #[serde(default)]
+    pub limits: Vec<LimitStatus>,
+    /// How many more there are.
+    #[serde(default)]
+    pub more_limits: usize,
     /// Endpoints and nodes of the peer that are known here.
     #[serde(default)]
     pub endpoints: u64,
@@ -461,7 +470,7 @@ mod tests {
             r#""congestion_events":7,"mtu":1452,"mtu_black_holes":8,"waiting_bytes":9,"#,
             r#""waiting":{"control":1,"services":2,"small_reliable":3,"small_best_effort":4,"bulk":5},"#,
             r#""waiting_ms":88,"samples_in":10,"samples_out":11,"bytes_in":12,"bytes_out":13,"#,
-            r#""dropped":{"no_key":1},"routes_refused":{},"more_routes_refused":0,"denied":{},"more_denied":0,"endpoints":14,"#,
+            r#""dropped":{"no_key":1},"routes_refused":{},"more_routes_refused":0,"denied":{},"more_denied":0,"limits":[],"more_limits":0,"endpoints":14,"#,
             r#""endpoints_left_out":15,"graph_bytes":16}"#
         );
         let read: LinkStatus = serde_json::from_str(link).unwrap();

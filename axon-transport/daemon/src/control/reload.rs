@@ -170,8 +170,13 @@ fn unfit(old: &Config, new: &Config) -> Option<&'static str> {
         );
     }
     // A file that is being written, or replaced, is empty or absent for a moment.
-    (!old.access.is_empty() && new.access.is_empty()).then_some(
-        "there are no access rules any more; to allow all, write default = \"allow\", or start the daemon again",
+    if !old.access.is_empty() && new.access.is_empty() {
+        return Some(
+            "there are no access rules any more; to allow all, write default = \"allow\", or start the daemon again",
+        );
+    }
+    (old.access.limits_anything() && !new.access.limits_anything()).then_some(
+        "there is no [[limit]] any more; to change the limits leave one, or start the daemon again to have none",
     )
 }
 
@@ -242,8 +247,16 @@ mod tests {
         let pinned = Config::builder().classic_key(key.path()).classic_trust(key.path());
         let report = control.take_settings(Ok(pinned.build().unwrap()));
         assert!(report.error.unwrap().contains("security differ"));
+        // Nor do limits.
+        let mut limited = new.clone();
+        let limits = format!("{rules}\n[[limit]]\npeer = \"*\"\nrate = 1");
+        limited.access = axon_transport::access::AccessRules::parse(&limits, "f").unwrap();
+        assert_eq!(control.take_settings(Ok(limited.clone())).changed, ["access rules"]);
+        assert!(seen.borrow_and_update().limits_anything());
+        let report = control.take_settings(Ok(new));
+        assert!(report.error.unwrap().contains("no [[limit]] any more"));
         // The same once more is no change.
-        assert_eq!(control.take_settings(Ok(new)).changed, Vec::<String>::new());
+        assert_eq!(control.take_settings(Ok(limited)).changed, Vec::<String>::new());
         assert!(!seen.has_changed().unwrap());
     }
 

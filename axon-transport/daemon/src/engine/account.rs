@@ -11,6 +11,7 @@ use std::{
 };
 
 use super::{
+    limits::Limits,
     pace::{Bucket, Turns},
     peer::routes::RouteKey,
 };
@@ -215,6 +216,8 @@ pub(crate) struct Account {
     pub(crate) sessions: Rc<Meter>,
     /// Its publishers, or clients, that each route shows.
     writers: RefCell<HashMap<RouteKey, Weak<Meter>>>,
+    /// How much of which topic may pass.
+    pub(crate) limits: Limits,
     /// When its changes are followed up.
     pub(crate) turns: RefCell<Turns>,
     said: RefCell<Bucket>,
@@ -234,6 +237,7 @@ impl Account {
             refusals: Meter::new(REFUSALS),
             sessions: Meter::new(MAX_PROVEN),
             writers: RefCell::default(),
+            limits: Limits::default(),
             turns: RefCell::default(),
             said: RefCell::new(Bucket::new(SAID.0, SAID.1)),
         }

@@ -93,8 +93,11 @@ impl Counters {
     }
 }
 
-/// Logs what was lost on the way to or from a peer, in one line: the topic that lost most by name.
+/// Logs what was lost on the way to or from a peer, in one line: the topic that lost most by name. What `max_hz` leaves
+/// out is what its author wants.
 pub(crate) fn log(losses: &[Loss], peer: &str) {
+    let unwanted: Vec<_> = losses.iter().filter(|loss| loss.cause != "max_hz").cloned().collect();
+    let losses = &unwanted;
     let Some((topic, causes, samples, others)) = worst(losses) else { return };
     let topic = plain(topic, LOGGED);
     if others == 0 {

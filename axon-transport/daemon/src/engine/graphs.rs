@@ -41,10 +41,10 @@ impl Engine {
         for (daemon, link) in peers {
             // A link that is gone is about to be reported as down.
             let Some(permissions) = self.links.permissions(link, &self.access) else { continue };
-            if let Some(peer) = self.peers.get_mut(daemon) {
-                peer.set_permissions(permissions);
+            self.peers.with(daemon, |peer, with| {
+                peer.set_permissions(permissions, with.config);
                 peer.stirred = false;
-            }
+            });
             self.follow_graph(daemon, now);
         }
         self.effects.tell_draining(self.peers.are_draining());

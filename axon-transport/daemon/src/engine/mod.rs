@@ -18,6 +18,7 @@ pub(crate) mod frames;
 mod graphs;
 pub(crate) mod inbound;
 pub(crate) mod keyring;
+pub(crate) mod limits;
 pub(crate) mod link;
 pub(crate) mod links;
 mod marks;
@@ -292,7 +293,7 @@ impl Engine {
             let old = self.links.connection(old).map(|connection| &mut connection.quic);
             self.peers.with(daemon, |peer, with| {
                 // Before anything is said of this host's graph.
-                peer.set_permissions(permissions);
+                peer.set_permissions(permissions, with.config);
                 peer.succeed(number, binding, with.local);
                 peer.outbound.succeed(old);
             });

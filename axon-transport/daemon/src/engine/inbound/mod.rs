@@ -7,6 +7,7 @@
 #[cfg(test)]
 mod held;
 mod incoming;
+mod limited;
 mod line;
 mod reading;
 mod receipts;
@@ -29,6 +30,7 @@ use quinn_proto::{StreamId, VarInt};
 pub(crate) use self::incoming::StreamHeader;
 use self::{
     incoming::{Incoming, Step},
+    limited::Limited,
     line::Line,
     receipts::Receipts,
 };
@@ -36,6 +38,7 @@ use crate::{
     engine::{
         account::{MessageMemory, Meter},
         counters::Counters,
+        limits::{Limit, RouteLimit},
         stand_in::StandIn,
         transport::STREAM_WINDOW,
     },
@@ -70,12 +73,15 @@ pub(crate) struct RouteIn {
     pub(crate) writers: HashMap<Gid, Rc<StandIn>>,
     /// Of responses: the local clients that they answer, and up to which number of its flow each has them.
     clients: HashMap<Gid, u64>,
+    /// The limits on what the peer sends.
+    pub(crate) limit: RouteLimit,
 }
 
 impl RouteIn {
     /// A route without writers.
-    pub(crate) fn new(topic: Arc<str>, route: Route) -> Self {
-        Self { topic, route, writers: HashMap::new(), clients: HashMap::new() }
+    pub(crate) fn new(topic: Arc<str>, route: Route, limits: Vec<Rc<Limit>>) -> Self {
+        let (writers, clients) = (HashMap::new(), HashMap::new());
+        Self { topic, route, writers, clients, limit: RouteLimit::new(limits) }
     }
 
     /// The route's responses go to these local clients.
@@ -106,6 +112,7 @@ pub(crate) struct Inbound {
     full: HashSet<Key>,
     /// Streams that wait for memory.
     without_room: Line,
+    limited: Limited,
     /// Memory for one short message where the identity has none left: those that have come whole are read one after the
     /// other.
     spare: Rc<Meter>,
@@ -144,6 +151,7 @@ impl Inbound {
             waiting: BTreeSet::new(),
             full: HashSet::new(),
             without_room: Line::default(),
+            limited: Limited::default(),
             spare: Meter::new(LONG),
             full_retry: None,
             exceeded: None,
@@ -290,7 +298,9 @@ impl Inbound {
     /// When [`handle_timeout`](Self::handle_timeout) or [`poll_receipt`](Self::poll_receipt) is due.
     pub(crate) fn poll_timeout(&self) -> Option<Duration> {
         let waiting = self.waiting.first().map(|(due, _)| *due);
-        [waiting, self.full_retry, self.receipts.poll_timeout()].into_iter().flatten().min()
+        let limited = self.limited.poll_timeout();
+        let parts = [waiting, self.full_retry, self.receipts.poll_timeout(), limited];
+        parts.into_iter().flatten().min()
     }
 
     /// Lets streams go on whose wait is over.
@@ -301,6 +311,7 @@ impl Inbound {
         let due: Vec<_> =
             self.waiting.iter().take_while(|(at, _)| *at <= now).map(|(_, key)| *key).collect();
         due.into_iter().for_each(|key| self.make_ready(key));
+        self.handle_limits_due(now);
     }
 
     /// The next acknowledgement that is due.

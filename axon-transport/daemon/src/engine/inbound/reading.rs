@@ -349,9 +349,20 @@ impl Inbound {
             return Next::Over;
         }
         let stand_in = Rc::clone(stand_in);
+        let limit = found.map(|route| &route.limit).filter(|limit| !limit.is_none()).cloned();
+        let message = match &limit {
+            Some(limit) => match self.pass_limit(key, stream, limit, message, acknowledged, now) {
+                Ok(message) => message,
+                Err(next) => return next,
+            },
+            None => message,
+        };
         let Some(there) = self.write(&stand_in, header, message.meta, &message.payload, now) else {
             return self.wait_for_room(key, stream, message, now);
         };
+        if let Some(limit) = &limit {
+            limit.pass(&header.of, length, now);
+        }
         if acknowledged
             && route.kind == Kind::Response
             && let Some(found) = self.routes.get_mut(&header.route)
@@ -446,7 +457,7 @@ pub(super) enum Next {
     Over,
 }
 
-fn wait(stream: &mut Incoming, step: Step) -> Next {
+pub(super) fn wait(stream: &mut Incoming, step: Step) -> Next {
     stream.step = step;
     Next::Wait
 }

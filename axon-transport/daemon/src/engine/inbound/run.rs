@@ -54,8 +54,11 @@ impl Inbound {
         if !header.reliable || route.kind != Kind::Topic || !stream.gathered.is_empty() {
             return Ok(None);
         }
+        // Where there are limits, each sample has a step of its own.
+        let unlimited = |of: &&RouteIn| of.limit.is_none();
         let writers = |of: &RouteIn| of.writers.get(&header.of).cloned();
-        let Some(stand_in) = self.routes.get(&header.route).and_then(writers) else {
+        let Some(stand_in) = self.routes.get(&header.route).filter(unlimited).and_then(writers)
+        else {
             return Ok(None);
         };
         let most = self.max_message + MAX_OVERHEAD as u64;

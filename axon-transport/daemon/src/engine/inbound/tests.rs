@@ -1,3 +1,5 @@
+mod limited;
+
 use std::{
     cell::{Cell, RefCell},
     rc::Rc,
@@ -123,7 +125,7 @@ impl Way {
         let mut inbound =
             Inbound::new(Rc::default(), MessageMemory::new(1 << 20, 1 << 20), 1 << 20, 0);
         let route = Route { kind, topic: TopicHash::new(0, "/t", "T").unwrap() };
-        let mut into = RouteIn::new("/t".into(), route);
+        let mut into = RouteIn::new("/t".into(), route, Vec::new());
         into.writers.insert(PUBLISHER, stand_in.unwrap());
         inbound.routes().insert(ROUTE, into);
         let header = StreamHeader {

@@ -44,7 +44,7 @@ use self::{
 };
 use super::{congestion::let_probe_through, connection::Carrier};
 use crate::{
-    engine::counters::Counters,
+    engine::{counters::Counters, limits::Limit},
     link::{CloseCode, Intake, ReceivedOf},
 };
 
@@ -114,6 +114,7 @@ impl Outbound {
             priority: route.priority,
             acknowledged: route.acknowledged,
             short_headers: route.short_headers,
+            limit: route.limit,
             responses: self.responses.clone(),
             credit: Rc::clone(self.turns.credit()),
         };
@@ -142,6 +143,18 @@ impl Outbound {
         // Samples may wait in any of its rings.
         let waiting = self.table.routes.get(number).map_or_else(Vec::new, Served::with_data);
         waiting.into_iter().for_each(|of| self.take_in(number, of, now));
+    }
+
+    /// Replaces the limits on a route.
+    pub(crate) fn set_limits(&mut self, number: u32, limits: Vec<Rc<Limit>>) {
+        let Some(served) = self.table.routes.get(number) else { return };
+        served.shared.limit.set(limits);
+        for id in served.flows.values().copied().collect::<Vec<_>>() {
+            if let Some(flow) = self.table.flows.get_mut(id) {
+                flow.handle_limits();
+                self.schedule(id);
+            }
+        }
     }
 
     /// Samples may wait for these sources, each of a writer. Those of other peers are among them.

@@ -18,7 +18,7 @@ use super::{
     served::{FlowRoute, ResponseNumbers},
     source::Source,
 };
-use crate::engine::{peer::routes::RelaySpec, rings::RingReader};
+use crate::engine::{limits::RouteLimit, peer::routes::RelaySpec, rings::RingReader};
 
 /// The ring of one publisher, with its one reader. It keeps every sample.
 pub(super) struct Ring {
@@ -152,6 +152,7 @@ pub(super) fn route(number: u32, priority: TopicPriority) -> FlowRoute {
         priority,
         acknowledged: true,
         short_headers: false,
+        limit: RouteLimit::default(),
         responses: ResponseNumbers::default(),
         credit: PeerCredit::new(),
     }

@@ -14,6 +14,7 @@ use super::{
     schedule::FlowId,
     source::{Done, Source},
 };
+use crate::engine::limits::RouteLimit;
 
 /// A route that the peer asked for.
 pub(crate) struct RouteOut {
@@ -27,6 +28,8 @@ pub(crate) struct RouteOut {
     pub(crate) acknowledged: bool,
     /// Whether the peer reads short headers.
     pub(crate) short_headers: bool,
+    /// The limits on what the peer gets of it.
+    pub(crate) limit: RouteLimit,
     /// Where its samples are taken.
     pub(crate) sources: Vec<Source>,
     /// The newest sample of each publisher that the peer has already.
@@ -41,6 +44,7 @@ pub(super) struct FlowRoute {
     pub(super) priority: TopicPriority,
     pub(super) acknowledged: bool,
     pub(super) short_headers: bool,
+    pub(super) limit: RouteLimit,
     pub(super) responses: ResponseNumbers,
     pub(super) credit: Rc<PeerCredit>,
 }

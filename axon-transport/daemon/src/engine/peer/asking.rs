@@ -169,11 +169,12 @@ impl Peer {
             self.asks(&key);
         }
         let changed = asked.wanted.subscribers != wanted.subscribers || fresh;
-        let route = self
-            .inbound
-            .routes()
-            .entry(asked.number)
-            .or_insert_with(|| RouteIn::new(key.topic.as_str().into(), asked.route));
+        if !self.inbound.routes().contains_key(&asked.number) {
+            let limits = self.incoming_limits(&key, with.config);
+            let route = RouteIn::new(key.topic.as_str().into(), asked.route, limits);
+            self.inbound.routes().insert(asked.number, route);
+        }
+        let Some(route) = self.inbound.routes().get_mut(&asked.number) else { return };
         route.writers.retain(|gid, _| asked.stand_ins.contains_key(gid));
         if key.kind == Kind::Response {
             route.set_clients(wanted.subscribers.iter().map(|client| client.gid));

@@ -4,6 +4,7 @@ mod access;
 mod asking;
 pub(super) mod graph;
 pub(super) mod kept;
+mod limits;
 pub(super) mod owners;
 mod refused;
 pub(super) mod routes;
@@ -334,7 +335,7 @@ impl Peer {
     }
 
     /// Replaces the access rules. Routes that they deny end at once; the graphs follow.
-    pub(super) fn set_permissions(&mut self, permissions: Permissions) {
+    pub(super) fn set_permissions(&mut self, permissions: Permissions, config: &Config) {
         self.access.set_permissions(permissions.clone());
         self.remote.set_permissions(permissions);
         let ending = std::mem::take(&mut self.ending);
@@ -348,6 +349,7 @@ impl Peer {
             self.unserve(route);
             self.refuse(route, &key, why, Some(DENIED_AGAIN));
         }
+        self.renew_limits(config);
     }
 
     /// Tells the peer which of its endpoints access rules deny, if that changed.
@@ -547,6 +549,7 @@ impl Peer {
         self.counters.fill(status);
         self.show_refused(status);
         self.access.fill(status);
+        self.remote.account().limits.fill(status);
         self.outbound.backlog().fill(status, now);
         status.endpoints = self.remote.len() as u64;
         status.endpoints_left_out = self.remote.left_out();

@@ -10,6 +10,7 @@ use super::{Peer, Surroundings, poll_after, reader_of};
 use crate::{
     engine::{
         account::Charge,
+        limits::RouteLimit,
         outbound::{RouteOut, Source},
         peer::routes::{MAX_RELAYS_OF_ROUTE, RelaySpec, RouteKey, admit, relays},
     },
@@ -149,6 +150,7 @@ impl Peer {
             priority: with.config.topic_priority(&key.topic),
             acknowledged,
             short_headers,
+            limit: RouteLimit::new(self.outgoing_limits(&key, with.config)),
             sources: sources.clone(),
             seen,
         };

@@ -80,7 +80,12 @@ impl Flow {
         // Each response has a number that rises, so that the peer can acknowledge it and drop a second copy.
         let is_numbered = info.acknowledged && kind == Kind::Response;
         Self {
-            taking: Taking::new(of, kind, is_numbered.then(|| route.responses.clone())),
+            taking: Taking::new(
+                of,
+                kind,
+                is_numbered.then(|| route.responses.clone()),
+                route.limit.clone(),
+            ),
             info,
             undemanded: 0,
             queue: Queue::new(qos, Rc::clone(budget)),
@@ -147,6 +152,11 @@ impl Flow {
         self.taking.handle_samples();
     }
 
+    /// The limits changed: what waited may pass now.
+    pub(super) fn handle_limits(&mut self) {
+        self.taking.handle_limits();
+    }
+
     /// Moves a burst of a KEEP_LAST publisher into the queue while QUIC takes nothing: in the ring it would be
     /// overwritten. BEST_EFFORT samples stay there: only the newest will be sent. A KEEP_ALL publisher waits.
     pub(super) fn take_burst(&mut self, sources: &[Source], counters: &Counters, now: Duration) {
@@ -205,6 +215,7 @@ impl Flow {
                 let queued =
                     self.fill(sources, counters, now) + std::mem::take(&mut self.undemanded);
                 carrier.seal.demand(queued, now);
+                self.finish_dropped(done);
             }
             let before = carrier.taken;
             let pause = match self.queue.delivery() {
@@ -285,10 +296,11 @@ impl Flow {
         (self.acknowledged_samples, self.reliable.parts())
     }
 
-    /// Whether it waits for other flows: none of its samples is in flight, and the peer takes in theirs first. Then it is
-    /// no fault of its own that it makes no progress.
+    /// Whether none of its samples is in flight, and the peer takes in those of other flows first, or a limit holds its
+    /// samples. Then it is no fault of the peer's that it makes no progress.
     pub(super) fn waits_for_others(&self) -> bool {
-        self.waits_for_credit && !self.queue.has_sent() && self.best_effort.is_idle()
+        let waits = self.waits_for_credit || self.taking.is_limited() && self.queue.is_empty();
+        waits && !self.queue.has_sent() && self.best_effort.is_idle()
     }
 
     /// The peer has the samples up to this number, and dropped some of them.
@@ -296,7 +308,20 @@ impl Flow {
         let (samples, newest) = self.queue.acknowledge(sequence);
         self.reliable.note_sent(&self.queue);
         self.acknowledged_samples += samples;
-        newest.map(|sequence| Done { sequence: Some(sequence), given_up: samples.min(dropped) })
+        let given_up = samples.min(dropped);
+        let mut done = newest.map(|sequence| Done { sequence: Some(sequence), given_up })?;
+        self.finish_dropped(&mut done);
+        Some(done)
+    }
+
+    /// The sources may forget samples that a limit dropped, once the peer has all before them.
+    fn finish_dropped(&mut self, done: &mut Done) {
+        if self.queue.is_empty()
+            && let Some((sequence, samples)) = self.taking.take_dropped()
+        {
+            done.sequence = done.sequence.max(Some(sequence));
+            done.given_up += samples;
+        }
     }
 
     /// The reliable stream carries nothing more.

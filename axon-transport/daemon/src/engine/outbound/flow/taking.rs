@@ -7,13 +7,17 @@ use axon_shm::{
     ids::Gid,
     qos::{Durability, Qos},
 };
-use axon_transport::internal::session::{
-    TakeLimit,
-    merge::{Merge, Taken},
+use axon_transport::{
+    access::Over,
+    internal::session::{
+        TakeLimit,
+        merge::{Merge, Taken},
+    },
 };
 
 use crate::engine::{
     counters::Counters,
+    limits::{Exceeded, RouteLimit},
     outbound::{
         queue::{Offered, Queue},
         served::ResponseNumbers,
@@ -54,11 +58,21 @@ pub(super) struct Taking {
     retry: Option<Duration>,
     /// The relay whose losses are counted, and how many are.
     counted: Option<(Gid, u64)>,
+    limit: RouteLimit,
+    /// The limit that the last turn came to. What newer samples replaced in the ring since is lost for it.
+    exceeded: Option<Exceeded>,
+    /// The newest sample that a limit dropped, and how many it did, since the sources were told last.
+    dropped: Option<(u64, u64)>,
 }
 
 impl Taking {
     /// Takes from nothing yet.
-    pub(super) fn new(of: Gid, kind: Kind, responses: Option<ResponseNumbers>) -> Self {
+    pub(super) fn new(
+        of: Gid,
+        kind: Kind,
+        responses: Option<ResponseNumbers>,
+        limit: RouteLimit,
+    ) -> Self {
         Self {
             of,
             kind,
@@ -69,7 +83,25 @@ impl Taking {
             more: false,
             retry: None,
             counted: None,
+            limit,
+            exceeded: None,
+            dropped: None,
         }
+    }
+
+    /// The limits changed: what waited may pass now.
+    pub(super) fn handle_limits(&mut self) {
+        self.more |= self.exceeded.is_some();
+    }
+
+    /// Whether samples wait, and a limit lets none pass.
+    pub(super) fn is_limited(&self) -> bool {
+        self.exceeded.is_some() && self.has_more()
+    }
+
+    /// Takes the number of the newest sample that a limit dropped, and how many it did.
+    pub(super) fn take_dropped(&mut self) -> Option<(u64, u64)> {
+        self.dropped.take()
     }
 
     /// Takes these sources; the peer has the samples up to number `seen`.
@@ -147,8 +179,12 @@ impl Taking {
             if has_enough {
                 break;
             }
+            let is_limited = self.exceeded.is_some() || !self.limit.is_none();
+            if is_limited && !self.pass_limit(sources, queue, topic, counters, now) {
+                break;
+            }
             let Some(sample) = self.taken.pop_front() else {
-                let left = together.min(most_samples - samples);
+                let left = together.min(most_samples - samples).min(self.limit.passes(now));
                 let most = limit(queue.room(), left, most_bytes - bytes);
                 if !self.take(sources, most, now) {
                     let behind = self.merge.is_behind().then_some(Duration::ZERO);
@@ -166,9 +202,11 @@ impl Taking {
                 }
                 continue;
             };
-            bytes += sample.payload.len();
+            let length = sample.payload.len();
+            bytes += length;
             match queue.offer(sample, now) {
                 Offered::Queued { dropped: older } => {
+                    self.limit.pass(&self.of, length, now);
                     samples += 1;
                     dropped += older;
                 }
@@ -232,7 +270,107 @@ impl Taking {
             _ if first.qos().durability == Durability::TransientLocal => lost,
             _ => 0,
         };
-        counters.lost(topic, "queue", lost.saturating_sub(counted));
+        let lost = lost.saturating_sub(counted);
+        if let Some(limit) = &self.exceeded {
+            limit.dropped(lost);
+        }
+        let cause = self.exceeded.as_ref().map_or("queue", Exceeded::cause);
+        counters.lost(topic, cause, lost);
+    }
+
+    /// Whether the next sample may pass the limits. If not, it waits or samples are dropped, as the limit says.
+    fn pass_limit(
+        &mut self,
+        sources: &[Source],
+        queue: &Queue,
+        topic: &Arc<str>,
+        counters: &Counters,
+        now: Duration,
+    ) -> bool {
+        let exceeded = self.limit.exceeded(&self.of, now);
+        if self.exceeded.is_some() || exceeded.is_some() {
+            // Until here it was another cause, or the limit that the last turn came to.
+            self.count_overwritten(sources, topic, counters);
+        }
+        let Some(exceeded) = exceeded else {
+            if let Some(before) = self.exceeded.take_if(|before| before.over() == Over::DropOldest)
+            {
+                self.leave_oldest(sources, queue, before, topic, counters, now);
+            }
+            self.exceeded = None;
+            return true;
+        };
+        let waits = match exceeded.over() {
+            Over::Hold => true,
+            // The publisher must not wait: what its ring holds is taken, and the newest of it is kept.
+            Over::DropOldest if queue.keeps_all() => {
+                self.drop_for(&exceeded, 1, sources, topic, counters, now);
+                !self.taken.is_empty()
+            }
+            // The ring keeps the newest, and replaces the others without a copy.
+            Over::DropOldest => true,
+            Over::DropNewest => {
+                self.drop_for(&exceeded, 0, sources, topic, counters, now);
+                self.more
+            }
+        };
+        if waits {
+            (self.retry, self.more) = (Some(exceeded.wait), true);
+        }
+        self.exceeded = Some(exceeded);
+        false
+    }
+
+    /// Passes over the samples that waited for a limit, but for those that may pass now.
+    fn leave_oldest(
+        &mut self,
+        sources: &[Source],
+        queue: &Queue,
+        limit: Exceeded,
+        topic: &Arc<str>,
+        counters: &Counters,
+        now: Duration,
+    ) {
+        let most = self.limit.passes(now);
+        if queue.keeps_all() {
+            return self.drop_for(&limit, most, sources, topic, counters, now);
+        }
+        for source in sources.iter().filter(|source| source.reads(&self.of)) {
+            source.skip_of(&self.of, most);
+        }
+        self.exceeded = Some(limit);
+        self.count_overwritten(sources, topic, counters);
+    }
+
+    /// Takes what the rings hold, and drops all of it but the newest `most` samples.
+    fn drop_for(
+        &mut self,
+        limit: &Exceeded,
+        most: usize,
+        sources: &[Source],
+        topic: &Arc<str>,
+        counters: &Counters,
+        now: Duration,
+    ) {
+        let (mut dropped, mut turns) = (0, 0);
+        self.more = loop {
+            let some = TakeLimit { samples: FILL.0, bytes: SHARED };
+            let there = self.take(sources, some, now);
+            while self.taken.len() > most
+                && let Some(sample) = self.taken.pop_front()
+            {
+                dropped += 1;
+                let (newest, samples) = self.dropped.unwrap_or_default();
+                self.dropped = Some((newest.max(sample.info.sequence), samples + 1));
+            }
+            turns += 1;
+            // A publisher that never rests must not keep the others waiting.
+            if !there || turns == REPEATS {
+                break there;
+            }
+        };
+        limit.dropped(dropped);
+        counters.lost(topic, limit.cause(), dropped);
     }
 
     /// Takes the next samples, as many as `most` says. Whether there was any, even one that was sent before.

@@ -6,6 +6,7 @@ use axon_shm::{ids::Gid, qos::Qos};
 use super::taking::Taking;
 use crate::engine::{
     counters::Counters,
+    limits::{RouteLimit, tests::limits},
     outbound::{budget::Budget, model::Ring, queue::Queue, source::Source},
 };
 
@@ -27,9 +28,13 @@ struct Way {
 
 impl Way {
     fn new(qos: Qos) -> Self {
+        Self::limited(qos, RouteLimit::default())
+    }
+
+    fn limited(qos: Qos, limit: RouteLimit) -> Self {
         let ring = Ring::new(Gid([2; 16]), PUBLISHER);
         let sources = vec![ring.source(qos)];
-        let mut taking = Taking::new(PUBLISHER, Kind::Topic, None);
+        let mut taking = Taking::new(PUBLISHER, Kind::Topic, None, limit);
         taking.set_sources(&sources, None);
         Self {
             ring,
@@ -61,6 +66,22 @@ impl Way {
     fn dropped(&self) -> u64 {
         self.counters.take_lost().iter().map(|loss| loss.samples).sum()
     }
+}
+
+/// What a limit of ten samples a second, two at once, lets pass of 100 samples in a second. The numbers, and when they were
+/// sent.
+fn passes(qos: Qos, over: &str) -> (Way, Vec<(u64, u64)>) {
+    let limit = limits(&format!("topic = \"/t\"\nrate = 10\nburst = 2\nover = \"{over}\""));
+    let mut way = Way::limited(qos, RouteLimit::new(limit));
+    let mut sent = Vec::new();
+    for ms in 0..1000 {
+        if ms % 10 == 0 {
+            way.ring.publish(1, 8);
+        }
+        way.fill(at(ms));
+        sent.extend(way.send_all().into_iter().map(|number| (number, ms)));
+    }
+    (way, sent)
 }
 
 fn keep_last(depth: u32) -> Qos {
@@ -210,4 +231,64 @@ fn a_flow_without_room_takes_one_sample_and_keeps_it() {
     assert_eq!(way.fill(at(0)), 1);
     assert_eq!(way.send_all(), [2]);
     assert_eq!(way.taking.end(), 1);
+}
+
+#[test]
+fn beyond_a_limit_the_newest_sample_waits_and_the_others_are_dropped() {
+    for (qos, copies) in [(keep_last(10), 12), (Qos::sensor_data(), 12), (Qos::keep_all(), 100)] {
+        let (mut way, sent) = passes(qos, "drop-oldest");
+        let numbers: Vec<_> = sent.iter().map(|(number, _)| *number).collect();
+        assert_eq!(numbers.len(), 11, "{sent:?}");
+        assert_eq!(numbers[..2], [1, 2], "two at once");
+        // Each is the newest at its time.
+        assert!(sent[2..].iter().all(|(number, ms)| *number == ms / 10 + 1), "{sent:?}");
+        // The last one waits, and is sent though nothing comes after it.
+        assert_eq!(way.fill(at(1001)), 1);
+        assert_eq!(way.send_all(), [100]);
+        assert!(way.ring.copied.get() <= copies, "{} copies", way.ring.copied.get());
+        let lost = way.counters.take_lost();
+        assert!(lost.iter().all(|loss| loss.cause == "limit"), "{lost:?}");
+        assert_eq!(lost.iter().map(|loss| loss.samples).sum::<u64>(), 100 - 12);
+    }
+}
+
+#[test]
+fn beyond_a_limit_that_drops_the_newest_samples_are_dropped_as_they_come() {
+    for qos in [keep_last(10), Qos::sensor_data(), Qos::keep_all()] {
+        let (mut way, sent) = passes(qos, "drop-newest");
+        assert_eq!(sent.len(), 11, "{sent:?}");
+        assert_eq!(sent[..3], [(1, 0), (2, 10), (11, 100)]);
+        assert_eq!(way.fill(at(1001)), 0, "none waits");
+        assert_eq!(way.dropped(), 100 - 11);
+        let (newest, samples) = way.taking.take_dropped().unwrap();
+        assert_eq!((newest, samples), (100, 89), "the publisher does not wait for them");
+    }
+}
+
+#[test]
+fn a_limit_that_holds_samples_loses_none() {
+    let (mut way, sent) = passes(Qos::keep_all(), "hold");
+    let numbers: Vec<_> = sent.iter().map(|(number, _)| *number).collect();
+    assert_eq!(numbers, (1..=11).collect::<Vec<_>>());
+    assert!(way.taking.is_limited());
+    for ms in 1000..10_000 {
+        way.fill(at(ms));
+        way.send_all();
+    }
+    assert_eq!((way.ring.copied.get(), way.dropped()), (100, 0));
+    assert!(!way.taking.is_limited());
+}
+
+#[test]
+fn a_limit_of_bytes_counts_the_length_of_samples() {
+    let limit = RouteLimit::new(limits("topic = \"/t\"\nbytes = \"1 MB/s\"\nover = \"hold\""));
+    let mut way = Way::limited(Qos::keep_all(), limit);
+    way.ring.publish(100, 100_000);
+    let mut sent = Vec::new();
+    for ms in 0..1000 {
+        way.fill(at(ms));
+        sent.extend(way.send_all());
+    }
+    // The first one passes at once, and each is made up for before the next.
+    assert_eq!(sent.len(), 11, "{sent:?}");
 }

@@ -4,6 +4,7 @@ mod access;
 mod cuts;
 mod hostile;
 mod kills;
+mod limits;
 mod long;
 mod losses;
 mod memory;

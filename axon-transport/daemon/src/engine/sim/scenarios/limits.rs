@@ -1,0 +1,156 @@
+//! Limits between hosts: what either side limits does not cross, and all that is dropped is counted.
+
+use axon_shm::qos::Qos;
+use axon_transport::{
+    access::{AccessRules, TopicPattern},
+    config::{Config, TopicPriority, TopicRule},
+    status::LimitStatus,
+};
+
+use crate::engine::sim::{
+    tests::{millis, secs},
+    world::{Pair, World},
+};
+
+const TEXT: &str = "[[limit]]\npeer = \"*\"\ntopic = \"/limited\"\nrate = 10\n";
+
+/// Two hosts, of which one has these rules.
+fn hosts(with_rules: usize, text: &str) -> World {
+    World::new(29, 2, |host| {
+        let mut config = Config::default();
+        if host == with_rules {
+            config.access = AccessRules::parse(text, "access.toml").unwrap();
+        }
+        config
+    })
+}
+
+/// Publishes a sample each 10 ms for so many seconds.
+fn publish(world: &mut World, pairs: &[Pair], seconds: u64) {
+    for _ in 0..seconds * 100 {
+        for pair in pairs {
+            world.publish(*pair, 100);
+        }
+        world.run_for(millis(10));
+    }
+}
+
+fn limits(world: &World, host: usize) -> &[LimitStatus] {
+    &world.hosts[host].status.values().next().unwrap().limits
+}
+
+#[test]
+fn what_is_beyond_a_limit_does_not_cross_whichever_host_sets_it() {
+    for with_rules in [0, 1] {
+        for (over, qos) in [
+            ("drop-oldest", Qos::keep_all()),
+            ("drop-oldest", Qos::default().with_depth(5)),
+            ("drop-oldest", Qos::sensor_data()),
+            ("drop-newest", Qos::keep_all()),
+            ("drop-newest", Qos::sensor_data()),
+        ] {
+            let mut world = hosts(with_rules, &format!("{TEXT}over = \"{over}\""));
+            let [limited, free] = ["/limited", "/free"].map(|topic| world.pair(0, 1, topic, qos));
+            world.until(secs(20), World::is_whole);
+            world.run_for(secs(1));
+            publish(&mut world, &[limited, free], 10);
+            world.run_for(secs(2));
+            let came = world.received(limited);
+            let text = format!("host {with_rules}, {over}, {qos:?}: {came:?}");
+            assert!((95..=103).contains(&came.len()), "{} of 100, {text}", came.len());
+            assert!(came.is_sorted_by(|one, next| one < next), "{text}");
+            assert_eq!(came.contains(&1000), over == "drop-oldest", "the newest arrives: {text}");
+            assert_eq!(world.received(free).len(), 1000, "{text}");
+            let [limit] = limits(&world, with_rules) else { panic!("{text}") };
+            let verb = ["subscribe", "publish"][with_rules];
+            assert_eq!((&*limit.verb, &*limit.name), (verb, "/limited"));
+            assert_eq!(limit.passed, came.len() as u64, "{text}");
+            assert_eq!(limit.passed + limit.dropped, 1000, "{text}");
+            assert!(limits(&world, 1 - with_rules).is_empty());
+            // Nobody is taken for stalled, and the publisher waits for nothing.
+            assert!(world.publish(limited, 10), "{text}");
+        }
+    }
+}
+
+#[test]
+fn a_limit_that_holds_a_keep_all_publisher_back_loses_nothing() {
+    for with_rules in [0, 1] {
+        let mut world = hosts(with_rules, &format!("{TEXT}over = \"hold\""));
+        let pairs = ["/limited", "/free"].map(|topic| world.pair(0, 1, topic, Qos::keep_all()));
+        world.until(secs(20), World::is_whole);
+        world.run_for(secs(1));
+        publish(&mut world, &pairs, 5);
+        let early = world.received(pairs[0]).len();
+        assert!((45..=55).contains(&early), "{early}");
+        world.run_for(secs(60));
+        for pair in pairs {
+            let published = world.hosts[0].rings.published(pair.publisher.1);
+            assert!(published > 300, "{published}");
+            assert_eq!(world.received(pair), (1..=published).collect::<Vec<_>>());
+        }
+    }
+}
+
+#[test]
+fn limits_that_change_count_at_once_and_lose_nothing_that_they_hold() {
+    let hold = format!("{TEXT}over = \"hold\"");
+    let open = "default = \"allow\"";
+    for host in [0, 1] {
+        let mut world = hosts(host, &hold);
+        let pair = world.pair(0, 1, "/limited", Qos::keep_all());
+        world.until(secs(20), World::is_whole);
+        world.run_for(secs(1));
+        for round in 0..20 {
+            publish(&mut world, &[pair], 1);
+            world.hosts[host].set_access([open, &hold][round % 2]);
+        }
+        world.hosts[host].set_access(open);
+        world.run_for(secs(3));
+        let published = world.hosts[0].rings.published(pair.publisher.1);
+        assert!(published > 1000, "{published}");
+        assert_eq!(world.received(pair), (1..=published).collect::<Vec<_>>(), "host {host}");
+    }
+}
+
+#[test]
+fn the_topics_of_a_peer_share_what_it_may_have_together() {
+    let text = "[[limit]]\npeer = \"*\"\nsubscribe = \"/**\"\nbytes = \"2 kB/s\"\ntogether = true";
+    let mut world = hosts(0, text);
+    let pairs = ["/a", "/b", "/c"].map(|topic| world.pair(0, 1, topic, Qos::sensor_data()));
+    world.until(secs(20), World::is_whole);
+    world.run_for(secs(1));
+    publish(&mut world, &pairs, 10);
+    world.run_for(secs(1));
+    let came = pairs.map(|pair| world.received(pair).len());
+    let sum: usize = came.iter().sum();
+    // A sample has 22 bytes more than was asked for.
+    assert!((160..=175).contains(&sum), "{came:?}");
+    assert!(came.iter().all(|one| *one > 50), "each has its turn: {came:?}");
+}
+
+#[test]
+fn max_hz_sends_the_newest_samples_of_a_topic_to_each_host() {
+    let mut world = World::new(31, 3, |host| {
+        let mut config = Config::default();
+        if host == 0 {
+            let name = TopicPattern::new("/limited").unwrap();
+            config.topics.push(TopicRule::new(name, TopicPriority::Normal).max_hz(10.0));
+        }
+        config
+    });
+    let qos = Qos::sensor_data();
+    let one = world.pair(0, 1, "/limited", qos);
+    let subscription = world.hosts[2].rings.create_subscription("/limited", qos, None);
+    let pairs = [one, Pair { subscription: (2, subscription), ..one }];
+    world.hosts[2].touch_graph();
+    world.until(secs(20), World::is_whole);
+    world.run_for(secs(1));
+    publish(&mut world, &[one], 5);
+    world.run_for(secs(1));
+    for pair in pairs {
+        let came = world.received(pair);
+        assert!((45..=55).contains(&came.len()), "{came:?}");
+        assert_eq!(came.last(), Some(&500), "the newest arrives");
+    }
+}

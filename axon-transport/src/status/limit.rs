@@ -1,0 +1,21 @@
+//! Limits in the status of a link.
+
+use serde::{Deserialize, Serialize};
+
+/// A limit that a rule of this host sets for a peer, and what it did. It counts for all links of the peer's identity.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
+pub struct LimitStatus {
+    /// What the peer does that is limited: `publish`, `subscribe` or `call`.
+    pub verb: String,
+    /// The topic or service, or `(all topics)` together.
+    pub name: String,
+    /// The limit.
+    pub limit: String,
+    /// Where it is written.
+    pub place: String,
+    /// Samples, or requests, that passed.
+    pub passed: u64,
+    /// Those that were dropped.
+    pub dropped: u64,
+}
