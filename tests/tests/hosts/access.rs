@@ -1,6 +1,8 @@
 //! Access rules between two hosts as real processes: what a rule denies never arrives, what it allows all does, and a
 //! daemon takes rules that changed without a restart.
 
+mod limits;
+
 use std::{
     fs,
     os::unix::fs::PermissionsExt,

@@ -1,0 +1,118 @@
+//! Limits between two hosts. Two samples of each topic may pass, and the next one after a hundred seconds or once the limit
+//! is gone.
+
+use axon_transport::status::LimitStatus;
+
+use super::*;
+
+const LIMITS: &str = r#"default = "allow"
+[[limit]]
+peer = "PEER"
+publish = "/cmd_vel"
+rate = 0.01
+burst = 2
+
+[[limit]]
+peer = "PEER"
+subscribe = "/scan"
+rate = 0.01
+burst = 2
+over = "hold"
+
+[[limit]]
+peer = "PEER"
+call = "/set_mode"
+rate = 0.01
+burst = 2
+over = "hold"
+"#;
+
+const SAMPLES: u64 = 200;
+
+fn publish(publisher: &Publisher) {
+    for number in 1..=SAMPLES {
+        publisher.publish(&number.to_be_bytes()).unwrap();
+    }
+}
+
+/// The next sample that comes.
+fn next(subscription: &Subscription) -> u64 {
+    let mut bytes = Vec::new();
+    subscription.recv(&mut bytes, Some(PATIENCE)).expect("a sample");
+    u64::from_be_bytes(bytes.try_into().unwrap())
+}
+
+/// The limit of a topic, as the robot shows it by now.
+fn limit(hosts: &Hosts, name: &str) -> LimitStatus {
+    let limits = hosts.robot.link().limits;
+    limits.into_iter().find(|limit| limit.name == name).unwrap_or_default()
+}
+
+#[test]
+fn what_is_beyond_a_limit_waits_or_is_dropped_and_counted_in_each_mode() {
+    Hosts::in_all(|hosts| {
+        hosts.write(LIMITS);
+        assert_eq!(hosts.reload().error, None);
+        let (here, there) = (hosts.robot.session("robot"), hosts.base.session("base"));
+        let (drive, drives) = (subscription(&here, "/cmd_vel"), publisher(&there, "/cmd_vel"));
+        let (scan, scans) = (publisher(&here, "/scan"), subscription(&there, "/scan"));
+        let service = || EndpointSpec::new("/set_mode", "test/Set", Qos::keep_all());
+        let (mode, sets) =
+            (here.create_server(service()).unwrap(), there.create_client(service()).unwrap());
+        meet(&drives, &drive);
+        meet(&scan, &scans);
+        assert!(sets.wait_available(PATIENCE));
+        publish(&drives);
+        publish(&scan);
+        let numbers: Vec<_> = (0..5).map(|n| sets.send_request(&[n]).unwrap()).collect();
+        // The first two pass, and of the others the newest waits.
+        assert_eq!([next(&drive), next(&drive)], [1, 2]);
+        until("what is beyond the limit is counted", || {
+            limit(&hosts, "/cmd_vel").dropped == SAMPLES - 3
+        });
+        assert_eq!([next(&scans), next(&scans)], [1, 2]);
+        let (mut bytes, mut asked) = (Vec::new(), Vec::new());
+        for _ in 0..2 {
+            asked.push(mode.recv_request(&mut bytes, Some(PATIENCE)).expect("a request"));
+        }
+        until("the robot shows both limits", || limit(&hosts, "/scan").passed == 2);
+        assert!(!drive.has_data() && !scans.has_data());
+        assert!(mode.recv_request(&mut bytes, Some(Duration::ZERO)).is_err());
+        let (drives_limit, scan_limit) = (limit(&hosts, "/cmd_vel"), limit(&hosts, "/scan"));
+        assert_eq!((&*drives_limit.verb, drives_limit.passed), ("publish", 2));
+        assert_eq!((&*scan_limit.verb, scan_limit.passed, scan_limit.dropped), ("subscribe", 2, 0));
+        assert_eq!(scan_limit.place, "line 8 of access.toml");
+        assert_eq!(scan_limit.limit, "0.01 a second, 2 at once, hold");
+        until("the link's status has the cause", || {
+            hosts.robot.link().dropped.get("limit") == Some(&(SAMPLES - 3))
+        });
+
+        hosts.write("default = \"allow\"");
+        let error = hosts.reload().error.unwrap();
+        assert!(error.contains("is no [[limit]] any more"), "{error}");
+        hosts
+            .write("default = \"allow\"\n[[limit]]\npeer = \"PEER\"\ntopic = \"/other\"\nrate = 1");
+        assert_eq!(hosts.reload().error, None);
+        assert_eq!(next(&drive), SAMPLES, "the newest arrives");
+        assert_eq!(drive.lost(), SAMPLES - 3);
+        for number in 3..=SAMPLES {
+            assert_eq!(next(&scans), number);
+        }
+        assert_eq!((scans.lost(), drive.has_data(), scans.has_data()), (0, false, false));
+        assert!(scan.wait_acknowledged(PATIENCE));
+        assert!(
+            !drives.wait_acknowledged(PATIENCE),
+            "the publisher is told of those that were dropped"
+        );
+        while asked.len() < numbers.len() {
+            asked.push(mode.recv_request(&mut bytes, Some(PATIENCE)).expect("a request"));
+        }
+        for (number, asked) in numbers.iter().zip(asked) {
+            mode.send_response(asked.publisher, asked.sequence, b"done").unwrap();
+            let response = sets.recv_response(&mut bytes, Some(PATIENCE)).expect("a response");
+            assert_eq!(response.sequence, *number);
+        }
+        assert!(mode.recv_request(&mut bytes, Some(Duration::ZERO)).is_err());
+        until("limits that are gone are not shown", || hosts.robot.link().limits.is_empty());
+    });
+}
