@@ -50,6 +50,26 @@ fn the_page_s_rules_meet_its_expectations_and_its_commands_run_as_typed() {
 }
 
 #[test]
+fn check_names_the_limits_of_the_page_that_count() {
+    let dir = tempfile::tempdir().expect("directory");
+    let limits = blocks(PAGE, "toml").into_iter().find(|rules| rules.contains("[[limit]]"));
+    let file = written(dir.path(), "access.toml", limits.expect("limits"));
+    let shown = blocks(PAGE, "text").into_iter().find(|text| text.starts_with("limited: "));
+    let check = |arguments: &[&str]| {
+        let output = run(&[&["acl", "check", &*file, "--peer"], arguments].concat(), &[]);
+        assert!(output.status.success(), "{}", text(&output.stderr));
+        text(&output.stdout)
+    };
+    let base = check(&["base", "--subscribe", "/camera/left"]);
+    assert!(base.ends_with(shown.expect("an example")), "{base}");
+    let guest = check(&["guest", "--publish", "/scan"]);
+    let said =
+        "limited: publish /scan: line 7 of access.toml: 500 kB/s, drop-oldest, all topics together";
+    assert!(guest.contains(said), "{guest}");
+    assert!(!check(&["base", "--publish", "/scan"]).contains("limited"));
+}
+
+#[test]
 fn check_says_which_line_decides_and_its_status_says_whether_it_may() {
     let dir = tempfile::tempdir().expect("directory");
     let rules = "[[allow]]\npeer = \"base\"\npublish = \"/cmd_vel\"\nact = \"/dock\"\n";

@@ -36,7 +36,14 @@ pub(super) fn run(args: &cli::Check) -> Result<ExitCode, CliError> {
         );
         table.row([printable(&format!("{verb} {name}")), decision.to_string(), printable(&there)]);
     }
-    std::io::stdout().lock().write_all(table.render(0).as_bytes())?;
+    let mut text = table.render(0);
+    for (verb, name) in args.what.uses() {
+        for limit in permissions.limits(verb, &name) {
+            let line = format!("limited: {verb} {name}: {limit}");
+            text.push_str(&format!("{}\n", printable(&line)));
+        }
+    }
+    std::io::stdout().lock().write_all(text.as_bytes())?;
     Ok(if allowed { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 

@@ -88,6 +88,9 @@ fn render(status: &Status) -> String {
     if status.links.iter().any(|link| !link.denied.is_empty()) {
         section(&mut out, "Denied by access rules", "none", denied(&status.links));
     }
+    if status.links.iter().any(|link| !link.limits.is_empty()) {
+        section(&mut out, "Limits", "none", limits(&status.links));
+    }
     keys(&mut out, &status.keys);
     section(&mut out, "Topics", "none", topics(status));
     section(&mut out, "Out of range", "no pair", out_of_range(status));
@@ -182,6 +185,28 @@ fn reasons<'a>(
 
 fn denied(links: &[LinkStatus]) -> TextTable {
     reasons(links, "use", |link| (&link.denied, link.more_denied))
+}
+
+fn limits(links: &[LinkStatus]) -> TextTable {
+    let mut table = TextTable::new(&["host", "use", "limit", "written in", ">passed", ">dropped"]);
+    for link in links {
+        for limit in &link.limits {
+            table.row([
+                link.host.clone(),
+                format!("{} {}", limit.verb, limit.name),
+                limit.limit.clone(),
+                limit.place.clone(),
+                grouped(limit.passed),
+                grouped(limit.dropped),
+            ]);
+        }
+        if link.more_limits > 0 {
+            let more = format!("and {} more", grouped(link.more_limits as u64));
+            let row = [link.host.clone(), more, dash(), dash(), dash(), dash()];
+            table.row(row);
+        }
+    }
+    table
 }
 
 fn causes(dropped: &BTreeMap<String, u64>) -> String {
