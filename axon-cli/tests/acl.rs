@@ -64,7 +64,7 @@ fn check_names_the_limits_of_the_page_that_count() {
     assert!(base.ends_with(shown.expect("an example")), "{base}");
     let guest = check(&["guest", "--publish", "/scan"]);
     let said =
-        "limited: publish /scan: line 7 of access.toml: 500 kB/s, drop-oldest, all topics together";
+        "limited: publish /scan: line 8 of access.toml: 500 kB/s, drop-oldest, all topics together";
     assert!(guest.contains(said), "{guest}");
     assert!(!check(&["base", "--publish", "/scan"]).contains("limited"));
 }
