@@ -43,6 +43,11 @@ pub(super) fn run(args: &cli::Check) -> Result<ExitCode, CliError> {
             text.push_str(&format!("{}\n", printable(&line)));
         }
     }
+    for limit in permissions.egress() {
+        let line =
+            format!("limited: all packets to it: line {} of {}: {limit}", limit.line, limit.file);
+        text.push_str(&format!("{}\n", printable(&line)));
+    }
     std::io::stdout().lock().write_all(text.as_bytes())?;
     Ok(if allowed { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }

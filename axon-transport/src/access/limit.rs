@@ -62,12 +62,7 @@ impl fmt::Display for RateLimit {
         }
         if let Some(bytes) = self.bytes {
             let comma = if self.rate.is_some() { ", " } else { "" };
-            let (bytes, unit) = match bytes {
-                b if b >= 1e6 => (b / 1e6, "MB"),
-                b if b >= 1e3 => (b / 1e3, "kB"),
-                b => (b, "B"),
-            };
-            write!(f, "{comma}{bytes} {unit}/s")?;
+            write!(f, "{comma}{}", bytes_text(bytes))?;
         }
         if self.burst > NonZeroU32::MIN {
             write!(f, ", {} at once", self.burst)?;
@@ -77,13 +72,47 @@ impl fmt::Display for RateLimit {
     }
 }
 
+/// So many bytes a second, with a unit.
+fn bytes_text(bytes: f64) -> String {
+    match bytes {
+        b if b >= 1e6 => format!("{} MB/s", b / 1e6),
+        b if b >= 1e3 => format!("{} kB/s", b / 1e3),
+        b => format!("{b} B/s"),
+    }
+}
+
+impl fmt::Display for EgressLimit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&bytes_text(self.bytes))
+    }
+}
+
 /// One `[[limit]]`.
 #[derive(Debug)]
 pub(super) struct LimitRule {
     pub(super) peers: Vec<PartyPattern>,
-    /// What the party does that is limited, and with which topics and services.
-    pub(super) uses: Vec<(Verb, TopicPattern)>,
-    pub(super) limit: PlacedLimit,
+    pub(super) limits: Limits,
+}
+
+/// What a `[[limit]]` limits.
+#[derive(Debug)]
+pub(super) enum Limits {
+    /// What the party does, with which topics and services.
+    Uses(Vec<(Verb, TopicPattern)>, PlacedLimit),
+    /// All that is sent to it.
+    Egress(EgressLimit),
+}
+
+/// The bytes a second that leave this host for a party.
+#[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
+pub struct EgressLimit {
+    /// Bytes a second, with the headers of IP and UDP.
+    pub bytes: f64,
+    /// The file, as decisions name it.
+    pub file: Arc<str>,
+    /// The line of the file.
+    pub line: u32,
 }
 
 /// A limit, and where it is written.
@@ -109,7 +138,26 @@ impl LimitRule {
         self.peers.iter().any(|peer| peer.fits(party))
     }
 
-    pub(super) fn fits(&self, verb: Verb, name: &str) -> bool {
-        self.uses.iter().any(|(used, pattern)| *used == verb && pattern.fits(name))
+    /// The limit, if it is on this use.
+    pub(super) fn of(&self, verb: Verb, name: &str) -> Option<&PlacedLimit> {
+        let Limits::Uses(uses, limit) = &self.limits else { return None };
+        let fits = uses.iter().any(|(used, pattern)| *used == verb && pattern.fits(name));
+        fits.then_some(limit)
+    }
+
+    /// The limit, if it is on all that is sent.
+    pub(super) fn egress(&self) -> Option<&EgressLimit> {
+        match &self.limits {
+            Limits::Egress(limit) => Some(limit),
+            Limits::Uses(..) => None,
+        }
+    }
+
+    /// How decisions name the file.
+    pub(super) fn file(&self) -> &str {
+        match &self.limits {
+            Limits::Uses(_, limit) => &limit.file,
+            Limits::Egress(limit) => &limit.file,
+        }
     }
 }

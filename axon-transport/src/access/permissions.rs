@@ -3,7 +3,8 @@
 use std::sync::Arc;
 
 use super::{
-    Decision, PlacedLimit, Verb, decision::Reason, limit::LimitRule, pattern_set::PatternSet,
+    Decision, EgressLimit, PlacedLimit, Verb, decision::Reason, limit::LimitRule,
+    pattern_set::PatternSet,
 };
 
 /// What one party may do. Cheap to clone; the time of a decision does not grow with the number of rules.
@@ -58,8 +59,12 @@ impl Permissions {
 
     /// The limits that count when the party does this with a topic or service of this full name. Each of them counts.
     pub fn limits(&self, verb: Verb, name: &str) -> impl Iterator<Item = &PlacedLimit> {
-        let fit = self.limits.iter().filter(move |limit| limit.fits(verb, name));
-        fit.map(|limit| &limit.limit)
+        self.limits.iter().filter_map(move |limit| limit.of(verb, name))
+    }
+
+    /// The limits on all that is sent to the party. Each of them counts.
+    pub fn egress(&self) -> impl Iterator<Item = &EgressLimit> {
+        self.limits.iter().filter_map(|limit| limit.egress())
     }
 
     /// Whether the party may do this with the topic, service or node of this full name.

@@ -107,7 +107,7 @@ impl AccessRules {
 
     /// How decisions name the file; `None` where there are no rules.
     pub fn file(&self) -> Option<&str> {
-        let limited = || self.limits.first().map(|limit| &*limit.limit.file);
+        let limited = || self.limits.first().map(|limit| limit.file());
         self.rules.as_ref().map(|rules| &*rules.file).or_else(limited)
     }
 

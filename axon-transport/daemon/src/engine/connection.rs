@@ -3,11 +3,12 @@
 use std::{collections::HashMap, net::SocketAddr, time::Duration};
 
 use axon_transport::status::LinkStatus;
-use quinn_proto::{ConnectionHandle, StreamId};
+use quinn_proto::{ConnectionHandle, StreamId, Transmit};
 use rustls_pki_types::CertificateDer;
 
 use super::{
     control::Control,
+    limits::Egress,
     marks::marks_reported,
     outbound::{Class, FlowId, Priorities, Rank},
     protection::Seal,
@@ -45,6 +46,8 @@ pub(crate) struct Connection {
     pub(super) control: Control,
     /// The flow of each data stream that this side opened.
     pub(super) flows: HashMap<StreamId, FlowId>,
+    /// The limits on what it sends.
+    pub(super) egress: Egress,
     /// How much is lost on the way.
     loss: Loss,
     /// Whether it is in the list of connections with something to do.
@@ -70,6 +73,7 @@ impl Connection {
             quic,
             control: Control::default(),
             flows: HashMap::new(),
+            egress: Egress::default(),
             loss: Loss::default(),
             is_dirty: false,
             is_transmitting: false,
@@ -110,9 +114,18 @@ impl Connection {
         status.waiting.control = self.control.queued() as u64;
     }
 
+    /// These packets leave: they count with the headers of IP and UDP.
+    pub(super) fn count_sent(&self, transmit: &Transmit, now: Duration) {
+        let each = transmit.segment_size.unwrap_or(transmit.size).max(1);
+        let packets = transmit.size.div_ceil(each) as u64;
+        let headers = if transmit.destination.is_ipv4() { 28 } else { 48 };
+        self.egress.sent(packets, transmit.size as u64 + packets * headers, now);
+    }
+
     /// The connection as a carrier of samples.
     pub(super) fn carrier<'a>(&'a mut self, seal: Seal<'a>, now: Duration) -> Carrier<'a> {
         let window = self.quic.congestion_state().window();
+        let window = self.egress.window(window, self.quic.rtt());
         self.loss.measure(&self.quic, now);
         let rounds = self.loss.rounds(window, self.quic.current_mtu());
         let ahead = AHEAD.min(window / 2).max(window / 8);

@@ -41,6 +41,7 @@ impl Engine {
         for (daemon, link) in peers {
             // A link that is gone is about to be reported as down.
             let Some(permissions) = self.links.permissions(link, &self.access) else { continue };
+            self.links.limit_egress(link, &permissions);
             self.peers.with(daemon, |peer, with| {
                 peer.set_permissions(permissions, with.config);
                 peer.stirred = false;

@@ -289,6 +289,7 @@ impl Engine {
     fn link_up(&mut self, number: u64, daemon: DaemonId, old: Option<u64>, now: Duration) {
         let binding = self.links.binding(number);
         let Some(permissions) = self.links.permissions(number, &self.access) else { return };
+        self.links.limit_egress(number, &permissions);
         if let Some(old) = old.filter(|_| self.peers.get(daemon).is_some()) {
             let old = self.links.connection(old).map(|connection| &mut connection.quic);
             self.peers.with(daemon, |peer, with| {

@@ -7,7 +7,7 @@ use toml::de::{DeTable, DeValue};
 use super::{AccessError, Reader, Value};
 use crate::access::{
     TopicPattern, Verb,
-    limit::{LimitRule, Over, PlacedLimit, RateLimit},
+    limit::{EgressLimit, LimitRule, Limits, Over, PlacedLimit, RateLimit},
     party::PartyPattern,
 };
 
@@ -15,6 +15,8 @@ use crate::access::{
 const RATES: (f64, f64) = (0.01, 1e6);
 /// The lowest number of bytes a second, and the highest.
 const BYTES: (f64, f64) = (1.0, 1e12);
+/// The lowest egress, in bytes a second.
+const LEAST_EGRESS: f64 = 1e4;
 /// Units of `bytes`, in bytes.
 const UNITS: [(&str, f64); 10] = [
     ("B/s", 1.0),
@@ -67,6 +69,7 @@ struct Parts {
     burst: Option<NonZeroU32>,
     over: Option<Over>,
     together: Option<bool>,
+    egress: Option<f64>,
 }
 
 impl Reader<'_> {
@@ -125,6 +128,15 @@ impl Reader<'_> {
                     let bytes = bytes_a_second(text);
                     parts.bytes = Some(bytes.map_err(|what| wrong(&format!("{text:?}"), what))?);
                 }
+                ("egress", DeValue::String(text)) => {
+                    let bytes = bytes_a_second(text);
+                    // Below that a handshake that follows would not come through.
+                    let bytes = bytes.and_then(|bytes| match bytes >= LEAST_EGRESS {
+                        true => Ok(bytes),
+                        false => Err("10 kB/s at least"),
+                    });
+                    parts.egress = Some(bytes.map_err(|what| wrong(&format!("{text:?}"), what))?);
+                }
                 ("burst", DeValue::Integer(number)) => {
                     let text = number.as_str();
                     let burst = text.parse::<NonZeroU32>().ok();
@@ -141,7 +153,7 @@ impl Reader<'_> {
                 ("together", DeValue::Boolean(together)) => parts.together = Some(*together),
                 ("rate", _) => return Err(wrong(&"something else", "a number")),
                 ("burst", _) => return Err(wrong(&"something else", "a whole number")),
-                ("bytes", _) => {
+                ("bytes" | "egress", _) => {
                     return Err(wrong(&"something else", "a string, such as \"4 MB/s\""));
                 }
                 ("over", _) => return Err(wrong(&"something else", "a string")),
@@ -149,7 +161,7 @@ impl Reader<'_> {
                 _ => {
                     let what = format!(
                         "unknown key {key:?}; accepted: peer, topic, publish, subscribe, call, rate, bytes, burst, \
-                         over, together"
+                         over, together, egress"
                     );
                     return Err(self.wrong(key_span, what));
                 }
@@ -162,12 +174,23 @@ impl Reader<'_> {
     /// # Errors
     /// What is missing, or does not go together.
     fn whole(&self, parts: Parts, line: u32) -> Result<LimitRule, &'static str> {
-        let Parts { peers, mut uses, rate, bytes, burst, over, together } = parts;
+        let Parts { peers, mut uses, rate, bytes, burst, over, together, egress } = parts;
         if peers.is_empty() {
             return Err("[[limit]] without peer: write the names it is about, or peer = \"*\"");
         }
+        if let Some(egress) = egress {
+            let others = [rate.is_some(), bytes.is_some(), burst.is_some(), over.is_some()];
+            if !uses.is_empty() || together.is_some() || others.contains(&true) {
+                return Err(
+                    "[[limit]] of egress: it is about all that is sent, write peer and egress alone",
+                );
+            }
+            let limits =
+                Limits::Egress(EgressLimit { bytes: egress, file: Arc::clone(&self.file), line });
+            return Ok(LimitRule { peers, limits });
+        }
         if rate.is_none() && bytes.is_none() {
-            return Err("[[limit]] without rate and bytes: write at least one of them");
+            return Err("[[limit]] without rate, bytes and egress: write at least one of them");
         }
         let calls = uses.iter().any(|(verb, _)| *verb == Verb::Call);
         if calls && (over != Some(Over::Hold) || uses.iter().any(|(verb, _)| *verb != Verb::Call)) {
@@ -189,7 +212,7 @@ impl Reader<'_> {
             together: together.unwrap_or(is_of_peer),
         };
         let limit = PlacedLimit { limit, file: Arc::clone(&self.file), line };
-        Ok(LimitRule { peers, uses, limit })
+        Ok(LimitRule { peers, limits: Limits::Uses(uses, limit) })
     }
 }
 

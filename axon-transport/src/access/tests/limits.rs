@@ -57,7 +57,7 @@ fn each_wrong_limit_is_refused_with_its_line_and_column() {
         ("limit = 3", (1, 9), "write [[limit]]"),
         ("[[limit]]", (1, 1), "without peer"),
         ("[[limit]]\nrate = 1", (1, 1), "without peer"),
-        ("[[limit]]\npeer = \"*\"", (1, 1), "without rate and bytes"),
+        ("[[limit]]\npeer = \"*\"", (1, 1), "without rate, bytes and egress"),
         ("[[limit]]\npeer = \"*\"\nrate = 0", (3, 8), "from 0.01 to 1000000"),
         ("[[limit]]\npeer = \"*\"\nrate = -1.5", (3, 8), "from 0.01"),
         ("[[limit]]\npeer = \"*\"\nrate = inf", (3, 8), "from 0.01"),
@@ -78,10 +78,28 @@ fn each_wrong_limit_is_refused_with_its_line_and_column() {
             (1, 1),
             "no topic",
         ),
+        ("[[limit]]\npeer = \"*\"\negress = 3", (3, 10), "such as"),
+        ("[[limit]]\npeer = \"*\"\negress = \"9 kB/s\"", (3, 10), "10 kB/s at least"),
+        ("[[limit]]\npeer = \"*\"\negress = \"1 MB/s\"\nrate = 1", (1, 1), "peer and egress alone"),
+        ("[[limit]]\npeer = \"*\"\negress = \"1 MB/s\"\ntopic = \"/a\"", (1, 1), "egress alone"),
         ("[[limit]]\npeer = \"*\"\nserve = \"/a\"", (3, 1), "unknown key"),
     ] {
         let AccessError { line, column, what, .. } = error(text);
         assert_eq!((line, column), at, "{text}: {what}");
         assert!(what.contains(says), "{text}: {what}");
     }
+}
+
+#[test]
+fn egress_limits_all_that_is_sent_and_no_topic() {
+    let rules = rules(
+        "[[limit]]\npeer = \"guest\"\negress = \"2 MB/s\"\n[[limit]]\npeer = \"*\"\negress = \"54 Mbit/s\"",
+    );
+    let of = |name| -> Vec<_> {
+        let permissions = rules.permissions(Party::Name(name));
+        assert_eq!(permissions.limits(Verb::Subscribe, "/a").count(), 0);
+        permissions.egress().map(|limit| (limit.line, limit.to_string())).collect()
+    };
+    assert_eq!(of("guest"), [(1, "2 MB/s".to_owned()), (4, "6.75 MB/s".to_owned())]);
+    assert_eq!(of("base"), [(4, "6.75 MB/s".to_owned())]);
 }

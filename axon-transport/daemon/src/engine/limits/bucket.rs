@@ -9,7 +9,7 @@ const ROUNDING: f64 = 1e-6;
 
 /// What may pass, as it grows back with time.
 #[derive(Clone, Copy, Debug)]
-struct Level {
+pub(super) struct Level {
     a_second: f64,
     most: f64,
     /// Below zero where more passed than there was.
@@ -18,21 +18,21 @@ struct Level {
 }
 
 impl Level {
-    fn full(a_second: f64, most: f64) -> Self {
+    pub(super) fn full(a_second: f64, most: f64) -> Self {
         Self { a_second, most, left: most, at: Duration::ZERO }
     }
 
-    fn at(&self, now: Duration) -> f64 {
+    pub(super) fn at(&self, now: Duration) -> f64 {
         let since = now.saturating_sub(self.at).as_secs_f64();
         (self.left + since * self.a_second).min(self.most)
     }
 
-    fn take(&mut self, amount: f64, now: Duration) {
+    pub(super) fn take(&mut self, amount: f64, now: Duration) {
         (self.left, self.at) = (self.at(now) - amount, now);
     }
 
     /// When there is, or was, so much.
-    fn when(&self, amount: f64) -> Duration {
+    pub(super) fn when(&self, amount: f64) -> Duration {
         let missing = amount - self.left;
         if missing <= ROUNDING {
             return self.at;

@@ -2,6 +2,7 @@
 //! `[[topic]]`.
 
 mod bucket;
+mod egress;
 mod line;
 
 use std::{
@@ -19,7 +20,8 @@ use axon_transport::{
     status::{LimitStatus, LinkStatus},
 };
 
-use self::{bucket::Bucket, line::Line};
+pub(crate) use self::egress::Egress;
+use self::{bucket::Bucket, egress::EgressCap, line::Line};
 
 /// Limits that status lists.
 const LISTED: usize = 64;
@@ -52,7 +54,10 @@ pub(crate) struct Limit {
 
 /// The limits of one identity, over all of its daemon ids and links.
 #[derive(Debug, Default)]
-pub(crate) struct Limits(RefCell<HashMap<Scope, Vec<Weak<Limit>>>>);
+pub(crate) struct Limits {
+    uses: RefCell<HashMap<Scope, Vec<Weak<Limit>>>>,
+    egress: RefCell<Vec<Weak<EgressCap>>>,
+}
 
 impl Limits {
     /// The limits on what a peer does with a topic or service; those that it has already stay as full as they are.
@@ -88,7 +93,7 @@ impl Limits {
     ) -> Rc<Limit> {
         let topic = (!rate.together).then(|| topic.into());
         let scope = Scope { verb, topic };
-        let mut all = self.0.borrow_mut();
+        let mut all = self.uses.borrow_mut();
         if !all.contains_key(&scope) && all.len() == all.capacity() {
             // Once for as many as there are.
             all.retain(|_, limits| limits.iter().any(|limit| limit.strong_count() > 0));
@@ -114,14 +119,31 @@ impl Limits {
         limit
     }
 
+    /// The limits on all that is sent to the peer.
+    pub(crate) fn egress(&self, permissions: &Permissions) -> Egress {
+        let mut all = self.egress.borrow_mut();
+        all.retain(|cap| cap.strong_count() > 0);
+        let caps = permissions.egress().map(|limit| {
+            if let Some(known) = all.iter().filter_map(Weak::upgrade).find(|cap| cap.is(limit)) {
+                return known;
+            }
+            let cap = Rc::new(EgressCap::new(limit));
+            all.push(Rc::downgrade(&cap));
+            cap
+        });
+        Egress::new(caps.collect())
+    }
+
     /// Names the limits in the link's status: those that dropped most come first.
     pub(crate) fn fill(&self, status: &mut LinkStatus) {
-        let all = self.0.borrow();
+        let all = self.uses.borrow();
         let mut limits: Vec<_> = all.values().flatten().filter_map(Weak::upgrade).collect();
         limits.sort_by(|one, other| {
             let key = |of: &Limit| (of.place.clone(), of.scope.topic.clone(), of.scope.verb);
             other.dropped.cmp(&one.dropped).then_with(|| key(one).cmp(&key(other)))
         });
+        let egress = self.egress.borrow();
+        status.limits.extend(egress.iter().filter_map(Weak::upgrade).map(|cap| cap.status()));
         status.more_limits = limits.len().saturating_sub(LISTED);
         status.limits.extend(limits.iter().take(LISTED).map(|limit| {
             let mut of = LimitStatus::default();
@@ -282,7 +304,7 @@ pub(crate) mod tests {
         for number in 0..10_000 {
             of(&all, Verb::Subscribe, &format!("/{number}"), rules);
         }
-        assert!(all.0.borrow().len() < 100, "{}", all.0.borrow().len());
+        assert!(all.uses.borrow().len() < 100, "{}", all.uses.borrow().len());
     }
 
     #[test]

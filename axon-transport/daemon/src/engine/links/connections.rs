@@ -17,6 +17,7 @@ use crate::{
     engine::{
         connection::Connection,
         endpoints::{Endpoints, Packet, Received},
+        limits::Egress,
         link::failure::close_text,
     },
     link::CloseCode,
@@ -33,6 +34,8 @@ pub(super) struct Connections {
     dirty: VecDeque<u64>,
     /// Connections that may have something to transmit.
     transmitting: VecDeque<u64>,
+    /// Those of them whose limit lets no packet leave, by the time when it does.
+    limited: BTreeSet<(Duration, u64)>,
     deadlines: BTreeSet<(Instant, u64)>,
 }
 
@@ -47,6 +50,7 @@ impl Connections {
             next_number: 1,
             dirty: VecDeque::new(),
             transmitting: VecDeque::new(),
+            limited: BTreeSet::new(),
             deadlines: BTreeSet::new(),
         }
     }
@@ -236,7 +240,8 @@ impl Connections {
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         let quic = self.deadlines.first().map(|(due, _)| due.saturating_duration_since(self.epoch));
         let control = self.all.values().filter_map(|c| c.control.poll_timeout()).min();
-        [quic, control].into_iter().flatten().min()
+        let limited = self.limited.first().map(|(due, _)| *due);
+        [quic, control, limited].into_iter().flatten().min()
     }
 
     /// Runs QUIC's timers, and has those connections looked at whose control streams may be read again.
@@ -252,10 +257,23 @@ impl Connections {
                 self.touch(number);
             }
         }
+        while let Some((due, number)) = self.limited.first().copied()
+            && due <= now
+        {
+            self.limited.pop_first();
+            self.transmitting.push_back(number);
+        }
         let paused =
             self.all.iter().filter(|(_, c)| c.control.poll_timeout().is_some_and(|t| t <= now));
         let paused: Vec<u64> = paused.map(|(number, _)| *number).collect();
         paused.into_iter().for_each(|number| self.touch(number));
+    }
+
+    /// Limits what a connection sends.
+    pub(super) fn set_egress(&mut self, number: u64, egress: Egress) {
+        if let Some(connection) = self.all.get_mut(&number) {
+            connection.egress = egress;
+        }
     }
 
     /// The next packets, and the endpoint that sends them. `buffer` is cleared and filled.
@@ -273,13 +291,19 @@ impl Connections {
                 Transmit { destination: to, ecn, size, segment_size: None, src_ip: from };
             return Some((endpoint, transmit));
         }
-        while let Some(number) = self.transmitting.front().copied() {
-            let transmit = self.all.get_mut(&number).and_then(|connection| {
-                let transmit = connection.quic.poll_transmit(now, max_datagrams, buffer)?;
-                Some((connection.endpoint, transmit))
+        let since = now.saturating_duration_since(self.epoch);
+        while let Some(number) = self.transmitting.pop_front() {
+            let Some(connection) = self.all.get_mut(&number) else { continue };
+            if let Some(until) = connection.egress.closed_until(since) {
+                self.limited.insert((until, number));
+                continue;
+            }
+            let most = max_datagrams.min(connection.egress.packets(since));
+            let transmit = connection.quic.poll_transmit(now, most, buffer).map(|transmit| {
+                connection.count_sent(&transmit, since);
+                (connection.endpoint, transmit)
             });
             // Connections take turns.
-            self.transmitting.pop_front();
             self.note_deadline(number);
             if let Some(transmit) = transmit {
                 self.transmitting.push_back(number);

@@ -412,6 +412,13 @@ impl Links {
         Some(rules.permissions(self.summary(number)?.who.party(address)))
     }
 
+    /// Limits what a link sends as the rules say.
+    pub(super) fn limit_egress(&mut self, number: u64, permissions: &Permissions) {
+        if let Some(account) = self.account(number) {
+            self.connections.set_egress(number, account.limits.egress(permissions));
+        }
+    }
+
     /// The status of a link.
     pub(super) fn status(&self, number: u64) -> Option<LinkStatus> {
         let (connection, peer) = (self.connections.get(number)?, self.table.peer(number)?);

@@ -7,6 +7,7 @@ use axon_transport::{
     status::LimitStatus,
 };
 
+use super::radio::{Stream, drive, radio};
 use crate::engine::sim::{
     tests::{millis, secs},
     world::{Pair, World},
@@ -153,4 +154,44 @@ fn max_hz_sends_the_newest_samples_of_a_topic_to_each_host() {
         assert!((45..=55).contains(&came.len()), "{came:?}");
         assert_eq!(came.last(), Some(&500), "the newest arrives");
     }
+}
+
+#[test]
+fn egress_to_a_peer_stays_below_its_limit_and_what_leaves_is_fresh() {
+    let text = "[[limit]]\npeer = \"*\"\negress = \"1 MB/s\"";
+    let mut world = hosts(0, text);
+    world.network.set_default_path(radio(54, 0.0));
+    // Five times the limit, and commands beside it.
+    let mut streams = [
+        Stream::new(&mut world, "/camera", Qos::sensor_data(), 64 << 10, millis(13)),
+        Stream::new(&mut world, "/cmd_vel", Qos::default(), 64, millis(20)),
+    ];
+    world.until(secs(20), World::is_whole);
+    world.run_for(secs(1));
+    drive(&mut world, &mut streams, secs(2));
+    let (from, before) = (world.now, world.network.counters(0).clone());
+    drive(&mut world, &mut streams, secs(10));
+    let after = world.network.counters(0);
+    let bytes = after.sent_bytes - before.sent_bytes + 28 * (after.sent - before.sent);
+    assert!((9_500_000..10_100_000).contains(&bytes), "{bytes} in ten seconds");
+    let median = |stream: &Stream| {
+        let ages = stream.ages(from);
+        (ages.len(), ages[ages.len() / 2])
+    };
+    let (cameras, camera) = median(&streams[0]);
+    let (commands, command) = median(&streams[1]);
+    assert!(cameras > 130 && camera < millis(220), "{cameras} images, {camera:?} old");
+    assert!(commands > 490 && command < millis(30), "{commands} commands, {command:?} old");
+    let limit = &limits(&world, 0)[0];
+    assert_eq!(
+        (&*limit.verb, &*limit.limit, &*limit.place),
+        ("egress", "1 MB/s", "line 1 of access.toml")
+    );
+    // The limit is gone: the link has all of its rate.
+    world.hosts[0].set_access("default = \"allow\"");
+    world.run_for(secs(1));
+    let before = world.network.counters(0).sent_bytes;
+    drive(&mut world, &mut streams, secs(5));
+    let free = world.network.counters(0).sent_bytes - before;
+    assert!(free > 20_000_000, "{free} in five seconds");
 }

@@ -1,0 +1,120 @@
+//! The bytes a second that leave this host for one identity.
+
+use std::{
+    cell::{Cell, RefCell},
+    rc::Rc,
+    time::Duration,
+};
+
+use axon_transport::{access::EgressLimit, status::LimitStatus};
+
+use super::bucket::Level;
+
+/// What may leave at once, in seconds of the limit, and at least in bytes: a few packets.
+const AT_ONCE: (f64, f64) = (0.005, 6000.0);
+/// Packets are handed to the kernel together up to so many bytes.
+const PACKET: f64 = 1500.0;
+/// QUIC holds what leaves in so much longer than a round trip.
+const AHEAD: Duration = Duration::from_millis(20);
+
+/// A limit on all packets to one identity.
+#[derive(Debug)]
+pub(crate) struct EgressCap {
+    limit: EgressLimit,
+    level: RefCell<Level>,
+    packets: Cell<u64>,
+}
+
+impl EgressCap {
+    pub(super) fn new(limit: &EgressLimit) -> Self {
+        let most = (limit.bytes * AT_ONCE.0).max(AT_ONCE.1);
+        let level = RefCell::new(Level::full(limit.bytes, most));
+        Self { limit: limit.clone(), level, packets: Cell::default() }
+    }
+
+    pub(super) fn is(&self, limit: &EgressLimit) -> bool {
+        self.limit == *limit
+    }
+
+    pub(super) fn status(&self) -> LimitStatus {
+        let mut status = LimitStatus::default();
+        (status.verb, status.name) = ("egress".into(), "(all packets)".into());
+        status.limit = self.limit.to_string();
+        status.place = format!("line {} of {}", self.limit.line, self.limit.file);
+        status.passed = self.packets.get();
+        status
+    }
+}
+
+/// The limits on what one connection sends.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Egress(Vec<Rc<EgressCap>>);
+
+impl Egress {
+    pub(crate) fn new(caps: Vec<Rc<EgressCap>>) -> Self {
+        Self(caps)
+    }
+
+    /// When the next packet may leave, if not now.
+    pub(crate) fn closed_until(&self, now: Duration) -> Option<Duration> {
+        let open = self.0.iter().map(|cap| cap.level.borrow().when(1.0));
+        open.max().filter(|at| *at > now)
+    }
+
+    /// How many packets may leave now.
+    pub(crate) fn packets(&self, now: Duration) -> usize {
+        let left = self.0.iter().map(|cap| cap.level.borrow().at(now));
+        left.reduce(f64::min).map_or(usize::MAX, |bytes| (bytes / PACKET).max(1.0) as usize)
+    }
+
+    /// These packets left.
+    pub(crate) fn sent(&self, packets: u64, bytes: u64, now: Duration) {
+        for cap in &self.0 {
+            cap.level.borrow_mut().take(bytes as f64, now);
+            cap.packets.set(cap.packets.get() + packets);
+        }
+    }
+
+    /// The congestion window, or as much as the limits let leave in a round trip. QUIC holds no more, so that samples
+    /// wait where newer ones replace them.
+    pub(crate) fn window(&self, window: u64, rtt: Duration) -> u64 {
+        let slowest = self.0.iter().map(|cap| cap.limit.bytes).reduce(f64::min);
+        let most = slowest.map(|bytes| (bytes * (rtt + AHEAD).as_secs_f64()).max(2.0 * PACKET));
+        most.map_or(window, |most| window.min(most as u64))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::limits::{Limits, tests::permissions};
+
+    #[test]
+    fn packets_leave_at_the_rate_of_the_slowest_limit_over_all_connections_of_an_identity() {
+        let rules = "[[limit]]\npeer = \"*\"\negress = \"1 MB/s\"\n[[limit]]\npeer = \"*\"\negress = \"9 MB/s\"";
+        let all = Limits::default();
+        let connections = [0, 1].map(|_| all.egress(&permissions(rules)));
+        let (mut now, mut sent) = (Duration::ZERO, 0);
+        while now < Duration::from_secs(10) {
+            let mut next = now + Duration::from_millis(1);
+            for egress in &connections {
+                match egress.closed_until(now) {
+                    Some(until) => next = next.min(until),
+                    None => {
+                        let packets = egress.packets(now).min(10) as u64;
+                        egress.sent(packets, packets * 1480, now);
+                        sent += packets * 1480;
+                    }
+                }
+            }
+            now = next;
+        }
+        assert!((9_950_000..10_030_000).contains(&sent), "{sent}");
+        let one = &connections[0];
+        assert_eq!(one.window(1 << 30, Duration::from_millis(80)), 100_000);
+        assert_eq!(one.window(50_000, Duration::from_millis(80)), 50_000);
+        let free = Egress::default();
+        assert_eq!((free.closed_until(now), free.packets(now)), (None, usize::MAX));
+        assert_eq!(free.window(7, Duration::ZERO), 7);
+    }
+}
