@@ -68,11 +68,13 @@ struct Reader<'t> {
     text: &'t str,
     file: Arc<str>,
     patterns: usize,
+    /// Those of limits.
+    limited: usize,
 }
 
 impl<'t> Reader<'t> {
     fn new(text: &'t str, file: &str) -> Self {
-        Self { text, file: file.into(), patterns: 0 }
+        Self { text, file: file.into(), patterns: 0, limited: 0 }
     }
 
     fn read(mut self, alone: bool) -> Result<AccessRules, AccessError> {

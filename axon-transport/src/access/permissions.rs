@@ -53,7 +53,7 @@ impl Permissions {
     }
 
     /// Whether there are no rules that allow or deny anything.
-    pub fn are_unlimited(&self) -> bool {
+    pub fn are_unrestricted(&self) -> bool {
         self.rules.is_none()
     }
 
@@ -69,7 +69,7 @@ impl Permissions {
 
     /// Whether the party may do this with the topic, service or node of this full name.
     pub fn allows(&self, verb: Verb, name: &str) -> bool {
-        self.are_unlimited() || self.check(verb, name).allowed()
+        self.are_unrestricted() || self.check(verb, name).allowed()
     }
 
     /// Whether a `[[deny]]` names this.

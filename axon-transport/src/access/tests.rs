@@ -56,7 +56,7 @@ fn the_example_lets_the_base_publish_and_the_guest_subscribe() {
 
 #[test]
 fn without_rules_all_is_allowed_and_a_file_without_any_is_refused() {
-    assert!(AccessRules::default().permissions(Party::User(1)).are_unlimited());
+    assert!(AccessRules::default().permissions(Party::User(1)).are_unrestricted());
     for text in ["", "# nothing", "[[expect]]\npeer = \"a\"\nsee = \"/x\"\nallowed = true"] {
         assert!(error(text).what.contains("no rules"), "{text}");
     }

@@ -27,14 +27,14 @@ pub fn other_end(verb: Verb) -> Verb {
 
 /// Whether a party may have this endpoint.
 pub fn permits(party: &Permissions, endpoint: &Endpoint) -> bool {
-    party.are_unlimited()
+    party.are_unrestricted()
         || verb_of(endpoint.kind).is_none_or(|verb| party.allows(verb, &endpoint.topic))
 }
 
 /// Whether a party is shown this endpoint of another party: it may see the topic, or needs the endpoint for its own. For
 /// a node the full name counts.
 pub fn shows(party: &Permissions, endpoint: &Endpoint) -> bool {
-    if party.are_unlimited() {
+    if party.are_unrestricted() {
         return true;
     }
     match verb_of(endpoint.kind) {

@@ -2,7 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-/// A limit that a rule of this host sets for a peer, and what it did. It counts for all links of the peer's identity.
+/// A limit that this host sets on what crosses between it and a peer, and what it did. It counts for all links of the
+/// peer's identity.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct LimitStatus {

@@ -45,6 +45,8 @@ const REFUSALS: usize = 2 << 20;
 pub(crate) const MAX_PROVEN: usize = 8192;
 /// Publishers, or clients, of one identity that one route shows here: a reader looks at all of its publishers.
 const MAX_WRITERS_OF_ROUTE: usize = 1024;
+/// Identities of which it is remembered how much passed.
+const LIMITED: usize = 1024;
 /// What one identity may say a second, and at once, by [`cost`] and [`cost_of_frame`].
 const SAID: (u32, u32) = (16_384, 65_536);
 /// Bytes of a control message that cost as much as one change: what it takes to decompress and decode
@@ -217,14 +219,20 @@ pub(crate) struct Account {
     /// Its publishers, or clients, that each route shows.
     writers: RefCell<HashMap<RouteKey, Weak<Meter>>>,
     /// How much of which topic may pass.
-    pub(crate) limits: Limits,
+    pub(crate) limits: Rc<Limits>,
     /// When its changes are followed up.
     pub(crate) turns: RefCell<Turns>,
     said: RefCell<Bucket>,
 }
 
 impl Account {
-    fn new(identity: &str, graph: usize, relays: &Rc<Meter>, stand_ins: &Rc<Meter>) -> Self {
+    fn new(
+        identity: &str,
+        graph: usize,
+        relays: &Rc<Meter>,
+        stand_ins: &Rc<Meter>,
+        limits: Rc<Limits>,
+    ) -> Self {
         Self {
             identity: identity.into(),
             graph: Meter::new(graph),
@@ -237,7 +245,7 @@ impl Account {
             refusals: Meter::new(REFUSALS),
             sessions: Meter::new(MAX_PROVEN),
             writers: RefCell::default(),
-            limits: Limits::default(),
+            limits,
             turns: RefCell::default(),
             said: RefCell::new(Bucket::new(SAID.0, SAID.1)),
         }
@@ -314,13 +322,15 @@ pub(crate) struct Accounts {
     relays: Rc<Meter>,
     stand_ins: Rc<Meter>,
     open: HashMap<String, Weak<Account>>,
+    /// What passed of late, also of identities without a link: a new link gives them no more.
+    limits: HashMap<String, Rc<Limits>>,
 }
 
 impl Accounts {
     /// Accounts whose graphs may take so many bytes.
     pub(crate) fn new(graph: usize) -> Self {
         let [relays, stand_ins] = [(); 2].map(|()| Meter::new(OF_ALL));
-        Self { graph, relays, stand_ins, open: HashMap::new() }
+        Self { graph, relays, stand_ins, open: HashMap::new(), limits: HashMap::new() }
     }
 
     /// The account of an identity.
@@ -329,7 +339,12 @@ impl Accounts {
             return account;
         }
         self.open.retain(|_, account| account.strong_count() > 0);
-        let account = Rc::new(Account::new(identity, self.graph, &self.relays, &self.stand_ins));
+        if self.limits.len() >= LIMITED && !self.limits.contains_key(identity) {
+            self.limits.retain(|_, limits| Rc::strong_count(limits) > 1);
+        }
+        let limits = Rc::clone(self.limits.entry(identity.to_owned()).or_default());
+        let (relays, stand_ins) = (&self.relays, &self.stand_ins);
+        let account = Rc::new(Account::new(identity, self.graph, relays, stand_ins, limits));
         self.open.insert(identity.to_owned(), Rc::downgrade(&account));
         account
     }

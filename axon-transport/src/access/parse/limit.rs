@@ -15,6 +15,8 @@ use crate::access::{
 const RATES: (f64, f64) = (0.01, 1e6);
 /// The lowest number of bytes a second, and the highest.
 const BYTES: (f64, f64) = (1.0, 1e12);
+/// Patterns of all limits: a route is compared with each of them.
+const MOST_LIMITED: usize = 1024;
 /// The lowest egress, in bytes a second.
 const LEAST_EGRESS: f64 = 1e4;
 /// Units of `bytes`, in bytes.
@@ -30,6 +32,8 @@ const UNITS: [(&str, f64); 10] = [
     ("Mbit/s", 125e3),
     ("Gbit/s", 125e6),
 ];
+/// The burst of a limit that says none: samples of a topic that keeps to the rate do not come exactly in time.
+const TWO: NonZeroU32 = NonZeroU32::MIN.saturating_add(1);
 const NO_USER: &str = "names of hosts: samples within a host have no limits";
 
 /// Bytes a second, such as `4 MB/s`.
@@ -114,9 +118,14 @@ impl Reader<'_> {
                         uses.extend(verbs.iter().map(|verb| (*verb, pattern.clone())));
                     }
                     self.count_patterns(uses.len(), value)?;
+                    self.limited += uses.len();
+                    if self.limited > MOST_LIMITED {
+                        let what = format!("at most {MOST_LIMITED} patterns in all [[limit]]");
+                        return Err(self.wrong(value.span(), what));
+                    }
                     parts.uses.append(&mut uses);
                 }
-                ("rate", DeValue::Integer(number)) => {
+                ("rate", DeValue::Integer(number)) if number.radix() == 10 => {
                     let text = number.as_str();
                     parts.rate = Some(rate(text).map_err(|what| wrong(&text, what))?);
                 }
@@ -137,7 +146,7 @@ impl Reader<'_> {
                     });
                     parts.egress = Some(bytes.map_err(|what| wrong(&format!("{text:?}"), what))?);
                 }
-                ("burst", DeValue::Integer(number)) => {
+                ("burst", DeValue::Integer(number)) if number.radix() == 10 => {
                     let text = number.as_str();
                     let burst = text.parse::<NonZeroU32>().ok();
                     let burst = burst.filter(|burst| burst.get() <= 100_000);
@@ -151,8 +160,8 @@ impl Reader<'_> {
                     parts.over = Some(over.ok_or_else(wrong)?);
                 }
                 ("together", DeValue::Boolean(together)) => parts.together = Some(*together),
-                ("rate", _) => return Err(wrong(&"something else", "a number")),
-                ("burst", _) => return Err(wrong(&"something else", "a whole number")),
+                ("rate", _) => return Err(wrong(&"something else", "a number, in decimal")),
+                ("burst", _) => return Err(wrong(&"something else", "a whole number, in decimal")),
                 ("bytes" | "egress", _) => {
                     return Err(wrong(&"something else", "a string, such as \"4 MB/s\""));
                 }
@@ -207,7 +216,7 @@ impl Reader<'_> {
         let limit = RateLimit {
             rate,
             bytes,
-            burst: burst.unwrap_or(NonZeroU32::MIN),
+            burst: burst.unwrap_or(TWO),
             over: over.unwrap_or_default(),
             together: together.unwrap_or(is_of_peer),
         };

@@ -60,6 +60,8 @@ fn each_wrong_limit_is_refused_with_its_line_and_column() {
         ("[[limit]]\npeer = \"*\"", (1, 1), "without rate, bytes and egress"),
         ("[[limit]]\npeer = \"*\"\nrate = 0", (3, 8), "from 0.01 to 1000000"),
         ("[[limit]]\npeer = \"*\"\nrate = -1.5", (3, 8), "from 0.01"),
+        ("[[limit]]\npeer = \"*\"\nrate = 0x20", (3, 8), "in decimal"),
+        ("[[limit]]\npeer = \"*\"\nrate = 1\nburst = 0b11", (4, 9), "in decimal"),
         ("[[limit]]\npeer = \"*\"\nrate = inf", (3, 8), "from 0.01"),
         ("[[limit]]\npeer = \"*\"\nrate = \"30\"", (3, 8), "a number"),
         ("[[limit]]\npeer = \"*\"\nbytes = 4", (3, 9), "such as \"4 MB/s\""),

@@ -12,7 +12,13 @@ impl Inbound {
     /// Entries of lists that have one a stream at most.
     pub(in crate::engine) fn listed(&self) -> usize {
         let turns = self.turns.values().map(std::collections::VecDeque::len).sum::<usize>();
-        let lists = [turns, self.waiting.len(), self.full.len(), self.without_room.len()];
+        let lists = [
+            turns,
+            self.waiting.len(),
+            self.full.len(),
+            self.without_room.len(),
+            self.limited.len(),
+        ];
         lists.into_iter().max().unwrap_or_default()
     }
 }

@@ -75,13 +75,15 @@ pub(crate) struct RouteIn {
     clients: HashMap<Gid, u64>,
     /// The limits on what the peer sends.
     pub(crate) limit: RouteLimit,
+    /// Whether all readers here are RELIABLE and KEEP_ALL.
+    pub(crate) keeps_all: bool,
 }
 
 impl RouteIn {
     /// A route without writers.
     pub(crate) fn new(topic: Arc<str>, route: Route, limits: Vec<Rc<Limit>>) -> Self {
         let (writers, clients) = (HashMap::new(), HashMap::new());
-        Self { topic, route, writers, clients, limit: RouteLimit::new(limits) }
+        Self { topic, route, writers, clients, limit: RouteLimit::new(limits), keeps_all: false }
     }
 
     /// The route's responses go to these local clients.
@@ -290,6 +292,7 @@ impl Inbound {
         self.end_turn(key, &stream);
         self.full.remove(&key);
         self.without_room.remove(&key);
+        self.limited.forget(&key);
         if let Step::Turn(until) | Step::Writer(_, until) = stream.step {
             self.waiting.remove(&(until, key));
         }

@@ -7,6 +7,9 @@ use axon_transport::access::RateLimit;
 /// What rounding may take from a whole sample.
 const ROUNDING: f64 = 1e-6;
 
+/// The shortest time between two samples that flows wait for.
+const SHORTEST: Duration = Duration::from_micros(100);
+
 /// What may pass, as it grows back with time.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Level {
@@ -66,6 +69,14 @@ impl Bucket {
     pub(super) fn open_at(&self) -> Duration {
         let (samples, bytes) = (self.samples.map(|s| s.when(1.0)), self.bytes.map(|b| b.when(1.0)));
         samples.max(bytes).unwrap_or_default()
+    }
+
+    /// The time between two samples, if they are as long as the last one.
+    pub(super) fn interval(&self) -> Duration {
+        let samples = self.samples.map(|level| 1.0 / level.a_second);
+        let bytes = self.bytes.map(|level| self.last / level.a_second);
+        let seconds = samples.unwrap_or(0.0).max(bytes.unwrap_or(0.0));
+        Duration::from_secs_f64(seconds).max(SHORTEST)
     }
 
     /// How many samples may pass now, if they are as long as the last one.

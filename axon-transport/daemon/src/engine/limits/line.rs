@@ -1,44 +1,36 @@
-//! The order of flows that share a limit: who passed least lately goes first.
+//! The flows that wait for a limit that they share, in the order in which they pass.
 
 use std::{collections::VecDeque, time::Duration};
 
 use axon_shm::ids::Gid;
 
-/// How long a flow that passed more lately lets each of the others go first.
-const EACH: Duration = Duration::from_micros(200);
-/// Flows that are known.
-const MOST: usize = 32;
-/// A flow that neither passed nor asked for so long is in nobody's way.
-const REST: Duration = Duration::from_secs(2);
+/// A flow that has not asked again so long after its turn has lost it: it may be blocked, or gone.
+const GRACE: Duration = Duration::from_millis(20);
 
-/// The flows that have samples, and when each was seen last. The one that passed last is at the end.
+/// The flows that wait, each with the time of its turn. The first one is the next to pass.
 #[derive(Debug, Default)]
 pub(super) struct Line(VecDeque<(Gid, Duration)>);
 
 impl Line {
-    /// How long after the limit is open the next sample of a flow passes. Flows that wait for the same time would else
-    /// always pass in the same order, and where there is room for one only, the others never.
-    pub(super) fn behind(&mut self, of: &Gid, now: Duration) -> Duration {
-        self.0.retain(|(known, seen)| known == of || now.saturating_sub(*seen) <= REST);
-        match self.0.iter().position(|(known, _)| known == of) {
-            Some(before) => {
-                self.0[before].1 = now;
-                EACH * before as u32
-            }
-            None => {
-                self.0.push_front((*of, now));
-                self.0.truncate(MOST);
-                Duration::ZERO
-            }
+    /// How many flows pass before this one: all that wait, if it does not wait itself.
+    pub(super) fn ahead_of(&mut self, flow: &Gid, now: Duration) -> usize {
+        self.0.retain(|(waiting, turn)| waiting == flow || *turn + GRACE >= now);
+        let place = self.0.iter().position(|(waiting, _)| waiting == flow);
+        place.unwrap_or(self.0.len())
+    }
+
+    /// The flow waits, and its turn is at this time.
+    pub(super) fn wait(&mut self, flow: &Gid, turn: Duration) {
+        match self.0.iter_mut().find(|(waiting, _)| waiting == flow) {
+            Some((_, before)) => *before = turn,
+            None => self.0.push_back((*flow, turn)),
         }
     }
 
-    /// A sample of a flow passed.
-    pub(super) fn pass(&mut self, of: &Gid, now: Duration) {
-        self.0.retain(|(known, _)| known != of);
-        self.0.push_back((*of, now));
-        if self.0.len() > MOST {
-            self.0.pop_front();
+    /// The flow waits no more.
+    pub(super) fn leave(&mut self, flow: &Gid) {
+        if !self.0.is_empty() {
+            self.0.retain(|(waiting, _)| waiting != flow);
         }
     }
 }
@@ -48,20 +40,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn who_passed_last_lets_all_others_go_first() {
+    fn flows_pass_in_the_order_in_which_they_began_to_wait() {
         let (mut line, now) = (Line::default(), Duration::from_secs(9));
         let [a, b, c] = [1, 2, 3].map(|n| Gid([n; 16]));
-        assert_eq!(line.behind(&a, now), Duration::ZERO);
-        line.pass(&a, now);
-        assert_eq!(line.behind(&a, now), Duration::ZERO, "it is alone");
-        // The others wait, and have passed nothing yet.
-        assert_eq!([b, c].map(|of| line.behind(&of, now)), [Duration::ZERO; 2]);
-        assert_eq!(line.behind(&a, now), 2 * EACH);
-        line.pass(&c, now);
-        assert_eq!([b, a, c].map(|of| line.behind(&of, now)), [Duration::ZERO, EACH, 2 * EACH]);
-        // Of those that are gone nothing is left.
-        assert_eq!(line.behind(&c, now + REST + EACH), Duration::ZERO);
-        (0..100).for_each(|n| line.pass(&Gid([n; 16]), now));
-        assert_eq!(line.0.len(), MOST);
+        assert_eq!(line.ahead_of(&a, now), 0);
+        line.wait(&a, now);
+        line.wait(&b, now + GRACE);
+        line.wait(&a, now + GRACE / 2);
+        assert_eq!([a, b, c].map(|flow| line.ahead_of(&flow, now)), [0, 1, 2]);
+        line.leave(&a);
+        line.wait(&a, now + GRACE);
+        assert_eq!([a, b].map(|flow| line.ahead_of(&flow, now)), [1, 0]);
+        // A flow that does not come for its turn is in nobody's way.
+        assert_eq!(line.ahead_of(&a, now + 3 * GRACE), 0);
     }
 }

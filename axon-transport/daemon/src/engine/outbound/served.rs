@@ -122,12 +122,13 @@ impl Served {
 
     /// Tells the sources up to which number they may forget the samples of a publisher.
     pub(super) fn done(&self, of: Gid, Done { sequence, given_up }: Done) {
+        if given_up > 0
+            && let Some(source) = self.source_of(&of)
+        {
+            source.give_up(of, given_up);
+        }
         let Some(sequence) = sequence else { return };
-        let sources = self.sources.iter().filter(|source| source.reads(&of));
-        for (number, source) in sources.enumerate() {
-            if number == 0 && given_up > 0 {
-                source.give_up(of, given_up);
-            }
+        for source in self.sources.iter().filter(|source| source.reads(&of)) {
             source.acknowledge_of(&of, sequence);
         }
     }

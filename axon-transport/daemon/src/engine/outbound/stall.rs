@@ -54,6 +54,8 @@ pub(super) struct BusyFlow {
     pub(super) uses_credit: bool,
     /// Whether it waits for others: none of its samples is in flight.
     pub(super) waits_for_others: bool,
+    /// Whether a limit of this host holds its samples.
+    pub(super) waits_for_limit: bool,
     /// Whether nothing of it waits, or is not acknowledged.
     pub(super) is_quiet: bool,
 }
@@ -127,6 +129,7 @@ impl Stalls {
                 Some(progress)
                     if progress.at == flow.progress
                         && !silent
+                        && !flow.waits_for_limit
                         && (starves || !flow.waits_for_others) =>
                 {
                     *progress
@@ -156,6 +159,7 @@ mod tests {
         is_held_back: true,
         uses_credit: false,
         waits_for_others: false,
+        waits_for_limit: false,
         is_quiet: false,
     };
 

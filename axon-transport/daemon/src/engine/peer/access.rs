@@ -78,7 +78,7 @@ impl PeerAccess {
 
     /// Why the peer may not do this, if it may not.
     pub(super) fn denial(&self, verb: Verb, name: &str) -> Option<String> {
-        if self.permissions.are_unlimited() {
+        if self.permissions.are_unrestricted() {
             return None;
         }
         let decision = self.permissions.check(verb, name);

@@ -7,7 +7,10 @@ use std::{
 };
 
 use axon_envelope::{Kind, Route, TopicHash};
-use axon_shm::ids::Gid;
+use axon_shm::{
+    ids::Gid,
+    qos::{History, Reliability},
+};
 use axon_transport::graph::{Endpoint, EndpointKind};
 
 use super::{
@@ -176,6 +179,10 @@ impl Peer {
         }
         let Some(route) = self.inbound.routes().get_mut(&asked.number) else { return };
         route.writers.retain(|gid, _| asked.stand_ins.contains_key(gid));
+        route.keeps_all = wanted.subscribers.iter().all(|reader| {
+            let kept = (Reliability::Reliable, History::KeepAll);
+            (reader.qos.reliability, reader.qos.history) == kept
+        });
         if key.kind == Kind::Response {
             route.set_clients(wanted.subscribers.iter().map(|client| client.gid));
         }

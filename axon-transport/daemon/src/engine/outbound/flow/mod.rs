@@ -296,11 +296,15 @@ impl Flow {
         (self.acknowledged_samples, self.reliable.parts())
     }
 
-    /// Whether none of its samples is in flight, and the peer takes in those of other flows first, or a limit holds its
-    /// samples. Then it is no fault of the peer's that it makes no progress.
+    /// Whether it waits for other flows: none of its samples is in flight, and the peer takes in theirs first. Then it is
+    /// no fault of its own that it makes no progress.
     pub(super) fn waits_for_others(&self) -> bool {
-        let waits = self.waits_for_credit || self.taking.is_limited() && self.queue.is_empty();
-        waits && !self.queue.has_sent() && self.best_effort.is_idle()
+        self.waits_for_credit && !self.queue.has_sent() && self.best_effort.is_idle()
+    }
+
+    /// Whether it waits for a limit, and the peer has all that passed.
+    pub(super) fn waits_for_limit(&self) -> bool {
+        self.taking.is_limited() && self.queue.is_empty()
     }
 
     /// The peer has the samples up to this number, and dropped some of them.
@@ -314,13 +318,12 @@ impl Flow {
         Some(done)
     }
 
-    /// The sources may forget samples that a limit dropped, once the peer has all before them.
+    /// Tells the sources of samples that a limit dropped: at once that they will not arrive, and that they may be
+    /// forgotten once the peer has all before them.
     fn finish_dropped(&mut self, done: &mut Done) {
-        if self.queue.is_empty()
-            && let Some((sequence, samples)) = self.taking.take_dropped()
-        {
-            done.sequence = done.sequence.max(Some(sequence));
-            done.given_up += samples;
+        done.given_up += self.taking.take_given_up();
+        if self.queue.is_empty() {
+            done.sequence = done.sequence.max(self.taking.take_dropped());
         }
     }
 
@@ -368,6 +371,7 @@ impl Flow {
         } else {
             self.best_effort.handle_stopped(stream, quic, counters, &self.info.topic);
         }
+        self.finish_dropped(done);
     }
 
     fn set_timer(&mut self, due: Option<Duration>) {

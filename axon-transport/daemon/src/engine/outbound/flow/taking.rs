@@ -32,6 +32,8 @@ const FILL: (usize, usize) = (1024, 256 << 10);
 const SHARED: usize = 32 << 10;
 /// Takes in one turn that found only samples that were sent before.
 const REPEATS: u32 = 16;
+/// Takes in one turn of samples that a limit drops.
+const DROPS: usize = 64;
 /// A KEEP_ALL flow with so many bytes waiting leaves further samples in the ring, which keeps them.
 const AHEAD: usize = 1 << 20;
 /// Bytes that a KEEP_LAST flow moves that is behind. What it leaves in the ring is replaced there without a copy.
@@ -61,8 +63,10 @@ pub(super) struct Taking {
     limit: RouteLimit,
     /// The limit that the last turn came to. What newer samples replaced in the ring since is lost for it.
     exceeded: Option<Exceeded>,
-    /// The newest sample that a limit dropped, and how many it did, since the sources were told last.
-    dropped: Option<(u64, u64)>,
+    /// The newest sample that a limit dropped after it was taken, since the sources were told last.
+    dropped: Option<u64>,
+    /// How many such samples the publisher was not told of.
+    given_up: u64,
 }
 
 impl Taking {
@@ -86,6 +90,7 @@ impl Taking {
             limit,
             exceeded: None,
             dropped: None,
+            given_up: 0,
         }
     }
 
@@ -99,9 +104,14 @@ impl Taking {
         self.exceeded.is_some() && self.has_more()
     }
 
-    /// Takes the number of the newest sample that a limit dropped, and how many it did.
-    pub(super) fn take_dropped(&mut self) -> Option<(u64, u64)> {
+    /// Takes the number of the newest sample that a limit dropped.
+    pub(super) fn take_dropped(&mut self) -> Option<u64> {
         self.dropped.take()
+    }
+
+    /// Takes how many samples a limit dropped of which the publisher was not told.
+    pub(super) fn take_given_up(&mut self) -> u64 {
+        std::mem::take(&mut self.given_up)
     }
 
     /// Takes these sources; the peer has the samples up to number `seen`.
@@ -184,7 +194,9 @@ impl Taking {
                 break;
             }
             let Some(sample) = self.taken.pop_front() else {
-                let left = together.min(most_samples - samples).min(self.limit.passes(now));
+                let left = together
+                    .min(most_samples - samples)
+                    .min(self.limit.passes(&self.of, now).max(1));
                 let most = limit(queue.room(), left, most_bytes - bytes);
                 if !self.take(sources, most, now) {
                     let behind = self.merge.is_behind().then_some(Duration::ZERO);
@@ -287,62 +299,98 @@ impl Taking {
         counters: &Counters,
         now: Duration,
     ) -> bool {
-        let exceeded = self.limit.exceeded(&self.of, now);
+        let exceeded = self.limit.exceeded_by(&self.of, now);
         if self.exceeded.is_some() || exceeded.is_some() {
             // Until here it was another cause, or the limit that the last turn came to.
             self.count_overwritten(sources, topic, counters);
         }
-        let Some(exceeded) = exceeded else {
-            if let Some(before) = self.exceeded.take_if(|before| before.over() == Over::DropOldest)
-            {
-                self.leave_oldest(sources, queue, before, topic, counters, now);
+        // One ring keeps the newest samples, and replaces the others without a copy. But a KEEP_ALL publisher would wait,
+        // and of several rings each would keep others.
+        let in_ring = !queue.keeps_all() && sources.len() == 1;
+        let (limit, most, waits) = match exceeded {
+            None => match self.exceeded.take_if(|before| before.over() == Over::DropOldest) {
+                Some(before) => (before, self.limit.passes(&self.of, now).max(1), false),
+                None => {
+                    self.exceeded = None;
+                    return true;
+                }
+            },
+            Some(exceeded) => {
+                let most = match exceeded.over() {
+                    Over::DropOldest => 1,
+                    Over::DropNewest => 0,
+                    Over::Hold => usize::MAX,
+                };
+                (exceeded, most, true)
             }
-            self.exceeded = None;
-            return true;
         };
-        let waits = match exceeded.over() {
+        let is_whole = match limit.over() {
             Over::Hold => true,
-            // The publisher must not wait: what its ring holds is taken, and the newest of it is kept.
-            Over::DropOldest if queue.keeps_all() => {
-                self.drop_for(&exceeded, 1, sources, topic, counters, now);
-                !self.taken.is_empty()
+            Over::DropOldest if in_ring && waits => true,
+            Over::DropOldest if in_ring => {
+                self.leave_oldest(sources, &limit, most, topic, counters);
+                true
             }
-            // The ring keeps the newest, and replaces the others without a copy.
-            Over::DropOldest => true,
-            Over::DropNewest => {
-                self.drop_for(&exceeded, 0, sources, topic, counters, now);
-                self.more
+            Over::DropOldest | Over::DropNewest => {
+                self.drop_for(&limit, most, sources, topic, counters, now)
             }
         };
-        if waits {
-            (self.retry, self.more) = (Some(exceeded.wait), true);
+        if !is_whole {
+            // There are newer ones: they are looked at before any passes.
+            (self.retry, self.more, self.exceeded) = (Some(Duration::ZERO), true, Some(limit));
+            return false;
         }
-        self.exceeded = Some(exceeded);
+        if !waits {
+            return true;
+        }
+        let may_pass_later = limit.over() != Over::DropNewest;
+        if may_pass_later {
+            self.more |= in_ring || limit.over() == Over::Hold;
+            self.retry = self.has_more().then_some(limit.wait);
+        }
+        self.exceeded = Some(limit);
         false
     }
 
-    /// Passes over the samples that waited for a limit, but for those that may pass now.
+    /// Passes over the samples that waited for a limit, but for the newest `most`.
     fn leave_oldest(
         &mut self,
         sources: &[Source],
-        queue: &Queue,
-        limit: Exceeded,
+        limit: &Exceeded,
+        most: usize,
         topic: &Arc<str>,
         counters: &Counters,
-        now: Duration,
     ) {
-        let most = self.limit.passes(now);
-        if queue.keeps_all() {
-            return self.drop_for(&limit, most, sources, topic, counters, now);
-        }
-        for source in sources.iter().filter(|source| source.reads(&self.of)) {
+        let own = sources.iter().filter(|source| source.reads(&self.of));
+        let mut newer = 0;
+        for source in own {
             source.skip_of(&self.of, most);
+            newer += source.with_data_of(&self.of).len();
         }
-        self.exceeded = Some(limit);
+        // What was taken is older than what the ring holds.
+        let keep = if newer > 0 { 0 } else { most };
+        self.drop_taken(limit, keep, topic, counters);
+        self.exceeded = Some(limit.clone());
         self.count_overwritten(sources, topic, counters);
+        self.exceeded = None;
     }
 
-    /// Takes what the rings hold, and drops all of it but the newest `most` samples.
+    /// Drops what was taken but the newest `most` samples.
+    fn drop_taken(&mut self, limit: &Exceeded, most: usize, topic: &Arc<str>, counters: &Counters) {
+        let mut dropped = 0;
+        while self.taken.len() > most
+            && let Some(sample) = self.taken.pop_front()
+        {
+            dropped += 1;
+            self.dropped = self.dropped.max(Some(sample.info.sequence));
+        }
+        self.given_up += dropped;
+        limit.dropped(dropped);
+        counters.lost(topic, limit.cause(), dropped);
+    }
+
+    /// Takes what the rings hold, and drops all of it but the newest `most` samples. Returns whether it came to the end: a
+    /// publisher that never rests must not keep the others waiting.
     fn drop_for(
         &mut self,
         limit: &Exceeded,
@@ -351,26 +399,17 @@ impl Taking {
         topic: &Arc<str>,
         counters: &Counters,
         now: Duration,
-    ) {
-        let (mut dropped, mut turns) = (0, 0);
-        self.more = loop {
+    ) -> bool {
+        for _ in 0..DROPS {
             let some = TakeLimit { samples: FILL.0, bytes: SHARED };
             let there = self.take(sources, some, now);
-            while self.taken.len() > most
-                && let Some(sample) = self.taken.pop_front()
-            {
-                dropped += 1;
-                let (newest, samples) = self.dropped.unwrap_or_default();
-                self.dropped = Some((newest.max(sample.info.sequence), samples + 1));
+            self.drop_taken(limit, most, topic, counters);
+            if !there {
+                self.more = false;
+                return true;
             }
-            turns += 1;
-            // A publisher that never rests must not keep the others waiting.
-            if !there || turns == REPEATS {
-                break there;
-            }
-        };
-        limit.dropped(dropped);
-        counters.lost(topic, limit.cause(), dropped);
+        }
+        false
     }
 
     /// Takes the next samples, as many as `most` says. Whether there was any, even one that was sent before.

@@ -147,6 +147,7 @@ impl FlowTable {
                 is_held_back: served.holds(&flow.info.of),
                 uses_credit: flow.uses_credit(),
                 waits_for_others: flow.waits_for_others(),
+                waits_for_limit: flow.waits_for_limit(),
                 is_quiet: flow.is_quiet(),
             })
         })
