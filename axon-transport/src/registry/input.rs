@@ -37,7 +37,8 @@ impl<F: Clone> Registry<F> {
         descriptors: Option<[F; 3]>,
         scope: Option<Scope>,
     ) -> Result<(), Violation> {
-        self.handle_disconnect(&id);
+        // The process of one that comes back lives.
+        while self.disconnect_in_parts(&id, true) {}
         self.sessions.insert(id, SessionEntry::new(role, name, pid, descriptors, scope))?;
         self.rescoped |= role == SessionRole::Application;
         Ok(())
@@ -71,8 +72,28 @@ impl<F: Clone> Registry<F> {
     /// As [`handle_disconnect`](Self::handle_disconnect), a part of it; whether there is more to do. The rest of
     /// the session is told nothing any more.
     pub fn handle_disconnect_in_parts(&mut self, id: &SessionId) -> bool {
+        self.disconnect_in_parts(id, false)
+    }
+
+    /// As [`handle_disconnect_in_parts`](Self::handle_disconnect_in_parts), of a session whose process may live on. What
+    /// its readers are handed once that has ended waits for [`handle_process_end`](Self::handle_process_end).
+    pub fn handle_hang_up_in_parts(&mut self, id: &SessionId) -> bool {
+        self.disconnect_in_parts(id, true)
+    }
+
+    /// Whether something of a session that hung up waits for the end of its process.
+    pub fn awaits_process(&self, id: &SessionId) -> bool {
+        self.sessions.awaits_process(id)
+    }
+
+    /// The process of a session that hung up before has ended.
+    pub fn handle_process_end(&mut self, id: &SessionId) {
+        self.sessions.process_ended(id);
+    }
+
+    fn disconnect_in_parts(&mut self, id: &SessionId, lives: bool) -> bool {
         self.sessions.fall_behind(id);
-        self.sessions.hand_over_pledges(id);
+        self.sessions.hand_over_pledges(id, lives);
         let mut pairs = 0;
         while let Some(entry) = self.sessions.get_mut(id) {
             let before = self.pairs.len();
@@ -81,7 +102,7 @@ impl<F: Clone> Registry<F> {
                 self.rescoped = true;
                 return false;
             };
-            self.hand_over_grants(id, &gid);
+            self.hand_over_grants(id, &gid, lives);
             self.remove_endpoint(&gid, "its session ended");
             pairs += 1 + before - self.pairs.len();
             if pairs >= PAIRS_TOGETHER {
@@ -92,7 +113,7 @@ impl<F: Clone> Registry<F> {
     }
 
     /// The session of a publisher ends: those of its readers that would not hear of its grants are handed them.
-    fn hand_over_grants(&mut self, id: &SessionId, gid: &Gid) {
+    fn hand_over_grants(&mut self, id: &SessionId, gid: &Gid, lives: bool) {
         let Some(writer) = self.endpoints.get(gid) else { return };
         if writer.endpoint.kind != EndpointKind::Publisher || !writer.endpoint.gid.is_of(id) {
             return;
@@ -103,7 +124,7 @@ impl<F: Clone> Registry<F> {
             reader.is_some_and(|reader| self.sessions.is_told_anew(&reader))
         });
         let granted: Vec<Granted> = granted.cloned().collect();
-        granted.into_iter().for_each(|granted| self.sessions.hand_over_grant(id, granted));
+        granted.into_iter().for_each(|granted| self.sessions.hand_over_grant(id, granted, lives));
     }
 
     /// A message of a session.
@@ -306,7 +327,7 @@ impl<F: Clone> Registry<F> {
         if !unmet.writer.is_of(id) {
             return Err(Violation::NotItsOwn(unmet.writer));
         }
-        self.sessions.tell_unmet(unmet);
+        self.sessions.tell_unmet(id, unmet);
         Ok(())
     }
 
@@ -342,7 +363,7 @@ impl<F: Clone> Registry<F> {
         let grant = Granted { session: *id, segments: Vec::new(), ..grant };
         if self.pairs.attach_of(&pair).is_none() && grant.writer.is_of(id) {
             // The reader has not come back from an earlier daemon.
-            self.sessions.pledge(grant);
+            self.sessions.pledge(id, grant);
         } else if self.pairs.grant(grant) {
             self.sessions.forget_pledge(&pair);
             self.forward_grant(&pair);

@@ -106,18 +106,20 @@ impl Session {
         Subscription { inner, session: self.clone() }
     }
 
-    /// A client, of whose responses those stand that `reads` asks for.
+    /// A client, of whose responses those stand that `reads` asks for. One that `carries` them to another process says
+    /// which of them are there.
     pub(super) fn add_client(
         &self,
         endpoint: Endpoint,
         role: EndpointRole,
         reads: Qos,
+        carries: bool,
     ) -> Result<Client, SessionError> {
         let options = self.ring(&endpoint, Qos::keep_all());
         let segment = self.shared().segment.clone();
         let writer = Arc::new(Writer::create_for_calls(segment, options)?);
         let rings = Rings::Shared(writer.clone());
-        let (requests, responses) = self.add_both(endpoint, role, reads, rings);
+        let (requests, responses) = self.add_both(endpoint, role, reads, rings, carries);
         Ok(Client::new(requests, responses, writer, self.clone()))
     }
 
@@ -128,7 +130,7 @@ impl Session {
         let by_client = RingsByClient::new(shared.segment.clone(), options, shared.room.clone());
         let by_client = Arc::new(by_client);
         let rings = Rings::Each(by_client.clone());
-        let (responses, requests) = self.add_both(endpoint, role, reads, rings);
+        let (responses, requests) = self.add_both(endpoint, role, reads, rings, false);
         Server::new(responses, requests, by_client, self.clone())
     }
 
@@ -139,9 +141,12 @@ impl Session {
         role: EndpointRole,
         reads: Qos,
         rings: Rings,
+        carries: bool,
     ) -> (Arc<PublisherInner>, Arc<SubscriptionInner>) {
         let writes = Arc::new(PublisherInner::new(endpoint.clone(), role, rings));
-        let reads = Arc::new(SubscriptionInner::of_service(endpoint, role, reads));
+        let mut reads = SubscriptionInner::of_service(endpoint, role, reads);
+        reads.carries = carries;
+        let reads = Arc::new(reads);
         self.announce(Some(&writes), Some(&reads));
         (writes, reads)
     }

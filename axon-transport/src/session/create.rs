@@ -67,7 +67,7 @@ impl Session {
     pub fn create_client(&self, spec: EndpointSpec) -> Result<Client, SessionError> {
         let endpoint = self.endpoint(spec, EndpointKind::Client)?;
         let reads = unread(&endpoint.qos);
-        let client = self.add_client(endpoint, EndpointRole::Application, reads)?;
+        let client = self.add_client(endpoint, EndpointRole::Application, reads, false)?;
         self.shared().meet(client.endpoint());
         client.await_servers();
         Ok(client)

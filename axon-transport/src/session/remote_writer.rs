@@ -38,22 +38,37 @@ impl RemoteWriter {
     /// # Errors
     /// When there is no memory.
     pub fn stand_in(session: &Session, remote: Endpoint) -> Result<Self, SessionError> {
-        Self::new(session, remote, EndpointRole::StandIn)
+        Self::new(session, remote, EndpointRole::StandIn, false)
     }
 
-    /// An endpoint of `session` as another process of the session describes it, under its GID there.
+    /// As [`stand_in`](Self::stand_in). A client says which of the responses that it takes are
+    /// [where they are to go](Self::finish_through): until then its servers keep them.
+    ///
+    /// # Errors
+    /// When there is no memory.
+    pub(crate) fn carrying(session: &Session, remote: Endpoint) -> Result<Self, SessionError> {
+        Self::new(session, remote, EndpointRole::StandIn, true)
+    }
+
+    /// An endpoint of `session` as another process of the session describes it, under its GID there. A client
+    /// [says](Self::finish_through) which responses that process has.
     ///
     /// # Errors
     /// When there is no memory.
     pub fn adopt(session: &Session, own: Endpoint) -> Result<Self, SessionError> {
-        Self::new(session, own, EndpointRole::Application)
+        Self::new(session, own, EndpointRole::Application, true)
     }
 
-    fn new(session: &Session, of: Endpoint, role: EndpointRole) -> Result<Self, SessionError> {
+    fn new(
+        session: &Session,
+        of: Endpoint,
+        role: EndpointRole,
+        carries: bool,
+    ) -> Result<Self, SessionError> {
         // What it takes is another's, whose depth counts there.
         let all = Qos::keep_all();
         Ok(match of.kind {
-            EndpointKind::Client => Self::Client(session.add_client(of, role, all)?),
+            EndpointKind::Client => Self::Client(session.add_client(of, role, all, carries)?),
             EndpointKind::Server => Self::Server(session.add_server(of, role, all)),
             _ => Self::Publisher(session.add_asserted(of, role)?),
         })
@@ -146,6 +161,30 @@ impl RemoteWriter {
         match self {
             Self::Publisher(publisher) => Some(publisher.delivered_up_to()),
             Self::Client(_) | Self::Server(_) => None,
+        }
+    }
+
+    /// How many responses to `client` are written and not where they are to go.
+    pub fn undelivered(&self, client: &Gid) -> u64 {
+        match self {
+            Self::Server(server) => server.undelivered(client),
+            Self::Publisher(_) | Self::Client(_) => 0,
+        }
+    }
+
+    /// Of a client that carries: the response of this number, and all that it took of `server` before, are where they
+    /// are to go.
+    pub fn finish_through(&self, server: &Gid, number: u64) {
+        if let Self::Client(client) = self {
+            client.finish_through(server, number);
+        }
+    }
+
+    /// Of a client that carries: responses that are not [where they are to go](Self::finish_through) are to be taken
+    /// once more.
+    pub(crate) fn take_back(&self) {
+        if let Self::Client(client) = self {
+            client.take_back();
         }
     }
 

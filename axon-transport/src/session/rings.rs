@@ -23,7 +23,8 @@ pub(super) enum Rings {
     Each(Arc<RingsByClient>),
 }
 
-/// A server's rings by client. Each is made when its client comes, and goes with it.
+/// A server's rings by client. Each is made when its client comes, and goes with it. The ring of a client that is
+/// reached through a daemon stays for a while when that daemon's process ends: the client may not have all responses.
 pub(super) struct RingsByClient {
     session: Arc<SessionSegment>,
     options: RingOptions,
@@ -96,7 +97,15 @@ impl Rings {
     pub(super) fn detach(&self, reader: Gid) -> bool {
         match self {
             Self::Shared(writer) => writer.detach(reader),
-            Self::Each(rings) => rings.lock().remove(&reader).is_some(),
+            Self::Each(rings) => {
+                let mut rings = rings.lock();
+                let Some((ring, _)) = rings.get(&reader) else { return false };
+                let attached = ring.detach(reader);
+                if !ring.has_absent_readers() {
+                    rings.remove(&reader);
+                }
+                attached
+            }
         }
     }
 
@@ -116,7 +125,7 @@ impl Rings {
                 rings.lock().retain(|reader, (ring, _)| {
                     let dead = !ring.drop_dead().is_empty();
                     gone.extend(dead.then_some(*reader));
-                    !dead
+                    !dead || ring.has_absent_readers()
                 });
                 gone
             }
@@ -127,7 +136,11 @@ impl Rings {
     pub(super) fn readers(&self) -> Vec<Gid> {
         match self {
             Self::Shared(writer) => writer.readers(),
-            Self::Each(rings) => rings.lock().keys().copied().collect(),
+            Self::Each(rings) => {
+                let rings = rings.lock();
+                let read = rings.iter().filter(|(_, (ring, _))| !ring.readers().is_empty());
+                read.map(|(client, _)| *client).collect()
+            }
         }
     }
 
@@ -136,8 +149,9 @@ impl Rings {
         match self {
             Self::Shared(writer) => writer.reclaim_idle(now),
             Self::Each(rings) => {
+                let absent = rings.drop_abandoned();
                 let rings: Vec<_> = rings.lock().values().map(|(ring, _)| ring.clone()).collect();
-                rings.iter().filter(|ring| ring.reclaim_idle(now)).count() > 0
+                rings.iter().filter(|ring| ring.reclaim_idle(now)).count() > 0 || absent
             }
         }
     }
@@ -162,6 +176,24 @@ impl RingsByClient {
     /// The ring of a client; `None` when it is not, or no more, served.
     pub(super) fn ring(&self, client: &Gid) -> Option<Arc<Writer>> {
         self.lock().get(client).map(|(ring, _)| ring.clone())
+    }
+
+    /// Drops the rings of clients whose daemon ended and that did not come back by way of the next; whether there
+    /// are some that still may.
+    fn drop_abandoned(&self) -> bool {
+        let mut rings = self.lock();
+        let mut absent = false;
+        rings.retain(|_, (ring, _)| {
+            if !ring.readers().is_empty() {
+                return true;
+            }
+            // What it kept is given up, and the log says so.
+            ring.drop_dead();
+            let kept = ring.has_absent_readers();
+            absent |= kept;
+            kept
+        });
+        absent
     }
 
     fn ring_for(&self, client: Gid) -> Result<Arc<Writer>, ShmError> {

@@ -163,6 +163,11 @@ impl Server {
         ring.try_publish(meta, payload).map(|_| true)
     }
 
+    /// For a relay: how many responses to this client are in its ring and are not where they are to go.
+    pub(crate) fn undelivered(&self, client: &Gid) -> u64 {
+        self.rings.ring(client).map_or(0, |ring| ring.under_way())
+    }
+
     /// For a relay: the next request of one client.
     pub(crate) fn take_request_from(&self, client: &Gid) -> Option<Sample> {
         take_from_one(&self.requests, &self.session, client)
@@ -246,6 +251,20 @@ impl Client {
     /// For a relay: the next response of one server.
     pub(crate) fn take_response_from(&self, server: &Gid) -> Option<Sample> {
         take_from_one(&self.responses, &self.session, server)
+    }
+
+    /// For a relay: the response of this number, and all that it took of this server before, are where they are to go.
+    pub(crate) fn finish_through(&self, server: &Gid, number: u64) {
+        if !self.session.is_forked() {
+            self.responses.lock().finish_through(server, number);
+        }
+    }
+
+    /// For a relay: responses that it took and that are not where they are to go are to be taken once more.
+    pub(crate) fn take_back(&self) {
+        if !self.session.is_forked() {
+            self.responses.lock().take_back(false);
+        }
     }
 
     /// Whether there is a response of this server to be taken.

@@ -40,5 +40,6 @@ mod services;
 mod slow;
 mod squatter;
 mod stranger;
+mod traffic_keys;
 mod unread;
 mod wire;

@@ -105,7 +105,7 @@ fn wait_erased(kmes: &Kmes, hosts: &[Host; 2], applications: [&Node; 2], spent: 
     }
 }
 
-fn may_search() -> bool {
+pub(crate) fn may_search() -> bool {
     let root = rustix::process::geteuid().is_root();
     if !root {
         eprintln!("skipped: only root may read the memory of a process that is not dumpable");

@@ -107,6 +107,9 @@ pub(super) enum InternalPeer {
     Relay { pid: u32, uid: u32, tally: Arc<RelayCounters>, key: Option<Arc<SessionKey>> },
 }
 
+/// How often it is looked whether a session that hung up came back.
+const AWAIT_PROCESS: Duration = Duration::from_secs(1);
+
 /// Serves one connection to its end. It is a `stranger` until it said HELLO.
 pub(super) async fn serve(
     control: Rc<RefCell<Control>>,
@@ -147,14 +150,28 @@ pub(super) async fn serve(
     let why = converse(&control, &socket, id, &bell, &turn, death.as_ref()).await;
     tracing::debug!(session = %id, why, "a session ended");
     // Its descriptors are closed at once, its endpoints removed in its process's turns.
-    drop((socket, death));
+    drop(socket);
     loop {
         {
             let _turn = turn.lock().await;
             if !control.borrow_mut().remove_some(&id, &bell) {
-                return;
+                break;
             }
             tokio::task::yield_now().await;
+        }
+    }
+    let Some(death) = death else { return };
+    await_process(&control, &id, &death).await;
+}
+
+/// Waits until the process of a session that hung up has ended, if readers are to be handed what it left. It may come
+/// back before.
+async fn await_process(control: &RefCell<Control>, id: &SessionId, death: &AsyncFd<PassedFd>) {
+    while control.borrow().registry.awaits_process(id) {
+        if timeout(AWAIT_PROCESS, death.readable()).await.is_ok() {
+            let control = &mut *control.borrow_mut();
+            control.registry.handle_process_end(id);
+            control.settle();
         }
     }
 }

@@ -139,7 +139,7 @@ impl Control {
         if !self.is_current(id, bell) {
             return false;
         }
-        let more = self.registry.handle_disconnect_in_parts(id);
+        let more = self.registry.handle_hang_up_in_parts(id);
         if !more {
             self.wakers.remove(id);
             self.keys_of_sessions.remove(id);
@@ -153,7 +153,7 @@ impl Control {
         if let Some(bell) = self.wakers.remove(id) {
             bell.notify_one();
         }
-        self.registry.handle_disconnect(id);
+        while self.registry.handle_hang_up_in_parts(id) {}
         self.keys_of_sessions.remove(id);
     }
 

@@ -1,6 +1,7 @@
 //! Sessions that share no memory, beside those that do.
 
 mod backlog;
+mod calls_killed;
 mod hostile;
 mod killed;
 mod left;

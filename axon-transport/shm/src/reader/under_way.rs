@@ -57,6 +57,19 @@ impl Reader {
         self.tell_cursor();
     }
 
+    /// The message of this number, and all that were taken before it, are done with: for a writer whose numbers do not
+    /// rise.
+    pub fn finish_through(&mut self, sequence: u64) {
+        let Some(under_way) = &mut self.under_way else { return };
+        if self.attachment.lane.is_forked() {
+            return;
+        }
+        if let Some(at) = under_way.0.iter().position(|(number, _)| *number == sequence) {
+            under_way.0.drain(..=at);
+            self.tell_cursor();
+        }
+    }
+
     /// So many samples do not get where they are to go: their publisher sees that no later than that they
     /// are [done with](Self::finish).
     pub fn give_up(&mut self, samples: u64) {

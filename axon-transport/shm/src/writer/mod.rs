@@ -286,6 +286,11 @@ impl Writer {
         !self.is_forked() && !self.lock().reader_set.is_empty()
     }
 
+    /// Whether it keeps samples for a reader whose process ended, and that may come back by way of another.
+    pub fn has_absent_readers(&self) -> bool {
+        !self.is_forked() && self.lock().reader_set.has_absent()
+    }
+
     /// If a sample would be read by nobody, now or later, uses up the next sequence number as if one
     /// had been published, and returns it. `None` when somebody would. So a caller that has to
     /// serialize first can save the work.

@@ -355,6 +355,11 @@ impl ReaderSet {
         self.carriers().filter_map(Attached::position).any(|position| position <= tail)
     }
 
+    /// Whether samples are kept for a reader whose process ended.
+    pub(crate) fn has_absent(&self) -> bool {
+        !self.absent.is_empty()
+    }
+
     /// How long it takes until one of the absent readers is given up.
     pub(crate) fn absent_for(&self) -> Option<Duration> {
         self.absent.left()

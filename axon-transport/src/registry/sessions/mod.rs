@@ -4,9 +4,11 @@
 //! the publishers that it reads from. It receives existing segments with the message that introduces the two
 //! sessions, and later segments when they are opened. If a segment is missing nevertheless, the session asks for it.
 
+mod entry;
 mod left;
 mod memory;
 mod outbox;
+mod shares;
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -14,106 +16,24 @@ use std::{
 };
 
 pub(super) use self::outbox::Due;
-use self::{
-    left::{LeftMemory, LeftNews, Pledges},
-    memory::{HeldMemory, NotTaken},
-    outbox::{Outbox, Pushed},
-};
 pub use self::{
+    entry::SessionEntry,
     memory::{OwnMemory, SessionSegment},
     outbox::Output,
 };
-use super::{
-    limits::{MAX_SEGMENTS, MAX_SESSIONS, Violation},
-    relayed::RelayCounters,
+use self::{
+    left::{Left, packets_of_grant},
+    memory::NotTaken,
+    outbox::Pushed,
 };
+use super::limits::{MAX_SEGMENTS, MAX_SESSIONS, Violation};
 use crate::{
-    config::DiscoveryRange,
-    graph::{EndpointRange, RangeToHost, Scope},
     ids::{DaemonId, Gid, SessionId},
     wire::session::{
         Granted, MAX_DESCRIPTORS, Message, Pair, Refused, Segment, SegmentName, SegmentOpened,
-        SessionRole, Unmatch, Unmet,
+        SessionRole, Unmet,
     },
 };
-
-/// A session as the registry knows it.
-#[derive(Debug)]
-pub struct SessionEntry<F> {
-    /// What kind it is.
-    pub role: SessionRole,
-    /// Its process's name.
-    pub name: String,
-    /// Its process.
-    pub pid: u32,
-    /// Its user, where that is another than the daemon's.
-    pub user: Option<u32>,
-    /// How far it is discovered; `None` of the gateway, and of all in a registry within a process.
-    pub scope: Option<Scope>,
-    /// Daemons of the linked peers that it lists.
-    pub lists: BTreeSet<DaemonId>,
-    /// Its endpoints.
-    pub endpoints: BTreeSet<Gid>,
-    /// Segment, doorbell and pidfd; a tool has none, nor has a session that nobody can meet.
-    pub descriptors: Option<[F; 3]>,
-    /// The segments of its memory besides the first.
-    pub segments: OwnMemory<F>,
-    /// What is shown of its relay, where it is relayed. Pairs within it are its own process's.
-    pub relay: Option<Arc<RelayCounters>>,
-    /// What waits for it.
-    pub(super) outbox: Outbox<F>,
-    /// The memory of other sessions whose descriptors it holds.
-    pub(super) held: HeldMemory,
-    /// An endpoint of its was refused.
-    pub(super) refused: bool,
-}
-
-impl<F> SessionEntry<F> {
-    pub(super) fn new(
-        role: SessionRole,
-        name: String,
-        pid: u32,
-        descriptors: Option<[F; 3]>,
-        scope: Option<Scope>,
-    ) -> Self {
-        Self {
-            role,
-            name,
-            pid,
-            user: None,
-            scope,
-            lists: BTreeSet::new(),
-            endpoints: BTreeSet::new(),
-            descriptors,
-            segments: OwnMemory::default(),
-            relay: None,
-            // There is no graph that a tool could be behind with.
-            outbox: Outbox::new(role != SessionRole::Tool),
-            held: HeldMemory::default(),
-            refused: false,
-        }
-    }
-
-    /// Packets that wait for it.
-    pub fn queued(&self) -> usize {
-        self.outbox.len()
-    }
-
-    /// Its range, and the daemons of linked peers that it lists; `None` where ranges do not apply.
-    pub(super) fn reach(&self) -> Option<EndpointRange> {
-        let scope = self.scope.as_ref()?;
-        Some(EndpointRange { range: scope.range, lists: self.lists.iter().copied().collect() })
-    }
-
-    pub(super) fn toward(&self, peer: &DaemonId) -> Option<RangeToHost> {
-        let scope = self.scope.as_ref()?;
-        Some(RangeToHost { range: scope.range, lists: self.lists.contains(peer) })
-    }
-
-    pub(super) fn is_off(&self) -> bool {
-        self.scope.as_ref().is_some_and(|scope| scope.range == DiscoveryRange::Off)
-    }
-}
 
 /// All sessions.
 #[derive(Debug)]
@@ -123,11 +43,8 @@ pub(super) struct Sessions<F> {
     ready: BTreeSet<SessionId>,
     /// The first endpoint of each session that was refused, and why.
     refused: Vec<(SessionId, String)>,
-    /// Memory of those that ended.
-    left: LeftMemory<F>,
-    /// What is for readers whose sessions are not here.
-    news: LeftNews<F>,
-    pledges: Pledges,
+    /// What they left to readers that are not here.
+    left: Left<F>,
 }
 
 impl<F> Default for Sessions<F> {
@@ -136,9 +53,7 @@ impl<F> Default for Sessions<F> {
             entries: BTreeMap::new(),
             ready: BTreeSet::new(),
             refused: Vec::new(),
-            left: LeftMemory::default(),
-            news: LeftNews::default(),
-            pledges: Pledges::default(),
+            left: Left::default(),
         }
     }
 }
@@ -169,32 +84,30 @@ impl<F> Sessions<F> {
             return Err(Violation::Sessions);
         }
         let tool = entry.role == SessionRole::Tool;
-        self.left.forget(&id);
+        self.left.session_came(&id);
         self.entries.insert(id, entry);
         if !tool {
             self.fall_behind(&id);
-            self.news.take(&id).into_iter().for_each(|output| self.push_kept(output));
+            self.left.take_for(&id).into_iter().for_each(|output| self.push_kept(output));
         }
         Ok(())
     }
 
     pub(super) fn remove(&mut self, id: &SessionId) {
         if let Some(entry) = self.entries.remove(id) {
-            self.left.keep(*id, entry.segments);
-            // It may come back.
-            entry.outbox.into_kept().for_each(|output| self.news.keep(output));
+            self.left.session_ended(*id, entry.segments, entry.outbox.into_kept());
         }
         self.ready.remove(id);
     }
 
     /// From now on keeps segments of sessions that end, `most` at a time.
     pub(super) fn keep_left_memory(&mut self, most: usize) {
-        self.left = LeftMemory::new(most);
+        self.left.keep_memory(most);
     }
 
     /// Whether segments of sessions that end are kept.
     pub(super) fn keeps_left_memory(&self) -> bool {
-        self.left.is_kept()
+        self.left.keeps_memory()
     }
 
     /// Sessions that got something to be told since the last call.
@@ -273,14 +186,15 @@ impl<F> Sessions<F> {
         if let Some(entry) = self.entries.get_mut(id) {
             entry.user = Some(user);
             let kept = entry.outbox.take_kept();
-            kept.into_iter().for_each(|output| self.news.keep(output));
+            kept.into_iter().for_each(|output| self.left.keep(output));
         }
     }
 
     /// Tells a reader's session of a pair that was never made. If it is not here, it is told when it comes.
-    pub(super) fn tell_unmet(&mut self, unmet: Unmet) {
+    pub(super) fn tell_unmet(&mut self, by: &SessionId, unmet: Unmet) {
         self.forget_pledge(&Pair { reader: unmet.reader, writer: unmet.writer });
-        let output = Output::kept(&Message::Unmet(unmet), Vec::new(), unmet.reader);
+        let process = self.process_of(by);
+        let output = Output::kept(&Message::Unmet(unmet), Vec::new(), unmet.reader, process);
         output.into_iter().for_each(|output| self.push_kept(output));
     }
 
@@ -291,11 +205,10 @@ impl<F> Sessions<F> {
         let takes =
             |entry: &&mut SessionEntry<F>| entry.role != SessionRole::Tool && entry.user.is_none();
         match to.and_then(|id| Some((id, self.entries.get_mut(&id).filter(takes)?))) {
-            None => self.news.keep(output),
+            None => self.left.keep(output),
             Some((id, entry)) => {
-                if entry.outbox.push_kept(output) {
-                    self.ready.insert(id);
-                }
+                entry.outbox.push_kept(output);
+                self.ready.insert(id);
             }
         }
     }
@@ -309,18 +222,23 @@ impl<F> Sessions<F> {
     }
 
     /// A publisher granted this by way of an earlier daemon.
-    pub(super) fn pledge(&mut self, granted: Granted) {
-        self.pledges.note(granted);
+    pub(super) fn pledge(&mut self, by: &SessionId, granted: Granted) {
+        let process = self.process_of(by);
+        self.left.pledge(granted, process);
+    }
+
+    fn process_of(&self, id: &SessionId) -> u32 {
+        self.entries.get(id).map_or(0, |entry| entry.pid)
     }
 
     /// A reader is granted something else, or was told that it gets nothing.
     pub(super) fn forget_pledge(&mut self, pair: &Pair) {
-        self.pledges.forget(|of| (of.reader, of.writer) == (pair.reader, pair.writer));
+        self.left.forget_pledge(pair);
     }
 
     /// A publisher has ended, and said what its readers lost.
     pub(super) fn forget_pledges(&mut self, writer: &Gid) {
-        self.pledges.forget(|granted| granted.writer == *writer);
+        self.left.forget_pledges(writer);
     }
 
     /// Queues a packet for several sessions, which share its memory.
@@ -413,32 +331,35 @@ impl<F: Clone> Sessions<F> {
         self.push(id, &Message::Refused(Refused::because(text)), Vec::new());
     }
 
-    /// A session ends. Hands what it pledged to the readers, who find in the rings what there was for them: all of what
-    /// is in the session's own segments, and the number of what is not. Called before its pairs end.
-    pub(super) fn hand_over_pledges(&mut self, id: &SessionId) {
-        let pledged = self.pledges.take(id);
-        pledged.into_iter().for_each(|granted| self.hand_over_grant(id, granted));
+    /// A session ends. Hands what it pledged to the readers. Called before its pairs end.
+    pub(super) fn hand_over_pledges(&mut self, id: &SessionId, lives: bool) {
+        let pledged = self.left.take_pledges(id);
+        pledged.into_iter().for_each(|granted| self.hand_over_grant(id, granted, lives));
     }
 
-    /// Hands what a session that ends granted to a reader, and its ring.
-    pub(super) fn hand_over_grant(&mut self, id: &SessionId, granted: Granted) {
-        // What another user may give to readers here, the access rules say, and these may have changed.
-        let Some(entry) = self.entries.get(id).filter(|entry| entry.user.is_none()) else { return };
-        let Some(descriptors) = entry.descriptors.clone() else { return };
-        let mut descriptors = Vec::from(descriptors);
-        let own = entry.segments.iter().filter(|of| of.segment.publisher.is_none());
-        let (ring, others): (Vec<_>, Vec<_>) =
-            own.partition(|of| of.segment.number == granted.ring.segment);
-        let own = ring.into_iter().chain(others).take(MAX_DESCRIPTORS - descriptors.len());
-        let (segments, maps): (Vec<_>, Vec<_>) =
-            own.map(|of| (of.segment, of.descriptor.clone())).unzip();
-        descriptors.extend(maps);
-        let Granted { reader, writer, .. } = granted;
-        let grant = Message::Grant(Granted { segments, ..granted });
-        let end = Unmatch { reader, writer, reason: "its session ended".to_owned() };
-        let grant = Output::kept(&grant, descriptors, reader);
-        let end = Output::kept(&Message::Unmatch(end), Vec::new(), reader);
-        grant.into_iter().chain(end).for_each(|output| self.push_kept(output));
+    /// Hands what a session that ends granted to a reader, and its ring. If its process still `lives`, this waits for the
+    /// process's end: the session may come back, and the ring may be written.
+    pub(super) fn hand_over_grant(&mut self, id: &SessionId, granted: Granted, lives: bool) {
+        let Some(entry) = self.entries.get(id) else { return };
+        // The memory of a relayed session is the daemon's, which outlives it.
+        let lives = lives && entry.relay.is_none();
+        for output in packets_of_grant(entry, granted) {
+            if lives {
+                self.left.hold_back(output, *id);
+            } else {
+                self.push_kept(output);
+            }
+        }
+    }
+
+    /// Whether something waits for the end of a session's process.
+    pub(super) fn awaits_process(&self, id: &SessionId) -> bool {
+        self.left.awaits_process(id)
+    }
+
+    /// The process of a session that ended before has ended, too.
+    pub(super) fn process_ended(&mut self, id: &SessionId) {
+        self.left.take_awaiting(id).into_iter().for_each(|output| self.push_kept(output));
     }
 
     /// Whether a reader's session is told everything anew, and so not what was granted before.

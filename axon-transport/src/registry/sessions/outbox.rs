@@ -2,7 +2,7 @@
 
 use std::{collections::VecDeque, sync::Arc};
 
-use super::encode;
+use super::{encode, shares::makes_room};
 use crate::{
     ids::{Gid, SessionId},
     registry::limits::{MAX_QUEUE, MAX_QUEUE_BYTES, STATUS_SLICE},
@@ -23,6 +23,8 @@ pub struct Output<F> {
     segment: Option<(SessionId, u32)>,
     /// The reader of the session's that it is for, where the session would not hear of it when it is told everything anew.
     pub(in crate::registry) kept_for: Option<Gid>,
+    /// The process whose publisher it is of, where it stays for its reader.
+    pub(super) process: u32,
     /// Which it is of the packets that were queued for its session; 0 before it is.
     number: u64,
 }
@@ -34,17 +36,36 @@ impl<F> Output<F> {
             Message::Segment(opened) => Some((opened.session, opened.segment.number)),
             _ => None,
         };
-        Some(Self { packet: encode(message)?, descriptors, segment, kept_for: None, number: 0 })
+        Some(Self {
+            packet: encode(message)?,
+            descriptors,
+            segment,
+            kept_for: None,
+            process: 0,
+            number: 0,
+        })
     }
 
-    /// A packet that stays for its reader whatever becomes of the session's queue.
-    pub(super) fn kept(message: &Message, descriptors: Vec<F>, reader: Gid) -> Option<Self> {
-        Some(Self { kept_for: Some(reader), ..Self::of(message, descriptors)? })
+    /// A packet of a publisher of `process` that stays for its reader whatever becomes of the session's queue.
+    pub(super) fn kept(
+        message: &Message,
+        descriptors: Vec<F>,
+        reader: Gid,
+        process: u32,
+    ) -> Option<Self> {
+        Some(Self { kept_for: Some(reader), process, ..Self::of(message, descriptors)? })
     }
 
     /// A packet without descriptors.
     pub(super) fn plain(packet: Arc<[u8]>) -> Self {
-        Self { packet, descriptors: Vec::new(), segment: None, kept_for: None, number: 0 }
+        Self {
+            packet,
+            descriptors: Vec::new(),
+            segment: None,
+            kept_for: None,
+            process: 0,
+            number: 0,
+        }
     }
 }
 
@@ -145,22 +166,31 @@ impl<F> Outbox<F> {
         Pushed::Queued
     }
 
-    /// Queues what the session would not hear of otherwise: it stays if the session falls behind. Returns whether it was
-    /// queued.
-    pub(super) fn push_kept(&mut self, output: Output<F>) -> bool {
+    /// Queues what the session would not hear of otherwise: it stays if the session falls behind. Beyond the bound the
+    /// process that said most of it loses the oldest.
+    pub(super) fn push_kept(&mut self, output: Output<F>) {
         if self.kept == MAX_WAITING_KEPT {
-            tracing::warn!(
-                reader = ?output.kept_for,
-                "a reader does not count what it lost: its process has yet to hear of {MAX_WAITING_KEPT} \
-                 publishers that ended"
-            );
-            return false;
+            self.make_room(output.process);
         }
         self.kept += 1;
         self.bytes += output.packet.len();
         self.last_queued += 1;
         self.queue.push_back(Output { number: self.last_queued, ..output });
-        true
+    }
+
+    fn make_room(&mut self, newcomer: u32) {
+        let kept: Vec<usize> =
+            (0..self.queue.len()).filter(|at| self.queue[*at].kept_for.is_some()).collect();
+        let processes = kept.iter().map(|at| self.queue[*at].process);
+        let Some(oldest) = makes_room(processes, newcomer) else { return };
+        let Some(gone) = self.queue.remove(kept[oldest]) else { return };
+        self.kept -= 1;
+        self.bytes -= gone.packet.len();
+        tracing::warn!(
+            reader = ?gone.kept_for, process = gone.process,
+            "a reader does not count what it lost: its process has yet to hear of {MAX_WAITING_KEPT} \
+             publishers that ended"
+        );
     }
 
     /// Takes back what stays for its readers.

@@ -8,7 +8,7 @@ use crate::{
     qos::Qos,
     registry::{
         MAX_QUEUE, Registry, Violation,
-        limits::{MAX_LEFT, MAX_UNMET},
+        limits::{MAX_LEFT, MAX_PLEDGES, MAX_UNMET},
     },
     wire::session::{
         Announce, Attach, EndpointRole, Gone, Granted, Message, Segment, SegmentOpened,
@@ -30,7 +30,8 @@ fn unmet(samples: u64) -> Unmet {
 fn connect(registry: &mut Registry<&'static str>, session: u8) {
     let handed = Some(["segment", "doorbell", "pidfd"]);
     let (role, name) = (SessionRole::Application, String::new());
-    registry.handle_connect(id(session), role, name, 1, handed, None).unwrap();
+    // Each is a process of its own.
+    registry.handle_connect(id(session), role, name, session.into(), handed, None).unwrap();
 }
 
 fn registry(sessions: &[u8]) -> Registry<&'static str> {
@@ -278,5 +279,104 @@ fn memory_is_handed_to_no_tool_and_no_other_user_that_claims_the_id_of_a_reader(
     registry.set_user(&id(WRITER), 1001);
     registry.handle_disconnect(&id(WRITER));
     connect(&mut registry, READER);
+    assert_eq!(handed(&mut registry), []);
+}
+
+/// Another process says or grants this, many times over.
+fn others_say(registry: &mut Registry<&'static str>, times: usize, what: impl Fn(u32) -> Message) {
+    for number in 1..=times as u32 {
+        registry.handle_message(&id(OTHER), what(number), vec![]).unwrap();
+    }
+}
+
+const OTHER: u8 = 7;
+
+#[test]
+fn process_that_fills_what_is_kept_displaces_nothing_of_another_one() {
+    let mut registry = registry(&[WRITER, OTHER]);
+    say(&mut registry, Message::Unmet(unmet(3)));
+    let of = |number| Unmet {
+        reader: Gid::new(id(8), number),
+        writer: Gid::new(id(OTHER), number),
+        samples: 1,
+    };
+    others_say(&mut registry, 3 * MAX_UNMET, |number| Message::Unmet(of(number)));
+    connect(&mut registry, READER);
+    assert_eq!(told(&mut registry), [3]);
+}
+
+#[test]
+fn rings_of_a_process_that_leaves_many_displace_no_ring_of_another_one() {
+    let mut registry = pledged(&[WRITER, OTHER]);
+    let of = |number| grant(Gid::new(id(8), number), Gid::new(id(OTHER), number));
+    others_say(&mut registry, 3 * MAX_LEFT, |number| Message::Grant(of(number)));
+    registry.handle_disconnect(&id(WRITER));
+    registry.handle_disconnect(&id(OTHER));
+    connect(&mut registry, READER);
+    assert_eq!(handed(&mut registry).len(), 1);
+}
+
+#[test]
+fn grants_of_a_process_that_repeats_many_displace_no_grant_of_another_one() {
+    let mut registry = pledged(&[WRITER, OTHER]);
+    let of = |number| grant(Gid::new(id(8), number), Gid::new(id(OTHER), number));
+    others_say(&mut registry, 3 * MAX_PLEDGES, |number| Message::Grant(of(number)));
+    registry.handle_disconnect(&id(WRITER));
+    connect(&mut registry, READER);
+    assert_eq!(handed(&mut registry).len(), 1);
+}
+
+#[test]
+fn reader_that_is_stopped_hears_of_a_pair_though_another_process_told_it_of_very_many() {
+    let mut registry = registry(&[WRITER, OTHER, READER]);
+    let of = |number| Unmet { writer: Gid::new(id(OTHER), number), ..unmet(1) };
+    others_say(&mut registry, 2000, |number| Message::Unmet(of(number)));
+    say(&mut registry, Message::Unmet(unmet(3)));
+    others_say(&mut registry, 2000, |number| Message::Unmet(of(2000 + number)));
+    assert!(told(&mut registry).contains(&3));
+}
+
+#[test]
+fn session_that_comes_back_on_another_connection_hands_no_ring_to_its_readers() {
+    let mut registry = pledged(&[WRITER, READER]);
+    connect(&mut registry, WRITER);
+    assert_eq!(handed(&mut registry), [], "its process lives");
+    // It says anew what it granted.
+    announce(&mut registry);
+    say(&mut registry, Message::Grant(grant(unmet(0).reader, unmet(0).writer)));
+    registry.handle_disconnect(&id(WRITER));
+    assert_eq!(handed(&mut registry).len(), 1);
+}
+
+fn hang_up(registry: &mut Registry<&'static str>, session: u8) {
+    while registry.handle_hang_up_in_parts(&id(session)) {}
+}
+
+#[test]
+fn ring_of_a_session_that_hung_up_is_handed_over_once_its_process_has_ended() {
+    for comes_before in [false, true] {
+        let mut registry = pledged(&[WRITER]);
+        if comes_before {
+            connect(&mut registry, READER);
+        }
+        hang_up(&mut registry, WRITER);
+        if !comes_before {
+            connect(&mut registry, READER);
+        }
+        assert_eq!(handed(&mut registry), [], "its process may write to the ring");
+        assert!(registry.awaits_process(&id(WRITER)));
+        registry.handle_process_end(&id(WRITER));
+        assert_eq!(handed(&mut registry).len(), 1);
+        assert!(!registry.awaits_process(&id(WRITER)));
+    }
+}
+
+#[test]
+fn ring_of_a_session_that_hung_up_and_came_back_is_handed_to_nobody() {
+    let mut registry = pledged(&[WRITER, READER]);
+    hang_up(&mut registry, WRITER);
+    connect(&mut registry, WRITER);
+    assert!(!registry.awaits_process(&id(WRITER)));
+    registry.handle_process_end(&id(WRITER));
     assert_eq!(handed(&mut registry), []);
 }

@@ -5,7 +5,10 @@ use std::collections::BTreeMap;
 
 use axon_shm::Sample;
 
-use super::flow::{Channel, OutboundSample};
+use super::{
+    flow::{Channel, Content, OutboundSample, Payload},
+    unanswered::Unanswered,
+};
 use crate::{
     ids::Gid,
     session::{
@@ -39,9 +42,29 @@ impl Calls {
         &mut self,
         client: &Gid,
         find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,
-    ) -> Option<OutboundSample<Sample>> {
+    ) -> Option<OutboundSample<Payload>> {
         let requests = self.requests.get_mut(client)?;
         requests.next(|server| find(server)?.take_from(client).map(taken)).map(OutboundSample::from)
+    }
+
+    /// As [`request`](Self::request), for the session's end: one that is to be sent again comes first, and each is kept
+    /// until it has a response.
+    pub(super) fn request_to_send<'a>(
+        &mut self,
+        client: &Gid,
+        unanswered: &mut Unanswered,
+        find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,
+    ) -> Option<OutboundSample<Payload>> {
+        if let Some(again) = unanswered.next_due(client) {
+            return Some(again);
+        }
+        let request = self.request(client, find)?;
+        let mut payload = vec![0; request.content.len()];
+        if request.content.read_at(0, &mut payload) == payload.len() {
+            let servers = self.requests.get(client).into_iter().flat_map(Merge::readers);
+            unanswered.add(*client, request.meta, payload, servers.copied().collect());
+        }
+        Some(request)
     }
 
     /// Takes the requests that were sent by way of another server; whether there are more.
@@ -63,7 +86,7 @@ impl Calls {
 pub fn response<'a>(
     channel: &Channel,
     find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,
-) -> Option<OutboundSample<Sample>> {
+) -> Option<OutboundSample<Payload>> {
     let client = find(&channel.client?)?;
     client.take_from(&channel.writer).map(taken).map(OutboundSample::from)
 }

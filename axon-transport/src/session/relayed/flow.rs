@@ -12,6 +12,8 @@ mod outgoing;
 #[cfg(test)]
 mod tests;
 
+use std::sync::Arc;
+
 use axon_shm::{Meta, Sample};
 
 pub use self::{
@@ -69,26 +71,45 @@ pub trait Content {
     fn read_at(&self, at: usize, out: &mut [u8]) -> usize;
 }
 
-impl Content for Sample {
-    fn len(&self) -> usize {
-        self.len()
-    }
-
-    fn read_at(&self, at: usize, out: &mut [u8]) -> usize {
-        self.read_at(at, out)
-    }
-}
-
 impl Content for Vec<u8> {
     fn len(&self) -> usize {
         self.len()
     }
 
     fn read_at(&self, at: usize, out: &mut [u8]) -> usize {
-        let count = out.len().min(self.len().saturating_sub(at));
-        out[..count].copy_from_slice(&self[at..][..count]);
-        count
+        read_at(self, at, out)
     }
+}
+
+/// The bytes of a sample that goes.
+#[derive(Debug)]
+pub enum Payload {
+    /// They stay in the ring.
+    Ring(Sample),
+    /// They are kept, to be sent again.
+    Kept(Arc<[u8]>),
+}
+
+impl Content for Payload {
+    fn len(&self) -> usize {
+        match self {
+            Self::Ring(sample) => sample.len(),
+            Self::Kept(bytes) => bytes.len(),
+        }
+    }
+
+    fn read_at(&self, at: usize, out: &mut [u8]) -> usize {
+        match self {
+            Self::Ring(sample) => sample.read_at(at, out),
+            Self::Kept(bytes) => read_at(bytes, at, out),
+        }
+    }
+}
+
+fn read_at(bytes: &[u8], at: usize, out: &mut [u8]) -> usize {
+    let count = out.len().min(bytes.len().saturating_sub(at));
+    out[..count].copy_from_slice(&bytes[at..][..count]);
+    count
 }
 
 /// A sample to be sent.
@@ -102,8 +123,8 @@ pub struct OutboundSample<S> {
     pub content: S,
 }
 
-impl From<Taken<Sample>> for OutboundSample<Sample> {
+impl From<Taken<Sample>> for OutboundSample<Payload> {
     fn from(Taken { lost, content, .. }: Taken<Sample>) -> Self {
-        Self { meta: content.meta(), lost, content }
+        Self { meta: content.meta(), lost, content: Payload::Ring(content) }
     }
 }

@@ -17,6 +17,8 @@ pub mod change_signal;
 pub mod flow;
 pub(crate) mod near;
 pub mod pipe;
+mod response_log;
+mod unanswered;
 
 pub use flow::Pool;
 

@@ -7,7 +7,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_shm::{ExternalLeader, PublishError, Sample, internal::descriptors::PassedFd};
+use axon_shm::{ExternalLeader, PublishError, internal::descriptors::PassedFd};
 use rustix::{
     event::{PollFd, PollFlags, Timespec, poll},
     net::{Shutdown, shutdown},
@@ -15,7 +15,10 @@ use rustix::{
 
 use super::{
     change_signal::ChangeSignal,
-    flow::{Channel, InboundSample, Incoming, OutboundSample, Outgoing, Violation},
+    flow::{
+        Channel, Content, InboundSample, Incoming, OutboundSample, Outgoing, Payload, Violation,
+    },
+    response_log::ResponseLog,
 };
 use crate::{
     ids::Gid,
@@ -101,7 +104,7 @@ pub struct Pipe {
     waiting: VecDeque<Vec<u8>>,
     waiting_bytes: usize,
     /// Samples on their way to the other end.
-    pub outgoing: Outgoing<Sample>,
+    pub outgoing: Outgoing<Payload>,
     pub(crate) incoming: Incoming,
     /// Samples that came and are not published yet.
     arrived: BTreeMap<Channel, VecDeque<InboundSample>>,
@@ -111,6 +114,10 @@ pub struct Pipe {
     blocked: bool,
     /// Channels whose samples are written and not all handed over.
     written: BTreeMap<Channel, Unacknowledged>,
+    /// The same of responses: the number of each, in the order in which they came.
+    undelivered: BTreeMap<Channel, VecDeque<u64>>,
+    /// Responses that were written, of which a copy may come through the next daemon.
+    pub(crate) response_log: Option<ResponseLog>,
     /// MATCHED that this end has said, and those that it has heard: by these both ends tell a channel
     /// from an earlier one of the same name.
     said: u64,
@@ -137,6 +144,8 @@ impl Pipe {
             begun: BTreeSet::new(),
             blocked: false,
             written: BTreeMap::new(),
+            undelivered: BTreeMap::new(),
+            response_log: None,
             said: 0,
             heard: 0,
             gone: false,
@@ -181,6 +190,7 @@ impl Pipe {
         self.incoming.retain(&keep);
         self.arrived.retain(|channel, _| keep(channel));
         self.written.retain(|channel, _| keep(channel));
+        self.undelivered.retain(|channel, _| keep(channel));
         self.begun.retain(&keep);
     }
 
@@ -191,7 +201,7 @@ impl Pipe {
 
     /// Whether readers that go on are worth being woken for.
     pub fn waits_for_readers(&self) -> bool {
-        self.blocked || !self.written.is_empty()
+        self.blocked || !self.written.is_empty() || !self.undelivered.is_empty()
     }
 
     /// The other end is gone, or as good as that: what it has said is heard, and nothing is said to it
@@ -274,8 +284,20 @@ impl Pipe {
                 let client = client.as_ref().unwrap_or(gid);
                 let number = sample.meta.sequence;
                 let mut last = number;
-                match remote_writer.try_write(client, sample.meta, &sample.payload) {
-                    Ok(Written::Yes) => self.tally.arrived(sample.payload.len()),
+                let repeated =
+                    self.response_log.as_ref().is_some_and(|log| log.has(channel, &sample.meta));
+                let written = if repeated {
+                    Ok(Written::Nobody)
+                } else {
+                    remote_writer.try_write(client, sample.meta, &sample.payload)
+                };
+                match written {
+                    Ok(Written::Yes) => {
+                        self.tally.arrived(sample.payload.len());
+                        if let Some(log) = &mut self.response_log {
+                            log.add(channel, &sample.meta);
+                        }
+                    }
                     Ok(Written::Nobody) => {}
                     Err(PublishError::Blocked { .. }) => {
                         self.blocked = true;
@@ -299,6 +321,10 @@ impl Pipe {
                         self.written
                             .insert(*channel, Unacknowledged { said: over, last, then: number });
                     }
+                    if channel.client.is_some() && remote_writer.undelivered(client) > 0 {
+                        credit.done = None;
+                        self.undelivered.entry(*channel).or_default().push_back(number);
+                    }
                     credits.push(credit);
                 }
             }
@@ -314,6 +340,14 @@ impl Pipe {
             }
             over < *last
         });
+        self.undelivered.retain(|channel, numbers| {
+            let client = channel.client.unwrap_or(channel.writer);
+            let left = find(&channel.writer).map_or(0, |server| server.undelivered(&client));
+            let left = usize::try_from(left).unwrap_or(usize::MAX).min(numbers.len());
+            let done = numbers.drain(..numbers.len() - left).next_back();
+            credits.extend(done.map(|number| channel.done(number)));
+            !numbers.is_empty()
+        });
         credits
     }
 
@@ -326,7 +360,7 @@ impl Pipe {
     /// send. Whether anything was sent.
     pub fn send(
         &mut self,
-        mut take: impl FnMut(&Channel) -> Option<OutboundSample<Sample>>,
+        mut take: impl FnMut(&Channel) -> Option<OutboundSample<Payload>>,
     ) -> Result<bool, End> {
         if self.gone {
             return Ok(false);

@@ -259,6 +259,14 @@ impl MatchedReaders {
         }
     }
 
+    /// As [`finish_of`](Self::finish_of), of a writer whose numbers do not rise: the message of this number, and all
+    /// that were taken before it.
+    pub(in crate::session) fn finish_through(&mut self, writer: &Gid, sequence: u64) {
+        let of = self.matched_readers.iter_mut().filter(|slot| slot.reader.writer() == *writer);
+        of.for_each(|slot| slot.reader.finish_through(sequence));
+        self.sweep();
+    }
+
     /// So many samples of `writer` do not get where they are to go.
     pub(in crate::session) fn give_up_of(&mut self, writer: &Gid, samples: u64) {
         let slot = self.matched_readers.iter_mut().find(|slot| slot.reader.writer() == *writer);

@@ -22,7 +22,7 @@ use axon_transport::{
             merge::{Merge, Taken},
             relayed::{
                 MAX_MATCHED,
-                flow::{Channel, OutboundSample},
+                flow::{Channel, OutboundSample, Payload},
                 pipe::End,
             },
         },
@@ -248,7 +248,7 @@ pub(super) fn take(
     source: &mut RelayedSource,
     subscriptions: &BTreeMap<Gid, Subscription>,
     writer: &Gid,
-) -> Option<OutboundSample<Sample>> {
+) -> Option<OutboundSample<Payload>> {
     source.samples.next(|reader| taken(subscriptions, reader, writer)).map(OutboundSample::from)
 }
 

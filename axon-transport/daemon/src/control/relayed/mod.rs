@@ -362,6 +362,11 @@ impl RelayedSession {
             }
             Message::Credit(credit) => {
                 self.pipe.outgoing.credit(&credit);
+                if let (Some(client), Some(number)) = (&credit.client, credit.done)
+                    && let Some(client) = self.writers.get(client)
+                {
+                    client.finish_through(&credit.publisher, number);
+                }
                 if let Some(source) = self.sources.get_mut(&credit.publisher) {
                     source.done = source.done.max(credit.done);
                     source.acknowledge(&self.subscriptions, &credit.publisher);

@@ -497,6 +497,8 @@ impl Control {
         for publisher in publishers {
             if publisher.drop_dead() {
                 self.writer_changed(&publisher);
+                // A server keeps the responses of a client that a daemon carried; one that does not come back has none.
+                self.look_after_memory();
             }
         }
         for subscription in subscriptions {

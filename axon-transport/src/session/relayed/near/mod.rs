@@ -2,6 +2,7 @@
 
 mod reconnect;
 mod relays;
+mod resumed;
 mod stand_ins;
 
 use std::{
@@ -20,13 +21,17 @@ use axon_shm::{
     internal::{BlockedSignals, descriptors::PassedFd},
 };
 
-use self::{relays::Relay, stand_ins::StandIn};
+use self::{
+    relays::Relay,
+    stand_ins::{Kept, KeptCalls, StandIn},
+};
 use super::{
     Pool,
     calls::{self, Calls},
     change_signal::ChangeSignal,
     flow::{Channel, Incoming},
     pipe::{End, LossReport, Pipe},
+    unanswered::Unanswered,
 };
 use crate::{
     events::Alive,
@@ -112,7 +117,7 @@ impl Drop for SessionRelay {
 impl Common {
     fn run(self, connected: Connected) {
         let mut next = Some(connected);
-        let mut kept = BTreeMap::new();
+        let mut kept = Kept::default();
         while let Some(connected) = next {
             let since = Instant::now();
             let daemon = connected.welcome.daemon;
@@ -120,9 +125,9 @@ impl Common {
             self.shared.set_daemon(Some(daemon));
             let why = served.serve();
             served.forget_world();
-            kept = served.keep_relays();
+            kept = Kept { relays: served.keep_relays(), calls: served.keep_calls() };
             drop(served);
-            if self.finishes() && (why.is_ok() || kept.is_empty()) {
+            if self.finishes() && (why.is_ok() || kept.relays.is_empty()) {
                 break;
             }
             if let Err(why) = why {
@@ -131,7 +136,7 @@ impl Common {
             self.shared.set_daemon(None);
             next = self.reconnect(since.elapsed() < Duration::from_secs(1), &mut kept);
         }
-        kept.values().for_each(Relay::give_up);
+        kept.relays.values().for_each(Relay::give_up);
     }
 }
 
@@ -158,6 +163,8 @@ struct RelayConnection<'a> {
     stand_ins: BTreeMap<Gid, StandIn>,
     /// What the session's clients ask.
     calls: Calls,
+    /// Their requests that have no response.
+    unanswered: Unanswered,
     /// Since when the daemon knows of each of its clients.
     asking: HashMap<Gid, Instant>,
     /// Those whose requests wait until they have been matched outside with all that they count.
@@ -170,15 +177,23 @@ struct RelayConnection<'a> {
 }
 
 impl<'a> RelayConnection<'a> {
-    fn new(common: &'a Common, connected: Connected, relays: BTreeMap<Gid, Relay>) -> Self {
+    fn new(common: &'a Common, connected: Connected, kept: Kept) -> Self {
+        let Kept { relays, calls } = kept;
+        let KeptCalls { stand_ins, calls, mut unanswered, response_log, .. } =
+            calls.for_daemon(connected.welcome.daemon);
+        // A client may have ended while there was no daemon.
+        let graph = common.outside.graph();
+        unanswered.keep_clients(|client| graph.endpoints.contains_key(client));
         // This end trusts its daemon with memory: there is one, and it takes what it is given credit
         // for.
         let incoming = Incoming::new(common.shared.config.max_message, Pool::new(u64::MAX));
         let socket = PassedFd::connection(connected.socket).trusted();
+        let mut pipe = Pipe::new(socket, incoming, Arc::new(RelayCounters::default()));
+        pipe.response_log = Some(response_log);
         Self {
             common,
             daemon: connected.welcome.daemon,
-            pipe: Pipe::new(socket, incoming, Arc::new(RelayCounters::default())),
+            pipe,
             own: BTreeMap::new(),
             refused: BTreeSet::new(),
             ending: BTreeMap::new(),
@@ -186,8 +201,9 @@ impl<'a> RelayConnection<'a> {
             parting: BTreeSet::new(),
             matched: HashMap::new(),
             relays,
-            stand_ins: BTreeMap::new(),
-            calls: Calls::default(),
+            stand_ins,
+            calls,
+            unanswered,
             asking: HashMap::new(),
             settling: HashMap::new(),
             callers: BTreeMap::new(),
@@ -210,6 +226,7 @@ impl<'a> RelayConnection<'a> {
             let waits = self.held_back
                 || !self.ending.is_empty()
                 || !self.settling.is_empty()
+                || self.stand_ins.values().any(StandIn::is_kept)
                 || self.relays.values().any(Relay::is_carried_over);
             if signalled || changed || waits {
                 self.update()?;
@@ -224,19 +241,25 @@ impl<'a> RelayConnection<'a> {
                 let first = matches!(loss, LossReport::Before { first: true, .. });
                 common.shared.lost(gid, loss.samples(), first);
             });
+            for credit in &credits {
+                if let (Some(client), Some(number)) = (credit.client, credit.done) {
+                    self.unanswered.answered(client, &credit.publisher, number);
+                }
+            }
             self.pipe.give_back(credits)?;
             if self.pipe.is_over() {
                 return Err(SocketError::Closed.into());
             }
             let (own, relays) = (&self.own, &mut self.relays);
             let (calls, settling) = (&mut self.calls, &self.settling);
+            let unanswered = &mut self.unanswered;
             let sent = self.pipe.send(|channel| {
                 let Channel { writer, client } = channel;
                 match own.get(writer)? {
                     _ if client.is_some() => calls::response(channel, find),
                     _ if settling.contains_key(writer) => None,
                     endpoint if endpoint.kind == EndpointKind::Client => {
-                        calls.request(writer, find)
+                        calls.request_to_send(writer, unanswered, find)
                     }
                     _ => relays.get_mut(writer)?.take(),
                 }
@@ -256,6 +279,7 @@ impl<'a> RelayConnection<'a> {
                 .left(Instant::now())
                 .into_iter()
                 .chain(self.settled_in())
+                .chain(self.kept_for())
                 .chain(self.relays.values().filter_map(Relay::waits_for))
                 .chain(end)
                 .min();
@@ -270,6 +294,11 @@ impl<'a> RelayConnection<'a> {
             Message::EndpointGone(gone) => self.part(&gone.gid),
             Message::Credit(credit) => {
                 self.pipe.outgoing.credit(&credit);
+                if let (Some(client), Some(number)) = (&credit.client, credit.done)
+                    && let Some(client) = self.stand_ins.get(client)
+                {
+                    client.remote_writer().finish_through(&credit.publisher, number);
+                }
                 if let Some(relay) = self.relays.get(&credit.publisher)
                     && let Some(sequence) = credit.done
                 {
@@ -328,6 +357,7 @@ impl<'a> RelayConnection<'a> {
         self.announce_ended()?;
         self.update_relays();
         self.end_writers()?;
+        self.forget_overdue();
         self.update_stand_ins()?;
         self.note_leaving();
         self.update_calls()?;
@@ -430,6 +460,7 @@ impl<'a> RelayConnection<'a> {
     fn let_go(&mut self, gid: &Gid) -> Option<Arc<Endpoint>> {
         self.callers.remove(gid);
         self.asking.remove(gid);
+        self.unanswered.forget_client(gid);
         self.pipe.outgoing.retain(|channel| channel.writer != *gid);
         self.own.remove(gid)
     }

@@ -2,18 +2,13 @@
 //! that for a limited time.
 
 use std::{
-    collections::BTreeMap,
     sync::atomic::Ordering,
     time::{Duration, Instant},
 };
 
-use super::{
-    Common,
-    relays::{Relay, drop_overdue},
-};
+use super::{Common, stand_ins::Kept};
 use crate::{
     config::{Config, DaemonPolicy},
-    ids::Gid,
     session::{
         SessionError,
         daemon::connect::{Caller, Connected},
@@ -43,15 +38,11 @@ impl Common {
 
     /// Another daemon; `None` when the session ends. `brief` says that the last one was as good as
     /// none.
-    pub(super) fn reconnect(
-        &self,
-        brief: bool,
-        kept: &mut BTreeMap<Gid, Relay>,
-    ) -> Option<Connected> {
+    pub(super) fn reconnect(&self, brief: bool, kept: &mut Kept) -> Option<Connected> {
         let mut pause = MIN_PAUSE;
         let mut wait = brief;
         while !self.is_over() {
-            drop_overdue(kept);
+            kept.drop_overdue();
             if std::mem::replace(&mut wait, true) {
                 std::thread::sleep(pause);
                 pause = (pause * 2).min(if self.finishes() { MIN_PAUSE } else { MAX_PAUSE });

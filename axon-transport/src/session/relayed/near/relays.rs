@@ -7,7 +7,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_shm::{Sample, internal::holds};
+use axon_shm::internal::holds;
 
 use super::RelayConnection;
 use crate::{
@@ -18,7 +18,7 @@ use crate::{
         EndpointSpec, Subscription,
         relayed::{
             MAX_MATCHED,
-            flow::{Channel, OutboundSample},
+            flow::{Channel, OutboundSample, Payload},
         },
     },
 };
@@ -43,7 +43,7 @@ struct Awaits {
 }
 
 /// How long samples that a daemon did not confirm are kept for their readers, once that daemon is gone.
-const ABSENCE: Duration = Duration::from_secs(10);
+pub(super) const ABSENCE: Duration = Duration::from_secs(10);
 
 impl Relay {
     /// When its publisher was last alive, if that has a lease.
@@ -105,7 +105,7 @@ impl Relay {
     }
 
     /// The next sample of its publisher.
-    pub(super) fn take(&mut self) -> Option<OutboundSample<Sample>> {
+    pub(super) fn take(&mut self) -> Option<OutboundSample<Payload>> {
         if self.is_carried_over() {
             return None;
         }
@@ -113,7 +113,7 @@ impl Relay {
         let before = std::mem::replace(&mut self.lost, now);
         // Where the publisher has granted anew, it counts from 0.
         let lost = now.checked_sub(before).unwrap_or(now);
-        Some(OutboundSample { meta: content.meta(), lost, content })
+        Some(OutboundSample { meta: content.meta(), lost, content: Payload::Ring(content) })
     }
 
     /// Takes back what was not confirmed, to be sent through the next daemon; whether it is kept for

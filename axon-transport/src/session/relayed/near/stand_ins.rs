@@ -5,13 +5,16 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::RelayConnection;
+use super::{RelayConnection, relays::Relay};
 use crate::{
     graph::{Endpoint, EndpointKind, Pairing, pairing, reads},
-    ids::Gid,
+    ids::{DaemonId, Gid},
     session::{
         RemoteWriter,
-        relayed::{MAX_CALLERS, flow::Channel, pipe::End},
+        relayed::{
+            MAX_CALLERS, calls::Calls, flow::Channel, pipe::End, response_log::ResponseLog,
+            unanswered::Unanswered,
+        },
     },
     wire::session::{Matched, Message},
 };
@@ -26,11 +29,58 @@ pub(super) struct StandIn {
     since: Instant,
     /// Whom it stands for is gone, and has left something.
     leaving: bool,
+    /// It comes from an earlier connection, and goes unless it is matched by then.
+    kept_until: Option<Instant>,
 }
 
 impl StandIn {
     pub(super) fn remote_writer(&self) -> &RemoteWriter {
         &self.remote_writer
+    }
+
+    /// It outlives its connection. Nobody counts it meanwhile.
+    pub(super) fn keep(&mut self, until: Instant) {
+        self.kept_until.get_or_insert(until);
+        if !std::mem::replace(&mut self.leaving, true) {
+            self.remote_writer.leave(true);
+        }
+    }
+
+    /// Until when it stays though nobody is matched with it.
+    pub(super) fn kept_until(&self) -> Option<Instant> {
+        self.kept_until
+    }
+
+    pub(super) fn is_kept(&self) -> bool {
+        self.kept_until.is_some()
+    }
+
+    pub(super) fn is_overdue(&self, now: Instant) -> bool {
+        self.kept_until.is_some_and(|until| until <= now)
+    }
+}
+
+/// What a connection leaves to the next one.
+#[derive(Default)]
+pub(super) struct Kept {
+    pub(super) relays: BTreeMap<Gid, Relay>,
+    pub(super) calls: KeptCalls,
+}
+
+/// The calls among that.
+pub(super) struct KeptCalls {
+    /// The daemon's process that carried them.
+    pub(super) daemon: Option<DaemonId>,
+    pub(super) stand_ins: BTreeMap<Gid, StandIn>,
+    pub(super) calls: Calls,
+    pub(super) unanswered: Unanswered,
+    pub(super) response_log: ResponseLog,
+}
+
+impl Default for KeptCalls {
+    fn default() -> Self {
+        let (stand_ins, calls, unanswered) = Default::default();
+        Self { daemon: None, stand_ins, calls, unanswered, response_log: ResponseLog::default() }
     }
 }
 
@@ -44,8 +94,10 @@ impl RelayConnection<'_> {
             return;
         }
         let others: BTreeSet<Gid> = others.into_iter().collect();
-        let before = self.matched.insert(gid, others.clone());
-        if before.is_some_and(|before| !before.is_subset(&others)) {
+        let before = self.matched.insert(gid, others.clone()).unwrap_or_default();
+        // A new server has nothing to get: it awaits none of these requests.
+        self.unanswered.resend(&gid, &others.difference(&before).copied().collect());
+        if !before.is_subset(&others) {
             self.forget_unwanted();
         }
     }
@@ -73,7 +125,17 @@ impl RelayConnection<'_> {
 
     fn forget_unwanted(&mut self) -> BTreeMap<Gid, Vec<Gid>> {
         let wanted = self.wanted();
-        self.stand_ins.retain(|gid, _| wanted.contains_key(gid));
+        self.stand_ins.retain(|gid, stand_in| {
+            let is_wanted = wanted.contains_key(gid);
+            if is_wanted {
+                stand_in.kept_until = None;
+            }
+            let stays = is_wanted || stand_in.is_kept();
+            if !stays {
+                self.unanswered.forget_server(gid);
+            }
+            stays
+        });
         self.pipe.retain(|Channel { writer, client }| {
             wanted.get(writer).is_some_and(|readers| client.is_none_or(|c| readers.contains(&c)))
         });
@@ -88,11 +150,16 @@ impl RelayConnection<'_> {
             if !self.stand_ins.contains_key(&writer) {
                 // The graph may say later who it is.
                 let Some((_, endpoint)) = self.world.get(&writer) else { continue };
-                match RemoteWriter::stand_in(&self.common.outside, endpoint.clone()) {
+                match RemoteWriter::carrying(&self.common.outside, endpoint.clone()) {
                     Ok(remote_writer) => {
                         self.stand_ins.insert(
                             writer,
-                            StandIn { remote_writer, since: Instant::now(), leaving: false },
+                            StandIn {
+                                remote_writer,
+                                since: Instant::now(),
+                                leaving: false,
+                                kept_until: None,
+                            },
                         );
                     }
                     Err(error) => {
@@ -218,7 +285,8 @@ impl RelayConnection<'_> {
 
     /// Whether all requests of a client of the session are with the daemon.
     pub(super) fn is_asked(&self, client: &Gid) -> bool {
-        self.pipe.outgoing.is_idle(&Channel::of(*client))
+        !self.unanswered.is_due(client)
+            && self.pipe.outgoing.is_idle(&Channel::of(*client))
             && self.stand_ins.iter().all(|(server, stand_in)| {
                 !stand_in.remote_writer().has_from(client) && !self.calls.holds(client, server)
             })

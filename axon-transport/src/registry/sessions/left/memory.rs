@@ -1,21 +1,13 @@
-//! What sessions left to readers that have not come to this daemon yet: memory, and what their readers lost.
+//! Memory of sessions that ended soon after this daemon's start, while readers of theirs may not have come back yet.
 //!
-//! Memory is of sessions that ended soon after this daemon's start, while readers of theirs may not have come back yet.
 //! When a daemon is killed, a session may open a segment that no daemon passes on. The session tells the next daemon,
 //! and may end before its readers have come back and met it there. A new daemon keeps such a session's segments for a
 //! while, and hands them to readers that ask.
 
 use std::collections::VecDeque;
 
-use super::{
-    memory::{OwnMemory, SessionSegment},
-    outbox::Output,
-};
-use crate::{
-    ids::SessionId,
-    registry::limits::{MAX_LEFT, MAX_PLEDGES, MAX_UNMET},
-    wire::session::Granted,
-};
+use super::super::memory::{OwnMemory, SessionSegment};
+use crate::ids::SessionId;
 
 /// The segments of sessions that ended.
 #[derive(Debug)]
@@ -62,87 +54,6 @@ impl<F> LeftMemory<F> {
     pub(super) fn segment(&self, of: &SessionId, number: u32) -> Option<&SessionSegment<F>> {
         let (_, segments) = self.sessions.iter().find(|(id, _)| id == of)?;
         segments.get(number)
-    }
-}
-
-/// Packets for readers that are not here, and that never learned of the grant of a publisher that ended. Their processes
-/// may be stopped, and may have ended.
-#[derive(Debug)]
-pub(super) struct LeftNews<F> {
-    outputs: VecDeque<Output<F>>,
-    full: bool,
-}
-
-impl<F> Default for LeftNews<F> {
-    fn default() -> Self {
-        Self { outputs: VecDeque::new(), full: false }
-    }
-}
-
-impl<F> LeftNews<F> {
-    /// Keeps a packet for its reader. A session may say the same again.
-    pub(super) fn keep(&mut self, output: Output<F>) {
-        self.outputs.retain(|kept| kept.packet != output.packet);
-        let holds = |output: &Output<F>| !output.descriptors.is_empty();
-        let oldest = if self.outputs.len() == MAX_UNMET {
-            Some(0)
-        } else if holds(&output) && self.outputs.iter().filter(|of| holds(of)).count() == MAX_LEFT {
-            self.outputs.iter().position(holds)
-        } else {
-            None
-        };
-        if let Some(oldest) = oldest {
-            self.outputs.remove(oldest);
-            if !std::mem::replace(&mut self.full, true) {
-                tracing::warn!(
-                    "publishers ended, or were killed, before more than {MAX_UNMET}, or {MAX_LEFT}, \
-                     readers were told of them: the oldest of these readers do not count what they \
-                     lost, should their processes go on"
-                );
-            }
-        }
-        self.outputs.push_back(output);
-    }
-
-    /// Takes those for a session's readers.
-    pub(super) fn take(&mut self, session: &SessionId) -> VecDeque<Output<F>> {
-        let is_for = |output: &Output<F>| output.kept_for.is_some_and(|gid| gid.is_of(session));
-        let (taken, rest) = self.outputs.drain(..).partition(is_for);
-        self.outputs = rest;
-        taken
-    }
-}
-
-/// What publishers granted, by way of an earlier daemon, to readers that had not taken it up when the publishers came here.
-/// A publisher whose process is killed tells nobody what these readers lost: they are handed the grant, and the ring.
-#[derive(Debug, Default)]
-pub(super) struct Pledges(VecDeque<Granted>);
-
-impl Pledges {
-    pub(super) fn note(&mut self, granted: Granted) {
-        self.forget(|known| (known.reader, known.writer) == (granted.reader, granted.writer));
-        if self.0.len() == MAX_PLEDGES
-            && let Some(Granted { reader, writer, .. }) = self.0.pop_front()
-        {
-            tracing::warn!(
-                %reader, %writer,
-                "more than {MAX_PLEDGES} readers have not come back from an earlier daemon: this one \
-                 does not count what it lost if its publisher is killed"
-            );
-        }
-        self.0.push_back(granted);
-    }
-
-    pub(super) fn forget(&mut self, which: impl Fn(&Granted) -> bool) {
-        self.0.retain(|granted| !which(granted));
-    }
-
-    /// Takes those of a session's publishers.
-    pub(super) fn take(&mut self, session: &SessionId) -> Vec<Granted> {
-        let (taken, rest): (Vec<_>, _) =
-            self.0.drain(..).partition(|granted| granted.writer.is_of(session));
-        self.0 = rest.into();
-        taken
     }
 }
 

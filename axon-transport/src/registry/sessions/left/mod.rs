@@ -1,0 +1,143 @@
+//! What is kept for readers whose sessions are not here, or do not read yet: memory, grants and their rings, and the
+//! numbers of samples that they lost.
+
+mod memory;
+mod news;
+mod pledges;
+
+use self::{memory::LeftMemory, news::LeftNews, pledges::Pledges};
+use super::{
+    entry::SessionEntry,
+    memory::{OwnMemory, SessionSegment},
+    outbox::Output,
+};
+use crate::{
+    ids::{Gid, SessionId},
+    wire::session::{Granted, MAX_DESCRIPTORS, Message, Pair, Unmatch},
+};
+
+/// What sessions left to readers.
+#[derive(Debug)]
+pub(super) struct Left<F> {
+    /// Memory of those that ended.
+    memory: LeftMemory<F>,
+    /// What is for readers whose sessions are not here.
+    news: LeftNews<F>,
+    pledges: Pledges,
+}
+
+impl<F> Default for Left<F> {
+    fn default() -> Self {
+        Self {
+            memory: LeftMemory::default(),
+            news: LeftNews::default(),
+            pledges: Pledges::default(),
+        }
+    }
+}
+
+impl<F> Left<F> {
+    /// From now on keeps segments of sessions that end, `most` at a time.
+    pub(super) fn keep_memory(&mut self, most: usize) {
+        self.memory = LeftMemory::new(most);
+    }
+
+    /// Whether segments of sessions that end are kept.
+    pub(super) fn keeps_memory(&self) -> bool {
+        self.memory.is_kept()
+    }
+
+    /// A segment of a session that ended.
+    pub(super) fn segment(&self, of: &SessionId, number: u32) -> Option<&SessionSegment<F>> {
+        self.memory.segment(of, number)
+    }
+
+    /// A session came, or came back. It says anew what it granted: its process lives.
+    pub(super) fn session_came(&mut self, id: &SessionId) {
+        self.memory.forget(id);
+        self.news.take_awaiting(id);
+    }
+
+    /// A session ended, which had this memory, and for whose readers these packets were kept.
+    pub(super) fn session_ended(
+        &mut self,
+        id: SessionId,
+        segments: OwnMemory<F>,
+        kept: impl Iterator<Item = Output<F>>,
+    ) {
+        self.memory.keep(id, segments);
+        // It may come back.
+        kept.for_each(|output| self.keep(output));
+    }
+
+    /// Keeps a packet for its reader.
+    pub(super) fn keep(&mut self, output: Output<F>) {
+        self.news.keep(output, None);
+    }
+
+    /// Keeps a packet for its reader, until the process of session `id` has ended.
+    pub(super) fn hold_back(&mut self, output: Output<F>, id: SessionId) {
+        self.news.keep(output, Some(id));
+    }
+
+    /// Takes what was kept for a session's readers.
+    pub(super) fn take_for(&mut self, id: &SessionId) -> Vec<Output<F>> {
+        self.news.take(id)
+    }
+
+    /// Whether something awaits the end of a session's process.
+    pub(super) fn awaits_process(&self, id: &SessionId) -> bool {
+        self.news.awaits(id)
+    }
+
+    /// Takes what awaited the end of a session's process.
+    pub(super) fn take_awaiting(&mut self, id: &SessionId) -> Vec<Output<F>> {
+        self.news.take_awaiting(id)
+    }
+
+    /// A publisher of a process granted this by way of an earlier daemon.
+    pub(super) fn pledge(&mut self, granted: Granted, process: u32) {
+        self.pledges.note(granted, process);
+    }
+
+    /// A reader is granted something else, or was told that it gets nothing.
+    pub(super) fn forget_pledge(&mut self, pair: &Pair) {
+        self.pledges.forget(|of| (of.reader, of.writer) == (pair.reader, pair.writer));
+    }
+
+    /// A publisher has ended, and said what its readers lost.
+    pub(super) fn forget_pledges(&mut self, writer: &Gid) {
+        self.pledges.forget(|granted| granted.writer == *writer);
+    }
+
+    /// Takes what a session's publishers pledged.
+    pub(super) fn take_pledges(&mut self, id: &SessionId) -> Vec<Granted> {
+        self.pledges.take(id)
+    }
+}
+
+/// The packets that hand a reader what a session that ends granted to it, and the ring. The reader finds there what there
+/// was for it: all of what is in the session's own segments, and the number of what is not.
+pub(super) fn packets_of_grant<F: Clone>(
+    entry: &SessionEntry<F>,
+    granted: Granted,
+) -> Vec<Output<F>> {
+    // What another user may give to readers here, the access rules say, and these may have changed.
+    let Some(descriptors) = entry.descriptors.clone().filter(|_| entry.user.is_none()) else {
+        return Vec::new();
+    };
+    let mut descriptors = Vec::from(descriptors);
+    let own = entry.segments.iter().filter(|of| of.segment.publisher.is_none());
+    let (ring, others): (Vec<_>, Vec<_>) =
+        own.partition(|of| of.segment.number == granted.ring.segment);
+    let own = ring.into_iter().chain(others).take(MAX_DESCRIPTORS - descriptors.len());
+    let (segments, maps): (Vec<_>, Vec<_>) =
+        own.map(|of| (of.segment, of.descriptor.clone())).unzip();
+    descriptors.extend(maps);
+    let Granted { reader, writer, .. } = granted;
+    let grant = Message::Grant(Granted { segments, ..granted });
+    let end = Unmatch { reader, writer, reason: "its session ended".to_owned() };
+    let grant = Output::kept(&grant, descriptors, reader, entry.pid);
+    let end = Output::kept(&Message::Unmatch(end), Vec::new(), reader, entry.pid);
+    grant.into_iter().chain(end).collect()
+}

@@ -1,0 +1,90 @@
+//! Packets for readers that are not here.
+
+use std::collections::VecDeque;
+
+use super::super::{outbox::Output, shares::makes_room};
+use crate::{
+    ids::SessionId,
+    registry::limits::{MAX_LEFT, MAX_UNMET},
+};
+
+/// Packets for readers that are not here, and that never learned of the grant of a publisher that ended. Their processes
+/// may be stopped, and may have ended. Packets that hand a ring over wait until the publisher's process has ended, too.
+#[derive(Debug)]
+pub(super) struct LeftNews<F> {
+    kept: VecDeque<Kept<F>>,
+    full: bool,
+}
+
+#[derive(Debug)]
+struct Kept<F> {
+    output: Output<F>,
+    /// The session whose process has to end first.
+    awaits: Option<SessionId>,
+}
+
+impl<F> Kept<F> {
+    fn holds(&self) -> bool {
+        !self.output.descriptors.is_empty()
+    }
+}
+
+impl<F> Default for LeftNews<F> {
+    fn default() -> Self {
+        Self { kept: VecDeque::new(), full: false }
+    }
+}
+
+impl<F> LeftNews<F> {
+    /// Keeps a packet for its reader, which does not get it before the process of session `awaits` has ended. A session
+    /// may say the same again.
+    pub(super) fn keep(&mut self, output: Output<F>, awaits: Option<SessionId>) {
+        self.kept.retain(|kept| kept.output.packet != output.packet);
+        let new = Kept { output, awaits };
+        let full = self.kept.len() == MAX_UNMET;
+        let rings = new.holds() && self.kept.iter().filter(|of| of.holds()).count() == MAX_LEFT;
+        if full || rings {
+            self.make_room(new.output.process, |kept| full && !rings || kept.holds());
+        }
+        self.kept.push_back(new);
+    }
+
+    /// Drops the oldest of those, of the process that has most of them.
+    fn make_room(&mut self, newcomer: u32, of: impl Fn(&Kept<F>) -> bool) {
+        let those: Vec<usize> =
+            (0..self.kept.len()).filter(|index| of(&self.kept[*index])).collect();
+        let processes = those.iter().map(|index| self.kept[*index].output.process);
+        let Some(oldest) = makes_room(processes, newcomer) else { return };
+        self.kept.remove(those[oldest]);
+        if !std::mem::replace(&mut self.full, true) {
+            tracing::warn!(
+                "publishers ended, or were killed, before more than {MAX_UNMET}, or {MAX_LEFT}, \
+                 readers were told of them: some of these readers, of the processes with the most such \
+                 publishers, do not count what they lost, should their processes go on"
+            );
+        }
+    }
+
+    /// Takes those for a session's readers.
+    pub(super) fn take(&mut self, session: &SessionId) -> Vec<Output<F>> {
+        self.take_where(|Kept { output, awaits }| {
+            awaits.is_none() && output.kept_for.is_some_and(|gid| gid.is_of(session))
+        })
+    }
+
+    /// Takes those that await the end of this session's process.
+    pub(super) fn take_awaiting(&mut self, session: &SessionId) -> Vec<Output<F>> {
+        self.take_where(|kept| kept.awaits.as_ref() == Some(session))
+    }
+
+    /// Whether there are some that do.
+    pub(super) fn awaits(&self, session: &SessionId) -> bool {
+        self.kept.iter().any(|kept| kept.awaits.as_ref() == Some(session))
+    }
+
+    fn take_where(&mut self, which: impl Fn(&Kept<F>) -> bool) -> Vec<Output<F>> {
+        let (taken, rest): (Vec<_>, _) = self.kept.drain(..).partition(which);
+        self.kept = rest.into();
+        taken.into_iter().map(|kept| kept.output).collect()
+    }
+}

@@ -1,0 +1,48 @@
+//! Grants that stand until their readers come.
+
+use std::collections::VecDeque;
+
+use super::super::shares::makes_room;
+use crate::{ids::SessionId, registry::limits::MAX_PLEDGES, wire::session::Granted};
+
+/// What publishers granted, by way of an earlier daemon, to readers that had not taken it up when the publishers came here.
+/// A publisher whose process is killed tells nobody what these readers lost: they are handed the grant, and the ring.
+#[derive(Debug, Default)]
+pub(super) struct Pledges(VecDeque<Pledge>);
+
+#[derive(Debug)]
+struct Pledge {
+    granted: Granted,
+    /// The publisher's process.
+    process: u32,
+}
+
+impl Pledges {
+    pub(super) fn note(&mut self, granted: Granted, process: u32) {
+        self.forget(|known| (known.reader, known.writer) == (granted.reader, granted.writer));
+        if self.0.len() == MAX_PLEDGES
+            && let Some(index) = makes_room(self.0.iter().map(|pledge| pledge.process), process)
+            && let Some(Pledge { granted: Granted { reader, writer, .. }, .. }) =
+                self.0.remove(index)
+        {
+            tracing::warn!(
+                %reader, %writer,
+                "more than {MAX_PLEDGES} readers have not come back from an earlier daemon: this one \
+                 does not count what it lost if its publisher is killed"
+            );
+        }
+        self.0.push_back(Pledge { granted, process });
+    }
+
+    pub(super) fn forget(&mut self, which: impl Fn(&Granted) -> bool) {
+        self.0.retain(|pledge| !which(&pledge.granted));
+    }
+
+    /// Takes those of a session's publishers.
+    pub(super) fn take(&mut self, session: &SessionId) -> Vec<Granted> {
+        let (taken, rest): (Vec<_>, _) =
+            self.0.drain(..).partition(|pledge| pledge.granted.writer.is_of(session));
+        self.0 = rest.into();
+        taken.into_iter().map(|pledge| pledge.granted).collect()
+    }
+}
