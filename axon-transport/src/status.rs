@@ -55,6 +55,9 @@ pub struct Status {
     /// Packets exchanged with sessions since the daemon's start.
     #[serde(default)]
     pub traffic: TrafficStatus,
+    /// The daemon's file descriptors; absent from a daemon of an earlier version.
+    #[serde(default)]
+    pub descriptors: Option<DescriptorStatus>,
     /// Sessions on this host.
     pub sessions: Vec<SessionStatus>,
     /// Topics with an endpoint somewhere.
@@ -87,6 +90,18 @@ pub struct TrafficStatus {
     pub packets_out: u64,
     /// Bytes of those.
     pub bytes_out: u64,
+}
+
+/// The daemon's file descriptors, of which each session takes some.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
+pub struct DescriptorStatus {
+    /// Those that are open.
+    pub open: u64,
+    /// How many there may be (RLIMIT_NOFILE); absent where there is no limit.
+    pub limit: Option<u64>,
+    /// Sessions that were refused for want of descriptors since the daemon's start, each time that they came.
+    pub sessions_refused: u64,
 }
 
 /// A session.

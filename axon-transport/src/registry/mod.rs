@@ -108,11 +108,6 @@ impl<F: Clone> Registry<F> {
         self.sessions.iter().any(|(_, s)| s.role == SessionRole::Application)
     }
 
-    /// Whether the daemon holds `most` descriptors of a session's memory.
-    pub fn holds_as_many_as(&self, id: &SessionId, most: usize) -> bool {
-        self.sessions.get(id).is_some_and(|entry| entry.segments.len() >= most)
-    }
-
     /// A segment of a session's memory is not taken, since `there_are` as many as may be. The session
     /// goes on, and is told once until it gives another one up.
     pub fn refuse_segment(&mut self, id: &SessionId, there_are: &str) {

@@ -99,6 +99,11 @@ impl<F> SessionEntry<F> {
         self.outbox.len()
     }
 
+    /// Of how many sessions it holds memory.
+    pub fn holds_memory_of(&self) -> usize {
+        self.held.len()
+    }
+
     /// Its range, and the daemons of linked peers that it lists; `None` where ranges do not apply.
     pub(super) fn reach(&self) -> Option<EndpointRange> {
         let scope = self.scope.as_ref()?;

@@ -4,11 +4,11 @@ mod topics;
 
 use std::collections::BTreeMap;
 
-use axon_shm::ids::SessionId;
+use axon_shm::{ids::SessionId, internal::descriptors};
 use axon_transport::{
     config::{KeyMode, Security},
     internal::wire::session::{PROTOCOL, SessionRole},
-    status::{DiscoveryStatus, SessionStatus, Status},
+    status::{DescriptorStatus, DiscoveryStatus, SessionStatus, Status},
 };
 
 use self::topics::topics;
@@ -94,6 +94,7 @@ fn status(control: &Control) -> Status {
     status.gateway = control.gateway.clone();
     status.discovery = discovery(&control.wanted.borrow());
     status.traffic = control.traffic;
+    status.descriptors = Some(descriptors(control));
     status.sessions = sessions.collect();
     status.topics = topics(&control.registry, &control.lost.all(), &refused);
     status.links = control.links.values().cloned().collect();
@@ -114,6 +115,14 @@ fn without_details(status: &Status) -> Status {
     public.domain = status.domain;
     public.gateway = status.gateway.clone();
     public
+}
+
+fn descriptors(control: &Control) -> DescriptorStatus {
+    let mut shown = DescriptorStatus::default();
+    shown.open = descriptors::open();
+    shown.limit = descriptors::limit();
+    shown.sessions_refused = control.crowded_out;
+    shown
 }
 
 fn discovery(wanted: &Wanted) -> DiscoveryStatus {
