@@ -114,6 +114,12 @@ pub struct SessionStatus {
     pub name: String,
     /// `application` or `gateway`.
     pub role: String,
+    /// Its user, where that is another than the daemon's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub user: Option<u32>,
+    /// How the GIDs of its endpoints begin, in hexadecimal.
+    #[serde(default)]
+    pub gids: String,
     /// How many endpoints it has.
     pub endpoints: usize,
     /// Control packets that wait for it.
@@ -316,6 +322,9 @@ pub struct LinkStatus {
     pub cipher: String,
     /// How and as whom the peer proved itself.
     pub authenticated_as: String,
+    /// The peer as access rules name it; empty from a daemon of an earlier version.
+    #[serde(default)]
+    pub party: String,
     /// When it was established; milliseconds since the Unix epoch in JSON, or 0.
     #[serde(rename = "since_unix_ms", with = "times::optional_unix_millis")]
     pub since: Option<SystemTime>,

@@ -4,7 +4,10 @@ mod topics;
 
 use std::collections::BTreeMap;
 
-use axon_shm::{ids::SessionId, internal::descriptors};
+use axon_shm::{
+    ids::{Gid, SessionId},
+    internal::descriptors,
+};
 use axon_transport::{
     config::{KeyMode, Security},
     internal::wire::session::{PROTOCOL, SessionRole},
@@ -14,6 +17,9 @@ use axon_transport::{
 use self::topics::topics;
 use super::plane::Control;
 use crate::discovery::Wanted;
+
+/// Characters of a GID in hexadecimal that its session decides.
+const GID_PREFIX: usize = 24;
 
 /// Answers a session that asks for the status. One that asks again before it has taken the
 /// answer gets the same one from its beginning.
@@ -54,8 +60,10 @@ fn status(control: &Control) -> Status {
         }
     };
     let sessions = control.registry.sessions().filter(|(_, s)| s.role != SessionRole::Tool);
-    let sessions = sessions.map(|(_, s)| {
+    let sessions = sessions.map(|(id, s)| {
         let mut session = SessionStatus::default();
+        session.user = s.user;
+        session.gids = Gid::new(*id, 0).to_string()[..GID_PREFIX].to_owned();
         session.pid = s.pid;
         session.name = s.name.clone();
         session.role =
