@@ -146,6 +146,12 @@ fn all_that_it_saw_goes_on_under_the_rules_that_it_writes_and_nothing_else() {
     let (other, heard) = (publisher(&there, "/other"), subscription(&here, "/other"));
     eventually("one more topic is denied", || hosts.denied("publish /other (the peer's)"));
     assert!(other.matched().is_empty() && heard.matched().is_empty());
+    // The process that waits for what is denied says why.
+    let _secret = publisher(&here, "/secret");
+    let mut echo = Running::start(hosts.base.axon(&["echo", "/secret", "--type", "test/Bytes"]));
+    let said = BufReader::new(echo.0.stderr.take().expect("standard error"));
+    let says = |line: &str| line.contains("/secret") && line.contains("by the peer: denied");
+    assert!(said.lines().any(|line| says(&line.expect("text"))), "it ended");
     // A new pair of what was seen is made.
     flows(&commands.0, &subscription(&here, "/cmd_vel"));
 

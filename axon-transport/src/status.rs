@@ -209,18 +209,18 @@ pub struct TopicStatus {
     #[serde(default)]
     pub out_of_range: Vec<OutOfRangeStatus>,
     /// Endpoints on this host that match some on another host, and to or from which nothing flows since a route is
-    /// refused: up to 64.
+    /// refused, and endpoints that this daemon does not take: up to 64.
     #[serde(default)]
     pub refused: Vec<RefusedRouteStatus>,
 }
 
-/// An endpoint that waits for a route which one of two hosts refuses.
+/// An endpoint that waits for a route which one of two hosts refuses, or that is refused itself.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct RefusedRouteStatus {
     /// Its GID.
     pub endpoint: String,
-    /// The other host, as it calls itself.
+    /// The other host, as it calls itself; empty where this daemon does not take the endpoint.
     pub host: String,
     /// Which host refuses it, and why.
     pub reason: String,

@@ -93,7 +93,7 @@ fn render(status: &Status) -> String {
     section(&mut out, "Topics", "none", topics(status));
     section(&mut out, "Out of range", "no pair", out_of_range(status));
     if status.topics.iter().any(|topic| !topic.refused.is_empty()) {
-        section(&mut out, "Waiting for a refused route", "none", refused(status));
+        section(&mut out, "Refused, or waiting for a refused route", "none", refused(status));
     }
     section(&mut out, "Sessions", "none", sessions(status));
     section(&mut out, "Refusals", "nobody was refused", refusals(status));
@@ -343,7 +343,7 @@ fn refused(status: &Status) -> TextTable {
             table.row([
                 topic.topic.clone(),
                 waiting.endpoint.clone(),
-                waiting.host.clone(),
+                if waiting.host.is_empty() { "this host" } else { &waiting.host }.to_owned(),
                 waiting.reason.clone(),
             ]);
         }

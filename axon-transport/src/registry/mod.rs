@@ -103,6 +103,11 @@ impl<F: Clone> Registry<F> {
         self.sessions.iter().filter(|(_, s)| s.relay.is_some()).count()
     }
 
+    /// Whether a session is told everything anew: what is pushed to it now is dropped.
+    pub fn is_told_anew(&self, id: &SessionId) -> bool {
+        self.sessions.is_told_anew(id)
+    }
+
     /// Whether there is an application's session.
     pub fn is_needed(&self) -> bool {
         self.sessions.iter().any(|(_, s)| s.role == SessionRole::Application)

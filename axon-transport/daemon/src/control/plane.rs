@@ -26,7 +26,9 @@ use axon_transport::{
 };
 use tokio::sync::{Notify, watch};
 
-use super::{admission::Admission, losses::Losses, room::Spare, turns::Turns};
+use super::{
+    admission::Admission, losses::Losses, report::waiting::Told, room::Spare, turns::Turns,
+};
 use crate::{
     bridge::{RefusedRoute, ToControl},
     discovery::Wanted,
@@ -46,6 +48,8 @@ pub(super) struct Control {
     pub(super) links: BTreeMap<String, LinkStatus>,
     /// Routes that do not cross these links.
     pub(super) refused_routes: BTreeMap<String, Vec<RefusedRoute>>,
+    /// The sessions that were told of them.
+    told: Told,
     pub(super) refusals: VecDeque<RefusalStatus>,
     /// Descriptors for callers that are refused for want of any.
     pub(super) spare: Rc<Spare>,
@@ -99,6 +103,7 @@ impl Control {
             registry,
             links: BTreeMap::new(),
             refused_routes: BTreeMap::new(),
+            told: Told::default(),
             refusals: VecDeque::new(),
             spare: Rc::new(spare),
             crowded_out: 0,
@@ -251,6 +256,7 @@ impl Control {
                 if let (Some(daemon), Ok(address)) = (daemon, address) {
                     self.linked_at(daemon, address.ip());
                 }
+                self.told.tell(&mut self.registry, &status.peer, &status.host, &refused);
                 self.refused_routes.insert(status.peer.clone(), refused);
                 self.links.insert(status.peer.clone(), *status);
             }
@@ -261,6 +267,7 @@ impl Control {
             }
             ToControl::LinkDown { daemon, reason } => {
                 tracing::info!(%daemon, reason, "link down");
+                self.told.forget(&daemon.to_string());
                 self.links.remove(&daemon.to_string());
                 self.refused_routes.remove(&daemon.to_string());
                 self.registry.remote_gone(&daemon);

@@ -29,7 +29,7 @@ use super::{
 };
 use crate::{
     config::DiscoveryRange,
-    graph::{EndpointRange, RangeToHost, Scope},
+    graph::{Endpoint, EndpointRange, RangeToHost, Scope},
     ids::{DaemonId, Gid, SessionId},
     wire::session::{
         Granted, MAX_DESCRIPTORS, Message, Pair, Refused, Segment, SegmentName, SegmentOpened,
@@ -66,6 +66,8 @@ pub struct SessionEntry<F> {
     pub(super) held: HeldMemory,
     /// An endpoint of its was refused.
     pub(super) refused: bool,
+    /// The first of its endpoints that were refused, and why.
+    pub(super) refused_endpoints: BTreeMap<Gid, (Endpoint, String)>,
 }
 
 impl<F> SessionEntry<F> {
@@ -91,12 +93,18 @@ impl<F> SessionEntry<F> {
             outbox: Outbox::new(role != SessionRole::Tool),
             held: HeldMemory::default(),
             refused: false,
+            refused_endpoints: BTreeMap::new(),
         }
     }
 
     /// Packets that wait for it.
     pub fn queued(&self) -> usize {
         self.outbox.len()
+    }
+
+    /// The first of its endpoints that were refused, and why.
+    pub fn refused_endpoints(&self) -> impl Iterator<Item = (&Endpoint, &str)> {
+        self.refused_endpoints.values().map(|(endpoint, why)| (endpoint, &**why))
     }
 
     /// Of how many sessions it holds memory.

@@ -1,6 +1,7 @@
 //! Builds the daemon's [`Status`] from the state of the control plane.
 
 mod topics;
+pub(super) mod waiting;
 
 use std::collections::BTreeMap;
 
