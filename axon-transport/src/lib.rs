@@ -34,7 +34,8 @@ pub mod internal {
     /// The names that ROS 2 gives to the parts of actions and to the services of parameters.
     pub mod access {
         pub use crate::access::ros::{
-            ACTION_SERVICES, ACTION_TOPICS, PARAMETER_EVENTS, PARAMETER_SERVICES,
+            ACTION_SERVICES, ACTION_TOPICS, LIFECYCLE_SERVICES, LIFECYCLE_TOPIC, PARAMETER_EVENTS,
+            PARAMETER_SERVICES,
         };
     }
     /// What `include/axon.h` declares, for crates that make libraries of it.

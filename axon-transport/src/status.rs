@@ -58,6 +58,9 @@ pub struct Status {
     /// Packets exchanged with sessions since the daemon's start.
     #[serde(default)]
     pub traffic: TrafficStatus,
+    /// The daemon's file descriptors; absent from a daemon of an earlier version.
+    #[serde(default)]
+    pub descriptors: Option<DescriptorStatus>,
     /// Sessions on this host.
     pub sessions: Vec<SessionStatus>,
     /// Topics with an endpoint somewhere.
@@ -92,6 +95,18 @@ pub struct TrafficStatus {
     pub bytes_out: u64,
 }
 
+/// The daemon's file descriptors, of which each session takes some.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
+pub struct DescriptorStatus {
+    /// Those that are open.
+    pub open: u64,
+    /// How many there may be (RLIMIT_NOFILE); absent where there is no limit.
+    pub limit: Option<u64>,
+    /// Sessions that were refused for want of descriptors since the daemon's start, each time that they came.
+    pub sessions_refused: u64,
+}
+
 /// A session.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[non_exhaustive]
@@ -102,6 +117,12 @@ pub struct SessionStatus {
     pub name: String,
     /// `application` or `gateway`.
     pub role: String,
+    /// Its user, where that is another than the daemon's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub user: Option<u32>,
+    /// How the GIDs of its endpoints begin, in hexadecimal.
+    #[serde(default)]
+    pub gids: String,
     /// How many endpoints it has.
     pub endpoints: usize,
     /// Control packets that wait for it.
@@ -191,18 +212,18 @@ pub struct TopicStatus {
     #[serde(default)]
     pub out_of_range: Vec<OutOfRangeStatus>,
     /// Endpoints on this host that match some on another host, and to or from which nothing flows since a route is
-    /// refused: up to 64.
+    /// refused, and endpoints that this daemon does not take: up to 64.
     #[serde(default)]
     pub refused: Vec<RefusedRouteStatus>,
 }
 
-/// An endpoint that waits for a route which one of two hosts refuses.
+/// An endpoint that waits for a route which one of two hosts refuses, or that is refused itself.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct RefusedRouteStatus {
     /// Its GID.
     pub endpoint: String,
-    /// The other host, as it calls itself.
+    /// The other host, as it calls itself; empty where this daemon does not take the endpoint.
     pub host: String,
     /// Which host refuses it, and why.
     pub reason: String,
@@ -304,6 +325,9 @@ pub struct LinkStatus {
     pub cipher: String,
     /// How and as whom the peer proved itself.
     pub authenticated_as: String,
+    /// The peer as access rules name it; empty from a daemon of an earlier version.
+    #[serde(default)]
+    pub party: String,
     /// When it was established; milliseconds since the Unix epoch in JSON, or 0.
     #[serde(rename = "since_unix_ms", with = "times::optional_unix_millis")]
     pub since: Option<SystemTime>,

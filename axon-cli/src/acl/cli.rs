@@ -1,6 +1,6 @@
 //! What can be typed after `axon acl`.
 
-use std::path::PathBuf;
+use std::{path::PathBuf, time::Duration};
 
 use axon_transport::{
     access::Verb,
@@ -20,6 +20,7 @@ A robot that only its base station may drive, in access.toml:
   axon acl test access.toml                the [[expect]] in it
   export AXON_ACCESS_FILE=$PWD/access.toml
   axon acl import permissions.xml --peer base > access.toml     from SROS2
+  axon acl learn --for 10m > access.toml                         from what others do here
   axon reload                              a daemon that runs takes the rules as they are now";
 
 /// `axon acl`.
@@ -34,6 +35,9 @@ pub(crate) enum Acl {
     /// Write the rules that say what SROS2's permissions or policy of an enclave say
     #[command(after_help = IMPORT_HELP)]
     Import(Import),
+    /// Watch what other hosts and users do here, and write the rules that let them go on
+    #[command(after_help = LEARN_HELP)]
+    Learn(Learn),
 }
 
 const CHECK_HELP: &str = "\
@@ -149,4 +153,63 @@ pub(crate) struct Import {
     /// The enclave whose rules are taken, where the document has more than one
     #[arg(long, value_name = "PATH")]
     pub(crate) enclave: Option<String>,
+}
+
+const LEARN_HELP: &str = "\
+A use counts where an endpoint of this host is at the other end, at the same time. Each host is named \
+as it proves itself, or by its address where it proves nothing. What rules in force deny stays denied, \
+and is a comment. The rules end with [[expect]] for each use, which axon acl test compares.
+
+Examples:
+  axon acl learn --for 10m --output access.toml
+  axon acl learn > access.toml             until Ctrl-C
+  axon acl test access.toml
+
+Exit status: 0 when rules were written, 1 when nobody did anything, or there is no daemon.";
+
+/// `axon acl learn`.
+#[derive(Args, Debug)]
+pub(crate) struct Learn {
+    /// How long to watch, as in 90s, 10m or 2h [default: until Ctrl-C]
+    #[arg(long = "for", value_name = "TIME", value_parser = duration)]
+    pub(crate) watch: Option<Duration>,
+    /// The file to write, which must not exist [default: standard output]
+    #[arg(long, value_name = "FILE")]
+    pub(crate) output: Option<PathBuf>,
+    /// Replace FILE
+    #[arg(long, requires = "output")]
+    pub(crate) force: bool,
+    /// Let each of them see the whole graph of this host, as ros2 node list needs
+    #[arg(long)]
+    pub(crate) see: bool,
+}
+
+/// A time with a unit.
+fn duration(text: &str) -> Result<Duration, String> {
+    let unit = text.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(text.len());
+    let (number, unit) = text.split_at(unit);
+    let factor = match unit {
+        "ms" => 0.001,
+        "s" => 1.0,
+        "m" => 60.0,
+        "h" => 3600.0,
+        _ => return Err("a number and ms, s, m or h".to_owned()),
+    };
+    let seconds = number.parse::<f64>().map_err(|error| error.to_string())? * factor;
+    Duration::try_from_secs_f64(seconds).map_err(|error| error.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_have_a_unit() {
+        for (text, seconds) in [("90s", 90.0), ("10m", 600.0), ("1.5h", 5400.0), ("250ms", 0.25)] {
+            assert_eq!(duration(text), Ok(Duration::from_secs_f64(seconds)));
+        }
+        for text in ["", "5", "s", "-5s", "5 s", "1d", "1e99h", "1.2.3s"] {
+            assert!(duration(text).is_err(), "{text}");
+        }
+    }
 }

@@ -3,6 +3,7 @@
 mod check;
 pub(crate) mod cli;
 mod import;
+mod learn;
 mod test;
 mod write;
 
@@ -22,6 +23,7 @@ pub(crate) fn run(args: &Acl) -> Result<ExitCode, CliError> {
         Acl::Check(args) => check::run(args),
         Acl::Test(args) => test::run(args),
         Acl::Import(args) => import::run(args),
+        Acl::Learn(args) => learn::run(args),
     }
 }
 

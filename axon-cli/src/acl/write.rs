@@ -4,7 +4,10 @@ use std::{collections::BTreeSet, fmt::Write as _};
 
 use axon_transport::{
     access::{AccessRules, TopicPattern},
-    internal::access::{ACTION_SERVICES, ACTION_TOPICS, PARAMETER_EVENTS, PARAMETER_SERVICES},
+    internal::access::{
+        ACTION_SERVICES, ACTION_TOPICS, LIFECYCLE_SERVICES, LIFECYCLE_TOPIC, PARAMETER_EVENTS,
+        PARAMETER_SERVICES,
+    },
 };
 
 /// Patterns of names, sorted.
@@ -20,6 +23,7 @@ pub(super) struct Uses {
     pub(super) act: Names,
     pub(super) see: Names,
     pub(super) parameters: Names,
+    pub(super) lifecycle: Names,
 }
 
 impl Uses {
@@ -59,6 +63,17 @@ impl Uses {
         }
     }
 
+    /// Writes a lifecycle node whose services are all called, and whose topic is subscribed to, as one name.
+    pub(super) fn collapse_lifecycle(&mut self) {
+        for node in complete(&self.call, &LIFECYCLE_SERVICES) {
+            if has_all(&self.subscribe, &node, &[LIFECYCLE_TOPIC]) {
+                remove_all(&mut self.call, &node, &LIFECYCLE_SERVICES);
+                remove_all(&mut self.subscribe, &node, &[LIFECYCLE_TOPIC]);
+                self.lifecycle.insert(node);
+            }
+        }
+    }
+
     /// The rule as TOML. `header` is `allow` or `deny`.
     pub(super) fn toml(&self, header: &str, peer: &str) -> String {
         let mut text = format!("[[{header}]]\npeer = {}\n", quoted(peer));
@@ -69,6 +84,7 @@ impl Uses {
             ("call", &self.call),
             ("act", &self.act),
             ("parameters", &self.parameters),
+            ("lifecycle", &self.lifecycle),
             ("see", &self.see),
         ] {
             let names: Vec<_> = names.iter().map(|name| quoted(name)).collect();
@@ -160,6 +176,19 @@ mod tests {
             (uses.parameters, uses.call, uses.subscribe.len()),
             (names(&["/arm"]), names(&[]), 0)
         );
+    }
+
+    #[test]
+    fn lifecycle_nodes_are_one_name_where_all_of_their_services_are_called() {
+        let (call, subscribe) =
+            (parts("/arm", &LIFECYCLE_SERVICES), parts("/arm", &[LIFECYCLE_TOPIC]));
+        let mut uses = Uses { call, subscribe, ..Uses::default() };
+        uses.collapse_lifecycle();
+        assert_eq!(uses, Uses { lifecycle: names(&["/arm"]), ..Uses::default() });
+        let some = Uses { call: parts("/arm", &LIFECYCLE_SERVICES[1..]), ..Uses::default() };
+        let mut uses = Uses { call: some.call.clone(), ..Uses::default() };
+        uses.collapse_lifecycle();
+        assert_eq!(uses, some);
     }
 
     #[test]

@@ -75,6 +75,7 @@ fn render(status: &Status) -> String {
             ("keeps files in", status.runtime_dir.clone().unwrap_or_else(|| "nothing".to_owned())),
             ("discovery", discovery(status)),
             ("gateway", format!("{}, UDP port {port}", status.gateway)),
+            ("descriptors", descriptors(status)),
         ],
     );
     section(&mut out, "Settings", "none", settings(status));
@@ -95,7 +96,7 @@ fn render(status: &Status) -> String {
     section(&mut out, "Topics", "none", topics(status));
     section(&mut out, "Out of range", "no pair", out_of_range(status));
     if status.topics.iter().any(|topic| !topic.refused.is_empty()) {
-        section(&mut out, "Waiting for a refused route", "none", refused(status));
+        section(&mut out, "Refused, or waiting for a refused route", "none", refused(status));
     }
     section(&mut out, "Sessions", "none", sessions(status));
     section(&mut out, "Refusals", "nobody was refused", refusals(status));
@@ -107,6 +108,17 @@ fn mode(status: &Status) -> String {
     let sae = status.sae.as_ref().map(|sae| format!(", SAE {sae}")).unwrap_or_default();
     let details: Vec<&str> = details.into_iter().flatten().collect();
     format!("{} ({}){sae}", status.mode, details.join(", "))
+}
+
+/// How many descriptors the daemon has of those that it may have.
+fn descriptors(status: &Status) -> String {
+    let Some(shown) = status.descriptors else { return "not told".to_owned() };
+    let limit = shown.limit.map_or_else(|| "any number".to_owned(), |limit| limit.to_string());
+    let refused = match shown.sessions_refused {
+        0 => String::new(),
+        times => format!("; sessions were refused for want of them {times} times (RLIMIT_NOFILE)"),
+    };
+    format!("{} open of {limit}{refused}", shown.open)
 }
 
 /// How far the daemon looks for other hosts, and for which by name.
@@ -356,7 +368,7 @@ fn refused(status: &Status) -> TextTable {
             table.row([
                 topic.topic.clone(),
                 waiting.endpoint.clone(),
-                waiting.host.clone(),
+                if waiting.host.is_empty() { "this host" } else { &waiting.host }.to_owned(),
                 waiting.reason.clone(),
             ]);
         }

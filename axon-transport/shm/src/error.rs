@@ -2,6 +2,11 @@
 
 use std::{fmt, io};
 
+use rustix::{
+    io::Errno,
+    process::{Resource, getrlimit},
+};
+
 use crate::ids::{Gid, SessionId};
 
 /// A segment could not be made, checked or mapped.
@@ -18,7 +23,7 @@ use crate::ids::{Gid, SessionId};
 #[non_exhaustive]
 pub enum ShmError {
     /// A system call failed.
-    #[error("shared memory: {what}: {source}")]
+    #[error("shared memory: {what}: {source}{}", OwnLimit(source))]
     System {
         /// What was being done.
         what: &'static str,
@@ -92,9 +97,27 @@ pub enum ShmError {
     Forked,
 }
 
+/// What to do where the system says that this process has too many descriptors open; nothing otherwise.
+#[derive(Debug)]
+pub struct OwnLimit<'a>(pub &'a io::Error);
+
+impl fmt::Display for OwnLimit<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.0.raw_os_error() != Some(Errno::MFILE.raw_os_error()) {
+            return Ok(());
+        }
+        let limit = getrlimit(Resource::Nofile).current.unwrap_or_default();
+        write!(
+            f,
+            ": this process has all of its own {limit} file descriptors open; raise its RLIMIT_NOFILE (ulimit -n \
+             where it is started, LimitNOFILE= of its systemd unit)"
+        )
+    }
+}
+
 impl ShmError {
     #[doc(hidden)]
-    pub fn system(what: &'static str) -> impl FnOnce(rustix::io::Errno) -> Self {
+    pub fn system(what: &'static str) -> impl FnOnce(Errno) -> Self {
         move |errno| Self::System { what, source: errno.into() }
     }
 }

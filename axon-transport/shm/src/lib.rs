@@ -52,6 +52,7 @@ pub mod internal {
     pub use crate::{
         alloc::segments::{SegmentEvent, SegmentInfo},
         direct::connect::reencode_packet,
+        error::OwnLimit,
         memory::{
             locked::LockedPages,
             probe::{out_of_reach, probe},
@@ -92,8 +93,8 @@ pub mod internal {
     /// Descriptors that go from process to process.
     pub mod descriptors {
         pub use crate::os::descriptors::{
-            Packet, PassedFd, carries_descriptors, close_queue_is_full, is_scarce, is_short,
-            receive, share,
+            FEW, Packet, PassedFd, carries_descriptors, close_queue_is_full, is_clogged, is_scarce,
+            is_tight, limit, look, open, receive, receive_few, share,
         };
     }
 }

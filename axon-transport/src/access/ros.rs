@@ -19,7 +19,7 @@ pub const PARAMETER_SERVICES: [&str; 6] = [
 /// The topic on which nodes tell of changes.
 pub const PARAMETER_EVENTS: &str = "/parameter_events";
 /// Services of a lifecycle node, behind its name.
-const LIFECYCLE_SERVICES: [&str; 5] = [
+pub const LIFECYCLE_SERVICES: [&str; 5] = [
     "change_state",
     "get_available_states",
     "get_available_transitions",
@@ -27,7 +27,7 @@ const LIFECYCLE_SERVICES: [&str; 5] = [
     "get_transition_graph",
 ];
 /// The topic of a lifecycle node, behind its name.
-const LIFECYCLE_TOPIC: &str = "transition_event";
+pub const LIFECYCLE_TOPIC: &str = "transition_event";
 
 fn below<'a>(
     name: &'a TopicPattern,

@@ -81,6 +81,21 @@ fn the_pairs_that_a_session_makes_are_bounded_and_others_make_theirs() {
     let shown = registry.take_refused();
     assert!(matches!(&shown[..], [(of, why)] if *of == id(1) && why.contains("pairs")), "once");
 
+    // Both are shown where they would be, until they end or are taken.
+    let refused = |registry: &Registry<Label>| -> Vec<(Gid, String)> {
+        let all = registry.session(&id(1)).unwrap().refused_endpoints();
+        all.map(|(endpoint, why)| (endpoint.gid, why.to_owned())).collect()
+    };
+    let [first, second] = [64, 65].map(|number| Gid::new(id(1), number));
+    let why = "its session has 1024 pairs of publishers and subscriptions, and would have 32 more: the most are 1024";
+    assert_eq!(refused(&registry), [(first, why.to_owned()), (second, why.to_owned())]);
+    let gone = |gid| Message::EndpointGone(Gone { gid });
+    registry.handle_message(&id(1), gone(first), vec![]).unwrap();
+    assert_eq!(refused(&registry).len(), 1);
+    registry.handle_message(&id(1), gone(Gid::new(id(1), 63)), vec![]).unwrap();
+    announce(&mut registry, 1, 65, EndpointKind::Subscription);
+    assert_eq!((refused(&registry).len(), registry.pairs.len()), (0, MAX_PAIRS));
+
     announce(&mut registry, 2, 1, EndpointKind::Subscription);
     assert_eq!(registry.pairs.len(), MAX_PAIRS + 32);
     registry.handle_disconnect(&id(1));

@@ -5,8 +5,8 @@ use std::collections::BTreeSet;
 use axon_shm::internal::holds;
 
 use super::{
-    Registry, Violation, endpoints::LocalEndpoint, output::PAIRS_TOGETHER, relayed::MAX_REASON,
-    sessions::SessionEntry,
+    Registry, Violation, endpoints::LocalEndpoint, limits::MAX_REFUSED, output::PAIRS_TOGETHER,
+    relayed::MAX_REASON, sessions::SessionEntry,
 };
 use crate::{
     access::AccessRules,
@@ -212,20 +212,27 @@ impl<F: Clone> Registry<F> {
             return Ok(());
         }
         let refusal = if !endpoint.is_sane() {
-            Some("a name, type hash or depth out of bounds")
+            Some("a name, type hash or depth out of bounds".to_owned())
         } else if entry.endpoints.len() >= most_endpoints(entry.role) {
-            Some("too many endpoints in one session")
+            Some(format!("its session has {} endpoints already", entry.endpoints.len()))
         } else {
             let new = self.endpoints.prospective_pairs(&endpoint).len();
             self.pairs.refusal(id, new, entry.role == SessionRole::Gateway)
         };
         if let Some(why) = refusal {
-            let refused = Refused::of(&endpoint, why);
+            let refused = Refused::of(&endpoint, &why);
             self.sessions.note_refused(id, &refused.text);
+            if let Some(entry) = self.sessions.get_mut(id)
+                && entry.refused_endpoints.len() < MAX_REFUSED
+                && endpoint.is_sane()
+            {
+                entry.refused_endpoints.insert(gid, (endpoint, why));
+            }
             self.push(id, &Message::Refused(refused), Vec::new());
             return Ok(());
         }
         if let Some(entry) = self.sessions.get_mut(id) {
+            entry.refused_endpoints.remove(&gid);
             entry.endpoints.insert(gid);
         }
         let denial = self.denial(id, role, &endpoint);
@@ -247,6 +254,9 @@ impl<F: Clone> Registry<F> {
     fn gone(&mut self, id: &SessionId, gid: Gid) -> Result<(), Violation> {
         if gid.is_of(id) {
             self.sessions.forget_pledges(&gid);
+        }
+        if let Some(entry) = self.sessions.get_mut(id) {
+            entry.refused_endpoints.remove(&gid);
         }
         match self.endpoints.get(&gid) {
             Some(local) if local.session == *id => {

@@ -13,6 +13,8 @@ pub const MAX_SEGMENTS: usize = if cfg!(test) { 256 } else { 1024 };
 pub const MAX_PAIRS: usize = if cfg!(test) { 1 << 10 } else { 1 << 20 };
 /// Pairs of all sessions.
 pub const MAX_ALL_PAIRS: usize = if cfg!(test) { 1 << 18 } else { 1 << 22 };
+/// Refused endpoints of one session that are remembered for status.
+pub(super) const MAX_REFUSED: usize = 64;
 /// Bytes of the status in one packet.
 pub(super) const STATUS_SLICE: usize = 24 * 1024;
 /// Sessions of one daemon.

@@ -103,14 +103,14 @@ impl<F: Clone> Registry<F> {
         self.sessions.iter().filter(|(_, s)| s.relay.is_some()).count()
     }
 
+    /// Whether a session is told everything anew: what is pushed to it now is dropped.
+    pub fn is_told_anew(&self, id: &SessionId) -> bool {
+        self.sessions.is_told_anew(id)
+    }
+
     /// Whether there is an application's session.
     pub fn is_needed(&self) -> bool {
         self.sessions.iter().any(|(_, s)| s.role == SessionRole::Application)
-    }
-
-    /// Whether the daemon holds `most` descriptors of a session's memory.
-    pub fn holds_as_many_as(&self, id: &SessionId, most: usize) -> bool {
-        self.sessions.get(id).is_some_and(|entry| entry.segments.len() >= most)
     }
 
     /// A segment of a session's memory is not taken, since `there_are` as many as may be. The session

@@ -45,17 +45,19 @@ impl Pairs {
 
     /// Why a session's announcement may not make so many pairs, if it may not. The gateway's stand-ins are bounded by
     /// its links, and not here.
-    pub(super) fn refusal(
-        &self,
-        by: &SessionId,
-        new: usize,
-        is_gateway: bool,
-    ) -> Option<&'static str> {
+    pub(super) fn refusal(&self, by: &SessionId, new: usize, is_gateway: bool) -> Option<String> {
         let made = self.made.get(by).copied().unwrap_or_default();
         if !is_gateway && made + new > MAX_PAIRS {
-            Some("its session would have too many pairs of publishers and subscriptions")
+            Some(format!(
+                "its session has {made} pairs of publishers and subscriptions, and would have {new} more: the most \
+                 are {MAX_PAIRS}"
+            ))
         } else if self.all.len() + new > MAX_ALL_PAIRS {
-            Some("there would be too many pairs of publishers and subscriptions")
+            let all = self.all.len();
+            Some(format!(
+                "all sessions have {all} pairs of publishers and subscriptions, and there would be {new} more: the \
+                 most are {MAX_ALL_PAIRS}"
+            ))
         } else {
             None
         }

@@ -2,7 +2,7 @@
 
 use std::{fmt, path::PathBuf};
 
-use axon_shm::ShmError;
+use axon_shm::{ShmError, internal::OwnLimit};
 
 use super::daemon::address::AddressError;
 use crate::{config::ConfigError, ids::SessionId, wire::session::CodecError};
@@ -207,7 +207,7 @@ pub enum SessionError {
     #[error(transparent)]
     Memory(#[from] ShmError),
     /// The system refused.
-    #[error("{what}: {source}")]
+    #[error("{what}: {source}{}", OwnLimit(source))]
     System {
         /// What was tried.
         what: &'static str,

@@ -22,6 +22,7 @@ use tokio::{io::unix::AsyncFd, sync::Notify};
 use super::{
     plane::Control,
     report::send_status,
+    room::{Room, Spare},
     turns::{PART, Turn},
 };
 
@@ -38,7 +39,7 @@ pub(super) async fn converse(
     id: SessionId,
     bell: &Rc<Notify>,
     turn: &Turn,
-    death: Option<&AsyncFd<PassedFd>>,
+    death: Option<&AsyncFd<Arc<PassedFd>>>,
 ) -> String {
     let mut buffer = Vec::new();
     loop {
@@ -181,12 +182,27 @@ fn send_packets(
     Ok(Sent::All)
 }
 
-/// Receives one packet, unless it has descriptors for which there may be no room.
-pub(super) fn receive(socket: &PassedFd, buffer: &mut Vec<u8>) -> Result<Received, SocketError> {
-    if descriptors::is_short() && descriptors::carries_descriptors(socket) {
+/// Receives one packet. Where descriptors are short, the spare ones make room for those that come with it, so that the
+/// daemon can refuse what the packet asks for.
+pub(super) fn receive(
+    spare: &Spare,
+    socket: &PassedFd,
+    buffer: &mut Vec<u8>,
+) -> Result<Received, SocketError> {
+    let (clogged, tight) = (descriptors::is_clogged(), descriptors::is_tight());
+    if !(clogged || tight) || !descriptors::carries_descriptors(socket) {
+        return socket::receive(socket, buffer);
+    }
+    if clogged {
         return Err(SocketError::NoDescriptors);
     }
-    socket::receive(socket, buffer)
+    match socket::receive_few(socket, buffer) {
+        Err(SocketError::NoDescriptors) => {
+            let _lent = spare.lend();
+            socket::receive_few(socket, buffer)
+        }
+        received => received,
+    }
 }
 
 /// Takes packets for as long as a turn is, or until as many as `unread` wait for the session to read them;
@@ -206,7 +222,7 @@ fn receive_some(
     let (mut outcome, begin) = (Ok(false), Instant::now());
     let queued = |c: &Control| c.registry.session(id).map_or(0, SessionEntry::queued);
     while begin.elapsed() < PART && queued(control) < unread {
-        match receive(socket.get_ref(), buffer) {
+        match receive(&control.spare, socket.get_ref(), buffer) {
             Ok(Received { message: Message::StatusRequest, .. }) => send_status(control, id),
             Ok(Received { message: Message::Reload, .. }) => control.ask_reload(id),
             // The one thing that is handed over after HELLO, and the only one that the daemon reads:
@@ -216,22 +232,16 @@ fn receive_some(
                 outcome = Err("it sent a descriptor that is no memfd".into());
                 break;
             }
-            // Without a segment it goes on; without its connection it would have to come back, with
-            // all that it has.
-            Ok(Received { message: Message::Segment(_), .. })
-                if control.registry.holds_as_many_as(id, descriptors::share()) =>
-            {
-                let share = descriptors::share();
-                control.registry.refuse_segment(
-                    id,
-                    &format!(
-                        "the daemon holds {share} descriptors of it, one session's share of its \
-                         RLIMIT_NOFILE (raise that: ulimit -n, LimitNOFILE)"
-                    ),
-                );
-            }
             Ok(Received { message, descriptors }) => {
                 control.traffic.packets_in += 1;
+                // Without a segment it goes on; without its connection it would have to come back, with all
+                // that it has.
+                if matches!(message, Message::Segment(_))
+                    && let Some(why) = no_room_for_segment(control, id)
+                {
+                    control.registry.refuse_segment(id, &why);
+                    continue;
+                }
                 let descriptors = descriptors.into_iter().map(Arc::new).collect();
                 if let Err(violation) = control.registry.handle_message(id, message, descriptors) {
                     tracing::warn!(session = %id, %violation, "a session was disconnected");
@@ -256,7 +266,13 @@ fn receive_some(
     outcome
 }
 
-async fn ended(death: Option<&AsyncFd<PassedFd>>) {
+/// Why the daemon has no descriptor for another segment of a session, if so.
+fn no_room_for_segment(control: &Control, id: &SessionId) -> Option<String> {
+    let pid = control.registry.session(id)?.pid;
+    Room::of(&control.registry, pid)?.refuses_segment()
+}
+
+async fn ended(death: Option<&AsyncFd<Arc<PassedFd>>>) {
     match death {
         Some(pidfd) => drop(pidfd.readable().await),
         None => std::future::pending().await,

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use axon_shm::internal::descriptors::{self, PassedFd};
 use axon_transport::internal::{
     OWNER, SessionKey,
-    session::daemon::socket::{Received, SocketError},
+    session::daemon::socket::{self, Received, SocketError},
     wire::session::{Hello, Message, Refused},
 };
 use tokio::io::unix::AsyncFd;
@@ -15,6 +15,7 @@ use zeroize::Zeroize;
 use super::{
     admission::unshared,
     conversation::{receive, say},
+    room::Spare,
 };
 
 /// Messages of unknown types that may come before HELLO.
@@ -26,6 +27,8 @@ pub(super) struct First {
     pub(super) descriptors: Vec<PassedFd>,
     /// What came before: the key that the session's id is made of.
     pub(super) key: Option<Arc<SessionKey>>,
+    /// Its descriptors were left where they are, since there is no room for them.
+    pub(super) is_crowded: bool,
 }
 
 impl First {
@@ -41,16 +44,27 @@ impl First {
     }
 }
 
-/// Waits for HELLO; `None` when something else comes.
-pub(super) async fn first(socket: &AsyncFd<PassedFd>) -> Option<First> {
+/// Waits for HELLO; `None` when something else comes. Where descriptors are short and there is no room for another
+/// session, those of HELLO stay in the socket: its sender could make their closing last.
+pub(super) async fn first(
+    spare: &Spare,
+    socket: &AsyncFd<PassedFd>,
+    has_room: impl Fn() -> bool,
+) -> Option<First> {
     let mut buffer = Vec::new();
     let mut unknown = 0;
     let mut key = None;
     loop {
         let mut ready = socket.readable().await.ok()?;
-        match receive(socket.get_ref(), &mut buffer) {
+        let fd = socket.get_ref();
+        if descriptors::is_tight() && descriptors::carries_descriptors(fd) && !has_room() {
+            let Ok(Message::Hello(hello)) = socket::look(fd, &mut buffer) else { return None };
+            let descriptors = Vec::new();
+            return Some(First { hello, descriptors, key, is_crowded: true });
+        }
+        match receive(spare, fd, &mut buffer) {
             Ok(Received { message: Message::Hello(hello), descriptors }) => {
-                return Some(First { hello, descriptors, key });
+                return Some(First { hello, descriptors, key, is_crowded: false });
             }
             Ok(Received { message: Message::Unknown(OWNER), descriptors })
                 if key.is_none() && descriptors.is_empty() =>
@@ -68,7 +82,9 @@ pub(super) async fn first(socket: &AsyncFd<PassedFd>) -> Option<First> {
             }
             Err(SocketError::NotReady) => ready.clear_ready(),
             // Not for want of room here: somebody keeps them back.
-            Err(SocketError::NoDescriptors) if !descriptors::is_short() => {
+            Err(SocketError::NoDescriptors)
+                if !descriptors::is_clogged() && spare.can_keep_caller() =>
+            {
                 let text = "its descriptors do not arrive".to_owned();
                 say(socket, Message::Refused(*unshared(text)), &[]);
                 return None;

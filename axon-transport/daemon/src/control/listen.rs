@@ -5,7 +5,7 @@ use std::{
     os::fd::{AsFd, BorrowedFd, OwnedFd},
     rc::Rc,
     sync::Arc,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use axon_shm::{
@@ -21,27 +21,36 @@ use axon_transport::{
     internal::{
         SessionKey,
         graph::Scope,
+        log_limit::LogLimit,
         registry::{MAX_OF_PROCESS, RelayCounters, SessionEntry},
         text,
-        wire::session::{Hello, Message, PROTOCOL, Refused, Welcome},
+        wire::session::{Hello, Message, PROTOCOL, Refused, SessionRole, Welcome},
     },
 };
-use rustix::net::{AddressFamily, SocketFlags, SocketType, accept_with, socketpair};
+use rustix::{
+    io::Errno,
+    net::{AddressFamily, SocketFlags, SocketType, accept_with, socketpair},
+};
 use tokio::{io::unix::AsyncFd, sync::Notify, task::spawn_local, time::timeout};
 
 use super::{
     conversation::{converse, say},
     first::{First, first},
-    pending::{PendingConnections, Stranger},
+    pending::{MOST, MOST_WHERE_SHORT, PendingConnections, Stranger},
     plane::Control,
+    room::Room,
     turns::Turn,
 };
-use crate::{control::relayed::DaemonRelay, watch::watch};
+use crate::{
+    control::relayed::DaemonRelay,
+    watch::{watch, watch_shared},
+};
 
 /// How long a connection may take to say HELLO.
 const HELLO: Duration = Duration::from_secs(5);
 /// Between attempts when no connection can be accepted.
 const PAUSE: Duration = Duration::from_millis(50);
+
 /// Accepts sessions for as long as it is polled.
 pub(super) async fn accept(control: Rc<RefCell<Control>>, listeners: Vec<OwnedFd>) {
     let strangers = PendingConnections::default();
@@ -64,32 +73,44 @@ async fn accept_at(
         Ok(listener) => listener,
         Err(error) => return tracing::error!(%error, "the session socket cannot be watched"),
     };
-    let mut full = false;
+    let spare = Rc::clone(&control.borrow().spare);
+    let (mut full, failures) = (false, LogLimit::default());
     loop {
         let Ok(mut ready) = listener.readable().await else { return };
-        if descriptors::is_short() || descriptors::close_queue_is_full() {
+        if descriptors::close_queue_is_full() {
             // Those that have a session keep it.
             if !std::mem::replace(&mut full, true) {
-                tracing::error!("too many descriptors are open: no more sessions are accepted");
+                tracing::error!("too many connections wait to be closed: no more are accepted");
             }
             tokio::time::sleep(PAUSE).await;
             continue;
         }
         full = false;
         let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
-        let accepted = ready.try_io(|l| Ok(accept_with(l.get_ref(), flags)?));
+        let accept = |l: &AsyncFd<PassedFd>| match accept_with(l.get_ref(), flags) {
+            // The caller is told why it is refused.
+            Err(Errno::MFILE | Errno::NFILE) => {
+                let _lent = spare.lend();
+                accept_with(l.get_ref(), flags)
+            }
+            accepted => accepted,
+        };
+        let accepted = ready.try_io(|l| Ok(accept(l)?));
         match accepted {
             Ok(Ok(socket)) => {
                 let socket = PassedFd::connection(socket);
                 let pid = peer_process(&socket).map_or(0, |peer| peer.pid);
-                let stranger = strangers.add(pid);
+                let most = if descriptors::is_tight() { MOST_WHERE_SHORT } else { MOST };
+                let stranger = strangers.add(pid, most);
                 spawn_local(serve(control.clone(), socket, InternalPeer::No, Some(stranger)));
                 // Those that were served meanwhile go on.
                 tokio::task::yield_now().await;
             }
             Ok(Err(error)) => {
                 // Out of descriptors, or the caller has gone: neither ends the daemon.
-                tracing::warn!(%error, "a session could not be accepted");
+                if let Some(times) = failures.count(Instant::now()) {
+                    tracing::warn!(%error, times, "a session could not be accepted");
+                }
                 tokio::time::sleep(PAUSE).await;
             }
             Err(_not_ready) => {}
@@ -123,6 +144,11 @@ pub(super) async fn serve(
         return;
     }
     let Ok(socket) = watch(socket.trusted()) else { return };
+    let spare = Rc::clone(&control.borrow().spare);
+    let has_room = || {
+        let control = control.borrow();
+        no_room(&control, SessionRole::Application, peer.pid, false).is_none()
+    };
     let replaced = async {
         match &stranger {
             Some(stranger) => stranger.replaced().await,
@@ -130,7 +156,7 @@ pub(super) async fn serve(
         }
     };
     let first = tokio::select! {
-        first = timeout(HELLO, first(&socket)) => first,
+        first = timeout(HELLO, first(&spare, &socket, has_room)) => first,
         () = replaced => {
             return tracing::warn!(
                 pid = peer.pid,
@@ -166,7 +192,7 @@ pub(super) async fn serve(
 
 /// Waits until the process of a session that hung up has ended, if readers are to be handed what it left. It may come
 /// back before.
-async fn await_process(control: &RefCell<Control>, id: &SessionId, death: &AsyncFd<PassedFd>) {
+async fn await_process(control: &RefCell<Control>, id: &SessionId, death: &AsyncFd<Arc<PassedFd>>) {
     while control.borrow().registry.awaits_process(id) {
         if timeout(AWAIT_PROCESS, death.readable()).await.is_ok() {
             let control = &mut *control.borrow_mut();
@@ -190,6 +216,29 @@ fn refuse(
     say(socket, Message::Refused(refused), &[]);
 }
 
+/// Refuses a session for want of descriptors.
+fn refuse_for_room(
+    control: &mut Control,
+    socket: &AsyncFd<PassedFd>,
+    name: &str,
+    peer: PeerProcess,
+    why: String,
+) {
+    control.refused_for_room(format!("session {name} (pid {})", peer.pid), why.clone());
+    say(socket, Message::Refused(Refused::because(why)), &[]);
+}
+
+/// Why there are no descriptors for a session, if so. What a tool needs is its connection.
+fn no_room(control: &Control, role: SessionRole, pid: u32, is_relayed: bool) -> Option<String> {
+    let room = Room::of(&control.registry, pid)?;
+    match role {
+        SessionRole::Gateway => None,
+        SessionRole::Application => room.refuses_session(is_relayed),
+        SessionRole::Tool if control.spare.can_keep_caller() => None,
+        SessionRole::Tool => room.refuses_session(false),
+    }
+}
+
 /// What is shown of a session in log and status.
 fn shown(name: &str) -> String {
     text::plain(name, 64)
@@ -203,7 +252,7 @@ fn relay(
     peer: PeerProcess,
 ) {
     let its_own = first.is_its_own();
-    let First { mut hello, descriptors, key } = first;
+    let First { mut hello, descriptors, key, .. } = first;
     hello.name = shown(&hello.name);
     let mut state = control.borrow_mut();
     let reason = hello.relay.clone().unwrap_or_default();
@@ -211,9 +260,13 @@ fn relay(
         let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
         socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None)
     };
-    let checked = its_own
-        .and_then(|()| state.admission.still_trusts(peer.uid))
-        .and_then(|()| state.admission.check(&hello, descriptors, peer, false));
+    let trusted = its_own.and_then(|()| state.admission.still_trusts(peer.uid));
+    if trusted.is_ok()
+        && let Some(why) = no_room(&state, hello.role, peer.pid, true)
+    {
+        return refuse_for_room(&mut state, &socket, &hello.name, peer, why);
+    }
+    let checked = trusted.and_then(|()| state.admission.check(&hello, descriptors, peer, false));
     let checked = match checked {
         Err(refused) => Err(*refused),
         Ok(_)
@@ -273,7 +326,7 @@ struct Admitted {
     /// Its process's.
     turn: Turn,
     /// Tells that its process ended.
-    death: Option<AsyncFd<PassedFd>>,
+    death: Option<AsyncFd<Arc<PassedFd>>>,
 }
 
 fn admit(
@@ -284,16 +337,27 @@ fn admit(
     inside: &InternalPeer,
 ) -> Option<Admitted> {
     let its_own = first.is_its_own();
-    let First { mut hello, descriptors, mut key } = first;
+    let First { mut hello, descriptors, mut key, is_crowded } = first;
     hello.name = shown(&hello.name);
     let control = &mut *control.borrow_mut();
     let gateway = matches!(inside, InternalPeer::Gateway);
-    let admission = &mut control.admission;
     // The settings may have changed since the connection was accepted.
     let uid = if let InternalPeer::Relay { uid, .. } = inside { *uid } else { peer.uid };
-    let checked = its_own
-        .and_then(|()| admission.still_trusts(uid))
-        .and_then(|()| admission.check(&hello, descriptors, peer, gateway));
+    let trusted = its_own.and_then(|()| control.admission.still_trusts(uid));
+    // The connection of a relayed session was let in with this one.
+    if trusted.is_ok()
+        && matches!(inside, InternalPeer::No)
+        && let Some(why) = no_room(control, hello.role, peer.pid, false)
+    {
+        refuse_for_room(control, socket, &hello.name, peer, why);
+        return None;
+    }
+    if is_crowded {
+        // There is room again: it comes again.
+        return None;
+    }
+    let checked =
+        trusted.and_then(|()| control.admission.check(&hello, descriptors, peer, gateway));
     let handed = match checked {
         Ok(handed) => handed,
         Err(refused) => {
@@ -314,14 +378,14 @@ fn admit(
         refuse(control, socket, &hello.name, peer, Refused::because(text));
         return None;
     }
+    let handed = handed.map(|fds| fds.map(Arc::new));
     let death = match &handed {
-        Some([_, _, pidfd]) => Some(watch(pidfd.try_clone().ok()?).ok()?),
+        Some([_, _, pidfd]) => Some(watch_shared(pidfd).ok()?),
         None => None,
     };
     let scope = (!gateway).then(|| scope_of(&hello));
     let Hello { session, role, name, .. } = hello;
     tracing::debug!(%session, name, pid, "a session");
-    let handed = handed.map(|fds| fds.map(Arc::new));
     if let Err(violation) =
         control.registry.handle_connect(session, role, name.clone(), pid, handed, scope)
     {

@@ -18,6 +18,7 @@ mod relayed;
 mod reload;
 mod remote;
 mod report;
+mod room;
 mod run;
 mod turns;
 

@@ -10,7 +10,9 @@ use std::{
 use tokio::sync::Notify;
 
 /// Connections that may be without a HELLO at a time.
-const MOST: usize = 256;
+pub(super) const MOST: usize = 256;
+/// The same where the daemon's descriptors are short.
+pub(super) const MOST_WHERE_SHORT: usize = 8;
 
 /// Those of all processes. Of too many the process goes short that has the most of them, by the one
 /// that has said nothing for longest: a process that speaks as it connects is not held up by others.
@@ -33,13 +35,13 @@ pub(super) struct Stranger {
 }
 
 impl PendingConnections {
-    /// A connection of process `pid` came. Another one may have to go for it.
-    pub(super) fn add(&self, pid: u32) -> Stranger {
+    /// A connection of process `pid` came. If there are more than `most`, one of them has to go.
+    pub(super) fn add(&self, pid: u32, most: usize) -> Stranger {
         let mut waiting = self.0.borrow_mut();
         let (number, replaced) = (waiting.next, Rc::new(Notify::new()));
         waiting.next += 1;
         waiting.connections.insert(number, (pid, Rc::clone(&replaced)));
-        if waiting.connections.len() > MOST
+        if waiting.connections.len() > most
             && let Some((_, victim)) =
                 waiting.victim().and_then(|number| waiting.connections.remove(&number))
         {
@@ -83,9 +85,9 @@ mod tests {
         let strangers = PendingConnections::default();
         let there =
             |stranger: &Stranger| strangers.0.borrow().connections.contains_key(&stranger.number);
-        let honest = strangers.add(7);
-        let crowd: Vec<_> = (0..3 * MOST).map(|_| strangers.add(9)).collect();
-        let late = strangers.add(8);
+        let honest = strangers.add(7, MOST);
+        let crowd: Vec<_> = (0..3 * MOST).map(|_| strangers.add(9, MOST)).collect();
+        let late = strangers.add(8, MOST);
         assert!(there(&honest) && there(&late));
         assert_eq!(crowd.iter().filter(|stranger| there(stranger)).count(), MOST - 2);
         assert!(!there(&crowd[0]) && there(crowd.last().unwrap()), "the oldest go");
@@ -96,7 +98,7 @@ mod tests {
     #[test]
     fn of_many_processes_with_one_each_the_oldest_makes_room() {
         let strangers = PendingConnections::default();
-        let crowd: Vec<_> = (0..2 * MOST).map(|pid| strangers.add(pid as u32)).collect();
+        let crowd: Vec<_> = (0..2 * MOST).map(|pid| strangers.add(pid as u32, MOST)).collect();
         let there: Vec<_> = strangers.0.borrow().connections.keys().copied().collect();
         assert_eq!(there, (MOST as u64..2 * MOST as u64).collect::<Vec<_>>());
         drop(crowd);

@@ -18,6 +18,7 @@ use axon_transport::{
     access::AccessRules,
     config::Config,
     internal::{
+        log_limit::LogLimit,
         registry::Registry,
         session::{daemon::address::Address, relayed::Pool},
     },
@@ -25,7 +26,9 @@ use axon_transport::{
 };
 use tokio::sync::{Notify, watch};
 
-use super::{admission::Admission, losses::Losses, turns::Turns};
+use super::{
+    admission::Admission, losses::Losses, report::waiting::Told, room::Spare, turns::Turns,
+};
 use crate::{
     bridge::{RefusedRoute, ToControl},
     discovery::Wanted,
@@ -45,7 +48,14 @@ pub(super) struct Control {
     pub(super) links: BTreeMap<String, LinkStatus>,
     /// Routes that do not cross these links.
     pub(super) refused_routes: BTreeMap<String, Vec<RefusedRoute>>,
+    /// The sessions that were told of them.
+    told: Told,
     pub(super) refusals: VecDeque<RefusalStatus>,
+    /// Descriptors for callers that are refused for want of any.
+    pub(super) spare: Rc<Spare>,
+    /// Sessions that were refused for want of descriptors.
+    pub(super) crowded_out: u64,
+    crowded_log: LogLimit,
     /// Samples that did not get to other hosts, or that ended relayed sessions left.
     pub(super) lost: Arc<Losses>,
     /// Whether samples of publishers that ended are on their way to other hosts.
@@ -82,7 +92,7 @@ pub(super) struct Control {
 }
 
 impl Control {
-    pub(super) fn new(config: Arc<Config>, settings: Vec<(String, String)>) -> Self {
+    pub(super) fn new(config: Arc<Config>, settings: Vec<(String, String)>, spare: Spare) -> Self {
         let mut registry = Registry::default();
         registry.set_access(config.access.clone());
         Self {
@@ -93,7 +103,11 @@ impl Control {
             registry,
             links: BTreeMap::new(),
             refused_routes: BTreeMap::new(),
+            told: Told::default(),
             refusals: VecDeque::new(),
+            spare: Rc::new(spare),
+            crowded_out: 0,
+            crowded_log: LogLimit::default(),
             lost: Arc::default(),
             draining: false,
             keys: serde_json::Value::Null,
@@ -202,6 +216,22 @@ impl Control {
         tracing::warn!(peer, what, reason, "refused");
         // The same peer refused for the same cause again is the same news.
         self.refusals.retain(|r| r.peer != peer || r.what != what || r.reason != reason);
+        self.show_refusal(peer, what, reason);
+    }
+
+    /// A session is refused for want of descriptors. All those of a host may come again and again.
+    pub(super) fn refused_for_room(&mut self, peer: String, reason: String) {
+        const WHAT: &str = "descriptors";
+        self.crowded_out += 1;
+        if let Some(sessions) = self.crowded_log.count(Instant::now()) {
+            tracing::warn!(peer, reason, sessions, "sessions are refused for want of descriptors");
+        }
+        // The numbers in the reason change.
+        self.refusals.retain(|r| r.peer != peer || r.what != WHAT);
+        self.show_refusal(peer, WHAT.to_owned(), reason);
+    }
+
+    fn show_refusal(&mut self, peer: String, what: String, reason: String) {
         if self.refusals.len() == REFUSALS {
             self.refusals.pop_front();
         }
@@ -226,6 +256,7 @@ impl Control {
                 if let (Some(daemon), Ok(address)) = (daemon, address) {
                     self.linked_at(daemon, address.ip());
                 }
+                self.told.tell(&mut self.registry, &status.peer, &status.host, &refused);
                 self.refused_routes.insert(status.peer.clone(), refused);
                 self.links.insert(status.peer.clone(), *status);
             }
@@ -236,6 +267,7 @@ impl Control {
             }
             ToControl::LinkDown { daemon, reason } => {
                 tracing::info!(%daemon, reason, "link down");
+                self.told.forget(&daemon.to_string());
                 self.links.remove(&daemon.to_string());
                 self.refused_routes.remove(&daemon.to_string());
                 self.registry.remote_gone(&daemon);

@@ -213,11 +213,12 @@ fn differing(old: &Named, new: &Named) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use super::{super::room::Spare, *};
     use axon_transport::access::{Party, Verb};
 
     fn control(config: Config) -> Control {
-        Control::new(Arc::new(config), vec![("AXON_QUIC_CIPHER".into(), "x".into())])
+        let settings = vec![("AXON_QUIC_CIPHER".into(), "x".into())];
+        Control::new(Arc::new(config), settings, Spare::default())
     }
 
     #[test]

@@ -32,6 +32,7 @@ use super::{
     plane::Control,
     reload::{SettingsSource, reload},
     remote::{GATEWAY, Remote},
+    room::Spare,
 };
 use crate::discovery::Event;
 
@@ -231,6 +232,9 @@ fn start(config: Config, _options: &DaemonOptions) -> Result<Started, DaemonErro
     erase_from_now_on();
     harden();
     let settings = security_settings(&config)?;
+    // Before anything else takes their low numbers.
+    let spare = Spare::default();
+    spare.fill();
     let address = Address::of(&config);
     let (listeners, lock) = match address.bind() {
         Ok(bound) => bound.into_parts(),
@@ -244,11 +248,11 @@ fn start(config: Config, _options: &DaemonOptions) -> Result<Started, DaemonErro
         tracing::warn!(%error, "nothing is kept across restarts");
         config.runtime_dir = None;
     }
-    Ok((Control::new(Arc::new(config), settings), listeners, lock))
+    Ok((Control::new(Arc::new(config), settings, spare), listeners, lock))
 }
 
 /// Keys live in this process: no core file, no debugger of the same user. And a robot has many
-/// sessions with three descriptors each.
+/// sessions with four descriptors each.
 fn harden() {
     let refused = |what, error: rustix::io::Errno| tracing::warn!(what, %error, "not hardened");
     if let Err(error) = set_dumpable_behavior(DumpableBehavior::NotDumpable) {

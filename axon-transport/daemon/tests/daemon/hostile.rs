@@ -3,6 +3,7 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::*;
+use crate::reluctant::{hiding, send_away};
 
 /// What a tool says first.
 fn tool_hello() -> Message {
@@ -122,43 +123,6 @@ fn the_daemon_is_handed_nothing_that_a_read_could_wait_for() {
         }
     }
     host.status().unwrap();
-}
-
-/// A socket whose last close takes hours, since it lingers over what its peer does not read.
-fn reluctant() -> (OwnedFd, std::net::TcpStream) {
-    use rustix::net::sockopt;
-    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
-    sockopt::set_socket_recv_buffer_size(&listener, 4096).unwrap();
-    let mut ours = std::net::TcpStream::connect(listener.local_addr().unwrap()).unwrap();
-    let (peer, _) = listener.accept().unwrap();
-    ours.set_nonblocking(true).unwrap();
-    sockopt::set_socket_send_buffer_size(&ours, 4096).unwrap();
-    while ours.write(&[0; 1 << 16]).is_ok() {}
-    sockopt::set_socket_linger(&ours, Some(Duration::from_secs(10_000))).unwrap();
-    (ours.into(), peer)
-}
-
-/// A unix socket in whose queue such a one waits, where nobody finds it before it is closed.
-fn hiding() -> (OwnedFd, std::net::TcpStream) {
-    use rustix::net::{AddressFamily, SocketFlags, SocketType, socketpair};
-    let (unix, packets) = (AddressFamily::UNIX, SocketType::SEQPACKET);
-    let (ours, theirs) = socketpair(unix, packets, SocketFlags::CLOEXEC, None).unwrap();
-    let (fd, peer) = reluctant();
-    send_away(&theirs, b"x", 0, fd);
-    (ours, peer)
-}
-
-/// A packet whose last descriptor is from then on in nobody's hands but the receiver's.
-fn send_away(socket: &OwnedFd, bytes: &[u8], before: usize, fd: OwnedFd) {
-    use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg};
-    let null: OwnedFd = std::fs::File::open("/dev/null").unwrap().into();
-    let mut space = [std::mem::MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(8))];
-    let mut control = SendAncillaryBuffer::new(&mut space);
-    let mut rights = vec![null.as_fd(); before];
-    rights.push(fd.as_fd());
-    assert!(control.push(SendAncillaryMessage::ScmRights(&rights)));
-    let bytes = [std::io::IoSlice::new(bytes)];
-    sendmsg(socket, &bytes, &mut control, SendFlags::NOSIGNAL).unwrap();
 }
 
 #[test]

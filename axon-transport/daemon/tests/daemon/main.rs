@@ -6,6 +6,8 @@ mod hostile;
 mod left;
 mod life;
 mod logging;
+#[path = "../support/reluctant.rs"]
+mod reluctant;
 #[path = "../support/skip.rs"]
 mod skip;
 #[path = "../support/mod.rs"]

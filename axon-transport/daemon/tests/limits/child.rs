@@ -4,7 +4,8 @@ use std::{fs, os::unix::process::CommandExt as _, path::Path, process::Command, 
 
 use axon_shm::{Context, PublishError, Publisher, PublisherOptions, Subscriber, SubscriberOptions};
 use axon_transport::{
-    SessionEvent,
+    Session, SessionError, SessionEvent, SessionOptions,
+    config::Config,
     internal::{
         session::daemon::socket,
         wire::session::{Hello, Message, PROTOCOL, SessionRole},
@@ -17,6 +18,12 @@ use crate::{
     blocks, descriptors, group, image, latched, meet, spec,
     support::{PATIENCE, of_child, say, until, wait_for_the_end},
 };
+
+/// A session, or why there is none.
+fn try_session() -> Result<Session, SessionError> {
+    let config = Config::from_env().unwrap();
+    Session::open(&config, SessionOptions::new("player"))
+}
 
 pub(crate) fn play(part: &str) {
     let place = || std::env::var("PLACE").unwrap();
@@ -218,6 +225,57 @@ pub(crate) fn play(part: &str) {
             let got = subscription.recv(&mut Vec::new(), Some(PATIENCE));
             say(if got.is_ok() { "heard" } else { "nothing" });
             wait_for_the_end();
+        }
+        "one session" => {
+            let session = match try_session() {
+                Ok(session) => session,
+                Err(error) => return say(error),
+            };
+            say("served");
+            let publisher = session.create_publisher(spec("/crowd")).unwrap();
+            let mut line = String::new();
+            std::io::stdin().read_line(&mut line).unwrap();
+            if line == "go\n" {
+                assert!(session.wait_graph(PATIENCE, |graph| graph.endpoints.len() >= 3));
+                say("everybody is there");
+                std::io::stdin().read_line(&mut line).unwrap();
+                if line == "go\ngo\n" {
+                    assert!(publisher.wait_matched(1, PATIENCE));
+                    publisher.publish(b"hello").unwrap();
+                    wait_for_the_end();
+                }
+            }
+        }
+        "many sessions" => {
+            let mut sessions = Vec::new();
+            let error = loop {
+                match try_session() {
+                    Ok(session) => sessions.push(session),
+                    Err(error) => break error,
+                }
+            };
+            say(error);
+            wait_for_the_end();
+        }
+        "no descriptors" => {
+            let few = Rlimit { current: Some(64), maximum: Some(64) };
+            setrlimit(Resource::Nofile, few).unwrap();
+            let open = || fs::File::open("/dev/null").ok();
+            let mut all: Vec<_> = std::iter::from_fn(open).collect();
+            // Short of each of those that a session opens, in turn.
+            loop {
+                match try_session() {
+                    Ok(session) => {
+                        say("served");
+                        wait_for_the_end();
+                        break drop(session);
+                    }
+                    Err(error) => {
+                        all.pop();
+                        say(error);
+                    }
+                }
+            }
         }
         _ => unreachable!("no such part: {part}"),
     }

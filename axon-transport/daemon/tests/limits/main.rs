@@ -2,10 +2,13 @@
 //! short, or a delay, and never somebody's end.
 
 mod child;
+mod crowded;
 mod elevated;
 #[path = "../support/group.rs"]
 mod group;
 mod interrupted;
+#[path = "../support/reluctant.rs"]
+mod reluctant;
 #[path = "../support/skip.rs"]
 mod skip;
 #[path = "../support/mod.rs"]
@@ -166,7 +169,8 @@ fn memory_that_a_subscriber_had_no_descriptor_for_comes_when_it_has_one() {
 fn a_session_with_more_memory_than_the_daemon_can_hold_is_told_once_and_stays() {
     let host = Host::new();
     let daemon = host.daemon();
-    let few = Rlimit { current: Some(500), maximum: Some(500) };
+    // The session asks for 150, and gets half of what is left.
+    let few = Rlimit { current: Some(300), maximum: Some(300) };
     let pid = rustix::process::Pid::from_child(&daemon.0);
     rustix::process::prlimit(Some(pid), Resource::Nofile, few).unwrap();
     let session = host.session("witness").unwrap();

@@ -52,8 +52,12 @@ impl FdClass {
 
     /// Whether so many wait that no more should be taken in.
     pub(super) fn is_full(self) -> bool {
-        let waiting = |closer: &Closer| closer.crews[self as usize].lock().waiting.len();
-        current().is_some_and(|closer| waiting(closer) >= MANY[self as usize])
+        self.waiting() >= MANY[self as usize]
+    }
+
+    /// How many wait for a thread.
+    pub(super) fn waiting(self) -> usize {
+        current().map_or(0, |closer| closer.crews[self as usize].lock().waiting.len())
     }
 
     #[cfg(test)]

@@ -13,7 +13,7 @@ use std::{
 };
 
 use rustix::{
-    fs::{fcntl_get_seals, fstat},
+    fs::{fcntl_get_seals, fstat, stat},
     io::Errno,
     net::{
         RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, ReturnFlags, Shutdown, recvmsg,
@@ -28,9 +28,10 @@ use super::closer::{self, FdClass, OPEN};
 const SMALL: i64 = (1 << 20) / 512;
 /// The most descriptors that the system lets a packet carry.
 const SCM_MAX_FD: usize = 253;
-/// Descriptors that stay free for what else a process opens, when what it [holds](PassedFd) of others
-/// [is too much](is_short): more than a packet can carry. Of a limit so low that this is more than half
-/// of it, half.
+/// Descriptors of a packet that [`receive_few`] receives at most.
+pub const FEW: usize = 16;
+/// More than a packet can carry, with what else a process opens meanwhile. Of a limit so low that this is more
+/// than half of it, half.
 const RESERVE: u64 = 400;
 
 /// A descriptor to be sent to another process, or [received](Self::received) from one. One that was
@@ -167,17 +168,38 @@ impl Drop for PassedFd {
     }
 }
 
-/// Whether descriptors of others should not be taken in: so many are open, or wait to be closed, that
-/// those of a packet might find no room. The kernel closes what does not fit in the thread that
-/// receives.
-pub fn is_short() -> bool {
+/// Whether the descriptors of a packet might find no room, so that only [`receive_few`] should receive it. The kernel
+/// closes what does not fit in the thread that receives.
+pub fn is_tight() -> bool {
     let open = OPEN.load(Ordering::Relaxed);
-    let limit = getrlimit(Resource::Nofile).current;
-    limit.is_some_and(|limit| open + reserve(limit) > limit) || FdClass::Session.is_full()
+    limit().is_some_and(|limit| open + RESERVE > limit)
+}
+
+/// How many descriptors this process may have: its soft RLIMIT_NOFILE. `None`: any number.
+pub fn limit() -> Option<u64> {
+    getrlimit(Resource::Nofile).current
+}
+
+/// How many descriptors this process has open, those of its other threads included.
+pub fn open() -> u64 {
+    const TABLE: &str = "/proc/self/fd";
+    // Linux 6.2 and later say it without opening anything.
+    if let Ok(Ok(open @ 1..)) = stat(TABLE).map(|found| u64::try_from(found.st_size)) {
+        return open;
+    }
+    // The listing's own descriptor counts itself.
+    let listed = std::fs::read_dir(TABLE).map(|all| all.count() as u64);
+    // Where nothing can be opened, nothing is left.
+    listed.unwrap_or_else(|_| limit().unwrap_or_else(|| OPEN.load(Ordering::Relaxed)))
 }
 
 fn reserve(limit: u64) -> u64 {
     RESERVE.min(limit / 2)
+}
+
+/// Whether so many descriptors that sessions sent wait to be closed that no more should be taken in.
+pub fn is_clogged() -> bool {
+    FdClass::Session.is_full()
 }
 
 /// Whether what this process may have open at most, `limit`, leaves no room for all that a packet can
@@ -186,14 +208,16 @@ pub fn is_scarce(limit: u64) -> bool {
     reserve(limit) < RESERVE
 }
 
-/// Whether so many connections of strangers wait to be closed that nobody's should be accepted.
+/// Whether so many connections of strangers wait to be closed that nobody's should be accepted. Where descriptors are
+/// short, few are too many, and so are those that sessions sent: what waits is open.
 pub fn close_queue_is_full() -> bool {
-    FdClass::Stranger.is_full()
+    let waits = || FdClass::Stranger.waiting().max(FdClass::Session.waiting());
+    FdClass::Stranger.is_full() || (is_tight() && waits() >= FEW)
 }
 
-/// The most descriptors that one of several processes should make this one hold.
+/// Half of the descriptors of others that this process can hold.
 pub fn share() -> usize {
-    let limit = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
+    let limit = limit().unwrap_or(u64::MAX);
     usize::try_from((limit - reserve(limit)) / 2).unwrap_or(usize::MAX)
 }
 
@@ -211,12 +235,17 @@ pub struct Packet {
 
 /// Receives one packet without waiting, with all descriptors that can come with it.
 pub fn receive(socket: impl AsFd, buffer: &mut [u8]) -> Result<Packet, Errno> {
-    receive_with(&socket, buffer, RecvFlags::empty())
+    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(SCM_MAX_FD))];
+    receive_with(&socket, buffer, RecvFlags::empty(), &mut space)
 }
 
-fn receive_with(socket: impl AsFd, buffer: &mut [u8], how: RecvFlags) -> Result<Packet, Errno> {
-    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(SCM_MAX_FD))];
-    let mut control = RecvAncillaryBuffer::new(&mut space);
+fn receive_with(
+    socket: impl AsFd,
+    buffer: &mut [u8],
+    how: RecvFlags,
+    space: &mut [MaybeUninit<u8>],
+) -> Result<Packet, Errno> {
+    let mut control = RecvAncillaryBuffer::new(space);
     let flags = RecvFlags::DONTWAIT | RecvFlags::CMSG_CLOEXEC | how;
     let got = loop {
         match recvmsg(&socket, &mut [IoSliceMut::new(buffer)], &mut control, flags) {
@@ -241,18 +270,43 @@ fn receive_with(socket: impl AsFd, buffer: &mut [u8], how: RecvFlags) -> Result<
 
 /// As [`receive`], but a packet for whose descriptors there is no room stays where it is.
 pub(crate) fn receive_whole(socket: impl AsFd, buffer: &mut [u8]) -> Result<Packet, Errno> {
+    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(SCM_MAX_FD))];
     // To look gives descriptors of the same things.
-    let packet = receive_with(&socket, buffer, RecvFlags::PEEK)?;
+    let packet = receive_with(&socket, buffer, RecvFlags::PEEK, &mut space)?;
     if packet.lost {
         return Err(Errno::MFILE);
     }
-    // So what goes with the packet is not closed for the last time here.
+    take_seen(&socket);
+    Ok(packet)
+}
+
+/// As [`receive`], for a packet of at most [`FEW`] descriptors: closes none of them for the last time, and needs no room
+/// for more. One with more stays where it is, as truncated, and one for which there is no room as lost.
+pub fn receive_few(socket: impl AsFd, buffer: &mut [u8]) -> Result<Packet, Errno> {
+    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(FEW))];
+    let packet = receive_with(&socket, buffer, RecvFlags::PEEK, &mut space)?;
+    if !packet.lost {
+        take_seen(&socket);
+    }
+    let truncated = packet.truncated || (packet.lost && packet.descriptors.len() == FEW);
+    Ok(Packet { truncated, ..packet })
+}
+
+/// Takes a packet that was looked at: what goes with it is not closed for the last time here.
+fn take_seen(socket: impl AsFd) {
     let mut none = RecvAncillaryBuffer::default();
     let mut byte = [0];
     while let Err(Errno::INTR) =
         recvmsg(&socket, &mut [IoSliceMut::new(&mut byte)], &mut none, RecvFlags::DONTWAIT)
     {}
-    Ok(packet)
+}
+
+/// Copies the next packet of a socket, which stays where it is with its descriptors. Returns its length, as far as there
+/// is room for it.
+pub fn look(socket: impl AsFd, buffer: &mut [u8]) -> Result<usize, Errno> {
+    let flags = RecvFlags::DONTWAIT | RecvFlags::PEEK;
+    let mut none = RecvAncillaryBuffer::default();
+    Ok(recvmsg(socket, &mut [IoSliceMut::new(buffer)], &mut none, flags)?.bytes)
 }
 
 /// Whether the next packet of a socket has descriptors, which stay where they are: nothing is closed
@@ -384,6 +438,37 @@ pub(crate) mod tests {
         assert_eq!(rustix::net::recv(&kept, &mut [0; 1], flags).err(), Some(Errno::AGAIN));
         let packet = receive(&ours, &mut [0; 1]).unwrap();
         assert!(packet.descriptors.len() == 1 && !packet.lost && !packet.truncated);
+    }
+
+    #[test]
+    fn few_descriptors_are_received_with_their_packet_and_more_stay_where_they_are() {
+        let (ours, theirs) = pair();
+        let send = |count: usize| {
+            let files: Vec<_> = (0..count).map(|_| tempfile::tempfile().unwrap()).collect();
+            let rights: Vec<_> = files.iter().map(AsFd::as_fd).collect();
+            let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(FEW * 2))];
+            let mut control = SendAncillaryBuffer::new(&mut space);
+            assert!(control.push(SendAncillaryMessage::ScmRights(&rights)));
+            sendmsg(&theirs, &[IoSlice::new(b"xy")], &mut control, SendFlags::empty()).unwrap();
+        };
+        send(FEW);
+        send(FEW + 1);
+        let mut buffer = [0; 2];
+        let packet = receive_few(&ours, &mut buffer).unwrap();
+        assert_eq!((packet.bytes, packet.descriptors.len(), packet.lost), (2, FEW, false));
+        for _ in 0..2 {
+            let packet = receive_few(&ours, &mut buffer).unwrap();
+            assert!(packet.truncated && packet.lost, "it is still there");
+        }
+    }
+
+    #[test]
+    fn open_descriptors_are_counted() {
+        let before = open();
+        let files: Vec<_> = (0..50).map(|_| tempfile::tempfile().unwrap()).collect();
+        // Other tests open and close meanwhile.
+        assert!(open() >= before.saturating_sub(20) + 50 - 20, "{} of {before}", open());
+        drop(files);
     }
 
     #[test]

@@ -1,6 +1,9 @@
 //! One session.
 
-use std::{collections::BTreeSet, sync::Arc};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    sync::Arc,
+};
 
 use super::{
     memory::{HeldMemory, OwnMemory},
@@ -8,7 +11,7 @@ use super::{
 };
 use crate::{
     config::DiscoveryRange,
-    graph::{EndpointRange, RangeToHost, Scope},
+    graph::{Endpoint, EndpointRange, RangeToHost, Scope},
     ids::{DaemonId, Gid},
     registry::relayed::RelayCounters,
     wire::session::SessionRole,
@@ -43,6 +46,8 @@ pub struct SessionEntry<F> {
     pub(in crate::registry) held: HeldMemory,
     /// An endpoint of its was refused.
     pub(in crate::registry) refused: bool,
+    /// The first of its endpoints that were refused, and why.
+    pub(in crate::registry) refused_endpoints: BTreeMap<Gid, (Endpoint, String)>,
 }
 
 impl<F> SessionEntry<F> {
@@ -68,12 +73,23 @@ impl<F> SessionEntry<F> {
             outbox: Outbox::new(role != SessionRole::Tool),
             held: HeldMemory::default(),
             refused: false,
+            refused_endpoints: BTreeMap::new(),
         }
     }
 
     /// Packets that wait for it.
     pub fn queued(&self) -> usize {
         self.outbox.len()
+    }
+
+    /// The first of its endpoints that were refused, and why.
+    pub fn refused_endpoints(&self) -> impl Iterator<Item = (&Endpoint, &str)> {
+        self.refused_endpoints.values().map(|(endpoint, why)| (endpoint, &**why))
+    }
+
+    /// Of how many sessions it holds memory.
+    pub fn holds_memory_of(&self) -> usize {
+        self.held.len()
     }
 
     /// Its range, and the daemons of linked peers that it lists; `None` where ranges do not apply.

@@ -23,7 +23,7 @@ use rustix::{
     },
 };
 
-use axon_shm::internal::peer_process;
+use axon_shm::internal::{OwnLimit, peer_process};
 
 use crate::{config::Config, wire::session::PROTOCOL};
 
@@ -93,7 +93,7 @@ pub enum AddressError {
         reason: String,
     },
     /// The system refused.
-    #[error("{0}")]
+    #[error("the session socket: {0}{own}", own = OwnLimit(&(*.0).into()))]
     System(#[from] Errno),
 }
 
@@ -146,6 +146,10 @@ impl Address {
                 let own = |socket: &OwnedFd| is_own(socket);
                 match at_place(place) {
                     Err(AddressError::Busy) => Err(AddressError::Busy),
+                    // It is not that there is no daemon.
+                    Err(AddressError::System(errno @ (Errno::MFILE | Errno::NFILE))) => {
+                        Err(errno.into())
+                    }
                     called => called.ok().filter(own).map_or_else(
                         || at_name(name).ok().filter(own).ok_or(AddressError::Absent),
                         Ok,

@@ -192,8 +192,8 @@ impl<'a> Caller<'a> {
                     Err(SocketError::NotReady) => {
                         self.await_socket(&socket, PollFlags::OUT, deadline, address)?;
                     }
-                    // It ended between our connecting and our speaking.
-                    Err(_) => return Err(Attempt::Again),
+                    // It ended between our connecting and our speaking, and may have said why.
+                    Err(_) => return Err(refusal(&socket, address).unwrap_or(Attempt::Again)),
                 }
             }
         };
@@ -303,6 +303,17 @@ fn look_into(descriptors: &[PassedFd]) -> Result<(), SessionError> {
             Err(SessionError::NotShared(text))
         }
         None => Ok(()),
+    }
+}
+
+/// What a daemon said that has closed the connection before it was spoken to.
+fn refusal(socket: &OwnedFd, address: &str) -> Option<Attempt> {
+    match socket::receive(socket, &mut Vec::new()).ok()?.message {
+        Message::Refused(refused) if refused.variable.is_empty() => {
+            let address = address.to_owned();
+            Some(Attempt::Final(SessionError::Refused { address, text: refused.text }))
+        }
+        _ => None,
     }
 }
 

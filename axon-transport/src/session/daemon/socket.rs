@@ -102,7 +102,39 @@ pub fn receive(socket: impl AsFd, buffer: &mut Vec<u8>) -> Result<Received, Sock
         Err(Errno::CONNRESET) => descriptors::receive(&socket, buffer),
         received => received,
     };
-    let Packet { bytes, truncated, lost, descriptors } = packet?;
+    received(packet?, buffer)
+}
+
+/// As [`receive`], where descriptors are short: needs room for no more than a packet may have, and closes none of them for
+/// the last time.
+///
+/// # Errors
+/// As [`receive`]. A packet for whose descriptors there is no room stays where it is.
+pub fn receive_few(socket: impl AsFd, buffer: &mut Vec<u8>) -> Result<Received, SocketError> {
+    const { assert!(MAX_DESCRIPTORS <= descriptors::FEW) };
+    buffer.resize(MAX_PACKET + 1, 0);
+    let packet = match descriptors::receive_few(&socket, buffer) {
+        Err(Errno::CONNRESET) => descriptors::receive_few(&socket, buffer),
+        received => received,
+    };
+    received(packet?, buffer)
+}
+
+/// The next packet's message, which stays where it is, as do its descriptors.
+///
+/// # Errors
+/// As [`receive`].
+pub fn look(socket: impl AsFd, buffer: &mut Vec<u8>) -> Result<Message, SocketError> {
+    buffer.resize(MAX_PACKET + 1, 0);
+    let bytes = descriptors::look(&socket, buffer)?;
+    if bytes > MAX_PACKET {
+        return Err(SocketError::Truncated);
+    }
+    Ok(Message::decode(&buffer[..bytes])?)
+}
+
+fn received(packet: Packet, buffer: &[u8]) -> Result<Received, SocketError> {
+    let Packet { bytes, truncated, lost, descriptors } = packet;
     if truncated || descriptors.len() > MAX_DESCRIPTORS {
         return Err(SocketError::Truncated);
     }

@@ -17,7 +17,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_shm::internal::is_elevated;
+use axon_shm::internal::{OwnLimit, is_elevated};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use crate::{
@@ -61,7 +61,7 @@ pub(crate) fn spawn(
             ))
         })?;
     }
-    let (reader, writer) = std::io::pipe().map_err(|e| failed(e.to_string()))?;
+    let (reader, writer) = std::io::pipe().map_err(|e| failed(format!("{e}{}", OwnLimit(&e))))?;
     let mut child = Command::new(&program)
         .args(arguments)
         .arg(SPAWNED)
@@ -71,7 +71,7 @@ pub(crate) fn spawn(
         .stdout(writer)
         .stderr(Stdio::null())
         .spawn()
-        .map_err(|e| failed(e.to_string()))?;
+        .map_err(|e| failed(format!("{e}{}", OwnLimit(&e))))?;
     let report = read_report(reader.into(), cancelled);
     // The first process ends as soon as it has started the second, or did not. A program that is no
     // daemon may stay.

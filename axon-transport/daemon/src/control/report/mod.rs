@@ -1,19 +1,26 @@
 //! Builds the daemon's [`Status`] from the state of the control plane.
 
 mod topics;
+pub(super) mod waiting;
 
 use std::collections::BTreeMap;
 
-use axon_shm::ids::SessionId;
+use axon_shm::{
+    ids::{Gid, SessionId},
+    internal::descriptors,
+};
 use axon_transport::{
     config::{KeyMode, Security},
     internal::wire::session::{PROTOCOL, SessionRole},
-    status::{DiscoveryStatus, SessionStatus, Status},
+    status::{DescriptorStatus, DiscoveryStatus, SessionStatus, Status},
 };
 
 use self::topics::topics;
 use super::plane::Control;
 use crate::discovery::Wanted;
+
+/// Characters of a GID in hexadecimal that its session decides.
+const GID_PREFIX: usize = 24;
 
 /// Answers a session that asks for the status. One that asks again before it has taken the
 /// answer gets the same one from its beginning.
@@ -54,8 +61,10 @@ fn status(control: &Control) -> Status {
         }
     };
     let sessions = control.registry.sessions().filter(|(_, s)| s.role != SessionRole::Tool);
-    let sessions = sessions.map(|(_, s)| {
+    let sessions = sessions.map(|(id, s)| {
         let mut session = SessionStatus::default();
+        session.user = s.user;
+        session.gids = Gid::new(*id, 0).to_string()[..GID_PREFIX].to_owned();
         session.pid = s.pid;
         session.name = s.name.clone();
         session.role =
@@ -94,6 +103,7 @@ fn status(control: &Control) -> Status {
     status.gateway = control.gateway.clone();
     status.discovery = discovery(&control.wanted.borrow());
     status.traffic = control.traffic;
+    status.descriptors = Some(descriptors(control));
     status.sessions = sessions.collect();
     status.topics = topics(&control.registry, &control.lost.all(), &refused);
     status.links = control.links.values().cloned().collect();
@@ -114,6 +124,14 @@ fn without_details(status: &Status) -> Status {
     public.domain = status.domain;
     public.gateway = status.gateway.clone();
     public
+}
+
+fn descriptors(control: &Control) -> DescriptorStatus {
+    let mut shown = DescriptorStatus::default();
+    shown.open = descriptors::open();
+    shown.limit = descriptors::limit();
+    shown.sessions_refused = control.crowded_out;
+    shown
 }
 
 fn discovery(wanted: &Wanted) -> DiscoveryStatus {

@@ -28,8 +28,8 @@ use axon_transport::{
     status::{OutOfRangeStatus, ReaderStatus, RefusedRouteStatus, TopicStatus, WriterStatus},
 };
 
-use crate::bridge::RefusedRoute;
-use crate::control::losses::ByTopic;
+use super::waiting::waiting;
+use crate::{bridge::RefusedRoute, control::losses::ByTopic};
 
 /// Publishers, readers, and endpoints whose routes are refused, of a topic that the status lists.
 const LISTED: usize = 64;
@@ -122,29 +122,25 @@ fn show_refused(
     topics: &mut BTreeMap<(String, String), TopicStatus>,
     refused: &[(&str, &[RefusedRoute])],
 ) {
-    if refused.iter().all(|(_, routes)| routes.is_empty()) {
-        return;
-    }
-    let mut waiting: HashMap<_, Vec<_>> = HashMap::new();
-    for local in registry.endpoints().filter(|e| e.role == EndpointRole::Application) {
-        let Endpoint { kind, topic, type_name, gid, .. } = &local.endpoint;
-        waiting.entry((*kind, &**topic)).or_default().push((&**type_name, *gid));
-    }
-    for (peer, route) in refused.iter().flat_map(|(peer, all)| all.iter().map(move |r| (peer, r))) {
-        let RefusedRoute { topic, type_name, waits, reason } = route;
-        let waiting = waiting.get(&(*waits, &**topic)).into_iter().flatten();
-        let same = |of: &str| type_name.as_ref().is_none_or(|type_name| *type_name == of);
-        for (type_name, gid) in waiting.filter(|(type_name, _)| same(type_name)) {
-            let key = (topic.clone(), (*type_name).to_owned());
-            let Some(shown) = topics.get_mut(&key) else { continue };
-            if shown.refused.len() < LISTED {
-                let mut route = RefusedRouteStatus::default();
-                route.endpoint = gid.to_string();
-                route.host = (*peer).to_owned();
-                route.reason = reason.clone();
-                shown.refused.push(route);
-            }
+    for (host, routes) in refused {
+        for (local, route) in waiting(registry, routes) {
+            let reason = route.reason.clone();
+            show_at(entry(topics, &local.endpoint), &local.endpoint, (*host).to_owned(), reason);
         }
+    }
+    // Those that this daemon does not take.
+    for (_, session) in registry.sessions() {
+        for (endpoint, why) in session.refused_endpoints() {
+            show_at(entry(topics, endpoint), endpoint, String::new(), why.to_owned());
+        }
+    }
+}
+
+fn show_at(topic: &mut TopicStatus, endpoint: &Endpoint, host: String, reason: String) {
+    if topic.refused.len() < LISTED {
+        let mut route = RefusedRouteStatus::default();
+        (route.endpoint, route.host, route.reason) = (endpoint.gid.to_string(), host, reason);
+        topic.refused.push(route);
     }
 }
 

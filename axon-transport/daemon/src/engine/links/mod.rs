@@ -423,6 +423,7 @@ impl Links {
     pub(super) fn status(&self, number: u64) -> Option<LinkStatus> {
         let (connection, peer) = (self.connections.get(number)?, self.table.peer(number)?);
         let mut status = peer.summary.status(peer.since);
+        status.party = peer.summary.who.party(connection.began_at).to_string();
         connection.fill(&mut status);
         Some(status)
     }

@@ -1,0 +1,176 @@
+//! The endpoints of this host that wait for routes which another host, or this one, refuses. Status shows them, and their
+//! sessions are told.
+
+use std::{
+    collections::{BTreeMap, HashMap, HashSet},
+    sync::Arc,
+};
+
+use axon_shm::{
+    ids::{Gid, SessionId},
+    internal::descriptors::PassedFd,
+};
+use axon_transport::internal::{
+    registry::{LocalEndpoint, Registry},
+    wire::session::{EndpointRole, Message, Refused},
+};
+
+use crate::bridge::RefusedRoute;
+
+/// Endpoints that are told of one peer's routes, while it is linked.
+const MOST: usize = 4096;
+
+type Sessions = Registry<Arc<PassedFd>>;
+
+/// Each endpoint that waits for one of these routes.
+pub(super) fn waiting<'a, 'r>(
+    registry: &'a Sessions,
+    routes: &'r [RefusedRoute],
+) -> Vec<(&'a LocalEndpoint, &'r RefusedRoute)> {
+    if routes.is_empty() {
+        return Vec::new();
+    }
+    let mut by_topic: HashMap<_, Vec<&LocalEndpoint>> = HashMap::new();
+    for local in registry.endpoints().filter(|e| e.role == EndpointRole::Application) {
+        by_topic.entry((local.endpoint.kind, &*local.endpoint.topic)).or_default().push(local);
+    }
+    let mut all = Vec::new();
+    for route in routes {
+        let waiting = by_topic.get(&(route.waits, &*route.topic)).into_iter().flatten();
+        let same = |local: &LocalEndpoint| {
+            route.type_name.as_ref().is_none_or(|name| *name == local.endpoint.type_name)
+        };
+        all.extend(waiting.filter(|local| same(local)).map(|local| (*local, route)));
+    }
+    all
+}
+
+/// The endpoints whose sessions were told, by peer: each is told once while the peer is linked.
+#[derive(Debug, Default)]
+pub(in crate::control) struct Told(BTreeMap<String, HashSet<Gid>>);
+
+impl Told {
+    /// A peer's link is over.
+    pub(in crate::control) fn forget(&mut self, peer: &str) {
+        self.0.remove(peer);
+    }
+
+    /// Tells the sessions of endpoints that wait for these routes to or from `peer`, which is the host `host`.
+    pub(in crate::control) fn tell(
+        &mut self,
+        registry: &mut Sessions,
+        peer: &str,
+        host: &str,
+        routes: &[RefusedRoute],
+    ) {
+        let news = self.news(registry, peer, host, routes);
+        for (session, text) in news {
+            registry.push(&session, &Message::Refused(Refused::because(text)), Vec::new());
+        }
+    }
+
+    fn news(
+        &mut self,
+        registry: &Sessions,
+        peer: &str,
+        host: &str,
+        routes: &[RefusedRoute],
+    ) -> Vec<(SessionId, String)> {
+        let mut news = Vec::new();
+        // Other users are shown neither hosts nor rules.
+        let is_own = |local: &LocalEndpoint| {
+            registry.session(&local.session).is_some_and(|session| session.user.is_none())
+        };
+        let all = waiting(registry, routes).into_iter();
+        for (local, route) in all.filter(|(local, _)| is_own(local)) {
+            let told = self.0.entry(peer.to_owned()).or_default();
+            let gid = local.endpoint.gid;
+            // One that is told everything anew would not hear of it: it is told with the next report.
+            if told.len() == MOST || registry.is_told_anew(&local.session) || !told.insert(gid) {
+                continue;
+            }
+            let text = format!(
+                "endpoint {gid} of topic {:?}: nothing crosses to or from host {host:?}: {}",
+                route.topic, route.reason
+            );
+            news.push((local.session, text));
+        }
+        news
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use axon_transport::{
+        graph::{Endpoint, EndpointKind},
+        internal::wire::session::{Announce, SessionRole},
+    };
+
+    use super::*;
+
+    const SESSION: SessionId = SessionId([1; 16]);
+
+    fn registry() -> Sessions {
+        let mut registry = Registry::default();
+        let (role, name) = (SessionRole::Application, String::new());
+        registry.handle_connect(SESSION, role, name, 1, None, None).unwrap();
+        registry
+    }
+
+    fn announce(registry: &mut Sessions, number: u32, topic: &str) {
+        let gid = Gid::new(SESSION, number);
+        let endpoint = Endpoint::new(gid, EndpointKind::Subscription, topic, "T");
+        let role = EndpointRole::Application;
+        let announce = Announce { endpoint, role, stands_for: vec![], ring: None, only: None };
+        registry.handle_message(&SESSION, Message::Endpoint(announce), vec![]).unwrap();
+    }
+
+    /// What the session is told.
+    fn heard(registry: &mut Sessions) -> Vec<String> {
+        let packets = std::iter::from_fn(|| registry.poll_output(&SESSION));
+        let texts = packets.filter_map(|output| match Message::decode(&output.packet).unwrap() {
+            Message::Refused(refused) => {
+                assert_eq!(refused.endpoint, None, "it stays in the graph");
+                Some(refused.text)
+            }
+            _ => None,
+        });
+        texts.collect()
+    }
+
+    fn route(topic: &str, type_name: Option<&str>) -> RefusedRoute {
+        let (topic, type_name) = (topic.to_owned(), type_name.map(str::to_owned));
+        let reason = "refused by the peer: no room".to_owned();
+        RefusedRoute { topic, type_name, waits: EndpointKind::Subscription, reason }
+    }
+
+    #[test]
+    fn session_of_an_endpoint_that_waits_is_told_once_while_the_peer_is_linked() {
+        let (mut registry, mut told) = (registry(), Told::default());
+        announce(&mut registry, 1, "/a");
+        announce(&mut registry, 2, "/b");
+        let routes = [route("/a", Some("T")), route("/a", Some("other")), route("/c", None)];
+        told.tell(&mut registry, "peer", "base", &routes);
+        assert_eq!(heard(&mut registry), [""; 0], "it is told everything first");
+        told.tell(&mut registry, "peer", "base", &routes);
+        let texts = heard(&mut registry);
+        assert_eq!(texts.len(), 1, "{texts:?}");
+        for part in ["\"/a\"", "\"base\"", "refused by the peer: no room"] {
+            assert!(texts[0].contains(part), "{texts:?}");
+        }
+        // The next report has it as well. One that came later is told.
+        announce(&mut registry, 3, "/a");
+        told.tell(&mut registry, "peer", "base", &routes);
+        let texts = heard(&mut registry);
+        let gid = Gid::new(SESSION, 3).to_string();
+        assert!(texts.len() == 1 && texts[0].contains(&gid), "{texts:?}");
+        told.forget("peer");
+        told.tell(&mut registry, "peer", "base", &routes);
+        assert_eq!(heard(&mut registry).len(), 2);
+        // Another user's session is told nothing.
+        told.forget("peer");
+        registry.set_user(&SESSION, 7);
+        told.tell(&mut registry, "peer", "base", &routes);
+        assert_eq!(heard(&mut registry).len(), 0);
+    }
+}

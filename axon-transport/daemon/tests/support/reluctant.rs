@@ -1,0 +1,49 @@
+//! Descriptors whose closing takes as long as their sender likes.
+
+use std::{
+    fs::File,
+    io::{IoSlice, Write as _},
+    mem::MaybeUninit,
+    net::{TcpListener, TcpStream},
+    os::fd::{AsFd, OwnedFd},
+    time::Duration,
+};
+
+use rustix::net::{
+    AddressFamily, SendAncillaryBuffer, SendAncillaryMessage, SendFlags, SocketFlags, SocketType,
+    sendmsg, socketpair, sockopt,
+};
+
+/// A socket whose last close takes hours, since it lingers over what its peer does not read.
+fn reluctant() -> (OwnedFd, TcpStream) {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    sockopt::set_socket_recv_buffer_size(&listener, 4096).unwrap();
+    let mut ours = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
+    let (peer, _) = listener.accept().unwrap();
+    ours.set_nonblocking(true).unwrap();
+    sockopt::set_socket_send_buffer_size(&ours, 4096).unwrap();
+    while ours.write(&[0; 1 << 16]).is_ok() {}
+    sockopt::set_socket_linger(&ours, Some(Duration::from_secs(10_000))).unwrap();
+    (ours.into(), peer)
+}
+
+/// A unix socket in whose queue such a one waits, where nobody finds it before it is closed.
+pub(crate) fn hiding() -> (OwnedFd, TcpStream) {
+    let (unix, packets) = (AddressFamily::UNIX, SocketType::SEQPACKET);
+    let (ours, theirs) = socketpair(unix, packets, SocketFlags::CLOEXEC, None).unwrap();
+    let (fd, peer) = reluctant();
+    send_away(&theirs, b"x", 0, fd);
+    (ours, peer)
+}
+
+/// A packet whose last descriptor is from then on in nobody's hands but the receiver's.
+pub(crate) fn send_away(socket: &OwnedFd, bytes: &[u8], before: usize, fd: OwnedFd) {
+    let null: OwnedFd = File::open("/dev/null").unwrap().into();
+    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(8))];
+    let mut control = SendAncillaryBuffer::new(&mut space);
+    let mut rights = vec![null.as_fd(); before];
+    rights.push(fd.as_fd());
+    assert!(control.push(SendAncillaryMessage::ScmRights(&rights)));
+    let bytes = [IoSlice::new(bytes)];
+    sendmsg(socket, &bytes, &mut control, SendFlags::NOSIGNAL).unwrap();
+}
