@@ -1,11 +1,9 @@
 //! Scenarios with many cases. `cargo test` runs a sample of them, `cargo xtask simulate --scenarios` all.
 
-mod access;
 mod best_effort;
 mod cuts;
 mod hostile;
 mod kills;
-mod limits;
 mod long;
 mod losses;
 mod memory;
@@ -13,5 +11,6 @@ mod moves;
 mod priorities;
 mod radio;
 mod refused;
+mod rules;
 mod segment;
 mod torture;

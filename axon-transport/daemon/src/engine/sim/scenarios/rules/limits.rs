@@ -7,7 +7,7 @@ use axon_transport::{
     status::LimitStatus,
 };
 
-use super::radio::{Stream, drive, radio};
+use super::super::radio::{Stream, drive, radio};
 use crate::engine::sim::{
     tests::{millis, secs},
     world::{Pair, World},

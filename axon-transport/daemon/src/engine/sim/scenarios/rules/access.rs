@@ -6,7 +6,9 @@ use axon_shm::{
 };
 use axon_transport::{access::AccessRules, config::Config, status::LinkStatus};
 
-use super::hostile::{LOWEST, dial, elect, greet, of_raw, publishes, samples, say, subscribe};
+use super::super::hostile::{
+    LOWEST, dial, elect, greet, of_raw, publishes, samples, say, subscribe,
+};
 use crate::{
     engine::sim::{
         tests::{millis, secs},
