@@ -20,7 +20,7 @@ pub struct RateLimit {
     pub together: bool,
 }
 
-/// What becomes of samples beyond a limit.
+/// The policy for samples beyond a limit.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Over {
     /// The newest waits until it may pass. It replaces the one that waited before.
@@ -34,7 +34,7 @@ pub enum Over {
 }
 
 impl Over {
-    /// Each of them.
+    /// All policies.
     pub const ALL: [Self; 3] = [Self::DropOldest, Self::DropNewest, Self::Hold];
 
     /// As rules spell it.
@@ -64,7 +64,7 @@ impl fmt::Display for RateLimit {
             let comma = if self.rate.is_some() { ", " } else { "" };
             write!(f, "{comma}{}", bytes_text(bytes))?;
         }
-        if self.burst > NonZeroU32::MIN {
+        if self.rate.is_some() && self.burst > NonZeroU32::MIN {
             write!(f, ", {} at once", self.burst)?;
         }
         write!(f, ", {}", self.over.name())?;

@@ -7,15 +7,15 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct LimitStatus {
-    /// What the peer does that is limited: `publish`, `subscribe` or `call`.
+    /// What the peer does that is limited: `publish`, `subscribe` or `call`; or `egress`, all packets to it.
     pub verb: String,
-    /// The topic or service, or `(all topics)` together.
+    /// The topic or service, or `(all topics)` together, or `(all packets)`.
     pub name: String,
     /// The limit.
     pub limit: String,
     /// Where it is written.
     pub place: String,
-    /// Samples, or requests, that passed.
+    /// Samples, requests or packets that passed.
     pub passed: u64,
     /// Those that were dropped.
     pub dropped: u64,

@@ -133,12 +133,15 @@ impl Watch {
         while !self.interrupt.is_triggered() {
             let elapsed = begin.elapsed();
             let left = time.map_or(LOOK, |time| time.saturating_sub(elapsed));
-            self.ask();
+            if self.ask() {
+                version = None;
+            }
             let graph = self.session.graph();
             let is_new = version != Some(graph.version);
-            let has_strangers = graph.endpoints.values().any(|entry| {
-                entry.daemon.is_some_and(|daemon| !self.known.hosts.contains_key(&daemon))
-            });
+            let has_strangers = graph
+                .endpoints
+                .values()
+                .any(|entry| entry.daemon.is_some_and(|daemon| self.known.is_unnamed(&daemon)));
             // After a host's name is known its endpoints are looked at again.
             if is_new || has_strangers || self.known.asked.is_none() {
                 version = (!has_strangers).then_some(graph.version);
@@ -167,26 +170,28 @@ impl Watch {
         self.known.unnamed = strangers.count();
     }
 
-    /// Asks the daemon for its status, if it is time, or if there is a host of which nothing is known.
-    fn ask(&mut self) {
+    /// Asks the daemon for its status, if it is time, or if there is a host of which nothing is known. Returns whether a host
+    /// or user became known: its endpoints are to be looked at again.
+    fn ask(&mut self) -> bool {
         let graph = self.session.graph();
-        let unknown = |daemon: &DaemonId| self.known.hosts.get(daemon).is_none_or(Option::is_none);
-        let has_strangers =
-            graph.endpoints.values().filter_map(|entry| entry.daemon).any(|d| unknown(&d));
+        let mut daemons = graph.endpoints.values().filter_map(|entry| entry.daemon);
+        let has_strangers = daemons.any(|daemon| self.known.is_unnamed(&daemon));
         let is_due = self.known.asked.is_none_or(|asked| asked.elapsed() >= STATUS);
         if !has_strangers && !is_due {
-            return;
+            return false;
         }
         // Without a daemon there is nothing to ask.
-        let Ok(json) = self.session.status_json() else { return };
-        let Ok(status) = serde_json::from_str::<Status>(&json) else { return };
+        let Ok(json) = self.session.status_json() else { return false };
+        let Ok(status) = serde_json::from_str::<Status>(&json) else { return false };
         self.known.asked = Some(Instant::now());
+        let before = self.known.counts();
         self.known.learn(&status, &graph);
         for link in &status.links {
             if !link.party.is_empty() {
                 self.seen.observe_denied(&link.party, &link.denied, link.more_denied);
             }
         }
+        self.known.counts() != before
     }
 
     fn look(&mut self, graph: &GraphView) {
@@ -218,6 +223,15 @@ impl Watch {
 }
 
 impl Known {
+    fn is_unnamed(&self, daemon: &DaemonId) -> bool {
+        self.hosts.get(daemon).is_none_or(Option::is_none)
+    }
+
+    /// Hosts and users that are known.
+    fn counts(&self) -> (usize, usize) {
+        (self.hosts.values().flatten().count(), self.users.len())
+    }
+
     fn learn(&mut self, status: &Status, graph: &GraphView) {
         let name = |daemon: &DaemonId| {
             let daemon = daemon.to_string();

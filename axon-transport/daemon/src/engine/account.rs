@@ -46,7 +46,7 @@ pub(crate) const MAX_PROVEN: usize = 8192;
 /// Publishers, or clients, of one identity that one route shows here: a reader looks at all of its publishers.
 const MAX_WRITERS_OF_ROUTE: usize = 1024;
 /// Identities of which it is remembered how much passed.
-const LIMITED: usize = 1024;
+const LIMITED: usize = 128;
 /// What one identity may say a second, and at once, by [`cost`] and [`cost_of_frame`].
 const SAID: (u32, u32) = (16_384, 65_536);
 /// Bytes of a control message that cost as much as one change: what it takes to decompress and decode

@@ -31,6 +31,8 @@ const LOSES: f64 = 0.01;
 const MOST_ROUNDS: f64 = 6.0;
 /// Bytes more that QUIC holds for all other classes.
 const RESERVE: u64 = 1 << 20;
+/// Where a limit lets less leave in this time, it holds that.
+const RESERVE_TIME: Duration = Duration::from_millis(80);
 
 /// A QUIC connection.
 pub(crate) struct Connection {
@@ -141,6 +143,7 @@ impl Connection {
             taken: 0,
             window,
             bulk,
+            reserve: self.egress.window(RESERVE, RESERVE_TIME),
             loses: self.loss.share >= LOSES,
         }
     }
@@ -205,6 +208,8 @@ pub(crate) struct Carrier<'a> {
     pub(super) taken: u64,
     window: u64,
     bulk: u64,
+    /// What QUIC may hold more of all other classes.
+    reserve: u64,
     /// Whether the link loses packets.
     pub(super) loses: bool,
 }
@@ -217,7 +222,7 @@ impl Carrier<'_> {
 
     /// What QUIC may hold while a flow of this rank writes. What others filled is no obstacle to a higher priority.
     pub(super) fn limit_of(&self, rank: Rank) -> u64 {
-        let reserve = if rank.class == Class::Bulk { 0 } else { RESERVE };
+        let reserve = if rank.class == Class::Bulk { 0 } else { self.reserve };
         (1 + self.priorities.below(rank.priority)) * self.bulk + reserve
     }
 

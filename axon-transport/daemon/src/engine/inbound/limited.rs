@@ -76,10 +76,14 @@ impl Inbound {
         now: Duration,
     ) -> Result<Message, Next> {
         let Some((header, Some(route))) = stream.header else { return Err(Next::Over) };
-        let Some(exceeded) = limit.exceeded(now) else { return Ok(message) };
         let keeps_all = self.routes.get(&header.route).is_some_and(|route| route.keeps_all);
         let may_wait = route.kind == Kind::Request || header.reliable && keeps_all;
-        if exceeded.over() == Over::Hold && may_wait {
+        // Streams that wait for one limit are read on in turn.
+        let waits = |over| may_wait && over == Over::Hold;
+        let Some(exceeded) = limit.exceeded_by(&header.of, waits, now) else {
+            return Ok(message);
+        };
+        if waits(exceeded.over()) {
             self.limited.hold(key, now + exceeded.wait);
             return Err(wait(stream, Step::Ring(message)));
         }

@@ -27,7 +27,9 @@ use self::{bucket::Bucket, egress::EgressCap, line::Line};
 const LISTED: usize = 64;
 /// Topics of which an identity's limits are remembered while no route has them: else a route that is asked for anew, or a
 /// new link, would have a full bucket.
-const REMEMBERED: usize = 4096;
+const REMEMBERED: usize = 1024;
+/// A flow that waits asks again after so long for each flow before it, at most.
+const ASK_AGAIN: Duration = Duration::from_millis(20);
 /// How status shows the name of a limit of all topics together.
 const ALL_TOPICS: &str = "(all topics)";
 
@@ -59,6 +61,8 @@ pub(crate) struct Limit {
 #[derive(Debug, Default)]
 pub(crate) struct Limits {
     uses: RefCell<HashMap<Scope, Vec<Rc<Limit>>>>,
+    /// How many topics there were after those without a route were forgotten last.
+    kept: Cell<usize>,
     egress: RefCell<Vec<Rc<EgressCap>>>,
 }
 
@@ -103,8 +107,9 @@ impl Limits {
         let mut all = self.uses.borrow_mut();
         let in_use =
             |limits: &Vec<Rc<Limit>>| limits.iter().any(|limit| Rc::strong_count(limit) > 1);
-        if all.len() >= REMEMBERED.max(all.capacity() / 2) && !all.contains_key(&scope) {
+        if all.len() >= REMEMBERED.max(2 * self.kept.get()) && !all.contains_key(&scope) {
             all.retain(|_, limits| in_use(limits));
+            self.kept.set(all.len());
         }
         let limits = all.entry(scope.clone()).or_default();
         if let Some(known) = limits.iter().find(|limit| limit.rate == *rate && limit.cause == cause)
@@ -211,17 +216,26 @@ impl RouteLimit {
         self.0.borrow().is_empty()
     }
 
-    /// Whether a sample that came is beyond a limit. If it is beyond several, the one counts that opens last.
-    pub(crate) fn exceeded(&self, now: Duration) -> Option<Exceeded> {
+    /// Whether the next sample of a flow is beyond a limit. If it is beyond several, the one counts that opens for it last.
+    /// Flows that wait for a limit pass one after the other: the flow has a turn if it `may_wait` for that limit.
+    pub(crate) fn exceeded_by(
+        &self,
+        flow: &Gid,
+        may_wait: impl Fn(Over) -> bool,
+        now: Duration,
+    ) -> Option<Exceeded> {
         let limits = self.0.borrow();
-        let waits = limits.iter().map(|limit| (limit.bucket.borrow().open_at(), limit));
-        longest(waits.map(|(at, limit)| (at.saturating_sub(now), limit)))
-    }
-
-    /// Whether the next sample of a flow has to wait. The flows that wait for a limit pass one after the other.
-    pub(crate) fn exceeded_by(&self, flow: &Gid, now: Duration) -> Option<Exceeded> {
-        let limits = self.0.borrow();
-        longest(limits.iter().map(|limit| (limit.wait_of(flow, now), limit)))
+        let waits = limits.iter().map(|limit| (limit.wait_of(flow, now), limit));
+        let (wait, last) = waits.max_by_key(|(wait, _)| *wait).filter(|(w, _)| !w.is_zero())?;
+        for limit in limits.iter() {
+            let mut line = limit.line.borrow_mut();
+            // It would keep others from limits that it cannot use yet.
+            match Rc::ptr_eq(limit, last) && may_wait(limit.rate.over) {
+                true => line.wait(flow, now + wait),
+                false => line.leave(flow),
+            }
+        }
+        Some(Exceeded { limit: Rc::clone(last), wait })
     }
 
     /// How many samples of a flow may pass now, if they are as long as the last one.
@@ -240,12 +254,6 @@ impl RouteLimit {
     }
 }
 
-/// The limit that has to be waited for longest, if one has to be.
-fn longest<'l>(waits: impl Iterator<Item = (Duration, &'l Rc<Limit>)>) -> Option<Exceeded> {
-    let longest = waits.max_by_key(|(wait, _)| *wait).filter(|(wait, _)| !wait.is_zero());
-    longest.map(|(wait, limit)| Exceeded { limit: Rc::clone(limit), wait })
-}
-
 impl Limit {
     /// How many samples of a flow may pass besides those of flows before it.
     fn passes(&self, flow: &Gid, now: Duration) -> usize {
@@ -258,11 +266,12 @@ impl Limit {
         if self.passes(flow, now) > 0 {
             return Duration::ZERO;
         }
-        let (bucket, mut line) = (self.bucket.borrow(), self.line.borrow_mut());
-        let ahead = u32::try_from(line.ahead_of(flow, now)).unwrap_or(u32::MAX);
-        let turn = bucket.open_at().max(now) + bucket.interval().saturating_mul(ahead);
-        line.wait(flow, turn);
-        turn.saturating_sub(now).max(Duration::from_nanos(1))
+        let ahead = self.line.borrow_mut().ahead_of(flow, now);
+        let ahead = u32::try_from(ahead).unwrap_or(u32::MAX);
+        let bucket = self.bucket.borrow();
+        // Samples before it may be shorter than the last one: it asks again in time.
+        let turn = bucket.interval().min(ASK_AGAIN).saturating_mul(ahead);
+        (bucket.open_at().saturating_sub(now) + turn).max(Duration::from_nanos(1))
     }
 }
 
@@ -297,8 +306,9 @@ pub(crate) mod tests {
             let all = Limits::default();
             let one = of(&all, Verb::Publish, "/a", rules);
             one.pass(&OF, 1, Duration::ZERO);
-            let is_full =
-                |verb, topic| of(&all, verb, topic, rules).exceeded(Duration::ZERO).is_none();
+            let is_full = |verb, topic| {
+                of(&all, verb, topic, rules).exceeded_by(&OF, |_| false, Duration::ZERO).is_none()
+            };
             assert!(!is_full(Verb::Publish, "/a"));
             assert_eq!(is_full(Verb::Publish, "/b"), !same, "{rules}");
             assert!(is_full(Verb::Subscribe, "/a"));
@@ -312,11 +322,11 @@ pub(crate) mod tests {
                      [[limit]]\npeer = \"*\"\ntopic = \"/**\"\nrate = 2\nburst = 1\nover = \"drop-newest\"";
         let limit = of(&Limits::default(), Verb::Subscribe, "/a", rules);
         limit.pass(&OF, 1, Duration::ZERO);
-        let exceeded = limit.exceeded(Duration::ZERO).unwrap();
+        let exceeded = limit.exceeded_by(&OF, |_| false, Duration::ZERO).unwrap();
         assert_eq!(exceeded.over(), Over::DropNewest);
         assert_eq!(exceeded.wait.as_millis(), 500);
         let at = Duration::from_millis(501);
-        assert!(limit.exceeded(at).is_none());
+        assert!(limit.exceeded_by(&OF, |_| false, at).is_none());
         assert_eq!(limit.passes(&OF, at), 1);
     }
 
@@ -327,10 +337,10 @@ pub(crate) mod tests {
         let limit = of(&all, Verb::Subscribe, "/a", rules);
         limit.pass(&OF, 1, Duration::ZERO);
         limit.set(all.of(Verb::Subscribe, "/a", &permissions(rules), &Config::default()));
-        assert!(limit.exceeded(Duration::ZERO).is_some());
+        assert!(limit.exceeded_by(&OF, |_| false, Duration::ZERO).is_some());
         let more = rules.replace("rate = 1\n", "rate = 2\n");
         limit.set(all.of(Verb::Subscribe, "/a", &permissions(&more), &Config::default()));
-        assert!(limit.exceeded(Duration::ZERO).is_none());
+        assert!(limit.exceeded_by(&OF, |_| false, Duration::ZERO).is_none());
     }
 
     #[test]
@@ -338,11 +348,15 @@ pub(crate) mod tests {
         let rules = "[[limit]]\npeer = \"*\"\ntopic = \"/**\"\nrate = 1\nburst = 1";
         let all = Limits::default();
         of(&all, Verb::Subscribe, "/a", rules).pass(&OF, 1, Duration::ZERO);
-        assert!(of(&all, Verb::Subscribe, "/a", rules).exceeded(Duration::ZERO).is_some());
+        assert!(
+            of(&all, Verb::Subscribe, "/a", rules)
+                .exceeded_by(&OF, |_| false, Duration::ZERO)
+                .is_some()
+        );
         for number in 0..100_000 {
             of(&all, Verb::Subscribe, &format!("/{number}"), rules);
         }
-        assert!(all.uses.borrow().len() <= 4 * REMEMBERED, "{}", all.uses.borrow().len());
+        assert!(all.uses.borrow().len() <= REMEMBERED, "{}", all.uses.borrow().len());
     }
 
     #[test]
@@ -350,7 +364,10 @@ pub(crate) mod tests {
         let one = "[[limit]]\npeer = \"*\"\ntopic = \"/a\"\nrate = 10\nburst = 1\n";
         let limit = of(&Limits::default(), Verb::Subscribe, "/a", &one.repeat(2));
         limit.pass(&OF, 1, Duration::ZERO);
-        assert_eq!(limit.exceeded(Duration::ZERO).unwrap().wait.as_millis(), 100);
+        assert_eq!(
+            limit.exceeded_by(&OF, |_| false, Duration::ZERO).unwrap().wait.as_millis(),
+            100
+        );
     }
 
     /// So many flows of a limit of samples a second: each has a sample each `every` milliseconds, and asks when it has one
@@ -369,7 +386,7 @@ pub(crate) mod tests {
                     continue;
                 }
                 let flow = Gid([number as u8; 16]);
-                waits[number] = limit.exceeded_by(&flow, now).map(|e| now + e.wait);
+                waits[number] = limit.exceeded_by(&flow, |_| true, now).map(|e| now + e.wait);
                 if waits[number].is_none() {
                     limit.pass(&flow, 1, now);
                     passed[number] += 1;
@@ -398,6 +415,27 @@ pub(crate) mod tests {
     }
 
     #[test]
+    fn a_flow_that_another_limit_holds_takes_nothing_of_a_limit_that_it_shares() {
+        let rules = "[[limit]]\npeer = \"*\"\nsubscribe = \"/**\"\nrate = 100\nburst = 1\ntogether = true\n\
+                     [[limit]]\npeer = \"*\"\nsubscribe = \"/imu\"\nrate = 1\nburst = 1";
+        let all = Limits::default();
+        let [imu, camera] =
+            ["/imu", "/camera"].map(|topic| of(&all, Verb::Subscribe, topic, rules));
+        let flows = [1, 2].map(|n| Gid([n; 16]));
+        let mut passed = [0, 0];
+        for tick in 0..10_000 {
+            let now = Duration::from_millis(tick);
+            for (number, limit) in [&imu, &camera].into_iter().enumerate() {
+                if limit.exceeded_by(&flows[number], |_| true, now).is_none() {
+                    limit.pass(&flows[number], 1, now);
+                    passed[number] += 1;
+                }
+            }
+        }
+        assert!((9..=11).contains(&passed[0]) && passed[1] > 960, "{passed:?}");
+    }
+
+    #[test]
     fn status_names_those_first_that_dropped_most() {
         let rules =
             "[[limit]]\npeer = \"*\"\ntopic = \"/**\"\nrate = 1.5\nburst = 1\nbytes = \"4 MB/s\"";
@@ -405,7 +443,7 @@ pub(crate) mod tests {
         let routes: Vec<_> =
             (0..70).map(|n| of(&all, Verb::Subscribe, &format!("/{n}"), rules)).collect();
         routes[42].pass(&OF, 1, Duration::ZERO);
-        routes[42].exceeded(Duration::ZERO).unwrap().dropped(7);
+        routes[42].exceeded_by(&OF, |_| false, Duration::ZERO).unwrap().dropped(7);
         let mut status = LinkStatus::default();
         all.fill(&mut status);
         assert_eq!((status.limits.len(), status.more_limits), (64, 6));

@@ -34,8 +34,10 @@ pub(super) struct Connections {
     dirty: VecDeque<u64>,
     /// Connections that may have something to transmit.
     transmitting: VecDeque<u64>,
-    /// Those of them whose limit lets no packet leave, by the time when it does.
-    limited: BTreeSet<(Duration, u64)>,
+    /// Those of them whose limit lets no packet leave, by the time when it does. Of those that share a limit the one that
+    /// began to wait first is first: it has a number that rises.
+    limited: BTreeSet<(Duration, u64, u64)>,
+    next_wait: u64,
     deadlines: BTreeSet<(Instant, u64)>,
 }
 
@@ -51,6 +53,7 @@ impl Connections {
             dirty: VecDeque::new(),
             transmitting: VecDeque::new(),
             limited: BTreeSet::new(),
+            next_wait: 0,
             deadlines: BTreeSet::new(),
         }
     }
@@ -240,7 +243,7 @@ impl Connections {
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         let quic = self.deadlines.first().map(|(due, _)| due.saturating_duration_since(self.epoch));
         let control = self.all.values().filter_map(|c| c.control.poll_timeout()).min();
-        let limited = self.limited.first().map(|(due, _)| *due);
+        let limited = self.limited.first().map(|(due, ..)| *due);
         [quic, control, limited].into_iter().flatten().min()
     }
 
@@ -257,7 +260,7 @@ impl Connections {
                 self.touch(number);
             }
         }
-        while let Some((due, number)) = self.limited.first().copied()
+        while let Some((due, _, number)) = self.limited.first().copied()
             && due <= now
         {
             self.limited.pop_first();
@@ -295,7 +298,8 @@ impl Connections {
         while let Some(number) = self.transmitting.pop_front() {
             let Some(connection) = self.all.get_mut(&number) else { continue };
             if let Some(until) = connection.egress.closed_until(since) {
-                self.limited.insert((until, number));
+                self.limited.insert((until, self.next_wait, number));
+                self.next_wait += 1;
                 continue;
             }
             let most = max_datagrams.min(connection.egress.packets(since));

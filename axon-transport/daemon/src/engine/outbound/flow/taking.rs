@@ -299,7 +299,8 @@ impl Taking {
         counters: &Counters,
         now: Duration,
     ) -> bool {
-        let exceeded = self.limit.exceeded_by(&self.of, now);
+        let may_wait = |over| over != Over::DropNewest;
+        let exceeded = self.limit.exceeded_by(&self.of, may_wait, now);
         if self.exceeded.is_some() || exceeded.is_some() {
             // Until here it was another cause, or the limit that the last turn came to.
             self.count_overwritten(sources, topic, counters);
@@ -420,8 +421,9 @@ impl Taking {
             if let (Some(response), Some(numbers)) = (&mut next, responses) {
                 response.info.sequence = numbers.next();
             }
+            let there = next.is_some();
             taken.extend(next);
-            return !taken.is_empty();
+            return there;
         }
         if let [source] = sources
             && merge.is_of_one()
@@ -438,8 +440,9 @@ impl Taking {
             let content = source.take_of(of, now)?;
             Some(Taken { number: content.info.sequence, lost: 0, content })
         });
+        let there = next.is_some();
         taken.extend(next.map(|next| next.content));
-        !taken.is_empty()
+        there
     }
 }
 

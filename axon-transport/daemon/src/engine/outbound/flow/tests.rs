@@ -253,6 +253,30 @@ fn beyond_a_limit_the_newest_sample_waits_and_the_others_are_dropped() {
 }
 
 #[test]
+fn of_two_relays_the_newest_sample_passes_when_the_limit_opens() {
+    for qos in [keep_last(10), Qos::keep_all()] {
+        let limit = limits("topic = \"/t\"\nrate = 10\nburst = 1\nover = \"drop-oldest\"");
+        let mut way = Way::limited(qos, RouteLimit::new(limit));
+        let second = Ring::new(Gid([3; 16]), PUBLISHER);
+        way.sources.push(second.source(keep_last(1)));
+        way.taking.set_sources(&way.sources, None);
+        let mut sent = Vec::new();
+        for ms in 0..=1000 {
+            if ms % 10 == 0 {
+                way.ring.publish(1, 8);
+                second.publish(1, 8);
+            }
+            way.fill(at(ms));
+            let retry = way.taking.take_retry();
+            assert!(retry.is_none_or(|wait| !wait.is_zero()), "it looks again at once, for ever");
+            sent.extend(way.send_all().into_iter().map(|number| (number, ms)));
+        }
+        assert_eq!(sent.len(), 11, "{sent:?}");
+        assert!(sent.iter().all(|(number, ms)| *number == ms / 10 + 1), "{sent:?}");
+    }
+}
+
+#[test]
 fn beyond_a_limit_that_drops_the_newest_samples_are_dropped_as_they_come() {
     for qos in [keep_last(10), Qos::sensor_data(), Qos::keep_all()] {
         let (mut way, sent) = passes(qos, "drop-newest");

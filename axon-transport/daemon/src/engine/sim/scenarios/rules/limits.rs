@@ -196,3 +196,18 @@ fn egress_to_a_peer_stays_below_its_limit_and_what_leaves_is_fresh() {
     let free = world.network.counters(0).sent_bytes - before;
     assert!(free > 20_000_000, "{free} in five seconds");
 }
+
+#[test]
+fn short_samples_beyond_the_egress_do_not_grow_old() {
+    let mut world = hosts(0, "[[limit]]\npeer = \"*\"\negress = \"100 kB/s\"");
+    world.network.set_default_path(radio(54, 0.0));
+    let mut streams = [Stream::new(&mut world, "/short", Qos::sensor_data(), 1000, millis(4))];
+    world.until(secs(20), World::is_whole);
+    world.run_for(secs(1));
+    drive(&mut world, &mut streams, secs(5));
+    let from = world.now;
+    drive(&mut world, &mut streams, secs(10));
+    let ages = streams[0].ages(from);
+    let oldest = ages.iter().max().unwrap();
+    assert!(ages.len() > 700 && *oldest < millis(600), "{} samples, {oldest:?} old", ages.len());
+}
