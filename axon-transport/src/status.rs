@@ -488,7 +488,7 @@ mod tests {
 
         let link = concat!(
             r#"{"peer":"cc","host":"robot-2","sae":null,"address":"192.0.2.1:61348","state":"connected","#,
-            r#""key_exchange":"X25519MLKEM768","cipher":"c","authenticated_as":"UNAUTHENTICATED","#,
+            r#""key_exchange":"X25519MLKEM768","cipher":"c","authenticated_as":"UNAUTHENTICATED","party":"","#,
             r#""since_unix_ms":1700000000123,"rtt_us":1500,"rtt_min_us":740,"congestion_window":1,"#,
             r#""packets_sent":2,"packets_lost":3,"bytes_lost":4,"ecn_marks_in":5,"ecn_marks_out":6,"#,
             r#""congestion_events":7,"mtu":1452,"mtu_black_holes":8,"waiting_bytes":9,"#,

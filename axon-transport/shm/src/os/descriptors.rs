@@ -281,15 +281,18 @@ pub(crate) fn receive_whole(socket: impl AsFd, buffer: &mut [u8]) -> Result<Pack
 }
 
 /// As [`receive`], for a packet of at most [`FEW`] descriptors: closes none of them for the last time, and needs no room
-/// for more. One with more stays where it is, as truncated, and one for which there is no room as lost.
+/// for more. A packet with more descriptors is reported as truncated and stays in the socket. A packet for whose descriptors
+/// the process has no room is reported as lost and stays, too.
 pub fn receive_few(socket: impl AsFd, buffer: &mut [u8]) -> Result<Packet, Errno> {
     let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(FEW))];
     let packet = receive_with(&socket, buffer, RecvFlags::PEEK, &mut space)?;
-    if !packet.lost {
+    // By its alignment the space may have room for one more.
+    let more = packet.descriptors.len() > FEW;
+    if !packet.lost && !more {
         take_seen(&socket);
     }
-    let truncated = packet.truncated || (packet.lost && packet.descriptors.len() == FEW);
-    Ok(Packet { truncated, ..packet })
+    let truncated = packet.truncated || more || packet.lost && packet.descriptors.len() == FEW;
+    Ok(Packet { truncated, lost: packet.lost || more, ..packet })
 }
 
 /// Takes a packet that was looked at: what goes with it is not closed for the last time here.
