@@ -74,7 +74,7 @@ pub(super) fn run(args: &cli::Learn) -> Result<ExitCode, CliError> {
     match &args.output {
         Some(file) => write(file, &rules, args.force)?,
         None => match io::stdout().lock().write_all(rules.as_bytes()) {
-            // Whoever read it has seen enough.
+            // The reader of the pipe closed it: it wants no more lines.
             Err(error) if error.kind() == io::ErrorKind::BrokenPipe => {}
             written => written?,
         },

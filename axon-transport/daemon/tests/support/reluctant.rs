@@ -27,7 +27,7 @@ fn reluctant() -> (OwnedFd, TcpStream) {
     (ours.into(), peer)
 }
 
-/// A unix socket in whose queue such a one waits, where nobody finds it before it is closed.
+/// A unix socket whose queue holds a packet with such a socket. Closing the unix socket closes it.
 pub(crate) fn hiding() -> (OwnedFd, TcpStream) {
     let (unix, packets) = (AddressFamily::UNIX, SocketType::SEQPACKET);
     let (ours, theirs) = socketpair(unix, packets, SocketFlags::CLOEXEC, None).unwrap();

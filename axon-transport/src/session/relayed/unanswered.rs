@@ -52,7 +52,7 @@ impl Unanswered {
         while self.requests.len() > MAX_REQUESTS
             || self.bytes > MAX_BYTES && self.requests.len() > 1
         {
-            // The oldest of this client, or of whoever has one.
+            // It forgets the oldest request of this client, or of any client if this one has none.
             let of = (client, 0)..(client, meta.sequence);
             let oldest = self.requests.range(of).next().or_else(|| self.requests.iter().next());
             let Some(oldest) = oldest.map(|(key, _)| *key) else { break };

@@ -153,7 +153,7 @@ mod tests {
     }
 
     proptest! {
-        /// Whoever waits as told gets no more than the limit, and hardly less.
+        /// A sender that waits until the bucket opens sends as much as the limit allows, and no more.
         #[test]
         fn what_passes_is_what_the_limit_says(
             rate in 0.5_f64..2000.0,

@@ -1,0 +1,136 @@
+//! A link to the daemon of another host, in the status.
+
+use std::{
+    collections::BTreeMap,
+    time::{Duration, SystemTime},
+};
+
+use serde::{Deserialize, Serialize};
+
+use super::{LimitStatus, times};
+
+/// A link to another host's daemon.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[non_exhaustive]
+pub struct LinkStatus {
+    /// The peer's daemon id, in hexadecimal.
+    pub peer: String,
+    /// The peer's host name, as it calls itself.
+    pub host: String,
+    /// The peer's SAE ID in qkd.
+    pub sae: Option<String>,
+    /// Its address and port.
+    pub address: String,
+    /// `connected`, or what it waits for.
+    pub state: String,
+    /// The key exchange as negotiated, read from the handshake.
+    pub key_exchange: String,
+    /// The cipher suite as negotiated.
+    pub cipher: String,
+    /// How and as whom the peer proved itself.
+    pub authenticated_as: String,
+    /// The peer as access rules name it; empty from a daemon of an earlier version.
+    #[serde(default)]
+    pub party: String,
+    /// When it was established; milliseconds since the Unix epoch in JSON, or 0.
+    #[serde(rename = "since_unix_ms", with = "times::optional_unix_millis")]
+    pub since: Option<SystemTime>,
+    /// Round-trip time; microseconds in JSON.
+    #[serde(rename = "rtt_us", with = "times::micros")]
+    pub rtt: Duration,
+    /// Shortest round-trip time so far; microseconds in JSON.
+    #[serde(default, rename = "rtt_min_us", with = "times::micros")]
+    pub rtt_min: Duration,
+    /// Congestion window in bytes.
+    #[serde(default)]
+    pub congestion_window: u64,
+    /// Packets sent.
+    #[serde(default)]
+    pub packets_sent: u64,
+    /// Packets that were lost.
+    #[serde(default)]
+    pub packets_lost: u64,
+    /// Bytes of these packets. QUIC retransmits what they carried and still matters: its own counter of that does not
+    /// exist.
+    #[serde(default)]
+    pub bytes_lost: u64,
+    /// Datagrams that arrived with an ECN mark: a router on the way here is congested.
+    #[serde(default)]
+    pub ecn_marks_in: u64,
+    /// Times that the peer reported new ECN marks on what was sent to it, since its address changed last.
+    #[serde(default)]
+    pub ecn_marks_out: u64,
+    /// Times that the congestion controller took packets for lost, or marked.
+    #[serde(default)]
+    pub congestion_events: u64,
+    /// Largest UDP payload, in bytes.
+    #[serde(default)]
+    pub mtu: u64,
+    /// Times that the path let packets of this size no longer pass, and the link went back to shorter ones.
+    #[serde(default)]
+    pub mtu_black_holes: u64,
+    /// Bytes of samples that wait for the link.
+    #[serde(default)]
+    pub waiting_bytes: u64,
+    /// The same by class, and control messages.
+    #[serde(default)]
+    pub waiting: WaitingStatus,
+    /// How long the oldest of them has waited; milliseconds in JSON.
+    #[serde(default, rename = "waiting_ms", with = "times::millis")]
+    pub oldest_waits: Duration,
+    /// Samples received.
+    pub samples_in: u64,
+    /// Samples sent.
+    pub samples_out: u64,
+    /// Bytes received.
+    pub bytes_in: u64,
+    /// Bytes sent.
+    pub bytes_out: u64,
+    /// Samples dropped, by cause.
+    pub dropped: BTreeMap<String, u64>,
+    /// Topics and services that do not cross though they match, and why: the first 64.
+    #[serde(default)]
+    pub routes_refused: BTreeMap<String, String>,
+    /// How many more there are.
+    #[serde(default)]
+    pub more_routes_refused: usize,
+    /// What access rules deny, here to the peer and there to this host: the first 64.
+    #[serde(default)]
+    pub denied: BTreeMap<String, String>,
+    /// How many more there are.
+    #[serde(default)]
+    pub more_denied: usize,
+    /// The limits in force between this host and the peer's identity: the first 64, those that dropped most first.
+    #[serde(default)]
+    pub limits: Vec<LimitStatus>,
+    /// How many more there are.
+    #[serde(default)]
+    pub more_limits: usize,
+    /// Endpoints and nodes of the peer that are known here.
+    #[serde(default)]
+    pub endpoints: u64,
+    /// Those that it announces and that are left out here; a refusal names the first.
+    #[serde(default)]
+    pub endpoints_left_out: u64,
+    /// Bytes that count for the graph of the peer's identity, over all of its daemon ids.
+    #[serde(default)]
+    pub graph_bytes: u64,
+}
+
+/// Bytes that wait in the daemon until QUIC takes them, by class: a class goes before those below it, and bulk has every
+/// eighth turn. A flow counts as a whole for the class of its next sample. BEST_EFFORT and KEEP_ALL samples wait in their
+/// publisher's ring: those that the daemon has not taken from there do not count.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
+pub struct WaitingStatus {
+    /// Control messages.
+    pub control: u64,
+    /// Requests and responses of services and actions.
+    pub services: u64,
+    /// RELIABLE samples of at most 4 KiB.
+    pub small_reliable: u64,
+    /// BEST_EFFORT samples of at most 4 KiB.
+    pub small_best_effort: u64,
+    /// Longer samples.
+    pub bulk: u64,
+}
