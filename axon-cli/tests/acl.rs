@@ -63,7 +63,10 @@ fn check_names_the_limits_of_the_page_that_count() {
     let base = check(&["base", "--subscribe", "/camera/left"]);
     assert!(base.contains(shown.expect("an example")), "{base}");
     assert!(
-        base.ends_with("limited: all packets to it: line 12 of access.toml: 2.5 MB/s\n"),
+        base.ends_with(
+            "limited: all packets to it: line 12 of access.toml: 2.5 MB/s\n\
+             limited: all packets by wlan*: line 16 of access.toml: 3.75 MB/s\n"
+        ),
         "{base}"
     );
     let guest = check(&["guest", "--publish", "/scan"]);

@@ -3,7 +3,7 @@
 use std::{io::Write as _, process::ExitCode};
 
 use axon_transport::{
-    access::Verb,
+    access::{InterfaceLimit, Verb},
     config::{Config, DaemonPlace},
     internal::graph::other_end,
     status::{LinkStatus, Status},
@@ -46,6 +46,14 @@ pub(super) fn run(args: &cli::Check) -> Result<ExitCode, CliError> {
     for limit in permissions.egress() {
         let line =
             format!("limited: all packets to it: line {} of {}: {limit}", limit.line, limit.file);
+        text.push_str(&format!("{}\n", printable(&line)));
+    }
+    for InterfaceLimit { interfaces, limit, .. } in rules.interface_limits() {
+        let interfaces = interfaces.join(", ");
+        let line = format!(
+            "limited: all packets by {interfaces}: line {} of {}: {limit}",
+            limit.line, limit.file
+        );
         text.push_str(&format!("{}\n", printable(&line)));
     }
     std::io::stdout().lock().write_all(text.as_bytes())?;

@@ -2,7 +2,7 @@
 
 use std::{fmt, num::NonZeroU32, sync::Arc};
 
-use super::{Party, TopicPattern, Verb, party::PartyPattern};
+use super::{Party, TopicPattern, Verb, party::PartyPattern, pattern::segment_fits};
 
 /// The samples that a limit lets pass. The time of a sample is that at which this host's daemon has it.
 #[derive(Clone, Debug, PartialEq)]
@@ -103,7 +103,24 @@ pub(super) enum Limits {
     Egress(EgressLimit),
 }
 
-/// The bytes a second that leave this host for a party.
+/// A `[[limit]]` of network interfaces: each interface that it names may send so much.
+#[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
+pub struct InterfaceLimit {
+    /// The interfaces, in whose names `*` stands for any characters.
+    pub interfaces: Vec<String>,
+    /// What leaves by each of them, for all peers together.
+    pub limit: EgressLimit,
+}
+
+impl InterfaceLimit {
+    /// Whether it names this interface.
+    pub fn names(&self, interface: &str) -> bool {
+        self.interfaces.iter().any(|pattern| segment_fits(pattern, interface))
+    }
+}
+
+/// The bytes a second that leave this host for a party, or by an interface.
 #[derive(Clone, Debug, PartialEq)]
 #[non_exhaustive]
 pub struct EgressLimit {

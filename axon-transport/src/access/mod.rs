@@ -41,7 +41,7 @@ mod rules;
 mod tests;
 
 pub use decision::Decision;
-pub use limit::{EgressLimit, Over, PlacedLimit, RateLimit};
+pub use limit::{EgressLimit, InterfaceLimit, Over, PlacedLimit, RateLimit};
 pub use parse::AccessError;
 pub(crate) use party::HostPattern;
 pub use party::Party;

@@ -88,7 +88,7 @@ impl<'t> Reader<'t> {
             deny: Vec::new(),
             expectations: Vec::new(),
         };
-        let (mut limits, mut found) = (Vec::new(), false);
+        let (mut limits, mut found) = (limit::Entries::default(), false);
         for (key, value) in table.get_ref() {
             let key_name = &**key.get_ref();
             found |= ["default", "allow", "deny"].contains(&key_name);
@@ -121,8 +121,10 @@ impl<'t> Reader<'t> {
                         default = \"allow\"";
             return Err(self.wrong(0..0, what));
         }
-        let limits = limits.into_iter().map(Arc::new).collect();
-        Ok(AccessRules { rules: found.then(|| Arc::new(file)), limits })
+        let rules = found.then(|| Arc::new(file));
+        let limit::Entries { peers, interfaces } = limits;
+        let limits = peers.into_iter().map(Arc::new).collect();
+        Ok(AccessRules { rules, limits, interface_limits: interfaces.into() })
     }
 
     fn wrong(&self, span: Range<usize>, what: impl Into<String>) -> AccessError {

@@ -4,7 +4,7 @@ use std::{fmt, sync::Arc};
 
 use super::{
     Decision, Party, Permissions, TopicPattern,
-    limit::LimitRule,
+    limit::{InterfaceLimit, LimitRule},
     party::{HostPattern, PartyPattern},
     permissions::{Compiled, Otherwise, VerbPatterns},
 };
@@ -52,6 +52,7 @@ impl fmt::Display for Verb {
 pub struct AccessRules {
     pub(super) rules: Option<Arc<RuleFile>>,
     pub(super) limits: Arc<[Arc<LimitRule>]>,
+    pub(super) interface_limits: Arc<[InterfaceLimit]>,
 }
 
 #[derive(Debug)]
@@ -102,13 +103,19 @@ impl AccessRules {
 
     /// Whether there is a `[[limit]]`.
     pub fn limits_anything(&self) -> bool {
-        !self.limits.is_empty()
+        !self.limits.is_empty() || !self.interface_limits.is_empty()
+    }
+
+    /// The limits on what leaves by network interfaces. Each that names an interface counts.
+    pub fn interface_limits(&self) -> &[InterfaceLimit] {
+        &self.interface_limits
     }
 
     /// How decisions name the file; `None` where there are no rules.
     pub fn file(&self) -> Option<&str> {
-        let limited = || self.limits.first().map(|limit| limit.file());
-        self.rules.as_ref().map(|rules| &*rules.file).or_else(limited)
+        let peers = || self.limits.first().map(|limit| limit.file());
+        let interfaces = || self.interface_limits.first().map(|limit| &*limit.limit.file);
+        self.rules.as_ref().map(|rules| &*rules.file).or_else(peers).or_else(interfaces)
     }
 
     /// What the rules let one party do. It takes the time of reading all rules once.

@@ -7,9 +7,10 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct LimitStatus {
-    /// What the peer does that is limited: `publish`, `subscribe` or `call`; or `egress`, all packets to it.
+    /// What the peer does that is limited: `publish`, `subscribe` or `call`; or `egress`, all packets to it, or by the
+    /// network interface that the link uses.
     pub verb: String,
-    /// The topic or service, or `(all topics)` together, or `(all packets)`.
+    /// The topic or service, or `(all topics)` together, or `(all packets)`, or `(all packets by wlan0)`.
     pub name: String,
     /// The limit.
     pub limit: String,

@@ -2,6 +2,7 @@
 //! in qkd a KME each, simulated in the test's process.
 
 mod access;
+mod churn;
 mod cut;
 mod delivery;
 mod disagree;

@@ -1,6 +1,10 @@
 //! One QUIC connection and its control stream.
 
-use std::{collections::HashMap, net::SocketAddr, time::Duration};
+use std::{
+    collections::HashMap,
+    net::{IpAddr, SocketAddr},
+    time::Duration,
+};
 
 use axon_transport::status::LinkStatus;
 use quinn_proto::{ConnectionHandle, StreamId, Transmit};
@@ -8,7 +12,7 @@ use rustls_pki_types::CertificateDer;
 
 use super::{
     control::Control,
-    limits::Egress,
+    limits::{Egress, InterfaceLimits},
     marks::marks_reported,
     outbound::{Class, FlowId, Priorities, Rank},
     protection::Seal,
@@ -42,6 +46,8 @@ pub(crate) struct Connection {
     pub(super) handle: ConnectionHandle,
     /// Where the peer was when the connection began: there it received what the handshake needs.
     pub(super) began_at: SocketAddr,
+    /// The address of this host that packets leave from, as far as it is known.
+    local: Option<IpAddr>,
     /// The connection.
     pub(super) quic: quinn_proto::Connection,
     /// Its control stream.
@@ -72,6 +78,7 @@ impl Connection {
             endpoint,
             handle,
             began_at: quic.remote_address(),
+            local: None,
             quic,
             control: Control::default(),
             flows: HashMap::new(),
@@ -81,6 +88,27 @@ impl Connection {
             is_transmitting: false,
             deadline: None,
             ecn_marks: 0,
+        }
+    }
+
+    /// A datagram came to this address of this host. A server's packets leave from the address that the connection began
+    /// at; where those of a client leave, the kernel decides, and it is taken for the interface that the peer's come by.
+    pub(super) fn set_local(&mut self, came_to: Option<IpAddr>, limits: &mut InterfaceLimits) {
+        let local = self.quic.local_ip().or(came_to);
+        if local.is_some() && self.local != local {
+            self.local = local;
+            self.limit_interface(limits);
+            limits.handle_address();
+        }
+    }
+
+    /// Keeps to the limits on the interface that packets leave by.
+    pub(super) fn limit_interface(&mut self, limits: &InterfaceLimits) {
+        let Some(local) = self.local else { return };
+        self.egress.set_interface(limits, local);
+        if limits.misses(local) {
+            tracing::warn!(address = %local, "no network interface has the address of a link: no limit of an interface \
+                                              acts on it");
         }
     }
 
@@ -114,6 +142,7 @@ impl Connection {
         status.ecn_marks_in = self.ecn_marks;
         status.ecn_marks_out = marks_reported(&self.quic);
         status.waiting.control = self.control.queued() as u64;
+        status.limits.extend(self.egress.interface_status());
     }
 
     /// These packets leave: they count with the headers of IP and UDP.

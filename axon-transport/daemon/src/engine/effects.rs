@@ -30,6 +30,9 @@ pub(crate) enum Effect {
         /// The key.
         key_id: String,
     },
+    /// List this host's network interfaces; the list comes back by
+    /// [`Engine::handle_interfaces`](super::Engine::handle_interfaces).
+    Interfaces,
     /// Give freed memory back to the system, after a while.
     ReturnMemory,
 }

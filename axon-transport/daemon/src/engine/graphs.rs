@@ -37,6 +37,7 @@ impl Engine {
     /// delay it.
     pub(super) fn set_access(&mut self, rules: AccessRules, now: Duration) {
         self.access = rules;
+        self.links.set_interface_rules(&self.access);
         let peers: Vec<_> = self.peers.iter().map(|(daemon, peer)| (daemon, peer.link)).collect();
         for (daemon, link) in peers {
             // A link that is gone is about to be reported as down.

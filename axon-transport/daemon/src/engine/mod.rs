@@ -67,6 +67,7 @@ use self::{
 };
 use crate::{
     bridge::{ToControl, ToGateway},
+    discovery::Interface,
     error::GatewayError,
     keys,
     link::{GraphResync, Message},
@@ -112,11 +113,14 @@ impl Engine {
     pub(crate) fn new(parts: EngineParts) -> Result<Self, GatewayError> {
         let EngineParts { links, rings, session_keys, session, epoch_nanos } = parts;
         let (config, daemon, epoch) = (Arc::clone(&links.config), links.hello.daemon, links.epoch);
+        let access = config.access.clone();
+        let mut links = Links::new(links)?;
+        links.set_interface_rules(&access);
         Ok(Self {
             peers: Peers::new(Arc::clone(&config), rings, epoch),
-            access: config.access.clone(),
+            access,
             factory: PeerFactory::new(config, daemon, session_keys, epoch_nanos),
-            links: Links::new(links)?,
+            links,
             session,
             epoch,
             effects: Effects::default(),
@@ -186,6 +190,11 @@ impl Engine {
         self.links.handle_recorded(link, first, now);
     }
 
+    /// Handles the list of this host's network interfaces.
+    pub(crate) fn handle_interfaces(&mut self, interfaces: Vec<Interface>) {
+        self.links.set_interfaces(interfaces);
+    }
+
     /// The files of the identity changed.
     pub(crate) fn handle_identity(&mut self, now: Duration) {
         self.links.close_untrusted(true, now);
@@ -218,6 +227,9 @@ impl Engine {
         }
         self.say(now);
         self.links.settle(now);
+        if self.links.asks_for_interfaces() {
+            self.effects.push(Effect::Interfaces);
+        }
         self.collect(now);
     }
 

@@ -15,6 +15,7 @@ use tokio::{
 use super::rings::ShmRings;
 use crate::{
     bridge::ToGateway,
+    discovery::Interface,
     keys::{Event, Events, Statistics, UsedStatistics},
     watch::watch,
 };
@@ -30,6 +31,8 @@ pub(super) enum Done {
     Keys(Box<(Statistics, UsedStatistics)>),
     /// The files of the identity changed.
     Identity,
+    /// This host's network interfaces.
+    Interfaces(Vec<Interface>),
 }
 
 /// An input.

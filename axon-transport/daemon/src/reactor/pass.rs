@@ -31,7 +31,7 @@ use super::{
 };
 use crate::{
     bridge::{ToControl, ToGateway},
-    discovery::is_discovery,
+    discovery::{interfaces, is_discovery},
     engine::{Effect, Engine},
     error::GatewayError,
     identity::Identity,
@@ -242,6 +242,7 @@ impl Reactor {
         match done {
             Done::Recorded(link, first) => self.engine.handle_recorded(link, first, now),
             Done::Identity => self.engine.handle_identity(now),
+            Done::Interfaces(interfaces) => self.engine.handle_interfaces(interfaces),
             Done::Keys(statistics) => {
                 self.key_reports.handle_report();
                 let (kme, used) = *statistics;
@@ -265,6 +266,7 @@ impl Reactor {
                     }
                 }
                 Effect::Record { link, key_id } => self.record(link, key_id, now),
+                Effect::Interfaces => self.list_interfaces(),
                 Effect::ReturnMemory => {
                     tokio::spawn(async {
                         sleep(RETURN).await;
@@ -284,6 +286,18 @@ impl Reactor {
             let first = used.record(&[key_id]) == [true];
             // An error: the reactor is gone.
             let _ = report.send(Done::Recorded(link, first));
+        });
+    }
+
+    fn list_interfaces(&self) {
+        let report = self.report_done.clone();
+        spawn_blocking(move || {
+            let found = interfaces().unwrap_or_else(|error| {
+                tracing::warn!(%error, "cannot list the network interfaces: their limits do not act");
+                Vec::new()
+            });
+            // An error: the reactor is gone.
+            let _ = report.send(Done::Interfaces(found));
         });
     }
 

@@ -7,7 +7,7 @@ use toml::de::{DeTable, DeValue};
 use super::{AccessError, Reader, Value};
 use crate::access::{
     TopicPattern, Verb,
-    limit::{EgressLimit, LimitRule, Limits, Over, PlacedLimit, RateLimit},
+    limit::{EgressLimit, InterfaceLimit, LimitRule, Limits, Over, PlacedLimit, RateLimit},
     party::PartyPattern,
 };
 
@@ -63,10 +63,37 @@ pub(crate) fn rate(text: &str) -> Result<f64, &'static str> {
     rate.ok_or("a number from 0.01 to 1000000")
 }
 
+/// The longest name of an interface, in bytes (IFNAMSIZ without its NUL).
+const LONGEST_NAME: usize = 15;
+/// Interfaces that an entry names at most.
+const MOST_INTERFACES: usize = 64;
+
+/// All `[[limit]]` of a file.
+#[derive(Default)]
+pub(super) struct Entries {
+    /// Those of peers.
+    pub(super) peers: Vec<LimitRule>,
+    /// Those of interfaces.
+    pub(super) interfaces: Vec<InterfaceLimit>,
+}
+
+impl Entries {
+    pub(super) fn is_empty(&self) -> bool {
+        self.peers.is_empty() && self.interfaces.is_empty()
+    }
+}
+
+/// One of them.
+enum Entry {
+    Peer(LimitRule),
+    Interface(InterfaceLimit),
+}
+
 /// The parts of an entry.
 #[derive(Default)]
 struct Parts {
     peers: Vec<PartyPattern>,
+    interfaces: Vec<String>,
     uses: Vec<(Verb, TopicPattern)>,
     rate: Option<f64>,
     bytes: Option<f64>,
@@ -77,12 +104,18 @@ struct Parts {
 }
 
 impl Reader<'_> {
-    pub(super) fn limits(&mut self, value: &Value<'_>) -> Result<Vec<LimitRule>, AccessError> {
-        let tables = self.tables(value, "[[limit]]")?;
-        tables.into_iter().map(|(table, span)| self.limit(table, span)).collect()
+    pub(super) fn limits(&mut self, value: &Value<'_>) -> Result<Entries, AccessError> {
+        let mut entries = Entries::default();
+        for (table, span) in self.tables(value, "[[limit]]")? {
+            match self.limit(table, span)? {
+                Entry::Peer(rule) => entries.peers.push(rule),
+                Entry::Interface(limit) => entries.interfaces.push(limit),
+            }
+        }
+        Ok(entries)
     }
 
-    fn limit(&mut self, table: &DeTable<'_>, span: Range<usize>) -> Result<LimitRule, AccessError> {
+    fn limit(&mut self, table: &DeTable<'_>, span: Range<usize>) -> Result<Entry, AccessError> {
         let mut parts = Parts::default();
         for (key, value) in table {
             let (key_span, key) = (key.span(), &**key.get_ref());
@@ -100,6 +133,21 @@ impl Reader<'_> {
                             self.wrong(value.span(), format!("peer {text:?}; accepted: {what}"))
                         };
                         parts.peers.push(peer.map_err(wrong)?);
+                    }
+                }
+                ("interface", _) => {
+                    for (text, value) in self.strings(key, value)? {
+                        let wrong = |what| {
+                            self.wrong(
+                                value.span(),
+                                format!("interface {text:?}; accepted: {what}"),
+                            )
+                        };
+                        parts.interfaces.push(interface(text).map_err(wrong)?);
+                    }
+                    if parts.interfaces.len() > MOST_INTERFACES {
+                        let what = format!("at most {MOST_INTERFACES} interfaces in a [[limit]]");
+                        return Err(self.wrong(value.span(), what));
                     }
                 }
                 ("topic" | "publish" | "subscribe" | "call", _) => {
@@ -169,7 +217,7 @@ impl Reader<'_> {
                 ("together", _) => return Err(wrong(&"something else", "true, false")),
                 _ => {
                     let what = format!(
-                        "unknown key {key:?}; accepted: peer, topic, publish, subscribe, call, rate, bytes, burst, \
+                        "unknown key {key:?}; accepted: peer, interface, topic, publish, subscribe, call, rate, bytes, burst, \
                          over, together, egress"
                     );
                     return Err(self.wrong(key_span, what));
@@ -182,21 +230,30 @@ impl Reader<'_> {
 
     /// # Errors
     /// What is missing, or does not go together.
-    fn whole(&self, parts: Parts, line: u32) -> Result<LimitRule, &'static str> {
-        let Parts { peers, mut uses, rate, bytes, burst, over, together, egress } = parts;
-        if peers.is_empty() {
+    fn whole(&self, parts: Parts, line: u32) -> Result<Entry, &'static str> {
+        let Parts { peers, interfaces, mut uses, rate, bytes, burst, over, together, egress } =
+            parts;
+        let is_of_interfaces = !interfaces.is_empty();
+        if is_of_interfaces && (!peers.is_empty() || egress.is_none()) {
+            return Err(
+                "[[limit]] of an interface: it is about all that leaves there, write interface and egress alone",
+            );
+        }
+        if peers.is_empty() && !is_of_interfaces {
             return Err("[[limit]] without peer: write the names it is about, or peer = \"*\"");
         }
         if let Some(egress) = egress {
             let others = [rate.is_some(), bytes.is_some(), burst.is_some(), over.is_some()];
             if !uses.is_empty() || together.is_some() || others.contains(&true) {
                 return Err(
-                    "[[limit]] of egress: it is about all that is sent, write peer and egress alone",
+                    "[[limit]] of egress: it is about all that is sent, write egress with peer or interface alone",
                 );
             }
-            let limits =
-                Limits::Egress(EgressLimit { bytes: egress, file: Arc::clone(&self.file), line });
-            return Ok(LimitRule { peers, limits });
+            let limit = EgressLimit { bytes: egress, file: Arc::clone(&self.file), line };
+            return Ok(match is_of_interfaces {
+                true => Entry::Interface(InterfaceLimit { interfaces, limit }),
+                false => Entry::Peer(LimitRule { peers, limits: Limits::Egress(limit) }),
+            });
         }
         if rate.is_none() && bytes.is_none() {
             return Err("[[limit]] without rate, bytes and egress: write at least one of them");
@@ -221,8 +278,19 @@ impl Reader<'_> {
             together: together.unwrap_or(is_of_peer),
         };
         let limit = PlacedLimit { limit, file: Arc::clone(&self.file), line };
-        Ok(LimitRule { peers, limits: Limits::Uses(uses, limit) })
+        Ok(Entry::Peer(LimitRule { peers, limits: Limits::Uses(uses, limit) }))
     }
+}
+
+/// The name of an interface, or a pattern of names.
+///
+/// # Errors
+/// What would be one.
+fn interface(text: &str) -> Result<String, &'static str> {
+    let is_name = |c: char| c.is_ascii_graphic() && c != '/';
+    let fits = (1..=LONGEST_NAME).contains(&text.len()) && text.chars().all(is_name);
+    fits.then(|| text.to_owned())
+        .ok_or("the name of a network interface as `ip link` shows it, of 1 to 15 bytes, in which * stands for any characters")
 }
 
 #[cfg(test)]

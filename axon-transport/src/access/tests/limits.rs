@@ -72,6 +72,22 @@ fn each_wrong_limit_is_refused_with_its_line_and_column() {
         ("[[limit]]\npeer = \"*\"\nrate = 1\nover = 1", (4, 8), "a string"),
         ("[[limit]]\npeer = \"*\"\nrate = 1\ntogether = 1", (4, 12), "true, false"),
         ("[[limit]]\npeer = \"local\"\nrate = 1", (2, 8), "within a host"),
+        ("[[limit]]\ninterface = \"wlan0\"", (1, 1), "write interface and egress alone"),
+        ("[[limit]]\ninterface = \"wlan0\"\nrate = 1", (1, 1), "write interface and egress alone"),
+        (
+            "[[limit]]\ninterface = \"wlan0\"\npeer = \"*\"\negress = \"1 MB/s\"",
+            (1, 1),
+            "write interface and egress alone",
+        ),
+        (
+            "[[limit]]\ninterface = \"wlan0\"\ntopic = \"/a\"\negress = \"1 MB/s\"",
+            (1, 1),
+            "peer or interface alone",
+        ),
+        ("[[limit]]\ninterface = \"a/b\"\negress = \"1 MB/s\"", (2, 13), "1 to 15 bytes"),
+        ("[[limit]]\ninterface = \"\"\negress = \"1 MB/s\"", (2, 13), "1 to 15 bytes"),
+        ("[[limit]]\ninterface = \"0123456789abcdef\"\negress = \"1 MB/s\"", (2, 13), "1 to 15"),
+        ("[[limit]]\ninterface = []\negress = \"1 MB/s\"", (2, 13), "interface"),
         ("[[limit]]\npeer = \"uid:3\"\nrate = 1", (2, 8), "within a host"),
         ("[[limit]]\npeer = \"*\"\nrate = 1\ntopic = \"a\"", (4, 9), "topic \"a\""),
         ("[[limit]]\npeer = \"*\"\nrate = 1\ncall = \"/a\"", (1, 1), "over = \"hold\""),
@@ -82,8 +98,12 @@ fn each_wrong_limit_is_refused_with_its_line_and_column() {
         ),
         ("[[limit]]\npeer = \"*\"\negress = 3", (3, 10), "such as"),
         ("[[limit]]\npeer = \"*\"\negress = \"9 kB/s\"", (3, 10), "10 kB/s at least"),
-        ("[[limit]]\npeer = \"*\"\negress = \"1 MB/s\"\nrate = 1", (1, 1), "peer and egress alone"),
-        ("[[limit]]\npeer = \"*\"\negress = \"1 MB/s\"\ntopic = \"/a\"", (1, 1), "egress alone"),
+        (
+            "[[limit]]\npeer = \"*\"\negress = \"1 MB/s\"\nrate = 1",
+            (1, 1),
+            "peer or interface alone",
+        ),
+        ("[[limit]]\npeer = \"*\"\negress = \"1 MB/s\"\ntopic = \"/a\"", (1, 1), "interface alone"),
         ("[[limit]]\npeer = \"*\"\nserve = \"/a\"", (3, 1), "unknown key"),
     ] {
         let AccessError { line, column, what, .. } = error(text);
@@ -104,4 +124,23 @@ fn egress_limits_all_that_is_sent_and_no_topic() {
     };
     assert_eq!(of("guest"), [(1, "2 MB/s".to_owned()), (4, "6.75 MB/s".to_owned())]);
     assert_eq!(of("base"), [(4, "6.75 MB/s".to_owned())]);
+}
+
+#[test]
+fn a_limit_of_interfaces_is_about_no_peer() {
+    let rules = rules(
+        "[[limit]]\ninterface = [\"wl*\", \"usb0\"]\negress = \"2 MB/s\"\n\
+         [[limit]]\ninterface = \"wlan0\"\negress = \"20 Mbit/s\"",
+    );
+    let lines = |name| -> Vec<_> {
+        let all = rules.interface_limits().iter().filter(|limit| limit.names(name));
+        all.map(|limit| (limit.limit.line, limit.limit.bytes)).collect()
+    };
+    assert_eq!(lines("wlan0"), [(1, 2e6), (4, 2.5e6)]);
+    assert_eq!(lines("usb0"), [(1, 2e6)]);
+    assert!(lines("eth0").is_empty());
+    let permissions = rules.permissions(Party::Name("base"));
+    assert!(permissions.egress().next().is_none());
+    assert!(rules.is_empty() && rules.limits_anything());
+    assert_eq!(rules.file(), Some("access.toml"));
 }

@@ -1,14 +1,15 @@
-//! The bytes a second that leave this host for one identity.
+//! The bytes a second that leave this host for one identity, or by one network interface.
 
 use std::{
     cell::{Cell, RefCell},
+    net::IpAddr,
     rc::Rc,
     time::Duration,
 };
 
 use axon_transport::{access::EgressLimit, status::LimitStatus};
 
-use super::bucket::Level;
+use super::{bucket::Level, interfaces::InterfaceLimits};
 
 /// What may leave at once, in seconds of the limit, and at least in bytes: a few packets.
 const AT_ONCE: (f64, f64) = (0.005, 6000.0);
@@ -17,19 +18,31 @@ const PACKET: f64 = 1500.0;
 /// QUIC holds what leaves in so much longer than a round trip.
 const AHEAD: Duration = Duration::from_millis(20);
 
-/// A limit on all packets to one identity.
+/// A limit on all packets to one identity, or by one interface.
 #[derive(Debug)]
 pub(crate) struct EgressCap {
     limit: EgressLimit,
+    /// `None`: it is on those to an identity.
+    interface: Option<String>,
     level: RefCell<Level>,
     packets: Cell<u64>,
 }
 
 impl EgressCap {
-    pub(super) fn new(limit: &EgressLimit) -> Self {
+    /// On all packets to an identity.
+    pub(super) fn of_peer(limit: &EgressLimit) -> Self {
+        Self::new(limit, None)
+    }
+
+    /// On all packets by an interface.
+    pub(super) fn of_interface(limit: &EgressLimit, interface: &str) -> Self {
+        Self::new(limit, Some(interface.to_owned()))
+    }
+
+    fn new(limit: &EgressLimit, interface: Option<String>) -> Self {
         let most = (limit.bytes * AT_ONCE.0).max(AT_ONCE.1);
         let level = RefCell::new(Level::full(limit.bytes, most));
-        Self { limit: limit.clone(), level, packets: Cell::default() }
+        Self { limit: limit.clone(), interface, level, packets: Cell::default() }
     }
 
     pub(super) fn is(&self, limit: &EgressLimit) -> bool {
@@ -38,7 +51,11 @@ impl EgressCap {
 
     pub(super) fn status(&self) -> LimitStatus {
         let mut status = LimitStatus::default();
-        (status.verb, status.name) = ("egress".into(), "(all packets)".into());
+        status.verb = "egress".into();
+        status.name = match &self.interface {
+            Some(interface) => format!("(all packets by {interface})"),
+            None => "(all packets)".into(),
+        };
         status.limit = self.limit.to_string();
         status.place = format!("line {} of {}", self.limit.line, self.limit.file);
         status.passed = self.packets.get();
@@ -48,28 +65,46 @@ impl EgressCap {
 
 /// The limits on what one connection sends.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Egress(Vec<Rc<EgressCap>>);
+pub(crate) struct Egress {
+    peer: Vec<Rc<EgressCap>>,
+    interface: Vec<Rc<EgressCap>>,
+}
 
 impl Egress {
-    pub(crate) fn new(caps: Vec<Rc<EgressCap>>) -> Self {
-        Self(caps)
+    /// Replaces the limits on what is sent to the peer.
+    pub(super) fn set_peer(&mut self, caps: Vec<Rc<EgressCap>>) {
+        self.peer = caps;
+    }
+
+    /// Replaces the limits on what leaves by the interface with this address.
+    pub(crate) fn set_interface(&mut self, limits: &InterfaceLimits, local: IpAddr) {
+        self.interface = limits.of(local).to_vec();
+    }
+
+    fn caps(&self) -> impl Iterator<Item = &EgressCap> {
+        self.peer.iter().chain(&self.interface).map(|cap| &**cap)
+    }
+
+    /// The status of the limits on the interface.
+    pub(crate) fn interface_status(&self) -> impl Iterator<Item = LimitStatus> {
+        self.interface.iter().map(|cap| cap.status())
     }
 
     /// When the next packet may leave, if not now.
     pub(crate) fn closed_until(&self, now: Duration) -> Option<Duration> {
-        let open = self.0.iter().map(|cap| cap.level.borrow().when(1.0));
+        let open = self.caps().map(|cap| cap.level.borrow().when(1.0));
         open.max().filter(|at| *at > now)
     }
 
     /// How many packets may leave now.
     pub(crate) fn packets(&self, now: Duration) -> usize {
-        let left = self.0.iter().map(|cap| cap.level.borrow().at(now));
+        let left = self.caps().map(|cap| cap.level.borrow().at(now));
         left.reduce(f64::min).map_or(usize::MAX, |bytes| (bytes / PACKET).max(1.0) as usize)
     }
 
     /// These packets left.
     pub(crate) fn sent(&self, packets: u64, bytes: u64, now: Duration) {
-        for cap in &self.0 {
+        for cap in self.caps() {
             cap.level.borrow_mut().take(bytes as f64, now);
             cap.packets.set(cap.packets.get() + packets);
         }
@@ -78,7 +113,7 @@ impl Egress {
     /// The congestion window, or as much as the limits let leave in a round trip. QUIC holds no more, so that samples
     /// wait where newer ones replace them.
     pub(crate) fn window(&self, window: u64, rtt: Duration) -> u64 {
-        let slowest = self.0.iter().map(|cap| cap.limit.bytes).reduce(f64::min);
+        let slowest = self.caps().map(|cap| cap.limit.bytes).reduce(f64::min);
         let most = slowest.map(|bytes| (bytes * (rtt + AHEAD).as_secs_f64()).max(2.0 * PACKET));
         most.map_or(window, |most| window.min(most as u64))
     }
@@ -93,7 +128,11 @@ mod tests {
     fn packets_leave_at_the_rate_of_the_slowest_limit_over_all_connections_of_an_identity() {
         let rules = "[[limit]]\npeer = \"*\"\negress = \"1 MB/s\"\n[[limit]]\npeer = \"*\"\negress = \"9 MB/s\"";
         let all = Limits::default();
-        let connections = [0, 1].map(|_| all.egress(&permissions(rules)));
+        let connections = [0, 1].map(|_| {
+            let mut egress = Egress::default();
+            all.limit_egress(&mut egress, &permissions(rules));
+            egress
+        });
         let (mut now, mut sent) = (Duration::ZERO, 0);
         while now < Duration::from_secs(10) {
             let mut next = now + Duration::from_millis(1);

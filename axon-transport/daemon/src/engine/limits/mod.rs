@@ -3,6 +3,7 @@
 
 mod bucket;
 mod egress;
+mod interfaces;
 mod line;
 
 use std::{
@@ -20,8 +21,8 @@ use axon_transport::{
     status::{LimitStatus, LinkStatus},
 };
 
-pub(crate) use self::egress::Egress;
 use self::{bucket::Bucket, egress::EgressCap, line::Line};
+pub(crate) use self::{egress::Egress, interfaces::InterfaceLimits};
 
 /// Limits that status lists.
 const LISTED: usize = 64;
@@ -133,19 +134,19 @@ impl Limits {
         limit
     }
 
-    /// The limits on all that is sent to the peer.
-    pub(crate) fn egress(&self, permissions: &Permissions) -> Egress {
+    /// Has a connection to the peer keep to the limits on all that is sent to it.
+    pub(crate) fn limit_egress(&self, egress: &mut Egress, permissions: &Permissions) {
         let mut all = self.egress.borrow_mut();
         let mut caps: Vec<Rc<EgressCap>> = Vec::new();
         for limit in permissions.egress() {
             let known = all.iter().find(|cap| cap.is(limit)).cloned();
-            let cap = known.unwrap_or_else(|| Rc::new(EgressCap::new(limit)));
+            let cap = known.unwrap_or_else(|| Rc::new(EgressCap::of_peer(limit)));
             if !caps.iter().any(|other| Rc::ptr_eq(other, &cap)) {
                 caps.push(cap);
             }
         }
         all.clone_from(&caps);
-        Egress::new(caps)
+        egress.set_peer(caps);
     }
 
     /// Names the limits in the link's status: those that dropped most come first.

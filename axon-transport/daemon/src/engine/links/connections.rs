@@ -17,7 +17,7 @@ use crate::{
     engine::{
         connection::Connection,
         endpoints::{Endpoints, Packet, Received},
-        limits::Egress,
+        limits::InterfaceLimits,
         link::failure::close_text,
     },
     link::CloseCode,
@@ -39,6 +39,8 @@ pub(super) struct Connections {
     limited: BTreeSet<(Duration, u64, u64)>,
     next_wait: u64,
     deadlines: BTreeSet<(Instant, u64)>,
+    /// The limits on what leaves by each network interface.
+    interfaces: InterfaceLimits,
 }
 
 impl Connections {
@@ -55,6 +57,7 @@ impl Connections {
             limited: BTreeSet::new(),
             next_wait: 0,
             deadlines: BTreeSet::new(),
+            interfaces: InterfaceLimits::default(),
         }
     }
 
@@ -110,6 +113,7 @@ impl Connections {
                 if let Some(connection) = self.all.get_mut(&number) {
                     connection.ecn_marks += u64::from(ecn == Some(EcnCodepoint::Ce));
                     connection.quic.handle_event(event);
+                    connection.set_local(local, &mut self.interfaces);
                     self.touch(number);
                 }
                 None
@@ -157,7 +161,9 @@ impl Connections {
         let number = self.next_number;
         self.next_number += 1;
         self.handles.insert((endpoint, handle), number);
-        self.all.insert(number, Connection::new(endpoint, handle, quic));
+        let mut connection = Connection::new(endpoint, handle, quic);
+        connection.set_local(None, &mut self.interfaces);
+        self.all.insert(number, connection);
         self.touch(number);
         number
     }
@@ -272,11 +278,17 @@ impl Connections {
         paused.into_iter().for_each(|number| self.touch(number));
     }
 
-    /// Limits what a connection sends.
-    pub(super) fn set_egress(&mut self, number: u64, egress: Egress) {
-        if let Some(connection) = self.all.get_mut(&number) {
-            connection.egress = egress;
+    /// Changes the limits of network interfaces, and has all connections keep to them.
+    pub(super) fn limit_interfaces(&mut self, change: impl FnOnce(&mut InterfaceLimits)) {
+        change(&mut self.interfaces);
+        for connection in self.all.values_mut() {
+            connection.limit_interface(&self.interfaces);
         }
+    }
+
+    /// Whether the owner has to list this host's network interfaces.
+    pub(super) fn asks_for_interfaces(&mut self) -> bool {
+        self.interfaces.asks()
     }
 
     /// The next packets, and the endpoint that sends them. `buffer` is cleared and filled.

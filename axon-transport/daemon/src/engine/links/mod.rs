@@ -54,7 +54,7 @@ use super::{
     keyring::Keyring,
 };
 use crate::{
-    discovery::is_discovery,
+    discovery::{Interface, is_discovery},
     engine::{
         account::{Account, Accounts},
         link::failure::peer_text,
@@ -414,9 +414,26 @@ impl Links {
 
     /// Limits what a link sends as the rules say.
     pub(super) fn limit_egress(&mut self, number: u64, permissions: &Permissions) {
-        if let Some(account) = self.account(number) {
-            self.connections.set_egress(number, account.limits.egress(permissions));
+        if let (Some(account), Some(connection)) =
+            (self.account(number), self.connections.get_mut(number))
+        {
+            account.limits.limit_egress(&mut connection.egress, permissions);
         }
+    }
+
+    /// Limits what leaves by network interfaces as the rules say.
+    pub(super) fn set_interface_rules(&mut self, rules: &AccessRules) {
+        self.connections.limit_interfaces(|limits| limits.set_rules(rules));
+    }
+
+    /// Handles the list of this host's network interfaces.
+    pub(super) fn set_interfaces(&mut self, interfaces: Vec<Interface>) {
+        self.connections.limit_interfaces(|limits| limits.set_interfaces(interfaces));
+    }
+
+    /// Whether the owner has to list this host's network interfaces.
+    pub(super) fn asks_for_interfaces(&mut self) -> bool {
+        self.connections.asks_for_interfaces()
     }
 
     /// The status of a link.

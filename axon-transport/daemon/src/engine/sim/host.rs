@@ -26,7 +26,7 @@ use super::{
 };
 use crate::{
     bridge::{ToControl, ToGateway},
-    discovery::AddressConfidence,
+    discovery::{AddressConfidence, Interface},
     engine::{
         Effect, Engine, EngineParts, credentials::Credentials, links::LinkParts, peer::MAX_ROUTES,
     },
@@ -68,6 +68,8 @@ pub(super) struct Host {
     /// Requests to the KME that wait for an answer.
     pub(super) requests: Vec<(Origin, Request)>,
     records: Vec<(u64, String)>,
+    /// The engine asked for the host's network interfaces.
+    interfaces_asked: bool,
     used: BTreeSet<String>,
     graph_changed: bool,
     /// Access rules that came.
@@ -107,6 +109,7 @@ impl Host {
             lost: BTreeMap::new(),
             requests: Vec::new(),
             records: Vec::new(),
+            interfaces_asked: false,
             used: BTreeSet::new(),
             graph_changed: false,
             rules: None,
@@ -158,6 +161,7 @@ impl Host {
         self.engine = Some(Engine::new(parts).unwrap());
         (self.graph, self.linked) = (BTreeMap::new(), BTreeSet::new());
         (self.requests, self.records) = (Vec::new(), Vec::new());
+        self.interfaces_asked = false;
         self.status.clear();
         for peer in self.peers.values_mut() {
             peer.dial_at = Some(now);
@@ -314,7 +318,7 @@ impl Host {
         let engine = self.engine.as_ref()?;
         let ready = {
             let came = self.graph_changed || self.rings_rang || self.rules.is_some();
-            (came || !self.records.is_empty()).then_some(now)
+            (came || self.interfaces_asked || !self.records.is_empty()).then_some(now)
         };
         let dials = self.peers.iter().filter(|(daemon, _)| !self.linked.contains(daemon));
         let dials = dials.filter_map(|(_, wanted)| wanted.dial_at).min();
@@ -336,6 +340,16 @@ impl Host {
         }
         if std::mem::take(&mut self.rings_rang) {
             engine.handle_rings(now);
+        }
+        if std::mem::take(&mut self.interfaces_asked) {
+            engine.handle_interfaces(vec![Interface {
+                name: "wlan0".into(),
+                index: 1,
+                address: IpAddr::V4(self.address),
+                prefix: 16,
+                broadcast: None,
+                loopback: false,
+            }]);
         }
         for (link, key_id) in std::mem::take(&mut self.records) {
             let first = self.used.insert(key_id);
@@ -371,6 +385,7 @@ impl Host {
             Effect::Tell(what) => self.told(what, now),
             Effect::Kme(origin, request) => self.requests.push((origin, request)),
             Effect::Record { link, key_id } => self.records.push((link, key_id)),
+            Effect::Interfaces => self.interfaces_asked = true,
             Effect::ReturnMemory => {}
         }
     }

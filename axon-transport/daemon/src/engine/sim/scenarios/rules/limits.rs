@@ -211,3 +211,57 @@ fn short_samples_beyond_the_egress_do_not_grow_old() {
     let oldest = ages.iter().max().unwrap();
     assert!(ages.len() > 700 && *oldest < millis(600), "{} samples, {oldest:?} old", ages.len());
 }
+
+#[test]
+fn all_peers_together_have_the_egress_of_an_interface_in_equal_parts() {
+    // Who dials whom is decided by ids: so both ends of a link are limited, as client and as server.
+    for limited in 0..3 {
+        let text = "[[limit]]\ninterface = \"w*0\"\negress = \"1 MB/s\"";
+        let mut world = World::new(37, 3, |host| {
+            let mut config = Config::default();
+            if host == limited {
+                config.access = AccessRules::parse(text, "access.toml").unwrap();
+            }
+            config
+        });
+        world.network.set_default_path(radio(54, 0.0));
+        let peers: Vec<usize> = (0..3).filter(|host| *host != limited).collect();
+        let pairs: Vec<_> = ["/a", "/b"]
+            .into_iter()
+            .zip(&peers)
+            .map(|(topic, peer)| world.pair(limited, *peer, topic, Qos::sensor_data()))
+            .collect();
+        world.until(secs(20), World::is_whole);
+        let measure = |world: &mut World| {
+            world.run_for(secs(1));
+            let before: Vec<_> = pairs.iter().map(|pair| world.received(*pair).len()).collect();
+            let sent = world.network.counters(limited).clone();
+            for _ in 0..500 {
+                // Each alone has more than the limit.
+                pairs.iter().for_each(|pair| assert!(world.publish(*pair, 30_000)));
+                world.run_for(millis(20));
+            }
+            let now = world.network.counters(limited);
+            let bytes = now.sent_bytes - sent.sent_bytes + 28 * (now.sent - sent.sent);
+            let came = pairs.iter().zip(before);
+            let came: Vec<_> =
+                came.map(|(pair, before)| world.received(*pair).len() - before).collect();
+            (bytes, came)
+        };
+        let (bytes, came) = measure(&mut world);
+        assert!((9_300_000..10_100_000).contains(&bytes), "host {limited}: {bytes} in ten seconds");
+        assert!(came.iter().all(|one| (140..=170).contains(one)), "host {limited}: {came:?}");
+        let all = world.hosts[limited].status.values().flat_map(|link| &link.limits);
+        let all: Vec<_> = all.map(|limit| (&*limit.name, &*limit.place)).collect();
+        assert_eq!(all, [("(all packets by wlan0)", "line 1 of access.toml"); 2]);
+        // The interface has another address.
+        world.move_host(limited);
+        world.until(secs(30), World::is_whole);
+        let (bytes, _) = measure(&mut world);
+        // QUIC begins anew with a small window.
+        assert!((7_000_000..10_100_000).contains(&bytes), "host {limited}: {bytes} after it moved");
+        world.hosts[limited].set_access("default = \"allow\"");
+        let (bytes, _) = measure(&mut world);
+        assert!(bytes > 20_000_000, "host {limited}: {bytes} without the limit");
+    }
+}
