@@ -101,6 +101,36 @@ fn one_line_lets_a_peer_use_an_action_or_serve_it_or_set_parameters() {
 }
 
 #[test]
+fn a_denial_of_parameters_or_lifecycle_takes_the_services_of_the_node_and_nothing_else() {
+    for (names, node) in [("true", "/robot/arm"), ("\"/robot/arm\"", "/robot/arm")] {
+        let rules = rules(&format!(
+            "[[deny]]\npeer = \"base\"\nparameters = {names}\n[[deny]]\npeer = \"manager\"\nlifecycle = {names}"
+        ));
+        let check = |party, verb, name: &str| rules.check(Party::Name(party), verb, name);
+        for service in ros::PARAMETER_SERVICES {
+            let decision = check("base", Verb::Call, &format!("{node}/{service}"));
+            assert_eq!(decision.line(), Some(3), "{names} {service}");
+        }
+        for service in ros::LIFECYCLE_SERVICES {
+            let decision = check("manager", Verb::Call, &format!("{node}/{service}"));
+            assert_eq!(decision.line(), Some(6), "{names} {service}");
+        }
+        let told = format!("{node}/{}", ros::LIFECYCLE_TOPIC);
+        assert!(!check("manager", Verb::Subscribe, &told).allowed());
+        assert!(check("base", Verb::Subscribe, ros::PARAMETER_EVENTS).allowed(), "of all nodes");
+        for party in ["base", "manager"] {
+            for verb in Verb::ALL {
+                // A topic may have the name of a node.
+                for name in [node, "/scan"] {
+                    assert!(check(party, verb, name).allowed(), "{names} {party} {verb} {name}");
+                }
+            }
+            assert!(check(party, Verb::See, &format!("{node}/set_parameters")).allowed());
+        }
+    }
+}
+
+#[test]
 fn a_pattern_of_one_kind_fits_no_party_of_another() {
     let rules = rules(
         r#"

@@ -101,6 +101,26 @@ fn a_topic_does_not_cross_where_either_host_denies_it() {
 }
 
 #[test]
+fn a_topic_crosses_beside_a_denial_of_parameters_or_lifecycle() {
+    for key in ["parameters", "lifecycle"] {
+        for (with_rules, names) in [(0, "true"), (1, "true"), (0, "\"/scan\""), (1, "\"/scan\"")] {
+            let text = format!("[[deny]]\npeer = \"*\"\n{key} = {names}");
+            let mut world = hosts(with_rules, &text);
+            let [scan, events] =
+                ["/scan", "/parameter_events"].map(|topic| world.pair(0, 1, topic, latched()));
+            world.until(secs(20), World::is_whole);
+            assert!(arrives(&mut world, scan) && arrives(&mut world, events), "{text}");
+            for pair in [scan, events] {
+                assert!(
+                    is_shown(&world, 1, pair.publisher) && is_shown(&world, 0, pair.subscription)
+                );
+            }
+            assert!((0..2).all(|host| link(&world, host).denied.is_empty()), "{text}");
+        }
+    }
+}
+
+#[test]
 fn rules_that_change_end_a_flow_and_begin_it_again_without_a_gap_in_what_is_allowed() {
     let closed = "[[allow]]\npeer = \"*\"\npublish = \"/other\"\nsubscribe = \"/other\"";
     for host in [0, 1] {
