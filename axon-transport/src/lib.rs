@@ -49,7 +49,7 @@ pub mod internal {
     /// The endpoints that may match, and the hosts on which they may.
     pub mod graph {
         pub use crate::graph::{
-            access::{other_end, permits, shows, verb_of},
+            access::{other_end, permits, permits_use, shows, verb_of},
             endpoint::{LIMITS, Limits},
             pairing::{Pairing, pairing, reads, writes},
             range::{EndpointRange, OutOfRange, RangeToHost, RemoteEndpoint, Scope, out_of_range},

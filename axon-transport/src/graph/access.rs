@@ -31,6 +31,12 @@ pub fn permits(party: &Permissions, endpoint: &Endpoint) -> bool {
         || verb_of(endpoint.kind).is_none_or(|verb| party.allows(verb, &endpoint.topic))
 }
 
+/// Whether a party may be at the other end of this endpoint of another party.
+pub fn permits_use(party: &Permissions, endpoint: &Endpoint) -> bool {
+    let denied = |verb| !party.allows(other_end(verb), &endpoint.topic);
+    party.are_unrestricted() || !verb_of(endpoint.kind).is_some_and(denied)
+}
+
 /// Whether a party is shown this endpoint of another party: it may see the topic, or needs the endpoint for its own. For
 /// a node the full name counts.
 pub fn shows(party: &Permissions, endpoint: &Endpoint) -> bool {
@@ -87,6 +93,8 @@ mod tests {
                 (has, sees),
                 "{kind:?} {topic}"
             );
+            let uses = sees && topic != "/seen";
+            assert_eq!(permits_use(&party, &endpoint), uses, "{kind:?} {topic}");
         }
         for (namespace, node, sees) in [
             ("/ns", "node", true),

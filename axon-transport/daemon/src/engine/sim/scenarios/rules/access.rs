@@ -121,6 +121,33 @@ fn a_topic_crosses_beside_a_denial_of_parameters_or_lifecycle() {
 }
 
 #[test]
+fn an_endpoint_that_may_be_seen_and_not_used_has_no_stand_in() {
+    let see = "default = \"deny\"\n[[allow]]\npeer = \"*\"\nsee = \"**\"";
+    for closed in ["[[deny]]\npeer = \"*\"\nsubscribe = \"/scan\"", see] {
+        let mut world = hosts(0, closed);
+        let scan = world.pair(0, 1, "/scan", latched());
+        // From before they are linked: it is not there for a moment either.
+        for _ in 0..3000 {
+            world.run_for(millis(1));
+            assert_eq!(world.hosts[1].shown(), 0, "{closed}");
+        }
+        assert!(is_shown(&world, 1, scan.publisher), "it may be seen");
+        assert!(denied(&world, 1).contains("subscribe /scan (ours)"), "{}", denied(&world, 1));
+        assert!(link(&world, 1).routes_refused.is_empty(), "it did not ask");
+        for _ in 0..2 {
+            world.hosts[0].set_access(OPEN);
+            world.run_for(secs(1));
+            assert!(arrives(&mut world, scan), "{closed}");
+            assert_eq!(world.hosts[1].shown(), 1);
+            world.hosts[0].set_access(closed);
+            world.run_for(secs(1));
+            assert_eq!(world.hosts[1].shown(), 0, "{closed}");
+            assert!(!arrives(&mut world, scan), "{closed}");
+        }
+    }
+}
+
+#[test]
 fn rules_that_change_end_a_flow_and_begin_it_again_without_a_gap_in_what_is_allowed() {
     let closed = "[[allow]]\npeer = \"*\"\npublish = \"/other\"\nsubscribe = \"/other\"";
     for host in [0, 1] {
