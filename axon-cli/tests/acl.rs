@@ -105,6 +105,27 @@ fn check_says_which_line_decides_and_its_status_says_whether_it_may() {
 }
 
 #[test]
+fn check_says_that_a_denial_of_see_takes_the_uses_that_no_allow_names() {
+    let dir = tempfile::tempdir().expect("directory");
+    let rules = "[[deny]]\npeer = [\"base\", \"guest\"]\nsee = \"/scan\"\n\
+                 [[allow]]\npeer = \"base\"\nsubscribe = \"/scan\"\n";
+    let file = written(dir.path(), "access.toml", rules);
+    for (peer, what, status, said) in [
+        ("base", "--subscribe", 0, "allowed by line 6 of access.toml"),
+        ("base", "--see", 1, "denied by line 3 of access.toml"),
+        ("base", "--publish", 1, "no [[allow]] in access.toml permits this"),
+        ("guest", "--subscribe", 1, "denied by line 3 of access.toml"),
+        ("guest", "--call", 1, "denied by line 3 of access.toml"),
+        ("other", "--subscribe", 0, "no rule in access.toml denies this"),
+    ] {
+        let output = run(&["acl", "check", &file, "--peer", peer, what, "/scan"], &[]);
+        let out = text(&output.stdout) + &text(&output.stderr);
+        assert_eq!(output.status.code(), Some(status), "{peer} {what} {out}");
+        assert!(out.contains(said), "{peer} {what} {out}");
+    }
+}
+
+#[test]
 fn check_takes_the_rules_that_the_settings_name_and_rules_beside_other_settings() {
     let dir = tempfile::tempdir().expect("directory");
     let rules = "quic_cipher = \"aes-256-gcm\"\n[[deny]]\npeer = \"*\"\ncall = \"/reboot\"\n";

@@ -72,12 +72,8 @@ impl Permissions {
         self.are_unrestricted() || self.check(verb, name).allowed()
     }
 
-    /// Whether a `[[deny]]` names this.
-    pub(crate) fn denies(&self, verb: Verb, name: &str) -> bool {
-        self.rules.as_ref().is_some_and(|rules| rules.deny.of(verb).first_fit(name).is_some())
-    }
-
-    /// As [`allows`](Self::allows), with the rule that decides.
+    /// As [`allows`](Self::allows), with the rule that decides. A `[[deny]]` of [`Verb::See`] denies each use that no
+    /// `[[allow]]` names: an endpoint that is hidden cannot be used.
     pub fn check(&self, verb: Verb, name: &str) -> Decision {
         let Some(rules) = &self.rules else { return Decision(Reason::NoRules) };
         let file = || Arc::clone(&rules.file);
@@ -86,6 +82,11 @@ impl Permissions {
         }
         if let Some(line) = rules.allow.of(verb).first_fit(name) {
             return Decision(Reason::Allowed { file: file(), line });
+        }
+        if rules.otherwise == Otherwise::Allow
+            && let Some(line) = rules.deny.of(Verb::See).first_fit(name)
+        {
+            return Decision(Reason::Denied { file: file(), line });
         }
         Decision(match rules.otherwise {
             Otherwise::Allow => Reason::Open { file: file() },

@@ -45,9 +45,8 @@ pub fn shows(party: &Permissions, endpoint: &Endpoint) -> bool {
     }
     match verb_of(endpoint.kind) {
         Some(verb) => {
-            !party.denies(Verb::See, &endpoint.topic)
-                && (party.allows(Verb::See, &endpoint.topic)
-                    || party.allows(other_end(verb), &endpoint.topic))
+            party.allows(Verb::See, &endpoint.topic)
+                || party.allows(other_end(verb), &endpoint.topic)
         }
         None => {
             let namespace = endpoint.namespace.strip_suffix('/').unwrap_or(&endpoint.namespace);
@@ -108,7 +107,20 @@ mod tests {
         }
         let hidden = "[[deny]]\npeer = \"a\"\nsee = \"/secret\"";
         let hidden = AccessRules::parse(hidden, "f").unwrap().permissions(Party::Name("a"));
-        assert!(!shows(&hidden, &of(Publisher, "/secret")) && shows(&hidden, &of(Publisher, "/x")));
+        for kind in [Publisher, Subscription, Server, Client] {
+            let [secret, other] = ["/secret", "/x"].map(|topic| of(kind, topic));
+            assert!(!shows(&hidden, &secret) && !permits(&hidden, &secret), "{kind:?}");
+            assert!(shows(&hidden, &other) && permits(&hidden, &other), "{kind:?}");
+        }
+        let both =
+            "[[deny]]\npeer = \"a\"\nsee = \"**\"\n[[allow]]\npeer = \"a\"\nsubscribe = \"/scan\"";
+        let both = AccessRules::parse(both, "f").unwrap().permissions(Party::Name("a"));
+        assert!(
+            shows(&both, &of(Publisher, "/scan")) && permits(&both, &of(Subscription, "/scan"))
+        );
+        for (kind, topic) in [(Subscription, "/scan"), (Publisher, "/odom"), (Server, "/scan")] {
+            assert!(!shows(&both, &of(kind, topic)), "{kind:?} {topic}");
+        }
         let nobody = Permissions::default();
         assert!(permits(&nobody, &of(Publisher, "/x")) && shows(&nobody, &of(Node, "")));
     }

@@ -148,6 +148,34 @@ fn an_endpoint_that_may_be_seen_and_not_used_has_no_stand_in() {
 }
 
 #[test]
+fn a_denial_of_see_leaves_what_an_allow_names_and_takes_the_rest_with_a_reason() {
+    for hides in ["/scan", "**"] {
+        let see = format!("[[deny]]\npeer = \"*\"\nsee = \"{hides}\"");
+        let text = format!("{see}\n[[allow]]\npeer = \"*\"\nsubscribe = \"/scan\"");
+        let mut world = hosts(0, &text);
+        let [scan, odom] = ["/scan", "/odom"].map(|topic| world.pair(0, 1, topic, latched()));
+        world.until(secs(20), World::is_linked);
+        world.run_for(secs(1));
+        assert!(arrives(&mut world, scan), "{text}");
+        assert!(is_shown(&world, 1, scan.publisher) && !is_shown(&world, 1, odom.publisher));
+        // Where no [[allow]] names the peer, what is hidden from it is denied to it.
+        for (with_rules, verb) in [(0, "subscribe"), (1, "publish")] {
+            let mut world = hosts(with_rules, &see);
+            let scan = world.pair(0, 1, "/scan", latched());
+            world.until(secs(20), World::is_linked);
+            world.run_for(secs(1));
+            assert!(!arrives(&mut world, scan), "{see}");
+            world.run_for(secs(2));
+            for host in [0, 1] {
+                let denied = denied(&world, host);
+                assert!(denied.contains(&format!("{verb} /scan (")), "{denied}");
+                assert!(denied.contains("denied by line 3 of access.toml"), "{denied}");
+            }
+        }
+    }
+}
+
+#[test]
 fn rules_that_change_end_a_flow_and_begin_it_again_without_a_gap_in_what_is_allowed() {
     let closed = "[[allow]]\npeer = \"*\"\npublish = \"/other\"\nsubscribe = \"/other\"";
     for host in [0, 1] {
