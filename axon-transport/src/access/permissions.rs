@@ -72,6 +72,15 @@ impl Permissions {
         self.are_unrestricted() || self.check(verb, name).allowed()
     }
 
+    /// Whether there is anything that the party may publish, subscribe to, serve or call.
+    pub(crate) fn allow_any_use(&self) -> bool {
+        let Some(rules) = &self.rules else { return true };
+        let open = rules.otherwise == Otherwise::Allow && !rules.deny.of(Verb::See).fits_all();
+        Verb::ALL.into_iter().filter(|verb| *verb != Verb::See).any(|verb| {
+            (open || !rules.allow.of(verb).is_empty()) && !rules.deny.of(verb).fits_all()
+        })
+    }
+
     /// As [`allows`](Self::allows), with the rule that decides. A `[[deny]]` of [`Verb::See`] denies each use that no
     /// `[[allow]]` names: an endpoint that is hidden cannot be used.
     pub fn check(&self, verb: Verb, name: &str) -> Decision {

@@ -25,10 +25,12 @@ pub fn other_end(verb: Verb) -> Verb {
     }
 }
 
-/// Whether a party may have this endpoint.
+/// Whether a party may have this endpoint. A node does nothing by itself: it is there for a party that may do anything.
 pub fn permits(party: &Permissions, endpoint: &Endpoint) -> bool {
-    party.are_unrestricted()
-        || verb_of(endpoint.kind).is_none_or(|verb| party.allows(verb, &endpoint.topic))
+    match verb_of(endpoint.kind) {
+        Some(verb) => party.allows(verb, &endpoint.topic),
+        None => party.allow_any_use(),
+    }
 }
 
 /// Whether a party may be at the other end of this endpoint of another party.
@@ -102,7 +104,7 @@ mod tests {
             ("/ns/", "node", true),
         ] {
             let node = of(Node, "").with_node(node, namespace);
-            assert!(permits(&party, &node), "it does nothing by itself");
+            assert!(permits(&party, &node), "a party that may do something");
             assert_eq!(shows(&party, &node), sees, "{node:?}");
         }
         let hidden = "[[deny]]\npeer = \"a\"\nsee = \"/secret\"";
@@ -120,6 +122,23 @@ mod tests {
         );
         for (kind, topic) in [(Subscription, "/scan"), (Publisher, "/odom"), (Server, "/scan")] {
             assert!(!shows(&both, &of(kind, topic)), "{kind:?} {topic}");
+        }
+        let all = "publish = \"**\"\nsubscribe = \"/**\"\nserve = \"**\"\ncall = \"**\"";
+        for (rules, has_nodes) in [
+            ("default = \"allow\"".to_owned(), true),
+            ("default = \"deny\"".to_owned(), false),
+            ("[[allow]]\npeer = \"a\"\nsee = \"**\"".to_owned(), false),
+            ("[[allow]]\npeer = \"a\"\ncall = \"/c\"".to_owned(), true),
+            ("[[allow]]\npeer = \"b\"\nsee = \"**\"".to_owned(), true),
+            (format!("[[deny]]\npeer = \"a\"\n{all}"), false),
+            (format!("[[deny]]\npeer = \"a\"\n{all}\n[[allow]]\npeer = \"a\"\n{all}"), false),
+            ("[[deny]]\npeer = \"a\"\npublish = \"**\"".to_owned(), true),
+            ("[[deny]]\npeer = \"a\"\nsee = \"**\"".to_owned(), false),
+            ("[[deny]]\npeer = \"a\"\nsee = \"/*\"".to_owned(), true),
+        ] {
+            let party = AccessRules::parse(&rules, "f").unwrap().permissions(Party::Name("a"));
+            let node = of(Node, "").with_node("node", "/ns");
+            assert_eq!(permits(&party, &node), has_nodes, "{rules}");
         }
         let nobody = Permissions::default();
         assert!(permits(&nobody, &of(Publisher, "/x")) && shows(&nobody, &of(Node, "")));

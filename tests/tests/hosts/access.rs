@@ -291,6 +291,29 @@ fn an_endpoint_that_the_other_host_denies_is_never_matched_and_seen_all_the_same
 }
 
 #[test]
+fn a_peer_that_may_do_nothing_here_shows_no_nodes_here() {
+    let keys = tempfile::tempdir().unwrap();
+    let settings = pinned(keys.path(), [[false, true], [true, false]]);
+    let hosts = Hosts::start(settings, "host-1", keys);
+    let (here, there) = (hosts.robot.session("robot"), hosts.base.session("base"));
+    let node = there.create_node("guest", "/far", "/").unwrap();
+    let has_node = || here.graph().endpoints.contains_key(&node.gid());
+    until("the node of a peer with rights is there", has_node);
+    for nothing in [
+        "[[allow]]\npeer = \"PEER\"\nsee = \"**\"",
+        "[[deny]]\npeer = \"PEER\"\npublish = \"**\"\nsubscribe = \"**\"\nserve = \"**\"\ncall = \"**\"",
+        "default = \"deny\"",
+    ] {
+        hosts.write(nothing);
+        assert_eq!(hosts.reload().error, None);
+        until("the node is not there", || !has_node());
+        hosts.write(ROBOT);
+        assert_eq!(hosts.reload().error, None);
+        until("the node is there again", has_node);
+    }
+}
+
+#[test]
 fn rules_that_change_under_load_lose_nothing_of_what_they_allow() {
     let keys = tempfile::tempdir().unwrap();
     let settings = pinned(keys.path(), [[false, true], [true, false]]);
