@@ -129,16 +129,37 @@ fn check_says_that_a_denial_of_see_takes_the_uses_that_no_allow_names() {
 fn check_takes_the_rules_that_the_settings_name_and_rules_beside_other_settings() {
     let dir = tempfile::tempdir().expect("directory");
     let rules = "quic_cipher = \"aes-256-gcm\"\n[[deny]]\npeer = \"*\"\ncall = \"/reboot\"\n";
-    let file = written(dir.path(), "axon.toml", rules);
+    for name in ["axon.toml", "robot.toml"] {
+        rules_among_settings(&dir, name, rules);
+    }
+    // A file of rules alone has no other key.
+    let wrong = rules.replace("quic_cipher", "quic_cypher");
+    let wrong = written(dir.path(), "wrong.toml", &wrong);
+    let output = run(&["acl", "check", &wrong, "--peer", "uid:7", "--call", "/reboot"], &[]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(text(&output.stderr).contains("unknown key \"quic_cypher\""));
+}
+
+/// The file as AXON_CONFIG names it, and as an argument.
+fn rules_among_settings(dir: &tempfile::TempDir, name: &str, rules: &str) {
+    let file = written(dir.path(), name, rules);
     let run_dir = dir.path().join("run");
     let settings =
         [("AXON_CONFIG", &*file), ("AXON_RUNTIME_DIR", run_dir.to_str().expect("UTF-8"))];
     let question = ["acl", "check", "--peer", "uid:7", "--call", "/reboot"];
     let output = run(&question, &settings);
     assert_eq!(output.status.code(), Some(1));
-    assert!(text(&output.stdout).contains("denied by line 4 of axon.toml"));
-    let named = ["acl", "check", &file, "--peer", "uid:7", "--call", "/reboot"];
-    assert_eq!(run(&named, &[]).status.code(), Some(1));
+    let line = format!("denied by line 4 of {name}");
+    assert!(text(&output.stdout).contains(&line), "{}", text(&output.stdout));
+    for settings in [&[][..], &settings] {
+        let named = ["acl", "check", &file, "--peer", "uid:7", "--call", "/reboot"];
+        let output = run(&named, settings);
+        let out = text(&output.stdout) + &text(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{out}");
+        assert!(out.contains(&line), "{out}");
+        let output = run(&["acl", "test", &file], settings);
+        assert!(text(&output.stderr).contains("has no [[expect]]"), "{}", text(&output.stderr));
+    }
 }
 
 #[test]

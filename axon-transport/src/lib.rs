@@ -38,6 +38,10 @@ pub mod internal {
             PARAMETER_SERVICES,
         };
     }
+    /// Access rules in a file that somebody names.
+    pub mod config {
+        pub use crate::config::rules_file::parse as parse_rules_file;
+    }
     /// What `include/axon.h` declares, for crates that make libraries of it.
     pub mod ffi {
         pub use crate::ffi::*;
