@@ -47,6 +47,15 @@ fn the_page_s_rules_meet_its_expectations_and_its_commands_run_as_typed() {
     assert_eq!(ran, 2, "the page has other commands than this test knows");
     let said = run(&["acl", "test", &file], &[]);
     assert_eq!(text(&said.stdout), "3 expectations, all met\n");
+    let mut tested = 0;
+    for rules in rules.iter().filter(|rules| rules.contains("[[expect]]")) {
+        let file = written(dir.path(), "access.toml", rules);
+        let said = run(&["acl", "test", &file], &[]);
+        let met = format!("{} expectations, all met\n", rules.matches("[[expect]]").count());
+        assert_eq!(text(&said.stdout), met, "{rules}{}", text(&said.stderr));
+        tested += 1;
+    }
+    assert_eq!(tested, 4, "a whole file of the page is tried");
 }
 
 #[test]
