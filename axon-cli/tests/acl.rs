@@ -47,6 +47,15 @@ fn the_page_s_rules_meet_its_expectations_and_its_commands_run_as_typed() {
     assert_eq!(ran, 2, "the page has other commands than this test knows");
     let said = run(&["acl", "test", &file], &[]);
     assert_eq!(text(&said.stdout), "3 expectations, all met\n");
+    let mut tested = 0;
+    for rules in rules.iter().filter(|rules| rules.contains("[[expect]]")) {
+        let file = written(dir.path(), "access.toml", rules);
+        let said = run(&["acl", "test", &file], &[]);
+        let met = format!("{} expectations, all met\n", rules.matches("[[expect]]").count());
+        assert_eq!(text(&said.stdout), met, "{rules}{}", text(&said.stderr));
+        tested += 1;
+    }
+    assert_eq!(tested, 4, "a whole file of the page is tried");
 }
 
 #[test]
@@ -108,19 +117,61 @@ fn check_says_which_line_decides_and_its_status_says_whether_it_may() {
 }
 
 #[test]
+fn check_says_that_a_denial_of_see_takes_the_uses_that_no_allow_names() {
+    let dir = tempfile::tempdir().expect("directory");
+    let rules = "[[deny]]\npeer = [\"base\", \"guest\"]\nsee = \"/scan\"\n\
+                 [[allow]]\npeer = \"base\"\nsubscribe = \"/scan\"\n";
+    let file = written(dir.path(), "access.toml", rules);
+    for (peer, what, status, said) in [
+        ("base", "--subscribe", 0, "allowed by line 6 of access.toml"),
+        ("base", "--see", 1, "denied by line 3 of access.toml"),
+        ("base", "--publish", 1, "no [[allow]] in access.toml permits this"),
+        ("guest", "--subscribe", 1, "denied by line 3 of access.toml"),
+        ("guest", "--call", 1, "denied by line 3 of access.toml"),
+        ("other", "--subscribe", 0, "no rule in access.toml denies this"),
+    ] {
+        let output = run(&["acl", "check", &file, "--peer", peer, what, "/scan"], &[]);
+        let out = text(&output.stdout) + &text(&output.stderr);
+        assert_eq!(output.status.code(), Some(status), "{peer} {what} {out}");
+        assert!(out.contains(said), "{peer} {what} {out}");
+    }
+}
+
+#[test]
 fn check_takes_the_rules_that_the_settings_name_and_rules_beside_other_settings() {
     let dir = tempfile::tempdir().expect("directory");
     let rules = "quic_cipher = \"aes-256-gcm\"\n[[deny]]\npeer = \"*\"\ncall = \"/reboot\"\n";
-    let file = written(dir.path(), "axon.toml", rules);
+    for name in ["axon.toml", "robot.toml"] {
+        rules_among_settings(&dir, name, rules);
+    }
+    // A file of rules alone has no other key.
+    let wrong = rules.replace("quic_cipher", "quic_cypher");
+    let wrong = written(dir.path(), "wrong.toml", &wrong);
+    let output = run(&["acl", "check", &wrong, "--peer", "uid:7", "--call", "/reboot"], &[]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(text(&output.stderr).contains("unknown key \"quic_cypher\""));
+}
+
+/// The file as AXON_CONFIG names it, and as an argument.
+fn rules_among_settings(dir: &tempfile::TempDir, name: &str, rules: &str) {
+    let file = written(dir.path(), name, rules);
     let run_dir = dir.path().join("run");
     let settings =
         [("AXON_CONFIG", &*file), ("AXON_RUNTIME_DIR", run_dir.to_str().expect("UTF-8"))];
     let question = ["acl", "check", "--peer", "uid:7", "--call", "/reboot"];
     let output = run(&question, &settings);
     assert_eq!(output.status.code(), Some(1));
-    assert!(text(&output.stdout).contains("denied by line 4 of axon.toml"));
-    let named = ["acl", "check", &file, "--peer", "uid:7", "--call", "/reboot"];
-    assert_eq!(run(&named, &[]).status.code(), Some(1));
+    let line = format!("denied by line 4 of {name}");
+    assert!(text(&output.stdout).contains(&line), "{}", text(&output.stdout));
+    for settings in [&[][..], &settings] {
+        let named = ["acl", "check", &file, "--peer", "uid:7", "--call", "/reboot"];
+        let output = run(&named, settings);
+        let out = text(&output.stdout) + &text(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{out}");
+        assert!(out.contains(&line), "{out}");
+        let output = run(&["acl", "test", &file], settings);
+        assert!(text(&output.stderr).contains("has no [[expect]]"), "{}", text(&output.stderr));
+    }
 }
 
 #[test]

@@ -38,6 +38,10 @@ pub mod internal {
             PARAMETER_SERVICES,
         };
     }
+    /// Access rules in a file that somebody names.
+    pub mod config {
+        pub use crate::config::rules_file::parse as parse_rules_file;
+    }
     /// What `include/axon.h` declares, for crates that make libraries of it.
     pub mod ffi {
         pub use crate::ffi::*;
@@ -49,7 +53,7 @@ pub mod internal {
     /// The endpoints that may match, and the hosts on which they may.
     pub mod graph {
         pub use crate::graph::{
-            access::{other_end, permits, shows, verb_of},
+            access::{other_end, permits, permits_use, shows, verb_of},
             endpoint::{LIMITS, Limits},
             pairing::{Pairing, pairing, reads, writes},
             range::{EndpointRange, OutOfRange, RangeToHost, RemoteEndpoint, Scope, out_of_range},

@@ -38,6 +38,10 @@ pub struct Status {
     /// The effective security settings, as sessions are compared with them: `AXON_` name and value
     /// or digest.
     pub settings: BTreeMap<String, String>,
+    /// The [digest](crate::access::AccessRules::digest) of the access rules in force. Absent where there are none, and from
+    /// a daemon of an earlier version.
+    #[serde(default)]
+    pub access_digest: Option<String>,
     /// `classic` or `qkd`.
     pub mode: String,
     /// `session` or `messages10` in qkd.

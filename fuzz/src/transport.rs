@@ -206,6 +206,7 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
         more: endpoints > 1,
         localhost: Some(vec![gid]),
         listing: Some(vec![gid]),
+        denied: Some(vec![gid]),
     };
     let mask = |bits| IndexMask::from_bits(bits).unwrap();
     let messages = [

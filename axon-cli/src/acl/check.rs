@@ -3,7 +3,7 @@
 use std::{io::Write as _, process::ExitCode};
 
 use axon_transport::{
-    access::{InterfaceLimit, Verb},
+    access::{AccessRules, InterfaceLimit, Party, Verb},
     config::{Config, DaemonPlace},
     internal::graph::other_end,
     status::{LinkStatus, Status},
@@ -20,10 +20,11 @@ use crate::{
 pub(super) fn run(args: &cli::Check) -> Result<ExitCode, CliError> {
     let rules = super::rules(args.file.as_deref())?;
     let wrong = |what| CliError::Setting(format!("--peer {:?}: accepted: {what}", args.peer));
-    let permissions = rules.permissions(super::party(&args.peer).map_err(wrong)?);
+    let peer = super::party(&args.peer).map_err(wrong)?;
+    let permissions = rules.permissions(peer);
     let status = if args.file.is_none() { status() } else { None };
     if let Some(status) = &status {
-        warn_of_other_rules(status);
+        warn_of_other_rules(status, &rules);
     }
     let mut table = TextTable::new(&["it would", "here", "there"]);
     let mut allowed = true;
@@ -32,7 +33,7 @@ pub(super) fn run(args: &cli::Check) -> Result<ExitCode, CliError> {
         allowed &= decision.allowed();
         let there = status.as_ref().map_or_else(
             || "not asked".to_owned(),
-            |status| there(status, &args.peer, other_end(verb), &name),
+            |status| there(status, peer, other_end(verb), &name),
         );
         table.row([printable(&format!("{verb} {name}")), decision.to_string(), printable(&there)]);
     }
@@ -66,8 +67,8 @@ fn status() -> Option<Status> {
     serde_json::from_str(&axon_transport::daemon_status_at(&place).ok()?).ok()
 }
 
-/// The daemon may have been started with other settings than this process.
-fn warn_of_other_rules(status: &Status) {
+/// The daemon may have been started with other settings than this process, or before the file was changed.
+fn warn_of_other_rules(status: &Status, rules: &AccessRules) {
     let daemon = status.settings.get("AXON_ACCESS_FILE").map_or("none", String::as_str);
     let own = Config::from_env().ok().and_then(|config| config.access_file);
     let own = own.map_or_else(|| "none".to_owned(), |file| file.display().to_string());
@@ -76,23 +77,26 @@ fn warn_of_other_rules(status: &Status) {
             "axon: AXON_ACCESS_FILE is {own} here and {daemon} in the daemon that runs: the answer is about \
              the rules here"
         ));
+    } else if status.access_digest.is_some() && status.access_digest != rules.digest() {
+        say(format_args!(
+            "axon: the daemon that runs has other rules in force than are in {own} now: the answer is about the \
+             file; `axon reload` has the daemon read it again"
+        ));
     }
 }
 
-/// What the peer's rules say of this host's end of the pair, as far as the peer has said it.
-fn there(status: &Status, peer: &str, verb: Verb, name: &str) -> String {
-    // In qkd the host's name is what the peer calls itself.
-    let of_peer = |link: &&LinkStatus| match &link.sae {
-        Some(sae) => sae == peer,
-        None => link.host == peer && !link.authenticated_as.starts_with("UNAUTHENTICATED"),
-    };
-    let Some(link) = status.links.iter().find(of_peer) else {
+/// What the peer's rules say of this host's end of the pair, as far as the peer has said it. A peer may have more than one
+/// link.
+fn there(status: &Status, peer: Party<'_>, verb: Verb, name: &str) -> String {
+    let links: Vec<_> = status.links.iter().filter(|link| is_of(link, peer)).collect();
+    if links.is_empty() {
         return "not linked".to_owned();
-    };
-    if let Some(why) = link.denied.get(&format!("{verb} {name} (ours)")) {
+    }
+    let used = format!("{verb} {name} (ours)");
+    if let Some(why) = links.iter().find_map(|link| link.denied.get(&used)) {
         return why.strip_prefix("by the peer: ").unwrap_or(why).to_owned();
     }
-    if link.more_denied > 0 {
+    if links.iter().any(|link| link.more_denied > 0) {
         return "not known: more is denied than status lists".to_owned();
     }
     // The peer speaks of endpoints that there are.
@@ -109,26 +113,55 @@ fn there(status: &Status, peer: &str, verb: Verb, name: &str) -> String {
     text.to_owned()
 }
 
+/// Whether a link is of this peer, as rules name it. What a host calls itself proves nothing.
+fn is_of(link: &LinkStatus, peer: Party<'_>) -> bool {
+    match (Party::parse(&link.party), peer) {
+        (Ok(Party::Name(of)), Party::Certificate(name)) => of.eq_ignore_ascii_case(name),
+        (Ok(Party::Address(of)), Party::Address(ip)) => of.to_canonical() == ip.to_canonical(),
+        (Ok(of), peer) => of == peer,
+        (Err(_), _) => false,
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use axon_transport::status::TopicStatus;
 
     use super::*;
 
+    /// A link of this party, whose host calls itself something else.
+    fn link(party: &str) -> LinkStatus {
+        let mut link = LinkStatus::default();
+        (link.host, link.party) = ("localhost".into(), party.into());
+        link
+    }
+
     #[test]
     fn what_the_peer_said_of_an_endpoint_is_shown_and_nothing_else_is_claimed() {
-        let mut link = LinkStatus::default();
-        link.host = "base".into();
+        let mut base = link("base");
         let why = "by the peer: denied by line 3 of access.toml";
-        link.denied.insert("publish /scan (ours)".into(), why.into());
+        base.denied.insert("publish /scan (ours)".into(), why.into());
         let mut topic = TopicStatus::default();
         (topic.topic, topic.publishers) = ("/odom".into(), 1);
         let mut status = Status::default();
-        (status.links, status.topics) = (vec![link], vec![topic]);
-        let there = |peer, verb, name| there(&status, peer, verb, name);
+        (status.links, status.topics) = (vec![link("base"), base], vec![topic]);
+        let there = |peer, verb, name| there(&status, Party::Name(peer), verb, name);
         assert_eq!(there("base", Verb::Publish, "/scan"), "denied by line 3 of access.toml");
         assert_eq!(there("base", Verb::Publish, "/odom"), "no denial was heard");
         assert!(there("base", Verb::Subscribe, "/odom").starts_with("not known"));
         assert_eq!(there("arm", Verb::Publish, "/scan"), "not linked");
+        assert_eq!(there("localhost", Verb::Publish, "/scan"), "not linked");
+    }
+
+    #[test]
+    fn a_link_is_of_the_party_that_rules_know_it_as() {
+        let address = |text: &str| Party::Address(text.parse().unwrap());
+        assert!(is_of(&link("address:10.0.0.7"), address("::ffff:10.0.0.7")));
+        assert!(!is_of(&link("address:10.0.0.7"), address("10.0.0.8")));
+        assert!(!is_of(&link("address:10.0.0.7"), Party::Name("address:10.0.0.7")));
+        assert!(is_of(&link("base"), Party::Name("base")));
+        assert!(!is_of(&link("base"), Party::Name("Base")));
+        assert!(is_of(&link("base.example"), Party::Certificate("Base.Example")));
+        assert!(!is_of(&link(""), Party::Name("")), "a daemon of an earlier version");
     }
 }

@@ -12,6 +12,7 @@ use std::{path::Path, process::ExitCode};
 use axon_transport::{
     access::{AccessRules, Party},
     config::{ClassicAuth, Config, Security},
+    internal::config::parse_rules_file,
 };
 
 use self::cli::Acl;
@@ -45,11 +46,6 @@ fn rules(file: Option<&Path>) -> Result<AccessRules, CliError> {
     let text = std::fs::read_to_string(path)
         .map_err(|error| CliError::Setting(format!("{shown}: {error}")))?;
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    // It has other settings beside its rules.
-    let rules = if name == "axon.toml" {
-        AccessRules::parse_among_settings(&text, &name)
-    } else {
-        AccessRules::parse(&text, &name)
-    };
+    let rules = parse_rules_file(&text, &name);
     rules.map_err(|error| CliError::Setting(error.to_string()))
 }

@@ -76,6 +76,7 @@ fn render(status: &Status) -> String {
             ("discovery", discovery(status)),
             ("gateway", format!("{}, UDP port {port}", status.gateway)),
             ("descriptors", descriptors(status)),
+            ("access rules", access_rules(status)),
         ],
     );
     section(&mut out, "Settings", "none", settings(status));
@@ -108,6 +109,15 @@ fn mode(status: &Status) -> String {
     let sae = status.sae.as_ref().map(|sae| format!(", SAE {sae}")).unwrap_or_default();
     let details: Vec<&str> = details.into_iter().flatten().collect();
     format!("{} ({}){sae}", status.mode, details.join(", "))
+}
+
+/// Where the access rules are that the daemon has in force.
+fn access_rules(status: &Status) -> String {
+    match (status.settings.get("AXON_ACCESS_FILE"), &status.access_digest) {
+        (Some(file), Some(digest)) => format!("{file}, digest {digest}"),
+        (Some(file), None) => file.clone(),
+        (None, _) => "none: everything is allowed".to_owned(),
+    }
 }
 
 /// How many descriptors the daemon has of those that it may have.

@@ -14,7 +14,7 @@ pub(super) enum Reason {
     Open { file: Arc<str> },
     /// An `[[allow]]` names it and what it does.
     Allowed { file: Arc<str>, line: u32 },
-    /// A `[[deny]]` does.
+    /// A `[[deny]]` does, or hides the topic or service, and no `[[allow]]` names what it does.
     Denied { file: Arc<str>, line: u32 },
     /// An `[[allow]]` names it, and none names what it does.
     NotAllowed { file: Arc<str> },

@@ -29,6 +29,7 @@
 #![forbid(unsafe_code)]
 
 mod decision;
+mod digest;
 mod limit;
 pub(crate) mod parse;
 mod party;

@@ -201,6 +201,7 @@ impl<'t> Reader<'t> {
         header: &str,
     ) -> Result<Rule, AccessError> {
         let mut rule = Rule { peers: Vec::new(), says: Vec::new() };
+        let denies = header == "[[deny]]";
         for (key, value) in table {
             let key_span = key.span();
             let key = &**key.get_ref();
@@ -220,7 +221,9 @@ impl<'t> Reader<'t> {
                 "see" => |name| vec![(Verb::See, name.clone())],
                 "serve" => ros::serve,
                 "act" => ros::act,
+                "parameters" if denies => ros::parameter_services,
                 "parameters" => ros::parameters,
+                "lifecycle" if denies => ros::lifecycle_parts,
                 "lifecycle" => ros::lifecycle,
                 _ => {
                     let what = format!(
@@ -250,7 +253,7 @@ impl<'t> Reader<'t> {
             return Err(self.wrong(span, what));
         }
         // An [[allow]] that lets its peers do nothing is a way to deny them everything.
-        if rule.says.is_empty() && header == "[[deny]]" {
+        if rule.says.is_empty() && denies {
             let what = "[[deny]] that denies nothing; to deny all, write \
                         publish, subscribe, serve, call and see = \"**\"";
             return Err(self.wrong(span, what));

@@ -45,6 +45,13 @@ impl PatternSet {
         self.nodes.len() == 1
     }
 
+    /// Whether one pattern fits each name of ROS 2: `**` or `/**`.
+    pub(super) fn fits_all(&self) -> bool {
+        let any = |node: &Node| node.any.is_some_and(|any| self.nodes[any].line.is_some());
+        let [root, ..] = &self.nodes[..] else { return false };
+        any(root) || root.literal.get("").is_some_and(|slash| any(&self.nodes[*slash]))
+    }
+
     /// The node of a segment behind a node.
     fn child(&mut self, at: usize, segment: &str) -> usize {
         let node = &self.nodes[at];

@@ -72,12 +72,17 @@ impl Permissions {
         self.are_unrestricted() || self.check(verb, name).allowed()
     }
 
-    /// Whether a `[[deny]]` names this.
-    pub(crate) fn denies(&self, verb: Verb, name: &str) -> bool {
-        self.rules.as_ref().is_some_and(|rules| rules.deny.of(verb).first_fit(name).is_some())
+    /// Whether there is anything that the party may publish, subscribe to, serve or call.
+    pub(crate) fn allow_any_use(&self) -> bool {
+        let Some(rules) = &self.rules else { return true };
+        let open = rules.otherwise == Otherwise::Allow && !rules.deny.of(Verb::See).fits_all();
+        Verb::ALL.into_iter().filter(|verb| *verb != Verb::See).any(|verb| {
+            (open || !rules.allow.of(verb).is_empty()) && !rules.deny.of(verb).fits_all()
+        })
     }
 
-    /// As [`allows`](Self::allows), with the rule that decides.
+    /// As [`allows`](Self::allows), with the rule that decides. A `[[deny]]` of [`Verb::See`] denies each use that no
+    /// `[[allow]]` names: an endpoint that is hidden cannot be used.
     pub fn check(&self, verb: Verb, name: &str) -> Decision {
         let Some(rules) = &self.rules else { return Decision(Reason::NoRules) };
         let file = || Arc::clone(&rules.file);
@@ -86,6 +91,11 @@ impl Permissions {
         }
         if let Some(line) = rules.allow.of(verb).first_fit(name) {
             return Decision(Reason::Allowed { file: file(), line });
+        }
+        if rules.otherwise == Otherwise::Allow
+            && let Some(line) = rules.deny.of(Verb::See).first_fit(name)
+        {
+            return Decision(Reason::Denied { file: file(), line });
         }
         Decision(match rules.otherwise {
             Otherwise::Allow => Reason::Open { file: file() },

@@ -50,16 +50,26 @@ pub(super) fn serve(name: &TopicPattern) -> Vec<(Verb, TopicPattern)> {
     [(Verb::Serve, name.clone())].into_iter().chain(services).chain(topics).collect()
 }
 
-/// What a tool does that reads and sets the parameters of a node.
+/// What a tool does that reads and sets the parameters of a node. The topic of changes is of all nodes.
 pub(super) fn parameters(node: &TopicPattern) -> Vec<(Verb, TopicPattern)> {
     let events = TopicPattern::new(PARAMETER_EVENTS).map(|events| (Verb::Subscribe, events));
-    let services = below(node, Verb::Call, &PARAMETER_SERVICES);
-    services.chain(events).chain([(Verb::See, node.clone())]).collect()
+    let own = parameter_services(node).into_iter();
+    own.chain(events).chain([(Verb::See, node.clone())]).collect()
+}
+
+/// The part of [`parameters`] that concerns this node alone. A denial takes no more: the topic of changes has those of
+/// other nodes, too, and a topic may have the node's name.
+pub(super) fn parameter_services(node: &TopicPattern) -> Vec<(Verb, TopicPattern)> {
+    below(node, Verb::Call, &PARAMETER_SERVICES).collect()
 }
 
 /// What a manager of lifecycle nodes does.
 pub(super) fn lifecycle(node: &TopicPattern) -> Vec<(Verb, TopicPattern)> {
+    lifecycle_parts(node).into_iter().chain([(Verb::See, node.clone())]).collect()
+}
+
+/// The part of [`lifecycle`] that a denial takes.
+pub(super) fn lifecycle_parts(node: &TopicPattern) -> Vec<(Verb, TopicPattern)> {
     let services = below(node, Verb::Call, &LIFECYCLE_SERVICES);
-    let topic = below(node, Verb::Subscribe, &[LIFECYCLE_TOPIC]);
-    services.chain(topic).chain([(Verb::See, node.clone())]).collect()
+    services.chain(below(node, Verb::Subscribe, &[LIFECYCLE_TOPIC])).collect()
 }

@@ -21,7 +21,8 @@ pub enum Verb {
     /// It sends requests to servers here.
     Call,
     /// It is shown the nodes of this name, and the endpoints of topics and services of this name. A party that may
-    /// publish, subscribe, serve or call is shown the endpoints that it needs for that.
+    /// publish, subscribe, serve or call is shown the endpoints that it needs for that. A `[[deny]]` of it takes the
+    /// uses that no `[[allow]]` names, too.
     See,
 }
 

@@ -3,6 +3,7 @@ use proptest::prelude::*;
 use super::*;
 
 mod limits;
+mod model;
 
 fn rules(text: &str) -> AccessRules {
     AccessRules::parse(text, "access.toml").unwrap()
@@ -101,6 +102,36 @@ fn one_line_lets_a_peer_use_an_action_or_serve_it_or_set_parameters() {
 }
 
 #[test]
+fn a_denial_of_parameters_or_lifecycle_takes_the_services_of_the_node_and_nothing_else() {
+    for (names, node) in [("true", "/robot/arm"), ("\"/robot/arm\"", "/robot/arm")] {
+        let rules = rules(&format!(
+            "[[deny]]\npeer = \"base\"\nparameters = {names}\n[[deny]]\npeer = \"manager\"\nlifecycle = {names}"
+        ));
+        let check = |party, verb, name: &str| rules.check(Party::Name(party), verb, name);
+        for service in ros::PARAMETER_SERVICES {
+            let decision = check("base", Verb::Call, &format!("{node}/{service}"));
+            assert_eq!(decision.line(), Some(3), "{names} {service}");
+        }
+        for service in ros::LIFECYCLE_SERVICES {
+            let decision = check("manager", Verb::Call, &format!("{node}/{service}"));
+            assert_eq!(decision.line(), Some(6), "{names} {service}");
+        }
+        let told = format!("{node}/{}", ros::LIFECYCLE_TOPIC);
+        assert!(!check("manager", Verb::Subscribe, &told).allowed());
+        assert!(check("base", Verb::Subscribe, ros::PARAMETER_EVENTS).allowed(), "of all nodes");
+        for party in ["base", "manager"] {
+            for verb in Verb::ALL {
+                // A topic may have the name of a node.
+                for name in [node, "/scan"] {
+                    assert!(check(party, verb, name).allowed(), "{names} {party} {verb} {name}");
+                }
+            }
+            assert!(check(party, Verb::See, &format!("{node}/set_parameters")).allowed());
+        }
+    }
+}
+
+#[test]
 fn a_pattern_of_one_kind_fits_no_party_of_another() {
     let rules = rules(
         r#"
@@ -186,62 +217,7 @@ fn hostile_names_are_judged_as_they_are_written() {
     assert!(may(&format!("/robot/{}/x", "a".repeat(65_536))));
 }
 
-/// A rule of the model: whether it denies, the peers, the verb and the names.
-type ModelRule = (bool, &'static str, Verb, &'static str);
-
-/// The definition: a `[[deny]]` wins; else an `[[allow]]`; else what no rule names is allowed, but to parties that an
-/// `[[allow]]` names, and where the default is to deny.
-fn model(rules: &[ModelRule], deny: bool, party: &str, verb: Verb, name: &str) -> bool {
-    let fits = |pattern: &str, text: &str| match pattern.strip_suffix('*') {
-        Some(start) => text.starts_with(start),
-        None => pattern == text,
-    };
-    let names = |rule: &&ModelRule| fits(rule.1, party);
-    let says = |rule: &&ModelRule| {
-        rule.2 == verb
-            && (rule.3 == name || rule.3 == "/**" || rule.3 == "/a/**" && fits("/a*", name))
-    };
-    let named: Vec<_> = rules.iter().filter(names).collect();
-    if named.iter().any(|rule| rule.0 && says(rule)) {
-        return false;
-    }
-    if named.iter().any(|rule| !rule.0 && says(rule)) {
-        return true;
-    }
-    !deny && named.iter().all(|rule| rule.0)
-}
-
 proptest! {
-    #[test]
-    fn decisions_are_those_of_the_definition(
-        all in prop::collection::vec(
-            (any::<bool>(), 0..4_usize, 0..5_usize, 0..4_usize),
-            0..10,
-        ),
-        deny in any::<bool>(),
-    ) {
-        const PEERS: [&str; 4] = ["base", "op*", "op-1", "*"];
-        const NAMES: [&str; 4] = ["/a", "/a/b", "/a/**", "/**"];
-        let all: Vec<ModelRule> = all
-            .into_iter()
-            .map(|(deny, peer, verb, name)| (deny, PEERS[peer], Verb::ALL[verb], NAMES[name]))
-            .collect();
-        let mut text = format!("default = \"{}\"\n", if deny { "deny" } else { "allow" });
-        for (deny, peer, verb, name) in &all {
-            let header = if *deny { "deny" } else { "allow" };
-            text += &format!("[[{header}]]\npeer = \"{peer}\"\n{verb} = \"{name}\"\n");
-        }
-        let rules = rules(&text);
-        for party in ["base", "op-1", "op-2", "x"] {
-            let permissions = rules.permissions(Party::Name(party));
-            // What serves an action publishes its feedback: other names than these.
-            for (verb, name) in Verb::ALL.into_iter().flat_map(|v| ["/a", "/a/b", "/b"].map(|n| (v, n))) {
-                let expected = model(&all, deny, party, verb, name);
-                prop_assert_eq!(permissions.allows(verb, name), expected, "{} {} {}\n{}", party, verb, name, text);
-            }
-        }
-    }
-
     #[test]
     fn no_text_makes_the_reader_panic(text in "(\\[\\[(allow|deny|limit|expect)\\]\\]|peer|see|=|\"|/|\\*|\n|[a-z]){0,40}") {
         let _ = AccessRules::parse(&text, "access.toml");

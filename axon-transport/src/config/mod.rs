@@ -22,6 +22,7 @@ mod model;
 mod names;
 mod place;
 mod resolve;
+pub(crate) mod rules_file;
 mod sources;
 mod summary;
 #[cfg(test)]

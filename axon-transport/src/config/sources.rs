@@ -286,6 +286,11 @@ fn setting_of_file(
     Ok((name, Setting { text, origin: Origin::File(Rc::clone(file)) }))
 }
 
+/// Whether a key at the top of a file is one of settings.
+pub(super) fn is_setting_key(key: &str) -> bool {
+    ["link", "qkd", "topic"].contains(&key) || setting_of_key(key).is_ok()
+}
+
 fn is_ours(name: &OsStr) -> bool {
     name.as_encoded_bytes().starts_with(b"AXON_")
 }

@@ -25,10 +25,18 @@ pub fn other_end(verb: Verb) -> Verb {
     }
 }
 
-/// Whether a party may have this endpoint.
+/// Whether a party may have this endpoint. A node does nothing by itself: it is there for a party that may do anything.
 pub fn permits(party: &Permissions, endpoint: &Endpoint) -> bool {
-    party.are_unrestricted()
-        || verb_of(endpoint.kind).is_none_or(|verb| party.allows(verb, &endpoint.topic))
+    match verb_of(endpoint.kind) {
+        Some(verb) => party.allows(verb, &endpoint.topic),
+        None => party.allow_any_use(),
+    }
+}
+
+/// Whether a party may be at the other end of this endpoint of another party.
+pub fn permits_use(party: &Permissions, endpoint: &Endpoint) -> bool {
+    let denied = |verb| !party.allows(other_end(verb), &endpoint.topic);
+    party.are_unrestricted() || !verb_of(endpoint.kind).is_some_and(denied)
 }
 
 /// Whether a party is shown this endpoint of another party: it may see the topic, or needs the endpoint for its own. For
@@ -39,9 +47,8 @@ pub fn shows(party: &Permissions, endpoint: &Endpoint) -> bool {
     }
     match verb_of(endpoint.kind) {
         Some(verb) => {
-            !party.denies(Verb::See, &endpoint.topic)
-                && (party.allows(Verb::See, &endpoint.topic)
-                    || party.allows(other_end(verb), &endpoint.topic))
+            party.allows(Verb::See, &endpoint.topic)
+                || party.allows(other_end(verb), &endpoint.topic)
         }
         None => {
             let namespace = endpoint.namespace.strip_suffix('/').unwrap_or(&endpoint.namespace);
@@ -87,6 +94,8 @@ mod tests {
                 (has, sees),
                 "{kind:?} {topic}"
             );
+            let uses = sees && topic != "/seen";
+            assert_eq!(permits_use(&party, &endpoint), uses, "{kind:?} {topic}");
         }
         for (namespace, node, sees) in [
             ("/ns", "node", true),
@@ -95,12 +104,42 @@ mod tests {
             ("/ns/", "node", true),
         ] {
             let node = of(Node, "").with_node(node, namespace);
-            assert!(permits(&party, &node), "it does nothing by itself");
+            assert!(permits(&party, &node), "a party that may do something");
             assert_eq!(shows(&party, &node), sees, "{node:?}");
         }
         let hidden = "[[deny]]\npeer = \"a\"\nsee = \"/secret\"";
         let hidden = AccessRules::parse(hidden, "f").unwrap().permissions(Party::Name("a"));
-        assert!(!shows(&hidden, &of(Publisher, "/secret")) && shows(&hidden, &of(Publisher, "/x")));
+        for kind in [Publisher, Subscription, Server, Client] {
+            let [secret, other] = ["/secret", "/x"].map(|topic| of(kind, topic));
+            assert!(!shows(&hidden, &secret) && !permits(&hidden, &secret), "{kind:?}");
+            assert!(shows(&hidden, &other) && permits(&hidden, &other), "{kind:?}");
+        }
+        let both =
+            "[[deny]]\npeer = \"a\"\nsee = \"**\"\n[[allow]]\npeer = \"a\"\nsubscribe = \"/scan\"";
+        let both = AccessRules::parse(both, "f").unwrap().permissions(Party::Name("a"));
+        assert!(
+            shows(&both, &of(Publisher, "/scan")) && permits(&both, &of(Subscription, "/scan"))
+        );
+        for (kind, topic) in [(Subscription, "/scan"), (Publisher, "/odom"), (Server, "/scan")] {
+            assert!(!shows(&both, &of(kind, topic)), "{kind:?} {topic}");
+        }
+        let all = "publish = \"**\"\nsubscribe = \"/**\"\nserve = \"**\"\ncall = \"**\"";
+        for (rules, has_nodes) in [
+            ("default = \"allow\"".to_owned(), true),
+            ("default = \"deny\"".to_owned(), false),
+            ("[[allow]]\npeer = \"a\"\nsee = \"**\"".to_owned(), false),
+            ("[[allow]]\npeer = \"a\"\ncall = \"/c\"".to_owned(), true),
+            ("[[allow]]\npeer = \"b\"\nsee = \"**\"".to_owned(), true),
+            (format!("[[deny]]\npeer = \"a\"\n{all}"), false),
+            (format!("[[deny]]\npeer = \"a\"\n{all}\n[[allow]]\npeer = \"a\"\n{all}"), false),
+            ("[[deny]]\npeer = \"a\"\npublish = \"**\"".to_owned(), true),
+            ("[[deny]]\npeer = \"a\"\nsee = \"**\"".to_owned(), false),
+            ("[[deny]]\npeer = \"a\"\nsee = \"/*\"".to_owned(), true),
+        ] {
+            let party = AccessRules::parse(&rules, "f").unwrap().permissions(Party::Name("a"));
+            let node = of(Node, "").with_node("node", "/ns");
+            assert_eq!(permits(&party, &node), has_nodes, "{rules}");
+        }
         let nobody = Permissions::default();
         assert!(permits(&nobody, &of(Publisher, "/x")) && shows(&nobody, &of(Node, "")));
     }

@@ -34,9 +34,16 @@ impl Users {
     /// Why a user may not have an endpoint, if it may not.
     pub(crate) fn denial(&self, user: Option<u32>, endpoint: &Endpoint) -> Option<String> {
         let permissions = self.permissions.get(&user?)?;
-        let verb = verb_of(endpoint.kind)?;
-        let denied = !permits(permissions, endpoint);
-        denied.then(|| permissions.check(verb, &endpoint.topic).to_string())
+        if permits(permissions, endpoint) {
+            return None;
+        }
+        Some(match verb_of(endpoint.kind) {
+            Some(verb) => permissions.check(verb, &endpoint.topic).to_string(),
+            None => {
+                let file = self.rules.file().unwrap_or_default();
+                format!("denied: nothing in {file} lets its user do anything")
+            }
+        })
     }
 
     /// Whether `user` is shown an endpoint of a session of user `of`.

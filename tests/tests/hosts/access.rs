@@ -11,9 +11,10 @@ use std::{
 };
 
 use axon_transport::{
-    EndpointSpec, Publisher, Session, Subscription,
+    EndpointSpec, Event, Publisher, Session, Subscription,
     config::DaemonPlace,
     daemon_reload_at,
+    events::{EventKind, EventStatus},
     qos::{Durability, Qos},
     status::ReloadReport,
 };
@@ -216,6 +217,100 @@ fn a_daemon_takes_rules_that_changed_and_refuses_those_that_are_wrong() {
     assert!(hosts.reload().error.unwrap().contains("AXON_ACCESS_FILE"));
     assert!(drive.matched().contains(&drives.gid()));
     hosts.write(ROBOT);
+}
+
+/// How often an endpoint was matched, and how often its QoS was incompatible.
+fn events(matched: &Event, incompatible: &Event) -> (u64, u64) {
+    let (EventStatus::Matched(matched), EventStatus::IncompatibleQos(incompatible)) =
+        (matched.take(), incompatible.take())
+    else {
+        unreachable!()
+    };
+    (matched.total, incompatible.count.total)
+}
+
+#[test]
+fn an_endpoint_that_the_other_host_denies_is_never_matched_and_seen_all_the_same() {
+    use EventKind::{
+        OfferedQosIncompatible, PublicationMatched, RequestedQosIncompatible, SubscriptionMatched,
+    };
+    let keys = tempfile::tempdir().unwrap();
+    let settings = pinned(keys.path(), [[false, true], [true, false]]);
+    let hosts = Hosts::start(settings, "host-1", keys);
+    let see = "default = \"deny\"\n[[allow]]\npeer = \"PEER\"\nsee = \"**\"\n\
+               subscribe = \"/other\"\npublish = \"/other\"\n";
+    let deny = "[[deny]]\npeer = \"PEER\"\npublish = \"/scan\"\nsubscribe = \"/scan\"\n\
+                serve = \"/scan\"\ncall = \"/scan\"\n";
+    let (here, there) = (hosts.robot.session("robot"), hosts.base.session("base"));
+    for closed in [deny, see] {
+        hosts.write(closed);
+        assert_eq!(hosts.reload().error, None);
+        for [from, to] in [[&here, &there], [&there, &here]] {
+            let (scan, scans) = (publisher(from, "/scan"), subscription(to, "/scan"));
+            let service = || EndpointSpec::new("/scan", "test/Set", Qos::keep_all());
+            let (_server, client) =
+                (from.create_server(service()).unwrap(), to.create_client(service()).unwrap());
+            let offers = [PublicationMatched, OfferedQosIncompatible];
+            let offers = offers.map(|kind| scan.event(kind).unwrap());
+            let requests = [SubscriptionMatched, RequestedQosIncompatible];
+            let requests = requests.map(|kind| scans.event(kind).unwrap());
+            let verb = if std::ptr::eq(from, &here) { "subscribe" } else { "publish" };
+            until("both hosts say what is denied", || {
+                Hosts::shows(&hosts.robot, &format!("{verb} /scan (the peer's)"), "denied")
+                    && Hosts::shows(&hosts.base, &format!("{verb} /scan (ours)"), "denied")
+            });
+            // What was created later is matched: the others would be by now.
+            meet(&publisher(from, "/other"), &subscription(to, "/other"));
+            assert!(scan.matched().is_empty() && scans.matched().is_empty(), "{closed}");
+            assert!(!client.is_available(), "{closed}");
+            // The robot shows what it has: it denies the use alone.
+            let own = if std::ptr::eq(from, &here) { scan.gid() } else { scans.gid() };
+            until("the base sees the robot's endpoint", || {
+                there.graph().endpoints.contains_key(&own)
+            });
+            assert_eq!(events(&offers[0], &offers[1]), (0, 0), "{closed}");
+            assert_eq!(events(&requests[0], &requests[1]), (0, 0), "{closed}");
+            for round in 1..=2 {
+                hosts.write("default = \"allow\"");
+                assert_eq!(hosts.reload().error, None);
+                meet(&scan, &scans);
+                assert!(client.wait_available(PATIENCE));
+                scan.publish(b"open").unwrap();
+                scans.recv(&mut Vec::new(), Some(PATIENCE)).expect("a sample");
+                hosts.write(closed);
+                assert_eq!(hosts.reload().error, None);
+                until("the pair ends on both hosts", || {
+                    scan.matched().is_empty() && scans.matched().is_empty()
+                });
+                until("the server is gone", || !client.is_available());
+                assert_eq!(events(&offers[0], &offers[1]), (round, 0), "{closed}");
+                assert_eq!(events(&requests[0], &requests[1]), (round, 0), "{closed}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_peer_that_may_do_nothing_here_shows_no_nodes_here() {
+    let keys = tempfile::tempdir().unwrap();
+    let settings = pinned(keys.path(), [[false, true], [true, false]]);
+    let hosts = Hosts::start(settings, "host-1", keys);
+    let (here, there) = (hosts.robot.session("robot"), hosts.base.session("base"));
+    let node = there.create_node("guest", "/far", "/").unwrap();
+    let has_node = || here.graph().endpoints.contains_key(&node.gid());
+    until("the node of a peer with rights is there", has_node);
+    for nothing in [
+        "[[allow]]\npeer = \"PEER\"\nsee = \"**\"",
+        "[[deny]]\npeer = \"PEER\"\npublish = \"**\"\nsubscribe = \"**\"\nserve = \"**\"\ncall = \"**\"",
+        "default = \"deny\"",
+    ] {
+        hosts.write(nothing);
+        assert_eq!(hosts.reload().error, None);
+        until("the node is not there", || !has_node());
+        hosts.write(ROBOT);
+        assert_eq!(hosts.reload().error, None);
+        until("the node is there again", has_node);
+    }
 }
 
 #[test]

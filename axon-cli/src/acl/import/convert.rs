@@ -41,7 +41,7 @@ impl Patterns {
     /// Whether each name that a pattern fits is in these, as far as that can be told.
     fn cover(&self, pattern: &str) -> bool {
         self.lines.contains_key(pattern)
-            || self.lines.contains_key("/**")
+            || ["/**", "**"].iter().any(|all| self.lines.contains_key(*all))
             || !pattern.contains('*') && self.starred.iter().any(|starred| starred.fits(pattern))
     }
 
@@ -103,6 +103,9 @@ pub(super) fn convert(grant: &Grant, notes: &mut Notes) -> Rules {
                             decides, here the denial does";
                 notes.add(Effect::Less, says.line, what);
             }
+            // `*` fits names without a slash before them, too.
+            let all = pattern == "/**" && says.expression.bytes().all(|byte| byte == b'*');
+            let pattern = if all { "**".to_owned() } else { pattern };
             denied.entry(key).or_default().insert(pattern, says.line);
         }
     }

@@ -155,6 +155,22 @@ fn each_thing_that_cannot_be_honoured_is_named_with_its_line() {
 }
 
 #[test]
+fn a_denial_of_all_names_those_without_a_slash_too() {
+    let deny = rule("deny", &["*"], &["*"]);
+    let (text, _) = imported(&permissions(&deny, "ALLOW"));
+    for verb in [Verb::Publish, Verb::Subscribe, Verb::Call, Verb::Serve] {
+        assert!(!may(&text, verb, "/a") && !may(&text, verb, "no_slash"), "{verb} {text}");
+    }
+    // The topics of ROS 2 alone, which all have one.
+    let (text, _) = imported(&permissions(&rule("deny", &["rt/*"], &[]), "ALLOW"));
+    assert!(!may(&text, Verb::Publish, "/a") && may(&text, Verb::Publish, "no_slash"), "{text}");
+    // Neither half of what is denied needs the other.
+    let deny = rule("deny", &["*", "rq/addRequest"], &["rr/addReply", "*"]);
+    let (text, notes) = imported(&permissions(&deny, "ALLOW"));
+    assert!(!may(&text, Verb::Call, "/add") && !notes.contains("names the"), "{notes}");
+}
+
+#[test]
 fn the_graph_is_seen_by_whom_ros_tells_of_it() {
     let (text, _) = imported(&permissions(&rule("allow", &[], &["ros_discovery_info"]), "DENY"));
     assert!(text.contains("see = \"**\"") && !may(&text, Verb::Subscribe, "/a"), "{text}");

@@ -283,7 +283,7 @@ pub(crate) fn cost_of_frame(frame: &[u8]) -> u32 {
 pub(crate) fn cost(message: &Message) -> u32 {
     costs(match message {
         Message::Graph(graph) => {
-            let toward = [&graph.localhost, &graph.listing].into_iter().flatten();
+            let toward = [&graph.localhost, &graph.listing, &graph.denied].into_iter().flatten();
             let toward = toward.map(Vec::len).sum::<usize>() / LOOKED_UP;
             graph.added.len() + graph.removed.len() + toward
         }

@@ -428,6 +428,8 @@ proptest! {
         file in proptest::option::of("[a-z_\\[\\]='\"0-9\n ]{0,60}"),
     ) {
         let mut disk = Disk::new();
+        // A setting may name the key as a file that is read, such as that of access rules.
+        disk.put("/f/key.pem", 0o600, "no rules");
         if let Some(text) = &file {
             disk.put("/f/axon.toml", 0o644, text);
         }

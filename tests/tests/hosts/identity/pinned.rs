@@ -121,8 +121,9 @@ fn a_pin_that_is_removed_ends_the_link_and_the_next_dial() {
     }
     assert!(hosts.iter().all(|host| host.status().links.is_empty()));
     fs::write(&trust, before).unwrap();
-    for host in &hosts {
-        host.link();
+    for (number, host) in hosts.iter().enumerate() {
+        // Rules about the name apply again.
+        assert_eq!(host.link().party, format!("host-{}", 1 - number));
         assert!(host.is_first_daemon());
     }
 }

@@ -110,6 +110,7 @@ fn status(control: &Control) -> Status {
     status.keys = control.keys.clone();
     status.refusals = control.refusals.iter().cloned().collect();
     status.settings = settings;
+    status.access_digest = config.access.digest();
     status
 }
 

@@ -55,7 +55,11 @@ impl Links {
             return self.turn_away(number, &hello, why, now);
         }
         let auth = self.credentials.auth();
-        let who = Who::of(self.keyring.is_some(), auth.as_ref(), &hello, &negotiated);
+        // The pins may have changed since they were looked at.
+        let who = match Who::of(self.keyring.is_some(), auth.as_ref(), &hello, negotiated.peer) {
+            Ok(who) => who,
+            Err(why) => return self.turn_away(number, &hello, why, now),
+        };
         let current = self.table.current_peer(daemon);
         if current.is_some_and(|current| !current.summary.who.is(&who)) {
             return self.turn_away(number, &hello, TAKEN.into(), now);

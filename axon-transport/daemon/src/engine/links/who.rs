@@ -2,10 +2,7 @@
 
 use std::{fmt, net::SocketAddr};
 
-use axon_tls::{
-    Negotiated,
-    identity::{Auth, SpkiDigest},
-};
+use axon_tls::identity::{Auth, SpkiDigest};
 
 use axon_transport::access::Party;
 
@@ -25,25 +22,29 @@ pub(crate) enum Who {
 }
 
 impl Who {
-    /// The peer of a link whose HELLO was checked.
+    /// The peer of a link whose HELLO was checked. `key` is the one that it proved to have.
+    ///
+    /// # Errors
+    /// The key is not pinned any more, or there is none. Rules about names would not apply to a link without a name, also once the pin
+    /// is there again.
     pub(crate) fn of(
         qkd: bool,
         auth: Option<&Auth>,
         hello: &Hello,
-        negotiated: &Negotiated,
-    ) -> Self {
+        key: Option<SpkiDigest>,
+    ) -> Result<Self, String> {
         if let (true, Some(sae)) = (qkd, &hello.sae) {
-            return Self::Sae(sae.clone());
+            return Ok(Self::Sae(sae.clone()));
         }
-        let Some(key) = negotiated.peer else { return Self::Somebody(None) };
-        match auth {
-            // The name can be gone by now: a pin that was removed after the handshake.
-            Some(Auth::Pinned { trust, .. }) => match trust.name_of(&key) {
-                Some(name) => Self::Pinned(name, key),
-                None => Self::Somebody(Some(key)),
-            },
-            Some(Auth::Ca(_)) => Self::Host(hello.host.to_ascii_lowercase(), key),
-            _ => Self::Somebody(Some(key)),
+        match (auth, key) {
+            (Some(Auth::Pinned { trust, .. }), key) => {
+                let name = key.and_then(|key| Some((trust.name_of(&key)?, key)));
+                let gone = || "its key is no longer pinned in AXON_CLASSIC_TRUST".to_owned();
+                name.map(|(name, key)| Self::Pinned(name, key)).ok_or_else(gone)
+            }
+            (Some(Auth::Ca(_)), Some(key)) => Ok(Self::Host(hello.host.to_ascii_lowercase(), key)),
+            (Some(Auth::Ca(_)), None) => Err("it proved no key of a certificate".to_owned()),
+            (_, key) => Ok(Self::Somebody(key)),
         }
     }
 
@@ -113,6 +114,28 @@ impl fmt::Display for Who {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::wire::link::samples::hello;
+
+    #[test]
+    fn a_key_whose_pin_is_gone_is_refused_and_does_not_become_an_address() {
+        use axon_tls::identity::{SigningKey, Trust, TrustFile};
+        let key = SpkiDigest([7; 32]);
+        let pins = |text: &str| TrustFile::parse(text).unwrap();
+        let trust = Trust::new(pins(&format!("arm {key}\n")));
+        let auth = Auth::Pinned { key: SigningKey::generate().unwrap(), trust: trust.clone() };
+        let of = |auth, key| Who::of(false, auth, &hello(), key);
+        let who = of(Some(&auth), Some(key)).unwrap();
+        assert_eq!(who.party(([127, 0, 0, 1], 1).into()), Party::Name("arm"));
+        // Between the handshake and HELLO.
+        for gone in ["# nobody\n".to_owned(), format!("arm {key} 2024-02-29\n")] {
+            trust.replace(pins(&gone));
+            let why = of(Some(&auth), Some(key)).unwrap_err();
+            assert!(why.contains("no longer pinned in AXON_CLASSIC_TRUST"), "{why}");
+        }
+        of(Some(&auth), None).unwrap_err();
+        let none = Auth::None(SigningKey::generate().unwrap());
+        assert!(matches!(of(Some(&none), Some(key)), Ok(Who::Somebody(Some(_)))));
+    }
 
     #[test]
     fn a_name_is_the_same_under_another_key_and_no_other_name_is() {

@@ -79,7 +79,7 @@ impl Peer {
         let publishers = endpoints.filter(|e| e.kind == EndpointKind::Publisher);
         self.alive.watch(publishers.filter_map(|e| e.qos.lease));
         self.answering = self.now_answering();
-        let reachable = self.remote.endpoints().filter(|remote| {
+        let reachable = self.remote.usable().filter(|remote| {
             let e = &remote.endpoint;
             e.kind != EndpointKind::Server || self.answering.contains(&e.gid)
         });

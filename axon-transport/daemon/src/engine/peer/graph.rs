@@ -49,6 +49,8 @@ struct Held {
     remote: RemoteEndpoint,
     /// Access rules deny it: for all others on this host it is not there.
     denied: bool,
+    /// Access rules of the peer deny this host the other end: it is shown, and in no pair.
+    closed: bool,
     _charge: Rc<Charge>,
 }
 
@@ -100,8 +102,8 @@ impl Remote {
 
     /// Takes a GRAPH in, as far as there is room.
     pub(crate) fn take(&mut self, graph: Graph) -> GraphTaken {
-        let Graph { version, before, added, removed, more, localhost, listing } = graph;
-        let [localhost, listing] = [localhost, listing]
+        let Graph { version, before, added, removed, more, localhost, listing, denied } = graph;
+        let [localhost, listing, closed] = [localhost, listing, denied]
             .map(|gids| gids.unwrap_or_default().into_iter().collect::<BTreeSet<Gid>>());
         let toward = |gid: &Gid| {
             let near = localhost.contains(gid);
@@ -117,8 +119,8 @@ impl Remote {
         self.version = version;
         if let Some(mut gathered) = self.gathered.take() {
             for endpoint in added {
-                let toward = toward(&endpoint.gid);
-                self.gather(&mut gathered, endpoint, toward);
+                let (toward, closed) = (toward(&endpoint.gid), closed.contains(&endpoint.gid));
+                self.gather(&mut gathered, endpoint, toward, closed);
             }
             if more {
                 self.gathered = Some(gathered);
@@ -152,7 +154,8 @@ impl Remote {
             let before = self.all.remove(&gid);
             let known = before.is_some();
             drop(before);
-            let held = self.hold(endpoint, toward(&gid), self.all.len());
+            let closed = closed.contains(&gid);
+            let held = self.hold(endpoint, toward(&gid), closed, self.all.len());
             if known || held.is_some() {
                 self.changed.insert(gid);
             }
@@ -168,6 +171,7 @@ impl Remote {
         gathered: &mut BTreeMap<Gid, Held>,
         endpoint: Endpoint,
         toward: RangeToHost,
+        closed: bool,
     ) {
         let gid = endpoint.gid;
         let held = match self.all.get(&gid) {
@@ -177,9 +181,9 @@ impl Remote {
             }
             Some(known) if *known.remote.endpoint == endpoint => {
                 let remote = RemoteEndpoint { toward, ..known.remote.clone() };
-                Some(Held { remote, ..known.clone() })
+                Some(Held { remote, closed, ..known.clone() })
             }
-            _ => self.hold(endpoint, toward, gathered.len()),
+            _ => self.hold(endpoint, toward, closed, gathered.len()),
         };
         gathered.extend(held.map(|held| (gid, held)));
     }
@@ -223,14 +227,20 @@ impl Remote {
         });
     }
 
-    fn hold(&mut self, endpoint: Endpoint, toward: RangeToHost, beside: usize) -> Option<Held> {
+    fn hold(
+        &mut self,
+        endpoint: Endpoint,
+        toward: RangeToHost,
+        closed: bool,
+        beside: usize,
+    ) -> Option<Held> {
         let bytes = endpoint.bytes();
         if beside < LIMITS.endpoints
             && let Some(charge) = self.account.graph.charge(bytes)
         {
             let remote = RemoteEndpoint { endpoint: Arc::new(endpoint), toward };
             let denied = !permits(&self.permissions, &remote.endpoint);
-            return Some(Held { remote, denied, _charge: Rc::new(charge) });
+            return Some(Held { remote, denied, closed, _charge: Rc::new(charge) });
         }
         self.left_out += 1;
         if self.refused.is_none() {
@@ -329,6 +339,11 @@ impl Remote {
         self.all.values().filter(|held| !held.denied).map(|held| &held.remote)
     }
 
+    /// The endpoints that access rules of neither host keep out of pairs with this host's.
+    pub(crate) fn usable(&self) -> impl Iterator<Item = &RemoteEndpoint> {
+        self.all.values().filter(|held| !held.denied && !held.closed).map(|held| &held.remote)
+    }
+
     /// These endpoints are another daemon's.
     pub(crate) fn forget(&mut self, gids: &[Gid]) {
         for gid in gids {
@@ -366,7 +381,7 @@ mod tests {
 
     fn graph(before: u64, added: Vec<Endpoint>, removed: Vec<Gid>, more: bool) -> Graph {
         let version = before + 1;
-        Graph { version, before, added, removed, more, localhost: None, listing: None }
+        Graph { version, before, added, removed, more, ..Graph::default() }
     }
 
     fn one() -> usize {
@@ -459,6 +474,22 @@ mod tests {
         assert_eq!((changes(&mut remote), remote.left_out()), ((vec![], vec![3]), 1));
         assert!(remote.has_room_again());
         assert_eq!(account.graph.held(), 2 * one());
+    }
+
+    #[test]
+    fn an_endpoint_whose_use_the_peer_denies_is_told_of_and_not_usable() {
+        let mut remote = Remote::new(Accounts::new(1 << 20).of("a"), false, Permissions::default());
+        let both = || vec![endpoint(1, "/t"), endpoint(2, "/t")];
+        let usable =
+            |remote: &Remote| remote.usable().map(|e| e.endpoint.gid.0[0]).collect::<Vec<_>>();
+        for (before, denied, left) in [(0, 1, 2), (1, 2, 1), (0, 1, 2)] {
+            let denied = Some(vec![Gid([denied; 16])]);
+            remote.take(Graph { denied, ..graph(before, both(), vec![], false) });
+            assert_eq!((usable(&remote), remote.endpoints().count()), (vec![left], 2));
+        }
+        assert_eq!(changes(&mut remote), (vec![1, 2], vec![]));
+        remote.take(graph(0, both(), vec![], false));
+        assert_eq!((usable(&remote), changes(&mut remote)), (vec![1, 2], (vec![], vec![])));
     }
 
     #[test]

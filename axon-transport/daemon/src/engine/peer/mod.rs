@@ -10,6 +10,7 @@ mod refused;
 pub(super) mod routes;
 mod serving;
 pub(super) mod stalls;
+mod told;
 
 use std::{
     cell::RefCell,
@@ -27,7 +28,7 @@ use axon_transport::{
     graph::{Endpoint, EndpointKind},
     internal::{
         events::Alive,
-        graph::{EndpointRange, RangeToHost, RemoteEndpoint, shows},
+        graph::{EndpointRange, RemoteEndpoint, permits_use, shows},
     },
     status::LinkStatus,
 };
@@ -38,6 +39,7 @@ use self::{
     asking::{Asked, Attaching},
     refused::RefusedRoutes,
     serving::{DENIED_AGAIN, Served},
+    told::{Told, added},
 };
 use super::{
     inbound::Inbound,
@@ -130,7 +132,7 @@ pub(crate) struct Peer {
     /// Endpoints of it were ignored, since another peer had them.
     pub(super) displaced: bool,
     /// The graph that it was sent.
-    sent: BTreeMap<Gid, RemoteEndpoint>,
+    sent: BTreeMap<Gid, Told>,
     sent_version: u64,
     resynced: Option<Duration>,
     resync_due: bool,
@@ -368,17 +370,17 @@ impl Peer {
     /// Publishers that ended stay in the graph that the peer sees until their samples have arrived.
     fn keep_ending(&mut self, local: &Local, now: Duration) {
         let ended = self.sent.iter().filter(|(gid, shown)| {
-            shown.endpoint.kind == EndpointKind::Publisher
+            shown.remote.endpoint.kind == EndpointKind::Publisher
                 && !local.contains_key(gid)
                 && !self.ending.contains_key(gid)
         });
-        let carried = |gid: &Gid, shown: &RemoteEndpoint| {
-            let number = *self.served_as.get(&RouteKey::of(&shown.endpoint)?)?;
+        let carried = |gid: &Gid, shown: &Told| {
+            let number = *self.served_as.get(&RouteKey::of(&shown.remote.endpoint)?)?;
             let sources = &self.served.get(&number)?.sources;
             sources.iter().any(|source| source.has_unacknowledged(gid)).then_some(number)
         };
-        let ended =
-            ended.filter_map(|(gid, shown)| Some((carried(gid, shown)?, *gid, shown.clone())));
+        let ended = ended
+            .filter_map(|(gid, shown)| Some((carried(gid, shown)?, *gid, shown.remote.clone())));
         for (number, gid, shown) in ended.collect::<Vec<_>>() {
             self.outbound.handle_publisher_ended(number, gid, now);
             self.ending.insert(gid, shown);
@@ -414,36 +416,35 @@ impl Peer {
         if whole {
             self.sent.clear();
         }
-        let now = self.visible(local);
-        self.prove(&now);
-        let added: Vec<_> =
+        let visible = self.visible(local);
+        self.prove(&visible);
+        let told = |remote: RemoteEndpoint| {
+            let denied = !permits_use(self.access.permissions(), &remote.endpoint);
+            Told { remote, denied }
+        };
+        let now: BTreeMap<_, _> = visible.into_iter().map(|(gid, e)| (gid, told(e))).collect();
+        let new: Vec<_> =
             now.iter().filter(|(gid, e)| self.sent.get(gid) != Some(e)).map(|(_, e)| e).collect();
         let removed: Vec<_> =
             self.sent.keys().filter(|gid| !now.contains_key(gid)).copied().collect();
-        if !whole && added.is_empty() && removed.is_empty() {
+        if !whole && new.is_empty() && removed.is_empty() {
             return;
         }
         let mut before = if whole { 0 } else { self.sent_version };
         let mut removed = Some(removed);
-        let mut parts: Vec<&[_]> = added.chunks(GRAPH_PART).collect();
+        let mut parts: Vec<&[_]> = new.chunks(GRAPH_PART).collect();
         if parts.is_empty() {
             parts.push(&[]);
         }
         let last = parts.len() - 1;
         for (index, part) in parts.into_iter().enumerate() {
             self.sent_version += 1;
-            let named = |is: fn(&RangeToHost) -> bool| {
-                let gids = part.iter().filter(|e| is(&e.toward)).map(|e| e.endpoint.gid);
-                Some(gids.collect::<Vec<_>>()).filter(|gids| !gids.is_empty())
-            };
             let graph = Graph {
                 version: self.sent_version,
                 before,
-                localhost: named(|toward| toward.range != DiscoveryRange::Subnet),
-                listing: named(|toward| toward.lists),
-                added: part.iter().map(|e| Endpoint::clone(&e.endpoint)).collect(),
                 removed: removed.take().unwrap_or_default(),
                 more: index < last,
+                ..added(part)
             };
             self.messages.push_back(Message::Graph(graph));
             before = self.sent_version;

@@ -108,6 +108,9 @@ pub struct Graph {
     /// Those of `added` whose session lists the receiver's host as a static peer.
     #[n(6)]
     pub listing: Option<Vec<Gid>>,
+    /// Those of `added` that the receiver may see and not use: access rules of the sender deny it the other end.
+    #[n(7)]
+    pub denied: Option<Vec<Gid>>,
 }
 
 /// The receiver of GRAPH missed a version and asks for the whole.
@@ -451,7 +454,7 @@ impl Message {
             Self::Graph(m) => ok(
                 m.added.len() <= LIMITS.endpoints
                     && m.removed.len() <= LIMITS.endpoints
-                    && [&m.localhost, &m.listing]
+                    && [&m.localhost, &m.listing, &m.denied]
                         .iter()
                         .all(|gids| gids.as_ref().is_none_or(|gids| gids.len() <= m.added.len()))
                     && m.added.iter().all(Endpoint::is_sane),

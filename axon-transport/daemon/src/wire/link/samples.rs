@@ -59,6 +59,7 @@ pub(crate) fn messages() -> Vec<Message> {
             more: true,
             localhost: None,
             listing: None,
+            denied: Some(vec![]),
         }),
         Message::GraphResync(GraphResync { version: 2 }),
         Message::Subscribe(Subscribe {

@@ -101,6 +101,81 @@ fn a_topic_does_not_cross_where_either_host_denies_it() {
 }
 
 #[test]
+fn a_topic_crosses_beside_a_denial_of_parameters_or_lifecycle() {
+    for key in ["parameters", "lifecycle"] {
+        for (with_rules, names) in [(0, "true"), (1, "true"), (0, "\"/scan\""), (1, "\"/scan\"")] {
+            let text = format!("[[deny]]\npeer = \"*\"\n{key} = {names}");
+            let mut world = hosts(with_rules, &text);
+            let [scan, events] =
+                ["/scan", "/parameter_events"].map(|topic| world.pair(0, 1, topic, latched()));
+            world.until(secs(20), World::is_whole);
+            assert!(arrives(&mut world, scan) && arrives(&mut world, events), "{text}");
+            for pair in [scan, events] {
+                assert!(
+                    is_shown(&world, 1, pair.publisher) && is_shown(&world, 0, pair.subscription)
+                );
+            }
+            assert!((0..2).all(|host| link(&world, host).denied.is_empty()), "{text}");
+        }
+    }
+}
+
+#[test]
+fn an_endpoint_that_may_be_seen_and_not_used_has_no_stand_in() {
+    let see = "default = \"deny\"\n[[allow]]\npeer = \"*\"\nsee = \"**\"";
+    for closed in ["[[deny]]\npeer = \"*\"\nsubscribe = \"/scan\"", see] {
+        let mut world = hosts(0, closed);
+        let scan = world.pair(0, 1, "/scan", latched());
+        // From before they are linked: it is not there for a moment either.
+        for _ in 0..3000 {
+            world.run_for(millis(1));
+            assert_eq!(world.hosts[1].shown(), 0, "{closed}");
+        }
+        assert!(is_shown(&world, 1, scan.publisher), "it may be seen");
+        assert!(denied(&world, 1).contains("subscribe /scan (ours)"), "{}", denied(&world, 1));
+        assert!(link(&world, 1).routes_refused.is_empty(), "it did not ask");
+        for _ in 0..2 {
+            world.hosts[0].set_access(OPEN);
+            world.run_for(secs(1));
+            assert!(arrives(&mut world, scan), "{closed}");
+            assert_eq!(world.hosts[1].shown(), 1);
+            world.hosts[0].set_access(closed);
+            world.run_for(secs(1));
+            assert_eq!(world.hosts[1].shown(), 0, "{closed}");
+            assert!(!arrives(&mut world, scan), "{closed}");
+        }
+    }
+}
+
+#[test]
+fn a_denial_of_see_leaves_what_an_allow_names_and_takes_the_rest_with_a_reason() {
+    for hides in ["/scan", "**"] {
+        let see = format!("[[deny]]\npeer = \"*\"\nsee = \"{hides}\"");
+        let text = format!("{see}\n[[allow]]\npeer = \"*\"\nsubscribe = \"/scan\"");
+        let mut world = hosts(0, &text);
+        let [scan, odom] = ["/scan", "/odom"].map(|topic| world.pair(0, 1, topic, latched()));
+        world.until(secs(20), World::is_linked);
+        world.run_for(secs(1));
+        assert!(arrives(&mut world, scan), "{text}");
+        assert!(is_shown(&world, 1, scan.publisher) && !is_shown(&world, 1, odom.publisher));
+        // Where no [[allow]] names the peer, what is hidden from it is denied to it.
+        for (with_rules, verb) in [(0, "subscribe"), (1, "publish")] {
+            let mut world = hosts(with_rules, &see);
+            let scan = world.pair(0, 1, "/scan", latched());
+            world.until(secs(20), World::is_linked);
+            world.run_for(secs(1));
+            assert!(!arrives(&mut world, scan), "{see}");
+            world.run_for(secs(2));
+            for host in [0, 1] {
+                let denied = denied(&world, host);
+                assert!(denied.contains(&format!("{verb} /scan (")), "{denied}");
+                assert!(denied.contains("denied by line 3 of access.toml"), "{denied}");
+            }
+        }
+    }
+}
+
+#[test]
 fn rules_that_change_end_a_flow_and_begin_it_again_without_a_gap_in_what_is_allowed() {
     let closed = "[[allow]]\npeer = \"*\"\npublish = \"/other\"\nsubscribe = \"/other\"";
     for host in [0, 1] {

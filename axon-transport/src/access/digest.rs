@@ -1,0 +1,45 @@
+//! A short text by which two programs compare their rules.
+
+use super::AccessRules;
+
+impl AccessRules {
+    /// A digest of the rules, limits and expectations, with their lines. It differs where they do, and is no protection
+    /// against somebody who looks for two rules with one digest. `None` where there are none. Programs of
+    /// other versions may have another one of the same rules.
+    pub fn digest(&self) -> Option<String> {
+        self.file()?;
+        // FNV-1a. The text names each field, and has no order that differs from run to run.
+        let text = format!("{:?} {:?}", self.rules, self.limits);
+        let add = |hash: u64, byte: u8| (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3);
+        Some(format!("{:016x}", text.bytes().fold(0xcbf2_9ce4_8422_2325, add)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_digest_is_the_same_for_the_same_rules_and_another_one_for_others() {
+        let of = |text: &str| AccessRules::parse(text, "access.toml").unwrap().digest().unwrap();
+        let rules =
+            "[[allow]]\npeer = \"a\"\npublish = \"/x\"\n[[limit]]\npeer = \"*\"\nrate = 5\n";
+        assert_eq!(of(rules), of(rules));
+        assert_eq!(of(rules), of(&format!("{rules}# a comment below all rules\n")));
+        let others = [
+            rules.replace("allow", "deny"),
+            rules.replace("\"a\"", "\"b\""),
+            rules.replace("publish", "subscribe"),
+            rules.replace("/x", "/y"),
+            rules.replace('5', "6"),
+            format!("default = \"deny\"\n{rules}"),
+            // Decisions name lines.
+            format!("\n{rules}"),
+        ];
+        let mut all: Vec<_> = others.iter().map(|text| of(text)).chain([of(rules)]).collect();
+        all.sort();
+        all.dedup();
+        assert_eq!(all.len(), others.len() + 1);
+        assert_eq!(AccessRules::default().digest(), None);
+    }
+}
