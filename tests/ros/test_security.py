@@ -177,17 +177,13 @@ def test_a_process_stays_within_its_enclave(host, keystore, tmp_path):
     """Each of two enclaves may do one thing with a topic, and what its node does by itself."""
     enforced(host, keystore, tmp_path)
 
-    def own(node):
-        return [f'rr/{node}/*Reply'], [f'rq/{node}/*Request', 'rt/parameter_events']
-
-    files = {}
-    for enclave, node, publish, subscribe in (
-            ('/robot/talker', 'qos_publisher', ['rt/qos'], []),
-            ('/robot/listener', 'qos_subscription', [], ['rt/qos'])):
-        replies, requests = own(node)
-        files[enclave] = keystore.enclave(
-            enclave, domain(host), (OWN_TOPICS + replies + publish, requests + subscribe),
-            (['rt/brake'], []))
+    # The services of parameters, of either node.
+    replies, requests = ['rr/qos_*Reply'], ['rq/qos_*Request', 'rt/parameter_events']
+    files = {
+        enclave: keystore.enclave(
+            enclave, domain(host), (OWN_TOPICS + replies + publish, requests + subscribe), (['rt/brake'], []))
+        for enclave, publish, subscribe in (
+            ('/robot/talker', ['rt/qos'], []), ('/robot/listener', [], ['rt/qos']))}
 
     def within(enclave):
         return '--ros-args', '--enclave', enclave

@@ -206,7 +206,7 @@ pub enum SessionError {
         /// The topic or service.
         topic: String,
         /// What denies it, where, and what to DDS it is called.
-        denial: Box<Denial>,
+        denial: Denial,
     },
     /// The permissions of the session's enclave do not count now, or not in its domain.
     #[cfg(feature = "sros2")]

@@ -18,9 +18,9 @@ impl SessionShared {
     pub(super) fn permit(&self, endpoint: &Endpoint) -> Result<(), SessionError> {
         let Some(permissions) = &self.options.permissions else { return Ok(()) };
         let (kind, topic) = (endpoint.kind, &endpoint.topic);
-        permissions.check(kind, topic, self.config.domain, SystemTime::now()).map_err(|denial| {
-            SessionError::Permission { topic: topic.clone(), denial: Box::new(denial) }
-        })
+        permissions
+            .check(kind, topic, self.config.domain, SystemTime::now())
+            .map_err(|denial| SessionError::Permission { topic: topic.clone(), denial })
     }
 }
 

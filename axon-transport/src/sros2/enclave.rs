@@ -8,7 +8,7 @@ use std::{
 use super::{
     Denial, PermissionsError, date,
     document::{self, MOST_EXPRESSIONS, common_name},
-    error::Reason,
+    error::{Denied, Reason},
     file,
     grant::{Decision, Grant},
     names::{Does, uses},
@@ -163,7 +163,8 @@ impl EnclavePermissions {
     }
 
     fn denial(&self, does: Does, topic: String, reason: Reason) -> Denial {
-        Denial { enclave: self.enclave.clone(), path: self.path.clone(), does, topic, reason }
+        let (enclave, path) = (self.enclave.clone(), self.path.clone());
+        Denial(Box::new(Denied { enclave, path, does, topic, reason }))
     }
 
     /// The first grant that is valid, or when the last one is.

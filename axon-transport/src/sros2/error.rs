@@ -89,7 +89,10 @@ pub enum PermissionsError {
 
 /// Why an enclave may not have an endpoint. Its text names the enclave, the topic of DDS, the file and the line.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Denial {
+pub struct Denial(pub(super) Box<Denied>);
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Denied {
     pub(super) enclave: String,
     pub(super) path: PathBuf,
     pub(super) does: Does,
@@ -111,7 +114,7 @@ pub(super) enum Reason {
 impl Denial {
     /// The line of the file that decides.
     pub fn line(&self) -> u32 {
-        match self.reason {
+        match self.0.reason {
             Reason::Rule(line) | Reason::Default(line) | Reason::NotValid { line, .. } => line,
         }
     }
@@ -119,7 +122,7 @@ impl Denial {
 
 impl fmt::Display for Denial {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { enclave, path, does, topic, reason } = self;
+        let Denied { enclave, path, does, topic, reason } = &*self.0;
         let (enclave, topic, line) = (plain(enclave, SHOWN), plain(topic, 1000), self.line());
         let path = path.display();
         write!(f, "enclave {enclave} may not {} {topic}: ", does.verb())?;

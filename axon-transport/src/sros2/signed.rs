@@ -33,12 +33,14 @@ pub fn cleartext(file: &str) -> Result<Cleartext<'_>, String> {
     }
     let (part, _) = between(body, &boundary).ok_or("its first part has no beginning or no end")?;
     let (header, text) = split_header(part).ok_or("the header of its first part has no end")?;
-    if let Some(encoding) = field(header, "content-transfer-encoding") {
-        if !["7bit", "8bit", "binary"].iter().any(|one| encoding.eq_ignore_ascii_case(one)) {
-            return Err(format!(
-                "its Content-Transfer-Encoding is {encoding:?}; accepted: 7bit, 8bit, binary"
-            ));
-        }
+    let is_plain = |encoding: &str| {
+        ["7bit", "8bit", "binary"].iter().any(|one| encoding.eq_ignore_ascii_case(one))
+    };
+    if let Some(encoding) = field(header, "content-transfer-encoding").filter(|one| !is_plain(one))
+    {
+        return Err(format!(
+            "its Content-Transfer-Encoding is {encoding:?}; accepted: 7bit, 8bit, binary"
+        ));
     }
     let before = text.as_ptr() as usize - file.as_ptr() as usize;
     Ok(Cleartext { text, lines_before: file[..before].matches('\n').count() })
