@@ -37,7 +37,7 @@
  * The version of this interface. It rises whenever a program that was compiled against the former
  * header would not work any more.
  */
-#define AXON_SESSION_ABI 2
+#define AXON_SESSION_ABI 3
 
 /**
  * The most bytes that the hash of a type may have.
@@ -713,6 +713,16 @@ typedef struct axon_session_options_t {
      * library's, those in `PATH`, and the one where cargo installs programs.
      */
     const char *daemon_path;
+    /**
+     * The file with the permissions of an SROS2 enclave, `permissions.p7s` or `permissions.xml`: the session creates no
+     * endpoint that they do not allow (AXON_RET_DENIED). Their signature is not verified. Null: no limit. A library
+     * that was built without the feature `sros2` takes null alone.
+     */
+    const char *permissions_path;
+    /**
+     * The enclave, as `/robot/arm`. Not null where `permissions_path` is not.
+     */
+    const char *enclave;
 } axon_session_options_t;
 
 /**
@@ -816,6 +826,12 @@ typedef struct axon_wait_set_t {
  * A defect of the library was caught. What the call should have done may be half done.
  */
 #define AXON_RET_PANIC 10
+
+/**
+ * The permissions of the session's enclave do not allow the endpoint; the text names the topic, the
+ * enclave, the file and its line.
+ */
+#define AXON_RET_DENIED 11
 
 #ifdef __cplusplus
 extern "C" {
@@ -1129,7 +1145,7 @@ axon_ret_t axon_session_node_graph_guard(struct axon_node_t node, struct axon_gu
  * graph shows, unless they take longer than 50 ms.
  *
  * AXON_RET_INVALID_ARGUMENT: a name, the hash or a policy is out of bounds. AXON_RET_BAD_ALLOC: shared
- * memory is short.
+ * memory is short. AXON_RET_DENIED: the session's permissions do not allow it.
  *
  * # Safety
  * `options` points to options whose pointers point to what they say; `publisher` points to room for
@@ -1367,8 +1383,9 @@ axon_ret_t axon_session_options_authentication(const struct axon_session_options
  * Blocks until the daemon has answered: milliseconds, or up to 20 s where one is started.
  *
  * AXON_RET_CONFIG: a setting is wrong, or the daemon that runs has other security settings; the text
- * names the variable. AXON_RET_ERROR: there is no daemon and none can be started, or it does not
- * answer. AXON_RET_BAD_ALLOC: shared memory is short.
+ * names the variable. Or the permissions cannot be read, are not valid now, or allow nothing in the
+ * session's domain; the text names the file. AXON_RET_ERROR: there is no daemon and none can be
+ * started, or it does not answer. AXON_RET_BAD_ALLOC: shared memory is short.
  *
  * # Safety
  * `options` points to options that `axon_session_options_init` filled in, whose pointers are null or

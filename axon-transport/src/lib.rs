@@ -11,6 +11,8 @@ mod registry;
 mod secrets;
 mod session;
 mod session_key;
+#[cfg(feature = "sros2")]
+pub mod sros2;
 pub mod status;
 mod text;
 mod wire;
@@ -75,6 +77,28 @@ pub mod internal {
     /// The parts of a session.
     pub mod session {
         pub use crate::session::*;
+    }
+    /// Documents of SROS2, for tools.
+    #[cfg(feature = "sros2")]
+    pub mod sros2 {
+        pub use crate::sros2::expression::Expression;
+
+        /// What a file of permissions says.
+        pub mod document {
+            pub use crate::sros2::document::*;
+        }
+        /// Topics of DDS.
+        pub mod names {
+            pub use crate::sros2::names::*;
+        }
+        /// The text in a signed file.
+        pub mod signed {
+            pub use crate::sros2::signed::*;
+        }
+        /// XML of limited size.
+        pub mod xml {
+            pub use crate::sros2::xml::*;
+        }
     }
     /// Text from outside.
     pub mod text {

@@ -9,6 +9,7 @@ pub mod config;
 pub mod envelope;
 pub mod kme;
 pub mod quic;
+pub mod sros2;
 pub mod tls;
 pub mod transport;
 
@@ -63,4 +64,5 @@ pub const TARGETS: &[Target] = &[
         seeds: kme::subject_seeds,
     },
     Target { name: "config", check: config::config, seeds: config::seeds },
+    Target { name: "permissions", check: sros2::permissions, seeds: sros2::seeds },
 ];

@@ -106,7 +106,11 @@ axon_session_t open_session(const rmw_init_options_t & options)
   set_discovery(options, session, peers);
   const std::string daemon = installed_daemon();
   session.daemon_path = daemon.empty() ? nullptr : daemon.c_str();
-  rmw_axon::check_security(options, session);
+  const rmw_axon::Enclave enclave = rmw_axon::check_security(options, session);
+  if (!enclave.permissions_path.empty()) {
+    session.permissions_path = enclave.permissions_path.c_str();
+    session.enclave = enclave.name.c_str();
+  }
   axon_session_t opened{};
   check(axon_session_open(&session, &opened));
   return opened;

@@ -1,12 +1,15 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// ROS_SECURITY_*: AXON authenticates and encrypts by settings of its own, and reads no keystore of ROS.
+// ROS_SECURITY_*: AXON authenticates and encrypts by settings of its own. Of ROS's keystore it reads the permissions
+// of the enclave, as middlewares of DDS do where the enclave's files are there.
 
 #include "security.hpp"
 
 #include <atomic>
 #include <cstring>
+#include <filesystem>
 #include <string>
+#include <system_error>
 #include <utility>
 
 #include "error.hpp"
@@ -29,6 +32,22 @@ bool is_enabled(const rmw_security_options_t & security)
          security.enforce_security == RMW_SECURITY_ENFORCEMENT_ENFORCE;
 }
 
+// The enclave that rcl looked the folder up for.
+std::string enclave_of(const rmw_init_options_t & options)
+{
+  const char * value = nullptr;
+  const bool overridden =
+    rcutils_get_env("ROS_SECURITY_ENCLAVE_OVERRIDE", &value) == nullptr && value[0] != '\0';
+  return overridden ? value : options.enclave;
+}
+
+// Whether there is no such file. One that cannot be looked at may be there.
+bool is_missing(const std::string & path)
+{
+  std::error_code error;
+  return !std::filesystem::exists(path, error) && !error;
+}
+
 const char * name_of(uint32_t authentication)
 {
   switch (authentication) {
@@ -49,37 +68,59 @@ constexpr char REMEDY[] =
 
 }  // namespace
 
-void check_security(const rmw_init_options_t & options, const axon_session_options_t & session)
+Enclave check_security(const rmw_init_options_t & options, const axon_session_options_t & session)
 {
   const rmw_security_options_t & security = options.security_options;
   if (!is_enabled(security)) {
-    return;
+    return {};
   }
+  const bool enforced = security.enforce_security == RMW_SECURITY_ENFORCEMENT_ENFORCE;
   uint32_t authentication = AXON_AUTHENTICATION_NONE;
   check(axon_session_options_authentication(&session, &authentication));
   const bool nobody = authentication == AXON_AUTHENTICATION_NONE;
-  if (nobody && security.enforce_security == RMW_SECURITY_ENFORCEMENT_ENFORCE) {
+  if (nobody && enforced) {
     throw Failure(
             RMW_RET_ERROR, std::string(
               "ROS security is enforced (ROS_SECURITY_STRATEGY=Enforce), and rmw_axon would authenticate "
-              "nobody: AXON_CLASSIC_AUTH is none. It does not use ROS's keystore: ") + REMEDY);
+              "nobody: AXON_CLASSIC_AUTH is none. It does not use the certificates of ROS's keystore: ") +
+            REMEDY);
+  }
+  Enclave enclave;
+  if (security.security_root_path != nullptr) {
+    const std::string path = std::string(security.security_root_path) + "/permissions.p7s";
+    // Who is permissive has the session limited where the keystore has permissions for it.
+    if (enforced || !is_missing(path)) {
+      enclave = {path, enclave_of(options)};
+    }
+  } else if (enforced) {
+    throw Failure(
+            RMW_RET_ERROR,
+            "ROS security is enforced (ROS_SECURITY_STRATEGY=Enforce), and the options name no folder of "
+            "an enclave: set ROS_SECURITY_KEYSTORE");
   }
   static std::atomic<bool> warned{false};
   // Relaxed: nothing else is read by it.
   if (warned.exchange(true, std::memory_order_relaxed)) {
-    return;
+    return enclave;
   }
-  std::string text = "ROS security is enabled. rmw_axon does not use ROS's keystore";
-  if (security.security_root_path != nullptr) {
-    text += std::string(" (") + security.security_root_path + ")";
+  std::string text = "ROS security is enabled. Of ROS's keystore rmw_axon uses ";
+  if (enclave.permissions_path.empty()) {
+    text += "nothing: there is no permissions.p7s";
+    if (security.security_root_path != nullptr) {
+      text += std::string(" in ") + security.security_root_path;
+    }
+    text += ", and what this process may publish and subscribe to is not limited. ";
+  } else {
+    text += "the permissions of enclave " + enclave.name + " (" + enclave.permissions_path +
+      ") and nothing else: it does not verify their signature. ";
   }
-  text += ", and applies no permissions of an enclave. ";
   if (nobody) {
     text += std::string("Nobody is authenticated, AXON_CLASSIC_AUTH is none: ") + REMEDY;
   } else {
     text += std::string("Hosts are authenticated, ") + name_of(authentication);
   }
   warn(std::move(text));
+  return enclave;
 }
 
 }  // namespace rmw_axon

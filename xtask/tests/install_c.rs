@@ -15,6 +15,23 @@ use std::process::Command;
 
 use support::{Kept, run, target, with_daemon, workspace};
 
+/// Prints what a session with permissions of an enclave is told.
+const LIMITED: &str = "#include <axon.h>
+#include <stdio.h>
+int main(void) {
+    axon_session_options_t options;
+    axon_session_t session;
+    if (axon_session_options_init(&options, AXON_SESSION_ABI) != AXON_RET_OK) {
+        return 1;
+    }
+    options.permissions_path = \"permissions.p7s\";
+    options.enclave = \"/arm\";
+    int returned = axon_session_open(&options, &session);
+    printf(\"%d %s\\n\", returned, axon_session_last_error());
+    return 0;
+}
+";
+
 /// What a command prints.
 fn printed(command: &mut Command) -> String {
     String::from_utf8_lossy(&run(command).stdout).into_owned()
@@ -102,6 +119,15 @@ fn programs_in_c_build_and_run_with_what_is_installed() {
     fs::rename(&shared, &aside).unwrap();
     let listener = installed.example("listener", &["--cflags", "--libs", "--static"]);
     fs::rename(&aside, &shared).unwrap();
+
+    // Built without the feature sros2, it opens no session that it could not limit.
+    let limited = installed.path("limited.c");
+    fs::write(&limited, LIMITED).unwrap();
+    let program = installed.path("limited");
+    let options = installed.asked(&["--cflags", "--libs"]);
+    run(Command::new("cc").arg(&limited).args(options).arg("-o").arg(&program));
+    let refused = printed(&mut installed.command(&program));
+    assert!(refused.starts_with("3 ") && refused.contains("feature sros2"), "{refused}");
 
     let _talker = Kept(installed.command(&talker).spawn().unwrap());
     let heard = printed(&mut installed.command(&listener));

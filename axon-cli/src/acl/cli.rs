@@ -42,7 +42,8 @@ pub(crate) enum Acl {
 
 const CHECK_HELP: &str = "\
 Without FILE the rules are those that the settings name, and a daemon that runs is asked what the \
-peer's rules say of this host's end of the pair.
+peer's rules say of this host's end of the pair. The permissions of SROS2's enclaves act in the processes \
+themselves, and are not seen here.
 
 Examples:
   axon acl check --peer base --publish /cmd_vel
@@ -144,7 +145,7 @@ Exit status: 0 when rules were written, 1 when the document cannot be read, 2 wh
 /// `axon acl import`.
 #[derive(Args, Debug)]
 pub(crate) struct Import {
-    /// permissions.xml of an enclave (not the signed .p7s), or the policy that SROS2 makes it of
+    /// permissions.xml or permissions.p7s of an enclave, or the policy that SROS2 makes them of
     #[arg(value_name = "FILE")]
     pub(crate) file: PathBuf,
     /// The host or user that the rules are for, as it stands in peer

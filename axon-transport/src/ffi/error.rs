@@ -40,6 +40,9 @@ pub const AXON_RET_ABI: axon_ret_t = 8;
 pub const AXON_RET_NO_NODE: axon_ret_t = 9;
 /// A defect of the library was caught. What the call should have done may be half done.
 pub const AXON_RET_PANIC: axon_ret_t = 10;
+/// The permissions of the session's enclave do not allow the endpoint; the text names the topic, the
+/// enclave, the file and its line.
+pub const AXON_RET_DENIED: axon_ret_t = 11;
 
 thread_local! {
     static LAST: RefCell<CString> = RefCell::default();
@@ -108,6 +111,10 @@ impl From<SessionError> for CallFailure {
             SessionError::Memory(ShmError::AlreadyLed(_)) => AXON_RET_ERROR,
             SessionError::Memory(_) => AXON_RET_BAD_ALLOC,
             SessionError::Config(_) | SessionError::Mismatch { .. } => AXON_RET_CONFIG,
+            #[cfg(feature = "sros2")]
+            SessionError::Permissions(_) => AXON_RET_CONFIG,
+            #[cfg(feature = "sros2")]
+            SessionError::Permission { .. } => AXON_RET_DENIED,
             SessionError::Endpoint { .. }
             | SessionError::Node { .. }
             | SessionError::OtherSession => AXON_RET_INVALID_ARGUMENT,

@@ -62,7 +62,7 @@ pub use wait::*;
 
 /// The version of this interface. It rises whenever a program that was compiled against the former
 /// header would not work any more.
-pub const AXON_SESSION_ABI: u32 = 2;
+pub const AXON_SESSION_ABI: u32 = 3;
 
 /// The version of the interface that the library has. `axon_session_options_init` compares it with
 /// the header's, so that no session is opened where they differ.

@@ -23,7 +23,7 @@ pub(super) fn time(timestamp: i64) -> Option<i64> {
 /// graph shows, unless they take longer than 50 ms.
 ///
 /// AXON_RET_INVALID_ARGUMENT: a name, the hash or a policy is out of bounds. AXON_RET_BAD_ALLOC: shared
-/// memory is short.
+/// memory is short. AXON_RET_DENIED: the session's permissions do not allow it.
 ///
 /// # Safety
 /// `options` points to options whose pointers point to what they say; `publisher` points to room for

@@ -61,6 +61,12 @@ pub struct axon_session_options_t {
     /// `axon_daemon`, else `axon`, in the first of the following folders that has it: this program's own, the
     /// library's, those in `PATH`, and the one where cargo installs programs.
     pub daemon_path: *const c_char,
+    /// The file with the permissions of an SROS2 enclave, `permissions.p7s` or `permissions.xml`: the session creates no
+    /// endpoint that they do not allow (AXON_RET_DENIED). Their signature is not verified. Null: no limit. A library
+    /// that was built without the feature `sros2` takes null alone.
+    pub permissions_path: *const c_char,
+    /// The enclave, as `/robot/arm`. Not null where `permissions_path` is not.
+    pub enclave: *const c_char,
 }
 
 /// Fills options in with what is usual. `abi` is the program's AXON_SESSION_ABI: AXON_RET_ABI where
@@ -84,6 +90,8 @@ pub unsafe extern "C" fn axon_session_options_init(
             static_peer_count: 0,
             name: std::ptr::null(),
             daemon_path: std::ptr::null(),
+            permissions_path: std::ptr::null(),
+            enclave: std::ptr::null(),
         };
         // SAFETY: the caller's word.
         unsafe { store(options, usual, "the place of the options") }
@@ -152,8 +160,9 @@ pub unsafe extern "C" fn axon_session_options_authentication(
 /// Blocks until the daemon has answered: milliseconds, or up to 20 s where one is started.
 ///
 /// AXON_RET_CONFIG: a setting is wrong, or the daemon that runs has other security settings; the text
-/// names the variable. AXON_RET_ERROR: there is no daemon and none can be started, or it does not
-/// answer. AXON_RET_BAD_ALLOC: shared memory is short.
+/// names the variable. Or the permissions cannot be read, are not valid now, or allow nothing in the
+/// session's domain; the text names the file. AXON_RET_ERROR: there is no daemon and none can be
+/// started, or it does not answer. AXON_RET_BAD_ALLOC: shared memory is short.
 ///
 /// # Safety
 /// `options` points to options that `axon_session_options_init` filled in, whose pointers are null or
@@ -225,7 +234,41 @@ unsafe fn settings(
     if let Some(program) = daemon {
         open = open.daemon_command(DaemonCommand { program, arguments: Vec::new() });
     }
+    if !options.permissions_path.is_null() {
+        // SAFETY: the caller's word.
+        let path = unsafe { text(options.permissions_path, "the path of the permissions") }?;
+        // SAFETY: the caller's word.
+        let enclave = unsafe { text(options.enclave, "the enclave") }?;
+        open = limit(open, &config, path, enclave)?;
+    }
     Ok((config, open))
+}
+
+/// Limits a session to what an enclave may do.
+#[cfg(feature = "sros2")]
+fn limit(
+    options: SessionOptions,
+    config: &Config,
+    path: &str,
+    enclave: &str,
+) -> Result<SessionOptions, CallFailure> {
+    let failure = |error| CallFailure::new(AXON_RET_CONFIG, error);
+    let permissions = crate::sros2::EnclavePermissions::read(path, enclave).map_err(failure)?;
+    permissions.check_domain(config.domain, std::time::SystemTime::now()).map_err(failure)?;
+    Ok(options.permissions(permissions))
+}
+
+/// Refuses the session: what cannot be judged is not let through.
+#[cfg(not(feature = "sros2"))]
+fn limit(
+    _: SessionOptions,
+    _: &Config,
+    path: &str,
+    _: &str,
+) -> Result<SessionOptions, CallFailure> {
+    Err(CallFailure::argument(format_args!(
+        "{path}: this library reads no permissions: build axon-transport with its feature sros2"
+    )))
 }
 
 fn own_name() -> String {

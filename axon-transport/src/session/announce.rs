@@ -34,11 +34,12 @@ impl Session {
         kind: EndpointKind,
     ) -> Result<Endpoint, SessionError> {
         let endpoint = self.describe(spec, kind)?;
-        if endpoint.is_sane() {
-            Ok(endpoint)
-        } else {
-            Err(SessionError::Endpoint { topic: endpoint.topic })
+        if !endpoint.is_sane() {
+            return Err(SessionError::Endpoint { topic: endpoint.topic });
         }
+        #[cfg(feature = "sros2")]
+        self.shared().permit(&endpoint)?;
+        Ok(endpoint)
     }
 
     /// An endpoint with a GID of its own.

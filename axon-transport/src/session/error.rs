@@ -5,6 +5,8 @@ use std::{fmt, path::PathBuf};
 use axon_shm::{ShmError, internal::OwnLimit};
 
 use super::daemon::address::AddressError;
+#[cfg(feature = "sros2")]
+use crate::sros2::{Denial, PermissionsError};
 use crate::{config::ConfigError, ids::SessionId, wire::session::CodecError};
 
 /// Why waiting for a message ended without one.
@@ -197,6 +199,19 @@ pub enum SessionError {
         /// The topic.
         topic: String,
     },
+    /// The permissions of the session's enclave do not allow an endpoint.
+    #[cfg(feature = "sros2")]
+    #[error("{topic}: {denial}")]
+    Permission {
+        /// The topic or service.
+        topic: String,
+        /// What denies it, where, and what to DDS it is called.
+        denial: Denial,
+    },
+    /// The permissions of the session's enclave do not count now, or not in its domain.
+    #[cfg(feature = "sros2")]
+    #[error(transparent)]
+    Permissions(Box<PermissionsError>),
     /// A setting or a file that it names.
     #[error(transparent)]
     Config(#[from] ConfigError),
@@ -219,6 +234,13 @@ pub enum SessionError {
 impl fmt::Debug for SessionError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         fmt::Display::fmt(self, f)
+    }
+}
+
+#[cfg(feature = "sros2")]
+impl From<PermissionsError> for SessionError {
+    fn from(error: PermissionsError) -> Self {
+        Self::Permissions(Box::new(error))
     }
 }
 

@@ -23,6 +23,8 @@ mod options;
 mod own_pairs;
 mod pair_waits;
 mod peers;
+#[cfg(feature = "sros2")]
+mod permit;
 mod publisher;
 pub mod relayed;
 mod remote_writer;

@@ -31,6 +31,8 @@ impl Session {
     /// names the variable.
     pub fn open(config: &Config, mut options: SessionOptions) -> Result<Self, SessionError> {
         warn_of_unknown_variables(config);
+        #[cfg(feature = "sros2")]
+        super::permit::check_domain(config, &options)?;
         options.key = SessionKey::generate().map(Arc::new);
         let id = options.key.as_ref().map_or_else(SessionId::random, |key| key.id());
         if config.daemon == DaemonPolicy::Off {

@@ -2,6 +2,8 @@
 
 use std::{ffi::OsString, io, path::PathBuf, sync::Arc};
 
+#[cfg(feature = "sros2")]
+use crate::sros2::EnclavePermissions;
 use crate::{qos::Qos, session_key::SessionKey, wire::session::SessionRole};
 
 /// How a session is opened.
@@ -26,6 +28,8 @@ pub struct SessionOptions {
     pub(super) callers: usize,
     /// What its id is made of.
     pub(super) key: Option<Arc<SessionKey>>,
+    #[cfg(feature = "sros2")]
+    pub(super) permissions: Option<Arc<EnclavePermissions>>,
 }
 
 impl SessionOptions {
@@ -36,7 +40,24 @@ impl SessionOptions {
             name.pop();
         }
         let role = SessionRole::Application;
-        Self { name, role, daemon_command: None, callers: usize::MAX, key: None }
+        Self {
+            name,
+            role,
+            daemon_command: None,
+            callers: usize::MAX,
+            key: None,
+            #[cfg(feature = "sros2")]
+            permissions: None,
+        }
+    }
+
+    /// Limits the session to what an enclave may do: it creates no endpoint that these permissions do not allow. The graph
+    /// shows all the same. Those that exist when the permissions run out stay, and no other one is created.
+    #[cfg(feature = "sros2")]
+    #[must_use]
+    pub fn permissions(mut self, permissions: EnclavePermissions) -> Self {
+        self.permissions = Some(Arc::new(permissions));
+        self
     }
 
     /// How to start a daemon, for a program that can be one itself. `AXON_DAEMON_PATH` wins.

@@ -70,6 +70,7 @@ void child_ends(pid_t child);
 
 /* The cases. */
 void case_authentication(void);
+void case_permissions(void);
 void case_settings(void);
 void case_topics(void);
 void case_loans(void);

@@ -99,6 +99,7 @@ int main(int argc, char **argv) {
         {"threads", case_threads},   {"texts", case_texts},   {"fork", case_fork},
         {"services", case_services}, {"graph", case_graph}, {"log", case_log},
         {"callbacks", case_callbacks}, {"authentication", case_authentication},
+        {"permissions", case_permissions},
     };
     size_t ran = 0;
     for (size_t i = 0; i < sizeof cases / sizeof cases[0]; i++) {

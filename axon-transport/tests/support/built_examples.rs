@@ -25,7 +25,7 @@ pub(crate) fn built_examples(package: &Path, examples: &[&str], files: &[&str]) 
         return folder;
     }
     let mut cargo = Command::new(env!("CARGO"));
-    cargo.args(["build", "--offline", "-p", "axon-transport"]);
+    cargo.args(["build", "--offline", "-p", "axon-transport", "--features", "sros2"]);
     for example in examples {
         cargo.args(["--example", example]);
     }

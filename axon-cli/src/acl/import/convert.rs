@@ -2,11 +2,14 @@
 
 use std::collections::BTreeMap;
 
-use axon_transport::access::TopicPattern;
+use axon_transport::{
+    access::TopicPattern,
+    internal::sros2::names::{Does, Part},
+};
 
 use super::{
-    document::{Does, Grant, Says},
-    names::{Part, parts},
+    document::{Grant, Says},
+    names::parts,
     notes::{Effect, Notes},
 };
 use crate::acl::write::{Names, Uses};

@@ -1,21 +1,8 @@
 //! What a document says, in the order in which it says it.
 
-use roxmltree::Node;
+use axon_transport::internal::sros2::{document::MOST_EXPRESSIONS, names::Does};
 
-use super::{
-    notes::{Effect, Notes},
-    xml::Lines,
-};
-
-/// As many expressions as the part of a document may have that is imported.
-const MOST: usize = 8192;
-
-/// What a participant of DDS does with a topic of DDS.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum Does {
-    Publish,
-    Subscribe,
-}
+use super::notes::{Effect, Notes};
 
 /// One expression.
 #[derive(Debug)]
@@ -39,8 +26,8 @@ impl Grant {
     /// # Errors
     /// There is too much.
     pub(super) fn push(&mut self, says: Says) -> Result<(), String> {
-        if self.says.len() == MOST {
-            return Err(format!("more than {MOST} expressions for {:?}", self.enclave));
+        if self.says.len() == MOST_EXPRESSIONS {
+            return Err(format!("more than {MOST_EXPRESSIONS} expressions for {:?}", self.enclave));
         }
         self.says.push(says);
         Ok(())
@@ -51,11 +38,11 @@ impl Grant {
 ///
 /// # Errors
 /// There is none, or more than one.
-pub(super) fn choose<'a, 'i>(
-    all: Vec<(Node<'a, 'i>, Vec<String>)>,
+pub(super) fn choose<T>(
+    all: Vec<(T, Vec<String>)>,
     what: &str,
     enclave: Option<&str>,
-) -> Result<(Node<'a, 'i>, String), String> {
+) -> Result<(T, String), String> {
     let named = |names: &[String]| names.first().cloned().unwrap_or_default();
     let known: Vec<_> =
         all.iter().take(20).map(|(_, names)| format!("{:?}", named(names))).collect();
@@ -65,7 +52,7 @@ pub(super) fn choose<'a, 'i>(
     let mut chosen = all.into_iter().filter(|(_, names)| fits(names));
     match (chosen.next(), chosen.next(), enclave) {
         _ if count == 0 => Err(format!("it has no {what}")),
-        (Some((node, names)), None, _) => Ok((node, named(&names))),
+        (Some((part, names)), None, _) => Ok((part, named(&names))),
         (Some(_), Some(_), None) => {
             Err(format!("it has {count} {what}s: name one with --enclave: {known}"))
         }
@@ -75,23 +62,6 @@ pub(super) fn choose<'a, 'i>(
 }
 
 /// Notes an element that nobody knows here.
-pub(super) fn unknown(node: Node<'_, '_>, lines: &Lines, effect: Effect, notes: &mut Notes) {
-    let name = node.tag_name().name();
-    notes.add(
-        effect,
-        lines.of(node),
-        format!("element <{name}> is not known, and was not looked at"),
-    );
-}
-
-/// The value of an element or attribute that says ALLOW or DENY.
-///
-/// # Errors
-/// It says neither.
-pub(super) fn allows(value: &str, line: u32) -> Result<bool, String> {
-    match value {
-        "ALLOW" => Ok(true),
-        "DENY" => Ok(false),
-        other => Err(format!("line {line}: {other:?}; accepted: ALLOW, DENY")),
-    }
+pub(super) fn unknown(name: &str, line: u32, effect: Effect, notes: &mut Notes) {
+    notes.add(effect, line, format!("element <{name}> is not known, and was not looked at"));
 }

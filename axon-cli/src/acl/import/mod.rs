@@ -8,13 +8,17 @@ mod permissions;
 mod policy;
 #[cfg(test)]
 mod tests;
-mod xml;
 
 use std::{
     fs::File,
     io::{Read as _, Write as _},
     path::Path,
     process::ExitCode,
+};
+
+use axon_transport::internal::sros2::{
+    document as read_document, signed,
+    xml::{self, Lines},
 };
 
 use self::notes::Notes;
@@ -57,14 +61,14 @@ fn import(
     enclave: Option<&str>,
     notes: &mut Notes,
 ) -> Result<String, String> {
-    if text.starts_with("MIME-Version") {
-        return Err("it is signed (.p7s): import the permissions.xml that it was made of".into());
-    }
+    let signed::Cleartext { text, lines_before } = signed::cleartext(text)?;
     let document = xml::parse(text)?;
-    let lines = xml::Lines::new(text);
+    let lines = Lines::new(text, lines_before);
     let root = document.root_element();
     let grant = match root.tag_name().name() {
-        "dds" => permissions::read(root, enclave, &lines, notes)?,
+        "dds" => {
+            permissions::choose_and_note(read_document::grants(root, &lines)?, enclave, notes)?
+        }
         "policy" => policy::read(root, enclave, &lines, notes)?,
         other => {
             return Err(format!(

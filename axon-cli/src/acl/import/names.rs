@@ -1,30 +1,6 @@
 //! Topics of DDS as ROS 2 and SROS2 write them, and the patterns of AXON that fit the same names.
 
-use axon_transport::access::TopicPattern;
-
-/// What a topic of DDS carries.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum Part {
-    /// The samples of a topic.
-    Topic,
-    /// The requests of a service.
-    Request,
-    /// Its responses.
-    Reply,
-}
-
-impl Part {
-    pub(super) const ALL: [Self; 3] = [Self::Topic, Self::Request, Self::Reply];
-
-    /// What stands before the name and behind it.
-    const fn mangling(self) -> (&'static str, &'static str) {
-        match self {
-            Self::Topic => ("rt/", ""),
-            Self::Request => ("rq/", "Request"),
-            Self::Reply => ("rr/", "Reply"),
-        }
-    }
-}
+use axon_transport::{access::TopicPattern, internal::sros2::names::Part};
 
 /// As many patterns as one expression may become.
 const MOST: usize = 16;
@@ -37,8 +13,11 @@ pub(super) fn parts(expression: &str) -> Result<Vec<(Part, Vec<String>)>, &'stat
     if !expression.is_empty() && expression.bytes().all(|byte| byte == b'*') {
         return Ok(Part::ALL.map(|part| (part, vec!["/**".to_owned()])).into());
     }
-    let part = Part::ALL.into_iter().find(|part| expression.starts_with(part.mangling().0));
-    let Some(part) = part else {
+    let is_of = |part: &Part| {
+        let name = expression.strip_prefix(part.mangling().0);
+        name.is_some_and(|name| name.starts_with('/'))
+    };
+    let Some(part) = Part::ALL.into_iter().find(is_of) else {
         return Err("not a topic of ROS 2: AXON carries those that begin with rt/, rq/ or rr/");
     };
     let suffix = part.mangling().1;

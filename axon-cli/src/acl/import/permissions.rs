@@ -1,50 +1,42 @@
-//! Permissions of DDS Security, as `permissions.xml` of an enclave has them.
+//! Permissions of DDS Security, as `permissions.xml` of an enclave has them, and what of them no rule can say.
 
-use roxmltree::Node;
+use axon_transport::internal::sros2::document::{self, Domains, Rule, Unknown};
 
 use super::{
-    document::{Does, Grant, Says, allows, choose, unknown},
+    document::{Grant, Says, choose, unknown},
     notes::{Effect, Notes},
-    xml::{Lines, child, elements, text},
 };
 
-/// Reads the grant for an enclave from the element `dds`.
+/// The grant for an enclave.
 ///
 /// # Errors
-/// There is none, or its rules cannot be told apart.
-pub(super) fn read(
-    root: Node<'_, '_>,
+/// There is none, or more than one.
+pub(super) fn choose_and_note(
+    grants: Vec<document::Grant>,
     enclave: Option<&str>,
-    lines: &Lines,
     notes: &mut Notes,
 ) -> Result<Grant, String> {
-    let permissions = elements(root).filter(|node| node.has_tag_name("permissions"));
-    let grants = permissions.flat_map(elements).filter(|node| node.has_tag_name("grant"));
-    let grants = grants.map(|grant| (grant, names(grant))).collect();
-    let (grant, enclave) = choose(grants, "grant", enclave)?;
-    let mut read = Grant { enclave, says: Vec::new(), allows_by_default: false };
-    for element in elements(grant) {
-        let line = lines.of(element);
-        match element.tag_name().name() {
-            "subject_name" => {
-                let subject = text(element);
-                let what = format!(
-                    "{subject:?} is an enclave's identity; here it is a host's or a user's, and all its processes may \
-                     do this"
-                );
-                notes.add(Effect::More, line, what);
-            }
-            "validity" => {
-                let until = child(element, "not_after").map(text).unwrap_or_default();
-                let from = child(element, "not_before").map(text).unwrap_or_default();
-                let what = format!("valid from {from} to {until}; rules here have no dates");
-                notes.add(Effect::More, line, what);
-            }
-            "allow_rule" => rule(element, true, &mut read, lines, notes)?,
-            "deny_rule" => rule(element, false, &mut read, lines, notes)?,
-            "default" => read.allows_by_default = allows(&text(element), line)?,
-            _ => unknown(element, lines, Effect::None, notes),
-        }
+    let named = grants.into_iter().map(|grant| {
+        let names = names(&grant);
+        (grant, names)
+    });
+    let (grant, enclave) = choose(named.collect(), "grant", enclave)?;
+    let allows_by_default = grant.default.is_some_and(|(allows, _)| allows);
+    let mut read = Grant { enclave, says: Vec::new(), allows_by_default };
+    if let Some((subject, line)) = &grant.subject {
+        let what = format!(
+            "{subject:?} is an enclave's identity; here it is a host's or a user's, and all its processes may \
+             do this"
+        );
+        notes.add(Effect::More, *line, what);
+    }
+    if let Some(document::Validity { not_before, not_after, line }) = &grant.validity {
+        let what = format!("valid from {not_before} to {not_after}; rules here have no dates");
+        notes.add(Effect::More, *line, what);
+    }
+    all_unknown(&grant.unknown, Effect::None, notes);
+    for rule in grant.rules {
+        self::rule(rule, &mut read, notes)?;
     }
     let what = "the signature (permissions.p7s) was not verified: the rights of the rules file decide who may change the rules";
     notes.add(Effect::None, 0, what);
@@ -55,90 +47,61 @@ pub(super) fn read(
 }
 
 /// What a grant can be called: its name, its subject, and the common name in it.
-fn names(grant: Node<'_, '_>) -> Vec<String> {
-    let subject = child(grant, "subject_name").map(text).unwrap_or_default();
-    let parts = subject.split(',').map(str::trim);
-    let common = parts.filter_map(|part| part.strip_prefix("CN=")).next().map(str::to_owned);
-    let name = grant.attribute("name").map(str::to_owned);
-    name.into_iter().chain(common).chain([subject]).collect()
+fn names(grant: &document::Grant) -> Vec<String> {
+    let subject = grant.subject.clone().map(|(subject, _)| subject).unwrap_or_default();
+    let common = document::common_name(&subject).map(str::to_owned);
+    grant.name.clone().into_iter().chain(common).chain([subject]).collect()
 }
 
-fn rule(
-    rule: Node<'_, '_>,
-    allows: bool,
-    read: &mut Grant,
-    lines: &Lines,
-    notes: &mut Notes,
-) -> Result<(), String> {
+fn rule(rule: Rule, read: &mut Grant, notes: &mut Notes) -> Result<(), String> {
+    let allows = rule.allows;
     // What is left out of an allow_rule allows less, and of a deny_rule more. What is taken in whole does the reverse.
     let (left_out, in_whole) =
         if allows { (Effect::Less, Effect::More) } else { (Effect::More, Effect::Less) };
-    for element in elements(rule) {
-        let does = match element.tag_name().name() {
-            "publish" => Does::Publish,
-            "subscribe" => Does::Subscribe,
-            "domains" => {
-                let what = format!(
-                    "for domains {}; rules here count in all domains of the daemon",
-                    domains(element)
-                );
-                notes.add(in_whole, lines.of(element), what);
-                continue;
-            }
-            "relay" => {
-                notes.add(left_out, lines.of(element), "relay: there is no such right here");
-                continue;
-            }
-            _ => {
-                unknown(element, lines, left_out, notes);
-                continue;
-            }
-        };
-        let mut topics = Vec::new();
-        let mut is_of_ros = true;
-        for part in elements(element) {
-            match part.tag_name().name() {
-                "topics" => topics.extend(elements(part)),
-                "partitions" => {
-                    // An endpoint of ROS is in the partition without a name.
-                    let all: Vec<_> = elements(part).map(text).collect();
-                    is_of_ros &= all.iter().any(|name| name.bytes().all(|byte| byte == b'*'));
-                }
-                "data_tags" => is_of_ros = false,
-                _ => unknown(part, lines, left_out, notes),
-            }
-        }
-        if !is_of_ros {
-            let (effect, done) = match allows {
-                true => (Effect::Less, "left out"),
-                false => (Effect::Less, "denied whatever their partition or tag"),
+    for of in &rule.domains {
+        let domains = domains(of);
+        let what = format!("for domains {domains}; rules here count in all domains of the daemon");
+        notes.add(in_whole, of.line, what);
+    }
+    for line in rule.relays {
+        notes.add(left_out, line, "relay: there is no such right here");
+    }
+    all_unknown(&rule.unknown, left_out, notes);
+    for criteria in rule.criteria {
+        // An endpoint of ROS is in the partition without a name.
+        let is_of_ros = criteria
+            .partitions
+            .is_none_or(|all| all.iter().any(|name| name.bytes().all(|byte| byte == b'*')));
+        if !is_of_ros || criteria.has_data_tags {
+            let done = match allows {
+                true => "left out",
+                false => "denied whatever their partition or tag",
             };
             let what =
                 format!("topics of a partition or with a data tag, which AXON has not: {done}");
-            notes.add(effect, lines.of(element), what);
+            notes.add(Effect::Less, criteria.line, what);
             if allows {
                 continue;
             }
         }
-        for topic in topics {
-            if topic.has_tag_name("topic") {
-                let (expression, line) = (text(topic), lines.of(topic));
-                read.push(Says { allows, does, expression, line })?;
-            } else {
-                unknown(topic, lines, left_out, notes);
-            }
+        for topic in criteria.topics {
+            let (expression, line) = (topic.text, topic.line);
+            read.push(Says { allows, does: criteria.does, expression, line })?;
         }
     }
     Ok(())
 }
 
-fn domains(element: Node<'_, '_>) -> String {
-    let one = |node: Node<'_, '_>| match node.tag_name().name() {
-        "id_range" => {
-            let bound = |name| child(node, name).map(text).unwrap_or_default();
-            format!("{} to {}", bound("min"), bound("max"))
-        }
-        _ => text(node),
+fn all_unknown(all: &[Unknown], effect: Effect, notes: &mut Notes) {
+    for Unknown { name, line } in all {
+        unknown(name, *line, effect, notes);
+    }
+}
+
+fn domains(of: &Domains) -> String {
+    let one = |(first, last): &(Option<String>, Option<String>)| {
+        let [first, last] = [first, last].map(|bound| bound.as_deref().unwrap_or_default());
+        if first == last { first.to_owned() } else { format!("{first} to {last}") }
     };
-    elements(element).map(one).collect::<Vec<_>>().join(", ")
+    of.ranges.iter().map(one).collect::<Vec<_>>().join(", ")
 }

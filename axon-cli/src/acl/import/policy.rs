@@ -1,12 +1,18 @@
 //! SROS2's policy, from which it makes the permissions of enclaves. Its denials come first there: they win, as here.
 
-use axon_transport::internal::access::{ACTION_SERVICES, ACTION_TOPICS};
+use axon_transport::internal::{
+    access::{ACTION_SERVICES, ACTION_TOPICS},
+    sros2::{
+        document::allows,
+        names::{Does, Part},
+        xml::{Lines, elements, text},
+    },
+};
 use roxmltree::Node;
 
 use super::{
-    document::{Does, Grant, Says, allows, choose, unknown},
+    document::{Grant, Says, choose, unknown},
     notes::{Effect, Notes},
-    xml::{Lines, elements, text},
 };
 
 /// Reads the profiles of an enclave from the element `policy`.
@@ -38,7 +44,7 @@ pub(super) fn read(
         for profile in elements(profiles) {
             match (profiles.tag_name().name(), profile.tag_name().name()) {
                 ("profiles", "profile") => self::profile(profile, &mut read, lines, notes)?,
-                _ => unknown(profile, lines, Effect::None, notes),
+                _ => unknown_element(profile, lines, Effect::None, notes),
             }
         }
     }
@@ -58,7 +64,7 @@ fn profile(
     for group in elements(profile) {
         let (kind, line) = (group.tag_name().name(), lines.of(group));
         if !["topics", "services", "actions"].contains(&kind) {
-            unknown(group, lines, Effect::None, notes);
+            unknown_element(group, lines, Effect::None, notes);
             continue;
         }
         for attribute in group.attributes() {
@@ -77,7 +83,7 @@ fn profile(
             for entry in elements(group) {
                 if !kind.strip_suffix('s').is_some_and(|one| entry.has_tag_name(one)) {
                     let effect = if allows { Effect::Less } else { Effect::More };
-                    unknown(entry, lines, effect, notes);
+                    unknown_element(entry, lines, effect, notes);
                     continue;
                 }
                 let line = lines.of(entry);
@@ -100,14 +106,18 @@ fn full(name: &str, namespace: &str, node: &str) -> String {
     }
 }
 
+fn unknown_element(node: Node<'_, '_>, lines: &Lines, effect: Effect, notes: &mut Notes) {
+    unknown(node.tag_name().name(), lines.of(node), effect, notes);
+}
+
 fn topic(does: Does, name: &str) -> (Does, String) {
-    (does, format!("rt{name}"))
+    (does, Part::Topic.dds_name(name))
 }
 
 /// A client publishes requests, and a server subscribes to them.
 fn service(requests: Does, name: &str) -> [(Does, String); 2] {
     let replies = if requests == Does::Publish { Does::Subscribe } else { Does::Publish };
-    [(requests, format!("rq{name}Request")), (replies, format!("rr{name}Reply"))]
+    [(requests, Part::Request.dds_name(name)), (replies, Part::Reply.dds_name(name))]
 }
 
 fn action(requests: Does, topics: Does, name: &str) -> Vec<(Does, String)> {

@@ -227,6 +227,22 @@ fn a_policy_says_the_same_as_the_permissions_that_sros2_makes_of_it() {
 }
 
 #[test]
+fn a_signed_document_says_the_same_with_the_lines_of_its_file() {
+    let plain = permissions(&rule("allow", &["rt/a?"], &["rt/b"]), "DENY");
+    let signed = format!(
+        "MIME-Version: 1.0\nContent-Type: multipart/signed; boundary=\"--x\"\n\n----x\n\
+         Content-Type: text/plain\r\n\r\n{plain}\n----x\nContent-Type: application/x-pkcs7-signature\n\n\
+         MII=\n\n----x--\n"
+    );
+    let ((text, notes), (same, moved)) = (imported(&plain), imported(&signed));
+    let rules = |text: &str| text.split_once("\n[[").unwrap().1.to_owned();
+    assert_eq!(rules(&text), rules(&same));
+    assert!(notes.contains("line 4: left out \"rt/a?\""), "{notes}");
+    assert!(moved.contains("line 10: left out \"rt/a?\""), "{moved}");
+    assert!(moved.contains("the signature (permissions.p7s) was not verified"), "{moved}");
+}
+
+#[test]
 fn what_is_no_such_document_is_refused_in_one_line() {
     let deep = |count: usize| format!("<dds>{}{}</dds>", "<a>".repeat(count), "</a>".repeat(count));
     let attributes: String = (0..100_000).map(|n| format!(" a{n}=\"\"")).collect();
@@ -244,7 +260,7 @@ fn what_is_no_such_document_is_refused_in_one_line() {
         ("<dds>", "not XML"),
         ("<dds>&nbsp;</dds>", "not XML"),
         ("<html/>", "its first element is <html>"),
-        ("MIME-Version: 1.0\n<dds/>", "it is signed"),
+        ("MIME-Version: 1.0\n<dds/>", "its MIME header has no end"),
         (bomb, "it has a DTD"),
         (outside, "it has a DTD"),
         (&deep(20), "deeper than 16"),

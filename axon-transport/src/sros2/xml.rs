@@ -3,7 +3,7 @@
 use roxmltree::{Document, Node, ParsingOptions};
 
 /// The largest document, in bytes.
-pub(super) const LARGEST: u64 = 1 << 20;
+pub const LARGEST: u64 = 1 << 20;
 /// The deepest element. Policies have eight levels.
 const DEEPEST: usize = 16;
 /// The longest start tag, in bytes: attributes are compared with each other.
@@ -11,9 +11,11 @@ const LONGEST_TAG: usize = 8192;
 /// As many declarations of namespaces: each element keeps those around it.
 const MOST_NAMESPACES: usize = 16;
 
+/// Parses a document.
+///
 /// # Errors
 /// The text is no such document; the error says why.
-pub(super) fn parse(text: &str) -> Result<Document<'_>, String> {
+pub fn parse(text: &str) -> Result<Document<'_>, String> {
     if text.matches("xmlns").count() > MOST_NAMESPACES {
         return Err(format!("more than {MOST_NAMESPACES} declarations of namespaces"));
     }
@@ -34,32 +36,37 @@ pub(super) fn parse(text: &str) -> Result<Document<'_>, String> {
 }
 
 /// The lines of a document.
-pub(super) struct Lines(Vec<usize>);
+#[derive(Debug)]
+pub struct Lines {
+    ends: Vec<usize>,
+    before: usize,
+}
 
 impl Lines {
-    pub(super) fn new(text: &str) -> Self {
-        Self(text.match_indices('\n').map(|(at, _)| at).collect())
+    /// Those of a document that begins `before` lines behind the start of its file.
+    pub fn new(text: &str, before: usize) -> Self {
+        Self { ends: text.match_indices('\n').map(|(at, _)| at).collect(), before }
     }
 
     /// That of an element, counted from 1.
-    pub(super) fn of(&self, node: Node<'_, '_>) -> u32 {
-        let before = self.0.partition_point(|end| *end < node.range().start);
-        u32::try_from(before + 1).unwrap_or(u32::MAX)
+    pub fn of(&self, node: Node<'_, '_>) -> u32 {
+        let ended = self.ends.partition_point(|end| *end < node.range().start);
+        u32::try_from(self.before + ended + 1).unwrap_or(u32::MAX)
     }
 }
 
 /// The elements in an element.
-pub(super) fn elements<'a, 'i>(node: Node<'a, 'i>) -> impl Iterator<Item = Node<'a, 'i>> {
+pub fn elements<'a, 'i>(node: Node<'a, 'i>) -> impl Iterator<Item = Node<'a, 'i>> {
     node.children().filter(Node::is_element)
 }
 
 /// The first element of this name in an element.
-pub(super) fn child<'a, 'i>(node: Node<'a, 'i>, name: &str) -> Option<Node<'a, 'i>> {
+pub fn child<'a, 'i>(node: Node<'a, 'i>, name: &str) -> Option<Node<'a, 'i>> {
     elements(node).find(|child| child.tag_name().name() == name)
 }
 
 /// The text of an element, without the blanks around it. A comment in it parts nothing.
-pub(super) fn text(node: Node<'_, '_>) -> String {
+pub fn text(node: Node<'_, '_>) -> String {
     let parts = node.children().filter(Node::is_text).filter_map(|part| part.text());
     parts.collect::<String>().trim().to_owned()
 }

@@ -1,0 +1,258 @@
+//! Expressions for names of DDS: those of POSIX's `fnmatch` without flags, in which `*` and `?` stand for slashes, too.
+
+/// The longest expression, in bytes.
+const LONGEST: usize = 4096;
+
+/// An expression that is known to be well-formed.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Expression(String);
+
+/// One step of an expression.
+enum Step<'a> {
+    /// `*`.
+    Many,
+    /// `?`.
+    One,
+    Character(char),
+    /// What is between brackets, without the `!`.
+    Set {
+        inner: &'a str,
+        inverted: bool,
+    },
+}
+
+impl Expression {
+    /// An expression.
+    ///
+    /// # Errors
+    /// What `fnmatch` would fit no name with, or each locale another one, and what is too long.
+    pub fn new(text: &str) -> Result<Self, &'static str> {
+        if text.len() > LONGEST {
+            return Err("longer than 4,096 bytes");
+        }
+        let mut rest = text;
+        while !rest.is_empty() {
+            let (step, behind) = step(rest).ok_or("ends in a backslash")?;
+            if let Step::Set { inner, .. } = step {
+                let mut members = inner;
+                while let Some((_, behind)) = member(members)? {
+                    members = behind;
+                }
+            }
+            rest = behind;
+        }
+        Ok(Self(text.to_owned()))
+    }
+
+    /// Whether it fits a name.
+    pub fn fits(&self, name: &str) -> bool {
+        let (mut pattern, mut name) = (self.0.as_str(), name);
+        // Behind the last star, and what that star has not taken.
+        let mut retry: Option<(&str, &str)> = None;
+        loop {
+            let character = name.chars().next();
+            match (step(pattern), character) {
+                (Some((Step::Many, behind)), _) => {
+                    retry = Some((behind, name));
+                    pattern = behind;
+                    continue;
+                }
+                (Some((step, behind)), Some(c)) if step.fits(c) => {
+                    pattern = behind;
+                    name = &name[c.len_utf8()..];
+                    continue;
+                }
+                (None, None) => return true,
+                _ => {}
+            }
+            // The star takes one character more.
+            let Some((behind, left)) = retry else { return false };
+            let Some(c) = left.chars().next() else { return false };
+            name = &left[c.len_utf8()..];
+            pattern = behind;
+            retry = Some((behind, name));
+        }
+    }
+
+    /// Its text.
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl Step<'_> {
+    /// Whether it fits one character.
+    fn fits(&self, c: char) -> bool {
+        match *self {
+            Self::Many | Self::One => true,
+            Self::Character(one) => one == c,
+            Self::Set { inner, inverted } => {
+                let mut members = inner;
+                let mut found = false;
+                while let Ok(Some((member, behind))) = member(members) {
+                    found |= match member {
+                        Member::Range(low, high) => (low..=high).contains(&c),
+                        Member::Class(class) => class(&c),
+                    };
+                    members = behind;
+                }
+                found != inverted
+            }
+        }
+    }
+}
+
+/// The first step of a pattern, and the rest. `None` at its end, and where a backslash escapes nothing.
+fn step(pattern: &str) -> Option<(Step<'_>, &str)> {
+    let mut characters = pattern.chars();
+    let step = match characters.next()? {
+        '*' => Step::Many,
+        '?' => Step::One,
+        '\\' => Step::Character(characters.next()?),
+        '[' => {
+            let (inner, behind) = match set(characters.as_str()) {
+                Some(found) => found,
+                // Nothing closes it.
+                None => return Some((Step::Character('['), characters.as_str())),
+            };
+            let positive = inner.strip_prefix(['!', '^']);
+            let inverted = positive.is_some();
+            return Some((Step::Set { inner: positive.unwrap_or(inner), inverted }, behind));
+        }
+        other => Step::Character(other),
+    };
+    Some((step, characters.as_str()))
+}
+
+/// What is between brackets, of which the first is open, and what is behind the second.
+fn set(open: &str) -> Option<(&str, &str)> {
+    // One that comes first closes nothing.
+    let mut at = usize::from(open.starts_with(['!', '^']));
+    at += usize::from(open[at..].starts_with(']'));
+    loop {
+        let rest = &open[at..];
+        let special = ["[:", "[=", "[."].iter().find(|start| rest.starts_with(**start));
+        let skipped = special.and_then(|start| {
+            let end = format!("{}]", &start[1..]);
+            rest[2..].find(&end).map(|found| found + 4)
+        });
+        let c = rest.chars().next()?;
+        at += match (skipped, c) {
+            (Some(length), _) => length,
+            (None, ']') => return Some((&open[..at], &open[at + 1..])),
+            (None, '\\') => 1 + rest[1..].chars().next()?.len_utf8(),
+            (None, c) => c.len_utf8(),
+        };
+    }
+}
+
+/// What a set has.
+enum Member {
+    Range(char, char),
+    Class(fn(&char) -> bool),
+}
+
+/// The first member of a set, and the rest.
+fn member(inner: &str) -> Result<Option<(Member, &str)>, &'static str> {
+    if inner.starts_with("[=") || inner.starts_with("[.") {
+        return Err("has an equivalence class or a collating symbol");
+    }
+    if let Some((name, behind)) = inner.strip_prefix("[:").and_then(|named| named.split_once(":]"))
+    {
+        let class = class(name).ok_or("has a class of characters that there is not")?;
+        return Ok(Some((Member::Class(class), behind)));
+    }
+    let Some((low, behind)) = character(inner) else { return Ok(None) };
+    let range = behind.strip_prefix('-').filter(|end| !end.is_empty());
+    if range.is_some_and(|end| ["[:", "[=", "[."].iter().any(|start| end.starts_with(start))) {
+        return Err("has a range that ends in a class");
+    }
+    match range.and_then(character) {
+        Some((high, behind)) => Ok(Some((Member::Range(low, high), behind))),
+        None => Ok(Some((Member::Range(low, low), behind))),
+    }
+}
+
+fn character(text: &str) -> Option<(char, &str)> {
+    let text = text.strip_prefix('\\').filter(|escaped| !escaped.is_empty()).unwrap_or(text);
+    let c = text.chars().next()?;
+    Some((c, &text[c.len_utf8()..]))
+}
+
+/// As in the locale C.
+fn class(name: &str) -> Option<fn(&char) -> bool> {
+    Some(match name {
+        "alnum" => char::is_ascii_alphanumeric,
+        "alpha" => char::is_ascii_alphabetic,
+        "blank" => |c| matches!(c, ' ' | '\t'),
+        "cntrl" => char::is_ascii_control,
+        "digit" => char::is_ascii_digit,
+        "graph" => char::is_ascii_graphic,
+        "lower" => char::is_ascii_lowercase,
+        "print" => |c| c.is_ascii_graphic() || *c == ' ',
+        "punct" => char::is_ascii_punctuation,
+        "space" => |c| c.is_ascii_whitespace() || *c == '\u{b}',
+        "upper" => char::is_ascii_uppercase,
+        "xdigit" => char::is_ascii_hexdigit,
+        _ => return None,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn fits(expression: &str, name: &str) -> bool {
+        Expression::new(expression).unwrap().fits(name)
+    }
+
+    #[test]
+    fn stars_and_question_marks_stand_for_slashes() {
+        for (expression, name) in [
+            ("*", ""),
+            ("*", "rt/a/b"),
+            ("rt/*", "rt/a/b"),
+            ("rt/*/c", "rt/a/b/c"),
+            ("rt?a", "rt/a"),
+            ("rt/[a-c][!d]", "rt/ae"),
+            ("rt/[]]", "rt/]"),
+            ("rt/[!]]", "rt/a"),
+            ("rt/[a", "rt/[a"),
+            ("rt/\\*", "rt/*"),
+            ("rt/[[:digit:]_]x", "rt/7x"),
+            ("rt/[a-]", "rt/-"),
+            ("*a*b*", "aab"),
+        ] {
+            assert!(fits(expression, name), "{expression} {name}");
+        }
+        for (expression, name) in [
+            ("", "a"),
+            ("rt/a", "rt/A"),
+            ("rt/a", "rt/ab"),
+            ("rt/a?", "rt/a"),
+            ("rt/*/c", "rt/c"),
+            ("rt/[!a]", "rt/a"),
+            ("rt/[c-a]", "rt/b"),
+            ("rt/\\*", "rt/a"),
+            ("*a*b", "abc"),
+        ] {
+            assert!(!fits(expression, name), "{expression} {name}");
+        }
+    }
+
+    #[test]
+    fn an_expression_that_fnmatch_knows_otherwise_is_refused() {
+        let long = "a".repeat(LONGEST + 1);
+        for wrong in ["a\\", "[[=a=]]", "[[.a.]]", "[[:vowel:]]", "[a-[:digit:]]", &long] {
+            Expression::new(wrong).unwrap_err();
+        }
+        Expression::new(&long[1..]).unwrap();
+    }
+
+    #[test]
+    fn many_stars_take_no_more_than_the_product_of_both_lengths() {
+        let expression = Expression::new(&"*a".repeat(LONGEST / 2)).unwrap();
+        assert!(!expression.fits(&"a".repeat(LONGEST / 2 - 1)));
+        assert!(!expression.fits(&format!("{}b", "a".repeat(50_000))));
+    }
+}

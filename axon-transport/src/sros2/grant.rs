@@ -1,0 +1,198 @@
+//! A grant of which everything is understood, and what it decides.
+
+use super::{
+    date,
+    document::{self, Unknown},
+    expression::Expression,
+    names::Does,
+};
+
+/// A grant that can be judged by.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Grant {
+    pub(super) line: u32,
+    pub(super) validity: document::Validity,
+    not_before: i64,
+    not_after: i64,
+    rules: Vec<Rule>,
+    allows_by_default: bool,
+    default_line: u32,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Rule {
+    allows: bool,
+    /// The first and the last of each range.
+    domains: Vec<(u32, u32)>,
+    publish: Vec<(Expression, u32)>,
+    subscribe: Vec<(Expression, u32)>,
+}
+
+/// What a grant decides, and the line that does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Decision {
+    Allowed,
+    DeniedByRule(u32),
+    DeniedByDefault(u32),
+}
+
+impl Grant {
+    /// # Errors
+    /// A part of it is missing or not understood. What is not understood might be a denial.
+    pub(super) fn new(read: document::Grant) -> Result<Self, String> {
+        let of_grant = |what: &str| format!("line {}: the grant has no <{what}>", read.line);
+        known(&read.unknown)?;
+        let validity = read.validity.ok_or_else(|| of_grant("validity"))?;
+        let (default, default_line) = read.default.ok_or_else(|| of_grant("default"))?;
+        let seconds = |text: &str, what| {
+            let line = validity.line;
+            date::seconds(text).ok_or_else(|| {
+                format!("line {line}: {what} is {text:?}; accepted: a date as 2036-01-31T12:00:00")
+            })
+        };
+        Ok(Self {
+            line: read.line,
+            not_before: seconds(&validity.not_before, "not_before")?,
+            not_after: seconds(&validity.not_after, "not_after")?,
+            validity,
+            rules: read.rules.into_iter().map(Rule::new).collect::<Result<_, _>>()?,
+            allows_by_default: default,
+            default_line,
+        })
+    }
+
+    /// Whether it counts at a time in seconds since 1970.
+    pub(super) fn is_valid(&self, now: i64) -> bool {
+        (self.not_before..=self.not_after).contains(&now)
+    }
+
+    /// Whether anything may be allowed in a domain.
+    pub(super) fn counts_in(&self, domain: u32) -> bool {
+        self.allows_by_default || self.rules.iter().any(|rule| rule.allows && rule.is_for(domain))
+    }
+
+    /// The domains in which something may be allowed, for people.
+    pub(super) fn domains(&self) -> String {
+        let ranges = self.rules.iter().filter(|rule| rule.allows).flat_map(|rule| &rule.domains);
+        let mut shown: Vec<_> = ranges
+            .map(|&range| match range {
+                (first, last) if first == last => first.to_string(),
+                (first, u32::MAX) => format!("{first} and above"),
+                (first, last) => format!("{first} to {last}"),
+            })
+            .collect();
+        shown.dedup();
+        shown.truncate(20);
+        if shown.is_empty() { "none".to_owned() } else { shown.join(", ") }
+    }
+
+    /// The first rule for the domain that fits decides, else the default.
+    pub(super) fn decide(&self, domain: u32, does: Does, topic: &str) -> Decision {
+        let rules = self.rules.iter().filter(|rule| rule.is_for(domain));
+        for rule in rules {
+            let expressions = match does {
+                Does::Publish => &rule.publish,
+                Does::Subscribe => &rule.subscribe,
+            };
+            if let Some((_, line)) = expressions.iter().find(|(one, _)| one.fits(topic)) {
+                return if rule.allows { Decision::Allowed } else { Decision::DeniedByRule(*line) };
+            }
+        }
+        if self.allows_by_default {
+            Decision::Allowed
+        } else {
+            Decision::DeniedByDefault(self.default_line)
+        }
+    }
+}
+
+impl Rule {
+    fn new(read: document::Rule) -> Result<Self, String> {
+        known(&read.unknown)?;
+        let mut rule = Self {
+            allows: read.allows,
+            domains: domains(&read.domains, read.line)?,
+            publish: Vec::new(),
+            subscribe: Vec::new(),
+        };
+        for criteria in read.criteria {
+            let line = criteria.line;
+            if criteria.has_data_tags {
+                return Err(format!("line {line}: data_tags, which AXON has not"));
+            }
+            if criteria.topics.is_empty() {
+                return Err(format!("line {line}: no topic"));
+            }
+            let mut expressions = Vec::with_capacity(criteria.topics.len());
+            for topic in criteria.topics {
+                let line = topic.line;
+                let expression = Expression::new(&topic.text)
+                    .map_err(|why| format!("line {line}: a topic's expression {why}"))?;
+                expressions.push((expression, line));
+            }
+            if !has_own_partition(criteria.partitions.as_deref(), line)? {
+                continue;
+            }
+            match criteria.does {
+                Does::Publish => rule.publish.append(&mut expressions),
+                Does::Subscribe => rule.subscribe.append(&mut expressions),
+            }
+        }
+        Ok(rule)
+    }
+
+    fn is_for(&self, domain: u32) -> bool {
+        self.domains.iter().any(|&(first, last)| (first..=last).contains(&domain))
+    }
+}
+
+/// Whether criteria are about the partition without a name, in which an endpoint of ROS 2 is. Where they name none,
+/// an allowance is about that one and a denial about all.
+fn has_own_partition(partitions: Option<&[String]>, line: u32) -> Result<bool, String> {
+    let Some(partitions) = partitions else { return Ok(true) };
+    if partitions.is_empty() {
+        return Err(format!("line {line}: no partition"));
+    }
+    let mut fits = false;
+    for partition in partitions {
+        let expression = Expression::new(partition)
+            .map_err(|why| format!("line {line}: a partition's expression {why}"))?;
+        fits |= expression.fits("");
+    }
+    Ok(fits)
+}
+
+fn domains(all: &[document::Domains], line: u32) -> Result<Vec<(u32, u32)>, String> {
+    let [domains] = all else {
+        return Err(format!(
+            "line {line}: a rule has its domains in one <domains>, and not in {}",
+            all.len()
+        ));
+    };
+    let line = domains.line;
+    if domains.ranges.is_empty() {
+        return Err(format!("line {line}: no domain"));
+    }
+    let number = |text: &str| {
+        text.parse::<u32>()
+            .map_err(|_| format!("line {line}: domain {text:?}; accepted: numbers from 0 on"))
+    };
+    let mut ranges = Vec::with_capacity(domains.ranges.len());
+    for (first, last) in &domains.ranges {
+        if first.is_none() && last.is_none() {
+            return Err(format!("line {line}: an id_range without min and max"));
+        }
+        let first = first.as_deref().map_or(Ok(0), number)?;
+        ranges.push((first, last.as_deref().map_or(Ok(u32::MAX), number)?));
+    }
+    Ok(ranges)
+}
+
+/// # Errors
+/// There is an element that nobody here knows.
+fn known(unknown: &[Unknown]) -> Result<(), String> {
+    match unknown.first() {
+        None => Ok(()),
+        Some(Unknown { name, line }) => Err(format!("line {line}: element <{name}> is not known")),
+    }
+}

@@ -1,0 +1,20 @@
+//! SROS2's permissions of an enclave: what a process of that enclave may publish and subscribe to.
+//!
+//! `document` is what a file says, in its order, for whoever reads one. [`EnclavePermissions`] judges by it as
+//! DDS Security 1.1 does (9.4.1.3): the first rule that fits decides.
+
+mod date;
+pub(crate) mod document;
+mod enclave;
+mod error;
+pub(crate) mod expression;
+mod file;
+mod grant;
+pub(crate) mod names;
+pub(crate) mod signed;
+#[cfg(test)]
+mod tests;
+pub(crate) mod xml;
+
+pub use enclave::EnclavePermissions;
+pub use error::{Denial, PermissionsError};
