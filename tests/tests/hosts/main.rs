@@ -4,10 +4,13 @@
 mod access;
 mod cut;
 mod delivery;
+mod dhe;
 mod disagree;
 mod dropped;
 mod election;
 mod ending;
+#[path = "../tls_memory/erase.rs"]
+mod erase;
 mod events;
 #[path = "../../../axon-transport/daemon/tests/support/excerpt.rs"]
 mod excerpt;
@@ -29,7 +32,9 @@ mod outage;
 mod pair;
 mod process;
 mod qlog;
+mod quic;
 mod range;
+mod recorded;
 mod renewal;
 mod repeated;
 mod restart;
