@@ -3,6 +3,7 @@
 #[cfg(target_os = "linux")]
 pub mod memory;
 mod samples;
+pub mod schedule;
 #[cfg(target_os = "linux")]
 mod secrets;
 mod words;

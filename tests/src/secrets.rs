@@ -2,6 +2,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use aes::{
+    Aes256,
+    cipher::{BlockCipherEncrypt, KeyInit},
+};
 use base64::{Engine, engine::general_purpose::STANDARD};
 use hkdf::Hkdf;
 use sha2::{Digest, Sha256};
@@ -48,6 +52,20 @@ impl Needles {
             let info: [&[u8]; 4] = [&[0, 32, 13], b"tls13 derived", &[32], &nothing_heard];
             hkdf.expand_multi_info(&info, &mut salt).expect("32 bytes are few");
             self.add("derived secret", number, &salt);
+        }
+    }
+
+    /// Adds what AES-256-GCM computes of its key once (NIST SP 800-38D, 7.1): the key of GHASH. It opens nothing, but lets
+    /// messages be forged.
+    pub fn add_ghash_key(&mut self, kind: &'static str, number: usize, aead_key: &[u8; 32]) {
+        let mut block = [0; 16].into();
+        Aes256::new(aead_key.into()).encrypt_block(&mut block);
+        let key = u128::from_be_bytes(block.into());
+        // Libraries that multiply with the processor's instruction keep it times x, in the field.
+        let reduction = if key >> 127 == 1 { 0xc2 << 120 | 1 } else { 0 };
+        for key in [key, key << 1 ^ reduction] {
+            self.add_text(Secret { kind, number }, &key.to_be_bytes());
+            self.add_text(Secret { kind, number }, &key.to_le_bytes());
         }
     }
 

@@ -82,7 +82,7 @@ pub mod internal {
             segment_message::{Segment, SegmentName, SegmentOpened},
         },
         wake::{ForwardedWakeups, Purpose, WakeCheck},
-        writer::{MAX_GAP, Writer},
+        writer::{Carried, MAX_GAP, Writer},
     };
 
     /// What rings and lanes say of themselves.

@@ -121,17 +121,25 @@ impl Session {
         let writer = Arc::new(Writer::create_for_calls(segment, options)?);
         let rings = Rings::Shared(writer.clone());
         let (requests, responses) = self.add_both(endpoint, role, reads, rings, carries);
+        responses.calls.set_ring(writer.clone());
         Ok(Client::new(requests, responses, writer, self.clone()))
     }
 
-    /// A server, of whose requests those stand that `reads` asks for.
-    pub(super) fn add_server(&self, endpoint: Endpoint, role: EndpointRole, reads: Qos) -> Server {
+    /// A server, of whose requests those stand that `reads` asks for. One that `carries` them to another process says
+    /// which of them are there.
+    pub(super) fn add_server(
+        &self,
+        endpoint: Endpoint,
+        role: EndpointRole,
+        reads: Qos,
+        carries: bool,
+    ) -> Server {
         let options = self.ring(&endpoint, Qos::keep_all());
         let shared = self.shared();
         let by_client = RingsByClient::new(shared.segment.clone(), options, shared.room.clone());
         let by_client = Arc::new(by_client);
         let rings = Rings::Each(by_client.clone());
-        let (responses, requests) = self.add_both(endpoint, role, reads, rings, false);
+        let (responses, requests) = self.add_both(endpoint, role, reads, rings, carries);
         Server::new(responses, requests, by_client, self.clone())
     }
 

@@ -52,7 +52,7 @@ impl Session {
     pub fn create_server(&self, spec: EndpointSpec) -> Result<Server, SessionError> {
         let endpoint = self.endpoint(spec, EndpointKind::Server)?;
         let reads = unread(&endpoint.qos);
-        let server = self.add_server(endpoint, EndpointRole::Application, reads);
+        let server = self.add_server(endpoint, EndpointRole::Application, reads, false);
         self.shared().meet(server.endpoint());
         server.await_clients();
         Ok(server)

@@ -51,7 +51,8 @@ impl RemoteWriter {
     }
 
     /// An endpoint of `session` as another process of the session describes it, under its GID there. A client
-    /// [says](Self::finish_through) which responses that process has.
+    /// [says](Self::finish_through) which responses that process has, and a server which
+    /// [requests](Self::finish_requests).
     ///
     /// # Errors
     /// When there is no memory.
@@ -69,7 +70,11 @@ impl RemoteWriter {
         let all = Qos::keep_all();
         Ok(match of.kind {
             EndpointKind::Client => Self::Client(session.add_client(of, role, all, carries)?),
-            EndpointKind::Server => Self::Server(session.add_server(of, role, all)),
+            EndpointKind::Server => {
+                // Requests to a stand-in are kept by the relay until they have a response (`relayed::unanswered`).
+                let carries = carries && role == EndpointRole::Application;
+                Self::Server(session.add_server(of, role, all, carries))
+            }
             _ => Self::Publisher(session.add_asserted(of, role)?),
         })
     }
@@ -177,6 +182,14 @@ impl RemoteWriter {
     pub fn finish_through(&self, server: &Gid, number: u64) {
         if let Self::Client(client) = self {
             client.finish_through(server, number);
+        }
+    }
+
+    /// Of a server that carries: the requests of `client` up to this number are where they are to go. Until then the
+    /// client keeps them.
+    pub fn finish_requests(&self, client: &Gid, number: u64) {
+        if let Self::Server(server) = self {
+            server.finish_requests(client, number);
         }
     }
 

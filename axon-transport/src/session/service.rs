@@ -173,6 +173,13 @@ impl Server {
         take_from_one(&self.requests, &self.session, client)
     }
 
+    /// For a relay: requests of this client up to this number are where they are to go.
+    pub(crate) fn finish_requests(&self, client: &Gid, number: u64) {
+        if !self.session.is_forked() {
+            self.requests.lock().finish_of(client, number);
+        }
+    }
+
     /// Whether there is a request of this client to be taken.
     pub(crate) fn has_request_from(&self, client: &Gid) -> bool {
         !self.session.is_forked() && self.requests.lock().has_from(client)

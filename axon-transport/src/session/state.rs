@@ -434,9 +434,15 @@ impl SessionShared {
     /// Has those who wait look again then.
     pub(super) fn look_again(&self, at: Instant) {
         let mut state = self.state();
-        state.again = Some(state.again.map_or(at, |before| before.min(at)));
+        let sooner = state.again.is_none_or(|before| at < before);
+        if sooner {
+            state.again = Some(at);
+        }
         drop(state);
-        self.wake();
+        // The control thread itself asks for the same time again and again, and must not wake itself each time.
+        if sooner {
+            self.wake();
+        }
     }
 
     /// Queues something for the daemon.

@@ -5,10 +5,13 @@ mod access;
 mod churn;
 mod cut;
 mod delivery;
+mod dhe;
 mod disagree;
 mod dropped;
 mod election;
 mod ending;
+#[path = "../tls_memory/erase.rs"]
+mod erase;
 mod events;
 #[path = "../../../axon-transport/daemon/tests/support/excerpt.rs"]
 mod excerpt;
@@ -30,7 +33,9 @@ mod outage;
 mod pair;
 mod process;
 mod qlog;
+mod quic;
 mod range;
+mod recorded;
 mod renewal;
 mod repeated;
 mod restart;

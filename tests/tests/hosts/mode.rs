@@ -7,7 +7,7 @@ use std::{
 };
 
 use axon_tls::identity::SigningKey;
-use etsi_qkd014::sim;
+use etsi_qkd014::{secrecy::ExposeSecret, sim};
 
 use super::pair::write_key;
 
@@ -15,7 +15,7 @@ use super::pair::write_key;
 pub(crate) type Settings = Vec<(&'static str, String)>;
 
 /// Keys by their key_ID, as they were drawn.
-type Drawn = Vec<(String, Vec<u8>)>;
+pub(crate) type Drawn = Vec<(String, Vec<u8>)>;
 
 pub(crate) const SAE: [&str; 2] = ["sae-a", "sae-b"];
 
@@ -23,7 +23,7 @@ pub(crate) const SAE: [&str; 2] = ["sae-a", "sae-b"];
 pub(crate) struct Kmes {
     network: sim::Network,
     dir: tempfile::TempDir,
-    _runtime: tokio::runtime::Runtime,
+    runtime: tokio::runtime::Runtime,
     drawn: Arc<Mutex<Drawn>>,
 }
 
@@ -44,7 +44,7 @@ impl Kmes {
         let network = runtime.block_on(network.start()).unwrap();
         let dir = tempfile::tempdir().unwrap();
         network.write_files(dir.path()).unwrap();
-        Self { network, dir, _runtime: runtime, drawn }
+        Self { network, dir, runtime, drawn }
     }
 
     /// Settings of host 0 or 1 in qkd.
@@ -59,6 +59,14 @@ impl Kmes {
     /// Each key that was drawn so far, and its key_ID.
     pub(crate) fn drawn(&self) -> Drawn {
         self.drawn.lock().unwrap().clone()
+    }
+
+    /// Draws a key as the SAE of host 0 or 1, for the other one: its key_ID, and the key.
+    pub(crate) fn draw(&self, host: usize) -> (String, Vec<u8>) {
+        let client = self.network.client_builder(SAE[host]).build().unwrap();
+        let call = client.enc_keys(SAE[1 - host]).number(1).size(256).send();
+        let key = self.runtime.block_on(call).unwrap().keys.remove(0);
+        (key.key_id().to_owned(), key.expose_secret().to_vec())
     }
 
     /// Has the KME of host 0 or 1 do something wrong.

@@ -2,9 +2,10 @@
 //!
 //! Searched for: each KME key, raw, as base64, and in the forms in which SHA-256 and HMAC handle it;
 //! what HKDF extracts from it for the PSK, the READY proof and the envelope; the PSK, the secrets of TLS
-//! that depend on nothing else, and the key of the READY proof. The envelope's AEAD key depends on an exporter of the connection, which this test
-//! does not know: `tests/tests/residue` searches for it, and `tests/tests/tls_memory` for the secrets
-//! of TLS.
+//! that depend on nothing else, and the key of the READY proof. Of each connection in `psk_ke`, whose handshake is
+//! [`recorded`](super::recorded): all secrets of TLS, the keys of QUIC's packets and headers, what the daemon exports,
+//! and the AEAD key of each KME key in both directions, with its key of GHASH. The module `dhe` searches for those
+//! of a connection in `psk_dhe_ke`.
 
 use std::{
     collections::BTreeSet,
@@ -17,17 +18,22 @@ use axon_tests::{
     memory::{Find, Needles, Stopped},
     unexpected,
 };
+use axon_tls::Cipher;
+use rustix::process::Signal;
 
 use super::{
+    cut::wired,
     mode::{Kmes, SAE},
-    pair::{Host, Plan},
+    pair::{Host, signal},
     process::{Node, PATIENCE, until},
+    recorded::{self, IN_USE, USED_UP},
+    wire::Wire,
 };
 
-/// Ten messages a key.
-const MESSAGES: u64 = 3_000;
+/// How long messages flow between two searches.
+const FLOW: Duration = Duration::from_millis(500);
 
-fn length_prefixed(names: [&[u8]; 4]) -> Vec<u8> {
+fn length_prefixed(names: &[&[u8]]) -> Vec<u8> {
     let mut info = Vec::new();
     for name in names {
         info.extend_from_slice(&(name.len() as u16).to_be_bytes());
@@ -36,24 +42,206 @@ fn length_prefixed(names: [&[u8]; 4]) -> Vec<u8> {
     info
 }
 
-/// Each key drawn so far, and all that a daemon derives of one without a secret of the connection.
-fn needles(kmes: &Kmes) -> (usize, Needles) {
-    let mut needles = Needles::default();
-    let drawn = kmes.drawn();
-    for (number, (key_id, key)) in drawn.iter().enumerate() {
-        needles.add_key(number, key);
-        needles.add_derived("READY key", number, None, key, &[b"axon ready"]);
-        // The AEAD key depends on the connection; what it is expanded from does not.
-        needles.add_extracted(number, Some(b"AXQKD001"), key);
-        for [client, server] in [SAE, [SAE[1], SAE[0]]] {
-            let names = [key_id.as_str(), client, server, "SHA256"].map(str::as_bytes);
-            let salt = b"AXON-QKD-TLS13-EXTERNAL-PSK-v1";
-            let info = length_prefixed(names);
-            let psk = needles.add_derived("PSK", number, Some(salt), key, &[&info]);
-            needles.add_tls_secrets(number, &psk);
+/// Two hosts with a wire between them.
+struct Hosts {
+    hosts: [Host; 2],
+    wire: Wire,
+    kmes: Kmes,
+    /// Whether the recorded handshakes tell the secrets of connections.
+    recorded: bool,
+}
+
+/// What is searched for.
+struct Sought {
+    needles: Needles,
+    /// Keys that were drawn so far.
+    drawn: usize,
+    /// Connections that were established so far, and that were recorded.
+    connections: usize,
+    /// The keys of these.
+    spent: BTreeSet<usize>,
+}
+
+/// What was found and may be there, or not.
+#[derive(Default)]
+struct Found {
+    wrong: usize,
+    /// Those among them that are text of the KME's answers.
+    texts: usize,
+    on_stacks: usize,
+    /// KME keys that wait for their use, or that the cipher of envelopes has.
+    held: BTreeSet<usize>,
+    /// Connections of which there are secrets.
+    connections: BTreeSet<usize>,
+    /// Processes that have the cipher of envelopes, and those that have secrets of connections.
+    with_ciphers: usize,
+    with_connections: usize,
+    /// What is of connections, or of the ciphers of their envelopes.
+    of_connections: Vec<Find>,
+}
+
+const AEAD: &str = "AEAD key";
+const GHASH: &str = "GHASH key";
+const TEXT: &str = "KME key, base64";
+
+/// Keys that wait for their use are in locked memory alone. Ciphers and the secrets of a connection are in use.
+fn is_allowed(find: &Find) -> bool {
+    match find.secret.kind {
+        "KME key" => find.guarded,
+        AEAD | GHASH | IN_USE => !find.on_stack,
+        _ => false,
+    }
+}
+
+impl Hosts {
+    fn start(settings: &[(&'static str, &str)], recorded: bool) -> Self {
+        let kmes = Kmes::start();
+        let (hosts, wire) = wired([0, 1].map(|host| kmes.settings(host, settings)));
+        Self { hosts, wire, kmes, recorded }
+    }
+
+    /// Each key drawn so far, all that a daemon derives of one, and the secrets of the connections that were recorded.
+    fn sought(&self) -> Sought {
+        let mut needles = Needles::default();
+        let drawn = self.kmes.drawn();
+        let connections = match self.recorded {
+            true => recorded::connections(&self.wire, Cipher::default(), &drawn, None),
+            false => Vec::new(),
+        };
+        for (number, connection) in connections.iter().enumerate() {
+            connection.add_to(&mut needles, number);
+        }
+        for (number, (key_id, key)) in drawn.iter().enumerate() {
+            needles.add_key(number, key);
+            needles.add_derived("READY key", number, None, key, &[b"axon ready"]);
+            needles.add_extracted(number, Some(b"AXQKD001"), key);
+            for [first, second] in [SAE, [SAE[1], SAE[0]]] {
+                let names = [key_id.as_str(), first, second, "SHA256"].map(str::as_bytes);
+                let salt = b"AXON-QKD-TLS13-EXTERNAL-PSK-v1";
+                let info = length_prefixed(&names);
+                let psk = needles.add_derived("PSK", number, Some(salt), key, &[&info]);
+                needles.add_tls_secrets(number, &psk);
+                for connection in &connections {
+                    let fields = [b"seal", names[0], names[1], names[2], &connection.context];
+                    let info = length_prefixed(&fields);
+                    let aead = needles.add_derived(AEAD, number, Some(b"AXQKD001"), key, &[&info]);
+                    needles.add_ghash_key(GHASH, number, &aead);
+                }
+            }
+        }
+        let is_spent = |key_id: &String| connections.iter().any(|c| c.key_id == *key_id);
+        let spent = (0..drawn.len()).filter(|number| is_spent(&drawn[*number].0)).collect();
+        Sought { needles, drawn: drawn.len(), connections: connections.len(), spent }
+    }
+
+    /// Searches the daemons of these hosts, and these applications, which have nothing.
+    fn search(&self, hosts: &[Host], applications: &[&Node]) -> (Sought, Found) {
+        let pids: Vec<u32> = hosts.iter().map(|host| host.status().pid).collect();
+        // All, or the one that runs on would find the other silent.
+        let stopped: Vec<_> = pids.iter().map(|pid| Stopped::new(*pid).unwrap()).collect();
+        let applications = applications.iter().map(|node| Stopped::new(node.pid()).unwrap());
+        let applications: Vec<_> = applications.collect();
+        let sought = self.sought();
+        let mut all = Found::default();
+        let is_of_connection = |find: &Find| match find.secret.kind {
+            "PSK" => sought.spent.contains(&find.secret.number),
+            kind => [IN_USE, USED_UP, AEAD, GHASH].contains(&kind),
+        };
+        for process in &stopped {
+            let found = process.search(&sought.needles).unwrap();
+            all.wrong += unexpected("a daemon", &found, is_allowed);
+            all.of_connections.extend(found.iter().filter(|find| is_of_connection(find)).cloned());
+            all.texts += found.iter().filter(|find| find.secret.kind == TEXT).count();
+            all.on_stacks += found.iter().filter(|find| find.on_stack).count();
+            let of = |kinds: &[&str]| -> BTreeSet<usize> {
+                let allowed = found.iter().filter(|find| is_allowed(find));
+                allowed
+                    .map(|find| find.secret)
+                    .filter(|s| kinds.contains(&s.kind))
+                    .map(|s| s.number)
+                    .collect()
+            };
+            all.held.extend(of(&["KME key", AEAD, GHASH]));
+            all.with_ciphers += usize::from(!of(&[AEAD]).is_empty());
+            let connections = of(&[IN_USE]);
+            all.with_connections += usize::from(!connections.is_empty());
+            all.connections.extend(connections);
+        }
+        for process in &applications {
+            let found = process.search(&sought.needles).unwrap();
+            all.wrong += unexpected("an application", &found, |_| false);
+            all.on_stacks += found.iter().filter(|find| find.on_stack).count();
+        }
+        (sought, all)
+    }
+
+    /// Searches while messages flow, until what is found is in use. A process that is stopped in the middle of a
+    /// derivation has its input on the stack, and text of the KME's answers goes while there are new ones only for the
+    /// next: neither is there each time, or for long.
+    fn wait_clean(&self, applications: [&Node; 2]) {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            thread::sleep(FLOW);
+            let (Sought { drawn, connections, .. }, found) =
+                self.search(&self.hosts, &applications);
+            let (wrong, on_stacks) = (found.wrong - found.texts, found.on_stacks);
+            let in_use = (found.with_connections, found.with_ciphers);
+            eprintln!(
+                "{drawn} keys were drawn, {connections} connections were recorded: {in_use:?}"
+            );
+            if (wrong, on_stacks, in_use) == (0, 0, (2, 2)) {
+                break;
+            }
+            let left = (wrong, on_stacks, in_use);
+            assert!(Instant::now() < deadline, "while messages flow: {left:?}");
         }
     }
-    (drawn.len(), needles)
+
+    /// Searches until nothing is left of `spent()` keys but what locked memory holds of the others, and of no connection
+    /// but the one that stands.
+    fn wait_erased(&self, applications: [&Node; 2], spent: impl Fn() -> u64) {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let spent = spent();
+            let (Sought { drawn, connections, .. }, found) =
+                self.search(&self.hosts, &applications);
+            let (held, stand) = (found.held.len(), found.connections.len());
+            eprintln!(
+                "{drawn} keys were drawn, {spent} are spent, {held} are held; {connections} connections were \
+                 recorded, {stand} are held"
+            );
+            // Nothing ever erases a stack but the work that used it, at once.
+            assert_eq!(found.on_stacks, 0, "parts of secrets are left on stacks");
+            // An answer of the KME stays in its connection's buffers until that is closed as idle.
+            if spent > 0 && found.wrong == 0 && held as u64 <= drawn as u64 - spent && stand <= 1 {
+                // Or the search finds nothing.
+                assert!(!self.recorded || found.with_connections == 2);
+                break;
+            }
+            assert!(Instant::now() < deadline, "{} parts of secrets are left behind", found.wrong);
+            thread::sleep(Duration::from_secs(2));
+        }
+    }
+
+    /// Ends one of the daemons, and searches the other until nothing is left of any connection, nor of the ciphers of its
+    /// envelopes.
+    fn wait_ended(mut self, ends: usize) {
+        let mut daemon = self.hosts[ends].daemon.take().unwrap();
+        signal(daemon.0.id(), Signal::TERM);
+        daemon.0.wait().unwrap();
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let stays = &self.hosts[1 - ends..2 - ends];
+            let (_, found) = self.search(stays, &[]);
+            assert_eq!(found.on_stacks, 0, "parts of secrets are left on stacks");
+            let left = unexpected("of links that ended", &found.of_connections, |_| false);
+            if left == 0 {
+                break;
+            }
+            assert!(Instant::now() < deadline, "{left} parts of secrets of links that ended");
+            thread::sleep(Duration::from_secs(2));
+        }
+    }
 }
 
 /// Messages that were sealed under keys which are no more.
@@ -61,48 +249,6 @@ fn retired(host: &Host) -> u64 {
     let keys = host.status().keys;
     let peers = keys["peers"].as_object().unwrap();
     peers.values().map(|peer| peer["sending"]["retired"].as_u64().unwrap()).sum()
-}
-
-/// Keys that wait for their use are in locked memory alone, and nothing else is anywhere.
-fn is_allowed(find: &Find) -> bool {
-    find.guarded && find.secret.kind == "KME key"
-}
-
-/// Searches the daemons and applications until nothing is left of `spent()` keys but what locked memory
-/// holds of the others.
-fn wait_erased(kmes: &Kmes, hosts: &[Host; 2], applications: [&Node; 2], spent: impl Fn() -> u64) {
-    let deadline = Instant::now() + PATIENCE;
-    loop {
-        let pids = hosts.each_ref().map(|host| host.status().pid);
-        let spent = spent();
-        // Both, or the one that runs on would find the other silent.
-        let stopped = pids.map(|pid| Stopped::new(pid).unwrap());
-        let applications = applications.map(|node| Stopped::new(node.pid()).unwrap());
-        let (drawn, needles) = needles(kmes);
-        let (mut wrong, mut on_stacks) = (0, 0);
-        let mut held = BTreeSet::new();
-        for (name, process) in ["host A", "host B"].into_iter().zip(&stopped) {
-            let found = process.search(&needles).unwrap();
-            wrong += unexpected(name, &found, is_allowed);
-            on_stacks += found.iter().filter(|find| find.on_stack).count();
-            held.extend(found.iter().filter(|f| is_allowed(f)).map(|find| find.secret.number));
-        }
-        for process in &applications {
-            let found = process.search(&needles).unwrap();
-            wrong += unexpected("an application", &found, |_| false);
-            on_stacks += found.iter().filter(|find| find.on_stack).count();
-        }
-        drop((stopped, applications));
-        eprintln!("{drawn} keys were drawn, {spent} are spent, {} are held", held.len());
-        // Nothing ever erases a stack but the work that used it, at once.
-        assert_eq!(on_stacks, 0, "parts of secrets are left on stacks");
-        // An answer of the KME stays in its connection's buffers until that is closed as idle.
-        if spent > 0 && wrong == 0 && held.len() as u64 <= drawn as u64 - spent {
-            break;
-        }
-        assert!(Instant::now() < deadline, "{wrong} parts of secrets are left behind");
-        thread::sleep(Duration::from_secs(2));
-    }
 }
 
 pub(crate) fn may_search() -> bool {
@@ -113,27 +259,38 @@ pub(crate) fn may_search() -> bool {
     root
 }
 
-#[test]
-fn in_messages10_keys_are_in_locked_memory_alone_and_spent_ones_nowhere() {
+/// At the end one of the daemons ends.
+fn in_messages10(ends: usize) {
     if !may_search() {
         return;
     }
-    let kmes = Kmes::start();
-    let mode = [("AXON_QKD_KEY_MODE", "messages10")];
-    let hosts = Plan::new([kmes.settings(0, &mode), kmes.settings(1, &mode)]).start();
-    let [a, b] = &hosts;
+    let all = Hosts::start(&[("AXON_QKD_KEY_MODE", "messages10")], true);
+    let [a, b] = &all.hosts;
     let mut there = b.subscribe(Sizes::Small);
-    let mut publisher = a.publish(Sizes::Small, 1, Some(MESSAGES));
-    publisher.wait_sent();
-    there.wait_taken(MESSAGES);
+    let mut publisher = a.publish(Sizes::Small, 1, None);
+    there.wait_taken(1);
+    all.wait_clean([&publisher, &there]);
+    let sent = publisher.stop();
+    there.wait_taken(sent);
     // The status is a little behind.
-    wait_erased(&kmes, &hosts, [&publisher, &there], || {
-        let spent = hosts.iter().map(retired).sum();
-        if spent >= MESSAGES / 10 - 1 { spent } else { 0 }
+    all.wait_erased([&publisher, &there], || {
+        let spent = all.hosts.iter().map(retired).sum();
+        if spent >= sent / 10 - 1 { spent } else { 0 }
     });
     for node in [publisher, there] {
         node.finish();
     }
+    all.wait_ended(ends);
+}
+
+#[test]
+fn in_messages10_keys_are_in_locked_memory_or_in_use_and_spent_ones_nowhere() {
+    in_messages10(0);
+}
+
+#[test]
+fn in_messages10_ciphers_of_a_link_that_ended_are_nowhere_at_its_sender() {
+    in_messages10(1);
 }
 
 /// Links are renewed under new keys while samples flow: the key of each of them is spent.
@@ -141,15 +298,14 @@ fn in_session(kex: &str) {
     if !may_search() {
         return;
     }
-    let kmes = Kmes::start();
-    let mode = [
+    let settings = [
         ("AXON_QKD_KEY_MODE", "session"),
         ("AXON_QKD_KEX", kex),
         // A KME's connection is closed as idle after four seconds.
         ("AXON_QKD_SESSION_MAX_AGE", "20"),
     ];
-    let hosts = Plan::new([0, 1].map(|host| kmes.settings(host, &mode))).start();
-    let [a, b] = &hosts;
+    let all = Hosts::start(&settings, kex == "psk_ke");
+    let [a, b] = &all.hosts;
     let mut there = b.subscribe(Sizes::Small);
     let mut publisher = a.publish(Sizes::Small, 1, None);
     there.wait_taken(1);
@@ -158,12 +314,13 @@ fn in_session(kex: &str) {
         links.extend(b.status().links.first().map(|link| link.since));
         links.len() >= 3
     });
-    wait_erased(&kmes, &hosts, [&publisher, &there], || links.len() as u64);
+    all.wait_erased([&publisher, &there], || links.len() as u64);
     let sent = publisher.stop();
     there.wait_taken(sent);
     for node in [publisher, there] {
         node.finish();
     }
+    all.wait_ended(0);
 }
 
 #[test]

@@ -12,6 +12,8 @@ use std::{
 
 /// Datagrams that are remembered.
 const MOST: usize = 1000;
+/// Datagrams of handshakes that are remembered.
+const MOST_OF_HANDSHAKES: usize = 10_000;
 
 const ALL: u8 = 0;
 const NOTHING: u8 = 1;
@@ -39,6 +41,16 @@ fn pass(passes: &AtomicU8, first: u8, number: u64) -> bool {
     }
 }
 
+fn note(handshakes: &Mutex<Vec<Vec<u8>>>, datagram: &[u8]) {
+    let mut handshakes = handshakes.lock().unwrap();
+    // A long header, which discovery's messages have not.
+    if datagram.first().is_some_and(|first| first & 0x80 != 0)
+        && handshakes.len() < MOST_OF_HANDSHAKES
+    {
+        handshakes.push(datagram.to_vec());
+    }
+}
+
 /// Passes datagrams on between one client and one server.
 pub(crate) struct Wire {
     /// Where the client finds the server.
@@ -47,6 +59,8 @@ pub(crate) struct Wire {
     pub(crate) towards: Arc<UdpSocket>,
     /// What the client said.
     pub(crate) said: Arc<Mutex<Vec<Vec<u8>>>>,
+    /// The datagrams of both that begin with a packet of a handshake.
+    pub(crate) handshakes: Arc<Mutex<Vec<Vec<u8>>>>,
     passes: Arc<AtomicU8>,
     over: Arc<AtomicBool>,
 }
@@ -64,11 +78,13 @@ impl Wire {
             address: near.local_addr().unwrap(),
             towards: Arc::clone(&towards),
             said: Arc::default(),
+            handshakes: Arc::default(),
             passes: Arc::default(),
             over: Arc::default(),
         };
         let client = Arc::new(Mutex::new(None));
         let (from, over, said) = (client.clone(), wire.over.clone(), wire.said.clone());
+        let [of_client, of_server] = [0, 1].map(|_| Arc::clone(&wire.handshakes));
         let (back, out, passes) =
             (Arc::clone(&near), Arc::clone(&towards), Arc::clone(&wire.passes));
         thread::spawn(move || {
@@ -85,6 +101,7 @@ impl Wire {
                     said.push(bytes[..length].to_vec());
                 }
                 drop(said);
+                note(&of_client, &bytes[..length]);
                 let _ = out.send_to(&bytes[..length], server);
             }
         });
@@ -94,6 +111,7 @@ impl Wire {
             while !over.load(Ordering::Relaxed) {
                 let Ok((length, _)) = towards.recv_from(&mut bytes) else { continue };
                 number += 1;
+                note(&of_server, &bytes[..length]);
                 if let Some(address) = *client.lock().unwrap()
                     && pass(&passes, bytes[0], number)
                 {

@@ -121,15 +121,7 @@ fn add_blocks(needles: &mut Needles, number: usize, aead_key: &[u8; 32]) {
         cipher.encrypt_block(&mut block);
         block.into()
     };
-    let hash_key = u128::from_be_bytes(encrypted([0; 16]));
-    // Libraries that multiply with the processor's instruction keep it times x, in the field.
-    let reduction = if hash_key >> 127 == 1 { 0xc2 << 120 | 1 } else { 0 };
-    let times_x = hash_key << 1 ^ reduction;
-    for hash_key in [hash_key, times_x] {
-        let secret = Secret { kind: "GHASH key", number };
-        needles.add_text(secret, &hash_key.to_be_bytes());
-        needles.add_text(secret, &hash_key.to_le_bytes());
-    }
+    needles.add_ghash_key("GHASH key", number, aead_key);
     for index in 0..MESSAGES_PER_KEY {
         let mut counter = [0; 16];
         counter[..8].copy_from_slice(&NONCE_PREFIX);

@@ -7,8 +7,9 @@ use std::net::Ipv4Addr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use axon_tests::schedule::{Mode, Terms};
 use axon_tls::qkd::{Psk, PskResolver, derive_psk};
-use axon_tls::{Cipher, PskKex, hybrid, quic};
+use axon_tls::{Cipher, hybrid, quic};
 use quinn::{ClientConfig, Connection, Endpoint, ServerConfig, TransportConfig};
 use rustls::version::TLS13;
 use tokio::runtime::{Builder, Runtime};
@@ -32,20 +33,9 @@ pub(crate) const SERVER_SAE: &str = "sae-server";
 pub(crate) const EXPORTER: &str = "EXPORTER-axon-test";
 const SENT: usize = 70_000;
 
-/// How a connection's secrets come about.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) enum Mode {
-    Psk(PskKex),
-    Hybrid,
-}
-
-impl fmt::Display for Mode {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Psk(kex) => kex.fmt(f),
-            Self::Hybrid => f.write_str("hybrid"),
-        }
-    }
+/// What both ends have in common.
+pub(crate) fn terms(cipher: Cipher, mode: Mode, key: &[u8]) -> Terms<'_> {
+    Terms { cipher, mode, key, key_id: KEY_ID, client: CLIENT_SAE, server: SERVER_SAE }
 }
 
 /// Which ends the child has.

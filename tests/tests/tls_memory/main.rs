@@ -13,17 +13,16 @@ mod child;
 mod erase;
 mod memory;
 mod quic;
-mod schedule;
 mod tapped;
 mod transcript;
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
+use axon_tests::schedule::{Mode, Schedule, Secret};
 use axon_tls::{Cipher, PskKex};
-use child::{Has, Mode};
+use child::Has;
 use memory::Needles;
-use schedule::{Schedule, Secret};
 use tapped::{Learnt, TappedEnd, Terms};
 
 /// The process that is looked at.
@@ -113,7 +112,7 @@ fn nothing_is_left_of(cipher: Cipher, kex: PskKex) {
     let mode = Mode::Psk(kex);
     let mut examined = Examined::start(cipher, mode, Has::Both, &key);
     let transcript = unhex(&examined.at(child::CONNECTED));
-    let schedule = Schedule::new(cipher, mode, &key, &transcript, None);
+    let schedule = Schedule::new(child::terms(cipher, mode, &key), &transcript, None);
     nothing_is_left_behind(&mut examined, &schedule, &format!("{cipher}, {mode}"));
 }
 
@@ -137,10 +136,17 @@ fn nothing_is_left_but(examined: &mut Examined, schedule: &Schedule, case: &str,
     let but = |found: Vec<String>| -> Vec<String> {
         found.into_iter().filter(|name| !allowed.contains(&name.as_str())).collect()
     };
-    let early = but(examined.left(&schedule.used_up()));
+    let mut used_up = schedule.used_up().to_vec();
+    let mut all = schedule.all();
+    if let Some([of_label, _]) = schedule.export(child::EXPORTER) {
+        let of_label = Secret::new("secret of one exporter label", &of_label);
+        used_up.push(of_label.clone());
+        all.push(of_label);
+    }
+    let early = but(examined.left(&used_up));
     examined.go_on();
     examined.at(child::DROPPED);
-    let late = but(examined.left(&schedule.all()));
+    let late = but(examined.left(&all));
     assert!(
         early.is_empty() && late.is_empty(),
         "{case}: while connected {early:?}, at the end {late:?}"
@@ -166,7 +172,8 @@ fn nothing_is_left_of_psk_dhe_ke() {
 fn nothing_is_left_of_one_end(mode: Mode, is_client: bool) {
     for cipher in Cipher::ALL {
         let key = random();
-        let psk = Schedule::psk(cipher, &key);
+        let shared_terms = child::terms(cipher, mode, &key);
+        let psk = Schedule::psk(shared_terms);
         let terms = Terms { cipher, mode, psk: &psk };
         let (mut examined, end, (connection, learnt));
         if is_client {
@@ -182,10 +189,11 @@ fn nothing_is_left_of_one_end(mode: Mode, is_client: bool) {
         }
         examined.at(child::CONNECTED);
         let Learnt { transcript, shared } = learnt;
-        let schedule = Schedule::new(cipher, mode, &key, &transcript, Some(&shared));
+        let schedule = Schedule::new(shared_terms, &transcript, Some(&shared));
         let mut exported = [0; 32];
         connection.export_keying_material(&mut exported, child::EXPORTER.as_bytes(), b"").unwrap();
-        assert_eq!(schedule.exported(), exported, "these are the secrets of the connection");
+        let [_, computed] = schedule.export(child::EXPORTER).unwrap();
+        assert_eq!(computed, exported, "these are the secrets of the connection");
         let side = if is_client { "client" } else { "server" };
         let allowed = if mode == Mode::Hybrid { &HELD_BY_RUSTLS[..] } else { &[] };
         let case = format!("{cipher}, {mode}, {side}");

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::fs::{self, File};
 use std::os::unix::fs::FileExt;
 
-use crate::schedule::Secret;
+use axon_tests::schedule::Secret;
 
 /// How much of a secret counts as a find.
 const PIECE: usize = 8;

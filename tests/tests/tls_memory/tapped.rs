@@ -4,6 +4,7 @@ use std::fmt;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::sync::{Arc, Mutex};
 
+use axon_tests::schedule::Mode;
 use axon_tls::qkd::PskIdentity;
 use axon_tls::{Cipher, hybrid};
 use quinn::{Connection, Endpoint};
@@ -16,7 +17,7 @@ use rustls_axon::external_psk::{
 use tokio::runtime::{Builder, Runtime};
 
 use crate::certificates;
-use crate::child::{self, CLIENT_SAE, KEY_ID, Mode};
+use crate::child::{self, CLIENT_SAE, KEY_ID};
 use crate::quic;
 use crate::transcript::{Messages, TappedClient, TappedServer};
 

@@ -22,6 +22,22 @@ fn with_either_server(test: impl Fn(&Host, Kept, &Server, &Client)) {
     }
 }
 
+/// The same, and besides a client that shares memory with a server that is relayed.
+fn with_any_client(test: impl Fn(&Host, Kept, &Server, &Client)) {
+    with_either_server(&test);
+    with_sharing_client(test);
+}
+
+fn with_sharing_client(test: impl FnOnce(&Host, Kept, &Server, &Client)) {
+    let host = host();
+    let daemon = host.daemon();
+    let server_session = session(&host, "server", false);
+    let client_session = session(&host, "client", true);
+    let server = serve(&server_session);
+    let client = ask(&client_session, &server);
+    test(&host, daemon, &server, &client);
+}
+
 fn take(server: &Server) -> u64 {
     let mut bytes = Vec::new();
     server.recv_request(&mut bytes, Some(PATIENCE)).expect("a request").sequence
@@ -44,7 +60,7 @@ fn nothing_is_left(server: &Server, client: &Client) {
 
 #[test]
 fn request_that_a_killed_daemon_had_comes_through_the_next() {
-    with_either_server(|host, daemon, server, client| {
+    with_any_client(|host, daemon, server, client| {
         stop(&daemon);
         let number = client.send_request(b"to nobody yet").unwrap();
         // It may be with the daemon by then, or still here.
@@ -60,7 +76,7 @@ fn request_that_a_killed_daemon_had_comes_through_the_next() {
 
 #[test]
 fn response_that_is_given_while_there_is_no_daemon_comes_through_the_next() {
-    with_either_server(|host, daemon, server, client| {
+    with_any_client(|host, daemon, server, client| {
         let number = client.send_request(b"taken").unwrap();
         assert_eq!(take(server), number);
         drop(daemon);
@@ -73,7 +89,7 @@ fn response_that_is_given_while_there_is_no_daemon_comes_through_the_next() {
 
 #[test]
 fn response_that_is_given_after_the_next_daemon_came_is_not_lost() {
-    with_either_server(|host, daemon, server, client| {
+    with_any_client(|host, daemon, server, client| {
         let numbers = [(); 3].map(|()| client.send_request(b"taken").unwrap());
         assert_eq!([(); 3].map(|()| take(server)), numbers);
         drop(daemon);
@@ -109,52 +125,64 @@ fn responses_that_a_killed_daemon_had_come_through_the_next() {
 
 #[test]
 fn many_calls_survive_killed_daemons_and_no_server_sees_one_twice() {
-    const CALLS: u64 = 1500;
     with_either_server(|host, daemon, server, client| {
-        let (tell, done) = mpsc::channel();
-        let answered = AtomicU32::new(0);
-        thread::scope(|scope| {
-            scope.spawn(|| {
-                let (mut seen, mut bytes) = (HashSet::new(), Vec::new());
-                while seen.len() < CALLS as usize {
-                    let info = server.recv_request(&mut bytes, Some(PATIENCE)).expect("a request");
-                    assert!(seen.insert(info.sequence), "{} came twice", info.sequence);
-                    bytes.reverse();
-                    respond(server, info.publisher, info.sequence, &bytes);
-                }
-            });
-            scope.spawn(|| {
-                let (mut seen, mut bytes) = (HashSet::new(), Vec::new());
-                while seen.len() < CALLS as usize {
-                    let info =
-                        client.recv_response(&mut bytes, Some(PATIENCE)).expect("a response");
-                    assert!(seen.insert(info.sequence), "{} came twice", info.sequence);
-                    bytes.reverse();
-                    assert_eq!(bytes, pattern(info.sequence, len_of(info.sequence)));
-                    answered.store(seen.len() as u32, Ordering::Relaxed);
-                }
-                tell.send(()).unwrap();
-            });
-            scope.spawn(|| {
-                for number in 1..=CALLS {
-                    let bytes = pattern(number, len_of(number));
-                    assert_eq!(patiently(|| client.send_request(&bytes)), number);
-                    // Some are in flight whenever the daemon is killed.
-                    until("the others are answered", || {
-                        number <= u64::from(answered.load(Ordering::Relaxed)) + 200
-                    });
-                }
-            });
-            let mut daemon = Some(daemon);
-            for kill_at in [300, 700, 1100] {
-                until("some are answered", || answered.load(Ordering::Relaxed) >= kill_at);
-                drop(daemon.take());
-                daemon = Some(host.daemon());
-            }
-            done.recv_timeout(PATIENCE).unwrap();
-        });
-        assert!(!server.has_request() && !client.has_response());
+        many_calls(host, daemon, server, client, false);
     });
+}
+
+#[test]
+fn many_calls_of_a_client_that_shares_memory_survive_killed_daemons() {
+    // It may get a response twice.
+    with_sharing_client(|host, daemon, server, client| {
+        many_calls(host, daemon, server, client, true);
+    });
+}
+
+fn many_calls(host: &Host, daemon: Kept, server: &Server, client: &Client, twice: bool) {
+    const CALLS: u64 = 1500;
+    let (tell, done) = mpsc::channel();
+    let answered = AtomicU32::new(0);
+    thread::scope(|scope| {
+        scope.spawn(|| {
+            let (mut seen, mut bytes) = (HashSet::new(), Vec::new());
+            while seen.len() < CALLS as usize {
+                let info = server.recv_request(&mut bytes, Some(PATIENCE)).expect("a request");
+                assert!(seen.insert(info.sequence), "{} came twice", info.sequence);
+                bytes.reverse();
+                respond(server, info.publisher, info.sequence, &bytes);
+            }
+        });
+        scope.spawn(|| {
+            let (mut seen, mut bytes) = (HashSet::new(), Vec::new());
+            while seen.len() < CALLS as usize {
+                let info = client.recv_response(&mut bytes, Some(PATIENCE)).expect("a response");
+                let first = seen.insert(info.sequence);
+                assert!(first || twice, "{} came twice", info.sequence);
+                bytes.reverse();
+                assert_eq!(bytes, pattern(info.sequence, len_of(info.sequence)));
+                answered.store(seen.len() as u32, Ordering::Relaxed);
+            }
+            tell.send(()).unwrap();
+        });
+        scope.spawn(|| {
+            for number in 1..=CALLS {
+                let bytes = pattern(number, len_of(number));
+                assert_eq!(patiently(|| client.send_request(&bytes)), number);
+                // Some are in flight whenever the daemon is killed.
+                until("the others are answered", || {
+                    number <= u64::from(answered.load(Ordering::Relaxed)) + 200
+                });
+            }
+        });
+        let mut daemon = Some(daemon);
+        for kill_at in [300, 700, 1100] {
+            until("some are answered", || answered.load(Ordering::Relaxed) >= kill_at);
+            drop(daemon.take());
+            daemon = Some(host.daemon());
+        }
+        done.recv_timeout(PATIENCE).unwrap();
+    });
+    assert!(!server.has_request() && (twice || !client.has_response()));
 }
 
 fn len_of(number: u64) -> usize {
@@ -163,7 +191,7 @@ fn len_of(number: u64) -> usize {
 
 #[test]
 fn call_that_waits_gets_its_response_through_the_next_daemon() {
-    with_either_server(|host, daemon, server, client| {
+    with_any_client(|host, daemon, server, client| {
         thread::scope(|scope| {
             let calling = scope.spawn(|| client.call_blocking(b"abc", Some(PATIENCE)));
             let number = take(server);
@@ -177,11 +205,11 @@ fn call_that_waits_gets_its_response_through_the_next_daemon() {
 
 #[test]
 fn call_fails_once_no_daemon_came_or_its_server_did_not_come_back() {
-    for next in [false, true] {
+    for (next, client_shares) in [(false, false), (true, false), (false, true), (true, true)] {
         let host = host();
         let daemon = host.daemon();
         let relaying = relaying(&host);
-        let client_session = session(&host, "client", false);
+        let client_session = session(&host, "client", client_shares);
         let mut server = relaying.play("server");
         assert_eq!(server.hear(), "serves");
         let client = client_session.create_client(services::service()).unwrap();
@@ -193,7 +221,10 @@ fn call_fails_once_no_daemon_came_or_its_server_did_not_come_back() {
             drop(daemon);
             signal(server.pid(), Signal::KILL);
             let _daemon = next.then(|| host.daemon());
-            assert!(matches!(calling.join().unwrap(), Err(CallError::ServerGone)), "{next}");
+            assert!(
+                matches!(calling.join().unwrap(), Err(CallError::ServerGone)),
+                "{next} {client_shares}"
+            );
         });
     }
 }

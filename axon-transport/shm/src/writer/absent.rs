@@ -12,6 +12,15 @@ use crate::ids::Gid;
 /// How long samples are kept for a reader whose process ended.
 const ABSENCE: Duration = Duration::from_secs(10);
 
+/// Of a reader that carries samples to another process: what keeps them for it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Carried {
+    /// It is attached.
+    Attached,
+    /// The process that carried them ended. They are kept until this for the next one.
+    Absent(Instant),
+}
+
 /// The absent readers of one ring.
 #[derive(Debug, Default)]
 pub(crate) struct Absences(Vec<Absent>);
@@ -85,6 +94,11 @@ impl Absences {
         self.there().filter(same).map(|absent| absent.position).min()
     }
 
+    /// Until when samples are kept for this reader, if they are.
+    pub(crate) fn until(&self, gid: &Gid) -> Option<Instant> {
+        self.there().filter(|absent| absent.gid == *gid).map(|absent| absent.until).max()
+    }
+
     /// The oldest position that is kept, and the reader that it is kept for.
     #[inline]
     pub(crate) fn oldest(&self) -> Option<(u64, Gid)> {
@@ -110,10 +124,12 @@ mod tests {
             (Some(6), Some((5, other)))
         );
         assert_eq!(absences.expire(9), 0, "they were not absent for long");
+        assert!(absences.until(&one).is_some_and(|until| until > Instant::now()));
         absences.end(&other, &[]);
         assert_eq!((absences.position_of(&other, &[]), absences.oldest()), (None, Some((6, one))));
         absences.0[0].until = Instant::now();
         assert!(absences.is_empty() && absences.position_of(&one, &[]).is_none());
+        assert_eq!(absences.until(&one), None);
         assert_eq!((absences.expire(9), absences.left()), (3, None));
     }
 

@@ -15,7 +15,7 @@ mod state;
 
 use std::{sync::Arc, time::Duration};
 
-pub use self::numbers::MAX_GAP;
+pub use self::{absent::Carried, numbers::MAX_GAP};
 pub(super) use self::{
     commit::{Bells, PublishDeadline},
     numbers::Numbering,
@@ -289,6 +289,14 @@ impl Writer {
     /// Whether it keeps samples for a reader whose process ended, and that may come back by way of another.
     pub fn has_absent_readers(&self) -> bool {
         !self.is_forked() && self.lock().reader_set.has_absent()
+    }
+
+    /// Whether it keeps samples for this reader, which carries them to another process; `None` for any other reader.
+    pub fn carried(&self, reader: &Gid) -> Option<Carried> {
+        if self.is_forked() {
+            return None;
+        }
+        self.change(|reader_set, head| reader_set.carried(reader, head))
     }
 
     /// If a sample would be read by nobody, now or later, uses up the next sequence number as if one

@@ -18,7 +18,10 @@ use crate::{
         reader_info::ReaderInfo,
     },
     wake::Purpose,
-    writer::{absent::Absences, attached::Attached},
+    writer::{
+        absent::{Absences, Carried},
+        attached::Attached,
+    },
 };
 
 /// The readers of one ring.
@@ -358,6 +361,15 @@ impl ReaderSet {
     /// Whether samples are kept for a reader whose process ended.
     pub(crate) fn has_absent(&self) -> bool {
         !self.absent.is_empty()
+    }
+
+    /// Whether samples are kept for this reader, which carries them to another process.
+    pub(crate) fn carried(&mut self, reader: &Gid, head: u64) -> Option<Carried> {
+        self.mark_dead(head);
+        if self.carriers().any(|known| known.info.gid == *reader) {
+            return Some(Carried::Attached);
+        }
+        self.absent.until(reader).map(Carried::Absent)
     }
 
     /// How long it takes until one of the absent readers is given up.

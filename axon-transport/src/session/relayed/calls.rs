@@ -22,6 +22,8 @@ use crate::{
 pub struct Calls {
     /// The requests of each client that is on this side, by way of the servers here.
     requests: BTreeMap<Gid, Merge<Sample>>,
+    /// The number up to which the other end has them, where it says so.
+    done: BTreeMap<Gid, u64>,
 }
 
 impl Calls {
@@ -32,6 +34,7 @@ impl Calls {
             servers.entry(client).or_default().push(server);
         }
         self.requests.retain(|client, _| servers.contains_key(client));
+        self.done.retain(|client, _| servers.contains_key(client));
         for (client, servers) in servers {
             self.requests.entry(client).or_default().set(servers);
         }
@@ -72,14 +75,43 @@ impl Calls {
         let mut more = false;
         for (client, requests) in &mut self.requests {
             more |= requests.pass_over(|server| find(server)?.take_from(client).map(taken));
+            // The other end has what was passed over.
+            if requests.readers().nth(1).is_some()
+                && let Some(number) = self.done.get(client)
+            {
+                finish(requests, client, *number, &find);
+            }
         }
         more
+    }
+
+    /// The other end has the requests of `client` up to this number: the client need not keep them.
+    pub fn finish<'a>(
+        &mut self,
+        client: &Gid,
+        number: u64,
+        find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,
+    ) {
+        if let Some(requests) = self.requests.get(client) {
+            self.done.insert(*client, number);
+            finish(requests, client, number, find);
+        }
     }
 
     /// Whether a request of `client` came by way of `server` and is still to be sent.
     pub fn holds(&self, client: &Gid, server: &Gid) -> bool {
         self.requests.get(client).is_some_and(|requests| requests.holds(server))
     }
+}
+
+fn finish<'a>(
+    requests: &Merge<Sample>,
+    client: &Gid,
+    number: u64,
+    find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,
+) {
+    let servers = requests.readers().filter_map(find);
+    servers.for_each(|server| server.finish_requests(client, number));
 }
 
 /// The next response on `channel`; `client` finds the one that it is for.

@@ -1,17 +1,20 @@
 //! Requests for whose responses tasks wait. Each task receives the response to its own request.
 
 use std::{
-    collections::HashMap,
+    collections::{HashMap, HashSet},
     fmt,
     future::poll_fn,
     pin::pin,
-    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError},
     task::{Context, Poll, Wake, Waker},
     thread::{self, Thread},
     time::{Duration, Instant},
 };
 
-use axon_shm::{PublishError, Sample};
+use axon_shm::{
+    PublishError, Sample,
+    internal::{Carried, Writer},
+};
 
 use super::listening::Listener;
 use crate::{
@@ -72,6 +75,8 @@ pub enum CallError {
 #[derive(Default)]
 pub(in crate::session) struct Calls {
     by_number: Mutex<HashMap<u64, Call>>,
+    /// The ring of the requests.
+    ring: OnceLock<Arc<Writer>>,
 }
 
 struct Call {
@@ -84,6 +89,18 @@ struct Call {
 struct ServerGone;
 
 impl Calls {
+    /// The ring of the client's requests.
+    pub(in crate::session) fn set_ring(&self, ring: Arc<Writer>) {
+        // There is one.
+        let _ = self.ring.set(ring);
+    }
+
+    /// Whether a server that is not read may still answer: a daemon carries its requests, or carried them, and the ring
+    /// keeps them for the next daemon.
+    fn carried(&self, server: &Gid) -> Option<Carried> {
+        self.ring.get()?.carried(server)
+    }
+
     /// Sends a request, and has its response kept. Its number.
     fn begin<E>(&self, servers: Vec<Gid>, send: impl FnOnce() -> Result<u64, E>) -> Result<u64, E> {
         // A response that comes before its number is in the table would be nobody's.
@@ -124,7 +141,11 @@ impl Calls {
                 break;
             }
             let Some((info, sample)) = take_sample_from(of, shared) else {
-                waiting -= fail_those_without_server(&mut calls, of, &mut woken);
+                let (failed, again) = self.fail_those_without_server(&mut calls, of, &mut woken);
+                waiting -= failed;
+                if let Some(again) = again {
+                    shared.look_again(again);
+                }
                 break;
             };
             looked += 1;
@@ -142,29 +163,47 @@ impl Calls {
         waiting > 0
     }
 
+    /// Once all responses that came are taken: those of whose servers none is left, and nothing more can come, get no
+    /// response any more. How many these are, and when to look again.
+    fn fail_those_without_server(
+        &self,
+        calls: &mut HashMap<u64, Call>,
+        of: &SubscriptionInner,
+        woken: &mut Vec<Waker>,
+    ) -> (usize, Option<Instant>) {
+        let servers: HashSet<Gid> =
+            calls.values().flat_map(|call| &call.servers).copied().collect();
+        let gone: Vec<Gid> = {
+            let matched_readers = of.lock();
+            servers.into_iter().filter(|server| !matched_readers.reads(server)).collect()
+        };
+        // After that: one that comes back is attached before it is read.
+        let mut again = None::<Instant>;
+        let lost: HashSet<Gid> = gone
+            .into_iter()
+            .filter(|server| match self.carried(server) {
+                Some(Carried::Attached) => false,
+                Some(Carried::Absent(until)) => {
+                    again = Some(again.map_or(until, |before| before.min(until)));
+                    false
+                }
+                None => true,
+            })
+            .collect();
+        let mut failed = 0;
+        for call in calls.values_mut().filter(|call| call.outcome.is_none()) {
+            if call.servers.iter().all(|server| lost.contains(server)) {
+                call.outcome = Some(Err(ServerGone));
+                woken.extend(call.waker.take());
+                failed += 1;
+            }
+        }
+        (failed, again)
+    }
+
     fn lock(&self) -> MutexGuard<'_, HashMap<u64, Call>> {
         self.by_number.lock().unwrap_or_else(PoisonError::into_inner)
     }
-}
-
-/// Once all responses that came are taken: those of whose servers none is left, and nothing more can come, get no
-/// response any more. How many these are.
-fn fail_those_without_server(
-    calls: &mut HashMap<u64, Call>,
-    of: &SubscriptionInner,
-    woken: &mut Vec<Waker>,
-) -> usize {
-    let matched_readers = of.lock();
-    let waiting = calls.values_mut().filter(|call| call.outcome.is_none());
-    let mut failed = 0;
-    for call in
-        waiting.filter(|call| !call.servers.iter().any(|server| matched_readers.reads(server)))
-    {
-        call.outcome = Some(Err(ServerGone));
-        woken.extend(call.waker.take());
-        failed += 1;
-    }
-    failed
 }
 
 /// A call that is under way, until it is dropped.

@@ -370,6 +370,9 @@ impl RelayedSession {
                 if let Some(source) = self.sources.get_mut(&credit.publisher) {
                     source.done = source.done.max(credit.done);
                     source.acknowledge(&self.subscriptions, &credit.publisher);
+                } else if let (None, Some(number)) = (&credit.client, credit.done) {
+                    let writers = &self.writers;
+                    self.calls.finish(&credit.publisher, number, |gid| writers.get(gid));
                 }
                 Ok(())
             }
