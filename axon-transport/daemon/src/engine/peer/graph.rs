@@ -14,7 +14,7 @@ use axon_transport::{
     internal::graph::{LIMITS, RangeToHost, RemoteEndpoint, permits},
 };
 
-use super::owners::Proven;
+use super::{decisions::note_look, owners::Proven};
 use crate::{
     engine::account::{Account, Charge},
     link::Graph,
@@ -239,6 +239,7 @@ impl Remote {
             && let Some(charge) = self.account.graph.charge(bytes)
         {
             let remote = RemoteEndpoint { endpoint: Arc::new(endpoint), toward };
+            note_look();
             let denied = !permits(&self.permissions, &remote.endpoint);
             return Some(Held { remote, denied, closed, _charge: Rc::new(charge) });
         }
@@ -316,6 +317,7 @@ impl Remote {
     pub(crate) fn set_permissions(&mut self, permissions: Permissions) {
         self.permissions = permissions;
         for (gid, held) in self.all.iter_mut().chain(self.gathered.iter_mut().flatten()) {
+            note_look();
             let denied = !permits(&self.permissions, &held.remote.endpoint);
             if std::mem::replace(&mut held.denied, denied) != denied {
                 self.changed.insert(*gid);

@@ -2,6 +2,7 @@
 
 mod access;
 mod asking;
+pub(super) mod decisions;
 pub(super) mod graph;
 pub(super) mod kept;
 mod limits;
