@@ -193,6 +193,15 @@ impl Host {
         Config::resolve(env.filter(|(n, _)| n != "RUST_BACKTRACE"), None, &OsFiles).unwrap()
     }
 
+    /// Bytes that its daemon has in memory, by this line of its `/proc/PID/status`.
+    pub(crate) fn memory(&self, line: &str) -> usize {
+        let pid = self.daemon.as_ref().unwrap().0.id();
+        let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
+        let line = status.lines().find_map(|l| l.strip_prefix(line)).unwrap();
+        let kib: usize = line.split_whitespace().nth(1).unwrap().parse().unwrap();
+        kib << 10
+    }
+
     pub(crate) fn try_status(&self) -> Option<Status> {
         let json = daemon_status(&self.config()).ok()?;
         Some(serde_json::from_str(&json).unwrap())

@@ -556,6 +556,8 @@ impl Peer {
         status.endpoints = self.remote.len() as u64;
         status.endpoints_left_out = self.remote.left_out();
         status.graph_bytes = self.remote.account().graph.held() as u64;
+        let held = &self.remote.account().held;
+        (status.held_bytes, status.held_limit) = (held.held(), held.most());
     }
 
     /// Bytes of refused routes that are remembered.

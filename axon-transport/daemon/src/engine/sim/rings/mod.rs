@@ -12,6 +12,7 @@ use std::{
 use axon_shm::{
     Meta,
     ids::{Gid, SessionId},
+    internal::Allowance,
     qos::{Durability, History, Qos, Reliability},
 };
 use axon_transport::{
@@ -433,7 +434,11 @@ impl Rings for SimRings {
         Ok(Rc::new(SimReader { rings: self.clone(), cursors }))
     }
 
-    fn open_writer(&self, remote: &Endpoint) -> Result<Rc<dyn RingWriter>, String> {
+    fn open_writer(
+        &self,
+        remote: &Endpoint,
+        _held: &Arc<Allowance>,
+    ) -> Result<Rc<dyn RingWriter>, String> {
         if self.state.borrow().fails {
             return Err("no memory".into());
         }
