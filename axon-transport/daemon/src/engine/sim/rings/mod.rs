@@ -150,6 +150,15 @@ impl SimRings {
         gid
     }
 
+    /// Creates a server or client, which takes all requests or responses. Calls of its own it makes none.
+    pub(super) fn create_of_service(&self, kind: EndpointKind, name: &str) -> Gid {
+        let gid = self.create_subscription(name, Qos::keep_all(), None);
+        let state = &mut *self.state.borrow_mut();
+        let of_service = state.subscriptions.get_mut(&gid).expect("just created");
+        Arc::make_mut(&mut of_service.endpoint).kind = kind;
+        gid
+    }
+
     /// Ends a publisher or subscription. What a publisher left stays in its ring.
     pub(super) fn end(&self, gid: Gid) {
         let mut state = self.state.borrow_mut();
