@@ -179,6 +179,11 @@ impl Host {
         self.env.push((name.to_owned(), value.to_owned()));
     }
 
+    /// Leaves a variable to `axon.toml`, for the processes that are started from now on.
+    pub(crate) fn unset(&mut self, name: &str) {
+        self.env.retain(|(n, _)| n != name);
+    }
+
     pub(crate) fn domain(&self) -> u32 {
         self.variable("ROS_DOMAIN_ID").parse().unwrap()
     }
