@@ -1,6 +1,9 @@
 //! What a decision of access rules costs, with 0, 10 and 1,000 rules: for one name, for a pair of endpoints on two hosts
 //! (the peer's endpoint is permitted, and its view has the other one), and to compile the rules for a peer.
 //!
+//! Limits are found once for each route; a sample asks for none of this
+//! (`rules_are_looked_at_for_endpoints_and_never_for_a_sample`).
+//!
 //! Rules name topics of three kinds: plain ones, ones below `/**`, and ones with a `*` in a segment, which are tried one
 //! by one. Budget: 2 microseconds a pair with 1,000 rules.
 
@@ -51,5 +54,35 @@ fn decisions(c: &mut Criterion) {
     }
 }
 
-criterion_group!(benches, decisions);
+/// What it costs to find the limits of a topic, once for each route, with so many entries: half of them name the topic by a
+/// pattern that fits.
+fn limits(c: &mut Criterion) {
+    for count in [0, 10, 1000] {
+        let entry = |number: usize| {
+            let name = match number % 4 {
+                0 => "/robot/**".to_owned(),
+                1 => "/robot/*/data".to_owned(),
+                2 => format!("/robot/sensor_{number}/*_raw"),
+                _ => format!("/group_{number}/**"),
+            };
+            format!("[[limit]]\npeer = \"base\"\ntopic = \"{name}\"\nrate = {}\n", number + 1)
+        };
+        let text: String = (0..count).map(entry).collect();
+        let rules = match count {
+            0 => AccessRules::default(),
+            _ => AccessRules::parse(&text, "access.toml").expect("limits"),
+        };
+        let peer = rules.permissions(Party::Name("base"));
+        let found = peer.limits(Verb::Publish, "/robot/sensor_7/data").count();
+        assert_eq!(found, count.div_ceil(4) + (count + 2) / 4, "of {count}");
+        c.bench_function(&format!("limits of a topic, {count} entries"), |b| {
+            b.iter(|| peer.limits(Verb::Publish, black_box("/robot/sensor_7/data")).count());
+        });
+        c.bench_function(&format!("compile {count} limits for a peer"), |b| {
+            b.iter(|| rules.permissions(black_box(Party::Name("base"))));
+        });
+    }
+}
+
+criterion_group!(benches, decisions, limits);
 criterion_main!(benches);

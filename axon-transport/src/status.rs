@@ -203,7 +203,7 @@ pub struct TopicStatus {
     /// the daemon could not write for such a process. On the way to other hosts: `queue`
     /// while more waited than the history's depth, `late` for what could not arrive in time, `no_key` while there
     /// was none, `no_link`, `no_route` when the other host did not want them any more. On arrival: `ring`, `no_link`,
-    /// `no_route`, `no_client`.
+    /// `no_route`, `no_client`, `held` where the other host's samples take as much memory here as they may.
     pub dropped: BTreeMap<String, u64>,
     /// The publishers on this host, stand-ins for remote ones among them: up to 64, those with the
     /// most memory first.
@@ -377,7 +377,7 @@ mod tests {
             r#""waiting":{"control":1,"services":2,"small_reliable":3,"small_best_effort":4,"bulk":5},"#,
             r#""waiting_ms":88,"samples_in":10,"samples_out":11,"bytes_in":12,"bytes_out":13,"#,
             r#""dropped":{"no_key":1},"routes_refused":{},"more_routes_refused":0,"denied":{},"more_denied":0,"limits":[],"more_limits":0,"endpoints":14,"#,
-            r#""endpoints_left_out":15,"graph_bytes":16}"#
+            r#""endpoints_left_out":15,"graph_bytes":16,"held_bytes":17,"held_limit":18}"#
         );
         let read: LinkStatus = serde_json::from_str(link).unwrap();
         let since = SystemTime::UNIX_EPOCH + Duration::from_millis(1_700_000_000_123);

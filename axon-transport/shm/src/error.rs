@@ -41,6 +41,18 @@ pub enum ShmError {
         /// Bytes available to this process when it asked.
         available: u64,
     },
+    /// Rings that share a bound on their memory have as much as they may.
+    #[error(
+        "shared memory: {needed} bytes needed, {available} left of the {most} that the rings of one peer may take"
+    )]
+    Allowance {
+        /// Bytes that were needed.
+        needed: u64,
+        /// Bytes that the ring could have had.
+        available: u64,
+        /// The bound that the rings share.
+        most: u64,
+    },
     /// A descriptor from another process is not a segment as it must be.
     #[error("shared memory of another process refused: {what}")]
     Refused {
@@ -163,6 +175,18 @@ pub enum PublishError {
         available: u64,
         /// A reader that pins samples whose memory would suffice.
         keeper: Option<PinHolder>,
+    },
+    /// Rings that share a bound on their memory have as much as they may.
+    #[error(
+        "{needed} bytes more needed for the sample, {available} left of the {most} that the rings of one peer may take"
+    )]
+    Allowance {
+        /// Bytes that were needed.
+        needed: u64,
+        /// Bytes that the ring could have had.
+        available: u64,
+        /// The bound that the rings share.
+        most: u64,
     },
     /// The system refused a segment for large samples.
     #[error("no segment for the sample: {reason}")]

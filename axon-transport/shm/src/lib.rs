@@ -50,7 +50,10 @@ pub use writer::loan::Loan;
 #[doc(hidden)]
 pub mod internal {
     pub use crate::{
-        alloc::segments::{SegmentEvent, SegmentInfo},
+        alloc::{
+            allowance::Allowance,
+            segments::{SegmentEvent, SegmentInfo},
+        },
         direct::connect::reencode_packet,
         error::OwnLimit,
         memory::{

@@ -368,6 +368,12 @@ impl ConfigBuilder {
         self.set("AXON_LINK_GRAPH_MB", mib)
     }
 
+    /// Memory for the samples and calls of one peer that are kept here for readers and servers, 16 to 1,048,576 MiB.
+    /// Default 2,048.
+    pub fn link_held_mb(self, mib: u64) -> Self {
+        self.set("AXON_LINK_HELD_MB", mib)
+    }
+
     /// Whether the daemon looks for the next input before it sleeps. Default [`LinkPoll::Adaptive`].
     pub fn link_poll(self, poll: LinkPoll) -> Self {
         let word = match poll {

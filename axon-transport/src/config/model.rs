@@ -375,6 +375,8 @@ pub struct LinkConfig {
     pub mtu: u16,
     /// Memory for the graph of one peer, in bytes. Its routes may take four times as much.
     pub graph: usize,
+    /// Memory for the samples and calls of one peer that are kept here for readers and servers, in bytes.
+    pub held: u64,
     /// What the daemon does between two inputs.
     pub poll: LinkPoll,
     /// Where QUIC's events are written, in the format qlog.
@@ -417,6 +419,7 @@ impl Default for LinkConfig {
             stalled: ten,
             mtu: 1452,
             graph: 16 << 20,
+            held: 2 << 30,
             poll: LinkPoll::Adaptive,
             qlog: None,
             congestion: Congestion::Auto,

@@ -47,6 +47,7 @@ pub(super) const LINK: &[&str] = &[
     "AXON_LINK_STALLED_S",
     "AXON_LINK_MTU",
     "AXON_LINK_GRAPH_MB",
+    "AXON_LINK_HELD_MB",
     "AXON_LINK_POLL",
     QLOG,
     "AXON_LINK_CONGESTION",

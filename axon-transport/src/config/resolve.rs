@@ -394,6 +394,7 @@ fn link(values: &Values<'_, impl Files>) -> Result<LinkConfig, ConfigError> {
             "stalled_s" => link.stalled = Duration::from_secs(number(1, 86_400, "seconds")?),
             "mtu" => link.mtu = number(1_200, 65_527, "bytes")? as u16,
             "graph_mb" => link.graph = (number(1, 1_024, "MiB")? as usize) << 20,
+            "held_mb" => link.held = number(16, 1 << 20, "MiB")? << 20,
             "poll" => {
                 let word = value.as_str().unwrap_or_else(|| value.type_str());
                 let known = POLL.iter().find(|(name, _)| *name == word);
@@ -412,7 +413,7 @@ fn link(values: &Values<'_, impl Files>) -> Result<LinkConfig, ConfigError> {
                     .ok_or_else(|| ConfigError::value(&name, word, accepted()).at(&*place))?;
             }
             _ => {
-                let known = "grace_s, stalled_s, mtu, graph_mb, poll, qlog, congestion";
+                let known = "grace_s, stalled_s, mtu, graph_mb, held_mb, poll, qlog, congestion";
                 return Err(ConfigError::name(&name, known).at(place));
             }
         }
@@ -429,6 +430,9 @@ fn link(values: &Values<'_, impl Files>) -> Result<LinkConfig, ConfigError> {
     }
     if let Some(graph) = values.number("AXON_LINK_GRAPH_MB", 1..=1_024, "MiB")? {
         link.graph = (graph as usize) << 20;
+    }
+    if let Some(held) = values.number("AXON_LINK_HELD_MB", 16..=1 << 20, "MiB")? {
+        link.held = held << 20;
     }
     if let Some(poll) = values.choice("AXON_LINK_POLL", &POLL)? {
         link.poll = poll;

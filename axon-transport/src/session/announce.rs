@@ -7,7 +7,7 @@ use std::{
 
 use axon_shm::{
     ShmError,
-    internal::{RingOptions, Writer},
+    internal::{Allowance, RingOptions, Writer},
 };
 
 use super::{
@@ -76,26 +76,33 @@ impl Session {
         expected_len: u64,
     ) -> Result<Publisher, SessionError> {
         let role = EndpointRole::Application;
-        self.add_writer(endpoint, expected_len, |e, rings| PublisherInner::new(e, role, rings))
+        self.add_writer(endpoint, expected_len, None, |e, rings| {
+            PublisherInner::new(e, role, rings)
+        })
     }
 
-    /// A publisher that is alive when it is said to be.
+    /// A publisher that is alive when it is said to be. It takes the memory for its samples of `allowance`, if there is one.
     pub(super) fn add_asserted(
         &self,
         endpoint: Endpoint,
         role: EndpointRole,
+        allowance: Option<&Arc<Allowance>>,
     ) -> Result<Publisher, SessionError> {
-        self.add_writer(endpoint, 0, |e, rings| PublisherInner::new(e, role, rings).asserted())
+        self.add_writer(endpoint, 0, allowance, |e, rings| {
+            PublisherInner::new(e, role, rings).asserted()
+        })
     }
 
     fn add_writer(
         &self,
         endpoint: Endpoint,
         expected: u64,
+        allowance: Option<&Arc<Allowance>>,
         inner: impl FnOnce(Endpoint, Rings) -> PublisherInner,
     ) -> Result<Publisher, SessionError> {
         let options = RingOptions { expected, ..self.ring(&endpoint, endpoint.qos) };
         let writer = Arc::new(Writer::create(self.shared().segment.clone(), options)?);
+        allowance.into_iter().for_each(|allowance| writer.share(allowance));
         let inner = Arc::new(inner(endpoint, Rings::Shared(writer.clone())));
         self.announce(Some(&inner), None);
         Ok(Publisher { inner, writer, session: self.clone() })
@@ -115,10 +122,12 @@ impl Session {
         role: EndpointRole,
         reads: Qos,
         carries: bool,
+        allowance: Option<&Arc<Allowance>>,
     ) -> Result<Client, SessionError> {
         let options = self.ring(&endpoint, Qos::keep_all());
         let segment = self.shared().segment.clone();
         let writer = Arc::new(Writer::create_for_calls(segment, options)?);
+        allowance.into_iter().for_each(|allowance| writer.share(allowance));
         let rings = Rings::Shared(writer.clone());
         let (requests, responses) = self.add_both(endpoint, role, reads, rings, carries);
         responses.calls.set_ring(writer.clone());
@@ -133,10 +142,12 @@ impl Session {
         role: EndpointRole,
         reads: Qos,
         carries: bool,
+        allowance: Option<&Arc<Allowance>>,
     ) -> Server {
         let options = self.ring(&endpoint, Qos::keep_all());
         let shared = self.shared();
-        let by_client = RingsByClient::new(shared.segment.clone(), options, shared.room.clone());
+        let (segment, room) = (shared.segment.clone(), shared.room.clone());
+        let by_client = RingsByClient::new(segment, options, room, allowance.cloned());
         let by_client = Arc::new(by_client);
         let rings = Rings::Each(by_client.clone());
         let (responses, requests) = self.add_both(endpoint, role, reads, rings, carries);

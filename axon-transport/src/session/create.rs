@@ -52,7 +52,7 @@ impl Session {
     pub fn create_server(&self, spec: EndpointSpec) -> Result<Server, SessionError> {
         let endpoint = self.endpoint(spec, EndpointKind::Server)?;
         let reads = unread(&endpoint.qos);
-        let server = self.add_server(endpoint, EndpointRole::Application, reads, false);
+        let server = self.add_server(endpoint, EndpointRole::Application, reads, false, None);
         self.shared().meet(server.endpoint());
         server.await_clients();
         Ok(server)
@@ -67,7 +67,7 @@ impl Session {
     pub fn create_client(&self, spec: EndpointSpec) -> Result<Client, SessionError> {
         let endpoint = self.endpoint(spec, EndpointKind::Client)?;
         let reads = unread(&endpoint.qos);
-        let client = self.add_client(endpoint, EndpointRole::Application, reads, false)?;
+        let client = self.add_client(endpoint, EndpointRole::Application, reads, false, None)?;
         self.shared().meet(client.endpoint());
         client.await_servers();
         Ok(client)

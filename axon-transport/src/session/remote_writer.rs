@@ -1,7 +1,9 @@
 //! Local stand-in for a remote writer: a publisher, client or server that represents one in another process, on this
 //! host or another. The gateway and relays write incoming messages to it.
 
-use axon_shm::{Meta, PublishError, Sample};
+use std::sync::Arc;
+
+use axon_shm::{Meta, PublishError, Sample, internal::Allowance};
 
 use super::{Client, Publisher, Server, Session, SessionError, state::Outgoing};
 use crate::{
@@ -32,13 +34,17 @@ pub enum Written {
 }
 
 impl RemoteWriter {
-    /// A stand-in for `remote`, under its GID. For gateways alone; a daemon refuses it from anybody
-    /// else.
+    /// A stand-in for `remote`, under its GID, which takes the memory for what it holds of `allowance`. For gateways
+    /// alone; a daemon refuses it from anybody else.
     ///
     /// # Errors
     /// When there is no memory.
-    pub fn stand_in(session: &Session, remote: Endpoint) -> Result<Self, SessionError> {
-        Self::new(session, remote, EndpointRole::StandIn, false)
+    pub fn stand_in(
+        session: &Session,
+        remote: Endpoint,
+        allowance: &Arc<Allowance>,
+    ) -> Result<Self, SessionError> {
+        Self::new(session, remote, EndpointRole::StandIn, false, Some(allowance))
     }
 
     /// As [`stand_in`](Self::stand_in). A client says which of the responses that it takes are
@@ -47,7 +53,7 @@ impl RemoteWriter {
     /// # Errors
     /// When there is no memory.
     pub(crate) fn carrying(session: &Session, remote: Endpoint) -> Result<Self, SessionError> {
-        Self::new(session, remote, EndpointRole::StandIn, true)
+        Self::new(session, remote, EndpointRole::StandIn, true, None)
     }
 
     /// An endpoint of `session` as another process of the session describes it, under its GID there. A client
@@ -57,7 +63,7 @@ impl RemoteWriter {
     /// # Errors
     /// When there is no memory.
     pub fn adopt(session: &Session, own: Endpoint) -> Result<Self, SessionError> {
-        Self::new(session, own, EndpointRole::Application, true)
+        Self::new(session, own, EndpointRole::Application, true, None)
     }
 
     fn new(
@@ -65,17 +71,20 @@ impl RemoteWriter {
         of: Endpoint,
         role: EndpointRole,
         carries: bool,
+        allowance: Option<&Arc<Allowance>>,
     ) -> Result<Self, SessionError> {
         // What it takes is another's, whose depth counts there.
         let all = Qos::keep_all();
         Ok(match of.kind {
-            EndpointKind::Client => Self::Client(session.add_client(of, role, all, carries)?),
+            EndpointKind::Client => {
+                Self::Client(session.add_client(of, role, all, carries, allowance)?)
+            }
             EndpointKind::Server => {
                 // Requests to a stand-in are kept by the relay until they have a response (`relayed::unanswered`).
                 let carries = carries && role == EndpointRole::Application;
-                Self::Server(session.add_server(of, role, all, carries))
+                Self::Server(session.add_server(of, role, all, carries, allowance))
             }
-            _ => Self::Publisher(session.add_asserted(of, role)?),
+            _ => Self::Publisher(session.add_asserted(of, role, allowance)?),
         })
     }
 

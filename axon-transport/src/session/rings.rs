@@ -11,7 +11,9 @@ use std::{
 
 use axon_shm::{
     ShmError,
-    internal::{Grant, Location, ReaderInfo, RingOptions, SessionSegment, Terms, Writer},
+    internal::{
+        Allowance, Grant, Location, ReaderInfo, RingOptions, SessionSegment, Terms, Writer,
+    },
 };
 
 use crate::ids::Gid;
@@ -29,6 +31,8 @@ pub(super) struct RingsByClient {
     session: Arc<SessionSegment>,
     options: RingOptions,
     room: Arc<ClientLimit>,
+    /// The memory that they share with rings of other endpoints.
+    allowance: Option<Arc<Allowance>>,
     rings: Mutex<BTreeMap<Gid, (Arc<Writer>, ClientSlot)>>,
 }
 
@@ -169,8 +173,9 @@ impl RingsByClient {
         session: Arc<SessionSegment>,
         options: RingOptions,
         room: Arc<ClientLimit>,
+        allowance: Option<Arc<Allowance>>,
     ) -> Self {
-        Self { session, options, room, rings: Mutex::default() }
+        Self { session, options, room, allowance, rings: Mutex::default() }
     }
 
     /// The ring of a client; `None` when it is not, or no more, served.
@@ -202,6 +207,9 @@ impl RingsByClient {
         }
         let place = self.room.take()?;
         let ring = Arc::new(Writer::create_for_calls(self.session.clone(), self.options)?);
+        if let Some(allowance) = &self.allowance {
+            ring.share(allowance);
+        }
         self.lock().insert(client, (ring.clone(), place));
         Ok(ring)
     }

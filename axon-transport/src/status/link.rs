@@ -115,6 +115,13 @@ pub struct LinkStatus {
     /// Bytes that count for the graph of the peer's identity, over all of its daemon ids.
     #[serde(default)]
     pub graph_bytes: u64,
+    /// Memory that the samples and calls of the peer's identity take that are kept here for readers and servers, over all of
+    /// its daemon ids.
+    #[serde(default)]
+    pub held_bytes: u64,
+    /// The most that they may take (`[link] held_mb` here).
+    #[serde(default)]
+    pub held_limit: u64,
 }
 
 /// Bytes that wait in the daemon until QUIC takes them, by class: a class goes before those below it, and bulk has every

@@ -3,7 +3,7 @@
 //!
 //! `publish TOPIC SIZES READERS COUNT`: waits for as many readers, then publishes; with a count of
 //! `stream` until the first line on standard input, one a millisecond, and with one of `flood` as fast
-//! as it may. `subscribe TOPIC SIZES`: takes, and compares.
+//! as it may. `subscribe TOPIC SIZES`: takes, and compares; `history` the same, with what was published before.
 //! `serve SERVICE COUNT`: answers as many requests with their bytes reversed, and takes one more.
 //! `ask SERVICE COUNT`: sends as many requests, and takes no response. `alive TOPIC`: a publisher that
 //! has a lease of half a second, and publishes nothing. `everything NAME`: a node with one endpoint of
@@ -19,7 +19,11 @@ use std::{
 
 use axon_shm::PublishError;
 use axon_tests::{Sizes, Tally, Word, payload};
-use axon_transport::{EndpointSpec, Session, SessionOptions, config::Config, qos::Qos};
+use axon_transport::{
+    EndpointSpec, Session, SessionOptions,
+    config::Config,
+    qos::{Durability, Qos},
+};
 
 const PATIENCE: Duration = Duration::from_secs(90);
 const REPORT: Duration = Duration::from_millis(50);
@@ -37,13 +41,18 @@ fn main() -> Result<(), Box<dyn Error>> {
             let count = count.parse().ok();
             publish(&session, &stdin, topic, sizes.parse()?, readers.parse()?, count, pace)
         }
-        ["subscribe", topic, sizes] => subscribe(&session, &stdin, topic, sizes.parse()?),
+        ["subscribe", topic, sizes] => subscribe(&session, &stdin, spec(topic), sizes.parse()?),
+        ["history", topic, sizes] => {
+            let qos = Qos::keep_all().with_durability(Durability::TransientLocal);
+            let latched = EndpointSpec::new(topic, "test/Bytes", qos);
+            subscribe(&session, &stdin, latched, sizes.parse()?)
+        }
         ["serve", service, count] => serve(&session, &stdin, service, count.parse()?),
         ["ask", service, count] => ask(&session, &stdin, service, count.parse()?),
         ["alive", topic] => alive(&session, &stdin, topic),
         ["everything", name] => everything(&session, &stdin, name),
         _ => Err(
-            "publish TOPIC SIZES READERS COUNT, subscribe TOPIC SIZES, serve or ask SERVICE COUNT, \
+            "publish TOPIC SIZES READERS COUNT, subscribe or history TOPIC SIZES, serve or ask SERVICE COUNT, \
              alive TOPIC, everything NAME"
                 .into(),
         ),
@@ -119,10 +128,10 @@ fn publish(
 fn subscribe(
     session: &Session,
     stdin: &Receiver<u8>,
-    topic: &str,
+    spec: EndpointSpec,
     sizes: Sizes,
 ) -> Result<(), Box<dyn Error>> {
-    let subscription = session.create_subscription(spec(topic))?;
+    let subscription = session.create_subscription(spec)?;
     Word::Ready.say()?;
     let (mut bytes, mut expected) = (Vec::new(), Vec::new());
     let (mut tally, mut told, mut reported) = (Tally::default(), Tally::default(), Instant::now());

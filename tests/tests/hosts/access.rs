@@ -1,14 +1,14 @@
 //! Access rules between two hosts as real processes: what a rule denies never arrives, what it allows all does, and a
 //! daemon takes rules that changed without a restart.
 
+mod flooded;
 mod limits;
+mod names;
+mod odd_names;
+mod reload;
+mod users;
 
-use std::{
-    fs,
-    os::unix::fs::PermissionsExt,
-    path::{Path, PathBuf},
-    time::Duration,
-};
+use std::{fs, path::PathBuf, time::Duration};
 
 use axon_transport::{
     EndpointSpec, Event, Publisher, Session, Subscription,
@@ -21,6 +21,7 @@ use axon_transport::{
 use rustix::process::Signal;
 
 use super::{
+    identity::authority::{self, Authority},
     mode::{Kmes, Settings, classic, pinned},
     pair::{Host, Plan, signal},
     process::{PATIENCE, until},
@@ -85,6 +86,13 @@ impl Hosts {
             let settings = [0, 1].map(|host| kmes.settings(host, &more));
             test(Self::start(settings, "sae-b", tempfile::tempdir().unwrap()));
         }
+        // DNS names are the same in any case.
+        let (files, ca) = (tempfile::tempdir().unwrap(), Authority::new("the CA"));
+        let own = |name: &str, serial| {
+            let certificate = ca.issue(name, serial, 2100);
+            authority::settings(files.path(), name, &ca.pem, &certificate, None)
+        };
+        test(Self::start([own("robot", 1), own("Base.Example", 2)], "base.example", files));
         let settings = [classic(&[]), classic(&[])];
         test(Self::start(settings, "address:127.*", tempfile::tempdir().unwrap()));
     }
@@ -363,71 +371,4 @@ fn a_pin_under_another_name_has_the_rights_of_that_name() {
     });
     fs::write(&trust, pins).unwrap();
     meet(&drives, &drive);
-}
-
-/// A copy of the program that plays a node, where another user can run it.
-struct NodeOfOthers(PathBuf);
-
-impl NodeOfOthers {
-    fn new() -> Self {
-        let path = std::env::temp_dir().join(format!("axon-node-{}", std::process::id()));
-        fs::copy(env!("CARGO_BIN_EXE_axon-test-node"), &path).unwrap();
-        fs::set_permissions(&path, fs::Permissions::from_mode(0o755)).unwrap();
-        Self(path)
-    }
-}
-
-impl Drop for NodeOfOthers {
-    fn drop(&mut self) {
-        let _ = fs::remove_file(&self.0);
-    }
-}
-
-#[test]
-fn another_user_of_the_host_publishes_what_rules_allow_it_and_nothing_else() {
-    if !rustix::process::geteuid().is_root() {
-        eprintln!("skipped: only root can be two users");
-        return;
-    }
-    const NOBODY: u32 = 65534;
-    let settings = [classic(&[]), classic(&[])];
-    let hosts = Hosts::start(settings, "address:*", tempfile::tempdir().unwrap());
-    let Hosts { mut robot, rules, .. } = hosts;
-    drop(robot.daemon.take());
-    robot.set("AXON_TRUSTED_UIDS", &format!("0;{NOBODY}"));
-    fs::write(&rules, format!("[[allow]]\npeer = \"uid:{NOBODY}\"\npublish = \"/allowed\""))
-        .unwrap();
-    robot.start();
-    let open = |path: &Path| fs::set_permissions(path, fs::Permissions::from_mode(0o755)).unwrap();
-    open(robot.dir.path());
-    open(&robot.dir.path().join("run"));
-    let session = robot.session("own");
-    let spec = |topic| EndpointSpec::new(topic, "test/Bytes", Qos::keep_all());
-    let [allowed, denied] =
-        ["/allowed", "/denied"].map(|topic| session.create_subscription(spec(topic)).unwrap());
-    let program = NodeOfOthers::new();
-    let denied_node =
-        robot.node_of(&program.0, NOBODY, &["publish", "/denied", "small", "0", "stream"]);
-    let allowed_node =
-        robot.node_of(&program.0, NOBODY, &["publish", "/allowed", "small", "1", "10"]);
-    let mut bytes = Vec::new();
-    for _ in 0..10 {
-        allowed.recv(&mut bytes, Some(PATIENCE)).expect("a sample of the other user");
-    }
-    robot.wait_refusal("the daemon says which rule denies", |refusal| {
-        refusal.contains("\"/denied\": denied: no [[allow]] in access.toml permits this")
-    });
-    assert!(!denied.has_data() && denied.matched().is_empty());
-    assert!(
-        session
-            .graph()
-            .endpoints
-            .values()
-            .all(|e| e.endpoint.topic != "/denied" || e.endpoint.gid == denied.gid())
-    );
-    // The rules change, and with them the pairs.
-    fs::write(&rules, "[[allow]]\npeer = \"local\"\npublish = \"/denied\"").unwrap();
-    daemon_reload_at(&DaemonPlace::from(&robot.config())).unwrap();
-    denied.recv(&mut bytes, Some(PATIENCE)).expect("a sample that is allowed now");
-    drop((denied_node, allowed_node));
 }

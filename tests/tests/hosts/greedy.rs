@@ -12,6 +12,8 @@ use axon_tests::Sizes;
 use axon_tls::identity::{Auth, KeyAlgorithm, SigningKey, Trust, TrustFile};
 use axon_transport::{
     EndpointSpec,
+    config::DaemonPlace,
+    daemon_reload_at,
     graph::{Endpoint, EndpointKind},
     ids::{DaemonId, Gid, SessionId},
     internal::SessionKey,
@@ -40,13 +42,18 @@ pub(crate) struct Camera {
     auth: Auth,
     pub(crate) a: Host,
     pub(crate) b: Host,
-    _dir: tempfile::TempDir,
+    dir: tempfile::TempDir,
 }
 
 impl Camera {
     pub(crate) fn new() -> Self {
+        Self::under("")
+    }
+
+    /// As [`new`](Self::new), where host A has these access rules, if any.
+    pub(crate) fn under(rules: &str) -> Self {
         let dir = tempfile::tempdir().unwrap();
-        let settings = pinned(dir.path(), [[false, true], [true, false]]);
+        let mut settings = pinned(dir.path(), [[false, true], [true, false]]);
         let pem = SigningKey::generate_pem_with(KeyAlgorithm::Ed25519).unwrap();
         let key = SigningKey::from_pem(&pem).unwrap();
         let trust = dir.path().join("host-0.trust");
@@ -56,9 +63,21 @@ impl Camera {
         let own = SigningKey::from_pem(&own).unwrap().spki_digest();
         let pins = TrustFile::parse(&format!("a {own}")).unwrap();
         let auth = Auth::Pinned { key, trust: Trust::new(pins) };
+        if !rules.is_empty() {
+            fs::write(dir.path().join("access.toml"), rules).unwrap();
+            let path = dir.path().join("access.toml").to_str().unwrap().to_owned();
+            settings[0].push(("AXON_ACCESS_FILE", path));
+        }
         let [a, b] = Plan::new(settings).start();
         b.link();
-        Self { stranger: Stranger::new(), auth, a, b, _dir: dir }
+        Self { stranger: Stranger::new(), auth, a, b, dir }
+    }
+
+    /// Has host A read these access rules.
+    pub(crate) fn set_rules(&self, rules: &str) {
+        fs::write(self.dir.path().join("access.toml"), rules).unwrap();
+        let report = daemon_reload_at(&DaemonPlace::from(&self.a.config())).unwrap();
+        assert_eq!((report.changed, report.error), (vec!["access rules".to_owned()], None));
     }
 
     pub(crate) fn link(&self, id: u8) -> Met {
@@ -97,11 +116,7 @@ impl Camera {
 
     /// Bytes that host A's daemon has in memory, by this line of its status: now, and at most.
     pub(crate) fn memory(&self, line: &str) -> usize {
-        let pid = self.a.daemon.as_ref().unwrap().0.id();
-        let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
-        let line = status.lines().find_map(|l| l.strip_prefix(line)).unwrap();
-        let kib: usize = line.split_whitespace().nth(1).unwrap().parse().unwrap();
-        kib << 10
+        self.a.memory(line)
     }
 }
 

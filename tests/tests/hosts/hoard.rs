@@ -4,14 +4,20 @@ use std::time::Duration;
 
 use axon_daemon::internal::link::{Graph, Message};
 use axon_transport::{
-    EndpointSpec,
+    EndpointSpec, Session,
     graph::{Endpoint, EndpointKind},
     ids::{DaemonId, Gid},
     internal::SessionKey,
-    qos::Qos,
+    qos::{Durability, Qos},
 };
 
-use super::{greedy::Camera, process::until, stranger::Met};
+use super::{
+    greedy::Camera,
+    mode::classic,
+    pair::{Host, Plan},
+    process::{PATIENCE, until},
+    stranger::Met,
+};
 
 pub(crate) const TOPIC: &str = "/hoarded";
 pub(crate) const TYPE: &str = "test/Bytes";
@@ -138,4 +144,106 @@ fn short_messages_that_do_not_come_whole_are_bounded_over_all_ids_of_a_peer_and_
     drop(streams);
     links.iter().for_each(|(link, ..)| camera.stranger.leave(link));
     until("memory is given back", || camera.memory("VmRSS") < before + (16 << 20));
+}
+
+/// MiB that the samples and calls of a peer may take that are kept here for readers and servers.
+const HELD_MB: usize = 64;
+/// What else may come with them: messages on their way, and the rings themselves.
+const BESIDE_MB: usize = 32;
+/// Publishers and clients of the peer, and messages of 1 MiB of each: three times as much as it may have here.
+const WRITERS: usize = 8;
+const MESSAGES: u64 = 24;
+
+/// Two hosts of which the first bounds what it keeps for the second, and what its daemon's shared memory is at first.
+fn bounded() -> ([Host; 2], usize) {
+    let held = HELD_MB.to_string();
+    let hosts = Plan::new([classic(&[("AXON_LINK_HELD_MB", &held)]), classic(&[])]).start();
+    hosts[0].link();
+    let before = hosts[0].memory("RssShmem");
+    (hosts, before)
+}
+
+/// What the first host keeps for the second is within the bound, and most of what it may.
+fn is_bounded(host: &Host, before: usize) {
+    let link = host.link();
+    let (held, limit) = (link.held_bytes >> 20, link.held_limit >> 20);
+    let memory = host.memory("RssShmem").saturating_sub(before) >> 20;
+    eprintln!("{held} MiB held of {limit}, and {memory} MiB of shared memory");
+    assert!(limit == HELD_MB as u64 && held <= limit && held > limit / 2, "{held} of {limit}");
+    assert!(memory <= HELD_MB + BESIDE_MB, "{memory} MiB");
+}
+
+fn latched(topic: usize) -> EndpointSpec {
+    let qos = Qos::keep_all().with_durability(Durability::TransientLocal);
+    EndpointSpec::new(format!("/kept_{topic}"), TYPE, qos)
+}
+
+#[test]
+fn history_that_is_delivered_is_bounded_for_a_peer_and_its_newest_is_kept() {
+    let ([a, b], before) = bounded();
+    let (here, there) = (a.session("reader"), b.session("writer"));
+    let readers: Vec<_> =
+        (0..WRITERS).map(|n| here.create_subscription(latched(n)).unwrap()).collect();
+    let writers: Vec<_> =
+        (0..WRITERS).map(|n| there.create_publisher(latched(n)).unwrap()).collect();
+    until("all are matched", || {
+        readers.iter().zip(&writers).all(|(r, w)| r.matched().contains(&w.gid()))
+            && writers.iter().all(|w| !w.matched().is_empty())
+    });
+    let mut bytes = Vec::new();
+    for number in 1..=MESSAGES {
+        for (reader, writer) in readers.iter().zip(&writers) {
+            writer.publish(&vec![number as u8; 1 << 20]).unwrap();
+            // A reader that takes all gets all.
+            let info = reader.recv(&mut bytes, Some(PATIENCE)).expect("a sample");
+            assert_eq!((info.sequence, bytes[0]), (number, number as u8));
+        }
+    }
+    is_bounded(&a, before);
+    // Who comes later gets the newest, as much as there is.
+    let mut late = 0;
+    for n in 0..WRITERS {
+        let reader = here.create_subscription(latched(n)).unwrap();
+        let mut last = 0;
+        while last < MESSAGES {
+            last = reader.recv(&mut bytes, Some(PATIENCE)).expect("history").sequence;
+            late += 1;
+        }
+    }
+    eprintln!("{late} samples of history");
+    // The publishers end, and their memory comes back.
+    drop((writers, readers, there));
+    until("memory is given back", || a.link().held_bytes < 1 << 20);
+}
+
+#[test]
+fn requests_that_a_server_does_not_take_are_bounded_for_a_peer_and_none_is_lost() {
+    let ([a, b], before) = bounded();
+    let here = a.session("servers");
+    let service = |name: &str| EndpointSpec::new(name.to_owned(), "test/Set", Qos::keep_all());
+    let [slow, quick] = ["/slow", "/quick"].map(|s| here.create_server(service(s)).unwrap());
+    let sessions: Vec<Session> = (0..WRITERS).map(|_| b.session("client")).collect();
+    let clients: Vec<_> =
+        sessions.iter().map(|s| s.create_client(service("/slow")).unwrap()).collect();
+    let other = sessions[0].create_client(service("/quick")).unwrap();
+    assert!(other.wait_available(PATIENCE) && clients.iter().all(|c| c.wait_available(PATIENCE)));
+    let mut sent = 0;
+    for number in 1..=MESSAGES {
+        for client in &clients {
+            // One that finds no room on its own host is not under way.
+            sent += u64::from(client.send_request(&vec![number as u8; 1 << 20]).is_ok());
+        }
+    }
+    until("as much as may be is there", || a.link().held_bytes > (HELD_MB as u64) << 19);
+    let mut bytes = Vec::new();
+    // What the peer asks another server is answered meanwhile.
+    let number = other.send_request(b"now").unwrap();
+    let asked = quick.recv_request(&mut bytes, Some(PATIENCE)).expect("a request");
+    quick.send_response(asked.publisher, asked.sequence, b"done").unwrap();
+    assert_eq!(other.recv_response(&mut bytes, Some(PATIENCE)).unwrap().sequence, number);
+    is_bounded(&a, before);
+    for taken in 0..sent {
+        slow.recv_request(&mut bytes, Some(PATIENCE))
+            .unwrap_or_else(|error| panic!("{taken} of {sent}: {error}"));
+    }
 }

@@ -179,6 +179,11 @@ impl Host {
         self.env.push((name.to_owned(), value.to_owned()));
     }
 
+    /// Leaves a variable to `axon.toml`, for the processes that are started from now on.
+    pub(crate) fn unset(&mut self, name: &str) {
+        self.env.retain(|(n, _)| n != name);
+    }
+
     pub(crate) fn domain(&self) -> u32 {
         self.variable("ROS_DOMAIN_ID").parse().unwrap()
     }
@@ -191,6 +196,15 @@ impl Host {
     pub(crate) fn config(&self) -> Config {
         let env = self.env.iter().map(|(n, v)| (OsString::from(n), OsString::from(v)));
         Config::resolve(env.filter(|(n, _)| n != "RUST_BACKTRACE"), None, &OsFiles).unwrap()
+    }
+
+    /// Bytes that its daemon has in memory, by this line of its `/proc/PID/status`.
+    pub(crate) fn memory(&self, line: &str) -> usize {
+        let pid = self.daemon.as_ref().unwrap().0.id();
+        let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
+        let line = status.lines().find_map(|l| l.strip_prefix(line)).unwrap();
+        let kib: usize = line.split_whitespace().nth(1).unwrap().parse().unwrap();
+        kib << 10
     }
 
     pub(crate) fn try_status(&self) -> Option<Status> {

@@ -7,8 +7,11 @@ use std::{
     cell::{Cell, RefCell},
     collections::HashMap,
     rc::{Rc, Weak},
+    sync::{Arc, Weak as SharedWeak},
     time::{Duration, Instant},
 };
+
+use axon_shm::internal::Allowance;
 
 use super::{
     limits::Limits,
@@ -39,6 +42,8 @@ const UNREAD: usize = 64 << 20;
 pub(crate) const MESSAGES: (usize, usize) = (64 << 20, 16 << 20);
 /// Control messages that wait for one identity to read them, in bytes.
 const UNSENT: usize = 128 << 20;
+/// How many times what one identity may hold all may hold together.
+const HELD_BY_ALL: u64 = 2;
 /// Names and reasons of refused routes of one identity that are remembered for status, in bytes.
 const REFUSALS: usize = 2 << 20;
 /// Sessions of one identity that are taken for proven.
@@ -212,6 +217,8 @@ pub(crate) struct Account {
     pub(crate) unread: Rc<Meter>,
     /// Memory for its messages that have not come whole, in bytes.
     pub(crate) messages: MessageMemory,
+    /// Memory for the samples, requests and responses that its stand-ins hold, in bytes.
+    pub(crate) held: Arc<Allowance>,
     /// Bytes of refused routes that are remembered.
     pub(crate) refusals: Rc<Meter>,
     /// Sessions that it proved to be its own.
@@ -231,6 +238,7 @@ impl Account {
         graph: usize,
         relays: &Rc<Meter>,
         stand_ins: &Rc<Meter>,
+        held: Arc<Allowance>,
         limits: Rc<Limits>,
     ) -> Self {
         Self {
@@ -242,6 +250,7 @@ impl Account {
             stand_ins: Meter::within(stand_ins, MAX_STAND_INS),
             unread: Meter::new(UNREAD),
             messages: MessageMemory::new(MESSAGES.0, MESSAGES.1),
+            held,
             refusals: Meter::new(REFUSALS),
             sessions: Meter::new(MAX_PROVEN),
             writers: RefCell::default(),
@@ -321,16 +330,22 @@ pub(crate) struct Accounts {
     graph: usize,
     relays: Rc<Meter>,
     stand_ins: Rc<Meter>,
+    /// What all stand-ins hold, and what one identity's may.
+    held: (Arc<Allowance>, u64),
     open: HashMap<String, Weak<Account>>,
     /// What passed of late, also of identities without a link: a new link gives them no more.
     limits: HashMap<String, Rc<Limits>>,
+    /// What the stand-ins of an identity hold. Readers may be at it when its last link is over.
+    held_by: HashMap<String, SharedWeak<Allowance>>,
 }
 
 impl Accounts {
-    /// Accounts whose graphs may take so many bytes.
-    pub(crate) fn new(graph: usize) -> Self {
+    /// Accounts whose graphs may take so many bytes, and whose stand-ins may hold so many.
+    pub(crate) fn new(graph: usize, held: u64) -> Self {
         let [relays, stand_ins] = [(); 2].map(|()| Meter::new(OF_ALL));
-        Self { graph, relays, stand_ins, open: HashMap::new(), limits: HashMap::new() }
+        let held = (Allowance::new(held.saturating_mul(HELD_BY_ALL)), held);
+        let (open, limits, held_by) = Default::default();
+        Self { graph, relays, stand_ins, held, open, limits, held_by }
     }
 
     /// The account of an identity.
@@ -343,10 +358,22 @@ impl Accounts {
             self.limits.retain(|_, limits| Rc::strong_count(limits) > 1);
         }
         let limits = Rc::clone(self.limits.entry(identity.to_owned()).or_default());
+        let held = self.held_by(identity);
         let (relays, stand_ins) = (&self.relays, &self.stand_ins);
-        let account = Rc::new(Account::new(identity, self.graph, relays, stand_ins, limits));
+        let account = Account::new(identity, self.graph, relays, stand_ins, held, limits);
+        let account = Rc::new(account);
         self.open.insert(identity.to_owned(), Rc::downgrade(&account));
         account
+    }
+
+    fn held_by(&mut self, identity: &str) -> Arc<Allowance> {
+        if let Some(held) = self.held_by.get(identity).and_then(SharedWeak::upgrade) {
+            return held;
+        }
+        self.held_by.retain(|_, held| held.strong_count() > 0);
+        let held = Allowance::within(&self.held.0, self.held.1);
+        self.held_by.insert(identity.to_owned(), Arc::downgrade(&held));
+        held
     }
 }
 
@@ -358,7 +385,7 @@ mod tests {
 
     #[test]
     fn an_identity_has_one_account_and_what_is_dropped_is_given_back() {
-        let mut accounts = Accounts::new(100);
+        let mut accounts = Accounts::new(100, 1 << 20);
         let (one, again, other) = (accounts.of("a"), accounts.of("a"), accounts.of("b"));
         let charge = one.graph.charge(60).unwrap();
         assert!(again.graph.charge(41).is_none(), "of the same identity");
@@ -370,6 +397,20 @@ mod tests {
         drop((one, again));
         assert_eq!(accounts.of("a").graph.held(), 0);
         assert_eq!(accounts.open.len(), 2);
+    }
+
+    #[test]
+    fn what_readers_have_of_an_identity_counts_when_it_comes_again() {
+        let mut accounts = Accounts::new(100, 1000);
+        let account = accounts.of("a");
+        let (ring, pool) = (Arc::clone(&account.held), Arc::clone(&accounts.held.0));
+        drop(account);
+        assert!(Arc::ptr_eq(&accounts.of("a").held, &ring));
+        assert!(!Arc::ptr_eq(&accounts.of("b").held, &ring));
+        assert_eq!((ring.most(), pool.most()), (1000, 2000));
+        drop(ring);
+        accounts.of("c");
+        assert_eq!(accounts.held_by.len(), 1, "{:?}", accounts.held_by);
     }
 
     #[test]

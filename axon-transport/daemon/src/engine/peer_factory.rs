@@ -109,7 +109,7 @@ mod tests {
     fn peers_share_the_memory_of_the_daemon_and_nothing_else() {
         let config = Arc::new(Config::default());
         let factory = PeerFactory::new(Arc::clone(&config), DaemonId([1; 16]), Arc::default(), 0);
-        let mut accounts = Accounts::new(config.link.graph);
+        let mut accounts = Accounts::new(config.link.graph, config.link.held);
         let mut make = |number: u8| {
             let link = FirstLink {
                 number: number.into(),

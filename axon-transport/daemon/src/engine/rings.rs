@@ -1,10 +1,10 @@
 //! The rings of this host, as the engine uses them: relay readers of local publishers, and stand-ins that write for
 //! remote ones. In the daemon they are shared memory; the simulator has models of them.
 
-use std::{collections::HashMap, rc::Rc, time::Duration};
+use std::{collections::HashMap, rc::Rc, sync::Arc, time::Duration};
 
 use axon_envelope::inner::RequestId;
-use axon_shm::{Meta, ids::Gid};
+use axon_shm::{Meta, ids::Gid, internal::Allowance};
 use axon_transport::{
     EndpointSpec, MessageInfo,
     graph::Endpoint,
@@ -24,11 +24,15 @@ pub(crate) trait Rings {
         stands_for: Vec<Gid>,
     ) -> Result<Rc<dyn RingReader>, String>;
 
-    /// Opens a stand-in for a remote publisher, client or server, under its GID.
+    /// Opens a stand-in for a remote publisher, client or server, under its GID. What it holds it takes of `held`.
     ///
     /// # Errors
     /// Why there is none, for the log.
-    fn open_writer(&self, remote: &Endpoint) -> Result<Rc<dyn RingWriter>, String>;
+    fn open_writer(
+        &self,
+        remote: &Endpoint,
+        held: &Arc<Allowance>,
+    ) -> Result<Rc<dyn RingWriter>, String>;
 
     /// Adds to `found` the readers that may have samples to take, each with the publisher: those whose rings got samples
     /// since the last call, and a few others. So the cost of a sample does not grow with the number of readers.
@@ -86,6 +90,8 @@ pub(crate) trait RingReader {
 pub(crate) enum RingError {
     /// A KEEP_ALL reader has no room: try again when a reader made some.
     Full,
+    /// The stand-ins of the peer's identity hold as much as they may; the text says how much.
+    Short(String),
     /// The sample is lost; the text says why.
     Lost(String),
 }

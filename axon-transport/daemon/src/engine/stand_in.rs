@@ -139,7 +139,7 @@ impl StandIns {
         let numbers = before.map_or_else(|| Rc::new(Numbers::new(now)), |b| Rc::clone(&b.numbers));
         let Some(place) = account.stand_ins.charge(1) else { return Err(NoStandIn::TooMany) };
         let stand_in = Rc::new(StandIn {
-            ring: rings.open_writer(remote).map_err(NoStandIn::Failed)?,
+            ring: rings.open_writer(remote, &account.held).map_err(NoStandIn::Failed)?,
             gid: remote.gid,
             rises: remote.kind != EndpointKind::Server,
             last: Cell::new(0),
@@ -213,7 +213,7 @@ mod tests {
 
     #[test]
     fn an_identity_whose_publishers_come_and_go_has_none_of_another_forgotten() {
-        let mut accounts = Accounts::new(1 << 20);
+        let mut accounts = Accounts::new(1 << 20, 1 << 20);
         let [flood, quiet] = ["flood", "quiet"].map(|of| Rc::clone(&accounts.of(of).identity));
         let mut known = HashMap::new();
         known.extend((0..10).map(|number| departed(&quiet, number, 1)));

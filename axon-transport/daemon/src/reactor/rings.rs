@@ -5,10 +5,11 @@ use std::{
     collections::HashMap,
     ops::Range,
     rc::Rc,
+    sync::Arc,
     time::Duration,
 };
 
-use axon_shm::{ExternalLeader, Meta, PublishError, ShmError, ids::Gid};
+use axon_shm::{ExternalLeader, Meta, PublishError, ShmError, ids::Gid, internal::Allowance};
 use axon_transport::{
     EndpointSpec, MessageInfo, Session, Subscription,
     graph::Endpoint,
@@ -74,8 +75,12 @@ impl Rings for ShmRings {
         Ok(Rc::new(Relay { subscription, taken: RefCell::default() }))
     }
 
-    fn open_writer(&self, remote: &Endpoint) -> Result<Rc<dyn RingWriter>, String> {
-        let writer = RemoteWriter::stand_in(&self.session, remote.clone());
+    fn open_writer(
+        &self,
+        remote: &Endpoint,
+        held: &Arc<Allowance>,
+    ) -> Result<Rc<dyn RingWriter>, String> {
+        let writer = RemoteWriter::stand_in(&self.session, remote.clone(), held);
         Ok(Rc::new(Writer(writer.map_err(|error| error.to_string())?)))
     }
 
@@ -194,6 +199,10 @@ impl RingWriter for Writer {
     fn try_write(&self, client: &Gid, meta: Meta, payload: &[u8]) -> Result<Written, RingError> {
         self.0.try_write_quietly(client, meta, payload).map_err(|error| match error {
             PublishError::Blocked { .. } => RingError::Full,
+            // One that never fits is lost like any that is too long.
+            error @ PublishError::Allowance { needed, most, .. } if needed <= most / 2 => {
+                RingError::Short(error.to_string())
+            }
             error => RingError::Lost(error.to_string()),
         })
     }

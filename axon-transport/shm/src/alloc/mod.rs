@@ -1,6 +1,7 @@
 //! Allocation of a session's own memory: segments, objects, slots for large samples, and limits for the samples
 //! that readers pin.
 
+pub(crate) mod allowance;
 pub(crate) mod area;
 pub(crate) mod blocks;
 pub(crate) mod classes;

@@ -162,13 +162,13 @@ impl RetireList {
         self.loans
     }
 
-    /// Forgets the segments that were left and hold nothing any more, and names them.
-    pub(crate) fn vacated(&mut self) -> Vec<u32> {
+    /// Forgets the segments that were left and hold nothing any more, and names them, each with how far it is backed.
+    pub(crate) fn vacated(&mut self) -> Vec<(u32, u64)> {
         let vacant = |store: &Store| store.left && store.slots.used() == 0;
-        let numbers = self.stores.iter().filter(|store| vacant(store)).map(|store| store.number);
-        let numbers = numbers.collect();
+        let vacated = self.stores.iter().filter(|store| vacant(store));
+        let vacated = vacated.map(|store| (store.number, store.slots.backed())).collect();
         self.stores.retain(|store| !vacant(store));
-        numbers
+        vacated
     }
 }
 
@@ -199,7 +199,7 @@ mod tests {
         list.give_back(loan, LEN);
         assert!(list.vacated().is_empty(), "a reader is still at it");
         list.reclaim(|_, _| false);
-        assert_eq!(list.vacated(), [1]);
+        assert_eq!(list.vacated(), [(1, 0)], "nothing of it was backed");
         assert_eq!(list.segments().collect::<Vec<_>>(), [2]);
     }
 
@@ -211,7 +211,7 @@ mod tests {
         assert!(list.vacated().is_empty());
         list.leave();
         assert!(list.extent().is_none());
-        assert_eq!((list.take(LEN), list.vacated()), (None, vec![1]));
+        assert_eq!((list.take(LEN), list.vacated()), (None, vec![(1, 0)]));
         assert_eq!(list.lend(LEN), None);
     }
 

@@ -5,6 +5,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use crate::{
     alloc::{
+        allowance::Holding,
         heap::{Block, Heap},
         segments::Segments,
     },
@@ -20,6 +21,8 @@ pub(crate) struct Orphan {
     pub(crate) blocks: Vec<Block>,
     /// The numbers of the segments of its large samples.
     pub(crate) samples: Vec<u32>,
+    /// What all of it takes of the memory that its publisher shared with others, until it is freed.
+    pub(crate) _holding: Holding,
 }
 
 /// So many of them are looked at whenever one comes or a reader leaves.

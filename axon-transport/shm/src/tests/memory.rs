@@ -2,6 +2,8 @@
 
 use super::*;
 
+mod allowance;
+
 /// A reader in another session that is told of segments only by [`hand`].
 fn attach_untold(
     writer: &Writer,

@@ -158,9 +158,13 @@ impl History {
         Ok(())
     }
 
-    /// Gives up the oldest sample, if another one is in a block or slot. Whether it did.
-    pub(crate) fn shrink(&mut self, may_go: impl Fn(u64) -> bool) -> Result<bool, OldestInUse> {
-        if self.placed <= 1 {
+    /// Gives up the oldest sample, if more than `kept` are in blocks or slots. Whether it did.
+    pub(crate) fn shrink(
+        &mut self,
+        kept: u64,
+        may_go: impl Fn(u64) -> bool,
+    ) -> Result<bool, OldestInUse> {
+        if self.placed <= kept {
             return Ok(false);
         }
         self.give_up_oldest(&may_go)?;
@@ -176,16 +180,16 @@ impl History {
             }
             Extent::Inline | Extent::Block(_) => false,
         };
-        !self.has_room(len) && !alike && !self.would_hold(len, false)
+        !self.has_room(len) && !alike && !self.would_hold(len, 1, false)
     }
 
-    /// Whether there would be a slot of `len` bytes if all samples were given up but one, and nothing
+    /// Whether there would be a slot of `len` bytes if all samples were given up but `kept`, and nothing
     /// that readers keep: with no more memory than there is, unless it can `grow`. Takes its time.
-    pub(crate) fn would_hold(&self, len: u64, grow: bool) -> bool {
+    pub(crate) fn would_hold(&self, len: u64, kept: u64, grow: bool) -> bool {
         let placed = (self.tail..self.head)
             .map(|position| self.extents[index(&self.extents, position)])
             .filter(|extent| *extent != Extent::Inline)
-            .take(self.placed.saturating_sub(1) as usize);
+            .take(self.placed.saturating_sub(kept) as usize);
         let slots = placed.filter_map(|extent| match extent {
             Extent::Slot { at, len, .. } => Some((at, len)),
             Extent::Inline | Extent::Block(_) => None,

@@ -24,6 +24,7 @@ pub(super) use self::{
 
 use crate::{
     alloc::{
+        allowance::{Allowance, Holding},
         area::Area,
         heap::{Need, Object},
         pin_limit::Pool,
@@ -206,6 +207,15 @@ impl Writer {
         let writer = Self::create(session, options)?;
         writer.lock().reader_set.enforce_depths();
         Ok(writer)
+    }
+
+    /// Has the ring share a bound on memory with others: from then on it takes what it needs for samples of `allowance`,
+    /// beside its first descriptors. Where that has no more, the ring does with what it has, like one whose host has no
+    /// memory; but its newest sample replaces even the last one that stands.
+    pub fn share(&self, allowance: &Arc<Allowance>) {
+        if !self.is_forked() {
+            self.lock().holding = Holding::of(Arc::clone(allowance));
+        }
     }
 
     /// The publisher's GID.
@@ -485,7 +495,7 @@ impl Drop for Writer {
         if self.is_forked() {
             return;
         }
-        let WriterState { mut history, array, reader_set, .. } = {
+        let WriterState { mut history, array, reader_set, holding, .. } = {
             let mut state = self.lock();
             let nobody = ReaderSet::new(self.options.qos, 0, Pool::default());
             let empty = WriterState::new(nobody, History::new(1, 0), self.header.object());
@@ -496,6 +506,6 @@ impl Drop for Writer {
         blocks.extend(history.all_blocks());
         let samples = history.pinned().segments().collect();
         let (pin_lanes, head) = (reader_set.into_pin_lanes(), history.head());
-        self.session.adopt(Orphan { pin_lanes, head, blocks, samples });
+        self.session.adopt(Orphan { pin_lanes, head, blocks, samples, _holding: holding });
     }
 }

@@ -95,8 +95,17 @@ pub(crate) fn no_memory(error: ShmError) -> PublishError {
         ShmError::NoMemory { needed, available } => {
             PublishError::NoMemory { needed, available, keeper: None }
         }
+        ShmError::Allowance { needed, available, most } => {
+            PublishError::Allowance { needed, available, most }
+        }
         other => PublishError::Segment { reason: other.to_string() },
     }
+}
+
+/// How many samples stay in a ring that has to do with the memory that it has. One, so that those who come later find it;
+/// but a ring that may have no more memory shows its newest sample rather than an old one.
+pub(crate) fn least_kept(short: &PublishError) -> u64 {
+    u64::from(!matches!(short, PublishError::Allowance { .. }))
 }
 
 impl Writer {
@@ -151,10 +160,18 @@ impl Writer {
         if descriptors > self.limit {
             return Ok(());
         }
-        let reader_set = &state.reader_set;
         let bytes = descriptors * layout::DESCRIPTOR;
+        let more = bytes - state.array.block.len;
+        state.holding.take(more)?;
+        let reader_set = &state.reader_set;
         let mapped = |number| reader_set.has_mapped(number);
-        let Some(array) = self.session.allocate(bytes, need, mapped)? else { return Ok(()) };
+        let array = match self.session.allocate(bytes, need, mapped) {
+            Ok(Some(array)) => array,
+            other => {
+                state.holding.give_back(more);
+                return other.map(drop);
+            }
+        };
         // Only what stands moves, so readers must not take more for standing.
         self.show_tail(state);
         let history = &mut state.history;
@@ -208,7 +225,7 @@ impl Writer {
                 Err(error) => {
                     let tail = state.history.tail();
                     let was_kept = tail >= floors.retained && tail >= state.consumed();
-                    match state.history.shrink(may_go) {
+                    match state.history.shrink(least_kept(&error), may_go) {
                         Ok(false) => return Err(error.into()),
                         Ok(true) if was_kept => self.header.count(Dropped::NoMemory),
                         Ok(true) => {}
@@ -227,11 +244,12 @@ impl Writer {
         if state.history.blocks().are_many() {
             self.give_blocks_back(state);
         }
+        state.holding.take(bytes).map_err(no_memory)?;
         let reader_set = &state.reader_set;
         let mapped = |number| reader_set.has_mapped(number);
-        let object = self
-            .session
-            .allocate(bytes, Need::Now, mapped)
+        let allocated = self.session.allocate(bytes, Need::Now, mapped);
+        let object = allocated
+            .inspect_err(|_| state.holding.give_back(bytes))
             .map_err(no_memory)?
             .expect("there is always one that will do");
         state.maps.add(&object);
@@ -244,6 +262,7 @@ impl Writer {
         self.show_tail(state);
         for block in state.history.blocks().drain() {
             self.header.subtract_bytes(block.len);
+            state.holding.give_back(block.len);
             self.session.release(block);
         }
     }

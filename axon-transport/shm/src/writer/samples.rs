@@ -8,6 +8,7 @@ use std::{
 
 use crate::{
     alloc::{
+        allowance::Holding,
         pin_limit::samples_bytes,
         retention::Retention,
         segments::{OwnSegment, SegmentEvent},
@@ -25,7 +26,7 @@ use crate::{
         header::Dropped,
         history::OldestInUse,
         loan::LoanPlace,
-        room::{PinnedMemory, Refusal, no_memory},
+        room::{PinnedMemory, Refusal, least_kept, no_memory},
     },
 };
 
@@ -45,11 +46,18 @@ pub(crate) struct Samples {
 }
 
 /// Backs a segment with memory up to `end`, a little further when it keeps growing. Up to where.
-fn back(segment: &OwnSegment, backed: u64, end: u64) -> Result<u64, PublishError> {
+fn back(
+    segment: &OwnSegment,
+    holding: &mut Holding,
+    backed: u64,
+    end: u64,
+) -> Result<u64, PublishError> {
     let ahead = backed + ((backed - SLOTS_AT) / 8).min(AHEAD);
     let memory = &segment.memory;
     let upto = end.max(ahead).next_multiple_of(layout::ALIGN).min(memory.bytes());
-    memory.commit(backed, upto).map_err(no_memory)?;
+    holding.take(upto - backed).map_err(no_memory)?;
+    let committed = memory.commit(backed, upto);
+    committed.inspect_err(|_| holding.give_back(upto - backed)).map_err(no_memory)?;
     memory.touch(backed, upto);
     Ok(upto)
 }
@@ -77,23 +85,34 @@ impl Writer {
                 pinned.put_back(at, len);
                 return Ok(());
             }
-            (segment, at, len, from, end.next_multiple_of(layout::ALIGN))
+            let end = end.next_multiple_of(layout::ALIGN).min(segment.memory.bytes());
+            if let Err(error) = state.holding.take(end - from) {
+                state.history.pinned().release_unbacked(at, len);
+                return Err(error);
+            }
+            (segment, at, len, from, end)
         };
         // It is nobody else's meanwhile, so this needs no lock. That a publish backs some of it,
         // too, does no harm.
-        let end = end.min(segment.memory.bytes());
         let committed = segment.memory.commit(from, end);
         if committed.is_ok() {
             segment.memory.touch(from, end);
         }
         let mut state = self.lock();
-        let pinned = state.history.pinned();
+        let WriterState { history, holding, .. } = &mut *state;
+        let pinned = history.pinned();
         match committed {
             Ok(()) => {
-                pinned.slots(at).back(end);
+                let slots = pinned.slots(at);
+                // What a publish backed meanwhile it took, too.
+                holding.give_back(slots.backed().min(end) - from);
+                slots.back(end);
                 pinned.put_back(at, len);
             }
-            Err(_) => pinned.release_unbacked(at, len),
+            Err(_) => {
+                holding.give_back(end - from);
+                pinned.release_unbacked(at, len);
+            }
         }
         committed
     }
@@ -114,9 +133,11 @@ impl Writer {
         let floors = reader_set.floors(history.head());
         history.release_below(floors.retained.max(reader_set.consumed(history.head())));
         self.reclaim(&mut state);
-        let WriterState { history, samples, .. } = &mut *state;
+        let WriterState { history, samples, holding, .. } = &mut *state;
+        // Where other rings want for memory, what is not in use goes to them at once.
+        let short = holding.is_short();
         if let (Some(open), Some((used, backed))) = (samples.as_mut(), history.pinned().extent())
-            && open.retention.is_over(now, used, backed - SLOTS_AT)
+            && (open.retention.is_over(now, used, backed - SLOTS_AT) || short && used == 0)
         {
             history.pinned().leave();
             *samples = None;
@@ -134,7 +155,9 @@ impl Writer {
     fn open_another(&self, state: &mut WriterState) -> Result<(), ShmError> {
         let options = self.options();
         let bytes = samples_bytes(options.budget, options.max_message, RECORDS as u64);
-        let segment = self.session.open_samples(options.gid, bytes)?;
+        state.holding.take(SLOTS_AT)?;
+        let opened = self.session.open_samples(options.gid, bytes);
+        let segment = opened.inspect_err(|_| state.holding.give_back(SLOTS_AT))?;
         state.history.pinned().open(segment.number(), SLOTS_AT..bytes);
         let retention = Retention::begin(Instant::now());
         state.samples = Some(Samples { segment, retention, ahead: None, turns: 0 });
@@ -200,8 +223,10 @@ impl Writer {
             // What stands lower may be large enough, or backed already. But nothing is given up for
             // a sample that not even all of it makes room for.
             let history = &mut state.history;
-            if *worthwhile.get_or_insert_with(|| history.would_hold(bytes, short.is_none())) {
-                match history.shrink(may_go) {
+            let stay = short.as_ref().map_or(1, least_kept);
+            let would_hold = || history.would_hold(bytes, stay, short.is_none());
+            if *worthwhile.get_or_insert_with(would_hold) {
+                match history.shrink(stay, may_go) {
                     Ok(true) => {
                         if short.is_some() {
                             self.header.count(Dropped::NoMemory);
@@ -270,7 +295,9 @@ impl Writer {
         bytes: u64,
         grow: bool,
     ) -> Result<Option<LoanPlace>, PublishError> {
-        let WriterState { history, samples: Some(samples), .. } = state else { return Ok(None) };
+        let WriterState { history, samples: Some(samples), holding, .. } = state else {
+            return Ok(None);
+        };
         let slots = history.pinned().slots(at);
         let end = slots.end(at.offset, bytes);
         let is_open = at.segment == samples.segment.number();
@@ -280,7 +307,7 @@ impl Writer {
         };
         if end > slots.backed() {
             let backed = match grow {
-                true => back(&segment, slots.backed(), end).map(Some),
+                true => back(&segment, holding, slots.backed(), end).map(Some),
                 false => Ok(None),
             };
             match backed {
@@ -317,7 +344,8 @@ impl Writer {
 
     /// Gives segments up that were left and that nobody reads any more.
     fn close_vacated(&self, state: &mut WriterState) {
-        for number in state.history.pinned().vacated() {
+        for (number, backed) in state.history.pinned().vacated() {
+            state.holding.give_back(backed);
             self.session.close_samples(number);
         }
     }

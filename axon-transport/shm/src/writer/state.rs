@@ -3,7 +3,11 @@
 use super::{
     history::History, numbers::Numbers, reader_set::ReaderSet, room::Maps, samples::Samples,
 };
-use crate::{alloc::heap::Object, ring::protocol, session::pin_lanes::Pinned};
+use crate::{
+    alloc::{allowance::Holding, heap::Object},
+    ring::protocol,
+    session::pin_lanes::Pinned,
+};
 
 /// The samples that stand, their readers and their memory.
 pub(crate) struct WriterState {
@@ -15,6 +19,8 @@ pub(crate) struct WriterState {
     pub(super) maps: Maps,
     /// Where the next samples go that readers pin, once there has been one.
     pub(super) samples: Option<Samples>,
+    /// What it takes of the memory that it shares with other rings.
+    pub(super) holding: Holding,
     /// The tail as readers see it.
     pub(super) shown_tail: u64,
     /// What was found pinned, kept for its memory.
@@ -32,6 +38,7 @@ impl WriterState {
             array,
             maps: Maps::default(),
             samples: None,
+            holding: Holding::default(),
             shown_tail: 0,
             pinned: Pinned::default(),
             numbers: Numbers::default(),

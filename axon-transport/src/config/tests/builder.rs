@@ -44,6 +44,7 @@ fn all_of_qkd() -> ConfigBuilder {
         .link_stalled(Duration::from_secs(4))
         .link_mtu(9_000)
         .link_graph_mb(4)
+        .link_held_mb(32)
         .link_poll(LinkPoll::Never)
         .link_qlog("/var/qlog")
         .link_congestion(Congestion::Cubic)
@@ -94,7 +95,8 @@ fn a_built_config_equals_that_of_its_environment() {
     }));
     let read = Config::resolve(environment, None, &OsFiles).unwrap();
     assert_eq!(without_origin(&read), without_origin(&built));
-    assert_eq!((built.link.mtu, built.link.graph), (9_000, 4 << 20));
+    let bounds = (built.link.graph, built.link.held);
+    assert_eq!((built.link.mtu, bounds), (9_000, (4 << 20, 32 << 20)));
     assert_eq!(built.link.poll, LinkPoll::Never);
     assert_eq!(built.link.qlog.as_deref(), Some(Path::new("/var/qlog")));
     assert_eq!(built.link.congestion, Congestion::Cubic);

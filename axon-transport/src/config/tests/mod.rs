@@ -135,6 +135,7 @@ fn nothing_given_is_the_table_of_defaults() {
             stalled: Duration::from_secs(10),
             mtu: 1452,
             graph: 16 << 20,
+            held: 2 << 30,
             poll: LinkPoll::Adaptive,
             qlog: None,
             congestion: Congestion::Auto,
@@ -260,6 +261,7 @@ fn the_environment_wins_over_the_file() {
         stalled_s = 4
         mtu = 9000
         graph_mb = 4
+        held_mb = 32
         poll = 'always'
         qlog = '/var/qlog'
         congestion = 'bbr'
@@ -277,6 +279,7 @@ fn the_environment_wins_over_the_file() {
             stalled: Duration::from_secs(4),
             mtu: 9000,
             graph: 4 << 20,
+            held: 32 << 20,
             poll: LinkPoll::Always,
             qlog: Some("/var/qlog".into()),
             congestion: Congestion::Bbr,

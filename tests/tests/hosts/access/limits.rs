@@ -117,3 +117,95 @@ fn what_is_beyond_a_limit_waits_or_is_dropped_and_counted_in_each_mode() {
         until("limits that are gone are not shown", || hosts.robot.link().limits.is_empty());
     });
 }
+
+/// Bytes of each sample in the tests of limits on bytes.
+const LENGTH: usize = 10_000;
+
+fn publish_long(publisher: &Publisher) {
+    for number in 1..=SAMPLES {
+        let mut sample = number.to_be_bytes().to_vec();
+        sample.resize(LENGTH, 0x5a);
+        publisher.publish(&sample).unwrap();
+    }
+}
+
+/// The next long sample that comes.
+fn next_long(subscription: &Subscription) -> u64 {
+    let mut bytes = Vec::new();
+    subscription.recv(&mut bytes, Some(PATIENCE)).expect("a sample");
+    assert_eq!(bytes.len(), LENGTH);
+    u64::from_be_bytes(bytes[..8].try_into().unwrap())
+}
+
+#[test]
+fn bytes_beyond_a_limit_are_dropped_or_wait_in_both_directions() {
+    // The next sample may pass after ten thousand seconds.
+    const BYTES: &str = "default = \"allow\"\n\
+        [[limit]]\npeer = \"PEER\"\npublish = \"/cmd_vel\"\nbytes = \"1 B/s\"\n\
+        [[limit]]\npeer = \"PEER\"\nsubscribe = \"/scan\"\nbytes = \"1 B/s\"\nover = \"hold\"\n";
+    let keys = tempfile::tempdir().unwrap();
+    let settings = pinned(keys.path(), [[false, true], [true, false]]);
+    let hosts = Hosts::start(settings, "host-1", keys);
+    hosts.write(BYTES);
+    assert_eq!(hosts.reload().error, None);
+    let (here, there) = (hosts.robot.session("robot"), hosts.base.session("base"));
+    let (drive, drives) = (subscription(&here, "/cmd_vel"), publisher(&there, "/cmd_vel"));
+    let (scan, scans) = (publisher(&here, "/scan"), subscription(&there, "/scan"));
+    meet(&drives, &drive);
+    meet(&scan, &scans);
+    publish_long(&drives);
+    publish_long(&scan);
+    assert_eq!((next_long(&drive), next_long(&scans)), (1, 1));
+    until("what is beyond the limit is counted", || {
+        limit(&hosts, "/cmd_vel").dropped == SAMPLES - 1
+    });
+    assert_eq!((limit(&hosts, "/cmd_vel").passed, limit(&hosts, "/scan").passed), (1, 1));
+    assert_eq!(limit(&hosts, "/scan").dropped, 0);
+    assert!(!drive.has_data() && !scans.has_data());
+
+    hosts.write("default = \"allow\"\n[[limit]]\npeer = \"PEER\"\ntopic = \"/other\"\nrate = 1");
+    assert_eq!(hosts.reload().error, None);
+    for number in 2..=SAMPLES {
+        assert_eq!(next_long(&scans), number, "what was held is not lost");
+    }
+    drives.publish(&[&(SAMPLES + 1).to_be_bytes()[..], &[0; LENGTH - 8]].concat()).unwrap();
+    assert_eq!(next_long(&drive), SAMPLES + 1);
+    assert_eq!((drive.lost(), scans.lost()), (SAMPLES - 1, 0));
+}
+
+#[test]
+fn an_egress_limit_slows_what_leaves_and_loses_nothing() {
+    // All samples take two hundred seconds.
+    const EGRESS: &str = "default = \"allow\"\n[[limit]]\npeer = \"PEER\"\negress = \"10 kB/s\"\n";
+    let keys = tempfile::tempdir().unwrap();
+    let settings = pinned(keys.path(), [[false, true], [true, false]]);
+    let hosts = Hosts::start(settings, "host-1", keys);
+    let (here, there) = (hosts.robot.session("robot"), hosts.base.session("base"));
+    let (drive, drives) = (subscription(&here, "/cmd_vel"), publisher(&there, "/cmd_vel"));
+    let (scan, scans) = (publisher(&here, "/scan"), subscription(&there, "/scan"));
+    meet(&drives, &drive);
+    meet(&scan, &scans);
+    hosts.write(EGRESS);
+    assert_eq!(hosts.reload().error, None);
+    publish_long(&scan);
+    // What comes in is not limited.
+    publish(&drives);
+    for number in 1..=SAMPLES {
+        assert_eq!(next(&drive), number);
+    }
+    assert_eq!(next_long(&scans), 1);
+    let egress = hosts.robot.link().limits;
+    let [egress] = &egress[..] else { panic!("{egress:?}") };
+    assert_eq!((&*egress.verb, &*egress.name, egress.dropped), ("egress", "(all packets)", 0));
+    assert!(egress.passed > 0, "{egress:?}");
+    let waits = hosts.robot.link().waiting_bytes;
+    assert!(waits > 0, "the rest waits");
+    assert!(!scan.wait_acknowledged(Duration::ZERO));
+
+    hosts.write("default = \"allow\"\n[[limit]]\npeer = \"PEER\"\ntopic = \"/other\"\nrate = 1");
+    assert_eq!(hosts.reload().error, None);
+    for number in 2..=SAMPLES {
+        assert_eq!(next_long(&scans), number);
+    }
+    assert_eq!(scans.lost(), 0);
+}

@@ -9,19 +9,19 @@ use rcgen::{
 
 use super::super::{mode::Settings, pair::write_key};
 
-pub(super) struct Authority {
-    pub(super) pem: String,
+pub(crate) struct Authority {
+    pub(crate) pem: String,
     issuer: Issuer<'static, KeyPair>,
 }
 
 /// A certificate and its key, as PEM.
-pub(super) struct Certificate {
-    pub(super) pem: String,
-    pub(super) key: String,
+pub(crate) struct Certificate {
+    pub(crate) pem: String,
+    pub(crate) key: String,
 }
 
 impl Authority {
-    pub(super) fn new(name: &str) -> Self {
+    pub(crate) fn new(name: &str) -> Self {
         let mut params = CertificateParams::new([]).unwrap();
         params.distinguished_name.push(DnType::CommonName, name);
         params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
@@ -32,8 +32,14 @@ impl Authority {
     }
 
     /// For one DNS name, good until the year begins.
-    pub(super) fn issue(&self, name: &str, serial: u64, until: i32) -> Certificate {
-        let mut params = CertificateParams::new([name.to_owned()]).unwrap();
+    pub(crate) fn issue(&self, name: &str, serial: u64, until: i32) -> Certificate {
+        self.issue_for(&[name], serial, until)
+    }
+
+    /// As [`issue`](Self::issue), for several DNS names.
+    pub(crate) fn issue_for(&self, names: &[&str], serial: u64, until: i32) -> Certificate {
+        let names: Vec<_> = names.iter().map(|name| (*name).to_owned()).collect();
+        let mut params = CertificateParams::new(names).unwrap();
         params.serial_number = Some(SerialNumber::from(serial));
         params.not_before = date_time_ymd(2020, 1, 1);
         params.not_after = date_time_ymd(until, 1, 1);
@@ -43,7 +49,7 @@ impl Authority {
     }
 
     /// A list of one certificate, good until the year begins.
-    pub(super) fn revoke(&self, serial: u64, until: i32) -> String {
+    pub(crate) fn revoke(&self, serial: u64, until: i32) -> String {
         let revoked = RevokedCertParams {
             serial_number: SerialNumber::from(serial),
             revocation_time: date_time_ymd(2020, 1, 1),
@@ -63,7 +69,7 @@ impl Authority {
 }
 
 /// Settings of host `host`, with its files in `dir`.
-pub(super) fn settings(
+pub(crate) fn settings(
     dir: &Path,
     host: &str,
     roots: &str,

@@ -2,7 +2,7 @@
 
 use axon_transport::ids::DaemonId;
 
-mod authority;
+pub(crate) mod authority;
 mod ca;
 mod pinned;
 mod replay;

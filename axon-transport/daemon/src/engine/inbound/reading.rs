@@ -8,7 +8,7 @@ use axon_transport::internal::session::Written;
 use bytes::Bytes;
 
 use super::{
-    ARRIVAL, FULL_RETRY, Inbound, Key, LONG, NO_ROUTE, TURN, Violation,
+    ARRIVAL, FULL_RETRY, Inbound, Key, LONG, NO_ROUTE, RouteIn, TURN, Violation,
     incoming::{HEADER, Incoming, Message, Piece, Step, StreamHeader},
 };
 use crate::{
@@ -403,11 +403,23 @@ impl Inbound {
                 Some(false)
             }
             Err(RingError::Full) => None,
+            Err(RingError::Short(_)) if self.may_wait(header) => None,
+            Err(RingError::Short(why)) => {
+                self.lost("held", header, &why);
+                Some(false)
+            }
             Err(RingError::Lost(why)) => {
                 self.lost("ring", header, &why);
                 Some(false)
             }
         }
+    }
+
+    /// Whether what its stream has next may wait here for as long as it takes: calls, and samples whose publisher waits
+    /// for its readers anyway.
+    pub(super) fn may_wait(&self, header: StreamHeader) -> bool {
+        let waits = |route: &RouteIn| route.route.kind != Kind::Topic || route.keeps_all;
+        header.reliable && self.routes.get(&header.route).is_some_and(waits)
     }
 
     /// The message's ring is full.

@@ -3,11 +3,12 @@ mod limited;
 use std::{
     cell::{Cell, RefCell},
     rc::Rc,
+    sync::Arc,
     time::Duration,
 };
 
 use axon_envelope::{Kind, Route, TopicHash, inner};
-use axon_shm::{Meta, ids::Gid, qos::Qos};
+use axon_shm::{Meta, ids::Gid, internal::Allowance, qos::Qos};
 use axon_transport::{
     EndpointSpec, MessageInfo,
     graph::{Endpoint, EndpointKind},
@@ -93,7 +94,11 @@ impl Rings for One {
         Err("it has no readers".into())
     }
 
-    fn open_writer(&self, _remote: &Endpoint) -> Result<Rc<dyn RingWriter>, String> {
+    fn open_writer(
+        &self,
+        _remote: &Endpoint,
+        _held: &Arc<Allowance>,
+    ) -> Result<Rc<dyn RingWriter>, String> {
         Ok(Rc::clone(&self.0) as Rc<dyn RingWriter>)
     }
 
@@ -120,7 +125,7 @@ impl Way {
             samples: RefCell::default(),
             quiet: Cell::new(0),
         });
-        let account = Accounts::new(1 << 20).of("peer");
+        let account = Accounts::new(1 << 20, 1 << 20).of("peer");
         let stand_in = StandIns::default().get(&One(Rc::clone(&ring)), &endpoint, &account, NOW);
         let mut inbound =
             Inbound::new(Rc::default(), MessageMemory::new(1 << 20, 1 << 20), 1 << 20, 0);

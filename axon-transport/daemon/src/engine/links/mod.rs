@@ -120,7 +120,7 @@ impl Links {
         let resolver = keyring.as_ref().map(|keys| keys.resolver(Duration::ZERO, unspecified));
         let server = Arc::new(credentials.server(resolver, unspecified)?);
         Ok(Self {
-            accounts: Accounts::new(config.link.graph),
+            accounts: Accounts::new(config.link.graph, config.link.held),
             config,
             credentials,
             keyring,

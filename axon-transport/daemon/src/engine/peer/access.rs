@@ -17,7 +17,7 @@ use axon_transport::{
     status::LinkStatus,
 };
 
-use super::refused::shown;
+use super::{decisions::note_look, refused::shown};
 use crate::{
     bridge::RefusedRoute,
     engine::account::{Charge, Meter},
@@ -69,6 +69,7 @@ impl PeerAccess {
     }
 
     pub(super) fn permissions(&self) -> &Permissions {
+        note_look();
         &self.permissions
     }
 
@@ -78,6 +79,7 @@ impl PeerAccess {
 
     /// Why the peer may not do this, if it may not.
     pub(super) fn denial(&self, verb: Verb, name: &str) -> Option<String> {
+        note_look();
         if self.permissions.are_unrestricted() {
             return None;
         }

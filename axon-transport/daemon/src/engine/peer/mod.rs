@@ -2,6 +2,7 @@
 
 mod access;
 mod asking;
+pub(super) mod decisions;
 pub(super) mod graph;
 pub(super) mod kept;
 mod limits;
@@ -555,6 +556,8 @@ impl Peer {
         status.endpoints = self.remote.len() as u64;
         status.endpoints_left_out = self.remote.left_out();
         status.graph_bytes = self.remote.account().graph.held() as u64;
+        let held = &self.remote.account().held;
+        (status.held_bytes, status.held_limit) = (held.held(), held.most());
     }
 
     /// Bytes of refused routes that are remembered.

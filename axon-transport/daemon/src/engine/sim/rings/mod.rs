@@ -12,6 +12,7 @@ use std::{
 use axon_shm::{
     Meta,
     ids::{Gid, SessionId},
+    internal::Allowance,
     qos::{Durability, History, Qos, Reliability},
 };
 use axon_transport::{
@@ -146,6 +147,15 @@ impl SimRings {
         let state = &mut *self.state.borrow_mut();
         state.subscriptions.insert(gid, subscription);
         state.topics.entry(topic.into()).or_default().insert(gid);
+        gid
+    }
+
+    /// Creates a server or client, which takes all requests or responses. Calls of its own it makes none.
+    pub(super) fn create_of_service(&self, kind: EndpointKind, name: &str) -> Gid {
+        let gid = self.create_subscription(name, Qos::keep_all(), None);
+        let state = &mut *self.state.borrow_mut();
+        let of_service = state.subscriptions.get_mut(&gid).expect("just created");
+        Arc::make_mut(&mut of_service.endpoint).kind = kind;
         gid
     }
 
@@ -433,7 +443,11 @@ impl Rings for SimRings {
         Ok(Rc::new(SimReader { rings: self.clone(), cursors }))
     }
 
-    fn open_writer(&self, remote: &Endpoint) -> Result<Rc<dyn RingWriter>, String> {
+    fn open_writer(
+        &self,
+        remote: &Endpoint,
+        _held: &Arc<Allowance>,
+    ) -> Result<Rc<dyn RingWriter>, String> {
         if self.state.borrow().fails {
             return Err("no memory".into());
         }

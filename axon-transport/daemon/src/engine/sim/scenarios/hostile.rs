@@ -22,7 +22,12 @@ use crate::engine::sim::{
     world::World,
 };
 use crate::{
-    engine::{frames::Frames, inbound::StreamHeader, protection::Seal, rings::Sample},
+    engine::{
+        frames::Frames,
+        inbound::StreamHeader,
+        protection::{Seal, call},
+        rings::Sample,
+    },
     link::{CloseCode, Elected, Graph, Hello, Message, Subscribe, Subscriber, Unsubscribe},
 };
 
@@ -94,8 +99,8 @@ pub(super) fn publishes(topic: &str, gid: Gid, qos: Qos) -> Message {
     Message::Graph(Graph { version: 1, added: vec![endpoint], ..Graph::default() })
 }
 
-/// Waits until a host asked for a topic. Returns the number of its route.
-fn asked(world: &mut World, on: usize, topic: &str) -> u32 {
+/// Waits until a host asked for a topic or service. Returns the number of its route.
+pub(super) fn asked(world: &mut World, on: usize, topic: &str) -> u32 {
     let route = |world: &World| {
         link(world, on).messages.iter().find_map(|message| match message {
             Message::Subscribe(subscribe) if subscribe.topic == topic => Some(subscribe.route),
@@ -113,13 +118,30 @@ pub(super) fn samples(
     gid: Gid,
     numbers: impl IntoIterator<Item = u64>,
 ) -> Vec<u8> {
-    let mut bytes = StreamHeader::plain(route, gid).encode().to_vec();
-    let hash = TopicHash::new(0, topic, "T").unwrap();
+    messages(Kind::Topic, route, topic, (gid, gid), numbers)
+}
+
+/// A data stream with some samples, requests or responses: of a writer, and of the flow of an endpoint.
+pub(super) fn messages(
+    kind: Kind,
+    route: u32,
+    topic: &str,
+    (writer, of): (Gid, Gid),
+    numbers: impl IntoIterator<Item = u64>,
+) -> Vec<u8> {
+    let mut bytes = StreamHeader::plain(route, of).encode().to_vec();
+    let number_of_kind = match kind {
+        Kind::Topic => 0,
+        Kind::Request => 1,
+        Kind::Response => 2,
+    };
+    let hash = TopicHash::new(number_of_kind, topic, "T").unwrap();
     let mut frames = Frames::default();
     for number in numbers {
-        let info = MessageInfo::of(gid, number);
-        let sample = Sample::new(info, payload(gid, number, 10).into(), Duration::ZERO);
-        let of = Route { kind: Kind::Topic, topic: hash };
+        let info = MessageInfo::of(writer, number);
+        let mut sample = Sample::new(info, payload(writer, number, 10).into(), Duration::ZERO);
+        sample.call = (kind != Kind::Topic).then(|| call(of, number));
+        let of = Route { kind, topic: hash };
         Seal::Link
             .write(&sample, of, Delivery::Reliable, None, &mut frames, Duration::ZERO)
             .unwrap();

@@ -33,7 +33,7 @@ const COMES: usize = 31 << 10;
 const SAYS: u32 = 32 << 10;
 
 /// A peer of this number dials under a daemon id. Returns its link once it is elected.
-fn linked_as(world: &mut World, peer: usize, id: u8) -> usize {
+pub(super) fn linked_as(world: &mut World, peer: usize, id: u8) -> usize {
     let to = world.hosts[0].address;
     let number = world.with_raw(peer, |raw, now| raw.dial(to, now));
     world.until(secs(5), |world| world.raws[peer].links[number].connected);

@@ -10,22 +10,25 @@ use super::super::hostile::{
     LOWEST, dial, elect, greet, of_raw, publishes, samples, say, subscribe,
 };
 use crate::{
-    engine::sim::{
-        tests::{millis, secs},
-        world::{Pair, World},
+    engine::{
+        peer::decisions::looks_at_rules,
+        sim::{
+            tests::{millis, secs},
+            world::{Pair, World},
+        },
     },
     link::Message,
 };
 
 /// Rules that deny nothing.
-const OPEN: &str = "default = \"allow\"";
+pub(super) const OPEN: &str = "default = \"allow\"";
 
 fn rules(text: &str) -> AccessRules {
     AccessRules::parse(text, "access.toml").unwrap()
 }
 
 /// Two hosts, of which one has these rules.
-fn hosts(with_rules: usize, text: &str) -> World {
+pub(super) fn hosts(with_rules: usize, text: &str) -> World {
     World::new(23, 2, |host| {
         let mut config = Config::default();
         if host == with_rules {
@@ -35,12 +38,12 @@ fn hosts(with_rules: usize, text: &str) -> World {
     })
 }
 
-fn link(world: &World, host: usize) -> &LinkStatus {
+pub(super) fn link(world: &World, host: usize) -> &LinkStatus {
     world.hosts[host].status.values().next().unwrap()
 }
 
 /// What a host shows as denied, as one text.
-fn denied(world: &World, host: usize) -> String {
+pub(super) fn denied(world: &World, host: usize) -> String {
     format!("{:?}", link(world, host).denied)
 }
 
@@ -286,4 +289,35 @@ fn a_peer_that_ignores_rules_receives_and_delivers_nothing() {
     assert!(world.raws[0].links[on].opened.is_empty(), "no sample was sent");
     assert!(world.hosts[0].rings.received(subscription, liar).is_empty());
     assert!(!is_shown(&world, 0, (0, liar)));
+}
+
+#[test]
+fn rules_are_looked_at_for_endpoints_and_never_for_a_sample() {
+    const RULES: &str = "[[deny]]\npeer = \"*\"\npublish = \"/denied\"\n\
+        [[limit]]\npeer = \"*\"\ntopic = \"/limited\"\nrate = 100000\n";
+    let mut world = hosts(0, RULES);
+    let qos = [Qos::keep_all(), Qos::keep_all(), Qos::sensor_data()];
+    let topics = ["/log", "/limited", "/scan"];
+    let before = looks_at_rules();
+    let pairs: Vec<_> = [(0, 1), (1, 0)]
+        .iter()
+        .flat_map(|(from, to)| {
+            topics.iter().zip(qos).map(move |(topic, qos)| (*from, *to, *topic, qos))
+        })
+        .map(|(from, to, topic, qos)| world.pair(from, to, topic, qos))
+        .collect();
+    world.until(secs(20), World::is_whole);
+    world.run_for(secs(2));
+    let matched = looks_at_rules();
+    assert!(matched > before, "endpoints are checked");
+    for _ in 0..500 {
+        pairs.iter().for_each(|pair| assert!(world.publish(*pair, 100)));
+        world.run_for(millis(2));
+    }
+    world.run_for(secs(2));
+    assert_eq!(looks_at_rules(), matched, "for {} samples", 500 * pairs.len());
+    assert!(pairs.iter().all(|pair| world.received(*pair).len() > 400));
+    world.pair(0, 1, "/one_more", qos[0]);
+    world.run_for(secs(2));
+    assert!(looks_at_rules() > matched, "another endpoint is checked");
 }

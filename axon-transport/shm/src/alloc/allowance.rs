@@ -1,0 +1,176 @@
+//! A bound on the memory that several rings take together: those that stand for publishers of one peer. Counters alone;
+//! nothing is reached by what they say.
+
+use std::sync::{
+    Arc,
+    atomic::{AtomicU64, Ordering},
+};
+
+use crate::error::ShmError;
+
+/// Memory that several rings may take together, in bytes. Each of them takes at most half of what the others leave, so
+/// none takes the last.
+#[derive(Debug)]
+pub struct Allowance {
+    most: u64,
+    held: AtomicU64,
+    /// How often there was not as much as a ring asked for.
+    refused: AtomicU64,
+    /// What this one is a part of.
+    pool: Option<Arc<Self>>,
+}
+
+impl Allowance {
+    /// Allows up to `most` bytes.
+    pub fn new(most: u64) -> Arc<Self> {
+        Self::with(most, None)
+    }
+
+    /// Allows up to `most` bytes, and half of what others leave of a pool.
+    pub fn within(pool: &Arc<Self>, most: u64) -> Arc<Self> {
+        Self::with(most, Some(Arc::clone(pool)))
+    }
+
+    fn with(most: u64, pool: Option<Arc<Self>>) -> Arc<Self> {
+        Arc::new(Self { most, held: AtomicU64::new(0), refused: AtomicU64::new(0), pool })
+    }
+
+    /// The bound.
+    pub fn most(&self) -> u64 {
+        self.most
+    }
+
+    /// What is taken now.
+    pub fn held(&self) -> u64 {
+        self.held.load(Ordering::Relaxed)
+    }
+
+    /// How often a ring was refused memory since the start.
+    pub fn refused(&self) -> u64 {
+        self.refused.load(Ordering::Relaxed)
+    }
+
+    /// Takes `bytes` for a part that has `own` of it. If they do not fit, the error is what would.
+    fn take(&self, own: u64, bytes: u64) -> Result<(), u64> {
+        let fits = |held: u64| {
+            let share = self.most.saturating_sub(held.saturating_sub(own)) / 2;
+            (own.saturating_add(bytes) <= share).then(|| held + bytes)
+        };
+        let taken = self.held.fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits);
+        taken.map(drop).map_err(|held| {
+            let share = self.most.saturating_sub(held.saturating_sub(own)) / 2;
+            share.saturating_sub(own)
+        })
+    }
+
+    fn give_back(&self, bytes: u64) {
+        self.held.fetch_sub(bytes, Ordering::Relaxed);
+    }
+}
+
+/// What one ring takes of an allowance. Given back when it is dropped.
+#[derive(Debug, Default)]
+pub(crate) struct Holding {
+    of: Option<Arc<Allowance>>,
+    bytes: u64,
+    /// Refusals that were known when it was last asked.
+    refused: u64,
+}
+
+impl Holding {
+    /// Of an allowance.
+    pub(crate) fn of(allowance: Arc<Allowance>) -> Self {
+        let refused = allowance.refused();
+        Self { of: Some(allowance), bytes: 0, refused }
+    }
+
+    /// Takes `bytes` more.
+    ///
+    /// # Errors
+    /// The allowance has not so much left.
+    pub(crate) fn take(&mut self, bytes: u64) -> Result<(), ShmError> {
+        let Some(of) = &self.of else { return Ok(()) };
+        let pool_held = of.held();
+        let taken = of.take(self.bytes, bytes).and_then(|()| {
+            let Some(pool) = &of.pool else { return Ok(()) };
+            pool.take(pool_held, bytes).inspect_err(|_| of.give_back(bytes))
+        });
+        match taken {
+            Ok(()) => {
+                self.bytes += bytes;
+                Ok(())
+            }
+            Err(available) => {
+                of.refused.fetch_add(1, Ordering::Relaxed);
+                Err(ShmError::Allowance { needed: bytes, available, most: of.most })
+            }
+        }
+    }
+
+    /// Gives `bytes` back.
+    pub(crate) fn give_back(&mut self, bytes: u64) {
+        let Some(of) = &self.of else { return };
+        let bytes = bytes.min(self.bytes);
+        self.bytes -= bytes;
+        of.give_back(bytes);
+        if let Some(pool) = &of.pool {
+            pool.give_back(bytes);
+        }
+    }
+
+    /// Whether a ring was refused memory since the last call: those that need none should give theirs back.
+    pub(crate) fn is_short(&mut self) -> bool {
+        let Some(of) = &self.of else { return false };
+        let refused = of.refused();
+        std::mem::replace(&mut self.refused, refused) != refused
+    }
+}
+
+impl Drop for Holding {
+    fn drop(&mut self) {
+        self.give_back(self.bytes);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_ring_takes_at_most_half_of_what_others_leave_and_gives_all_of_it_back() {
+        let allowance = Allowance::new(100);
+        let [mut one, mut two] = [(); 2].map(|()| Holding::of(Arc::clone(&allowance)));
+        assert!(one.take(51).is_err() && one.take(30).is_ok() && one.take(20).is_ok());
+        assert!(one.take(1).is_err(), "it has half of all");
+        assert!(two.take(26).is_err() && two.take(25).is_ok());
+        assert_eq!((allowance.held(), allowance.refused()), (75, 3));
+        one.give_back(40);
+        assert!(two.take(21).is_err() && two.take(20).is_ok());
+        drop((one, two));
+        assert_eq!(allowance.held(), 0);
+    }
+
+    #[test]
+    fn what_a_pool_does_not_have_is_not_taken() {
+        let pool = Allowance::new(100);
+        let [one, two] = [80, 80].map(|most| Allowance::within(&pool, most));
+        let mut of_one = [(); 2].map(|()| Holding::of(Arc::clone(&one)));
+        assert!(of_one[0].take(40).is_ok() && of_one[1].take(10).is_ok());
+        assert!(of_one[1].take(1).is_err(), "the identity has half of the pool");
+        assert_eq!((one.held(), pool.held()), (50, 50), "what was refused took nothing");
+        let mut of_two = Holding::of(Arc::clone(&two));
+        assert!(of_two.take(26).is_err() && of_two.take(25).is_ok());
+        drop((of_one, of_two));
+        assert_eq!((one.held(), two.held(), pool.held()), (0, 0, 0));
+    }
+
+    #[test]
+    fn a_ring_hears_once_that_another_one_was_refused() {
+        let allowance = Allowance::new(100);
+        let [mut one, mut two] = [(); 2].map(|()| Holding::of(Arc::clone(&allowance)));
+        assert!(!one.is_short());
+        two.take(60).unwrap_err();
+        assert!(one.is_short() && !one.is_short());
+        assert!(!Holding::default().is_short() && Holding::default().take(u64::MAX).is_ok());
+    }
+}

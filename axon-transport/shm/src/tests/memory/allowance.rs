@@ -1,0 +1,151 @@
+//! Rings that share a bound on their memory: what is beyond it follows their QoS.
+
+use std::os::fd::AsFd;
+
+use super::*;
+use crate::{
+    alloc::{allowance::Allowance, retention::IDLE},
+    ring::inspect::committed,
+};
+
+const IMAGE: usize = 300_000;
+const MOST: u64 = 8 << 20;
+/// What a ring has that counts for no allowance: its first descriptors and header, of several rings.
+const BESIDE: u64 = 1 << 20;
+
+/// A ring of 4 MiB whose number is that of its publisher.
+fn ring(session: &Arc<SessionSegment>, number: u32, qos: Qos, of: &Arc<Allowance>) -> Writer {
+    let gid = Gid::new(session.id(), number);
+    let options = RingOptions { gid, qos, budget: 4 << 20, max_message: MAX, expected: 0 };
+    let writer = Writer::create(session.clone(), options).unwrap();
+    writer.share(of);
+    writer
+}
+
+/// Bytes that are backed by memory, of all segments of a session.
+fn backed(session: &SessionSegment) -> u64 {
+    let numbers = session.segments().into_iter().map(|info| info.number).chain([0]);
+    let segments = numbers.map(|number| session.segment(number).unwrap().unwrap().1);
+    segments.map(|fd| committed(fd.as_fd())).sum()
+}
+
+fn try_publish(writer: &Writer, sequence: u64, len: usize) -> Result<(), PublishError> {
+    writer.try_publish(meta(sequence), &pattern(sequence, len)).map(drop)
+}
+
+/// Publishes samples of this length in each ring in turn.
+fn fill(writers: &[Writer], len: usize, count: u64) -> u64 {
+    let mut refused = 0;
+    for sequence in 0..count {
+        for writer in writers {
+            match try_publish(writer, sequence, len) {
+                Ok(()) => {}
+                Err(PublishError::Allowance { most: MOST, .. }) => refused += 1,
+                Err(other) => panic!("{other}"),
+            }
+        }
+    }
+    refused
+}
+
+#[test]
+fn history_of_many_rings_is_bounded_together_and_given_back() {
+    for (len, count) in [(IMAGE, 20), (2_000, 2_500), (60, 5_000)] {
+        let (a, b) = (session(), session());
+        let allowance = Allowance::new(MOST);
+        let before = backed(&a);
+        let all = transient(Qos::keep_all());
+        let mut writers: Vec<_> = (0..10).map(|n| ring(&a, n, all, &allowance)).collect();
+        fill(&writers, len, count);
+        let held = backed(&a) - before;
+        assert!(held <= MOST + BESIDE, "{held} of samples of {len}");
+        assert!(allowance.held() > MOST / 2, "most of it is of use: {}", allowance.held());
+        assert!(allowance.refused() > 0);
+        // The newest sample is there for those that come later.
+        let mut reader = attach(&writers[0], &a, &b, all);
+        let mut last = None;
+        while let Some(sequence) = take(&mut reader) {
+            last = Some(sequence);
+        }
+        assert_eq!(last, Some(count - 1), "{len}");
+        // A publisher that ends keeps its part for as long as readers may be at it.
+        drop(writers.remove(0));
+        let with_reader = allowance.held();
+        drop(reader);
+        a.tidy();
+        assert!(allowance.held() < with_reader, "{len}");
+        drop(writers);
+        a.tidy();
+        assert_eq!(allowance.held(), 0);
+    }
+}
+
+#[test]
+fn a_ring_that_may_have_no_more_memory_shows_its_newest_sample() {
+    let (a, b) = (session(), session());
+    let allowance = Allowance::new(MOST);
+    let writers = [1, 2].map(|n| ring(&a, n, transient(keep_last(1)), &allowance));
+    publish(&writers[0], 0, IMAGE);
+    // Others take all but what the sample took.
+    let others: Vec<_> =
+        (3..12).map(|n| ring(&a, n, transient(Qos::keep_all()), &allowance)).collect();
+    fill(&others, IMAGE, 20);
+    for sequence in 1..10 {
+        publish(&writers[0], sequence, IMAGE);
+        let mut late = attach(&writers[0], &a, &b, transient(keep_last(1)));
+        assert_eq!((take(&mut late), take(&mut late)), (Some(sequence), None));
+    }
+}
+
+#[test]
+fn a_ring_that_its_readers_hold_is_held_back_and_goes_on_when_they_take() {
+    let (a, b) = (session(), session());
+    let allowance = Allowance::new(MOST);
+    let writer = ring(&a, 1, Qos::keep_all(), &allowance);
+    let mut reader = attach(&writer, &a, &b, Qos::keep_all());
+    let others: Vec<_> =
+        (2..12).map(|n| ring(&a, n, transient(Qos::keep_all()), &allowance)).collect();
+    let mut sequence = 0;
+    while sequence < 4 {
+        publish(&writer, sequence, IMAGE);
+        sequence += 1;
+    }
+    fill(&others, IMAGE, 20);
+    let refused = loop {
+        match try_publish(&writer, sequence, IMAGE) {
+            Ok(()) => sequence += 1,
+            Err(error) => break error,
+        }
+    };
+    assert!(matches!(refused, PublishError::Blocked { .. }), "{refused}");
+    for taken in 0..200 {
+        assert_eq!(take(&mut reader), Some(taken), "nothing of it is lost");
+        while try_publish(&writer, sequence, IMAGE).is_ok() {
+            sequence += 1;
+        }
+    }
+}
+
+#[test]
+fn memory_that_is_not_in_use_goes_to_those_that_were_refused_some() {
+    let (a, b) = (session(), session());
+    let allowance = Allowance::new(MOST);
+    let idle = ring(&a, 1, Qos::default(), &allowance);
+    let mut reader = attach(&idle, &a, &b, Qos::default());
+    for sequence in 0..10 {
+        publish(&idle, sequence, IMAGE);
+    }
+    while take(&mut reader).is_some() {}
+    let now = Instant::now();
+    idle.reclaim_idle(now);
+    let kept = allowance.held();
+    assert!(kept > 0, "it may need it again");
+    let others: Vec<_> =
+        (2..12).map(|n| ring(&a, n, transient(Qos::keep_all()), &allowance)).collect();
+    fill(&others, IMAGE, 20);
+    let full = allowance.held();
+    assert!(now + IDLE > Instant::now());
+    idle.reclaim_idle(now);
+    assert!(allowance.held() < full, "{} of {full}", allowance.held());
+    assert_eq!(fill(&others[..1], IMAGE, 0), 0);
+}
