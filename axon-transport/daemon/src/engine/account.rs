@@ -25,8 +25,10 @@ use crate::{
 pub(crate) const MAX_RELAYS: usize = 1 << 15;
 /// Stand-ins of one identity. Each costs a ring: with all that belongs to it some 6 KiB.
 pub(crate) const MAX_STAND_INS: usize = 1 << 15;
-/// Relays of all identities, and as many stand-ins. The registry lets the engine's session have both. An identity may
-/// take half of what the others leave, so that none takes the last.
+/// Lanes of the relays and stand-ins of one identity.
+const MAX_LANES: usize = 1 << 16;
+/// Relays of all identities, and as many stand-ins, and lanes. The registry lets the engine's session have all three. An
+/// identity may take half of what the others leave, so that none takes the last.
 const OF_ALL: usize = 1 << 17;
 /// How much more an identity's routes may take than its graph: three copies of names and subscribers are held, and a
 /// route has more to it than an endpoint.
@@ -150,6 +152,11 @@ impl Charge {
         Self { meter: Rc::clone(&self.meter), amount }
     }
 
+    /// Another one of the same meter, if it fits.
+    pub(crate) fn more(&self, amount: usize) -> Option<Self> {
+        self.meter.charge(amount)
+    }
+
     /// Adds another one of the same meter.
     pub(crate) fn add(&mut self, mut other: Self) {
         debug_assert!(Rc::ptr_eq(&self.meter, &other.meter), "charges of two meters");
@@ -204,6 +211,8 @@ pub(crate) struct Account {
     pub(crate) routes: Rc<Meter>,
     /// Relays for the routes that it asks for.
     pub(crate) relays: Rc<Meter>,
+    /// Lanes that these, and stand-ins of services, take.
+    pub(crate) lanes: Rc<Meter>,
     /// Control messages that it has not read.
     pub(crate) unsent: Rc<Meter>,
     /// Its publishers, servers and clients that are shown here.
@@ -229,8 +238,7 @@ impl Account {
     fn new(
         identity: &str,
         graph: usize,
-        relays: &Rc<Meter>,
-        stand_ins: &Rc<Meter>,
+        [relays, lanes, stand_ins]: [&Rc<Meter>; 3],
         limits: Rc<Limits>,
     ) -> Self {
         Self {
@@ -238,6 +246,7 @@ impl Account {
             graph: Meter::new(graph),
             routes: Meter::new(ROUTES_TO_GRAPH.saturating_mul(graph)),
             relays: Meter::within(relays, MAX_RELAYS),
+            lanes: Meter::within(lanes, MAX_LANES),
             unsent: Meter::new(UNSENT),
             stand_ins: Meter::within(stand_ins, MAX_STAND_INS),
             unread: Meter::new(UNREAD),
@@ -320,6 +329,7 @@ pub(crate) struct Accounts {
     /// Bytes of a graph.
     graph: usize,
     relays: Rc<Meter>,
+    lanes: Rc<Meter>,
     stand_ins: Rc<Meter>,
     open: HashMap<String, Weak<Account>>,
     /// What passed of late, also of identities without a link: a new link gives them no more.
@@ -329,8 +339,8 @@ pub(crate) struct Accounts {
 impl Accounts {
     /// Accounts whose graphs may take so many bytes.
     pub(crate) fn new(graph: usize) -> Self {
-        let [relays, stand_ins] = [(); 2].map(|()| Meter::new(OF_ALL));
-        Self { graph, relays, stand_ins, open: HashMap::new(), limits: HashMap::new() }
+        let [relays, lanes, stand_ins] = [(); 3].map(|()| Meter::new(OF_ALL));
+        Self { graph, relays, lanes, stand_ins, open: HashMap::new(), limits: HashMap::new() }
     }
 
     /// The account of an identity.
@@ -343,8 +353,8 @@ impl Accounts {
             self.limits.retain(|_, limits| Rc::strong_count(limits) > 1);
         }
         let limits = Rc::clone(self.limits.entry(identity.to_owned()).or_default());
-        let (relays, stand_ins) = (&self.relays, &self.stand_ins);
-        let account = Rc::new(Account::new(identity, self.graph, relays, stand_ins, limits));
+        let pools = [&self.relays, &self.lanes, &self.stand_ins];
+        let account = Rc::new(Account::new(identity, self.graph, pools, limits));
         self.open.insert(identity.to_owned(), Rc::downgrade(&account));
         account
     }

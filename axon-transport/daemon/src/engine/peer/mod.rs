@@ -4,6 +4,7 @@ mod access;
 mod asking;
 pub(super) mod graph;
 pub(super) mod kept;
+mod lanes;
 mod limits;
 pub(super) mod owners;
 mod refused;
@@ -33,13 +34,16 @@ use axon_transport::{
     status::LinkStatus,
 };
 
-pub(crate) use self::serving::{MAX_ROUTES, StalledRoute};
 use self::{
     access::PeerAccess,
     asking::{Asked, Attaching},
     refused::RefusedRoutes,
     serving::{DENIED_AGAIN, Served},
     told::{Told, added},
+};
+pub(crate) use self::{
+    lanes::WritersHere,
+    serving::{MAX_ROUTES, StalledRoute},
 };
 use super::{
     inbound::Inbound,
@@ -99,6 +103,8 @@ pub(crate) struct Surroundings<'a> {
     pub(crate) stand_ins: &'a StandIns,
     /// The endpoints of this host.
     pub(crate) local: &'a Local,
+    /// How many writers of each route are among them.
+    pub(crate) writers: &'a WritersHere,
     /// The settings of this host.
     pub(crate) config: &'a Config,
     /// Routes that were given up.
@@ -363,6 +369,7 @@ impl Peer {
     /// The graph of this host changed: the peer is told, and routes follow.
     pub(super) fn handle_local_graph(&mut self, with: &Surroundings<'_>, now: Duration) {
         self.keep_ending(with.local, now);
+        self.fit_lanes(with, now);
         self.send_graph(with.local, false);
         self.update(with, now);
     }
