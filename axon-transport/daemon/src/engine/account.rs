@@ -49,6 +49,11 @@ pub(crate) const MAX_PROVEN: usize = 8192;
 const MAX_WRITERS_OF_ROUTE: usize = 1024;
 /// Identities of which it is remembered how much passed.
 const LIMITED: usize = 128;
+/// Control messages of one identity that are decompressed and not handled, in bytes: one of the largest length.
+pub(crate) const DECODED: usize = DECODED_TO_UNPACKED * MAX_INFLATED;
+/// What a control message takes while it is decoded, to its length once it is decompressed: that length, and up to six
+/// times as much.
+const DECODED_TO_UNPACKED: usize = 7;
 /// What one identity may say a second, and at once, by [`cost`] and [`cost_of_frame`].
 const SAID: (u32, u32) = (16_384, 65_536);
 /// Bytes of a control message that cost as much as one change: what it takes to decompress and decode
@@ -66,6 +71,9 @@ pub(crate) struct Meter {
     held: Cell<usize>,
     /// What was given back since the start.
     released: Cell<usize>,
+    /// The most that was held.
+    #[cfg(test)]
+    peak: Cell<usize>,
 }
 
 /// A part of what a [`Meter`] allows.
@@ -78,13 +86,29 @@ pub(crate) struct Charge {
 impl Meter {
     /// Allows up to `most`.
     pub(crate) fn new(most: usize) -> Rc<Self> {
-        Rc::new(Self { most, pool: None, held: Cell::new(0), released: Cell::new(0) })
+        Rc::new(Self::with(most, None))
+    }
+
+    fn with(most: usize, pool: Option<Rc<Self>>) -> Self {
+        Self {
+            most,
+            pool,
+            held: Cell::new(0),
+            released: Cell::new(0),
+            #[cfg(test)]
+            peak: Cell::new(0),
+        }
+    }
+
+    /// The most that was held.
+    #[cfg(test)]
+    pub(crate) fn peak(&self) -> usize {
+        self.peak.get()
     }
 
     /// Allows up to `most`, and half of what others leave in a pool.
     pub(crate) fn within(pool: &Rc<Self>, most: usize) -> Rc<Self> {
-        let pool = Some(Rc::clone(pool));
-        Rc::new(Self { most, pool, held: Cell::new(0), released: Cell::new(0) })
+        Rc::new(Self::with(most, Some(Rc::clone(pool))))
     }
 
     /// What it allows besides what is held.
@@ -108,6 +132,8 @@ impl Meter {
             return None;
         }
         self.held.set(self.held.get() + amount);
+        #[cfg(test)]
+        self.peak.set(self.peak.get().max(self.held.get()));
         if let Some(pool) = &self.pool {
             pool.held.set(pool.held.get() + amount);
         }
@@ -215,6 +241,8 @@ pub(crate) struct Account {
     pub(crate) lanes: Rc<Meter>,
     /// Control messages that it has not read.
     pub(crate) unsent: Rc<Meter>,
+    /// Control messages of it that are decompressed and not handled.
+    pub(crate) decoded: Rc<Meter>,
     /// Its publishers, servers and clients that are shown here.
     pub(crate) stand_ins: Rc<Meter>,
     /// Stream data that it may send and that was not read.
@@ -248,6 +276,7 @@ impl Account {
             relays: Meter::within(relays, MAX_RELAYS),
             lanes: Meter::within(lanes, MAX_LANES),
             unsent: Meter::new(UNSENT),
+            decoded: Meter::new(DECODED),
             stand_ins: Meter::within(stand_ins, MAX_STAND_INS),
             unread: Meter::new(UNREAD),
             messages: MessageMemory::new(MESSAGES.0, MESSAGES.1),
@@ -316,6 +345,15 @@ pub(crate) fn cost(message: &Message) -> u32 {
         | Message::Keepalive
         | Message::LinkClosed(_) => 0,
     })
+}
+
+/// What a frame takes while it is decoded and handled, in bytes.
+pub(crate) fn decoded_length(frame: &[u8]) -> usize {
+    if is_known(frame) {
+        DECODED_TO_UNPACKED * unpacked_length(frame).max(frame.len()).min(MAX_INFLATED)
+    } else {
+        0
+    }
 }
 
 /// That of a message with so many elements: it costs something itself.

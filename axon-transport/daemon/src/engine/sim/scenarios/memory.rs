@@ -23,7 +23,7 @@ use crate::{
             world::World,
         },
     },
-    link::{Graph, Hello, Message, Subscribe, Subscriber},
+    link::{Graph, Hello, Message, RouteReady, Subscribe, Subscriber},
 };
 
 /// Publishers of one topic of the hostile peer: as many as one route shows.
@@ -353,4 +353,36 @@ fn no_identity_takes_all_lanes_and_each_is_told_what_it_does_not_get() {
     (5..12).for_each(|topic| subscribe_in_many_ways(&mut world, 1, other, 0xf8, topic));
     world.run_for(secs(3));
     assert_eq!(world.hosts[0].rings.lanes(), other_has + 7 * 16 * PUBLISHERS);
+}
+
+#[test]
+fn control_messages_that_are_not_handled_are_bounded_over_all_links_of_an_identity() {
+    const LINKS: u8 = 16;
+    let mut world = World::new(88, 1, |_| Config::default());
+    world.add_raw(Config::default(), DaemonId([0xff; 16]));
+    world.hosts[0].rings.create_publisher("/t", Qos::keep_all());
+    world.hosts[0].touch_graph();
+    let links: Vec<_> = (0..LINKS).map(|n| linked_as(&mut world, 0, 0xe0 + n)).collect();
+    world.run_for(secs(1));
+    // 1.1 MB after decompression, and nearly nothing before. All come while the host stands still.
+    let long =
+        Message::RouteReady(RouteReady { route: 9, publishers: vec![Gid::default(); 65_536] });
+    world.stop(0, true);
+    for (n, link) in (0..).zip(&links) {
+        world.with_raw(0, |raw, _| {
+            raw.links[*link].say(&long);
+            raw.links[*link].say(&subscribe(1, "/t", gid(0xe0 + n, 1)));
+        });
+    }
+    world.run_for(millis(100));
+    world.stop(0, false);
+    let served = |world: &World| {
+        let ready = |m: &Message| matches!(m, Message::RouteReady(ready) if ready.route == 1);
+        links.iter().filter(|link| world.raws[0].links[**link].messages.iter().any(ready)).count()
+    };
+    // All are handled, one after the other.
+    world.until(secs(60), |world| served(world) == usize::from(LINKS));
+    let most = world.hosts[0].most_decoded();
+    assert!((20 << 20..=28 << 20).contains(&most), "{} MiB", most >> 20);
+    assert!(world.raws[0].links.iter().all(|link| link.closed.is_none()), "{}", world.describe());
 }
