@@ -54,6 +54,8 @@ pub(crate) const DECODED: usize = DECODED_TO_UNPACKED * MAX_INFLATED;
 /// What a control message takes while it is decoded, to its length once it is decompressed: that length, and up to six
 /// times as much.
 const DECODED_TO_UNPACKED: usize = 7;
+/// Uses of one identity that are denied here and remembered.
+const DENIED: usize = 1024;
 /// What one identity may say a second, and at once, by [`cost`] and [`cost_of_frame`].
 const SAID: (u32, u32) = (16_384, 65_536);
 /// Bytes of a control message that cost as much as one change: what it takes to decompress and decode
@@ -243,6 +245,8 @@ pub(crate) struct Account {
     pub(crate) unsent: Rc<Meter>,
     /// Control messages of it that are decompressed and not handled.
     pub(crate) decoded: Rc<Meter>,
+    /// Uses of its endpoints that are denied here.
+    pub(crate) denied: Rc<Meter>,
     /// Its publishers, servers and clients that are shown here.
     pub(crate) stand_ins: Rc<Meter>,
     /// Stream data that it may send and that was not read.
@@ -277,6 +281,7 @@ impl Account {
             lanes: Meter::within(lanes, MAX_LANES),
             unsent: Meter::new(UNSENT),
             decoded: Meter::new(DECODED),
+            denied: Meter::new(DENIED),
             stand_ins: Meter::within(stand_ins, MAX_STAND_INS),
             unread: Meter::new(UNREAD),
             messages: MessageMemory::new(MESSAGES.0, MESSAGES.1),

@@ -217,7 +217,7 @@ impl Peer {
             identity,
             counters,
             refused: RefusedRoutes::new(Rc::clone(&account.refusals)),
-            access: PeerAccess::new(permissions.clone(), Rc::clone(&account.refusals)),
+            access: PeerAccess::new(permissions.clone(), &account),
             remote: Remote::new(account, prover.is_needed(), permissions),
             prover,
             displaced: false,
