@@ -384,7 +384,7 @@ impl Peer {
         let carried = |gid: &Gid, shown: &Told| {
             let number = *self.served_as.get(&RouteKey::of(&shown.remote.endpoint)?)?;
             let sources = &self.served.get(&number)?.sources;
-            sources.iter().any(|source| source.has_unacknowledged(gid)).then_some(number)
+            self.outbound.has_left(number, sources, gid).then_some(number)
         };
         let ended = ended
             .filter_map(|(gid, shown)| Some((carried(gid, shown)?, *gid, shown.remote.clone())));
