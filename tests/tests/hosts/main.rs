@@ -20,6 +20,7 @@ mod history;
 mod hoard;
 mod hostile;
 mod identity;
+mod kme_keys;
 mod liar;
 mod load;
 mod many_topics;
