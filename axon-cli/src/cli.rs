@@ -135,7 +135,9 @@ were, or when a link or a daemon was lost with them. A message that had no subsc
 acknowledged; with --wait N one that had fewer than N makes it fail as well.
 
 A log whose end is missing, or that fails a checksum, is refused; the error says how much of it is \
-whole, and --incomplete publishes that.
+whole, and --incomplete publishes that. Where no checksum covers a message of that part (a log without \
+chunks, or one that was written without checksums), --incomplete publishes nothing, unless --unverified \
+is given too.
 
 Examples:
   axon play examples/data/mit-csail.mcap
@@ -163,6 +165,9 @@ pub(crate) struct Play {
     /// Play a damaged log as far as it is whole
     #[arg(long)]
     pub(crate) incomplete: bool,
+    /// With --incomplete: play also messages that no checksum covers
+    #[arg(long, requires = "incomplete")]
+    pub(crate) unverified: bool,
 }
 
 /// The profiles on offer.

@@ -14,7 +14,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use crate::{
     cli::{self, Profile},
     failure::CliError,
-    log::{LogError, Message, Survey},
+    log::{LogError, Message, Part, Survey},
     logging,
     say::say,
     session, text,
@@ -56,15 +56,24 @@ pub(crate) struct Sent {
 /// Runs `axon play`.
 pub(crate) fn run(args: &cli::Play) -> Result<(), CliError> {
     let config = logging::configure()?;
-    let survey =
-        if args.incomplete { Survey::of_whole_part(&args.file) } else { Survey::of(&args.file) };
-    let survey = survey.map_err(CliError::failed)?;
+    let part = match (args.incomplete, args.unverified) {
+        (false, _) => Part::Nothing,
+        (true, false) => Part::Verified,
+        (true, true) => Part::Unverified,
+    };
+    let survey = Survey::of_part(&args.file, part).map_err(CliError::failed)?;
     if let Some(damage) = &survey.damage {
         let (messages, time) = (text::grouped(survey.messages), text::duration(survey.duration));
         let file = survey.path.display();
         say(format_args!(
             "axon play: {file} is damaged ({damage}); playing the {messages} messages, {time}, before"
         ));
+        if survey.unverified > 0 {
+            let unverified = text::grouped(survey.unverified);
+            say(format_args!(
+                "axon play: {unverified} of them are covered by no checksum that was right, and may be wrong"
+            ));
+        }
     }
     let session = session::open(&config, "axon play")?;
     let publishers = publishers(&session, &survey, args.qos.qos())?;

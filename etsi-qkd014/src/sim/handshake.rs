@@ -1,5 +1,6 @@
 //! TLS as a KME speaks it: which certificate it shows, and how it refuses.
 
+use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -7,7 +8,7 @@ use rustls::pki_types::PrivateKeyDer;
 use rustls::pki_types::pem::PemObject;
 use rustls::server::{ServerConfig, WebPkiClientVerifier};
 use rustls::version::{TLS12, TLS13};
-use rustls::{RootCertStore, SupportedProtocolVersion};
+use rustls::{KeyLog, RootCertStore, SupportedProtocolVersion};
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio_rustls::TlsAcceptor;
@@ -21,6 +22,36 @@ use crate::tls;
 pub(super) const TIME: Duration = Duration::from_secs(10);
 const LINGER: Duration = Duration::from_secs(1);
 
+/// Who is told the secrets of TLS connections, if anybody is.
+#[derive(Clone, Default)]
+pub(super) struct TlsWitness(Option<Arc<Tell>>);
+
+type Tell = dyn Fn(&str, &[u8]) + Send + Sync;
+
+impl TlsWitness {
+    pub(super) fn new(tell: impl Fn(&str, &[u8]) + Send + Sync + 'static) -> Self {
+        Self(Some(Arc::new(tell)))
+    }
+}
+
+impl fmt::Debug for TlsWitness {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(if self.0.is_some() { "a witness" } else { "no witness" })
+    }
+}
+
+impl KeyLog for TlsWitness {
+    fn will_log(&self, _: &str) -> bool {
+        self.0.is_some()
+    }
+
+    fn log(&self, label: &str, _: &[u8], secret: &[u8]) {
+        if let Some(tell) = &self.0 {
+            tell(label, secret);
+        }
+    }
+}
+
 /// One acceptor for each certificate that a KME can show.
 pub(super) struct Acceptors {
     valid: TlsAcceptor,
@@ -29,9 +60,15 @@ pub(super) struct Acceptors {
 }
 
 impl Acceptors {
-    pub(super) fn new(pki: &Pki, kme: &str, tls12_only: bool) -> Result<Self, Error> {
+    pub(super) fn new(
+        pki: &Pki,
+        kme: &str,
+        tls12_only: bool,
+        witness: &TlsWitness,
+    ) -> Result<Self, Error> {
         let of = |validity| {
-            let config = server_config(pki.ca_pem(), pki.known(kme, validity)?, tls12_only)?;
+            let mut config = server_config(pki.ca_pem(), pki.known(kme, validity)?, tls12_only)?;
+            config.key_log = Arc::new(witness.clone());
             Ok::<_, Error>(TlsAcceptor::from(Arc::new(config)))
         };
         Ok(Self {
@@ -52,7 +89,7 @@ impl Acceptors {
 }
 
 fn server_config(ca: &str, pair: &Pair, tls12_only: bool) -> Result<ServerConfig, Error> {
-    let wrong = |e: &dyn std::fmt::Display| Error::Certificates(e.to_string());
+    let wrong = |e: &dyn fmt::Display| Error::Certificates(e.to_string());
     let provider = tls::provider();
     let mut roots = RootCertStore::empty();
     for cert in tls::certificates(ca.as_bytes(), "ca").map_err(|e| wrong(&e))? {

@@ -9,7 +9,7 @@ use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 
 use super::fault::Fault;
-use super::handshake::Acceptors;
+use super::handshake::{Acceptors, TlsWitness};
 use super::pki::{Layout, Pair, Pki, Sae, Site, Validity};
 use super::plan::{FaultPlan, Faults};
 use super::store::{FillRate, Store, Witness};
@@ -39,6 +39,7 @@ pub struct NetworkBuilder {
     tls12_only: bool,
     strict: bool,
     witness: Witness,
+    tls_witness: TlsWitness,
 }
 
 impl NetworkBuilder {
@@ -110,13 +111,21 @@ impl NetworkBuilder {
         self
     }
 
+    /// Calls `tell` with label (as in `SSLKEYLOGFILE`) and value of each secret of TLS connections, for tests that search
+    /// memory for them.
+    pub fn tls_witness(mut self, tell: impl Fn(&str, &[u8]) + Send + Sync + 'static) -> Self {
+        self.tls_witness = TlsWitness::new(tell);
+        self
+    }
+
     /// Makes the certificates, binds and serves. Needs a tokio runtime, on which the KMEs run until
     /// the network is dropped.
     ///
     /// # Errors
     /// [`Error`] names the ID, setting or address that cannot be used.
     pub async fn start(self) -> Result<Network, Error> {
-        let Self { layout, pki, limits, rate, initially, tls12_only, strict, witness } = self;
+        let Self { layout, pki, limits, rate, initially, tls12_only, strict, witness, tls_witness } =
+            self;
         layout.check()?;
         let sizes = limits.min_key_size..=limits.max_key_size;
         if !sizes.contains(&limits.key_size) || !limits.key_size.is_multiple_of(8) {
@@ -156,7 +165,7 @@ impl NetworkBuilder {
         for (index, site) in layout.sites.iter().enumerate() {
             let listener = TcpListener::bind(site.bind).await.map_err(Error::io(site.bind))?;
             let addr = listener.local_addr().map_err(Error::io(site.bind))?;
-            let tls = Acceptors::new(&pki, &site.kme, tls12_only)?;
+            let tls = Acceptors::new(&pki, &site.kme, tls12_only, &tls_witness)?;
             let state = Arc::new(KmeState {
                 id: site.kme.clone(),
                 index,
@@ -217,6 +226,7 @@ impl Network {
             tls12_only: false,
             strict: false,
             witness: Witness::default(),
+            tls_witness: TlsWitness::default(),
         }
     }
 

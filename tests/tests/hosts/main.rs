@@ -23,6 +23,7 @@ mod history;
 mod hoard;
 mod hostile;
 mod identity;
+mod kme_keys;
 mod liar;
 mod load;
 mod many_topics;

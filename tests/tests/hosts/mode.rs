@@ -14,7 +14,7 @@ use super::pair::write_key;
 /// Variables and their values.
 pub(crate) type Settings = Vec<(&'static str, String)>;
 
-/// Keys by their key_ID, as they were drawn.
+/// Keys by their key_ID, as they were drawn; or secrets of TLS by their labels.
 pub(crate) type Drawn = Vec<(String, Vec<u8>)>;
 
 pub(crate) const SAE: [&str; 2] = ["sae-a", "sae-b"];
@@ -25,6 +25,7 @@ pub(crate) struct Kmes {
     dir: tempfile::TempDir,
     runtime: tokio::runtime::Runtime,
     drawn: Arc<Mutex<Drawn>>,
+    tls: Arc<Mutex<Drawn>>,
 }
 
 impl Kmes {
@@ -36,15 +37,18 @@ impl Kmes {
             .strict()
             .kme("kme-a", ([127, 0, 0, 1], 0).into(), [SAE[0]])
             .kme("kme-b", ([127, 0, 0, 2], 0).into(), [SAE[1]]);
-        let drawn = Arc::new(Mutex::new(Drawn::new()));
-        let witness = Arc::clone(&drawn);
-        let network = network.witness(move |key_id, key| {
-            witness.lock().unwrap().push((key_id.to_owned(), key.to_vec()));
-        });
+        let [drawn, tls] = [(); 2].map(|()| Arc::new(Mutex::new(Drawn::new())));
+        let into = |all: &Arc<Mutex<Drawn>>| {
+            let all = Arc::clone(all);
+            move |name: &str, secret: &[u8]| {
+                all.lock().unwrap().push((name.to_owned(), secret.to_vec()));
+            }
+        };
+        let network = network.witness(into(&drawn)).tls_witness(into(&tls));
         let network = runtime.block_on(network.start()).unwrap();
         let dir = tempfile::tempdir().unwrap();
         network.write_files(dir.path()).unwrap();
-        Self { network, dir, runtime, drawn }
+        Self { network, dir, runtime, drawn, tls }
     }
 
     /// Settings of host 0 or 1 in qkd.
@@ -67,6 +71,11 @@ impl Kmes {
         let call = client.enc_keys(SAE[1 - host]).number(1).size(256).send();
         let key = self.runtime.block_on(call).unwrap().keys.remove(0);
         (key.key_id().to_owned(), key.expose_secret().to_vec())
+    }
+
+    /// The secrets of all TLS connections of the KMEs so far, with their labels.
+    pub(crate) fn tls_secrets(&self) -> Drawn {
+        self.tls.lock().unwrap().clone()
     }
 
     /// Has the KME of host 0 or 1 do something wrong.

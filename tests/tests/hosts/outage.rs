@@ -1,12 +1,15 @@
 //! KMEs that fail for a while, and what log and status say of it.
 
 use std::{
+    net::{SocketAddr, TcpStream},
+    os::fd::OwnedFd,
     thread::sleep,
     time::{Duration, Instant},
 };
 
 use axon_tests::Sizes;
 use etsi_qkd014::sim::{Fault, FaultPlan, Method};
+use rustix::net::{AddressFamily, SocketType, bind, getsockname, listen, socket};
 
 use super::{
     mode::{Kmes, SAE},
@@ -128,9 +131,14 @@ fn hangs_as_a_whole(failing: usize, call: Method, name: &str) {
     there.wait_taken(SOME);
     let url = kmes.url(failing);
     let said = ["WARN", url.as_str(), name, "AXON_KME_ANSWER_TIMEOUT"];
+    // Keys that both hosts hold: ten messages each, but for the one in use.
+    let ready = || hosts[0].status().keys["peers"][SAE[1]]["sending"]["ready"].as_u64().unwrap();
+    until("there are keys in stock", || ready() >= 2);
     let before = kmes.calls_of(failing, call);
     let begin = Instant::now();
     kmes.plan(failing, FaultPlan::new(Fault::Latency(HANGS)));
+    let (taken, in_stock) = (there.tally().taken, ready());
+    let go_on = taken + 10 * in_stock.saturating_sub(1);
     let mut given_up = 0;
     until("a second call", || {
         given_up = hosts[failing].log_lines(&said);
@@ -149,6 +157,8 @@ fn hangs_as_a_whole(failing: usize, call: Method, name: &str) {
         watch(there.tally().taken);
         sleep(Duration::from_millis(10));
     }
+    // No call is answered in time: messages went on with the keys in stock, and to the last of them.
+    until("messages of the keys in stock", || there.tally().taken >= go_on);
     kmes.clear_faults();
     let after = publisher.published() + SOME;
     until("messages go on", || {
@@ -156,6 +166,7 @@ fn hangs_as_a_whole(failing: usize, call: Method, name: &str) {
         watch(tally.taken);
         tally.last >= after
     });
+    eprintln!("{} messages of {in_stock} keys in stock", go_on - taken);
     eprintln!("{name} and all else hang for {HANGS:?}: longest pause of the messages {longest:?}");
     let sent = publisher.stop();
     there.wait_taken(sent);
@@ -171,4 +182,50 @@ fn a_kme_that_hangs_for_five_seconds_loses_nothing_where_new_keys_come_from() {
 #[test]
 fn a_kme_that_hangs_for_five_seconds_loses_nothing_where_keys_come_by_name() {
     hangs_as_a_whole(1, Method::DecKeys, "dec_keys");
+}
+
+/// A socket that lets nobody connect, as a host does behind a firewall: what fills its queue stands, and of others the
+/// first packet is dropped.
+struct Deaf {
+    address: SocketAddr,
+    _socket: OwnedFd,
+    _queued: Vec<TcpStream>,
+}
+
+impl Deaf {
+    fn new() -> Self {
+        let listener = socket(AddressFamily::INET, SocketType::STREAM, None).unwrap();
+        bind(&listener, &SocketAddr::from(([127, 0, 0, 1], 0))).unwrap();
+        listen(&listener, 0).unwrap();
+        let address = getsockname(&listener).unwrap().try_into().unwrap();
+        let mut queued = Vec::new();
+        while let Ok(stream) = TcpStream::connect_timeout(&address, Duration::from_millis(500)) {
+            queued.push(stream);
+        }
+        Self { address, _socket: listener, _queued: queued }
+    }
+}
+
+#[test]
+fn a_kme_that_accepts_no_connection_is_given_up_at_the_limit_for_connecting() {
+    let kmes = Kmes::start();
+    let deaf = Deaf::new();
+    let url = format!("https://{}", deaf.address);
+    // One that waited for an answer would say so, and name that setting.
+    let limits = [("AXON_KME_CONNECT_TIMEOUT", "1"), ("AXON_KME_ANSWER_TIMEOUT", "10")];
+    let of_deaf = [limits[0], limits[1], ("AXON_KME_URL", url.as_str())];
+    let hosts = Plan::new([kmes.settings(0, &of_deaf), kmes.settings(1, &limits)]).start();
+    hosts[0].wait_log(&[
+        "WARN",
+        &url,
+        "enc_keys",
+        SAE[0],
+        SAE[1],
+        "fails",
+        "AXON_KME_CONNECT_TIMEOUT",
+    ]);
+    let failures = || hosts[0].status().keys["kme"]["enc_keys"]["failures"].as_u64().unwrap();
+    until("it is tried again", || failures() >= 2);
+    assert_eq!(hosts[0].log_lines(&["WARN", "AXON_KME_ANSWER_TIMEOUT"]), 0, "no call got so far");
+    assert!(hosts[0].is_first_daemon() && hosts[0].status().links.is_empty());
 }

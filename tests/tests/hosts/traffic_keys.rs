@@ -50,7 +50,7 @@ impl KeyLog for Said {
 }
 
 /// HKDF-Expand-Label of RFC 8446, section 7.1, without a context.
-fn expand(secret: &[u8], label: &str, length: usize) -> Vec<u8> {
+pub(crate) fn expand(secret: &[u8], label: &str, length: usize) -> Vec<u8> {
     let label = format!("tls13 {label}");
     let info: [&[u8]; 4] = [&[0, length as u8, label.len() as u8], label.as_bytes(), &[0], &[]];
     let mut out = vec![0; length];

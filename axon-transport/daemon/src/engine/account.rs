@@ -28,8 +28,10 @@ use crate::{
 pub(crate) const MAX_RELAYS: usize = 1 << 15;
 /// Stand-ins of one identity. Each costs a ring: with all that belongs to it some 6 KiB.
 pub(crate) const MAX_STAND_INS: usize = 1 << 15;
-/// Relays of all identities, and as many stand-ins. The registry lets the engine's session have both. An identity may
-/// take half of what the others leave, so that none takes the last.
+/// Lanes of the relays and stand-ins of one identity.
+const MAX_LANES: usize = 1 << 16;
+/// Relays of all identities, and as many stand-ins, and lanes. The registry lets the engine's session have all three. An
+/// identity may take half of what the others leave, so that none takes the last.
 const OF_ALL: usize = 1 << 17;
 /// How much more an identity's routes may take than its graph: three copies of names and subscribers are held, and a
 /// route has more to it than an endpoint.
@@ -52,6 +54,13 @@ pub(crate) const MAX_PROVEN: usize = 8192;
 const MAX_WRITERS_OF_ROUTE: usize = 1024;
 /// Identities of which it is remembered how much passed.
 const LIMITED: usize = 128;
+/// Control messages of one identity that are decompressed and not handled, in bytes: one of the largest length.
+pub(crate) const DECODED: usize = DECODED_TO_UNPACKED * MAX_INFLATED;
+/// What a control message takes while it is decoded, to its length once it is decompressed: that length, and up to six
+/// times as much.
+const DECODED_TO_UNPACKED: usize = 7;
+/// Uses of one identity that are denied here and remembered.
+const DENIED: usize = 1024;
 /// What one identity may say a second, and at once, by [`cost`] and [`cost_of_frame`].
 const SAID: (u32, u32) = (16_384, 65_536);
 /// Bytes of a control message that cost as much as one change: what it takes to decompress and decode
@@ -69,6 +78,9 @@ pub(crate) struct Meter {
     held: Cell<usize>,
     /// What was given back since the start.
     released: Cell<usize>,
+    /// The most that was held.
+    #[cfg(test)]
+    peak: Cell<usize>,
 }
 
 /// A part of what a [`Meter`] allows.
@@ -81,13 +93,29 @@ pub(crate) struct Charge {
 impl Meter {
     /// Allows up to `most`.
     pub(crate) fn new(most: usize) -> Rc<Self> {
-        Rc::new(Self { most, pool: None, held: Cell::new(0), released: Cell::new(0) })
+        Rc::new(Self::with(most, None))
+    }
+
+    fn with(most: usize, pool: Option<Rc<Self>>) -> Self {
+        Self {
+            most,
+            pool,
+            held: Cell::new(0),
+            released: Cell::new(0),
+            #[cfg(test)]
+            peak: Cell::new(0),
+        }
+    }
+
+    /// The most that was held.
+    #[cfg(test)]
+    pub(crate) fn peak(&self) -> usize {
+        self.peak.get()
     }
 
     /// Allows up to `most`, and half of what others leave in a pool.
     pub(crate) fn within(pool: &Rc<Self>, most: usize) -> Rc<Self> {
-        let pool = Some(Rc::clone(pool));
-        Rc::new(Self { most, pool, held: Cell::new(0), released: Cell::new(0) })
+        Rc::new(Self::with(most, Some(Rc::clone(pool))))
     }
 
     /// What it allows besides what is held.
@@ -111,6 +139,8 @@ impl Meter {
             return None;
         }
         self.held.set(self.held.get() + amount);
+        #[cfg(test)]
+        self.peak.set(self.peak.get().max(self.held.get()));
         if let Some(pool) = &self.pool {
             pool.held.set(pool.held.get() + amount);
         }
@@ -153,6 +183,11 @@ impl Charge {
         let amount = amount.min(self.amount);
         self.amount -= amount;
         Self { meter: Rc::clone(&self.meter), amount }
+    }
+
+    /// Another one of the same meter, if it fits.
+    pub(crate) fn more(&self, amount: usize) -> Option<Self> {
+        self.meter.charge(amount)
     }
 
     /// Adds another one of the same meter.
@@ -209,8 +244,14 @@ pub(crate) struct Account {
     pub(crate) routes: Rc<Meter>,
     /// Relays for the routes that it asks for.
     pub(crate) relays: Rc<Meter>,
+    /// Lanes that these, and stand-ins of services, take.
+    pub(crate) lanes: Rc<Meter>,
     /// Control messages that it has not read.
     pub(crate) unsent: Rc<Meter>,
+    /// Control messages of it that are decompressed and not handled.
+    pub(crate) decoded: Rc<Meter>,
+    /// Uses of its endpoints that are denied here.
+    pub(crate) denied: Rc<Meter>,
     /// Its publishers, servers and clients that are shown here.
     pub(crate) stand_ins: Rc<Meter>,
     /// Stream data that it may send and that was not read.
@@ -236,8 +277,7 @@ impl Account {
     fn new(
         identity: &str,
         graph: usize,
-        relays: &Rc<Meter>,
-        stand_ins: &Rc<Meter>,
+        [relays, lanes, stand_ins]: [&Rc<Meter>; 3],
         held: Arc<Allowance>,
         limits: Rc<Limits>,
     ) -> Self {
@@ -246,7 +286,10 @@ impl Account {
             graph: Meter::new(graph),
             routes: Meter::new(ROUTES_TO_GRAPH.saturating_mul(graph)),
             relays: Meter::within(relays, MAX_RELAYS),
+            lanes: Meter::within(lanes, MAX_LANES),
             unsent: Meter::new(UNSENT),
+            decoded: Meter::new(DECODED),
+            denied: Meter::new(DENIED),
             stand_ins: Meter::within(stand_ins, MAX_STAND_INS),
             unread: Meter::new(UNREAD),
             messages: MessageMemory::new(MESSAGES.0, MESSAGES.1),
@@ -318,6 +361,15 @@ pub(crate) fn cost(message: &Message) -> u32 {
     })
 }
 
+/// What a frame takes while it is decoded and handled, in bytes.
+pub(crate) fn decoded_length(frame: &[u8]) -> usize {
+    if is_known(frame) {
+        DECODED_TO_UNPACKED * unpacked_length(frame).max(frame.len()).min(MAX_INFLATED)
+    } else {
+        0
+    }
+}
+
 /// That of a message with so many elements: it costs something itself.
 fn costs(elements: usize) -> u32 {
     u32::try_from(1 + elements).unwrap_or(u32::MAX)
@@ -329,6 +381,7 @@ pub(crate) struct Accounts {
     /// Bytes of a graph.
     graph: usize,
     relays: Rc<Meter>,
+    lanes: Rc<Meter>,
     stand_ins: Rc<Meter>,
     /// What all stand-ins hold, and what one identity's may.
     held: (Arc<Allowance>, u64),
@@ -342,10 +395,10 @@ pub(crate) struct Accounts {
 impl Accounts {
     /// Accounts whose graphs may take so many bytes, and whose stand-ins may hold so many.
     pub(crate) fn new(graph: usize, held: u64) -> Self {
-        let [relays, stand_ins] = [(); 2].map(|()| Meter::new(OF_ALL));
+        let [relays, lanes, stand_ins] = [(); 3].map(|()| Meter::new(OF_ALL));
         let held = (Allowance::new(held.saturating_mul(HELD_BY_ALL)), held);
         let (open, limits, held_by) = Default::default();
-        Self { graph, relays, stand_ins, held, open, limits, held_by }
+        Self { graph, relays, lanes, stand_ins, held, open, limits, held_by }
     }
 
     /// The account of an identity.
@@ -359,9 +412,8 @@ impl Accounts {
         }
         let limits = Rc::clone(self.limits.entry(identity.to_owned()).or_default());
         let held = self.held_by(identity);
-        let (relays, stand_ins) = (&self.relays, &self.stand_ins);
-        let account = Account::new(identity, self.graph, relays, stand_ins, held, limits);
-        let account = Rc::new(account);
+        let pools = [&self.relays, &self.lanes, &self.stand_ins];
+        let account = Rc::new(Account::new(identity, self.graph, pools, held, limits));
         self.open.insert(identity.to_owned(), Rc::downgrade(&account));
         account
     }

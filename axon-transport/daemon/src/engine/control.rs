@@ -7,7 +7,7 @@ use bytes::{Buf, Bytes};
 use quinn_proto::{ReadError, ReadableError, StreamId, WriteError};
 
 use crate::{
-    engine::account::{Charge, Meter, cost, cost_of_frame},
+    engine::account::{Account, Charge, Meter, cost, cost_of_frame, decoded_length},
     link::{
         CloseCode, FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, Message, is_known,
         read_length,
@@ -64,6 +64,17 @@ impl FrameLimits {
     pub(crate) const PROVEN: Self = Self { frame: MAX_FRAME, inflated: MAX_INFLATED };
 }
 
+/// What is read of a control stream.
+#[derive(Debug)]
+pub(crate) enum Input {
+    /// A message, with what it weighs on the account until it is handled.
+    Message(Message, Option<Charge>),
+    /// No whole message has come, or the peer has to wait.
+    Nothing,
+    /// One has come, and is decompressed once messages of the same identity are handled.
+    NoRoom,
+}
+
 /// The control stream.
 #[derive(Debug)]
 pub(crate) struct Control {
@@ -73,6 +84,8 @@ pub(crate) struct Control {
     out: VecDeque<(Bytes, Option<Charge>)>,
     queued: usize,
     meter: Option<Rc<Meter>>,
+    /// What messages take that are decompressed and not handled.
+    decoded: Option<Rc<Meter>>,
     /// Nothing is sent after the frames that wait.
     finishing: bool,
     finished: bool,
@@ -96,6 +109,7 @@ impl Default for Control {
             out: VecDeque::new(),
             queued: 0,
             meter: None,
+            decoded: None,
             finishing: false,
             finished: false,
             piece: Bytes::new(),
@@ -126,9 +140,10 @@ impl Control {
         self.limits = limits;
     }
 
-    /// Messages that wait count against this meter from now on.
-    pub(super) fn charge_to(&mut self, meter: Rc<Meter>) {
-        self.meter = Some(meter);
+    /// Messages that wait, to be sent or to be handled, count on this account from now on.
+    pub(super) fn charge_to(&mut self, account: &Account) {
+        self.meter = Some(Rc::clone(&account.unsent));
+        self.decoded = Some(Rc::clone(&account.decoded));
     }
 
     /// Queues a message.
@@ -225,7 +240,7 @@ impl Control {
             && self.paused_until.is_none_or(|until| until <= now)
     }
 
-    /// The next message. `owe` is told what reading it costs, and says how long the peer has to wait then.
+    /// The next message, if there is one. `owe` is told what reading it costs, and says how long the peer has to wait then.
     ///
     /// # Errors
     /// Nothing more comes.
@@ -234,7 +249,7 @@ impl Control {
         quic: &mut quinn_proto::Connection,
         mut owe: impl FnMut(u32) -> Duration,
         now: Duration,
-    ) -> Result<Option<Message>, ControlError> {
+    ) -> Result<Input, ControlError> {
         let result = self.try_read(quic, &mut owe, now);
         self.ended |= result.is_err();
         result
@@ -245,14 +260,14 @@ impl Control {
         quic: &mut quinn_proto::Connection,
         owe: &mut impl FnMut(u32) -> Duration,
         now: Duration,
-    ) -> Result<Option<Message>, ControlError> {
+    ) -> Result<Input, ControlError> {
         if !self.has_input(now) {
-            return Ok(None);
+            return Ok(Input::Nothing);
         }
         self.paused_until = None;
         loop {
             if !self.gather(quic)? {
-                return Ok(None);
+                return Ok(Input::Nothing);
             }
             let paid = match self.paid {
                 Some(paid) => paid,
@@ -260,12 +275,21 @@ impl Control {
                     let cost = cost_of_frame(&self.frame[4..]);
                     self.paid = Some(cost);
                     if self.pause(owe(cost), now) {
-                        return Ok(None);
+                        return Ok(Input::Nothing);
                     }
                     cost
                 }
             };
             let body = &self.frame[4..];
+            let room = match &self.decoded {
+                Some(decoded) => {
+                    let Some(room) = decoded.charge(decoded_length(body)) else {
+                        return Ok(Input::NoRoom);
+                    };
+                    Some(room)
+                }
+                None => None,
+            };
             let message = match is_known(body) {
                 true => Message::from_frame(body, self.limits.inflated)?,
                 false => None,
@@ -275,7 +299,7 @@ impl Control {
                 if let more @ 1.. = cost(&message).saturating_sub(paid) {
                     self.pause(owe(more), now);
                 }
-                return Ok(Some(message));
+                return Ok(Input::Message(message, room));
             }
         }
     }

@@ -246,7 +246,7 @@ impl Engine {
                 let opened = StreamEvent::Opened { dir: Dir::Uni };
                 self.handle_stream(number, daemon, opened, now);
             }
-            LinkEvent::Message(number, daemon, message) => {
+            LinkEvent::Message(number, daemon, message, _room) => {
                 self.handle_message(number, daemon, message, now);
             }
             LinkEvent::Stream(number, daemon, event) => {

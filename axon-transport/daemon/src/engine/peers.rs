@@ -12,7 +12,7 @@ use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::config::Config;
 
 use super::{
-    peer::{Local, Peer, Surroundings, kept::KeptRelays, stalls::Stalls},
+    peer::{Local, Peer, Surroundings, WritersHere, kept::KeptRelays, stalls::Stalls},
     rings::Rings,
     stand_in::StandIns,
 };
@@ -32,6 +32,7 @@ pub(super) struct Peers {
     stalls: RefCell<Stalls>,
     kept: RefCell<KeptRelays>,
     local: Local,
+    writers: WritersHere,
     epoch: Instant,
     waiting_for_room: bool,
     /// Readers with samples to take; kept for its memory.
@@ -51,6 +52,7 @@ impl Peers {
             stalls: RefCell::default(),
             kept: RefCell::default(),
             local: Local::new(),
+            writers: WritersHere::default(),
             epoch,
             waiting_for_room: false,
             active: Vec::new(),
@@ -109,20 +111,23 @@ impl Peers {
         daemon: DaemonId,
         act: impl FnOnce(&mut Peer, &Surroundings<'_>) -> T,
     ) -> Option<T> {
-        let Self { all, config, rings, stand_ins, stalls, kept, local, epoch, .. } = self;
-        let with = surroundings(config, &**rings, stand_ins, (stalls, kept), local, *epoch);
+        let Self { all, config, rings, stand_ins, stalls, kept, local, writers, epoch, .. } = self;
+        let with =
+            surroundings(config, &**rings, stand_ins, (stalls, kept), (local, writers), *epoch);
         all.get_mut(&daemon).map(|peer| act(peer, &with))
     }
 
     /// Has each peer act with what all peers use.
     pub(super) fn with_each(&mut self, mut each: impl FnMut(&mut Peer, &Surroundings<'_>)) {
-        let Self { all, config, rings, stand_ins, stalls, kept, local, epoch, .. } = self;
-        let with = surroundings(config, &**rings, stand_ins, (stalls, kept), local, *epoch);
+        let Self { all, config, rings, stand_ins, stalls, kept, local, writers, epoch, .. } = self;
+        let with =
+            surroundings(config, &**rings, stand_ins, (stalls, kept), (local, writers), *epoch);
         all.values_mut().for_each(|peer| each(peer, &with));
     }
 
     /// The graph of this host changed.
     pub(super) fn handle_local_graph(&mut self, local: Local, now: Duration) {
+        self.writers = WritersHere::of(&local);
         self.local = local;
         let endpoints = self.all.values().map(|peer| peer.remote.len() + self.local.len());
         let took = ENDPOINT * u32::try_from(endpoints.sum::<usize>()).unwrap_or(u32::MAX);
@@ -207,8 +212,8 @@ fn surroundings<'a>(
     rings: &'a dyn Rings,
     stand_ins: &'a StandIns,
     (stalls, kept): (&'a RefCell<Stalls>, &'a RefCell<KeptRelays>),
-    local: &'a Local,
+    (local, writers): (&'a Local, &'a WritersHere),
     epoch: Instant,
 ) -> Surroundings<'a> {
-    Surroundings { rings, stand_ins, local, config, stalls, kept, epoch }
+    Surroundings { rings, stand_ins, local, writers, config, stalls, kept, epoch }
 }

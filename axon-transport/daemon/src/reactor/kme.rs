@@ -1,4 +1,8 @@
 //! The KME client, on a runtime with a thread of its own: TLS with the KME does not hold up the links.
+//!
+//! The TLS library of that connection (rustls as released) leaves traffic secrets and keys of ciphers on the stack. They
+//! pass through tasks of the HTTP library, which this crate does not call, so the whole stack is overwritten whenever the
+//! thread has nothing left to do.
 
 use axon_transport::config::{Config, Security};
 use tokio::runtime::{Builder, Runtime};
@@ -7,6 +11,10 @@ use crate::{
     error::GatewayError,
     keys::{Events, Kme, UsedKeys},
 };
+
+/// How much of the stack is overwritten: more than a handshake takes below the tasks that it runs in, in builds without
+/// optimization too (`tests/tests/hosts/kme_keys.rs`).
+const STACK_DEPTH: usize = 384 << 10;
 
 /// The KME client and its thread.
 pub(super) struct KmeThread {
@@ -24,6 +32,8 @@ pub(super) fn start(config: &Config) -> Result<Option<(KmeThread, Events)>, Gate
     let runtime = Builder::new_multi_thread()
         .worker_threads(1)
         .thread_name("axon-kme")
+        // A thread parks from the frame that it runs tasks in.
+        .on_thread_park(|| axon_tls::erasing::<STACK_DEPTH, _>(|| ()))
         .enable_all()
         .build()?;
     let used = UsedKeys::open(config.runtime_dir.as_deref(), config.domain);

@@ -3,11 +3,21 @@
 use std::{
     fs::{self, File, OpenOptions},
     io::Read as _,
-    os::{fd::OwnedFd, unix::fs::PermissionsExt as _},
+    net::{Ipv4Addr, SocketAddr},
+    os::{
+        fd::OwnedFd,
+        unix::fs::{PermissionsExt as _, symlink},
+    },
+    path::Path,
     process::{Command, Stdio},
     time::Instant,
 };
 
+use axon_tls::{
+    Cipher, hybrid,
+    identity::{Auth, SigningKey},
+    quic::hybrid_client_with,
+};
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with};
 
 use super::*;
@@ -36,11 +46,55 @@ fn cause_log_lines(host: &Host) {
     }
 }
 
+/// A stranger's handshakes that the daemon refuses and logs: it speaks another protocol.
+fn refused_handshakes(host: &Host) {
+    let last = |status: &Status| status.refusals.iter().map(|refusal| refusal.at).max();
+    let status = host.status().unwrap();
+    let (before, port) = (last(&status), status.port.expect("a port of QUIC"));
+    let daemon = SocketAddr::from((Ipv4Addr::LOCALHOST, port));
+    let auth = Auth::None(SigningKey::generate().unwrap());
+    let tls = hybrid::client_config(&auth, Cipher::default(), b"other/1").unwrap();
+    let client = hybrid_client_with(tls).unwrap();
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        let endpoint = quinn::Endpoint::client((Ipv4Addr::LOCALHOST, 0).into()).unwrap();
+        for _ in 0..3 {
+            let connecting = endpoint.connect_with(client.clone(), daemon, "axon").unwrap();
+            assert!(connecting.await.is_err(), "a protocol that the daemon does not speak");
+        }
+        endpoint.wait_idle().await;
+    });
+    until("status shows that they were refused", || {
+        host.status().is_ok_and(|status| last(&status) > before)
+    });
+}
+
 fn assert_it_goes_on(host: &Host, mut daemon: Kept) {
     cause_log_lines(host);
+    refused_handshakes(host);
     let status = host.status().expect("the daemon answers");
     assert_eq!(status.pid, daemon.0.id());
     assert!(daemon.0.try_wait().unwrap().is_none(), "the daemon runs");
+}
+
+/// Without this the tests below could pass where nothing is logged.
+#[test]
+fn what_the_tests_do_is_logged_into_an_ordinary_file() {
+    let host = Host::new();
+    let log = host.dir.path().join("stderr");
+    let daemon = foreground(&host, program(&host), File::create(&log).unwrap());
+    let lines = || fs::read_to_string(&log).unwrap().lines().count();
+    let before = lines();
+    cause_log_lines(&host);
+    until("sessions and strangers leave lines", || lines() >= before + 6);
+    let refused = || {
+        let text = fs::read_to_string(&log).unwrap();
+        text.lines().filter(|line| line.contains("WARN") && line.contains("127.0.0.1")).count()
+    };
+    assert_eq!(refused(), 0);
+    refused_handshakes(&host);
+    until("so do refused handshakes", || refused() > 0);
+    assert_it_goes_on(&host, daemon);
 }
 
 #[test]
@@ -72,6 +126,34 @@ fn a_daemon_outlives_a_limit_on_the_size_of_files() {
     assert_eq!(fs::metadata(&log).unwrap().len(), length);
 }
 
+/// A runtime directory in which a daemon in the background finds its log.
+fn with_log(host: &Host, log: impl FnOnce(&Path)) {
+    let run = host.dir.path().join("run");
+    fs::create_dir(&run).unwrap();
+    fs::set_permissions(&run, fs::Permissions::from_mode(0o700)).unwrap();
+    log(&run.join("axon-0.log"));
+}
+
+#[test]
+fn a_daemon_in_the_background_starts_though_the_file_system_of_its_log_is_full() {
+    let host = Host::new();
+    with_log(&host, |log| symlink("/dev/full", log).unwrap());
+    let mut player = host.play("idle");
+    player.hear();
+    let daemon = host.status().expect("a daemon was started").pid;
+    let stderr = fs::read_link(format!("/proc/{daemon}/fd/2")).unwrap();
+    assert_eq!(stderr, Path::new("/dev/full"), "its log is where nothing can be written");
+    cause_log_lines(&host);
+    refused_handshakes(&host);
+    assert_eq!(host.status().expect("it answers").pid, daemon);
+    // Its end takes the log with it, and the next one starts as well.
+    signal(daemon, Signal::KILL);
+    until("it has ended", || !host.status().is_ok_and(|status| status.pid == daemon));
+    let mut next = host.play("idle");
+    next.hear();
+    assert_ne!(host.status().expect("a daemon was started").pid, daemon);
+}
+
 #[test]
 fn a_daemon_that_may_not_write_at_all_ends_with_an_error_and_not_by_a_signal() {
     let host = Host::new();
@@ -99,9 +181,7 @@ fn a_daemon_in_the_background_begins_a_new_log_file_at_8_mib() {
     let host = Host::new();
     let run = host.dir.path().join("run");
     let [log, before] = ["axon-0.log", "axon-0.log.1"].map(|name| run.join(name));
-    fs::create_dir(&run).unwrap();
-    fs::set_permissions(&run, fs::Permissions::from_mode(0o700)).unwrap();
-    fs::write(&log, vec![b'\n'; 8 << 20]).unwrap();
+    with_log(&host, |log| fs::write(log, vec![b'\n'; 8 << 20]).unwrap());
     fs::write(&before, "two files before").unwrap();
     let mut player = host.play("idle");
     player.hear();

@@ -37,7 +37,12 @@ fn send_until_held_back(host: &Host, socket: &OwnedFd, mut credit: u64) -> u64 {
 
 /// The sample of this number, or the part of it that has so many bytes.
 fn fragment(sequence: u64, bytes: usize) -> Message {
-    let (length, source_timestamp, lost, published) = (LENGTH as u32, 0, 0, 0);
+    after_loss(sequence, bytes, 0)
+}
+
+/// The same, of a publisher that lost so many samples before it.
+fn after_loss(sequence: u64, bytes: usize, lost: u64) -> Message {
+    let (length, source_timestamp, published) = (LENGTH as u32, 0, 0);
     let head = Some(SampleHeader { length, sequence, source_timestamp, lost, published });
     let bytes = pattern(sequence, bytes);
     Message::SampleFragment(SampleFragment { publisher: own(), head, bytes, client: None })
@@ -81,4 +86,31 @@ fn what_an_ended_process_left_for_a_reader_that_takes_nothing_is_counted_by_topi
     let log = fs::read_to_string(host.log()).unwrap();
     let told = |line: &str| line.contains("discarded samples") && line.contains("topic=\"/t\"");
     assert!(log.lines().any(told), "the log does not name the topic:\n{log}");
+}
+
+#[test]
+fn samples_that_are_lost_before_the_first_and_after_the_last_are_counted_by_topic() {
+    let host = host();
+    let _daemon = host.daemon();
+    let listener = session(&host, "listener", true);
+    let subscription = listener.create_subscription(spec("/t", Qos::keep_all())).unwrap();
+    let socket = by_hand(&host, hello(&host));
+    announce_and_await_credit(&socket);
+    until("it is received from", || subscription.matched() == [own()]);
+    say_to(&socket, &after_loss(8, LENGTH, 7));
+    say_to(&socket, &after_loss(12, LENGTH, 3));
+    let mut bytes = Vec::new();
+    for number in [8, 12] {
+        let sample = subscription.recv(&mut bytes, Some(PATIENCE)).expect("a sample");
+        assert_eq!(sample.sequence, number);
+    }
+    // The subscription knows what is between two samples. Only status knows what was before the first.
+    assert_eq!(subscription.lost(), 3);
+    until("the topic's count", || dropped(&host, "queue") == 10);
+    // The beginning of one more, and the end of the process.
+    say_to(&socket, &after_loss(13, LENGTH / 2, 0));
+    drop(socket);
+    until("nobody is relayed any more", || relays(&host.status().unwrap()).is_empty());
+    assert_eq!((dropped(&host, "queue"), dropped(&host, "publisher_ended")), (10, 1));
+    assert_eq!(subscription.lost(), 3);
 }

@@ -261,10 +261,14 @@ impl RelayedSession {
             |gid| writers.get(gid),
             |gid, loss| {
                 tally.lost(loss.samples());
+                let cause = match loss {
+                    LossReport::Before { .. } => "queue",
+                    LossReport::Unwritten => "ring",
+                };
+                if let Some(writer) = writers.get(gid) {
+                    losses.add(&writer.endpoint().topic, cause, loss.samples());
+                }
                 if let LossReport::Unwritten = loss {
-                    if let Some(writer) = writers.get(gid) {
-                        losses.add(&writer.endpoint().topic, "ring", 1);
-                    }
                     unreached.entry(*gid).or_default().unwritten += 1;
                 }
             },

@@ -2,7 +2,6 @@
 
 use std::{
     net::IpAddr,
-    rc::Rc,
     time::{Duration, SystemTime},
 };
 
@@ -101,7 +100,7 @@ impl Links {
         }
         let account = self.accounts.of(&who.host_identity(address));
         let Some(connection) = self.connections.get_mut(number) else { return };
-        connection.control.charge_to(Rc::clone(&account.unsent));
+        connection.control.charge_to(&account);
         let Some(link) = self.table.get_mut(number) else { return };
         link.place = None;
         link.phase = Phase::Electing(now + ELECTION_TIMEOUT);

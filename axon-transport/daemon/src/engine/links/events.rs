@@ -7,7 +7,7 @@ use quinn_proto::StreamEvent;
 
 use crate::{
     discovery::{AddressConfidence, Datagrams},
-    engine::refusal::Refusal,
+    engine::{account::Charge, refusal::Refusal},
     link::{LinkClosed, Message},
 };
 
@@ -22,8 +22,8 @@ pub(in crate::engine) enum LinkEvent {
         /// To be said over the new link.
         closed: Option<LinkClosed>,
     },
-    /// A message on the link in use.
-    Message(u64, DaemonId, Message),
+    /// A message on the link in use, with what it weighs on the peer's account until it is handled.
+    Message(u64, DaemonId, Message, Option<Charge>),
     /// An event of a data stream of any link of this peer.
     Stream(u64, DaemonId, StreamEvent),
     /// The keys of this link changed.

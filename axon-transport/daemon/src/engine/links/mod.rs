@@ -50,13 +50,16 @@ use self::{
     unfinished::Unfinished,
 };
 use super::{
-    connection::Connection, control::ControlError, credentials::Credentials, endpoints::Endpoints,
+    connection::Connection,
+    control::{ControlError, Input},
+    credentials::Credentials,
+    endpoints::Endpoints,
     keyring::Keyring,
 };
 use crate::{
     discovery::{Interface, is_discovery},
     engine::{
-        account::{Account, Accounts},
+        account::{Account, Accounts, Charge},
         link::failure::peer_text,
         qlog::{self, Qlogs},
         refusal::Refusal,
@@ -294,8 +297,11 @@ impl Links {
                 (self.epoch + now, link.peer.as_ref().map(|peer| Rc::clone(&peer.account)));
             let owe = |cost| account.as_ref().map_or(Duration::ZERO, |a| a.owe(cost, instant));
             match connection.control.read(&mut connection.quic, owe, now) {
-                Ok(Some(message)) => self.handle_message(number, message, now),
-                Ok(None) => return,
+                Ok(Input::Message(message, room)) => {
+                    self.handle_message(number, message, room, now);
+                }
+                Ok(Input::Nothing) => return,
+                Ok(Input::NoRoom) => return self.unfinished.add_blocked(number),
                 Err(error) => return self.handle_control_error(number, error, now),
             }
             // A message is handled before the next is decoded, so that a peer fills no queue here.
@@ -327,7 +333,13 @@ impl Links {
         }
     }
 
-    fn handle_message(&mut self, number: u64, message: Message, now: Duration) {
+    fn handle_message(
+        &mut self,
+        number: u64,
+        message: Message,
+        room: Option<Charge>,
+        now: Duration,
+    ) {
         let Some(link) = self.table.get_mut(number) else { return };
         if let Phase::Opening(opening) = &mut link.phase {
             opening.handle_message(now, &message, self.keyring.as_mut());
@@ -358,7 +370,7 @@ impl Links {
                     Message::LinkClosed(closed) => self.closed_by_peer(daemon, *closed),
                     _ => {}
                 }
-                self.outbox.event(LinkEvent::Message(number, daemon, message));
+                self.outbox.event(LinkEvent::Message(number, daemon, message, room));
             }
         }
     }

@@ -10,6 +10,8 @@ use quinn_proto::ConnectionError;
 pub(super) struct Unfinished {
     /// Their control streams have more, once the events that came are handled.
     unread: Vec<u64>,
+    /// The same, and there was no room for their next message: they go first.
+    blocked: Vec<u64>,
     /// They are lost, and their links stand.
     lost: VecDeque<(u64, ConnectionError)>,
 }
@@ -20,14 +22,21 @@ impl Unfinished {
         self.unread.push(number);
     }
 
+    /// The same, and there was no room for its next message.
+    pub(super) fn add_blocked(&mut self, number: u64) {
+        self.blocked.push(number);
+    }
+
     /// Whether there are control streams with more.
     pub(super) fn has_unread(&self) -> bool {
-        !self.unread.is_empty()
+        !self.unread.is_empty() || !self.blocked.is_empty()
     }
 
     /// Takes the connections whose control streams have more.
     pub(super) fn take_unread(&mut self) -> Vec<u64> {
-        std::mem::take(&mut self.unread)
+        let mut next = std::mem::take(&mut self.blocked);
+        next.append(&mut self.unread);
+        next
     }
 
     /// A connection was lost.
@@ -60,6 +69,16 @@ mod tests {
         assert!(!unfinished.is_lost(3) && unfinished.is_lost(1));
         assert_eq!(unfinished.poll_lost(), Some((1, ConnectionError::Reset)));
         assert_eq!(unfinished.poll_lost(), None);
+    }
+
+    #[test]
+    fn streams_whose_message_found_no_room_go_first() {
+        let mut unfinished = Unfinished::default();
+        unfinished.add_unread(1);
+        [3, 2].into_iter().for_each(|number| unfinished.add_blocked(number));
+        assert!(unfinished.has_unread());
+        assert_eq!(unfinished.take_unread(), [3, 2, 1]);
+        assert!(!unfinished.has_unread());
     }
 
     #[test]

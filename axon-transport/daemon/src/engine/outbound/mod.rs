@@ -206,6 +206,12 @@ impl Outbound {
         kept
     }
 
+    /// Whether samples of a publisher are left that wait to be acknowledged, or for a limit.
+    pub(crate) fn has_left(&self, number: u32, sources: &[Source], publisher: &Gid) -> bool {
+        sources.iter().any(|source| source.has_unacknowledged(publisher))
+            || self.table.holds_best_effort(number, publisher)
+    }
+
     /// A publisher of a route ended: the samples that it left are sent, and then [`OutboundEvent::Drained`] comes.
     pub(crate) fn handle_publisher_ended(&mut self, number: u32, publisher: Gid, now: Duration) {
         self.endings.add(number, publisher, now);
@@ -429,13 +435,16 @@ impl Outbound {
     fn give_up_ended(&mut self, number: u32, of: Gid, samples: u64) {
         let Some(served) = self.table.routes.get(number) else { return };
         let topic = Arc::clone(&served.shared.topic);
+        // What BEST_EFFORT samples are left in the rings shows when they are taken.
+        let is_reliable = served.is_reliable(&of);
+        let in_rings = served.give_up_ended(&of);
+        let samples = if is_reliable { samples } else { samples + in_rings };
         tracing::warn!(
             topic = &*topic,
             publisher = %of,
             samples,
             "a publisher ended, and the peer did not take its last samples: they are lost"
         );
-        served.give_up_ended(&of);
         let gone = self.table.remove(number, &of);
         self.forget(gone);
         self.counters.dropped("publisher_ended", samples);

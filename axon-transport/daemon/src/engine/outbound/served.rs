@@ -143,13 +143,16 @@ impl Served {
         most
     }
 
-    /// Gives up all samples of a publisher that ended.
-    pub(super) fn give_up_ended(&self, of: &Gid) {
+    /// Gives up all samples of a publisher that ended. Returns how many were in a ring.
+    pub(super) fn give_up_ended(&self, of: &Gid) -> u64 {
+        let mut most = 0;
         for source in self.sources.iter().filter(|source| source.reads(of)) {
             // Nothing more is sent of it.
-            while source.take_of(of, Duration::ZERO).is_some() {}
+            let taken = std::iter::from_fn(|| source.take_of(of, Duration::ZERO)).count();
             source.acknowledge_of(of, u64::MAX);
+            most = most.max(taken as u64);
         }
+        most
     }
 
     /// Tells the publishers which samples will not reach the peer. Returns how many.

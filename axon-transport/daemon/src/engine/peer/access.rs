@@ -20,7 +20,7 @@ use axon_transport::{
 use super::{decisions::note_look, refused::shown};
 use crate::{
     bridge::RefusedRoute,
-    engine::account::{Charge, Meter},
+    engine::account::{Account, Charge, Meter},
     link::{Denied, DeniedUse, MAX_DENIED, Message},
 };
 
@@ -28,8 +28,6 @@ use crate::{
 const LISTED: usize = 64;
 /// Uses that status shows at the endpoints that wait for them.
 const AT_ENDPOINTS: usize = 1024;
-/// Uses of a peer that are remembered and told.
-const MOST: usize = 1024;
 /// Bytes that count for a denied use besides its name and reason.
 const ENTRY: usize = 200;
 
@@ -53,19 +51,21 @@ fn kind_of(verb: Verb) -> EndpointKind {
 /// The rules about one peer.
 pub(super) struct PeerAccess {
     permissions: Permissions,
-    /// Uses by endpoints of the peer that are denied here. The peer was told.
-    here: BTreeMap<Use, String>,
+    /// Uses by endpoints of the peer that are denied here, with what remembers them. The peer was told.
+    here: BTreeMap<Use, (String, Charge)>,
     /// Uses by endpoints of this host that the peer's host denies, with what remembers them.
     there: BTreeMap<Use, (String, Charge)>,
-    /// What may be remembered, of all daemon ids of the peer's identity.
+    /// What may be remembered of those there, and of those here, of all daemon ids of the peer's identity.
     room: Rc<Meter>,
+    places: Rc<Meter>,
     logged: LogLimit,
 }
 
 impl PeerAccess {
-    pub(super) fn new(permissions: Permissions, room: Rc<Meter>) -> Self {
+    pub(super) fn new(permissions: Permissions, account: &Account) -> Self {
         let (here, there) = (BTreeMap::new(), BTreeMap::new());
-        Self { permissions, here, there, room, logged: LogLimit::default() }
+        let (room, places) = (Rc::clone(&account.refusals), Rc::clone(&account.denied));
+        Self { permissions, here, there, room, places, logged: LogLimit::default() }
     }
 
     pub(super) fn permissions(&self) -> &Permissions {
@@ -101,25 +101,33 @@ impl PeerAccess {
         for used in uses {
             if told.contains(&used) {
                 now.insert(used);
-            } else if new.len() < MOST {
+            } else if new.len() < self.places.most() {
                 new.insert(used);
             }
         }
-        let room = MOST.saturating_sub(now.len());
-        now.extend(new.into_iter().take(room));
-        let now: BTreeMap<Use, String> = now
-            .into_iter()
-            .map(|(verb, name)| {
-                let reason = self.permissions.check(verb, name).to_string();
-                ((verb, name.to_owned()), reason)
-            })
-            .collect();
-        if now == self.here {
-            return Vec::new();
+        let lifted: Vec<Use> = {
+            let gone = |(verb, name): &&Use| !now.contains(&(*verb, name.as_str()));
+            self.here.keys().filter(gone).cloned().collect()
+        };
+        let (now, new): (Vec<Use>, Vec<Use>) = {
+            let owned = |(verb, name): (Verb, &str)| (verb, name.to_owned());
+            (now.into_iter().map(owned).collect(), new.into_iter().map(owned).collect())
+        };
+        // What goes makes room for what comes.
+        lifted.iter().for_each(|used| drop(self.here.remove(used)));
+        let mut denied = Vec::new();
+        for used in now.into_iter().chain(new) {
+            let reason = self.permissions.check(used.0, &used.1).to_string();
+            match self.here.get_mut(&used) {
+                Some((before, _)) if *before == reason => continue,
+                Some((before, _)) => before.clone_from(&reason),
+                None => {
+                    let Some(place) = self.places.charge(1) else { continue };
+                    self.here.insert(used.clone(), (reason.clone(), place));
+                }
+            }
+            denied.push(message(&used, &reason));
         }
-        let before = std::mem::replace(&mut self.here, now);
-        let new = |(used, reason): &(&Use, &String)| before.get(*used) != Some(*reason);
-        let denied: Vec<_> = self.here.iter().filter(new).map(|(u, why)| message(u, why)).collect();
         if let Some(first) = denied.first()
             && let Some(uses) = self.logged.count(Instant::now())
         {
@@ -127,14 +135,13 @@ impl PeerAccess {
             tracing::warn!(%peer, verb, name, why = first.reason, uses,
                 "a peer's endpoints are denied by access rules; `axon status` names them");
         }
-        let lifted = before.keys().filter(|used| !self.here.contains_key(*used));
-        parts(denied, lifted.map(|used| message(used, "")).collect())
+        parts(denied, lifted.iter().map(|used| message(used, "")).collect())
     }
 
     /// Another connection takes over: what was said and not heard is said again, by both sides.
     pub(super) fn succeed(&mut self) -> Vec<Message> {
         self.there.clear();
-        parts(self.here.iter().map(|(used, why)| message(used, why)).collect(), Vec::new())
+        parts(self.here.iter().map(|(used, (why, _))| message(used, why)).collect(), Vec::new())
     }
 
     /// The peer tells what is denied there. Returns what is not any more.
@@ -159,7 +166,7 @@ impl PeerAccess {
     /// Each denied use, the host that denies it, and the reason.
     fn all(&self) -> impl Iterator<Item = (&Use, &'static str, &str)> {
         let there = self.there.iter().map(|(used, (why, _))| (used, "by the peer", &**why));
-        there.chain(self.here.iter().map(|(used, why)| (used, "here", &**why)))
+        there.chain(self.here.iter().map(|(used, (why, _))| (used, "here", &**why)))
     }
 
     /// Names the denied uses in the link's status.
@@ -194,4 +201,45 @@ fn parts(denied: Vec<DeniedUse>, lifted: Vec<DeniedUse>) -> Vec<Message> {
     };
     let lifted = lifted.chunks(MAX_DENIED).map(|lifted| part(&[], lifted));
     lifted.chain(denied.chunks(MAX_DENIED).map(|denied| part(denied, &[]))).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use axon_shm::ids::Gid;
+    use axon_transport::access::{AccessRules, Party};
+
+    use super::*;
+    use crate::engine::account::Accounts;
+
+    fn publishers(names: std::ops::Range<u32>) -> Vec<Endpoint> {
+        let of = |n| Endpoint::new(Gid::default(), EndpointKind::Publisher, format!("/{n}"), "T");
+        names.map(of).collect()
+    }
+
+    fn said(messages: &[Message]) -> (usize, usize) {
+        messages.iter().fold((0, 0), |(denied, lifted), message| match message {
+            Message::Denied(uses) => (denied + uses.denied.len(), lifted + uses.lifted.len()),
+            other => panic!("{other:?}"),
+        })
+    }
+
+    #[test]
+    fn denied_uses_are_bounded_over_all_daemons_of_an_identity() {
+        let rules = AccessRules::parse("default = \"deny\"", "access.toml").unwrap();
+        let permissions = rules.permissions(Party::Address("10.0.0.1".parse().unwrap()));
+        let account = Accounts::new(1 << 20).of("a");
+        let [mut one, mut other] = [(); 2].map(|()| PeerAccess::new(permissions.clone(), &account));
+        let daemons = [DaemonId([1; 16]), DaemonId([2; 16])];
+        let set = |access: &mut PeerAccess, daemon, names| {
+            said(&access.set_denied(daemon, publishers(names).iter()))
+        };
+        assert_eq!(set(&mut one, daemons[0], 0..700), (700, 0));
+        assert_eq!(set(&mut other, daemons[1], 0..700), (324, 0));
+        assert_eq!(set(&mut one, daemons[0], 0..700), (0, 0), "it was told");
+        // What one leaves the other may use, in the same step too.
+        assert_eq!(set(&mut one, daemons[0], 650..800), (100, 650));
+        assert_eq!(set(&mut other, daemons[1], 0..700), (376, 0));
+        drop(one);
+        assert_eq!(account.denied.held(), 700);
+    }
 }

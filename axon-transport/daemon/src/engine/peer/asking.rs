@@ -15,7 +15,7 @@ use axon_transport::graph::{Endpoint, EndpointKind};
 
 use super::{
     Peer, Surroundings, poll_after,
-    refused::{NO_STAND_IN, TOO_MANY_ASKED, TOO_MANY_WRITERS},
+    refused::{NO_STAND_IN, TOO_MANY_ASKED, TOO_MANY_LANES, TOO_MANY_WRITERS},
 };
 use crate::{
     engine::{
@@ -41,6 +41,8 @@ pub(super) struct Asked {
     pub(super) stand_ins: HashMap<Gid, Rc<StandIn>>,
     /// One for each stand-in, of what the route may show of the peer's identity.
     places: Charge,
+    /// One for each stand-in and each writer here that it may read.
+    pub(super) lanes: Charge,
     room: Rc<Meter>,
 }
 
@@ -51,6 +53,20 @@ pub(super) struct Attaching {
 }
 
 impl Asked {
+    /// Shows no more of its writers than these, for now.
+    pub(super) fn leave(&mut self, stand_ins: usize) {
+        let mut left = stand_ins;
+        self.stand_ins.retain(|_, _| {
+            left.checked_sub(1).is_some_and(|less| {
+                left = less;
+                true
+            })
+        });
+        let gone = self.places.amount().saturating_sub(self.stand_ins.len());
+        drop(self.places.split(gone));
+        self.incomplete = true;
+    }
+
     /// Asks for it.
     pub(super) fn message(&self, key: &RouteKey) -> Message {
         let last = self.stand_ins.iter().filter_map(|(gid, stand_in)| {
@@ -151,6 +167,7 @@ impl Peer {
                 let room = self.remote.account().writers_of(&key);
                 Asked {
                     places: room.nothing(),
+                    lanes: self.remote.account().lanes.nothing(),
                     room,
                     number: self.next_route - 1,
                     route: Route { kind: key.kind, topic },
@@ -164,6 +181,8 @@ impl Peer {
         asked.stand_ins.retain(|gid, _| writers.contains(gid));
         let gone = asked.places.amount() - asked.stand_ins.len();
         drop(asked.places.split(gone));
+        let lanes = asked.stand_ins.len() * with.writers.read_by_stand_in(&key);
+        drop(asked.lanes.split(asked.lanes.amount().saturating_sub(lanes)));
         let fresh = self.show(&key, &mut asked, &wanted.writers, with, now);
         if asked.stand_ins.is_empty() && asked.wanted.subscribers.is_empty() {
             return;
@@ -219,9 +238,15 @@ impl Peer {
                 asked.incomplete = true;
                 break;
             };
+            let Some(lanes) = asked.lanes.more(with.writers.read_by_stand_in(key)) else {
+                self.does_not_ask(key, TOO_MANY_LANES);
+                asked.incomplete = true;
+                break;
+            };
             match with.stand_ins.get(with.rings, writer, self.remote.account(), now) {
                 Ok(stand_in) => {
                     asked.places.add(place);
+                    asked.lanes.add(lanes);
                     asked.stand_ins.insert(writer.gid, stand_in);
                     fresh = true;
                 }

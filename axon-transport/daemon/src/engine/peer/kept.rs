@@ -37,6 +37,16 @@ struct Kept {
     until: Duration,
     /// It counts among those that are kept, and still among the relays of the identity.
     _charges: [Charge; 2],
+    lanes: Option<Charge>,
+}
+
+impl Kept {
+    /// Whether a peer with this identity may adopt it for a relay of this kind.
+    fn fits(&self, key: &RouteKey, spec: &RelaySpec, identity: &str) -> bool {
+        let same = |gid| self.spec.stands_for.contains(gid);
+        let is_same_topic = self.key == *key && self.spec.is(spec);
+        is_same_topic && self.identity == identity && spec.stands_for.iter().any(same)
+    }
 }
 
 impl Default for KeptRelays {
@@ -61,14 +71,31 @@ impl KeptRelays {
     pub(crate) fn add(&mut self, peer: &mut Peer, now: Duration) {
         let room = self.room_of(&peer.identity);
         for (number, served) in &mut peer.served {
+            let lanes = served.lanes.amount() / served.sources.len().max(1);
             for source in peer.outbound.take_kept(*number, room.left()) {
                 let Source::Relay(spec, reader) = source else { continue };
                 let Some(place) = room.charge(1) else { continue };
                 let charges = [place, served.relays.split(1)];
                 let identity = peer.identity.clone();
                 let (key, until) = (served.key.clone(), now + PATIENCE);
-                self.all.push(Kept { identity, key, spec, reader, until, _charges: charges });
+                let lanes = Some(served.lanes.split(lanes));
+                self.all.push(Kept {
+                    identity,
+                    key,
+                    spec,
+                    reader,
+                    until,
+                    _charges: charges,
+                    lanes,
+                });
             }
+        }
+    }
+
+    /// Gives back the lanes of a relay that the peer is about to adopt, since it pays for them anew.
+    pub(super) fn release_lanes(&mut self, key: &RouteKey, spec: &RelaySpec, identity: &str) {
+        if let Some(kept) = self.all.iter_mut().find(|kept| kept.fits(key, spec, identity)) {
+            kept.lanes = None;
         }
     }
 
@@ -80,12 +107,7 @@ impl KeptRelays {
         spec: &RelaySpec,
         identity: &str,
     ) -> Option<Rc<dyn RingReader>> {
-        let fits = |kept: &Kept| {
-            let same = |gid| kept.spec.stands_for.contains(gid);
-            let is_same_topic = kept.key == *key && kept.spec.is(spec);
-            is_same_topic && kept.identity == identity && spec.stands_for.iter().any(same)
-        };
-        let at = self.all.iter().position(fits)?;
+        let at = self.all.iter().position(|kept| kept.fits(key, spec, identity))?;
         let Kept { reader, .. } = self.all.swap_remove(at);
         reader.take_back();
         reader.set_stands_for(spec.stands_for.clone());

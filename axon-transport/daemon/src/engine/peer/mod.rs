@@ -5,6 +5,7 @@ mod asking;
 pub(super) mod decisions;
 pub(super) mod graph;
 pub(super) mod kept;
+mod lanes;
 mod limits;
 pub(super) mod owners;
 mod refused;
@@ -34,13 +35,16 @@ use axon_transport::{
     status::LinkStatus,
 };
 
-pub(crate) use self::serving::{MAX_ROUTES, StalledRoute};
 use self::{
     access::PeerAccess,
     asking::{Asked, Attaching},
     refused::RefusedRoutes,
     serving::{DENIED_AGAIN, Served},
     told::{Told, added},
+};
+pub(crate) use self::{
+    lanes::WritersHere,
+    serving::{MAX_ROUTES, StalledRoute},
 };
 use super::{
     inbound::Inbound,
@@ -100,6 +104,8 @@ pub(crate) struct Surroundings<'a> {
     pub(crate) stand_ins: &'a StandIns,
     /// The endpoints of this host.
     pub(crate) local: &'a Local,
+    /// How many writers of each route are among them.
+    pub(crate) writers: &'a WritersHere,
     /// The settings of this host.
     pub(crate) config: &'a Config,
     /// Routes that were given up.
@@ -212,7 +218,7 @@ impl Peer {
             identity,
             counters,
             refused: RefusedRoutes::new(Rc::clone(&account.refusals)),
-            access: PeerAccess::new(permissions.clone(), Rc::clone(&account.refusals)),
+            access: PeerAccess::new(permissions.clone(), &account),
             remote: Remote::new(account, prover.is_needed(), permissions),
             prover,
             displaced: false,
@@ -364,6 +370,7 @@ impl Peer {
     /// The graph of this host changed: the peer is told, and routes follow.
     pub(super) fn handle_local_graph(&mut self, with: &Surroundings<'_>, now: Duration) {
         self.keep_ending(with.local, now);
+        self.fit_lanes(with, now);
         self.send_graph(with.local, false);
         self.update(with, now);
     }
@@ -378,7 +385,7 @@ impl Peer {
         let carried = |gid: &Gid, shown: &Told| {
             let number = *self.served_as.get(&RouteKey::of(&shown.remote.endpoint)?)?;
             let sources = &self.served.get(&number)?.sources;
-            sources.iter().any(|source| source.has_unacknowledged(gid)).then_some(number)
+            self.outbound.has_left(number, sources, gid).then_some(number)
         };
         let ended = ended
             .filter_map(|(gid, shown)| Some((carried(gid, shown)?, *gid, shown.remote.clone())));

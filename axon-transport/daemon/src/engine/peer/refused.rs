@@ -41,6 +41,10 @@ pub(super) const TOO_MANY_ASKED: &str = "the peer serves no more routes than thi
 pub(super) const TOO_MANY_WRITERS: &str = "the peer has more publishers and clients for this host \
      than are shown; fewer topics subscribed to here make room";
 
+/// Why a relay or a stand-in is not opened.
+pub(super) const TOO_MANY_LANES: &str = "what a peer reads here takes as many connections to publishers, clients and \
+     servers as a peer may have, or all peers";
+
 /// A reason that is remembered.
 struct Reason {
     text: String,

@@ -6,7 +6,7 @@ use axon_envelope::{Kind, Route, TopicHash};
 use axon_shm::ids::Gid;
 use axon_transport::EndpointSpec;
 
-use super::{Peer, Surroundings, poll_after, reader_of};
+use super::{Peer, Surroundings, poll_after, reader_of, refused::TOO_MANY_LANES};
 use crate::{
     engine::{
         account::Charge,
@@ -20,7 +20,7 @@ use crate::{
 /// A route is said to be ready once it has a writer, or after this time.
 const READY_TIMEOUT: Duration = Duration::from_secs(2);
 /// A peer that lacks relays may ask for them again after this time.
-const ASK_AGAIN: Duration = Duration::from_secs(10);
+pub(super) const ASK_AGAIN: Duration = Duration::from_secs(10);
 /// A peer whose route access rules deny asks for it again after this time, if DENIED does not tell it when.
 pub(super) const DENIED_AGAIN: Duration = Duration::from_secs(30);
 /// Memory of a route, in bytes, beside the names and subscribers of which it holds three copies.
@@ -37,6 +37,8 @@ pub(super) struct Served {
     _room: Charge,
     /// One for each relay.
     pub(super) relays: Charge,
+    /// One for each relay and each publisher here that it may read.
+    pub(super) lanes: Charge,
     /// Why some of the subscribers get nothing, and when the peer may ask again.
     without: Option<Without>,
     /// Whether the peer asked for it over the link in use.
@@ -52,6 +54,11 @@ struct Relays {
     /// Those among them that another daemon of the peer's host had.
     adopted: Vec<Gid>,
     without: Option<Without>,
+}
+
+/// That some of the relays of a route are not there, and why.
+pub(super) fn missing(missing: usize, asked: usize, why: &str) -> String {
+    format!("{missing} of {asked} kinds of subscriptions get nothing: {why}")
 }
 
 /// A route that was given up since the peer does not read it.
@@ -99,9 +106,9 @@ impl Peer {
         if self.served.get(&number).is_some_and(|old| !old.repeated && old.key != key) {
             self.unserve(number);
         }
-        let relays = Rc::clone(&self.remote.account().relays);
-        let (old, mut places) = match self.take_served(number) {
-            Some(served) if served.key == key => (served.sources, served.relays),
+        let account = Rc::clone(self.remote.account());
+        let (old, mut places, mut lanes) = match self.take_served(number) {
+            Some(served) if served.key == key => (served.sources, served.relays, served.lanes),
             Some(_) => return Err("a route number for two topics".into()),
             None => {
                 if self.served.len() >= MAX_ROUTES {
@@ -109,7 +116,7 @@ impl Peer {
                     self.refuse(number, &key, why, None);
                     return Ok(());
                 }
-                (Vec::new(), relays.nothing())
+                (Vec::new(), account.relays.nothing(), account.lanes.nothing())
             }
         };
         self.served_as.remove(&key);
@@ -133,7 +140,9 @@ impl Peer {
         };
         self.refused.forget(number);
         let relays = match kind {
-            Kind::Topic => self.open_relays(&key, &subscribers, &old, &mut places, with),
+            Kind::Topic => {
+                self.open_relays(&key, &subscribers, &old, (&mut places, &mut lanes), with)
+            }
             Kind::Request | Kind::Response => {
                 let sources = self.sources_of_service(&key);
                 Relays { sources, adopted: Vec::new(), without: None }
@@ -170,6 +179,7 @@ impl Peer {
             sources,
             _room: charge,
             relays: places,
+            lanes,
             without,
             repeated: true,
         };
@@ -248,14 +258,14 @@ impl Peer {
         lost.into_iter().for_each(|route| self.unserve(route));
     }
 
-    /// Opens the relays of a topic; those that the route has are kept. `places` is what counts for these, and then for
-    /// all.
+    /// Opens the relays of a topic; those that the route has are kept. `places` and `lanes` are what counts for these, and
+    /// then for all.
     fn open_relays(
         &self,
         key: &RouteKey,
         subscribers: &[Subscriber],
         old: &[Source],
-        places: &mut Charge,
+        (places, lanes): (&mut Charge, &mut Charge),
         with: &Surroundings<'_>,
     ) -> Relays {
         let hash = |gid: &Gid| self.remote.get(gid).map_or_else(Vec::new, |e| e.type_hash.clone());
@@ -273,7 +283,9 @@ impl Peer {
             without = Some((why, None));
         }
         let stay = specs.iter().filter(|spec| there(spec).is_some()).count();
+        let each = with.writers.of_route(key);
         drop(places.split(places.amount().saturating_sub(stay)));
+        drop(lanes.split(lanes.amount().saturating_sub(stay * each)));
         let (mut sources, mut adopted) = (Vec::new(), Vec::new());
         for spec in specs {
             if let Some(reader) = there(&spec) {
@@ -285,6 +297,11 @@ impl Peer {
             let Some(place) = self.remote.account().relays.charge(1) else {
                 let why = "this host has as many relays as a peer may have, or all peers";
                 without = Some((why.to_owned(), Some(ASK_AGAIN)));
+                continue;
+            };
+            with.kept.borrow_mut().release_lanes(key, &spec, &self.identity);
+            let Some(its_lanes) = lanes.more(each) else {
+                without = Some((TOO_MANY_LANES.to_owned(), Some(ASK_AGAIN)));
                 continue;
             };
             let reader = match with.kept.borrow_mut().adopt(key, &spec, &self.identity) {
@@ -299,6 +316,7 @@ impl Peer {
             match reader {
                 Ok((reader, is_adopted)) => {
                     places.add(place);
+                    lanes.add(its_lanes);
                     let source = Source::Relay(spec, reader);
                     adopted.extend(is_adopted.then(|| source.gid()));
                     sources.push(source);
@@ -311,10 +329,8 @@ impl Peer {
                 }
             }
         }
-        let missing = asked - sources.len();
-        let without = without.map(|(why, again)| {
-            (format!("{missing} of {asked} kinds of subscriptions get nothing: {why}"), again)
-        });
+        let lacks = asked - sources.len();
+        let without = without.map(|(why, again)| (missing(lacks, asked, &why), again));
         Relays { sources, adopted, without }
     }
 

@@ -237,6 +237,12 @@ impl Host {
         peers.map(|(_, peer)| peer.held_of_refusals()).sum()
     }
 
+    /// The most that control messages of one peer took that were decompressed and not handled, in bytes.
+    pub(super) fn most_decoded(&self) -> usize {
+        let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());
+        peers.map(|(_, peer)| peer.remote.account().decoded.peak()).max().unwrap_or(0)
+    }
+
     /// Publishers, servers and clients of all peers that are shown here.
     pub(super) fn shown(&self) -> usize {
         let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());

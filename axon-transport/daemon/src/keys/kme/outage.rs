@@ -116,7 +116,9 @@ impl Outages {
 /// What to do about it.
 fn advice(kind: FailureKind) -> &'static str {
     match kind {
-        FailureKind::Unreachable => "Check that the KME runs, and AXON_KME_URL",
+        FailureKind::Unreachable => {
+            "Check that the KME runs, and AXON_KME_URL; TCP and TLS may take AXON_KME_CONNECT_TIMEOUT"
+        }
         FailureKind::Unavailable => {
             "It has no keys for these two SAEs, or too much to do: see its key rate and its QKD link"
         }

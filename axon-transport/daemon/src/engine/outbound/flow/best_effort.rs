@@ -58,6 +58,8 @@ struct UnderWay {
 pub(super) struct BestEffort {
     writing: Option<Writing>,
     under_way: VecDeque<UnderWay>,
+    /// Samples that arrived.
+    arrived: u64,
     /// What the last sample took to arrive.
     took: Duration,
 }
@@ -66,6 +68,11 @@ impl BestEffort {
     /// Whether QUIC has a part of a sample.
     pub(super) fn is_writing(&self) -> bool {
         self.writing.is_some()
+    }
+
+    /// How many samples arrived.
+    pub(super) fn arrived(&self) -> u64 {
+        self.arrived
     }
 
     /// Whether no sample is under way.
@@ -167,6 +174,7 @@ impl BestEffort {
             return;
         };
         let Some(sample) = self.under_way.remove(at) else { return };
+        self.arrived += 1;
         self.took = now.saturating_sub(sample.begun);
         counters.sent(sample.payload);
         if let Some(first) = self.under_way.front() {

@@ -302,6 +302,20 @@ impl Flow {
         self.waits_for_credit && !self.queue.has_sent() && self.best_effort.is_idle()
     }
 
+    /// Whether BEST_EFFORT samples of it wait for a limit.
+    pub(super) fn holds_best_effort(&self) -> bool {
+        self.taking.is_limited() && !self.is_reliable()
+    }
+
+    /// What is left of the BEST_EFFORT samples of a publisher that ended: how many were taken from its rings, and how many
+    /// arrived so far. `None`: nothing is left, in its rings either.
+    pub(super) fn best_effort_left(&self) -> Option<(u64, u64)> {
+        let is_left = !self.is_reliable() && !self.is_quiet();
+        is_left.then(|| {
+            (self.taking.waiting() as u64 + self.queue.waiting(), self.best_effort.arrived())
+        })
+    }
+
     /// Whether it waits for a limit, and the peer has all that passed.
     pub(super) fn waits_for_limit(&self) -> bool {
         self.taking.is_limited() && self.queue.is_empty()

@@ -151,6 +151,11 @@ impl Taking {
         self.taken.is_empty() && !self.merge.holds_any()
     }
 
+    /// How many samples it has taken that are not in the queue.
+    pub(super) fn waiting(&self) -> usize {
+        self.taken.len() + self.merge.held()
+    }
+
     /// Forgets the samples that it has taken and that are not in the queue. Returns how many.
     pub(super) fn end(&mut self) -> usize {
         self.held = false;

@@ -124,13 +124,21 @@ impl FlowTable {
         (kept, gone)
     }
 
+    /// Whether BEST_EFFORT samples of a publisher wait for a limit.
+    pub(super) fn holds_best_effort(&self, number: u32, of: &Gid) -> bool {
+        let flow = self.find(number, of).and_then(|id| self.flows.get(id));
+        flow.is_some_and(Flow::holds_best_effort)
+    }
+
     /// What is left of a publisher that ended, whose route had this number. While the link `starves`, no flow that waits
     /// for others is excused.
     pub(super) fn left_of(&self, number: u32, of: &Gid, starves: bool) -> Option<Left> {
         let route = self.routes.successor_of(number, of);
-        let samples = self.routes.get(route)?.unacknowledged().get(of).copied()?;
         let flow = self.find(route, of).and_then(|id| self.flows.get(id));
-        let progress = flow.map_or((0, 0), Flow::progress);
+        let (samples, progress) = match self.routes.get(route)?.unacknowledged().get(of) {
+            Some(samples) => (*samples, flow.map_or((0, 0), Flow::progress)),
+            None => flow.and_then(Flow::best_effort_left).map(|(left, sent)| (left, (sent, 0)))?,
+        };
         let is_excused = !starves && flow.is_some_and(Flow::waits_for_others);
         Some(Left { route, samples, progress, is_excused })
     }

@@ -303,6 +303,17 @@ impl SimRings {
         state.readers.values().flatten().filter(|reader| !reader.closed.get()).count()
     }
 
+    /// Pairs of a relay and a publisher that it may read.
+    pub(super) fn lanes(&self) -> usize {
+        let state = self.state.borrow();
+        let open = state.readers.values().flatten().filter(|reader| !reader.closed.get());
+        let of = |reader: &Rc<Cursors>| {
+            let all = state.publishers_of(&reader.spec.topic);
+            all.filter(|(_, p)| p.endpoint.node != "ended" && reader.reads(&p.endpoint)).count()
+        };
+        open.map(of).sum()
+    }
+
     /// How often the engine asked a relay whether it has samples.
     pub(super) fn looks(&self) -> u64 {
         self.state.borrow().looks

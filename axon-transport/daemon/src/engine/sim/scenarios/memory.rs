@@ -5,7 +5,7 @@ use std::time::Duration;
 use axon_envelope::inner;
 use axon_shm::{
     ids::{DaemonId, Gid},
-    qos::Qos,
+    qos::{Durability, Qos},
 };
 use axon_transport::{
     config::Config,
@@ -23,7 +23,7 @@ use crate::{
             world::World,
         },
     },
-    link::{Graph, Hello, Message, Subscribe, Subscriber},
+    link::{Graph, Hello, Message, RouteReady, Subscribe, Subscriber},
 };
 
 /// Publishers of one topic of the hostile peer: as many as one route shows.
@@ -268,4 +268,121 @@ fn relays_that_are_kept_for_one_identity_leave_room_for_those_of_another() {
     assert_eq!(world.hosts[0].kept(), 1_024, "{}", world.describe());
     restarts(&mut world, 1, 0xf8, 10);
     assert_eq!(world.hosts[0].kept(), 1_034, "{}", world.describe());
+}
+
+/// Asks for a topic for subscriptions of which each needs a relay of its own.
+fn subscribe_in_many_ways(world: &mut World, peer: usize, link: usize, id: u8, route: u32) {
+    let kinds = [Qos::default(), Qos::sensor_data()].into_iter().flat_map(|qos| {
+        [Durability::Volatile, Durability::TransientLocal]
+            .map(|durability| qos.with_durability(durability))
+    });
+    let kinds = kinds.flat_map(|qos| {
+        let keeps_all = qos.with_history(Qos::keep_all().history);
+        [1, 100, 1000].map(|depth| qos.with_depth(depth)).into_iter().chain([keeps_all])
+    });
+    let subscribers =
+        (0..).zip(kinds).map(|(n, qos)| Subscriber { gid: gid(id, route << 4 | n), qos });
+    let message = Message::Subscribe(Subscribe {
+        route,
+        topic: format!("/topic_{route}"),
+        type_name: "T".into(),
+        kind: 0,
+        subscribers: subscribers.collect(),
+        last: Vec::new(),
+        acknowledges: Some(true),
+        short_headers: None,
+    });
+    world.with_raw(peer, |raw, _| raw.links[link].say(&message));
+}
+
+/// Routes of which a peer was told that some of its subscriptions get nothing for want of lanes.
+fn without_lanes(world: &World, peer: usize, link: usize) -> Vec<u32> {
+    let refused =
+        world.raws[peer].links[link].messages.iter().filter_map(|message| match message {
+            Message::RouteRefused(refused) if refused.reason.contains("connections") => {
+                Some(refused.route)
+            }
+            _ => None,
+        });
+    refused.collect()
+}
+
+#[test]
+fn no_identity_takes_all_lanes_and_each_is_told_what_it_does_not_get() {
+    const PUBLISHERS: usize = 200;
+    let mut world = World::new(87, 1, |_| Config::default());
+    world.add_raw(Config::default(), DaemonId([0xff; 16]));
+    world.add_raw(Config::default(), DaemonId([0xfe; 16]));
+    for topic in 0..21 {
+        for _ in 0..PUBLISHERS {
+            world.hosts[0].rings.create_publisher(&format!("/topic_{topic}"), Qos::keep_all());
+        }
+    }
+    world.hosts[0].touch_graph();
+    let greedy = linked_as(&mut world, 0, 0xf0);
+    (0..21).for_each(|topic| subscribe_in_many_ways(&mut world, 0, greedy, 0xf0, topic));
+    world.run_for(secs(3));
+    // 65,536 of 67,200.
+    let most = 327 * PUBLISHERS;
+    assert_eq!(world.hosts[0].rings.lanes(), most, "{}", world.describe());
+    assert_eq!(without_lanes(&world, 0, greedy), [20]);
+
+    let other = linked_as(&mut world, 1, 0xf8);
+    (0..5).for_each(|topic| subscribe_in_many_ways(&mut world, 1, other, 0xf8, topic));
+    world.run_for(secs(3));
+    let of_other = 5 * 16 * PUBLISHERS;
+    assert_eq!(world.hosts[0].rings.lanes(), most + of_other, "{}", world.describe());
+    assert_eq!(without_lanes(&world, 1, other), Vec::<u32>::new());
+
+    // More publishers of a topic that both read: the one that has more than its share loses relays.
+    for _ in 0..20 {
+        world.hosts[0].rings.create_publisher("/topic_0", Qos::keep_all());
+    }
+    world.hosts[0].touch_graph();
+    world.run_for(secs(3));
+    let (greedy_has, other_has) =
+        (most - 16 * PUBLISHERS + 14 * (PUBLISHERS + 20), of_other + 16 * 20);
+    assert_eq!(world.hosts[0].rings.lanes(), greedy_has + other_has, "{}", world.describe());
+    assert_eq!(without_lanes(&world, 0, greedy), [20, 0]);
+    assert_eq!(without_lanes(&world, 1, other), Vec::<u32>::new());
+
+    // What it leaves is there again.
+    world.with_raw(0, |raw, now| raw.close(greedy, now));
+    world.run_for(secs(2));
+    assert_eq!(world.hosts[0].rings.lanes(), other_has, "{}", world.describe());
+    (5..12).for_each(|topic| subscribe_in_many_ways(&mut world, 1, other, 0xf8, topic));
+    world.run_for(secs(3));
+    assert_eq!(world.hosts[0].rings.lanes(), other_has + 7 * 16 * PUBLISHERS);
+}
+
+#[test]
+fn control_messages_that_are_not_handled_are_bounded_over_all_links_of_an_identity() {
+    const LINKS: u8 = 16;
+    let mut world = World::new(88, 1, |_| Config::default());
+    world.add_raw(Config::default(), DaemonId([0xff; 16]));
+    world.hosts[0].rings.create_publisher("/t", Qos::keep_all());
+    world.hosts[0].touch_graph();
+    let links: Vec<_> = (0..LINKS).map(|n| linked_as(&mut world, 0, 0xe0 + n)).collect();
+    world.run_for(secs(1));
+    // 1.1 MB after decompression, and nearly nothing before. All come while the host stands still.
+    let long =
+        Message::RouteReady(RouteReady { route: 9, publishers: vec![Gid::default(); 65_536] });
+    world.stop(0, true);
+    for (n, link) in (0..).zip(&links) {
+        world.with_raw(0, |raw, _| {
+            raw.links[*link].say(&long);
+            raw.links[*link].say(&subscribe(1, "/t", gid(0xe0 + n, 1)));
+        });
+    }
+    world.run_for(millis(100));
+    world.stop(0, false);
+    let served = |world: &World| {
+        let ready = |m: &Message| matches!(m, Message::RouteReady(ready) if ready.route == 1);
+        links.iter().filter(|link| world.raws[0].links[**link].messages.iter().any(ready)).count()
+    };
+    // All are handled, one after the other.
+    world.until(secs(60), |world| served(world) == usize::from(LINKS));
+    let most = world.hosts[0].most_decoded();
+    assert!((20 << 20..=28 << 20).contains(&most), "{} MiB", most >> 20);
+    assert!(world.raws[0].links.iter().all(|link| link.closed.is_none()), "{}", world.describe());
 }

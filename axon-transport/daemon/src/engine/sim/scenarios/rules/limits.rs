@@ -265,3 +265,38 @@ fn all_peers_together_have_the_egress_of_an_interface_in_equal_parts() {
         assert!(bytes > 20_000_000, "host {limited}: {bytes} without the limit");
     }
 }
+
+#[test]
+fn best_effort_samples_that_wait_when_their_publisher_ends_arrive_or_are_counted() {
+    const SAMPLES: u64 = 5;
+    // One in fifty seconds is none while anybody waits.
+    for (rate, over, arrive) in
+        [("1", "hold", 5), ("1", "drop-oldest", 2), ("0.02", "hold", 1), ("0.02", "drop-oldest", 1)]
+    {
+        let text = format!(
+            "[[limit]]\npeer = \"*\"\ntopic = \"/limited\"\nrate = {rate}\nover = \"{over}\""
+        );
+        let mut world = hosts(0, &text);
+        let pair = world.pair(0, 1, "/limited", Qos::sensor_data());
+        world.until(secs(20), World::is_whole);
+        world.run_for(secs(1));
+        for _ in 0..SAMPLES {
+            world.publish(pair, 100);
+        }
+        world.run_for(millis(300));
+        world.hosts[0].rings.end(pair.publisher.1);
+        world.hosts[0].touch_graph();
+        world.run_for(secs(30));
+        let came = world.received(pair);
+        let text = format!("{rate} a second, {over}: {came:?}, {:?}", world.hosts[0].lost);
+        assert_eq!(came.len(), arrive, "{text}");
+        assert_eq!(
+            came.len() as u64 + world.hosts[0].lost.values().sum::<u64>(),
+            SAMPLES,
+            "{text}"
+        );
+        assert!(world.hosts[1].lost.is_empty(), "{text}: {:?}", world.hosts[1].lost);
+        let is_shown = world.hosts[1].graph.values().any(|all| all.contains_key(&pair.publisher.1));
+        assert!(!is_shown, "it is over, {text}");
+    }
+}

@@ -1,0 +1,108 @@
+//! What the TLS connection to a KME leaves in the memory of a daemon: traffic secrets, and keys of its ciphers.
+//!
+//! The KMEs run in this process, and their TLS library says the secrets (`KeyLog`). While a connection stands its secrets
+//! have to be somewhere: that they are found shows that the search works, and they are on no stack. Once it is closed as
+//! idle they are nowhere: heap, freed heap, stacks.
+
+use std::{
+    collections::BTreeSet,
+    thread,
+    time::{Duration, Instant},
+};
+
+use axon_tests::{
+    Sizes,
+    memory::{Find, Needles, Stopped},
+    unexpected,
+};
+
+use super::{
+    mode::Kmes,
+    pair::{Host, Plan},
+    process::PATIENCE,
+    secrets::may_search,
+    traffic_keys::expand,
+};
+
+const MESSAGES: u64 = 1_000;
+/// No call begins or ends for so long: the thread of the KME client waits.
+const QUIET: Duration = Duration::from_millis(200);
+/// Searches while a connection stands.
+const SEARCHES: usize = 5;
+
+/// All that TLS makes of the secrets of all connections so far.
+fn needles(kmes: &Kmes) -> Needles {
+    let mut needles = Needles::default();
+    for (number, (label, secret)) in kmes.tls_secrets().iter().enumerate() {
+        let kinds = match label.as_str() {
+            "CLIENT_HANDSHAKE_TRAFFIC_SECRET" | "SERVER_HANDSHAKE_TRAFFIC_SECRET" => {
+                ["handshake traffic secret", "handshake key"]
+            }
+            "CLIENT_TRAFFIC_SECRET_0" | "SERVER_TRAFFIC_SECRET_0" => ["traffic secret", "key"],
+            "EXPORTER_SECRET" => {
+                needles.add("exporter secret", number, secret);
+                continue;
+            }
+            other => panic!("{other} is none of TLS 1.3"),
+        };
+        needles.add(kinds[0], number, secret);
+        needles.add(kinds[1], number, &expand(secret, "key", 32));
+    }
+    needles
+}
+
+/// Searches a daemon in a moment in which its KME client waits.
+fn search(kmes: &Kmes, host: &Host) -> Vec<Find> {
+    let pid = host.status().pid;
+    let begin = Instant::now();
+    let (stopped, needles) = loop {
+        let calls = kmes.calls();
+        thread::sleep(QUIET);
+        let stopped = Stopped::new(pid).unwrap();
+        let needles = needles(kmes);
+        if kmes.calls() == calls {
+            break (stopped, needles);
+        }
+        assert!(begin.elapsed() < PATIENCE, "calls without end");
+    };
+    let found = stopped.search(&needles).unwrap();
+    let on_stacks: Vec<_> = found.iter().filter(|find| find.on_stack).collect();
+    assert!(on_stacks.is_empty(), "parts of secrets on stacks: {on_stacks:?}");
+    found
+}
+
+#[test]
+fn secrets_of_the_connection_to_the_kme_are_on_no_stack_and_nowhere_after_its_end() {
+    if !may_search() {
+        return;
+    }
+    let kmes = Kmes::start();
+    let more = [("AXON_QKD_KEY_MODE", "messages10")];
+    let hosts = Plan::new([0, 1].map(|host| kmes.settings(host, &more))).start();
+    let mut there = hosts[1].subscribe(Sizes::Small);
+    let mut publisher = hosts[0].publish(Sizes::Small, 1, None);
+    let mut kinds = BTreeSet::new();
+    for _ in 0..SEARCHES {
+        let taken = there.tally().taken;
+        there.wait_taken(taken + MESSAGES / SEARCHES as u64);
+        for host in &hosts {
+            kinds.extend(search(&kmes, host).iter().map(|find| find.secret.kind));
+        }
+    }
+    eprintln!("while connections stand, in live memory: {kinds:?}");
+    assert!(kinds.contains("traffic secret"), "the search finds nothing: {kinds:?}");
+    let sent = publisher.stop();
+    there.wait_taken(sent);
+    // It is closed when it was idle for a while.
+    let deadline = Instant::now() + PATIENCE;
+    for host in &hosts {
+        while unexpected("the daemon", &search(&kmes, host), |_| false) > 0 {
+            assert!(
+                Instant::now() < deadline,
+                "parts of secrets are left of connections that ended"
+            );
+            thread::sleep(Duration::from_millis(500));
+        }
+    }
+    assert_eq!(there.tally().lost, 0);
+}
