@@ -34,6 +34,8 @@ const RING: usize = 256;
 struct Publisher {
     endpoint: Arc<Endpoint>,
     published: u64,
+    /// Publishes that found no room.
+    refused: u64,
     history: VecDeque<(u64, Vec<u8>)>,
 }
 
@@ -131,7 +133,7 @@ impl SimRings {
     pub(super) fn create_publisher(&self, topic: &str, qos: Qos) -> Gid {
         let endpoint = Arc::new(self.endpoint(EndpointKind::Publisher, topic, qos));
         let gid = endpoint.gid;
-        let publisher = Publisher { endpoint, published: 0, history: VecDeque::new() };
+        let publisher = Publisher { endpoint, published: 0, refused: 0, history: VecDeque::new() };
         let state = &mut *self.state.borrow_mut();
         state.publishers.insert(gid, publisher);
         state.topics.entry(topic.into()).or_default().insert(gid);
@@ -188,6 +190,7 @@ impl SimRings {
         if of.history.len() >= most {
             let first = of.history.front().map_or(0, |(sequence, _)| *sequence);
             if oldest.is_some_and(|oldest| oldest < first) {
+                of.refused += 1;
                 return false;
             }
             of.history.pop_front();
