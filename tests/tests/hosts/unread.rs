@@ -172,23 +172,6 @@ fn a_stopped_reader_behind_an_honest_daemon_is_served_again_once_it_reads() {
     }
 }
 
-/// A daemon that is stopped until the end of the scope, however that ends.
-struct Stopped(u32);
-
-impl Stopped {
-    fn new(host: &Host) -> Self {
-        let pid = host.status().pid;
-        signal(pid, Signal::STOP);
-        Self(pid)
-    }
-}
-
-impl Drop for Stopped {
-    fn drop(&mut self) {
-        signal(self.0, Signal::CONT);
-    }
-}
-
 #[test]
 fn a_host_that_falls_silent_holds_up_no_reader_of_another_one_for_long() {
     let hosts = Plan { stalled_s: 10, ..Plan::new([classic(&[]), classic(&[])]) }.start();
@@ -196,7 +179,7 @@ fn a_host_that_falls_silent_holds_up_no_reader_of_another_one_for_long() {
     let mut here = hosts[0].subscribe(Sizes::Small);
     let mut publisher = hosts[0].flood(Sizes::Small, 2);
     there.wait_taken(100);
-    let stopped = Stopped::new(&hosts[1]);
+    let stopped = hosts[1].stop_daemon();
     // The link stands for much longer.
     hosts[0].wait_refusal("it is disconnected", |text| text.contains("stalled_s"));
     assert_eq!(hosts[0].status().links.len(), 1);

@@ -4,6 +4,7 @@ use axon_transport::ids::DaemonId;
 
 mod authority;
 mod ca;
+mod claims;
 mod pinned;
 mod replay;
 

@@ -97,6 +97,12 @@ pub(super) struct SimRings {
 /// GIDs of endpoints of a peer without an engine begin with this. Nobody vouches for their samples.
 pub(super) const FOREIGN: [u8; 12] = [0xaa; 12];
 
+/// A key that the run's seed decides.
+pub(super) fn session_key(seed: &[u8; 32]) -> SessionKey {
+    let packet = [&[OWNER, 0xa1, 0x00, 0x58, 0x20], &seed[..]].concat();
+    SessionKey::from_packet(&packet).unwrap()
+}
+
 /// The payload of a sample: its number, its publisher and filling, so that damage shows.
 pub(super) fn payload(of: Gid, sequence: u64, length: usize) -> Vec<u8> {
     let mut payload = of.0.to_vec();
@@ -109,10 +115,9 @@ pub(super) fn payload(of: Gid, sequence: u64, length: usize) -> Vec<u8> {
 impl SimRings {
     /// The rings of a host whose sessions have this number.
     pub(super) fn new(host: usize) -> Self {
-        let mut packet = vec![OWNER, 0xa1, 0x00, 0x58, 0x20];
-        packet.extend_from_slice(&[0x51; 24]);
-        packet.extend_from_slice(&(host as u64).to_be_bytes());
-        let key = Arc::new(SessionKey::from_packet(&packet).unwrap());
+        let mut seed = [0x51; 32];
+        seed[24..].copy_from_slice(&(host as u64).to_be_bytes());
+        let key = Arc::new(session_key(&seed));
         Self { session: key.id(), key, state: Rc::default() }
     }
 
