@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use axon_daemon::internal::{
+    daemon_key::DaemonProof,
     keys::KeyMessage,
     link::{self, FrameError},
     wire::{
@@ -195,6 +196,7 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
         expects: Some(DaemonId([4; 16])),
         static_peer: true,
         routes: Some(1024),
+        proof: Some(DaemonProof { key: [5; 32], signature: [6; 64] }),
     };
     let gid = Gid([6; 16]);
     let key_id = KeyId::new("bc490419-7d60-487f-adc1-4ddcc177c139").unwrap();

@@ -19,6 +19,7 @@ use axon_transport::{
 use tokio::sync::mpsc;
 
 use crate::{
+    daemon_key::DaemonKey,
     discovery::{AddressConfidence, Datagrams},
     owner::SessionKeys,
 };
@@ -36,6 +37,8 @@ pub struct GatewayParts {
     pub config: Arc<Config>,
     /// The daemon.
     pub daemon: DaemonId,
+    /// The key of which its id is made.
+    pub daemon_key: Option<Arc<DaemonKey>>,
     /// The keys of the sessions, with which the gateway proves to peers that they are this daemon's.
     pub keys: Arc<SessionKeys>,
     /// One end of a socket pair, for [`Session::over`](axon_transport::Session::over).
@@ -84,6 +87,8 @@ pub enum ToControl {
         daemon: DaemonId,
         /// Where it is.
         address: SocketAddr,
+        /// Whether it proved that the id is its own.
+        proven: bool,
     },
     /// How a link does, and routes that do not cross it: at its start and from time to time. Replaces what was known of
     /// the peer.

@@ -5,6 +5,7 @@ mod attempt;
 mod bridge;
 mod check;
 mod control;
+mod daemon_key;
 mod discovery;
 mod engine;
 mod error;
@@ -64,6 +65,10 @@ pub mod internal {
     /// The protocol between two daemons.
     pub mod link {
         pub use crate::link::*;
+    }
+    /// The key of which a daemon's id is made.
+    pub mod daemon_key {
+        pub use crate::daemon_key::*;
     }
     /// Which daemon a session belongs to.
     pub mod owner {

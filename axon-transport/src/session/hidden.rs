@@ -226,6 +226,12 @@ impl Subscription {
         if self.session.is_forked() { HashMap::new() } else { self.inner.lock().undone() }
     }
 
+    /// For a relay: how many publishes of this publisher found no room since readers were not done with its oldest sample,
+    /// if this one is not.
+    pub fn refused_of(&self, writer: &Gid) -> Option<u64> {
+        if self.session.is_forked() { None } else { self.inner.lock().refused_of(writer) }
+    }
+
     /// For a relay: so many samples of this publisher do not get where they are to go. It is told.
     pub fn give_up(&self, writer: Gid, samples: u64) {
         if self.session.is_forked() {

@@ -39,7 +39,7 @@ const BOUND: usize = 16 << 20;
 /// Two hosts that know each other, and a peer that A's trust file knows as "camera".
 pub(crate) struct Camera {
     pub(crate) stranger: Stranger,
-    auth: Auth,
+    pub(crate) auth: Auth,
     pub(crate) a: Host,
     pub(crate) b: Host,
     dir: tempfile::TempDir,

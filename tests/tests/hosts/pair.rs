@@ -173,6 +173,13 @@ impl Host {
         self.dir.path().join("host.txt")
     }
 
+    /// Stops its daemon, until the end of a scope.
+    pub(crate) fn stop_daemon(&self) -> Stopped {
+        let pid = self.status().pid;
+        signal(pid, Signal::STOP);
+        Stopped(pid)
+    }
+
     /// Gives a variable another value for the processes that are started from now on.
     pub(crate) fn set(&mut self, name: &str, value: &str) {
         self.env.retain(|(n, _)| n != name);
@@ -339,6 +346,15 @@ impl Drop for Host {
         if std::thread::panicking() {
             eprintln!("{}", excerpt(&format!("the log of host {}", self.name), &self.all_logs()));
         }
+    }
+}
+
+/// A daemon that is stopped until the end of the scope, however that ends.
+pub(crate) struct Stopped(u32);
+
+impl Drop for Stopped {
+    fn drop(&mut self) {
+        signal(self.0, Signal::CONT);
     }
 }
 

@@ -7,7 +7,7 @@ use std::{
 };
 
 use axon_daemon::internal::{
-    link::{Hello, MAX_FRAME, Message, Owners, read_length},
+    link::{Elected, Hello, MAX_FRAME, Message, Owners, read_length},
     owner::{EXPORTER, prove},
 };
 use axon_tls::{
@@ -74,6 +74,25 @@ impl Stranger {
     ) -> Result<Met, String> {
         let mut met = self.meet(to, domain, auth, claim)?;
         self.hear(&mut met, |message| matches!(message, Message::Elected(_)))?;
+        Ok(met)
+    }
+
+    /// As [`dial`](Self::dial), under any daemon id: the lower one elects.
+    pub(crate) fn dial_as(
+        &self,
+        host: &Host,
+        auth: &Auth,
+        claim: &Claim<'_>,
+    ) -> Result<Met, String> {
+        let status = host.status();
+        let to = SocketAddr::from((host.address, status.port.unwrap()));
+        let mut met = self.meet(to, host.domain(), auth, claim)?;
+        if claim.daemon.to_string() < status.daemon {
+            self.say(&mut met, &Message::Elected(Elected { link: [7; 16], election: 1 }));
+            self.hear(&mut met, |message| !matches!(message, Message::Elected(_)))?;
+        } else {
+            self.hear(&mut met, |message| matches!(message, Message::Elected(_)))?;
+        }
         Ok(met)
     }
 
@@ -192,6 +211,7 @@ fn hello(domain: u32, claim: &Claim<'_>) -> Hello {
         expects: None,
         static_peer: false,
         routes: None,
+        proof: None,
     }
 }
 

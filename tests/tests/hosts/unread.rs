@@ -171,3 +171,26 @@ fn a_stopped_reader_behind_an_honest_daemon_is_served_again_once_it_reads() {
         node.finish();
     }
 }
+
+#[test]
+fn a_host_that_falls_silent_holds_up_no_reader_of_another_one_for_long() {
+    let hosts = Plan { stalled_s: 10, ..Plan::new([classic(&[]), classic(&[])]) }.start();
+    let mut there = hosts[1].subscribe(Sizes::Small);
+    let mut here = hosts[0].subscribe(Sizes::Small);
+    let mut publisher = hosts[0].flood(Sizes::Small, 2);
+    there.wait_taken(100);
+    let stopped = hosts[1].stop_daemon();
+    // The link stands for much longer.
+    hosts[0].wait_refusal("it is disconnected", |text| text.contains("stalled_s"));
+    assert_eq!(hosts[0].status().links.len(), 1);
+    let now = publisher.published();
+    here.wait_taken(now + 100);
+    let sent = publisher.stop();
+    here.wait_taken(sent);
+    let tally = here.tally();
+    assert_eq!((tally.lost, tally.repeated, tally.corrupt), (0, 0, 0), "{tally:?}");
+    drop(stopped);
+    for node in [publisher, here, there] {
+        node.finish();
+    }
+}

@@ -58,6 +58,7 @@ impl Running {
             GatewayParts {
                 config: Arc::clone(&control.config),
                 daemon: control.id,
+                daemon_key: control.daemon_key.clone(),
                 keys: Arc::clone(&control.keys_of_sessions),
                 socket: theirs,
                 control: to_control,

@@ -31,6 +31,7 @@ use super::{
 };
 use crate::{
     bridge::{RefusedRoute, ToControl},
+    daemon_key::DaemonKey,
     discovery::Wanted,
     owner::SessionKeys,
 };
@@ -42,6 +43,8 @@ pub(super) struct Control {
     pub(super) config: Arc<Config>,
     pub(super) admission: Admission,
     pub(super) id: DaemonId,
+    /// The key of which it is made.
+    pub(super) daemon_key: Option<Arc<DaemonKey>>,
     pub(super) started: Instant,
     pub(super) address: Address,
     pub(super) registry: Registry<Arc<PassedFd>>,
@@ -95,9 +98,16 @@ impl Control {
     pub(super) fn new(config: Arc<Config>, settings: Vec<(String, String)>, spare: Spare) -> Self {
         let mut registry = Registry::default();
         registry.set_access(config.access.clone());
+        let daemon_key = DaemonKey::generate().map(Arc::new);
+        if daemon_key.is_none() {
+            tracing::error!(
+                "could not make a key for the daemon's id: another host may claim the id"
+            );
+        }
         Self {
             admission: Admission::new(Arc::clone(&config), settings),
-            id: DaemonId::random(),
+            id: daemon_key.as_ref().map_or_else(DaemonId::random, |key| key.id()),
+            daemon_key,
             started: Instant::now(),
             address: Address::of(&config),
             registry,
@@ -245,7 +255,7 @@ impl Control {
                 self.port = Some(port);
                 self.gateway = "running".into();
             }
-            ToControl::LinkUp { daemon, address } => self.linked_at(daemon, address.ip()),
+            ToControl::LinkUp { daemon, address, .. } => self.linked_at(daemon, address.ip()),
             ToControl::RemoteGraph { daemon, reset, added, removed } => {
                 self.registry.remote_graph(daemon, reset, added, removed);
             }

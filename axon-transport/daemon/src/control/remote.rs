@@ -1,7 +1,14 @@
 //! Connects the control plane to other hosts: discovery selects the daemons to dial, the gateway dials them, and the
 //! registry receives their endpoints.
 
-use std::{cell::RefCell, collections::BTreeSet, net::IpAddr, rc::Rc, sync::Arc, time::Duration};
+use std::{
+    cell::RefCell,
+    collections::{BTreeMap, BTreeSet},
+    net::IpAddr,
+    rc::Rc,
+    sync::Arc,
+    time::Duration,
+};
 
 use axon_shm::ids::DaemonId;
 use axon_transport::access::AccessRules;
@@ -35,7 +42,8 @@ pub(super) struct Remote {
     running: Option<Running>,
     pause: Pause,
     discovery: Option<Discovery>,
-    linked: BTreeSet<DaemonId>,
+    /// Whether the id was proven.
+    linked: BTreeMap<DaemonId, bool>,
     /// Addresses of listed peers, as the gateway was told.
     listed: BTreeSet<IpAddr>,
     /// The gateway has nothing on its way any more, or it does not get on.
@@ -65,7 +73,7 @@ impl Remote {
             running: None,
             pause: Pause::new(),
             discovery: None,
-            linked: BTreeSet::new(),
+            linked: BTreeMap::new(),
             listed: BTreeSet::new(),
             finished: false,
             access: control.borrow().access.subscribe(),
@@ -150,9 +158,10 @@ impl Remote {
                 self.order(ToGateway::Listed(self.listed.clone()));
                 self.tell(Event::QuicPort(*port));
             }
-            ToControl::LinkUp { daemon, address } => {
-                self.linked.insert(*daemon);
-                self.tell(Event::LinkUp { daemon: *daemon, address: *address });
+            ToControl::LinkUp { daemon, address, proven } => {
+                let (daemon, address, proven) = (*daemon, *address, *proven);
+                self.linked.insert(daemon, proven);
+                self.tell(Event::LinkUp { daemon, address, proven });
             }
             ToControl::LinkDown { daemon, .. } => {
                 self.linked.remove(daemon);
@@ -212,7 +221,7 @@ impl Remote {
     fn gateway_ended(&mut self, control: &Rc<RefCell<Control>>, why: &str) {
         self.running = None;
         control.borrow_mut().gateway_ended(why);
-        for daemon in std::mem::take(&mut self.linked) {
+        for daemon in std::mem::take(&mut self.linked).into_keys() {
             self.tell(Event::LinkDown { daemon });
         }
     }
@@ -224,9 +233,9 @@ impl Remote {
             discovery.tell(Event::QuicPort(port));
         }
         for link in control.links.values() {
-            let daemon = self.linked.iter().find(|daemon| daemon.to_string() == link.peer);
-            if let (Some(&daemon), Ok(address)) = (daemon, link.address.parse()) {
-                discovery.tell(Event::LinkUp { daemon, address });
+            let peer = self.linked.iter().find(|(daemon, _)| daemon.to_string() == link.peer);
+            if let (Some((&daemon, &proven)), Ok(address)) = (peer, link.address.parse()) {
+                discovery.tell(Event::LinkUp { daemon, address, proven });
             }
         }
         self.discovery = Some(discovery);

@@ -51,6 +51,8 @@ pub(crate) enum Event {
         daemon: DaemonId,
         /// At this address.
         address: SocketAddr,
+        /// Whether it proved that the id is its own.
+        proven: bool,
     },
     /// The last link with a daemon is gone.
     LinkDown {
@@ -234,7 +236,9 @@ impl DiscoveryIo {
                 }
             }
             Event::QuicPort(port) => self.peers.set_port(now, port),
-            Event::LinkUp { daemon, address } => self.peers.handle_link_up(now, daemon, address),
+            Event::LinkUp { daemon, address, proven } => {
+                self.peers.handle_link_up(now, daemon, address, proven);
+            }
             Event::LinkDown { daemon } => self.peers.handle_link_down(now, daemon),
             Event::DialFailed { daemon, standing } => {
                 self.peers.handle_dial_failed(now, daemon, standing);

@@ -105,7 +105,7 @@ async fn two_daemons_find_each_other_by_multicast_and_part_with_a_goodbye() {
         }
     }
     for (one, other) in [(&a, &b), (&b, &a)] {
-        let up = Event::LinkUp { daemon: other.id, address: other.address };
+        let up = Event::LinkUp { daemon: other.id, address: other.address, proven: true };
         one.events.send(up).await.unwrap();
     }
     drop(b.events);

@@ -113,7 +113,9 @@ impl Effects {
             LinkReport::DialFailed { daemon, standing } => {
                 self.tell(ToControl::DialFailed { daemon, standing });
             }
-            LinkReport::Up { daemon, address } => self.tell(ToControl::LinkUp { daemon, address }),
+            LinkReport::Up { daemon, address, proven } => {
+                self.tell(ToControl::LinkUp { daemon, address, proven });
+            }
             LinkReport::Datagrams(datagrams) => self.tell(ToControl::Datagrams(datagrams)),
         }
     }

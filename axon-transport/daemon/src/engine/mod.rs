@@ -408,9 +408,10 @@ impl Engine {
             OutboundEvent::Lost { topic, cause, samples } => {
                 self.effects.tell(ToControl::Lost { topic: topic.to_string(), cause, samples });
             }
-            OutboundEvent::Stalled(route) => {
-                let Some(Some(stalled)) =
-                    self.peers.with(daemon, |peer, with| peer.handle_stalled(route, with, now))
+            OutboundEvent::Stalled(route, why) => {
+                let Some(Some(stalled)) = self
+                    .peers
+                    .with(daemon, |peer, with| peer.handle_stalled(route, why, with, now))
                 else {
                     return;
                 };

@@ -77,6 +77,9 @@ pub(crate) trait RingReader {
     fn take_back(&self);
     /// How many samples of each publisher are not acknowledged.
     fn unacknowledged(&self) -> HashMap<Gid, u64>;
+    /// How many publishes of this publisher found no room since readers had not taken, or acknowledged, its oldest
+    /// sample, if this reader is one of these now.
+    fn refused_of(&self, publisher: &Gid) -> Option<u64>;
     /// So many samples of this publisher will never reach the peer.
     fn give_up(&self, publisher: Gid, samples: u64);
     /// How often each publisher asserted its liveliness.

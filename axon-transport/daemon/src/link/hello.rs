@@ -48,6 +48,7 @@ impl Hello {
             expects: None,
             static_peer: false,
             routes: None,
+            proof: None,
         }
     }
 

@@ -72,7 +72,7 @@ async fn serve(
     kme: Option<(crate::keys::Kme, crate::keys::UsedKeys)>,
     key_events: Option<Events>,
 ) -> Result<(), GatewayError> {
-    let GatewayParts { config, daemon, keys, socket, control, orders } = parts;
+    let GatewayParts { config, daemon, daemon_key, keys, socket, control, orders } = parts;
     let mut hello = Hello::new(&config, daemon);
     hello.routes = u32::try_from(MAX_ROUTES).ok();
     let identity = match &config.security {
@@ -96,6 +96,7 @@ async fn serve(
         links: LinkParts {
             credentials: Credentials::new(Arc::clone(&config), identity.clone()),
             hello,
+            daemon_key,
             addresses: sockets.addresses(),
             endpoint: Arc::new(endpoint_config(&reset)),
             qlogs: qlogs.map(|files| Rc::new(files) as Rc<dyn Qlogs>),

@@ -171,6 +171,10 @@ impl RingReader for Relay {
         self.subscription.unacknowledged()
     }
 
+    fn refused_of(&self, publisher: &Gid) -> Option<u64> {
+        self.subscription.refused_of(publisher)
+    }
+
     fn give_up(&self, publisher: Gid, samples: u64) {
         self.subscription.give_up(publisher, samples);
     }

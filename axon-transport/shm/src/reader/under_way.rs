@@ -4,7 +4,10 @@
 use std::collections::VecDeque;
 
 use super::Reader;
-use crate::ring::protocol;
+use crate::{
+    ring::{layout, protocol},
+    sync::Ordering,
+};
 
 /// Numbers and positions of samples that were taken and are not done with, and how many samples were given
 /// up so far.
@@ -42,6 +45,21 @@ impl Reader {
     pub fn undone(&self) -> u64 {
         let under_way = self.under_way.as_ref().map_or(0, |under_way| under_way.0.len() as u64);
         under_way.saturating_add(self.unread())
+    }
+
+    /// How many publishes found no room since KEEP_ALL readers were not done with the oldest sample that stands, if this
+    /// reader is not. Another process wrote the number: any value is possible.
+    pub fn refused(&self) -> Option<u64> {
+        if self.attachment.lane.is_forked() {
+            return None;
+        }
+        let ring = self.attachment.ring();
+        let first =
+            self.under_way.as_ref().and_then(|under_way| under_way.first()).unwrap_or(self.cursor);
+        let (tail, head) = protocol::bounds(ring).ok()?;
+        // Relaxed: a number for which nothing else is read.
+        let refused = || ring[layout::ring::REFUSED].load(Ordering::Relaxed);
+        (first <= tail && first < head).then(refused)
     }
 
     /// Samples up to this number are done with.

@@ -111,6 +111,8 @@ pub(crate) mod ring {
     pub(crate) const PINNED: usize = 8;
     /// The ring's number in its session, by which the journal names it.
     pub(crate) const NUMBER: usize = 9;
+    /// Publishes that found no room since KEEP_ALL readers had not taken the oldest sample, if they waited or not.
+    pub(crate) const REFUSED: usize = 10;
     pub(crate) const HEAD: usize = 128 / 8;
     /// Samples published, those that nobody was there to read among them.
     pub(crate) const PUBLISHED: usize = 136 / 8;

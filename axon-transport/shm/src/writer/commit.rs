@@ -239,7 +239,11 @@ impl Writer {
                     Err(Refusal::OldestInUse { short }) => short,
                 };
                 let WriterState { history, reader_set, .. } = &mut *state;
-                (short, reader_set.laggards(history.tail(), history.head()))
+                let laggards = reader_set.laggards(history.tail(), history.head());
+                if look == 0 && laggards.is_some() {
+                    self.header.count_refused();
+                }
+                (short, laggards)
             };
             let left = deadline.left();
             match laggards {

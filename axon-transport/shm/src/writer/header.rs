@@ -9,7 +9,9 @@ use crate::{
     alloc::heap::{Block, Object},
     error::PublishError,
     ring::{
-        layout::ring::{ASSERTED, BLOCKED, BYTES, NO_MEMORY, PINNED, PUBLISHED, SAMPLED, WINDOW},
+        layout::ring::{
+            ASSERTED, BLOCKED, BYTES, NO_MEMORY, PINNED, PUBLISHED, REFUSED, SAMPLED, WINDOW,
+        },
         times::{Times, read},
     },
     sync::{Ordering, Word},
@@ -97,6 +99,12 @@ impl RingHeader {
         self.update(word, |now| now.wrapping_add(1));
     }
 
+    /// A publish found no room since KEEP_ALL readers have not taken the oldest sample. It may wait for them.
+    #[cold]
+    pub(super) fn count_refused(&self) {
+        self.update(REFUSED, |now| now.wrapping_add(1));
+    }
+
     /// Says that a sample was published at `now`.
     #[inline]
     pub(super) fn note_sample(&self, now: u64) {
@@ -147,13 +155,14 @@ mod tests {
         header.subtract_bytes(40);
         header.show_window(7);
         header.show_published(3);
+        (0..9).for_each(|_| header.count_refused());
         for (dropped, times) in
             [(Dropped::Blocked, 1), (Dropped::NoMemory, 2), (Dropped::Pinned, 4)]
         {
             (0..times).for_each(|_| header.count(dropped));
         }
-        let words = [BYTES, WINDOW, PUBLISHED, BLOCKED, NO_MEMORY, PINNED];
-        assert_eq!(words.map(|at| word(&header, at)), [60, 7, 3, 1, 2, 4]);
+        let words = [BYTES, WINDOW, PUBLISHED, BLOCKED, NO_MEMORY, PINNED, REFUSED];
+        assert_eq!(words.map(|at| word(&header, at)), [60, 7, 3, 1, 2, 4, 9]);
     }
 
     #[test]

@@ -289,6 +289,12 @@ impl MatchedReaders {
         }
     }
 
+    /// How many publishes of `writer` found no room, if a reader of its oldest sample is not done with that.
+    pub(in crate::session) fn refused_of(&self, writer: &Gid) -> Option<u64> {
+        let of = self.matched_readers.iter().filter(|slot| slot.reader.writer() == *writer);
+        of.filter_map(|slot| slot.reader.refused()).max()
+    }
+
     /// Samples that are not done with, by writer.
     pub(in crate::session) fn undone(&self) -> HashMap<Gid, u64> {
         let mut undone = HashMap::new();

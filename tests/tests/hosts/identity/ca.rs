@@ -152,6 +152,6 @@ fn another_name_than_the_certificates_is_refused() {
     let daemon = a.status().links.iter().find(|l| l.host == "host-b").unwrap().peer.clone();
     let claim = Claim { daemon: super::daemon_id(&daemon), ..Claim::ca("camera") };
     let why = stranger.dial(&a, &auth, &claim).expect_err("B's id");
-    assert!(why.contains("under another identity"), "{why}");
+    assert!(why.contains("that of another host"), "{why}");
     stranger.leave(&link);
 }

@@ -4,6 +4,7 @@ use axon_transport::ids::DaemonId;
 
 pub(crate) mod authority;
 mod ca;
+mod claims;
 mod pinned;
 mod replay;
 

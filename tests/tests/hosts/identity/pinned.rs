@@ -191,7 +191,7 @@ fn strangers_get_no_link_and_who_is_pinned_none_under_another_name() {
     // Another daemon's id is taken, whatever peer asks for it.
     let claim = Claim { daemon: super::daemon_id(&daemon), ..Claim::pinned("host-1") };
     let why = stranger.dial(&a, &camera, &claim).expect_err("B's id");
-    assert!(why.contains("under another identity"), "{why}");
+    assert!(why.contains("that of another host"), "{why}");
     // Under an id of its own it is who its pin says, whatever it calls itself.
     let link = stranger.dial(&a, &camera, &Claim::pinned("host-1")).expect("a pinned key");
     until("A knows it by its pin", || {

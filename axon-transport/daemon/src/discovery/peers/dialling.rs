@@ -62,7 +62,7 @@ impl Peers {
             if !self.wants_dial(record, standing) {
                 continue;
             }
-            let Some(source) = record.of(standing).next() else { continue };
+            let Some(source) = record.to_dial(standing).next() else { continue };
             let ours = (self.local.sae.as_ref().map(|(own, _)| own), self.local.daemon);
             let listed = record.listed && self.lists(source.address.ip());
             let first = listed || ours < (source.sae.as_ref(), daemon);
@@ -87,7 +87,7 @@ impl Peers {
                 let dial = &record.dials[standing as usize];
                 let Some(at) = dial.due.filter(|at| *at <= now) else { continue };
                 if self.wants_dial(record, standing) {
-                    let host = record.of(standing).next().map(|source| source.address.ip());
+                    let host = record.to_dial(standing).next().map(|source| source.address.ip());
                     due.push((standing, in_flight.of_host(standing, host), at, *id, host));
                 }
             }
@@ -112,9 +112,9 @@ impl Peers {
         let jitter = self.random.random_range(0.5..1.5);
         let Some(record) = self.records.get_mut(&daemon) else { return false };
         let listed = record.listed && standing <= AddressConfidence::Known;
-        let Some(first) = record.of(standing).next() else { return false };
+        let Some(first) = record.to_dial(standing).next() else { return false };
         let (sae, advertised) = (first.sae.clone(), first.advertised.clone());
-        let same = record.of(standing).filter(|source| source.sae == sae);
+        let same = record.to_dial(standing).filter(|source| source.sae == sae);
         let sources: Vec<_> = same.map(|source| source.address).collect();
         let addrs = self.here.candidates(&sources, &advertised, listed);
         record.dials[standing as usize].start(now, sources.first().copied());

@@ -63,7 +63,7 @@ impl Scene {
         let mut scene = Self::new(honest, forger);
         scene.honest_speaks();
         let (at, address) = (scene.time(), scene.address);
-        scene.peers.handle_link_up(at, honest, address);
+        scene.peers.handle_link_up(at, honest, address, true);
         scene
     }
 

@@ -11,7 +11,7 @@ fn a_goodbye_counts_once_the_link_is_down_and_only_from_where_the_peer_is() {
     let goodbye = Datagram::Goodbye { domain: 0, daemon: HIGHER }.encode();
     let mut peers = settled(local());
     hear(&mut peers, 3.0, beacon(HIGHER));
-    peers.handle_link_up(secs(3.1), HIGHER, from("10.0.0.2:61301"));
+    peers.handle_link_up(secs(3.1), HIGHER, from("10.0.0.2:61301"), true);
     actions(&mut peers);
     peers.handle_datagram(secs(4.0), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
     peers.handle_link_down(secs(4.1), HIGHER);
@@ -40,7 +40,7 @@ fn a_peer_that_answers_after_a_goodbye_in_its_name_stays() {
     let mut peers = settled(local());
     hear(&mut peers, 3.0, beacon(HIGHER));
     let address = from("10.0.0.2:61301");
-    peers.handle_link_up(secs(3.1), HIGHER, address);
+    peers.handle_link_up(secs(3.1), HIGHER, address, true);
     actions(&mut peers);
     peers.handle_datagram(secs(4.0), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
     peers.handle_link_down(secs(4.1), HIGHER);

@@ -7,6 +7,8 @@
 mod announcing;
 mod bucket;
 mod candidates;
+#[cfg(test)]
+mod claims;
 mod dialling;
 mod eviction;
 #[cfg(test)]
@@ -147,7 +149,7 @@ impl Peers {
         let of_records = self.records.values().flat_map(|record| {
             let dials = AddressConfidence::ALL.into_iter().flat_map(|standing| {
                 let dial = &record.dials[standing as usize];
-                let host = record.of(standing).next().map(|source| source.address.ip());
+                let host = record.to_dial(standing).next().map(|source| source.address.ip());
                 let may_dial =
                     self.wants_dial(record, standing) && in_flight.has_room(standing, host);
                 [dial.due.filter(|_| may_dial), dial.in_flight]
@@ -251,7 +253,14 @@ impl Peers {
     }
 
     /// A link with `daemon` stands, whichever side dialled it.
-    pub(crate) fn handle_link_up(&mut self, now: Duration, daemon: DaemonId, address: SocketAddr) {
+    /// `proven`: the daemon proved that the id is its own. If not, another host may have the id: it is dialled all the same.
+    pub(crate) fn handle_link_up(
+        &mut self,
+        now: Duration,
+        daemon: DaemonId,
+        address: SocketAddr,
+        proven: bool,
+    ) {
         let listed = self.lists(address.ip().to_canonical());
         let address = SocketAddr::new(address.ip().to_canonical(), address.port());
         self.meet(address.ip());
@@ -263,6 +272,8 @@ impl Peers {
         record.from = Some(address.ip());
         record.done();
         record.proved(address);
+        record.found(address, proven);
+        self.schedule_dial(now, daemon);
         self.dial_due(now);
     }
 
@@ -270,6 +281,7 @@ impl Peers {
     pub(crate) fn handle_link_down(&mut self, now: Duration, daemon: DaemonId) {
         let Some(record) = self.records.get_mut(&daemon) else { return };
         record.linked = false;
+        record.doubt = None;
         record.done();
         let left = record.left(now);
         // One that dialled us and whose beacons never came cannot be dialled.

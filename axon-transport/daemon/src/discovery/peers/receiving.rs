@@ -205,10 +205,12 @@ impl Peers {
 
     /// Asks whether the daemon is there, if beacons under its id came from elsewhere, too.
     fn ask_if_contested(&mut self, now: Duration, daemon: DaemonId, address: SocketAddr) {
-        let Some(record) = self.records.get(&daemon).filter(|record| !record.linked) else {
-            return;
+        let Some(record) = self.records.get(&daemon) else { return };
+        let contested = match record.linked {
+            false => record.sources.len() > 1,
+            true => record.doubts(address),
         };
-        if record.sources.len() < 2 {
+        if !contested {
             return;
         }
         let source = record.sources.iter().find(|source| source.address == address);

@@ -18,6 +18,10 @@ const DIAL_SPACING: Duration = Duration::from_secs(1);
 const GOODBYE_COUNTS: Duration = Duration::from_secs(10);
 const BACKOFF_FIRST: Duration = Duration::from_millis(250);
 const BACKOFF_MOST: Duration = Duration::from_secs(8);
+/// Where another host may have the id of a linked one, it is dialled again after this.
+const DOUBT_AGAIN: Duration = Duration::from_secs(30);
+/// Most addresses at which a peer was found that proves nothing.
+const MOST_FOUND: usize = 16;
 
 /// An address at which a peer may be, and what was said of it from there.
 #[derive(Clone, Debug)]
@@ -74,9 +78,15 @@ pub(super) struct Record {
     /// When it was still there after a goodbye in its name.
     pub(super) stayed: Option<Duration>,
     pub(super) linked: bool,
+    /// The peer of the link did not prove that the id is its own: another one may have the id.
+    pub(super) doubt: Option<Doubt>,
     /// One for each standing: a dial to an address where nobody is holds up no better one.
     pub(super) dials: [Dial; AddressConfidence::COUNT],
 }
+
+/// Where the peer of a link is that did not prove its id, and the other addresses where it was found.
+#[derive(Debug, Default)]
+pub(super) struct Doubt(Vec<SocketAddr>);
 
 /// When to dial.
 #[derive(Debug, Default)]
@@ -148,6 +158,34 @@ impl Record {
         self.sources.iter().filter(move |source| source.standing() == standing)
     }
 
+    /// The addresses of this standing that may be dialled. While a link stands: those where another host may be that has
+    /// the id, if its address is known or it answered there.
+    pub(super) fn to_dial(
+        &self,
+        standing: AddressConfidence,
+    ) -> impl Iterator<Item = &DialAddress> {
+        self.of(standing).filter(move |source| match self.linked {
+            false => true,
+            true => standing != AddressConfidence::Heard && self.doubts(source.address),
+        })
+    }
+
+    /// Whether another host than the linked one may have the id, at this address.
+    pub(super) fn doubts(&self, address: SocketAddr) -> bool {
+        self.doubt.as_ref().is_some_and(|doubt| !doubt.0.contains(&address))
+    }
+
+    /// A link stands with a peer at this address. `proven`: the id is its own.
+    pub(super) fn found(&mut self, address: SocketAddr, proven: bool) {
+        let mut doubt = self.doubt.take().unwrap_or_default();
+        if !proven {
+            doubt.0.retain(|other| *other != address);
+            doubt.0.insert(0, address);
+            doubt.0.truncate(MOST_FOUND);
+            self.doubt = Some(doubt);
+        }
+    }
+
     /// Where it is, as far as is known: the best of its addresses.
     pub(super) fn host(&self) -> Option<IpAddr> {
         self.sources.first().map(|source| source.address.ip()).or(self.from)
@@ -165,11 +203,10 @@ impl Record {
 
     /// Whether a dial to addresses of this standing would make sense.
     pub(super) fn wants_dial(&self, standing: AddressConfidence) -> bool {
-        let Some(source) = self.of(standing).next() else { return false };
+        let Some(source) = self.to_dial(standing).next() else { return false };
         let elsewhere =
             |dial: &Dial| dial.in_flight.is_none() || dial.first != Some(source.address);
         self.compatible
-            && !self.linked
             && self.leaving.is_none()
             && self.dials[standing as usize].in_flight.is_none()
             && self.dials.iter().all(elsewhere)
@@ -193,7 +230,8 @@ impl Record {
         dial.in_flight = None;
         let doubled = BACKOFF_FIRST.saturating_mul(1 << dial.failures.min(16));
         dial.failures = dial.failures.saturating_add(1);
-        let at = now + doubled.min(BACKOFF_MOST).mul_f64(jitter);
+        let pause = if self.linked { DOUBT_AGAIN } else { doubled.min(BACKOFF_MOST) };
+        let at = now + pause.mul_f64(jitter);
         self.dials[standing as usize].due = Some(self.spaced(standing, at));
     }
 

@@ -207,7 +207,7 @@ impl Subnet {
         for (a, b) in [(from, to), (to, from)] {
             let address = self.hosts[b].address;
             self.hosts[a].links.insert(b);
-            self.hosts[a].peers.handle_link_up(now, id(b), address);
+            self.hosts[a].peers.handle_link_up(now, id(b), address, true);
             self.settle(a);
         }
     }

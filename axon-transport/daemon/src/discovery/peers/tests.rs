@@ -204,7 +204,7 @@ fn forged_beacons_change_nothing_for_a_peer_that_was_acceptable() {
     peers.handle_timeout(secs(4.5));
     assert_eq!(dials(&mut peers), [HIGHER], "still dialled");
 
-    peers.handle_link_up(secs(5.0), HIGHER, from("10.0.0.2:61301"));
+    peers.handle_link_up(secs(5.0), HIGHER, from("10.0.0.2:61301"), true);
     hear(&mut peers, 5.1, forged());
     let goodbye = Datagram::Goodbye { domain: 0, daemon: HIGHER }.encode();
     peers.handle_datagram(secs(5.2), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
@@ -237,7 +237,7 @@ fn the_lower_id_dials_at_once_the_other_after_a_start() {
     // Linked by its dial in the meantime.
     let mut peers = settled(local());
     hear(&mut peers, 3.0, beacon(LOWER));
-    peers.handle_link_up(secs(3.2), LOWER, from("10.0.0.2:61301"));
+    peers.handle_link_up(secs(3.2), LOWER, from("10.0.0.2:61301"), true);
     peers.handle_timeout(secs(4.0));
     assert_eq!(dials(&mut peers), []);
 }
@@ -282,7 +282,7 @@ fn strangers_are_bounded_and_push_out_no_linked_peer() {
     let mut peers = settled(local());
     let linked: Vec<DaemonId> = (0..100).map(|n| DaemonId([n; 16])).collect();
     for daemon in &linked {
-        peers.handle_link_up(secs(3.0), *daemon, from("10.0.0.9:61300"));
+        peers.handle_link_up(secs(3.0), *daemon, from("10.0.0.9:61300"), true);
     }
     for n in 0..5_000_u32 {
         let mut id = [0xee; 16];
@@ -369,7 +369,7 @@ fn a_range_that_changes_is_followed() {
     assert_eq!(multicasts(&mut peers, 2.0), 1);
     hear(&mut peers, 3.0, beacon(HIGHER));
     assert_eq!(dials(&mut peers), [HIGHER]);
-    peers.handle_link_up(secs(3.0), HIGHER, from("10.0.0.2:61301"));
+    peers.handle_link_up(secs(3.0), HIGHER, from("10.0.0.2:61301"), true);
 
     // A link stays; once it is down it is not made again for nobody.
     peers.set_range(secs(4.0), Localhost);
@@ -438,7 +438,7 @@ proptest! {
             let at = SocketAddr::new([10, 0, 0, who].into(), 61300);
             let quic = if wait % 2 == 0 { Arrival::Quic } else { Arrival::Shared };
             match step {
-                0 => peers.handle_link_up(now, daemon, at),
+                0 => peers.handle_link_up(now, daemon, at, true),
                 1 => peers.handle_link_down(now, daemon),
                 2 => fail(&mut peers, now, daemon),
                 3 => peers.handle_datagram(now, at, quic, &bytes),

@@ -5,6 +5,7 @@ use std::{
     time::{Duration, SystemTime},
 };
 
+use axon_shm::ids::DaemonId;
 use quinn_proto::{Dir, StreamEvent, VarInt};
 
 use super::{
@@ -16,6 +17,7 @@ use super::{
     silence::Silence,
 };
 use crate::{
+    daemon_key::DaemonProof,
     engine::{
         account::MESSAGES,
         link::{
@@ -27,7 +29,7 @@ use crate::{
         refusal::Refusal,
         transport::{LINK_WINDOW, STREAMS_OPEN, window_credit},
     },
-    link::{Candidate, CloseCode, Elected, Intake, Message, Side, keep},
+    link::{Candidate, CloseCode, Elected, Hello, Intake, Message, Side, keep},
 };
 
 /// The peer elects one of its connections within this time.
@@ -36,7 +38,8 @@ const ELECTION_TIMEOUT: Duration = Duration::from_secs(10);
 const MAX_LINKS: usize = 128 + 32;
 /// Links of one proven identity.
 const MAX_LINKS_OF_PEER: usize = 16;
-const TAKEN: &str = "this daemon id is linked already, under another identity";
+/// What a peer is told that claims the id of another one.
+const OTHERS: &str = "this daemon id is that of another host";
 
 impl Links {
     /// A connection's peer said HELLO and proved its name.
@@ -59,10 +62,17 @@ impl Links {
             Ok(who) => who,
             Err(why) => return self.turn_away(number, &hello, why, now),
         };
-        let current = self.table.current_peer(daemon);
-        if current.is_some_and(|current| !current.summary.who.is(&who)) {
-            return self.turn_away(number, &hello, TAKEN.into(), now);
+        let binding = self.binding(number);
+        let proves = |proof: &DaemonProof| binding.is_some_and(|b| proof.proves(daemon, &b));
+        if hello.proof.as_ref().is_some_and(|proof| !proves(proof)) {
+            let why = format!("{who} says a proof of daemon id {daemon} that is none");
+            return self.turn_away_told(number, &hello, why, OTHERS, now);
         }
+        let proven = hello.proof.is_some();
+        if let Err(why) = self.claim(daemon, &who, proven, now) {
+            return self.turn_away_told(number, &hello, why, OTHERS, now);
+        }
+        let current = self.table.current_peer(daemon);
         let of_identity = self.table.of_identity(&who);
         let links = self.table.peers().count();
         let is_new = current.is_none();
@@ -94,7 +104,7 @@ impl Links {
             self.dials.opened(number);
             self.close_connection(number, CloseCode::Duplicate, "another connection stands", now);
             if side == Side::Client {
-                self.outbox.report(LinkReport::Up { daemon, address });
+                self.outbox.report(LinkReport::Up { daemon, address, proven });
             }
             return;
         }
@@ -106,6 +116,7 @@ impl Links {
         link.phase = Phase::Electing(now + ELECTION_TIMEOUT);
         link.peer = Some(LinkPeer {
             summary: Summary { hello, negotiated, who },
+            proven,
             order,
             candidate,
             seals: sealing.is_some(),
@@ -130,10 +141,22 @@ impl Links {
         self.connections.touch(number);
     }
 
-    fn turn_away(&mut self, number: u64, hello: &crate::link::Hello, why: String, now: Duration) {
+    fn turn_away(&mut self, number: u64, hello: &Hello, why: String, now: Duration) {
+        self.turn_away_told(number, hello, why.clone(), &why, now);
+    }
+
+    /// As [`turn_away`](Self::turn_away), with another text for the peer.
+    fn turn_away_told(
+        &mut self,
+        number: u64,
+        hello: &Hello,
+        why: String,
+        told: &str,
+        now: Duration,
+    ) {
         let address = self.connections.address(number);
         self.table.remove(number);
-        self.close_connection(number, CloseCode::NotAllowed, &why, now);
+        self.close_connection(number, CloseCode::NotAllowed, told, now);
         if let Some(address) = address {
             let peer = peer_text(hello.sae.as_deref(), address);
             self.outbox
@@ -170,11 +193,12 @@ impl Links {
             return;
         };
         let daemon = peer.summary.hello.daemon;
+        let (who, proven) = (peer.summary.who.clone(), peer.proven);
+        if let Err(why) = self.claim(daemon, &who, proven, now) {
+            return self.violation_told(number, CloseCode::NotAllowed, &why, OTHERS, now);
+        }
         let current = self.current(daemon);
         let current_peer = self.table.current_peer(daemon);
-        if current_peer.is_some_and(|current| !current.summary.who.is(&peer.summary.who)) {
-            return self.violation(number, CloseCode::NotAllowed, TAKEN, now);
-        }
         let newer = current_peer.and_then(|current| current.elected);
         let superseded = newer.is_some_and(|current| current.election > elected.election);
         let age = self.keyring.as_ref().map(|keyring| keyring.config.session_max_age);
@@ -217,9 +241,39 @@ impl Links {
         if let Some(connection) = self.connections.get(number) {
             let address = connection.quic.remote_address();
             tracing::info!(peer = %daemon, %address, new = current.is_none(), "link up");
-            self.outbox.report(LinkReport::Up { daemon, address });
+            self.outbox.report(LinkReport::Up { daemon, address, proven });
         }
         self.connections.touch(number);
+    }
+
+    /// Whether a peer may link under a daemon id. A link under it whose peer did not prove the id ends if this one did.
+    ///
+    /// # Errors
+    /// The id is another peer's.
+    fn claim(
+        &mut self,
+        daemon: DaemonId,
+        who: &Who,
+        proven: bool,
+        now: Duration,
+    ) -> Result<(), String> {
+        let Some(current) = self.table.current_peer(daemon) else { return Ok(()) };
+        if current.proven == proven && current.summary.who.is(who) {
+            return Ok(());
+        }
+        let other = &current.summary.who;
+        if !proven {
+            let has = if current.proven { "which proved it" } else { "which came first" };
+            return Err(format!(
+                "{who} claims daemon id {daemon}, which is that of {other}, {has}"
+            ));
+        }
+        let why =
+            format!("{other} claims daemon id {daemon}, which is that of {who}, which proved it");
+        if let Some(number) = self.current(daemon) {
+            self.violation_told(number, CloseCode::NotAllowed, &why, OTHERS, now);
+        }
+        Ok(())
     }
 
     /// Lets the peer send more that is not read, as far as its identity has room. Returns whether it may.

@@ -52,8 +52,8 @@ pub(in crate::engine) enum LinkReport {
     Refused(String, Refusal),
     /// A dial failed.
     DialFailed { daemon: DaemonId, standing: AddressConfidence },
-    /// A link of this daemon is up at this address.
-    Up { daemon: DaemonId, address: SocketAddr },
+    /// A link of this daemon is up at this address. Whether the daemon proved its id.
+    Up { daemon: DaemonId, address: SocketAddr, proven: bool },
     /// Datagrams of discovery.
     Datagrams(Datagrams),
 }

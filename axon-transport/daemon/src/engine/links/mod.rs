@@ -57,6 +57,7 @@ use super::{
     keyring::Keyring,
 };
 use crate::{
+    daemon_key::DaemonKey,
     discovery::{Interface, is_discovery},
     engine::{
         account::{Account, Accounts, Charge},
@@ -75,6 +76,7 @@ pub(super) struct Links {
     pub(super) credentials: Credentials,
     pub(super) keyring: Option<Keyring>,
     hello: Hello,
+    daemon_key: Option<Arc<DaemonKey>>,
     qlogs: Option<Rc<dyn Qlogs>>,
     epoch: Instant,
     accounts: Accounts,
@@ -101,6 +103,8 @@ pub(crate) struct LinkParts {
     pub(crate) credentials: Credentials,
     /// This side's HELLO.
     pub(crate) hello: Hello,
+    /// The key of which this side's id is made.
+    pub(crate) daemon_key: Option<Arc<DaemonKey>>,
     /// The addresses that the endpoints are bound to.
     pub(crate) addresses: Vec<SocketAddr>,
     /// The settings of the endpoints.
@@ -117,7 +121,9 @@ impl Links {
     /// # Errors
     /// The settings make no TLS server.
     pub(super) fn new(parts: LinkParts) -> Result<Self, GatewayError> {
-        let LinkParts { config, credentials, hello, addresses, endpoint, qlogs, epoch } = parts;
+        let LinkParts { config, credentials, hello, daemon_key, .. } = parts;
+        let (addresses, endpoint) = (parts.addresses, parts.endpoint);
+        let (qlogs, epoch) = (parts.qlogs, parts.epoch);
         let keyring = Keyring::new(&config);
         let unspecified = IpAddr::from([0, 0, 0, 0]);
         let resolver = keyring.as_ref().map(|keys| keys.resolver(Duration::ZERO, unspecified));
@@ -128,6 +134,7 @@ impl Links {
             credentials,
             keyring,
             hello,
+            daemon_key,
             qlogs,
             epoch,
             connections: Connections::new(Endpoints::new(&addresses, &endpoint, &server), epoch),

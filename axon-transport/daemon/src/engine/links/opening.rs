@@ -109,12 +109,20 @@ impl Links {
     }
 
     /// Begins HELLO on a connection whose handshake is complete.
-    fn begin_opening(&mut self, number: u64, ours: Hello, dialled: Option<String>, now: Duration) {
+    fn begin_opening(
+        &mut self,
+        number: u64,
+        mut ours: Hello,
+        dialled: Option<String>,
+        now: Duration,
+    ) {
         let (Some(connection), Some(link)) =
             (self.connections.get_mut(number), self.table.get_mut(number))
         else {
             return;
         };
+        let key = self.daemon_key.as_ref();
+        ours.proof = key.and_then(|key| key.prove(&connection.binding()?));
         let session = connection.quic.crypto_session();
         let exporters = Exporters::derive(|out, label| {
             session.export_keying_material(out, label, b"").map_err(|_| ())

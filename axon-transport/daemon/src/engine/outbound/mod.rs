@@ -30,6 +30,7 @@ pub(crate) use self::{
     schedule::{Class, FlowId, Priorities, Rank},
     served::{ResponseNumbers, RouteOut},
     source::Source,
+    stall::Stall,
 };
 use self::{
     budget::Budget,
@@ -66,7 +67,7 @@ pub(crate) enum OutboundEvent {
         samples: u64,
     },
     /// The peer does not read what it asked for over this route.
-    Stalled(u32),
+    Stalled(u32, Stall),
 }
 
 /// The samples to one peer.
@@ -106,7 +107,7 @@ impl Outbound {
 
     /// Serves this route from now on, or changes it.
     pub(crate) fn set_route(&mut self, number: u32, route: RouteOut, now: Duration) {
-        let RouteOut { sources, seen, .. } = route;
+        let RouteOut { sources, seen, idle, .. } = route;
         let shared = FlowRoute {
             number,
             topic: route.topic,
@@ -120,6 +121,9 @@ impl Outbound {
         };
         self.table.routes.add(number, shared);
         self.update_sources(number, sources, seen, now);
+        if let Some(served) = self.table.routes.get(number).filter(|_| !idle.is_zero()) {
+            served.flows.values().for_each(|id| self.stalls.inherit(*id, idle));
+        }
     }
 
     /// The route has these sources from now on.
@@ -199,11 +203,11 @@ impl Outbound {
     }
 
     /// Takes the KEEP_ALL relays of a route, as many as `most` says, whose samples another daemon of the peer's host may
-    /// ask for. Nothing of their flows is given up.
-    pub(crate) fn take_kept(&mut self, number: u32, most: usize) -> Vec<Source> {
+    /// ask for. Nothing of their flows is given up. Returns also for how long one of them made no progress.
+    pub(crate) fn take_kept(&mut self, number: u32, most: usize) -> (Vec<Source>, Duration) {
         let (kept, gone) = self.table.take_kept(number, most);
-        self.forget(gone);
-        kept
+        let idle = self.forget(gone);
+        (kept, idle)
     }
 
     /// Whether samples of a publisher are left that wait to be acknowledged, or for a limit.
@@ -223,13 +227,15 @@ impl Outbound {
         }
     }
 
-    /// These flows are gone. Their numbers are free for others.
-    fn forget(&mut self, gone: impl IntoIterator<Item = FlowId>) {
+    /// These flows are gone. Their numbers are free for others. Returns for how long one of them made no progress.
+    fn forget(&mut self, gone: impl IntoIterator<Item = FlowId>) -> Duration {
+        let mut idle = Duration::ZERO;
         for id in gone {
             self.turns.forget(id);
             self.nudges.forget(id);
-            self.stalls.forget(id);
+            idle = idle.max(self.stalls.forget(id));
         }
+        idle
     }
 
     /// Hands samples to QUIC until it takes no more, or none is left.
@@ -421,7 +427,7 @@ impl Outbound {
 
     /// Reports the publishers of which nothing is left, and gives up the samples of those that make no progress.
     fn look_at_endings(&mut self, now: Duration) {
-        let starves = self.stalls.starves(now);
+        let starves = self.stalls.starves();
         let left_of = |route, of: &Gid| self.table.left_of(route, of, starves);
         let over = self.endings.handle_timeout(now, left_of);
         for Over { publisher, given_up } in over {
@@ -456,11 +462,11 @@ impl Outbound {
         let (returned, is_awaited) = (self.turns.credit().returned(), self.turns.wait_for_credit());
         let peer = PeerActivity { heard, returned, is_awaited };
         let found = self.stalls.handle_timeout(peer, self.table.busy(), now);
-        for number in found.stalled {
+        for (number, why) in found.stalled {
             if let Some(served) = self.table.routes.get_mut(number) {
                 served.stalled = true;
             }
-            self.events.push(OutboundEvent::Stalled(number));
+            self.events.push(OutboundEvent::Stalled(number, why));
         }
         found.quiet.into_iter().for_each(|id| self.table.flows.set_quiet(id));
     }

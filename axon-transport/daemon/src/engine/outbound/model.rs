@@ -134,6 +134,10 @@ impl RingReader for Ring {
         HashMap::new()
     }
 
+    fn refused_of(&self, _publisher: &Gid) -> Option<u64> {
+        None
+    }
+
     fn give_up(&self, _publisher: Gid, _samples: u64) {}
 
     fn assertions(&self) -> Vec<(Gid, u64)> {

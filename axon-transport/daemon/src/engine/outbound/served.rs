@@ -34,6 +34,8 @@ pub(crate) struct RouteOut {
     pub(crate) sources: Vec<Source>,
     /// The newest sample of each publisher that the peer has already.
     pub(crate) seen: HashMap<Gid, u64>,
+    /// For how long an earlier daemon of the peer's host took nothing of what waits.
+    pub(crate) idle: Duration,
 }
 
 /// The parts of a route that its flows share.
@@ -104,10 +106,19 @@ impl Served {
         self.source_of(of).is_some_and(|s| s.qos().reliability == Reliability::Reliable)
     }
 
-    /// Whether a KEEP_ALL relay holds a publisher back.
-    pub(super) fn holds(&self, of: &Gid) -> bool {
-        let keeping = |source: &Source| source.qos().history == History::KeepAll;
-        self.sources.iter().any(|source| keeping(source) && source.has_unacknowledged(of))
+    /// Samples that KEEP_ALL relays have a publisher keep, if there are any.
+    pub(super) fn keeps(&self, of: &Gid) -> Option<u64> {
+        self.keeping(of).filter_map(|source| source.unacknowledged().get(of).copied()).max()
+    }
+
+    /// How many publishes of a publisher found no room, if a KEEP_ALL relay is why the next one may not.
+    pub(super) fn refused(&self, of: &Gid) -> Option<u64> {
+        self.keeping(of).filter_map(|source| source.refused_of(of)).max()
+    }
+
+    fn keeping(&self, of: &Gid) -> impl Iterator<Item = &Source> {
+        let keeping = |source: &&Source| source.qos().history == History::KeepAll;
+        self.sources.iter().filter(keeping).filter(|source| source.reads(of))
     }
 
     /// The publishers, or clients, that have samples to take, each once.

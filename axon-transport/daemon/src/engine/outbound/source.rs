@@ -163,6 +163,14 @@ impl Source {
         self.reads(of) && self.unacknowledged().contains_key(of)
     }
 
+    /// How many publishes of this publisher found no room, if it is this source that may leave none to the next one.
+    pub(super) fn refused_of(&self, of: &Gid) -> Option<u64> {
+        match self {
+            Self::Relay(_, reader) => reader.refused_of(of),
+            Self::StandIn(_) => None,
+        }
+    }
+
     /// So many samples of a publisher will never reach the peer.
     pub(super) fn give_up(&self, of: Gid, samples: u64) {
         if let Self::Relay(_, reader) = self {

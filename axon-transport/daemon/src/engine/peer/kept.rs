@@ -34,6 +34,8 @@ struct Kept {
     key: RouteKey,
     spec: RelaySpec,
     reader: Rc<dyn RingReader>,
+    /// When it was kept, and for how long the peer had taken nothing then.
+    since: (Duration, Duration),
     until: Duration,
     /// It counts among those that are kept, and still among the relays of the identity.
     _charges: [Charge; 2],
@@ -72,18 +74,20 @@ impl KeptRelays {
         let room = self.room_of(&peer.identity);
         for (number, served) in &mut peer.served {
             let lanes = served.lanes.amount() / served.sources.len().max(1);
-            for source in peer.outbound.take_kept(*number, room.left()) {
+            let (sources, idle) = peer.outbound.take_kept(*number, room.left());
+            for source in sources {
                 let Source::Relay(spec, reader) = source else { continue };
                 let Some(place) = room.charge(1) else { continue };
                 let charges = [place, served.relays.split(1)];
                 let identity = peer.identity.clone();
-                let (key, until) = (served.key.clone(), now + PATIENCE);
+                let (key, since, until) = (served.key.clone(), (now, idle), now + PATIENCE);
                 let lanes = Some(served.lanes.split(lanes));
                 self.all.push(Kept {
                     identity,
                     key,
                     spec,
                     reader,
+                    since,
                     until,
                     _charges: charges,
                     lanes,
@@ -100,18 +104,23 @@ impl KeptRelays {
     }
 
     /// The relay that was kept, of a peer with this identity, for one of the subscriptions for which a new one is to
-    /// stand. It begins with what was not acknowledged.
+    /// stand. It begins with what was not acknowledged. Returns also for how long nothing of it was taken: a daemon that
+    /// follows another one is no way around the `limit` on that. All the time for which a relay may be kept counts as half
+    /// of it, so that a daemon that is slow to start has the other half.
     pub(super) fn adopt(
         &mut self,
         key: &RouteKey,
         spec: &RelaySpec,
         identity: &str,
-    ) -> Option<Rc<dyn RingReader>> {
+        limit: Duration,
+        now: Duration,
+    ) -> Option<(Rc<dyn RingReader>, Duration)> {
         let at = self.all.iter().position(|kept| kept.fits(key, spec, identity))?;
-        let Kept { reader, .. } = self.all.swap_remove(at);
+        let Kept { reader, since: (kept, idle), .. } = self.all.swap_remove(at);
         reader.take_back();
         reader.set_stands_for(spec.stands_for.clone());
-        Some(reader)
+        let kept = now.saturating_sub(kept).min(PATIENCE).as_millis() as u32;
+        Some((reader, idle + limit * kept / (2 * PATIENCE.as_millis() as u32)))
     }
 
     /// How many there are.

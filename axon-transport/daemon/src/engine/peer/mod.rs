@@ -48,7 +48,7 @@ pub(crate) use self::{
 };
 use super::{
     inbound::Inbound,
-    outbound::{Outbound, Source},
+    outbound::{Outbound, Source, Stall},
     rings::Rings,
     stand_in::StandIns,
 };
@@ -545,10 +545,11 @@ impl Peer {
     pub(super) fn handle_stalled(
         &mut self,
         route: u32,
+        why: Stall,
         with: &Surroundings<'_>,
         now: Duration,
     ) -> Option<StalledRoute> {
-        let stalled = self.give_up_stalled(route, with, now)?;
+        let stalled = self.give_up_stalled(route, why, with, now)?;
         self.update_services(with, now);
         Some(stalled)
     }

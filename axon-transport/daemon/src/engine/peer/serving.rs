@@ -11,7 +11,7 @@ use crate::{
     engine::{
         account::Charge,
         limits::RouteLimit,
-        outbound::{RouteOut, Source},
+        outbound::{RouteOut, Source, Stall},
         peer::routes::{MAX_RELAYS_OF_ROUTE, RelaySpec, RouteKey, admit, relays},
     },
     link::{Message, RouteReady, Subscribe, Subscriber},
@@ -53,6 +53,8 @@ struct Relays {
     sources: Vec<Source>,
     /// Those among them that another daemon of the peer's host had.
     adopted: Vec<Gid>,
+    /// For how long nothing of one of them was taken.
+    idle: Duration,
     without: Option<Without>,
 }
 
@@ -141,14 +143,14 @@ impl Peer {
         self.refused.forget(number);
         let relays = match kind {
             Kind::Topic => {
-                self.open_relays(&key, &subscribers, &old, (&mut places, &mut lanes), with)
+                self.open_relays(&key, &subscribers, &old, (&mut places, &mut lanes), with, now)
             }
             Kind::Request | Kind::Response => {
                 let sources = self.sources_of_service(&key);
-                Relays { sources, adopted: Vec::new(), without: None }
+                Relays { sources, adopted: Vec::new(), idle: Duration::ZERO, without: None }
             }
         };
-        let Relays { sources, adopted, without } = relays;
+        let Relays { sources, adopted, idle, without } = relays;
         self.announcing.insert(number, now + READY_TIMEOUT);
         self.look_at_announcing = Some(now);
         let route = Route { kind, topic: hash };
@@ -162,6 +164,7 @@ impl Peer {
             limit: RouteLimit::new(self.outgoing_limits(&key, with.config)),
             sources: sources.clone(),
             seen,
+            idle,
         };
         self.outbound.set_route(number, out, now);
         // Of a relay that was kept: publishers that ended meanwhile. The graph of this host is followed late, so others
@@ -221,6 +224,7 @@ impl Peer {
     pub(super) fn give_up_stalled(
         &mut self,
         route: u32,
+        why: Stall,
         with: &Surroundings<'_>,
         now: Duration,
     ) -> Option<StalledRoute> {
@@ -231,12 +235,12 @@ impl Peer {
         let (limit, key) = (with.config.link.stalled, &served.key);
         let instant = with.instant(now);
         let wait = with.stalls.borrow_mut().add(&self.identity, key, limit, instant);
-        let reason = format!(
-            "nothing of {} was read for {} s; it is not sent for {} s ([link] stalled_s)",
-            key.topic,
-            limit.as_secs(),
-            wait.as_secs()
-        );
+        let (topic, again) = (&key.topic, wait.as_secs());
+        let what = match why {
+            Stall::NothingRead => format!("nothing of {topic} was read for {} s", limit.as_secs()),
+            Stall::TooSlow => format!("{topic} was read so slowly that its publisher waited"),
+        };
+        let reason = format!("{what}; it is not sent for {again} s ([link] stalled_s)");
         self.refuse(route, key, reason.clone(), Some(wait));
         Some(StalledRoute { topic: served.key.topic.clone(), reason, samples })
     }
@@ -267,6 +271,7 @@ impl Peer {
         old: &[Source],
         (places, lanes): (&mut Charge, &mut Charge),
         with: &Surroundings<'_>,
+        now: Duration,
     ) -> Relays {
         let hash = |gid: &Gid| self.remote.get(gid).map_or_else(Vec::new, |e| e.type_hash.clone());
         let mut specs = relays(subscribers, hash);
@@ -286,7 +291,7 @@ impl Peer {
         let each = with.writers.of_route(key);
         drop(places.split(places.amount().saturating_sub(stay)));
         drop(lanes.split(lanes.amount().saturating_sub(stay * each)));
-        let (mut sources, mut adopted) = (Vec::new(), Vec::new());
+        let (mut sources, mut adopted, mut idle) = (Vec::new(), Vec::new(), Duration::ZERO);
         for spec in specs {
             if let Some(reader) = there(&spec) {
                 reader.set_stands_for(spec.stands_for.clone());
@@ -304,8 +309,13 @@ impl Peer {
                 without = Some((TOO_MANY_LANES.to_owned(), Some(ASK_AGAIN)));
                 continue;
             };
-            let reader = match with.kept.borrow_mut().adopt(key, &spec, &self.identity) {
-                Some(reader) => Ok((reader, true)),
+            let limit = with.config.link.stalled;
+            let kept = with.kept.borrow_mut().adopt(key, &spec, &self.identity, limit, now);
+            let reader = match kept {
+                Some((reader, without_progress)) => {
+                    idle = idle.max(without_progress);
+                    Ok((reader, true))
+                }
                 None => {
                     let endpoint = EndpointSpec::new(&*key.topic, &*key.type_name, spec.qos)
                         .type_hash(spec.type_hash.clone());
@@ -331,7 +341,7 @@ impl Peer {
         }
         let lacks = asked - sources.len();
         let without = without.map(|(why, again)| (missing(lacks, asked, &why), again));
-        Relays { sources, adopted, without }
+        Relays { sources, adopted, idle, without }
     }
 
     /// The stand-ins from which the calls, or responses, of a service are taken.

@@ -21,11 +21,12 @@ use quinn_proto::{EcnCodepoint, EndpointConfig, Transmit};
 use rand::RngExt;
 
 use super::{
-    rings::SimRings,
+    rings::{SimRings, session_key},
     rng::{Stream, stream},
 };
 use crate::{
     bridge::{ToControl, ToGateway},
+    daemon_key::DaemonKey,
     discovery::{AddressConfidence, Interface},
     engine::{
         Effect, Engine, EngineParts, credentials::Credentials, links::LinkParts, peer::MAX_ROUTES,
@@ -50,6 +51,8 @@ pub(super) struct Host {
     pub(super) number: usize,
     pub(super) address: Ipv4Addr,
     pub(super) daemon: DaemonId,
+    /// The daemon whose id the next one of this host claims.
+    pub(super) poses_as: Option<DaemonId>,
     pub(super) rings: SimRings,
     config: Arc<Config>,
     epoch: Instant,
@@ -95,6 +98,7 @@ impl Host {
             number,
             address: Ipv4Addr::new(10, 0, high, low),
             daemon: DaemonId::default(),
+            poses_as: None,
             rings: SimRings::new(number),
             config: Arc::new(config),
             epoch,
@@ -125,7 +129,9 @@ impl Host {
         self.starts += 1;
         let host = Stream::Host { host: self.number as u32, start: self.starts };
         let mut random = stream(self.seed, host);
-        self.daemon = DaemonId(random.random());
+        let key = DaemonKey::from(session_key(&random.random()));
+        self.daemon = self.poses_as.unwrap_or(key.id());
+        let key = self.poses_as.is_none().then(|| Arc::new(key));
         let mut endpoint = EndpointConfig::default();
         endpoint.rng_seed(Some(random.random())).grease_quic_bit(false);
         endpoint.supported_versions(vec![1]);
@@ -144,6 +150,7 @@ impl Host {
             config: Arc::clone(&self.config),
             credentials: Credentials::new(Arc::clone(&self.config), identity),
             hello,
+            daemon_key: key,
             addresses: vec![SocketAddr::from(([0, 0, 0, 0], PORT))],
             endpoint: Arc::new(endpoint),
             qlogs: None,

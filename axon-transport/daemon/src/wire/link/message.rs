@@ -8,7 +8,7 @@ use axon_transport::{graph::Endpoint, internal::graph::LIMITS};
 use minicbor::{Decode, Encode};
 
 use super::frame::{FrameError, from_map, to_map};
-use crate::{owner::Proof, wire::keys::KeyMessage};
+use crate::{daemon_key::DaemonProof, owner::Proof, wire::keys::KeyMessage};
 
 /// Who a daemon is and how it is set up: the first message in each direction.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
@@ -59,6 +59,9 @@ pub struct Hello {
     /// Routes that the sender serves a peer at most. Absent: 1,024.
     #[n(18)]
     pub routes: Option<u32>,
+    /// Proves the sender's id for this connection. Versions before say none.
+    #[n(19)]
+    pub proof: Option<DaemonProof>,
 }
 
 /// The connection that the lower daemon id keeps.

@@ -7,7 +7,7 @@ use axon_shm::{
 };
 
 use super::*;
-use crate::{owner::Proof, wire::keys::KeyMessage};
+use crate::{daemon_key::DaemonProof, owner::Proof, wire::keys::KeyMessage};
 
 pub(crate) fn key_id(id: &str) -> KeyId {
     KeyId::new(id).unwrap()
@@ -30,6 +30,7 @@ pub(crate) fn hello() -> Hello {
         expects: None,
         static_peer: false,
         routes: None,
+        proof: None,
     }
 }
 
@@ -48,6 +49,7 @@ pub(crate) fn messages() -> Vec<Message> {
         Message::Hello(Hello {
             replaces: Some([3; 16]),
             expects: Some(DaemonId([4; 16])),
+            proof: Some(DaemonProof { key: [5; 32], signature: [6; 64] }),
             ..hello()
         }),
         elected(),

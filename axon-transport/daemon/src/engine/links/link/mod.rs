@@ -82,6 +82,8 @@ impl Summary {
 /// The peer of a link.
 pub(super) struct LinkPeer {
     pub(super) summary: Summary,
+    /// Whether it proved that its daemon id is its own.
+    pub(super) proven: bool,
     pub(super) order: Order,
     pub(super) candidate: Candidate,
     /// Key material of the connection, until it is elected.

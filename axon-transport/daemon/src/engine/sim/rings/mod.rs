@@ -35,6 +35,8 @@ const RING: usize = 256;
 struct Publisher {
     endpoint: Arc<Endpoint>,
     published: u64,
+    /// Publishes that found no room.
+    refused: u64,
     history: VecDeque<(u64, Vec<u8>)>,
 }
 
@@ -96,6 +98,12 @@ pub(super) struct SimRings {
 /// GIDs of endpoints of a peer without an engine begin with this. Nobody vouches for their samples.
 pub(super) const FOREIGN: [u8; 12] = [0xaa; 12];
 
+/// A key that the run's seed decides.
+pub(super) fn session_key(seed: &[u8; 32]) -> SessionKey {
+    let packet = [&[OWNER, 0xa1, 0x00, 0x58, 0x20], &seed[..]].concat();
+    SessionKey::from_packet(&packet).unwrap()
+}
+
 /// The payload of a sample: its number, its publisher and filling, so that damage shows.
 pub(super) fn payload(of: Gid, sequence: u64, length: usize) -> Vec<u8> {
     let mut payload = of.0.to_vec();
@@ -108,10 +116,9 @@ pub(super) fn payload(of: Gid, sequence: u64, length: usize) -> Vec<u8> {
 impl SimRings {
     /// The rings of a host whose sessions have this number.
     pub(super) fn new(host: usize) -> Self {
-        let mut packet = vec![OWNER, 0xa1, 0x00, 0x58, 0x20];
-        packet.extend_from_slice(&[0x51; 24]);
-        packet.extend_from_slice(&(host as u64).to_be_bytes());
-        let key = Arc::new(SessionKey::from_packet(&packet).unwrap());
+        let mut seed = [0x51; 32];
+        seed[24..].copy_from_slice(&(host as u64).to_be_bytes());
+        let key = Arc::new(session_key(&seed));
         Self { session: key.id(), key, state: Rc::default() }
     }
 
@@ -132,7 +139,7 @@ impl SimRings {
     pub(super) fn create_publisher(&self, topic: &str, qos: Qos) -> Gid {
         let endpoint = Arc::new(self.endpoint(EndpointKind::Publisher, topic, qos));
         let gid = endpoint.gid;
-        let publisher = Publisher { endpoint, published: 0, history: VecDeque::new() };
+        let publisher = Publisher { endpoint, published: 0, refused: 0, history: VecDeque::new() };
         let state = &mut *self.state.borrow_mut();
         state.publishers.insert(gid, publisher);
         state.topics.entry(topic.into()).or_default().insert(gid);
@@ -198,6 +205,7 @@ impl SimRings {
         if of.history.len() >= most {
             let first = of.history.front().map_or(0, |(sequence, _)| *sequence);
             if oldest.is_some_and(|oldest| oldest < first) {
+                of.refused += 1;
                 return false;
             }
             of.history.pop_front();

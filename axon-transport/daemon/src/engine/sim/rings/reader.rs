@@ -153,6 +153,14 @@ impl RingReader for SimReader {
         left.filter(|(_, left)| *left > 0).collect()
     }
 
+    fn refused_of(&self, publisher: &Gid) -> Option<u64> {
+        let state = self.rings.state.borrow();
+        let of = state.publishers.get(publisher)?;
+        let (oldest, _) = of.history.front()?;
+        let acknowledged = self.cursors.acknowledged.borrow().get(publisher).copied().unwrap_or(0);
+        (acknowledged < *oldest).then_some(of.refused)
+    }
+
     fn give_up(&self, publisher: Gid, samples: u64) {
         *self.rings.state.borrow_mut().given_up.entry(publisher).or_default() += samples;
     }

@@ -14,3 +14,4 @@ mod refused;
 mod rules;
 mod segment;
 mod torture;
+mod unfair;

@@ -1,0 +1,4 @@
+//! Peers that keep the protocol, and take what is not theirs: a publisher's time, the id of another daemon.
+
+mod claims;
+mod stalls;
