@@ -274,7 +274,7 @@ fn best_effort_samples_that_wait_when_their_publisher_ends_arrive_or_are_counted
         [("1", "hold", 5), ("1", "drop-oldest", 2), ("0.02", "hold", 1), ("0.02", "drop-oldest", 1)]
     {
         let text = format!(
-            "[[limit]]\npeer = \"*\"\ntopic = \"/limited\"\nrate = {rate}\nover = \"{over}\""
+            "[[limit]]\npeer = \"*\"\ntopic = \"/limited\"\nrate = {rate}\nburst = 1\nover = \"{over}\""
         );
         let mut world = hosts(0, &text);
         let pair = world.pair(0, 1, "/limited", Qos::sensor_data());
