@@ -68,7 +68,7 @@ impl FrameLimits {
 #[derive(Debug)]
 pub(crate) enum Input {
     /// A message, with what it weighs on the account until it is handled.
-    Message(Message, Option<Charge>),
+    Message(Box<Message>, Option<Charge>),
     /// No whole message has come, or the peer has to wait.
     Nothing,
     /// One has come, and is decompressed once messages of the same identity are handled.
@@ -299,7 +299,7 @@ impl Control {
                 if let more @ 1.. = cost(&message).saturating_sub(paid) {
                     self.pause(owe(more), now);
                 }
-                return Ok(Input::Message(message, room));
+                return Ok(Input::Message(Box::new(message), room));
             }
         }
     }

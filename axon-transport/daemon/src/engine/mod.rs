@@ -12,6 +12,7 @@ pub(crate) mod connection;
 pub(crate) mod control;
 pub(crate) mod counters;
 pub(crate) mod credentials;
+mod dropped;
 mod effects;
 pub(crate) mod endpoints;
 pub(crate) mod frames;

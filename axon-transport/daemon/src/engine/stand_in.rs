@@ -15,6 +15,7 @@ use axon_transport::{
 };
 
 use super::{
+    dropped::DroppedRuns,
     numbers::{FORGOTTEN, Numbers},
     rings::{RingError, RingWriter, Rings},
 };
@@ -28,6 +29,8 @@ pub(crate) struct StandIn {
     rises: bool,
     /// The number that was written last; 0 is none.
     last: Cell<u64>,
+    /// The newest that were dropped here.
+    dropped: RefCell<DroppedRuns>,
     /// What its publisher can have published.
     numbers: Rc<Numbers>,
     _place: Charge,
@@ -75,6 +78,19 @@ impl StandIn {
     /// The number of the newest sample of a publisher, or request of a client, that is in the ring.
     pub(crate) fn last_sequence(&self) -> Option<u64> {
         Some(self.last.get()).filter(|last| self.rises && *last > 0)
+    }
+
+    /// A sample was dropped here by a limit or for want of room. One whose number cannot be is not meant: the true one may
+    /// come.
+    pub(crate) fn drop_sample(&self, sequence: u64) {
+        if self.rises {
+            self.dropped.borrow_mut().add(sequence);
+        }
+    }
+
+    /// Whether a sample was dropped here before: a publisher whose link broke sends it again.
+    pub(crate) fn has_dropped(&self, sequence: u64) -> bool {
+        self.dropped.borrow().has(sequence)
     }
 }
 
@@ -143,6 +159,7 @@ impl StandIns {
             gid: remote.gid,
             rises: remote.kind != EndpointKind::Server,
             last: Cell::new(0),
+            dropped: RefCell::default(),
             numbers: Rc::clone(&numbers),
             _place: place,
         });

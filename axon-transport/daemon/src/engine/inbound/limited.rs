@@ -62,7 +62,8 @@ impl Limited {
 }
 
 impl Inbound {
-    /// Returns the message if it may pass the limits of its route. Else it is dropped, or its stream is held.
+    /// Returns the message if it may pass the limits of its route. Else its stream is held, and what it does next is
+    /// returned; or the message is to be dropped and is counted.
     ///
     /// A sample that waited here would be in the way of others: it would keep memory, streams and window of its peer, and its
     /// publisher would not be told of it. So a topic is held only where its publisher waits for its readers anyway.
@@ -72,10 +73,9 @@ impl Inbound {
         stream: &mut Incoming,
         limit: &RouteLimit,
         message: Message,
-        acknowledged: bool,
         now: Duration,
-    ) -> Result<Message, Next> {
-        let Some((header, Some(route))) = stream.header else { return Err(Next::Over) };
+    ) -> Result<Message, Option<Next>> {
+        let Some((header, Some(route))) = stream.header else { return Err(Some(Next::Over)) };
         let keeps_all = self.routes.get(&header.route).is_some_and(|route| route.keeps_all);
         let may_wait = route.kind == Kind::Request || header.reliable && keeps_all;
         // Streams that wait for one limit are read on in turn.
@@ -85,15 +85,11 @@ impl Inbound {
         };
         if waits(exceeded.over()) {
             self.limited.hold(key, now + exceeded.wait);
-            return Err(wait(stream, Step::Ring(message)));
+            return Err(Some(wait(stream, Step::Ring(message))));
         }
         exceeded.dropped(1);
         self.counters.lost(&self.topic(header.route), exceeded.cause(), 1);
-        if acknowledged {
-            self.receipts.dropped((header.route, header.of), message.number, now);
-        }
-        self.release(stream);
-        Err(if header.reliable { Next::Go } else { Next::Over })
+        Err(None)
     }
 
     /// Has the streams read on whose limit opens.

@@ -337,6 +337,11 @@ impl Inbound {
             Kind::Topic | Kind::Request => stand_in.last_sequence(),
             Kind::Response => found.and_then(|route| route.clients.get(&header.of)).copied(),
         };
+        if acknowledged && stand_in.has_dropped(sequence) {
+            self.receipts.dropped_again(flow, sequence, now);
+            self.release(stream);
+            return Next::Go;
+        }
         if acknowledged && last >= Some(sequence) {
             self.receipts.came(flow, sequence, length, now);
             self.release(stream);
@@ -351,9 +356,15 @@ impl Inbound {
         let stand_in = Rc::clone(stand_in);
         let limit = found.map(|route| &route.limit).filter(|limit| !limit.is_none()).cloned();
         let message = match &limit {
-            Some(limit) => match self.pass_limit(key, stream, limit, message, acknowledged, now) {
+            Some(limit) => match self.pass_limit(key, stream, limit, message, now) {
                 Ok(message) => message,
-                Err(next) => return next,
+                Err(Some(next)) => return next,
+                Err(None) => {
+                    if acknowledged {
+                        stand_in.drop_sample(sequence);
+                    }
+                    return self.after_drop(stream, acknowledged, sequence, now);
+                }
             },
             None => message,
         };
@@ -369,10 +380,27 @@ impl Inbound {
         {
             found.clients.entry(header.of).and_modify(|last| *last = sequence);
         }
-        match acknowledged {
-            true if there => self.receipts.came(flow, sequence, length, now),
-            true => self.receipts.dropped(flow, sequence, now),
-            false => {}
+        if !there {
+            return self.after_drop(stream, acknowledged, sequence, now);
+        }
+        if acknowledged {
+            self.receipts.came(flow, sequence, length, now);
+        }
+        self.release(stream);
+        if header.reliable { Next::Go } else { Next::Over }
+    }
+
+    /// Goes on after a message that was dropped and counted. The peer is told where it waits to hear of it.
+    fn after_drop(
+        &mut self,
+        stream: &mut Incoming,
+        acknowledged: bool,
+        sequence: u64,
+        now: Duration,
+    ) -> Next {
+        let Some((header, _)) = stream.header else { return Next::Over };
+        if acknowledged {
+            self.receipts.dropped((header.route, header.of), sequence, now);
         }
         self.release(stream);
         if header.reliable { Next::Go } else { Next::Over }
@@ -405,6 +433,9 @@ impl Inbound {
             Err(RingError::Full) => None,
             Err(RingError::Short(_)) if self.may_wait(header) => None,
             Err(RingError::Short(why)) => {
+                if header.reliable {
+                    stand_in.drop_sample(meta.sequence);
+                }
                 self.lost("held", header, &why);
                 Some(false)
             }

@@ -15,8 +15,18 @@ const FLOWS: usize = 4096;
 
 #[derive(Debug, Default)]
 struct Due {
+    /// The first that was noted.
+    first: Option<u64>,
     sequence: u64,
     dropped: u64,
+}
+
+impl Due {
+    /// Notes a sample of this number.
+    fn note(&mut self, sequence: u64) {
+        self.first.get_or_insert(sequence);
+        self.sequence = self.sequence.max(sequence);
+    }
 }
 
 /// What is to be acknowledged.
@@ -44,16 +54,24 @@ impl Receipts {
         bytes: usize,
         now: Duration,
     ) {
-        let due = self.due.entry(flow).or_default();
-        due.sequence = due.sequence.max(sequence);
+        self.due.entry(flow).or_default().note(sequence);
         self.note(samples, bytes, now);
     }
 
     /// A sample was dropped here.
     pub(super) fn dropped(&mut self, flow: (u32, Gid), sequence: u64, now: Duration) {
         let due = self.due.entry(flow).or_default();
-        due.sequence = due.sequence.max(sequence);
+        due.note(sequence);
         due.dropped += 1;
+        self.note(1, 0, now);
+    }
+
+    /// A sample that was dropped here comes again, over a new link. Its publisher may not know of it.
+    pub(super) fn dropped_again(&mut self, flow: (u32, Gid), sequence: u64, now: Duration) {
+        let due = self.due.entry(flow).or_default();
+        let is_due = due.first.is_some_and(|first| (first..=due.sequence).contains(&sequence));
+        due.note(sequence);
+        due.dropped += u64::from(!is_due);
         self.note(1, 0, now);
     }
 
@@ -114,6 +132,24 @@ mod tests {
         let of = ReceivedOf { route: 1, publisher: FLOW.1, sequence: 4, dropped: 1 };
         assert_eq!(receipts.poll_message(at(10)), Some(Received { flows: vec![of] }));
         assert_eq!((receipts.poll_message(at(20)), receipts.poll_timeout()), (None, None));
+    }
+
+    #[test]
+    fn a_dropped_sample_that_comes_again_is_told_once() {
+        let mut receipts = Receipts::default();
+        let told = |receipts: &mut Receipts, ms| {
+            let message = receipts.poll_message(at(ms))?;
+            Some((message.flows[0].sequence, message.flows[0].dropped))
+        };
+        [2, 3].into_iter().for_each(|number| receipts.dropped(FLOW, number, at(0)));
+        // The message with the first two is lost.
+        assert_eq!(told(&mut receipts, 10), Some((3, 2)));
+        receipts.dropped(FLOW, 4, at(20));
+        [2, 3, 4].into_iter().for_each(|number| receipts.dropped_again(FLOW, number, at(21)));
+        receipts.dropped(FLOW, 5, at(22));
+        assert_eq!(told(&mut receipts, 30), Some((5, 4)));
+        receipts.dropped_again(FLOW, 5, at(40));
+        assert_eq!(told(&mut receipts, 50), Some((5, 1)));
     }
 
     #[test]

@@ -119,12 +119,17 @@ impl Inbound {
                 }
             };
             let (length, bytes) = (LENGTH + body.len(), payload.len());
+            let flow = (to.header.route, to.header.of);
+            if to.stand_in.has_dropped(told.sequence) {
+                self.receipts.dropped_again(flow, told.sequence, now);
+                chunk.advance(length);
+                continue;
+            }
             if to.stand_in.last_sequence() < Some(told.sequence) {
                 let meta = self.meta(told, now);
                 match self.write(&to.stand_in, to.header, meta, payload, now) {
                     Some(true) => {}
                     Some(false) => {
-                        let flow = (to.header.route, to.header.of);
                         self.receipts.dropped(flow, told.sequence, now);
                         chunk.advance(length);
                         continue;

@@ -305,7 +305,7 @@ impl Links {
             let owe = |cost| account.as_ref().map_or(Duration::ZERO, |a| a.owe(cost, instant));
             match connection.control.read(&mut connection.quic, owe, now) {
                 Ok(Input::Message(message, room)) => {
-                    self.handle_message(number, message, room, now);
+                    self.handle_message(number, *message, room, now);
                 }
                 Ok(Input::Nothing) => return,
                 Ok(Input::NoRoom) => return self.unfinished.add_blocked(number),

@@ -70,6 +70,21 @@ fn samples_beyond_a_limit_are_dropped_as_they_come_and_the_peer_is_told() {
 }
 
 #[test]
+fn samples_that_were_dropped_and_come_again_are_not_delivered_and_counted_once() {
+    let mut way = way("drop-oldest", 1000);
+    for number in 1..=5 {
+        way.come(number, NOW);
+    }
+    assert_eq!((way.numbers(), way.told(at(10))), (vec![1, 2], Some((5, 3))));
+    // The link breaks before the peer is told. By the time that all come again the limit has opened.
+    for number in 1..=7 {
+        way.come(number, at(1000));
+    }
+    assert_eq!((way.numbers(), way.told(at(1010))), (vec![1, 2, 6, 7], Some((7, 3))));
+    assert_eq!(way.limited(), [("limit", 3)]);
+}
+
+#[test]
 fn the_stream_of_a_keep_all_topic_is_read_on_when_its_sample_may_pass() {
     let mut way = way("hold", 1000);
     way.inbound.routes().get_mut(&ROUTE).unwrap().keeps_all = true;
