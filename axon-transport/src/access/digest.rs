@@ -9,7 +9,7 @@ impl AccessRules {
     pub fn digest(&self) -> Option<String> {
         self.file()?;
         // FNV-1a. The text names each field, and has no order that differs from run to run.
-        let text = format!("{:?} {:?}", self.rules, self.limits);
+        let text = format!("{:?} {:?} {:?}", self.rules, self.limits, self.interface_limits);
         let add = |hash: u64, byte: u8| (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3);
         Some(format!("{:016x}", text.bytes().fold(0xcbf2_9ce4_8422_2325, add)))
     }
@@ -33,6 +33,8 @@ mod tests {
             rules.replace("/x", "/y"),
             rules.replace('5', "6"),
             format!("default = \"deny\"\n{rules}"),
+            format!("{rules}[[limit]]\ninterface = \"wlan*\"\negress = \"30 Mbit/s\"\n"),
+            format!("{rules}[[limit]]\ninterface = \"wlan*\"\negress = \"40 Mbit/s\"\n"),
             // Decisions name lines.
             format!("\n{rules}"),
         ];

@@ -15,10 +15,11 @@ use axon_tests::{
     memory::{Find, Needles, Stopped},
     unexpected,
 };
+use rustix::process::Signal;
 
 use super::{
     mode::Kmes,
-    pair::{Host, Plan},
+    pair::{Host, Plan, signal},
     process::PATIENCE,
     secrets::may_search,
     traffic_keys::expand,
@@ -85,9 +86,12 @@ fn secrets_of_the_connection_to_the_kme_are_on_no_stack_and_nowhere_after_its_en
     for _ in 0..SEARCHES {
         let taken = there.tally().taken;
         there.wait_taken(taken + MESSAGES / SEARCHES as u64);
+        // Without it there are calls without end.
+        signal(publisher.pid(), Signal::STOP);
         for host in &hosts {
             kinds.extend(search(&kmes, host).iter().map(|find| find.secret.kind));
         }
+        signal(publisher.pid(), Signal::CONT);
     }
     eprintln!("while connections stand, in live memory: {kinds:?}");
     assert!(kinds.contains("traffic secret"), "the search finds nothing: {kinds:?}");

@@ -132,7 +132,8 @@ fn hangs_as_a_whole(failing: usize, call: Method, name: &str) {
     let url = kmes.url(failing);
     let said = ["WARN", url.as_str(), name, "AXON_KME_ANSWER_TIMEOUT"];
     // Keys that both hosts hold: ten messages each, but for the one in use.
-    let ready = || hosts[0].status().keys["peers"][SAE[1]]["sending"]["ready"].as_u64().unwrap();
+    let ready =
+        || hosts[0].status().keys["peers"][SAE[1]]["sending"]["ready"].as_u64().unwrap_or_default();
     until("there are keys in stock", || ready() >= 2);
     let before = kmes.calls_of(failing, call);
     let begin = Instant::now();

@@ -15,7 +15,7 @@ const LIBRARIES: [(&str, &str, &str); 7] = [
     ("rustls-axon", "aws_lc_rs,std,logging,tls12", ""),
     ("axon-tls", "hybrid,quic,tokio", ""),
     ("axon-shm", "", ""),
-    ("axon-transport", "", ""),
+    ("axon-transport", "sros2", ""),
     ("axon-daemon", "", ""),
 ];
 

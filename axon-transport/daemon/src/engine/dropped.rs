@@ -13,13 +13,16 @@ pub(super) struct DroppedRuns(VecDeque<(u64, u64)>);
 impl DroppedRuns {
     /// A sample was dropped. Numbers rise.
     pub(super) fn add(&mut self, sequence: u64) {
-        match self.0.back_mut() {
-            Some((_, last)) if last.checked_add(1) == Some(sequence) => *last = sequence,
-            _ => self.0.push_back((sequence, sequence)),
+        if let Some((_, last)) = self.0.back_mut()
+            && last.checked_add(1) == Some(sequence)
+        {
+            *last = sequence;
+            return;
         }
-        if self.0.len() > RUNS {
+        if self.0.len() == RUNS {
             self.0.pop_front();
         }
+        self.0.push_back((sequence, sequence));
     }
 
     /// Whether this one was dropped.

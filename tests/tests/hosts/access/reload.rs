@@ -1,6 +1,4 @@
-//! Settings that are read again beside the rules: log levels, and the peers that a daemon looks for.
-
-use std::net::{Ipv4Addr, UdpSocket};
+//! Log levels are read again beside the rules.
 
 use super::*;
 
@@ -22,61 +20,6 @@ fn rewrite(host: &Host, toml: &str) -> Vec<String> {
     let report = daemon_reload_at(&DaemonPlace::from(&host.config())).unwrap();
     assert_eq!(report.error, None);
     report.changed
-}
-
-/// A host that listens, and says nothing.
-struct Listener(UdpSocket);
-
-impl Listener {
-    fn new(beside: &Host, last: u8) -> Self {
-        let [a, b, c, _] = beside.address.octets();
-        let socket = UdpSocket::bind((Ipv4Addr::new(a, b, c, last), 0)).unwrap();
-        socket.set_nonblocking(true).unwrap();
-        Self(socket)
-    }
-
-    fn peer(&self) -> String {
-        format!("\"{}\"", self.0.local_addr().unwrap())
-    }
-
-    /// How many datagrams came since the last call.
-    fn heard(&self) -> usize {
-        let mut bytes = [0; 2048];
-        std::iter::from_fn(|| self.0.recv_from(&mut bytes).ok()).count()
-    }
-
-    fn wait(&self, datagrams: usize) {
-        let mut heard = 0;
-        until("a host that is listed is asked", || {
-            heard += self.heard();
-            heard >= datagrams
-        });
-    }
-}
-
-#[test]
-fn peers_that_are_added_are_looked_for_and_those_that_are_removed_are_not() {
-    let [mut a, mut b] = unlisted();
-    let [first, second] = [7, 8].map(|last| Listener::new(&a, last));
-    fs::write(a.dir.path().join("axon.toml"), format!("daemon_peers = [{}]", first.peer()))
-        .unwrap();
-    a.start();
-    b.start();
-    first.wait(1);
-    assert_eq!(second.heard(), 0);
-    assert_eq!(rewrite(&a, &format!("daemon_peers = [{}]", second.peer())), ["AXON_DAEMON_PEERS"]);
-    second.wait(1);
-    // What was on its way when the settings changed.
-    first.heard();
-    second.wait(4);
-    assert_eq!(first.heard(), 0, "it is not listed any more");
-    assert!(a.status().links.is_empty(), "nobody listed B");
-
-    let both = format!("daemon_peers = [{}, \"{}\"]", second.peer(), b.address);
-    assert_eq!(rewrite(&a, &both), ["AXON_DAEMON_PEERS"]);
-    a.link();
-    b.link();
-    assert!(rewrite(&a, &both).is_empty());
 }
 
 #[test]
@@ -106,4 +49,5 @@ fn log_levels_follow_the_settings() {
     fs::write(a.dir.path().join("axon.toml"), "log = \"axon_daemon=loud\"").unwrap();
     let error = daemon_reload_at(&place).unwrap().error.expect("why not");
     assert!(error.contains("log") && error.contains("loud"), "{error}");
+    fs::write(a.dir.path().join("axon.toml"), "log = \"error\"").unwrap();
 }

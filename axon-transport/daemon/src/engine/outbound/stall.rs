@@ -269,7 +269,7 @@ impl Pace {
         }
         let taken = flow.progress.0.saturating_sub(self.begin.0);
         let is_over = self.held >= limit * PERIOD;
-        if self.free >= limit || is_over && taken >= self.begin.1 / SHARE {
+        if self.free >= limit || is_over && taken >= self.begin.1.div_ceil(SHARE) {
             *self = Self::default();
         }
     }
@@ -322,6 +322,17 @@ mod tests {
 
     fn stalled(why: Stall) -> Found {
         Found { stalled: vec![(1, why)], quiet: Vec::new() }
+    }
+
+    #[test]
+    fn a_peer_that_lets_bytes_pass_and_takes_none_of_few_samples_is_too_slow() {
+        let busy = |now: Duration| {
+            let parts = now.as_secs() / 9;
+            vec![BusyFlow { progress: (0, parts), keeps: Some(30), ..held(now) }]
+        };
+        let (at, found) = look(false, busy, secs).expect("it is found");
+        assert_eq!(found, stalled(Stall::TooSlow));
+        assert!(at >= LIMIT * PERIOD, "{at:?}");
     }
 
     #[test]
