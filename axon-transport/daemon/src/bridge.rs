@@ -136,6 +136,8 @@ pub enum ToControl {
     /// Whether samples of publishers that ended are on their way to other hosts: the daemon does not
     /// end meanwhile.
     Draining(bool),
+    /// The access rules of the order with this number count: no pair is there that they deny.
+    Access(u64),
     /// What is to be shown of the key supply.
     Keys(serde_json::Value),
     /// What waited when the daemon was told to end has arrived, or does not get on: it may end.
@@ -165,8 +167,8 @@ pub enum ToGateway {
         /// What.
         bytes: Vec<u8>,
     },
-    /// These access rules count from now on.
-    Access(AccessRules),
+    /// These access rules count from now on. Answered by [`ToControl::Access`] with this number.
+    Access(AccessRules, u64),
     /// These addresses are those of listed peers from now on.
     Listed(BTreeSet<IpAddr>),
     /// Say when what waits to be sent has arrived: the daemon is to end.

@@ -74,8 +74,10 @@ pub(super) struct Control {
     pub(super) probe: Option<OwnedFd>,
     /// Packets that were exchanged with sessions.
     pub(super) traffic: TrafficStatus,
-    /// The access rules in force, for the gateway.
-    pub(super) access: watch::Sender<AccessRules>,
+    /// The access rules for the gateway, and how often they changed.
+    pub(super) access: watch::Sender<(u64, AccessRules)>,
+    /// The number of those that the gateway says it has.
+    pub(super) access_in_force: watch::Sender<u64>,
     /// Wakes the task that reads the settings again, and the sessions that asked for it.
     pub(super) reload: Rc<Notify>,
     pub(super) reload_asked: Vec<SessionId>,
@@ -131,7 +133,8 @@ impl Control {
                 )
                 .ok(),
             traffic: TrafficStatus::default(),
-            access: watch::Sender::new(config.access.clone()),
+            access: watch::Sender::new((0, config.access.clone())),
+            access_in_force: watch::Sender::new(0),
             reload: Rc::default(),
             reload_asked: Vec::new(),
             wanted: watch::Sender::new(Wanted::of(&config, [])),
@@ -211,7 +214,7 @@ impl Control {
         }
     }
 
-    /// Tells discovery which hosts to look for now.
+    /// Tells discovery which hosts the sessions that there are want.
     pub(super) fn look_for_hosts(&self) {
         let wanted = Wanted::of(&self.config, self.registry.scopes());
         self.wanted.send_if_modified(|known| std::mem::replace(known, wanted.clone()) != wanted);
@@ -251,6 +254,7 @@ impl Control {
     /// What the gateway says, but for what concerns discovery alone.
     pub(super) fn gateway_says(&mut self, message: ToControl) {
         match message {
+            ToControl::Access(number) => drop(self.access_in_force.send_replace(number)),
             ToControl::Started { port } => {
                 self.port = Some(port);
                 self.gateway = "running".into();

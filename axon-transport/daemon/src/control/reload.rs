@@ -2,16 +2,19 @@
 //!
 //! Where something is wrong with them, nothing changes.
 
-use std::{cell::RefCell, ffi::OsString, rc::Rc, sync::Arc};
+use std::{cell::RefCell, ffi::OsString, rc::Rc, sync::Arc, time::Duration};
 
 use axon_shm::ids::SessionId;
 use axon_transport::{
     config::{Config, ConfigError, absolute_paths},
     status::ReloadReport,
 };
-use tokio::signal::unix::Signal;
+use tokio::{signal::unix::Signal, time::timeout};
 
 use super::{log, plane::Control};
+
+/// How long the gateway may take to have new access rules.
+const IN_FORCE: Duration = Duration::from_secs(10);
 
 /// The environment that a daemon read its settings from.
 #[derive(Clone, Debug)]
@@ -51,7 +54,7 @@ pub(super) async fn reload(
         // Sessions that ask from here on are answered by the next reading.
         let asking = std::mem::take(&mut control.borrow_mut().reload_asked);
         // It reads files, and a file system may hang.
-        let report = match source.clone() {
+        let mut report = match source.clone() {
             Some(source) => {
                 let read = tokio::task::spawn_blocking(move || source.read()).await;
                 let Ok(read) = read else { continue };
@@ -65,11 +68,38 @@ pub(super) async fn reload(
             }
         };
         log_report(&report);
+        if let Err(error) = wait_in_force(&control).await {
+            tracing::error!(error);
+            report.error.get_or_insert(error);
+        }
         let mut control = control.borrow_mut();
         for id in asking {
             control.answer_reload(&id, &report);
         }
         control.settle();
+    }
+}
+
+/// Waits until the gateway has the access rules in force: a session that asked may rely on them once it is answered.
+///
+/// # Errors
+/// It did not say so in time.
+async fn wait_in_force(control: &Rc<RefCell<Control>>) -> Result<(), String> {
+    let (number, mut in_force) = {
+        let control = control.borrow();
+        if control.gateway == "off" {
+            return Ok(());
+        }
+        (control.access.borrow().0, control.access_in_force.subscribe())
+    };
+    let has_them = in_force.wait_for(|has| *has >= number);
+    match timeout(IN_FORCE, has_them).await {
+        Ok(_) => Ok(()),
+        Err(_) => Err(format!(
+            "the settings were read, but other hosts are not judged by the new access rules yet: the gateway did not \
+             take them within {} s. `axon status` says how it does",
+            IN_FORCE.as_secs()
+        )),
     }
 }
 
@@ -139,7 +169,10 @@ impl Control {
         self.admission.set_config(&self.config);
         self.end_excluded();
         self.registry.set_access(self.config.access.clone());
-        self.access.send_replace(self.config.access.clone());
+        self.access.send_modify(|(number, rules)| {
+            *number += 1;
+            rules.clone_from(&self.config.access);
+        });
         self.look_for_hosts();
     }
 }
@@ -214,6 +247,7 @@ fn differing(old: &Named, new: &Named) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::{super::room::Spare, *};
+    use crate::bridge::ToControl;
     use axon_transport::access::{Party, Verb};
 
     fn control(config: Config) -> Control {
@@ -236,7 +270,7 @@ mod tests {
         let denied = |rules: &axon_transport::access::AccessRules| {
             !rules.check(Party::User(7), Verb::Publish, "/y").allowed()
         };
-        assert!(seen.has_changed().unwrap() && denied(&seen.borrow_and_update()));
+        assert!(seen.has_changed().unwrap() && denied(&seen.borrow_and_update().1));
         assert!(control.wanted.borrow().hosts.iter().any(|(host, _)| host == "10.0.0.7"));
         // Rules that are gone do not let everything in.
         let mut without = new.clone();
@@ -253,12 +287,47 @@ mod tests {
         let limits = format!("{rules}\n[[limit]]\npeer = \"*\"\nrate = 1");
         limited.access = axon_transport::access::AccessRules::parse(&limits, "f").unwrap();
         assert_eq!(control.take_settings(Ok(limited.clone())).changed, ["access rules"]);
-        assert!(seen.borrow_and_update().limits_anything());
+        assert!(seen.borrow_and_update().1.limits_anything());
         let report = control.take_settings(Ok(new));
         assert!(report.error.unwrap().contains("no [[limit]] any more"));
         // The same once more is no change.
         assert_eq!(control.take_settings(Ok(limited)).changed, Vec::<String>::new());
         assert!(!seen.has_changed().unwrap());
+    }
+
+    /// A daemon whose gateway stands and has not taken the rules that were read.
+    fn reloaded() -> Rc<RefCell<Control>> {
+        let mut control = control(Config::default());
+        control.gateway_says(ToControl::Started { port: 1 });
+        let rules = "[[allow]]\npeer = \"a\"\npublish = \"/x\"";
+        let mut new = Config::default();
+        new.access = axon_transport::access::AccessRules::parse(rules, "f").unwrap();
+        assert_eq!(control.take_settings(Ok(new)).changed, ["access rules"]);
+        Rc::new(RefCell::new(control))
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_reload_is_answered_once_the_gateway_has_the_rules() {
+        let control = reloaded();
+        let in_force = wait_in_force(&control);
+        tokio::pin!(in_force);
+        let early = timeout(IN_FORCE / 2, &mut in_force).await;
+        assert!(early.is_err(), "{early:?}");
+        control.borrow_mut().gateway_says(ToControl::Access(1));
+        assert_eq!(in_force.await, Ok(()));
+        // Rules that did not change are in force.
+        assert_eq!(wait_in_force(&control).await, Ok(()));
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_reload_whose_rules_the_gateway_does_not_take_fails_and_says_so() {
+        let control = reloaded();
+        control.borrow_mut().gateway_says(ToControl::Access(0));
+        let error = wait_in_force(&control).await.unwrap_err();
+        assert!(error.contains("did not take them within 10 s"), "{error}");
+        // A daemon without a gateway has no other hosts.
+        control.borrow_mut().gateway = "off".into();
+        assert_eq!(wait_in_force(&control).await, Ok(()));
     }
 
     #[test]

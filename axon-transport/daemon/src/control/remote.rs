@@ -49,7 +49,7 @@ pub(super) struct Remote {
     /// The gateway has nothing on its way any more, or it does not get on.
     finished: bool,
     /// The access rules in force, and when to tell the gateway of them again.
-    access: watch::Receiver<AccessRules>,
+    access: watch::Receiver<(u64, AccessRules)>,
     access_due: Option<Instant>,
 }
 
@@ -146,9 +146,9 @@ impl Remote {
 
     /// Gives the gateway the access rules in force. An order that finds the channel full is given again.
     fn order_access(&mut self) {
-        let rules = self.access.borrow_and_update().clone();
-        // A gateway that is started later begins with them.
-        let missed = self.running.is_some() && !self.order(ToGateway::Access(rules));
+        let (number, rules) = self.access.borrow_and_update().clone();
+        // A gateway that is started later is told when it stands.
+        let missed = self.running.is_some() && !self.order(ToGateway::Access(rules, number));
         self.access_due = missed.then(|| Instant::now() + BUSY);
     }
 
@@ -156,6 +156,8 @@ impl Remote {
         match &event {
             ToControl::Started { port } => {
                 self.order(ToGateway::Listed(self.listed.clone()));
+                // They may have changed since it was started. It says that they count.
+                self.order_access();
                 self.tell(Event::QuicPort(*port));
             }
             ToControl::LinkUp { daemon, address, proven } => {

@@ -157,7 +157,10 @@ impl Engine {
                 self.links.dial(target, now);
             }
             ToGateway::SendDatagram { to, bytes } => self.links.send_datagram(to, bytes),
-            ToGateway::Access(rules) => self.set_access(rules, now),
+            ToGateway::Access(rules, number) => {
+                self.set_access(rules, now);
+                self.effects.tell(ToControl::Access(number));
+            }
             ToGateway::Listed(addresses) => self.links.set_listed(addresses),
             // The owner looks at `backlog`.
             ToGateway::Finish | ToGateway::Shutdown => {}

@@ -349,7 +349,7 @@ impl Host {
             engine.handle_local_graph(local, now);
         }
         if let Some(rules) = self.rules.take() {
-            engine.handle_order(ToGateway::Access(rules), now);
+            engine.handle_order(ToGateway::Access(rules, 0), now);
         }
         if std::mem::take(&mut self.rings_rang) {
             engine.handle_rings(now);
