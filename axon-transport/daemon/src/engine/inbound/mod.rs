@@ -4,6 +4,7 @@
 //! order when a successor takes over. A stream whose ring is full is not read on: QUIC's flow control holds back the
 //! peer.
 
+mod delivery;
 #[cfg(test)]
 mod held;
 mod incoming;

@@ -1,0 +1,179 @@
+//! Delivers whole messages to the rings of stand-ins: once each, as far as limits and room allow.
+
+use std::{rc::Rc, time::Duration};
+
+use axon_envelope::Kind;
+use axon_shm::Meta;
+use axon_transport::internal::session::Written;
+
+use super::{
+    FULL_RETRY, Inbound, Key, RouteIn,
+    incoming::{Incoming, Message, Step, StreamHeader},
+    reading::{Next, wait},
+};
+use crate::engine::{rings::RingError, stand_in::StandIn};
+
+impl Inbound {
+    /// Writes a message to its ring.
+    pub(super) fn deliver(
+        &mut self,
+        key: Key,
+        stream: &mut Incoming,
+        message: Message,
+        until: Duration,
+        now: Duration,
+    ) -> Next {
+        let Some((header, Some(route))) = stream.header else { return Next::Over };
+        let found = self.routes.get(&header.route);
+        let Some(stand_in) = found.and_then(|route| route.writers.get(&message.writer)) else {
+            if found.is_some() && now < until {
+                self.waiting.insert((until, key));
+                return wait(stream, Step::Writer(message, until));
+            }
+            self.waiting.remove(&(until, key));
+            self.counters.lost(&self.topic(header.route), "no_route", 1);
+            if header.acknowledged {
+                // The sender would keep it for as long as the link stands.
+                self.receipts.dropped((header.route, header.of), message.number, now);
+            }
+            self.release(stream);
+            return Next::Go;
+        };
+        self.waiting.remove(&(until, key));
+        let of_topic = route.kind == Kind::Topic;
+        let acknowledged = header.reliable && (of_topic || header.acknowledged);
+        let flow = (header.route, header.of);
+        let (sequence, length) = (message.number, message.payload.len());
+        let last = match route.kind {
+            Kind::Topic | Kind::Request => stand_in.last_sequence(),
+            Kind::Response => found.and_then(|route| route.clients.get(&header.of)).copied(),
+        };
+        if acknowledged && stand_in.has_dropped(sequence) {
+            self.receipts.dropped_again(flow, sequence, now);
+            self.release(stream);
+            return Next::Go;
+        }
+        if acknowledged && last >= Some(sequence) {
+            self.receipts.came(flow, sequence, length, now);
+            self.release(stream);
+            return Next::Go;
+        }
+        if !header.reliable && last >= Some(sequence) {
+            // A newer one overtook it: readers drop it.
+            self.counters.lost(&self.topic(header.route), "late", 1);
+            self.release(stream);
+            return Next::Over;
+        }
+        let stand_in = Rc::clone(stand_in);
+        let limit = found.map(|route| &route.limit).filter(|limit| !limit.is_none()).cloned();
+        let message = match &limit {
+            Some(limit) => match self.pass_limit(key, stream, limit, message, now) {
+                Ok(message) => message,
+                Err(Some(next)) => return next,
+                Err(None) => {
+                    if acknowledged {
+                        stand_in.drop_sample(sequence);
+                    }
+                    return self.after_drop(stream, acknowledged, sequence, now);
+                }
+            },
+            None => message,
+        };
+        let Some(there) = self.write(&stand_in, header, message.meta, &message.payload, now) else {
+            return self.wait_for_room(key, stream, message, now);
+        };
+        if let Some(limit) = &limit {
+            limit.pass(&header.of, length, now);
+        }
+        if acknowledged
+            && route.kind == Kind::Response
+            && let Some(found) = self.routes.get_mut(&header.route)
+        {
+            found.clients.entry(header.of).and_modify(|last| *last = sequence);
+        }
+        if !there {
+            return self.after_drop(stream, acknowledged, sequence, now);
+        }
+        if acknowledged {
+            self.receipts.came(flow, sequence, length, now);
+        }
+        self.release(stream);
+        if header.reliable { Next::Go } else { Next::Over }
+    }
+
+    /// Goes on after a message that was dropped and counted. The peer is told where it waits to hear of it.
+    fn after_drop(
+        &mut self,
+        stream: &mut Incoming,
+        acknowledged: bool,
+        sequence: u64,
+        now: Duration,
+    ) -> Next {
+        let Some((header, _)) = stream.header else { return Next::Over };
+        if acknowledged {
+            self.receipts.dropped((header.route, header.of), sequence, now);
+        }
+        self.release(stream);
+        if header.reliable { Next::Go } else { Next::Over }
+    }
+
+    /// Writes a sample to its ring. Whether it is there; `None`: the ring is full.
+    pub(super) fn write(
+        &mut self,
+        stand_in: &Rc<StandIn>,
+        header: StreamHeader,
+        meta: Meta,
+        payload: &[u8],
+        now: Duration,
+    ) -> Option<bool> {
+        match stand_in.try_write(&header.of, meta, payload, now) {
+            Ok(Written::Yes) => {
+                self.counters.arrived(payload.len());
+                let before = self.written.as_ref();
+                if before.is_none_or(|before| !Rc::ptr_eq(before, stand_in))
+                    && let Some(before) = self.written.replace(Rc::clone(stand_in))
+                {
+                    before.announce();
+                }
+                Some(true)
+            }
+            Ok(Written::Nobody) => {
+                self.counters.lost(&self.topic(header.route), "no_client", 1);
+                Some(false)
+            }
+            Err(RingError::Full) => None,
+            Err(RingError::Short(_)) if self.may_wait(header) => None,
+            Err(RingError::Short(why)) => {
+                if header.reliable {
+                    stand_in.drop_sample(meta.sequence);
+                }
+                self.lost("held", header, &why);
+                Some(false)
+            }
+            Err(RingError::Lost(why)) => {
+                self.lost("ring", header, &why);
+                Some(false)
+            }
+        }
+    }
+
+    /// Whether what its stream has next may wait here for as long as it takes: calls, and samples whose publisher waits
+    /// for its readers anyway.
+    pub(super) fn may_wait(&self, header: StreamHeader) -> bool {
+        let waits = |route: &RouteIn| route.route.kind != Kind::Topic || route.keeps_all;
+        header.reliable && self.routes.get(&header.route).is_some_and(waits)
+    }
+
+    /// The message's ring is full.
+    pub(super) fn wait_for_room(
+        &mut self,
+        key: Key,
+        stream: &mut Incoming,
+        message: Message,
+        now: Duration,
+    ) -> Next {
+        self.full.insert(key);
+        self.full_retry.get_or_insert(now + FULL_RETRY);
+        wait(stream, Step::Ring(message))
+    }
+}
