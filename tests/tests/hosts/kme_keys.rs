@@ -13,11 +13,11 @@ use std::{
 use axon_tests::{
     Sizes,
     memory::{Find, Needles, Stopped},
-    unexpected,
 };
 use rustix::process::Signal;
 
 use super::{
+    link_memory::wait_until_nowhere,
     mode::Kmes,
     pair::{Host, Plan, signal},
     process::PATIENCE,
@@ -97,16 +97,8 @@ fn secrets_of_the_connection_to_the_kme_are_on_no_stack_and_nowhere_after_its_en
     assert!(kinds.contains("traffic secret"), "the search finds nothing: {kinds:?}");
     let sent = publisher.stop();
     there.wait_taken(sent);
-    // It is closed when it was idle for a while.
-    let deadline = Instant::now() + PATIENCE;
     for host in &hosts {
-        while unexpected("the daemon", &search(&kmes, host), |_| false) > 0 {
-            assert!(
-                Instant::now() < deadline,
-                "parts of secrets are left of connections that ended"
-            );
-            thread::sleep(Duration::from_millis(500));
-        }
+        wait_until_nowhere("KME", || search(&kmes, host));
     }
     assert_eq!(there.tally().lost, 0);
 }

@@ -25,6 +25,7 @@ mod hostile;
 mod identity;
 mod kme_keys;
 mod liar;
+mod link_memory;
 mod load;
 mod many_topics;
 mod mismatch;

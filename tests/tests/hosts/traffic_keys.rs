@@ -8,12 +8,10 @@ use std::{
     collections::BTreeSet,
     net::{Ipv4Addr, SocketAddr},
     sync::{Arc, Mutex},
-    thread,
-    time::{Duration, Instant},
 };
 
 use axon_tests::{
-    memory::{Find, Needles, Stopped},
+    memory::{Find, Needles},
     unexpected,
 };
 use axon_tls::{
@@ -26,7 +24,12 @@ use quinn::Endpoint;
 use rustls::KeyLog;
 use sha2::{Sha256, Sha384};
 
-use super::{mode::classic, pair::Plan, process::PATIENCE, secrets::may_search};
+use super::{
+    link_memory::{begin_hello, close, search, wait_until_nowhere},
+    mode::classic,
+    pair::Plan,
+    secrets::may_search,
+};
 
 /// What stands in memory while a link does: the keys of its packets and headers, the secrets that the next keys are made
 /// of, and what the TLS library (rustls as released) keeps until the connection ends (`docs/security.md`).
@@ -89,13 +92,6 @@ fn needles(said: &Said) -> Needles {
     needles
 }
 
-fn search(pid: u32, needles: &Needles) -> Vec<Find> {
-    let stopped = Stopped::new(pid).unwrap();
-    let found = stopped.search(needles).unwrap();
-    assert!(!found.iter().any(|find| find.on_stack), "parts of secrets on stacks: {found:?}");
-    found
-}
-
 fn of_a_link(cipher: Cipher) {
     if !may_search() {
         return;
@@ -114,11 +110,8 @@ fn of_a_link(cipher: Cipher) {
     let (endpoint, connection, control) = runtime.block_on(async {
         let endpoint = Endpoint::client((Ipv4Addr::UNSPECIFIED, 0).into()).unwrap();
         let connection = endpoint.connect_with(client, daemon, "axon").unwrap().await.unwrap();
-        // A part of HELLO, so that the daemon has read something, and answered it.
-        let (mut send, receive) = connection.open_bi().await.unwrap();
-        send.write_all(&[0]).await.unwrap();
-        tokio::time::sleep(Duration::from_millis(300)).await;
-        (endpoint, connection, (send, receive))
+        let control = begin_hello(&connection).await;
+        (endpoint, connection, control)
     });
     let needles = needles(&said);
     let alive = search(status.pid, &needles);
@@ -128,19 +121,8 @@ fn of_a_link(cipher: Cipher) {
     let is_needed = |find: &Find| ALIVE.contains(&find.secret.kind);
     assert_eq!(unexpected("the daemon", &alive, is_needed), 0, "{name}: while the link stands");
     drop(control);
-    runtime.block_on(async {
-        connection.close(0_u32.into(), b"done");
-        endpoint.wait_idle().await;
-    });
-    // A closed connection waits for late packets.
-    let deadline = Instant::now() + PATIENCE;
-    while unexpected("the daemon", &search(status.pid, &needles), |_| false) > 0 {
-        assert!(
-            Instant::now() < deadline,
-            "{name}: parts of secrets are left of a link that ended"
-        );
-        thread::sleep(Duration::from_millis(500));
-    }
+    runtime.block_on(close(&endpoint, &connection));
+    wait_until_nowhere(&name, || search(status.pid, &needles));
 }
 
 #[test]

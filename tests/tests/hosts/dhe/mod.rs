@@ -8,12 +8,11 @@ mod tapped;
 
 use std::{
     net::Ipv4Addr,
-    thread,
     time::{Duration, Instant},
 };
 
 use axon_tests::{
-    memory::{Needles, Stopped},
+    memory::{Find, Needles},
     schedule::{Mode, Terms},
     unexpected,
 };
@@ -22,6 +21,7 @@ use quinn::{Connection, Endpoint};
 
 use self::tapped::Told;
 use super::{
+    link_memory::{begin_hello, close, search, wait_until_nowhere},
     mode::{Kmes, SAE},
     pair::Plan,
     process::PATIENCE,
@@ -69,11 +69,8 @@ fn of_a_link(cipher: Cipher) {
     let (endpoint, connection, control) = runtime.block_on(async {
         let endpoint = Endpoint::client((Ipv4Addr::LOCALHOST, 0).into()).unwrap();
         let connection = dial(&endpoint, config, &wire).await;
-        // A part of HELLO, so that the daemon has read something, and answered it.
-        let (mut send, receive) = connection.open_bi().await.unwrap();
-        send.write_all(&[0]).await.unwrap();
-        tokio::time::sleep(Duration::from_millis(300)).await;
-        (endpoint, connection, (send, receive))
+        let control = begin_hello(&connection).await;
+        (endpoint, connection, control)
     });
     let shared = told.lock().unwrap().clone();
     let connections = recorded::connections(&wire, cipher, &kmes.drawn(), Some(&shared));
@@ -84,29 +81,13 @@ fn of_a_link(cipher: Cipher) {
     assert_eq!(recorded.context, exported, "these are the secrets of the connection");
     let mut needles = Needles::default();
     recorded.add_to(&mut needles, 0);
-    let search = || {
-        let found = Stopped::new(status.pid).unwrap().search(&needles).unwrap();
-        assert!(!found.iter().any(|find| find.on_stack), "parts of secrets on stacks: {found:?}");
-        found
-    };
-    let alive = search();
+    let alive = search(status.pid, &needles);
     assert!(alive.iter().any(|find| find.secret.kind == IN_USE), "what is in use is found");
-    let is_in_use = |find: &axon_tests::memory::Find| find.secret.kind == IN_USE;
+    let is_in_use = |find: &Find| find.secret.kind == IN_USE;
     assert_eq!(unexpected("the daemon", &alive, is_in_use), 0, "{name}: while the link stands");
     drop(control);
-    runtime.block_on(async {
-        connection.close(0_u32.into(), b"done");
-        endpoint.wait_idle().await;
-    });
-    // A closed connection waits for late packets.
-    let deadline = Instant::now() + PATIENCE;
-    while unexpected("the daemon", &search(), |_| false) > 0 {
-        assert!(
-            Instant::now() < deadline,
-            "{name}: parts of secrets are left of a link that ended"
-        );
-        thread::sleep(Duration::from_millis(500));
-    }
+    runtime.block_on(close(&endpoint, &connection));
+    wait_until_nowhere(&name, || search(status.pid, &needles));
 }
 
 #[test]
