@@ -70,7 +70,7 @@ mod tests {
         let denied = session.create_publisher(spec("/in")).unwrap_err().to_string();
         let expected = "/in: enclave /arm may not publish rt/in: no rule allows it, and line 6 of p denies the rest";
         assert_eq!(denied, expected);
-        // Nothing of them is left in the graph, and what there is works.
+        // The graph has no endpoint that was denied. The endpoints that were allowed work.
         assert_eq!(session.graph().endpoints.len(), 4, "{:?}", session.graph());
         publisher.publish(b"x").unwrap();
     }

@@ -1,6 +1,7 @@
 //! SROS2's permissions of an enclave: what a process of that enclave may publish and subscribe to.
 //!
-//! `document` is what a file says, in its order, for whoever reads one. [`EnclavePermissions`] judges by it as
+//! `document` is what a file says, in its order. The session judges by it, and `axon acl import` translates it.
+//! [`EnclavePermissions`] judges as
 //! DDS Security 1.1 does (9.4.1.3): the first rule that fits decides.
 
 mod date;

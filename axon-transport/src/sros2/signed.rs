@@ -1,7 +1,7 @@
 //! The text in a signed document: S/MIME, `multipart/signed`, as `ros2 security` and OpenSSL write it.
 //!
 //! The signature is not verified. The certificate of the CA by which a DDS middleware would verify it lies in the same
-//! folder as the document, so that whoever can replace the one can replace the other.
+//! folder as the document. A user who can replace the document can replace the certificate too.
 
 /// Where a document begins that may be signed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -53,7 +53,7 @@ pub(super) struct Attaching {
 }
 
 impl Asked {
-    /// Shows no more of its writers than these, for now.
+    /// Keeps so many of its stand-ins, and gives up the others until there are lanes for them again.
     pub(super) fn leave(&mut self, stand_ins: usize) {
         let mut left = stand_ins;
         self.stand_ins.retain(|_, _| {

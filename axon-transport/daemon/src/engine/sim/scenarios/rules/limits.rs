@@ -214,7 +214,7 @@ fn short_samples_beyond_the_egress_do_not_grow_old() {
 
 #[test]
 fn all_peers_together_have_the_egress_of_an_interface_in_equal_parts() {
-    // Who dials whom is decided by ids: so both ends of a link are limited, as client and as server.
+    // The ids of two daemons decide which of them dials. With three hosts each limit is tried on a client and on a server.
     for limited in 0..3 {
         let text = "[[limit]]\ninterface = \"w*0\"\negress = \"1 MB/s\"";
         let mut world = World::new(37, 3, |host| {

@@ -75,7 +75,7 @@ fn a_claim_made_at_the_same_time_takes_nothing_away() {
         for seed in 150..158 {
             let case = format!("{mode}, seed {seed}");
             let mut world = world(seed, &config);
-            // Whoever is first by a packet.
+            // With even seeds the owner of the id sends its first packet before the impostor, with odd ones after it.
             for host in if seed % 2 == 0 { [1, 2] } else { [2, 1] } {
                 world.tell(host, 0);
             }
