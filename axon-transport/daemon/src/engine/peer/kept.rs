@@ -40,7 +40,8 @@ struct Kept {
     until: Duration,
     /// It counts among those that are kept, and still among the relays of the identity.
     _charges: [Charge; 2],
-    lanes: Option<Charge>,
+    /// Those of its relay.
+    lanes: Charge,
 }
 
 impl Kept {
@@ -84,7 +85,7 @@ impl KeptRelays {
                 let identity = peer.identity.clone();
                 let (key, since, until) = (served.key.clone(), now, now + PATIENCE);
                 let unfinished = Rc::clone(&unfinished);
-                let lanes = Some(served.lanes.split(lanes));
+                let lanes = served.lanes.split(lanes);
                 self.all.push(Kept {
                     identity,
                     key,
@@ -100,10 +101,27 @@ impl KeptRelays {
         }
     }
 
-    /// Gives back the lanes of a relay that the peer is about to adopt, since it pays for them anew.
-    pub(super) fn release_lanes(&mut self, key: &RouteKey, spec: &RelaySpec, identity: &str) {
-        if let Some(kept) = self.all.iter_mut().find(|kept| kept.fits(key, spec, identity)) {
-            kept.lanes = None;
+    /// Charges the `lanes` of a new relay as many. If the peer is about to adopt one that was kept, the lanes of that make
+    /// room for them; it has none from then on, so [`adopt`](Self::adopt) has to follow. `None`: there are not so many, and
+    /// what is kept stays charged.
+    pub(super) fn charge_lanes(
+        &mut self,
+        key: &RouteKey,
+        spec: &RelaySpec,
+        identity: &str,
+        lanes: &Charge,
+        many: usize,
+    ) -> Option<Charge> {
+        let Some(kept) = self.all.iter_mut().find(|kept| kept.fits(key, spec, identity)) else {
+            return lanes.more(many);
+        };
+        let before = std::mem::replace(&mut kept.lanes, lanes.meter().nothing());
+        match before.exchange(lanes.meter(), many) {
+            Ok(charged) => Some(charged),
+            Err(before) => {
+                kept.lanes = before;
+                None
+            }
         }
     }
 

@@ -306,13 +306,14 @@ impl Peer {
                 without = Some((why.to_owned(), Some(ASK_AGAIN)));
                 continue;
             };
-            with.kept.borrow_mut().release_lanes(key, &spec, &self.identity);
-            let Some(its_lanes) = lanes.more(each) else {
+            let mut relays_kept = with.kept.borrow_mut();
+            let own = &self.identity;
+            let Some(its_lanes) = relays_kept.charge_lanes(key, &spec, own, lanes, each) else {
                 without = Some((TOO_MANY_LANES.to_owned(), Some(ASK_AGAIN)));
                 continue;
             };
             let limit = with.config.link.stalled;
-            let kept = with.kept.borrow_mut().adopt(key, &spec, &self.identity, limit, now);
+            let kept = relays_kept.adopt(key, &spec, own, limit, now);
             let reader = match kept {
                 Some((reader, flows)) => {
                     for (of, flow) in flows {
