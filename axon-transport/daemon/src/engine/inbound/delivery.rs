@@ -11,7 +11,7 @@ use super::{
     incoming::{Incoming, Message, Step, StreamHeader},
     reading::{Next, wait},
 };
-use crate::engine::{rings::RingError, stand_in::StandIn};
+use crate::engine::{dropped::Before, rings::RingError, stand_in::StandIn};
 
 impl Inbound {
     /// Writes a message to its ring.
@@ -48,12 +48,13 @@ impl Inbound {
             Kind::Topic | Kind::Request => stand_in.last_sequence(),
             Kind::Response => found.and_then(|route| route.clients.get(&header.of)).copied(),
         };
-        if acknowledged && stand_in.has_dropped(sequence) {
+        let before = stand_in.dropped(sequence);
+        if acknowledged && before == Before::Dropped {
             self.receipts.dropped_again(flow, sequence, now);
             self.release(stream);
             return Next::Go;
         }
-        if acknowledged && last >= Some(sequence) {
+        if acknowledged && (before == Before::Passed || last >= Some(sequence)) {
             self.receipts.came(flow, sequence, length, now);
             self.release(stream);
             return Next::Go;
