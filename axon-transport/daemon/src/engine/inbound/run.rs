@@ -92,7 +92,7 @@ impl Inbound {
         came: &mut Came,
     ) -> Result<Option<Step>, Violation> {
         let now = to.now;
-        let Incoming { chunk, headers, .. } = stream;
+        let Incoming { chunk, headers, short_since, .. } = stream;
         while let Some(body) = next_body(chunk, to.most) {
             let (told, payload): (Told, &[u8]) = match headers {
                 Some(headers) => {
@@ -130,7 +130,7 @@ impl Inbound {
             let is_new = to.stand_in.last_sequence() < Some(told.sequence);
             if is_new && before == Before::Unknown {
                 let meta = self.meta(told, now);
-                match self.write(&to.stand_in, to.header, meta, payload, now) {
+                match self.write(&to.stand_in, to.header, meta, payload, short_since, now) {
                     Some(true) => {}
                     Some(false) => {
                         self.receipts.dropped(flow, told.sequence, now);
