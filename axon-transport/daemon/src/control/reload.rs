@@ -34,7 +34,7 @@ impl SettingsSource {
     /// # Errors
     /// A setting that is wrong.
     pub(super) fn read(&self) -> Result<Config, ConfigError> {
-        Config::from_env_with(self.paths.iter().cloned(), None)
+        Config::from_env_with(self.paths.iter().cloned(), None)?.with_rules_of_host()
     }
 }
 

@@ -231,6 +231,7 @@ type Started = (Control, Vec<OwnedFd>, axon_transport::internal::session::daemon
 fn start(config: Config, _options: &DaemonOptions) -> Result<Started, DaemonError> {
     erase_from_now_on();
     harden();
+    let config = config.with_rules_of_host()?;
     let settings = security_settings(&config)?;
     // Before anything else takes their low numbers.
     let spare = Spare::default();

@@ -2,6 +2,7 @@
 
 mod address;
 mod foreign;
+mod host_rules;
 mod hostile;
 mod left;
 mod life;
