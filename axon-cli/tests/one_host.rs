@@ -54,11 +54,38 @@ fn log_without_its_end() -> tempfile::NamedTempFile {
     file
 }
 
+/// A log whose last chunk has a wrong checksum.
+fn log_with_a_wrong_checksum() -> tempfile::NamedTempFile {
+    const MAGIC: usize = 8;
+    const CHUNK: u8 = 6;
+    let mut bytes = std::fs::read(LOG).expect("the log");
+    let (mut at, mut last) = (MAGIC, None);
+    // Each record begins with its kind and the length of its body.
+    while let Some((kind, length)) = bytes[at..].split_first().filter(|(_, rest)| rest.len() >= 8) {
+        last = if *kind == CHUNK { Some(at + 9) } else { last };
+        let length = u64::from_le_bytes(*length.first_chunk().expect("eight bytes"));
+        at += 9 + usize::try_from(length).expect("a length");
+    }
+    // The checksum follows two times and the length after decompression.
+    bytes[last.expect("a chunk") + 24] ^= 1;
+    let file = tempfile::NamedTempFile::new().expect("temporary file");
+    std::fs::write(file.path(), &bytes).expect("write");
+    file
+}
+
 #[test]
 fn play_of_a_damaged_log_publishes_nothing_unless_told_to_publish_its_whole_part() {
+    publishes_the_whole_part_when_told(&log_without_its_end());
+}
+
+#[test]
+fn play_publishes_nothing_of_a_chunk_with_a_wrong_checksum_nor_what_follows_it() {
+    publishes_the_whole_part_when_told(&log_with_a_wrong_checksum());
+}
+
+fn publishes_the_whole_part_when_told(damaged: &tempfile::NamedTempFile) {
     let host = Host::new();
-    let cut = log_without_its_end();
-    let file = cut.path().to_str().expect("a path in UTF-8");
+    let file = damaged.path().to_str().expect("a path in UTF-8");
     let output = host.run(&["play", file, "--rate", "0"]);
     let said = Stderr::of(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{said}");

@@ -241,26 +241,38 @@ pub(crate) fn few_descriptors() {
     wait_for_the_end();
 }
 
-#[test]
-fn many_that_lose_their_daemon_do_not_each_start_one() {
-    let host = Host::new();
-    // Counts those that are started.
+/// The host with a daemon that counts how often it is [started].
+pub(crate) fn counting(host: Host) -> Host {
     let script = host.dir.path().join("daemon.sh");
-    let count = host.dir.path().join("started");
     let text = format!(
         "#!/bin/sh\necho one >> {}\nexec {} \"$@\"\n",
-        count.display(),
+        host.dir.path().join(STARTED).display(),
         env!("CARGO_BIN_EXE_axon_daemon")
     );
     fs::write(&script, text).unwrap();
     fs::set_permissions(&script, fs::Permissions::from_mode(0o755)).unwrap();
-    let host = host.with("AXON_DAEMON_PATH", script.to_str().unwrap());
+    let script = script.to_str().unwrap().to_owned();
+    host.with("AXON_DAEMON_PATH", &script)
+}
+
+/// How often the daemon of a [counting] host was started.
+pub(crate) fn started(host: &Host) -> usize {
+    let count = fs::read_to_string(host.dir.path().join(STARTED));
+    count.map_or(0, |count| count.lines().count())
+}
+
+/// Where a [counting] host's daemon counts.
+const STARTED: &str = "started";
+
+#[test]
+fn many_that_lose_their_daemon_do_not_each_start_one() {
+    let host = counting(Host::new());
     let players: Vec<_> = (0..20).map(|_| host.play("idle")).collect();
     let first = sessions(&host, 20);
     signal(first.pid, Signal::KILL);
     until("there is another", || host.status().is_ok_and(|next| next.daemon != first.daemon));
     sessions(&host, 20);
-    let started = fs::read_to_string(&count).unwrap().lines().count();
+    let started = started(&host);
     // Two, unless the machine is so slow that some of them lost patience.
     assert!(started < 8, "{started} daemons were started");
     players.into_iter().for_each(Player::finish);
