@@ -250,6 +250,24 @@ impl Host {
         peers.map(|(_, peer)| peer.remote.account().decoded.peak()).max().unwrap_or(0)
     }
 
+    /// Bytes that control messages of all peers took while they were decompressed and handled, since their links began.
+    pub(super) fn handled(&self) -> usize {
+        let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());
+        peers.map(|(_, peer)| peer.remote.account().decoded.released()).sum()
+    }
+
+    /// Endpoints of all peers that are known, or left out.
+    pub(super) fn heard_endpoints(&self) -> u64 {
+        let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());
+        peers.map(|(_, peer)| peer.remote.len() as u64 + peer.remote.left_out()).sum()
+    }
+
+    /// The most control messages of one peer that waited to be read, in bytes.
+    pub(super) fn most_unsent(&self) -> usize {
+        let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());
+        peers.map(|(_, peer)| peer.remote.account().unsent.peak()).max().unwrap_or(0)
+    }
+
     /// Publishers, servers and clients of all peers that are shown here.
     pub(super) fn shown(&self) -> usize {
         let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());
