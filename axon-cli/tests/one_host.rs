@@ -5,6 +5,7 @@
 mod common;
 
 use std::{
+    io::Write as _,
     process::{Command, Stdio},
     time::Duration,
 };
@@ -207,7 +208,8 @@ fn assert_echo_says_what_it_missed(end: End) {
 fn echo_says_what_it_missed_when_a_signal_or_a_closed_terminal_ends_it() {
     for signal in [Signal::INT, Signal::TERM, Signal::HUP] {
         if signal == Signal::HUP && ignores_hangup() {
-            println!("skipped: SIGHUP, which this test was started to ignore, as under nohup");
+            let said = "skipped: SIGHUP, which this test was started to ignore, as under nohup";
+            let _ = writeln!(std::io::stderr(), "{said}");
         } else {
             assert_echo_says_what_it_missed(End::Signal(signal));
         }
