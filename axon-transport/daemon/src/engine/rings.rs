@@ -95,7 +95,8 @@ pub(crate) trait RingReader {
 pub(crate) enum RingError {
     /// A KEEP_ALL reader has no room: try again when a reader made some.
     Full,
-    /// The stand-ins of the peer's identity hold as much as they may; the text says how much.
+    /// The stand-ins of the peer's identity hold as much as they may; the text says how much. Nothing says that others will
+    /// give any of it back.
     Short(String),
     /// The sample is lost; the text says why.
     Lost(String),

@@ -15,7 +15,7 @@ use axon_transport::{
 };
 
 use super::{
-    dropped::DroppedRuns,
+    dropped::{Before, DroppedRuns},
     numbers::{FORGOTTEN, Numbers},
     rings::{RingError, RingWriter, Rings},
 };
@@ -88,9 +88,9 @@ impl StandIn {
         }
     }
 
-    /// Whether a sample was dropped here before: a publisher whose link broke sends it again.
-    pub(crate) fn has_dropped(&self, sequence: u64) -> bool {
-        self.dropped.borrow().has(sequence)
+    /// What became of a sample that may have been dropped here before: a publisher whose link broke sends it again.
+    pub(crate) fn dropped(&self, sequence: u64) -> Before {
+        self.dropped.borrow().find(sequence)
     }
 }
 

@@ -207,7 +207,8 @@ impl RingWriter for Writer {
     fn try_write(&self, client: &Gid, meta: Meta, payload: &[u8]) -> Result<Written, RingError> {
         self.0.try_write_quietly(client, meta, payload).map_err(|error| match error {
             PublishError::Blocked { .. } => RingError::Full,
-            // One that never fits is lost like any that is too long.
+            // One that fits in no state of the other rings is lost like any that is too long. Whether one fits in the end that
+            // is a little shorter is for them to say, so the engine does not wait for ever.
             error @ PublishError::Allowance { needed, most, .. } if needed <= most / 2 => {
                 RingError::Short(error.to_string())
             }

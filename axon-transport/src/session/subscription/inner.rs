@@ -67,7 +67,8 @@ impl SubscriptionInner {
     /// The reading side of a client or server.
     pub(in crate::session) fn of_service(endpoint: Endpoint, role: EndpointRole, qos: Qos) -> Self {
         let rising = endpoint.kind != EndpointKind::Client;
-        Self { rising, ..Self::reading(endpoint, role, qos) }
+        let matched_readers = MatchedReaders::of_service().into();
+        Self { rising, matched_readers, ..Self::reading(endpoint, role, qos) }
     }
 
     fn reading(endpoint: Endpoint, role: EndpointRole, qos: Qos) -> Self {

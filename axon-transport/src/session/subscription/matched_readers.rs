@@ -7,11 +7,10 @@ use std::{
 
 use axon_shm::internal::{Grant, Lane, Location, MAX_GAP, Reader};
 
+use super::remembered::Remembered;
 use crate::{ids::Gid, session::clock};
 
-/// Publishers whose last sequence number is remembered after they are gone.
-const REMEMBERED: usize = 4096;
-/// Rings that a KEEP_ALL subscription reads of what a writer left, each by way of another daemon.
+/// Rings that a KEEP_ALL subscription, a client or a server reads of what a writer left, each by way of another daemon.
 const LEFT: usize = 8;
 /// How long nobody is woken for a sample that there was no memory to take.
 const SHORT: Duration = Duration::from_secs(1);
@@ -21,9 +20,8 @@ pub(in crate::session) struct MatchedReaders {
     pub(super) matched_readers: Vec<MatchedReader>,
     /// Lanes given to writers that have not granted yet, and the number behind which each is to go on.
     pub(super) pending: HashMap<Gid, (Lane, Option<u64>)>,
-    /// The last sequence number taken of each publisher that is gone: one that comes back, as a remote
-    /// one does with its link, must not be heard twice.
-    last: HashMap<Gid, u64>,
+    /// The last sequence number taken of each writer that is gone.
+    last: Remembered,
     pub(super) received: u64,
     pub(super) expired: u64,
     pub(super) lost: u64,
@@ -36,6 +34,8 @@ pub(in crate::session) struct MatchedReaders {
     pub(super) short: Option<Instant>,
     /// Whether the subscription wants every sample.
     pub(super) keeps_all: bool,
+    /// Whether it is of a client or server. What of its calls was not taken comes again with the next daemon.
+    of_service: bool,
     /// Writers whose memory was not usable, of which the others have to be told.
     pub(super) discarded: Vec<Gid>,
 }
@@ -84,6 +84,8 @@ pub(super) struct MatchedReader {
     pub(super) leaving: bool,
     /// Found nothing in the take that is under way, since the writer was faster.
     pub(super) overtaken: bool,
+    /// There was no memory for its next sample in the take that is under way. Later samples of its writer wait as well.
+    pub(super) short: bool,
     /// The last sequence number taken of its writer, by way of whatever slot; of one that was attached
     /// before and has taken nothing, the one in front of its first.
     pub(super) last: Option<u64>,
@@ -162,6 +164,11 @@ impl MatchedReaders {
         Self { keeps_all, ..Self::default() }
     }
 
+    /// Those of a client or server.
+    pub(super) fn of_service() -> Self {
+        Self { of_service: true, ..Self::default() }
+    }
+
     pub(super) fn has_data(&self) -> bool {
         !self.is_short() && self.matched_readers.iter().any(|slot| slot.reader.has_data())
     }
@@ -225,7 +232,7 @@ impl MatchedReaders {
             return Ok(Asking { lane: lane.location(), after: *after });
         }
         let earlier = self.matched_readers.iter().find(|slot| slot.reader.writer() == writer);
-        let after = earlier.map_or_else(|| self.last.get(&writer).copied(), MatchedReader::reached);
+        let after = earlier.map_or_else(|| self.last.get(&writer), MatchedReader::reached);
         let lane = allocate()?;
         let location = lane.location();
         self.pending.insert(writer, (lane, after));
@@ -269,7 +276,7 @@ impl MatchedReaders {
         let times = reader.times();
         let lifespan = times.lifespan.map(Duration::from_nanos);
         let lease = times.lease;
-        let (over, leaving, overtaken) = (false, false, false);
+        let (over, leaving, overtaken, short) = (false, false, false, false);
         let earlier = self
             .matched_readers
             .iter()
@@ -292,6 +299,7 @@ impl MatchedReaders {
             over,
             leaving,
             overtaken,
+            short,
             last,
             after,
             gaps,
@@ -371,7 +379,8 @@ impl MatchedReaders {
             let [older, newer, ..] = of[..] else { return };
             let same =
                 self.matched_readers[newer].reader.is_of_ring(&self.matched_readers[older].reader);
-            if over <= if self.keeps_all && !same { LEFT } else { 1 } {
+            let keeps = self.keeps_all || self.of_service;
+            if over <= if keeps && !same { LEFT } else { 1 } {
                 return;
             }
             let mut slot = self.matched_readers.remove(older);
@@ -389,6 +398,10 @@ impl MatchedReaders {
         if newer.reader.is_of_ring(&slot.reader) {
             let later = newer.reader.grant().first;
             self.lost = self.lost.saturating_add(slot.reader.unread_below(later));
+            return;
+        }
+        // They come again, and none of them counts as taken.
+        if self.of_service {
             return;
         }
         // One after the other: samples missing among them were counted, or are by their numbers.
@@ -410,10 +423,14 @@ impl MatchedReaders {
     pub(super) fn retire(&mut self, slot: &MatchedReader) {
         self.lost = self.lost.saturating_add(slot.lost());
         self.arrived += slot.reader.arrived();
-        if self.last.len() >= REMEMBERED {
-            self.last.clear();
+        if let Some(last) = slot.reached() {
+            self.remember(slot.reader.writer(), last);
         }
-        self.last.extend(slot.reached().map(|last| (slot.reader.writer(), last)));
+    }
+
+    /// A writer is gone.
+    pub(super) fn remember(&mut self, writer: Gid, last: u64) {
+        self.last.add(writer, last);
     }
 
     /// This sample of `writer` was taken.

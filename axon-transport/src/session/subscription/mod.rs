@@ -2,6 +2,7 @@
 
 mod inner;
 mod matched_readers;
+mod remembered;
 mod taking;
 mod trusted;
 mod unmet;

@@ -37,7 +37,7 @@ impl MatchedReaders {
         mut take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
         of: &SubscriptionInner,
     ) -> Option<(MessageInfo, T)> {
-        self.matched_readers.iter_mut().for_each(|slot| slot.overtaken = false);
+        self.begin_take();
         // A writer that repeats itself without end must not keep the lock: callers come back as
         // long as there is something to take.
         for _ in 0..REPEATS {
@@ -59,6 +59,13 @@ impl MatchedReaders {
         None
     }
 
+    /// A take begins: each slot may have something.
+    fn begin_take(&mut self) {
+        for slot in &mut self.matched_readers {
+            (slot.overtaken, slot.short) = (false, false);
+        }
+    }
+
     /// As [`take`](Self::take), of one writer.
     pub(super) fn take_of<T>(
         &mut self,
@@ -66,7 +73,7 @@ impl MatchedReaders {
         mut take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
         of: &SubscriptionInner,
     ) -> Option<(MessageInfo, T)> {
-        self.matched_readers.iter_mut().for_each(|slot| slot.overtaken = false);
+        self.begin_take();
         for _ in 0..REPEATS {
             let Some(index) = self.next_of(writer) else {
                 self.sweep();
@@ -89,7 +96,7 @@ impl MatchedReaders {
         of: &SubscriptionInner,
         mut each: impl FnMut(MessageInfo, Range<usize>),
     ) -> usize {
-        self.matched_readers.iter_mut().for_each(|slot| slot.overtaken = false);
+        self.begin_take();
         let received_timestamp = clock_now();
         let (mut taken, mut passed_over) = (0, 0);
         let mut last = None;
@@ -126,9 +133,11 @@ impl MatchedReaders {
     /// Where the next sample of a writer is.
     fn next_of(&mut self, writer: &Gid) -> Option<usize> {
         self.skip_missing();
-        self.matched_readers.iter().position(|slot| {
-            !slot.overtaken && slot.reader.writer() == *writer && slot.reader.has_data()
-        })
+        let mut of = self.matched_readers.iter().enumerate().filter(|(_, slot)| {
+            slot.reader.writer() == *writer
+                && (slot.short || !slot.overtaken && slot.reader.has_data())
+        });
+        of.next().filter(|(_, slot)| !slot.short).map(|(index, _)| index)
     }
 
     /// The publishers that have a lease, and when each was last alive, by the monotonic clock.
@@ -170,7 +179,7 @@ impl MatchedReaders {
             }
             // It stands, and may be taken when there is memory again.
             Err(error @ TakeError::NoMemory { .. }) => {
-                slot.overtaken = true;
+                (slot.overtaken, slot.short) = (true, true);
                 if !self.is_short() {
                     tracing::error!(topic = endpoint.topic, %error, "a sample is not taken yet");
                 }
@@ -354,12 +363,20 @@ impl MatchedReaders {
     /// writer wrote before it granted anew comes before what it wrote since, whatever its clock
     /// says: taken the other way round it would count as repeated.
     fn oldest(&mut self) -> Option<usize> {
-        let index = self.oldest_by_time()?;
-        let writer = self.matched_readers[index].reader.writer();
-        let earlier = self.matched_readers[..index].iter().position(|slot| {
-            slot.over && !slot.overtaken && slot.reader.writer() == writer && slot.reader.has_data()
-        });
-        Some(earlier.unwrap_or(index))
+        loop {
+            let index = self.oldest_by_time()?;
+            let writer = self.matched_readers[index].reader.writer();
+            let earlier = self.matched_readers[..index].iter().position(|slot| {
+                slot.reader.writer() == writer
+                    && (slot.short || slot.over && !slot.overtaken && slot.reader.has_data())
+            });
+            match earlier {
+                Some(earlier) if self.matched_readers[earlier].short => {
+                    self.matched_readers[index].overtaken = true;
+                }
+                earlier => return Some(earlier.unwrap_or(index)),
+            }
+        }
     }
 
     fn oldest_by_time(&mut self) -> Option<usize> {
@@ -435,6 +452,121 @@ mod tests {
     fn subscription(gid: Gid) -> SubscriptionInner {
         let endpoint = Endpoint::example(gid, EndpointKind::Subscription);
         SubscriptionInner::new(endpoint, EndpointRole::Application, Vec::new())
+    }
+
+    /// A server that reads its client's requests by way of one daemon after the other. Numbers that each brings, with the
+    /// second daemon's clock behind that of the first.
+    struct Served {
+        session: Arc<SessionSegment>,
+        client: Gid,
+        server: Gid,
+        requests: MatchedReaders,
+        inner: SubscriptionInner,
+        rings: Vec<Writer>,
+    }
+
+    impl Served {
+        fn new() -> Self {
+            let session = SessionSegment::create(SessionId::random()).unwrap();
+            let [client, server] = [1, 2].map(|number| Gid::new(session.id(), number));
+            let endpoint = Endpoint::example(server, EndpointKind::Server);
+            let qos = Qos::keep_all();
+            Self {
+                inner: SubscriptionInner::of_service(endpoint, EndpointRole::Application, qos),
+                requests: MatchedReaders::of_service(),
+                session,
+                client,
+                server,
+                rings: Vec::new(),
+            }
+        }
+
+        /// The next daemon brings these requests.
+        fn daemon(&mut self, numbers: impl IntoIterator<Item = u64>) {
+            let (ring, reader) = reading(&self.session, self.client, self.server);
+            self.requests.end(&self.client);
+            self.requests.add(reader, None, Numbers::None);
+            let stamp = -(self.rings.len() as i64);
+            for number in numbers {
+                ring.publish(Meta::at_nanos(number, stamp), b"request").unwrap();
+            }
+            self.rings.push(ring);
+        }
+
+        /// Takes a request. One that is `short_of` has no memory.
+        fn take(&mut self, short_of: Option<u64>) -> Option<u64> {
+            let mut out = Vec::new();
+            let take = |reader: &mut Reader| {
+                if reader.peek()?.is_some_and(|meta| Some(meta.sequence) == short_of) {
+                    return Err(TakeError::NoMemory { len: 7 });
+                }
+                Ok(reader.take(&mut out)?.map(|taken| (taken.meta, ())))
+            };
+            self.requests.take(take, &self.inner).map(|(info, ())| info.sequence)
+        }
+
+        fn take_all(&mut self) -> Vec<u64> {
+            std::iter::from_fn(|| self.take(None)).collect()
+        }
+    }
+
+    #[test]
+    fn a_server_takes_each_request_once_in_order_however_many_daemons_bring_it() {
+        let mut of = Served::new();
+        of.daemon([1, 2, 3]);
+        assert_eq!(of.take(None), Some(1));
+        of.daemon([2, 3, 4]);
+        of.daemon([2, 3, 4, 5]);
+        assert_eq!(
+            of.take_all(),
+            [2, 3, 4, 5],
+            "what an earlier daemon left is not given up as taken"
+        );
+        let mut of = Served::new();
+        for daemon in 0..20 {
+            // None is answered, so the client sends all again.
+            of.daemon(1..=daemon / 2);
+        }
+        assert_eq!(of.take_all(), (1..10).collect::<Vec<_>>());
+        of.daemon(1..=10);
+        assert_eq!(of.take_all(), [10]);
+    }
+
+    #[test]
+    fn a_request_that_there_is_no_memory_for_is_not_overtaken_by_later_ones_of_its_client() {
+        let mut of = Served::new();
+        of.daemon([1, 2]);
+        of.daemon([1, 2, 3]);
+        assert_eq!(of.take(Some(1)), None, "the first waits in both rings");
+        assert_eq!(of.take_all(), [1, 2, 3]);
+        let mut of = Served::new();
+        of.daemon([1]);
+        of.daemon([2]);
+        assert_eq!(of.take(Some(1)), None);
+        let taken = std::iter::from_fn(|| {
+            let take = |reader: &mut Reader| {
+                Ok(reader.take(&mut Vec::new())?.map(|taken| (taken.meta, ())))
+            };
+            of.requests.take_of(&of.client, take, &of.inner).map(|(info, ())| info.sequence)
+        });
+        assert_eq!(taken.collect::<Vec<_>>(), [1, 2]);
+    }
+
+    #[test]
+    fn clients_that_were_there_last_are_remembered_when_there_were_very_many() {
+        let mut of = Served::new();
+        // Clients that made one call each, and one that is there when the daemon is killed.
+        for number in 0..12_000 {
+            of.requests.remember(Gid::new(of.session.id(), 10 + number), 1);
+        }
+        of.daemon([1, 2]);
+        assert_eq!(of.take_all(), [1, 2]);
+        of.requests.end(&of.client);
+        for number in 0..2000 {
+            of.requests.remember(Gid::new(of.session.id(), 100_000 + number), 1);
+        }
+        of.daemon([1, 2, 3]);
+        assert_eq!(of.take_all(), [3]);
     }
 
     #[test]

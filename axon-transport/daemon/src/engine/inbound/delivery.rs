@@ -11,7 +11,12 @@ use super::{
     incoming::{Incoming, Message, Step, StreamHeader},
     reading::{Next, wait},
 };
-use crate::engine::{rings::RingError, stand_in::StandIn};
+use crate::engine::{dropped::Before, rings::RingError, stand_in::StandIn};
+
+/// A message waits for so long while other rings of its peer have the memory that it needs. Their readers may never take
+/// what these hold, and history stays for as long as its publisher. A ring that has samples itself is full, and waits for
+/// its own readers.
+const LONGEST_SHORT: Duration = Duration::from_secs(60);
 
 impl Inbound {
     /// Writes a message to its ring.
@@ -48,12 +53,13 @@ impl Inbound {
             Kind::Topic | Kind::Request => stand_in.last_sequence(),
             Kind::Response => found.and_then(|route| route.clients.get(&header.of)).copied(),
         };
-        if acknowledged && stand_in.has_dropped(sequence) {
+        let before = stand_in.dropped(sequence);
+        if acknowledged && before == Before::Dropped {
             self.receipts.dropped_again(flow, sequence, now);
             self.release(stream);
             return Next::Go;
         }
-        if acknowledged && last >= Some(sequence) {
+        if acknowledged && (before == Before::Passed || last >= Some(sequence)) {
             self.receipts.came(flow, sequence, length, now);
             self.release(stream);
             return Next::Go;
@@ -79,7 +85,9 @@ impl Inbound {
             },
             None => message,
         };
-        let Some(there) = self.write(&stand_in, header, message.meta, &message.payload, now) else {
+        let Message { meta, payload, .. } = &message;
+        let since = &mut stream.short_since;
+        let Some(there) = self.write(&stand_in, header, *meta, payload, since, now) else {
             return self.wait_for_room(key, stream, message, now);
         };
         if let Some(limit) = &limit {
@@ -117,16 +125,26 @@ impl Inbound {
         if header.reliable { Next::Go } else { Next::Over }
     }
 
-    /// Writes a sample to its ring. Whether it is there; `None`: the ring is full.
+    /// Writes a sample to its ring. Whether it is there; `None`: the ring is full. `short_since` says since when it has been
+    /// for want of memory alone.
     pub(super) fn write(
         &mut self,
         stand_in: &Rc<StandIn>,
         header: StreamHeader,
         meta: Meta,
         payload: &[u8],
+        short_since: &mut Option<Duration>,
         now: Duration,
     ) -> Option<bool> {
-        match stand_in.try_write(&header.of, meta, payload, now) {
+        let written = stand_in.try_write(&header.of, meta, payload, now);
+        if let Err(RingError::Short(_)) = &written
+            && self.may_wait(header)
+            && now < *short_since.get_or_insert(now) + LONGEST_SHORT
+        {
+            return None;
+        }
+        *short_since = None;
+        match written {
             Ok(Written::Yes) => {
                 self.counters.arrived(payload.len());
                 let before = self.written.as_ref();
@@ -142,7 +160,6 @@ impl Inbound {
                 Some(false)
             }
             Err(RingError::Full) => None,
-            Err(RingError::Short(_)) if self.may_wait(header) => None,
             Err(RingError::Short(why)) => {
                 if header.reliable {
                     stand_in.drop_sample(meta.sequence);
@@ -157,8 +174,7 @@ impl Inbound {
         }
     }
 
-    /// Whether what its stream has next may wait here for as long as it takes: calls, and samples whose publisher waits
-    /// for its readers anyway.
+    /// Whether what its stream has next may wait here: calls, and samples whose publisher waits for its readers anyway.
     pub(super) fn may_wait(&self, header: StreamHeader) -> bool {
         let waits = |route: &RouteIn| route.route.kind != Kind::Topic || route.keeps_all;
         header.reliable && self.routes.get(&header.route).is_some_and(waits)

@@ -143,6 +143,8 @@ pub(super) struct Incoming {
     pub(super) room: Option<Charge>,
     /// The memory by which it is longer once it is decompressed.
     pub(super) unpacked: Option<Charge>,
+    /// Since when its message has waited for memory that other rings have.
+    pub(super) short_since: Option<Duration>,
     pub(super) is_ready: bool,
 }
 
@@ -156,6 +158,7 @@ impl Default for Incoming {
             gathered: BytesMut::new(),
             room: None,
             unpacked: None,
+            short_since: None,
             is_ready: false,
         }
     }

@@ -11,6 +11,7 @@ use super::{
     reading::{Next, malformed, permit_short, refused, told},
 };
 use crate::engine::{
+    dropped::Before,
     protection::{MAX_OVERHEAD, Open, writer_of},
     short_header::Told,
     stand_in::StandIn,
@@ -91,7 +92,7 @@ impl Inbound {
         came: &mut Came,
     ) -> Result<Option<Step>, Violation> {
         let now = to.now;
-        let Incoming { chunk, headers, .. } = stream;
+        let Incoming { chunk, headers, short_since, .. } = stream;
         while let Some(body) = next_body(chunk, to.most) {
             let (told, payload): (Told, &[u8]) = match headers {
                 Some(headers) => {
@@ -120,14 +121,16 @@ impl Inbound {
             };
             let (length, bytes) = (LENGTH + body.len(), payload.len());
             let flow = (to.header.route, to.header.of);
-            if to.stand_in.has_dropped(told.sequence) {
+            let before = to.stand_in.dropped(told.sequence);
+            if before == Before::Dropped {
                 self.receipts.dropped_again(flow, told.sequence, now);
                 chunk.advance(length);
                 continue;
             }
-            if to.stand_in.last_sequence() < Some(told.sequence) {
+            let is_new = to.stand_in.last_sequence() < Some(told.sequence);
+            if is_new && before == Before::Unknown {
                 let meta = self.meta(told, now);
-                match self.write(&to.stand_in, to.header, meta, payload, now) {
+                match self.write(&to.stand_in, to.header, meta, payload, short_since, now) {
                     Some(true) => {}
                     Some(false) => {
                         self.receipts.dropped(flow, told.sequence, now);

@@ -41,6 +41,8 @@ const NOW: Duration = Duration::from_secs(1);
 struct Ring {
     endpoint: Endpoint,
     room: Cell<usize>,
+    /// Others have the memory for samples of at least this length.
+    short_from: Cell<usize>,
     samples: RefCell<Vec<(u64, Bytes)>>,
     /// Samples that no reader was woken for.
     quiet: Cell<usize>,
@@ -56,6 +58,9 @@ impl RingWriter for Ring {
     }
 
     fn try_write(&self, _client: &Gid, meta: Meta, payload: &[u8]) -> Result<Written, RingError> {
+        if payload.len() >= self.short_from.get() {
+            return Err(RingError::Short("others have it".into()));
+        }
         let Some(left) = self.room.get().checked_sub(1) else { return Err(RingError::Full) };
         self.room.set(left);
         self.quiet.set(self.quiet.get() + 1);
@@ -122,6 +127,7 @@ impl Way {
         let ring = Rc::new(Ring {
             endpoint: endpoint.clone(),
             room: Cell::new(room),
+            short_from: Cell::new(usize::MAX),
             samples: RefCell::default(),
             quiet: Cell::new(0),
         });
@@ -192,7 +198,7 @@ impl Way {
 
     /// What is acknowledged in the end.
     fn acknowledged(&mut self) -> Option<ReceivedOf> {
-        let received = self.inbound.poll_receipt(NOW + Duration::from_secs(1))?;
+        let received = self.inbound.poll_receipt(NOW + Duration::from_secs(1000))?;
         received.flows.into_iter().next()
     }
 }
@@ -295,4 +301,65 @@ fn a_call_of_a_client_that_is_gone_is_acknowledged_as_dropped() {
     assert!(matches!(next, Next::Go));
     let of = ReceivedOf { route: ROUTE, publisher: PUBLISHER, sequence: 4, dropped: 1 };
     assert_eq!(way.acknowledged(), Some(of));
+}
+
+/// Delivers the sample of this number and length, again each 100 ms while it waits. For how long it waited.
+fn deliver_in_time(
+    way: &mut Way,
+    number: u64,
+    length: usize,
+    ring: impl Fn(&Ring, Duration),
+) -> Duration {
+    let key = (1, StreamId::new(Side::Client, Dir::Uni, 0));
+    let meta = way.inbound.meta(Told { sequence: number, source_timestamp: 1000, age_ms: 5 }, NOW);
+    let mut message =
+        Some(Message { writer: PUBLISHER, number, meta, payload: vec![0; length].into() });
+    let mut waited = Duration::ZERO;
+    while let Some(next) = message.take() {
+        assert!(waited < Duration::from_secs(300), "it waits for ever");
+        ring(&way.ring, waited);
+        way.inbound.deliver(key, &mut way.stream, next, NOW, NOW + waited);
+        if let Step::Ring(waits) = std::mem::replace(&mut way.stream.step, Step::Length) {
+            message = Some(waits);
+            waited += super::FULL_RETRY;
+        }
+    }
+    waited
+}
+
+#[test]
+fn a_sample_whose_memory_others_keep_is_lost_in_the_end_and_told_as_dropped() {
+    let secs = Duration::from_secs;
+    for kind in [Kind::Topic, Kind::Request] {
+        let mut way = Way::new(kind, false, 10);
+        way.inbound.routes().get_mut(&ROUTE).unwrap().keeps_all = true;
+        let (header, _) = way.stream.header.as_mut().unwrap();
+        header.acknowledged = true;
+        way.ring.short_from.set(100);
+        // Others give it back in time.
+        let in_time = |ring: &Ring, waited| {
+            if waited >= secs(50) {
+                ring.short_from.set(usize::MAX);
+            }
+        };
+        assert_eq!(deliver_in_time(&mut way, 1, 100, in_time), secs(50));
+        assert_eq!(way.acknowledged().map(|of| (of.sequence, of.dropped)), Some((1, 0)));
+        // They never do. What a reader keeps of its own ring is another matter: it may take its time.
+        way.ring.short_from.set(100);
+        let full_at_first = |ring: &Ring, waited: Duration| {
+            let is_full = waited < secs(100) && waited > secs(30);
+            ring.short_from.set(if is_full { usize::MAX } else { 100 });
+            ring.room.set(if is_full { 0 } else { 10 });
+        };
+        let waited = deliver_in_time(&mut way, 2, 100, full_at_first);
+        assert_eq!(waited, secs(160));
+        assert_eq!(way.acknowledged().map(|of| (of.sequence, of.dropped)), Some((2, 1)));
+        let lost = way.inbound.counters.take_lost();
+        assert_eq!((lost.len(), lost[0].cause, lost[0].samples), (1, "held", 1));
+        // It is not delivered when it comes again, and what is behind it is.
+        way.ring.short_from.set(usize::MAX);
+        assert_eq!(deliver_in_time(&mut way, 2, 100, |_, _| {}), Duration::ZERO);
+        assert_eq!(deliver_in_time(&mut way, 3, 8, |_, _| {}), Duration::ZERO);
+        assert_eq!(way.ring.samples.borrow().iter().map(|(n, _)| *n).collect::<Vec<_>>(), [1, 3]);
+    }
 }

@@ -9,6 +9,7 @@ pub(crate) mod budget;
 mod burst;
 mod ending;
 mod flow;
+mod furthest;
 #[cfg(test)]
 mod model;
 mod nudges;
@@ -19,6 +20,7 @@ mod source;
 mod stall;
 mod table;
 mod turns;
+mod unfinished;
 
 use std::{collections::HashMap, rc::Rc, sync::Arc, time::Duration};
 
@@ -31,6 +33,7 @@ pub(crate) use self::{
     served::{ResponseNumbers, RouteOut},
     source::Source,
     stall::Stall,
+    unfinished::{Unfinished, UnfinishedFlows},
 };
 use self::{
     budget::Budget,
@@ -107,7 +110,7 @@ impl Outbound {
 
     /// Serves this route from now on, or changes it.
     pub(crate) fn set_route(&mut self, number: u32, route: RouteOut, now: Duration) {
-        let RouteOut { sources, seen, idle, .. } = route;
+        let RouteOut { sources, seen, unfinished, .. } = route;
         let shared = FlowRoute {
             number,
             topic: route.topic,
@@ -121,8 +124,11 @@ impl Outbound {
         };
         self.table.routes.add(number, shared);
         self.update_sources(number, sources, seen, now);
-        if let Some(served) = self.table.routes.get(number).filter(|_| !idle.is_zero()) {
-            served.flows.values().for_each(|id| self.stalls.inherit(*id, idle));
+        for (of, Unfinished { progress, furthest }) in unfinished {
+            let Some(id) = self.table.find(number, &of) else { continue };
+            let Some(flow) = self.table.flows.get_mut(id) else { continue };
+            flow.go_on(furthest);
+            self.stalls.inherit(id, flow.progress(), progress, now);
         }
     }
 
@@ -203,11 +209,21 @@ impl Outbound {
     }
 
     /// Takes the KEEP_ALL relays of a route, as many as `most` says, whose samples another daemon of the peer's host may
-    /// ask for. Nothing of their flows is given up. Returns also for how long one of them made no progress.
-    pub(crate) fn take_kept(&mut self, number: u32, most: usize) -> (Vec<Source>, Duration) {
+    /// ask for. Nothing of their flows is given up. Returns also what is known of these.
+    pub(crate) fn take_kept(
+        &mut self,
+        number: u32,
+        most: usize,
+        now: Duration,
+    ) -> (Vec<Source>, UnfinishedFlows) {
+        let mut unfinished = UnfinishedFlows::new();
+        for (of, flow, furthest) in self.table.kept_flows(number) {
+            let progress = self.stalls.leave(&flow, now);
+            unfinished.insert(of, Unfinished { progress, furthest });
+        }
         let (kept, gone) = self.table.take_kept(number, most);
-        let idle = self.forget(gone);
-        (kept, idle)
+        self.forget(gone);
+        (kept, unfinished)
     }
 
     /// Whether samples of a publisher are left that wait to be acknowledged, or for a limit.
@@ -227,15 +243,13 @@ impl Outbound {
         }
     }
 
-    /// These flows are gone. Their numbers are free for others. Returns for how long one of them made no progress.
-    fn forget(&mut self, gone: impl IntoIterator<Item = FlowId>) -> Duration {
-        let mut idle = Duration::ZERO;
+    /// These flows are gone. Their numbers are free for others.
+    fn forget(&mut self, gone: impl IntoIterator<Item = FlowId>) {
         for id in gone {
             self.turns.forget(id);
             self.nudges.forget(id);
-            idle = idle.max(self.stalls.forget(id));
+            self.stalls.forget(id);
         }
-        idle
     }
 
     /// Hands samples to QUIC until it takes no more, or none is left.

@@ -13,6 +13,7 @@ use super::{
     flow::PeerCredit,
     schedule::FlowId,
     source::{Done, Source},
+    unfinished::UnfinishedFlows,
 };
 use crate::engine::limits::RouteLimit;
 
@@ -34,8 +35,8 @@ pub(crate) struct RouteOut {
     pub(crate) sources: Vec<Source>,
     /// The newest sample of each publisher that the peer has already.
     pub(crate) seen: HashMap<Gid, u64>,
-    /// For how long an earlier daemon of the peer's host took nothing of what waits.
-    pub(crate) idle: Duration,
+    /// The flows of an earlier daemon of the peer's host that go on.
+    pub(crate) unfinished: UnfinishedFlows,
 }
 
 /// The parts of a route that its flows share.

@@ -10,7 +10,7 @@ use std::{
 use super::{Peer, routes::RelaySpec};
 use crate::engine::{
     account::{Charge, Meter},
-    outbound::Source,
+    outbound::{Source, UnfinishedFlows},
     peer::routes::RouteKey,
     rings::RingReader,
 };
@@ -34,12 +34,14 @@ struct Kept {
     key: RouteKey,
     spec: RelaySpec,
     reader: Rc<dyn RingReader>,
-    /// When it was kept, and for how long the peer had taken nothing then.
-    since: (Duration, Duration),
+    /// What is known of its route's flows, those of all its relays.
+    unfinished: Rc<UnfinishedFlows>,
+    since: Duration,
     until: Duration,
     /// It counts among those that are kept, and still among the relays of the identity.
     _charges: [Charge; 2],
-    lanes: Option<Charge>,
+    /// Those of its relay.
+    lanes: Charge,
 }
 
 impl Kept {
@@ -74,19 +76,22 @@ impl KeptRelays {
         let room = self.room_of(&peer.identity);
         for (number, served) in &mut peer.served {
             let lanes = served.lanes.amount() / served.sources.len().max(1);
-            let (sources, idle) = peer.outbound.take_kept(*number, room.left());
+            let (sources, unfinished) = peer.outbound.take_kept(*number, room.left(), now);
+            let unfinished = Rc::new(unfinished);
             for source in sources {
                 let Source::Relay(spec, reader) = source else { continue };
                 let Some(place) = room.charge(1) else { continue };
                 let charges = [place, served.relays.split(1)];
                 let identity = peer.identity.clone();
-                let (key, since, until) = (served.key.clone(), (now, idle), now + PATIENCE);
-                let lanes = Some(served.lanes.split(lanes));
+                let (key, since, until) = (served.key.clone(), now, now + PATIENCE);
+                let unfinished = Rc::clone(&unfinished);
+                let lanes = served.lanes.split(lanes);
                 self.all.push(Kept {
                     identity,
                     key,
                     spec,
                     reader,
+                    unfinished,
                     since,
                     until,
                     _charges: charges,
@@ -96,17 +101,34 @@ impl KeptRelays {
         }
     }
 
-    /// Gives back the lanes of a relay that the peer is about to adopt, since it pays for them anew.
-    pub(super) fn release_lanes(&mut self, key: &RouteKey, spec: &RelaySpec, identity: &str) {
-        if let Some(kept) = self.all.iter_mut().find(|kept| kept.fits(key, spec, identity)) {
-            kept.lanes = None;
+    /// Charges the `lanes` of a new relay as many. If the peer is about to adopt one that was kept, the lanes of that make
+    /// room for them; it has none from then on, so [`adopt`](Self::adopt) has to follow. `None`: there are not so many, and
+    /// what is kept stays charged.
+    pub(super) fn charge_lanes(
+        &mut self,
+        key: &RouteKey,
+        spec: &RelaySpec,
+        identity: &str,
+        lanes: &Charge,
+        many: usize,
+    ) -> Option<Charge> {
+        let Some(kept) = self.all.iter_mut().find(|kept| kept.fits(key, spec, identity)) else {
+            return lanes.more(many);
+        };
+        let before = std::mem::replace(&mut kept.lanes, lanes.meter().nothing());
+        match before.exchange(lanes.meter(), many) {
+            Ok(charged) => Some(charged),
+            Err(before) => {
+                kept.lanes = before;
+                None
+            }
         }
     }
 
     /// The relay that was kept, of a peer with this identity, for one of the subscriptions for which a new one is to
-    /// stand. It begins with what was not acknowledged. Returns also for how long nothing of it was taken: a daemon that
-    /// follows another one is no way around the `limit` on that. All the time for which a relay may be kept counts as half
-    /// of it, so that a daemon that is slow to start has the other half.
+    /// stand. It begins with what was not acknowledged. Returns also what is known of the flows that it had: a daemon that
+    /// follows another one is no way around the `limit` on those that take nothing, or too little. All the time for which a
+    /// relay may be kept counts as half of the limit, so that a daemon that is slow to start has the other half.
     pub(super) fn adopt(
         &mut self,
         key: &RouteKey,
@@ -114,13 +136,16 @@ impl KeptRelays {
         identity: &str,
         limit: Duration,
         now: Duration,
-    ) -> Option<(Rc<dyn RingReader>, Duration)> {
+    ) -> Option<(Rc<dyn RingReader>, UnfinishedFlows)> {
         let at = self.all.iter().position(|kept| kept.fits(key, spec, identity))?;
-        let Kept { reader, since: (kept, idle), .. } = self.all.swap_remove(at);
+        let Kept { reader, since, unfinished, .. } = self.all.swap_remove(at);
         reader.take_back();
         reader.set_stands_for(spec.stands_for.clone());
-        let kept = now.saturating_sub(kept).min(PATIENCE).as_millis() as u32;
-        Some((reader, idle + limit * kept / (2 * PATIENCE.as_millis() as u32)))
+        let kept = now.saturating_sub(since).min(PATIENCE);
+        let idle = limit * kept.as_millis() as u32 / (2 * PATIENCE.as_millis() as u32);
+        let mut unfinished = Rc::unwrap_or_clone(unfinished);
+        unfinished.values_mut().for_each(|flow| flow.keep(kept, idle));
+        Some((reader, unfinished))
     }
 
     /// How many there are.

@@ -11,7 +11,7 @@ use crate::{
     engine::{
         account::Charge,
         limits::RouteLimit,
-        outbound::{RouteOut, Source, Stall},
+        outbound::{RouteOut, Source, Stall, UnfinishedFlows},
         peer::routes::{MAX_RELAYS_OF_ROUTE, RelaySpec, RouteKey, admit, relays},
     },
     link::{Message, RouteReady, Subscribe, Subscriber},
@@ -53,8 +53,8 @@ struct Relays {
     sources: Vec<Source>,
     /// Those among them that another daemon of the peer's host had.
     adopted: Vec<Gid>,
-    /// For how long nothing of one of them was taken.
-    idle: Duration,
+    /// The flows that these had.
+    unfinished: UnfinishedFlows,
     without: Option<Without>,
 }
 
@@ -147,10 +147,11 @@ impl Peer {
             }
             Kind::Request | Kind::Response => {
                 let sources = self.sources_of_service(&key);
-                Relays { sources, adopted: Vec::new(), idle: Duration::ZERO, without: None }
+                let (adopted, unfinished) = Default::default();
+                Relays { sources, adopted, unfinished, without: None }
             }
         };
-        let Relays { sources, adopted, idle, without } = relays;
+        let Relays { sources, adopted, unfinished, without } = relays;
         self.announcing.insert(number, now + READY_TIMEOUT);
         self.look_at_announcing = Some(now);
         let route = Route { kind, topic: hash };
@@ -164,7 +165,7 @@ impl Peer {
             limit: RouteLimit::new(self.outgoing_limits(&key, with.config)),
             sources: sources.clone(),
             seen,
-            idle,
+            unfinished,
         };
         self.outbound.set_route(number, out, now);
         // Of a relay that was kept: publishers that ended meanwhile. The graph of this host is followed late, so others
@@ -291,7 +292,8 @@ impl Peer {
         let each = with.writers.of_route(key);
         drop(places.split(places.amount().saturating_sub(stay)));
         drop(lanes.split(lanes.amount().saturating_sub(stay * each)));
-        let (mut sources, mut adopted, mut idle) = (Vec::new(), Vec::new(), Duration::ZERO);
+        let (mut sources, mut adopted) = (Vec::new(), Vec::new());
+        let mut unfinished = UnfinishedFlows::new();
         for spec in specs {
             if let Some(reader) = there(&spec) {
                 reader.set_stands_for(spec.stands_for.clone());
@@ -304,16 +306,20 @@ impl Peer {
                 without = Some((why.to_owned(), Some(ASK_AGAIN)));
                 continue;
             };
-            with.kept.borrow_mut().release_lanes(key, &spec, &self.identity);
-            let Some(its_lanes) = lanes.more(each) else {
+            let mut relays_kept = with.kept.borrow_mut();
+            let own = &self.identity;
+            let Some(its_lanes) = relays_kept.charge_lanes(key, &spec, own, lanes, each) else {
                 without = Some((TOO_MANY_LANES.to_owned(), Some(ASK_AGAIN)));
                 continue;
             };
             let limit = with.config.link.stalled;
-            let kept = with.kept.borrow_mut().adopt(key, &spec, &self.identity, limit, now);
+            let kept = relays_kept.adopt(key, &spec, own, limit, now);
             let reader = match kept {
-                Some((reader, without_progress)) => {
-                    idle = idle.max(without_progress);
+                Some((reader, flows)) => {
+                    for (of, flow) in flows {
+                        let known = unfinished.entry(of).or_insert(flow);
+                        *known = known.and(flow);
+                    }
                     Ok((reader, true))
                 }
                 None => {
@@ -341,7 +347,7 @@ impl Peer {
         }
         let lacks = asked - sources.len();
         let without = without.map(|(why, again)| (missing(lacks, asked, &why), again));
-        Relays { sources, adopted, idle, without }
+        Relays { sources, adopted, unfinished, without }
     }
 
     /// The stand-ins from which the calls, or responses, of a service are taken.

@@ -20,6 +20,8 @@ pub(super) struct Batch {
     /// What QUIC has not taken.
     chunks: VecDeque<Bytes>,
     sealed: VecDeque<Sealed>,
+    /// Where the frame of the first of them begins, in bytes of the batch.
+    begin: u64,
     /// Bytes that QUIC has taken.
     taken: u64,
 }
@@ -39,7 +41,7 @@ impl Batch {
     pub(super) fn clear(&mut self) {
         self.chunks.clear();
         self.sealed.clear();
-        self.taken = 0;
+        (self.begin, self.taken) = (0, 0);
     }
 
     /// A message belongs to it.
@@ -68,13 +70,19 @@ impl Batch {
         self.chunks.drain(..chunks);
     }
 
-    /// QUIC took so many bytes. `each` is told of the messages that it has wholly then.
-    pub(super) fn handle_taken(&mut self, bytes: u64, mut each: impl FnMut(&Sealed)) {
+    /// QUIC took so many bytes. `each` is told of the messages that it has a part of, or the rest now: how many bytes of
+    /// the frame it has, and whether that is all.
+    pub(super) fn handle_taken(&mut self, bytes: u64, mut each: impl FnMut(&Sealed, u64, bool)) {
         self.taken += bytes;
-        while let Some(sealed) = self.sealed.front()
-            && sealed.end <= self.taken
-        {
-            each(sealed);
+        while let Some(sealed) = self.sealed.front() {
+            let is_whole = sealed.end <= self.taken;
+            if self.begin < self.taken {
+                each(sealed, self.taken.min(sealed.end) - self.begin, is_whole);
+            }
+            if !is_whole {
+                break;
+            }
+            self.begin = sealed.end;
             self.sealed.pop_front();
         }
     }
@@ -94,11 +102,14 @@ mod tests {
         assert_eq!(batch.left(), 24);
         let mut sent = |bytes| {
             let mut sent = Vec::new();
-            batch.handle_taken(bytes, |sealed| sent.push(sealed.sequence));
+            batch.handle_taken(bytes, |sealed, bytes, is_whole| {
+                sent.push((sealed.sequence, bytes, is_whole));
+            });
             sent
         };
-        assert!(sent(13).is_empty(), "the header counts");
-        assert_eq!(sent(1), [1]);
-        assert_eq!(sent(10), [2]);
+        assert_eq!(sent(13), [(1, 13, false)], "the header counts");
+        assert_eq!(sent(1), [(1, 14, true)]);
+        assert_eq!(sent(2), [(2, 2, false)]);
+        assert_eq!(sent(8), [(2, 10, true)]);
     }
 }

@@ -25,6 +25,7 @@ use self::{
 };
 use super::{
     budget::Budget,
+    furthest::Furthest,
     queue::Queue,
     schedule::{Class, Rank},
     served::FlowRoute,
@@ -270,7 +271,8 @@ impl Flow {
     pub(super) fn succeed(&mut self, mut old: Option<&mut Connection>, counters: &Counters) {
         self.reliable.leave(old.as_deref_mut(), &mut self.queue);
         self.best_effort.leave(old, counters, &self.info.topic);
-        self.blocked = false;
+        // It has not asked for credit of the new link.
+        (self.blocked, self.waits_for_credit) = (false, false);
     }
 
     /// The streams that carry it, which end with it, and whether a sample is cut off there.
@@ -291,9 +293,19 @@ impl Flow {
         self.reliable.credit().is_used()
     }
 
-    /// Samples that the peer acknowledged, and how often QUIC took a quarter of a MiB.
+    /// Samples that the peer acknowledged, and how often QUIC took a quarter of a MiB that it had not taken before.
     pub(super) fn progress(&self) -> (u64, u64) {
         (self.acknowledged_samples, self.reliable.parts())
+    }
+
+    /// How far QUIC took its samples.
+    pub(super) fn furthest(&self) -> Furthest {
+        self.reliable.furthest()
+    }
+
+    /// Goes on with the samples of a flow that ended.
+    pub(super) fn go_on(&mut self, furthest: Furthest) {
+        self.reliable.go_on(furthest);
     }
 
     /// Whether it waits for other flows: none of its samples is in flight, and the peer takes in theirs first. Then it is

@@ -20,6 +20,7 @@ use crate::{
         counters::Counters,
         frames::Frames,
         outbound::{
+            furthest::Furthest,
             queue::Queue,
             schedule::{Rank, SMALL},
             source::Done,
@@ -34,7 +35,7 @@ use crate::{
 pub(super) const TOGETHER: usize = 64 << 10;
 /// A sample of at most so many bytes is copied to its neighbours.
 const COPIED: usize = 4096;
-/// Bytes that count as progress of a long sample.
+/// Bytes that count as progress of a long sample, if QUIC took them for the first time.
 const PART: u64 = 256 << 10;
 /// A stream that sent nothing for so long is finished.
 pub(super) const STREAM_IDLE: Duration = Duration::from_secs(30);
@@ -53,8 +54,9 @@ pub(super) struct ReliableStream {
     credit: CreditShare,
     /// When the stream was opened, or handed something to QUIC last.
     active_at: Duration,
-    /// Bytes that QUIC took.
-    taken_bytes: u64,
+    /// Bytes that QUIC took for the first time, and how far.
+    new_bytes: u64,
+    furthest: Furthest,
 }
 
 impl ReliableStream {
@@ -67,7 +69,8 @@ impl ReliableStream {
             batch: Batch::default(),
             credit,
             active_at: Duration::ZERO,
-            taken_bytes: 0,
+            new_bytes: 0,
+            furthest: Furthest::default(),
         }
     }
 
@@ -96,9 +99,19 @@ impl ReliableStream {
         &self.credit
     }
 
-    /// How often QUIC took a quarter of a MiB.
+    /// How often QUIC took a quarter of a MiB that it had never taken before.
     pub(super) fn parts(&self) -> u64 {
-        self.taken_bytes / PART
+        self.new_bytes / PART
+    }
+
+    /// How far QUIC took the samples.
+    pub(super) fn furthest(&self) -> Furthest {
+        self.furthest
+    }
+
+    /// QUIC took them so far over a link before.
+    pub(super) fn go_on(&mut self, furthest: Furthest) {
+        self.furthest = self.furthest.max(furthest);
     }
 
     /// Writes the pending batch, or seals the next one. `None`: go on.
@@ -192,10 +205,20 @@ impl ReliableStream {
         done: &mut Done,
         now: Duration,
     ) {
-        self.taken_bytes += bytes;
         self.active_at = now;
+        // Only these numbers rise.
+        let is_ordered = info.acknowledged || !info.is_service();
+        if !is_ordered {
+            self.new_bytes += bytes;
+        }
         let mut whole = 0;
-        self.batch.handle_taken(bytes, |sealed| {
+        self.batch.handle_taken(bytes, |sealed, taken, is_whole| {
+            if is_ordered {
+                self.new_bytes += self.furthest.advance(sealed.sequence, taken);
+            }
+            if !is_whole {
+                return;
+            }
             counters.sent(sealed.payload);
             if !info.acknowledged {
                 done.sequence = done.sequence.max(Some(sealed.sequence));

@@ -10,8 +10,8 @@ use axon_shm::{ids::Gid, qos::Qos};
 pub(super) use self::flows::Flows;
 use self::routes::Routes;
 use super::{
-    backlog::Backlog, budget::Budget, ending::Left, flow::Flow, schedule::FlowId, served::Served,
-    source::Source, stall::BusyFlow,
+    backlog::Backlog, budget::Budget, ending::Left, flow::Flow, furthest::Furthest,
+    schedule::FlowId, served::Served, source::Source, stall::BusyFlow,
 };
 use crate::engine::counters::Counters;
 
@@ -151,20 +151,18 @@ impl FlowTable {
     /// The flows with samples that are not acknowledged.
     pub(super) fn busy(&self) -> impl Iterator<Item = BusyFlow> {
         self.flows.busy().filter_map(|(id, flow)| {
-            let served = self.routes.get(flow.info.route_number)?;
-            Some(BusyFlow {
-                id,
-                route: flow.info.route_number,
-                is_stalled: served.stalled,
-                progress: flow.progress(),
-                keeps: served.keeps(&flow.info.of),
-                refused: served.refused(&flow.info.of),
-                uses_credit: flow.uses_credit(),
-                waits_for_others: flow.waits_for_others(),
-                waits_for_limit: flow.waits_for_limit(),
-                is_quiet: flow.is_quiet(),
-            })
+            Some(busy_flow(id, flow, self.routes.get(flow.info.route_number)?))
         })
+    }
+
+    /// The flows of a route that have KEEP_ALL relays keep samples, by publisher, and how far QUIC took these.
+    pub(super) fn kept_flows(&self, number: u32) -> Vec<(Gid, BusyFlow, Furthest)> {
+        let Some(served) = self.routes.get(number) else { return Vec::new() };
+        let flows = served.flows.iter().filter_map(|(of, id)| {
+            let flow = self.flows.get(*id)?;
+            Some((*of, busy_flow(*id, flow, served), flow.furthest()))
+        });
+        flows.filter(|(_, flow, _)| flow.keeps.is_some()).collect()
     }
 
     /// Counts the samples that were overwritten in their rings while their flows left them there.
@@ -217,6 +215,21 @@ impl FlowTable {
             }
         }
         losses
+    }
+}
+
+fn busy_flow(id: FlowId, flow: &Flow, served: &Served) -> BusyFlow {
+    BusyFlow {
+        id,
+        route: flow.info.route_number,
+        is_stalled: served.stalled,
+        progress: flow.progress(),
+        keeps: served.keeps(&flow.info.of),
+        refused: served.refused(&flow.info.of),
+        uses_credit: flow.uses_credit(),
+        waits_for_others: flow.waits_for_others(),
+        waits_for_limit: flow.waits_for_limit(),
+        is_quiet: flow.is_quiet(),
     }
 }
 

@@ -356,6 +356,52 @@ fn no_identity_takes_all_lanes_and_each_is_told_what_it_does_not_get() {
 }
 
 #[test]
+fn the_lanes_of_a_relay_that_is_kept_stay_charged_where_the_next_daemon_finds_none() {
+    const PUBLISHERS: usize = 200;
+    let mut world = World::new(89, 1, |_| Config::default());
+    world.add_raw(Config::default(), DaemonId([0xff; 16]));
+    let publish = |world: &mut World, topic: u32, publishers: usize| {
+        for _ in 0..publishers {
+            world.hosts[0].rings.create_publisher(&format!("/topic_{topic}"), Qos::keep_all());
+        }
+        world.hosts[0].touch_graph();
+    };
+    (0..22).for_each(|topic| publish(&mut world, topic, PUBLISHERS));
+    let says = |world: &mut World, link: usize, message: &Message| {
+        world.with_raw(0, |raw, _| raw.links[link].say(message));
+    };
+    let moved = endpoint(EndpointKind::Subscription, gid(0xf0, 0), "/moved");
+    let graph = Message::Graph(Graph { version: 1, added: vec![moved], ..Graph::default() });
+    let asks = subscribe(21, "/topic_21", gid(0xf0, 1));
+    let first = linked_as(&mut world, 0, 0xf0);
+    says(&mut world, first, &graph);
+    says(&mut world, first, &asks);
+    world.run_for(secs(1));
+    // Another daemon of the host has nearly all others of the 65,536.
+    let other = linked_as(&mut world, 0, 0xf4);
+    (0..21).for_each(|topic| subscribe_in_many_ways(&mut world, 0, other, 0xf4, topic));
+    world.run_for(secs(3));
+    let most = 327 * PUBLISHERS;
+    assert_eq!(world.hosts[0].rings.lanes(), most, "{}", world.describe());
+    // The first one is killed, and there are more publishers when the next one asks for its topic.
+    let next = linked_as(&mut world, 0, 0xf1);
+    says(&mut world, next, &graph);
+    world.run_for(secs(1));
+    assert_eq!(world.hosts[0].kept(), 1, "{}", world.describe());
+    publish(&mut world, 21, PUBLISHERS);
+    world.run_for(secs(1));
+    says(&mut world, next, &asks);
+    world.run_for(secs(3));
+    assert_eq!(without_lanes(&world, 0, next), [21]);
+    assert_eq!(world.hosts[0].kept(), 1, "{}", world.describe());
+    // What it has is nobody else's.
+    let relays = world.hosts[0].rings.relays();
+    subscribe_in_many_ways(&mut world, 0, other, 0xf4, 20);
+    world.run_for(secs(1));
+    assert_eq!(world.hosts[0].rings.relays(), relays, "{}", world.describe());
+}
+
+#[test]
 fn control_messages_that_are_not_handled_are_bounded_over_all_links_of_an_identity() {
     const LINKS: u8 = 16;
     let mut world = World::new(88, 1, |_| Config::default());

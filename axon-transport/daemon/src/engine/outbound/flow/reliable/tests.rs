@@ -82,6 +82,16 @@ impl Way {
         self.pair.exchange();
     }
 
+    /// The same towards a peer that reads what comes.
+    fn write_and_read_all(&mut self) {
+        while self.write() == Pause::Blocked {
+            self.pair.exchange();
+            let _ = self.pair.read(self.stream());
+        }
+        self.pair.exchange();
+        let _ = self.pair.read(self.stream());
+    }
+
     fn stream(&self) -> StreamId {
         self.reliable.stream.unwrap()
     }
@@ -144,6 +154,31 @@ fn a_long_sample_makes_progress_while_quic_takes_it() {
     read += way.pair.read(way.stream()).unwrap().0.len();
     assert!(read > 1 << 20, "{read}");
     assert_eq!((way.reliable.parts(), way.reliable.is_writing()), (4, false));
+}
+
+#[test]
+fn what_is_sent_again_over_another_link_is_no_progress() {
+    let mut way = Way::new(true);
+    way.offer(8, 128 << 10);
+    way.write_and_read_all();
+    assert_eq!(way.reliable.parts(), 4);
+    for _ in 0..3 {
+        way.reliable.rewind(&mut way.queue);
+        way.write_and_read_all();
+        assert_eq!(way.reliable.parts(), 4);
+    }
+    // Nor is it where another flow goes on.
+    let mut next = Way::new(true);
+    next.reliable.go_on(way.reliable.furthest());
+    next.offer(8, 128 << 10);
+    next.write_and_read_all();
+    assert_eq!(next.reliable.parts(), 0);
+    // What is new counts.
+    way.offer(2, 128 << 10);
+    way.write_and_read_all();
+    next.offer(2, 128 << 10);
+    next.write_and_read_all();
+    assert_eq!((way.reliable.parts(), next.reliable.parts()), (5, 1));
 }
 
 #[test]

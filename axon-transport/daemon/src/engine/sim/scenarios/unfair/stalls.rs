@@ -41,6 +41,8 @@ struct Held {
     world: World,
     pair: Pair,
     published: u64,
+    /// Bytes of each sample.
+    length: usize,
 }
 
 impl Held {
@@ -50,11 +52,16 @@ impl Held {
         let pair = world.pair(0, 1, "/t", Qos::keep_all());
         world.until(secs(5), World::is_whole);
         world.run_for(secs(1));
-        Self { world, pair, published: 0 }
+        Self { world, pair, published: 0, length: 100 }
     }
 
     /// The peer dials under a daemon id, and asks for the topic.
     fn subscribe(&mut self, id: u8) -> usize {
+        self.subscribe_over(id, None)
+    }
+
+    /// The same over a link that may replace another one.
+    fn subscribe_over(&mut self, id: u8, replaces: Option<[u8; 16]>) -> usize {
         let to = self.world.hosts[0].address;
         let world = &mut self.world;
         let link = world.with_raw(0, |raw, now| raw.dial(to, now));
@@ -63,7 +70,7 @@ impl Held {
             // Higher than any other, so that elections are the other side's.
             let mut daemon = DaemonId([0xff; 16]);
             daemon.0[15] = id;
-            let hello = Hello { daemon, ..raw.hello() };
+            let hello = Hello { daemon, replaces, ..raw.hello() };
             raw.links[link].say(&Message::Hello(hello));
         });
         world.until(secs(5), |world| world.raws[0].links[link].is_elected());
@@ -81,18 +88,28 @@ impl Held {
             acknowledges: Some(true),
             short_headers: None,
         };
-        world.with_raw(0, |raw, _| {
-            raw.links[link].say(&Message::Graph(graph));
-            raw.links[link].say(&Message::Subscribe(subscribe));
-        });
+        let mut says = [Message::Graph(graph), Message::Subscribe(subscribe)];
+        if replaces.is_some() {
+            // A route that is asked for before the graph goes on.
+            says.reverse();
+        }
+        world.with_raw(0, |raw, _| says.iter().for_each(|message| raw.links[link].say(message)));
         link
+    }
+
+    /// What host 0 calls a link of the peer.
+    fn name(&self, link: usize) -> Option<[u8; 16]> {
+        self.world.raws[0].links[link].messages.iter().find_map(|message| match message {
+            Message::Elected(elected) => Some(elected.link),
+            _ => None,
+        })
     }
 
     /// Publishes for so long, and does something after each step. Whether many samples were published by then.
     fn publish(&mut self, time: Duration, mut each: impl FnMut(&mut World)) -> bool {
         let end = self.world.now + time;
         while self.world.now < end && self.published < MANY {
-            self.published += u64::from(self.world.publish(self.pair, 100));
+            self.published += u64::from(self.world.publish(self.pair, self.length));
             self.world.run_for(EVERY);
             each(&mut self.world);
         }
@@ -152,19 +169,37 @@ fn a_host_that_is_switched_off_holds_no_publisher_up_for_long() {
 
 #[test]
 fn a_peer_that_has_one_daemon_after_another_holds_no_publisher_up_for_long() {
-    let mut of = Held::new(125);
-    let mut next = Duration::ZERO;
-    let (begin, mut ids) = (of.world.now, 0..=0xff);
-    // Each daemon takes over what the one before it did not acknowledge.
-    while of.world.now < begin + secs(85) && of.published < MANY {
-        if of.world.now >= next {
-            of.subscribe(ids.next().unwrap());
-            next = of.world.now + secs(4);
+    // What is not acknowledged of samples of 2 KiB is more than the bytes that count as progress.
+    for (seed, length) in [(125, 100), (127, 2048)] {
+        let mut of = Held { length, ..Held::new(seed) };
+        let mut next = Duration::ZERO;
+        let (begin, mut ids) = (of.world.now, 0..=0xff);
+        // Each daemon takes over what the one before it did not acknowledge.
+        while of.world.now < begin + secs(85) && of.published < MANY {
+            if of.world.now >= next {
+                of.subscribe(ids.next().unwrap());
+                next = of.world.now + secs(4);
+            }
+            of.publish(millis(500), |_| {});
         }
-        of.publish(millis(500), |_| {});
+        assert_eq!(of.published, MANY, "{length}: {}", of.world.describe());
+        of.ends_well("one daemon after another");
+    }
+}
+
+#[test]
+fn a_peer_that_breaks_its_link_again_and_again_holds_no_publisher_up_for_long() {
+    let mut of = Held { length: 2048, ..Held::new(128) };
+    let mut link = of.subscribe(0xff);
+    let begin = of.world.now;
+    // All is sent again over each link.
+    while of.world.now < begin + secs(85) && of.published < MANY {
+        of.publish(secs(4), |_| {});
+        let name = of.name(link);
+        link = of.subscribe_over(0xff, name);
     }
     assert_eq!(of.published, MANY, "{}", of.world.describe());
-    of.ends_well("one daemon after another");
+    of.ends_well("one link after another");
 }
 
 #[test]

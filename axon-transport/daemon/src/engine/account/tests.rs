@@ -1,0 +1,101 @@
+use super::*;
+use crate::link::{Received, ReceivedOf, RouteReady};
+use axon_shm::ids::Gid;
+
+#[test]
+fn an_identity_has_one_account_and_what_is_dropped_is_given_back() {
+    let mut accounts = Accounts::new(100, 1 << 20);
+    let (one, again, other) = (accounts.of("a"), accounts.of("a"), accounts.of("b"));
+    let charge = one.graph.charge(60).unwrap();
+    assert!(again.graph.charge(41).is_none(), "of the same identity");
+    assert!(other.graph.charge(100).is_some());
+    assert!(again.graph.charge(usize::MAX).is_none());
+    assert_eq!(again.graph.held(), 60);
+    drop(charge);
+    assert!(again.graph.charge(100).is_some());
+    drop((one, again));
+    assert_eq!(accounts.of("a").graph.held(), 0);
+    assert_eq!(accounts.open.len(), 2);
+}
+
+#[test]
+fn what_readers_have_of_an_identity_counts_when_it_comes_again() {
+    let mut accounts = Accounts::new(100, 1000);
+    let account = accounts.of("a");
+    let (ring, pool) = (Arc::clone(&account.held), Arc::clone(&accounts.held.0));
+    drop(account);
+    assert!(Arc::ptr_eq(&accounts.of("a").held, &ring));
+    assert!(!Arc::ptr_eq(&accounts.of("b").held, &ring));
+    assert_eq!((ring.most(), pool.most()), (1000, 2000));
+    drop(ring);
+    accounts.of("c");
+    assert_eq!(accounts.held_by.len(), 1, "{:?}", accounts.held_by);
+}
+
+#[test]
+fn no_identity_takes_the_last_of_what_all_share() {
+    let pool = Meter::new(100);
+    let [one, two, three] = [80, 80, 10].map(|most| Meter::within(&pool, most));
+    let first = one.charge(50).unwrap();
+    assert!(one.charge(1).is_none(), "half of all");
+    let second = two.charge(25).unwrap();
+    assert!(two.charge(1).is_none() && three.charge(11).is_none());
+    assert_eq!((one.left(), two.left(), three.left()), (0, 0, 10));
+    drop(first);
+    assert_eq!((one.left(), two.left()), (37, 25));
+    drop(second);
+    assert_eq!((pool.held(), three.charge(10).is_some()), (0, true));
+}
+
+#[test]
+fn a_charge_makes_room_for_the_one_in_its_place_and_stays_where_that_does_not_fit() {
+    let pool = Meter::new(100);
+    // Of an account that is gone, and of the one that the identity has now.
+    let [old, new] = [80, 80].map(|most| Meter::within(&pool, most));
+    let [kept, own] = [old.charge(30).unwrap(), new.charge(30).unwrap()];
+    assert!(new.charge(10).is_none(), "half of what others leave");
+    let kept = kept.exchange(&new, 25).expect_err("20 fit");
+    assert_eq!((kept.amount(), old.held(), new.held(), pool.held()), (30, 30, 30, 60));
+    let kept = kept.exchange(&new, 20).expect("the 30 are given back");
+    assert_eq!((kept.amount(), old.held(), new.held(), pool.held()), (20, 0, 50, 50));
+    assert_eq!((old.released(), new.released()), (30, 0));
+    // Of one meter.
+    let kept = kept.exchange(&new, 21).expect_err("half of all");
+    assert_eq!((kept.amount(), new.held()), (20, 50));
+    let kept = kept.exchange(&new, 5).unwrap();
+    drop((kept, own));
+    assert_eq!((new.held(), pool.held()), (0, 0));
+}
+
+#[test]
+fn each_that_shares_leaves_as_much_and_takes_up_what_others_leave() {
+    let meter = Meter::new(64);
+    let [mut one, mut two, mut three] = [0; 3].map(|_| meter.nothing());
+    assert!(meter.share(&mut one) && meter.share(&mut two) && meter.share(&mut three));
+    assert_eq!([one.amount(), two.amount(), three.amount()], [32, 16, 8]);
+    assert!(!meter.share(&mut one) && !meter.share(&mut three), "it has its share");
+    drop(one);
+    assert!(meter.share(&mut two));
+    assert_eq!((two.amount(), meter.held()), (28, 36));
+    drop((two, three));
+    assert_eq!(meter.held(), 0);
+}
+
+#[test]
+fn a_message_costs_what_it_says_and_a_frame_what_it_is_unpacked() {
+    let flow = ReceivedOf { route: 1, publisher: Gid::default(), sequence: 1, dropped: 0 };
+    let received = |count| Message::Received(Received { flows: vec![flow; count] });
+    let publishers = vec![Gid::default(); 65_536];
+    let ready = Message::RouteReady(RouteReady { route: 1, publishers });
+    assert_eq!((cost(&received(65_536)), cost(&ready)), (2049, 2049));
+    // An honest peer sends one after each few samples, and one of a thousand topics at once.
+    assert_eq!((cost(&received(1)), cost(&received(1024))), (1, 33));
+
+    let frame = |kind: u8, unpacked: u32| [&[kind][..], &unpacked.to_be_bytes()].concat();
+    assert_eq!(cost_of_frame(&frame(0x83, 4 << 20)), 1025);
+    // Nobody unpacks more than that, and nobody what is of unknown type.
+    assert_eq!(cost_of_frame(&frame(0x83, u32::MAX)), 1025);
+    assert_eq!(cost_of_frame(&frame(0xff, 4 << 20)), 1);
+    assert_eq!(cost_of_frame(&vec![0x7f; 1 << 20]), 257);
+    assert_eq!(cost_of_frame(&[8, 0xa0]), 1);
+}

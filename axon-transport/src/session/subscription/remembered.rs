@@ -1,0 +1,63 @@
+//! The last numbers of writers that are gone.
+
+use std::collections::HashMap;
+
+use crate::ids::Gid;
+
+/// So many writers that were there last are remembered in any case, and twice as many at most.
+pub(super) const REMEMBERED: usize = 2048;
+
+/// The last sequence number taken of each writer that is gone: what one that comes back sends again must not be taken
+/// twice. A remote writer comes back with its link, a client with the next daemon. Those that left longest ago are
+/// forgotten first.
+#[derive(Default)]
+pub(super) struct Remembered {
+    newer: HashMap<Gid, u64>,
+    older: HashMap<Gid, u64>,
+}
+
+impl Remembered {
+    /// A writer is gone.
+    pub(super) fn add(&mut self, writer: Gid, last: u64) {
+        if self.newer.len() >= REMEMBERED {
+            self.older = std::mem::take(&mut self.newer);
+        }
+        self.newer.insert(writer, last);
+    }
+
+    /// The last number of a writer that was here before.
+    pub(super) fn get(&self, writer: &Gid) -> Option<u64> {
+        self.newer.get(writer).or_else(|| self.older.get(writer)).copied()
+    }
+
+    /// The same. It is back.
+    pub(super) fn remove(&mut self, writer: &Gid) -> Option<u64> {
+        let older = self.older.remove(writer);
+        self.newer.remove(writer).or(older)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn writers_that_were_there_last_are_remembered_and_the_newest_number_counts() {
+        let gid = |number: u64| Gid((u128::from(number)).to_be_bytes());
+        let mut remembered = Remembered::default();
+        remembered.add(gid(0), 1);
+        (1..5 * REMEMBERED as u64).for_each(|number| remembered.add(gid(number), number));
+        assert!(remembered.newer.len() + remembered.older.len() <= 2 * REMEMBERED);
+        let newest = 5 * REMEMBERED as u64 - 1;
+        for number in newest - REMEMBERED as u64 + 1..=newest {
+            assert_eq!(remembered.get(&gid(number)), Some(number));
+        }
+        assert_eq!(remembered.get(&gid(0)), None);
+        // One that is in both.
+        let twice = newest - REMEMBERED as u64 + 1;
+        remembered.add(gid(twice), 7);
+        (0..10).for_each(|number| remembered.add(gid(1 << 40 | number), number));
+        assert_eq!(remembered.get(&gid(twice)), Some(7));
+        assert_eq!((remembered.remove(&gid(twice)), remembered.get(&gid(twice))), (Some(7), None));
+    }
+}
