@@ -40,19 +40,23 @@ pub(crate) fn run(args: &cli::Echo) -> Result<(), CliError> {
     let interrupt = interrupt::of(&session)?;
     let mut numbers = Numbers::default();
     let outcome = print(args, &session, &subscription, &interrupt, &mut numbers);
-    let missed = numbers.missing.max(subscription.lost());
+    let missed = numbers.missing.max(subscription.lost()) + numbers.unprinted;
     if missed > 0 {
-        say(format_args!("axon echo: missed {} messages", text::grouped(missed)));
+        let messages = if missed == 1 { "message" } else { "messages" };
+        say(format_args!("axon echo: missed {} {messages}", text::grouped(missed)));
     }
     outcome
 }
 
-/// Counts the messages missing among those that came: lost, or passed over since more came than may wait.
+/// Counts what was not printed: messages missing among those that came (lost, or passed over since more came than
+/// may wait), and those for which standard output has no room.
 #[derive(Default)]
 struct Numbers {
     /// The last number of each publisher.
     last: HashMap<Gid, u64>,
     missing: u64,
+    /// Those that came and could not be printed.
+    unprinted: u64,
 }
 
 impl Numbers {
@@ -96,7 +100,10 @@ fn print(
                 Ok(()) => {}
                 // The reader of the pipe has seen enough.
                 Err(error) if error.kind() == io::ErrorKind::BrokenPipe => return Ok(()),
-                Err(error) => return Err(error.into()),
+                Err(error) => {
+                    numbers.unprinted += 1;
+                    return Err(error.into());
+                }
             }
             left = left.map(|left| left - 1);
         }

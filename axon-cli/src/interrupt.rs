@@ -1,4 +1,4 @@
-//! SIGINT and SIGTERM as a condition at which a session waits, so that a command can say how it was
+//! SIGINT, SIGTERM and SIGHUP as a condition at which a session waits, so that a command can say how it was
 //! before it ends.
 
 use std::{io, process, thread};
@@ -9,6 +9,15 @@ use tokio::{
     signal::unix::{SignalKind, signal},
 };
 
+/// Whether whoever started this process had it outlive its terminal, as `nohup` does.
+fn ignores_hangup() -> bool {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    let mask = mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
+    // Signal 1 is the lowest bit.
+    mask.is_some_and(|mask| mask & 1 == 1)
+}
+
 /// A condition that is triggered by the first signal. The second ends the process.
 ///
 /// # Errors
@@ -17,9 +26,10 @@ pub(crate) fn of(session: &Session) -> io::Result<GuardCondition> {
     let guard = session.create_guard_condition();
     let condition = guard.clone();
     let runtime = runtime::Builder::new_current_thread().enable_io().build()?;
-    let (mut interrupt, mut terminate) = {
+    let (mut interrupt, mut terminate, mut hangup) = {
         let _context = runtime.enter();
-        (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?)
+        let hangup = if ignores_hangup() { None } else { Some(signal(SignalKind::hangup())?) };
+        (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?, hangup)
     };
     thread::Builder::new().name("signals".into()).spawn(move || {
         let mut signal = || {
@@ -27,6 +37,7 @@ pub(crate) fn of(session: &Session) -> io::Result<GuardCondition> {
                 tokio::select! {
                     _ = interrupt.recv() => {}
                     _ = terminate.recv() => {}
+                    Some(_) = async { hangup.as_mut()?.recv().await } => {}
                 }
             });
         };

@@ -4,7 +4,11 @@
 
 mod common;
 
-use std::time::Duration;
+use std::{
+    io::Write as _,
+    process::{Command, Stdio},
+    time::Duration,
+};
 
 use axon_transport::{EndpointSpec, qos::Qos};
 use common::{Echoes, Host, LOG, Running, Stderr, eventually};
@@ -51,11 +55,38 @@ fn log_without_its_end() -> tempfile::NamedTempFile {
     file
 }
 
+/// A log whose last chunk has a wrong checksum.
+fn log_with_a_wrong_checksum() -> tempfile::NamedTempFile {
+    const MAGIC: usize = 8;
+    const CHUNK: u8 = 6;
+    let mut bytes = std::fs::read(LOG).expect("the log");
+    let (mut at, mut last) = (MAGIC, None);
+    // Each record begins with its kind and the length of its body.
+    while let Some((kind, length)) = bytes[at..].split_first().filter(|(_, rest)| rest.len() >= 8) {
+        last = if *kind == CHUNK { Some(at + 9) } else { last };
+        let length = u64::from_le_bytes(*length.first_chunk().expect("eight bytes"));
+        at += 9 + usize::try_from(length).expect("a length");
+    }
+    // The checksum follows two times and the length after decompression.
+    bytes[last.expect("a chunk") + 24] ^= 1;
+    let file = tempfile::NamedTempFile::new().expect("temporary file");
+    std::fs::write(file.path(), &bytes).expect("write");
+    file
+}
+
 #[test]
 fn play_of_a_damaged_log_publishes_nothing_unless_told_to_publish_its_whole_part() {
+    publishes_the_whole_part_when_told(&log_without_its_end());
+}
+
+#[test]
+fn play_publishes_nothing_of_a_chunk_with_a_wrong_checksum_nor_what_follows_it() {
+    publishes_the_whole_part_when_told(&log_with_a_wrong_checksum());
+}
+
+fn publishes_the_whole_part_when_told(damaged: &tempfile::NamedTempFile) {
     let host = Host::new();
-    let cut = log_without_its_end();
-    let file = cut.path().to_str().expect("a path in UTF-8");
+    let file = damaged.path().to_str().expect("a path in UTF-8");
     let output = host.run(&["play", file, "--rate", "0"]);
     let said = Stderr::of(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{said}");
@@ -127,34 +158,131 @@ fn echo_finds_the_type_and_shows_the_message() {
     assert!(echo.finish().status.success());
 }
 
-/// More messages come than may wait while nobody reads what `axon echo` prints.
-#[test]
-fn echo_says_what_it_missed_whether_interrupted_or_no_longer_read() {
-    for interrupted in [true, false] {
-        let host = Host::new();
-        let mut echo = Running::start(host.axon(&["echo", "/tf"]));
-        let pid = Pid::from_child(&echo.0);
-        let mut lines = echo.lines();
-        let _play = Running::start(host.axon(&["play", LOG, "--rate", "200", "--loop"]));
-        lines.next().expect("a line");
-        kill_process(pid, Signal::STOP).expect("it runs");
-        let before = host.published();
-        eventually("more than may wait", || host.published() > before + 6_000);
-        if interrupted {
+/// How an `axon echo` ends.
+#[derive(Clone, Copy, Debug)]
+enum End {
+    Signal(Signal),
+    /// Nobody reads what it prints any more.
+    Unread,
+    /// As many came as were asked for.
+    Count,
+}
+
+/// More messages come than may wait while an `axon echo` is stopped.
+fn assert_echo_says_what_it_missed(end: End) {
+    let host = Host::new();
+    let count = ["--count", "2500"];
+    let count = if matches!(end, End::Count) { &count[..] } else { &[] };
+    let mut echo = Running::start(host.axon(&[&["echo", "/tf"], count].concat()));
+    let pid = Pid::from_child(&echo.0);
+    let mut lines = echo.lines();
+    let _play = Running::start(host.axon(&["play", LOG, "--rate", "200", "--loop"]));
+    lines.next().expect("a line");
+    kill_process(pid, Signal::STOP).expect("it runs");
+    let before = host.published();
+    eventually("more than may wait", || host.published() > before + 6_000);
+    match end {
+        End::Signal(signal) => {
             kill_process(pid, Signal::CONT).expect("it runs");
             // More than the pipe can hold of what was printed before the stop.
             assert_eq!(lines.by_ref().take(2_000).count(), 2_000);
-            kill_process(pid, Signal::INT).expect("it runs");
+            kill_process(pid, signal).expect("it runs");
             lines.for_each(drop);
-        } else {
+        }
+        End::Unread => {
             drop(lines);
             kill_process(pid, Signal::CONT).expect("it runs");
         }
-        let output = echo.finish();
-        let said = Stderr::of(&output.stderr);
-        assert!(said.contains("axon echo: missed "), "interrupted {interrupted}: {said}");
-        assert!(output.status.success(), "{said}");
+        End::Count => {
+            kill_process(pid, Signal::CONT).expect("it runs");
+            assert_eq!(lines.count(), 2_499);
+        }
     }
+    let output = echo.finish();
+    let said = Stderr::of(&output.stderr);
+    assert!(said.contains("axon echo: missed "), "{end:?}: {said}");
+    assert!(output.status.success(), "{end:?}: {said}");
+}
+
+#[test]
+fn echo_says_what_it_missed_when_a_signal_or_a_closed_terminal_ends_it() {
+    for signal in [Signal::INT, Signal::TERM, Signal::HUP] {
+        if signal == Signal::HUP && ignores_hangup() {
+            let said = "skipped: SIGHUP, which this test was started to ignore, as under nohup";
+            let _ = writeln!(std::io::stderr(), "{said}");
+        } else {
+            assert_echo_says_what_it_missed(End::Signal(signal));
+        }
+    }
+}
+
+/// Whether this process ignores SIGHUP: so do the programs that it starts.
+fn ignores_hangup() -> bool {
+    let status = std::fs::read_to_string("/proc/self/status").expect("Linux has it");
+    let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:")).expect("a mask");
+    u64::from_str_radix(ignored.trim(), 16).expect("a mask in hexadecimal") & 1 != 0
+}
+
+#[test]
+fn echo_says_what_it_missed_when_it_is_no_longer_read_or_has_had_as_many_as_asked_for() {
+    for end in [End::Unread, End::Count] {
+        assert_echo_says_what_it_missed(end);
+    }
+}
+
+fn bytes(topic: &str) -> EndpointSpec {
+    EndpointSpec::new(topic, "test/Bytes", Qos::keep_all())
+}
+
+#[test]
+fn echo_says_what_it_missed_where_the_disk_is_full() {
+    let host = Host::new();
+    let _daemon = Running::start(host.axon(&["daemon"]));
+    host.wait_daemon();
+    let session = host.session("talker");
+    let publisher = session.create_publisher(bytes("/t")).expect("a publisher");
+    let full = std::fs::OpenOptions::new().write(true).open("/dev/full").expect("Linux has it");
+    let mut echo = host.axon(&["echo", "/t"]);
+    let echo = Running(echo.stdout(full).stderr(Stdio::piped()).spawn().expect("the tool starts"));
+    assert!(publisher.wait_matched(1, Duration::from_secs(60)));
+    publisher.publish(b"hello").expect("published");
+    let output = echo.finish();
+    let said = Stderr::of(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("axon echo: missed 1 message\n"), "{said}");
+    assert!(said.contains("No space left on device"), "{said}");
+}
+
+#[test]
+fn echo_under_nohup_outlives_its_terminal() {
+    let host = Host::new();
+    let _daemon = Running::start(host.axon(&["daemon"]));
+    host.wait_daemon();
+    let session = host.session("talker");
+    let publisher = session.create_publisher(bytes("/t")).expect("a publisher");
+    let echo = host.axon(&["echo", "/t", "--count", "2"]);
+    let mut shell = Command::new("sh");
+    shell
+        .args(["-c", "trap '' HUP; exec \"$0\" \"$@\""])
+        .arg(echo.get_program())
+        .args(echo.get_args());
+    for (name, value) in echo.get_envs() {
+        match value {
+            Some(value) => shell.env(name, value),
+            None => shell.env_remove(name),
+        };
+    }
+    let mut echo = Running::start(shell);
+    let pid = Pid::from_child(&echo.0);
+    let mut lines = echo.lines();
+    assert!(publisher.wait_matched(1, Duration::from_secs(60)));
+    publisher.publish(b"before").expect("published");
+    lines.next().expect("a line");
+    kill_process(pid, Signal::HUP).expect("it runs");
+    publisher.publish(b"after").expect("published");
+    lines.next().expect("another line");
+    let output = echo.finish();
+    assert!(output.status.success(), "{}", Stderr::of(&output.stderr));
 }
 
 #[test]

@@ -19,6 +19,41 @@ fn file(dir: &Path, name: &str, text: &str, mode: u32) -> String {
 
 const MISSING: &str = "/nowhere/ca.pem";
 
+/// A certificate of a CA, in files.
+struct Pki {
+    ca: String,
+    cert: String,
+    key: String,
+}
+
+impl Pki {
+    fn new(dir: &Path) -> Self {
+        let ca_key = rcgen::KeyPair::generate().expect("a key");
+        let mut params = rcgen::CertificateParams::default();
+        params.is_ca = rcgen::IsCa::Ca(rcgen::BasicConstraints::Unconstrained);
+        let ca = params.self_signed(&ca_key).expect("a CA").pem();
+        let issuer = rcgen::Issuer::new(params, ca_key);
+        let key = rcgen::KeyPair::generate().expect("a key");
+        let params = rcgen::CertificateParams::new(["host-a".to_owned()]).expect("a name");
+        let cert = params.signed_by(&key, &issuer).expect("a certificate").pem();
+        Self {
+            ca: file(dir, "ca.pem", &ca, 0o644),
+            cert: file(dir, "host.pem", &cert, 0o644),
+            key: file(dir, "host.key", &key.serialize_pem(), 0o600),
+        }
+    }
+
+    /// The settings of a host with this certificate, or with another CA or certificate.
+    fn settings(&self, ca: &str, cert: &str) -> Vec<(&'static str, String)> {
+        vec![
+            ("AXON_CLASSIC_AUTH", "ca".to_owned()),
+            ("AXON_CLASSIC_CA", ca.to_owned()),
+            ("AXON_CLASSIC_CERT", cert.to_owned()),
+            ("AXON_CLASSIC_KEY", self.key.clone()),
+        ]
+    }
+}
+
 /// Settings, the one that is wrong, and words that say how; and the exit status without a daemon.
 type Case = (Vec<(&'static str, String)>, &'static str, &'static [&'static str], i32);
 
@@ -32,10 +67,17 @@ fn cases(dir: &Path) -> Vec<Case> {
     let encrypted = file(dir, "encrypted.key", encrypted, 0o600);
     let trust = file(dir, "trust", "", 0o644);
     let broken = file(dir, "broken-trust", "half a line", 0o644);
+    let rules = file(dir, "broken-rules", "[[allow]]\npeer = 7\n", 0o644);
     let toml = file(dir, "broken.toml", "this is no TOML", 0o644);
     let certificate = file(dir, "junk.pem", "junk", 0o644);
     let classic = |key: &String, trust: &String| {
         vec![("AXON_CLASSIC_KEY", key.clone()), ("AXON_CLASSIC_TRUST", trust.clone())]
+    };
+    let pki = Pki::new(dir);
+    let revoked = |crl: &str| {
+        let mut settings = pki.settings(&pki.ca, &pki.cert);
+        settings.push(("AXON_CLASSIC_CRL", crl.to_owned()));
+        settings
     };
     let qkd = |ca: &str, key: &String| {
         vec![
@@ -52,11 +94,20 @@ fn cases(dir: &Path) -> Vec<Case> {
         (qkd(MISSING, &good), "AXON_KME_CA", &[MISSING, "exists"], 2),
         (qkd(&certificate, &open), "AXON_SAE_KEY", &["open.key", "0600"], 2),
         (qkd(&certificate, &good), "AXON_KME_CA", &["junk.pem"], 1),
+        (qkd(&pki.ca, &good), "AXON_SAE_CERT", &["junk.pem"], 1),
         (classic(&open, &trust), "AXON_CLASSIC_KEY", &["open.key", "0600"], 2),
         (classic(&"/nowhere/key".to_owned(), &trust), "AXON_CLASSIC_KEY", &["/nowhere/key"], 2),
         (classic(&wrong, &trust), "AXON_CLASSIC_KEY", &["wrong.key", "PRIVATE KEY"], 1),
         (classic(&encrypted, &trust), "AXON_CLASSIC_KEY", &["encrypted.key", "is encrypted"], 1),
         (classic(&good, &broken), "AXON_CLASSIC_TRUST", &["broken-trust", "line 1"], 1),
+        (pki.settings(&certificate, &pki.cert), "AXON_CLASSIC_CA", &["junk.pem"], 1),
+        (pki.settings(MISSING, &pki.cert), "AXON_CLASSIC_CA", &[MISSING, "exists"], 2),
+        (pki.settings(&pki.ca, &certificate), "AXON_CLASSIC_CERT", &["junk.pem"], 1),
+        (pki.settings(&pki.ca, MISSING), "AXON_CLASSIC_CERT", &[MISSING, "exists"], 2),
+        (revoked(&certificate), "AXON_CLASSIC_CRL", &["junk.pem"], 1),
+        (revoked(MISSING), "AXON_CLASSIC_CRL", &[MISSING, "exists"], 2),
+        (vec![("AXON_ACCESS_FILE", rules)], "AXON_ACCESS_FILE", &["broken-rules", "line 2"], 2),
+        (vec![("AXON_ACCESS_FILE", MISSING.to_owned())], "AXON_ACCESS_FILE", &[MISSING], 2),
         (vec![("AXON_CONFIG", toml)], "AXON_CONFIG", &["broken.toml", "line 1"], 2),
         (vec![("AXON_CONFIG", "/nowhere/axon.toml".to_owned())], "AXON_CONFIG", &["/nowhere"], 2),
         (vec![("AXON_QKD_TYPO", "x".to_owned())], "AXON_QKD_TYPO", &[], 2),

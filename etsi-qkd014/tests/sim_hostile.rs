@@ -5,20 +5,22 @@ mod raw;
 
 use std::time::Duration;
 
-use etsi_qkd014::sim::Network;
+use etsi_qkd014::sim::{Network, NetworkBuilder};
 use etsi_qkd014::{Client, RetryPolicy};
 use raw::{get, post};
 use tokio::io::AsyncWriteExt;
 use tokio::time::timeout;
 
+fn builder() -> NetworkBuilder {
+    Network::builder().kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a", "sae-c"]).kme(
+        "kme-b",
+        "127.0.0.2:0".parse().unwrap(),
+        ["sae-b"],
+    )
+}
+
 async fn network() -> Network {
-    Network::builder()
-        .kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a", "sae-c"])
-        .kme("kme-b", "127.0.0.2:0".parse().unwrap(), ["sae-b"])
-        .strict()
-        .start()
-        .await
-        .unwrap()
+    builder().strict().start().await.unwrap()
 }
 
 /// A client that asks once and has a minute for it.
@@ -77,6 +79,95 @@ async fn requests_that_are_too_large_or_ambiguous_are_refused_in_words() {
     }
     assert_eq!(network.kme("kme-a").unwrap().counters().keys_to_masters, 0);
     served(&network).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn bodies_in_chunks_that_are_too_large_or_ambiguous_are_refused_in_words() {
+    let network = builder().start().await.unwrap();
+    let coded = |coding: &str, body: &str| {
+        format!(
+            "POST {PATH} HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n\
+             Transfer-Encoding: {coding}\r\n\r\n{body}"
+        )
+    };
+    let chunks = |body: &str| coded("chunked", body);
+    let million = format!("100000\r\n{}\r\n", " ".repeat(1 << 20));
+    for (status, word, request) in [
+        (413, "1 MiB", chunks("100001\r\n")),
+        (413, "1 MiB", chunks("ffffffffffffffff\r\n")),
+        (413, "1 MiB", chunks(&format!("{million}1\r\n"))),
+        (413, "1 MiB", chunks(&"1\r\n \r\n".repeat((1 << 20) + 1))),
+        (400, "chunk", chunks("fffffffffffffffff\r\n")),
+        (400, "chunk", chunks("\r\n")),
+        (400, "chunk", chunks(" 2\r\n{}\r\n0\r\n\r\n")),
+        (400, "chunk", chunks("+2\r\n{}\r\n0\r\n\r\n")),
+        (400, "chunk", chunks("0x2\r\n{}\r\n0\r\n\r\n")),
+        (400, "chunk", chunks("2 2\r\n{}\r\n0\r\n\r\n")),
+        (400, "chunk", chunks("2\n{}\r\n0\r\n\r\n")),
+        (400, "chunk", chunks("1\r\n{}\r\n0\r\n\r\n")),
+        (400, "chunk", chunks("2\r\n{}0\r\n\r\n")),
+        (400, "chunk", chunks("2;a=\n\r\n{}\r\n0\r\n\r\n")),
+        (400, "chunk", chunks(&format!("2;{}", "x".repeat(512 << 10)))),
+        (431, "16 KiB", chunks(&format!("0\r\nX: {}", "x".repeat(512 << 10)))),
+        (431, "16 KiB", chunks(&format!("0\r\n{}", "X: y\r\n".repeat(50_000)))),
+        (501, "chunked", coded("gzip, chunked", "2\r\n{}\r\n0\r\n\r\n")),
+        (501, "chunked", coded("identity", "{}")),
+        (501, "chunked", coded("", "{}")),
+        (501, "chunked", coded("chunked\r\nTransfer-Encoding: chunked", "0\r\n\r\n")),
+    ] {
+        let mut connection = raw::connect(&network, "sae-a").await;
+        // It may be refused before it has all been sent.
+        let _ = connection.send(&request).await;
+        let start: String = request.chars().skip(80).take(120).collect();
+        let answer = connection.answer().await.unwrap_or_else(|| panic!("no answer: {start}"));
+        assert_eq!(answer.status, status, "{start}: {}", answer.body);
+        let message = answer.body["message"].as_str().unwrap_or_default();
+        assert!(message.contains(word), "{start}: {message}");
+    }
+    // What has no end is no request.
+    for body in ["", "2", "2\r\n{", "2\r\n{}\r\n", "2\r\n{}\r\n0\r\n"] {
+        let mut connection = raw::connect(&network, "sae-a").await;
+        connection.send(&chunks(body)).await.unwrap();
+        connection.stream.shutdown().await.unwrap();
+        assert!(connection.answer().await.is_none(), "{body:?}");
+    }
+    assert_eq!(network.kme("kme-a").unwrap().counters().keys_to_masters, 0);
+    served(&network).await;
+}
+
+#[tokio::test]
+async fn bodies_in_chunks_are_read_whichever_way_they_come() {
+    let network = builder().start().await.unwrap();
+    let head = |expect: &str| {
+        format!(
+            "POST {PATH} HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n{expect}\
+             Transfer-Encoding: chunked\r\n\r\n"
+        )
+    };
+    let body = |number: usize| {
+        let text = format!("{{\"number\":{number}}}{}", " ".repeat(300));
+        let mut chunks = String::new();
+        for piece in text.as_bytes().chunks(number) {
+            let piece = std::str::from_utf8(piece).unwrap();
+            chunks += &format!("{:X}\r\n{piece}\r\n", piece.len());
+        }
+        chunks + "0\r\n\r\n"
+    };
+    let mut connection = raw::connect(&network, "sae-a").await;
+    let all: String = (1..=20).map(|number| head("") + &body(number)).collect();
+    // In pieces that end anywhere.
+    for piece in all.as_bytes().chunks(97) {
+        connection.stream.write_all(piece).await.unwrap();
+        connection.stream.flush().await.unwrap();
+    }
+    for number in 1..=20 {
+        let answer = connection.answer().await.unwrap();
+        assert_eq!(answer.body["keys"].as_array().unwrap().len(), number, "{}", answer.body);
+    }
+    connection.send(&head("Expect: 100-continue\r\n")).await.unwrap();
+    assert_eq!(connection.answer().await.unwrap().status, 100);
+    connection.send(&body(3)).await.unwrap();
+    assert_eq!(connection.answer().await.unwrap().status, 200);
 }
 
 #[tokio::test]

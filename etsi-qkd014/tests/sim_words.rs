@@ -170,6 +170,73 @@ async fn a_kme_passes_over_nulls_and_members_that_the_specification_does_not_lis
     assert_eq!(exchange(&strict, "sae-a", get).await.status, 400);
 }
 
+/// A POST without a length, whose body is `pieces`, each a chunk.
+fn chunked(path: &str, pieces: &[&str]) -> String {
+    let mut text = format!(
+        "POST /api/v1/keys/{path} HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n\
+         Transfer-Encoding: chunked\r\n\r\n"
+    );
+    for piece in pieces.iter().chain([&""]) {
+        text += &format!("{:x}\r\n{piece}\r\n", piece.len());
+    }
+    text
+}
+
+#[tokio::test]
+async fn a_body_in_chunks_is_taken_unless_the_kme_is_strict() {
+    let network = three().start().await.unwrap();
+    let strict = three().strict().start().await.unwrap();
+    let plain = chunked("sae-b/enc_keys", &["{\"num", "b", "er\":2,\"size\":128}"]);
+    let extended = plain
+        .replace("\r\n1\r\n", "\r\n01 ;a=\"b\"\r\n")
+        .replace("\r\n0\r\n", "\r\n000\r\nTrailer: is passed over\r\n")
+        .replace("chunked", "Chunked");
+    for request in [plain, extended] {
+        let got = exchange(&network, "sae-a", &request).await;
+        assert_eq!(got.status, 200, "{request}: {}", got.body);
+        assert_eq!(got.body["keys"].as_array().unwrap().len(), 2, "{}", got.body);
+        assert!(!got.closed, "the next request begins where the body ends");
+        assert_eq!(exchange(&strict, "sae-a", &request).await.status, 411, "{request}");
+    }
+    let key = enc_keys(&network, "{}").await.body["keys"][0]["key_ID"].clone();
+    let body = json!({ "key_IDs": [{ "key_ID": key }] }).to_string();
+    let got = exchange(&network, "sae-b", &chunked("sae-a/dec_keys", &[&body])).await;
+    assert_eq!(got.status, 200, "{}", got.body);
+}
+
+#[tokio::test]
+async fn an_empty_body_asks_for_the_default_unless_the_kme_is_strict() {
+    let network = three().start().await.unwrap();
+    let strict = three().strict().start().await.unwrap();
+    let bare = |path: &str, head: &str| {
+        format!("POST /api/v1/keys/{path} HTTP/1.1\r\nHost: x\r\n{head}\r\n")
+    };
+    for request in [
+        raw::post("sae-b/enc_keys", ""),
+        chunked("sae-b/enc_keys", &[]),
+        // As `curl -X POST` sends it: what is not there has no type either.
+        bare("sae-b/enc_keys", ""),
+        bare("sae-b/enc_keys", "Content-Length: 0\r\n"),
+    ] {
+        let got = exchange(&network, "sae-a", &request).await;
+        assert_eq!((got.status, got.closed), (200, false), "{request}: {}", got.body);
+        let keys = got.body["keys"].as_array().unwrap();
+        assert_eq!(keys.len(), 1, "{request}");
+        // 256 bits, in base64.
+        assert_eq!(keys[0]["key"].as_str().unwrap().len(), 44, "{request}");
+        let refused = exchange(&strict, "sae-a", &request).await.status;
+        assert!([400, 411].contains(&refused), "{request}: {refused}");
+    }
+    // Which keys has to be said.
+    for request in [raw::post("sae-a/dec_keys", ""), chunked("sae-a/dec_keys", &[])] {
+        let got = exchange(&network, "sae-b", &request).await;
+        assert_eq!(got.status, 400, "{request}");
+        assert!(got.body["message"].as_str().unwrap().contains("key_IDs"), "{}", got.body);
+    }
+    assert_eq!(enc_keys(&network, " ").await.status, 400);
+    assert_eq!(strict.kme("kme-a").unwrap().counters().keys_to_masters, 0);
+}
+
 #[tokio::test]
 async fn heads_that_are_not_http_1_1_are_refused() {
     let network = three().start().await.unwrap();

@@ -3,6 +3,7 @@
 
 import datetime
 import shutil
+import socket
 import subprocess
 
 import pytest
@@ -104,6 +105,23 @@ def pinned(directory):
     return {'AXON_CLASSIC_KEY': str(key), 'AXON_CLASSIC_TRUST': str(trust)}
 
 
+def ca(directory):
+    """Settings of a host with a certificate for its name, and with the root that issued it."""
+    def openssl(*arguments):
+        subprocess.run(['openssl', *arguments], cwd=directory, check=True, capture_output=True)
+
+    new = ['-newkey', 'ec', '-pkeyopt', 'ec_paramgen_curve:prime256v1', '-nodes']
+    openssl('req', '-x509', *new, '-keyout', 'root.key', '-out', 'root.pem', '-subj', '/CN=root', '-days', '10')
+    openssl('req', *new, '-keyout', 'host.key', '-out', 'host.csr', '-subj', '/CN=host')
+    (directory / 'host.ext').write_text(f'subjectAltName=DNS:{socket.gethostname()}\n', encoding='utf-8')
+    openssl('x509', '-req', '-in', 'host.csr', '-CA', 'root.pem', '-CAkey', 'root.key', '-CAcreateserial',
+            '-days', '10', '-extfile', 'host.ext', '-out', 'host.pem')
+    (directory / 'host.key').chmod(0o600)
+    return {
+        'AXON_CLASSIC_AUTH': 'ca', 'AXON_CLASSIC_KEY': str(directory / 'host.key'),
+        'AXON_CLASSIC_CERT': str(directory / 'host.pem'), 'AXON_CLASSIC_CA': str(directory / 'root.pem')}
+
+
 def publisher(host, *arguments):
     return host.node('qos', 'publisher', 100000, 0.1, *arguments)
 
@@ -133,9 +151,9 @@ def domain(host):
     return host.env['ROS_DOMAIN_ID']
 
 
-def enforced(host, keystore, tmp_path):
+def enforced(host, keystore, tmp_path, authentication=pinned):
     enable(host, keystore, 'Enforce')
-    host.env.update(pinned(tmp_path))
+    host.env.update(authentication(tmp_path))
 
 
 def refused(host, process, *parts):
@@ -147,11 +165,12 @@ def refused(host, process, *parts):
     assert not any(host.runtime.iterdir()), 'something was created'
 
 
-def test_enforced_security_is_content_with_pinned_keys(host, keystore, tmp_path):
-    enforced(host, keystore, tmp_path)
+@pytest.mark.parametrize('authentication', [pinned, ca])
+def test_enforced_security_is_content_with_authenticated_hosts(host, keystore, tmp_path, authentication):
+    enforced(host, keystore, tmp_path, authentication)
     file = keystore.enclave('/', domain(host))
     said = heard(host).said(WARNED)
-    assert len(said) == 1 and 'AXON_CLASSIC_AUTH is pinned' in said[0], said
+    assert len(said) == 1 and f'AXON_CLASSIC_AUTH is {authentication.__name__}' in said[0], said
     assert f'permissions of enclave / ({file})' in said[0] and 'does not verify their signature' in said[0], said
 
 

@@ -70,7 +70,8 @@ fn status() -> Option<Status> {
 /// The daemon may have been started with other settings than this process, or before the file was changed.
 fn warn_of_other_rules(status: &Status, rules: &AccessRules) {
     let daemon = status.settings.get("AXON_ACCESS_FILE").map_or("none", String::as_str);
-    let own = Config::from_env().ok().and_then(|config| config.access_file);
+    let own = Config::from_env().and_then(Config::with_rules_of_host);
+    let own = own.ok().and_then(|config| config.access_file);
     let own = own.map_or_else(|| "none".to_owned(), |file| file.display().to_string());
     if own != daemon {
         say(format_args!(

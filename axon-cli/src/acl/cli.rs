@@ -27,7 +27,7 @@ A robot that only its base station may drive, in access.toml:
 #[derive(Debug, Subcommand)]
 pub(crate) enum Acl {
     /// Say whether a peer may do something, and which rule decides
-    #[command(after_help = CHECK_HELP)]
+    #[command(after_help = CHECK_HELP, override_usage = CHECK_USAGE)]
     Check(Check),
     /// Compare the rules of a file with the expectations written beside them
     #[command(after_help = TEST_HELP)]
@@ -39,6 +39,10 @@ pub(crate) enum Acl {
     #[command(after_help = LEARN_HELP)]
     Learn(Learn),
 }
+
+/// What clap makes of the group is one line that is wider than a page.
+const CHECK_USAGE: &str =
+    "axon acl check --peer <PEER> --publish|--subscribe|--serve|--call|--act|--see <NAME> [FILE]";
 
 const CHECK_HELP: &str = "\
 Without FILE the rules are those that the settings name, and a daemon that runs is asked what the \

@@ -39,9 +39,9 @@ fn party(name: &str) -> Result<Party<'_>, &'static str> {
     })
 }
 
-/// The rules of a file, or those that the settings name.
+/// The rules of a file, or those that a daemon with these settings has.
 fn rules(file: Option<&Path>) -> Result<AccessRules, CliError> {
-    let Some(path) = file else { return Ok(logging::check()?.access) };
+    let Some(path) = file else { return Ok(logging::check()?.with_rules_of_host()?.access) };
     let shown = path.display();
     let text = std::fs::read_to_string(path)
         .map_err(|error| CliError::Setting(format!("{shown}: {error}")))?;

@@ -27,7 +27,7 @@ use crate::{
 /// A setting by which the daemon is found; or what it answers cannot be shown.
 pub(crate) fn run(args: &cli::Status) -> Result<ExitCode, CliError> {
     // Whatever is wrong with this host's settings and files: a daemon that runs can be looked at.
-    let wrong = match logging::configure() {
+    let wrong = match logging::configure().and_then(|config| Ok(config.with_rules_of_host()?)) {
         Ok(config) => {
             if let Some(line) = config.unknown_variables() {
                 say(format_args!("axon: {line}"));

@@ -13,7 +13,10 @@ use std::{
 
 use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::{
-    access::AccessRules, config::Config, graph::EndpointKind, internal::graph::RemoteEndpoint,
+    access::AccessRules,
+    config::{Config, TopicRule},
+    graph::EndpointKind,
+    internal::graph::RemoteEndpoint,
     status::LinkStatus,
 };
 use tokio::sync::mpsc;
@@ -60,6 +63,23 @@ pub struct RefusedRoute {
     pub waits: EndpointKind,
     /// Who refuses it, and why.
     pub reason: String,
+}
+
+/// The settings on what crosses between hosts that may change while the gateway runs.
+#[derive(Clone, Debug)]
+#[non_exhaustive]
+pub struct TrafficRules {
+    /// The access rules.
+    pub access: AccessRules,
+    /// `[[topic]]` of the file.
+    pub topics: Vec<TopicRule>,
+}
+
+impl TrafficRules {
+    /// Those of a configuration.
+    pub fn of(config: &Config) -> Self {
+        Self { access: config.access.clone(), topics: config.topics.clone() }
+    }
 }
 
 /// From the gateway to the control plane.
@@ -136,8 +156,8 @@ pub enum ToControl {
     /// Whether samples of publishers that ended are on their way to other hosts: the daemon does not
     /// end meanwhile.
     Draining(bool),
-    /// The access rules of the order with this number count: no pair is there that they deny.
-    Access(u64),
+    /// The rules of the order with this number count: no pair is there that they deny.
+    Rules(u64),
     /// What is to be shown of the key supply.
     Keys(serde_json::Value),
     /// What waited when the daemon was told to end has arrived, or does not get on: it may end.
@@ -167,8 +187,8 @@ pub enum ToGateway {
         /// What.
         bytes: Vec<u8>,
     },
-    /// These access rules count from now on. Answered by [`ToControl::Access`] with this number.
-    Access(AccessRules, u64),
+    /// These rules count from now on. Answered by [`ToControl::Rules`] with this number.
+    Rules(TrafficRules, u64),
     /// These addresses are those of listed peers from now on.
     Listed(BTreeSet<IpAddr>),
     /// Say when what waits to be sent has arrived: the daemon is to end.

@@ -138,6 +138,8 @@ pub struct EgressLimit {
 pub struct PlacedLimit {
     /// What it lets pass.
     pub limit: RateLimit,
+    /// The topics and services of the entry as written there, in alphabetical order; `**` where it names none.
+    pub names: Arc<str>,
     /// The file, as decisions name it.
     pub file: Arc<str>,
     /// The line of the file.

@@ -11,11 +11,10 @@ use super::{
     KeyMode, LinkConfig, LinkPoll, QkdConfig, QkdKex, QkdPeers, QuicCipher, Security, SecurityMode,
     daemon_env::DaemonEnv,
     files::Files,
-    names,
+    names, rules_file,
     sources::{Given, Sources},
     values::{self, Use, Values},
 };
-use crate::access::{AccessRules, HostPattern};
 
 const MIB: u64 = 1 << 20;
 /// Longest path of a unix socket on Linux, in bytes, without the closing zero.
@@ -57,7 +56,7 @@ pub(super) fn resolve(
             Security::Qkd(qkd(&values)?)
         }
     };
-    let (access, access_file) = access(&values, &security)?;
+    let (access, access_file) = rules_file::of_settings(&values, &security)?;
     let ciphers = [QuicCipher::ChaCha20Poly1305, QuicCipher::Aes256Gcm].map(|c| (c.name(), c));
     let policies = [DaemonPolicy::Spawn, DaemonPolicy::Require, DaemonPolicy::Off];
     let policies = policies.map(|policy| (policy.name(), policy));
@@ -117,53 +116,6 @@ fn refuse_all(
             format!("this setting with AXON_SECURITY_MODE={mode} only; set that, or remove this"),
         )),
     }
-}
-
-/// The access rules, and the file that they are in.
-fn access(
-    values: &Values<'_, impl Files>,
-    security: &Security,
-) -> Result<(AccessRules, Option<PathBuf>), ConfigError> {
-    const NAME: &str = names::ACCESS_FILE;
-    let inline = &values.sources.access;
-    let (rules, file) = match values.file(NAME, Use::Public)? {
-        Some(_) if inline.file().is_some() => {
-            let accepted = "rules in one place: in this file, or in axon.toml without this setting";
-            return Err(values.refuse(NAME, accepted));
-        }
-        Some(path) => {
-            let shown = path.to_string_lossy();
-            let wrong = |what: String| ConfigError::value(NAME, &shown, what);
-            let bytes = values.files.read(&path);
-            let bytes = bytes.map_err(|e| wrong(format!("a file that can be read ({e})")))?;
-            let text = String::from_utf8(bytes).map_err(|_| wrong("a file in UTF-8".into()))?;
-            let name = path.file_name().unwrap_or_default().to_string_lossy();
-            let rules = AccessRules::parse(&text, &name);
-            let rules = rules.map_err(|error| ConfigError::rules(NAME, &error).at(&*shown))?;
-            (rules, Some(path))
-        }
-        None if inline.file().is_none() => (AccessRules::default(), None),
-        None => (inline.clone(), values.sources.file.as_deref().cloned()),
-    };
-    let unnamed = matches!(security, Security::Classic(c) if c.auth == ClassicAuth::None);
-    // A rule that can fit nobody would protect nothing.
-    let dead = rules.hosts().find_map(|host| match host {
-        HostPattern::Name(name) if unnamed => Some((
-            name.to_owned(),
-            "*, local, uid: and a number, or address: and an address: with AXON_CLASSIC_AUTH=none no host \
-             proves a name. Pin the hosts, or name addresses",
-        )),
-        HostPattern::Address(address) if !unnamed => Some((
-            format!("address:{address}"),
-            "names: hosts prove theirs in this mode, and rules know them by these alone",
-        )),
-        _ => None,
-    });
-    if let Some((peer, accepted)) = dead {
-        let place = file.as_ref().map_or(String::new(), |file| file.display().to_string());
-        return Err(ConfigError::value("peer", &peer, accepted).at(place));
-    }
-    Ok((rules, file))
 }
 
 fn required<T>(value: Option<T>, name: &str, accepted: &str) -> Result<T, ConfigError> {

@@ -1,7 +1,24 @@
-//! A file of access rules that somebody names: one of rules alone, or an `axon.toml` under any name.
+//! Files of access rules: the one that the settings name, the one that each daemon of a host obeys, and any other that
+//! somebody names.
 
-use super::sources::is_setting_key;
-use crate::access::{AccessError, AccessRules};
+use std::{
+    io::ErrorKind,
+    path::{Path, PathBuf},
+};
+
+use super::{
+    ClassicAuth, Config, ConfigError, Security,
+    files::{FileKind, Files, OsFiles},
+    names,
+    sources::is_setting_key,
+    values::{Use, Values},
+};
+use crate::access::{AccessError, AccessRules, HostPattern};
+
+/// The access rules of a host. A daemon whose settings name no rules has these.
+const OF_HOST: &str = "/etc/axon/access.toml";
+/// What `AXON_ACCESS_FILE` names to have no rules, not those of the host either.
+const NO_FILE: &str = "/dev/null";
 
 /// The rules of a file. One that has a setting is read as settings with rules among them, which `AXON_CONFIG` may
 /// name; any other as `AXON_ACCESS_FILE` is.
@@ -14,6 +31,111 @@ pub fn parse(text: &str, file: &str) -> Result<AccessRules, AccessError> {
         return AccessRules::parse_among_settings(text, file);
     }
     AccessRules::parse(text, file)
+}
+
+/// The rules that the settings name, and the file that they are in.
+pub(super) fn of_settings(
+    values: &Values<'_, impl Files>,
+    security: &Security,
+) -> Result<(AccessRules, Option<PathBuf>), ConfigError> {
+    const NAME: &str = names::ACCESS_FILE;
+    let inline = &values.sources.access;
+    let named = match values.sources.settings.get(NAME) {
+        Some(setting) if setting.text == NO_FILE => Some(NO_FILE.into()),
+        _ => values.file(NAME, Use::Public)?,
+    };
+    let (rules, file) = match named {
+        Some(_) if inline.file().is_some() => {
+            let accepted = "rules in one place: in this file, or in axon.toml without this setting";
+            return Err(values.refuse(NAME, accepted));
+        }
+        Some(path) if path == Path::new(NO_FILE) => (AccessRules::default(), Some(path)),
+        Some(path) => (read(&path, values.files)?, Some(path)),
+        None if inline.file().is_none() => (AccessRules::default(), None),
+        None => (inline.clone(), values.sources.file.as_deref().cloned()),
+    };
+    if let Some(file) = &file {
+        check_parties(&rules, file, security)?;
+    }
+    Ok((rules, file))
+}
+
+impl Config {
+    /// Takes the access rules of this host, `/etc/axon/access.toml`, where the settings name none and there is such a
+    /// file. A daemon does so before it starts: a session may have started it whose environment names no rules.
+    ///
+    /// # Errors
+    /// A file that cannot be read or used. It never counts as no rules.
+    #[doc(hidden)]
+    pub fn with_rules_of_host(self) -> Result<Self, ConfigError> {
+        self.with_rules_of(Path::new(OF_HOST), &OsFiles)
+    }
+
+    pub(super) fn with_rules_of(
+        mut self,
+        path: &Path,
+        files: &impl Files,
+    ) -> Result<Self, ConfigError> {
+        if self.access_file.is_some() {
+            return Ok(self);
+        }
+        let wrong = |accepted: String| {
+            let place = "not set: the rules of this host count";
+            ConfigError::value(names::ACCESS_FILE, &path.to_string_lossy(), accepted).at(place)
+        };
+        let facts = match files.facts(path) {
+            Ok(facts) => facts,
+            // Only a file that is certainly not there is no file.
+            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(self),
+            Err(error) => return Err(wrong(format!("a file that can be read ({error})"))),
+        };
+        if facts.kind != FileKind::Regular {
+            return Err(wrong("a regular file".into()));
+        }
+        if facts.mode & 0o002 != 0 {
+            return Err(wrong("a file that not everybody may write; chmod o-w".into()));
+        }
+        let rules = read(path, files)?;
+        check_parties(&rules, path, &self.security)?;
+        (self.access, self.access_file) = (rules, Some(path.to_path_buf()));
+        Ok(self)
+    }
+}
+
+/// The rules in a file that has nothing else.
+fn read(path: &Path, files: &impl Files) -> Result<AccessRules, ConfigError> {
+    const NAME: &str = names::ACCESS_FILE;
+    let shown = path.to_string_lossy();
+    let wrong = |what: String| ConfigError::value(NAME, &shown, what);
+    let bytes = files.read(path);
+    let bytes = bytes.map_err(|e| wrong(format!("a file that can be read ({e})")))?;
+    let text = String::from_utf8(bytes).map_err(|_| wrong("a file in UTF-8".into()))?;
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let rules = AccessRules::parse(&text, &name);
+    rules.map_err(|error| ConfigError::rules(NAME, &error).at(&*shown))
+}
+
+/// Refuses a rule that fits nobody in this mode: it would protect nothing.
+fn check_parties(rules: &AccessRules, file: &Path, security: &Security) -> Result<(), ConfigError> {
+    let unnamed = matches!(security, Security::Classic(c) if c.auth == ClassicAuth::None);
+    let dead = rules.hosts().find_map(|host| match host {
+        HostPattern::Name(name) if unnamed => Some((
+            name.to_owned(),
+            "*, local, uid: and a number, or address: and an address: with AXON_CLASSIC_AUTH=none no host \
+             proves a name. Pin the hosts, or name addresses",
+        )),
+        HostPattern::Address(address) if !unnamed => Some((
+            format!("address:{address}"),
+            "names: hosts prove theirs in this mode, and rules know them by these alone",
+        )),
+        _ => None,
+    });
+    match dead {
+        Some((peer, accepted)) => {
+            Err(ConfigError::value("peer", &peer, accepted).at(file.display().to_string()))
+        }
+        None => Ok(()),
+    }
 }
 
 #[cfg(test)]

@@ -226,6 +226,11 @@ impl Subscription {
         if self.session.is_forked() { HashMap::new() } else { self.inner.lock().undone() }
     }
 
+    /// For a relay: bytes that the samples of this publisher take that are not acknowledged.
+    pub fn unacknowledged_bytes_of(&self, writer: &Gid) -> u64 {
+        if self.session.is_forked() { 0 } else { self.inner.lock().undone_bytes_of(writer) }
+    }
+
     /// For a relay: how many publishes of this publisher found no room since readers were not done with its oldest sample,
     /// if this one is not.
     pub fn refused_of(&self, writer: &Gid) -> Option<u64> {

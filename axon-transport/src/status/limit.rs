@@ -10,7 +10,8 @@ pub struct LimitStatus {
     /// What the peer does that is limited: `publish`, `subscribe` or `call`; or `egress`, all packets to it, or by the
     /// network interface that the link uses.
     pub verb: String,
-    /// The topic or service, or `(all topics)` together, or `(all packets)`, or `(all packets by wlan0)`.
+    /// The topic or service, or those that have the limit together, as `(/a, /b together)` or `(all topics)`; or
+    /// `(all packets)`, or `(all packets by wlan0)`.
     pub name: String,
     /// The limit.
     pub limit: String,

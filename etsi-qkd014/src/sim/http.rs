@@ -1,15 +1,16 @@
-//! HTTP/1.1 as far as this interface needs it: requests with a Content-Length, one after the other
-//! or pipelined, and answers that can also be wrong on purpose.
+//! HTTP/1.1 as far as this interface needs it: requests whose body has a Content-Length or comes in
+//! chunks, one after the other or pipelined, and answers that can also be wrong on purpose.
 
 use std::time::Duration;
 
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use zeroize::{Zeroize, Zeroizing};
 
-use super::fault::Fault;
+use super::{chunks, fault::Fault};
 
-const MAX_HEAD: usize = 16 << 10;
-const MAX_BODY: usize = 1 << 20;
+pub(super) const MAX_HEAD: usize = 16 << 10;
+pub(super) const MAX_BODY: usize = 1 << 20;
+pub(super) const TOO_LARGE: NoRequest = NoRequest::Refused(413, "the body is larger than 1 MiB");
 /// A buffer that has grown beyond it is given back when it is empty.
 const KEPT_BUFFER: usize = 32 << 10;
 
@@ -43,10 +44,11 @@ pub(super) struct Answer {
     pub(super) close: bool,
 }
 
-/// Reads one request. `buffer` keeps what came after it.
+/// Reads one request. `buffer` keeps what came after it. Where `strict`, a body needs a Content-Length.
 pub(super) async fn read<S: AsyncRead + AsyncWrite + Unpin>(
     stream: &mut S,
     buffer: &mut Vec<u8>,
+    strict: bool,
 ) -> Result<Request, NoRequest> {
     let mut searched = 0;
     let end = loop {
@@ -63,29 +65,41 @@ pub(super) async fn read<S: AsyncRead + AsyncWrite + Unpin>(
             return Err(NoRequest::Closed);
         }
     };
-    let Head { mut request, length, chunked, waits } = head(&buffer[..end])
+    let Head { mut request, length, coding, waits } = head(&buffer[..end])
         .ok_or(NoRequest::Refused(400, "the head is not one of HTTP/1.1 with one Host"))?;
-    if chunked {
+    let chunked = coding.is_some();
+    if chunked && strict {
         return Err(NoRequest::Refused(411, "a body needs a Content-Length"));
     }
-    if length > MAX_BODY {
-        return Err(NoRequest::Refused(413, "the body is larger than 1 MiB"));
+    if coding.is_some_and(|coding| !coding.eq_ignore_ascii_case("chunked")) {
+        return Err(NoRequest::Refused(501, "a body may be chunked, and coded in no other way"));
     }
-    let total = end + 4 + length;
-    if waits && buffer.len() < total {
+    if length > MAX_BODY {
+        return Err(TOO_LARGE);
+    }
+    let head = end + 4;
+    let total = head + length;
+    if waits && (buffer.len() < total || (chunked && buffer.len() == head)) {
         let go_on = async {
             stream.write_all(b"HTTP/1.1 100 Continue\r\n\r\n").await?;
             stream.flush().await
         };
         go_on.await.map_err(|_| NoRequest::Closed)?;
     }
-    while buffer.len() < total {
-        if stream.read_buf(buffer).await.unwrap_or(0) == 0 {
-            return Err(NoRequest::Closed);
+    let behind = if chunked {
+        let (body, behind) = chunks::read(stream, buffer, head).await?;
+        request.body = body;
+        behind
+    } else {
+        while buffer.len() < total {
+            if stream.read_buf(buffer).await.unwrap_or(0) == 0 {
+                return Err(NoRequest::Closed);
+            }
         }
-    }
-    request.body = buffer[end + 4..total].to_vec();
-    buffer.drain(..total);
+        request.body = buffer[head..total].to_vec();
+        total
+    };
+    buffer.drain(..behind);
     if buffer.is_empty() && buffer.capacity() > KEPT_BUFFER {
         *buffer = Vec::new();
     }
@@ -96,8 +110,8 @@ struct Head {
     request: Request,
     /// Of the body.
     length: usize,
-    /// Whether a transfer coding says where the body ends.
-    chunked: bool,
+    /// The transfer codings, of which the last one says where the body ends.
+    coding: Option<String>,
     /// Whether the client sends the body only when it is told to (RFC 9110, 10.1.1).
     waits: bool,
 }
@@ -113,7 +127,7 @@ fn head(bytes: &[u8]) -> Option<Head> {
     }
     let mut length = None;
     let (mut hosts, mut media, mut close) = (0, None, false);
-    let (mut chunked, mut waits) = (false, false);
+    let (mut coding, mut waits) = (None::<String>, false);
     for line in lines {
         let (name, value) = line.split_once(':')?;
         // No space beside a name, and so no folded line (RFC 9112, 5.1 and 5.2).
@@ -127,7 +141,12 @@ fn head(bytes: &[u8]) -> Option<Head> {
             }
             length = Some(value.parse().ok()?);
         }
-        chunked |= name.eq_ignore_ascii_case("transfer-encoding");
+        if name.eq_ignore_ascii_case("transfer-encoding") {
+            let value = value.trim();
+            // Several headers are one list (RFC 9110, 5.3).
+            coding =
+                Some(coding.map_or_else(|| value.to_owned(), |first| format!("{first}, {value}")));
+        }
         waits |= name.eq_ignore_ascii_case("expect")
             && value.trim().eq_ignore_ascii_case("100-continue");
         if name.eq_ignore_ascii_case("host") {
@@ -141,7 +160,7 @@ fn head(bytes: &[u8]) -> Option<Head> {
         }
     }
     // Two ways to say where a body ends are one too many (RFC 9112, 6.1).
-    if hosts != 1 || (chunked && length.is_some()) {
+    if hosts != 1 || (coding.is_some() && length.is_some()) {
         return None;
     }
     let media = media.and_then(|media| media.split(';').next()).unwrap_or_default().trim();
@@ -154,7 +173,7 @@ fn head(bytes: &[u8]) -> Option<Head> {
         close,
         body: Vec::new(),
     };
-    Some(Head { request, length: length.unwrap_or(0), chunked, waits })
+    Some(Head { request, length: length.unwrap_or(0), coding, waits })
 }
 
 /// Undoes percent-encoding; `None` where it is broken or not UTF-8.
@@ -255,6 +274,7 @@ fn reason(status: u16) -> &'static str {
         411 => "Length Required",
         413 => "Content Too Large",
         431 => "Request Header Fields Too Large",
+        501 => "Not Implemented",
         503 => "Service Unavailable",
         _ => "Status",
     }

@@ -28,6 +28,7 @@
 //! It is no KME for production: its keys have never seen a quantum channel.
 
 mod api;
+mod chunks;
 mod control;
 mod fault;
 mod handshake;

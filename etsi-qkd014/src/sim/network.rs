@@ -97,8 +97,8 @@ impl NetworkBuilder {
     }
 
     /// Refuses what the specification does not list: other members of a request, `null` for an absent
-    /// one, other parameters of a query. Clients in the field send these, and ETSI GS QKD 014 does not
-    /// forbid them, so by default they are passed over.
+    /// one, other parameters of a query, a POST of `enc_keys` with an empty body, a body in chunks. Clients
+    /// in the field send these, and ETSI GS QKD 014 does not forbid them, so by default they are accepted.
     pub fn strict(mut self) -> Self {
         self.strict = true;
         self

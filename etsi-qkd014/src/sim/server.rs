@@ -150,7 +150,8 @@ async fn connection(
         .and_then(|chain| subject::common_name(chain.first()?));
     let mut buffer = Vec::new();
     loop {
-        let request = match timeout(IDLE_TIME, http::read(&mut stream, &mut buffer)).await {
+        let read = http::read(&mut stream, &mut buffer, shared.strict);
+        let request = match timeout(IDLE_TIME, read).await {
             Ok(Ok(request)) => request,
             Ok(Err(NoRequest::Refused(status, why))) => {
                 let answer = Answer { close: true, ..api::error(status, why, Vec::new()) };

@@ -165,11 +165,12 @@ fn short(session: SessionId, number: u32, topic: &str) -> Endpoint {
     }
 }
 
-/// While a graph is loaded host A's daemon tells its status, and a stream of host B goes on: for each part of
-/// the graph there is an answer and a sample at least.
+/// While a graph is loaded host A's daemon tells its status, and a stream of host B goes on: for each part of the graph there
+/// is a sample at least. How long either pauses at most, the simulator says, in `unfair/floods.rs`: here a status names
+/// thousands of endpoints, and takes as long as the machine is slow.
 fn serves_others(camera: &Camera, there: &mut Node, load: impl FnOnce()) {
     let over = AtomicBool::new(false);
-    let (mut answers, mut longest) = (0, Duration::ZERO);
+    let (mut answers, mut longest) = (0_u32, Duration::ZERO);
     let before = there.tally().taken;
     thread::scope(|scope| {
         let (camera, over, answers, longest) = (&camera, &over, &mut answers, &mut longest);
@@ -189,7 +190,7 @@ fn serves_others(camera: &Camera, there: &mut Node, load: impl FnOnce()) {
     });
     let samples = there.tally().taken - before;
     eprintln!("{samples} samples and {answers} answers while it was taken, within {longest:?}");
-    assert!(answers >= MANY.div_ceil(PART), "{answers} answers");
+    assert!(answers > 0, "the status did not answer");
     let tally = there.tally();
     assert_eq!((tally.lost, tally.repeated, tally.corrupt), (0, 0, 0), "{tally:?}");
     assert!(samples >= u64::from(MANY.div_ceil(PART)), "{samples} samples");

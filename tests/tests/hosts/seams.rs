@@ -214,3 +214,8 @@ fn keep_all_between_relayed_sessions_outlasts_a_killed_daemon_of_the_publisher()
 fn keep_all_between_relayed_sessions_outlasts_a_killed_daemon_of_the_subscription() {
     outlasts(&[1], [false, false]);
 }
+
+#[test]
+fn keep_all_between_relayed_sessions_outlasts_killed_daemons_of_both() {
+    outlasts(&[0, 1], [false, false]);
+}

@@ -80,7 +80,7 @@ fn the_readme_of_etsi_qkd014_does_what_it_says() {
     assert_ne!(programs.len(), 0);
     let commands = Readme::of("etsi-qkd014").commands;
     let told = |line: &str| assert!(commands.iter().any(|one| one == line), "{line}: {commands:?}");
-    told("cargo install --locked etsi-qkd014 --features sim");
+    told("cargo install --locked --path axon/etsi-qkd014 --features sim");
     told("kme-sim init certs");
     told("kme-sim run certs");
 

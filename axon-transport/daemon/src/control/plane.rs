@@ -15,7 +15,6 @@ use axon_shm::{
     internal::{descriptors::PassedFd, probe},
 };
 use axon_transport::{
-    access::AccessRules,
     config::Config,
     internal::{
         log_limit::LogLimit,
@@ -30,7 +29,7 @@ use super::{
     admission::Admission, losses::Losses, report::waiting::Told, room::Spare, turns::Turns,
 };
 use crate::{
-    bridge::{RefusedRoute, ToControl},
+    bridge::{RefusedRoute, ToControl, TrafficRules},
     daemon_key::DaemonKey,
     discovery::Wanted,
     owner::SessionKeys,
@@ -74,10 +73,10 @@ pub(super) struct Control {
     pub(super) probe: Option<OwnedFd>,
     /// Packets that were exchanged with sessions.
     pub(super) traffic: TrafficStatus,
-    /// The access rules for the gateway, and how often they changed.
-    pub(super) access: watch::Sender<(u64, AccessRules)>,
+    /// The rules for the gateway, and how often they changed.
+    pub(super) rules: watch::Sender<(u64, TrafficRules)>,
     /// The number of those that the gateway says it has.
-    pub(super) access_in_force: watch::Sender<u64>,
+    pub(super) rules_in_force: watch::Sender<u64>,
     /// Wakes the task that reads the settings again, and the sessions that asked for it.
     pub(super) reload: Rc<Notify>,
     pub(super) reload_asked: Vec<SessionId>,
@@ -133,8 +132,8 @@ impl Control {
                 )
                 .ok(),
             traffic: TrafficStatus::default(),
-            access: watch::Sender::new((0, config.access.clone())),
-            access_in_force: watch::Sender::new(0),
+            rules: watch::Sender::new((0, TrafficRules::of(&config))),
+            rules_in_force: watch::Sender::new(0),
             reload: Rc::default(),
             reload_asked: Vec::new(),
             wanted: watch::Sender::new(Wanted::of(&config, [])),
@@ -254,7 +253,7 @@ impl Control {
     /// What the gateway says, but for what concerns discovery alone.
     pub(super) fn gateway_says(&mut self, message: ToControl) {
         match message {
-            ToControl::Access(number) => drop(self.access_in_force.send_replace(number)),
+            ToControl::Rules(number) => drop(self.rules_in_force.send_replace(number)),
             ToControl::Started { port } => {
                 self.port = Some(port);
                 self.gateway = "running".into();

@@ -12,8 +12,9 @@ use axon_transport::{
 use tokio::{signal::unix::Signal, time::timeout};
 
 use super::{log, plane::Control};
+use crate::bridge::TrafficRules;
 
-/// How long the gateway may take to have new access rules.
+/// How long the gateway may take to have new rules.
 const IN_FORCE: Duration = Duration::from_secs(10);
 
 /// The environment that a daemon read its settings from.
@@ -34,7 +35,7 @@ impl SettingsSource {
     /// # Errors
     /// A setting that is wrong.
     pub(super) fn read(&self) -> Result<Config, ConfigError> {
-        Config::from_env_with(self.paths.iter().cloned(), None)
+        Config::from_env_with(self.paths.iter().cloned(), None)?.with_rules_of_host()
     }
 }
 
@@ -80,7 +81,7 @@ pub(super) async fn reload(
     }
 }
 
-/// Waits until the gateway has the access rules in force: a session that asked may rely on them once it is answered.
+/// Waits until the gateway has the rules in force: a session that asked may rely on them once it is answered.
 ///
 /// # Errors
 /// It did not say so in time.
@@ -90,13 +91,13 @@ async fn wait_in_force(control: &Rc<RefCell<Control>>) -> Result<(), String> {
         if control.gateway == "off" {
             return Ok(());
         }
-        (control.access.borrow().0, control.access_in_force.subscribe())
+        (control.rules.borrow().0, control.rules_in_force.subscribe())
     };
     let has_them = in_force.wait_for(|has| *has >= number);
     match timeout(IN_FORCE, has_them).await {
         Ok(_) => Ok(()),
         Err(_) => Err(format!(
-            "the settings were read, but other hosts are not judged by the new access rules yet: the gateway did not \
+            "the settings were read, but other hosts are not judged by the new rules yet: the gateway did not \
              take them within {} s. `axon status` says how it does",
             IN_FORCE.as_secs()
         )),
@@ -158,6 +159,7 @@ impl Control {
             config.daemon_peers = new.daemon_peers;
             config.trusted_uids = new.trusted_uids;
             config.log = new.log;
+            config.topics = new.topics;
             self.set_config(config);
         }
         report
@@ -169,9 +171,9 @@ impl Control {
         self.admission.set_config(&self.config);
         self.end_excluded();
         self.registry.set_access(self.config.access.clone());
-        self.access.send_modify(|(number, rules)| {
+        self.rules.send_modify(|(number, rules)| {
             *number += 1;
-            rules.clone_from(&self.config.access);
+            *rules = TrafficRules::of(&self.config);
         });
         self.look_for_hosts();
     }
@@ -222,6 +224,7 @@ fn variable(config: &Config) -> Named {
         ("AXON_DAEMON_PEERS", format!("{:?}", config.daemon_peers)),
         ("AXON_TRUSTED_UIDS", format!("{:?}", config.trusted_uids)),
         ("AXON_LOG", config.log.clone()),
+        ("[[topic]]", format!("{:?}", config.topics)),
     ]
 }
 
@@ -235,7 +238,6 @@ fn fixed(config: &Config) -> Named {
         ("AXON_MAX_MESSAGE_MB", config.max_message.to_string()),
         ("AXON_RELIABLE_QUEUE_MB", config.reliable_queue.to_string()),
         ("[link]", format!("{:?}", config.link)),
-        ("[[topic]]", format!("{:?}", config.topics)),
     ]
 }
 
@@ -248,7 +250,10 @@ fn differing(old: &Named, new: &Named) -> Vec<String> {
 mod tests {
     use super::{super::room::Spare, *};
     use crate::bridge::ToControl;
-    use axon_transport::access::{Party, Verb};
+    use axon_transport::{
+        access::{Party, Verb},
+        config::{TopicPattern, TopicPriority, TopicRule},
+    };
 
     fn control(config: Config) -> Control {
         let settings = vec![("AXON_QUIC_CIPHER".into(), "x".into())];
@@ -258,20 +263,23 @@ mod tests {
     #[test]
     fn a_reload_takes_what_may_change_and_names_the_rest() {
         let mut control = control(Config::default());
-        let mut seen = control.access.subscribe();
+        let mut seen = control.rules.subscribe();
         let mut new = Config::builder().daemon_peers(["10.0.0.7"]).domain(3).build().unwrap();
         new.link.mtu = 9000;
+        let topic = TopicPattern::new("/camera").unwrap();
+        new.topics = vec![TopicRule::new(topic, TopicPriority::Low).max_hz(5.0)];
         let rules = "[[allow]]\npeer = \"uid:7\"\npublish = \"/x\"";
         new.access = axon_transport::access::AccessRules::parse(rules, "f").unwrap();
         let report = control.take_settings(Ok(new.clone()));
-        assert_eq!(report.changed, ["access rules", "AXON_DAEMON_PEERS"]);
+        assert_eq!(report.changed, ["access rules", "AXON_DAEMON_PEERS", "[[topic]]"]);
         assert_eq!(report.needs_restart, ["ROS_DOMAIN_ID", "[link]"]);
         assert_eq!((control.config.domain, control.config.link.mtu), (0, 1452));
         let denied = |rules: &axon_transport::access::AccessRules| {
             !rules.check(Party::User(7), Verb::Publish, "/y").allowed()
         };
-        assert!(seen.has_changed().unwrap() && denied(&seen.borrow_and_update().1));
+        assert!(seen.has_changed().unwrap() && denied(&seen.borrow_and_update().1.access));
         assert!(control.wanted.borrow().hosts.iter().any(|(host, _)| host == "10.0.0.7"));
+        assert_eq!(seen.borrow().1.topics, new.topics);
         // Rules that are gone do not let everything in.
         let mut without = new.clone();
         without.access = Default::default();
@@ -287,7 +295,7 @@ mod tests {
         let limits = format!("{rules}\n[[limit]]\npeer = \"*\"\nrate = 1");
         limited.access = axon_transport::access::AccessRules::parse(&limits, "f").unwrap();
         assert_eq!(control.take_settings(Ok(limited.clone())).changed, ["access rules"]);
-        assert!(seen.borrow_and_update().1.limits_anything());
+        assert!(seen.borrow_and_update().1.access.limits_anything());
         let report = control.take_settings(Ok(new));
         assert!(report.error.unwrap().contains("no [[limit]] any more"));
         // The same once more is no change.
@@ -313,7 +321,7 @@ mod tests {
         tokio::pin!(in_force);
         let early = timeout(IN_FORCE / 2, &mut in_force).await;
         assert!(early.is_err(), "{early:?}");
-        control.borrow_mut().gateway_says(ToControl::Access(1));
+        control.borrow_mut().gateway_says(ToControl::Rules(1));
         assert_eq!(in_force.await, Ok(()));
         // Rules that did not change are in force.
         assert_eq!(wait_in_force(&control).await, Ok(()));
@@ -322,7 +330,7 @@ mod tests {
     #[tokio::test(start_paused = true)]
     async fn a_reload_whose_rules_the_gateway_does_not_take_fails_and_says_so() {
         let control = reloaded();
-        control.borrow_mut().gateway_says(ToControl::Access(0));
+        control.borrow_mut().gateway_says(ToControl::Rules(0));
         let error = wait_in_force(&control).await.unwrap_err();
         assert!(error.contains("did not take them within 10 s"), "{error}");
         // A daemon without a gateway has no other hosts.

@@ -11,7 +11,6 @@ use std::{
 };
 
 use axon_shm::ids::DaemonId;
-use axon_transport::access::AccessRules;
 use tokio::{
     sync::{mpsc, watch},
     task::{JoinHandle, spawn_local},
@@ -23,7 +22,7 @@ use super::{
     plane::Control,
 };
 use crate::{
-    bridge::{CHANNEL, ToControl, ToGateway},
+    bridge::{CHANNEL, ToControl, ToGateway, TrafficRules},
     discovery::{self, Action, Event},
 };
 
@@ -48,9 +47,9 @@ pub(super) struct Remote {
     listed: BTreeSet<IpAddr>,
     /// The gateway has nothing on its way any more, or it does not get on.
     finished: bool,
-    /// The access rules in force, and when to tell the gateway of them again.
-    access: watch::Receiver<(u64, AccessRules)>,
-    access_due: Option<Instant>,
+    /// The rules in force, and when to tell the gateway of them again.
+    rules: watch::Receiver<(u64, TrafficRules)>,
+    rules_due: Option<Instant>,
 }
 
 struct Discovery {
@@ -76,8 +75,8 @@ impl Remote {
             linked: BTreeMap::new(),
             listed: BTreeSet::new(),
             finished: false,
-            access: control.borrow().access.subscribe(),
-            access_due: None,
+            rules: control.borrow().rules.subscribe(),
+            rules_due: None,
         };
         let Some(entry) = entry else { return Ok(remote) };
         let mut running = Running::start(control, entry).map_err(|e| e.to_string())?;
@@ -130,8 +129,8 @@ impl Remote {
                         }
                     }
                 },
-                Ok(()) = self.access.changed() => self.order_access(),
-                () = due(self.access_due) => self.order_access(),
+                Ok(()) = self.rules.changed() => self.order_rules(),
+                () = due(self.rules_due) => self.order_rules(),
                 action = wanted(self.discovery.as_mut()) => match action {
                     Some(action) => self.action(control, action),
                     None => {
@@ -144,12 +143,12 @@ impl Remote {
         }
     }
 
-    /// Gives the gateway the access rules in force. An order that finds the channel full is given again.
-    fn order_access(&mut self) {
-        let (number, rules) = self.access.borrow_and_update().clone();
+    /// Gives the gateway the rules in force. An order that finds the channel full is given again.
+    fn order_rules(&mut self) {
+        let (number, rules) = self.rules.borrow_and_update().clone();
         // A gateway that is started later is told when it stands.
-        let missed = self.running.is_some() && !self.order(ToGateway::Access(rules, number));
-        self.access_due = missed.then(|| Instant::now() + BUSY);
+        let missed = self.running.is_some() && !self.order(ToGateway::Rules(rules, number));
+        self.rules_due = missed.then(|| Instant::now() + BUSY);
     }
 
     fn event(&mut self, control: &Rc<RefCell<Control>>, event: ToControl) {
@@ -157,7 +156,7 @@ impl Remote {
             ToControl::Started { port } => {
                 self.order(ToGateway::Listed(self.listed.clone()));
                 // They may have changed since it was started. It says that they count.
-                self.order_access();
+                self.order_rules();
                 self.tell(Event::QuicPort(*port));
             }
             ToControl::LinkUp { daemon, address, proven } => {

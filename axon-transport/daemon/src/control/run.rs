@@ -134,9 +134,10 @@ pub enum DaemonError {
     },
 }
 
-/// The whole of a daemon program's `main`: reads the configuration from the environment, detaches
-/// if it is to, sets logging up (to standard error, which is the log file by then), and runs. Call
-/// it before anything else opens a file or starts a thread.
+/// The whole of a daemon program's `main`: reads the configuration from the environment and the files
+/// that it names, detaches if it is to, sets logging up (to standard error, which is the log file by then), and runs. A
+/// setting or a file that cannot be used ends it with status 2 before it makes anything. Call it before
+/// anything else opens a file or starts a thread.
 pub fn main(start: Start) -> ExitCode {
     survive_file_size_limit();
     let fail = |report: &mut Report, text: &str, status: u8| {
@@ -169,6 +170,11 @@ pub fn main(start: Start) -> ExitCode {
         Ok(config) => config,
         Err(error) => return fail(&mut report, &error.to_string(), 2),
     };
+    // It reads the private key.
+    harden();
+    if let Err(error) = crate::check(&config) {
+        return fail(&mut report, &error.to_string(), 2);
+    }
     if detached && let Err(error) = detach(Some(&config)) {
         return fail(&mut report, &error.to_string(), 1);
     }
@@ -231,6 +237,7 @@ type Started = (Control, Vec<OwnedFd>, axon_transport::internal::session::daemon
 fn start(config: Config, _options: &DaemonOptions) -> Result<Started, DaemonError> {
     erase_from_now_on();
     harden();
+    let config = config.with_rules_of_host()?;
     let settings = security_settings(&config)?;
     // Before anything else takes their low numbers.
     let spare = Spare::default();

@@ -3,11 +3,11 @@
 use std::{rc::Rc, time::Duration};
 
 use axon_shm::ids::{DaemonId, Gid};
-use axon_transport::{access::AccessRules, internal::graph::RemoteEndpoint};
+use axon_transport::internal::graph::RemoteEndpoint;
 
 use super::{Engine, peer::graph::GraphChange};
 use crate::{
-    bridge::ToControl,
+    bridge::{ToControl, TrafficRules},
     link::{GraphResync, Message, Subscribe},
 };
 
@@ -33,10 +33,11 @@ impl Engine {
         }
     }
 
-    /// Replaces the access rules. Pairs that they deny end before the engine handles any other input, so that no peer can
+    /// Replaces the rules. Pairs that they deny end before the engine handles any other input, so that no peer can
     /// delay it.
-    pub(super) fn set_access(&mut self, rules: AccessRules, now: Duration) {
-        self.access = rules;
+    pub(super) fn set_rules(&mut self, rules: TrafficRules, now: Duration) {
+        self.access = rules.access;
+        self.peers.set_topics(rules.topics);
         self.links.set_interface_rules(&self.access);
         let peers: Vec<_> = self.peers.iter().map(|(daemon, peer)| (daemon, peer.link)).collect();
         for (daemon, link) in peers {

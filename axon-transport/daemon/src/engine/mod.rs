@@ -157,9 +157,9 @@ impl Engine {
                 self.links.dial(target, now);
             }
             ToGateway::SendDatagram { to, bytes } => self.links.send_datagram(to, bytes),
-            ToGateway::Access(rules, number) => {
-                self.set_access(rules, now);
-                self.effects.tell(ToControl::Access(number));
+            ToGateway::Rules(rules, number) => {
+                self.set_rules(rules, now);
+                self.effects.tell(ToControl::Rules(number));
             }
             ToGateway::Listed(addresses) => self.links.set_listed(addresses),
             // The owner looks at `backlog`.

@@ -9,7 +9,7 @@ use std::{
 };
 
 use axon_shm::ids::{DaemonId, Gid};
-use axon_transport::config::Config;
+use axon_transport::config::{Config, TopicRule};
 
 use super::{
     peer::{Local, Peer, Surroundings, WritersHere, kept::KeptRelays, stalls::Stalls},
@@ -103,6 +103,14 @@ impl Peers {
     /// All peers.
     pub(super) fn values_mut(&mut self) -> hash_map::ValuesMut<'_, DaemonId, Peer> {
         self.all.values_mut()
+    }
+
+    /// Replaces `[[topic]]`. A rate counts once the limits of a peer are [renewed](Peer::set_permissions), and a priority
+    /// for routes that are served from now on.
+    pub(super) fn set_topics(&mut self, topics: Vec<TopicRule>) {
+        if self.config.topics != topics {
+            Arc::make_mut(&mut self.config).topics = topics;
+        }
     }
 
     /// Has a peer act with what all peers use.

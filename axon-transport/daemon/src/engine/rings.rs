@@ -77,6 +77,8 @@ pub(crate) trait RingReader {
     fn take_back(&self);
     /// How many samples of each publisher are not acknowledged.
     fn unacknowledged(&self) -> HashMap<Gid, u64>;
+    /// Bytes of its ring that the samples of this publisher take that are not acknowledged.
+    fn unacknowledged_bytes_of(&self, publisher: &Gid) -> u64;
     /// How many publishes of this publisher found no room since readers had not taken, or acknowledged, its oldest
     /// sample, if this reader is one of these now.
     fn refused_of(&self, publisher: &Gid) -> Option<u64>;

@@ -171,6 +171,10 @@ impl RingReader for Relay {
         self.subscription.unacknowledged()
     }
 
+    fn unacknowledged_bytes_of(&self, publisher: &Gid) -> u64 {
+        self.subscription.unacknowledged_bytes_of(publisher)
+    }
+
     fn refused_of(&self, publisher: &Gid) -> Option<u64> {
         self.subscription.refused_of(publisher)
     }

@@ -3,12 +3,17 @@
 use std::os::{fd::OwnedFd, unix::fs::PermissionsExt as _};
 
 use rustix::{
-    net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, bind, listen, socket_with},
+    net::{
+        AddressFamily, SocketAddrUnix, SocketFlags, SocketType, accept, bind, listen, socket_with,
+    },
     process::Uid,
     thread::set_thread_uid,
 };
 
-use super::*;
+use super::{
+    life::{counting, started},
+    *,
+};
 
 /// A host whose sessions have an abstract name, in a domain that no other test has.
 fn host(domain: &str) -> Host {
@@ -38,10 +43,12 @@ fn bind_name(address: &str) -> OwnedFd {
 
 #[test]
 fn a_bound_name_is_an_error_that_says_so_where_there_is_no_runtime_directory() {
-    let host = host("183");
+    let host = counting(host("183"));
     let _squatter = squat(&host);
     let said = host.play("idle").hear();
     assert!(said.contains("XDG_RUNTIME_DIR") && said.contains("serves no session"), "{said}");
+    // Half a second apart: a session that has patience with the squatter starts one after the other for 20 s.
+    assert_eq!(started(&host), 5, "a daemon finds the name taken");
 }
 
 #[test]
@@ -58,6 +65,7 @@ fn a_name_at_which_another_user_listens_is_an_error_that_says_whose_it_is() {
         let other_user = scope.spawn(|| {
             set_thread_uid(Uid::from_raw(NOBODY)).unwrap();
             let socket = bind_name(&address);
+            rustix::io::ioctl_fionbio(&socket, true).unwrap();
             listen(&socket, 8).unwrap();
             socket
         });
@@ -65,6 +73,8 @@ fn a_name_at_which_another_user_listens_is_an_error_that_says_whose_it_is() {
     });
     let said = host.play("idle").hear();
     assert!(said.contains("belongs to uid 65534") && said.contains("XDG_RUNTIME_DIR"), "{said}");
+    let calls = std::iter::from_fn(|| accept(&listener).ok()).count();
+    assert_eq!(calls, 1, "another try would meet the same user");
     drop(listener);
     let daemon = host.play("idle").hear();
     assert!(daemon.len() == 32, "{daemon}");

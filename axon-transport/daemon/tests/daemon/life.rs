@@ -34,6 +34,56 @@ fn sessions(host: &Host, count: usize) -> Status {
     status.unwrap()
 }
 
+/// Settings, the variable among them whose file cannot be used, and that file's name.
+type Unusable = (Vec<(&'static str, String)>, &'static str, &'static str);
+
+/// Settings that are right by themselves and name a file in `dir` that is not.
+fn unusable_files(dir: &Path) -> [Unusable; 3] {
+    let file = |name: &str, text: &str| {
+        let path = dir.join(name);
+        fs::write(&path, text).unwrap();
+        fs::set_permissions(&path, fs::Permissions::from_mode(0o600)).unwrap();
+        path.to_str().unwrap().to_owned()
+    };
+    let good = file("good.key", &axon_tls::identity::SigningKey::generate_pem().unwrap());
+    let empty = file("empty-trust", "");
+    let classic = |key: &String, trust: &String| {
+        vec![("AXON_CLASSIC_KEY", key.clone()), ("AXON_CLASSIC_TRUST", trust.clone())]
+    };
+    let qkd = vec![
+        ("AXON_SECURITY_MODE", "qkd".to_owned()),
+        ("AXON_QKD_PEERS", "sae-b".to_owned()),
+        ("AXON_SAE_ID", "sae-a".to_owned()),
+        ("AXON_KME_URL", "https://127.0.0.1:9".to_owned()),
+        ("AXON_KME_CA", file("junk.pem", "junk")),
+        ("AXON_SAE_CERT", file("sae.crt", "junk")),
+        ("AXON_SAE_KEY", good.clone()),
+    ];
+    [
+        (classic(&file("junk.key", "junk"), &empty), "AXON_CLASSIC_KEY", "junk.key"),
+        (classic(&good, &file("junk-trust", "half a line")), "AXON_CLASSIC_TRUST", "junk-trust"),
+        (qkd, "AXON_KME_CA", "junk.pem"),
+    ]
+}
+
+#[test]
+fn a_file_that_cannot_be_used_ends_a_daemon_with_status_2_before_it_makes_anything() {
+    let dir = tempfile::tempdir().unwrap();
+    for (settings, variable, file) in unusable_files(dir.path()) {
+        let host = settings.iter().fold(Host::new(), |host, (name, value)| host.with(name, value));
+        let output = host.command(env!("CARGO_BIN_EXE_axon_daemon")).output().unwrap();
+        let text = String::from_utf8(output.stderr).unwrap();
+        assert_eq!((output.status.code(), text.lines().count()), (Some(2), 1), "{text}");
+        assert!(text.contains(variable) && text.contains(file), "{text}");
+        assert!(!host.dir.path().join("run").exists(), "something was made: {text}");
+        // A session hears the same of the daemon that it starts.
+        let said = host.play("idle").hear();
+        assert!(said.contains(variable) && said.contains(file), "{said}");
+        let log = host.dir.path().join("run/axon-0.log");
+        assert!(!log.exists(), "{:?}", fs::read_to_string(log));
+    }
+}
+
 #[test]
 fn the_terminals_interrupt_ends_an_application_and_not_the_daemon_it_started() {
     let host = Host::new();
@@ -191,26 +241,38 @@ pub(crate) fn few_descriptors() {
     wait_for_the_end();
 }
 
-#[test]
-fn many_that_lose_their_daemon_do_not_each_start_one() {
-    let host = Host::new();
-    // Counts those that are started.
+/// The host with a daemon that counts how often it is [started].
+pub(crate) fn counting(host: Host) -> Host {
     let script = host.dir.path().join("daemon.sh");
-    let count = host.dir.path().join("started");
     let text = format!(
         "#!/bin/sh\necho one >> {}\nexec {} \"$@\"\n",
-        count.display(),
+        host.dir.path().join(STARTED).display(),
         env!("CARGO_BIN_EXE_axon_daemon")
     );
     fs::write(&script, text).unwrap();
     fs::set_permissions(&script, fs::Permissions::from_mode(0o755)).unwrap();
-    let host = host.with("AXON_DAEMON_PATH", script.to_str().unwrap());
+    let script = script.to_str().unwrap().to_owned();
+    host.with("AXON_DAEMON_PATH", &script)
+}
+
+/// How often the daemon of a [counting] host was started.
+pub(crate) fn started(host: &Host) -> usize {
+    let count = fs::read_to_string(host.dir.path().join(STARTED));
+    count.map_or(0, |count| count.lines().count())
+}
+
+/// Where a [counting] host's daemon counts.
+const STARTED: &str = "started";
+
+#[test]
+fn many_that_lose_their_daemon_do_not_each_start_one() {
+    let host = counting(Host::new());
     let players: Vec<_> = (0..20).map(|_| host.play("idle")).collect();
     let first = sessions(&host, 20);
     signal(first.pid, Signal::KILL);
     until("there is another", || host.status().is_ok_and(|next| next.daemon != first.daemon));
     sessions(&host, 20);
-    let started = fs::read_to_string(&count).unwrap().lines().count();
+    let started = started(&host);
     // Two, unless the machine is so slow that some of them lost patience.
     assert!(started < 8, "{started} daemons were started");
     players.into_iter().for_each(Player::finish);

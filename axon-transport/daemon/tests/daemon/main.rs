@@ -2,6 +2,7 @@
 
 mod address;
 mod foreign;
+mod host_rules;
 mod hostile;
 mod left;
 mod life;
@@ -197,6 +198,10 @@ fn two_processes_talk_through_a_daemon_that_the_first_one_started() {
     let limits = std::fs::read_to_string(format!("/proc/{}/limits", status.pid)).unwrap();
     let core = limits.lines().find(|l| l.starts_with("Max core file size")).unwrap();
     assert_eq!(core.split_whitespace().nth(4), Some("0"), "{core}");
+    // The kernel gives the files of a process that is not dumpable to root. A test of root cannot tell.
+    let own = rustix::process::geteuid().as_raw();
+    let files = std::fs::metadata(format!("/proc/{}/stat", status.pid)).unwrap();
+    assert!(own == 0 || std::os::unix::fs::MetadataExt::uid(&files) != own, "it is dumpable");
 }
 
 #[test]

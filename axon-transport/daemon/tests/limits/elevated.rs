@@ -43,15 +43,16 @@ impl Trap {
         let trap = Self { dir };
         fs::create_dir(&trap.dir).unwrap();
         mode(&trap.dir, 0o755);
-        fs::copy(std::env::current_exe().unwrap(), trap.program()).unwrap();
+        copy(&std::env::current_exe().unwrap(), &trap.program());
         mode(&trap.program(), 0o755);
         fs::create_dir(trap.path("open")).unwrap();
         mode(&trap.path("open"), 0o777);
         let script = format!("#!/bin/sh\n: > {}\n", trap.path("open/executed").display());
-        fs::write(trap.path("daemon"), script).unwrap();
+        fs::write(trap.path("script"), script).unwrap();
+        copy(&trap.path("script"), &trap.path("daemon"));
         mode(&trap.path("daemon"), 0o755);
         fs::create_dir(trap.path("bin")).unwrap();
-        fs::copy(trap.path("daemon"), trap.path("bin/axon_daemon")).unwrap();
+        copy(&trap.path("daemon"), &trap.path("bin/axon_daemon"));
         fs::write(trap.path("axon.toml.of_caller"), "daemon_path = \"daemon\"\n").unwrap();
         mode(&trap.path("axon.toml.of_caller"), 0o644);
         Some(trap)
@@ -122,6 +123,8 @@ impl Trap {
             ("AXON_KME_CA", &file),
             ("AXON_SAE_CERT", &file),
             ("AXON_SAE_KEY", &file),
+            ("AXON_ACCESS_FILE", &file),
+            ("AXON_LINK_QLOG", &self.path("open")),
             ("AXON_RUNTIME_DIR", &self.path("open")),
             ("AXON_TRUSTED_UIDS", &PathBuf::from("65534")),
         ] {
@@ -148,6 +151,12 @@ impl Drop for Trap {
     }
 }
 
+/// Copies a program by another process. If this one wrote it, a child that another test forks meanwhile would have it open
+/// for writing, and executing it would fail (ETXTBSY).
+fn copy(from: &Path, to: &Path) {
+    assert!(Command::new("cp").args([from, to]).status().unwrap().success());
+}
+
 fn mode(path: &Path, mode: u32) {
     fs::set_permissions(path, fs::Permissions::from_mode(mode)).unwrap();
 }
@@ -165,7 +174,7 @@ fn a_set_uid_program_takes_no_paths_from_its_callers_environment() {
     fs::hard_link(trap.program(), &linked).unwrap();
     for name in ["axon_daemon", "axon.toml"] {
         let from = if name == "axon.toml" { "axon.toml.of_caller" } else { "daemon" };
-        fs::copy(trap.path(from), trap.path("open").join(name)).unwrap();
+        copy(&trap.path(from), &trap.path("open").join(name));
         let said = trap.run(&linked, "HOME", Path::new("/"));
         assert!(!trap.was_executed(), "{said}");
         assert!(said.contains("its caller") || said.contains("caller of this program"), "{said}");

@@ -114,3 +114,29 @@ fn samples_that_are_lost_before_the_first_and_after_the_last_are_counted_by_topi
     assert_eq!((dropped(&host, "queue"), dropped(&host, "publisher_ended")), (10, 1));
     assert_eq!(subscription.lost(), 3);
 }
+
+#[test]
+fn losses_that_cannot_be_are_not_counted() {
+    let host = host();
+    let _daemon = host.daemon();
+    let listener = session(&host, "listener", true);
+    let subscription = listener.create_subscription(spec("/t", Qos::keep_all())).unwrap();
+    let socket = by_hand(&host, hello(&host));
+    announce_and_await_credit(&socket);
+    until("it is received from", || subscription.matched() == [own()]);
+    say_to(&socket, &after_loss(8, LENGTH, u64::MAX));
+    say_to(&socket, &after_loss(12, LENGTH, u64::MAX));
+    // The number cannot be, either: this sample is refused.
+    say_to(&socket, &after_loss(1 << 63, LENGTH, u64::MAX));
+    say_to(&socket, &after_loss(13, LENGTH, u64::MAX));
+    let mut bytes = Vec::new();
+    for number in [8, 12, 13] {
+        let sample = subscription.recv(&mut bytes, Some(PATIENCE)).expect("a sample");
+        assert_eq!(sample.sequence, number);
+    }
+    until("the refused sample's count", || dropped(&host, "ring") == 1);
+    // No more than there are numbers missing.
+    assert_eq!(dropped(&host, "queue"), 10);
+    assert_eq!(relays(&host.status().unwrap())[0].lost, 11);
+    assert_eq!(subscription.lost(), 3);
+}

@@ -12,13 +12,14 @@
 //! process must come to have the last sample of every other, and every call its answers.
 //! When something is missing, both processes print the history of the pair.
 //!
-//! There are two plans. `Brief`: eight processes, stopped for some tenths of a second, often. `Stops`:
-//! twelve, stopped for one to four seconds, while the daemon is killed.
+//! There are three plans. `Brief`: eight processes, stopped for some tenths of a second, often. `Stops`: twelve, stopped
+//! for one to four seconds, while the daemon is killed. `Ends`: the same twelve, and the daemon lives: there no reader may
+//! miss anything of a publisher that ended by itself, counted or not.
 //!
 //! One round of some seconds of each by default. For longer, `cargo test --release -p axon-daemon
 //! --test torture -- --minutes 60`: rounds of half a minute, each of another seed, and a line of a table
-//! for each; `--stops` has them all be of the second plan, which otherwise alternate. `--seed N` begins
-//! with that one: the same disturbances again, though not the same moments.
+//! for each. The plans take turns; `--stops` leaves the first one out. `--seed N` begins with that one: the same
+//! disturbances again, though not the same moments.
 #![expect(clippy::print_stdout, reason = "what it prints is its result")]
 
 mod child;
@@ -35,8 +36,13 @@ use std::{
 use conductor::{Namespaces, Plan, Round};
 
 /// How long the processes are disturbed in an ordinary run, by each plan.
-const SHORT: [(Plan, Duration); 2] =
-    [(Plan::Brief, Duration::from_secs(6)), (Plan::Stops, Duration::from_secs(12))];
+const SHORT: [(Plan, Duration); 3] = [
+    (Plan::Brief, Duration::from_secs(6)),
+    (Plan::Stops, Duration::from_secs(12)),
+    (Plan::Ends, Duration::from_secs(8)),
+];
+/// The plans of a long run, in turn; the first is left out with `--stops`.
+const PLANS: [Plan; 3] = [Plan::Brief, Plan::Stops, Plan::Ends];
 /// The same of each round of a long run.
 const LONG: Duration = Duration::from_secs(25);
 
@@ -66,11 +72,10 @@ fn main() -> ExitCode {
         }
         return ExitCode::SUCCESS;
     };
-    let stops = arguments.iter().any(|a| a == "--stops");
+    let stops = usize::from(arguments.iter().any(|a| a == "--stops"));
     let (start, time) = (Instant::now(), Duration::from_secs(60 * minutes));
-    for seed in seed.. {
-        let plan = if stops || seed.is_multiple_of(2) { Plan::Stops } else { Plan::Brief };
-        println!("{}", conductor::run(plan, LONG, seed, &namespaces));
+    for (seed, plan) in (seed..).zip(PLANS[stops..].iter().cycle()) {
+        println!("{}", conductor::run(*plan, LONG, seed, &namespaces));
         if start.elapsed() >= time {
             break;
         }

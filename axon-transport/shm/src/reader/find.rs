@@ -266,6 +266,7 @@ impl Reader {
             Some(missing) if missing.segment == segment => {
                 let missing = *missing;
                 if self.is_over(&missing) {
+                    self.waited |= self.writer_dead();
                     // So are all samples that are in it.
                     return true;
                 }
@@ -286,7 +287,8 @@ impl Reader {
     pub(super) fn is_over(&self, missing: &Missing) -> bool {
         let waited = missing.since.elapsed();
         // It asks a second time in between.
-        self.ended && waited >= 2 * MISSING || waited >= MISSING_DEAD && self.writer_dead()
+        let dead = if self.waited { MISSING } else { MISSING_DEAD };
+        self.ended && waited >= 2 * MISSING || waited >= dead && self.writer_dead()
     }
 
     /// All that is published is lost, and nothing else will be.

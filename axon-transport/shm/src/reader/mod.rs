@@ -45,7 +45,7 @@ const ATTEMPTS: u32 = 16;
 /// that the publisher is gone.
 const MISSING: Duration = Duration::from_secs(1);
 /// How long a reader waits for memory of a process that has ended where nobody has said so: the
-/// daemon hands over what the process left, and may be slow.
+/// daemon hands over what the process left, and may be slow. It waits once for all that the process left.
 const MISSING_DEAD: Duration = Duration::from_secs(10);
 /// Segments of samples that a reader finds without a lock.
 const KNOWN: usize = 4;
@@ -82,6 +82,8 @@ pub struct Reader {
     /// Maps of the segments that samples were in.
     maps: Vec<(u32, Weak<Map>)>,
     missing: Option<Missing>,
+    /// Whether memory of the publisher's process, which has ended, was waited for in vain.
+    waited: bool,
     /// Whether the publisher is known to be gone.
     ended: bool,
     cursor: u64,
@@ -164,6 +166,7 @@ impl Reader {
             descriptors: None,
             maps: Vec::new(),
             missing: None,
+            waited: false,
             ended: false,
             cursor: grant.first,
             under_way: None,

@@ -5,9 +5,15 @@ use std::collections::VecDeque;
 
 use super::Reader;
 use crate::{
-    ring::{layout, protocol},
+    ring::{
+        layout,
+        protocol::{self, PositionState, RecordRead},
+    },
     sync::Ordering,
 };
+
+/// The length of so many samples is looked at, or of less than twice as many.
+const LOOKS: u64 = 1 << 13;
 
 /// Numbers and positions of samples that were taken and are not done with, and how many samples were given
 /// up so far.
@@ -45,6 +51,34 @@ impl Reader {
     pub fn undone(&self) -> u64 {
         let under_way = self.under_way.as_ref().map_or(0, |under_way| under_way.0.len() as u64);
         under_way.saturating_add(self.unread())
+    }
+
+    /// Bytes that these samples take, their descriptors included. Of many it looks at each nth one, and takes the others to be
+    /// like them. Another process wrote the lengths: any value is possible.
+    pub fn undone_bytes(&self) -> u64 {
+        let undone = self.undone();
+        if undone == 0 || self.attachment.lane.is_forked() {
+            return 0;
+        }
+        let described = undone.saturating_mul(layout::DESCRIPTOR);
+        let ring = self.attachment.ring();
+        let (Ok(descriptors), Ok((tail, head))) =
+            (self.resolve(protocol::array(ring)), protocol::bounds(ring))
+        else {
+            return described;
+        };
+        let under_way = self.under_way.as_ref().and_then(|under_way| under_way.first());
+        let first = under_way.unwrap_or(self.cursor).max(tail);
+        let every = (head.saturating_sub(first) / LOOKS).max(1);
+        let view = descriptors.view(&self.attachment);
+        let lengths =
+            (first..head).step_by(usize::try_from(every).unwrap_or(usize::MAX)).map(|at| {
+                match (view.state(at), view.look(at)) {
+                    (PositionState::Here, RecordRead::Sample(record)) => u64::from(record.len),
+                    _ => 0,
+                }
+            });
+        described.saturating_add(lengths.sum::<u64>().saturating_mul(every))
     }
 
     /// How many publishes found no room since KEEP_ALL readers were not done with the oldest sample that stands, if this

@@ -1,5 +1,9 @@
 //! Rings that grow, segments that arrive later than the samples in them, and memory that is returned.
 
+use std::process::Command;
+
+use rustix::process::{Pid, PidfdFlags, pidfd_open};
+
 use super::*;
 
 mod allowance;
@@ -11,7 +15,19 @@ fn attach_untold(
     reader: &Arc<SessionSegment>,
     qos: Qos,
 ) -> (Reader, Arc<PeerSession>) {
-    let from = PeerSession::map(publisher.id(), publisher.descriptors().unwrap()).unwrap();
+    let descriptors = publisher.descriptors().unwrap();
+    attach_untold_with(descriptors, writer, publisher, reader, qos)
+}
+
+/// The same, of a publisher's session with these descriptors.
+fn attach_untold_with(
+    descriptors: PeerDescriptors,
+    writer: &Writer,
+    publisher: &Arc<SessionSegment>,
+    reader: &Arc<SessionSegment>,
+    qos: Qos,
+) -> (Reader, Arc<PeerSession>) {
+    let from = PeerSession::map(publisher.id(), descriptors).unwrap();
     let reader = attach_to(writer, publisher, reader, Peer::Remote(from.clone()), qos);
     (reader, from)
 }
@@ -241,6 +257,36 @@ fn a_publish_that_waits_for_readers_goes_where_they_do_not_look_yet() {
         assert_eq!(take(&mut reader), Some(sequence));
     }
     assert_eq!(reader.lost() + reader.skipped(), 0);
+}
+
+#[test]
+fn memory_of_a_dead_process_that_never_comes_is_waited_for_once() {
+    let (a, b) = (silent_session(), session());
+    let writer = writer(&a, Qos::keep_all(), 1 << 20);
+    let mut process = Command::new("true").spawn().unwrap();
+    let pidfd = pidfd_open(Pid::from_child(&process), PidfdFlags::empty()).unwrap().into();
+    process.wait().unwrap();
+    let descriptors = PeerDescriptors { pidfd, ..a.descriptors().unwrap() };
+    let (mut reader, from) = attach_untold_with(descriptors, &writer, &a, &b, Qos::keep_all());
+    // The short one is in memory that is there.
+    for (sequence, length) in [(0, 5000), (1, 10), (2, 5000)] {
+        publish(&writer, sequence, length);
+    }
+    // How often the reader asks for the memory of a sample, until it gives it up.
+    let asks = |reader: &mut Reader, lost| {
+        let mut times = 0;
+        while reader.lost() < lost {
+            if reader.has_data() {
+                let _ = take(reader);
+            }
+            times += from.take_wanted().len();
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        times
+    };
+    let [first, second] = [1, 2].map(|lost| asks(&mut reader, lost));
+    assert!(first > 1 && second == 1, "{first} and {second} times");
+    assert_eq!((reader.received(), reader.lost()), (1, 2));
 }
 
 #[test]

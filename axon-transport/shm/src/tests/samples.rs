@@ -378,3 +378,26 @@ fn in_a_forked_child_a_slice_is_empty() {
     assert_eq!(unsafe { libc::waitpid(child, &mut status, 0) }, child);
     assert_eq!(status, 0);
 }
+
+#[test]
+fn bytes_that_are_not_done_with_are_told_of_taken_samples_too() {
+    const DESCRIPTOR: u64 = 128;
+    let (a, b) = (session(), session());
+    let writer = writer(&a, Qos::keep_all(), 1 << 20);
+    let mut reader = attach(&writer, &a, &b, Qos::keep_all());
+    reader.finish_later();
+    assert_eq!(reader.undone_bytes(), 0);
+    // In the descriptor, in a block, and in a place of its own.
+    for (sequence, len) in (1..).zip([10, 2000, 9000, 5000]) {
+        writer.publish(meta(sequence), &pattern(sequence, len)).unwrap();
+    }
+    assert_eq!(reader.undone_bytes(), 16_010 + 4 * DESCRIPTOR);
+    assert!(take(&mut reader).is_some() && take(&mut reader).is_some());
+    assert_eq!(reader.undone_bytes(), 16_010 + 4 * DESCRIPTOR, "taken, and not done with");
+    reader.finish(1);
+    assert_eq!(reader.undone_bytes(), 16_000 + 3 * DESCRIPTOR);
+    reader.finish(2);
+    assert!(take(&mut reader).is_some() && take(&mut reader).is_some());
+    reader.finish(4);
+    assert_eq!(reader.undone_bytes(), 0);
+}

@@ -1,6 +1,6 @@
 //! Reads `[[limit]]`.
 
-use std::{num::NonZeroU32, ops::Range, sync::Arc};
+use std::{collections::BTreeSet, num::NonZeroU32, ops::Range, sync::Arc};
 
 use toml::de::{DeTable, DeValue};
 
@@ -277,7 +277,9 @@ impl Reader<'_> {
             over: over.unwrap_or_default(),
             together: together.unwrap_or(is_of_peer),
         };
-        let limit = PlacedLimit { limit, file: Arc::clone(&self.file), line };
+        let names: BTreeSet<_> = uses.iter().map(|(_, pattern)| pattern.to_string()).collect();
+        let names = names.into_iter().collect::<Vec<_>>().join(", ").into();
+        let limit = PlacedLimit { limit, names, file: Arc::clone(&self.file), line };
         Ok(Entry::Peer(LimitRule { peers, limits: Limits::Uses(uses, limit) }))
     }
 }

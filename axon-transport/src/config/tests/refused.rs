@@ -368,3 +368,65 @@ fn rules_that_cannot_be_used_are_refused_with_their_place() {
     let error = pinned(&[("AXON_ACCESS_FILE", "/f/address.toml")]).unwrap_err();
     assert!(error.contains("\"address:10.*\""), "{error}");
 }
+
+#[test]
+fn the_rules_of_the_host_count_where_the_settings_name_none_and_never_count_as_none() {
+    const RULES: &str = "[[allow]]\npeer = \"*\"\npublish = \"/x\"";
+    let of_host = Path::new("/etc/axon/access.toml");
+    let load = |env: &[(&str, &str)], mode, text: &str| {
+        let mut disk = Disk::new();
+        disk.put("/f/own.toml", 0o644, "[[deny]]\npeer = \"*\"\ncall = \"/own\"");
+        disk.put("/f/axon.toml", 0o644, "[[deny]]\npeer = \"*\"\ncall = \"/inline\"");
+        disk.put("/etc/axon/access.toml", mode, text);
+        Config::resolve(pairs(env), None, &disk).unwrap().with_rules_of(of_host, &disk)
+    };
+    let obeyed = load(&[], 0o644, RULES).unwrap();
+    assert_eq!(obeyed.access_file.as_deref(), Some(of_host));
+    assert_eq!(obeyed.access.file(), Some("access.toml"));
+    let own = load(&[("AXON_ACCESS_FILE", "/f/own.toml")], 0o644, RULES).unwrap();
+    assert_eq!(own.access.file(), Some("own.toml"));
+    let inline = load(&[("AXON_CONFIG", "/f/axon.toml")], 0o644, RULES).unwrap();
+    assert_eq!(inline.access.file(), Some("axon.toml"));
+    let none = load(&[("AXON_ACCESS_FILE", "/dev/null")], 0o644, RULES).unwrap();
+    assert!(none.access.is_empty());
+    assert_eq!(none.access_file.as_deref(), Some(Path::new("/dev/null")));
+    let absent = Config::default().with_rules_of(of_host, &Disk::new()).unwrap();
+    assert!(absent.access_file.is_none() && absent.access.is_empty());
+
+    let refused = |mode, text| load(&[], mode, text).unwrap_err().to_string();
+    for (mode, text, why) in [
+        (0o644, "", "line 1"),
+        (0o644, "[[alow]]", "unknown key"),
+        (0o644, "[[allow]]\npeer = \"base\"\npublish = \"/x\"", "AXON_CLASSIC_AUTH=none"),
+        (0o646, RULES, "chmod o-w"),
+    ] {
+        let error = refused(mode, text);
+        assert!(error.contains("/etc/axon/access.toml") && error.contains(why), "{error}");
+    }
+    // Nobody can say what is in it.
+    let directory = Config::default().with_rules_of(Path::new("/f"), &Disk::new());
+    assert!(directory.unwrap_err().to_string().contains("regular file"));
+    let denied = Config::default().with_rules_of(of_host, &Unreadable).unwrap_err().to_string();
+    assert!(denied.contains("permission denied"), "{denied}");
+}
+
+/// Files of which this user may know nothing.
+struct Unreadable;
+
+impl Files for Unreadable {
+    fn read(&self, _: &Path) -> io::Result<Vec<u8>> {
+        Err(io::ErrorKind::PermissionDenied.into())
+    }
+
+    fn facts(&self, _: &Path) -> io::Result<FileFacts> {
+        Err(io::ErrorKind::PermissionDenied.into())
+    }
+
+    fn readable(&self, _: &Path) -> io::Result<()> {
+        Err(io::ErrorKind::PermissionDenied.into())
+    }
+
+    fn current_dir(&self) -> io::Result<PathBuf> {
+        Ok("/f".into())
+    }
+}

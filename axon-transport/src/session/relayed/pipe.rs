@@ -1,13 +1,16 @@
 //! The socket of a relay, as either end uses it: control messages first, then pieces of samples.
 
 use std::{
-    collections::{BTreeMap, BTreeSet, VecDeque},
+    collections::{BTreeMap, VecDeque},
     os::fd::BorrowedFd,
     sync::Arc,
     time::{Duration, Instant},
 };
 
-use axon_shm::{ExternalLeader, PublishError, internal::descriptors::PassedFd};
+use axon_shm::{
+    ExternalLeader, PublishError,
+    internal::{MAX_GAP, descriptors::PassedFd},
+};
 use rustix::{
     event::{PollFd, PollFlags, Timespec, poll},
     net::{Shutdown, shutdown},
@@ -96,6 +99,14 @@ impl LossReport {
     }
 }
 
+/// Returns how many of the samples that the other end says were `lost` between the numbers `before` and `number` count.
+/// The other end may be another user's process, and the sums that they are added to never shrink.
+fn judge_loss(lost: u64, before: Option<u64>, number: u64) -> u64 {
+    let missing = number.saturating_sub(before.unwrap_or(0)).saturating_sub(1);
+    let lost = lost.min(missing);
+    if lost > MAX_GAP { 0 } else { lost }
+}
+
 /// One end of a relay's connection: sends samples within the other end's credit, publishes those that come.
 pub struct Pipe {
     socket: PassedFd,
@@ -108,8 +119,8 @@ pub struct Pipe {
     pub(crate) incoming: Incoming,
     /// Samples that came and are not published yet.
     arrived: BTreeMap<Channel, VecDeque<InboundSample>>,
-    /// Channels of which a sample was written, or is to be.
-    begun: BTreeSet<Channel>,
+    /// Channels of which a sample was written, or is to be, each with the highest number that came.
+    begun: BTreeMap<Channel, u64>,
     /// Whether one of them waits for a reader.
     blocked: bool,
     /// Channels whose samples are written and not all handed over.
@@ -141,7 +152,7 @@ impl Pipe {
             outgoing: Outgoing::default(),
             incoming,
             arrived: BTreeMap::new(),
-            begun: BTreeSet::new(),
+            begun: BTreeMap::new(),
             blocked: false,
             written: BTreeMap::new(),
             undelivered: BTreeMap::new(),
@@ -191,7 +202,7 @@ impl Pipe {
         self.arrived.retain(|channel, _| keep(channel));
         self.written.retain(|channel, _| keep(channel));
         self.undelivered.retain(|channel, _| keep(channel));
-        self.begun.retain(&keep);
+        self.begun.retain(|channel, _| keep(channel));
     }
 
     /// Whether a sample waits for a reader.
@@ -273,16 +284,16 @@ impl Pipe {
             let Channel { writer: gid, client } = channel;
             while let Some(sample) = samples.front_mut() {
                 let Some(remote_writer) = find(gid) else { break };
-                match std::mem::take(&mut sample.lost) {
+                let number = sample.meta.sequence;
+                let before = self.begun.get(channel).copied();
+                match judge_loss(std::mem::take(&mut sample.lost), before, number) {
                     0 => {}
                     samples => {
-                        let first = !self.begun.contains(channel);
-                        lost(gid, LossReport::Before { samples, first });
+                        lost(gid, LossReport::Before { samples, first: before.is_none() });
                     }
                 }
-                self.begun.insert(*channel);
+                self.begun.insert(*channel, before.map_or(number, |before| before.max(number)));
                 let client = client.as_ref().unwrap_or(gid);
-                let number = sample.meta.sequence;
                 let mut last = number;
                 let repeated =
                     self.response_log.as_ref().is_some_and(|log| log.has(channel, &sample.meta));
@@ -428,5 +439,28 @@ impl Pipe {
         if end.is_some() && fds.pop().is_some_and(|end| !end.revents().is_empty()) {
             self.hang_up();
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_more_losses_count_than_numbers_are_missing() {
+        assert_eq!(judge_loss(7, None, 8), 7);
+        assert_eq!(judge_loss(u64::MAX, None, 8), 7);
+        assert_eq!(judge_loss(u64::MAX, Some(8), 12), 3);
+        assert_eq!(judge_loss(2, Some(8), 12), 2, "a gap is not always a loss");
+        for number in [0, 1, 8, 9] {
+            assert_eq!(judge_loss(u64::MAX, Some(8), number), 0, "{number}");
+        }
+    }
+
+    #[test]
+    fn a_loss_that_no_publisher_can_have_had_does_not_count() {
+        assert_eq!(judge_loss(MAX_GAP, None, u64::MAX), MAX_GAP);
+        assert_eq!(judge_loss(MAX_GAP + 1, None, u64::MAX), 0);
+        assert_eq!(judge_loss(u64::MAX, Some(8), u64::MAX), 0);
     }
 }

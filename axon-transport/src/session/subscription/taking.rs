@@ -307,6 +307,11 @@ impl MatchedReaders {
         undone
     }
 
+    pub(in crate::session) fn undone_bytes_of(&self, writer: &Gid) -> u64 {
+        let of = self.matched_readers.iter().filter(|slot| slot.reader.writer() == *writer);
+        of.map(|slot| slot.reader.undone_bytes()).fold(0, u64::saturating_add)
+    }
+
     pub(in crate::session) fn has_from(&self, writer: &Gid) -> bool {
         self.matched_readers
             .iter()

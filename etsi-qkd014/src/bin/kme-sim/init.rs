@@ -1,7 +1,7 @@
 //! `kme-sim init`: certificates, keys and the environment to use them.
 
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use etsi_qkd014::sim::{Layout, Pki, Site};
@@ -18,6 +18,9 @@ pub(crate) struct Arguments {
     /// kme-b=127.0.0.2:8443=sae-b.
     #[arg(long = "kme", value_name = "ID=ADDRESS:PORT=SAE[,SAE...]", value_parser = site)]
     sites: Vec<Site>,
+    /// Replaces the files of an earlier run.
+    #[arg(long)]
+    force: bool,
 }
 
 pub(crate) fn init(arguments: &Arguments) -> CommandResult {
@@ -34,6 +37,15 @@ pub(crate) fn init(arguments: &Arguments) -> CommandResult {
         )));
     }
     let pki = Pki::create(&layout).map_err(other)?;
+    if !arguments.force
+        && let Some(file) = present(dir, &layout)
+    {
+        return Err(other(format!(
+            "{} is there already, and nothing was written: name another directory, or say --force to \
+             replace the certificates and keys in this one",
+            file.display()
+        )));
+    }
     pki.write(dir).map_err(other)?;
     let text = serde_json::to_string_pretty(&layout).map_err(other)?;
     let file = layout_file(dir);
@@ -48,6 +60,14 @@ pub(crate) fn init(arguments: &Arguments) -> CommandResult {
     }
     say(&out);
     Ok(())
+}
+
+/// A file of an earlier run that would be replaced. A dangling link is one, too.
+fn present(dir: &Path, layout: &Layout) -> Option<PathBuf> {
+    let ids = layout.sites.iter().flat_map(|site| site.saes.iter().chain([&site.kme]));
+    let pairs = ids.flat_map(|id| [format!("{id}.crt"), format!("{id}.key")]);
+    let files = pairs.chain(["ca.pem".to_owned()]).map(|name| dir.join(name));
+    files.chain([layout_file(dir)]).find(|file| file.symlink_metadata().is_ok())
 }
 
 fn site(text: &str) -> Result<Site, String> {

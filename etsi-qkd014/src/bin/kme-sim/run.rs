@@ -31,8 +31,8 @@ pub(crate) struct Arguments {
     /// Most keys in one request.
     #[arg(long, value_name = "KEYS")]
     max_per_request: Option<u64>,
-    /// Refuses members, parameters and nulls that the specification does not list. By default they are
-    /// passed over, since it does not forbid them.
+    /// Refuses members, parameters and nulls that the specification does not list, empty bodies, and bodies in
+    /// chunks. By default they are accepted, since it does not forbid them.
     #[arg(long)]
     strict: bool,
     /// Delays every answer of every KME.

@@ -1,4 +1,8 @@
-//! Log levels are read again beside the rules.
+//! Log levels and peers are read again beside the rules.
+
+use std::net::{Ipv4Addr, UdpSocket};
+
+use axon_daemon::internal::shared_group;
 
 use super::*;
 
@@ -50,4 +54,38 @@ fn log_levels_follow_the_settings() {
     let error = daemon_reload_at(&place).unwrap().error.expect("why not");
     assert!(error.contains("log") && error.contains("loud"), "{error}");
     fs::write(a.dir.path().join("axon.toml"), "log = \"error\"").unwrap();
+}
+
+#[test]
+fn a_peer_that_is_listed_with_its_port_while_the_daemon_runs_is_linked() {
+    links_once_listed(|b| format!("{}:{}", b.address, b.status().port.unwrap()));
+}
+
+#[test]
+fn a_peer_that_is_listed_without_a_port_while_the_daemon_runs_is_linked() {
+    links_once_listed(|b| b.address.to_string());
+}
+
+fn links_once_listed(name_of: impl Fn(&Host) -> String) {
+    let plan = Plan { listed: false, ..Plan::new([classic(&[]), classic(&[])]) };
+    let [mut a, mut b] = plan.prepare();
+    // A program that shares the port with nobody: the daemons find each other by their lists alone.
+    let group = shared_group(a.domain());
+    let _alone = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, group.port())).unwrap();
+    a.unset("AXON_DAEMON_PEERS");
+    for host in [&mut a, &mut b] {
+        host.start();
+        host.wait_log(&["cannot open the shared discovery port"]);
+    }
+    let subscription = subscription(&b.session("b"), "/listed");
+    let publisher = publisher(&a.session("a"), "/listed");
+    assert!(a.status().links.is_empty());
+    let listing = format!("daemon_peers = [\"{}\"]\n", name_of(&b));
+    assert_eq!(rewrite(&a, &listing), ["AXON_DAEMON_PEERS"]);
+    assert!(publisher.wait_matched(1, PATIENCE) && subscription.wait_matched(1, PATIENCE));
+    until("the link is in the status", || a.status().links.len() == 1);
+    // A link that stands stays.
+    assert_eq!(rewrite(&a, ""), ["AXON_DAEMON_PEERS"]);
+    publisher.publish(b"still linked").unwrap();
+    assert!(subscription.recv(&mut Vec::new(), Some(PATIENCE)).is_ok());
 }

@@ -34,6 +34,12 @@ impl Edits {
         self.files.keys().map(String::as_str).collect()
     }
 
+    /// What is going to be in a file that changes.
+    #[cfg(test)]
+    pub(super) fn text(&self, name: &str) -> Option<&str> {
+        self.files.get(name)?.as_deref()
+    }
+
     fn read(&self, name: &str) -> Result<String, String> {
         fs::read_to_string(self.root.join(name)).map_err(|err| format!("cannot read {name}: {err}"))
     }
@@ -135,7 +141,11 @@ pub(super) fn plan(
         (path("src/lib.rs"), "This is rustls VERSION with"),
         (path("src/lib.rs"), "https://docs.rs/rustls/VERSION\n"),
         (path("README.md"), "[rustls](https://docs.rs/rustls) VERSION with"),
+        (path("README.md"), "+rustls.VERSION`"),
+        (path("CHANGELOG.md"), "+rustls.VERSION`)."),
+        ("docs/release.md".into(), "+rustls.VERSION`"),
         ("docs/rustls-axon.md".into(), "`third_party/rustls-axon` is rustls VERSION with"),
+        ("docs/rustls-axon.md".into(), "+rustls.VERSION`"),
     ] {
         let with = |version: &str| place.replace("VERSION", version);
         edits.replace(&name, &with(pinned), &with(version))?;

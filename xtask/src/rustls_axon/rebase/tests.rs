@@ -247,7 +247,7 @@ fn small_workspace() -> Option<tempfile::TempDir> {
     let members = format!("[workspace]\nresolver = \"3\"\nmembers = [\"{CRATE}\"]\n");
     fs::write(root.join("Cargo.toml"), format!("{members}\n[workspace.package]{rest}\n")).unwrap();
     fs::create_dir(root.join("docs")).unwrap();
-    for name in ["Cargo.lock", "docs/rustls-axon.md"] {
+    for name in ["Cargo.lock", "docs/release.md", "docs/rustls-axon.md"] {
         fs::copy(workspace().join(name), root.join(name)).unwrap();
     }
 
@@ -263,6 +263,31 @@ fn small_workspace() -> Option<tempfile::TempDir> {
     // Past the harness, which would show it only beside a failure.
     let _ = writeln!(std::io::stderr(), "skipped: no registry: {why}");
     None
+}
+
+/// Our own version says which rustls it is made from, wherever a page shows it.
+#[test]
+fn every_page_that_shows_the_version_is_moved() {
+    let root = workspace();
+    let pinned = upstream::pinned_version(&root.join(CRATE)).unwrap();
+    let patches = tree::read_patches(&root.join(CRATE)).unwrap();
+    let mut edits = pin::Edits::new(root);
+    pin::plan(&mut edits, (&pinned, OTHER), &Tree::new(), &Tree::new(), &patches).unwrap();
+
+    let metadata = format!("+rustls.{pinned}");
+    let shown = std::process::Command::new("git")
+        .args(["grep", "--files-with-matches", "--fixed-strings", &metadata, "--", ":!*Cargo.lock"])
+        .current_dir(root)
+        .output()
+        .unwrap();
+    let shown = String::from_utf8(shown.stdout).unwrap();
+    let shown: Vec<&str> = shown.lines().collect();
+    assert!(shown.contains(&"third_party/rustls-axon/Cargo.toml"), "{shown:?}");
+    for name in shown {
+        let text = edits.text(name).unwrap_or_else(|| panic!("{name} is not moved"));
+        assert!(!text.contains(&metadata), "{name}");
+        assert!(text.contains(&format!("+rustls.{OTHER}")), "{name}");
+    }
 }
 
 #[test]

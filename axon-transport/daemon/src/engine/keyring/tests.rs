@@ -386,3 +386,63 @@ fn used() -> UsedStatistics {
 fn classic_has_no_keyring() {
     assert!(Keyring::new(&Config::default()).is_none());
 }
+
+/// Two keyrings between which a message goes every 20 ms. All calls of one of them that begin within five seconds are
+/// given up after the answer limit. Returns the longest time without a message, and how many calls that were.
+fn longest_pause(hangs: usize, begin: Duration) -> (Duration, usize) {
+    const ANSWER_LIMIT: Duration = Duration::from_secs(3);
+    let mut pair = Pair::new();
+    pair.connect(1);
+    pair.run();
+    let hang = begin..begin + s(5);
+    let (mut given_up, mut last, mut longest) = (0, pair.now, Duration::ZERO);
+    let mut answers: Vec<(Duration, usize, Event)> = Vec::new();
+    while pair.now < hang.end + s(20) {
+        let now = pair.now;
+        for at in [0, 1] {
+            if pair.rings[at].poll_timeout() <= now {
+                pair.rings[at].handle_timeout(now);
+            }
+        }
+        for (_, at, event) in answers.extract_if(.., |(due, ..)| *due <= now) {
+            let _ = pair.rings[at].handle_answer(now, event);
+        }
+        let mut quiet = false;
+        while !mem::replace(&mut quiet, true) {
+            for at in [0, 1] {
+                while let Some((origin, request)) = pair.rings[at].poll_request(now) {
+                    let mut due = now + ms(10);
+                    if at == hangs && hang.contains(&now) {
+                        due = now + ANSWER_LIMIT;
+                        given_up += 1;
+                        pair.kmes.failures.push(FailureKind::Unavailable);
+                    }
+                    answers.push((due, at, Event { origin, answer: pair.kmes.answer(request) }));
+                    quiet = false;
+                }
+                while let Some((connection, message)) = pair.rings[at].poll_message(now) {
+                    pair.rings[1 - at].handle_message(now, connection, &message).unwrap();
+                    quiet = false;
+                }
+            }
+        }
+        if let Ok(mut envelope) = pair.seal(0, 1) {
+            assert!(pair.open(1, 1, &mut envelope));
+            (longest, last) = (longest.max(now - last), now);
+        }
+        pair.now += ms(20);
+    }
+    (longest.max(pair.now - last), given_up)
+}
+
+#[test]
+fn messages_go_on_when_a_kme_does_within_the_answer_limit() {
+    // The sender's KME gives new keys, the receiver's gives them by name.
+    for hangs in [0, 1] {
+        for phase in 0..25 {
+            let (longest, given_up) = longest_pause(hangs, s(10) + ms(phase * 40));
+            assert!(given_up > 0, "a call hangs");
+            assert!(longest <= s(5) + s(3), "KME {hangs}, phase {phase}: {longest:?}");
+        }
+    }
+}

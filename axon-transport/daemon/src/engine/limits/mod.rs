@@ -33,13 +33,35 @@ const REMEMBERED: usize = 1024;
 const ASK_AGAIN: Duration = Duration::from_millis(20);
 /// How status shows the name of a limit of all topics together.
 const ALL_TOPICS: &str = "(all topics)";
+/// Characters of the topics that have a limit together, in status.
+const SHOWN: usize = 80;
 
 /// What a limit is about.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 struct Scope {
     verb: Verb,
-    /// `None`: all topics together.
-    topic: Option<Arc<str>>,
+    topics: Topics,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+enum Topics {
+    One(Arc<str>),
+    /// All topics of an entry, which has these names.
+    Together(Arc<str>),
+}
+
+impl Topics {
+    /// As status shows them.
+    fn text(&self) -> String {
+        match self {
+            Self::One(topic) => topic.to_string(),
+            Self::Together(names) if &**names == "**" => ALL_TOPICS.to_owned(),
+            Self::Together(names) => {
+                let cut = names.chars().nth(SHOWN).map_or("", |_| "…");
+                format!("({}{cut} together)", names.chars().take(SHOWN).collect::<String>())
+            }
+        }
+    }
 }
 
 /// One limit on one topic, or on several together, and what it let pass.
@@ -78,13 +100,17 @@ impl Limits {
     ) -> Vec<Rc<Limit>> {
         let placed = permissions.limits(verb, topic);
         let found = placed.map(|placed| {
-            let PlacedLimit { limit, file, line, .. } = placed;
-            self.find(verb, topic, limit, "limit", || format!("line {line} of {file}"))
+            let PlacedLimit { limit, names, file, line, .. } = placed;
+            let topics = match limit.together {
+                true => Topics::Together(Arc::clone(names)),
+                false => Topics::One(topic.into()),
+            };
+            self.find(Scope { verb, topics }, limit, "limit", || format!("line {line} of {file}"))
         });
-        let max_hz = config
-            .topic_limit(topic)
-            .filter(|_| verb == Verb::Subscribe)
-            .map(|limit| self.find(verb, topic, &limit, "max_hz", || "max_hz of [[topic]]".into()));
+        let max_hz = config.topic_limit(topic).filter(|_| verb == Verb::Subscribe).map(|limit| {
+            let scope = Scope { verb, topics: Topics::One(topic.into()) };
+            self.find(scope, &limit, "max_hz", || "max_hz of [[topic]]".into())
+        });
         let mut limits: Vec<Rc<Limit>> = Vec::new();
         for limit in found.chain(max_hz) {
             // Two entries that say the same count once.
@@ -97,14 +123,11 @@ impl Limits {
 
     fn find(
         &self,
-        verb: Verb,
-        topic: &str,
+        scope: Scope,
         rate: &RateLimit,
         cause: &'static str,
         place: impl Fn() -> String,
     ) -> Rc<Limit> {
-        let topic = (!rate.together).then(|| topic.into());
-        let scope = Scope { verb, topic };
         let mut all = self.uses.borrow_mut();
         let in_use =
             |limits: &Vec<Rc<Limit>>| limits.iter().any(|limit| Rc::strong_count(limit) > 1);
@@ -155,7 +178,7 @@ impl Limits {
         let in_force = |limit: &&Rc<Limit>| Rc::strong_count(limit) > 1;
         let mut limits: Vec<_> = all.values().flatten().filter(in_force).collect();
         limits.sort_by(|one, other| {
-            let key = |of: &Limit| (of.scope.topic.clone(), of.scope.verb);
+            let key = |of: &Limit| (of.scope.topics.clone(), of.scope.verb);
             other.dropped.cmp(&one.dropped).then_with(|| key(one).cmp(&key(other)))
         });
         status.limits.extend(self.egress.borrow().iter().map(|cap| cap.status()));
@@ -163,7 +186,7 @@ impl Limits {
         status.limits.extend(limits.iter().take(LISTED).map(|limit| {
             let mut of = LimitStatus::default();
             of.verb = limit.scope.verb.name().to_owned();
-            of.name = limit.scope.topic.as_deref().unwrap_or(ALL_TOPICS).to_owned();
+            of.name = limit.scope.topics.text();
             of.limit = limit.rate.to_string();
             of.place.clone_from(&limit.place.borrow());
             (of.passed, of.dropped) = (limit.passed.get(), limit.dropped.get());
@@ -315,6 +338,30 @@ pub(crate) mod tests {
             assert!(is_full(Verb::Subscribe, "/a"));
             assert!(is_full(Verb::Call, "/a"), "no limit on calls");
         }
+    }
+
+    #[test]
+    fn entries_of_other_topics_share_no_bucket_though_their_numbers_are_the_same() {
+        let entry = |topics: &str| {
+            format!("[[limit]]\npeer = \"b*\"\n{topics}rate = 1\nburst = 1\ntogether = true\n")
+        };
+        let entries = ["", "topic = [\"/b\", \"/c\"]\n", "topic = \"/d\"\n"].map(entry);
+        let rules = entries.concat();
+        let all = Limits::default();
+        let limits = |topic| all.of(Verb::Publish, topic, &permissions(&rules), &Config::default());
+        let [b, c, d] = ["/b", "/c", "/d"].map(limits);
+        assert!(Rc::ptr_eq(&b[0], &c[0]) && Rc::ptr_eq(&b[0], &d[0]), "the entry of all topics");
+        assert!(Rc::ptr_eq(&b[1], &c[1]) && !Rc::ptr_eq(&b[1], &d[1]));
+        let mut names: Vec<_> = b.iter().chain(&d).map(|limit| limit.scope.topics.text()).collect();
+        names.sort();
+        names.dedup();
+        assert_eq!(names, ["(/b, /c together)", "(/d together)", "(all topics)"]);
+        // The same topics in another order are the same entry.
+        let turned = rules.replace("\"/b\", \"/c\"", "\"/c\", \"/b\"");
+        let again = all.of(Verb::Publish, "/c", &permissions(&turned), &Config::default());
+        assert!(Rc::ptr_eq(&again[1], &c[1]), "it stays as full as it is");
+        let long = Topics::Together(["/x", &"y".repeat(200)].concat().into()).text();
+        assert!(long.ends_with("… together)") && long.chars().count() < 100, "{long}");
     }
 
     #[test]

@@ -41,6 +41,11 @@ impl Budget {
         })
     }
 
+    /// Bytes that all queues of the daemon may hold.
+    pub(super) fn of_daemon(&self) -> u64 {
+        self.parent.as_ref().map_or(self.most as u64, |parent| parent.of_daemon())
+    }
+
     /// Bytes that one flow may hold.
     pub(super) fn of_flow(&self) -> usize {
         self.of_flow

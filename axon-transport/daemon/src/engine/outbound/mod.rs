@@ -34,7 +34,7 @@ pub(crate) use self::{
 };
 use self::{
     budget::Budget,
-    ending::{Endings, Over},
+    ending::{Endings, GivenUp, Over},
     flow::{Flow, Pause},
     nudges::Nudges,
     served::{FlowRoute, Served},
@@ -95,7 +95,7 @@ impl Outbound {
         Self {
             table: FlowTable::default(),
             turns: Turns::new(Rc::clone(&budget)),
-            endings: Endings::default(),
+            endings: Endings::new(budget.of_daemon()),
             stalls: Stalls::new(stalled_after, now),
             nudges: Nudges::default(),
             budget,
@@ -429,28 +429,25 @@ impl Outbound {
     fn look_at_endings(&mut self, now: Duration) {
         let starves = self.stalls.starves();
         let left_of = |route, of: &Gid| self.table.left_of(route, of, starves);
-        let over = self.endings.handle_timeout(now, left_of);
+        let bytes_of = |route, of: &Gid| self.table.bytes_left_of(route, of);
+        let over = self.endings.handle_timeout(now, left_of, bytes_of);
         for Over { publisher, given_up } in over {
-            if let Some((route, samples)) = given_up {
-                self.give_up_ended(route, publisher, samples);
+            if let Some(given_up) = given_up {
+                self.give_up_ended(publisher, given_up);
             }
             self.events.push(OutboundEvent::Drained(publisher));
         }
     }
 
-    fn give_up_ended(&mut self, number: u32, of: Gid, samples: u64) {
+    fn give_up_ended(&mut self, of: Gid, given_up: GivenUp) {
+        let GivenUp { route: number, samples, why } = given_up;
         let Some(served) = self.table.routes.get(number) else { return };
         let topic = Arc::clone(&served.shared.topic);
         // What BEST_EFFORT samples are left in the rings shows when they are taken.
         let is_reliable = served.is_reliable(&of);
         let in_rings = served.give_up_ended(&of);
         let samples = if is_reliable { samples } else { samples + in_rings };
-        tracing::warn!(
-            topic = &*topic,
-            publisher = %of,
-            samples,
-            "a publisher ended, and the peer did not take its last samples: they are lost"
-        );
+        why.warn(&topic, &of, samples);
         let gone = self.table.remove(number, &of);
         self.forget(gone);
         self.counters.dropped("publisher_ended", samples);

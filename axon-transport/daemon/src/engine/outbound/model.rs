@@ -134,6 +134,10 @@ impl RingReader for Ring {
         HashMap::new()
     }
 
+    fn unacknowledged_bytes_of(&self, _publisher: &Gid) -> u64 {
+        0
+    }
+
     fn refused_of(&self, _publisher: &Gid) -> Option<u64> {
         None
     }

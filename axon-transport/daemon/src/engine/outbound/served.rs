@@ -154,6 +154,12 @@ impl Served {
         most
     }
 
+    /// Bytes of its ring that the samples of this publisher take that are not acknowledged.
+    pub(super) fn unacknowledged_bytes_of(&self, of: &Gid) -> u64 {
+        let of = self.sources.iter().map(|source| source.unacknowledged_bytes_of(of));
+        of.max().unwrap_or(0)
+    }
+
     /// Gives up all samples of a publisher that ended. Returns how many were in a ring.
     pub(super) fn give_up_ended(&self, of: &Gid) -> u64 {
         let mut most = 0;

@@ -163,6 +163,14 @@ impl Source {
         self.reads(of) && self.unacknowledged().contains_key(of)
     }
 
+    /// Bytes of its ring that the samples of this publisher take that are not acknowledged.
+    pub(super) fn unacknowledged_bytes_of(&self, of: &Gid) -> u64 {
+        match self {
+            Self::Relay(_, reader) => reader.unacknowledged_bytes_of(of),
+            Self::StandIn(_) => 0,
+        }
+    }
+
     /// How many publishes of this publisher found no room, if it is this source that may leave none to the next one.
     pub(super) fn refused_of(&self, of: &Gid) -> Option<u64> {
         match self {

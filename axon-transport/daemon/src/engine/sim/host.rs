@@ -25,7 +25,7 @@ use super::{
     rng::{Stream, stream},
 };
 use crate::{
-    bridge::{ToControl, ToGateway},
+    bridge::{ToControl, ToGateway, TrafficRules},
     daemon_key::DaemonKey,
     discovery::{AddressConfidence, Interface},
     engine::{
@@ -75,8 +75,8 @@ pub(super) struct Host {
     interfaces_asked: bool,
     used: BTreeSet<String>,
     graph_changed: bool,
-    /// Access rules that came.
-    rules: Option<AccessRules>,
+    /// Rules that came.
+    rules: Option<TrafficRules>,
     rings_rang: bool,
     /// When the host has something to do, while nothing changed since that was asked.
     due: Cell<Option<Option<Duration>>>,
@@ -250,6 +250,24 @@ impl Host {
         peers.map(|(_, peer)| peer.remote.account().decoded.peak()).max().unwrap_or(0)
     }
 
+    /// Bytes that control messages of all peers took while they were decompressed and handled, since their links began.
+    pub(super) fn handled(&self) -> usize {
+        let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());
+        peers.map(|(_, peer)| peer.remote.account().decoded.released()).sum()
+    }
+
+    /// Endpoints of all peers that are known, or left out.
+    pub(super) fn heard_endpoints(&self) -> u64 {
+        let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());
+        peers.map(|(_, peer)| peer.remote.len() as u64 + peer.remote.left_out()).sum()
+    }
+
+    /// The most control messages of one peer that waited to be read, in bytes.
+    pub(super) fn most_unsent(&self) -> usize {
+        let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());
+        peers.map(|(_, peer)| peer.remote.account().unsent.peak()).max().unwrap_or(0)
+    }
+
     /// Publishers, servers and clients of all peers that are shown here.
     pub(super) fn shown(&self) -> usize {
         let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());
@@ -287,8 +305,14 @@ impl Host {
 
     /// Other access rules count from now on.
     pub(super) fn set_access(&mut self, rules: &str) {
+        let access = AccessRules::parse(rules, "access.toml").unwrap();
+        self.set_rules(TrafficRules { access, ..TrafficRules::of(&self.config) });
+    }
+
+    /// Other rules count from now on.
+    pub(super) fn set_rules(&mut self, rules: TrafficRules) {
         self.due.set(None);
-        self.rules = Some(AccessRules::parse(rules, "access.toml").unwrap());
+        self.rules = Some(rules);
     }
 
     /// A ring rang.
@@ -349,7 +373,7 @@ impl Host {
             engine.handle_local_graph(local, now);
         }
         if let Some(rules) = self.rules.take() {
-            engine.handle_order(ToGateway::Access(rules, 0), now);
+            engine.handle_order(ToGateway::Rules(rules, 0), now);
         }
         if std::mem::take(&mut self.rings_rang) {
             engine.handle_rings(now);

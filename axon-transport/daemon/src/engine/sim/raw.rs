@@ -53,6 +53,8 @@ pub(super) struct RawLink {
     partial: Vec<u8>,
     /// The messages that came on the control stream.
     pub(super) messages: Vec<Message>,
+    /// It reads nothing more of the control stream.
+    pub(super) is_deaf: bool,
     /// The data streams that the other side opened. Nobody reads them but a test.
     pub(super) opened: Vec<StreamId>,
     /// How the other side closed it, or why it was lost.
@@ -111,6 +113,7 @@ impl Raw {
             control: None,
             partial: Vec::new(),
             messages: Vec::new(),
+            is_deaf: false,
             opened: Vec::new(),
             closed: None,
             waiting: VecDeque::new(),
@@ -237,7 +240,9 @@ impl RawLink {
     }
 
     fn read_control(&mut self) {
-        let Some(control) = self.control.filter(|_| self.closed.is_none()) else { return };
+        let Some(control) = self.control.filter(|_| self.closed.is_none() && !self.is_deaf) else {
+            return;
+        };
         let bytes = self.read(control);
         self.partial.extend_from_slice(&bytes);
         while let Some(prefix) = self.partial.first_chunk::<4>() {

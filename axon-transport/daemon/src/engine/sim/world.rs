@@ -247,7 +247,7 @@ impl World {
     }
 
     /// The time of the next event.
-    fn next(&mut self) -> Option<Duration> {
+    pub(super) fn next(&mut self) -> Option<Duration> {
         let raws = self.raws.iter_mut().filter_map(Raw::poll_timeout).min();
         let hosts = (0..self.hosts.len()).filter_map(|host| self.due(host)).min();
         let answer = self.answers.iter().map(|(at, ..)| *at).min();

@@ -26,13 +26,15 @@ pub(crate) enum Plan {
     Brief,
     /// Twelve are stopped for some seconds, and the daemon is killed meanwhile.
     Stops,
+    /// The same, and the daemon lives: what a publisher leaves that ends must come to every reader.
+    Ends,
 }
 
 impl Plan {
     fn processes(self) -> usize {
         match self {
             Self::Brief => 8,
-            Self::Stops => 12,
+            Self::Stops | Self::Ends => 12,
         }
     }
 
@@ -48,6 +50,11 @@ impl Plan {
                 Disturbance::StopAround(Duration::from_millis(1000 + random.below(3000)))
             }
             (Self::Stops, 160..180) => Disturbance::Daemon,
+            (Self::Ends, 0..20) => Disturbance::Kill,
+            (Self::Ends, 20..80) => Disturbance::Stop(Duration::from_millis(random.below(400))),
+            (Self::Ends, 80..140) => {
+                Disturbance::Stop(Duration::from_millis(1000 + random.below(3000)))
+            }
             _ => Disturbance::None,
         }
     }

@@ -143,6 +143,11 @@ impl FlowTable {
         Some(Left { route, samples, progress, is_excused })
     }
 
+    /// Bytes of its ring that the samples of a publisher take that are not acknowledged.
+    pub(super) fn bytes_left_of(&self, number: u32, of: &Gid) -> u64 {
+        self.routes.get(number).map_or(0, |served| served.unacknowledged_bytes_of(of))
+    }
+
     /// The flows with samples that are not acknowledged.
     pub(super) fn busy(&self) -> impl Iterator<Item = BusyFlow> {
         self.flows.busy().filter_map(|(id, flow)| {

@@ -153,6 +153,14 @@ impl RingReader for SimReader {
         left.filter(|(_, left)| *left > 0).collect()
     }
 
+    fn unacknowledged_bytes_of(&self, publisher: &Gid) -> u64 {
+        let acknowledged = self.cursors.acknowledged.borrow().get(publisher).copied().unwrap_or(0);
+        let state = self.rings.state.borrow();
+        let history = state.publishers.get(publisher).map(|of| &of.history);
+        let left = history.into_iter().flatten().filter(|(sequence, _)| *sequence > acknowledged);
+        left.map(|(_, payload)| payload.len() as u64).sum()
+    }
+
     fn refused_of(&self, publisher: &Gid) -> Option<u64> {
         let state = self.rings.state.borrow();
         let of = state.publishers.get(publisher)?;

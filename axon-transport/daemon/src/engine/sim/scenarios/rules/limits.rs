@@ -8,9 +8,12 @@ use axon_transport::{
 };
 
 use super::super::radio::{Stream, drive, radio};
-use crate::engine::sim::{
-    tests::{millis, secs},
-    world::{Pair, World},
+use crate::{
+    bridge::TrafficRules,
+    engine::sim::{
+        tests::{millis, secs},
+        world::{Pair, World},
+    },
 };
 
 const TEXT: &str = "[[limit]]\npeer = \"*\"\ntopic = \"/limited\"\nrate = 10\n";
@@ -154,6 +157,35 @@ fn max_hz_sends_the_newest_samples_of_a_topic_to_each_host() {
         let came = world.received(pair);
         assert!((45..=55).contains(&came.len()), "{came:?}");
         assert_eq!(came.last(), Some(&500), "the newest arrives");
+    }
+}
+
+#[test]
+fn max_hz_that_changes_counts_for_a_topic_that_is_matched() {
+    let entry = |hz: f64| {
+        let name = TopicPattern::new("/limited").unwrap();
+        TopicRule::new(name, TopicPriority::Normal).max_hz(hz)
+    };
+    let mut world = World::new(32, 2, |_| Config::default());
+    let pair = world.pair(0, 1, "/limited", Qos::sensor_data());
+    world.until(secs(20), World::is_whole);
+    world.run_for(secs(1));
+    // Five seconds with a hundred samples each, under each of these.
+    for (topics, fits) in [
+        (vec![], 500..=500),
+        (vec![entry(10.0)], 45..=56),
+        (vec![entry(40.0)], 190..=211),
+        (vec![], 500..=500),
+    ] {
+        let mut rules = TrafficRules::of(&Config::default());
+        rules.topics = topics;
+        world.hosts[0].set_rules(rules);
+        world.run_for(secs(1));
+        let before = world.received(pair).len();
+        publish(&mut world, &[pair], 5);
+        world.run_for(secs(1));
+        let came = world.received(pair).len() - before;
+        assert!(fits.contains(&came), "{came} of {fits:?}");
     }
 }
 
