@@ -11,13 +11,18 @@ TOPICS = ('map', 'text', 'image', 'mixed')
 NEEDED = ('ros2bag', 'rosbag2_transport', 'rosbag2_storage_sqlite3')
 
 
-@pytest.fixture(autouse=True)
-def installed():
+def need_bags():
+    """Skip the test where a package is missing."""
     if shutil.which('ros2') is None:
         return
     for package in NEEDED:
         if subprocess.run(['ros2', 'pkg', 'prefix', package], capture_output=True).returncode != 0:
             pytest.skip(f'{package} is not installed')
+
+
+@pytest.fixture(autouse=True)
+def installed():
+    need_bags()
 
 
 def counts(info):

@@ -12,7 +12,8 @@ from rclpy.utilities import remove_ros_args
 
 
 def say(text):
-    print(text, flush=True)
+    # In one call: other threads say something, too.
+    print(f'{text}\n', end='', flush=True)
 
 
 def spin(*nodes):
