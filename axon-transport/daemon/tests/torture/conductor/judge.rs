@@ -11,6 +11,10 @@ use super::{
 /// milliseconds: it waits for ten seconds, and may be stopped for four.
 const DAEMON: u128 = 15_000;
 
+/// How long after one gap a reader may give up the next one of the same dead process, in milliseconds: it waits for a
+/// second more, may be stopped for four, and the machine is busy.
+const NEXT_GAP: u128 = 6_000;
+
 /// How long before its end a process may have had no daemon to tell what its readers lost: it waits for two seconds, and
 /// says that it ends some time before it does. And how long after it the daemon may have been killed that it told, before
 /// the readers were: they may be stopped for four seconds, and then have to come to that daemon.
@@ -161,11 +165,18 @@ pub(super) fn missed(players: &mut [Player], past: &Past) -> Gone {
     for (index, player) in players.iter_mut().enumerate() {
         let answer = player.ask("missed");
         let words: Vec<&str> = answer.split_ascii_whitespace().collect();
+        // When this reader last gave up a gap in memory that a killed daemon may have held, by publisher.
+        let mut gaps: HashMap<&str, u128> = HashMap::new();
         for [partner, messages, at, what] in words.as_chunks::<4>().0 {
             let at: u128 = at.parse().expect("a time");
             let number: u64 = messages.parse().expect("a number");
-            let was_dead = deaths.get(session(partner)).is_some_and(|death| *death <= at)
-                || !living.contains(session(partner)) && past.lost_daemon(at);
+            let with_daemon = !living.contains(session(partner))
+                && (past.lost_daemon(at) || gaps.get(partner).is_some_and(|last| at <= last + NEXT_GAP));
+            if with_daemon {
+                gaps.insert(partner, at);
+            }
+            let was_dead =
+                deaths.get(session(partner)).is_some_and(|death| *death <= at) || with_daemon;
             match *what {
                 "counted" if was_dead => gone.samples += number,
                 "request" | "response" if was_dead => gone.calls += number,
