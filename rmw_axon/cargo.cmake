@@ -197,3 +197,22 @@ function(axon_cargo_build rustc source build command artefacts)
   set(${command} ${CMAKE_COMMAND} -E env ${env} ${CARGO} ${arguments} PARENT_SCOPE)
   set(${artefacts} ${out} PARENT_SCOPE)
 endfunction()
+
+# The core: one cargo call makes the static library that is linked in and the daemon beside it. Adds the target
+# axon_core; sets core_library and core_daemon, cargo_build as axon_cargo_build does, and core_artefacts.
+function(axon_add_core rustc source build)
+  axon_cargo_build(${rustc} ${source} ${build} cargo_build core_artefacts)
+  set(core_library ${core_artefacts}/librmw_axon_core.a)
+  set(core_daemon ${core_artefacts}/axon_daemon)
+  # Cargo knows best what is out of date: it is asked every time, and has nothing to do mostly.
+  add_custom_target(axon_core ALL
+    COMMAND ${cargo_build} --package rmw-axon-core --package axon-daemon --lib --bin axon_daemon
+    WORKING_DIRECTORY ${source}
+    BYPRODUCTS ${core_library} ${core_daemon}
+    USES_TERMINAL
+    COMMENT "AXON's core: cargo builds it, which takes minutes the first time"
+    VERBATIM)
+  foreach(name IN ITEMS core_library core_daemon core_artefacts cargo_build)
+    set(${name} "${${name}}" PARENT_SCOPE)
+  endforeach()
+endfunction()

@@ -19,7 +19,15 @@ pub(crate) fn locate(
     let pinned = pinned_version(crate_dir)?;
     // as in the build dependency in `Cargo.toml`
     let range = format!(">={pinned}, <0.24");
-    let (found, src) = find(cargo, crate_dir, host, scratch, &range, &["--offline"])?;
+    let (found, src) =
+        find(cargo, crate_dir, host, scratch, &range, &["--offline"]).map_err(|why| {
+            // the lock file of the project being built need not have the version that ours has
+            format!(
+                "{why}\nIf cargo does not have rustls {pinned} yet, this gets it: \
+                 cargo fetch --locked --manifest-path {}",
+                crate_dir.join("Cargo.toml").display()
+            )
+        })?;
     check_version(&found, &pinned)?;
     Ok(src)
 }

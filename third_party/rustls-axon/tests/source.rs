@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 #[path = "../build/patch.rs"]
@@ -156,6 +157,28 @@ fn another_version_is_refused_with_the_way_out() {
     for part in ["rustls 0.23.99", &*pinned, "cargo update -p rustls@0.23.99 --precise"] {
         assert!(error.contains(part), "{error}");
     }
+}
+
+/// As in a project that took this crate by its path and resolved a newer rustls: cargo fetched that one, and
+/// nothing had it fetch the pinned one.
+#[test]
+fn a_pinned_rustls_that_cargo_never_fetched_is_named_with_the_command_that_does() {
+    let dir = tempfile::tempdir().unwrap();
+    let (cargo, home) = (dir.path().join("cargo"), dir.path().join("home"));
+    let script = format!(
+        "#!/bin/sh\nCARGO_HOME='{}' exec '{}' \"$@\"\n",
+        home.display(),
+        std::env::var("CARGO").unwrap()
+    );
+    fs::write(&cargo, script).unwrap();
+    fs::set_permissions(&cargo, fs::Permissions::from_mode(0o755)).unwrap();
+    let host = "x86_64-unknown-linux-gnu";
+    let error = upstream::locate(&cargo, crate_dir(), host, &dir.path().join("where")).unwrap_err();
+    let fetch = format!(
+        "cargo fetch --locked --manifest-path {}",
+        crate_dir().join("Cargo.toml").display()
+    );
+    assert!(error.contains(&fetch), "{error}");
 }
 
 /// The committed patches: one purpose each, said in front, and no more of rustls than a diff needs.

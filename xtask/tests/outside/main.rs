@@ -1,5 +1,5 @@
 //! The published crates as somebody outside of this repository has them: from their packages, in
-//! projects of their own.
+//! projects of their own, and from a checkout.
 //!
 //! Doc tests compile the README's blocks with the features, dependencies and hidden lines of this
 //! workspace. Here each block stands alone, in a project to which was added what the README says, and
@@ -9,6 +9,7 @@
 //! `cargo test -p xtask --test outside -- --include-ignored`.
 
 mod beside;
+mod checkout;
 mod examples;
 mod project;
 mod readme;

@@ -7,9 +7,10 @@ use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use crate::project::{Project, cargo, package};
+use crate::checkout::installed;
+use crate::project::Project;
 use crate::readme::Readme;
-use crate::support::{Kept, alone, run, target, with_daemon, workspace};
+use crate::support::{Kept, alone, run, target, with_daemon};
 
 /// A project with a program for each `rust` block of the README, built. `None` without a registry.
 fn built(name: &str) -> Option<Vec<PathBuf>> {
@@ -29,19 +30,6 @@ fn built(name: &str) -> Option<Vec<PathBuf>> {
     }
     run(&mut project.cargo(&["build", "--bins"]));
     Some(runnable)
-}
-
-/// Builds a program of a package, as `cargo install` does but for the profile and the versions.
-fn installed(name: &str, bin: &str, features: &[&str]) -> PathBuf {
-    let dir = package(name);
-    fs::copy(workspace().join("Cargo.lock"), dir.join("Cargo.lock")).expect("a lock file");
-    let manifest = dir.join("Cargo.toml");
-    let text = fs::read_to_string(&manifest).expect("a manifest");
-    if !text.contains("[patch.crates-io]") {
-        fs::write(&manifest, text + &crate::project::patch()).expect("a manifest");
-    }
-    run(cargo(dir, &["build", "--bin", bin]).args(features));
-    target().join("debug").join(bin)
 }
 
 /// A program with nothing of AXON or ROS 2 in its environment, in an empty directory.
@@ -84,7 +72,8 @@ fn the_readme_of_etsi_qkd014_does_what_it_says() {
     told("kme-sim init certs");
     told("kme-sim run certs");
 
-    let kme_sim = installed("etsi-qkd014", "kme-sim", &["--features", "sim"]);
+    let install = ["--path", "axon/etsi-qkd014", "--features", "sim"];
+    let Some(kme_sim) = installed(&install) else { return };
     let place = Place::new();
     // As the README has it, but at a port that is free.
     let port = TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr());
@@ -166,7 +155,8 @@ fn the_readmes_of_axon_transport_and_axon_cli_do_what_they_say() {
     }
     let Some(programs) = built("axon-transport") else { return };
     assert_ne!(programs.len(), 0);
-    let axon = installed("axon-cli", "axon", &[]);
+    let install = ["--git", env!("CARGO_PKG_REPOSITORY"), "axon-cli"];
+    let Some(axon) = installed(&install) else { return };
     for program in programs {
         let place = Place::new();
         // Where `cargo install` puts it, and far from what the workspace built.
