@@ -129,10 +129,12 @@ pub(crate) struct Demo {
 const PLAY_HELP: &str = "\
 Each topic is published under the name and type in the log, at the pace of the recording. With \
 --qos keep-all, the default, a full reader that keeps all as well slows the replay and nothing is \
-lost; the other profiles never wait. At the end it waits for other hosts to acknowledge what they got, \
-prints how many messages are acknowledged, and fails where some are not: after 15 s in which no more \
-were, or when a link or a daemon was lost with them. A message that had no subscription is not \
-acknowledged; with --wait N one that had fewer than N makes it fail as well.
+lost; the other profiles never wait for a reader. At the end it waits for other hosts to acknowledge what \
+they got. It prints how many messages every RELIABLE and KEEP_ALL subscription has (acknowledged), and \
+fails where such a subscription misses some: after 15 s in which no more were acknowledged, or when \
+messages were given up, with a link or a daemon for example. It counts the subscriptions that keep the \
+last messages only, or are best effort: these may miss messages, and it does not fail for that. With \
+--wait N a message that had fewer than N subscriptions makes it fail.
 
 A log whose end is missing, or that fails a checksum, is refused; the error says how much of it is \
 whole, and --incomplete publishes that. Where no checksum covers a message of that part (a log without \

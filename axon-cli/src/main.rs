@@ -18,6 +18,7 @@ mod logging;
 mod play;
 mod reload;
 mod say;
+mod served;
 mod session;
 mod status;
 mod text;

@@ -8,7 +8,7 @@ use std::{
 };
 
 use axon_shm::PublishError;
-use axon_transport::{EndpointSpec, Publisher, Session, qos::Qos};
+use axon_transport::{EndpointSpec, Publisher, Session, qos::Qos, status::Status};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::{
@@ -17,14 +17,17 @@ use crate::{
     log::{LogError, Message, Part, Survey},
     logging,
     say::say,
+    served::Served,
     session, text,
 };
 
 /// Messages read ahead of their time.
 const READ_AHEAD: usize = 64;
-/// Messages that other hosts do not acknowledge are waited for so long.
+/// The end of a replay waits so long while other hosts acknowledge nothing.
 const UNACKNOWLEDGED: Duration = Duration::from_secs(15);
-/// Between two looks at them.
+/// The status counts losses of links once a second. After this time it has those of the replay.
+const REPORTED: Duration = Duration::from_millis(1_200);
+/// Between two looks at what is not acknowledged.
 const LOOK: Duration = Duration::from_millis(10);
 
 impl Profile {
@@ -49,8 +52,6 @@ pub(crate) struct Sent {
     pub(crate) waits: u64,
     /// Messages that were published while their topic had fewer subscriptions than were waited for.
     pub(crate) missed: u64,
-    /// Messages that were published while their topic had none.
-    pub(crate) unread: u64,
 }
 
 /// Runs `axon play`.
@@ -81,11 +82,15 @@ pub(crate) fn run(args: &cli::Play) -> Result<(), CliError> {
         say(format_args!("axon play: waiting for {} subscriptions a topic", args.wait));
         wait_matched(&publishers, args.wait, Duration::MAX);
     }
+    let names: Vec<&str> = survey.topics.iter().map(|topic| topic.name.as_str()).collect();
+    let dropped_before = Dropped::of(&session, &names);
+    let mut served = Served::new(args.qos.qos(), publishers.len());
     let started = Instant::now();
     let bar = progress_bar(&survey);
     let mut total = Sent::default();
     loop {
-        let sent = replay(&survey, &publishers, (args.rate, args.wait), |sent| {
+        let pace = (args.rate, args.wait);
+        let sent = replay(&survey, &session, &publishers, &mut served, pace, |sent| {
             bar.set_position(sent.messages);
             Ok(true)
         })?;
@@ -93,31 +98,111 @@ pub(crate) fn run(args: &cli::Play) -> Result<(), CliError> {
         total.bytes += sent.bytes;
         total.waits += sent.waits;
         total.missed += sent.missed;
-        total.unread += sent.unread;
         if !args.repeat {
             break;
         }
     }
     bar.finish_and_clear();
-    let left = wait_acknowledged(&publishers, UNACKNOWLEDGED);
-    let given_up = publishers.iter().map(Publisher::given_up).sum::<u64>();
-    let Sent { messages, bytes, waits, missed, unread } = total;
-    let read = messages.saturating_sub(unread);
-    let acknowledged = read.saturating_sub(left).saturating_sub(given_up);
+    wait_acknowledged(&publishers, UNACKNOWLEDGED);
+    let outcome = Outcome::of(&publishers, &served);
+    let Sent { messages, bytes, waits, missed } = total;
+    let waited = match args.qos {
+        Profile::KeepAll => format!(
+            "{} acknowledged; waited {} times for a reader",
+            text::grouped(outcome.acknowledged),
+            text::grouped(waits)
+        ),
+        Profile::Default => "--qos default waits for no reader".to_owned(),
+        Profile::SensorData => "--qos sensor-data waits for no reader".to_owned(),
+    };
     say(format_args!(
-        "axon play: {} messages, {} in {}; {} acknowledged; waited {} times for a reader",
+        "axon play: {} messages, {} in {}; {waited}",
         text::grouped(messages),
         text::bytes(bytes),
         text::duration(started.elapsed().as_nanos() as u64),
-        text::grouped(acknowledged),
-        text::grouped(waits),
     ));
-    unheard(left, given_up, missed)
+    if let Some(others) = served.others() {
+        let dropped = dropped_before.and_then(|before| {
+            thread::sleep(REPORTED);
+            before.since(&Dropped::of(&session, &names)?)
+        });
+        say(format_args!("axon play: {}", unpromised(&others, &outcome, dropped)));
+    }
+    unheard(outcome.left, outcome.given_up, missed)
 }
 
-/// Waits until other hosts have acknowledged what was published, for as long as that gets on; how many
-/// messages they have not.
-fn wait_acknowledged(publishers: &[Publisher], patience: Duration) -> u64 {
+/// What became of the messages of a replay.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct Outcome {
+    /// Messages that their RELIABLE and KEEP_ALL subscriptions have.
+    acknowledged: u64,
+    /// Messages of topics with such subscriptions that are not acknowledged.
+    left: u64,
+    /// Messages of such topics that will never be acknowledged.
+    given_up: u64,
+    /// Messages of other topics that are not acknowledged, or never will be.
+    unpromised: u64,
+}
+
+impl Outcome {
+    fn of(publishers: &[Publisher], served: &Served) -> Self {
+        let mut outcome = Self::default();
+        for (index, publisher) in publishers.iter().enumerate() {
+            let counts = (publisher.unacknowledged(), publisher.given_up());
+            outcome.add(served.kept(index), counts);
+        }
+        outcome
+    }
+
+    /// Adds a publisher. For `kept` of its messages a subscription was promised everything.
+    fn add(&mut self, kept: u64, (left, given_up): (u64, u64)) {
+        if kept == 0 {
+            self.unpromised += left + given_up;
+        } else {
+            self.acknowledged += kept.saturating_sub(left).saturating_sub(given_up);
+            self.left += left;
+            self.given_up += given_up;
+        }
+    }
+}
+
+/// Samples of the replay's topics that this host's daemon dropped on their way, as its status says.
+struct Dropped {
+    daemon: String,
+    samples: u64,
+}
+
+impl Dropped {
+    /// `None`: the status cannot be had.
+    fn of(session: &Session, topics: &[&str]) -> Option<Self> {
+        let status: Status = serde_json::from_str(&session.status_json().ok()?).ok()?;
+        let own = status.topics.iter().filter(|topic| topics.contains(&topic.topic.as_str()));
+        let samples = own.filter_map(|topic| topic.dropped.get("queue")).sum();
+        Some(Self { daemon: status.daemon, samples })
+    }
+
+    /// How many more `now` has. `None`: it is of another daemon.
+    fn since(&self, now: &Self) -> Option<u64> {
+        (self.daemon == now.daemon).then(|| now.samples.saturating_sub(self.samples))
+    }
+}
+
+/// What is said of subscriptions that were not promised everything.
+fn unpromised(others: &str, outcome: &Outcome, dropped: Option<u64>) -> String {
+    let mut text = others.to_owned();
+    if let Some(dropped) = dropped.filter(|dropped| *dropped > 0) {
+        let dropped = text::grouped(dropped);
+        text += &format!("; this host's daemon dropped at least {dropped} for newer ones");
+    }
+    if outcome.unpromised > 0 {
+        let unpromised = text::grouped(outcome.unpromised);
+        text += &format!("; {unpromised} more may not have left this host");
+    }
+    text
+}
+
+/// Waits until other hosts have acknowledged what was published, for as long as that gets on.
+fn wait_acknowledged(publishers: &[Publisher], patience: Duration) {
     let left = || publishers.iter().map(Publisher::unacknowledged).sum::<u64>();
     let (mut least, mut since) = (left(), Instant::now());
     while least > 0 && since.elapsed() < patience {
@@ -127,10 +212,9 @@ fn wait_acknowledged(publishers: &[Publisher], patience: Duration) -> u64 {
             (least, since) = (now, Instant::now());
         }
     }
-    least
 }
 
-/// Why a replay is not known to have reached everybody, if so.
+/// Why a replay is not known to have reached each subscription that was promised everything, if so.
 fn unheard(left: u64, given_up: u64, missed: u64) -> Result<(), CliError> {
     let mut why = Vec::new();
     if left > 0 {
@@ -140,7 +224,9 @@ fn unheard(left: u64, given_up: u64, missed: u64) -> Result<(), CliError> {
     }
     if given_up > 0 {
         let given_up = text::grouped(given_up);
-        why.push(format!("{given_up} messages were lost with a link or a daemon"));
+        why.push(format!(
+            "{given_up} messages were given up (a link or a daemon ended, a host read nothing, or a limit dropped them)"
+        ));
     }
     if missed > 0 {
         let missed = text::grouped(missed);
@@ -180,10 +266,13 @@ pub(crate) fn wait_matched(
 
 /// Publishes the log at `rate` times its pace, in the order of the file: a message that was
 /// recorded before the one in front of it goes at once. Messages of topics with fewer subscriptions than
-/// `readers` are counted. `progress` says whether to go on.
+/// `readers` are counted, and `served` counts those for which a subscription was promised everything. `progress` says
+/// whether to go on.
 pub(crate) fn replay(
     survey: &Survey,
+    session: &Session,
     publishers: &[Publisher],
+    served: &mut Served,
     (rate, readers): (f64, usize),
     mut progress: impl FnMut(Sent) -> std::io::Result<bool>,
 ) -> Result<Sent, CliError> {
@@ -194,7 +283,9 @@ pub(crate) fn replay(
         let pace = *pace.get_or_insert_with(|| Pace::new(message.time, rate));
         thread::sleep(pace.until(message.time, Instant::now()));
         // Before: a subscription that got the last message may leave with it.
-        let there = publishers[message.topic].matched().len();
+        let matched = publishers[message.topic].matched();
+        let there = matched.len();
+        served.look(session, message.topic, matched);
         loop {
             match publishers[message.topic].publish(&message.data) {
                 Ok(_) => break,
@@ -208,8 +299,8 @@ pub(crate) fn replay(
                 return Ok(sent);
             }
         }
+        served.count(message.topic);
         sent.missed += u64::from(there < readers);
-        sent.unread += u64::from(there == 0);
         sent.messages += 1;
         sent.bytes += message.data.len() as u64;
         if !progress(sent)? {
@@ -283,7 +374,7 @@ mod tests {
         assert!(unheard(0, 0, 0).is_ok());
         for (counts, part) in [
             ((1, 0, 0), "1 messages were not acknowledged"),
-            ((0, 2000, 0), "2,000 messages were lost"),
+            ((0, 2000, 0), "2,000 messages were given up"),
             ((0, 0, 3), "3 messages found fewer"),
         ] {
             match unheard(counts.0, counts.1, counts.2) {
@@ -291,6 +382,28 @@ mod tests {
                 other => panic!("{other:?}"),
             }
         }
+    }
+
+    #[test]
+    fn messages_that_no_subscription_was_promised_fail_nothing() {
+        let mut outcome = Outcome::default();
+        outcome.add(0, (3, 4));
+        assert_eq!(outcome, Outcome { unpromised: 7, ..Outcome::default() });
+        outcome.add(100, (20, 5));
+        let expected = Outcome { acknowledged: 75, left: 20, given_up: 5, unpromised: 7 };
+        assert_eq!(outcome, expected);
+        outcome.add(1, (2, 0));
+        assert_eq!((outcome.acknowledged, outcome.left), (75, 22));
+    }
+
+    #[test]
+    fn what_subscriptions_without_a_promise_missed_is_said_as_far_as_it_is_known() {
+        let outcome = Outcome { unpromised: 1, ..Outcome::default() };
+        assert_eq!(unpromised("others", &Outcome::default(), None), "others");
+        assert_eq!(unpromised("others", &Outcome::default(), Some(0)), "others");
+        let text = unpromised("others", &outcome, Some(5_839));
+        assert!(text.contains("dropped at least 5,839"), "{text}");
+        assert!(text.contains("1 more may not have left"), "{text}");
     }
 
     #[test]

@@ -11,7 +11,17 @@ use rustix::process::Signal;
 const MESSAGES: u64 = 3 * 1_988;
 
 fn play(host: &Host, rate: &str) -> Running {
-    Running::start(host.axon(&["play", LOG, "--rate", rate, "--wait", "1", "--qos", "keep-all"]))
+    play_with(host, rate, "keep-all")
+}
+
+fn play_with(host: &Host, rate: &str, qos: &str) -> Running {
+    Running::start(host.axon(&["play", LOG, "--rate", rate, "--wait", "1", "--qos", qos]))
+}
+
+/// An `echo` with these policies for each topic of the log, that stays.
+fn echo_all(host: &Host, qos: &str) -> [Running; 3] {
+    ["/scan", "/odom", "/tf"]
+        .map(|topic| Running::start(host.axon(&["echo", topic, "--qos", qos, "--json"])))
 }
 
 /// The exit status, and what it said.
@@ -30,6 +40,49 @@ fn play_waits_until_the_other_host_has_every_message() {
     echoes.assert_whole();
 }
 
+/// Their depth decides what they get: no promise is broken, and none is claimed to be kept.
+#[test]
+fn nothing_is_called_acknowledged_where_no_subscription_keeps_all() {
+    for (qos, kind) in [
+        ("default", "3 subscriptions keep the last messages only (KEEP_LAST)"),
+        ("sensor-data", "3 subscriptions are best effort"),
+    ] {
+        let [a, b] = Host::pair();
+        let _echoes = echo_all(&b, qos);
+        let (code, said) = outcome(play(&a, "0"));
+        assert_eq!(code, Some(0), "{said}");
+        assert!(said.contains("; 0 acknowledged"), "{said}");
+        assert!(said.contains(&format!("{kind}: messages may be missing there")), "{said}");
+    }
+}
+
+#[test]
+fn a_profile_that_waits_for_nobody_acknowledges_nothing() {
+    for qos in ["default", "sensor-data"] {
+        let [a, b] = Host::pair();
+        let _echoes = echo_all(&b, qos);
+        let (code, said) = outcome(play_with(&a, "0", qos));
+        assert_eq!(code, Some(0), "{said}");
+        assert!(said.contains(&format!("--qos {qos} waits for no reader")), "{said}");
+        assert!(!said.contains("acknowledged"), "{said}");
+        assert!(said.contains("messages may be missing there"), "{said}");
+    }
+}
+
+/// The subscription that keeps all has every message, whatever the one beside it misses.
+#[test]
+fn a_subscription_of_another_profile_takes_no_acknowledgement_away() {
+    let [a, b] = Host::pair();
+    let echoes = Echoes::start(&b);
+    let _last = echo_all(&b, "default");
+    let play = Running::start(a.axon(&["play", LOG, "--rate", "0", "--wait", "2"]));
+    let (code, said) = outcome(play);
+    assert_eq!(code, Some(0), "{said}");
+    assert!(said.contains("5,964 acknowledged"), "{said}");
+    assert!(said.contains("3 subscriptions keep the last messages only"), "{said}");
+    echoes.assert_whole();
+}
+
 #[test]
 fn play_fails_where_the_other_host_takes_nothing_more() {
     let [a, b] = Host::pair();
@@ -43,7 +96,7 @@ fn play_fails_where_the_other_host_takes_nothing_more() {
     signal(there, Signal::CONT);
     assert_eq!(code, Some(1), "{said}");
     // The link is given up after 120 s without a sign of life, which may be first.
-    let unheard = ["messages were not acknowledged, none of them for 15 s", "lost with a link"];
+    let unheard = ["messages were not acknowledged, none of them for 15 s", "were given up"];
     assert!(unheard.iter().any(|why| said.contains(why)), "{said}");
 }
 
@@ -62,7 +115,7 @@ fn no_message_is_lost_with_the_daemon_of_play() {
     signal(a.wait_daemon(), Signal::KILL);
     signal(there, Signal::CONT);
     let (code, said) = outcome(play);
-    assert!(!said.contains("lost with a link or a daemon"), "{said}");
+    assert!(!said.contains("were given up"), "{said}");
     assert_eq!(code, Some(i32::from(said.contains("found fewer subscriptions"))), "{said}");
     echoes.assert_whole();
 }

@@ -12,11 +12,11 @@
 #include "features.hpp"
 #include "gid.hpp"
 #include "graph.hpp"
-#include "names.hpp"
 #include "qos.hpp"
 #include "rmw/get_topic_endpoint_info.h"
 #include "rmw/rmw.h"
 #include "rmw/topic_endpoint_info_array.h"
+#include "shown.hpp"
 #if AXON_RMW_SERVICE_ENDPOINT_INFO
 #include "rmw/get_service_endpoint_info.h"
 #include "rmw/service_endpoint_info_array.h"
@@ -45,8 +45,8 @@ std::vector<EndpointInfo> endpoints(const Node & node, uint32_t kind, const std:
       Seen<EndpointInfo>::add(
         user, [&](auto & items) {
           items.push_back(
-            {endpoint->gid, endpoint->qos, endpoint->node, endpoint->namespace_,
-              endpoint->type_name,
+            {endpoint->gid, endpoint->qos, printable(endpoint->node), printable(endpoint->namespace_),
+              printable(endpoint->type_name),
               {endpoint->type_hash, endpoint->type_hash + endpoint->type_hash_size}});
         });
     };
@@ -146,7 +146,7 @@ rmw_ret_t infos(
       }
       // Nothing has a name that is none, for which rmw.h knows no error.
       std::vector<EndpointInfo> found;
-      if (no_mangle || is_ros_name(name)) {
+      if (no_mangle || is_full_name(name)) {
         found = endpoints(of, kind, name);
       }
       if (found.empty()) {

@@ -2,7 +2,6 @@
 
 // What one asks of the graph: nodes, names with their types, counts.
 
-#include <algorithm>
 #include <string>
 #include <tuple>
 #include <utility>
@@ -24,25 +23,13 @@
 #include "rmw/sanity_checks.h"
 #include "rmw/validate_namespace.h"
 #include "rmw/validate_node_name.h"
+#include "shown.hpp"
 
 namespace rmw_axon
 {
 
 namespace
 {
-
-struct NodeNames
-{
-  std::string name;
-  std::string name_space;
-  std::string enclave;
-};
-
-struct NameAndTypes
-{
-  std::string name;
-  std::vector<std::string> types;
-};
 
 std::vector<NodeNames> nodes(const Node & node)
 {
@@ -53,7 +40,9 @@ std::vector<NodeNames> nodes(const Node & node)
         user, [&](auto & items) {items.push_back({name, name_space, enclave});});
     };
   check(axon_session_graph_nodes(session_of(node), visitor, &seen));
-  return seen.take();
+  std::vector<NodeNames> found = seen.take();
+  leave_out_strange(found);
+  return found;
 }
 
 // Of one node where its name is given, else of all.
@@ -69,10 +58,7 @@ std::vector<NameAndTypes> names(
   check(
     axon_session_graph_names(session_of(node), kinds, of_node, of_namespace, visitor, &seen));
   std::vector<NameAndTypes> found = seen.take();
-  if (!all_names) {
-    const auto strange = [](const NameAndTypes & one) {return !is_ros_name(one.name.c_str());};
-    found.erase(std::remove_if(found.begin(), found.end(), strange), found.end());
-  }
+  leave_out_strange(found, all_names);
   return found;
 }
 

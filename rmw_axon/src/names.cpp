@@ -50,9 +50,4 @@ std::string service_name(const char * name, bool avoid_ros_namespace_conventions
   return avoid_ros_namespace_conventions ? bare(name, "service_name") : full_name(name, "service");
 }
 
-bool is_ros_name(const char * topic)
-{
-  return topic[0] == '/';
-}
-
 }  // namespace rmw_axon

@@ -21,9 +21,6 @@ std::string topic_name(const char * name, bool avoid_ros_namespace_conventions);
 // AXON's name of a service.
 std::string service_name(const char * name, bool avoid_ros_namespace_conventions);
 
-// Whether a topic of AXON's is one of ROS.
-bool is_ros_name(const char * topic);
-
 }  // namespace rmw_axon
 
 #endif  // NAMES_HPP_

@@ -9,7 +9,7 @@ use std::{
 use axon_transport::qos::Qos;
 
 use super::events::Event;
-use crate::{cli, failure::CliError, log::Survey, logging, play, session};
+use crate::{cli, failure::CliError, log::Survey, logging, play, served::Served, session};
 
 /// How often it says how far it is.
 const REPORT: Duration = Duration::from_millis(200);
@@ -38,7 +38,9 @@ pub(crate) fn run(args: &cli::DemoPlayer) -> Result<(), CliError> {
 
     let stopped = end_of_stdin();
     let mut reported = Instant::now();
-    let sent = play::replay(&survey, &publishers, (args.rate, 0), |progress| {
+    let mut served = Served::new(Qos::keep_all(), publishers.len());
+    let pace = (args.rate, 0);
+    let sent = play::replay(&survey, &session, &publishers, &mut served, pace, |progress| {
         if reported.elapsed() >= REPORT {
             reported = Instant::now();
             Event::Progress { messages: progress.messages }.say()?;
