@@ -1,6 +1,9 @@
 //! The state of the control plane in a running daemon. One thread uses it, and no borrow of it lives across
 //! an await.
 
+#[cfg(test)]
+mod tests;
+
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
     net::IpAddr,
@@ -334,6 +337,8 @@ impl Control {
         self.draining = false;
         self.links.clear();
         self.linked.clear();
+        self.refused_routes.clear();
+        self.told = Told::default();
         self.relist();
         let daemons: BTreeSet<DaemonId> =
             self.registry.remote_endpoints().map(|(daemon, _)| *daemon).collect();
