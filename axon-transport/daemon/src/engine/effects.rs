@@ -80,21 +80,30 @@ impl Effects {
         unacknowledged: &[(Arc<str>, u64)],
         counted: Vec<Loss>,
     ) {
-        for (topic, samples) in unacknowledged {
-            tracing::warn!(topic = &**topic, peer = %daemon, samples,
+        if !unacknowledged.is_empty() {
+            let all = unacknowledged.iter().map(|(topic, samples)| (&**topic, *samples));
+            let (topics, samples) = counters::by_topic(all);
+            tracing::warn!(peer = %daemon, samples, topics,
                 "the link ended before the peer acknowledged them: samples may be lost");
         }
         self.tell_lost(peer, counted);
     }
 
-    /// Logs, and tells the control plane, that a relay was kept for a peer that did not come back.
-    pub(super) fn tell_relay_given_up(&mut self, topic: String, samples: u64) {
+    /// Logs, and tells the control plane, that relays were kept for peers that did not come back: samples by topic.
+    pub(super) fn tell_relays_given_up(&mut self, given_up: Vec<(String, u64)>) {
+        if given_up.is_empty() {
+            return;
+        }
+        let all = given_up.iter().map(|(topic, samples)| (&**topic, *samples));
+        let (topics, samples) = counters::by_topic(all);
         tracing::warn!(
-            topic,
             samples,
-            "a peer's daemon was restarted and did not ask for the topic again: samples are lost"
+            topics,
+            "a peer's daemon was restarted and did not ask for the topics again: samples are lost"
         );
-        self.tell(ToControl::Lost { topic, cause: "link_ended", samples });
+        for (topic, samples) in given_up {
+            self.tell(ToControl::Lost { topic, cause: "link_ended", samples });
+        }
     }
 
     /// Logs, and tells the control plane, that a peer does not read a route that it asked for.
@@ -143,6 +152,8 @@ impl Effects {
 
 #[cfg(test)]
 mod tests {
+    use std::{io, sync::Mutex};
+
     use super::*;
 
     /// What the control plane is told.
@@ -174,8 +185,47 @@ mod tests {
         let unacknowledged = [("/t".into(), 2)];
         let counted = vec![Loss { topic: "/t".into(), cause: "link_ended", samples: 2 }];
         effects.tell_link_over(DaemonId([1; 16]), "peer", &unacknowledged, counted);
-        effects.tell_relay_given_up("/u".into(), 3);
+        effects.tell_relays_given_up(vec![("/u".into(), 3)]);
         assert_eq!(told(&mut effects), ["/t: 2 link_ended", "/u: 3 link_ended"]);
+    }
+
+    /// A log in memory.
+    #[derive(Clone, Default)]
+    struct Sink(Arc<Mutex<Vec<u8>>>);
+
+    impl io::Write for Sink {
+        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+            self.0.lock().unwrap().write(bytes)
+        }
+
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn a_link_that_ends_and_relays_that_are_given_up_have_one_line_each() {
+        let log = Sink::default();
+        let sink = log.clone();
+        let subscriber = tracing_subscriber::fmt().with_ansi(false);
+        let subscriber = subscriber.with_writer(move || sink.clone());
+        let names: Vec<_> = (10..60).map(|number| format!("/topic_{number}")).collect();
+        tracing::subscriber::with_default(subscriber.finish(), || {
+            let mut effects = Effects::default();
+            let unacknowledged: Vec<_> = names.iter().map(|name| ((&**name).into(), 2)).collect();
+            effects.tell_link_over(DaemonId([1; 16]), "peer", &unacknowledged, Vec::new());
+            effects.tell_relays_given_up(names.iter().map(|name| (name.clone(), 3)).collect());
+            effects.tell_link_over(DaemonId([1; 16]), "peer", &[], Vec::new());
+            effects.tell_relays_given_up(Vec::new());
+            assert_eq!(told(&mut effects).len(), 50);
+        });
+        let log = String::from_utf8(log.0.lock().unwrap().clone()).unwrap();
+        let [over, given_up] = &log.lines().collect::<Vec<_>>()[..] else { panic!("{log}") };
+        for (line, samples, others) in [(over, 100, 60), (given_up, 150, 90)] {
+            assert_eq!(line.matches("/topic_").count(), 20, "{line}");
+            assert!(line.contains(&format!("samples={samples}")), "{line}");
+            assert!(line.contains(&format!("{others} of 30 other topics")), "{line}");
+        }
     }
 
     #[test]
