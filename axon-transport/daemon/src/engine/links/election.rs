@@ -108,7 +108,7 @@ impl Links {
             }
             return;
         }
-        let account = self.accounts.of(&who.host_identity(address));
+        let account = self.accounts.of(&who.host_identity(address), &who.budget(address));
         let Some(connection) = self.connections.get_mut(number) else { return };
         connection.control.charge_to(&account);
         let Some(link) = self.table.get_mut(number) else { return };
