@@ -11,7 +11,7 @@ use super::{
     refusal::{Refusal, RefusedBy},
 };
 use crate::{
-    bridge::ToControl,
+    bridge::{RefusalKind, ToControl},
     keys::{Origin, Request},
 };
 
@@ -107,18 +107,18 @@ impl Effects {
     }
 
     /// Logs, and tells the control plane, that a peer does not read a route that it asked for.
-    pub(super) fn tell_stalled(&mut self, peer: String, stalled: StalledRoute) {
+    pub(super) fn tell_stalled(&mut self, kind: RefusalKind, peer: String, stalled: StalledRoute) {
         let StalledRoute { topic, reason, samples } = stalled;
         tracing::warn!(topic, samples, "samples are lost: a peer does not read the topic");
         let what = format!("topic {topic}");
-        self.tell(ToControl::Refusal { peer, what, reason });
+        self.tell(ToControl::Refusal { kind, peer, what, reason });
         self.tell(ToControl::Lost { topic, cause: "stalled", samples });
     }
 
     /// Passes on what the links report.
     pub(super) fn tell_report(&mut self, report: LinkReport) {
         match report {
-            LinkReport::Refused(peer, refusal) => self.tell_refused(peer, &refusal),
+            LinkReport::Refused(kind, peer, refusal) => self.tell_refused(kind, peer, refusal),
             LinkReport::DialFailed { daemon, standing } => {
                 self.tell(ToControl::DialFailed { daemon, standing });
             }
@@ -129,19 +129,15 @@ impl Effects {
         }
     }
 
-    fn tell_refused(&mut self, peer: String, refusal: &Refusal) {
-        if refusal.by == RefusedBy::Network {
-            tracing::debug!(peer, %refusal, "no link");
-        } else {
-            tracing::warn!(peer, %refusal, "link refused");
-        }
+    /// Tells the control plane, which logs it.
+    fn tell_refused(&mut self, kind: RefusalKind, peer: String, refusal: Refusal) {
         let by = match refusal.by {
             RefusedBy::Here => "refused here",
             RefusedBy::Peer => "refused by the peer",
             RefusedBy::Network => "not reached",
         };
         let reason = format!("{by}: {}", refusal.reason);
-        self.tell(ToControl::Refusal { peer, what: refusal.name.clone(), reason });
+        self.tell(ToControl::Refusal { kind, peer, what: refusal.name, reason });
     }
 
     /// The next effect.
@@ -163,7 +159,7 @@ mod tests {
             Effect::Tell(ToControl::Lost { topic, cause, samples }) => {
                 format!("{topic}: {samples} {cause}")
             }
-            Effect::Tell(ToControl::Refusal { peer, what, reason }) => {
+            Effect::Tell(ToControl::Refusal { peer, what, reason, .. }) => {
                 format!("{peer}, {what}: {reason}")
             }
             Effect::Tell(ToControl::Draining(draining)) => format!("draining: {draining}"),
@@ -232,7 +228,7 @@ mod tests {
     fn a_route_that_stalls_is_a_refusal_and_a_loss() {
         let mut effects = Effects::default();
         let stalled = StalledRoute { topic: "/t".into(), reason: "why".into(), samples: 4 };
-        effects.tell_stalled("peer".into(), stalled);
+        effects.tell_stalled(RefusalKind::Peer, "peer".into(), stalled);
         assert_eq!(told(&mut effects), ["peer, topic /t: why", "/t: 4 stalled"]);
     }
 }

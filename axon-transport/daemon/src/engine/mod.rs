@@ -421,7 +421,8 @@ impl Engine {
                 };
                 let Some(peer) = self.peers.get(daemon) else { return };
                 peer.counters.dropped("stalled", stalled.samples);
-                self.effects.tell_stalled(self.links.peer_text(peer.link), stalled);
+                let (kind, text) = (self.links.kind(peer.link), self.links.peer_text(peer.link));
+                self.effects.tell_stalled(kind, text, stalled);
             }
         }
     }
