@@ -65,6 +65,22 @@ pub struct RefusedRoute {
     pub reason: String,
 }
 
+/// What is known of somebody who is refused. Each kind has a rate limit of its own in the log, and a share of the
+/// refusals that status shows, so that a flood of one kind hides no other.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RefusalKind {
+    /// A beacon says so, and anybody can send one.
+    Beacon,
+    /// It has not proved who it is, or was dialled at an address that discovery found.
+    Unproven,
+    /// It is at the address of a static peer.
+    Listed,
+    /// It proved who it is.
+    Peer,
+    /// It is a session, or an endpoint, of this host.
+    Local,
+}
+
 /// The settings on what crosses between hosts that may change while the gateway runs.
 #[derive(Clone, Debug)]
 #[non_exhaustive]
@@ -137,6 +153,8 @@ pub enum ToControl {
     Datagrams(Datagrams),
     /// Somebody was refused, by this host or by the other.
     Refusal {
+        /// What is known of the other.
+        kind: RefusalKind,
         /// The other: a daemon id, SAE ID or address.
         peer: String,
         /// What was refused, such as `handshake` or the variable that differs.

@@ -42,6 +42,7 @@ use super::{
     turns::Turn,
 };
 use crate::{
+    bridge::RefusalKind,
     control::relayed::DaemonRelay,
     watch::{watch, watch_shared},
 };
@@ -212,7 +213,7 @@ fn refuse(
 ) {
     let what = if refused.variable.is_empty() { "session" } else { &refused.variable }.to_owned();
     let who = format!("session {name} (pid {})", peer.pid);
-    control.refused(who, what, refused.text.clone());
+    control.refused(RefusalKind::Local, who, what, refused.text.clone());
     say(socket, Message::Refused(refused), &[]);
 }
 

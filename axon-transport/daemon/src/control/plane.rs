@@ -1,8 +1,12 @@
 //! The state of the control plane in a running daemon. One thread uses it, and no borrow of it lives across
 //! an await.
 
+mod refusals;
+#[cfg(test)]
+mod tests;
+
 use std::{
-    collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
+    collections::{BTreeMap, BTreeSet, HashMap},
     net::IpAddr,
     os::fd::OwnedFd,
     rc::Rc,
@@ -25,18 +29,16 @@ use axon_transport::{
 };
 use tokio::sync::{Notify, watch};
 
+use self::refusals::Refusals;
 use super::{
     admission::Admission, losses::Losses, report::waiting::Told, room::Spare, turns::Turns,
 };
 use crate::{
-    bridge::{RefusedRoute, ToControl, TrafficRules},
+    bridge::{RefusalKind, RefusedRoute, ToControl, TrafficRules},
     daemon_key::DaemonKey,
     discovery::Wanted,
     owner::SessionKeys,
 };
-
-/// Refusals that are remembered.
-const REFUSALS: usize = 32;
 
 pub(super) struct Control {
     pub(super) config: Arc<Config>,
@@ -52,7 +54,7 @@ pub(super) struct Control {
     pub(super) refused_routes: BTreeMap<String, Vec<RefusedRoute>>,
     /// The sessions that were told of them.
     told: Told,
-    pub(super) refusals: VecDeque<RefusalStatus>,
+    pub(super) refusals: Refusals,
     /// Descriptors for callers that are refused for want of any.
     pub(super) spare: Rc<Spare>,
     /// Sessions that were refused for want of descriptors.
@@ -115,7 +117,7 @@ impl Control {
             links: BTreeMap::new(),
             refused_routes: BTreeMap::new(),
             told: Told::default(),
-            refusals: VecDeque::new(),
+            refusals: Refusals::default(),
             spare: Rc::new(spare),
             crowded_out: 0,
             crowded_log: LogLimit::default(),
@@ -196,7 +198,7 @@ impl Control {
                 || format!("session {id}"),
                 |session| format!("session {} (pid {})", session.name, session.pid),
             );
-            self.refused(who, "endpoint".into(), why);
+            self.refused(RefusalKind::Local, who, "endpoint".into(), why);
         }
         for id in self.registry.take_ready() {
             if let Some(bell) = self.wakers.get(&id) {
@@ -224,11 +226,16 @@ impl Control {
         self.draining || self.registry.is_needed()
     }
 
-    pub(super) fn refused(&mut self, peer: String, what: String, reason: String) {
-        tracing::warn!(peer, what, reason, "refused");
-        // The same peer refused for the same cause again is the same news.
-        self.refusals.retain(|r| r.peer != peer || r.what != what || r.reason != reason);
-        self.show_refusal(peer, what, reason);
+    /// Logs and shows that somebody is refused.
+    pub(super) fn refused(
+        &mut self,
+        kind: RefusalKind,
+        peer: String,
+        what: String,
+        reason: String,
+    ) {
+        refusals::warn(kind, &peer, &what, &reason);
+        self.refusals.add(kind, RefusalStatus::new(SystemTime::now(), peer, what, reason));
     }
 
     /// A session is refused for want of descriptors. All those of a host may come again and again.
@@ -239,15 +246,9 @@ impl Control {
             tracing::warn!(peer, reason, sessions, "sessions are refused for want of descriptors");
         }
         // The numbers in the reason change.
-        self.refusals.retain(|r| r.peer != peer || r.what != WHAT);
-        self.show_refusal(peer, WHAT.to_owned(), reason);
-    }
-
-    fn show_refusal(&mut self, peer: String, what: String, reason: String) {
-        if self.refusals.len() == REFUSALS {
-            self.refusals.pop_front();
-        }
-        self.refusals.push_back(RefusalStatus::new(SystemTime::now(), peer, what, reason));
+        self.refusals.forget(&peer, WHAT);
+        let refusal = RefusalStatus::new(SystemTime::now(), peer, WHAT.to_owned(), reason);
+        self.refusals.add(RefusalKind::Local, refusal);
     }
 
     /// What the gateway says, but for what concerns discovery alone.
@@ -287,7 +288,9 @@ impl Control {
                 self.linked.remove(&daemon);
                 self.relist();
             }
-            ToControl::Refusal { peer, what, reason } => self.refused(peer, what, reason),
+            ToControl::Refusal { kind, peer, what, reason } => {
+                self.refused(kind, peer, what, reason);
+            }
             ToControl::Keys(keys) => self.keys = keys,
             ToControl::Lost { topic, cause, samples } => self.lost.add(&topic, cause, samples),
             ToControl::Draining(draining) => self.draining = draining,
@@ -334,6 +337,8 @@ impl Control {
         self.draining = false;
         self.links.clear();
         self.linked.clear();
+        self.refused_routes.clear();
+        self.told = Told::default();
         self.relist();
         let daemons: BTreeSet<DaemonId> =
             self.registry.remote_endpoints().map(|(daemon, _)| *daemon).collect();

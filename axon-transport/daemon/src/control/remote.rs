@@ -22,7 +22,7 @@ use super::{
     plane::Control,
 };
 use crate::{
-    bridge::{CHANNEL, ToControl, ToGateway, TrafficRules},
+    bridge::{CHANNEL, RefusalKind, ToControl, ToGateway, TrafficRules},
     discovery::{self, Action, Event},
 };
 
@@ -196,7 +196,7 @@ impl Remote {
                 let what = mismatch.setting.to_owned();
                 let reason =
                     format!("{what} is {} here and {} there", mismatch.ours, mismatch.theirs);
-                control.borrow_mut().refused(peer, what, reason);
+                control.borrow_mut().refused(RefusalKind::Beacon, peer, what, reason);
             }
             Action::Named(names) => {
                 self.listed = names.values().flatten().copied().collect();

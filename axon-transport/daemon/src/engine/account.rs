@@ -1,7 +1,8 @@
 //! Limits what one peer may make this daemon hold, over all of its daemon ids and links.
 //!
-//! A peer here is an identity: its proven SAE ID, pinned name or certificate host, else its address. A
-//! [`Charge`] holds what counts for a [`Meter`], and gives it back when it is dropped.
+//! A peer here is an identity: its proven SAE ID, pinned name or certificate host, else its address. Addresses of one IPv6
+//! network share what they may take, as a host may have any of them. A [`Charge`] holds what counts for a [`Meter`], and
+//! gives it back when it is dropped.
 
 #[cfg(test)]
 mod tests;
@@ -267,11 +268,11 @@ impl MessageMemory {
     }
 }
 
-/// The account of one identity.
-#[derive(Debug)]
+/// The account of one identity. Those that share a budget have all but their `limits` in common: rules tell them apart.
+#[derive(Clone, Debug)]
 pub(crate) struct Account {
-    /// Whose it is.
-    pub(crate) identity: Rc<str>,
+    /// Whose budget it is.
+    pub(crate) budget: Rc<str>,
     /// Bytes of its graph.
     pub(crate) graph: Rc<Meter>,
     /// Bytes of the routes that it asks for: on their own, so that one whose graph is full is served.
@@ -299,24 +300,24 @@ pub(crate) struct Account {
     /// Sessions that it proved to be its own.
     pub(crate) sessions: Rc<Meter>,
     /// Its publishers, or clients, that each route shows.
-    writers: RefCell<HashMap<RouteKey, Weak<Meter>>>,
+    writers: Rc<RefCell<HashMap<RouteKey, Weak<Meter>>>>,
     /// How much of which topic may pass.
     pub(crate) limits: Rc<Limits>,
     /// When its changes are followed up.
-    pub(crate) turns: RefCell<Turns>,
-    said: RefCell<Bucket>,
+    pub(crate) turns: Rc<RefCell<Turns>>,
+    said: Rc<RefCell<Bucket>>,
 }
 
 impl Account {
     fn new(
-        identity: &str,
+        budget: &str,
         graph: usize,
         [relays, lanes, stand_ins]: [&Rc<Meter>; 3],
         held: Arc<Allowance>,
         limits: Rc<Limits>,
     ) -> Self {
         Self {
-            identity: identity.into(),
+            budget: budget.into(),
             graph: Meter::new(graph),
             routes: Meter::new(ROUTES_TO_GRAPH.saturating_mul(graph)),
             relays: Meter::within(relays, MAX_RELAYS),
@@ -330,10 +331,10 @@ impl Account {
             held,
             refusals: Meter::new(REFUSALS),
             sessions: Meter::new(MAX_PROVEN),
-            writers: RefCell::default(),
+            writers: Rc::default(),
             limits,
-            turns: RefCell::default(),
-            said: RefCell::new(Bucket::new(SAID.0, SAID.1)),
+            turns: Rc::default(),
+            said: Rc::new(RefCell::new(Bucket::new(SAID.0, SAID.1))),
         }
     }
 
@@ -422,7 +423,7 @@ pub(crate) struct Accounts {
     open: HashMap<String, Weak<Account>>,
     /// What passed of late, also of identities without a link: a new link gives them no more.
     limits: HashMap<String, Rc<Limits>>,
-    /// What the stand-ins of an identity hold. Readers may be at it when its last link is over.
+    /// What the stand-ins of a budget hold. Readers may be at it when its last link is over.
     held_by: HashMap<String, SharedWeak<Allowance>>,
 }
 
@@ -435,8 +436,14 @@ impl Accounts {
         Self { graph, relays, lanes, stand_ins, held, open, limits, held_by }
     }
 
-    /// The account of an identity.
-    pub(crate) fn of(&mut self, identity: &str) -> Rc<Account> {
+    /// The account of an identity that has a budget of its own.
+    #[cfg(test)]
+    pub(crate) fn of_one(&mut self, identity: &str) -> Rc<Account> {
+        self.of(identity, identity)
+    }
+
+    /// The account of an identity, which takes from this `budget`.
+    pub(crate) fn of(&mut self, identity: &str, budget: &str) -> Rc<Account> {
         if let Some(account) = self.open.get(identity).and_then(Weak::upgrade) {
             return account;
         }
@@ -445,20 +452,27 @@ impl Accounts {
             self.limits.retain(|_, limits| Rc::strong_count(limits) > 1);
         }
         let limits = Rc::clone(self.limits.entry(identity.to_owned()).or_default());
-        let held = self.held_by(identity);
-        let pools = [&self.relays, &self.lanes, &self.stand_ins];
-        let account = Rc::new(Account::new(identity, self.graph, pools, held, limits));
+        let mut open = self.open.values().filter_map(Weak::upgrade);
+        let account = match open.find(|account| *account.budget == *budget) {
+            Some(account) => Account { limits, ..(*account).clone() },
+            None => {
+                let held = self.held_by(budget);
+                let pools = [&self.relays, &self.lanes, &self.stand_ins];
+                Account::new(budget, self.graph, pools, held, limits)
+            }
+        };
+        let account = Rc::new(account);
         self.open.insert(identity.to_owned(), Rc::downgrade(&account));
         account
     }
 
-    fn held_by(&mut self, identity: &str) -> Arc<Allowance> {
-        if let Some(held) = self.held_by.get(identity).and_then(SharedWeak::upgrade) {
+    fn held_by(&mut self, budget: &str) -> Arc<Allowance> {
+        if let Some(held) = self.held_by.get(budget).and_then(SharedWeak::upgrade) {
             return held;
         }
         self.held_by.retain(|_, held| held.strong_count() > 0);
         let held = Allowance::within(&self.held.0, self.held.1);
-        self.held_by.insert(identity.to_owned(), Arc::downgrade(&held));
+        self.held_by.insert(budget.to_owned(), Arc::downgrade(&held));
         held
     }
 }

@@ -2,6 +2,7 @@
 
 use std::{
     cell::{Cell, RefCell},
+    cmp::Reverse,
     collections::BTreeMap,
     sync::Arc,
 };
@@ -16,6 +17,8 @@ const TOPICS: usize = 2048;
 const NAME: usize = 1024;
 /// How much of a name is logged, in characters.
 const LOGGED: usize = 256;
+/// How many topics one line of the log names.
+const NAMED: usize = 20;
 
 /// Samples of one topic that were dropped for one cause.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -93,6 +96,26 @@ impl Counters {
     }
 }
 
+/// Samples by topic, for one line of the log: the topics that have most of them by name, and how many others there are. A
+/// line for each would be left out where there are many: the log's rate limit is by line of code.
+pub(crate) fn by_topic<'a>(samples: impl IntoIterator<Item = (&'a str, u64)>) -> (String, u64) {
+    let mut topics = BTreeMap::<_, u64>::new();
+    for (topic, samples) in samples {
+        let of_topic = topics.entry(topic).or_default();
+        *of_topic = of_topic.saturating_add(samples);
+    }
+    let mut topics: Vec<_> = topics.into_iter().collect();
+    topics.sort_by_key(|(_, samples)| Reverse(*samples));
+    let sum = |topics: &[(_, u64)]| topics.iter().fold(0_u64, |all, of| all.saturating_add(of.1));
+    let (named, others) = topics.split_at(topics.len().min(NAMED));
+    let named = named.iter().map(|(topic, samples)| format!("{} {samples}", plain(topic, LOGGED)));
+    let mut text = named.collect::<Vec<_>>().join(", ");
+    if !others.is_empty() {
+        text += &format!(", {} of {} other topics", sum(others), others.len());
+    }
+    (text, sum(&topics))
+}
+
 /// Logs what was lost on the way to or from a peer, in one line: the topic that lost most by name. What `max_hz` leaves
 /// out is what its author wants.
 pub(crate) fn log(losses: &[Loss], peer: &str) {
@@ -143,6 +166,20 @@ mod tests {
         counters.fill(&mut status);
         let of_link = [("late", 1), ("no_key", 1), ("queue", 5)];
         assert_eq!(status.dropped, of_link.map(|(cause, n)| (cause.to_owned(), n)).into());
+    }
+
+    #[test]
+    fn a_line_names_the_topics_with_most_samples_and_counts_the_others() {
+        let names: Vec<_> = (1..=50).map(|number| format!("/t{number}")).collect();
+        let (text, samples) = by_topic(names.iter().map(|name| (&**name, 3)).chain([("/t50", 2)]));
+        assert_eq!(samples, 152);
+        let parts: Vec<_> = text.split(", ").collect();
+        assert_eq!((parts.len(), parts[0]), (NAMED + 1, "/t50 5"));
+        assert!(parts[1..NAMED].iter().all(|part| part.ends_with(" 3")), "{text}");
+        assert_eq!(parts[NAMED], "90 of 30 other topics");
+        assert_eq!(by_topic([("/a", 1), ("/b", 2)]), ("/b 2, /a 1".to_owned(), 3));
+        let long = "n".repeat(NAME);
+        assert!(by_topic([(&*long, 1)]).0.len() < 2 * LOGGED);
     }
 
     #[test]

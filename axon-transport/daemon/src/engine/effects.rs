@@ -11,7 +11,7 @@ use super::{
     refusal::{Refusal, RefusedBy},
 };
 use crate::{
-    bridge::ToControl,
+    bridge::{RefusalKind, ToControl},
     keys::{Origin, Request},
 };
 
@@ -80,36 +80,45 @@ impl Effects {
         unacknowledged: &[(Arc<str>, u64)],
         counted: Vec<Loss>,
     ) {
-        for (topic, samples) in unacknowledged {
-            tracing::warn!(topic = &**topic, peer = %daemon, samples,
+        if !unacknowledged.is_empty() {
+            let all = unacknowledged.iter().map(|(topic, samples)| (&**topic, *samples));
+            let (topics, samples) = counters::by_topic(all);
+            tracing::warn!(peer = %daemon, samples, topics,
                 "the link ended before the peer acknowledged them: samples may be lost");
         }
         self.tell_lost(peer, counted);
     }
 
-    /// Logs, and tells the control plane, that a relay was kept for a peer that did not come back.
-    pub(super) fn tell_relay_given_up(&mut self, topic: String, samples: u64) {
+    /// Logs, and tells the control plane, that relays were kept for peers that did not come back: samples by topic.
+    pub(super) fn tell_relays_given_up(&mut self, given_up: Vec<(String, u64)>) {
+        if given_up.is_empty() {
+            return;
+        }
+        let all = given_up.iter().map(|(topic, samples)| (&**topic, *samples));
+        let (topics, samples) = counters::by_topic(all);
         tracing::warn!(
-            topic,
             samples,
-            "a peer's daemon was restarted and did not ask for the topic again: samples are lost"
+            topics,
+            "a peer's daemon was restarted and did not ask for the topics again: samples are lost"
         );
-        self.tell(ToControl::Lost { topic, cause: "link_ended", samples });
+        for (topic, samples) in given_up {
+            self.tell(ToControl::Lost { topic, cause: "link_ended", samples });
+        }
     }
 
     /// Logs, and tells the control plane, that a peer does not read a route that it asked for.
-    pub(super) fn tell_stalled(&mut self, peer: String, stalled: StalledRoute) {
+    pub(super) fn tell_stalled(&mut self, kind: RefusalKind, peer: String, stalled: StalledRoute) {
         let StalledRoute { topic, reason, samples } = stalled;
         tracing::warn!(topic, samples, "samples are lost: a peer does not read the topic");
         let what = format!("topic {topic}");
-        self.tell(ToControl::Refusal { peer, what, reason });
+        self.tell(ToControl::Refusal { kind, peer, what, reason });
         self.tell(ToControl::Lost { topic, cause: "stalled", samples });
     }
 
     /// Passes on what the links report.
     pub(super) fn tell_report(&mut self, report: LinkReport) {
         match report {
-            LinkReport::Refused(peer, refusal) => self.tell_refused(peer, &refusal),
+            LinkReport::Refused(kind, peer, refusal) => self.tell_refused(kind, peer, refusal),
             LinkReport::DialFailed { daemon, standing } => {
                 self.tell(ToControl::DialFailed { daemon, standing });
             }
@@ -120,19 +129,15 @@ impl Effects {
         }
     }
 
-    fn tell_refused(&mut self, peer: String, refusal: &Refusal) {
-        if refusal.by == RefusedBy::Network {
-            tracing::debug!(peer, %refusal, "no link");
-        } else {
-            tracing::warn!(peer, %refusal, "link refused");
-        }
+    /// Tells the control plane, which logs it.
+    fn tell_refused(&mut self, kind: RefusalKind, peer: String, refusal: Refusal) {
         let by = match refusal.by {
             RefusedBy::Here => "refused here",
             RefusedBy::Peer => "refused by the peer",
             RefusedBy::Network => "not reached",
         };
         let reason = format!("{by}: {}", refusal.reason);
-        self.tell(ToControl::Refusal { peer, what: refusal.name.clone(), reason });
+        self.tell(ToControl::Refusal { kind, peer, what: refusal.name, reason });
     }
 
     /// The next effect.
@@ -143,6 +148,8 @@ impl Effects {
 
 #[cfg(test)]
 mod tests {
+    use std::{io, sync::Mutex};
+
     use super::*;
 
     /// What the control plane is told.
@@ -152,7 +159,7 @@ mod tests {
             Effect::Tell(ToControl::Lost { topic, cause, samples }) => {
                 format!("{topic}: {samples} {cause}")
             }
-            Effect::Tell(ToControl::Refusal { peer, what, reason }) => {
+            Effect::Tell(ToControl::Refusal { peer, what, reason, .. }) => {
                 format!("{peer}, {what}: {reason}")
             }
             Effect::Tell(ToControl::Draining(draining)) => format!("draining: {draining}"),
@@ -174,15 +181,54 @@ mod tests {
         let unacknowledged = [("/t".into(), 2)];
         let counted = vec![Loss { topic: "/t".into(), cause: "link_ended", samples: 2 }];
         effects.tell_link_over(DaemonId([1; 16]), "peer", &unacknowledged, counted);
-        effects.tell_relay_given_up("/u".into(), 3);
+        effects.tell_relays_given_up(vec![("/u".into(), 3)]);
         assert_eq!(told(&mut effects), ["/t: 2 link_ended", "/u: 3 link_ended"]);
+    }
+
+    /// A log in memory.
+    #[derive(Clone, Default)]
+    struct Sink(Arc<Mutex<Vec<u8>>>);
+
+    impl io::Write for Sink {
+        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+            self.0.lock().unwrap().write(bytes)
+        }
+
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn a_link_that_ends_and_relays_that_are_given_up_have_one_line_each() {
+        let log = Sink::default();
+        let sink = log.clone();
+        let subscriber = tracing_subscriber::fmt().with_ansi(false);
+        let subscriber = subscriber.with_writer(move || sink.clone());
+        let names: Vec<_> = (10..60).map(|number| format!("/topic_{number}")).collect();
+        tracing::subscriber::with_default(subscriber.finish(), || {
+            let mut effects = Effects::default();
+            let unacknowledged: Vec<_> = names.iter().map(|name| ((&**name).into(), 2)).collect();
+            effects.tell_link_over(DaemonId([1; 16]), "peer", &unacknowledged, Vec::new());
+            effects.tell_relays_given_up(names.iter().map(|name| (name.clone(), 3)).collect());
+            effects.tell_link_over(DaemonId([1; 16]), "peer", &[], Vec::new());
+            effects.tell_relays_given_up(Vec::new());
+            assert_eq!(told(&mut effects).len(), 50);
+        });
+        let log = String::from_utf8(log.0.lock().unwrap().clone()).unwrap();
+        let [over, given_up] = &log.lines().collect::<Vec<_>>()[..] else { panic!("{log}") };
+        for (line, samples, others) in [(over, 100, 60), (given_up, 150, 90)] {
+            assert_eq!(line.matches("/topic_").count(), 20, "{line}");
+            assert!(line.contains(&format!("samples={samples}")), "{line}");
+            assert!(line.contains(&format!("{others} of 30 other topics")), "{line}");
+        }
     }
 
     #[test]
     fn a_route_that_stalls_is_a_refusal_and_a_loss() {
         let mut effects = Effects::default();
         let stalled = StalledRoute { topic: "/t".into(), reason: "why".into(), samples: 4 };
-        effects.tell_stalled("peer".into(), stalled);
+        effects.tell_stalled(RefusalKind::Peer, "peer".into(), stalled);
         assert_eq!(told(&mut effects), ["peer, topic /t: why", "/t: 4 stalled"]);
     }
 }

@@ -60,7 +60,8 @@ impl Engine {
         if let Some(reason) = peer.newly_refused() {
             let who = self.links.summary(number).map(|summary| summary.who.to_string());
             let peer = format!("{} at {}", who.unwrap_or_default(), self.links.peer_text(number));
-            self.effects.tell(ToControl::Refusal { peer, what: "graph".into(), reason });
+            let (kind, what) = (self.links.kind(number), "graph".into());
+            self.effects.tell(ToControl::Refusal { kind, peer, what, reason });
         }
         let Some(peer) = self.peers.get_mut(daemon) else { return 0 };
         let GraphChange { reset, mut added, removed } = peer.remote.changes();

@@ -421,7 +421,8 @@ impl Engine {
                 };
                 let Some(peer) = self.peers.get(daemon) else { return };
                 peer.counters.dropped("stalled", stalled.samples);
-                self.effects.tell_stalled(self.links.peer_text(peer.link), stalled);
+                let (kind, text) = (self.links.kind(peer.link), self.links.peer_text(peer.link));
+                self.effects.tell_stalled(kind, text, stalled);
             }
         }
     }
@@ -521,9 +522,8 @@ impl Engine {
 
     /// Counts and logs what kept relays hold whose peers did not come back by this time.
     fn give_up_relays(&mut self, now: Duration) {
-        for (topic, samples) in self.peers.give_up_relays(now) {
-            self.effects.tell_relay_given_up(topic, samples);
-        }
+        let given_up = self.peers.give_up_relays(now);
+        self.effects.tell_relays_given_up(given_up);
     }
 
     /// Whether all connections are over.

@@ -115,7 +115,7 @@ mod tests {
                 number: number.into(),
                 daemon: DaemonId([number; 16]),
                 identity: number.to_string(),
-                account: accounts.of(&number.to_string()),
+                account: accounts.of_one(&number.to_string()),
                 permissions: Permissions::default(),
                 binding: None,
                 routes: None,

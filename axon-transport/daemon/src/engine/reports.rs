@@ -65,8 +65,8 @@ fn report_excess(peers: &mut Peers, links: &Links, effects: &mut Effects) {
              stand still until it gives them up"
         );
         tracing::warn!(peer = text, reason, "a peer sends too many long messages at a time");
-        let what = "long messages".to_owned();
-        effects.tell(ToControl::Refusal { peer: text, what, reason });
+        let (kind, what) = (links.kind(peer.link), "long messages".to_owned());
+        effects.tell(ToControl::Refusal { kind, peer: text, what, reason });
     }
 }
 

@@ -168,7 +168,7 @@ impl StandIns {
             forget(&mut known, now);
             self.clean_at.set(2 * known.len().max(KNOWN));
         }
-        let identity = Rc::clone(&account.identity);
+        let identity = Rc::clone(&account.budget);
         let stand_in_known = Known { stand_in: Rc::downgrade(&stand_in), numbers, identity };
         known.insert(remote.gid, stand_in_known);
         Ok(stand_in)
@@ -231,7 +231,7 @@ mod tests {
     #[test]
     fn an_identity_whose_publishers_come_and_go_has_none_of_another_forgotten() {
         let mut accounts = Accounts::new(1 << 20, 1 << 20);
-        let [flood, quiet] = ["flood", "quiet"].map(|of| Rc::clone(&accounts.of(of).identity));
+        let [flood, quiet] = ["flood", "quiet"].map(|of| Rc::clone(&accounts.of_one(of).budget));
         let mut known = HashMap::new();
         known.extend((0..10).map(|number| departed(&quiet, number, 1)));
         known.extend((10..210).map(|number| departed(&flood, number, u64::from(number))));

@@ -5,7 +5,7 @@ use axon_shm::ids::Gid;
 #[test]
 fn an_identity_has_one_account_and_what_is_dropped_is_given_back() {
     let mut accounts = Accounts::new(100, 1 << 20);
-    let (one, again, other) = (accounts.of("a"), accounts.of("a"), accounts.of("b"));
+    let (one, again, other) = (accounts.of_one("a"), accounts.of_one("a"), accounts.of_one("b"));
     let charge = one.graph.charge(60).unwrap();
     assert!(again.graph.charge(41).is_none(), "of the same identity");
     assert!(other.graph.charge(100).is_some());
@@ -14,21 +14,47 @@ fn an_identity_has_one_account_and_what_is_dropped_is_given_back() {
     drop(charge);
     assert!(again.graph.charge(100).is_some());
     drop((one, again));
-    assert_eq!(accounts.of("a").graph.held(), 0);
+    assert_eq!(accounts.of_one("a").graph.held(), 0);
     assert_eq!(accounts.open.len(), 2);
+}
+
+#[test]
+fn identities_with_one_budget_share_all_but_the_limits_of_rules() {
+    let mut accounts = Accounts::new(100, 1 << 20);
+    let [one, two] = ["a", "b"].map(|identity| accounts.of(identity, "network"));
+    let other = accounts.of("c", "another");
+    let charge = one.graph.charge(60).unwrap();
+    assert!(two.graph.charge(41).is_none() && other.graph.charge(41).is_some());
+    let meters = |account: &Account| {
+        let Account { routes, relays, lanes, unsent, decoded, denied, .. } = account.clone();
+        let Account { stand_ins, unread, messages, refusals, sessions, .. } = account.clone();
+        let long = [messages.long, messages.short, refusals, sessions, stand_ins, unread];
+        [routes, relays, lanes, unsent, decoded, denied].into_iter().chain(long)
+    };
+    assert!(meters(&one).zip(meters(&two)).all(|(one, two)| Rc::ptr_eq(&one, &two)));
+    assert!(!meters(&one).zip(meters(&other)).any(|(one, other)| Rc::ptr_eq(&one, &other)));
+    assert!(Arc::ptr_eq(&one.held, &two.held) && !Rc::ptr_eq(&one.limits, &two.limits));
+    let now = Instant::now();
+    one.owe(2 * SAID.1, now);
+    assert!(two.owe(1, now) > Duration::ZERO && other.owe(1, now) == Duration::ZERO);
+    // While one of them is there.
+    drop(one);
+    let again = accounts.of("a", "network");
+    assert_eq!((again.graph.held(), two.graph.held()), (60, 60));
+    drop(charge);
 }
 
 #[test]
 fn what_readers_have_of_an_identity_counts_when_it_comes_again() {
     let mut accounts = Accounts::new(100, 1000);
-    let account = accounts.of("a");
+    let account = accounts.of_one("a");
     let (ring, pool) = (Arc::clone(&account.held), Arc::clone(&accounts.held.0));
     drop(account);
-    assert!(Arc::ptr_eq(&accounts.of("a").held, &ring));
-    assert!(!Arc::ptr_eq(&accounts.of("b").held, &ring));
+    assert!(Arc::ptr_eq(&accounts.of_one("a").held, &ring));
+    assert!(!Arc::ptr_eq(&accounts.of_one("b").held, &ring));
     assert_eq!((ring.most(), pool.most()), (1000, 2000));
     drop(ring);
-    accounts.of("c");
+    accounts.of_one("c");
     assert_eq!(accounts.held_by.len(), 1, "{:?}", accounts.held_by);
 }
 

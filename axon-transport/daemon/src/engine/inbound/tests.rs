@@ -131,7 +131,7 @@ impl Way {
             samples: RefCell::default(),
             quiet: Cell::new(0),
         });
-        let account = Accounts::new(1 << 20, 1 << 20).of("peer");
+        let account = Accounts::new(1 << 20, 1 << 20).of_one("peer");
         let stand_in = StandIns::default().get(&One(Rc::clone(&ring)), &endpoint, &account, NOW);
         let mut inbound =
             Inbound::new(Rc::default(), MessageMemory::new(1 << 20, 1 << 20), 1 << 20, 0);

@@ -108,7 +108,7 @@ impl Links {
             }
             return;
         }
-        let account = self.accounts.of(&who.host_identity(address));
+        let account = self.accounts.of(&who.host_identity(address), &who.budget(address));
         let Some(connection) = self.connections.get_mut(number) else { return };
         connection.control.charge_to(&account);
         let Some(link) = self.table.get_mut(number) else { return };
@@ -159,8 +159,9 @@ impl Links {
         self.close_connection(number, CloseCode::NotAllowed, told, now);
         if let Some(address) = address {
             let peer = peer_text(hello.sae.as_deref(), address);
-            self.outbox
-                .report(LinkReport::Refused(peer, Refusal::here(CloseCode::NotAllowed, why)));
+            let kind = self.authenticated(address.ip());
+            let refusal = Refusal::here(CloseCode::NotAllowed, why);
+            self.outbox.report(LinkReport::Refused(kind, peer, refusal));
         }
     }
 
@@ -179,8 +180,9 @@ impl Links {
             && self.admission.is_news(address, instant)
         {
             let peer = self.peer_text(number);
-            self.outbox
-                .report(LinkReport::Refused(peer, Refusal::here(CloseCode::NotAllowed, text)));
+            let kind = self.authenticated(address);
+            let refusal = Refusal::here(CloseCode::NotAllowed, text);
+            self.outbox.report(LinkReport::Refused(kind, peer, refusal));
         }
         self.close_connection(number, CloseCode::NotAllowed, text, now);
         self.end_link(number, text, None, now);

@@ -1,11 +1,12 @@
 //! The ends of links: lost connections, broken rules, the end of the daemon.
 
-use std::time::Duration;
+use std::{net::IpAddr, time::Duration};
 
 use quinn_proto::ConnectionError;
 
 use super::{LinkEvent, LinkReport, Links, explained::explained, link::Phase};
 use crate::{
+    bridge::RefusalKind,
     engine::refusal::{Refusal, RefusedBy},
     link::CloseCode,
 };
@@ -37,7 +38,8 @@ impl Links {
                 if let Some(address) = address
                     && let Some(refusal) = explained(reason, resolver.as_deref(), address)
                 {
-                    self.refused_incoming(address, resolver.as_deref(), refusal);
+                    let kind = self.unauthenticated(address.ip());
+                    self.refused_incoming(kind, address, resolver.as_deref(), refusal);
                 }
             }
             Phase::Opening(opening) => {
@@ -52,6 +54,24 @@ impl Links {
                 self.end_link_of(number, &text, Some(refusal), restarted, now);
             }
         }
+    }
+
+    /// What is known of the peer of a link.
+    pub(in crate::engine) fn kind(&self, number: u64) -> RefusalKind {
+        let address = self.connections.address(number);
+        address.map_or(RefusalKind::Unproven, |address| self.authenticated(address.ip()))
+    }
+
+    /// What is known of a peer at this address whose handshake is complete.
+    pub(super) fn authenticated(&self, address: IpAddr) -> RefusalKind {
+        let proves = self.credentials.authenticates();
+        if proves { RefusalKind::Peer } else { self.unauthenticated(address) }
+    }
+
+    /// What is known of a host at this address, before it proves anything.
+    pub(super) fn unauthenticated(&self, address: IpAddr) -> RefusalKind {
+        let listed = self.admission.is_listed(address);
+        if listed { RefusalKind::Listed } else { RefusalKind::Unproven }
     }
 
     /// Ends a link since its host has another one.
@@ -82,7 +102,8 @@ impl Links {
     ) {
         if self.table.contains(number) {
             let peer = self.peer_text(number);
-            self.outbox.report(LinkReport::Refused(peer, Refusal::here(code, why)));
+            let kind = self.kind(number);
+            self.outbox.report(LinkReport::Refused(kind, peer, Refusal::here(code, why)));
             self.close_connection(number, code, told, now);
         }
         self.end_link(number, why, None, now);
@@ -132,7 +153,7 @@ impl Links {
         now: Duration,
     ) {
         let Some(link) = self.table.get(number) else { return };
-        let peer = self.peer_text(number);
+        let (peer, kind) = (self.peer_text(number), self.kind(number));
         let daemon = link.peer.as_ref().map(|peer| peer.summary.hello.daemon);
         self.table.remove(number);
         self.close_connection(number, CloseCode::Goodbye, "the control stream ended", now);
@@ -146,7 +167,7 @@ impl Links {
         if let Some(refusal) = refusal.filter(|refusal| refusal.by == RefusedBy::Peer)
             && !["GOODBYE", "DUPLICATE", "REPLACED"].contains(&refusal.name.as_str())
         {
-            self.outbox.report(LinkReport::Refused(peer.clone(), refusal));
+            self.outbox.report(LinkReport::Refused(kind, peer.clone(), refusal));
         }
         let reason = reason.to_owned();
         self.outbox.event(LinkEvent::Down { number, daemon, peer, reason, restarted });

@@ -6,6 +6,7 @@ use axon_shm::ids::DaemonId;
 use quinn_proto::StreamEvent;
 
 use crate::{
+    bridge::RefusalKind,
     discovery::{AddressConfidence, Datagrams},
     engine::{account::Charge, refusal::Refusal},
     link::{LinkClosed, Message},
@@ -49,7 +50,7 @@ pub(in crate::engine) enum LinkEvent {
 #[derive(Debug)]
 pub(in crate::engine) enum LinkReport {
     /// A link, or an attempt at one, was refused.
-    Refused(String, Refusal),
+    Refused(RefusalKind, String, Refusal),
     /// A dial failed.
     DialFailed { daemon: DaemonId, standing: AddressConfidence },
     /// A link of this daemon is up at this address. Whether the daemon proved its id.

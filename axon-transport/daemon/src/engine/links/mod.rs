@@ -37,6 +37,7 @@ use axon_transport::{
 use bytes::BytesMut;
 use quinn_proto::{Dir, EcnCodepoint, Event, StreamEvent, Transmit, TransportConfig};
 
+pub(crate) use self::admission::place;
 pub(super) use self::events::{LinkEvent, LinkReport};
 use self::{
     admission::Admission,
@@ -528,7 +529,9 @@ impl Links {
                 self.close_connection(number, CloseCode::Goodbye, "", now);
                 if let Some(address) = address {
                     let text = "the dialler did not finish its handshake within 10 s";
-                    self.refused_incoming(address, resolver.as_deref(), Refusal::network(text));
+                    let (kind, refusal) =
+                        (self.unauthenticated(address.ip()), Refusal::network(text));
+                    self.refused_incoming(kind, address, resolver.as_deref(), refusal);
                 }
             }
             Phase::Opening(opening) => {

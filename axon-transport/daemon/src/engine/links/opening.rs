@@ -12,6 +12,7 @@ use super::{
     link::{Link, Phase},
 };
 use crate::{
+    bridge::RefusalKind,
     engine::{
         link::{
             dialling::Action,
@@ -52,7 +53,8 @@ impl Links {
             if self.admission.is_news(source.ip(), instant) {
                 let text = "hosts at this address have as many handshakes under way as they may";
                 let refusal = Refusal::here(CloseCode::NotAllowed, text);
-                self.outbox.report(LinkReport::Refused(peer_text(None, source), refusal));
+                let kind = self.unauthenticated(source.ip());
+                self.outbox.report(LinkReport::Refused(kind, peer_text(None, source), refusal));
             }
             return;
         };
@@ -62,7 +64,9 @@ impl Links {
             Err(error) => {
                 self.connections.endpoints().refuse(endpoint, incoming);
                 let refusal = Refusal::here(CloseCode::Internal, error);
-                return self.outbox.report(LinkReport::Refused(peer_text(None, source), refusal));
+                let kind = self.unauthenticated(source.ip());
+                let report = LinkReport::Refused(kind, peer_text(None, source), refusal);
+                return self.outbox.report(report);
             }
         };
         if let Some(logged) = self.logged(Side::Server, source, now) {
@@ -77,7 +81,8 @@ impl Links {
             }
             Err(error) => {
                 if let Some(refusal) = explained(&error, resolver.as_deref(), source) {
-                    self.refused_incoming(source, resolver.as_deref(), refusal);
+                    let kind = self.unauthenticated(source.ip());
+                    self.refused_incoming(kind, source, resolver.as_deref(), refusal);
                 }
             }
         }
@@ -86,13 +91,14 @@ impl Links {
     /// Reports an incoming handshake that failed.
     pub(super) fn refused_incoming(
         &mut self,
+        kind: RefusalKind,
         source: SocketAddr,
         resolver: Option<&keys::Resolver>,
         refusal: Refusal,
     ) {
         let claimed = resolver.and_then(keys::Resolver::identity);
         let peer = peer_text(claimed.as_ref().map(|i| i.client_sae()), source);
-        self.outbox.report(LinkReport::Refused(peer, refusal));
+        self.outbox.report(LinkReport::Refused(kind, peer, refusal));
     }
 
     /// The TLS handshake of a connection is complete.
@@ -179,10 +185,11 @@ impl Links {
             self.close_connection(number, code, &told, now);
         }
         let Some(address) = address else { return };
+        let kind = self.authenticated(address.ip());
         match link.side {
-            Side::Server => self.refused_incoming(address, link.resolver.as_deref(), refusal),
+            Side::Server => self.refused_incoming(kind, address, link.resolver.as_deref(), refusal),
             Side::Client => {
-                self.outbox.report(LinkReport::Refused(peer_text(None, address), refusal));
+                self.outbox.report(LinkReport::Refused(kind, peer_text(None, address), refusal));
                 self.opening_failed(number);
             }
         }
@@ -246,7 +253,13 @@ impl Links {
             Action::Failed(refusal) => {
                 let Some(Dial { dialling, .. }) = self.dials.remove(dial) else { return };
                 let target = dialling.target();
-                self.outbox.report(LinkReport::Refused(target.text(), refusal));
+                // A successor is dialled where a peer with a link is.
+                let kind = match target.replaces {
+                    _ if target.listed => RefusalKind::Listed,
+                    Some(_) if self.credentials.authenticates() => RefusalKind::Peer,
+                    _ => RefusalKind::Unproven,
+                };
+                self.outbox.report(LinkReport::Refused(kind, target.text(), refusal));
                 if let (Some(daemon), Some(standing)) = (target.daemon, target.standing) {
                     self.outbox.report(LinkReport::DialFailed { daemon, standing });
                 }

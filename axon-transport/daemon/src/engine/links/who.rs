@@ -6,6 +6,7 @@ use axon_tls::identity::{Auth, SpkiDigest};
 
 use axon_transport::access::Party;
 
+use super::admission::place;
 use crate::link::Hello;
 
 /// As whom a peer proved itself.
@@ -94,7 +95,16 @@ impl Who {
             Self::Sae(sae) => format!("sae {sae}"),
             Self::Pinned(name, _) => format!("pin {name}"),
             Self::Host(name, _) => format!("host {name}"),
-            Self::Somebody(_) => format!("address {}", address.ip()),
+            Self::Somebody(_) => format!("address {}", address.ip().to_canonical()),
+        }
+    }
+
+    /// Tells whether two daemons share the budget of a peer: those of one host, and with nothing proven those of one IPv6
+    /// network, as a host may take any address in it.
+    pub(super) fn budget(&self, address: SocketAddr) -> String {
+        match self {
+            Self::Somebody(_) => format!("address {}", place(address.ip())),
+            _ => self.host_identity(address),
         }
     }
 }
@@ -135,6 +145,27 @@ mod tests {
         of(Some(&auth), None).unwrap_err();
         let none = Auth::None(SigningKey::generate().unwrap());
         assert!(matches!(of(Some(&none), Some(key)), Ok(Who::Somebody(Some(_)))));
+    }
+
+    #[test]
+    fn neighbours_that_prove_nothing_share_a_budget_and_are_two_hosts() {
+        let somebody = Who::Somebody(Some(SpkiDigest([1; 32])));
+        let at = |address: &str| address.parse().unwrap();
+        let same = |one: &str, other: &str| {
+            let [one, other] = [one, other].map(at);
+            [
+                somebody.host_identity(one) == somebody.host_identity(other),
+                somebody.budget(one) == somebody.budget(other),
+            ]
+        };
+        assert_eq!(same("[2001:db8::1]:1", "[2001:db8::2]:1"), [false, true]);
+        assert_eq!(same("[2001:db8::1]:1", "[2001:db8:0:1::1]:1"), [false, false]);
+        assert_eq!(same("10.0.0.1:1", "10.0.0.2:1"), [false, false]);
+        assert_eq!(same("10.0.0.1:1", "[::ffff:10.0.0.1]:2"), [true, true]);
+        let arm = Who::Sae("arm".into());
+        assert_eq!(arm.budget(at("10.0.0.1:1")), arm.host_identity(at("10.0.0.2:1")));
+        let base = Who::Sae("base".into());
+        assert_ne!(arm.budget(at("[::1]:1")), base.budget(at("[::1]:1")));
     }
 
     #[test]

@@ -402,7 +402,7 @@ mod tests {
 
     #[test]
     fn what_was_proved_on_one_connection_counts_for_nothing_on_the_next() {
-        let account = Accounts::new(10 * one(), 1 << 20).of("a");
+        let account = Accounts::new(10 * one(), 1 << 20).of_one("a");
         let mut remote = Remote::new(account, true, Permissions::default());
         let key = SessionKey::generate().unwrap();
         let (own, from) = (Gid::new(key.id(), 1), DaemonId([7; 16]));
@@ -435,7 +435,7 @@ mod tests {
 
     #[test]
     fn what_there_is_no_room_for_is_left_out_by_name_and_the_rest_counts() {
-        let account = Accounts::new(2 * one(), 1 << 20).of("a");
+        let account = Accounts::new(2 * one(), 1 << 20).of_one("a");
         let (mut remote, mut other) = (
             Remote::new(Rc::clone(&account), false, Permissions::default()),
             Remote::new(Rc::clone(&account), false, Permissions::default()),
@@ -461,7 +461,7 @@ mod tests {
 
     #[test]
     fn a_whole_graph_that_is_said_again_takes_no_more_and_changes_nothing() {
-        let account = Accounts::new(3 * one(), 1 << 20).of("a");
+        let account = Accounts::new(3 * one(), 1 << 20).of_one("a");
         let mut remote = Remote::new(Rc::clone(&account), false, Permissions::default());
         let all = || (1..=3).map(|n| endpoint(n, "/t")).collect::<Vec<_>>();
         remote.take(graph(0, all(), vec![], false));
@@ -481,7 +481,7 @@ mod tests {
     #[test]
     fn an_endpoint_whose_use_the_peer_denies_is_told_of_and_not_usable() {
         let mut remote =
-            Remote::new(Accounts::new(1 << 20, 1 << 30).of("a"), false, Permissions::default());
+            Remote::new(Accounts::new(1 << 20, 1 << 30).of_one("a"), false, Permissions::default());
         let both = || vec![endpoint(1, "/t"), endpoint(2, "/t")];
         let usable =
             |remote: &Remote| remote.usable().map(|e| e.endpoint.gid.0[0]).collect::<Vec<_>>();
@@ -498,7 +498,7 @@ mod tests {
     #[test]
     fn the_newest_state_of_an_endpoint_counts_once() {
         let mut remote =
-            Remote::new(Accounts::new(1 << 20, 1 << 20).of("a"), false, Permissions::default());
+            Remote::new(Accounts::new(1 << 20, 1 << 20).of_one("a"), false, Permissions::default());
         remote.take(graph(0, vec![endpoint(1, "/t")], vec![], false));
         changes(&mut remote);
         for before in (1..100).step_by(2) {
@@ -520,7 +520,7 @@ mod tests {
         let (own, others) = (SessionKey::generate().unwrap(), SessionKey::generate().unwrap());
         let (binding, here) = ([7; 32], DaemonId([1; 16]));
         let mut remote =
-            Remote::new(Accounts::new(1 << 20, 1 << 20).of("a"), true, Permissions::default());
+            Remote::new(Accounts::new(1 << 20, 1 << 20).of_one("a"), true, Permissions::default());
         remote.prove(&[prove(&own, &binding, here).unwrap()], &binding, here);
         // The proof of another host, for another connection.
         remote.prove(&[prove(&others, &[8; 32], here).unwrap()], &binding, here);

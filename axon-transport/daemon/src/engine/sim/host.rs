@@ -451,7 +451,7 @@ impl Host {
                 self.redial(daemon, now);
             }
             ToControl::DialFailed { daemon, .. } => self.redial(daemon, now),
-            ToControl::Refusal { peer, what, reason } => {
+            ToControl::Refusal { peer, what, reason, .. } => {
                 self.refusals.push_back((now, format!("{peer}: {what}: {reason}")));
             }
             ToControl::Lost { topic, cause, samples } => {

@@ -5,6 +5,7 @@ mod shares;
 use std::{collections::BTreeSet, net::IpAddr, rc::Rc, time::Instant};
 
 pub(super) use self::shares::Place;
+pub(crate) use self::shares::place;
 use self::shares::{Handshakes, Said, gives_way};
 
 /// Handshakes under way at once, but for those of listed peers; further dials are refused and come again.

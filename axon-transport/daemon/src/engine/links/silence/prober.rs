@@ -26,11 +26,15 @@ const GRACE_AFTER_LONG: Duration = Duration::from_millis(50);
 /// The side that was dialled waits for so much longer: two successors would be one too many.
 const DIALLED: Duration = Duration::from_millis(100);
 
-/// When a successor did not come about, probing begins again after this, and after twice as long each time:
-/// a dial may cost a key.
+/// When a successor did not come about, the next one is dialled after this, and after twice as long each time: a dial may
+/// cost a key.
 const AGAIN: Duration = Duration::from_secs(1);
 
 const AGAIN_AT_MOST: Duration = Duration::from_secs(8);
+
+/// So many probes in a row without an answer show that the path was cut after the dial, which may be why no successor came
+/// about. A lossy path loses one or two.
+const CUT: u32 = 3;
 
 /// What went over a connection, as far as silence is concerned.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -113,28 +117,32 @@ pub(in crate::engine::links) struct Prober {
     side: Side,
     next: Step,
     due: Duration,
-    /// A probe was sent and not answered.
-    asked: bool,
-    /// The pause after the next dial.
-    again: Duration,
+    /// Probes that were sent in a row and not answered.
+    asked: u32,
+    /// The last dial, and the pause after it.
+    dialled: Option<(Duration, Duration)>,
 }
 
 impl Prober {
     /// The link was found silent: a probe is due.
     pub(crate) fn new(side: Side) -> Self {
-        Self { side, next: Step::Probe, due: Duration::ZERO, asked: false, again: AGAIN }
+        Self { side, next: Step::Probe, due: Duration::ZERO, asked: 0, dialled: None }
     }
 
     /// Whether an answer to a probe counts.
     pub(crate) fn awaits_echo(&self) -> bool {
-        self.asked
+        self.asked > 0
     }
 
-    /// A probe was answered: QUIC is given some time more.
+    /// A probe was answered: QUIC is given some time more, and a successor that was dialled its pause.
     pub(crate) fn handle_echo(&mut self, now: Duration) {
+        self.asked = 0;
+        if self.dialled.is_some_and(|(at, pause)| now < at + pause) {
+            return;
+        }
         let grace = if now < LONG { GRACE } else { GRACE_AFTER_LONG };
         let more = if self.side == Side::Client { Duration::ZERO } else { DIALLED };
-        (self.next, self.due, self.asked) = (Step::Replace, now + grace + more, false);
+        (self.next, self.due) = (Step::Replace, now + grace + more);
     }
 
     /// When to call [`handle_timeout`](Self::handle_timeout).
@@ -148,21 +156,27 @@ impl Prober {
             return None;
         }
         let step = self.next;
-        let pause = match step {
-            Step::Probe => PROBE_EVERY,
-            Step::Replace => {
-                let pause = self.again;
-                self.again = (2 * pause).min(AGAIN_AT_MOST);
-                pause
+        match step {
+            Step::Probe => {
+                if self.asked >= CUT {
+                    self.dialled = None;
+                }
+                self.asked += 1;
             }
-        };
-        (self.next, self.due, self.asked) = (Step::Probe, now + pause, step == Step::Probe);
+            Step::Replace => {
+                let pause = self.dialled.map_or(AGAIN, |(_, pause)| 2 * pause);
+                self.dialled = Some((now, pause.min(AGAIN_AT_MOST)));
+            }
+        }
+        (self.next, self.due) = (Step::Probe, now + PROBE_EVERY);
         Some(step)
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::cell::Cell;
+
     use super::*;
 
     const ROUND_TRIP: Duration = Duration::from_millis(30);
@@ -232,6 +246,45 @@ mod tests {
             let after = again + HANDSHAKE - back;
             assert!(after <= Duration::from_millis(500), "{millis} ms: {after:?}");
         }
+    }
+
+    #[test]
+    fn a_path_that_returns_several_times_too_shortly_is_replaced_within_500_ms_of_its_last_return()
+    {
+        // How often it returns, for how long it works, and for how long it does not.
+        for returns in 1..6 {
+            for (works, cut) in [(50, 1_000), (100, 1_800), (300, 2_500), (700, 5_000)] {
+                let [works, cut] = [works, cut].map(Duration::from_millis);
+                let mut prober = Prober::new(Side::Client);
+                let mut back = cut;
+                for _ in 0..returns {
+                    let (_, dialled) = walk(&mut prober, |now| now >= back);
+                    // The handshake does not come through: the path is cut a moment after the dial.
+                    back = dialled + works + cut;
+                }
+                let (_, dialled) = walk(&mut prober, |now| now >= back);
+                let after = dialled + HANDSHAKE - back;
+                let most = Duration::from_millis(500);
+                assert!(after <= most, "{returns} returns, cut for {cut:?}: {after:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_lost_probe_is_no_cut() {
+        let mut prober = Prober::new(Side::Client);
+        let mut dials = Vec::new();
+        for _ in 0..6 {
+            // Of three probes one is answered.
+            let number = Cell::new(0);
+            let answered = |_| {
+                number.set(number.get() + 1);
+                number.get() % 3 == 1
+            };
+            dials.push(walk(&mut prober, answered).1);
+        }
+        let pauses: Vec<_> = dials.windows(2).map(|d| (d[1] - d[0]).as_secs()).collect();
+        assert_eq!(pauses, [1, 2, 4, 8, 8]);
     }
 
     #[test]

@@ -190,6 +190,32 @@ fn after_a_cut_of_60_s_samples_flow_within_half_a_second_and_none_is_lost() {
     flows_again_with(secs(60), Load::Many, Ways::Both, |config| config.link.stalled = secs(60));
 }
 
+/// Cuts the path, lets it return so briefly that no handshake comes through, several times, and then heals it.
+#[test]
+fn after_several_short_returns_samples_flow_within_half_a_second_of_the_last_and_none_is_lost() {
+    for (mode, config) in modes() {
+        // All together shorter than the time after which a route counts as one that is not read.
+        for (brief, pause, returns) in [(120, 1_500, 5), (350, 1_500, 5), (350, 2_500, 2)] {
+            let case = format!("{mode}, {returns} times back for {brief} ms after {pause} ms");
+            let mut of = Cut::new(90, &config, Load::Few);
+            of.publish(&[0, 1], secs(1));
+            for _ in 0..returns {
+                let broken = of.cut(Ways::Both);
+                of.publish(&[0, 1], millis(pause));
+                of.world.network.heal(broken);
+                of.world.run_for(millis(brief));
+            }
+            let broken = of.cut(Ways::Both);
+            of.publish(&[0, 1], millis(pause));
+            of.world.network.heal(broken);
+            let took = of.flows(&[0, 1]);
+            println!("{case}: {took:.0?}");
+            assert!(took <= BACK, "{case}: {took:?} {}", of.world.describe());
+            of.is_complete(&case);
+        }
+    }
+}
+
 #[test]
 fn after_a_cut_of_one_way_samples_flow_within_a_second_and_none_is_lost() {
     // After longer ones a route counts as one that is not read: the other host is heard.
