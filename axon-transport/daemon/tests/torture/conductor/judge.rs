@@ -171,7 +171,8 @@ pub(super) fn missed(players: &mut [Player], past: &Past) -> Gone {
             let at: u128 = at.parse().expect("a time");
             let number: u64 = messages.parse().expect("a number");
             let with_daemon = !living.contains(session(partner))
-                && (past.lost_daemon(at) || gaps.get(partner).is_some_and(|last| at <= last + NEXT_GAP));
+                && (past.lost_daemon(at)
+                    || gaps.get(partner).is_some_and(|last| at <= last + NEXT_GAP));
             if with_daemon {
                 gaps.insert(partner, at);
             }
