@@ -66,8 +66,13 @@ fn check_says_what_a_linked_peer_denies_and_that_a_changed_file_is_not_in_force(
     let (out, said) = robot.check("--subscribe", "/odom");
     assert!(out.contains("denied by line 3 of base.toml"), "{out}{said}");
     let (out, said) = robot.check("--subscribe", "/scan");
-    assert!(out.contains("no denial was heard"), "{out}{said}");
+    assert!(out.contains("allowed: no rule in base.toml denies this"), "{out}{said}");
     assert_eq!(said, "", "the file is in force");
+    // The peer answers for what no endpoint uses, and for services.
+    let (out, said) = robot.check("--subscribe", "/nobody");
+    assert!(out.contains("allowed: no rule in base.toml denies this"), "{out}{said}");
+    let (out, said) = base.check("--serve", "/x");
+    assert!(out.contains("denied by line 3 of robot.toml"), "{out}{said}");
     assert!(base.check("--publish", "/odom").0.contains("denied by line 3 of base.toml"));
 
     // The file is changed, and the daemon has not read it.

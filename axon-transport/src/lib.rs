@@ -23,8 +23,8 @@ pub use axon_shm::{ids, qos};
 pub use session::{
     CallError, Client, DaemonCommand, EndpointSpec, Event, GuardCondition, Lifetime, Loan,
     MessageInfo, Messages, Node, OnNew, Publisher, Ready, RecvError, Server, Session, SessionError,
-    SessionEvent, SessionOptions, Subscription, TrustedSubscription, Waitable, daemon_reload_at,
-    daemon_status, daemon_status_at,
+    SessionEvent, SessionOptions, Subscription, TrustedSubscription, Waitable,
+    daemon_check_access_at, daemon_reload_at, daemon_status, daemon_status_at,
 };
 
 /// What the other crates of AXON and its tests use of this one. It is not part of its interface, and changes

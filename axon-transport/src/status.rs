@@ -352,6 +352,33 @@ pub struct ReloadReport {
     pub error: Option<String>,
 }
 
+/// What access rules of a linked peer let this host do there.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
+pub struct PeerDecisions {
+    /// One decision for each use that was asked about, in that order.
+    pub decisions: Vec<PeerDecision>,
+    /// Why there are none.
+    pub error: Option<String>,
+}
+
+/// What a peer's access rules say of one use.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
+pub struct PeerDecision {
+    /// Whether the peer allows it.
+    pub allowed: bool,
+    /// Which rule decides, in the peer's words, without control characters.
+    pub reason: String,
+}
+
+impl PeerDecision {
+    /// What a peer said.
+    pub fn new(allowed: bool, reason: String) -> Self {
+        Self { allowed, reason }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

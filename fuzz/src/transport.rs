@@ -258,6 +258,14 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
             }],
             lifted: vec![link::DeniedUse { verb: 3, name: "/dock".into(), reason: String::new() }],
         }),
+        Message::AccessCheck(link::AccessCheck {
+            number: 5,
+            uses: vec![session::CheckedUse { verb: 4, name: "/scan".into() }],
+        }),
+        Message::AccessDecisions(link::AccessDecisions {
+            number: 5,
+            decisions: vec![link::UseDecision { allowed: true, reason: "line 4".into() }],
+        }),
         Message::Keys(KeyMessage::Announce(vec![key_id.clone(), KeyId::new("k2").unwrap()])),
         Message::Keys(KeyMessage::Ready { key_id: key_id.clone(), proof: [8; 32] }),
         Message::Keys(KeyMessage::Failed { key_id: key_id.clone(), reason: "unknown".into() }),
@@ -383,6 +391,10 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
         Message::Detach(Pair { reader, writer }),
         Message::Unmatch(Unmatch { reader, writer, reason: "gone".into() }),
         Message::StatusRequest,
+        Message::AccessCheck(session::AccessCheck {
+            daemon: DaemonId([9; 16]),
+            uses: vec![session::CheckedUse { verb: 0, name: "/scan".into() }],
+        }),
         Message::Status(StatusPart { part: 0, parts: 1, text: b"{}".to_vec() }),
         Message::Resync,
         Message::Segment(SegmentOpened { session, segment }),

@@ -5,8 +5,9 @@ use std::{io::Write as _, process::ExitCode};
 use axon_transport::{
     access::{AccessRules, InterfaceLimit, Party, Verb},
     config::{Config, DaemonPlace},
+    daemon_check_access_at,
     internal::graph::other_end,
-    status::{LinkStatus, Status},
+    status::{LinkStatus, PeerDecision, Status},
 };
 
 use super::cli;
@@ -15,6 +16,9 @@ use crate::{
     say::say,
     text::{TextTable, printable},
 };
+
+/// Uses that a peer is asked about at a time.
+const AT_ONCE: usize = 32;
 
 /// Runs `axon acl check`.
 pub(super) fn run(args: &cli::Check) -> Result<ExitCode, CliError> {
@@ -28,13 +32,16 @@ pub(super) fn run(args: &cli::Check) -> Result<ExitCode, CliError> {
     }
     let mut table = TextTable::new(&["it would", "here", "there"]);
     let mut allowed = true;
-    for (verb, name) in args.what.uses() {
+    let uses = args.what.uses();
+    // What this host does there is the other end of what the peer does here.
+    let ends: Vec<_> = uses.iter().map(|(verb, name)| (other_end(*verb), name.clone())).collect();
+    let there = match &status {
+        Some(status) => there(status, peer, &ends),
+        None => vec!["not asked".to_owned(); ends.len()],
+    };
+    for ((verb, name), there) in uses.into_iter().zip(there) {
         let decision = permissions.check(verb, &name);
         allowed &= decision.allowed();
-        let there = status.as_ref().map_or_else(
-            || "not asked".to_owned(),
-            |status| there(status, peer, other_end(verb), &name),
-        );
         table.row([printable(&format!("{verb} {name}")), decision.to_string(), printable(&there)]);
     }
     let mut text = table.render(0);
@@ -86,10 +93,51 @@ fn warn_of_other_rules(status: &Status, rules: &AccessRules) {
     }
 }
 
-/// What the peer's rules say of this host's end of the pair, as far as the peer has said it. A peer may have more than one
-/// link.
-fn there(status: &Status, peer: Party<'_>, verb: Verb, name: &str) -> String {
+/// What the peer's rules say of each of these uses by this host. A peer may have more than one link: what one of them denies
+/// is denied.
+fn there(status: &Status, peer: Party<'_>, uses: &[(Verb, String)]) -> Vec<String> {
     let links: Vec<_> = status.links.iter().filter(|link| is_of(link, peer)).collect();
+    let answers: Vec<_> = links.iter().filter_map(|link| ask(link, uses)).collect();
+    let of = |at: usize| {
+        let decisions = || answers.iter().map(move |decisions| &decisions[at]);
+        decisions().find(|decision| !decision.allowed).or_else(|| decisions().next())
+    };
+    let all = uses.iter().enumerate().map(|(at, (verb, name))| match of(at) {
+        Some(decision) => decision.reason.clone(),
+        None => heard(status, &links, *verb, name),
+    });
+    all.collect()
+}
+
+/// The decisions of the peer of one link, if it answers: a daemon of an earlier version does not.
+fn ask(link: &LinkStatus, uses: &[(Verb, String)]) -> Option<Vec<PeerDecision>> {
+    let place = DaemonPlace::from_env().ok()?;
+    let mut decisions = Vec::new();
+    for part in uses.chunks(AT_ONCE) {
+        match daemon_check_access_at(&place, &link.peer, part) {
+            Ok(answer) if answer.decisions.len() == part.len() => {
+                decisions.extend(answer.decisions);
+            }
+            Ok(answer) => {
+                let why = answer.error.unwrap_or_else(|| "it gave no answer".to_owned());
+                say(format_args!("axon: {} was not asked: {why}", printable(&link.host)));
+                return None;
+            }
+            Err(error) => {
+                say(format_args!(
+                    "axon: {} does not say which of its rules decides ({error}): \"there\" is what it has said \
+                     of endpoints of this host",
+                    printable(&link.host)
+                ));
+                return None;
+            }
+        }
+    }
+    Some(decisions)
+}
+
+/// What the peer has said by itself: it names what it denies to endpoints that there are.
+fn heard(status: &Status, links: &[&LinkStatus], verb: Verb, name: &str) -> String {
     if links.is_empty() {
         return "not linked".to_owned();
     }
@@ -146,7 +194,11 @@ mod tests {
         (topic.topic, topic.publishers) = ("/odom".into(), 1);
         let mut status = Status::default();
         (status.links, status.topics) = (vec![link("base"), base], vec![topic]);
-        let there = |peer, verb, name| there(&status, Party::Name(peer), verb, name);
+        let there = |peer, verb, name| {
+            let of_peer = |link: &&LinkStatus| is_of(link, Party::Name(peer));
+            let links: Vec<_> = status.links.iter().filter(of_peer).collect();
+            heard(&status, &links, verb, name)
+        };
         assert_eq!(there("base", Verb::Publish, "/scan"), "denied by line 3 of access.toml");
         assert_eq!(there("base", Verb::Publish, "/odom"), "no denial was heard");
         assert!(there("base", Verb::Subscribe, "/odom").starts_with("not known"));

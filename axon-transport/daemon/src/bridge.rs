@@ -16,8 +16,8 @@ use axon_transport::{
     access::AccessRules,
     config::{Config, TopicRule},
     graph::EndpointKind,
-    internal::graph::RemoteEndpoint,
-    status::LinkStatus,
+    internal::{graph::RemoteEndpoint, wire::session::CheckedUse},
+    status::{LinkStatus, PeerDecision},
 };
 use tokio::sync::mpsc;
 
@@ -176,6 +176,13 @@ pub enum ToControl {
     Draining(bool),
     /// The rules of the order with this number count: no pair is there that they deny.
     Rules(u64),
+    /// A peer answered a question about its access rules.
+    Decisions {
+        /// The number of the question.
+        number: u64,
+        /// The peer's decisions. `None`: it is not linked.
+        decisions: Option<Vec<PeerDecision>>,
+    },
     /// What is to be shown of the key supply.
     Keys(serde_json::Value),
     /// What waited when the daemon was told to end has arrived, or does not get on: it may end.
@@ -207,6 +214,15 @@ pub enum ToGateway {
     },
     /// These rules count from now on. Answered by [`ToControl::Rules`] with this number.
     Rules(TrafficRules, u64),
+    /// Ask a peer what its access rules let this host do. Answered by [`ToControl::Decisions`] once the peer answered.
+    CheckAccess {
+        /// The peer.
+        daemon: DaemonId,
+        /// A number for the question, used once.
+        number: u64,
+        /// What this host would do.
+        uses: Vec<CheckedUse>,
+    },
     /// These addresses are those of listed peers from now on.
     Listed(BTreeSet<IpAddr>),
     /// Say when what waits to be sent has arrived: the daemon is to end.

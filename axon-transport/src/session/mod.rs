@@ -46,7 +46,7 @@ use std::{
 
 pub use callback::OnNew;
 pub use clock::{from_unix_nanos, unix_nanos};
-pub use daemon::{daemon_reload_at, daemon_status, daemon_status_at};
+pub use daemon::{daemon_check_access_at, daemon_reload_at, daemon_status, daemon_status_at};
 pub use error::{RecvError, SessionError};
 pub use events::Event;
 pub use guard::GuardCondition;

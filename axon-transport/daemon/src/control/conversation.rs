@@ -225,6 +225,9 @@ fn receive_some(
         match receive(&control.spare, socket.get_ref(), buffer) {
             Ok(Received { message: Message::StatusRequest, .. }) => send_status(control, id),
             Ok(Received { message: Message::Reload, .. }) => control.ask_reload(id),
+            Ok(Received { message: Message::AccessCheck(check), .. }) => {
+                control.ask_decisions(id, check);
+            }
             // The one thing that is handed over after HELLO, and the only one that the daemon reads:
             // reading anything else may block.
             Ok(Received { descriptors, .. }) if !descriptors.iter().all(PassedFd::is_memfd) => {

@@ -31,7 +31,14 @@ use tokio::sync::{Notify, watch};
 
 use self::refusals::Refusals;
 use super::{
-    admission::Admission, losses::Losses, report::waiting::Told, room::Spare, turns::Turns,
+    admission::Admission,
+    losses::Losses,
+    report::{
+        decisions::{AccessQuestions, NOT_LINKED},
+        waiting::Told,
+    },
+    room::Spare,
+    turns::Turns,
 };
 use crate::{
     bridge::{RefusalKind, RefusedRoute, ToControl, TrafficRules},
@@ -82,6 +89,8 @@ pub(super) struct Control {
     /// Wakes the task that reads the settings again, and the sessions that asked for it.
     pub(super) reload: Rc<Notify>,
     pub(super) reload_asked: Vec<SessionId>,
+    /// Questions about the access rules of peers.
+    pub(super) questions: AccessQuestions,
     /// The range and the hosts of discovery: what the widest session needs.
     pub(super) wanted: watch::Sender<Wanted>,
     /// The addresses that names of static peers have.
@@ -138,6 +147,7 @@ impl Control {
             rules_in_force: watch::Sender::new(0),
             reload: Rc::default(),
             reload_asked: Vec::new(),
+            questions: AccessQuestions::default(),
             wanted: watch::Sender::new(Wanted::of(&config, [])),
             names: BTreeMap::new(),
             linked: BTreeMap::new(),
@@ -255,6 +265,10 @@ impl Control {
     pub(super) fn gateway_says(&mut self, message: ToControl) {
         match message {
             ToControl::Rules(number) => drop(self.rules_in_force.send_replace(number)),
+            ToControl::Decisions { number, decisions } => {
+                let decisions = decisions.ok_or_else(|| NOT_LINKED.to_owned());
+                self.answer_decisions(number, decisions);
+            }
             ToControl::Started { port } => {
                 self.port = Some(port);
                 self.gateway = "running".into();
@@ -286,6 +300,7 @@ impl Control {
                 self.refused_routes.remove(&daemon.to_string());
                 self.registry.remote_gone(&daemon);
                 self.linked.remove(&daemon);
+                self.forget_questions(Some(daemon));
                 self.relist();
             }
             ToControl::Refusal { kind, peer, what, reason } => {
@@ -304,6 +319,11 @@ impl Control {
         self.names = names;
         self.relist();
         self.settle();
+    }
+
+    /// Whether there is a link with this daemon.
+    pub(super) fn is_linked(&self, daemon: &DaemonId) -> bool {
+        self.linked.contains_key(daemon)
     }
 
     fn linked_at(&mut self, daemon: DaemonId, address: IpAddr) {
@@ -339,6 +359,7 @@ impl Control {
         self.linked.clear();
         self.refused_routes.clear();
         self.told = Told::default();
+        self.forget_questions(None);
         self.relist();
         let daemons: BTreeSet<DaemonId> =
             self.registry.remote_endpoints().map(|(daemon, _)| *daemon).collect();

@@ -115,6 +115,7 @@ impl Remote {
     /// [has finished](Self::finish).
     pub(super) async fn run(&mut self, control: &Rc<RefCell<Control>>) {
         let Some(entry) = self.entry else { return std::future::pending().await };
+        let questions = control.borrow().questions.bell();
         while !self.finished {
             tokio::select! {
                 event = said(self.running.as_mut()) => match event {
@@ -131,6 +132,7 @@ impl Remote {
                 },
                 Ok(()) = self.rules.changed() => self.order_rules(),
                 () = due(self.rules_due) => self.order_rules(),
+                () = questions.notified() => self.pass_questions(control),
                 action = wanted(self.discovery.as_mut()) => match action {
                     Some(action) => self.action(control, action),
                     None => {
@@ -149,6 +151,18 @@ impl Remote {
         // A gateway that is started later is told when it stands.
         let missed = self.running.is_some() && !self.order(ToGateway::Rules(rules, number));
         self.rules_due = missed.then(|| Instant::now() + BUSY);
+    }
+
+    /// Gives the gateway the questions of tools about the rules of peers.
+    fn pass_questions(&mut self, control: &Rc<RefCell<Control>>) {
+        let mut control = control.borrow_mut();
+        while let Some((number, daemon, uses)) = control.questions.poll() {
+            if !self.order(ToGateway::CheckAccess { daemon, number, uses }) {
+                let why = "the gateway is busy or has failed: ask again".to_owned();
+                control.answer_decisions(number, Err(why));
+            }
+        }
+        control.settle();
     }
 
     fn event(&mut self, control: &Rc<RefCell<Control>>, event: ToControl) {

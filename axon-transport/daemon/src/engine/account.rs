@@ -379,6 +379,8 @@ pub(crate) fn cost(message: &Message) -> u32 {
         Message::Intake(_) => 63,
         Message::Unsubscribe(_) | Message::RouteRefused(_) | Message::RouteUnasked(_) => 7,
         Message::Denied(uses) => 7 * (uses.denied.len() + uses.lifted.len()),
+        Message::AccessCheck(check) => 7 + 7 * check.uses.len(),
+        Message::AccessDecisions(decisions) => decisions.decisions.len(),
         Message::Asserted(asserted) => asserted.publishers.len() / 8,
         Message::Owners(owners) => 7 * owners.proofs.len(),
         Message::Received(received) => received.flows.len() / LOOKED_UP,

@@ -161,6 +161,10 @@ impl Engine {
                 self.set_rules(rules, now);
                 self.effects.tell(ToControl::Rules(number));
             }
+            ToGateway::CheckAccess { daemon, number, uses } => match self.peers.get_mut(daemon) {
+                Some(peer) => peer.check_access(number, uses),
+                None => self.effects.tell(ToControl::Decisions { number, decisions: None }),
+            },
             ToGateway::Listed(addresses) => self.links.set_listed(addresses),
             // The owner looks at `backlog`.
             ToGateway::Finish | ToGateway::Shutdown => {}
@@ -351,6 +355,12 @@ impl Engine {
             Message::Owners(owners) => {
                 if let Some(binding) = self.links.binding(number) {
                     peer.remote.prove(&owners.proofs, &binding, daemon);
+                }
+            }
+            Message::AccessDecisions(answer) => {
+                let number = answer.number;
+                if let Some(decisions) = peer.take_decisions(answer) {
+                    self.effects.tell(ToControl::Decisions { number, decisions: Some(decisions) });
                 }
             }
             message => {

@@ -9,10 +9,11 @@ mod order;
 
 pub(crate) use crate::wire::link::is_known;
 pub use crate::wire::link::{
-    Asserted, CloseCode, Denied, DeniedUse, Elected, FrameError, Graph, GraphResync, Hello, Intake,
-    LastSeen, LinkClosed, MAX_DENIED, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, MAX_PROOFS,
-    Message, Owners, Received, ReceivedOf, RouteReady, RouteRefused, RouteUnasked, Subscribe,
-    Subscriber, Unsubscribe, read_length, unpacked_length,
+    AccessCheck, AccessDecisions, Asserted, CloseCode, Denied, DeniedUse, Elected, FrameError,
+    Graph, GraphResync, Hello, Intake, LastSeen, LinkClosed, MAX_DENIED, MAX_FRAME,
+    MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, MAX_PROOFS, Message, Owners, Received, ReceivedOf,
+    RouteReady, RouteRefused, RouteUnasked, Subscribe, Subscriber, Unsubscribe, UseDecision,
+    read_length, unpacked_length,
 };
 pub use election::{Candidate, keep};
 pub use hello::{Mismatch, PROTOCOL, check};

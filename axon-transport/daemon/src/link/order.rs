@@ -130,6 +130,8 @@ impl Message {
             Self::LinkClosed(_) => "LINK_CLOSED",
             Self::Intake(_) => "INTAKE",
             Self::Denied(_) => "DENIED",
+            Self::AccessCheck(_) => "ACCESS_CHECK",
+            Self::AccessDecisions(_) => "ACCESS_DECISIONS",
             Self::Keys(m) => m.name(),
         }
     }

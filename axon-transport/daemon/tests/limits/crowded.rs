@@ -75,6 +75,25 @@ fn session_beyond_the_daemons_descriptors_is_told_the_numbers_and_what_to_set() 
     });
 }
 
+#[test]
+fn daemon_takes_as_many_descriptors_as_its_hard_limit_allows() {
+    let host = host();
+    let mut shell = host.command("sh");
+    shell.args(["-c", "ulimit -H -n 512 && ulimit -S -n 64 && exec \"$0\""]);
+    shell.arg(env!("CARGO_BIN_EXE_axon_daemon"));
+    let _daemon = host.daemon_by(shell);
+    let descriptors = host.status().expect("a tool is served").descriptors;
+    assert_eq!(descriptors.expect("they are counted").limit, Some(512));
+    // Four descriptors a session: the sixty-four that were set would not do for these.
+    let _served: Vec<Player> = (0..24)
+        .map(|_| {
+            let mut player = host.play("one session");
+            assert_eq!(player.hear(), "served");
+            player
+        })
+        .collect();
+}
+
 /// The daemon's words in an error of the session.
 fn said_here(said: &str) -> &str {
     said.split_once("refuses the session: ").expect("refused").1

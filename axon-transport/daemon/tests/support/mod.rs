@@ -93,7 +93,11 @@ impl Host {
 
     /// A daemon in the foreground, once it answers.
     pub(crate) fn daemon(&self) -> Kept {
-        let mut command = self.command(env!("CARGO_BIN_EXE_axon_daemon"));
+        self.daemon_by(self.command(env!("CARGO_BIN_EXE_axon_daemon")))
+    }
+
+    /// The same, where `command` is the daemon, or becomes it.
+    pub(crate) fn daemon_by(&self, mut command: Command) -> Kept {
         let log = fs::OpenOptions::new().create(true).append(true).open(self.log()).unwrap();
         let kept = Kept(command.stderr(log).spawn().unwrap());
         until("the daemon answers", || self.status().is_ok());

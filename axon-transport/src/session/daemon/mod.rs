@@ -8,4 +8,4 @@ pub mod socket;
 pub mod spawn;
 mod status;
 
-pub use status::{daemon_reload_at, daemon_status, daemon_status_at};
+pub use status::{daemon_check_access_at, daemon_reload_at, daemon_status, daemon_status_at};

@@ -15,19 +15,22 @@ use super::{
     socket::{self, SocketError},
 };
 use crate::{
+    access::Verb,
     config::{Config, DaemonPlace, DaemonPolicy},
-    ids::SessionId,
+    ids::{DaemonId, SessionId},
     session::{
         Session, SessionOptions,
         error::SessionError,
         state::{Outgoing, StatusAnswer, StatusText},
     },
-    status::ReloadReport,
-    wire::session::{Message, SessionRole},
+    status::{PeerDecisions, ReloadReport},
+    wire::session::{AccessCheck, CheckedUse, Message, SessionRole},
 };
 
 /// How long a daemon may take to answer.
 const ANSWER: Duration = Duration::from_secs(5);
+/// How long a peer may take to answer: a lost packet is sent again by then.
+const PEER_ANSWER: Duration = Duration::from_secs(3);
 
 impl Session {
     /// The daemon's status: the JSON of [`Status`](crate::status::Status).
@@ -123,6 +126,31 @@ pub fn daemon_reload_at(place: &DaemonPlace) -> Result<ReloadReport, SessionErro
     let address = Address::of(&config).to_string();
     let text = status_text(ask(&connected.socket, &Message::Reload, &address, ANSWER)?)?;
     serde_json::from_str(&text).map_err(|e| SessionError::Protocol(format!("reload: {e}")))
+}
+
+/// Asks a linked peer, by way of the daemon of this user and domain, which of the peer's access rules decide what this
+/// host may do there: at most 32 uses at a time, each a verb and the name of a topic, service or node. `peer` is the
+/// daemon that [`LinkStatus::peer`](crate::status::LinkStatus::peer) names. A question that the daemon cannot pass on, such as
+/// of a peer that is not linked, is answered by [`PeerDecisions::error`].
+///
+/// # Errors
+/// As [`daemon_status`]. [`SessionError::Silent`] also where the peer does not answer, as a daemon of an earlier version.
+pub fn daemon_check_access_at(
+    place: &DaemonPlace,
+    peer: &str,
+    uses: &[(Verb, String)],
+) -> Result<PeerDecisions, SessionError> {
+    let daemon = u128::from_str_radix(peer, 16).map(|id| DaemonId(id.to_be_bytes()));
+    let daemon = daemon
+        .map_err(|e| SessionError::Protocol(format!("access check: no daemon id {peer:?}: {e}")))?;
+    let config = Config { daemon: DaemonPolicy::Require, ..place.config() };
+    let options = SessionOptions::new("access check").role(SessionRole::Tool);
+    let connected = Caller::new(&config, &options, SessionId::random()).connect()?;
+    let address = Address::of(&config).to_string();
+    let uses = uses.iter().map(|(verb, name)| CheckedUse { verb: *verb as u8, name: name.clone() });
+    let question = Message::AccessCheck(AccessCheck { daemon, uses: uses.collect() });
+    let text = status_text(ask(&connected.socket, &question, &address, PEER_ANSWER)?)?;
+    serde_json::from_str(&text).map_err(|e| SessionError::Protocol(format!("access check: {e}")))
 }
 
 fn status_text(bytes: Vec<u8>) -> Result<String, SessionError> {

@@ -65,6 +65,7 @@ impl Message {
             Self::Credit(m) => (26, minicbor::to_vec(m)),
             Self::Asserted(m) => (27, minicbor::to_vec(m)),
             Self::Reload => (28, minicbor::to_vec(Empty {})),
+            Self::AccessCheck(m) => (29, minicbor::to_vec(m)),
             Self::Unknown(kind) => (*kind, minicbor::to_vec(Empty {})),
         };
         // Encoding into a Vec has no way to fail.
@@ -119,6 +120,7 @@ impl Message {
             26 => Self::Credit(map(kind, body)?),
             27 => Self::Asserted(map(kind, body)?),
             28 => map::<Empty>(kind, body).map(|_| Self::Reload)?,
+            29 => Self::AccessCheck(map(kind, body)?),
             _ => Self::Unknown(kind),
         })
     }

@@ -466,6 +466,33 @@ pub struct Unmet {
     pub samples: u64,
 }
 
+/// Uses that one question about access rules is about, at most.
+pub const MOST_CHECKED: usize = 32;
+
+/// A tool asks what access rules of a linked peer let this host do there. Answered as a STATUS_REQUEST is.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct AccessCheck {
+    /// The peer.
+    #[n(0)]
+    pub daemon: DaemonId,
+    /// What this host would do there.
+    #[n(1)]
+    pub uses: Vec<CheckedUse>,
+}
+
+/// One use of a topic or service that access rules are asked about.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(array)]
+pub struct CheckedUse {
+    /// 0 publish, 1 subscribe, 2 serve, 3 call, 4 see.
+    #[n(0)]
+    pub verb: u8,
+    /// Topic, service or node.
+    #[n(1)]
+    pub name: String,
+}
+
 /// A message of the session socket.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[allow(missing_docs)]
@@ -484,6 +511,7 @@ pub enum Message {
     StatusRequest,
     /// Read the settings that may change while the daemon runs. Answered as a STATUS_REQUEST is.
     Reload,
+    AccessCheck(AccessCheck),
     Status(StatusPart),
     Resync,
     Segment(SegmentOpened),

@@ -94,6 +94,10 @@ fn messages() -> Vec<Message> {
         Message::Unmatch(Unmatch { reader, writer, reason: "gone".into() }),
         Message::StatusRequest,
         Message::Reload,
+        Message::AccessCheck(AccessCheck {
+            daemon: DaemonId([9; 16]),
+            uses: vec![CheckedUse { verb: 0, name: "/scan".into() }],
+        }),
         Message::Status(StatusPart { part: 0, parts: 1, text: b"{}".to_vec() }),
         Message::Resync,
         Message::Segment(SegmentOpened {

@@ -1,5 +1,6 @@
 //! Builds the daemon's [`Status`] from the state of the control plane.
 
+pub(super) mod decisions;
 mod topics;
 pub(super) mod waiting;
 

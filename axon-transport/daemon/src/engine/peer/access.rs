@@ -13,15 +13,16 @@ use axon_transport::{
     internal::{
         graph::{other_end, verb_of},
         log_limit::LogLimit,
+        wire::session::CheckedUse,
     },
-    status::LinkStatus,
+    status::{LinkStatus, PeerDecision},
 };
 
 use super::{decisions::note_look, refused::shown};
 use crate::{
     bridge::RefusedRoute,
     engine::account::{Account, Charge, Meter},
-    link::{Denied, DeniedUse, MAX_DENIED, Message},
+    link::{AccessCheck, AccessDecisions, Denied, DeniedUse, MAX_DENIED, Message, UseDecision},
 };
 
 /// Uses that status lists.
@@ -30,12 +31,17 @@ const LISTED: usize = 64;
 const AT_ENDPOINTS: usize = 1024;
 /// Bytes that count for a denied use besides its name and reason.
 const ENTRY: usize = 200;
+/// Questions that wait for the peer's answer. The oldest is given up.
+const UNANSWERED: usize = 64;
 
 /// What somebody does with a topic or service.
 pub(super) type Use = (Verb, String);
 
 /// The verbs that need an endpoint, as DENIED numbers them.
 const VERBS: [Verb; 4] = [Verb::Publish, Verb::Subscribe, Verb::Serve, Verb::Call];
+
+/// All verbs, as ACCESS_CHECK numbers them.
+const CHECKED: [Verb; 5] = Verb::ALL;
 
 /// The endpoints that are there for a verb.
 fn kind_of(verb: Verb) -> EndpointKind {
@@ -58,6 +64,8 @@ pub(super) struct PeerAccess {
     /// What may be remembered of those there, and of those here, of all daemon ids of the peer's identity.
     room: Rc<Meter>,
     places: Rc<Meter>,
+    /// The numbers of questions that the peer has not answered, and how many uses each is about.
+    asked: BTreeMap<u64, usize>,
     logged: LogLimit,
 }
 
@@ -65,7 +73,8 @@ impl PeerAccess {
     pub(super) fn new(permissions: Permissions, account: &Account) -> Self {
         let (here, there) = (BTreeMap::new(), BTreeMap::new());
         let (room, places) = (Rc::clone(&account.refusals), Rc::clone(&account.denied));
-        Self { permissions, here, there, room, places, logged: LogLimit::default() }
+        let asked = BTreeMap::new();
+        Self { permissions, here, there, room, places, asked, logged: LogLimit::default() }
     }
 
     pub(super) fn permissions(&self) -> &Permissions {
@@ -161,6 +170,35 @@ impl PeerAccess {
         }
         let lifted = denied.lifted.into_iter().map(used);
         lifted.filter(|used| self.there.remove(used).is_some()).collect()
+    }
+
+    /// Answers what the peer may do here. It learns no more than by announcing such endpoints, of which DENIED speaks.
+    pub(super) fn answer(&self, check: &AccessCheck) -> Message {
+        let decisions = check.uses.iter().map(|used| {
+            let decision =
+                self.permissions.check(CHECKED[usize::from(used.verb.min(4))], &used.name);
+            UseDecision { allowed: decision.allowed(), reason: decision.to_string() }
+        });
+        let decisions = decisions.collect();
+        Message::AccessDecisions(AccessDecisions { number: check.number, decisions })
+    }
+
+    /// Asks the peer what it lets this host do.
+    pub(super) fn ask(&mut self, number: u64, uses: Vec<CheckedUse>) -> Message {
+        while self.asked.len() >= UNANSWERED {
+            self.asked.pop_first();
+        }
+        self.asked.insert(number, uses.len());
+        Message::AccessCheck(AccessCheck { number, uses })
+    }
+
+    /// The peer's answer, if this host asked. Each question has one.
+    pub(super) fn take_decisions(&mut self, answer: AccessDecisions) -> Option<Vec<PeerDecision>> {
+        let uses = self.asked.remove(&answer.number)?;
+        let decisions = answer.decisions.into_iter();
+        let decisions: Vec<_> =
+            decisions.map(|of| PeerDecision::new(of.allowed, shown(&of.reason))).collect();
+        (decisions.len() == uses).then_some(decisions)
     }
 
     /// Each denied use, the host that denies it, and the reason.

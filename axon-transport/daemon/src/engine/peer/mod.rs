@@ -31,8 +31,9 @@ use axon_transport::{
     internal::{
         events::Alive,
         graph::{EndpointRange, RemoteEndpoint, permits_use, shows},
+        wire::session::CheckedUse,
     },
-    status::LinkStatus,
+    status::{LinkStatus, PeerDecision},
 };
 
 use self::{
@@ -64,7 +65,7 @@ use crate::{
             stalls::Stalls,
         },
     },
-    link::{Asserted, CloseCode, Graph, Message},
+    link::{AccessDecisions, Asserted, CloseCode, Graph, Message},
     owner::Binding,
 };
 
@@ -311,6 +312,10 @@ impl Peer {
                 let allowed = self.access.handle_denied(self.daemon, denied);
                 self.ask_for_allowed(&allowed);
             }
+            Message::AccessCheck(check) => {
+                let answer = self.access.answer(&check);
+                self.say(answer);
+            }
             Message::RouteUnasked(unasked) => self.handle_route_unasked(unasked),
             Message::RouteReady(ready) => {
                 self.handle_route_ready(ready.route);
@@ -359,6 +364,17 @@ impl Peer {
             self.refuse(route, &key, why, Some(DENIED_AGAIN));
         }
         self.renew_limits(config);
+    }
+
+    /// Asks the peer what its access rules let this host do.
+    pub(super) fn check_access(&mut self, number: u64, uses: Vec<CheckedUse>) {
+        let question = self.access.ask(number, uses);
+        self.say(question);
+    }
+
+    /// The peer answers a question about its access rules. `None`: it was not asked.
+    pub(super) fn take_decisions(&mut self, answer: AccessDecisions) -> Option<Vec<PeerDecision>> {
+        self.access.take_decisions(answer)
     }
 
     /// Tells the peer which of its endpoints access rules deny, if that changed.

@@ -14,7 +14,8 @@ use axon_transport::{
     access::AccessRules,
     config::{Config, DiscoveryRange},
     internal::graph::{EndpointRange, RemoteEndpoint},
-    status::LinkStatus,
+    internal::wire::session::CheckedUse,
+    status::{LinkStatus, PeerDecision},
 };
 use bytes::BytesMut;
 use quinn_proto::{EcnCodepoint, EndpointConfig, Transmit};
@@ -75,6 +76,10 @@ pub(super) struct Host {
     interfaces_asked: bool,
     used: BTreeSet<String>,
     graph_changed: bool,
+    /// Questions about the access rules of peers, as orders.
+    questions: Vec<ToGateway>,
+    /// The answers, by number.
+    pub(super) decisions: BTreeMap<u64, Option<Vec<PeerDecision>>>,
     /// Rules that came.
     rules: Option<TrafficRules>,
     rings_rang: bool,
@@ -116,6 +121,8 @@ impl Host {
             interfaces_asked: false,
             used: BTreeSet::new(),
             graph_changed: false,
+            questions: Vec::new(),
+            decisions: BTreeMap::new(),
             rules: None,
             rings_rang: false,
             due: Cell::new(None),
@@ -315,6 +322,12 @@ impl Host {
         self.rules = Some(rules);
     }
 
+    /// A tool asks what a peer lets this host do.
+    pub(super) fn check_access(&mut self, daemon: DaemonId, number: u64, uses: Vec<CheckedUse>) {
+        self.due.set(None);
+        self.questions.push(ToGateway::CheckAccess { daemon, number, uses });
+    }
+
     /// A ring rang.
     pub(super) fn ring(&mut self) {
         self.due.set(None);
@@ -355,6 +368,7 @@ impl Host {
         let engine = self.engine.as_ref()?;
         let ready = {
             let came = self.graph_changed || self.rings_rang || self.rules.is_some();
+            let came = came || !self.questions.is_empty();
             (came || self.interfaces_asked || !self.records.is_empty()).then_some(now)
         };
         let dials = self.peers.iter().filter(|(daemon, _)| !self.linked.contains(daemon));
@@ -374,6 +388,9 @@ impl Host {
         }
         if let Some(rules) = self.rules.take() {
             engine.handle_order(ToGateway::Rules(rules, 0), now);
+        }
+        for question in std::mem::take(&mut self.questions) {
+            engine.handle_order(question, now);
         }
         if std::mem::take(&mut self.rings_rang) {
             engine.handle_rings(now);
@@ -467,6 +484,10 @@ impl Host {
                         engine.handle_order(ToGateway::SendDatagram { to, bytes }, now);
                     }
                 }
+            }
+            ToControl::Decisions { number, decisions } => {
+                let before = self.decisions.insert(number, decisions);
+                assert_eq!(before, None, "a question has one answer");
             }
             ToControl::Link(status, _) => {
                 self.status.insert(status.peer.clone(), *status);

@@ -4,7 +4,13 @@ use axon_shm::{
     ids::{DaemonId, Gid},
     qos::Qos,
 };
-use axon_transport::{graph::Endpoint, internal::graph::LIMITS};
+use axon_transport::{
+    graph::Endpoint,
+    internal::{
+        graph::LIMITS,
+        wire::session::{CheckedUse, MOST_CHECKED},
+    },
+};
 use minicbor::{Decode, Encode};
 
 use super::frame::{FrameError, from_map, to_map};
@@ -321,6 +327,42 @@ pub struct DeniedUse {
 /// Uses in one message, at most.
 pub const MAX_DENIED: usize = 512;
 
+/// The sender asks what access rules at the receiver's host let it do there.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct AccessCheck {
+    /// The sender's number for the question.
+    #[n(0)]
+    pub number: u64,
+    /// What it would do.
+    #[n(1)]
+    pub uses: Vec<CheckedUse>,
+}
+
+/// Answers an [`AccessCheck`].
+#[derive(Clone, Debug, Default, PartialEq, Eq, Encode, Decode)]
+#[cbor(map)]
+pub struct AccessDecisions {
+    /// The number of the question.
+    #[n(0)]
+    pub number: u64,
+    /// One for each use, in the order of the question.
+    #[n(1)]
+    pub decisions: Vec<UseDecision>,
+}
+
+/// What access rules say of one use.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+#[cbor(array)]
+pub struct UseDecision {
+    /// Whether they allow it.
+    #[n(0)]
+    pub allowed: bool,
+    /// Which rule decides, for people.
+    #[n(1)]
+    pub reason: String,
+}
+
 /// That sessions are the sender's. Said before GRAPH, once on each connection.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
@@ -378,6 +420,10 @@ pub enum Message {
     Intake(Intake),
     /// These are things that you may not do here.
     Denied(Denied),
+    /// May I do this at your host?
+    AccessCheck(AccessCheck),
+    /// These rules decide.
+    AccessDecisions(AccessDecisions),
     /// About keys.
     Keys(KeyMessage),
 }
@@ -402,6 +448,8 @@ impl Message {
             Self::RouteUnasked(m) => (14, to_map(m)),
             Self::Intake(m) => (15, to_map(m)),
             Self::Denied(m) => (20, to_map(m)),
+            Self::AccessCheck(m) => (21, to_map(m)),
+            Self::AccessDecisions(m) => (22, to_map(m)),
             Self::Keys(m) => {
                 let mut map = Vec::new();
                 m.encode(&mut map);
@@ -412,7 +460,7 @@ impl Message {
 
     /// Whether [`decode`](Self::decode) knows this type.
     pub(super) fn is_known(kind: u8) -> bool {
-        matches!(kind, 1..=20)
+        matches!(kind, 1..=22)
     }
 
     /// The message of type `kind`, `None` for an unknown type.
@@ -438,6 +486,8 @@ impl Message {
                     .map_err(|e| FrameError::Malformed { kind, reason: e.to_string() })?,
             ),
             20 => Self::Denied(from_map(kind, map)?),
+            21 => Self::AccessCheck(from_map(kind, map)?),
+            22 => Self::AccessDecisions(from_map(kind, map)?),
             _ => return Ok(None),
         };
         match message.bounds() {
@@ -487,6 +537,16 @@ impl Message {
                             && denied.reason.len() <= MAX_REASON
                     }),
                 "a denied use is out of bounds",
+            ),
+            Self::AccessCheck(m) => ok(
+                m.uses.len() <= MOST_CHECKED
+                    && m.uses.iter().all(|used| used.verb <= 4 && used.name.len() <= LIMITS.name),
+                "a use that is asked about is out of bounds",
+            ),
+            Self::AccessDecisions(m) => ok(
+                m.decisions.len() <= MOST_CHECKED
+                    && m.decisions.iter().all(|decision| decision.reason.len() <= MAX_REASON),
+                "a decision is out of bounds",
             ),
             Self::Owners(m) => ok(m.proofs.len() <= MAX_PROOFS, "too many proofs"),
             Self::Subscribe(m) => ok(

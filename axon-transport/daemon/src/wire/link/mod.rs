@@ -14,7 +14,7 @@ pub use frame::{
     FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, read_length, unpacked_length,
 };
 pub use message::{
-    Asserted, Denied, DeniedUse, Elected, Graph, GraphResync, Hello, Intake, LastSeen, LinkClosed,
-    MAX_DENIED, MAX_PROOFS, Message, Owners, Received, ReceivedOf, RouteReady, RouteRefused,
-    RouteUnasked, Subscribe, Subscriber, Unsubscribe,
+    AccessCheck, AccessDecisions, Asserted, Denied, DeniedUse, Elected, Graph, GraphResync, Hello,
+    Intake, LastSeen, LinkClosed, MAX_DENIED, MAX_PROOFS, Message, Owners, Received, ReceivedOf,
+    RouteReady, RouteRefused, RouteUnasked, Subscribe, Subscriber, Unsubscribe, UseDecision,
 };

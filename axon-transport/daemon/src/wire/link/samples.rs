@@ -5,6 +5,7 @@ use axon_shm::{
     ids::{DaemonId, Gid},
     qos::Qos,
 };
+use axon_transport::internal::wire::session::CheckedUse;
 
 use super::*;
 use crate::{daemon_key::DaemonProof, owner::Proof, wire::keys::KeyMessage};
@@ -94,6 +95,14 @@ pub(crate) fn messages() -> Vec<Message> {
         Message::Denied(Denied {
             denied: vec![DeniedUse { verb: 0, name: "/cmd_vel".into(), reason: "line 4".into() }],
             lifted: vec![DeniedUse { verb: 3, name: "/dock".into(), reason: String::new() }],
+        }),
+        Message::AccessCheck(AccessCheck {
+            number: 5,
+            uses: vec![CheckedUse { verb: 4, name: "/scan".into() }],
+        }),
+        Message::AccessDecisions(AccessDecisions {
+            number: 5,
+            decisions: vec![UseDecision { allowed: true, reason: "line 4".into() }],
         }),
         Message::Keys(KeyMessage::Announce(vec![key_id("k1"), key_id("k2")])),
         Message::Keys(KeyMessage::Ready { key_id: key_id("k1"), proof: [8; 32] }),

@@ -121,6 +121,8 @@ impl Torture {
             Message::RouteRefused(m) => m.route = route,
             Message::RouteUnasked(m) => (m.topic, m.type_name) = ("/t".into(), "T".into()),
             Message::Denied(m) => m.denied.iter_mut().for_each(|denied| denied.name = "/t".into()),
+            Message::AccessCheck(m) => m.number = number,
+            Message::AccessDecisions(m) => m.number = number,
             Message::RouteReady(m) => (m.route, m.publishers) = (route, vec![gid]),
             Message::Asserted(m) => m.publishers = vec![gid],
             Message::GraphResync(m) => m.version = number,

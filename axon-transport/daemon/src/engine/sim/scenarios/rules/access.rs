@@ -1,10 +1,15 @@
 //! Access rules between hosts: what either side denies does not cross, whatever the other side does.
 
 use axon_shm::{
-    ids::Gid,
+    ids::{DaemonId, Gid},
     qos::{Durability, Qos},
 };
-use axon_transport::{access::AccessRules, config::Config, status::LinkStatus};
+use axon_transport::{
+    access::AccessRules,
+    config::Config,
+    internal::wire::session::{CheckedUse, MOST_CHECKED},
+    status::{LinkStatus, PeerDecision},
+};
 
 use super::super::hostile::{
     LOWEST, dial, elect, greet, of_raw, publishes, samples, say, subscribe,
@@ -17,7 +22,7 @@ use crate::{
             world::{Pair, World},
         },
     },
-    link::Message,
+    link::{AccessCheck, AccessDecisions, Message, UseDecision},
 };
 
 /// Rules that deny nothing.
@@ -320,4 +325,78 @@ fn rules_are_looked_at_for_endpoints_and_never_for_a_sample() {
     world.pair(0, 1, "/one_more", qos[0]);
     world.run_for(secs(2));
     assert!(looks_at_rules() > matched, "another endpoint is checked");
+}
+
+#[test]
+fn a_peer_says_which_of_its_rules_decides_and_answers_each_question_once() {
+    let mut world = hosts(1, "[[deny]]\npeer = \"*\"\npublish = \"/cmd_vel\"");
+    world.until(secs(20), World::is_whole);
+    let daemon = world.hosts[1].daemon;
+    let uses = |uses: &[(u8, &str)]| {
+        let used = |(verb, name): &(u8, &str)| CheckedUse { verb: *verb, name: (*name).to_owned() };
+        uses.iter().map(used).collect()
+    };
+    world.hosts[0].check_access(daemon, 1, uses(&[(0, "/cmd_vel"), (0, "/scan"), (3, "/x")]));
+    world.hosts[0].check_access(DaemonId([9; 16]), 2, uses(&[(0, "/scan")]));
+    world.run_for(secs(1));
+    let said = |decision: &PeerDecision| (decision.allowed, decision.reason.clone());
+    let decisions = world.hosts[0].decisions.remove(&1).unwrap().unwrap();
+    let open = (true, "allowed: no rule in access.toml denies this".to_owned());
+    let denied = (false, "denied by line 3 of access.toml".to_owned());
+    assert_eq!(decisions.iter().map(said).collect::<Vec<_>>(), [denied, open.clone(), open]);
+    assert_eq!(world.hosts[0].decisions.remove(&2), Some(None), "there is no such peer");
+    assert!(world.hosts[0].decisions.is_empty());
+
+    // The host without rules says so.
+    let daemon = world.hosts[0].daemon;
+    world.hosts[1].check_access(daemon, 7, uses(&[(4, "/scan")]));
+    world.run_for(secs(1));
+    let decisions = world.hosts[1].decisions.remove(&7).unwrap().unwrap();
+    assert_eq!(said(&decisions[0]), (true, "allowed: there are no access rules".to_owned()));
+}
+
+#[test]
+fn answers_that_nobody_asked_for_and_questions_out_of_bounds_change_nothing() {
+    let mut world = super::super::hostile::world(29, 1, LOWEST);
+    let on = dial(&mut world, 0);
+    greet(&mut world, on, None);
+    say(&mut world, on, &elect(1));
+    world.run_for(millis(200));
+    let decision = |reason: &str| UseDecision { allowed: true, reason: reason.to_owned() };
+    let answer =
+        |number, decisions| Message::AccessDecisions(AccessDecisions { number, decisions });
+    say(&mut world, on, &answer(1, vec![decision("unasked")]));
+    world.run_for(millis(200));
+    assert!(world.hosts[0].decisions.is_empty());
+
+    // An answer about another number of uses is none, and the first one counts.
+    let raw = world.raws[0].hello().daemon;
+    let used = CheckedUse { verb: 0, name: "/scan".into() };
+    world.hosts[0].check_access(raw, 5, vec![used.clone()]);
+    world.hosts[0].check_access(raw, 6, vec![used.clone()]);
+    world.run_for(millis(200));
+    say(&mut world, on, &answer(5, vec![decision("a"), decision("b")]));
+    say(&mut world, on, &answer(6, vec![decision("\u{1b}[2Jone")]));
+    say(&mut world, on, &answer(6, vec![decision("two")]));
+    world.run_for(millis(200));
+    let one = Some(vec![PeerDecision::new(true, "[2Jone".into())]);
+    assert_eq!(world.hosts[0].decisions, [(6, one)].into());
+
+    // A flood of questions is answered at the rate of control messages, and the link stands.
+    for number in 0..200 {
+        let uses = vec![used.clone(); MOST_CHECKED];
+        say(&mut world, on, &Message::AccessCheck(AccessCheck { number, uses }));
+    }
+    world.run_for(secs(1));
+    let answers = |world: &World| {
+        let heard = &world.raws[0].links[on].messages;
+        heard.iter().filter(|message| matches!(message, Message::AccessDecisions(_))).count()
+    };
+    let first = answers(&world);
+    assert!((1..200).contains(&first), "{first} at once");
+    world.until(secs(60), |world| answers(world) == 200);
+    let uses = vec![used; MOST_CHECKED + 1];
+    say(&mut world, on, &Message::AccessCheck(AccessCheck { number: 0, uses }));
+    world.run_for(secs(1));
+    assert!(world.hosts[0].refusals.iter().any(|(_, why)| why.contains("out of bounds")));
 }
