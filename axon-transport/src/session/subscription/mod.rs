@@ -1,11 +1,15 @@
 //! A reader of all matched publishers of a topic, merged into one stream.
 
+mod counts;
 mod inner;
+mod matched_reader;
 mod matched_readers;
 mod remembered;
+mod slots;
 mod taking;
+#[cfg(test)]
+mod tests;
 mod trusted;
-mod unmet;
 
 use std::{
     fmt,
@@ -19,10 +23,11 @@ use axon_shm::{
     internal::{Reader, WakeCheck},
 };
 
-use self::matched_readers::MatchedReaders;
+use self::taking::Take;
 pub(super) use self::{
     inner::SubscriptionInner,
-    matched_readers::{Accept, Asking, Numbers},
+    matched_reader::Numbers,
+    matched_readers::{Accept, Asking},
 };
 pub use self::{taking::TakeLimit, trusted::TrustedSubscription};
 use super::{
@@ -201,12 +206,8 @@ impl Subscription {
             return Vec::new();
         }
         let matched_readers = self.inner.lock();
-        matched_readers
-            .matched_readers
-            .iter()
-            .filter(|s| s.counts())
-            .map(|s| s.reader.writer())
-            .collect()
+        let matched = matched_readers.slots.iter().filter(|slot| slot.counts());
+        matched.map(|slot| slot.reader.writer()).collect()
     }
 
     /// Waits until it receives from at least `count` publishers; whether it does.
@@ -225,7 +226,7 @@ impl Subscription {
 
     /// Samples that were older than their publisher's lifespan when they would have been taken.
     pub fn expired(&self) -> u64 {
-        if self.session.is_forked() { 0 } else { self.inner.lock().expired }
+        if self.session.is_forked() { 0 } else { self.inner.lock().counts.expired }
     }
 
     /// Has `callback` told of new samples from now on, in place of the one before, which is not
@@ -258,7 +259,7 @@ impl Subscription {
 
     /// Samples taken.
     pub fn received(&self) -> u64 {
-        if self.session.is_forked() { 0 } else { self.inner.lock().received }
+        if self.session.is_forked() { 0 } else { self.inner.lock().counts.received }
     }
 }
 
@@ -293,7 +294,7 @@ pub(super) fn take_from<T>(
     shared: &SessionShared,
     take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
 ) -> Option<(MessageInfo, T)> {
-    take_with(inner, shared, |matched_readers| matched_readers.take(take, inner))
+    take_with(inner, shared, |begun| begun.next(take))
 }
 
 /// The same as bytes, into `out`, which it replaces.
@@ -315,8 +316,7 @@ pub(super) fn take_of(
     let mut out = Vec::new();
     let take = |reader: &mut Reader| Ok(reader.take(&mut out)?.map(|taken| (taken.meta, ())));
     let shared = session.shared();
-    let (info, ()) =
-        take_with(inner, shared, |matched_readers| matched_readers.take_of(writer, take, inner))?;
+    let (info, ()) = take_with(inner, shared, |begun| begun.next_of(writer, take))?;
     Some((info, out))
 }
 
@@ -330,18 +330,22 @@ pub(super) fn take_many_of(
     each: impl FnMut(MessageInfo, Range<usize>),
 ) -> usize {
     out.clear();
-    let taken = take_with(inner, session.shared(), |matched_readers| {
-        Some(matched_readers.take_many_of(writer, most, out, inner, each))
-            .filter(|taken| *taken > 0)
+    let taken = take_with(inner, session.shared(), |begun| {
+        Some(begun.many_of(writer, most, out, each)).filter(|taken| *taken > 0)
     });
     taken.unwrap_or(0)
+}
+
+/// The next sample of one writer, for a relay, and how many of that writer's were lost by then. The process has not forked.
+pub(super) fn sample_of(inner: &SubscriptionInner, writer: &Gid) -> Option<(Sample, u64)> {
+    Take::begin(&mut inner.lock(), inner).sample_of(writer)
 }
 
 /// What `take` takes; `None` when there is nothing.
 fn take_with<T>(
     inner: &SubscriptionInner,
     shared: &SessionShared,
-    take: impl FnOnce(&mut MatchedReaders) -> Option<T>,
+    take: impl FnOnce(Take<'_>) -> Option<T>,
 ) -> Option<T> {
     // A thread of the parent may have held the lock when this process was forked.
     if shared.segment.is_forked() {
@@ -349,10 +353,10 @@ fn take_with<T>(
         return None;
     }
     let mut matched_readers = inner.lock();
-    let taken = take(&mut matched_readers);
+    let taken = take(Take::begin(&mut matched_readers, inner));
     let gone = std::mem::take(&mut matched_readers.discarded);
     let lost = matched_readers.new_losses();
-    let again = if taken.is_none() { matched_readers.look_again() } else { None };
+    let again = if taken.is_none() { matched_readers.slots.look_again() } else { None };
     drop(matched_readers);
     if let Some(again) = again {
         shared.look_again(again);
