@@ -2,9 +2,17 @@
 
 use std::time::Instant;
 
+use axon_daemon::internal::link::{Graph, Message};
 use axon_tls::identity::{Auth, KeyAlgorithm, SigningKey, Trust, TrustFile};
+use axon_transport::{
+    Session, SessionOptions,
+    config::QuicCipher,
+    graph::{Endpoint, EndpointKind},
+    ids::{Gid, SessionId},
+};
 
 use super::{
+    greedy::Camera,
     mode::pinned,
     pair::Plan,
     stranger::{Claim, Stranger},
@@ -40,8 +48,59 @@ fn refused_handshakes_leave_few_lines_in_the_log() {
         "{HANDSHAKES} refused handshakes in {took:?}: {lines} lines, {:.0} bytes a second",
         bytes as f64 / took.as_secs_f64()
     );
-    // Of each kind ten at once, and then one a second; a refusal is of two kinds at most.
+    // Ten at once, and then one a second.
     let most = 10 + took.as_secs() + 1;
-    assert!(lines <= 2 * most, "{lines} lines in {took:?}");
+    assert!(lines <= most + 2, "{lines} lines in {took:?}");
     assert!(refused > 0 && lines < HANDSHAKES / 2, "{refused} and {lines}");
+}
+
+#[test]
+fn a_flood_of_strangers_hides_no_refused_session_and_no_claim_of_a_pinned_peer() {
+    let camera = Camera::new();
+    let host = &camera.a;
+    let mut link = camera.link(0xff);
+    let Auth::Pinned { trust, .. } = &camera.auth else { panic!("it is pinned") };
+    let pem = SigningKey::generate_pem_with(KeyAlgorithm::Ed25519).unwrap();
+    let auth = Auth::Pinned { key: SigningKey::from_pem(&pem).unwrap(), trust: trust.clone() };
+    let to = (host.address, host.status().port.unwrap()).into();
+    let stranger = Stranger::new();
+    let flood = |handshakes| {
+        for _ in 0..handshakes {
+            let dialled = stranger.dial_at(to, host.domain(), &auth, &Claim::pinned("stranger"));
+            assert!(dialled.is_err(), "nobody pinned it");
+        }
+    };
+    flood(60);
+    for name in ["one", "two", "three", "four"] {
+        let mut config = host.config();
+        config.cipher = match config.cipher {
+            QuicCipher::Aes256Gcm => QuicCipher::ChaCha20Poly1305,
+            _ => QuicCipher::Aes256Gcm,
+        };
+        let options = SessionOptions::new(format!("differs_{name}"));
+        assert!(Session::open(&config, options).is_err(), "AXON_QUIC_CIPHER differs");
+        flood(10);
+    }
+    let gid = Gid::new(SessionId([7; 16]), 1);
+    let claim = Endpoint::new(gid, EndpointKind::Publisher, "/claimed", "test/Text");
+    let graph = Graph { version: 1, added: vec![claim], ..Graph::default() };
+    camera.stranger.say(&mut link, &Message::Graph(graph));
+    camera.a.wait_refusal("the claim", |text| text.contains("did not prove"));
+    flood(60);
+    let strangers = |text: &str| text.contains("trust");
+    host.wait_refusal("the last stranger", strangers);
+    let refusals = host.status().refusals;
+    let texts: Vec<_> =
+        refusals.iter().map(|r| format!("{} {} {}", r.peer, r.what, r.reason)).collect();
+    let has =
+        |parts: &[&str]| texts.iter().any(|text| parts.iter().all(|part| text.contains(part)));
+    for name in ["one", "two", "three", "four"] {
+        let name = format!("differs_{name}");
+        assert!(has(&[&name, "AXON_QUIC_CIPHER"]), "{texts:?}");
+        assert_eq!(host.log_lines(&["refused", &name, "AXON_QUIC_CIPHER"]), 1, "{name}");
+    }
+    assert!(has(&["camera", "did not prove"]), "{texts:?}");
+    assert!(host.log_lines(&["refused", "camera", "did not prove"]) >= 1);
+    let of_strangers = texts.iter().filter(|text| strangers(text)).count();
+    assert!((1..=8).contains(&of_strangers), "{texts:?}");
 }
