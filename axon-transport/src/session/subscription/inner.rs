@@ -7,7 +7,7 @@ use axon_shm::{
     internal::{Grant, Lane, Location, Peer, Reader, ReaderOptions, WakeCheck, holds},
 };
 
-use super::matched_readers::MatchedReaders;
+use super::{matched_readers::MatchedReaders, taking::TakeRules};
 use crate::{
     graph::{Endpoint, EndpointKind},
     ids::Gid,
@@ -97,6 +97,16 @@ impl SubscriptionInner {
     /// Whether it wants every sample of its publishers.
     pub(in crate::session) fn keeps_all(&self) -> bool {
         self.endpoint.kind == EndpointKind::Subscription && holds(&self.qos)
+    }
+
+    /// What a take has to know.
+    pub(super) fn take_rules(&self) -> TakeRules<'_> {
+        TakeRules {
+            topic: &self.endpoint.topic,
+            shared_depth: self.shared_depth,
+            rising: self.rising,
+            loses_skipped: self.role == EndpointRole::Relay,
+        }
     }
 
     pub(in crate::session) fn has_data(&self) -> bool {

@@ -5,10 +5,11 @@ use std::{ops::Range, time::SystemTime};
 use axon_shm::{Meta, Sample, TakeError, internal::Reader};
 
 use super::{
-    Lifetime, MessageInfo, inner::SubscriptionInner, matched_reader::Turn,
+    matched_reader::Turn,
     matched_readers::MatchedReaders,
+    message_info::{Lifetime, MessageInfo},
 };
-use crate::{ids::Gid, session::clock, wire::session::EndpointRole};
+use crate::{ids::Gid, session::clock};
 
 /// Samples that one take passes over because they were taken before.
 const REPEATS: usize = 64;
@@ -26,17 +27,30 @@ fn clock_now() -> SystemTime {
     clock::from_unix_nanos(clock::wall())
 }
 
+/// What a take has to know of its subscription.
+#[derive(Clone, Copy)]
+pub(super) struct TakeRules<'a> {
+    /// The topic, for log lines.
+    pub(super) topic: &'a str,
+    /// How many samples stand of all writers together, if they share a depth.
+    pub(super) shared_depth: Option<u32>,
+    /// Whether the numbers of each writer rise: one that does not was taken before.
+    pub(super) rising: bool,
+    /// Whether samples that are skipped count as lost: nobody asked a relay to skip any.
+    pub(super) loses_skipped: bool,
+}
+
 /// One take by a subscription.
 pub(super) struct Take<'a> {
     readers: &'a mut MatchedReaders,
-    of: &'a SubscriptionInner,
+    of: TakeRules<'a>,
     /// When its samples were received. Without a time, each sample has that at which it was taken.
     received_timestamp: Option<SystemTime>,
 }
 
 impl<'a> Take<'a> {
     /// A take from these `readers`, which are `of` the subscription and whose lock the caller holds.
-    pub(super) fn begin(readers: &'a mut MatchedReaders, of: &'a SubscriptionInner) -> Self {
+    pub(super) fn begin(readers: &'a mut MatchedReaders, of: TakeRules<'a>) -> Self {
         readers.slots.begin_take();
         Self { readers, of, received_timestamp: None }
     }
@@ -138,7 +152,7 @@ impl<'a> Take<'a> {
         take: &mut impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
     ) -> Option<(MessageInfo, T)> {
         let readers = &mut *self.readers;
-        let topic = &self.of.endpoint.topic;
+        let topic = self.of.topic;
         let slot = &mut readers.slots[index];
         let writer = slot.reader.writer();
         let (meta, taken) = match take(&mut slot.reader) {
@@ -198,7 +212,7 @@ impl<'a> Take<'a> {
     /// The next sample of one writer, for a relay, and how many of that writer's were lost by then.
     pub(super) fn sample_of(mut self, writer: &Gid) -> Option<(Sample, u64)> {
         let readers = &mut *self.readers;
-        let topic = &self.of.endpoint.topic;
+        let topic = self.of.topic;
         let index = readers.slots.iter().position(|slot| {
             slot.reader.writer() == *writer && (!slot.over || slot.reader.has_data())
         })?;
@@ -208,9 +222,7 @@ impl<'a> Take<'a> {
                 if let Some(sample) = &sample {
                     slot.passed(sample.meta().sequence);
                 }
-                // What a relay passes over, nobody asked it to.
-                let relay = self.of.role == EndpointRole::Relay;
-                let skipped = if relay { slot.reader.skipped() } else { 0 };
+                let skipped = if self.of.loses_skipped { slot.reader.skipped() } else { 0 };
                 let taken = sample.map(|sample| (sample, slot.lost().saturating_add(skipped)));
                 readers.sweep();
                 taken
@@ -228,7 +240,7 @@ impl<'a> Take<'a> {
 
     /// Gives up a reader whose ring is not usable.
     fn discard(&mut self, index: usize, error: &TakeError) {
-        let topic = &self.of.endpoint.topic;
+        let topic = self.of.topic;
         tracing::error!(topic, %error, "a publisher's memory is not usable");
         let slot = self.readers.slots.remove(index);
         self.readers.retire(&slot);

@@ -83,7 +83,9 @@ impl Served {
             }
             Ok(reader.take(&mut out)?.map(|taken| (taken.meta, ())))
         };
-        Take::begin(&mut self.requests, &self.inner).next(take).map(|(info, ())| info.sequence)
+        Take::begin(&mut self.requests, self.inner.take_rules())
+            .next(take)
+            .map(|(info, ())| info.sequence)
     }
 
     fn take_all(&mut self) -> Vec<u64> {
@@ -123,7 +125,7 @@ fn a_request_that_there_is_no_memory_for_is_not_overtaken_by_later_ones_of_its_c
     let taken = std::iter::from_fn(|| {
         let take =
             |reader: &mut Reader| Ok(reader.take(&mut Vec::new())?.map(|taken| (taken.meta, ())));
-        Take::begin(&mut of.requests, &of.inner)
+        Take::begin(&mut of.requests, of.inner.take_rules())
             .next_of(&of.client, take)
             .map(|(info, ())| info.sequence)
     });
@@ -159,13 +161,13 @@ fn nobody_is_woken_at_once_for_a_sample_that_there_is_no_memory_for() {
     let inner = subscription(gid);
     let none = |_: &mut Reader| Err::<Option<(Meta, ())>, _>(TakeError::NoMemory { len: 6 });
     assert!(
-        Take::begin(&mut matched_readers, &inner).next(none).is_none()
+        Take::begin(&mut matched_readers, inner.take_rules()).next(none).is_none()
             && !matched_readers.slots().has_data()
     );
     // A caller that asks nevertheless gets it, if it can be had.
     let mut out = Vec::new();
     let take = |reader: &mut Reader| Ok(reader.take(&mut out)?.map(|taken| (taken.meta, ())));
-    assert!(Take::begin(&mut matched_readers, &inner).next(take).is_some());
+    assert!(Take::begin(&mut matched_readers, inner.take_rules()).next(take).is_some());
     assert_eq!(out, b"sample");
 }
 
@@ -219,7 +221,7 @@ fn numbers_from_other_hosts_leave_losses_that_can_be_counted() {
     let mut numbers = Vec::new();
     let mut take = |matched_readers: &mut MatchedReaders| {
         let take = |reader: &mut Reader| Ok(reader.take(&mut out)?.map(|t| (t.meta, ())));
-        Take::begin(matched_readers, &inner).next(take)
+        Take::begin(matched_readers, inner.take_rules()).next(take)
     };
     while let Some((info, ())) = take(&mut matched_readers) {
         numbers.push(info.sequence);
