@@ -34,7 +34,7 @@ use super::{
     admission::Admission,
     losses::Losses,
     report::{
-        decisions::{AccessQuestions, NOT_LINKED},
+        questions::{AccessQuestions, NOT_LINKED},
         waiting::Told,
     },
     room::Spare,

@@ -1,6 +1,7 @@
 //! Builds the daemon's [`Status`] from the state of the control plane.
 
-pub(super) mod decisions;
+mod decisions;
+pub(super) mod questions;
 mod topics;
 pub(super) mod waiting;
 
