@@ -40,7 +40,12 @@ impl AccessQuestions {
     }
 
     /// Takes a question. Returns the number of another one that waits no longer.
-    pub(super) fn push(&mut self, id: SessionId, daemon: DaemonId, uses: Vec<CheckedUse>) -> Option<u64> {
+    pub(super) fn push(
+        &mut self,
+        id: SessionId,
+        daemon: DaemonId,
+        uses: Vec<CheckedUse>,
+    ) -> Option<u64> {
         self.number += 1;
         self.unsent.push_back((self.number, daemon, uses));
         self.waiting.insert(self.number, (id, daemon));
