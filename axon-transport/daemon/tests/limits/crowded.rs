@@ -79,7 +79,7 @@ fn session_beyond_the_daemons_descriptors_is_told_the_numbers_and_what_to_set() 
 fn daemon_takes_as_many_descriptors_as_its_hard_limit_allows() {
     let host = host();
     let mut shell = host.command("sh");
-    shell.args(["-c", "ulimit -H -n 512 && ulimit -S -n 64 && exec \"$0\""]);
+    shell.args(["-c", "ulimit -S -n 64 && ulimit -H -n 512 && exec \"$0\""]);
     shell.arg(env!("CARGO_BIN_EXE_axon_daemon"));
     let _daemon = host.daemon_by(shell);
     let descriptors = host.status().expect("a tool is served").descriptors;

@@ -157,7 +157,7 @@ fn a_file_that_is_gone_keeps_who_is_there_and_lets_nobody_in() {
     assert_eq!(b.status().links.len(), 1, "nothing says that B was removed");
     b.kill_daemon();
     b.start();
-    a.wait_log(&["link refused", "AXON_CLASSIC_TRUST"]);
+    a.wait_log(&["peer refused", "AXON_CLASSIC_TRUST"]);
     b.wait_refusal("that nobody is let in", |text| text.contains("its log says more"));
     assert!(b.status().links.is_empty());
     fs::rename(&away, &trust).unwrap();
