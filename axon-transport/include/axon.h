@@ -647,7 +647,8 @@ typedef struct axon_loan_t {
 
 /**
  * Told of a line: how severe it is (AXON_LOG_*), which part of the library says it, and what. Both
- * strings stand during the call. It is called on a thread of the library's own, which begins with the
+ * strings stand during the call. A line is one line: characters that could steer a terminal are escaped,
+ * as in the daemon's log. It is called on a thread of the library's own, which begins with the
  * first line, for one line after another. That thread has nothing else to do and holds nothing that the
  * program may wait for, so the callback may block and may call this interface. Meanwhile 256 lines wait;
  * of more only the number is told. What the callback makes the library say on its thread is not told.
