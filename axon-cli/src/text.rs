@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use axon_transport::internal::text::is_plain;
+use axon_transport::internal::text::{escaped, is_plain};
 
 /// A table of text: a header, rows, columns as wide as their widest cell.
 pub(crate) struct TextTable {
@@ -62,14 +62,7 @@ impl TextTable {
 
 /// `text` with every character escaped that could steer a terminal.
 pub(crate) fn printable(text: &str) -> String {
-    text.chars().fold(String::with_capacity(text.len()), |mut out, c| {
-        if is_plain(c) {
-            out.push(c);
-        } else {
-            out.extend(c.escape_unicode());
-        }
-        out
-    })
+    escaped(text)
 }
 
 /// A JSON text in which every character that could steer a terminal is escaped; it means the same.

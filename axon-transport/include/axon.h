@@ -647,7 +647,8 @@ typedef struct axon_loan_t {
 
 /**
  * Told of a line: how severe it is (AXON_LOG_*), which part of the library says it, and what. Both
- * strings stand during the call. It is called on a thread of the library's own, which begins with the
+ * strings stand during the call. A line is one line: characters that could steer a terminal are escaped,
+ * as in the daemon's log. It is called on a thread of the library's own, which begins with the
  * first line, for one line after another. That thread has nothing else to do and holds nothing that the
  * program may wait for, so the callback may block and may call this interface. Meanwhile 256 lines wait;
  * of more only the number is told. What the callback makes the library say on its thread is not told.
@@ -1221,8 +1222,11 @@ axon_ret_t axon_session_publisher_wait_matched(struct axon_publisher_t publisher
 /**
  * Blocks until every sample published so far is acknowledged, for at most `timeout` nanoseconds
  * (negative: for ever): AXON_RET_TIMEOUT where one is not. A sample for this host is acknowledged at
- * once, and a RELIABLE sample for another host when that host has it. AXON_RET_TIMEOUT comes at once, and
- * once, when samples were given up since the last call: with a link, or with this host's daemon.
+ * once. For another host it depends on the QoS of publisher and subscription. Both RELIABLE and KEEP_ALL:
+ * that host has the sample. Both RELIABLE, one of them KEEP_LAST: that host has the newest samples, as many
+ * as the depth (the smaller one), or newer ones; older ones may be missing. One of them BEST_EFFORT: the
+ * sample was sent or dropped. AXON_RET_TIMEOUT comes at once, and once, when samples were given up since the
+ * last call: with a link, or with this host's daemon, for a host that read nothing, or by a limit.
  */
 axon_ret_t axon_session_publisher_wait_acknowledged(struct axon_publisher_t publisher,
                                                     int64_t timeout);

@@ -7,6 +7,18 @@ pub fn is_plain(c: char) -> bool {
     matches!(c, '"' | '\'' | '\\') || c.escape_debug().len() == 1
 }
 
+/// `text` with each character that is not plain escaped.
+pub fn escaped(text: &str) -> String {
+    text.chars().fold(String::with_capacity(text.len()), |mut out, c| {
+        if is_plain(c) {
+            out.push(c);
+        } else {
+            out.extend(c.escape_unicode());
+        }
+        out
+    })
+}
+
 /// The first `longest` characters of `text`, each that is not plain replaced by a space.
 pub fn plain(text: &str, longest: usize) -> String {
     text.chars().take(longest).map(|c| if is_plain(c) { c } else { ' ' }).collect()
@@ -33,5 +45,7 @@ mod tests {
             assert_eq!(plain(text, 100), text);
         }
         assert_eq!(plain("a\u{2066}b\nc", 4), "a b ");
+        assert_eq!(escaped("カメラ \"\u{1b}]0;evil\u{7}"), r#"カメラ "\u{1b}]0;evil\u{7}"#);
+        assert_eq!(escaped("\0\u{202e}"), r"\u{0}\u{202e}");
     }
 }

@@ -29,6 +29,7 @@ use super::{
     error::{AXON_RET_BAD_ALLOC, AXON_RET_ERROR, CallFailure, axon_ret_t},
     guarded,
 };
+use crate::text::escaped;
 
 /// Debug: details that help to find a fault.
 pub const AXON_LOG_DEBUG: u32 = 10;
@@ -40,7 +41,8 @@ pub const AXON_LOG_WARN: u32 = 30;
 pub const AXON_LOG_ERROR: u32 = 40;
 
 /// Told of a line: how severe it is (AXON_LOG_*), which part of the library says it, and what. Both
-/// strings stand during the call. It is called on a thread of the library's own, which begins with the
+/// strings stand during the call. A line is one line: characters that could steer a terminal are escaped,
+/// as in the daemon's log. It is called on a thread of the library's own, which begins with the
 /// first line, for one line after another. That thread has nothing else to do and holds nothing that the
 /// program may wait for, so the callback may block and may call this interface. Meanwhile 256 lines wait;
 /// of more only the number is told. What the callback makes the library say on its thread is not told.
@@ -176,7 +178,8 @@ impl Log {
         let Some(told) = slot.told.filter(|_| is_wanted(line.severity)) else { return };
         slot.called = Some(slot.version);
         drop(slot);
-        let text = |text: &str| CString::new(text.replace('\0', " ")).unwrap_or_default();
+        // A NUL is escaped, too. A line may quote a peer, and the program shows it on a terminal.
+        let text = |text: &str| CString::new(escaped(text)).unwrap_or_default();
         let (part, text) = (text(line.part), text(&line.text));
         // SAFETY: the caller that set it says that it may be called so until it is replaced, and `set` does
         // not return before this call has.
@@ -306,6 +309,15 @@ mod tests {
                 break;
             }
         }
+        tracing::error!(peer = "\u{1b}[2J\u{202e}", "a peer is named \u{1b}]0;evil\u{7}\n\0");
+        let named = loop {
+            let text = heard.recv().unwrap();
+            if text.starts_with("a peer is named") {
+                break text;
+            }
+        };
+        assert!(named.contains(r"named \u{1b}]0;evil\u{7}\u{a}\u{0}"), "{named}");
+        assert!(named.chars().all(crate::text::is_plain), "{named:?}");
         tracing::error!("the last");
         while !heard.recv().unwrap().starts_with("the last") {}
         assert_eq!(set(None), AXON_RET_OK);

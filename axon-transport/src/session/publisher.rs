@@ -115,14 +115,20 @@ impl Publisher {
 
     /// Waits until every sample published so far is acknowledged; whether it is.
     ///
-    /// A sample for this host is acknowledged at once, whether or not it has been taken. A RELIABLE sample
-    /// for another host is acknowledged when that host has it in the ring from which its subscriptions
-    /// take, or has no subscription for it any more. A best-effort sample is acknowledged when it is sent
-    /// or dropped. A peer that runs a version of AXON which sends no acknowledgements counts as having a
-    /// sample when it was handed to the link.
+    /// A sample for this host is acknowledged at once, whether or not it has been taken. What it says of
+    /// another host depends on the QoS of the publisher and of each subscription there that it matches:
+    ///
+    /// - Both RELIABLE and KEEP_ALL: the host has the sample in the ring from which its subscriptions take.
+    /// - Both RELIABLE, one of them KEEP_LAST: that ring has the newest samples that were published, as many
+    ///   as the depth (the smaller one, where both are KEEP_LAST), or newer ones. Older samples are
+    ///   acknowledged, too, though newer ones may have replaced them on the way.
+    /// - One of them BEST_EFFORT: nothing. The sample was sent or dropped.
+    ///
+    /// A host that has no such subscription any more waits for nothing. A peer that runs a version of AXON
+    /// which sends no acknowledgements counts as having a sample when it was handed to the link.
     ///
     /// Returns false, once and at once, when samples were [given up](Self::given_up) since the last call:
-    /// their link broke, the peer stopped reading, or this host's daemon was killed.
+    /// their link broke, the peer stopped reading, a limit dropped them, or this host's daemon was killed.
     ///
     /// Where one of two processes of this host shares no memory (`AXON_SHM`), a sample of a RELIABLE and
     /// KEEP_ALL publisher for a subscription like it is acknowledged when the other process has it. Until
@@ -132,13 +138,14 @@ impl Publisher {
         self.session.is_forked() || self.writer.wait_handed_over(timeout)
     }
 
-    /// Samples for other hosts that are not acknowledged yet.
+    /// Samples for other hosts that are not [acknowledged](Self::wait_acknowledged) yet.
     pub fn unacknowledged(&self) -> u64 {
         self.writer.under_way()
     }
 
     /// Samples that were never acknowledged, and will not be: for other hosts, or lost in the daemon where
-    /// it carries this session's samples. Some of them may have arrived.
+    /// it carries this session's samples. Some of them may have arrived. Samples that newer ones replaced,
+    /// for a KEEP_LAST or BEST_EFFORT subscription, are not among them.
     pub fn given_up(&self) -> u64 {
         self.writer.given_up()
     }

@@ -1,8 +1,9 @@
 //! The queue of one flow: samples that wait to be sent, and samples that were sent and are not acknowledged.
 //!
 //! KEEP_LAST never blocks its publisher. A [burst](Burst) is lossless: the flow holds as many samples as its bytes allow.
-//! A flow that had some waiting for too long is behind: it holds its depth, and drops the oldest. KEEP_ALL drops nothing:
-//! what does not fit stays in the ring, and in time holds the publisher back.
+//! A flow that had some waiting for too long is behind: it holds its depth, and drops the oldest. What does not fit within
+//! the depth stays in the ring. KEEP_ALL drops nothing: what does not fit stays in the ring, and in time holds the publisher
+//! back.
 
 #[cfg(test)]
 mod tests;
@@ -163,9 +164,15 @@ impl Queue {
             Policy::KeepLast(_) => usize::MAX,
             Policy::BestEffort(depth) => depth,
         };
+        // Samples that are never dropped for want of bytes: an acknowledgement says that the newest of the depth arrived.
+        let kept = match self.policy {
+            Policy::KeepAll => usize::MAX,
+            Policy::KeepLast(depth) => depth,
+            Policy::BestEffort(_) => 0,
+        };
         let mut dropped = 0;
         while self.waiting.len() >= most || !self.takes(sample.size()) {
-            if self.policy == Policy::KeepAll {
+            if self.waiting.len() < kept {
                 return Offered::Full(sample);
             }
             dropped += u64::from(self.pop().is_some());

@@ -171,7 +171,12 @@ impl Taking {
         counters: &Counters,
         now: Duration,
     ) -> u32 {
-        if !self.has_more() || !queue.wants_more(now) {
+        if !self.has_more() {
+            return 0;
+        }
+        if !queue.wants_more(now) {
+            // It is looked at again when what waits is sent.
+            self.held = false;
             return 0;
         }
         let first = sources.iter().find(|source| source.reads(&self.of));

@@ -234,6 +234,26 @@ fn a_flow_without_room_takes_one_sample_and_keeps_it() {
 }
 
 #[test]
+fn keep_last_without_room_sends_the_newest_of_its_depth() {
+    let mut way = Way::new(keep_last(10));
+    // All the memory that the daemon has is another flow's.
+    let budget = Budget::new(1024);
+    budget.overtake(1024);
+    way.queue = Queue::new(&keep_last(10), budget.of_peer());
+    way.ring.publish(1, 100);
+    assert_eq!(way.fill(at(0)), 1);
+    way.ring.publish(100, 100);
+    let mut sent = Vec::new();
+    for turn in 0..100 {
+        way.fill(at(600 + turn));
+        sent.extend(way.send_all());
+    }
+    assert_eq!(sent, [1].into_iter().chain(92..=101).collect::<Vec<_>>());
+    assert_eq!(way.dropped(), 90);
+    assert!(way.taking.is_idle() && !way.taking.is_held());
+}
+
+#[test]
 fn beyond_a_limit_the_newest_sample_waits_and_the_others_are_dropped() {
     for (qos, copies) in [(keep_last(10), 12), (Qos::sensor_data(), 12), (Qos::keep_all(), 100)] {
         let (mut way, sent) = passes(qos, "drop-oldest");

@@ -116,6 +116,24 @@ fn keep_last_sends_the_newest_while_a_long_one_is_not_acknowledged() {
 }
 
 #[test]
+fn keep_last_drops_nothing_of_its_depth_for_want_of_bytes() {
+    // 1 MiB a flow.
+    let budget = Budget::new(32 * MIB);
+    let mut queue = Queue::new(&keep_last(3), budget.of_peer());
+    for sequence in 1..=2 {
+        assert_eq!(dropped(queue.offer(sample(sequence, 400 << 10, at(0)), at(0))), 0);
+    }
+    for now in [at(0), at(600)] {
+        let third = queue.offer(sample(3, 400 << 10, now), now);
+        assert!(matches!(third, Offered::Full(_)), "{third:?}");
+    }
+    assert_eq!(queue.send().unwrap().info.sequence, 1);
+    assert_eq!(queue.acknowledge(1), (1, Some(1)));
+    assert_eq!(dropped(queue.offer(sample(3, 400 << 10, at(600)), at(600))), 0);
+    assert_eq!(numbers(&mut queue), [2, 3]);
+}
+
+#[test]
 fn numbers_that_were_not_sent_acknowledge_nothing() {
     let budget = Budget::new(256 * MIB);
     let mut queue = Queue::new(&Qos::keep_all(), budget.of_peer());
