@@ -16,8 +16,9 @@ const MOST_UNPROVEN: usize = 8;
 
 /// The last refusals, oldest first.
 ///
-/// Kinds share the room, and so do the addresses of those who prove nothing: what makes room is the oldest refusal of
-/// whoever has the most. A flood of one kind, or from one address, replaces its own refusals.
+/// Kinds share the room, and so do the addresses of hosts that prove nothing. The kind with the most refusals makes room,
+/// and within it the address with the most: its oldest refusal goes. A flood of one kind, or from one address, replaces its
+/// own refusals.
 #[derive(Debug, Default)]
 pub(in crate::control) struct Refusals(Vec<(RefusalKind, RefusalStatus)>);
 
