@@ -30,7 +30,7 @@ use rustls::server::NoServerSessionStorage;
 use rustls::version::TLS13;
 use rustls::{ClientConfig, CommonState, ConfigBuilder, NamedGroup, ServerConfig, WantsVerifier};
 
-use self::erasing::suite;
+use self::erasing::{suite, suite_without_resumption};
 use crate::identity::{Auth, SpkiDigest};
 use crate::negotiated::protocols;
 use crate::{Cipher, Error, KeyExchange, Negotiated};
@@ -49,6 +49,10 @@ pub fn provider() -> CryptoProvider {
 /// The same with one cipher suite.
 pub fn provider_with(cipher: Cipher) -> CryptoProvider {
     CryptoProvider { cipher_suites: vec![suite(cipher)], ..provider() }
+}
+
+fn provider_without_resumption(cipher: Cipher) -> CryptoProvider {
+    CryptoProvider { cipher_suites: vec![suite_without_resumption(cipher)], ..provider() }
 }
 
 /// A builder of your own client configuration, which goes on where it is chosen how the server's
@@ -90,11 +94,15 @@ pub fn quic_initial_suite() -> rustls::quic::Suite {
 
 /// A client's configuration, with one ALPN protocol, or none if `alpn` is empty.
 ///
+/// It resumes nothing. The resumption secret of its connections is made of random bytes, so that none is in memory: with
+/// resumption turned on a server would refuse what it is offered. [`client_builder()`] makes one that can resume.
+///
 /// No server name is sent: what the connection is made with says which certificate is accepted
 /// under [`Auth::Ca`], and nothing under the others.
 pub fn client_config(auth: &Auth, cipher: Cipher, alpn: &[u8]) -> Result<ClientConfig, Error> {
-    let builder = ClientConfig::builder_with_provider(Arc::new(provider_with(cipher)))
-        .with_protocol_versions(&[&TLS13])?;
+    let builder =
+        ClientConfig::builder_with_provider(Arc::new(provider_without_resumption(cipher)))
+            .with_protocol_versions(&[&TLS13])?;
     let mut config = auth.client(builder)?;
     config.alpn_protocols = protocols(alpn)?;
     config.resumption = Resumption::disabled();
@@ -103,9 +111,12 @@ pub fn client_config(auth: &Auth, cipher: Cipher, alpn: &[u8]) -> Result<ClientC
 }
 
 /// A server's configuration, with one ALPN protocol, or none if `alpn` is empty.
+///
+/// It issues no tickets, and makes no resumption secret either, as [`client_config()`].
 pub fn server_config(auth: &Auth, cipher: Cipher, alpn: &[u8]) -> Result<ServerConfig, Error> {
-    let builder = ServerConfig::builder_with_provider(Arc::new(provider_with(cipher)))
-        .with_protocol_versions(&[&TLS13])?;
+    let builder =
+        ServerConfig::builder_with_provider(Arc::new(provider_without_resumption(cipher)))
+            .with_protocol_versions(&[&TLS13])?;
     let mut config = auth.server(builder)?;
     config.alpn_protocols = protocols(alpn)?;
     config.session_storage = Arc::new(NoServerSessionStorage {});

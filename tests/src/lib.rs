@@ -10,7 +10,7 @@ mod words;
 
 pub use samples::{Sizes, payload};
 #[cfg(target_os = "linux")]
-pub use secrets::unexpected;
+pub use secrets::{tag_masks, unexpected};
 pub use words::{Tally, Word};
 
 use rustix::process::{Signal, getpid, kill_process};

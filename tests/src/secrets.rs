@@ -69,6 +69,19 @@ impl Needles {
         }
     }
 
+    /// Adds the blocks that mask the tags of AES-256-GCM for each message of an envelopes' key ([`tag_masks`]).
+    pub fn add_tag_masks(
+        &mut self,
+        kind: &'static str,
+        number: usize,
+        aead_key: &[u8; 32],
+        nonce_prefix: [u8; 8],
+    ) {
+        for mask in tag_masks(aead_key, nonce_prefix) {
+            self.add_text(Secret { kind, number }, &mask);
+        }
+    }
+
     /// Adds what `HKDF-SHA256` extracts from a key, and the two states of HMAC that stand for it.
     pub fn add_extracted(&mut self, number: usize, salt: Option<&[u8]>, key: &[u8]) {
         let (prk, _) = Hkdf::<Sha256>::extract(salt, key);
@@ -82,6 +95,21 @@ impl Needles {
             self.add_text(Secret { kind: "PRK", number }, &state);
         }
     }
+}
+
+/// For each message of an envelopes' key, the block that masks its tag (NIST SP 800-38D, 7.1). It opens nothing, but with the
+/// key of GHASH it lets messages be forged.
+pub fn tag_masks(aead_key: &[u8; 32], nonce_prefix: [u8; 8]) -> [[u8; 16]; 10] {
+    let cipher = Aes256::new(aead_key.into());
+    std::array::from_fn(|index| {
+        let mut block = [0; 16];
+        block[..8].copy_from_slice(&nonce_prefix);
+        block[8..12].copy_from_slice(&(index as u32).to_be_bytes());
+        block[15] = 1;
+        let mut block = block.into();
+        cipher.encrypt_block(&mut block);
+        block.into()
+    })
 }
 
 /// What SHA-256 begins with (FIPS 180-4, 5.3.3).

@@ -21,6 +21,15 @@ pub(crate) async fn begin_hello(connection: &Connection) -> (SendStream, RecvStr
     (send, receive)
 }
 
+/// Waits until a daemon that dialled has sent a part of HELLO, and has read that the handshake is complete. It waits for an
+/// answer as long as the streams are kept, but no longer than five seconds.
+pub(crate) async fn hear_hello(connection: &Connection) -> (SendStream, RecvStream) {
+    let (send, mut receive) = connection.accept_bi().await.unwrap();
+    receive.read_exact(&mut [0]).await.unwrap();
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    (send, receive)
+}
+
 /// Closes a connection, and waits until its end is sent.
 pub(crate) async fn close(endpoint: &Endpoint, connection: &Connection) {
     connection.close(0_u32.into(), b"done");

@@ -19,6 +19,8 @@ mod flooded;
 mod forged;
 mod graph;
 mod greedy;
+#[path = "../tls_memory/groups.rs"]
+mod groups;
 mod history;
 mod hoard;
 mod hostile;
@@ -27,6 +29,7 @@ mod kme_keys;
 mod liar;
 mod link_memory;
 mod load;
+mod lure;
 mod many_topics;
 mod mismatch;
 mod mixed;
@@ -49,5 +52,7 @@ mod slow;
 mod squatter;
 mod stranger;
 mod traffic_keys;
+#[path = "../tls_memory/transcript.rs"]
+mod transcript;
 mod unread;
 mod wire;

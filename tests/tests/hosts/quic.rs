@@ -1,8 +1,9 @@
-//! axon-tls's glue between quinn and rustls-axon, for configurations of a test's own.
+//! axon-tls's glue between quinn and each rustls, for configurations of a test's own.
 
-#[allow(dead_code, reason = "the tests have a client alone")]
 #[path = "../tls_memory/quic/axon.rs"]
 pub(crate) mod axon;
-#[allow(dead_code, reason = "a client makes no Retry")]
+#[allow(dead_code, reason = "nobody here makes a Retry")]
 #[path = "../../../axon-tls/src/quic/protection.rs"]
 mod protection;
+#[path = "../tls_memory/quic/released.rs"]
+pub(crate) mod released;

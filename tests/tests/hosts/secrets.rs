@@ -4,10 +4,11 @@
 //! what HKDF extracts from it for the PSK, the READY proof and the envelope; the PSK, the secrets of TLS
 //! that depend on nothing else, and the key of the READY proof. Of each connection in `psk_ke`, whose handshake is
 //! [`recorded`](super::recorded): all secrets of TLS, the keys of QUIC's packets and headers, what the daemon exports,
-//! and the AEAD key of each KME key in both directions, with its key of GHASH. The module `dhe` searches for those
-//! of a connection in `psk_dhe_ke`.
+//! and the AEAD key of each KME key in both directions, with its key of GHASH and the masks of its tags, whose nonces are
+//! read from the recorded packets. The module `dhe` searches for those of a connection in `psk_dhe_ke`.
 
 use std::{
+    cell::RefCell,
     collections::BTreeSet,
     thread,
     time::{Duration, Instant},
@@ -26,7 +27,7 @@ use super::{
     mode::{Kmes, SAE},
     pair::{Host, signal},
     process::{Node, PATIENCE, until},
-    recorded::{self, IN_USE, USED_UP},
+    recorded::{self, IN_USE, Nonces, USED_UP},
     wire::Wire,
 };
 
@@ -49,6 +50,9 @@ struct Hosts {
     kmes: Kmes,
     /// Whether the recorded handshakes tell the secrets of connections.
     recorded: bool,
+    /// Those of the envelopes, which the recorded packets tell; whether there are any.
+    nonces: RefCell<Nonces>,
+    reads_nonces: bool,
 }
 
 /// What is searched for.
@@ -56,6 +60,8 @@ struct Sought {
     needles: Needles,
     /// Keys that were drawn so far.
     drawn: usize,
+    /// Keys whose nonces are known.
+    with_nonces: usize,
     /// Connections that were established so far, and that were recorded.
     connections: usize,
     /// The keys of these.
@@ -82,6 +88,8 @@ struct Found {
 
 const AEAD: &str = "AEAD key";
 const GHASH: &str = "GHASH key";
+/// Nobody ever needs it but for the moment in which an envelope is sealed or opened.
+const MASK: &str = "tag mask";
 const TEXT: &str = "KME key, base64";
 
 /// Keys that wait for their use are in locked memory alone. Ciphers and the secrets of a connection are in use.
@@ -97,7 +105,11 @@ impl Hosts {
     fn start(settings: &[(&'static str, &str)], recorded: bool) -> Self {
         let kmes = Kmes::start();
         let (hosts, wire) = wired([0, 1].map(|host| kmes.settings(host, settings)));
-        Self { hosts, wire, kmes, recorded }
+        let reads_nonces = settings.contains(&("AXON_QKD_KEY_MODE", "messages10"));
+        if reads_nonces {
+            wire.remember_data();
+        }
+        Self { hosts, wire, kmes, recorded, nonces: RefCell::default(), reads_nonces }
     }
 
     /// Each key drawn so far, all that a daemon derives of one, and the secrets of the connections that were recorded.
@@ -111,7 +123,12 @@ impl Hosts {
         for (number, connection) in connections.iter().enumerate() {
             connection.add_to(&mut needles, number);
         }
+        let mut nonces = self.nonces.borrow_mut();
+        nonces.read(&self.wire, Cipher::default(), &connections);
+        let mut with_nonces = 0;
         for (number, (key_id, key)) in drawn.iter().enumerate() {
+            let prefix = nonces.prefix(key_id);
+            with_nonces += usize::from(prefix.is_some());
             needles.add_key(number, key);
             needles.add_derived("READY key", number, None, key, &[b"axon ready"]);
             needles.add_extracted(number, Some(b"AXQKD001"), key);
@@ -126,12 +143,15 @@ impl Hosts {
                     let info = length_prefixed(&fields);
                     let aead = needles.add_derived(AEAD, number, Some(b"AXQKD001"), key, &[&info]);
                     needles.add_ghash_key(GHASH, number, &aead);
+                    if let Some(prefix) = prefix {
+                        needles.add_tag_masks(MASK, number, &aead, prefix);
+                    }
                 }
             }
         }
         let is_spent = |key_id: &String| connections.iter().any(|c| c.key_id == *key_id);
         let spent = (0..drawn.len()).filter(|number| is_spent(&drawn[*number].0)).collect();
-        Sought { needles, drawn: drawn.len(), connections: connections.len(), spent }
+        Sought { needles, drawn: drawn.len(), with_nonces, connections: connections.len(), spent }
     }
 
     /// Searches the daemons of these hosts, and these applications, which have nothing.
@@ -145,7 +165,7 @@ impl Hosts {
         let mut all = Found::default();
         let is_of_connection = |find: &Find| match find.secret.kind {
             "PSK" => sought.spent.contains(&find.secret.number),
-            kind => [IN_USE, USED_UP, AEAD, GHASH].contains(&kind),
+            kind => [IN_USE, USED_UP, AEAD, GHASH, MASK].contains(&kind),
         };
         for process in &stopped {
             let found = process.search(&sought.needles).unwrap();
@@ -182,14 +202,15 @@ impl Hosts {
         let deadline = Instant::now() + PATIENCE;
         loop {
             thread::sleep(FLOW);
-            let (Sought { drawn, connections, .. }, found) =
+            let (Sought { drawn, connections, with_nonces, .. }, found) =
                 self.search(&self.hosts, &applications);
             let (wrong, on_stacks) = (found.wrong - found.texts, found.on_stacks);
             let in_use = (found.with_connections, found.with_ciphers);
             eprintln!(
-                "{drawn} keys were drawn, {connections} connections were recorded: {in_use:?}"
+                "{drawn} keys were drawn, of {with_nonces} nonces were read, {connections} connections were \
+                 recorded: {in_use:?}"
             );
-            if (wrong, on_stacks, in_use) == (0, 0, (2, 2)) {
+            if (wrong, on_stacks, in_use) == (0, 0, (2, 2)) && with_nonces > 0 {
                 break;
             }
             let left = (wrong, on_stacks, in_use);
@@ -203,17 +224,24 @@ impl Hosts {
         let deadline = Instant::now() + PATIENCE;
         loop {
             let spent = spent();
-            let (Sought { drawn, connections, .. }, found) =
+            let (Sought { drawn, connections, with_nonces, .. }, found) =
                 self.search(&self.hosts, &applications);
             let (held, stand) = (found.held.len(), found.connections.len());
             eprintln!(
                 "{drawn} keys were drawn, {spent} are spent, {held} are held; {connections} connections were \
-                 recorded, {stand} are held"
+                 recorded, {stand} are held; of {with_nonces} keys nonces were read"
             );
             // Nothing ever erases a stack but the work that used it, at once.
             assert_eq!(found.on_stacks, 0, "parts of secrets are left on stacks");
             // An answer of the KME stays in its connection's buffers until that is closed as idle.
-            if spent > 0 && found.wrong == 0 && held as u64 <= drawn as u64 - spent && stand <= 1 {
+            // Or the masks of their tags were not searched for.
+            let are_read = !self.reads_nonces || 2 * with_nonces as u64 >= spent;
+            if spent > 0
+                && are_read
+                && found.wrong == 0
+                && held as u64 <= drawn as u64 - spent
+                && stand <= 1
+            {
                 // Or the search finds nothing.
                 assert!(!self.recorded || found.with_connections == 2);
                 break;

@@ -14,6 +14,8 @@ use std::{
 const MOST: usize = 1000;
 /// Datagrams of handshakes that are remembered.
 const MOST_OF_HANDSHAKES: usize = 10_000;
+/// Other datagrams that are remembered, if they are.
+const MOST_OF_DATA: usize = 200_000;
 
 const ALL: u8 = 0;
 const NOTHING: u8 = 1;
@@ -41,13 +43,29 @@ fn pass(passes: &AtomicU8, first: u8, number: u64) -> bool {
     }
 }
 
-fn note(handshakes: &Mutex<Vec<Vec<u8>>>, datagram: &[u8]) {
-    let mut handshakes = handshakes.lock().unwrap();
-    // A long header, which discovery's messages have not.
-    if datagram.first().is_some_and(|first| first & 0x80 != 0)
-        && handshakes.len() < MOST_OF_HANDSHAKES
-    {
-        handshakes.push(datagram.to_vec());
+/// What is remembered of both ends.
+#[derive(Clone, Default)]
+struct Notes {
+    handshakes: Arc<Mutex<Vec<Vec<u8>>>>,
+    data: Arc<Mutex<Vec<Vec<u8>>>>,
+    of_data: Arc<AtomicBool>,
+}
+
+impl Notes {
+    fn note(&self, datagram: &[u8]) {
+        // A long header, which discovery's messages have not.
+        let is_handshake = datagram.first().is_some_and(|first| first & 0x80 != 0);
+        let (notes, most) = match is_handshake {
+            true => (&self.handshakes, MOST_OF_HANDSHAKES),
+            false => (&self.data, MOST_OF_DATA),
+        };
+        // Relaxed: nothing else is told by it.
+        if is_handshake || self.of_data.load(Ordering::Relaxed) {
+            let mut notes = notes.lock().unwrap();
+            if notes.len() < most {
+                notes.push(datagram.to_vec());
+            }
+        }
     }
 }
 
@@ -61,6 +79,9 @@ pub(crate) struct Wire {
     pub(crate) said: Arc<Mutex<Vec<Vec<u8>>>>,
     /// The datagrams of both that begin with a packet of a handshake.
     pub(crate) handshakes: Arc<Mutex<Vec<Vec<u8>>>>,
+    /// The other ones, from when they are [remembered](Self::remember_data) on.
+    pub(crate) data: Arc<Mutex<Vec<Vec<u8>>>>,
+    notes: Notes,
     passes: Arc<AtomicU8>,
     over: Arc<AtomicBool>,
 }
@@ -74,17 +95,20 @@ impl Wire {
             rustix::net::sockopt::set_ip_tos(&socket, ECN_CAPABLE).unwrap();
             Arc::new(socket)
         });
+        let notes = Notes::default();
         let wire = Self {
             address: near.local_addr().unwrap(),
             towards: Arc::clone(&towards),
             said: Arc::default(),
-            handshakes: Arc::default(),
+            handshakes: notes.handshakes.clone(),
+            data: notes.data.clone(),
+            notes,
             passes: Arc::default(),
             over: Arc::default(),
         };
         let client = Arc::new(Mutex::new(None));
         let (from, over, said) = (client.clone(), wire.over.clone(), wire.said.clone());
-        let [of_client, of_server] = [0, 1].map(|_| Arc::clone(&wire.handshakes));
+        let [of_client, of_server] = [0, 1].map(|_| wire.notes.clone());
         let (back, out, passes) =
             (Arc::clone(&near), Arc::clone(&towards), Arc::clone(&wire.passes));
         thread::spawn(move || {
@@ -101,7 +125,7 @@ impl Wire {
                     said.push(bytes[..length].to_vec());
                 }
                 drop(said);
-                note(&of_client, &bytes[..length]);
+                of_client.note(&bytes[..length]);
                 let _ = out.send_to(&bytes[..length], server);
             }
         });
@@ -111,7 +135,7 @@ impl Wire {
             while !over.load(Ordering::Relaxed) {
                 let Ok((length, _)) = towards.recv_from(&mut bytes) else { continue };
                 number += 1;
-                note(&of_server, &bytes[..length]);
+                of_server.note(&bytes[..length]);
                 if let Some(address) = *client.lock().unwrap()
                     && pass(&passes, bytes[0], number)
                 {
@@ -120,6 +144,11 @@ impl Wire {
             }
         });
         wire
+    }
+
+    /// From now on remembers datagrams that are of no handshake, too.
+    pub(crate) fn remember_data(&self) {
+        self.notes.of_data.store(true, Ordering::Relaxed);
     }
 
     /// From now on nothing gets through.

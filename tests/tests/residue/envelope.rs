@@ -2,18 +2,12 @@
 
 use std::{io::Read, thread, time::Duration};
 
-use aes::{
-    Aes256,
-    cipher::{BlockCipherEncrypt, KeyInit},
-};
 use axon_envelope::aead::{Aead, AwsLc, RustCrypto};
 use axon_envelope::{
     Channel, Delivery, KeyId, Kind, KmeKey, MESSAGES_PER_KEY, Opener, Route, Sealer, TopicHash,
 };
 use axon_tests::memory::{Find, Needles, Secret, Stopped};
-use axon_tests::unexpected;
-use hkdf::Hkdf;
-use sha2::Sha256;
+use axon_tests::{tag_masks, unexpected};
 
 use crate::child::{self, Searched};
 
@@ -104,30 +98,22 @@ fn needles(keys: &[[u8; 32]]) -> Needles {
             info.extend_from_slice(&(field.len() as u16).to_be_bytes());
             info.extend_from_slice(field);
         }
-        needles.add_derived("AEAD key", number, Some(b"AXQKD001"), key, &[&info]);
-        let mut aead_key = [0; 32];
-        Hkdf::<Sha256>::new(Some(b"AXQKD001"), key).expand(&info, &mut aead_key).unwrap();
-        add_blocks(&mut needles, number, &aead_key);
+        let aead_key = needles.add_derived("AEAD key", number, Some(b"AXQKD001"), key, &[&info]);
+        needles.add_ghash_key("GHASH key", number, &aead_key);
+        needles.add_tag_masks("tag mask", number, &aead_key, NONCE_PREFIX);
     }
     needles
 }
 
-/// Adds what AES-GCM computes of its key (NIST SP 800-38D, 7.1): the key of GHASH, and for each
-/// message the block that masks its tag. Either opens nothing, but both let messages be forged.
-fn add_blocks(needles: &mut Needles, number: usize, aead_key: &[u8; 32]) {
-    let cipher = Aes256::new(aead_key.into());
-    let encrypted = |block: [u8; 16]| -> [u8; 16] {
-        let mut block = block.into();
-        cipher.encrypt_block(&mut block);
-        block.into()
-    };
-    needles.add_ghash_key("GHASH key", number, aead_key);
-    for index in 0..MESSAGES_PER_KEY {
-        let mut counter = [0; 16];
-        counter[..8].copy_from_slice(&NONCE_PREFIX);
-        counter[8..12].copy_from_slice(&u32::from(index).to_be_bytes());
-        counter[15] = 1;
-        needles.add_text(Secret { kind: "tag mask", number }, &encrypted(counter));
+/// What AES-GCM makes of nothing is the mask of its tag.
+#[test]
+fn the_masks_of_tags_are_those_of_aes_gcm() {
+    let key = random_keys()[0];
+    for (index, mask) in (0_u32..).zip(tag_masks(&key, NONCE_PREFIX)) {
+        let mut nonce = [0; 12];
+        nonce[..8].copy_from_slice(&NONCE_PREFIX);
+        nonce[8..].copy_from_slice(&index.to_be_bytes());
+        assert_eq!(AwsLc::new(&key).seal_in_place(&nonce, b"", &mut []).unwrap(), mask);
     }
 }
 

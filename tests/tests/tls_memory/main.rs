@@ -11,6 +11,7 @@
 mod certificates;
 mod child;
 mod erase;
+mod groups;
 mod memory;
 mod quic;
 mod tapped;

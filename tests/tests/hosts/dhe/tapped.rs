@@ -1,75 +1,86 @@
-//! A client in `psk_dhe_ke` that tells the shared secret of its key exchange.
+//! Ends in `psk_dhe_ke` that tell the shared secret of their key exchange.
 
-use std::sync::{Arc, Mutex};
+use std::{fmt, sync::Arc};
 
-use axon_tests::schedule::{Schedule, Terms};
-use axon_tls::{Cipher, qkd::PskIdentity, quic::ALPN};
+use axon_tests::schedule::{Mode, Schedule, Terms};
+use axon_tls::{Cipher, PskKex, qkd::PskIdentity, quic::ALPN};
 use rustls_axon::{
-    ClientConfig, Error, NamedGroup,
+    ClientConfig, ServerConfig,
     crypto::{
-        ActiveKeyExchange, CryptoProvider, SharedSecret, SupportedKxGroup,
-        aws_lc_rs::{cipher_suite, default_provider, kx_group::X25519MLKEM768},
+        CryptoProvider,
+        aws_lc_rs::{cipher_suite, default_provider},
         hash::HashAlgorithm,
     },
-    external_psk::{ExternalPsk, PskKeyExchangeMode},
+    external_psk::{ExternalPsk, ExternalPskOffer, PskKeyExchangeMode, ResolvesExternalPsk},
 };
 
-use crate::quic;
+use crate::{
+    groups::{Told, of_axon},
+    mode::{Kmes, SAE},
+    quic,
+};
 
-/// What the last key exchange gave.
-pub(super) type Told = Arc<Mutex<Vec<u8>>>;
+/// What is agreed on in all of these tests.
+pub(super) const MODE: Mode = Mode::Psk(PskKex::PskDheKe);
 
-/// A group that tells the shared secret.
-#[derive(Debug)]
-struct Group(Told);
-
-struct Active(Box<dyn ActiveKeyExchange>, Told);
-
-impl SupportedKxGroup for Group {
-    fn start(&self) -> Result<Box<dyn ActiveKeyExchange>, Error> {
-        Ok(Box::new(Active(X25519MLKEM768.start()?, self.0.clone())))
-    }
-
-    fn name(&self) -> NamedGroup {
-        X25519MLKEM768.name()
-    }
+fn provider(cipher: Cipher, told: &Told) -> Arc<CryptoProvider> {
+    let suite = match cipher {
+        Cipher::ChaCha20Poly1305 => cipher_suite::TLS13_CHACHA20_POLY1305_SHA256,
+        Cipher::Aes256Gcm => cipher_suite::TLS13_AES_256_GCM_SHA384,
+    };
+    Arc::new(CryptoProvider {
+        cipher_suites: vec![suite],
+        kx_groups: vec![Box::leak(Box::new(of_axon::Group(told.clone())))],
+        ..default_provider()
+    })
 }
 
-impl ActiveKeyExchange for Active {
-    fn complete(self: Box<Self>, peer: &[u8]) -> Result<SharedSecret, Error> {
-        let secret = self.0.complete(peer)?;
-        *self.1.lock().unwrap() = secret.secret_bytes().to_vec();
-        Ok(secret)
-    }
-
-    fn pub_key(&self) -> &[u8] {
-        self.0.pub_key()
-    }
-
-    fn group(&self) -> NamedGroup {
-        self.0.group()
-    }
+fn external(terms: Terms<'_>) -> Arc<ExternalPsk> {
+    let hash = match terms.cipher {
+        Cipher::ChaCha20Poly1305 => HashAlgorithm::SHA256,
+        Cipher::Aes256Gcm => HashAlgorithm::SHA384,
+    };
+    let identity = PskIdentity::new(terms.client, terms.key_id).unwrap().to_bytes();
+    Arc::new(ExternalPsk::new(identity, Schedule::psk(terms).into(), hash).unwrap())
 }
 
 /// The configuration of a client on these terms.
 pub(super) fn client(terms: Terms<'_>, told: &Told) -> quinn::ClientConfig {
-    let (suite, hash) = match terms.cipher {
-        Cipher::ChaCha20Poly1305 => {
-            (cipher_suite::TLS13_CHACHA20_POLY1305_SHA256, HashAlgorithm::SHA256)
-        }
-        Cipher::Aes256Gcm => (cipher_suite::TLS13_AES_256_GCM_SHA384, HashAlgorithm::SHA384),
-    };
-    let provider = CryptoProvider {
-        cipher_suites: vec![suite],
-        kx_groups: vec![Box::leak(Box::new(Group(told.clone())))],
-        ..default_provider()
-    };
-    let identity = PskIdentity::new(terms.client, terms.key_id).unwrap().to_bytes();
-    let psk = ExternalPsk::new(identity, Schedule::psk(terms).into(), hash).unwrap();
-    let mut config = ClientConfig::builder_with_provider(Arc::new(provider))
-        .with_external_psks(vec![Arc::new(psk)], PskKeyExchangeMode::PskDheKe)
+    let psks = vec![external(terms)];
+    let mut config = ClientConfig::builder_with_provider(provider(terms.cipher, told))
+        .with_external_psks(psks, PskKeyExchangeMode::PskDheKe)
         .unwrap();
     config.alpn_protocols = vec![ALPN.to_vec()];
     config.enable_sni = false;
     quinn::ClientConfig::new(quic::axon::client(config))
+}
+
+/// The configuration of a server, as the SAE of host 1, that knows each key which the SAE of host 0 draws.
+pub(super) fn server(cipher: Cipher, kmes: &Arc<Kmes>, told: &Told) -> quinn::ServerConfig {
+    let drawn = Arc::new(Drawn(cipher, kmes.clone()));
+    let mut config = ServerConfig::builder_with_provider(provider(cipher, told))
+        .with_external_psk_resolver(drawn, PskKeyExchangeMode::PskDheKe)
+        .unwrap();
+    config.alpn_protocols = vec![ALPN.to_vec()];
+    quinn::ServerConfig::with_crypto(quic::axon::server(config))
+}
+
+/// The keys that were drawn.
+struct Drawn(Cipher, Arc<Kmes>);
+
+impl fmt::Debug for Drawn {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Drawn")
+    }
+}
+
+impl ResolvesExternalPsk for Drawn {
+    fn resolve(&self, offer: ExternalPskOffer<'_>) -> Option<Arc<ExternalPsk>> {
+        let [client, server] = SAE;
+        let mut psks = self.1.drawn().into_iter().map(|(key_id, key)| {
+            let (key, key_id) = (&key[..], &key_id[..]);
+            external(Terms { cipher: self.0, mode: MODE, key, key_id, client, server })
+        });
+        psks.find(|psk| offer.identities().any(|identity| identity == psk.identity()))
+    }
 }

@@ -3,6 +3,7 @@
 //! In `psk_ke` nothing else comes into them: there is no key exchange. So both ends can be daemons as they are released,
 //! which tell their secrets to nobody. In `psk_dhe_ke` one end has to tell the shared secret of the key exchange.
 
+mod envelopes;
 mod packets;
 
 use std::collections::BTreeMap;
@@ -13,6 +14,7 @@ use axon_tests::{
 };
 use axon_tls::{Cipher, PskKex};
 
+pub(crate) use self::envelopes::Nonces;
 use self::packets::{Kind, Opens, Packet, Stream, packets};
 use super::{
     mode::{Drawn, SAE},
@@ -34,6 +36,8 @@ pub(crate) struct Connection {
     pub(crate) key_id: String,
     /// What the envelope's exporter gave.
     pub(crate) context: Vec<u8>,
+    /// The first traffic secret and those of the next key updates, the client's and the server's.
+    traffic: [[Vec<u8>; 3]; 2],
 }
 
 impl Connection {
@@ -46,6 +50,13 @@ impl Connection {
         let mut used_up: Vec<_> = psk.chain(schedule.used_up().iter().cloned()).collect();
         let mut in_use: Vec<_> =
             schedule.in_use().iter().filter(|secret| !is_psk(secret)).cloned().collect();
+        let traffic = ["client", "server"].map(|end| {
+            [0, 1, 2].map(|update| {
+                let name = format!("{end} traffic secret {update}");
+                let mut all = used_up.iter().chain(&in_use);
+                all.find(|secret| secret.name == name).unwrap().bytes.clone()
+            })
+        });
         let mut context = Vec::new();
         for label in EXPORTERS.into_iter().chain([SIGNED]) {
             let [of_label, exported] = schedule.export(label).expect("the schedule is complete");
@@ -57,7 +68,7 @@ impl Connection {
                 context = exported;
             }
         }
-        Self { in_use, used_up, key_id: terms.key_id.to_owned(), context }
+        Self { in_use, used_up, key_id: terms.key_id.to_owned(), context, traffic }
     }
 
     /// Adds its secrets to what is searched for, as of the kinds [`IN_USE`] and [`USED_UP`].

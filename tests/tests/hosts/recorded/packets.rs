@@ -134,18 +134,52 @@ impl Opens {
         }
     }
 
+    /// For packets under a later traffic secret, after a key update: the key of their headers stays (RFC 9001, section 6).
+    pub(super) fn updated(cipher: Cipher, first: &[u8], later: &[u8]) -> Self {
+        let [first, later] = [first, later].map(|secret| Self::with(cipher, secret));
+        Self { packet: later.packet, header: first.header }
+    }
+
     /// The frames of a packet; `None` if it is not one of that end.
     pub(super) fn open(&self, packet: &Packet<'_>) -> Option<Vec<u8>> {
-        let mut bytes = packet.bytes.to_vec();
-        let (head, rest) = bytes.split_at_mut_checked(packet.number_at)?;
+        // Those of a handshake are so few that their numbers are whole.
+        let frames = self.open_at(packet.bytes, packet.number_at, 0);
+        frames.map(|(_, frames)| frames)
+    }
+
+    /// The number and the frames of a packet with a short header, of which `next` is expected; `None` if it is not one of
+    /// that end.
+    pub(super) fn open_short(&self, datagram: &[u8], next: u64) -> Option<(u64, Vec<u8>)> {
+        self.open_at(datagram, 1 + CONNECTION_ID, next)
+    }
+
+    fn open_at(&self, packet: &[u8], number_at: usize, next: u64) -> Option<(u64, Vec<u8>)> {
+        let mut bytes = packet.to_vec();
+        let (head, rest) = bytes.split_at_mut_checked(number_at)?;
         let (number, sample) = rest.split_at_mut_checked(4)?;
         let sample = sample.get(..self.header.sample_len())?;
         self.header.decrypt_in_place(sample, &mut head[0], number).ok()?;
         let length = usize::from(head[0] & 3) + 1;
-        // Those of a handshake are so few that they are whole.
         let number = number[..length].iter().fold(0, |all, byte| all << 8 | u64::from(*byte));
-        let (head, payload) = bytes.split_at_mut(packet.number_at + length);
-        self.packet.decrypt_in_place(number, head, payload).ok().map(<[u8]>::to_vec)
+        let number = whole_number(number, 1 << (8 * length), next);
+        let (head, payload) = bytes.split_at_mut(number_at + length);
+        let frames = self.packet.decrypt_in_place(number, head, payload).ok()?;
+        Some((number, frames.to_vec()))
+    }
+}
+
+/// Length of the connection IDs of daemons.
+const CONNECTION_ID: usize = 8;
+
+/// The packet number nearest to `next` that ends as this one, of `window` different ends (RFC 9000, A.3).
+fn whole_number(end: u64, window: u64, next: u64) -> u64 {
+    let candidate = next & !(window - 1) | end;
+    if candidate + window / 2 <= next {
+        candidate + window
+    } else if candidate > next + window / 2 && candidate >= window {
+        candidate - window
+    } else {
+        candidate
     }
 }
 

@@ -1,0 +1,201 @@
+//! Ends in `classic` that tell the shared secret of their key exchange, and the messages of their handshake.
+
+use std::sync::Arc;
+
+use axon_tls::{Cipher, hybrid, quic::ALPN};
+use rustls::{
+    ClientConfig, DigitallySignedStruct, DistinguishedName, Error, ServerConfig, SignatureScheme,
+    client::{
+        AlwaysResolvesClientRawPublicKeys, Resumption,
+        danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier},
+    },
+    crypto::{
+        CryptoProvider,
+        aws_lc_rs::{default_provider, sign::any_supported_type},
+    },
+    pki_types::{CertificateDer, PrivateKeyDer, ServerName, UnixTime, pem::PemObject},
+    server::{
+        AlwaysResolvesServerRawPublicKeys,
+        danger::{ClientCertVerified, ClientCertVerifier},
+    },
+    sign::CertifiedKey,
+    version::TLS13,
+};
+
+use crate::{
+    groups::{Told, of_rustls},
+    quic,
+    transcript::{Messages, TappedClient, TappedServer},
+};
+
+/// What an end learns.
+#[derive(Default)]
+pub(super) struct Learnt {
+    /// What the key exchange gave.
+    pub(super) shared: Told,
+    /// ClientHello to the client's Finished.
+    pub(super) transcript: Messages,
+}
+
+/// What an end shows of itself, as PEM. It accepts anybody.
+pub(super) struct Own {
+    pub(super) key: String,
+    /// `None`: a raw public key (RFC 7250) is shown.
+    pub(super) certificate: Option<String>,
+}
+
+impl Own {
+    fn key(&self) -> PrivateKeyDer<'static> {
+        PrivateKeyDer::from_pem_slice(self.key.as_bytes()).unwrap()
+    }
+
+    fn chain(&self) -> Option<Vec<CertificateDer<'static>>> {
+        let pem = self.certificate.as_ref()?;
+        Some(vec![CertificateDer::from_pem_slice(pem.as_bytes()).unwrap()])
+    }
+
+    fn raw(&self) -> Arc<CertifiedKey> {
+        let key = any_supported_type(&self.key()).unwrap();
+        let public = CertificateDer::from(key.public_key().unwrap().to_vec());
+        Arc::new(CertifiedKey::new(vec![public], key))
+    }
+
+    fn anybody(&self) -> Arc<Anybody> {
+        Arc::new(Anybody { raw: self.certificate.is_none() })
+    }
+}
+
+fn provider(cipher: Cipher, learnt: &Learnt) -> Arc<CryptoProvider> {
+    Arc::new(CryptoProvider {
+        kx_groups: vec![Box::leak(Box::new(of_rustls::Group(learnt.shared.clone())))],
+        ..hybrid::provider_with(cipher)
+    })
+}
+
+pub(super) fn client(cipher: Cipher, own: &Own, learnt: &Learnt) -> quinn::ClientConfig {
+    let builder = ClientConfig::builder_with_provider(provider(cipher, learnt))
+        .with_protocol_versions(&[&TLS13])
+        .unwrap()
+        .dangerous()
+        .with_custom_certificate_verifier(own.anybody());
+    let mut config = match own.chain() {
+        Some(chain) => builder.with_client_auth_cert(chain, own.key()).unwrap(),
+        None => {
+            let raw = AlwaysResolvesClientRawPublicKeys::new(own.raw());
+            builder.with_client_cert_resolver(Arc::new(raw))
+        }
+    };
+    config.alpn_protocols = vec![ALPN.to_vec()];
+    config.resumption = Resumption::disabled();
+    config.enable_sni = false;
+    let crypto = TappedClient(quic::released::client(config), learnt.transcript.clone());
+    quinn::ClientConfig::new(Arc::new(crypto))
+}
+
+pub(super) fn server(cipher: Cipher, own: &Own, learnt: &Learnt) -> quinn::ServerConfig {
+    let builder = ServerConfig::builder_with_provider(provider(cipher, learnt))
+        .with_protocol_versions(&[&TLS13])
+        .unwrap()
+        .with_client_cert_verifier(own.anybody());
+    let mut config = match own.chain() {
+        Some(chain) => builder.with_single_cert(chain, own.key()).unwrap(),
+        None => {
+            let raw = AlwaysResolvesServerRawPublicKeys::new(own.raw());
+            builder.with_cert_resolver(Arc::new(raw))
+        }
+    };
+    config.alpn_protocols = vec![ALPN.to_vec()];
+    config.send_tls13_tickets = 0;
+    let crypto = TappedServer(quic::released::server(config), learnt.transcript.clone());
+    quinn::ServerConfig::with_crypto(Arc::new(crypto))
+}
+
+/// Accepts any peer: who it is has no part in the secrets.
+#[derive(Debug)]
+struct Anybody {
+    raw: bool,
+}
+
+fn schemes() -> Vec<SignatureScheme> {
+    default_provider().signature_verification_algorithms.supported_schemes()
+}
+
+impl ServerCertVerifier for Anybody {
+    fn verify_server_cert(
+        &self,
+        _: &CertificateDer<'_>,
+        _: &[CertificateDer<'_>],
+        _: &ServerName<'_>,
+        _: &[u8],
+        _: UnixTime,
+    ) -> Result<ServerCertVerified, Error> {
+        Ok(ServerCertVerified::assertion())
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        _: &[u8],
+        _: &CertificateDer<'_>,
+        _: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        unreachable!("TLS 1.3 alone is spoken")
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        _: &[u8],
+        _: &CertificateDer<'_>,
+        _: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        Ok(HandshakeSignatureValid::assertion())
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
+        schemes()
+    }
+
+    fn requires_raw_public_keys(&self) -> bool {
+        self.raw
+    }
+}
+
+impl ClientCertVerifier for Anybody {
+    fn root_hint_subjects(&self) -> &[DistinguishedName] {
+        &[]
+    }
+
+    fn verify_client_cert(
+        &self,
+        _: &CertificateDer<'_>,
+        _: &[CertificateDer<'_>],
+        _: UnixTime,
+    ) -> Result<ClientCertVerified, Error> {
+        Ok(ClientCertVerified::assertion())
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        _: &[u8],
+        _: &CertificateDer<'_>,
+        _: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        unreachable!("TLS 1.3 alone is spoken")
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        _: &[u8],
+        _: &CertificateDer<'_>,
+        _: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        Ok(HandshakeSignatureValid::assertion())
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
+        schemes()
+    }
+
+    fn requires_raw_public_keys(&self) -> bool {
+        self.raw
+    }
+}
