@@ -17,7 +17,7 @@ use super::{
     daemon::connect::Caller,
     daemon::control::Start,
     state::Outgoing,
-    subscription::{SubscriptionInner, take_many_of, take_of},
+    subscription::{SubscriptionInner, sample_of, take_many_of, take_of},
 };
 use crate::{
     config::Config,
@@ -176,7 +176,7 @@ impl Subscription {
     pub fn attached(&self) -> Vec<Gid> {
         let mut gids = self.matched();
         if !self.session.is_forked() {
-            gids.extend(self.inner.lock().leaving());
+            gids.extend(self.inner.lock().slots().leaving());
         }
         gids
     }
@@ -187,7 +187,7 @@ impl Subscription {
         if self.session.is_forked() {
             return None;
         }
-        self.inner.lock().take_from(writer, &self.inner)
+        sample_of(&self.inner, writer)
     }
 
     /// For a relay: how many samples of this publisher newer ones replaced before they were taken.
@@ -223,18 +223,18 @@ impl Subscription {
     /// For a relay: samples that are not acknowledged, those that were not taken among them, by
     /// publisher.
     pub fn unacknowledged(&self) -> HashMap<Gid, u64> {
-        if self.session.is_forked() { HashMap::new() } else { self.inner.lock().undone() }
+        if self.session.is_forked() { HashMap::new() } else { self.inner.lock().slots().undone() }
     }
 
     /// For a relay: bytes that the samples of this publisher take that are not acknowledged.
     pub fn unacknowledged_bytes_of(&self, writer: &Gid) -> u64 {
-        if self.session.is_forked() { 0 } else { self.inner.lock().undone_bytes_of(writer) }
+        if self.session.is_forked() { 0 } else { self.inner.lock().slots().undone_bytes_of(writer) }
     }
 
     /// For a relay: how many publishes of this publisher found no room since readers were not done with its oldest sample,
     /// if this one is not.
     pub fn refused_of(&self, writer: &Gid) -> Option<u64> {
-        if self.session.is_forked() { None } else { self.inner.lock().refused_of(writer) }
+        if self.session.is_forked() { None } else { self.inner.lock().slots().refused_of(writer) }
     }
 
     /// For a relay: so many samples of this publisher do not get where they are to go. It is told.
@@ -268,7 +268,11 @@ impl Subscription {
 
     /// The publishers of which there is something to take.
     pub fn with_data(&self) -> Vec<Gid> {
-        if self.session.is_forked() { Vec::new() } else { self.inner.lock().with_data().collect() }
+        if self.session.is_forked() {
+            Vec::new()
+        } else {
+            self.inner.lock().slots().with_data().collect()
+        }
     }
 
     /// Whether it reads what this publisher writes or wrote, or may do so soon.
@@ -279,12 +283,12 @@ impl Subscription {
     /// For a relay: after what time [`take_of`](Self::take_of) may have a sample of this publisher, where it had none
     /// although some wait. It had passed over samples that do not count, or there was no memory for one.
     pub fn retry_of(&self, writer: &Gid) -> Option<Duration> {
-        if self.session.is_forked() { None } else { self.inner.lock().retry_of(writer) }
+        if self.session.is_forked() { None } else { self.inner.lock().slots().retry_of(writer) }
     }
 
     /// Whether there is something to take of this publisher.
     pub fn has_from(&self, writer: &Gid) -> bool {
-        !self.session.is_forked() && self.inner.lock().has_from(writer)
+        !self.session.is_forked() && self.inner.lock().slots().has_from(writer)
     }
 
     /// The publishers that have a lease, and when each was last alive, by the monotonic clock.
@@ -292,7 +296,7 @@ impl Subscription {
         if self.session.is_forked() {
             return Vec::new();
         }
-        self.inner.lock().assertions()
+        self.inner.lock().slots().assertions()
     }
 
     /// For a relay: the remote subscriptions that it stands for from now on.
@@ -317,7 +321,7 @@ impl Server {
         if self.session.is_forked() {
             Vec::new()
         } else {
-            self.requests.lock().with_data().collect()
+            self.requests.lock().slots().with_data().collect()
         }
     }
 

@@ -13,7 +13,7 @@ use super::{
     MessageInfo, OnNew, RecvError, Session, SessionError, clock,
     publisher::PublisherInner,
     rings::RingsByClient,
-    subscription::{SubscriptionInner, recv_from, take_bytes_from, take_sample_from},
+    subscription::{SubscriptionInner, recv_from, sample_of, take_bytes_from, take_sample_from},
 };
 use crate::{graph::Endpoint, ids::Gid};
 
@@ -182,7 +182,7 @@ impl Server {
 
     /// Whether there is a request of this client to be taken.
     pub(crate) fn has_request_from(&self, client: &Gid) -> bool {
-        !self.session.is_forked() && self.requests.lock().has_from(client)
+        !self.session.is_forked() && self.requests.lock().slots().has_from(client)
     }
 
     pub(super) fn await_clients(&self) {
@@ -276,7 +276,7 @@ impl Client {
 
     /// Whether there is a response of this server to be taken.
     pub(crate) fn has_response_from(&self, server: &Gid) -> bool {
-        !self.session.is_forked() && self.responses.lock().has_from(server)
+        !self.session.is_forked() && self.responses.lock().slots().has_from(server)
     }
 
     pub(super) fn await_servers(&self) {
@@ -353,7 +353,7 @@ fn take_from_one(inner: &SubscriptionInner, session: &Session, writer: &Gid) -> 
     if session.is_forked() {
         return None;
     }
-    inner.lock().take_from(writer, inner).map(|(sample, _)| sample)
+    sample_of(inner, writer).map(|(sample, _)| sample)
 }
 
 fn await_both(writes: &PublisherInner, reads: &SubscriptionInner, session: &Session) {
@@ -376,7 +376,7 @@ fn both(writes: &PublisherInner, reads: &SubscriptionInner, session: &Session) -
 fn attached(writes: &PublisherInner, reads: &SubscriptionInner, session: &Session) -> Vec<Gid> {
     let mut gids = both(writes, reads, session);
     if !session.is_forked() {
-        let leaving = reads.lock().leaving();
+        let leaving = reads.lock().slots().leaving();
         gids.extend(leaving.into_iter().filter(|gid| writes.events.is_matched(gid)));
     }
     gids

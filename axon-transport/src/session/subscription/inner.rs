@@ -7,7 +7,7 @@ use axon_shm::{
     internal::{Grant, Lane, Location, Peer, Reader, ReaderOptions, WakeCheck, holds},
 };
 
-use super::matched_readers::MatchedReaders;
+use super::{matched_readers::MatchedReaders, taking::TakeRules};
 use crate::{
     graph::{Endpoint, EndpointKind},
     ids::Gid,
@@ -99,8 +99,18 @@ impl SubscriptionInner {
         self.endpoint.kind == EndpointKind::Subscription && holds(&self.qos)
     }
 
+    /// What a take has to know.
+    pub(super) fn take_rules(&self) -> TakeRules<'_> {
+        TakeRules {
+            topic: &self.endpoint.topic,
+            shared_depth: self.shared_depth,
+            rising: self.rising,
+            loses_skipped: self.role == EndpointRole::Relay,
+        }
+    }
+
     pub(in crate::session) fn has_data(&self) -> bool {
-        self.lock().has_data()
+        self.lock().slots.has_data()
     }
 
     pub(in crate::session) fn set_on_new_sample(
@@ -114,8 +124,13 @@ impl SubscriptionInner {
             let mut matched_readers = self.lock();
             // Of those that nobody was told of some may have been taken, or lost.
             let untold = untold + matched_readers.new_arrivals();
-            Ok(untold.min(matched_readers.unread(self.shared_depth)))
+            Ok(untold.min(self.within_depth(matched_readers.slots.unread())))
         })
+    }
+
+    /// At most as many samples as all writers together may have to be taken, if they share a depth.
+    fn within_depth(&self, unread: u64) -> u64 {
+        self.shared_depth.map_or(unread, |depth| unread.min(depth.into()))
     }
 
     /// Nobody hears of samples any more, whatever is set from now on.
@@ -178,7 +193,7 @@ impl SubscriptionInner {
     pub(in crate::session) fn rematch(&self) -> Changes {
         let leases = || {
             let matched_readers = self.lock();
-            let active = matched_readers.matched_readers.iter().filter(|slot| slot.counts());
+            let active = matched_readers.slots.iter().filter(|slot| slot.counts());
             active.map(|slot| (slot.reader.writer(), slot.lease)).collect()
         };
         self.events.writers(leases, clock::monotonic())
@@ -189,7 +204,7 @@ impl SubscriptionInner {
     pub(in crate::session) fn look_at_time(&self, now: u64) -> (Option<u64>, bool) {
         let times: Vec<_> = {
             let matched_readers = self.lock();
-            let active = matched_readers.matched_readers.iter().filter(|slot| slot.counts());
+            let active = matched_readers.slots.iter().filter(|slot| slot.counts());
             let times = active.map(|slot| {
                 let mut times = slot.reader.times();
                 times.sampled = times.sampled.filter(|sampled| *sampled >= slot.since);
@@ -203,14 +218,14 @@ impl SubscriptionInner {
     /// The same for who must not wait for a thread that takes.
     pub(in crate::session) fn may_have_losses(&self) -> bool {
         let Ok(mut matched_readers) = self.matched_readers.try_lock() else { return true };
-        matched_readers.matched_readers.iter_mut().for_each(|slot| drop(slot.reader.peek()));
-        matched_readers.losses() != matched_readers.lost_before
+        matched_readers.slots.iter_mut().for_each(|slot| drop(slot.reader.peek()));
+        matched_readers.counts.has_new_losses(matched_readers.slots.lost())
     }
 
     /// Counts what would be found lost by taking now.
     pub(in crate::session) fn look_for_losses(&self) {
         let mut matched_readers = self.lock();
-        for slot in &mut matched_readers.matched_readers {
+        for slot in matched_readers.slots.iter_mut() {
             // What is wrong with its memory, the next take says.
             let _ = slot.reader.peek();
         }
@@ -235,7 +250,7 @@ impl SubscriptionInner {
 impl WakeCheck for SubscriptionInner {
     fn ready(&self) -> bool {
         match self.matched_readers.try_lock() {
-            Ok(matched_readers) => matched_readers.has_data(),
+            Ok(matched_readers) => matched_readers.slots.has_data(),
             // The thread that holds the lock may be about to add something.
             Err(_) => true,
         }

@@ -1,17 +1,22 @@
 //! A reader of all matched publishers of a topic, merged into one stream.
 
+mod counts;
 mod inner;
+mod matched_reader;
 mod matched_readers;
+mod message_info;
 mod remembered;
+mod slots;
 mod taking;
+#[cfg(test)]
+mod tests;
 mod trusted;
-mod unmet;
 
 use std::{
     fmt,
     ops::Range,
     sync::Arc,
-    time::{Duration, Instant, SystemTime},
+    time::{Duration, Instant},
 };
 
 use axon_shm::{
@@ -19,14 +24,19 @@ use axon_shm::{
     internal::{Reader, WakeCheck},
 };
 
-use self::matched_readers::MatchedReaders;
+use self::taking::Take;
 pub(super) use self::{
     inner::SubscriptionInner,
-    matched_readers::{Accept, Asking, Numbers},
+    matched_reader::Numbers,
+    matched_readers::{Accept, Asking},
 };
-pub use self::{taking::TakeLimit, trusted::TrustedSubscription};
+pub use self::{
+    message_info::{Lifetime, MessageInfo},
+    taking::TakeLimit,
+    trusted::TrustedSubscription,
+};
 use super::{
-    OnNew, RecvError, Session, SessionError, clock,
+    OnNew, RecvError, Session, SessionError,
     events::{Event, EventSource},
     state::{Outgoing, SessionShared},
 };
@@ -62,90 +72,6 @@ use crate::{
 pub struct Subscription {
     pub(super) inner: Arc<SubscriptionInner>,
     pub(super) session: Session,
-}
-
-/// What is known of a sample besides its bytes.
-///
-/// ```
-/// # use std::time::Duration;
-/// # use axon_transport::{
-/// #     EndpointSpec, Session, SessionOptions,
-/// #     config::{Config, DaemonPolicy},
-/// #     qos::Qos,
-/// # };
-/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
-/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
-/// # let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default());
-/// let publisher = session.create_publisher(spec())?;
-/// let subscription = session.create_subscription(spec())?;
-/// assert!(publisher.wait_matched(1, Duration::from_secs(10)));
-/// publisher.publish(b"1.5 m/s")?;
-///
-/// let info = subscription.recv(&mut Vec::new(), Some(Duration::from_secs(10)))?;
-/// assert_eq!((info.publisher, info.sequence, info.reception), (publisher.gid(), 1, 1));
-/// # Ok::<(), Box<dyn std::error::Error>>(())
-/// ```
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[non_exhaustive]
-pub struct MessageInfo {
-    /// Who published it.
-    pub publisher: Gid,
-    /// The publication's number, from 1.
-    pub sequence: u64,
-    /// When it was published, by the publisher's clock.
-    pub source_timestamp: SystemTime,
-    /// When it was taken, by this host's clock.
-    pub received_timestamp: SystemTime,
-    /// Its number among those that the endpoint has taken, from 1.
-    pub reception: u64,
-    /// Its age and lifespan, where the lifespan is finite.
-    pub lifetime: Option<Lifetime>,
-}
-
-/// The age of a sample when it was taken, and its publisher's lifespan. The monotonic clock tells both,
-/// so that neither a step of the wall clock nor that of another host counts.
-///
-/// ```
-/// # use std::time::Duration;
-/// # use axon_transport::{
-/// #     EndpointSpec, Session, SessionOptions,
-/// #     config::{Config, DaemonPolicy},
-/// #     qos::Qos,
-/// # };
-/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
-/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
-/// let lifespan = Duration::from_secs(60);
-/// let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default().with_lifespan(lifespan));
-/// let publisher = session.create_publisher(spec())?;
-/// let subscription = session.create_subscription(spec())?;
-/// assert!(publisher.wait_matched(1, Duration::from_secs(10)));
-/// publisher.publish(b"1.5 m/s")?;
-///
-/// let info = subscription.recv(&mut Vec::new(), Some(Duration::from_secs(10)))?;
-/// let lifetime = info.lifetime.expect("the lifespan is finite");
-/// assert_eq!(lifetime.lifespan, lifespan);
-/// assert!(lifetime.age < lifespan);
-/// # Ok::<(), Box<dyn std::error::Error>>(())
-/// ```
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[non_exhaustive]
-pub struct Lifetime {
-    /// How long ago it was published when it was taken.
-    pub age: Duration,
-    /// How old it may be to be delivered.
-    pub lifespan: Duration,
-}
-
-impl Lifetime {
-    fn of(meta: &Meta, lifespan: Duration) -> Self {
-        let age = clock::monotonic().saturating_sub(meta.published);
-        Self { age: Duration::from_nanos(age), lifespan }
-    }
-
-    /// Whether the sample is not to be delivered any more.
-    fn is_over(self) -> bool {
-        self.age > self.lifespan
-    }
 }
 
 impl Subscription {
@@ -201,12 +127,8 @@ impl Subscription {
             return Vec::new();
         }
         let matched_readers = self.inner.lock();
-        matched_readers
-            .matched_readers
-            .iter()
-            .filter(|s| s.counts())
-            .map(|s| s.reader.writer())
-            .collect()
+        let matched = matched_readers.slots.iter().filter(|slot| slot.counts());
+        matched.map(|slot| slot.reader.writer()).collect()
     }
 
     /// Waits until it receives from at least `count` publishers; whether it does.
@@ -225,7 +147,7 @@ impl Subscription {
 
     /// Samples that were older than their publisher's lifespan when they would have been taken.
     pub fn expired(&self) -> u64 {
-        if self.session.is_forked() { 0 } else { self.inner.lock().expired }
+        if self.session.is_forked() { 0 } else { self.inner.lock().counts.expired }
     }
 
     /// Has `callback` told of new samples from now on, in place of the one before, which is not
@@ -258,7 +180,7 @@ impl Subscription {
 
     /// Samples taken.
     pub fn received(&self) -> u64 {
-        if self.session.is_forked() { 0 } else { self.inner.lock().received }
+        if self.session.is_forked() { 0 } else { self.inner.lock().counts.received }
     }
 }
 
@@ -293,7 +215,7 @@ pub(super) fn take_from<T>(
     shared: &SessionShared,
     take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
 ) -> Option<(MessageInfo, T)> {
-    take_with(inner, shared, |matched_readers| matched_readers.take(take, inner))
+    take_with(inner, shared, |begun| begun.next(take))
 }
 
 /// The same as bytes, into `out`, which it replaces.
@@ -315,8 +237,7 @@ pub(super) fn take_of(
     let mut out = Vec::new();
     let take = |reader: &mut Reader| Ok(reader.take(&mut out)?.map(|taken| (taken.meta, ())));
     let shared = session.shared();
-    let (info, ()) =
-        take_with(inner, shared, |matched_readers| matched_readers.take_of(writer, take, inner))?;
+    let (info, ()) = take_with(inner, shared, |begun| begun.next_of(writer, take))?;
     Some((info, out))
 }
 
@@ -330,18 +251,22 @@ pub(super) fn take_many_of(
     each: impl FnMut(MessageInfo, Range<usize>),
 ) -> usize {
     out.clear();
-    let taken = take_with(inner, session.shared(), |matched_readers| {
-        Some(matched_readers.take_many_of(writer, most, out, inner, each))
-            .filter(|taken| *taken > 0)
+    let taken = take_with(inner, session.shared(), |begun| {
+        Some(begun.many_of(writer, most, out, each)).filter(|taken| *taken > 0)
     });
     taken.unwrap_or(0)
+}
+
+/// The next sample of one writer, for a relay, and how many of that writer's were lost by then. The process has not forked.
+pub(super) fn sample_of(inner: &SubscriptionInner, writer: &Gid) -> Option<(Sample, u64)> {
+    Take::begin(&mut inner.lock(), inner.take_rules()).sample_of(writer)
 }
 
 /// What `take` takes; `None` when there is nothing.
 fn take_with<T>(
     inner: &SubscriptionInner,
     shared: &SessionShared,
-    take: impl FnOnce(&mut MatchedReaders) -> Option<T>,
+    take: impl FnOnce(Take<'_>) -> Option<T>,
 ) -> Option<T> {
     // A thread of the parent may have held the lock when this process was forked.
     if shared.segment.is_forked() {
@@ -349,10 +274,10 @@ fn take_with<T>(
         return None;
     }
     let mut matched_readers = inner.lock();
-    let taken = take(&mut matched_readers);
+    let taken = take(Take::begin(&mut matched_readers, inner.take_rules()));
     let gone = std::mem::take(&mut matched_readers.discarded);
     let lost = matched_readers.new_losses();
-    let again = if taken.is_none() { matched_readers.look_again() } else { None };
+    let again = if taken.is_none() { matched_readers.slots.look_again() } else { None };
     drop(matched_readers);
     if let Some(again) = again {
         shared.look_again(again);

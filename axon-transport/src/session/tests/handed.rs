@@ -165,5 +165,5 @@ fn a_daemon_is_killed_whose_memory(comes: bool) {
     });
     assert_eq!((taken, subscription.lost()), (vec![2, 3, 4], 0));
     // Nothing is left that would be given up, and counted, later.
-    assert_eq!(subscription.inner.lock().look_again(), None);
+    assert_eq!(subscription.inner.lock().slots().look_again(), None);
 }

@@ -75,7 +75,8 @@ fn is_timed(source: &EventSource) -> bool {
             qos.deadline.is_some() || qos.lease.is_some()
         }
         EventSource::Subscription(subscription) => {
-            subscription.endpoint.qos.deadline.is_some() || subscription.lock().offers_lease()
+            subscription.endpoint.qos.deadline.is_some()
+                || subscription.lock().slots().offers_lease()
         }
     }
 }
