@@ -5,7 +5,7 @@ use std::{rc::Rc, time::Duration};
 use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::internal::graph::RemoteEndpoint;
 
-use super::{Engine, peer::graph::GraphChange};
+use super::{Engine, peer_graph::GraphChange};
 use crate::{
     bridge::{ToControl, TrafficRules},
     link::{GraphResync, Message, Subscribe},

@@ -28,6 +28,7 @@ pub(crate) mod outbound;
 mod pace;
 pub(crate) mod peer;
 mod peer_factory;
+pub(crate) mod peer_graph;
 mod peers;
 pub(crate) mod protection;
 pub(crate) mod qlog;
@@ -60,8 +61,9 @@ use self::{
     link::target::Target,
     links::{LinkEvent, LinkParts, Links},
     outbound::OutboundEvent,
-    peer::{Local, Peer, graph::GraphTaken},
+    peer::{Local, Peer},
     peer_factory::{FirstLink, PeerFactory},
+    peer_graph::GraphTaken,
     peers::Peers,
     reports::Reports,
     rings::Rings,
