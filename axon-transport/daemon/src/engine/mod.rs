@@ -305,8 +305,9 @@ impl Engine {
 
     /// A link of a peer is elected, the first or a successor.
     fn link_up(&mut self, number: u64, daemon: DaemonId, old: Option<u64>, now: Duration) {
-        let binding = self.links.binding(number);
-        let Some(permissions) = self.links.permissions(number, &self.access) else { return };
+        let Some(link) = self.links.view(number) else { return };
+        let binding = link.binding();
+        let Some(permissions) = link.permissions(&self.access) else { return };
         self.links.limit_egress(number, &permissions);
         if let Some(old) = old.filter(|_| self.peers.get(daemon).is_some()) {
             let old = self.links.connection(old).map(|connection| &mut connection.quic);
@@ -319,15 +320,12 @@ impl Engine {
             self.back(daemon, now);
             return;
         }
-        let (Some(summary), Some(account)) =
-            (self.links.summary(number), self.links.account(number))
-        else {
-            return;
-        };
+        let Some(link) = self.links.view(number) else { return };
+        let (Some(summary), Some(account)) = (link.summary(), link.account()) else { return };
         let link = FirstLink {
             number,
             daemon,
-            identity: self.links.identity(number).unwrap_or_default(),
+            identity: link.identity().unwrap_or_default(),
             account,
             permissions,
             binding,
@@ -351,7 +349,7 @@ impl Engine {
                 }
             },
             Message::Owners(owners) => {
-                if let Some(binding) = self.links.binding(number) {
+                if let Some(binding) = self.links.view(number).and_then(|link| link.binding()) {
                     peer.remote.prove(&owners.proofs, &binding, daemon);
                 }
             }
