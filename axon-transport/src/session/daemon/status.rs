@@ -13,15 +13,12 @@ use super::{
     address::Address,
     connect::Caller,
     socket::{self, SocketError},
+    status_text::{StatusAnswer, StatusText},
 };
 use crate::{
     config::{Config, DaemonPlace, DaemonPolicy},
     ids::SessionId,
-    session::{
-        Session, SessionOptions,
-        error::SessionError,
-        state::{Outgoing, StatusAnswer, StatusText},
-    },
+    session::{Session, SessionOptions, error::SessionError, state::Outgoing},
     status::ReloadReport,
     wire::session::{Message, SessionRole},
 };
