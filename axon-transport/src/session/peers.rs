@@ -23,7 +23,7 @@ use rustix::{
     io::Errno,
 };
 
-use super::state::MemoryNews;
+use super::daemon::memory_changes::MemoryChanges;
 use crate::{
     ids::{Gid, SessionId},
     wire::session::{Pair, Segment},
@@ -31,7 +31,7 @@ use crate::{
 
 pub(super) struct Peers {
     own: Arc<SessionSegment>,
-    news: Arc<MemoryNews>,
+    news: Arc<MemoryChanges>,
     peers: HashMap<SessionId, Entry>,
     held: PairRefs,
     /// An epoll instance of their pidfds: with hundreds of them, looking at each whenever anything
@@ -149,7 +149,7 @@ pub(super) enum PeerError {
 }
 
 impl Peers {
-    pub(super) fn new(own: Arc<SessionSegment>, news: Arc<MemoryNews>) -> Result<Self, Errno> {
+    pub(super) fn new(own: Arc<SessionSegment>, news: Arc<MemoryChanges>) -> Result<Self, Errno> {
         let deaths = Arc::new(epoll::create(epoll::CreateFlags::CLOEXEC)?);
         Ok(Self { own, news, peers: HashMap::new(), held: PairRefs::default(), deaths })
     }

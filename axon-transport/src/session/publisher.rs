@@ -326,7 +326,7 @@ pub(super) struct PublisherInner {
 }
 
 /// How far readers were sent what they need to find a publisher's samples, by the session's count of
-/// [handovers](super::state::MemoryNews::handovers).
+/// [handovers](super::daemon::memory_changes::MemoryChanges::handovers).
 #[derive(Default)]
 struct Sending {
     /// What the daemon was asked, and has not answered.

@@ -6,19 +6,17 @@ use std::{
     os::fd::OwnedFd,
     sync::{
         Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError,
-        atomic::{AtomicBool, AtomicU64, Ordering},
+        atomic::{AtomicBool, Ordering},
     },
     thread::ThreadId,
     time::{Duration, Instant},
 };
 
-use axon_shm::{
-    ShmError,
-    internal::{SegmentEvent, SessionSegment},
-};
+use axon_shm::{ShmError, internal::SessionSegment};
 
 use super::{
     SessionOptions,
+    daemon::{memory_changes::MemoryChanges, status_text::StatusAnswer},
     events::{Changes, EventSource},
     guard::GuardCondition,
     pair_waits::PairWaits,
@@ -32,7 +30,7 @@ use crate::{
     config::Config,
     graph::{Endpoint, GraphEntry, GraphView},
     ids::{DaemonId, Gid, SessionId},
-    wire::session::{EndpointRole, Fence, Gone, Message, StatusPart, Unmet},
+    wire::session::{EndpointRole, Fence, Gone, Message, Unmet},
 };
 
 /// Something that a session's owner may want to hear of.
@@ -74,7 +72,7 @@ pub(crate) struct SessionShared {
     pub(super) segment: Arc<SessionSegment>,
     /// Wakes the control thread (an eventfd).
     pub(super) wake: Arc<OwnedFd>,
-    pub(super) memory: Arc<MemoryNews>,
+    pub(super) memory: Arc<MemoryChanges>,
     pub(crate) stopping: AtomicBool,
     /// The control thread, once it runs.
     pub(super) control: OnceLock<ThreadId>,
@@ -218,86 +216,6 @@ impl SessionState {
     }
 }
 
-/// What changed in the session's own memory, and whether other sessions' is missing. Of use under any
-/// lock.
-pub(super) struct MemoryNews {
-    wake: Arc<OwnedFd>,
-    changes: Mutex<Vec<SegmentChange>>,
-    /// Counts what readers have to be sent before they find samples.
-    handovers: AtomicU64,
-    /// Counts the times that the daemon was told, or tells, everything from the beginning.
-    connections: AtomicU64,
-}
-
-/// What became of the session's own memory, or is to be asked of another's.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum SegmentChange {
-    Opened(u32),
-    Gone(u32),
-    /// This publisher has no memory ready for its next large sample.
-    Low(Gid),
-    /// Readers miss memory of this other session.
-    Wanted(SessionId),
-}
-
-impl MemoryNews {
-    fn note(&self, event: SegmentEvent<'_>) {
-        match event {
-            SegmentEvent::Opened(info, _) => {
-                self.push(SegmentChange::Opened(info.number));
-                self.hands_over();
-            }
-            SegmentEvent::Gone(info) => self.push(SegmentChange::Gone(info.number)),
-            SegmentEvent::Low(publisher) => self.push(SegmentChange::Low(publisher)),
-        }
-    }
-
-    /// Readers have to be sent something more: memory that was opened, a grant, or all of it by another
-    /// daemon.
-    pub(super) fn hands_over(&self) {
-        // Relaxed: this is counted before the writer's lock is taken, and the publishing thread reads it
-        // under that lock or after.
-        self.handovers.fetch_add(1, Ordering::Relaxed);
-    }
-
-    /// The daemon is another one, or tells everything anew: it may not answer what it was asked before.
-    pub(super) fn begins_anew(&self) {
-        // Relaxed: a question that is asked once more is answered once more.
-        self.connections.fetch_add(1, Ordering::Relaxed);
-        self.hands_over();
-    }
-
-    /// How often that was so.
-    pub(super) fn connections(&self) -> u64 {
-        self.connections.load(Ordering::Relaxed)
-    }
-
-    /// How often readers had to be sent something more. Read after a sample was published, it covers all that its readers need.
-    pub(super) fn handovers(&self) -> u64 {
-        self.handovers.load(Ordering::Relaxed)
-    }
-
-    /// Readers miss memory of another session.
-    pub(super) fn want(&self, session: SessionId) {
-        self.push(SegmentChange::Wanted(session));
-    }
-
-    fn push(&self, change: SegmentChange) {
-        self.changes.lock().unwrap_or_else(PoisonError::into_inner).push(change);
-        self.wake();
-    }
-
-    pub(super) fn take(&self) -> Vec<SegmentChange> {
-        std::mem::take(&mut *self.changes.lock().unwrap_or_else(PoisonError::into_inner))
-    }
-
-    /// Has the control thread look around.
-    pub(super) fn wake(&self) {
-        // An eventfd whose counter is full is readable, which is all that is wanted.
-        let _ = rustix::io::write(&self.wake, &1u64.to_ne_bytes());
-    }
-}
-
 /// Something for the daemon to be told.
 #[derive(Debug)]
 pub(super) enum Outgoing {
@@ -309,41 +227,6 @@ pub(super) enum Outgoing {
     Fence(Fence),
 }
 
-/// The parts of a status that have come.
-#[derive(Debug, Default)]
-pub(super) struct StatusText {
-    text: Vec<u8>,
-    next: u32,
-}
-
-/// The longest status that is put together.
-const MAX_STATUS: usize = 64 << 20;
-
-impl StatusText {
-    /// Adds the part that is due; the whole, once it was the last. The first one may come again, for
-    /// a caller that asks again; any other part is of an answer that nobody waits for any more.
-    pub(super) fn add(&mut self, part: &StatusPart) -> Option<Vec<u8>> {
-        if part.part == 0 {
-            *self = Self::default();
-        }
-        if part.part != self.next || self.text.len() + part.text.len() > MAX_STATUS {
-            return None;
-        }
-        self.text.extend_from_slice(&part.text);
-        self.next += 1;
-        (self.next >= part.parts).then(|| std::mem::take(&mut self.text))
-    }
-}
-
-#[derive(Debug, Default)]
-pub(super) enum StatusAnswer {
-    #[default]
-    None,
-    Parts(StatusText),
-    Whole(Vec<u8>),
-    Lost,
-}
-
 impl SessionShared {
     pub(super) fn new(
         config: Config,
@@ -353,14 +236,7 @@ impl SessionShared {
     ) -> Self {
         let wake = Arc::new(wake);
         let room = Arc::new(ClientLimit::new(options.callers));
-        let memory = Arc::new(MemoryNews {
-            wake: wake.clone(),
-            changes: Mutex::default(),
-            handovers: AtomicU64::new(0),
-            connections: AtomicU64::new(0),
-        });
-        let listener = memory.clone();
-        segment.on_segment(move |event| listener.note(event));
+        let memory = MemoryChanges::follow(&segment, wake.clone());
         Self {
             config,
             options,
@@ -519,23 +395,5 @@ impl SessionShared {
 impl fmt::Debug for SessionShared {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("SessionShared").field("id", &self.id).finish_non_exhaustive()
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_status_is_put_together_of_its_own_parts_only() {
-        let mut status = StatusText::default();
-        let mut add =
-            |part, text: &[u8]| status.add(&StatusPart { part, parts: 3, text: text.into() });
-        assert_eq!(add(2, b"the end of another"), None);
-        assert_eq!(add(0, b"first"), None);
-        assert_eq!(add(2, b"one was lost"), None);
-        assert_eq!(add(0, b"a"), None, "it begins again");
-        assert_eq!(add(1, b"b"), None);
-        assert_eq!(add(2, b"c"), Some(b"abc".to_vec()));
     }
 }

@@ -5,7 +5,7 @@ use std::{rc::Rc, time::Duration};
 use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::internal::graph::RemoteEndpoint;
 
-use super::{Engine, peer::graph::GraphChange};
+use super::{Engine, peer_graph::GraphChange};
 use crate::{
     bridge::{ToControl, TrafficRules},
     link::{GraphResync, Message, Subscribe},
@@ -42,7 +42,8 @@ impl Engine {
         let peers: Vec<_> = self.peers.iter().map(|(daemon, peer)| (daemon, peer.link)).collect();
         for (daemon, link) in peers {
             // A link that is gone is about to be reported as down.
-            let Some(permissions) = self.links.permissions(link, &self.access) else { continue };
+            let permissions = self.links.view(link).and_then(|link| link.permissions(&self.access));
+            let Some(permissions) = permissions else { continue };
             self.links.limit_egress(link, &permissions);
             self.peers.with(daemon, |peer, with| {
                 peer.set_permissions(permissions, with.config);
@@ -58,7 +59,8 @@ impl Engine {
         let Some(peer) = self.peers.get_mut(daemon) else { return 0 };
         let number = peer.link;
         if let Some(reason) = peer.newly_refused() {
-            let who = self.links.summary(number).map(|summary| summary.who.to_string());
+            let summary = self.links.view(number).and_then(|link| link.summary());
+            let who = summary.map(|summary| summary.who.to_string());
             let peer = format!("{} at {}", who.unwrap_or_default(), self.links.peer_text(number));
             let (kind, what) = (self.links.kind(number), "graph".into());
             self.effects.tell(ToControl::Refusal { kind, peer, what, reason });
@@ -106,7 +108,7 @@ impl Engine {
     /// A peer asks for a route. Ends the links of daemons of the same host that were asked for by the same
     /// subscriptions: those links are dead, and the route begins with what they did not carry.
     pub(super) fn take_over_route(&mut self, daemon: DaemonId, asks: &Subscribe, now: Duration) {
-        let identity = |other| self.links.identity(self.links.current(other)?);
+        let identity = |other| self.links.view(self.links.current(other)?)?.identity();
         let (Some(owner), Some(asking)) = (identity(daemon), self.peers.get(daemon)) else {
             return;
         };
@@ -126,8 +128,9 @@ impl Engine {
     /// claim of another host is ignored.
     fn taken_over(&mut self, daemon: DaemonId, added: &[RemoteEndpoint]) -> Vec<u64> {
         let mut dead = Vec::new();
-        let identity =
-            |engine: &Self, daemon: DaemonId| engine.links.identity(engine.links.current(daemon)?);
+        let identity = |engine: &Self, daemon: DaemonId| {
+            engine.links.view(engine.links.current(daemon)?)?.identity()
+        };
         let Some(owner) = identity(self, daemon) else { return dead };
         let others: Vec<_> =
             self.peers.iter().map(|(other, _)| other).filter(|other| *other != daemon).collect();

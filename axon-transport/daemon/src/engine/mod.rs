@@ -28,6 +28,7 @@ pub(crate) mod outbound;
 mod pace;
 pub(crate) mod peer;
 mod peer_factory;
+pub(crate) mod peer_graph;
 mod peers;
 pub(crate) mod protection;
 pub(crate) mod qlog;
@@ -60,8 +61,9 @@ use self::{
     link::target::Target,
     links::{LinkEvent, LinkParts, Links},
     outbound::OutboundEvent,
-    peer::{Local, Peer, graph::GraphTaken},
+    peer::{Local, Peer},
     peer_factory::{FirstLink, PeerFactory},
+    peer_graph::GraphTaken,
     peers::Peers,
     reports::Reports,
     rings::Rings,
@@ -307,8 +309,9 @@ impl Engine {
 
     /// A link of a peer is elected, the first or a successor.
     fn link_up(&mut self, number: u64, daemon: DaemonId, old: Option<u64>, now: Duration) {
-        let binding = self.links.binding(number);
-        let Some(permissions) = self.links.permissions(number, &self.access) else { return };
+        let Some(link) = self.links.view(number) else { return };
+        let binding = link.binding();
+        let Some(permissions) = link.permissions(&self.access) else { return };
         self.links.limit_egress(number, &permissions);
         if let Some(old) = old.filter(|_| self.peers.get(daemon).is_some()) {
             let old = self.links.connection(old).map(|connection| &mut connection.quic);
@@ -321,15 +324,12 @@ impl Engine {
             self.back(daemon, now);
             return;
         }
-        let (Some(summary), Some(account)) =
-            (self.links.summary(number), self.links.account(number))
-        else {
-            return;
-        };
+        let Some(link) = self.links.view(number) else { return };
+        let (Some(summary), Some(account)) = (link.summary(), link.account()) else { return };
         let link = FirstLink {
             number,
             daemon,
-            identity: self.links.identity(number).unwrap_or_default(),
+            identity: link.identity().unwrap_or_default(),
             account,
             permissions,
             binding,
@@ -353,7 +353,7 @@ impl Engine {
                 }
             },
             Message::Owners(owners) => {
-                if let Some(binding) = self.links.binding(number) {
+                if let Some(binding) = self.links.view(number).and_then(|link| link.binding()) {
                     peer.remote.prove(&owners.proofs, &binding, daemon);
                 }
             }

@@ -10,7 +10,8 @@ use super::{
     counters::Counters,
     inbound::Inbound,
     outbound::{Outbound, ResponseNumbers, budget::Budget},
-    peer::{Peer, PeerParts, ROUTES_UNSAID, owners::Prover},
+    peer::{Peer, PeerParts, ROUTES_UNSAID},
+    peer_graph::owners::Prover,
 };
 use crate::owner::{Binding, SessionKeys};
 

@@ -46,7 +46,7 @@ pub(super) fn report(peers: &mut Peers, links: &Links, effects: &mut Effects, no
     for (_, peer) in peers.iter() {
         effects.tell_lost(&links.peer_text(peer.link), peer.counters.take_lost());
         if !peer.silent
-            && let Some(mut status) = links.status(peer.link)
+            && let Some(mut status) = links.view(peer.link).and_then(|link| link.status())
         {
             peer.fill(&mut status, now);
             effects.tell(ToControl::Link(Box::new(status), peer.refused_routes()));

@@ -30,25 +30,21 @@ impl Engine {
             StreamEvent::Readable { id } => peer.inbound.handle_readable(number, id),
             StreamEvent::Available { .. } if in_use => peer.outbound.handle_streams_available(),
             StreamEvent::Writable { id } if in_use => {
-                if let Some(flow) = self.links.flow_of(number, id) {
+                if let Some(flow) = self.links.view(number).and_then(|link| link.flow_of(id)) {
                     peer.outbound.handle_writable(flow);
                 }
             }
             StreamEvent::Finished { id } => {
-                let Some(flow) = self.links.flow_of(number, id) else { return };
-                if let Some(connection) = self.links.connection(number) {
-                    connection.flows.remove(&id);
-                    if in_use {
-                        peer.outbound.handle_finished(flow, id, &mut connection.quic, now);
-                    }
+                let Some(connection) = self.links.connection(number) else { return };
+                let Some(flow) = connection.flows.remove(&id) else { return };
+                if in_use {
+                    peer.outbound.handle_finished(flow, id, &mut connection.quic, now);
                 }
             }
             StreamEvent::Stopped { id, .. } if in_use => {
-                let Some(flow) = self.links.flow_of(number, id) else { return };
-                if let Some(connection) = self.links.connection(number) {
-                    connection.flows.remove(&id);
-                    peer.outbound.handle_stopped(flow, id, &mut connection.quic);
-                }
+                let Some(connection) = self.links.connection(number) else { return };
+                let Some(flow) = connection.flows.remove(&id) else { return };
+                peer.outbound.handle_stopped(flow, id, &mut connection.quic);
             }
             _ => {}
         }

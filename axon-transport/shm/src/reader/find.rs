@@ -6,7 +6,7 @@ use std::{
     time::Instant,
 };
 
-use super::{ATTEMPTS, Attachment, KNOWN, MISSING, MISSING_DEAD, Missing, Obstacle, Reader};
+use super::{ATTEMPTS, Attachment, KNOWN, Obstacle, Reader, awaited::Wait};
 use crate::{
     error::TakeError,
     memory::{copy, segment::Map},
@@ -50,7 +50,7 @@ impl Reader {
             Ok(found) => {
                 if found.is_none() {
                     // Nothing at the cursor needs it.
-                    self.missing = None;
+                    self.awaited.clear();
                 }
                 Ok(found)
             }
@@ -138,7 +138,7 @@ impl Reader {
         let Ok((_, head)) = protocol::bounds(self.attachment.ring()) else { return };
         let unread = head.saturating_sub(self.cursor);
         if unread > depth {
-            self.missing = None;
+            self.awaited.clear();
             self.skipped += unread - depth;
             self.advance(head - depth);
         }
@@ -171,7 +171,7 @@ impl Reader {
             }
             match self.locate(&record) {
                 Ok(bytes) => {
-                    self.missing = None;
+                    self.awaited.clear();
                     return Ok(Some((record, bytes)));
                 }
                 Err(Obstacle::Missing(segment)) => {
@@ -259,43 +259,23 @@ impl Reader {
     }
 
     /// Notes that `segment` has not come, and has it asked for again at times. True when it never
-    /// will.
+    /// will: then none of the samples in it can be read.
     fn lacks(&mut self, segment: u32) -> bool {
-        let now = Instant::now();
-        match &mut self.missing {
-            Some(missing) if missing.segment == segment => {
-                let missing = *missing;
-                if self.is_over(&missing) {
-                    self.waited |= self.writer_dead();
-                    // So are all samples that are in it.
-                    return true;
-                }
-                if now.duration_since(missing.asked) < MISSING {
-                    return false;
-                }
-                self.missing = Some(Missing { asked: now, ..missing });
-            }
-            _ => self.missing = Some(Missing { segment, since: now, asked: now }),
-        }
-        if let Some(session) = self.reads.peer.remote() {
+        let peer = &self.reads.peer;
+        let wait = self.awaited.handle_missing(segment, Instant::now(), || peer.is_dead());
+        if wait == Wait::Ask
+            && let Some(session) = peer.remote()
+        {
             session.want(segment);
         }
-        false
-    }
-
-    /// Whether a segment that has not come will not come any more.
-    pub(super) fn is_over(&self, missing: &Missing) -> bool {
-        let waited = missing.since.elapsed();
-        // It asks a second time in between.
-        let dead = if self.waited { MISSING } else { MISSING_DEAD };
-        self.ended && waited >= 2 * MISSING || waited >= dead && self.writer_dead()
+        wait == Wait::InVain
     }
 
     /// All that is published is lost, and nothing else will be.
     fn give_all_up(&mut self) -> Result<(), &'static str> {
         let (_, head) = protocol::bounds(self.attachment.ring())?;
         self.given_up = true;
-        self.missing = None;
+        self.awaited.clear();
         self.lost += head.saturating_sub(self.cursor);
         self.advance(head.max(self.cursor));
         Ok(())

@@ -1,5 +1,6 @@
 //! The reading end of a ring.
 
+mod awaited;
 mod batch;
 mod find;
 pub(crate) mod sample;
@@ -8,10 +9,11 @@ mod under_way;
 
 use std::{
     sync::{Arc, Weak, atomic::AtomicU64},
-    time::{Duration, Instant},
+    time::Instant,
 };
 
 use self::{
+    awaited::Awaited,
     find::{Bytes, Descriptors},
     under_way::UnderWay,
 };
@@ -41,12 +43,6 @@ use crate::{
 
 /// How often a take follows a publisher that keeps overtaking it before it lets go.
 const ATTEMPTS: u32 = 16;
-/// How often a reader asks for memory that has not come, and how long it waits for it once it was told
-/// that the publisher is gone.
-const MISSING: Duration = Duration::from_secs(1);
-/// How long a reader waits for memory of a process that has ended where nobody has said so: the
-/// daemon hands over what the process left, and may be slow. It waits once for all that the process left.
-const MISSING_DEAD: Duration = Duration::from_secs(10);
 /// Segments of samples that a reader finds without a lock.
 const KNOWN: usize = 4;
 
@@ -81,11 +77,7 @@ pub struct Reader {
     descriptors: Option<Descriptors>,
     /// Maps of the segments that samples were in.
     maps: Vec<(u32, Weak<Map>)>,
-    missing: Option<Missing>,
-    /// Whether memory of the publisher's process, which has ended, was waited for in vain.
-    waited: bool,
-    /// Whether the publisher is known to be gone.
-    ended: bool,
+    awaited: Awaited,
     cursor: u64,
     /// Samples that the caller releases explicitly. Boxed: few readers have any, and the fields that each take reads
     /// stay together.
@@ -98,14 +90,6 @@ pub struct Reader {
     corrupt: Option<&'static str>,
     /// The publisher is gone, and its descriptors are in memory that never came.
     given_up: bool,
-}
-
-/// A segment that is needed to go on.
-#[derive(Clone, Copy)]
-struct Missing {
-    segment: u32,
-    since: Instant,
-    asked: Instant,
 }
 
 /// What is in the way of a reader.
@@ -165,9 +149,7 @@ impl Reader {
             attachment,
             descriptors: None,
             maps: Vec::new(),
-            missing: None,
-            waited: false,
-            ended: false,
+            awaited: Awaited::default(),
             cursor: grant.first,
             under_way: None,
             seen: 0,
@@ -188,15 +170,15 @@ impl Reader {
         if self.corrupt.is_some() || self.given_up || self.attachment.lane.is_forked() {
             return false;
         }
-        if let Some(missing) = &self.missing {
+        if let Some(segment) = self.awaited.segment() {
             let more = |(tail, head): (u64, u64)| {
                 tail > self.cursor || head.saturating_sub(self.cursor) > self.reads.depth
             };
-            return !matches!(self.reads.peer.find(missing.segment), Found::Absent)
+            return !matches!(self.reads.peer.find(segment), Found::Absent)
                 // It may not be needed any more.
                 || protocol::bounds(self.attachment.ring()).is_ok_and(more)
                 // It is to be asked for again, or given up.
-                || missing.asked.elapsed() >= MISSING;
+                || self.awaited.look_again().is_some_and(|due| Instant::now() >= due);
         }
         let word = protocol::array(self.attachment.ring());
         let found;
@@ -321,7 +303,7 @@ impl Reader {
     pub fn skip(&mut self) -> bool {
         match self.find() {
             Ok(Some(_)) => {
-                self.missing = None;
+                self.awaited.clear();
                 self.skipped += 1;
                 self.advance(self.cursor + 1);
                 true
@@ -386,13 +368,13 @@ impl Reader {
     /// When to look again for memory that is needed to go on and has not come.
     #[inline]
     pub fn look_again(&self) -> Option<Instant> {
-        self.missing.map(|missing| missing.asked + MISSING)
+        self.awaited.look_again()
     }
 
     /// The number of the segment of the publisher's session that is needed to go on and has not
     /// come.
     pub fn missing(&self) -> Option<u32> {
-        self.missing.map(|missing| missing.segment)
+        self.awaited.segment()
     }
 
     /// Gives up the remaining samples if memory that the reader needs to go on has not come; returns
@@ -400,14 +382,13 @@ impl Reader {
     /// whose samples another reader has, too.
     pub fn skip_missing(&mut self) -> bool {
         // It may have come since it was looked for.
-        let lacks =
-            |missing: &Missing| matches!(self.reads.peer.find(missing.segment), Found::Absent);
-        if self.given_up || !self.missing.as_ref().is_some_and(lacks) {
+        let lacks = |segment| matches!(self.reads.peer.find(segment), Found::Absent);
+        if self.given_up || !self.awaited.segment().is_some_and(lacks) {
             return false;
         }
         let head = protocol::bounds(self.attachment.ring()).map_or(self.cursor, |(_, head)| head);
         self.given_up = true;
-        self.missing = None;
+        self.awaited.clear();
         self.skipped += head.saturating_sub(self.cursor);
         self.advance(head.max(self.cursor));
         true
@@ -416,16 +397,13 @@ impl Reader {
     /// Whether there is nothing to take now, nor will be when the segments come that are on their
     /// way. For one whose publisher is gone.
     pub fn is_drained(&self) -> bool {
-        self.missing.is_none() && !self.has_data()
+        self.awaited.segment().is_none() && !self.has_data()
     }
 
     /// Notes that the publisher is gone and that all of its memory was handed over, whether or not its
     /// process has ended: memory that does not come soon never will.
     pub fn end(&mut self) {
-        if !std::mem::replace(&mut self.ended, true) {
-            // The next take asks for it once more, and waits for the answer.
-            self.missing = None;
-        }
+        self.awaited.end();
     }
 
     /// How many samples have come since the grant, whatever became of them.

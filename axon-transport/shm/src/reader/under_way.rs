@@ -142,7 +142,7 @@ impl Reader {
         if let Some((_, position)) = samples.front() {
             self.cursor = *position;
             self.received = self.received.saturating_sub(samples.len() as u64);
-            self.missing = None;
+            self.awaited.clear();
         }
     }
 

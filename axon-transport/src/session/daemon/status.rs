@@ -13,16 +13,13 @@ use super::{
     address::Address,
     connect::Caller,
     socket::{self, SocketError},
+    status_text::{StatusAnswer, StatusText},
 };
 use crate::{
     access::Verb,
     config::{Config, DaemonPlace, DaemonPolicy},
     ids::{DaemonId, SessionId},
-    session::{
-        Session, SessionOptions,
-        error::SessionError,
-        state::{Outgoing, StatusAnswer, StatusText},
-    },
+    session::{Session, SessionOptions, error::SessionError, state::Outgoing},
     status::{PeerDecisions, ReloadReport},
     wire::session::{AccessCheck, CheckedUse, Message, SessionRole},
 };

@@ -62,7 +62,7 @@ impl Links {
             Ok(who) => who,
             Err(why) => return self.turn_away(number, &hello, why, now),
         };
-        let binding = self.binding(number);
+        let binding = connection.binding();
         let proves = |proof: &DaemonProof| binding.is_some_and(|b| proof.proves(daemon, &b));
         if hello.proof.as_ref().is_some_and(|proof| !proves(proof)) {
             let why = format!("{who} says a proof of daemon id {daemon} that is none");

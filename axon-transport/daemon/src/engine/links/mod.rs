@@ -32,7 +32,6 @@ use axon_shm::ids::DaemonId;
 use axon_transport::{
     access::{AccessRules, Permissions},
     config::Config,
-    status::LinkStatus,
 };
 use bytes::BytesMut;
 use quinn_proto::{Dir, EcnCodepoint, Event, StreamEvent, Transmit, TransportConfig};
@@ -45,7 +44,7 @@ use self::{
     dials::Dials,
     events::Outbox,
     inbox::DiscoveryInbox,
-    link::{Link, Phase, Summary},
+    link::{Link, Phase, view::LinkView},
     silence::{Looks, Nonce, frames_came},
     table::Table,
     unfinished::Unfinished,
@@ -61,14 +60,12 @@ use crate::{
     daemon_key::DaemonKey,
     discovery::{Interface, is_discovery},
     engine::{
-        account::{Account, Accounts, Charge},
-        link::failure::peer_text,
+        account::{Accounts, Charge},
         qlog::{self, Qlogs},
         refusal::Refusal,
     },
     error::GatewayError,
     link::{CloseCode, FrameError, Hello, Message, Side},
-    owner::Binding,
 };
 
 /// All links.
@@ -400,44 +397,22 @@ impl Links {
         self.connections.get_mut(number)
     }
 
-    /// The flow of a stream of a link.
-    pub(super) fn flow_of(
-        &self,
-        number: u64,
-        stream: quinn_proto::StreamId,
-    ) -> Option<super::outbound::FlowId> {
-        self.connections.get(number)?.flows.get(&stream).copied()
+    /// A link whose connection stands.
+    pub(super) fn view(&self, number: u64) -> Option<LinkView<'_>> {
+        Some(LinkView::new(self.connections.get(number)?, self.table.peer(number)))
     }
 
-    /// The summary of a link.
-    pub(super) fn summary(&self, number: u64) -> Option<&Summary> {
-        Some(&self.table.get(number)?.peer.as_ref()?.summary)
-    }
-
-    /// The account of a link's peer.
-    pub(super) fn account(&self, number: u64) -> Option<Rc<Account>> {
-        Some(Rc::clone(&self.table.get(number)?.peer.as_ref()?.account))
-    }
-
-    /// Who the peer of a link proved to be, beyond its daemon id.
-    pub(super) fn identity(&self, number: u64) -> Option<String> {
-        let address = self.connections.get(number)?.quic.remote_address();
-        Some(self.summary(number)?.who.host_identity(address))
-    }
-
-    /// What access rules let the peer of a link do. The address of one that proved nothing is that at which the
-    /// handshake took place: any later one may be spoofed.
-    pub(super) fn permissions(&self, number: u64, rules: &AccessRules) -> Option<Permissions> {
-        let address = self.connections.get(number)?.began_at;
-        Some(rules.permissions(self.summary(number)?.who.party(address)))
+    /// The peer of a link, as log and status name it.
+    pub(super) fn peer_text(&self, number: u64) -> String {
+        self.view(number).map_or_else(String::new, |link| link.peer_text())
     }
 
     /// Limits what a link sends as the rules say.
     pub(super) fn limit_egress(&mut self, number: u64, permissions: &Permissions) {
-        if let (Some(account), Some(connection)) =
-            (self.account(number), self.connections.get_mut(number))
+        if let (Some(peer), Some(connection)) =
+            (self.table.peer(number), self.connections.get_mut(number))
         {
-            account.limits.limit_egress(&mut connection.egress, permissions);
+            peer.account.limits.limit_egress(&mut connection.egress, permissions);
         }
     }
 
@@ -456,30 +431,9 @@ impl Links {
         self.connections.asks_for_interfaces()
     }
 
-    /// The status of a link.
-    pub(super) fn status(&self, number: u64) -> Option<LinkStatus> {
-        let (connection, peer) = (self.connections.get(number)?, self.table.peer(number)?);
-        let mut status = peer.summary.status(peer.since);
-        status.party = peer.summary.who.party(connection.began_at).to_string();
-        connection.fill(&mut status);
-        Some(status)
-    }
-
     /// Frames that came over a link.
     pub(super) fn heard(&self, number: u64) -> u64 {
         self.connections.get(number).map_or(0, |c| frames_came(&c.quic.stats()))
-    }
-
-    /// The peer of a link, as log and status name it.
-    pub(super) fn peer_text(&self, number: u64) -> String {
-        let sae = self.summary(number).and_then(|summary| summary.hello.sae.as_deref());
-        let address = self.connections.address(number);
-        address.map_or_else(String::new, |address| peer_text(sae, address))
-    }
-
-    /// Bytes that both ends of a connection share and no other connection has.
-    pub(super) fn binding(&self, number: u64) -> Option<Binding> {
-        self.connections.get(number)?.binding()
     }
 
     /// The link in use of a peer.

@@ -18,10 +18,13 @@ use axon_transport::{
     status::{LinkStatus, PeerDecision},
 };
 
-use super::{decisions::note_look, refused::shown};
+use super::refused::shown;
 use crate::{
     bridge::RefusedRoute,
-    engine::account::{Account, Charge, Meter},
+    engine::{
+        account::{Account, Charge, Meter},
+        peer_graph::decisions::note_look,
+    },
     link::{AccessCheck, AccessDecisions, Denied, DeniedUse, MAX_DENIED, Message, UseDecision},
 };
 

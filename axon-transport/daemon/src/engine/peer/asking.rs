@@ -120,7 +120,7 @@ impl Peer {
 
     /// The servers of the peer to which requests of this host go: their responses are wanted.
     fn now_answering(&self) -> std::collections::BTreeSet<Gid> {
-        let services = self.services.iter().filter_map(|number| self.served.get(number));
+        let services = self.served.services().map(|(_, served)| served);
         let requests = services.filter(|served| served.key.kind == Kind::Request);
         requests.flat_map(|served| served.subscribers.iter().copied()).collect()
     }

@@ -74,9 +74,9 @@ impl KeptRelays {
     /// Takes the KEEP_ALL relays of a peer that is gone.
     pub(crate) fn add(&mut self, peer: &mut Peer, now: Duration) {
         let room = self.room_of(&peer.identity);
-        for (number, served) in &mut peer.served {
+        for (number, served) in peer.served.iter_mut() {
             let lanes = served.lanes.amount() / served.sources.len().max(1);
-            let (sources, unfinished) = peer.outbound.take_kept(*number, room.left(), now);
+            let (sources, unfinished) = peer.outbound.take_kept(number, room.left(), now);
             let unfinished = Rc::new(unfinished);
             for source in sources {
                 let Source::Relay(spec, reader) = source else { continue };

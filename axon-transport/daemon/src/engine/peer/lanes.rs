@@ -58,7 +58,7 @@ impl Peer {
     /// up.
     pub(super) fn fit_lanes(&mut self, with: &Surroundings<'_>, now: Duration) {
         let mut without = Vec::new();
-        for (number, served) in &mut self.served {
+        for (number, served) in self.served.iter_mut() {
             if served.key.kind != Kind::Topic {
                 continue;
             }
@@ -67,7 +67,7 @@ impl Peer {
             if fitting < had {
                 served.sources.truncate(fitting);
                 drop(served.relays.split(had - fitting));
-                without.push((*number, had, served.key.clone(), served.sources.clone()));
+                without.push((number, had, served.key.clone(), served.sources.clone()));
             }
         }
         for (number, had, key, sources) in without {

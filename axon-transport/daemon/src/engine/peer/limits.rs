@@ -34,7 +34,7 @@ impl Peer {
     /// The rules changed: the routes that stand have the limits that they set now.
     pub(super) fn renew_limits(&mut self, config: &Config) {
         let served = self.served.iter();
-        let outgoing = served.map(|(number, of)| (*number, self.outgoing_limits(&of.key, config)));
+        let outgoing = served.map(|(number, of)| (number, self.outgoing_limits(&of.key, config)));
         for (number, limits) in outgoing.collect::<Vec<_>>() {
             self.outbound.set_limits(number, limits);
         }

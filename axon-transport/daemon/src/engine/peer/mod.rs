@@ -2,20 +2,17 @@
 
 mod access;
 mod asking;
-pub(super) mod decisions;
-pub(super) mod graph;
 pub(super) mod kept;
 mod lanes;
 mod limits;
-pub(super) mod owners;
 mod refused;
 pub(super) mod routes;
+mod served;
 mod serving;
 pub(super) mod stalls;
-mod told;
+mod surroundings;
 
 use std::{
-    cell::RefCell,
     collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
     rc::Rc,
     sync::Arc,
@@ -27,10 +24,10 @@ use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::{
     access::{Permissions, Verb},
     config::{Config, DiscoveryRange},
-    graph::{Endpoint, EndpointKind},
+    graph::EndpointKind,
     internal::{
         events::Alive,
-        graph::{EndpointRange, RemoteEndpoint, permits_use, shows},
+        graph::{RemoteEndpoint, permits_use, shows},
         wire::session::CheckedUse,
     },
     status::{LinkStatus, PeerDecision},
@@ -40,39 +37,33 @@ use self::{
     access::PeerAccess,
     asking::{Asked, Attaching},
     refused::RefusedRoutes,
-    serving::{DENIED_AGAIN, Served},
-    told::{Told, added},
+    served::{Served, ServedRoutes},
+    serving::DENIED_AGAIN,
 };
 pub(crate) use self::{
     lanes::WritersHere,
     serving::{MAX_ROUTES, StalledRoute},
+    surroundings::{Local, Surroundings},
 };
 use super::{
     inbound::Inbound,
     outbound::{Outbound, Source, Stall},
-    rings::Rings,
-    stand_in::StandIns,
 };
 use crate::{
     engine::{
         account::{Account, MAX_STAND_INS},
         counters::Counters,
-        peer::{
-            graph::{GraphTaken, Remote},
-            kept::KeptRelays,
+        peer::routes::RouteKey,
+        peer_graph::{
+            GraphTaken, Remote,
             owners::Prover,
-            routes::RouteKey,
-            stalls::Stalls,
+            told::{Told, ToldGraph},
         },
     },
     link::{AccessDecisions, Asserted, CloseCode, Graph, Message},
     owner::Binding,
 };
 
-/// Endpoints in one message of a graph.
-const GRAPH_PART: usize = 512;
-/// A whole graph is sent so often at most.
-const RESYNC: Duration = Duration::from_secs(1);
 /// Between two looks at pairs that are being attached, at least.
 const POLL: Duration = Duration::from_millis(5);
 /// The same for each of them: thousands of pairs that wait leave time for samples.
@@ -94,36 +85,6 @@ fn poll_after(pairs: usize) -> Duration {
     POLL.max(POLL_EACH * u32::try_from(pairs).unwrap_or(u32::MAX))
 }
 
-/// The endpoints of applications on this host, and how far their sessions are discovered.
-pub(crate) type Local = BTreeMap<Gid, (Arc<Endpoint>, EndpointRange)>;
-
-/// The parts of the engine that all peers use.
-pub(crate) struct Surroundings<'a> {
-    /// The rings of this host.
-    pub(crate) rings: &'a dyn Rings,
-    /// All stand-ins.
-    pub(crate) stand_ins: &'a StandIns,
-    /// The endpoints of this host.
-    pub(crate) local: &'a Local,
-    /// How many writers of each route are among them.
-    pub(crate) writers: &'a WritersHere,
-    /// The settings of this host.
-    pub(crate) config: &'a Config,
-    /// Routes that were given up.
-    pub(crate) stalls: &'a RefCell<Stalls>,
-    /// Relays that are kept for daemons that are restarted.
-    pub(crate) kept: &'a RefCell<KeptRelays>,
-    /// When the engine's time was zero.
-    pub(crate) epoch: Instant,
-}
-
-impl Surroundings<'_> {
-    /// The same time as an instant.
-    fn instant(&self, now: Duration) -> Instant {
-        self.epoch + now
-    }
-}
-
 /// A peer with an elected link.
 pub(crate) struct Peer {
     pub(super) daemon: DaemonId,
@@ -140,10 +101,7 @@ pub(crate) struct Peer {
     /// Endpoints of it were ignored, since another peer had them.
     pub(super) displaced: bool,
     /// The graph that it was sent.
-    sent: BTreeMap<Gid, Told>,
-    sent_version: u64,
-    resynced: Option<Duration>,
-    resync_due: bool,
+    told: ToldGraph,
     /// It has been silent for so long that the control plane takes it for gone.
     pub(super) silent: bool,
     /// Its graph changed, and what follows was not done.
@@ -162,13 +120,7 @@ pub(crate) struct Peer {
     pub(super) outbound: Outbound,
     /// Publishers here that ended and whose samples have not all arrived: the peer sees them until then.
     ending: BTreeMap<Gid, RemoteEndpoint>,
-    served: HashMap<u32, Served>,
-    /// Those of them that are of services.
-    services: BTreeSet<u32>,
-    /// The numbers of `served`.
-    served_as: HashMap<RouteKey, u32>,
-    announcing: BTreeMap<u32, Duration>,
-    look_at_announcing: Option<Duration>,
+    served: ServedRoutes,
     alive: Alive,
     answering: BTreeSet<Gid>,
     messages: VecDeque<Message>,
@@ -223,10 +175,7 @@ impl Peer {
             remote: Remote::new(account, prover.is_needed(), permissions),
             prover,
             displaced: false,
-            sent: BTreeMap::new(),
-            sent_version: 0,
-            resynced: None,
-            resync_due: false,
+            told: ToldGraph::default(),
             silent: false,
             stirred: false,
             refusal_said: false,
@@ -239,11 +188,7 @@ impl Peer {
             inbound,
             outbound,
             ending: BTreeMap::new(),
-            served: HashMap::new(),
-            services: BTreeSet::new(),
-            served_as: HashMap::new(),
-            announcing: BTreeMap::new(),
-            look_at_announcing: None,
+            served: ServedRoutes::default(),
             alive: Alive::default(),
             answering: BTreeSet::new(),
             messages: VecDeque::new(),
@@ -263,9 +208,7 @@ impl Peer {
         self.say_unasked_again();
         let denied = self.access.succeed();
         denied.into_iter().for_each(|message| self.say(message));
-        for served in self.served.values_mut() {
-            served.repeated = false;
-        }
+        self.served.iter_mut().for_each(|(_, served)| served.repeated = false);
     }
 
     /// Queues a control message.
@@ -291,16 +234,16 @@ impl Peer {
         match message {
             Message::GraphResync(_) => self.resync(with.local, now),
             Message::Subscribe(subscribe) => {
-                let services = self.services.len();
+                let services = self.served.service_count();
                 let of_service = subscribe.kind != Kind::Topic as u8;
                 let served = self.serve(subscribe, with, now);
-                if of_service || self.services.len() != services {
+                if of_service || self.served.service_count() != services {
                     self.stirred |= self.services_changed();
                 }
                 return served.map_err(|reason| (CloseCode::Malformed, reason));
             }
             Message::Unsubscribe(unsubscribe) => {
-                let of_service = self.services.contains(&unsubscribe.route);
+                let of_service = self.served.is_service(unsubscribe.route);
                 self.unserve(unsubscribe.route);
                 self.stirred |= of_service && self.services_changed();
             }
@@ -358,7 +301,7 @@ impl Peer {
             let why = self.access.denial(reader_of(served.key.kind), &served.key.topic)?;
             Some((served.key.clone(), why))
         };
-        let ended = self.served.iter().filter_map(|(route, s)| Some((*route, denied(s)?)));
+        let ended = self.served.iter().filter_map(|(route, s)| Some((route, denied(s)?)));
         for (route, (key, why)) in ended.collect::<Vec<_>>() {
             self.unserve(route);
             self.refuse(route, &key, why, Some(DENIED_AGAIN));
@@ -393,14 +336,14 @@ impl Peer {
 
     /// Publishers that ended stay in the graph that the peer sees until their samples have arrived.
     fn keep_ending(&mut self, local: &Local, now: Duration) {
-        let ended = self.sent.iter().filter(|(gid, shown)| {
+        let ended = self.told.iter().filter(|(gid, shown)| {
             shown.remote.endpoint.kind == EndpointKind::Publisher
                 && !local.contains_key(gid)
                 && !self.ending.contains_key(gid)
         });
         let carried = |gid: &Gid, shown: &Told| {
-            let number = *self.served_as.get(&RouteKey::of(&shown.remote.endpoint)?)?;
-            let sources = &self.served.get(&number)?.sources;
+            let number = self.served.number_of(&RouteKey::of(&shown.remote.endpoint)?)?;
+            let sources = &self.served.get(number)?.sources;
             self.outbound.has_left(number, sources, gid).then_some(number)
         };
         let ended = ended
@@ -437,9 +380,6 @@ impl Peer {
 
     /// Tells the peer what changed in the graph of this host, or all of it.
     pub(super) fn send_graph(&mut self, local: &Local, whole: bool) {
-        if whole {
-            self.sent.clear();
-        }
         let visible = self.visible(local);
         self.prove(&visible);
         let told = |remote: RemoteEndpoint| {
@@ -447,41 +387,12 @@ impl Peer {
             Told { remote, denied }
         };
         let now: BTreeMap<_, _> = visible.into_iter().map(|(gid, e)| (gid, told(e))).collect();
-        let new: Vec<_> =
-            now.iter().filter(|(gid, e)| self.sent.get(gid) != Some(e)).map(|(_, e)| e).collect();
-        let removed: Vec<_> =
-            self.sent.keys().filter(|gid| !now.contains_key(gid)).copied().collect();
-        if !whole && new.is_empty() && removed.is_empty() {
-            return;
-        }
-        let mut before = if whole { 0 } else { self.sent_version };
-        let mut removed = Some(removed);
-        let mut parts: Vec<&[_]> = new.chunks(GRAPH_PART).collect();
-        if parts.is_empty() {
-            parts.push(&[]);
-        }
-        let last = parts.len() - 1;
-        for (index, part) in parts.into_iter().enumerate() {
-            self.sent_version += 1;
-            let graph = Graph {
-                version: self.sent_version,
-                before,
-                removed: removed.take().unwrap_or_default(),
-                more: index < last,
-                ..added(part)
-            };
-            self.messages.push_back(Message::Graph(graph));
-            before = self.sent_version;
-        }
-        self.sent = now;
+        self.messages.extend(self.told.tell(now, whole));
     }
 
     /// The peer asks for the whole graph.
     fn resync(&mut self, local: &Local, now: Duration) {
-        let recent = |sent| now.saturating_sub(sent) < RESYNC;
-        self.resync_due = self.resynced.is_some_and(recent);
-        if !self.resync_due {
-            self.resynced = Some(now);
+        if self.told.handle_resync(now) {
             self.prover.forget();
             self.send_graph(local, true);
         }
@@ -517,7 +428,7 @@ impl Peer {
     }
 
     fn tell_alive(&mut self, epoch: Instant, now: Duration) {
-        let sources = self.served.values().flat_map(|served| &served.sources);
+        let sources = self.served.iter().flat_map(|(_, served)| &served.sources);
         let asserted = sources.flat_map(|source| match source {
             Source::Relay(_, reader) => reader.assertions(),
             Source::StandIn(_) => Vec::new(),
@@ -539,11 +450,10 @@ impl Peer {
 
     /// When [`handle_timeout`](Self::handle_timeout) is due, besides its samples.
     pub(super) fn poll_timeout(&self, epoch: Instant, now: Duration) -> Option<Duration> {
-        let resync = self.resync_due.then(|| self.resynced.unwrap_or_default() + RESYNC);
         let alive = self.alive_due(epoch, now);
-        let looks = [self.look_at_attaching, self.look_at_announcing];
-        let asks = self.refused.poll_timeout();
-        looks.into_iter().chain([alive, resync, asks]).flatten().min()
+        let (attaching, announcing) = (self.look_at_attaching, self.served.poll_timeout());
+        let (resync, asks) = (self.told.poll_timeout(), self.refused.poll_timeout());
+        [attaching, announcing, alive, resync, asks].into_iter().flatten().min()
     }
 
     /// Does what is due.
@@ -552,7 +462,7 @@ impl Peer {
         self.announce_ready(now);
         self.tell_alive(with.epoch, now);
         self.ask_again(now);
-        if self.resync_due {
+        if self.told.owes_resync() {
             self.resync(with.local, now);
         }
     }

@@ -6,7 +6,11 @@ use axon_envelope::{Kind, Route, TopicHash};
 use axon_shm::ids::Gid;
 use axon_transport::EndpointSpec;
 
-use super::{Peer, Surroundings, poll_after, reader_of, refused::TOO_MANY_LANES};
+use super::{
+    Peer, Surroundings, reader_of,
+    refused::TOO_MANY_LANES,
+    served::{Served, Without},
+};
 use crate::{
     engine::{
         account::Charge,
@@ -14,11 +18,9 @@ use crate::{
         outbound::{RouteOut, Source, Stall, UnfinishedFlows},
         peer::routes::{MAX_RELAYS_OF_ROUTE, RelaySpec, RouteKey, admit, relays},
     },
-    link::{Message, RouteReady, Subscribe, Subscriber},
+    link::{Message, Subscribe, Subscriber},
 };
 
-/// A route is said to be ready once it has a writer, or after this time.
-const READY_TIMEOUT: Duration = Duration::from_secs(2);
 /// A peer that lacks relays may ask for them again after this time.
 pub(super) const ASK_AGAIN: Duration = Duration::from_secs(10);
 /// A peer whose route access rules deny asks for it again after this time, if DENIED does not tell it when.
@@ -28,25 +30,6 @@ const ROUTE: usize = 2048;
 const COPIES: usize = 3;
 /// Routes that a peer is served. HELLO says it. What they take is bounded apart from it.
 pub(crate) const MAX_ROUTES: usize = 1 << 15;
-
-/// A route that the peer asked for.
-pub(super) struct Served {
-    pub(super) key: RouteKey,
-    pub(super) subscribers: Vec<Gid>,
-    pub(super) sources: Vec<Source>,
-    _room: Charge,
-    /// One for each relay.
-    pub(super) relays: Charge,
-    /// One for each relay and each publisher here that it may read.
-    pub(super) lanes: Charge,
-    /// Why some of the subscribers get nothing, and when the peer may ask again.
-    without: Option<Without>,
-    /// Whether the peer asked for it over the link in use.
-    pub(super) repeated: bool,
-}
-
-/// Why subscribers of a route have no relay, and after what time one may be had.
-type Without = (String, Option<Duration>);
 
 /// The relays of a route.
 struct Relays {
@@ -98,18 +81,18 @@ impl Peer {
         let acknowledged = subscribe.acknowledges == Some(true);
         let short_headers = kind == Kind::Topic && subscribe.short_headers == Some(true);
         let key = RouteKey { kind, topic, type_name };
-        if let Some(other) = self.served_as.get(&key).copied().filter(|other| *other != number) {
-            if self.served.get(&other).is_some_and(|served| served.repeated) {
+        if let Some(other) = self.served.number_of(&key).filter(|other| *other != number) {
+            if self.served.get(other).is_some_and(|served| served.repeated) {
                 return Err(format!("{} has a route already", key.topic));
             }
             // The number is of a link before this one.
             self.unserve(other);
         }
-        if self.served.get(&number).is_some_and(|old| !old.repeated && old.key != key) {
+        if self.served.get(number).is_some_and(|old| !old.repeated && old.key != key) {
             self.unserve(number);
         }
         let account = Rc::clone(self.remote.account());
-        let (old, mut places, mut lanes) = match self.take_served(number) {
+        let (old, mut places, mut lanes) = match self.served.take(number) {
             Some(served) if served.key == key => (served.sources, served.relays, served.lanes),
             Some(_) => return Err("a route number for two topics".into()),
             None => {
@@ -121,7 +104,6 @@ impl Peer {
                 (Vec::new(), account.relays.nothing(), account.lanes.nothing())
             }
         };
-        self.served_as.remove(&key);
         if let Some(why) = self.access.denial(reader_of(kind), &key.topic) {
             self.outbound.end_route(number);
             self.refuse(number, &key, why, Some(DENIED_AGAIN));
@@ -152,8 +134,7 @@ impl Peer {
             }
         };
         let Relays { sources, adopted, unfinished, without } = relays;
-        self.announcing.insert(number, now + READY_TIMEOUT);
-        self.look_at_announcing = Some(now);
+        self.served.announce(number, now);
         let route = Route { kind, topic: hash };
         let seen = last.iter().map(|l| (l.publisher, l.sequence)).collect();
         let out = RouteOut {
@@ -176,7 +157,6 @@ impl Peer {
                 self.outbound.handle_publisher_ended(number, of, now);
             }
         }
-        self.served_as.insert(key.clone(), number);
         let served = Served {
             key,
             subscribers: subscribers.iter().map(|subscriber| subscriber.gid).collect(),
@@ -187,24 +167,15 @@ impl Peer {
             without,
             repeated: true,
         };
-        if served.key.kind != Kind::Topic {
-            self.services.insert(number);
-        }
         self.served.insert(number, served);
         Ok(())
-    }
-
-    /// Takes a route out of those that are served.
-    fn take_served(&mut self, number: u32) -> Option<Served> {
-        self.services.remove(&number);
-        self.served.remove(&number)
     }
 
     /// Whether it is served this topic's route for one of these subscriptions.
     pub(in crate::engine) fn serves_one_of(&self, asks: &Subscribe, subscriptions: &[Gid]) -> bool {
         let (topic, type_name) = (asks.topic.clone(), asks.type_name.clone());
         let key = RouteKey { kind: Kind::Topic, topic, type_name };
-        let served = self.served_as.get(&key).and_then(|number| self.served.get(number));
+        let served = self.served.number_of(&key).and_then(|number| self.served.get(number));
         served
             .filter(|_| asks.kind == Kind::Topic as u8)
             .is_some_and(|served| subscriptions.iter().any(|gid| served.subscribers.contains(gid)))
@@ -229,9 +200,7 @@ impl Peer {
         with: &Surroundings<'_>,
         now: Duration,
     ) -> Option<StalledRoute> {
-        let served = self.take_served(route)?;
-        self.served_as.remove(&served.key);
-        self.announcing.remove(&route);
+        let served = self.served.remove(route)?;
         let samples = self.outbound.give_up_route(route);
         let (limit, key) = (with.config.link.stalled, &served.key);
         let instant = with.instant(now);
@@ -249,17 +218,14 @@ impl Peer {
     /// The peer no longer wants a route.
     pub(super) fn unserve(&mut self, route: u32) {
         self.refused.forget(route);
-        self.announcing.remove(&route);
-        if let Some(served) = self.take_served(route) {
-            self.served_as.remove(&served.key);
-        }
+        self.served.remove(route);
         self.outbound.end_route(route);
     }
 
     /// Ends the routes that the peer did not ask for again over the link in use.
     pub(super) fn unserve_unrepeated(&mut self) {
         let unrepeated = self.served.iter().filter(|(_, served)| !served.repeated);
-        let lost: Vec<_> = unrepeated.map(|(route, _)| *route).collect();
+        let lost: Vec<_> = unrepeated.map(|(route, _)| route).collect();
         lost.into_iter().for_each(|route| self.unserve(route));
     }
 
@@ -361,19 +327,17 @@ impl Peer {
 
     /// Has the routes of services use the stand-ins that exist now.
     pub(super) fn feed_services(&mut self, now: Duration) {
-        let services = self.services.iter();
-        let services = services.filter_map(|number| Some((number, self.served.get(number)?)));
         let mut changes = Vec::new();
-        for (number, served) in services {
+        for (number, served) in self.served.services() {
             let sources = self.sources_of_service(&served.key);
             let same = sources.len() == served.sources.len()
                 && sources.iter().zip(&served.sources).all(|(one, other)| one.is(other));
             if !same {
-                changes.push((*number, sources));
+                changes.push((number, sources));
             }
         }
         for (number, sources) in changes {
-            let Some(served) = self.served.get_mut(&number) else { continue };
+            let Some(served) = self.served.get_mut(number) else { continue };
             served.sources.clone_from(&sources);
             self.outbound.set_sources(number, sources, now);
         }
@@ -381,30 +345,16 @@ impl Peer {
 
     /// Says which routes have a writer by now.
     pub(super) fn announce_ready(&mut self, now: Duration) {
-        if self.look_at_announcing.is_none_or(|due| due > now) {
-            return;
-        }
-        let mut ready = Vec::new();
-        for (number, until) in &self.announcing {
-            let sources = self.served.get(number).map_or(&[][..], |served| &served.sources);
-            let publishers: Vec<Gid> = sources.iter().flat_map(Source::writers).collect();
-            if !publishers.is_empty() || now >= *until {
-                ready.push(RouteReady { route: *number, publishers });
-            }
-        }
-        for ready in ready {
+        for ready in self.served.take_ready(now) {
             let number = ready.route;
-            self.announcing.remove(&number);
             self.say(Message::RouteReady(ready));
             // What is ready is not refused: it is said in this order.
-            if let Some(served) = self.served.get(&number)
+            if let Some(served) = self.served.get(number)
                 && let Some((reason, again)) = served.without.clone()
             {
                 let key = served.key.clone();
                 self.refuse(number, &key, reason, again);
             }
         }
-        let waiting = self.announcing.len();
-        self.look_at_announcing = (waiting > 0).then(|| now + poll_after(waiting));
     }
 }

@@ -12,9 +12,9 @@ use crate::{
     graph::EndpointKind,
     ids::{Gid, SessionId},
     session::{
+        daemon::status_text::StatusAnswer,
         peers::PeerError,
         publisher::PublisherInner,
-        state::StatusAnswer,
         subscription::{Accept, Asking, Numbers, SubscriptionInner},
     },
     wire::session::{

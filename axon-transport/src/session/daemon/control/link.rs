@@ -12,8 +12,8 @@ use super::{
 use crate::{
     ids::Gid,
     session::{
-        daemon::connect::Connected,
-        state::{Outgoing, SegmentChange, SessionEvent, StatusAnswer},
+        daemon::{connect::Connected, memory_changes::SegmentChange, status_text::StatusAnswer},
+        state::{Outgoing, SessionEvent},
     },
     wire::session::{Gone, Message},
 };

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use super::Control;
 use crate::{
-    session::state::SegmentChange,
+    session::daemon::memory_changes::SegmentChange,
     wire::session::{Message, SegmentName, SegmentOpened},
 };
 

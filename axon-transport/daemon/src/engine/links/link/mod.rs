@@ -2,6 +2,7 @@
 
 pub(super) mod age;
 pub(super) mod hand_over;
+pub(super) mod view;
 
 use std::{
     rc::Rc,

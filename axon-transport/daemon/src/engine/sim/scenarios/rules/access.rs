@@ -16,7 +16,7 @@ use super::super::hostile::{
 };
 use crate::{
     engine::{
-        peer::decisions::looks_at_rules,
+        peer_graph::decisions::looks_at_rules,
         sim::{
             tests::{millis, secs},
             world::{Pair, World},

@@ -12,7 +12,7 @@ pub(crate) fn looks_at_rules() -> u64 {
 }
 
 /// The rules about a peer are looked at.
-pub(super) fn note_look() {
+pub(in crate::engine) fn note_look() {
     #[cfg(test)]
     LOOKS.set(LOOKS.get() + 1);
 }

@@ -1,4 +1,11 @@
-//! A peer's graph as this side holds it: as much of it as the peer's account has room for.
+//! The graph of a peer as this side holds it: as much of it as the peer's account has room for. Besides, the graph of
+//! this host as far as a peer was told of it, and the proofs that sessions are of their daemons.
+
+pub(super) mod decisions;
+mod left_out;
+pub(super) mod owners;
+mod terms;
+pub(super) mod told;
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -9,12 +16,11 @@ use std::{
 use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::{
     access::Permissions,
-    config::DiscoveryRange,
-    graph::{Endpoint, EndpointKind},
-    internal::graph::{LIMITS, RangeToHost, RemoteEndpoint, permits},
+    graph::Endpoint,
+    internal::graph::{LIMITS, RemoteEndpoint, permits},
 };
 
-use super::{decisions::note_look, owners::Proven};
+use self::{decisions::note_look, left_out::LeftOut, owners::Proven, terms::Terms};
 use crate::{
     engine::account::{Account, Charge},
     link::Graph,
@@ -54,15 +60,6 @@ struct Held {
     _charge: Rc<Charge>,
 }
 
-/// An endpoint for which there was no room.
-#[derive(Debug)]
-struct Refused {
-    /// It by name, and why.
-    text: String,
-    /// Bytes that it would take; `None` when bytes are not what is missing.
-    bytes: Option<usize>,
-}
-
 /// The graph of one peer.
 #[derive(Debug)]
 pub(crate) struct Remote {
@@ -77,9 +74,7 @@ pub(crate) struct Remote {
     changed: BTreeSet<Gid>,
     /// Nothing was told of it yet.
     fresh: bool,
-    /// The first that was refused since the last whole graph, and how many there were.
-    refused: Option<Refused>,
-    left_out: u64,
+    left_out: LeftOut,
 }
 
 impl Remote {
@@ -95,32 +90,24 @@ impl Remote {
             gathered: None,
             changed: BTreeSet::new(),
             fresh: true,
-            refused: None,
-            left_out: 0,
+            left_out: LeftOut::default(),
         }
     }
 
     /// Takes a GRAPH in, as far as there is room.
     pub(crate) fn take(&mut self, graph: Graph) -> GraphTaken {
         let Graph { version, before, added, removed, more, localhost, listing, denied } = graph;
-        let [localhost, listing, closed] = [localhost, listing, denied]
-            .map(|gids| gids.unwrap_or_default().into_iter().collect::<BTreeSet<Gid>>());
-        let toward = |gid: &Gid| {
-            let near = localhost.contains(gid);
-            let range = if near { DiscoveryRange::Localhost } else { DiscoveryRange::Subnet };
-            RangeToHost { range, lists: listing.contains(gid) }
-        };
+        let terms = Terms::new([localhost, listing, denied]);
         if before == 0 {
             self.gathered = Some(BTreeMap::new());
-            (self.refused, self.left_out) = (None, 0);
+            self.left_out = LeftOut::default();
         } else if before != self.version {
             return GraphTaken::Gap;
         }
         self.version = version;
         if let Some(mut gathered) = self.gathered.take() {
             for endpoint in added {
-                let (toward, closed) = (toward(&endpoint.gid), closed.contains(&endpoint.gid));
-                self.gather(&mut gathered, endpoint, toward, closed);
+                self.gather(&mut gathered, endpoint, &terms);
             }
             if more {
                 self.gathered = Some(gathered);
@@ -147,15 +134,14 @@ impl Remote {
         for endpoint in added {
             let gid = endpoint.gid;
             if !self.proven.owns(&gid) {
-                self.disown(&gid, || named(&endpoint));
+                self.left_out.add_unproven(&endpoint);
                 continue;
             }
             // What it replaces makes room for it.
             let before = self.all.remove(&gid);
             let known = before.is_some();
             drop(before);
-            let closed = closed.contains(&gid);
-            let held = self.hold(endpoint, toward(&gid), closed, self.all.len());
+            let held = self.hold(endpoint, &terms, self.all.len());
             if known || held.is_some() {
                 self.changed.insert(gid);
             }
@@ -166,24 +152,18 @@ impl Remote {
     }
 
     /// One more endpoint of a whole graph. One that is known already takes nothing more.
-    fn gather(
-        &mut self,
-        gathered: &mut BTreeMap<Gid, Held>,
-        endpoint: Endpoint,
-        toward: RangeToHost,
-        closed: bool,
-    ) {
+    fn gather(&mut self, gathered: &mut BTreeMap<Gid, Held>, endpoint: Endpoint, terms: &Terms) {
         let gid = endpoint.gid;
         let held = match self.all.get(&gid) {
             _ if !self.proven.owns(&gid) => {
-                self.disown(&gid, || named(&endpoint));
+                self.left_out.add_unproven(&endpoint);
                 None
             }
             Some(known) if *known.remote.endpoint == endpoint => {
-                let remote = RemoteEndpoint { toward, ..known.remote.clone() };
-                Some(Held { remote, closed, ..known.clone() })
+                let remote = RemoteEndpoint { toward: terms.toward(&gid), ..known.remote.clone() };
+                Some(Held { remote, closed: terms.denies(&gid), ..known.clone() })
             }
-            _ => self.hold(endpoint, toward, closed, gathered.len()),
+            _ => self.hold(endpoint, terms, gathered.len()),
         };
         gathered.extend(held.map(|held| (gid, held)));
     }
@@ -213,46 +193,27 @@ impl Remote {
 
     /// A reader that the peer names in SUBSCRIBE is left out.
     pub(crate) fn disown_reader(&mut self, gid: &Gid, topic: &str) {
-        self.disown(gid, || format!("the reader of {}", short(topic)));
+        self.left_out.add_unproven_reader(gid, topic);
     }
 
-    fn disown(&mut self, gid: &Gid, named: impl FnOnce() -> String) {
-        self.left_out += 1;
-        self.refused.get_or_insert_with(|| {
-            let text = format!(
-                "{} is left out: the peer did not prove that its GID {gid} is of a session of its own",
-                named()
-            );
-            Refused { text, bytes: None }
-        });
-    }
-
-    fn hold(
-        &mut self,
-        endpoint: Endpoint,
-        toward: RangeToHost,
-        closed: bool,
-        beside: usize,
-    ) -> Option<Held> {
+    fn hold(&mut self, endpoint: Endpoint, terms: &Terms, beside: usize) -> Option<Held> {
         let bytes = endpoint.bytes();
         if beside < LIMITS.endpoints
             && let Some(charge) = self.account.graph.charge(bytes)
         {
+            let (toward, closed) = (terms.toward(&endpoint.gid), terms.denies(&endpoint.gid));
             let remote = RemoteEndpoint { endpoint: Arc::new(endpoint), toward };
             note_look();
             let denied = !permits(&self.permissions, &remote.endpoint);
             return Some(Held { remote, denied, closed, _charge: Rc::new(charge) });
         }
-        self.left_out += 1;
-        if self.refused.is_none() {
-            let (why, bytes) = if beside < LIMITS.endpoints {
-                let most = self.account.graph.most() >> 20;
-                (format!("more than {most} MiB ([link] graph_mb here)"), Some(bytes))
-            } else {
-                (format!("more than {} endpoints", LIMITS.endpoints), None)
-            };
-            let text = format!("{} is left out: the peer's graph has {why}", named(&endpoint));
-            self.refused = Some(Refused { text, bytes });
+        if beside < LIMITS.endpoints {
+            let most = self.account.graph.most() >> 20;
+            let has = || format!("more than {most} MiB ([link] graph_mb here)");
+            self.left_out.add_for_room(&endpoint, Some(bytes), has);
+        } else {
+            let has = || format!("more than {} endpoints", LIMITS.endpoints);
+            self.left_out.add_for_room(&endpoint, None, has);
         }
         None
     }
@@ -278,18 +239,18 @@ impl Remote {
 
     /// The first endpoint that was left out of the graph, and why; `None` when it is complete.
     pub(crate) fn refused(&self) -> Option<&str> {
-        self.refused.as_ref().map(|refused| refused.text.as_str())
+        self.left_out.first()
     }
 
     /// How many were left out since the peer said its whole graph.
     pub(crate) fn left_out(&self) -> u64 {
-        self.left_out
+        self.left_out.count()
     }
 
     /// Whether there is room by now for the first that was left out: the whole graph is worth asking
     /// for.
     pub(crate) fn has_room_again(&self) -> bool {
-        let needed = self.refused.as_ref().and_then(|refused| refused.bytes);
+        let needed = self.left_out.needed();
         self.gathered.is_none() && needed.is_some_and(|n| self.account.graph.charge(n).is_some())
     }
 
@@ -354,26 +315,10 @@ impl Remote {
     }
 }
 
-fn short(name: &str) -> String {
-    format!("{:?}", name.chars().take(100).collect::<String>())
-}
-
-/// An endpoint for log and status, with whatever names a peer gave it.
-fn named(endpoint: &Endpoint) -> String {
-    let what = match endpoint.kind {
-        EndpointKind::Publisher => "the publisher of",
-        EndpointKind::Subscription => "the subscription to",
-        EndpointKind::Server => "the server of",
-        EndpointKind::Client => "the client of",
-        EndpointKind::Node => return format!("the node {}", short(&endpoint.node)),
-    };
-    format!("{what} {} in node {}", short(&endpoint.topic), short(&endpoint.node))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use axon_transport::internal::SessionKey;
+    use axon_transport::{graph::EndpointKind, internal::SessionKey};
 
     use crate::{engine::account::Accounts, owner::prove};
 

@@ -1,0 +1,203 @@
+//! The routes that a peer is served.
+
+use std::{
+    collections::{BTreeMap, BTreeSet, HashMap},
+    time::Duration,
+};
+
+use axon_envelope::Kind;
+use axon_shm::ids::Gid;
+
+use super::{poll_after, routes::RouteKey};
+use crate::{
+    engine::{account::Charge, outbound::Source},
+    link::RouteReady,
+};
+
+/// A route is said to be ready once it has a writer, or after this time.
+const READY_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// A route that the peer asked for.
+pub(super) struct Served {
+    pub(super) key: RouteKey,
+    pub(super) subscribers: Vec<Gid>,
+    pub(super) sources: Vec<Source>,
+    pub(super) _room: Charge,
+    /// One for each relay.
+    pub(super) relays: Charge,
+    /// One for each relay and each publisher here that it may read.
+    pub(super) lanes: Charge,
+    /// Why some of the subscribers get nothing, and when the peer may ask again.
+    pub(super) without: Option<Without>,
+    /// Whether the peer asked for it over the link in use.
+    pub(super) repeated: bool,
+}
+
+/// Why subscribers of a route have no relay, and after what time one may be had.
+pub(super) type Without = (String, Option<Duration>);
+
+/// Routes by number and by what they carry.
+#[derive(Default)]
+pub(super) struct ServedRoutes {
+    routes: HashMap<u32, Served>,
+    numbers: HashMap<RouteKey, u32>,
+    /// The routes of services.
+    services: BTreeSet<u32>,
+    /// Routes whose readiness the peer was not told of, and until when that waits for a writer.
+    announcing: BTreeMap<u32, Duration>,
+    look_at_announcing: Option<Duration>,
+}
+
+impl ServedRoutes {
+    pub(super) fn len(&self) -> usize {
+        self.routes.len()
+    }
+
+    pub(super) fn get(&self, number: u32) -> Option<&Served> {
+        self.routes.get(&number)
+    }
+
+    pub(super) fn get_mut(&mut self, number: u32) -> Option<&mut Served> {
+        self.routes.get_mut(&number)
+    }
+
+    /// The number of the route that carries this.
+    pub(super) fn number_of(&self, key: &RouteKey) -> Option<u32> {
+        self.numbers.get(key).copied()
+    }
+
+    pub(super) fn iter(&self) -> impl Iterator<Item = (u32, &Served)> {
+        self.routes.iter().map(|(number, served)| (*number, served))
+    }
+
+    pub(super) fn iter_mut(&mut self) -> impl Iterator<Item = (u32, &mut Served)> {
+        self.routes.iter_mut().map(|(number, served)| (*number, served))
+    }
+
+    /// The routes of services, by number.
+    pub(super) fn services(&self) -> impl Iterator<Item = (u32, &Served)> {
+        self.services.iter().filter_map(|number| Some((*number, self.routes.get(number)?)))
+    }
+
+    /// How many routes of services there are.
+    pub(super) fn service_count(&self) -> usize {
+        self.services.len()
+    }
+
+    /// Whether a route is of a service.
+    pub(super) fn is_service(&self, number: u32) -> bool {
+        self.services.contains(&number)
+    }
+
+    /// Adds a route, in place of what [`take`](Self::take) took.
+    pub(super) fn insert(&mut self, number: u32, served: Served) {
+        self.numbers.insert(served.key.clone(), number);
+        if served.key.kind != Kind::Topic {
+            self.services.insert(number);
+        }
+        self.routes.insert(number, served);
+    }
+
+    /// Takes a route out, to be changed. The peer may still be waiting to be told that it is ready.
+    pub(super) fn take(&mut self, number: u32) -> Option<Served> {
+        self.services.remove(&number);
+        let served = self.routes.remove(&number)?;
+        self.numbers.remove(&served.key);
+        Some(served)
+    }
+
+    /// Ends a route.
+    pub(super) fn remove(&mut self, number: u32) -> Option<Served> {
+        self.announcing.remove(&number);
+        self.take(number)
+    }
+
+    /// Has the peer told when a route is ready.
+    pub(super) fn announce(&mut self, number: u32, now: Duration) {
+        self.announcing.insert(number, now + READY_TIMEOUT);
+        self.look_at_announcing = Some(now);
+    }
+
+    /// When [`take_ready`](Self::take_ready) is due.
+    pub(super) fn poll_timeout(&self) -> Option<Duration> {
+        self.look_at_announcing
+    }
+
+    /// The routes that are ready by now and of which the peer was not told.
+    pub(super) fn take_ready(&mut self, now: Duration) -> Vec<RouteReady> {
+        if self.look_at_announcing.is_none_or(|due| due > now) {
+            return Vec::new();
+        }
+        let mut ready = Vec::new();
+        self.announcing.retain(|number, until| {
+            let sources = self.routes.get(number).map_or(&[][..], |served| &served.sources);
+            let publishers: Vec<Gid> = sources.iter().flat_map(Source::writers).collect();
+            let waits = publishers.is_empty() && now < *until;
+            if !waits {
+                ready.push(RouteReady { route: *number, publishers });
+            }
+            waits
+        });
+        let waiting = self.announcing.len();
+        self.look_at_announcing = (waiting > 0).then(|| now + poll_after(waiting));
+        ready
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::account::Accounts;
+
+    fn served(kind: Kind, topic: &str) -> Served {
+        let account = Accounts::new(1 << 20, 1 << 20).of_one("a");
+        Served {
+            key: RouteKey { kind, topic: topic.into(), type_name: "T".into() },
+            subscribers: Vec::new(),
+            sources: Vec::new(),
+            _room: account.routes.nothing(),
+            relays: account.relays.nothing(),
+            lanes: account.lanes.nothing(),
+            without: None,
+            repeated: true,
+        }
+    }
+
+    #[test]
+    fn a_route_is_found_by_number_and_by_what_it_carries_until_it_ends() {
+        let mut routes = ServedRoutes::default();
+        let all = [(1, Kind::Topic, "/t"), (7, Kind::Request, "/s"), (9, Kind::Response, "/s")];
+        for (number, kind, topic) in all {
+            routes.insert(number, served(kind, topic));
+        }
+        assert_eq!(routes.services().map(|(number, _)| number).collect::<Vec<_>>(), [7, 9]);
+        for (left, (number, kind, topic)) in (0..3).rev().zip(all) {
+            let key = served(kind, topic).key;
+            assert_eq!(routes.number_of(&key), Some(number));
+            assert_eq!(routes.is_service(number), kind != Kind::Topic);
+            assert!(routes.remove(number).is_some_and(|served| served.key == key));
+            assert!(routes.get(number).is_none() && routes.number_of(&key).is_none());
+            assert!(!routes.is_service(number) && routes.remove(number).is_none());
+            assert_eq!((routes.len(), routes.service_count()), (left, left.min(2)));
+        }
+    }
+
+    #[test]
+    fn a_route_without_a_writer_is_announced_once_after_its_time() {
+        let mut routes = ServedRoutes::default();
+        routes.insert(1, served(Kind::Topic, "/t"));
+        routes.insert(2, served(Kind::Topic, "/u"));
+        let start = Duration::from_secs(5);
+        routes.announce(1, start);
+        routes.announce(2, start);
+        assert_eq!(routes.poll_timeout(), Some(start));
+        assert!(routes.take_ready(start).is_empty());
+        assert_eq!(routes.poll_timeout(), Some(start + poll_after(2)));
+        assert!(routes.take_ready(start).is_empty(), "it is not due");
+        routes.remove(2);
+        let ready = routes.take_ready(start + READY_TIMEOUT);
+        assert_eq!(ready, [RouteReady { route: 1, publishers: Vec::new() }]);
+        assert_eq!(routes.poll_timeout(), None);
+        assert!(routes.take_ready(start + 2 * READY_TIMEOUT).is_empty());
+    }
+}

@@ -1,0 +1,44 @@
+//! The parts of the engine that all peers use.
+
+use std::{
+    cell::RefCell,
+    collections::BTreeMap,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use axon_shm::ids::Gid;
+use axon_transport::{config::Config, graph::Endpoint, internal::graph::EndpointRange};
+
+use super::{kept::KeptRelays, lanes::WritersHere, stalls::Stalls};
+use crate::engine::{rings::Rings, stand_in::StandIns};
+
+/// The endpoints of applications on this host, and how far their sessions are discovered.
+pub(crate) type Local = BTreeMap<Gid, (Arc<Endpoint>, EndpointRange)>;
+
+/// The parts of the engine that all peers use.
+pub(crate) struct Surroundings<'a> {
+    /// The rings of this host.
+    pub(crate) rings: &'a dyn Rings,
+    /// All stand-ins.
+    pub(crate) stand_ins: &'a StandIns,
+    /// The endpoints of this host.
+    pub(crate) local: &'a Local,
+    /// How many writers of each route are among them.
+    pub(crate) writers: &'a WritersHere,
+    /// The settings of this host.
+    pub(crate) config: &'a Config,
+    /// Routes that were given up.
+    pub(crate) stalls: &'a RefCell<Stalls>,
+    /// Relays that are kept for daemons that are restarted.
+    pub(crate) kept: &'a RefCell<KeptRelays>,
+    /// When the engine's time was zero.
+    pub(crate) epoch: Instant,
+}
+
+impl Surroundings<'_> {
+    /// The same time as an instant.
+    pub(super) fn instant(&self, now: Duration) -> Instant {
+        self.epoch + now
+    }
+}

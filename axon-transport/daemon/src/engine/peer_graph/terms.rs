@@ -1,0 +1,53 @@
+//! What a GRAPH message says about the endpoints that it adds.
+
+use std::collections::BTreeSet;
+
+use axon_shm::ids::Gid;
+use axon_transport::{config::DiscoveryRange, internal::graph::RangeToHost};
+
+/// The endpoints of a GRAPH message that the message says more about.
+pub(super) struct Terms {
+    localhost: BTreeSet<Gid>,
+    listing: BTreeSet<Gid>,
+    denied: BTreeSet<Gid>,
+}
+
+impl Terms {
+    /// What the fields of a message say: endpoints with the range LOCALHOST, of sessions that list this host as a static
+    /// peer, and whose other end access rules of the peer deny this host.
+    pub(super) fn new(fields: [Option<Vec<Gid>>; 3]) -> Self {
+        let [localhost, listing, denied] =
+            fields.map(|gids| gids.unwrap_or_default().into_iter().collect());
+        Self { localhost, listing, denied }
+    }
+
+    /// The range of an endpoint towards this host.
+    pub(super) fn toward(&self, gid: &Gid) -> RangeToHost {
+        let near = self.localhost.contains(gid);
+        let range = if near { DiscoveryRange::Localhost } else { DiscoveryRange::Subnet };
+        RangeToHost { range, lists: self.listing.contains(gid) }
+    }
+
+    /// Whether access rules of the peer deny this host the other end of an endpoint.
+    pub(super) fn denies(&self, gid: &Gid) -> bool {
+        self.denied.contains(gid)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_endpoint_that_no_field_names_is_for_the_subnet_and_denied_nobody() {
+        let gids = [1, 2, 3].map(|number| Gid([number; 16]));
+        let terms = Terms::new([Some(vec![gids[0]]), Some(vec![gids[0], gids[1]]), None]);
+        let toward = gids.map(|gid| terms.toward(&gid));
+        assert_eq!(toward.map(|to| to.lists), [true, true, false]);
+        let (near, subnet) = (DiscoveryRange::Localhost, DiscoveryRange::Subnet);
+        assert_eq!(toward.map(|to| to.range), [near, subnet, subnet]);
+        assert!(!gids.iter().any(|gid| terms.denies(gid)));
+        let terms = Terms::new([None, None, Some(vec![gids[2]])]);
+        assert_eq!(gids.map(|gid| terms.denies(&gid)), [false, false, true]);
+    }
+}

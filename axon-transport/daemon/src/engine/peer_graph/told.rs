@@ -1,0 +1,170 @@
+//! The endpoints of this host as a peer is told of them.
+
+use std::{collections::BTreeMap, time::Duration};
+
+use axon_shm::ids::Gid;
+use axon_transport::{config::DiscoveryRange, graph::Endpoint, internal::graph::RemoteEndpoint};
+
+use crate::link::{Graph, Message};
+
+/// Endpoints in one message of a graph.
+const GRAPH_PART: usize = 512;
+/// A whole graph is sent so often at most.
+const RESYNC: Duration = Duration::from_secs(1);
+
+/// An endpoint of this host that a peer is shown.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(in crate::engine) struct Told {
+    /// The endpoint, and its range towards the peer.
+    pub(in crate::engine) remote: RemoteEndpoint,
+    /// Access rules deny the peer the other end.
+    pub(in crate::engine) denied: bool,
+}
+
+/// The graph of this host as far as a peer was told of it.
+#[derive(Default)]
+pub(in crate::engine) struct ToldGraph {
+    endpoints: BTreeMap<Gid, Told>,
+    version: u64,
+    /// When the peer had the whole graph last because it asked for that.
+    resynced: Option<Duration>,
+    /// It asked again too early.
+    resync_due: bool,
+}
+
+impl ToldGraph {
+    /// The endpoints that the peer knows.
+    pub(in crate::engine) fn iter(&self) -> impl Iterator<Item = (&Gid, &Told)> {
+        self.endpoints.iter()
+    }
+
+    /// The peer asks for the whole graph, or asked for it too early. Returns whether it gets it now.
+    pub(in crate::engine) fn handle_resync(&mut self, now: Duration) -> bool {
+        let recent = |sent| now.saturating_sub(sent) < RESYNC;
+        self.resync_due = self.resynced.is_some_and(recent);
+        if !self.resync_due {
+            self.resynced = Some(now);
+        }
+        !self.resync_due
+    }
+
+    /// Whether the peer still has to get the whole graph.
+    pub(in crate::engine) fn owes_resync(&self) -> bool {
+        self.resync_due
+    }
+
+    /// When the peer gets the whole graph for which it asked too early.
+    pub(in crate::engine) fn poll_timeout(&self) -> Option<Duration> {
+        self.resync_due.then(|| self.resynced.unwrap_or_default() + RESYNC)
+    }
+
+    /// The peer may see these endpoints now. Returns the messages that tell it what changed, or all of them for the `whole`
+    /// graph.
+    pub(in crate::engine) fn tell(
+        &mut self,
+        now: BTreeMap<Gid, Told>,
+        whole: bool,
+    ) -> Vec<Message> {
+        let before = if whole { BTreeMap::new() } else { std::mem::take(&mut self.endpoints) };
+        let new: Vec<_> = now
+            .iter()
+            .filter(|(gid, told)| before.get(gid) != Some(told))
+            .map(|(_, e)| e)
+            .collect();
+        let removed: Vec<_> = before.keys().filter(|gid| !now.contains_key(gid)).copied().collect();
+        let mut messages = Vec::new();
+        if whole || !new.is_empty() || !removed.is_empty() {
+            let mut before = if whole { 0 } else { self.version };
+            let mut removed = Some(removed);
+            let mut parts: Vec<&[_]> = new.chunks(GRAPH_PART).collect();
+            if parts.is_empty() {
+                parts.push(&[]);
+            }
+            let last = parts.len() - 1;
+            for (index, part) in parts.into_iter().enumerate() {
+                self.version += 1;
+                messages.push(Message::Graph(Graph {
+                    version: self.version,
+                    before,
+                    removed: removed.take().unwrap_or_default(),
+                    more: index < last,
+                    ..added(part)
+                }));
+                before = self.version;
+            }
+        }
+        self.endpoints = now;
+        messages
+    }
+}
+
+/// A GRAPH that adds these. Its versions and what it removes are the caller's.
+fn added(part: &[&Told]) -> Graph {
+    let named = |is: fn(&Told) -> bool| {
+        let gids = part.iter().filter(|told| is(told)).map(|told| told.remote.endpoint.gid);
+        Some(gids.collect::<Vec<Gid>>()).filter(|gids| !gids.is_empty())
+    };
+    Graph {
+        localhost: named(|told| told.remote.toward.range != DiscoveryRange::Subnet),
+        listing: named(|told| told.remote.toward.lists),
+        denied: named(|told| told.denied),
+        added: part.iter().map(|told| Endpoint::clone(&told.remote.endpoint)).collect(),
+        ..Graph::default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use axon_transport::graph::EndpointKind;
+
+    /// Endpoints of these numbers; those from 1000 on are denied.
+    fn endpoints(numbers: impl IntoIterator<Item = u32>) -> BTreeMap<Gid, Told> {
+        let of = |number: u32| {
+            let gid = Gid((u128::from(number % 1000)).to_be_bytes());
+            let remote = Endpoint::new(gid, EndpointKind::Publisher, "/t", "T").into();
+            (gid, Told { remote, denied: number >= 1000 })
+        };
+        numbers.into_iter().map(of).collect()
+    }
+
+    /// Version, version before, and how many endpoints come and go, with whether more follows.
+    fn said(messages: Vec<Message>) -> Vec<(u64, u64, usize, usize, bool)> {
+        let of = |message| match message {
+            Message::Graph(g) => (g.version, g.before, g.added.len(), g.removed.len(), g.more),
+            other => panic!("{other:?}"),
+        };
+        messages.into_iter().map(of).collect()
+    }
+
+    #[test]
+    fn a_peer_is_told_what_changed_and_of_nothing_twice() {
+        let mut told = ToldGraph::default();
+        assert_eq!(said(told.tell(endpoints(1..4), false)), [(1, 0, 3, 0, false)]);
+        assert!(told.tell(endpoints(1..4), false).is_empty());
+        assert_eq!(said(told.tell(endpoints([2, 3, 4, 5]), false)), [(2, 1, 2, 1, false)]);
+        assert_eq!(said(told.tell(endpoints([1002, 3, 4, 5]), false)), [(3, 2, 1, 0, false)]);
+        assert_eq!(said(told.tell(endpoints([]), false)), [(4, 3, 0, 4, false)]);
+    }
+
+    #[test]
+    fn a_whole_graph_begins_at_version_0_and_is_sent_if_it_is_empty() {
+        let mut told = ToldGraph::default();
+        told.tell(endpoints(1..4), false);
+        assert_eq!(said(told.tell(endpoints(2..4), true)), [(2, 0, 2, 0, false)]);
+        assert_eq!(said(told.tell(endpoints([]), true)), [(3, 0, 0, 0, false)]);
+        let parts = said(told.tell(endpoints(0..999), true));
+        assert_eq!(parts, [(4, 0, 512, 0, true), (5, 4, 487, 0, false)]);
+    }
+
+    #[test]
+    fn a_peer_that_asks_again_and_again_gets_the_whole_graph_once_a_second() {
+        let mut told = ToldGraph::default();
+        let at = Duration::from_millis;
+        assert!(told.handle_resync(at(100)) && !told.owes_resync());
+        assert!(!told.handle_resync(at(200)) && !told.handle_resync(at(1099)));
+        assert_eq!((told.poll_timeout(), told.owes_resync()), (Some(at(1100)), true));
+        assert!(told.handle_resync(at(1100)));
+        assert_eq!((told.poll_timeout(), told.owes_resync()), (None, false));
+    }
+}

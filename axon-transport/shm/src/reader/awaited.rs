@@ -1,0 +1,142 @@
+//! Memory of a publisher's session that a reader needs to go on and that has not come.
+
+use std::time::{Duration, Instant};
+
+/// How often a reader asks for memory that has not come, and how long it waits for it once it was told
+/// that the publisher is gone.
+const MISSING: Duration = Duration::from_secs(1);
+/// How long a reader waits for memory of a process that has ended where nobody has said so: the
+/// daemon hands over what the process left, and may be slow. It waits once for all that the process left.
+const MISSING_DEAD: Duration = Duration::from_secs(10);
+
+/// The segment that a reader waits for, if it waits for one, and for how long it waits.
+#[derive(Default)]
+pub(super) struct Awaited {
+    missing: Option<Missing>,
+    /// Whether memory of the publisher's process, which has ended, was waited for in vain.
+    waited: bool,
+    /// Whether the publisher is known to be gone.
+    ended: bool,
+}
+
+/// A segment that is needed to go on.
+#[derive(Clone, Copy)]
+struct Missing {
+    segment: u32,
+    since: Instant,
+    asked: Instant,
+}
+
+/// What a reader does about a segment that has not come.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Wait {
+    /// Asks for it, and waits.
+    Ask,
+    /// Waits.
+    Longer,
+    /// Waits no longer: it will not come.
+    InVain,
+}
+
+impl Awaited {
+    /// The segment that is needed to go on and has not come.
+    #[inline]
+    pub(super) fn segment(&self) -> Option<u32> {
+        self.missing.map(|missing| missing.segment)
+    }
+
+    /// When the reader looks again for it.
+    #[inline]
+    pub(super) fn look_again(&self) -> Option<Instant> {
+        self.missing.map(|missing| missing.asked + MISSING)
+    }
+
+    /// Nothing is needed to go on.
+    #[inline]
+    pub(super) fn clear(&mut self) {
+        self.missing = None;
+    }
+
+    /// The publisher is gone, and all of its memory was handed over: what does not come soon never will.
+    pub(super) fn end(&mut self) {
+        if !std::mem::replace(&mut self.ended, true) {
+            // The next take asks for it once more, and waits for the answer.
+            self.clear();
+        }
+    }
+
+    /// A segment is needed to go on, and has not come. `is_dead` finds out whether the publisher's process has ended: a
+    /// system call.
+    pub(super) fn handle_missing(
+        &mut self,
+        segment: u32,
+        now: Instant,
+        is_dead: impl Fn() -> bool,
+    ) -> Wait {
+        let Some(missing) = self.missing.as_mut().filter(|missing| missing.segment == segment)
+        else {
+            self.missing = Some(Missing { segment, since: now, asked: now });
+            return Wait::Ask;
+        };
+        let waited = now.duration_since(missing.since);
+        // It asks a second time in between.
+        let dead = if self.waited { MISSING } else { MISSING_DEAD };
+        if self.ended && waited >= 2 * MISSING || waited >= dead && is_dead() {
+            self.waited |= is_dead();
+            return Wait::InVain;
+        }
+        if now.duration_since(missing.asked) < MISSING {
+            return Wait::Longer;
+        }
+        missing.asked = now;
+        Wait::Ask
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What the reader does about a segment, by the second from when it found the segment missing.
+    fn waits(awaited: &mut Awaited, segment: u32, seconds: u64, is_dead: bool) -> Vec<Wait> {
+        let start = Instant::now();
+        let at = |second| start + Duration::from_secs(second);
+        (0..=seconds)
+            .map(|second| awaited.handle_missing(segment, at(second), || is_dead))
+            .collect()
+    }
+
+    #[test]
+    fn a_reader_asks_once_a_second_as_long_as_the_publisher_lives() {
+        let (mut awaited, start) = (Awaited::default(), Instant::now());
+        let at = |tenth: u64| start + Duration::from_millis(100 * tenth);
+        let asked = (0..1000)
+            .filter(|tenth| awaited.handle_missing(1, at(*tenth), || false) == Wait::Ask)
+            .collect::<Vec<_>>();
+        assert_eq!(asked, (0..1000).step_by(10).collect::<Vec<_>>());
+        assert_eq!((awaited.segment(), awaited.look_again()), (Some(1), Some(at(1000))));
+        awaited.clear();
+        assert_eq!((awaited.segment(), awaited.look_again()), (None, None));
+    }
+
+    #[test]
+    fn a_reader_waits_once_for_all_memory_of_a_dead_process() {
+        let mut awaited = Awaited::default();
+        let first = waits(&mut awaited, 1, 10, true);
+        assert_eq!((&first[..10], first[10]), (&[Wait::Ask; 10][..], Wait::InVain));
+        assert_eq!(waits(&mut awaited, 2, 1, true), [Wait::Ask, Wait::InVain]);
+    }
+
+    #[test]
+    fn a_reader_that_was_told_of_the_end_asks_anew_and_twice_for_each_segment() {
+        let mut awaited = Awaited::default();
+        assert_eq!(waits(&mut awaited, 1, 5, false), [Wait::Ask; 6]);
+        awaited.end();
+        assert_eq!(awaited.segment(), None);
+        for segment in [1, 2] {
+            let told = waits(&mut awaited, segment, 2, false);
+            assert_eq!(told, [Wait::Ask, Wait::Ask, Wait::InVain]);
+            awaited.end();
+        }
+    }
+}
