@@ -129,6 +129,14 @@ pub enum ToControl {
     /// How a link does, and routes that do not cross it: at its start and from time to time. Replaces what was known of
     /// the peer.
     Link(Box<LinkStatus>, Vec<RefusedRoute>),
+    /// Whether the path of a link carries anything. While it does not, the peer is looked for at its other addresses. A
+    /// successor's path works until this says otherwise.
+    Path {
+        /// The peer.
+        daemon: DaemonId,
+        /// Whether it does.
+        works: bool,
+    },
     /// A peer has been silent for so long that its endpoints are forgotten. Its link stands:
     /// [`RemoteGraph`](Self::RemoteGraph) brings them back, or the link goes down.
     Silent {

@@ -309,7 +309,10 @@ impl Control {
             ToControl::Keys(keys) => self.keys = keys,
             ToControl::Lost { topic, cause, samples } => self.lost.add(&topic, cause, samples),
             ToControl::Draining(draining) => self.draining = draining,
-            ToControl::DialFailed { .. } | ToControl::Datagrams(_) | ToControl::Finished => {}
+            ToControl::DialFailed { .. }
+            | ToControl::Datagrams(_)
+            | ToControl::Path { .. }
+            | ToControl::Finished => {}
         }
         self.settle();
     }

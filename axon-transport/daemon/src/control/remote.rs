@@ -185,6 +185,9 @@ impl Remote {
             ToControl::DialFailed { daemon, standing } => {
                 self.tell(Event::DialFailed { daemon: *daemon, standing: *standing });
             }
+            ToControl::Path { daemon, works } => {
+                self.tell(Event::Path { daemon: *daemon, works: *works });
+            }
             ToControl::Finished => self.finished = true,
             _ => {}
         }

@@ -59,6 +59,13 @@ pub(crate) enum Event {
         /// Which.
         daemon: DaemonId,
     },
+    /// Whether the path of a link carries anything.
+    Path {
+        /// With this daemon.
+        daemon: DaemonId,
+        /// Whether it does.
+        works: bool,
+    },
     /// An [`Action::Dial`] became no link.
     DialFailed {
         /// To whom.
@@ -240,6 +247,7 @@ impl DiscoveryIo {
                 self.peers.handle_link_up(now, daemon, address, proven);
             }
             Event::LinkDown { daemon } => self.peers.handle_link_down(now, daemon),
+            Event::Path { daemon, works } => self.peers.handle_path(now, daemon, works),
             Event::DialFailed { daemon, standing } => {
                 self.peers.handle_dial_failed(now, daemon, standing);
             }

@@ -125,6 +125,7 @@ impl Effects {
             LinkReport::Up { daemon, address, proven } => {
                 self.tell(ToControl::LinkUp { daemon, address, proven });
             }
+            LinkReport::Path { daemon, works } => self.tell(ToControl::Path { daemon, works }),
             LinkReport::Datagrams(datagrams) => self.tell(ToControl::Datagrams(datagrams)),
         }
     }

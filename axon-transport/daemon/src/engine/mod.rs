@@ -154,8 +154,9 @@ impl Engine {
     pub(crate) fn handle_order(&mut self, order: ToGateway, now: Duration) {
         match order {
             ToGateway::Dial { daemon, sae, addresses, listed, standing } => {
+                let replaces = self.links.cut_link(daemon);
                 let (daemon, standing) = (Some(daemon), Some(standing));
-                let target = Target { daemon, sae, addresses, listed, standing, replaces: None };
+                let target = Target { daemon, sae, addresses, listed, standing, replaces };
                 self.links.dial(target, now);
             }
             ToGateway::SendDatagram { to, bytes } => self.links.send_datagram(to, bytes),

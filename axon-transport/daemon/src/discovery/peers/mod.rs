@@ -16,6 +16,7 @@ mod flood;
 #[cfg(test)]
 mod goodbye;
 mod local;
+mod moved;
 mod probing;
 mod receiving;
 mod record;
@@ -267,6 +268,7 @@ impl Peers {
         let record = self.records.entry(daemon).or_default();
         record.listed |= listed;
         record.linked = true;
+        record.cut = false;
         record.leaving = None;
         record.last_seen = record.last_seen.max(now);
         record.from = Some(address.ip());
@@ -280,7 +282,7 @@ impl Peers {
     /// The link with `daemon` is no more.
     pub(crate) fn handle_link_down(&mut self, now: Duration, daemon: DaemonId) {
         let Some(record) = self.records.get_mut(&daemon) else { return };
-        record.linked = false;
+        (record.linked, record.cut) = (false, false);
         record.doubt = None;
         record.done();
         let left = record.left(now);

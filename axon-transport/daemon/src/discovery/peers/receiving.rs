@@ -206,15 +206,15 @@ impl Peers {
     /// Asks whether the daemon is there, if beacons under its id came from elsewhere, too.
     fn ask_if_contested(&mut self, now: Duration, daemon: DaemonId, address: SocketAddr) {
         let Some(record) = self.records.get(&daemon) else { return };
+        let Some(source) = record.sources.iter().find(|source| source.address == address) else {
+            return;
+        };
         let contested = match record.linked {
             false => record.sources.len() > 1,
-            true => record.doubts(address),
+            true => record.may_be_at(source),
         };
-        if !contested {
-            return;
-        }
-        let source = record.sources.iter().find(|source| source.address == address);
-        if let Some(standing) = source.map(DialAddress::standing) {
+        if contested {
+            let standing = source.standing();
             self.ask_whether_there(now, daemon, standing);
         }
     }

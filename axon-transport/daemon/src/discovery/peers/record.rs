@@ -78,6 +78,8 @@ pub(super) struct Record {
     /// When it was still there after a goodbye in its name.
     pub(super) stayed: Option<Duration>,
     pub(super) linked: bool,
+    /// The path of its link does not work: it may have other addresses.
+    pub(super) cut: bool,
     /// The peer of the link did not prove that the id is its own: another one may have the id.
     pub(super) doubt: Option<Doubt>,
     /// One for each standing: a dial to an address where nobody is holds up no better one.
@@ -159,15 +161,20 @@ impl Record {
     }
 
     /// The addresses of this standing that may be dialled. While a link stands: those where another host may be that has
-    /// the id, if its address is known or it answered there.
+    /// the id, or the peer if the link's path is cut, if its address is known or it answered there.
     pub(super) fn to_dial(
         &self,
         standing: AddressConfidence,
     ) -> impl Iterator<Item = &DialAddress> {
         self.of(standing).filter(move |source| match self.linked {
             false => true,
-            true => standing != AddressConfidence::Heard && self.doubts(source.address),
+            true => standing != AddressConfidence::Heard && self.may_be_at(source),
         })
+    }
+
+    /// Whether, besides the linked host, another one that has the id may be at this address, or the linked one itself.
+    pub(super) fn may_be_at(&self, source: &DialAddress) -> bool {
+        (self.cut && !source.proven) || self.doubts(source.address)
     }
 
     /// Whether another host than the linked one may have the id, at this address.
@@ -230,7 +237,8 @@ impl Record {
         dial.in_flight = None;
         let doubled = BACKOFF_FIRST.saturating_mul(1 << dial.failures.min(16));
         dial.failures = dial.failures.saturating_add(1);
-        let pause = if self.linked { DOUBT_AGAIN } else { doubled.min(BACKOFF_MOST) };
+        let stands = self.linked && !self.cut;
+        let pause = if stands { DOUBT_AGAIN } else { doubled.min(BACKOFF_MOST) };
         let at = now + pause.mul_f64(jitter);
         self.dials[standing as usize].due = Some(self.spaced(standing, at));
     }

@@ -346,6 +346,12 @@ impl Links {
         self.dial(target, now);
     }
 
+    /// The link of a peer, if its path is taken for cut: what discovery dials succeeds it.
+    pub(in crate::engine) fn cut_link(&self, daemon: DaemonId) -> Option<[u8; 16]> {
+        let peer = self.table.current_peer(daemon).filter(|peer| peer.silence.is_cut())?;
+        peer.elected.map(|elected| elected.link)
+    }
+
     /// Closes the links of peers that are no longer trusted. Certificates are looked at if `certificates` says so:
     /// that costs signatures.
     pub(in crate::engine) fn close_untrusted(&mut self, certificates: bool, now: Duration) {

@@ -55,6 +55,8 @@ pub(in crate::engine) enum LinkReport {
     DialFailed { daemon: DaemonId, standing: AddressConfidence },
     /// A link of this daemon is up at this address. Whether the daemon proved its id.
     Up { daemon: DaemonId, address: SocketAddr, proven: bool },
+    /// Whether the path of this daemon's link carries anything: probes of it were not answered, or it answers again.
+    Path { daemon: DaemonId, works: bool },
     /// Datagrams of discovery.
     Datagrams(Datagrams),
 }

@@ -253,10 +253,12 @@ impl Links {
             Action::Failed(refusal) => {
                 let Some(Dial { dialling, .. }) = self.dials.remove(dial) else { return };
                 let target = dialling.target();
-                // A successor is dialled where a peer with a link is.
+                // A successor is dialled where a peer with a link is, unless discovery says where it may be.
                 let kind = match target.replaces {
                     _ if target.listed => RefusalKind::Listed,
-                    Some(_) if self.credentials.authenticates() => RefusalKind::Peer,
+                    Some(_) if target.standing.is_none() && self.credentials.authenticates() => {
+                        RefusalKind::Peer
+                    }
                     _ => RefusalKind::Unproven,
                 };
                 self.outbox.report(LinkReport::Refused(kind, target.text(), refusal));

@@ -66,6 +66,10 @@ pub(super) struct Host {
     /// The endpoints of each peer, as the control plane was told.
     pub(super) graph: BTreeMap<DaemonId, BTreeMap<Gid, RemoteEndpoint>>,
     pub(super) linked: BTreeSet<DaemonId>,
+    /// Where links stand whose path does not work.
+    cut: BTreeMap<DaemonId, SocketAddr>,
+    /// Where links stand.
+    at: BTreeMap<DaemonId, SocketAddr>,
     pub(super) status: BTreeMap<String, LinkStatus>,
     pub(super) refusals: VecDeque<(Duration, String)>,
     pub(super) lost: BTreeMap<(String, &'static str), u64>,
@@ -113,6 +117,8 @@ impl Host {
             peers: BTreeMap::new(),
             graph: BTreeMap::new(),
             linked: BTreeSet::new(),
+            cut: BTreeMap::new(),
+            at: BTreeMap::new(),
             status: BTreeMap::new(),
             refusals: VecDeque::new(),
             lost: BTreeMap::new(),
@@ -174,6 +180,7 @@ impl Host {
         };
         self.engine = Some(Engine::new(parts).unwrap());
         (self.graph, self.linked) = (BTreeMap::new(), BTreeSet::new());
+        (self.cut, self.at) = (BTreeMap::new(), BTreeMap::new());
         (self.requests, self.records) = (Vec::new(), Vec::new());
         self.interfaces_asked = false;
         self.status.clear();
@@ -301,7 +308,16 @@ impl Host {
         self.due.set(None);
         if let Some(wanted) = self.peers.get_mut(&daemon) {
             wanted.address = SocketAddr::from((address, PORT));
+            if self.cut.contains_key(&daemon) {
+                wanted.dial_at = Some(Duration::ZERO);
+            }
         }
+    }
+
+    /// Whether a peer is looked for: it is not linked, or elsewhere than at the end of a path that does not work.
+    fn looks_for(&self, daemon: &DaemonId, wanted: &Wanted) -> bool {
+        !self.linked.contains(daemon)
+            || self.cut.get(daemon).is_some_and(|at| *at != wanted.address)
     }
 
     /// The endpoints of the host changed.
@@ -371,7 +387,7 @@ impl Host {
             let came = came || !self.questions.is_empty();
             (came || self.interfaces_asked || !self.records.is_empty()).then_some(now)
         };
-        let dials = self.peers.iter().filter(|(daemon, _)| !self.linked.contains(daemon));
+        let dials = self.peers.iter().filter(|(daemon, wanted)| self.looks_for(daemon, wanted));
         let dials = dials.filter_map(|(_, wanted)| wanted.dial_at).min();
         [engine.poll_timeout(now), ready, dials].into_iter().flatten().min()
     }
@@ -379,6 +395,10 @@ impl Host {
     /// One pass of the host.
     pub(super) fn pass(&mut self, now: Duration) {
         self.due.set(None);
+        let looked_for = self.peers.iter().filter(|(daemon, wanted)| {
+            self.looks_for(daemon, wanted) && wanted.dial_at.is_some_and(|at| at <= now)
+        });
+        let looked_for: Vec<_> = looked_for.map(|(daemon, _)| *daemon).collect();
         let Some(engine) = &mut self.engine else { return };
         if std::mem::take(&mut self.graph_changed) {
             let range = EndpointRange { range: DiscoveryRange::Subnet, lists: Vec::new() };
@@ -409,15 +429,13 @@ impl Host {
             let first = self.used.insert(key_id);
             engine.handle_recorded(link, first, now);
         }
-        for (daemon, wanted) in &mut self.peers {
-            if self.linked.contains(daemon) || wanted.dial_at.is_none_or(|at| at > now) {
-                continue;
-            }
+        for daemon in looked_for {
+            let Some(wanted) = self.peers.get_mut(&daemon) else { continue };
             wanted.dial_at = None;
             self.dialled.push_back(now);
             let (addresses, sae) = (vec![wanted.address], wanted.sae.clone());
             let standing = AddressConfidence::Heard;
-            let dial = ToGateway::Dial { daemon: *daemon, sae, addresses, listed: false, standing };
+            let dial = ToGateway::Dial { daemon, sae, addresses, listed: false, standing };
             engine.handle_order(dial, now);
         }
         if engine.poll_timeout(now).is_some_and(|due| due <= now) {
@@ -458,11 +476,22 @@ impl Host {
                 self.graph.remove(&daemon);
                 self.refusals.push_back((now, "silent".into()));
             }
-            ToControl::LinkUp { daemon, .. } => {
+            ToControl::LinkUp { daemon, address, .. } => {
                 self.linked.insert(daemon);
+                self.at.insert(daemon, address);
+                self.cut.remove(&daemon);
+            }
+            ToControl::Path { daemon, works } => {
+                self.cut.remove(&daemon);
+                if let (false, Some(at)) = (works, self.at.get(&daemon)) {
+                    self.cut.insert(daemon, *at);
+                    self.redial(daemon, now);
+                }
             }
             ToControl::LinkDown { daemon, reason } => {
                 self.linked.remove(&daemon);
+                self.at.remove(&daemon);
+                self.cut.remove(&daemon);
                 self.graph.remove(&daemon);
                 self.refusals.push_back((now, format!("down: {reason}")));
                 self.redial(daemon, now);

@@ -15,7 +15,7 @@ pub(super) use self::{
     watch::{Nonce, Silence},
 };
 use crate::{
-    engine::links::{LinkEvent, Links},
+    engine::links::{LinkEvent, LinkReport, Links},
     wire::beacon::Datagram,
 };
 
@@ -32,8 +32,11 @@ impl Links {
             && let Ok(Datagram::Echo { nonce, .. }) = Datagram::decode(&bytes)
             && let Some(number) = self.nonces.remove(&nonce)
         {
-            if let Some(peer) = self.table.peer_mut(number) {
-                peer.silence.handle_echo(now);
+            if let Some(peer) = self.table.peer_mut(number)
+                && peer.silence.handle_echo(now)
+            {
+                let daemon = peer.summary.hello.daemon;
+                self.outbox.report(LinkReport::Path { daemon, works: true });
             }
             return;
         }
@@ -77,6 +80,12 @@ impl Links {
         }
     }
 
+    fn send_probe(&mut self, number: u64, to: SocketAddr, nonce: Nonce) {
+        self.nonces.insert(nonce, number);
+        let probe = Datagram::Probe { daemon: self.hello.daemon, nonce };
+        self.connections.endpoints().send(to, probe.encode());
+    }
+
     /// Goes on with the probes of a silent link.
     pub(super) fn probe(&mut self, number: u64, now: Duration) {
         let (Some(connection), Some(peer)) =
@@ -86,13 +95,16 @@ impl Links {
         };
         let (address, daemon) = (connection.quic.remote_address(), peer.summary.hello.daemon);
         match peer.silence.handle_timeout(Traffic::from(&connection.quic.stats()), now) {
-            Some(Action::Answered(nonce)) => {
+            Some(Action::Answered(nonce, was_cut)) => {
                 self.nonces.remove(&nonce);
+                if was_cut {
+                    self.outbox.report(LinkReport::Path { daemon, works: true });
+                }
             }
-            Some(Action::Probe(nonce)) => {
-                self.nonces.insert(nonce, number);
-                let probe = Datagram::Probe { daemon: self.hello.daemon, nonce };
-                self.connections.endpoints().send(address, probe.encode());
+            Some(Action::Probe(nonce)) => self.send_probe(number, address, nonce),
+            Some(Action::ProbeCut(nonce)) => {
+                self.send_probe(number, address, nonce);
+                self.outbox.report(LinkReport::Path { daemon, works: false });
             }
             Some(Action::Replace) => {
                 tracing::info!(peer = %daemon, %address,

@@ -145,6 +145,11 @@ impl Prober {
         (self.next, self.due) = (Step::Replace, now + grace + more);
     }
 
+    /// Whether the path is taken for cut: nobody answers probes.
+    pub(crate) fn is_cut(&self) -> bool {
+        self.asked >= CUT
+    }
+
     /// When to call [`handle_timeout`](Self::handle_timeout).
     pub(crate) fn poll_timeout(&self) -> Option<Duration> {
         Some(self.due)
@@ -158,7 +163,7 @@ impl Prober {
         let step = self.next;
         match step {
             Step::Probe => {
-                if self.asked >= CUT {
+                if self.is_cut() {
                     self.dialled = None;
                 }
                 self.asked += 1;

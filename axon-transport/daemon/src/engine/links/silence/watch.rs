@@ -13,7 +13,8 @@ const GONE: Duration = Duration::from_secs(20);
 /// Whether a peer answers over its link. A state machine as `docs/architecture.md` describes them.
 ///
 /// A link is *unheard* while nothing comes, *probed* once something was asked and nothing came for a second, *silent*
-/// once a successor was dialled, and its peer is *gone* after a longer time. An acknowledgement ends all of that.
+/// once its path was found cut or a successor was dialled, and its peer is *gone* after a longer time. An acknowledgement
+/// ends all of that.
 #[derive(Debug)]
 pub(in crate::engine::links) struct Silence {
     side: Side,
@@ -25,7 +26,7 @@ pub(in crate::engine::links) struct Silence {
     heard_at: Duration,
     /// Probes of the path, while the link is silent.
     probing: Option<Probing>,
-    /// A successor was dialled since it is silent, and nothing was acknowledged since.
+    /// Its path was found cut, or a successor was dialled, and nothing was acknowledged since.
     silent: bool,
     /// What had come and gone when the peer was taken for gone, while it is.
     gone: Option<Traffic>,
@@ -40,6 +41,8 @@ struct Probing {
     begun: Duration,
     /// The traffic before.
     traffic: Traffic,
+    /// It was said that the path is cut.
+    said_cut: bool,
 }
 
 /// What a probe says and its echo repeats.
@@ -59,8 +62,10 @@ pub(super) struct Look {
 pub(super) enum Action {
     /// Send a probe.
     Probe(Nonce),
-    /// The peer answers: no echo of this is waited for.
-    Answered(Nonce),
+    /// Send a probe, and say that the path is cut: those before were not answered.
+    ProbeCut(Nonce),
+    /// The peer answers: no echo of this is waited for. Whether it was said that the path is cut.
+    Answered(Nonce, bool),
     /// Dial a successor.
     Replace,
 }
@@ -76,7 +81,7 @@ impl Silence {
         self.gone.is_some()
     }
 
-    /// Whether a successor was dialled since nothing is acknowledged.
+    /// Whether its path was found cut, or a successor dialled, and nothing was acknowledged since.
     pub(in crate::engine::links) fn is_silent(&self) -> bool {
         self.silent
     }
@@ -113,18 +118,24 @@ impl Silence {
         let probed = silent && self.probing.is_none();
         if probed {
             let (prober, nonce) = (Prober::new(self.side), nonce());
-            self.probing = Some(Probing { prober, nonce, begun: now, traffic });
+            self.probing = Some(Probing { prober, nonce, begun: now, traffic, said_cut: false });
         }
         Look { gone, probed }
     }
 
-    /// A probe was answered.
-    pub(super) fn handle_echo(&mut self, now: Duration) {
-        if let Some(probing) = &mut self.probing
-            && probing.prober.awaits_echo()
-        {
-            probing.prober.handle_echo(now.saturating_sub(probing.begun));
-        }
+    /// A probe was answered. Returns whether it was said that the path is cut.
+    pub(super) fn handle_echo(&mut self, now: Duration) -> bool {
+        let Some(probing) = self.probing.as_mut().filter(|probing| probing.prober.awaits_echo())
+        else {
+            return false;
+        };
+        probing.prober.handle_echo(now.saturating_sub(probing.begun));
+        std::mem::take(&mut probing.said_cut)
+    }
+
+    /// Whether the path is taken for cut: probes of it are not answered.
+    pub(in crate::engine::links) fn is_cut(&self) -> bool {
+        self.probing.as_ref().is_some_and(|probing| probing.prober.is_cut())
     }
 
     /// A successor took over the link. Returns whether the link is silent.
@@ -142,12 +153,18 @@ impl Silence {
     pub(super) fn handle_timeout(&mut self, traffic: Traffic, now: Duration) -> Option<Action> {
         let probing = self.probing.as_mut()?;
         if traffic.answered_since(probing.traffic) {
-            let nonce = probing.nonce;
+            let answered = Action::Answered(probing.nonce, probing.said_cut);
             self.probing = None;
-            return Some(Action::Answered(nonce));
+            return Some(answered);
         }
         match probing.prober.handle_timeout(now.saturating_sub(probing.begun))? {
-            Step::Probe => Some(Action::Probe(probing.nonce)),
+            Step::Probe => {
+                let news =
+                    probing.prober.is_cut() && !std::mem::replace(&mut probing.said_cut, true);
+                self.silent |= news;
+                let action = if news { Action::ProbeCut } else { Action::Probe };
+                Some(action(probing.nonce))
+            }
             Step::Replace => {
                 self.silent = true;
                 Some(Action::Replace)
@@ -203,16 +220,47 @@ mod tests {
         assert!(silence.is_silent());
         // An acknowledgement ends it.
         let answered = traffic(2, 2, 2);
-        assert_eq!(silence.handle_timeout(answered, due), Some(Action::Answered(NONCE)));
+        assert_eq!(silence.handle_timeout(answered, due), Some(Action::Answered(NONCE, false)));
         assert_eq!((silence.poll_timeout(), silence.handle_timeout(answered, due)), (None, None));
         silence.handle_second(answered, || NONCE, second(5));
         assert!(!silence.is_silent());
     }
 
     #[test]
+    fn a_path_whose_probes_nobody_answers_is_said_to_be_cut_once_and_to_work_again() {
+        let mut silence = Silence::new(Side::Client, START);
+        silence.handle_second(traffic(0, 0, 1), || NONCE, second(1));
+        let asked = traffic(0, 0, 1);
+        let probe = |silence: &mut Silence| {
+            let due = silence.poll_timeout().unwrap();
+            (due, silence.handle_timeout(asked, due).unwrap())
+        };
+        for answered in [false, true] {
+            let found: Vec<_> = (0..5).map(|_| probe(&mut silence)).collect();
+            let found: Vec<_> = found.into_iter().map(|(_, action)| action).collect();
+            let cut = Action::ProbeCut(NONCE);
+            let again = Action::Probe(NONCE);
+            assert_eq!(found, [again, again, cut, again, again]);
+            assert!(silence.is_cut());
+            if answered {
+                let due = silence.poll_timeout().unwrap();
+                let more = traffic(1, 1, 1);
+                assert_eq!(silence.handle_timeout(more, due), Some(Action::Answered(NONCE, true)));
+            } else {
+                let due = silence.poll_timeout().unwrap();
+                assert!(silence.handle_echo(due), "it was said");
+                assert!(!silence.handle_echo(due), "once");
+                let (_, action) = probe(&mut silence);
+                assert_eq!(action, Action::Replace);
+            }
+            assert!(!silence.is_cut());
+        }
+    }
+
+    #[test]
     fn an_echo_of_no_probe_changes_nothing() {
         let mut silence = Silence::new(Side::Server, START);
-        silence.handle_echo(START);
+        assert!(!silence.handle_echo(START));
         silence.handle_second(traffic(0, 0, 1), || NONCE, second(1));
         let due = silence.poll_timeout();
         silence.handle_echo(second(1));

@@ -132,3 +132,18 @@ fn a_host_that_gets_another_address_is_linked_again() {
         }
     }
 }
+
+#[test]
+#[cfg_attr(debug_assertions, ignore = "a debug assertion of quinn-proto fails")]
+fn two_hosts_that_get_other_addresses_at_once_flow_again_soon_and_lose_nothing() {
+    for (mode, config) in modes() {
+        let mut moving = Moving::new(43, &config, None);
+        for _ in 0..3 {
+            (0..2).for_each(|host| moving.world.move_host(host));
+            // Neither knows where to probe: the beacons of the other one say it.
+            moving.publish(secs(10));
+        }
+        moving.is_complete(mode);
+        assert_eq!(moving.downs(), 0, "{mode}: {}", moving.world.describe());
+    }
+}
