@@ -18,7 +18,7 @@ use axon_transport::{
     status::{LinkStatus, PeerDecision},
 };
 use bytes::BytesMut;
-use quinn_proto::{EcnCodepoint, EndpointConfig, Transmit};
+use quinn_proto::{EcnCodepoint, Transmit};
 use rand::RngExt;
 
 use super::{
@@ -31,6 +31,7 @@ use crate::{
     discovery::{AddressConfidence, Interface},
     engine::{
         Effect, Engine, EngineParts, credentials::Credentials, links::LinkParts, peer::MAX_ROUTES,
+        transport::endpoint_config,
     },
     identity::Identity,
     keys::{Origin, Request},
@@ -145,7 +146,9 @@ impl Host {
         let key = DaemonKey::from(session_key(&random.random()));
         self.daemon = self.poses_as.unwrap_or(key.id());
         let key = self.poses_as.is_none().then(|| Arc::new(key));
-        let mut endpoint = EndpointConfig::default();
+        // All daemons of the host have the key of resets, as they find it in its runtime folder.
+        let resets = Stream::Host { host: self.number as u32, start: 0 };
+        let mut endpoint = endpoint_config(&stream(self.seed, resets).random());
         endpoint.rng_seed(Some(random.random())).grease_quic_bit(false);
         endpoint.supported_versions(vec![1]);
         let identity = match &self.config.security {

@@ -173,21 +173,26 @@ impl World {
         }
     }
 
-    /// For each RELIABLE and KEEP_ALL pair of which samples came: the publisher, and the subscription with the
-    /// samples that are missing after the first that came.
+    /// For each RELIABLE and KEEP_ALL pair of which samples came: the publisher, and the subscription with the samples that
+    /// are missing after the first that came. What was published while no relay stood for the subscription was never for
+    /// it: its host, or the publisher's daemon, was not there.
     fn losses(&self) -> Vec<(HostEndpoint, (HostEndpoint, u64))> {
         let mut losses = Vec::new();
         for there in &self.hosts {
-            for (subscription, publisher, first, came) in there.rings.complete() {
-                let from = self.hosts.iter().find_map(|host| {
-                    let (qos, published) = host.rings.publisher(publisher)?;
-                    let complete =
-                        qos.history == History::KeepAll && qos.reliability == Reliability::Reliable;
-                    complete.then_some((host.number, published))
+            for (subscription, publisher, mut came) in there.rings.complete() {
+                let from = self.hosts.iter().find(|host| {
+                    host.rings.publisher(publisher).is_some_and(|qos| {
+                        qos.history == History::KeepAll && qos.reliability == Reliability::Reliable
+                    })
                 });
-                let Some((from, published)) = from else { continue };
-                let missing = (published + 1 - first).saturating_sub(came);
-                losses.push(((from, publisher), ((there.number, subscription), missing)));
+                let Some(from) = from else { continue };
+                let first = came[0];
+                came.sort_unstable();
+                let promised = from.rings.promised(publisher, subscription).into_iter();
+                let missing = promised
+                    .filter(|number| *number > first && came.binary_search(number).is_err())
+                    .count() as u64;
+                losses.push(((from.number, publisher), ((there.number, subscription), missing)));
             }
         }
         losses

@@ -58,6 +58,8 @@ struct State {
     topics: HashMap<String, BTreeSet<Gid>>,
     /// Relays whose publishers have news for them.
     active: Vec<(Gid, Gid)>,
+    /// Samples that were published while a relay stood for a subscription of a peer, by publisher and subscription.
+    promised: BTreeMap<(Gid, Gid), Vec<u64>>,
     /// How often a relay was asked whether it has samples.
     looks: u64,
     /// Samples of each publisher up to this number are past their lifespan.
@@ -80,6 +82,8 @@ struct State {
 struct Cursors {
     gid: Gid,
     spec: EndpointSpec,
+    /// The subscriptions of a peer for which it reads.
+    stands_for: RefCell<Vec<Gid>>,
     read: RefCell<HashMap<Gid, u64>>,
     /// Samples of each publisher that newer ones replaced before they were read, or that were passed over.
     lost: RefCell<HashMap<Gid, u64>>,
@@ -213,8 +217,12 @@ impl SimRings {
         of.published += 1;
         let sequence = of.published;
         of.history.push_back((sequence, payload(publisher, sequence, length)));
-        let reading = readers.iter().filter(|reader| reader.reads(&of.endpoint));
-        state.active.extend(reading.map(|reader| (reader.gid, publisher)));
+        for reader in readers.iter().filter(|reader| reader.reads(&of.endpoint)) {
+            state.active.push((reader.gid, publisher));
+            for subscription in reader.stands_for.borrow().iter() {
+                state.promised.entry((publisher, *subscription)).or_default().push(sequence);
+            }
+        }
         true
     }
 
@@ -281,28 +289,31 @@ impl SimRings {
         of.map(|(gid, _)| *gid).collect()
     }
 
-    /// For each RELIABLE and KEEP_ALL subscription, and each publisher of which it received a sample: the first
-    /// number, and how many came.
-    pub(super) fn complete(&self) -> Vec<(Gid, Gid, u64, u64)> {
+    /// The samples that a publisher published while a relay stood for a subscription of a peer.
+    pub(super) fn promised(&self, publisher: Gid, subscription: Gid) -> Vec<u64> {
+        self.state.borrow().promised.get(&(publisher, subscription)).cloned().unwrap_or_default()
+    }
+
+    /// Each RELIABLE and KEEP_ALL subscription, and each publisher of which it received a sample: the numbers that came.
+    pub(super) fn complete(&self) -> Vec<(Gid, Gid, Vec<u64>)> {
         let state = self.state.borrow();
         let keeping = state.subscriptions.iter().filter(|(_, s)| {
             let qos = &s.endpoint.qos;
             qos.history == History::KeepAll && qos.reliability == Reliability::Reliable
         });
         let of = keeping.flat_map(|(gid, subscription)| {
-            subscription.received.iter().filter_map(|(publisher, received)| {
-                Some((*gid, *publisher, *received.first()?, received.len() as u64))
-            })
+            let came = subscription.received.iter().filter(|(_, received)| !received.is_empty());
+            came.map(|(publisher, received)| (*gid, *publisher, received.clone()))
         });
         of.collect()
     }
 
-    /// A publisher's QoS, and how many samples it published, if it has not ended.
-    pub(super) fn publisher(&self, gid: Gid) -> Option<(Qos, u64)> {
+    /// A publisher's QoS, if it has not ended.
+    pub(super) fn publisher(&self, gid: Gid) -> Option<Qos> {
         let state = self.state.borrow();
         let publisher = state.publishers.get(&gid)?;
         let ended = publisher.endpoint.node == "ended";
-        (!ended).then_some((publisher.endpoint.qos, publisher.published))
+        (!ended).then_some(publisher.endpoint.qos)
     }
 
     /// Relays that are open.
@@ -429,7 +440,7 @@ impl Rings for SimRings {
     fn open_reader(
         &self,
         spec: EndpointSpec,
-        _stands_for: Vec<Gid>,
+        stands_for: Vec<Gid>,
     ) -> Result<Rc<dyn RingReader>, String> {
         let mut state = self.state.borrow_mut();
         if state.fails {
@@ -447,6 +458,7 @@ impl Rings for SimRings {
         let cursors = Rc::new(Cursors {
             gid: Gid::new(self.session, state.next),
             spec,
+            stands_for: RefCell::new(stands_for),
             acknowledged: RefCell::new(known.clone()),
             read: RefCell::new(known),
             lost: RefCell::default(),

@@ -177,5 +177,7 @@ impl RingReader for SimReader {
         Vec::new()
     }
 
-    fn set_stands_for(&self, _gids: Vec<Gid>) {}
+    fn set_stands_for(&self, gids: Vec<Gid>) {
+        *self.cursors.stands_for.borrow_mut() = gids;
+    }
 }
