@@ -149,8 +149,7 @@ impl Host {
         // All daemons of the host have the key of resets, as they find it in its runtime folder.
         let resets = Stream::Host { host: self.number as u32, start: 0 };
         let mut endpoint = endpoint_config(&stream(self.seed, resets).random());
-        endpoint.rng_seed(Some(random.random())).grease_quic_bit(false);
-        endpoint.supported_versions(vec![1]);
+        endpoint.rng_seed(Some(random.random()));
         let identity = match &self.config.security {
             axon_transport::config::Security::Classic(classic) => {
                 Some(Arc::new(Identity::load(classic, "host").unwrap()))
