@@ -141,9 +141,8 @@ impl Host {
         let mut command = self.command(env!("CARGO_BIN_EXE_axon-test-daemon"));
         command.arg("--while-stdin").stdin(Stdio::piped()).stdout(Stdio::null());
         self.daemon = Some(Kept(command.spawn().unwrap()));
+        // An application that lost its daemon may have started one first: then this one ends at once.
         until("the daemon stands", || {
-            let ended = self.daemon.as_mut().and_then(|d| d.0.try_wait().unwrap());
-            assert!(ended.is_none(), "the daemon of {} ended: {ended:?}", self.name);
             self.try_status().is_some_and(|status| status.port.is_some())
         });
     }

@@ -82,7 +82,7 @@ impl Engine {
             }
         }
         self.freed |= !removed.is_empty();
-        let dead = self.taken_over(daemon, &added);
+        let dead = self.taken_over(daemon, &mut added);
         // Before the dead links let go of their stand-ins: rings and readers stay as they are.
         self.peers.with(daemon, |peer, with| peer.handle_remote_graph(with, now));
         self.end_dead(dead, now);
@@ -125,8 +125,8 @@ impl Engine {
     }
 
     /// The links of peers whose endpoints a restarted daemon of the same host announces: those links are dead. The
-    /// claim of another host is ignored.
-    fn taken_over(&mut self, daemon: DaemonId, added: &[RemoteEndpoint]) -> Vec<u64> {
+    /// claim of another host is ignored, and taken out of what it added.
+    fn taken_over(&mut self, daemon: DaemonId, added: &mut Vec<RemoteEndpoint>) -> Vec<u64> {
         let mut dead = Vec::new();
         let identity = |engine: &Self, daemon: DaemonId| {
             engine.links.view(engine.links.current(daemon)?)?.identity()
@@ -152,6 +152,7 @@ impl Engine {
                 claimer.remote.forget(&moved);
                 claimer.displaced = true;
             }
+            added.retain(|e| !moved.contains(&e.endpoint.gid));
         }
         dead
     }

@@ -340,6 +340,14 @@ impl Host {
         self.rules = Some(rules);
     }
 
+    /// Whether the host knows the endpoints of another one, and no more of it.
+    pub(super) fn knows(&self, other: &Self) -> bool {
+        let shown = other.rings.endpoints();
+        self.graph.get(&other.daemon).is_some_and(|known| {
+            known.len() == shown.len() && shown.iter().all(|e| known.contains_key(&e.gid))
+        })
+    }
+
     /// A tool asks what a peer lets this host do.
     pub(super) fn check_access(&mut self, daemon: DaemonId, number: u64, uses: Vec<CheckedUse>) {
         self.due.set(None);

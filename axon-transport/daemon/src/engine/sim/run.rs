@@ -17,6 +17,9 @@ use crate::keys::FailureKind;
 
 /// All hosts know each other again within this time after the last fault.
 const HEALS: Duration = Duration::from_secs(90);
+/// The same, where a daemon ended after its host got another address. In mode none the address decides whose endpoints
+/// they are, and nobody is at the old one who could say that the daemon is gone: QUIC gives the link up after 120 s.
+const HEALS_AFTER_MOVE: Duration = Duration::from_secs(150);
 /// Samples that were on their way have arrived, or were counted, within this time after that.
 const QUIET: Duration = Duration::from_secs(40);
 
@@ -62,9 +65,26 @@ pub(super) fn run(script: &Script, config: impl Fn(usize) -> Config) {
         run.apply(step.fault, step.edge);
     }
     run.heal();
-    run.world.until(HEALS, World::is_whole);
+    let heals = if moves_and_ends(script) { HEALS_AFTER_MOVE } else { HEALS };
+    run.world.until(heals, World::is_whole);
     run.run_until(run.world.now + QUIET);
     run.check();
+}
+
+/// Whether a daemon ends whose host gets another address.
+fn moves_and_ends(script: &Script) -> bool {
+    let moved: Vec<_> = script
+        .faults
+        .iter()
+        .filter_map(|fault| match fault.kind {
+            Kind::Move { host, .. } => Some(host),
+            _ => None,
+        })
+        .collect();
+    script.faults.iter().any(|fault| match fault.kind {
+        Kind::Kill { host, .. } => moved.contains(&host),
+        _ => false,
+    })
 }
 
 fn qos(qos: ScriptQos) -> Qos {

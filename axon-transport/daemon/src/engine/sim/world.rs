@@ -1,7 +1,7 @@
 //! A world of hosts on one network, with a virtual clock.
 
 use std::{
-    collections::BTreeSet,
+    collections::{BTreeMap, BTreeSet},
     fmt::Write,
     net::SocketAddr,
     time::{Duration, Instant},
@@ -391,13 +391,8 @@ impl World {
     pub(super) fn is_whole(&self) -> bool {
         self.is_linked()
             && self.hosts.iter().filter(|host| host.is_running()).all(|host| {
-                self.hosts.iter().filter(|o| o.is_running() && o.number != host.number).all(|o| {
-                    let shown: Vec<Gid> = o.rings.endpoints().iter().map(|e| e.gid).collect();
-                    let known = host.graph.get(&o.daemon);
-                    known.is_some_and(|known| {
-                        known.len() == shown.len() && shown.iter().all(|g| known.contains_key(g))
-                    })
-                })
+                let others = self.hosts.iter().filter(|o| o.is_running());
+                others.filter(|o| o.number != host.number).all(|o| host.knows(o))
             })
     }
 
@@ -414,6 +409,12 @@ impl World {
                 host.lost,
                 host.rings.waits_for_room()
             );
+            let others = self.hosts.iter().filter(|o| o.is_running() && o.number != host.number);
+            for o in others.filter(|o| !host.knows(o)) {
+                let known = host.graph.get(&o.daemon).map(BTreeMap::len);
+                let shown = o.rings.endpoints().len();
+                let _ = writeln!(text, "  knows {known:?} of {shown} endpoints of {}", o.number);
+            }
             for (at, refusal) in host.refusals.iter().rev().take(8) {
                 let _ = writeln!(text, "  {at:?} {refusal}");
             }

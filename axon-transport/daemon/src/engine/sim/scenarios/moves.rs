@@ -147,3 +147,21 @@ fn two_hosts_that_get_other_addresses_at_once_flow_again_soon_and_lose_nothing()
         assert_eq!(moving.downs(), 0, "{mode}: {}", moving.world.describe());
     }
 }
+
+#[test]
+#[cfg_attr(debug_assertions, ignore = "a debug assertion of quinn-proto fails")]
+fn an_endpoint_that_ends_while_its_daemons_predecessor_is_not_given_up_leaves_nothing() {
+    let mut world = World::new(44, 2, crate::engine::sim::tests::classic);
+    let pair = world.pair(0, 1, "/out", Qos::keep_all());
+    world.until(secs(20), World::is_whole);
+    // Nobody is at the old address who could say that the daemon is gone, and in `none` the address decides whose
+    // endpoints they are.
+    world.move_host(1);
+    world.kill(1, false);
+    world.restart(1);
+    world.until(secs(5), World::is_linked);
+    world.run_for(secs(1));
+    world.hosts[1].rings.end(pair.subscription.1);
+    world.hosts[1].touch_graph();
+    world.until(secs(5), World::is_whole);
+}
