@@ -2,26 +2,27 @@
 //! peers that take other signatures alone; peers with nothing after TLS 1.2.
 #![cfg(feature = "hybrid")]
 
+#[path = "common/anybody.rs"]
+mod anybody;
+
 use std::sync::Arc;
 
 use axon_tls::identity::{
     Auth, CaMaterial, KeyAlgorithm, SigningKey, SpkiDigest, Trust, TrustFile,
 };
 use axon_tls::{Cipher, hybrid};
-use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
 use rustls::client::{AlwaysResolvesClientRawPublicKeys, ResolvesClientCert};
 use rustls::crypto::aws_lc_rs::{default_provider, sign::any_supported_type};
-use rustls::pki_types::{
-    CertificateDer, PrivateKeyDer, ServerName, SubjectPublicKeyInfoDer, UnixTime,
-};
-use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
+use rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName, SubjectPublicKeyInfoDer};
 use rustls::server::{AlwaysResolvesServerRawPublicKeys, ResolvesServerCert};
 use rustls::sign::CertifiedKey;
 use rustls::version::{TLS12, TLS13};
 use rustls::{
-    ClientConfig, ClientConnection, DigitallySignedStruct, DistinguishedName, Error,
-    PeerIncompatible, ServerConfig, ServerConnection, SignatureAlgorithm, SignatureScheme,
+    ClientConfig, ClientConnection, Error, PeerIncompatible, ServerConfig, ServerConnection,
+    SignatureAlgorithm, SignatureScheme,
 };
+
+use self::anybody::Anybody;
 
 type Key = Arc<dyn rustls::sign::SigningKey>;
 
@@ -74,90 +75,6 @@ fn every_scheme() -> Vec<SignatureScheme> {
     default_provider().signature_verification_algorithms.supported_schemes()
 }
 
-/// Accepts any peer, in the given schemes.
-#[derive(Debug)]
-struct Anybody(Vec<SignatureScheme>);
-
-impl ServerCertVerifier for Anybody {
-    fn verify_server_cert(
-        &self,
-        _: &CertificateDer<'_>,
-        _: &[CertificateDer<'_>],
-        _: &ServerName<'_>,
-        _: &[u8],
-        _: UnixTime,
-    ) -> Result<ServerCertVerified, Error> {
-        Ok(ServerCertVerified::assertion())
-    }
-
-    fn verify_tls12_signature(
-        &self,
-        _: &[u8],
-        _: &CertificateDer<'_>,
-        _: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        Ok(HandshakeSignatureValid::assertion())
-    }
-
-    fn verify_tls13_signature(
-        &self,
-        _: &[u8],
-        _: &CertificateDer<'_>,
-        _: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        Ok(HandshakeSignatureValid::assertion())
-    }
-
-    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
-        self.0.clone()
-    }
-
-    fn requires_raw_public_keys(&self) -> bool {
-        true
-    }
-}
-
-impl ClientCertVerifier for Anybody {
-    fn root_hint_subjects(&self) -> &[DistinguishedName] {
-        &[]
-    }
-
-    fn verify_client_cert(
-        &self,
-        _: &CertificateDer<'_>,
-        _: &[CertificateDer<'_>],
-        _: UnixTime,
-    ) -> Result<ClientCertVerified, Error> {
-        Ok(ClientCertVerified::assertion())
-    }
-
-    fn verify_tls12_signature(
-        &self,
-        _: &[u8],
-        _: &CertificateDer<'_>,
-        _: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        Ok(HandshakeSignatureValid::assertion())
-    }
-
-    fn verify_tls13_signature(
-        &self,
-        _: &[u8],
-        _: &CertificateDer<'_>,
-        _: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        Ok(HandshakeSignatureValid::assertion())
-    }
-
-    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
-        self.0.clone()
-    }
-
-    fn requires_raw_public_keys(&self) -> bool {
-        true
-    }
-}
-
 /// A client or a server on rustls as released, with a key to show and schemes to take.
 struct Stranger {
     shown: Arc<CertifiedKey>,
@@ -177,7 +94,10 @@ impl Stranger {
             .with_protocol_versions(&[&TLS13])
             .unwrap()
             .dangerous()
-            .with_custom_certificate_verifier(Arc::new(Anybody(self.takes.clone())))
+            .with_custom_certificate_verifier(Arc::new(Anybody {
+                schemes: self.takes.clone(),
+                raw: true,
+            }))
             .with_client_cert_resolver(resolver);
         ClientConnection::new(Arc::new(config), "peer".try_into().unwrap()).unwrap()
     }
@@ -188,7 +108,7 @@ impl Stranger {
         let config = ServerConfig::builder_with_provider(Arc::new(hybrid::provider()))
             .with_protocol_versions(&[&TLS13])
             .unwrap()
-            .with_client_cert_verifier(Arc::new(Anybody(self.takes.clone())))
+            .with_client_cert_verifier(Arc::new(Anybody { schemes: self.takes.clone(), raw: true }))
             .with_cert_resolver(resolver);
         ServerConnection::new(Arc::new(config)).unwrap()
     }
@@ -365,7 +285,10 @@ fn tls12_is_refused_under_every_authentication() {
             .with_protocol_versions(&[&TLS12])
             .unwrap()
             .dangerous()
-            .with_custom_certificate_verifier(Arc::new(Anybody(every_scheme())))
+            .with_custom_certificate_verifier(Arc::new(Anybody {
+                schemes: every_scheme(),
+                raw: true,
+            }))
             .with_no_client_auth();
         let name = "peer".try_into().unwrap();
         let mut client = ClientConnection::new(Arc::new(client), name).unwrap();

@@ -102,3 +102,16 @@ fn secrets_of_the_connection_to_the_kme_are_on_no_stack_and_nowhere_after_its_en
     }
     assert_eq!(there.tally().lost, 0);
 }
+
+#[test]
+fn a_daemon_that_may_lock_no_memory_says_once_what_that_means_and_what_to_set() {
+    let kmes = Kmes::start();
+    let [mut host, _other] = Plan::new([0, 1].map(|host| kmes.settings(host, &[]))).prepare();
+    host.start_by("ulimit -l 0");
+    let warned = || host.all_logs().matches("RLIMIT_MEMLOCK").count();
+    let log = host.all_logs();
+    assert_eq!(warned(), 1, "{log}");
+    for part in ["mlock", "swap", "LimitMEMLOCK=", "ulimit -l"] {
+        assert!(log.contains(part), "{part} is not in {log}");
+    }
+}

@@ -2,6 +2,8 @@
 //! in qkd a KME each, simulated in the test's process.
 
 mod access;
+#[path = "../../../axon-tls/tests/common/anybody.rs"]
+mod anybody;
 mod churn;
 mod cut;
 mod delivery;

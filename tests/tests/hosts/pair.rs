@@ -139,7 +139,27 @@ impl Host {
     /// Starts its daemon, which has none.
     pub(crate) fn start(&mut self) {
         let mut command = self.command(env!("CARGO_BIN_EXE_axon-test-daemon"));
-        command.arg("--while-stdin").stdin(Stdio::piped()).stdout(Stdio::null());
+        command.arg("--while-stdin");
+        self.start_as(command);
+    }
+
+    /// The same, after a command of the shell, and without the right to go beyond the limits that it sets.
+    pub(crate) fn start_by(&mut self, shell: &str) {
+        let script = format!("{shell} && exec \"$0\" --while-stdin");
+        let mut command = match rustix::process::geteuid().is_root() {
+            true => {
+                let mut command = self.command("setpriv");
+                command.args(["--bounding-set=-ipc_lock", "--inh-caps=-ipc_lock", "sh"]);
+                command
+            }
+            false => self.command("sh"),
+        };
+        command.args(["-c", &script, env!("CARGO_BIN_EXE_axon-test-daemon")]);
+        self.start_as(command);
+    }
+
+    fn start_as(&mut self, mut command: Command) {
+        command.stdin(Stdio::piped()).stdout(Stdio::null());
         self.daemon = Some(Kept(command.spawn().unwrap()));
         // An application that lost its daemon may have started one first: then this one ends at once.
         until("the daemon stands", || {
@@ -324,7 +344,7 @@ impl Host {
         Node::start(command)
     }
 
-    fn all_logs(&self) -> String {
+    pub(crate) fn all_logs(&self) -> String {
         let spawned = self.dir.path().join(format!("run/axon-{}.log", self.domain()));
         let text = |log| String::from_utf8_lossy(&fs::read(log).unwrap_or_default()).into_owned();
         [self.log(), spawned].map(text).concat()

@@ -2,10 +2,11 @@
 //! hosts decide for each pair.
 
 use axon_tests::Sizes;
+use axon_tls::identity::{Auth, SigningKey};
 use axon_transport::{
     EndpointSpec, Publisher, Session, SessionOptions, Subscription,
     config::{Config, DaemonPolicy, DiscoveryRange},
-    ids::Gid,
+    ids::{DaemonId, Gid},
     qos::Qos,
     status::SessionStatus,
 };
@@ -14,6 +15,8 @@ use super::{
     mode::classic,
     pair::{Host, Plan, TOPIC},
     process::{PATIENCE, until},
+    stranger::{Claim, Stranger},
+    unread::{SUBSCRIPTION, subscribe},
 };
 use DiscoveryRange::{Localhost, Off, Subnet};
 
@@ -311,4 +314,38 @@ fn ranges_are_kept_for_a_relayed_session() {
     meet(&silent, &own);
     apart(&off, &silent, &wide, &here);
     apart(&wide, &sent, &off, &own);
+}
+
+/// A peer that heeds no range asks for a topic of which one publisher here is LOCALHOST: this host decides.
+#[test]
+fn a_peer_that_heeds_no_range_gets_nothing_of_a_localhost_session() {
+    const SAMPLES: usize = 20;
+    let [host, _other] = Plan::new([classic(&[]), classic(&[])]).start();
+    let (near, wide) = (open(&host, Localhost, &[]), open(&host, Subnet, &[]));
+    let (kept, sent) = (publisher(&near), publisher(&wide));
+    let (stranger, auth) = (Stranger::new(), Auth::None(SigningKey::generate().unwrap()));
+    let claim = Claim { host: "greedy", daemon: DaemonId([0xff; 16]), auth: 0 };
+    let mut met = stranger.dial(&host, &auth, &claim).expect("a link");
+    let came = stranger.read_streams(&met);
+    subscribe(&stranger, &mut met, TOPIC);
+    until("it is served", || sent.matched().contains(&SUBSCRIPTION));
+    let [of_kept, of_sent] = ["near", "wide"].map(|text| text.repeat(16).into_bytes());
+    for _ in 0..SAMPLES {
+        kept.publish(&of_kept).unwrap();
+        sent.publish(&of_sent).unwrap();
+    }
+    let count = |of: &[u8]| {
+        let came = came.lock().unwrap();
+        came.windows(of.len()).filter(|window| *window == of).count()
+    };
+    until("what is in range comes", || count(&of_sent) == SAMPLES);
+    assert_eq!(count(&of_kept[..16]), 0, "what a LOCALHOST session published left the host");
+    assert!(!kept.matched().contains(&SUBSCRIPTION), "it counts as matched");
+    let status = host.status();
+    let topic = status.topics.iter().find(|topic| topic.topic == TOPIC).unwrap();
+    let (kept, asked) = (kept.gid().to_string(), SUBSCRIPTION.to_string());
+    assert!(
+        topic.out_of_range.iter().any(|pair| pair.writer == kept && pair.reader == asked),
+        "{topic:?}"
+    );
 }

@@ -2,7 +2,7 @@
 
 use std::{
     net::{Ipv4Addr, SocketAddr},
-    sync::Arc,
+    sync::{Arc, Mutex},
     time::Duration,
 };
 
@@ -175,6 +175,23 @@ impl Stranger {
         let write = async { tokio::time::timeout(time, stream.write_all(bytes)).await };
         // An error: the other side takes no more in that time, or stopped the stream.
         self.runtime.block_on(write).is_ok_and(|written| written.is_ok())
+    }
+
+    /// Reads all streams of samples from now on. What came so far grows meanwhile.
+    pub(crate) fn read_streams(&self, met: &Met) -> Arc<Mutex<Vec<u8>>> {
+        let came = Arc::default();
+        let (connection, all) = (met.connection.clone(), Arc::clone(&came));
+        self.runtime.spawn(async move {
+            while let Ok(mut stream) = connection.accept_uni().await {
+                let all: Arc<Mutex<Vec<u8>>> = Arc::clone(&all);
+                tokio::spawn(async move {
+                    while let Ok(Some(chunk)) = stream.read_chunk(usize::MAX, true).await {
+                        all.lock().unwrap().extend_from_slice(&chunk.bytes);
+                    }
+                });
+            }
+        });
+        came
     }
 
     /// Why the other side closed the connection.

@@ -24,17 +24,18 @@ use super::{
 const TOPIC: &str = "/unread";
 const TYPE: &str = "test/Bytes";
 /// The peer's subscription of the topic.
-const SUBSCRIPTION: Gid = Gid([7; 16]);
+pub(super) const SUBSCRIPTION: Gid = Gid([7; 16]);
 
-fn subscribe(stranger: &Stranger, met: &mut Met) {
-    let subscription = Endpoint::new(SUBSCRIPTION, EndpointKind::Subscription, TOPIC, TYPE)
+/// Subscribes to a topic, KEEP_ALL.
+pub(super) fn subscribe(stranger: &Stranger, met: &mut Met, topic: &str) {
+    let subscription = Endpoint::new(SUBSCRIPTION, EndpointKind::Subscription, topic, TYPE)
         .with_qos(Qos::keep_all())
         .with_node("idle", "/");
     let graph = Graph { version: 1, added: vec![subscription], ..Graph::default() };
     stranger.say(met, &Message::Graph(graph));
     let subscribe = Subscribe {
         route: 1,
-        topic: TOPIC.into(),
+        topic: topic.into(),
         type_name: TYPE.into(),
         kind: 0,
         subscribers: vec![Subscriber { gid: SUBSCRIPTION, qos: Qos::keep_all() }],
@@ -66,7 +67,7 @@ fn a_peer_that_reads_nothing_is_disconnected_from_the_topic_and_the_publisher_go
     let (stranger, auth) = (Stranger::new(), Auth::None(SigningKey::generate().unwrap()));
     let claim = Claim { host: "idle", daemon: DaemonId([0xff; 16]), auth: 0 };
     let mut met = stranger.dial(&host, &auth, &claim).expect("a link");
-    subscribe(&stranger, &mut met);
+    subscribe(&stranger, &mut met, TOPIC);
     until("it is served", || publisher.matched().len() == 2);
     let reader = thread::spawn(move || {
         let mut bytes = Vec::new();
@@ -118,7 +119,7 @@ fn claims_to_have_dropped(host: &Host, session: &Session) {
     let (stranger, auth) = (Stranger::new(), Auth::None(SigningKey::generate().unwrap()));
     let claim = Claim { host: "liar", daemon: DaemonId([0xff; 16]), auth: 0 };
     let mut met = stranger.dial(host, &auth, &claim).expect("a link");
-    subscribe(&stranger, &mut met);
+    subscribe(&stranger, &mut met, TOPIC);
     until("it is served", || publisher.matched().len() == 1);
     let mut say = |sequence, dropped| {
         let flow = ReceivedOf { route: 1, publisher: publisher.gid(), sequence, dropped };

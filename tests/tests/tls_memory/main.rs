@@ -8,6 +8,8 @@
 //! Where there is a key exchange, the child has one end, and this process the other: a group of the test takes the
 //! shared secret there.
 
+#[path = "../../../axon-tls/tests/common/anybody.rs"]
+mod anybody;
 mod certificates;
 mod child;
 mod erase;

@@ -122,6 +122,21 @@ fn a_runtime_directory_of_another_user_is_left_alone() {
 }
 
 #[test]
+fn a_named_runtime_directory_of_another_user_is_an_error_that_says_whose_it_is() {
+    if !rustix::process::geteuid().is_root() {
+        return skip::skip("only root can be two users");
+    }
+    let host = Host::new();
+    let named = host.dir.path().join("of_nobody");
+    std::fs::create_dir(&named).unwrap();
+    std::os::unix::fs::chown(&named, Some(65534), Some(65534)).unwrap();
+    let host = host.with("AXON_RUNTIME_DIR", named.to_str().unwrap());
+    let said = host.play("idle").hear();
+    assert!(said.contains("belongs to uid 65534") && said.contains("of_nobody"), "{said}");
+    assert_eq!(std::fs::read_dir(&named).unwrap().count(), 0, "nothing was put there");
+}
+
+#[test]
 fn a_session_in_a_pid_namespace_with_the_outer_proc_shares_memory_with_its_daemon() {
     let host = Host::new();
     let own = std::env::current_exe().unwrap();

@@ -4,25 +4,20 @@ use std::sync::Arc;
 
 use axon_tls::{Cipher, hybrid, quic::ALPN};
 use rustls::{
-    ClientConfig, DigitallySignedStruct, DistinguishedName, Error, ServerConfig, SignatureScheme,
-    client::{
-        AlwaysResolvesClientRawPublicKeys, Resumption,
-        danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier},
-    },
+    ClientConfig, ServerConfig,
+    client::{AlwaysResolvesClientRawPublicKeys, Resumption},
     crypto::{
         CryptoProvider,
         aws_lc_rs::{default_provider, sign::any_supported_type},
     },
-    pki_types::{CertificateDer, PrivateKeyDer, ServerName, UnixTime, pem::PemObject},
-    server::{
-        AlwaysResolvesServerRawPublicKeys,
-        danger::{ClientCertVerified, ClientCertVerifier},
-    },
+    pki_types::{CertificateDer, PrivateKeyDer, pem::PemObject},
+    server::AlwaysResolvesServerRawPublicKeys,
     sign::CertifiedKey,
     version::TLS13,
 };
 
 use crate::{
+    anybody::Anybody,
     groups::{Told, of_rustls},
     quic,
     transcript::{Messages, TappedClient, TappedServer},
@@ -61,7 +56,8 @@ impl Own {
     }
 
     fn anybody(&self) -> Arc<Anybody> {
-        Arc::new(Anybody { raw: self.certificate.is_none() })
+        let schemes = default_provider().signature_verification_algorithms.supported_schemes();
+        Arc::new(Anybody { schemes, raw: self.certificate.is_none() })
     }
 }
 
@@ -108,94 +104,4 @@ pub(super) fn server(cipher: Cipher, own: &Own, learnt: &Learnt) -> quinn::Serve
     config.send_tls13_tickets = 0;
     let crypto = TappedServer(quic::released::server(config), learnt.transcript.clone());
     quinn::ServerConfig::with_crypto(Arc::new(crypto))
-}
-
-/// Accepts any peer: who it is has no part in the secrets.
-#[derive(Debug)]
-struct Anybody {
-    raw: bool,
-}
-
-fn schemes() -> Vec<SignatureScheme> {
-    default_provider().signature_verification_algorithms.supported_schemes()
-}
-
-impl ServerCertVerifier for Anybody {
-    fn verify_server_cert(
-        &self,
-        _: &CertificateDer<'_>,
-        _: &[CertificateDer<'_>],
-        _: &ServerName<'_>,
-        _: &[u8],
-        _: UnixTime,
-    ) -> Result<ServerCertVerified, Error> {
-        Ok(ServerCertVerified::assertion())
-    }
-
-    fn verify_tls12_signature(
-        &self,
-        _: &[u8],
-        _: &CertificateDer<'_>,
-        _: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        unreachable!("TLS 1.3 alone is spoken")
-    }
-
-    fn verify_tls13_signature(
-        &self,
-        _: &[u8],
-        _: &CertificateDer<'_>,
-        _: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        Ok(HandshakeSignatureValid::assertion())
-    }
-
-    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
-        schemes()
-    }
-
-    fn requires_raw_public_keys(&self) -> bool {
-        self.raw
-    }
-}
-
-impl ClientCertVerifier for Anybody {
-    fn root_hint_subjects(&self) -> &[DistinguishedName] {
-        &[]
-    }
-
-    fn verify_client_cert(
-        &self,
-        _: &CertificateDer<'_>,
-        _: &[CertificateDer<'_>],
-        _: UnixTime,
-    ) -> Result<ClientCertVerified, Error> {
-        Ok(ClientCertVerified::assertion())
-    }
-
-    fn verify_tls12_signature(
-        &self,
-        _: &[u8],
-        _: &CertificateDer<'_>,
-        _: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        unreachable!("TLS 1.3 alone is spoken")
-    }
-
-    fn verify_tls13_signature(
-        &self,
-        _: &[u8],
-        _: &CertificateDer<'_>,
-        _: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        Ok(HandshakeSignatureValid::assertion())
-    }
-
-    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
-        schemes()
-    }
-
-    fn requires_raw_public_keys(&self) -> bool {
-        self.raw
-    }
 }

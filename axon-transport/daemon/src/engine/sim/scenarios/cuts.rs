@@ -178,6 +178,12 @@ fn after_a_cut_of_5_s_samples_flow_within_half_a_second_and_none_is_lost() {
 }
 
 #[test]
+fn after_a_cut_of_8_s_samples_flow_within_half_a_second_and_none_is_lost() {
+    flows_again_after(secs(8), Load::Few, Ways::Both);
+    flows_again_after(secs(8), Load::Many, Ways::Both);
+}
+
+#[test]
 fn after_a_cut_of_20_s_samples_flow_within_half_a_second_and_none_is_lost() {
     flows_again_after(secs(20), Load::Few, Ways::Both);
     flows_again_after(secs(20), Load::Many, Ways::Both);
