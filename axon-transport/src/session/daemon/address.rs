@@ -219,10 +219,10 @@ impl Address {
 
     fn try_turn(&self) -> Result<OwnedFd, Errno> {
         if let Some(place) = &self.place {
-            // What is wrong with the directory, the daemon says.
+            // What is wrong with the directory, the daemon says. Nothing is put into another user's.
             let ours = place.socket.parent().map(private_directory).is_none_or(|made| made.is_ok());
-            if !ours && self.name.is_some() {
-                return self.name_turn();
+            if !ours {
+                return if self.name.is_some() { self.name_turn() } else { Err(Errno::ACCESS) };
             }
             let flags = OFlags::CREATE | OFlags::WRONLY | OFlags::CLOEXEC;
             let file = place.socket.with_extension("start");
