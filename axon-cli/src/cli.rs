@@ -220,7 +220,7 @@ Examples:
   axon status
   axon status --json | jq '.refusals'
 
-Exit status: 1 when there is no daemon.";
+Exit status: 0 when the daemon answers; otherwise 1, or 2 where a setting is wrong as well.";
 
 /// `axon status`.
 #[derive(Args, Debug)]
@@ -243,8 +243,8 @@ Exit status: 1 when there is no daemon, 2 when its settings are wrong.";
 
 const DAEMON_HELP: &str = "\
 The same as axon_daemon. The first session on a host starts it, so this is for service managers, \
-for logs (AXON_LOG=info) and for a host that only relays. Ends on SIGINT or SIGTERM. One that a \
-session started ends after its grace time without sessions; this one stays.
+for logs (AXON_LOG=info) and for a host that has no sessions yet. Ends on SIGINT or SIGTERM. One that \
+a session started ends after its grace time without sessions; this one stays.
 
 Examples:
   AXON_LOG=info axon daemon

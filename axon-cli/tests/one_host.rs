@@ -316,3 +316,23 @@ fn the_daemon_in_the_foreground_is_the_one_that_status_shows_and_ends_on_sigterm
     assert!(output.status.success(), "{}", Stderr::of(&output.stderr));
     assert!(host.status().is_none());
 }
+
+#[test]
+fn the_daemon_in_the_foreground_stays_when_its_last_session_has_ended() {
+    let host = Host::new();
+    let mut command = host.axon(&["daemon"]);
+    command.env("AXON_LINK_GRACE_S", "0");
+    let daemon = Running::start(command);
+    host.wait_daemon();
+    for _ in 0..2 {
+        drop(host.session("visitor"));
+        eventually("the session is gone", || {
+            let status = host.status().expect("a status");
+            let sessions = status["sessions"].as_array().expect("sessions");
+            sessions.iter().all(|session| session["name"] != "visitor")
+        });
+    }
+    // A daemon that does not stay ends at once, without a grace time.
+    std::thread::sleep(Duration::from_millis(500));
+    assert_eq!(host.status().expect("a status")["pid"], daemon.0.id());
+}

@@ -3,7 +3,7 @@
 use crate::bench::harness::{Load, Motion, Wake};
 
 /// Bytes that a descriptor holds.
-const INLINE: usize = 96;
+const INLINE: usize = 88;
 /// From here on a copy is judged by its bytes alone.
 const BYTES_ALONE: usize = 16 << 10;
 
@@ -39,10 +39,10 @@ mod tests {
     #[test]
     fn each_budget_has_its_loads() {
         let of = |size, wake, motion| latency(&Load::ping_pong(size, wake, motion));
-        for size in [8, 96] {
+        for size in [8, 88] {
             assert_eq!(of(size, Wake::Poll, Motion::Copy), Some(1.3));
         }
-        assert_eq!(of(97, Wake::Poll, Motion::Copy), None);
+        assert_eq!(of(89, Wake::Poll, Motion::Copy), None);
         assert_eq!(of(16 << 10, Wake::Poll, Motion::Copy), Some(1.05));
         for size in [8, 25_000_000] {
             assert_eq!(of(size, Wake::Poll, Motion::Touch), Some(2.5));

@@ -160,12 +160,15 @@ pub extern "C" fn axon_session_publisher_wait_matched(
 }
 
 /// Blocks until every sample published so far is acknowledged, for at most `timeout` nanoseconds
-/// (negative: for ever): AXON_RET_TIMEOUT where one is not. A sample for this host is acknowledged at
-/// once. For another host it depends on the QoS of publisher and subscription. Both RELIABLE and KEEP_ALL:
-/// that host has the sample. Both RELIABLE, one of them KEEP_LAST: that host has the newest samples, as many
-/// as the depth (the smaller one), or newer ones; older ones may be missing. One of them BEST_EFFORT: the
-/// sample was sent or dropped. AXON_RET_TIMEOUT comes at once, and once, when samples were given up since the
-/// last call: with a link, or with this host's daemon, for a host that read nothing, or by a limit.
+/// (negative: for ever): AXON_RET_TIMEOUT where one is not. Between processes of this host that share
+/// memory a sample is acknowledged at once. Where they share none (AXON_SHM), this host's daemon carries it:
+/// a sample of a RELIABLE and KEEP_ALL publisher for a subscription like it is acknowledged when the other
+/// process has it, any other when the daemon has it. For another host it depends on the QoS of publisher and
+/// subscription. Both RELIABLE and KEEP_ALL: that host has the sample. Both RELIABLE, one of them KEEP_LAST:
+/// that host has the newest samples, as many as the depth (the smaller one), or newer ones; older ones may be
+/// missing. One of them BEST_EFFORT: the sample was sent or dropped. AXON_RET_TIMEOUT comes at once, and
+/// once, when samples were given up since the last call: with a link, or with this host's daemon, for a host
+/// that read nothing, or by a limit.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_publisher_wait_acknowledged(
     publisher: axon_publisher_t,

@@ -115,8 +115,9 @@ impl Publisher {
 
     /// Waits until every sample published so far is acknowledged; whether it is.
     ///
-    /// A sample for this host is acknowledged at once, whether or not it has been taken. What it says of
-    /// another host depends on the QoS of the publisher and of each subscription there that it matches:
+    /// Between processes of this host that share memory a sample is acknowledged at once, whether or not it
+    /// has been taken. What it says of another host depends on the QoS of the publisher and of each
+    /// subscription there that it matches:
     ///
     /// - Both RELIABLE and KEEP_ALL: the host has the sample in the ring from which its subscriptions take.
     /// - Both RELIABLE, one of them KEEP_LAST: that ring has the newest samples that were published, as many

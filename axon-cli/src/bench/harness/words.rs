@@ -33,8 +33,8 @@ pub(crate) fn limit(wake: Wake, motion: Motion) -> String {
     };
     match motion {
         Motion::Touch => wake.to_owned(),
-        Motion::Fill => format!("{wake}, and a memcpy from 97 B on"),
-        Motion::Copy => format!("{wake}, and two memcpy from 97 B on"),
+        Motion::Fill => format!("{wake}, and a memcpy from 89 B on"),
+        Motion::Copy => format!("{wake}, and two memcpy from 89 B on"),
     }
 }
 

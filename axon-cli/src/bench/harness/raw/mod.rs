@@ -16,7 +16,7 @@ use super::{Channel, End, Load, Medium, Motion, Result, Side, Wake, agree, stamp
 
 /// A message of up to this many bytes has room beside the word that announces it, so that its
 /// limit is the word alone.
-const INLINE: usize = 96;
+const INLINE: usize = 88;
 /// Bytes between two things that must not share a cache line, or two that are fetched together.
 const APART: usize = 256;
 const PAYLOADS: usize = 4096;
@@ -25,7 +25,7 @@ const PAYLOADS: usize = 4096;
 const ASLEEP: usize = 128;
 
 /// A shared atomic that is spun on, or slept for in one of three ways; with as many plain copies as the
-/// load has. Messages of up to 96 bytes are not copied.
+/// load has. Messages of up to 88 bytes are not copied.
 ///
 /// Where the receiver polls there is one for all, [`Sleeps::Epoll`]. Where messages follow each other at
 /// once AXON looks before it sleeps, so the limit that does so, too, is [`Sleeps::SpinEpoll`]; the other two
