@@ -52,13 +52,10 @@ fn publish(world: &mut World, pairs: &[Pair], length: usize) {
 #[test]
 fn long_messages_of_many_topics_at_one_time_arrive() {
     for seed in seeds() {
-        for (publishers, length, rounds) in [
-            (20, 8 * MIB, 1),
-            (6, 40 * MIB, 1),
-            (2, 60 * MIB, 2),
-            (60, 3 * MIB, 2),
-            (200, 300 << 10, 3),
-        ] {
+        let of_few = [(20, 8 * MIB, 1), (2, 60 * MIB, 2), (60, 3 * MIB, 2)];
+        let sample = [(6, 40 * MIB, 1), (200, 300 << 10, 3)];
+        let of_few = of_few.into_iter().filter(|_| all_cases());
+        for (publishers, length, rounds) in of_few.chain(sample) {
             let (mut world, pairs) = pairs(seed, publishers);
             (0..rounds).for_each(|_| publish(&mut world, &pairs, length));
             let most = Duration::from_secs(60);
