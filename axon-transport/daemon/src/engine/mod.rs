@@ -154,6 +154,10 @@ impl Engine {
     pub(crate) fn handle_order(&mut self, order: ToGateway, now: Duration) {
         match order {
             ToGateway::Dial { daemon, sae, addresses, listed, standing } => {
+                // Discovery did not hear yet that it is linked, or that its path works again.
+                if self.links.stands(daemon) {
+                    return self.effects.tell(ToControl::DialFailed { daemon, standing });
+                }
                 let replaces = self.links.cut_link(daemon);
                 let (daemon, standing) = (Some(daemon), Some(standing));
                 let target = Target { daemon, sae, addresses, listed, standing, replaces };
@@ -249,7 +253,7 @@ impl Engine {
             LinkEvent::Up { number, daemon, old, closed } => {
                 self.link_up(number, daemon, old, now);
                 self.peers.with(daemon, |peer, with| {
-                    closed.into_iter().for_each(|closed| peer.say(Message::LinkClosed(closed)));
+                    peer.say_closed(closed);
                     peer.send_graph(with.local, true);
                 });
                 self.reports.hurry(now);

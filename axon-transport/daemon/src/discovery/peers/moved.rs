@@ -14,10 +14,11 @@ impl Peers {
         let Some(record) = self.records.get_mut(&daemon).filter(|record| record.linked) else {
             return;
         };
-        record.cut = !works;
-        if works {
-            return record.done();
+        // What is said again was not lost.
+        if std::mem::replace(&mut record.cut, !works) == !works || works {
+            return;
         }
+        record.ask_anew();
         for standing in [AddressConfidence::Known, AddressConfidence::Heard] {
             self.ask_whether_there(now, daemon, standing);
         }

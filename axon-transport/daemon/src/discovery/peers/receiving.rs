@@ -193,7 +193,8 @@ impl Peers {
         let others = record.sources.iter().any(|source| source.address.ip() != from);
         let best = record.sources.first().is_some_and(|source| source.address.ip() == from);
         if record.linked {
-            if best || !others {
+            // Where its path is cut it is looked for, and nobody can say for it that it leaves.
+            if !record.cut && (best || !others) {
                 record.leaving = Some(now);
             }
         } else if others {

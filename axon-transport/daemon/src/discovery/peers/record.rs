@@ -105,8 +105,10 @@ pub(super) struct Dial {
 impl Record {
     /// A beacon came from there; or the peer answered there.
     pub(super) fn saw(&mut self, mut source: DialAddress) {
+        let mut place = 0;
         if let Some(at) = self.sources.iter().position(|s| s.address == source.address) {
             let known = self.sources.remove(at);
+            place = if self.cut { at } else { 0 };
             source.answered |= known.answered;
             source.known |= known.known;
             if known.proven {
@@ -114,7 +116,8 @@ impl Record {
                 source = DialAddress { proven: true, sae: known.sae, ..source };
             }
         }
-        self.sources.insert(0, source);
+        // Who beacons most often is not dialled before the others while a path is cut.
+        self.sources.insert(place, source);
         self.order();
     }
 
@@ -161,14 +164,18 @@ impl Record {
     }
 
     /// The addresses of this standing that may be dialled. While a link stands: those where another host may be that has
-    /// the id, or the peer if the link's path is cut, if its address is known or it answered there.
+    /// the id, if its address is known or it answered there; where the link's path is cut, those where the peer answered
+    /// since.
     pub(super) fn to_dial(
         &self,
         standing: AddressConfidence,
     ) -> impl Iterator<Item = &DialAddress> {
         self.of(standing).filter(move |source| match self.linked {
             false => true,
-            true => standing != AddressConfidence::Heard && self.may_be_at(source),
+            true => {
+                let moved = self.cut && source.answered && !source.proven;
+                standing != AddressConfidence::Heard && (moved || self.doubts(source.address))
+            }
         })
     }
 
@@ -213,7 +220,10 @@ impl Record {
         let Some(source) = self.to_dial(standing).next() else { return false };
         let elsewhere =
             |dial: &Dial| dial.in_flight.is_none() || dial.first != Some(source.address);
+        // While a link's path is cut one dial after the other: each would succeed the link.
+        let alone = !self.cut || self.in_flight().next().is_none();
         self.compatible
+            && alone
             && self.leaving.is_none()
             && self.dials[standing as usize].in_flight.is_none()
             && self.dials.iter().all(elsewhere)
@@ -237,6 +247,13 @@ impl Record {
         dial.in_flight = None;
         let doubled = BACKOFF_FIRST.saturating_mul(1 << dial.failures.min(16));
         dial.failures = dial.failures.saturating_add(1);
+        // Somebody who answers in its name keeps no other address out: that one is next.
+        let first = self.dials[standing as usize].first.filter(|_| self.cut);
+        if let Some(at) = self.sources.iter().position(|source| Some(source.address) == first) {
+            let last = self.sources.remove(at);
+            self.sources.push(last);
+            self.order();
+        }
         let stands = self.linked && !self.cut;
         let pause = if stands { DOUBT_AGAIN } else { doubled.min(BACKOFF_MOST) };
         let at = now + pause.mul_f64(jitter);
@@ -249,6 +266,16 @@ impl Record {
         let same = self.dials.iter().filter(|dial| dial.first.is_some() && dial.first == address);
         let last = same.filter_map(|dial| dial.last).chain(own).max();
         last.map_or(at, |last| at.max(last + DIAL_SPACING))
+    }
+
+    /// The path of its link is cut: where it answered before says nothing any more.
+    pub(super) fn ask_anew(&mut self) {
+        for source in self.sources.iter_mut().filter(|source| !source.proven) {
+            (source.answered, source.asked) = (false, false);
+        }
+        self.order();
+        // A pause of doubt is for links that stand.
+        self.dials.iter_mut().for_each(|dial| dial.due = None);
     }
 
     /// The peer is linked, or was: nothing is under way.

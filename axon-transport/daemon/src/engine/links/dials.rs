@@ -131,6 +131,11 @@ impl Dials {
         self.opening.extend(of.map(|of| (connection, of)));
     }
 
+    /// The daemon that was looked for with this connection, while it is being opened.
+    pub(super) fn expected(&self, connection: u64) -> Option<DaemonId> {
+        self.opening.get(&connection).map(|(daemon, _)| *daemon)
+    }
+
     /// The opening of a dialled connection succeeded.
     pub(super) fn opened(&mut self, connection: u64) {
         self.opening.remove(&connection);

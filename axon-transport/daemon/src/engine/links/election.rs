@@ -14,7 +14,7 @@ use super::{
         LinkPeer, Phase,
         age::{Age, Due},
     },
-    silence::Silence,
+    silence::{Silence, Traffic},
 };
 use crate::{
     daemon_key::DaemonProof,
@@ -52,6 +52,11 @@ impl Links {
         let (side, address) = (link.side, connection.quic.remote_address());
         let replaces = if side == Side::Server { hello.replaces } else { link.replaces };
         let (daemon, ours) = (hello.daemon, self.hello.daemon);
+        // The other end compares, too. Who says nothing of that must not count as found.
+        if let Some(expected) = self.dials.expected(number).filter(|expected| *expected != daemon) {
+            let why = format!("daemon id is {daemon} there, and {expected} was dialled");
+            return self.turn_away(number, &hello, why, now);
+        }
         let chain = connection.peer_chain();
         if let Some(why) = self.credentials.distrust(&negotiated, side, Some(&chain)) {
             return self.turn_away(number, &hello, why, now);
@@ -348,8 +353,16 @@ impl Links {
 
     /// The link of a peer, if its path is taken for cut: what discovery dials succeeds it.
     pub(in crate::engine) fn cut_link(&self, daemon: DaemonId) -> Option<[u8; 16]> {
-        let peer = self.table.current_peer(daemon).filter(|peer| peer.silence.is_cut())?;
-        peer.elected.map(|elected| elected.link)
+        let connection = self.connections.get(self.current(daemon)?)?;
+        let peer = self.table.current_peer(daemon)?;
+        let cut = peer.silence.is_cut(Traffic::from(&connection.quic.stats()));
+        peer.elected.filter(|_| cut).map(|elected| elected.link)
+    }
+
+    /// Whether a link stands with a daemon that proved its id, and its path is not taken for cut.
+    pub(in crate::engine) fn stands(&self, daemon: DaemonId) -> bool {
+        let proven = self.table.current_peer(daemon).is_some_and(|peer| peer.proven);
+        proven && self.cut_link(daemon).is_none()
     }
 
     /// Closes the links of peers that are no longer trusted. Certificates are looked at if `certificates` says so:

@@ -367,13 +367,13 @@ impl Links {
                     self.violation(number, code, &error.to_string(), now);
                 }
             }
+            // Over whichever link it comes: another one may have taken over meanwhile.
+            Message::LinkClosed(closed) => self.closed_by_peer(daemon, closed),
             // A predecessor's are old.
             _ if self.current(daemon) != Some(number) => {}
             message => {
-                match &message {
-                    Message::Graph(_) => self.succeeded(daemon),
-                    Message::LinkClosed(closed) => self.closed_by_peer(daemon, *closed),
-                    _ => {}
+                if let Message::Graph(_) = &message {
+                    self.succeeded(daemon);
                 }
                 self.outbox.event(LinkEvent::Message(number, daemon, message, room));
             }

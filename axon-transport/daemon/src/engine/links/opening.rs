@@ -242,6 +242,15 @@ impl Links {
                     return;
                 };
                 let target = dialling.target();
+                if let (Some(daemon), Some(standing), Some(_)) =
+                    (target.daemon, target.standing, target.replaces)
+                    && self.cut_link(daemon) != target.replaces
+                {
+                    let why = "the link that it was to succeed works again, or has a successor";
+                    self.table.remove(number);
+                    self.close_connection(number, CloseCode::Duplicate, why, now);
+                    return self.outbox.report(LinkReport::DialFailed { daemon, standing });
+                }
                 let hello = target.hello(&self.hello);
                 let sae = target.sae.clone();
                 self.dials.note_opening(number, target.daemon.zip(target.standing));

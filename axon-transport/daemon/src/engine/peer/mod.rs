@@ -60,7 +60,7 @@ use crate::{
             told::{Told, ToldGraph},
         },
     },
-    link::{AccessDecisions, Asserted, CloseCode, Graph, Message},
+    link::{AccessDecisions, Asserted, CloseCode, Graph, LinkClosed, Message},
     owner::Binding,
 };
 
@@ -68,6 +68,8 @@ use crate::{
 const POLL: Duration = Duration::from_millis(5);
 /// The same for each of them: thousands of pairs that wait leave time for samples.
 const POLL_EACH: Duration = Duration::from_micros(4);
+/// Links of which a peer is told again that they are closed: as many as may wait for their end.
+const SAID_CLOSED: usize = 8;
 /// Routes of a peer whose HELLO does not say how many it serves.
 pub(crate) const ROUTES_UNSAID: usize = 1024;
 
@@ -124,6 +126,8 @@ pub(crate) struct Peer {
     alive: Alive,
     answering: BTreeSet<Gid>,
     messages: VecDeque<Message>,
+    /// Links with it that were closed while their packets did not arrive, the latest of them.
+    closed: Vec<LinkClosed>,
 }
 
 /// The parts of a new peer.
@@ -192,6 +196,7 @@ impl Peer {
             alive: Alive::default(),
             answering: BTreeSet::new(),
             messages: VecDeque::new(),
+            closed: Vec::new(),
         }
     }
 
@@ -209,6 +214,16 @@ impl Peer {
         let denied = self.access.succeed();
         denied.into_iter().for_each(|message| self.say(message));
         self.served.iter_mut().for_each(|(_, served)| served.repeated = false);
+    }
+
+    /// Tells the peer which links are closed here, whose packets may not arrive. The one that takes over may have come
+    /// before those said earlier left: they are said again.
+    pub(super) fn say_closed(&mut self, closed: Option<LinkClosed>) {
+        self.closed.extend(closed);
+        let before = self.closed.len().saturating_sub(SAID_CLOSED);
+        self.closed.drain(..before);
+        let all: Vec<_> = self.closed.iter().copied().map(Message::LinkClosed).collect();
+        all.into_iter().for_each(|message| self.say(message));
     }
 
     /// Queues a control message.

@@ -164,6 +164,20 @@ impl World {
         self.hosts.iter_mut().for_each(|other| other.moved(daemon, address));
     }
 
+    /// Two hosts get each other's address, which all learn.
+    pub(super) fn swap_hosts(&mut self, one: usize, other: usize) {
+        let [first, second] = [one, other].map(|host| self.hosts[host].address);
+        self.move_host(one);
+        let between = self.hosts[one].address;
+        self.network.move_host(second, first);
+        self.network.move_host(between, second);
+        (self.hosts[one].address, self.hosts[other].address) = (second, first);
+        for host in [one, other] {
+            let (daemon, address) = (self.hosts[host].daemon, self.hosts[host].address);
+            self.hosts.iter_mut().for_each(|other| other.moved(daemon, address));
+        }
+    }
+
     /// Has each publisher of a topic on a host publish a sample.
     pub(super) fn publish_all(&mut self, host: usize, topic: usize, size: usize) {
         let publishers = self.hosts[host].rings.publishers(&super::run::name(topic));

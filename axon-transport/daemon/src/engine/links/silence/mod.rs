@@ -29,14 +29,17 @@ impl Links {
             return;
         }
         if !self.nonces.is_empty()
-            && let Ok(Datagram::Echo { nonce, .. }) = Datagram::decode(&bytes)
-            && let Some(number) = self.nonces.remove(&nonce)
+            && let Ok(Datagram::Echo { nonce, daemon }) = Datagram::decode(&bytes)
+            && let Some(number) = self.nonces.get(&nonce).copied()
         {
+            // Another daemon at the address says nothing of the path to this one.
             if let Some(peer) = self.table.peer_mut(number)
-                && peer.silence.handle_echo(now)
+                && peer.summary.hello.daemon == daemon
             {
-                let daemon = peer.summary.hello.daemon;
-                self.outbox.report(LinkReport::Path { daemon, works: true });
+                self.nonces.remove(&nonce);
+                if peer.silence.handle_echo(now) {
+                    self.outbox.report(LinkReport::Path { daemon, works: true });
+                }
             }
             return;
         }
@@ -94,7 +97,9 @@ impl Links {
             return;
         };
         let (address, daemon) = (connection.quic.remote_address(), peer.summary.hello.daemon);
-        match peer.silence.handle_timeout(Traffic::from(&connection.quic.stats()), now) {
+        let (traffic, round_trip) =
+            (Traffic::from(&connection.quic.stats()), connection.quic.rtt());
+        match peer.silence.handle_timeout(traffic, round_trip, now) {
             Some(Action::Answered(nonce, was_cut)) => {
                 self.nonces.remove(&nonce);
                 if was_cut {

@@ -36,6 +36,9 @@ const AGAIN_AT_MOST: Duration = Duration::from_secs(8);
 /// about. A lossy path loses one or two.
 const CUT: u32 = 3;
 
+/// After so many more it is said again: what is told to discovery may get lost.
+const CUT_AGAIN: u32 = 16;
+
 /// What went over a connection, as far as silence is concerned.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(in crate::engine::links) struct Traffic {
@@ -119,6 +122,8 @@ pub(in crate::engine::links) struct Prober {
     due: Duration,
     /// Probes that were sent in a row and not answered.
     asked: u32,
+    /// When the first of them was sent.
+    unanswered_since: Duration,
     /// The last dial, and the pause after it.
     dialled: Option<(Duration, Duration)>,
 }
@@ -126,7 +131,8 @@ pub(in crate::engine::links) struct Prober {
 impl Prober {
     /// The link was found silent: a probe is due.
     pub(crate) fn new(side: Side) -> Self {
-        Self { side, next: Step::Probe, due: Duration::ZERO, asked: 0, dialled: None }
+        let due = Duration::ZERO;
+        Self { side, next: Step::Probe, due, asked: 0, unanswered_since: due, dialled: None }
     }
 
     /// Whether an answer to a probe counts.
@@ -145,9 +151,13 @@ impl Prober {
         (self.next, self.due) = (Step::Replace, now + grace + more);
     }
 
-    /// Whether the path is taken for cut: nobody answers probes.
-    pub(crate) fn is_cut(&self) -> bool {
-        self.asked >= CUT
+    /// Whether the path is taken for cut at the latest probe: those before were not answered, the first of them for two
+    /// round trips. Said again from time to time, as long as that lasts.
+    pub(crate) fn finds_cut(&self, round_trip: Duration, now: Duration) -> bool {
+        let unanswered = self.asked.saturating_sub(1);
+        unanswered >= CUT
+            && (unanswered - CUT).is_multiple_of(CUT_AGAIN)
+            && now.saturating_sub(self.unanswered_since) >= 2 * round_trip
     }
 
     /// When to call [`handle_timeout`](Self::handle_timeout).
@@ -163,8 +173,11 @@ impl Prober {
         let step = self.next;
         match step {
             Step::Probe => {
-                if self.is_cut() {
+                if self.asked >= CUT {
                     self.dialled = None;
+                }
+                if self.asked == 0 {
+                    self.unanswered_since = now;
                 }
                 self.asked += 1;
             }

@@ -133,9 +133,10 @@ impl Silence {
         std::mem::take(&mut probing.said_cut)
     }
 
-    /// Whether the path is taken for cut: probes of it are not answered.
-    pub(in crate::engine::links) fn is_cut(&self) -> bool {
-        self.probing.as_ref().is_some_and(|probing| probing.prober.is_cut())
+    /// Whether the path is taken for cut: probes of it are not answered, and nothing was acknowledged since.
+    pub(in crate::engine::links) fn is_cut(&self, traffic: Traffic) -> bool {
+        let cut = |probing: &Probing| probing.said_cut && !traffic.answered_since(probing.traffic);
+        self.probing.as_ref().is_some_and(cut)
     }
 
     /// A successor took over the link. Returns whether the link is silent.
@@ -150,7 +151,12 @@ impl Silence {
         Some(probing.begun + probing.prober.poll_timeout()?)
     }
 
-    pub(super) fn handle_timeout(&mut self, traffic: Traffic, now: Duration) -> Option<Action> {
+    pub(super) fn handle_timeout(
+        &mut self,
+        traffic: Traffic,
+        round_trip: Duration,
+        now: Duration,
+    ) -> Option<Action> {
         let probing = self.probing.as_mut()?;
         if traffic.answered_since(probing.traffic) {
             let answered = Action::Answered(probing.nonce, probing.said_cut);
@@ -159,10 +165,10 @@ impl Silence {
         }
         match probing.prober.handle_timeout(now.saturating_sub(probing.begun))? {
             Step::Probe => {
-                let news =
-                    probing.prober.is_cut() && !std::mem::replace(&mut probing.said_cut, true);
-                self.silent |= news;
-                let action = if news { Action::ProbeCut } else { Action::Probe };
+                let cut = probing.prober.finds_cut(round_trip, now.saturating_sub(probing.begun));
+                probing.said_cut |= cut;
+                self.silent |= cut;
+                let action = if cut { Action::ProbeCut } else { Action::Probe };
                 Some(action(probing.nonce))
             }
             Step::Replace => {
@@ -178,6 +184,7 @@ mod tests {
     use super::*;
 
     const START: Duration = Duration::from_secs(1000);
+    const ROUND_TRIP: Duration = Duration::from_millis(30);
     const NONCE: Nonce = [7; 8];
 
     fn second(number: u64) -> Duration {
@@ -213,39 +220,51 @@ mod tests {
         assert_eq!(look, Look { gone: false, probed: true });
         assert_eq!(silence.handle_second(traffic(1, 1, 2), || [9; 8], second(3)), Look::default());
         let asked = traffic(1, 1, 2);
-        assert_eq!(silence.handle_timeout(asked, second(3)), Some(Action::Probe(NONCE)));
+        assert_eq!(
+            silence.handle_timeout(asked, ROUND_TRIP, second(3)),
+            Some(Action::Probe(NONCE))
+        );
         silence.handle_echo(second(3));
         let due = silence.poll_timeout().unwrap();
-        assert_eq!(silence.handle_timeout(asked, due), Some(Action::Replace));
+        assert_eq!(silence.handle_timeout(asked, ROUND_TRIP, due), Some(Action::Replace));
         assert!(silence.is_silent());
         // An acknowledgement ends it.
         let answered = traffic(2, 2, 2);
-        assert_eq!(silence.handle_timeout(answered, due), Some(Action::Answered(NONCE, false)));
-        assert_eq!((silence.poll_timeout(), silence.handle_timeout(answered, due)), (None, None));
+        assert_eq!(
+            silence.handle_timeout(answered, ROUND_TRIP, due),
+            Some(Action::Answered(NONCE, false))
+        );
+        assert_eq!(
+            (silence.poll_timeout(), silence.handle_timeout(answered, ROUND_TRIP, due)),
+            (None, None)
+        );
         silence.handle_second(answered, || NONCE, second(5));
         assert!(!silence.is_silent());
     }
 
     #[test]
-    fn a_path_whose_probes_nobody_answers_is_said_to_be_cut_once_and_to_work_again() {
+    fn a_path_whose_probes_nobody_answers_is_said_to_be_cut_and_to_work_again() {
         let mut silence = Silence::new(Side::Client, START);
         silence.handle_second(traffic(0, 0, 1), || NONCE, second(1));
         let asked = traffic(0, 0, 1);
         let probe = |silence: &mut Silence| {
             let due = silence.poll_timeout().unwrap();
-            (due, silence.handle_timeout(asked, due).unwrap())
+            (due, silence.handle_timeout(asked, ROUND_TRIP, due).unwrap())
         };
         for answered in [false, true] {
-            let found: Vec<_> = (0..5).map(|_| probe(&mut silence)).collect();
-            let found: Vec<_> = found.into_iter().map(|(_, action)| action).collect();
-            let cut = Action::ProbeCut(NONCE);
-            let again = Action::Probe(NONCE);
-            assert_eq!(found, [again, again, cut, again, again]);
-            assert!(silence.is_cut());
+            let found: Vec<_> = (0..20).map(|_| probe(&mut silence).1).collect();
+            // Three are not answered when the fourth is sent. It is said again after a while.
+            let said = |action: &Action| *action == Action::ProbeCut(NONCE);
+            let said: Vec<_> = (0..).zip(&found).filter(|(_, a)| said(a)).map(|(n, _)| n).collect();
+            assert_eq!(said, [3, 19]);
+            assert!(silence.is_cut(asked) && !silence.is_cut(traffic(1, 1, 1)));
             if answered {
                 let due = silence.poll_timeout().unwrap();
                 let more = traffic(1, 1, 1);
-                assert_eq!(silence.handle_timeout(more, due), Some(Action::Answered(NONCE, true)));
+                assert_eq!(
+                    silence.handle_timeout(more, ROUND_TRIP, due),
+                    Some(Action::Answered(NONCE, true))
+                );
             } else {
                 let due = silence.poll_timeout().unwrap();
                 assert!(silence.handle_echo(due), "it was said");
@@ -253,7 +272,26 @@ mod tests {
                 let (_, action) = probe(&mut silence);
                 assert_eq!(action, Action::Replace);
             }
-            assert!(!silence.is_cut());
+            assert!(!silence.is_cut(asked));
+        }
+    }
+
+    #[test]
+    fn a_path_is_not_cut_while_an_echo_may_be_on_its_way() {
+        let slow = Duration::from_millis(900);
+        let mut silence = Silence::new(Side::Client, START);
+        silence.handle_second(traffic(0, 0, 1), || NONCE, second(1));
+        let begin = silence.poll_timeout().unwrap();
+        loop {
+            let due = silence.poll_timeout().unwrap();
+            let action = silence.handle_timeout(traffic(0, 0, 1), slow, due).unwrap();
+            if due < begin + 2 * slow {
+                assert_eq!(action, Action::Probe(NONCE));
+                assert!(!silence.is_cut(traffic(0, 0, 1)));
+            } else if action == Action::ProbeCut(NONCE) {
+                break;
+            }
+            assert!(due < begin + 10 * slow, "it is never said");
         }
     }
 
@@ -284,10 +322,13 @@ mod tests {
     fn a_superseded_link_is_probed_no_more() {
         let mut silence = Silence::new(Side::Client, START);
         silence.handle_second(traffic(0, 0, 1), || NONCE, second(1));
-        silence.handle_timeout(traffic(0, 0, 1), second(1));
+        silence.handle_timeout(traffic(0, 0, 1), ROUND_TRIP, second(1));
         silence.handle_echo(second(1));
         let due = silence.poll_timeout().unwrap();
-        assert_eq!(silence.handle_timeout(traffic(0, 0, 1), due), Some(Action::Replace));
+        assert_eq!(
+            silence.handle_timeout(traffic(0, 0, 1), ROUND_TRIP, due),
+            Some(Action::Replace)
+        );
         assert!(silence.handle_superseded(traffic(0, 0, 1)));
         assert_eq!(silence.poll_timeout(), None);
         assert!(!silence.handle_superseded(traffic(1, 1, 1)), "it answers after all");

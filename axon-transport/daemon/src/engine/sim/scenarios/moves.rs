@@ -165,3 +165,26 @@ fn an_endpoint_that_ends_while_its_daemons_predecessor_is_not_given_up_leaves_no
     world.hosts[1].touch_graph();
     world.until(secs(5), World::is_whole);
 }
+
+#[test]
+#[cfg_attr(debug_assertions, ignore = "a debug assertion of quinn-proto fails")]
+fn two_hosts_that_swap_their_addresses_flow_again_soon_with_a_third_and_lose_nothing() {
+    for (mode, config) in modes() {
+        let mut world = World::new(45, 3, &config);
+        let pairs = [(0, 1, "/a"), (2, 0, "/b"), (1, 2, "/c")]
+            .map(|(from, to, topic)| world.pair(from, to, topic, Qos::keep_all()));
+        world.until(secs(20), World::is_whole);
+        world.run_for(secs(1));
+        // Whoever answers a probe at the old address of one is the other one.
+        world.swap_hosts(1, 2);
+        for _ in 0..100 {
+            pairs.iter().for_each(|pair| assert!(world.publish(*pair, 500), "the history is full"));
+            world.run_for(millis(100));
+        }
+        world.run_for(secs(10));
+        for pair in pairs {
+            let expected: Vec<u64> = (1..=100).collect();
+            assert_eq!(world.received(pair), expected, "{mode}: {}", world.describe());
+        }
+    }
+}
