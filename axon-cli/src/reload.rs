@@ -12,8 +12,8 @@ use crate::{failure::CliError, session::failure, text::printable};
 /// There is no daemon, or its settings are wrong.
 pub(crate) fn run() -> Result<ExitCode, CliError> {
     let report = axon_transport::daemon_reload_at(&DaemonPlace::from_env()?).map_err(failure)?;
-    if let Some(error) = report.error {
-        return Err(CliError::Setting(format!("nothing was changed: {error}")));
+    if let Some(error) = &report.error {
+        return Err(CliError::Setting(refused(error, &report.changed)));
     }
     let list = |all: &[String]| match all.is_empty() {
         true => "nothing".to_owned(),
@@ -25,4 +25,25 @@ pub(crate) fn run() -> Result<ExitCode, CliError> {
     }
     std::io::stdout().lock().write_all(text.as_bytes())?;
     Ok(ExitCode::SUCCESS)
+}
+
+/// What went wrong, and what the daemon took all the same.
+fn refused(error: &str, changed: &[String]) -> String {
+    match changed {
+        [] => format!("nothing was changed: {error}"),
+        changed => format!("changed: {}; but {error}", printable(&changed.join(", "))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_daemon_took_is_named_beside_what_went_wrong() {
+        assert_eq!(refused("line 3: x", &[]), "nothing was changed: line 3: x");
+        let changed = ["access rules".to_owned(), "[[topic]]".to_owned()];
+        let text = refused("the gateway did not take them", &changed);
+        assert_eq!(text, "changed: access rules, [[topic]]; but the gateway did not take them");
+    }
 }

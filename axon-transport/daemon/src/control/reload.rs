@@ -165,7 +165,7 @@ impl Control {
         report
     }
 
-    fn set_config(&mut self, config: Config) {
+    pub(super) fn set_config(&mut self, config: Config) {
         log::set_filter(&config.log);
         self.config = Arc::new(config);
         self.admission.set_config(&self.config);

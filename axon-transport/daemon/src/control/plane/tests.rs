@@ -1,10 +1,17 @@
-use axon_shm::ids::{Gid, SessionId};
-use axon_transport::{
-    graph::{Endpoint, EndpointKind},
-    internal::wire::session::{Announce, EndpointRole, Message, SessionRole},
-};
+use std::{fs::File, os::fd::OwnedFd};
 
-use super::*;
+use axon_shm::{
+    ids::{Gid, SessionId},
+    internal::descriptors::PassedFd,
+};
+use axon_transport::{
+    access::AccessRules,
+    graph::{Endpoint, EndpointKind},
+    internal::wire::session::{AccessCheck, Announce, EndpointRole, Message, SessionRole},
+};
+use serde_json::Value;
+
+use super::{super::report::send_status, *};
 
 const SESSION: SessionId = SessionId([1; 16]);
 const DAEMON: DaemonId = DaemonId([2; 16]);
@@ -51,4 +58,95 @@ fn a_gateway_that_ended_leaves_no_refused_route_and_sessions_are_told_by_the_nex
     assert!(control.links.is_empty() && control.refused_routes.is_empty());
     link(&mut control);
     assert_eq!(told(&mut control), 1);
+}
+
+const RULES: &str = "[[allow]]\npeer = \"uid:7\"\npublish = \"/x\"";
+
+/// A daemon with access rules, or without, and a session of another user, and one of its own, with an endpoint each.
+fn with_users(rules: &str) -> Control {
+    let mut config = Config::default();
+    if !rules.is_empty() {
+        config.access = AccessRules::parse(rules, "access.toml").unwrap();
+    }
+    config.trusted_uids = vec![7];
+    let mut control = Control::new(Arc::new(config), Vec::new(), Spare::default());
+    for session in [SESSION, OWN] {
+        connect(&mut control, session, false);
+        let endpoint = Endpoint::new(Gid::new(session, 1), EndpointKind::Subscription, "/t", "T");
+        let role = EndpointRole::Application;
+        let announce = Announce { endpoint, role, stands_for: vec![], ring: None, only: None };
+        control.registry.handle_message(&session, Message::Endpoint(announce), vec![]).unwrap();
+    }
+    control.registry.set_user(&SESSION, 7);
+    link(&mut control);
+    control
+}
+
+const OWN: SessionId = SessionId([3; 16]);
+
+fn connect(control: &mut Control, session: SessionId, shares_memory: bool) {
+    let descriptor = || Arc::new(PassedFd::from(OwnedFd::from(File::open("/dev/null").unwrap())));
+    let descriptors = shares_memory.then(|| [(); 3].map(|()| descriptor()));
+    let (role, name) = (SessionRole::Application, String::new());
+    control.registry.handle_connect(session, role, name, 1, descriptors, None).unwrap();
+}
+
+/// The report that a session is given next.
+fn report(control: &mut Control, session: SessionId) -> Value {
+    let mut text = Vec::new();
+    while let Some(output) = control.registry.poll_output(&session) {
+        if let Ok(Message::Status(part)) = Message::decode(&output.packet) {
+            text.extend(part.text);
+        }
+    }
+    serde_json::from_slice(&text).unwrap()
+}
+
+#[test]
+fn another_user_sees_no_details_where_there_are_rules_and_the_own_user_all() {
+    for (rules, asks, sees) in [(RULES, SESSION, false), (RULES, OWN, true), ("", SESSION, true)] {
+        let mut control = with_users(rules);
+        send_status(&mut control, &asks);
+        let status = report(&mut control, asks);
+        assert!(status["daemon"].as_str().is_some_and(|id| !id.is_empty()), "{status}");
+        for details in ["sessions", "topics", "links"] {
+            let shown = status[details].as_array().is_some_and(|all| !all.is_empty());
+            assert_eq!(shown, sees, "{details} of {status}");
+        }
+        let digest = status["access_digest"].as_str().is_some_and(|digest| !digest.is_empty());
+        assert_eq!(digest, sees && !rules.is_empty(), "{status}");
+    }
+}
+
+#[test]
+fn another_user_may_neither_reload_nor_ask_what_peers_allow() {
+    let mut control = with_users("");
+    control.ask_reload(&SESSION);
+    let answer = report(&mut control, SESSION).to_string();
+    assert!(answer.contains("user 7 may not change"), "{answer}");
+    assert!(control.reload_asked.is_empty());
+    control.ask_decisions(&SESSION, AccessCheck { daemon: DAEMON, uses: Vec::new() });
+    let answer = report(&mut control, SESSION).to_string();
+    assert!(answer.contains("user 7 may not ask"), "{answer}");
+    assert!(control.questions.poll().is_none(), "the peer is not asked");
+    control.ask_reload(&OWN);
+    assert_eq!(control.reload_asked, [OWN]);
+}
+
+#[test]
+fn settings_that_changed_end_the_sessions_of_other_users_that_they_exclude() {
+    const SHARES: SessionId = SessionId([4; 16]);
+    let mut control = with_users("");
+    connect(&mut control, SHARES, true);
+    control.registry.set_user(&SHARES, 7);
+    let is_there = |control: &Control, id| control.registry.session(&id).is_some();
+    let mut config = Config::clone(&control.config);
+    config.access = AccessRules::parse(RULES, "access.toml").unwrap();
+    control.set_config(config.clone());
+    assert!(!is_there(&control, SHARES), "rules cannot be kept to where memory is shared");
+    assert!(is_there(&control, SESSION) && is_there(&control, OWN));
+    config.trusted_uids.clear();
+    control.set_config(config);
+    assert!(!is_there(&control, SESSION), "its user is not trusted any more");
+    assert!(is_there(&control, OWN));
 }
