@@ -3,7 +3,7 @@
 use std::time::SystemTime;
 
 use axon_transport::status::{
-    OutOfRangeStatus, ReaderStatus, RefusalStatus, RefusedRouteStatus, WriterStatus,
+    LimitStatus, OutOfRangeStatus, ReaderStatus, RefusalStatus, RefusedRouteStatus, WriterStatus,
 };
 use serde_json::json;
 
@@ -82,6 +82,14 @@ fn link() -> LinkStatus {
     link.waiting.control = 17;
     link.waiting.bulk = 4_500_000;
     link.oldest_waits = Duration::from_millis(88);
+    let denied = ("publish /brake (the peer's)", "here: denied by access.toml:7");
+    link.denied = BTreeMap::from([(denied.0.to_owned(), denied.1.to_owned())]);
+    link.more_denied = 3;
+    let mut limit = LimitStatus::default();
+    (limit.verb, limit.name) = ("subscribe".to_owned(), "/camera".to_owned());
+    (limit.limit, limit.place) = ("30 msg/s".to_owned(), "access.toml:12".to_owned());
+    (limit.passed, limit.dropped) = (4_321, 98);
+    link.limits = vec![limit];
     link
 }
 
@@ -123,6 +131,13 @@ fn every_part_is_shown() {
         "LOCALHOST, lists robot-2; linked: none",
         "the range is LOCALHOST",
         "refused by the peer: no room",
+        "publish /brake (the peer's)",
+        "denied by access.toml:7",
+        "subscribe /camera",
+        "30 msg/s",
+        "access.toml:12",
+        "4,321",
+        "98",
     ] {
         assert!(text.contains(part), "{part:?} is missing in:\n{text}");
     }

@@ -178,6 +178,8 @@ fn the_wrong_topic_never_arrives_and_the_right_one_does_in_each_mode() {
                     && Hosts::shows(&hosts.base, "subscribe /secret (ours)", "access.toml")
                     && Hosts::shows(&hosts.base, "call /reboot (ours)", "access.toml")
             });
+            hosts.robot.wait_log(&["a peer's endpoints are denied by access rules", "access.toml"]);
+            hosts.base.wait_log(&["access rules of a peer deny endpoints of this host", "denied"]);
             let topic =
                 hosts.base.status().topics.into_iter().find(|t| t.topic == "/brake").unwrap();
             let waits = topic.refused.iter().find(|r| r.endpoint == brakes.gid().to_string());

@@ -175,8 +175,18 @@ fn bytes_beyond_a_limit_are_dropped_or_wait_in_both_directions() {
 
 #[test]
 fn an_egress_limit_slows_what_leaves_and_loses_nothing() {
+    egress_is_limited("peer = \"PEER\"", "(all packets)");
+}
+
+#[test]
+fn an_egress_limit_of_an_interface_slows_what_leaves_by_it_and_loses_nothing() {
+    egress_is_limited("interface = \"lo\"", "(all packets by lo)");
+}
+
+/// A limit of what leaves the robot, by peer or interface, with the name that status gives it.
+fn egress_is_limited(whose: &str, name: &str) {
     // All samples take two hundred seconds.
-    const EGRESS: &str = "default = \"allow\"\n[[limit]]\npeer = \"PEER\"\negress = \"10 kB/s\"\n";
+    let rules = format!("default = \"allow\"\n[[limit]]\n{whose}\negress = \"10 kB/s\"\n");
     let keys = tempfile::tempdir().unwrap();
     let settings = pinned(keys.path(), [[false, true], [true, false]]);
     let hosts = Hosts::start(settings, "host-1", keys);
@@ -185,7 +195,7 @@ fn an_egress_limit_slows_what_leaves_and_loses_nothing() {
     let (scan, scans) = (publisher(&here, "/scan"), subscription(&there, "/scan"));
     meet(&drives, &drive);
     meet(&scan, &scans);
-    hosts.write(EGRESS);
+    hosts.write(&rules);
     assert_eq!(hosts.reload().error, None);
     publish_long(&scan);
     // What comes in is not limited.
@@ -197,11 +207,11 @@ fn an_egress_limit_slows_what_leaves_and_loses_nothing() {
     // A link's status is renewed each second.
     until("the robot shows the limit, and that the rest waits", || {
         let link = hosts.robot.link();
-        link.waiting_bytes > 0 && limit(&hosts, "(all packets)").passed > 0
+        link.waiting_bytes > 0 && limit(&hosts, name).passed > 0
     });
     let egress = hosts.robot.link().limits;
     let [egress] = &egress[..] else { panic!("{egress:?}") };
-    assert_eq!((&*egress.verb, &*egress.name, egress.dropped), ("egress", "(all packets)", 0));
+    assert_eq!((&*egress.verb, &*egress.name, egress.dropped), ("egress", name, 0));
     assert!(!scan.wait_acknowledged(Duration::ZERO));
 
     hosts.write("default = \"allow\"\n[[limit]]\npeer = \"PEER\"\ntopic = \"/other\"\nrate = 1");
