@@ -128,9 +128,7 @@ impl<'t> Reader<'t> {
     }
 
     fn wrong(&self, span: Range<usize>, what: impl Into<String>) -> AccessError {
-        let before = self.text.get(..span.start).unwrap_or(self.text);
-        let line = before.matches('\n').count() + 1;
-        let column = before.rsplit('\n').next().unwrap_or("").chars().count() + 1;
+        let (line, column) = position(self.text, span.start);
         let number = |n: usize| u32::try_from(n).unwrap_or(u32::MAX);
         let (file, what) = (self.file.to_string(), what.into());
         AccessError { file, line: number(line), column: number(column), what }
@@ -301,4 +299,11 @@ impl<'t> Reader<'t> {
             )),
         }
     }
+}
+
+/// The line and the column, in characters, of a byte of a text, both counted from 1.
+pub(crate) fn position(text: &str, byte: usize) -> (usize, usize) {
+    let before = text.get(..byte).unwrap_or(text);
+    let column = before.rsplit('\n').next().unwrap_or("").chars().count() + 1;
+    (before.matches('\n').count() + 1, column)
 }

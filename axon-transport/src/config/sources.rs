@@ -12,7 +12,7 @@ use super::{
     files::{FileKind, Files},
     names, topics,
 };
-use crate::access::AccessRules;
+use crate::access::{AccessRules, parse::position};
 
 /// One setting as text, before anything is known about its value.
 #[derive(Clone, Debug)]
@@ -184,13 +184,11 @@ impl Sources {
         let text = String::from_utf8(bytes)
             .map_err(|_| ConfigError::value(names::CONFIG, &shown, "a file in UTF-8"))?;
         let table: toml::Table = text.parse().map_err(|error: toml::de::Error| {
-            let line = error.span().map_or(1, |span| {
-                1 + text.bytes().take(span.start).filter(|byte| *byte == b'\n').count()
-            });
+            let (line, column) = error.span().map_or((1, 1), |span| position(&text, span.start));
             ConfigError::value(
                 names::CONFIG,
                 &shown,
-                format!("a file in TOML; line {line}: {}", error.message()),
+                format!("a file in TOML; line {line}, column {column}: {}", error.message()),
             )
         })?;
 

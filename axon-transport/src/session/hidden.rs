@@ -280,6 +280,16 @@ impl Subscription {
         !self.session.is_forked() && self.inner.lock().reads(writer)
     }
 
+    /// Whether it is RELIABLE and KEEP_ALL.
+    pub fn may_lose_nothing(&self) -> bool {
+        self.inner.keeps_all()
+    }
+
+    /// Whether samples of `writer` wait that cannot be taken yet, for want of its memory or of our own.
+    pub fn is_held_up(&self, writer: &Gid) -> bool {
+        !self.session.is_forked() && self.inner.lock().slots().is_held_up(writer)
+    }
+
     /// For a relay: after what time [`take_of`](Self::take_of) may have a sample of this publisher, where it had none
     /// although some wait. It had passed over samples that do not count, or there was no memory for one.
     pub fn retry_of(&self, writer: &Gid) -> Option<Duration> {

@@ -32,6 +32,8 @@ pub struct Merge<T> {
     ways: BTreeMap<Gid, MergeSource<T>>,
     /// Whether a reader had more to be dropped than was looked at.
     behind: bool,
+    /// Whether a reader that may lose nothing had messages that it could not give.
+    held_up: bool,
 }
 
 #[derive(Debug)]
@@ -46,7 +48,7 @@ struct MergeSource<T> {
 
 impl<T> Default for Merge<T> {
     fn default() -> Self {
-        Self { given: None, ways: BTreeMap::new(), behind: false }
+        Self { given: None, ways: BTreeMap::new(), behind: false, held_up: false }
     }
 }
 
@@ -114,14 +116,26 @@ impl<T> Merge<T> {
         self.behind
     }
 
-    /// The next message. `take` has that of one reader.
-    pub fn next(&mut self, take: impl Fn(&Gid) -> Option<Taken<T>>) -> Option<Taken<T>> {
+    /// Whether a reader that may lose nothing has messages that it cannot give yet: there is no next one until it can.
+    pub fn is_held_up(&self) -> bool {
+        self.held_up
+    }
+
+    /// The next message. `take` has that of one reader. `waits` says of a reader that has none whether there are some that
+    /// it cannot give yet, for want of memory, and may not lose: what others have meanwhile may be newer.
+    pub fn next(
+        &mut self,
+        take: impl Fn(&Gid) -> Option<Taken<T>>,
+        waits: impl Fn(&Gid) -> bool,
+    ) -> Option<Taken<T>> {
         self.look(&take);
         if self.ways.len() > 1 && self.holds_any() {
             // Where there was nothing there may be by now what was written before that one.
             self.look(&take);
         }
-        if self.behind {
+        let without = |(reader, way): (&Gid, &MergeSource<T>)| way.next.is_none() && waits(reader);
+        self.held_up = self.ways.iter().any(without);
+        if self.behind || self.held_up {
             return None;
         }
         let there = self.ways.values_mut().filter(|way| way.next.is_some());
@@ -187,6 +201,11 @@ mod tests {
     #[derive(Default)]
     struct Readers(RefCell<HashMap<Gid, VecDeque<(u64, u64)>>>);
 
+    /// No reader waits for memory.
+    fn never(_: &Gid) -> bool {
+        false
+    }
+
     impl Readers {
         fn have(&self, reader: Gid, samples: impl IntoIterator<Item = (u64, u64)>) {
             self.0.borrow_mut().entry(reader).or_default().extend(samples);
@@ -208,7 +227,7 @@ mod tests {
     fn all(merge: &mut Merge<()>, readers: &Readers) -> Vec<(u64, u64)> {
         let mut all = Vec::new();
         loop {
-            let next = merge.next(|reader| readers.take(reader));
+            let next = merge.next(|reader| readers.take(reader), never);
             all.extend(next.as_ref().map(|next| (next.number, next.lost)));
             if next.is_none() && !merge.pass_over(|reader| readers.take(reader)) {
                 return all;
@@ -236,7 +255,7 @@ mod tests {
         let (mut merge, readers) = (merge(), Readers::default());
         readers.have(ONE, whole(1..=300));
         readers.have(OTHER, whole(1..=300));
-        let next = merge.next(|reader| readers.take(reader)).unwrap();
+        let next = merge.next(|reader| readers.take(reader), never).unwrap();
         assert_eq!(next.number, 1);
         while merge.pass_over(|reader| readers.take(reader)) {}
         assert!(merge.holds(&ONE) && merge.holds(&OTHER));
@@ -257,7 +276,7 @@ mod tests {
             }
             readers.take(reader)
         };
-        assert_eq!(merge.next(take).unwrap().number, 1);
+        assert_eq!(merge.next(take, never).unwrap().number, 1);
         assert!(all(&mut merge, &readers).into_iter().eq(whole(2..=5)));
     }
 
@@ -320,5 +339,26 @@ mod tests {
         merge.rewind();
         readers.have(ONE, whole(10..=10));
         assert!(all(&mut merge, &readers).into_iter().eq(whole(1..=10)));
+    }
+
+    #[test]
+    fn what_one_has_waits_for_another_that_may_lose_nothing_and_waits_for_memory() {
+        let mut merge = Merge::default();
+        merge.set([ONE, OTHER]);
+        let readers = Readers::default();
+        readers.have(ONE, [(1, 0)]);
+        readers.have(OTHER, [(1, 0)]);
+        let take = |reader: &Gid| readers.take(reader);
+        assert_eq!(merge.next(take, never).unwrap().number, 1);
+        // The memory of 2 to 8 has not come; the other one keeps the newest alone.
+        readers.have(OTHER, [(9, 7), (10, 7)]);
+        let waits = |reader: &Gid| *reader == ONE;
+        assert!(merge.next(take, waits).is_none() && merge.is_held_up());
+        assert!(merge.next(take, waits).is_none(), "however often it is asked");
+        readers.have(ONE, (2..=10).map(|number| (number, 0)));
+        let numbers: Vec<_> =
+            std::iter::from_fn(|| merge.next(take, never)).map(|next| next.number).collect();
+        assert_eq!(numbers, (2..=10).collect::<Vec<_>>());
+        assert!(!merge.is_held_up());
     }
 }

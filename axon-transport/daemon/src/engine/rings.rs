@@ -65,6 +65,11 @@ pub(crate) trait RingReader {
     /// over a number that do not count, such as expired ones, and then lets others have their turn; or there was no
     /// memory for a sample.
     fn retry_of(&self, publisher: &Gid) -> Option<Duration>;
+    /// Whether samples of this publisher wait that cannot be taken yet, for want of memory: of the publisher's that has
+    /// not come, or of this process.
+    fn is_held_up(&self, _publisher: &Gid) -> bool {
+        false
+    }
     /// Passes over all samples of this publisher but the newest `depth`.
     fn skip_of(&self, publisher: &Gid, depth: u64);
     /// How many samples of this publisher newer ones replaced before they were taken, or were passed over.

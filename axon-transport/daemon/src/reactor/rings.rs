@@ -155,6 +155,10 @@ impl RingReader for Relay {
         self.subscription.retry_of(publisher)
     }
 
+    fn is_held_up(&self, publisher: &Gid) -> bool {
+        self.subscription.is_held_up(publisher)
+    }
+
     fn lost_of(&self, publisher: &Gid) -> u64 {
         self.subscription.lost_of(publisher)
     }

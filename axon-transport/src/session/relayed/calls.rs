@@ -47,7 +47,9 @@ impl Calls {
         find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,
     ) -> Option<OutboundSample<Payload>> {
         let requests = self.requests.get_mut(client)?;
-        requests.next(|server| find(server)?.take_from(client).map(taken)).map(OutboundSample::from)
+        // Each server reads all requests, from the same memory: none is ahead of the others.
+        let next = requests.next(|server| find(server)?.take_from(client).map(taken), |_| false);
+        next.map(OutboundSample::from)
     }
 
     /// As [`request`](Self::request), for the session's end: one that is to be sent again comes first, and each is kept

@@ -244,6 +244,13 @@ impl Slots {
         self.has_from(writer).then(|| self.short_until().map_or(Duration::ZERO, wait))
     }
 
+    /// Whether samples of `writer` wait that cannot be taken yet, for want of its memory or of our own.
+    pub(in crate::session) fn is_held_up(&self, writer: &Gid) -> bool {
+        let mut slots = self.of(writer);
+        slots.any(|slot| slot.reader.missing().is_some())
+            || self.short_until().is_some() && self.has_from(writer)
+    }
+
     /// How many publishes of `writer` found no room, if a reader of its oldest sample is not done with that.
     pub(in crate::session) fn refused_of(&self, writer: &Gid) -> Option<u64> {
         self.of(writer).filter_map(|slot| slot.reader.refused()).max()

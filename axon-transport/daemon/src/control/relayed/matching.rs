@@ -249,7 +249,11 @@ pub(super) fn take(
     subscriptions: &BTreeMap<Gid, Subscription>,
     writer: &Gid,
 ) -> Option<OutboundSample<Payload>> {
-    source.samples.next(|reader| taken(subscriptions, reader, writer)).map(OutboundSample::from)
+    let waits = |reader: &Gid| {
+        subscriptions.get(reader).is_some_and(|s| s.may_lose_nothing() && s.is_held_up(writer))
+    };
+    let next = source.samples.next(|reader| taken(subscriptions, reader, writer), waits);
+    next.map(OutboundSample::from)
 }
 
 fn taken(

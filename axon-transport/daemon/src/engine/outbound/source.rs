@@ -111,6 +111,18 @@ impl Source {
         }
     }
 
+    /// Whether it may lose no sample of a publisher, and has some that it cannot give yet.
+    pub(super) fn is_held_up(&self, of: &Gid) -> bool {
+        match self {
+            Self::Relay(spec, reader) => {
+                let keeps_all = spec.qos.history == History::KeepAll
+                    && spec.qos.reliability == Reliability::Reliable;
+                keeps_all && reader.is_held_up(of)
+            }
+            Self::StandIn(_) => false,
+        }
+    }
+
     /// After what time a sample of this publisher may be taken, where none could be although some wait.
     pub(super) fn retry_of(&self, of: &Gid) -> Option<Duration> {
         match self {

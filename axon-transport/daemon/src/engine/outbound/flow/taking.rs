@@ -38,6 +38,8 @@ const DROPS: usize = 64;
 const AHEAD: usize = 1 << 20;
 /// Bytes that a KEEP_LAST flow moves that is behind. What it leaves in the ring is replaced there without a copy.
 const BEHIND: usize = 64 << 10;
+/// Where a relay that may lose nothing waits for memory, it is looked at again after this.
+const HELD_UP: Duration = Duration::from_millis(1);
 /// Turns that move a burst while QUIC takes nothing. A publisher that never rests must not keep the others waiting.
 const BURST: usize = 4;
 
@@ -210,8 +212,9 @@ impl Taking {
                 let most = limit(queue.room(), left, most_bytes - bytes);
                 if !self.take(sources, most, now) {
                     let behind = self.merge.is_behind().then_some(Duration::ZERO);
+                    let held_up = self.merge.is_held_up().then_some(HELD_UP);
                     let retries = sources.iter().filter_map(|source| source.retry_of(&self.of));
-                    self.retry = retries.chain(behind).min();
+                    self.retry = retries.chain(behind).chain(held_up).min();
                     self.more = self.retry.is_some();
                     if !self.more {
                         queue.handle_empty_ring(now);
@@ -288,9 +291,11 @@ impl Taking {
         let before = self.counted.replace((relay, lost));
         let counted = match before {
             Some((before, counted)) if before == relay => counted,
+            // Another relay asked for more until now, and sent what this one lost.
+            Some(_) => lost,
             // What a relay with history passes over when it begins is no loss.
-            _ if first.qos().durability == Durability::TransientLocal => lost,
-            _ => 0,
+            None if first.qos().durability == Durability::TransientLocal => lost,
+            None => 0,
         };
         let lost = lost.saturating_sub(counted);
         if let Some(limit) = &self.exceeded {
@@ -445,11 +450,13 @@ impl Taking {
             };
             return source.take_many(of, most, now, &mut each) > 0;
         }
-        let next = merge.next(|reader| {
-            let source = sources.iter().find(|source| source.gid() == *reader)?;
-            let content = source.take_of(of, now)?;
+        let of_reader = |reader: &Gid| sources.iter().find(|source| source.gid() == *reader);
+        let take = |reader: &Gid| {
+            let content = of_reader(reader)?.take_of(of, now)?;
             Some(Taken { number: content.info.sequence, lost: 0, content })
-        });
+        };
+        let waits = |reader: &Gid| of_reader(reader).is_some_and(|source| source.is_held_up(of));
+        let next = merge.next(take, waits);
         let there = next.is_some();
         taken.extend(next.map(|next| next.content));
         there
