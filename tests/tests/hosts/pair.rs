@@ -1,13 +1,17 @@
 //! Two hosts that list each other as peers, on addresses and in a domain of their own.
 
 use std::{
+    collections::BTreeSet,
     ffi::OsString,
     fs,
     net::Ipv4Addr,
     os::unix::{fs::PermissionsExt, process::CommandExt},
     path::Path,
     process::{Command, Stdio},
-    sync::atomic::{AtomicU32, Ordering},
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicU32, Ordering},
+    },
 };
 
 use axon_tests::Sizes;
@@ -74,8 +78,8 @@ impl Plan {
         let (pair, pid) = (PAIRS.fetch_add(1, Ordering::Relaxed), std::process::id());
         // A network that hardly anybody uses; another run of the tests at the same time has its own.
         let net = [(16 + pair % 200) as u8, (1 + pid % 250) as u8];
-        // Below 100: the tool's tests, whose daemons may still be in their grace time, are above.
-        let domain = 1 + (pid.wrapping_mul(31) + 2 * pair) % 98;
+        let lease = Arc::new(DomainLease::next(pid.wrapping_mul(31) + 2 * pair));
+        let domain = lease.0;
         let [addresses, ends] =
             [[1, 2], [4, 3]].map(|of| of.map(|host| Ipv4Addr::new(127, net[0], net[1], host)));
         [0, 1].map(|host| {
@@ -97,7 +101,8 @@ impl Plan {
             let graph = self.graph_mb.map_or_else(String::new, |mib| format!("graph_mb = {mib}\n"));
             let [grace_s, stalled_s] = [self.grace_s, self.stalled_s];
             let link = format!("[link]\ngrace_s = {grace_s}\nstalled_s = {stalled_s}\n{graph}");
-            Host::new(["A", "B"][host], addresses[host], settings, &link)
+            let lease = Arc::clone(&lease);
+            Host::new(["A", "B"][host], addresses[host], settings, &link, lease)
         })
     }
 }
@@ -110,6 +115,35 @@ pub(crate) struct Host {
     pub(crate) dir: tempfile::TempDir,
     env: Vec<(String, String)>,
     pub(crate) daemon: Option<Kept>,
+    /// Until no process of the host runs any more.
+    _lease: Arc<DomainLease>,
+}
+
+/// Two domains that no other test has meanwhile: hosts of one domain find each other by multicast.
+#[derive(Debug)]
+struct DomainLease(u32);
+
+static DOMAINS_IN_USE: Mutex<BTreeSet<u32>> = Mutex::new(BTreeSet::new());
+
+impl DomainLease {
+    /// The first pair of free domains from this one on.
+    fn next(from: u32) -> Self {
+        let mut in_use = DOMAINS_IN_USE.lock().unwrap();
+        // Below 100: the tool's tests, whose daemons may still be in their grace time, are above.
+        let all = (0..49).map(|later| 1 + (from / 2 + later) % 49 * 2);
+        let free = all.into_iter().find(|domain| !in_use.contains(domain));
+        let domain = free.expect("fewer than 50 pairs of hosts at a time");
+        in_use.insert(domain);
+        Self(domain)
+    }
+}
+
+impl Drop for DomainLease {
+    fn drop(&mut self) {
+        if let Ok(mut in_use) = DOMAINS_IN_USE.lock() {
+            in_use.remove(&self.0);
+        }
+    }
 }
 
 impl Host {
@@ -118,6 +152,7 @@ impl Host {
         address: Ipv4Addr,
         settings: impl IntoIterator<Item = (&'static str, String)>,
         toml: &str,
+        lease: Arc<DomainLease>,
     ) -> Self {
         let dir = tempfile::tempdir().unwrap();
         let path = |name: &str| dir.path().join(name).to_str().unwrap().to_owned();
@@ -133,7 +168,7 @@ impl Host {
             ("RUST_BACKTRACE".to_owned(), "1".to_owned()),
         ];
         env.extend(settings.into_iter().map(|(name, value)| (name.to_owned(), value)));
-        Self { name, address, dir, env, daemon: None }
+        Self { name, address, dir, env, daemon: None, _lease: lease }
     }
 
     /// Starts its daemon, which has none.
