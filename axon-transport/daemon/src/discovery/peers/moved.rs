@@ -14,8 +14,9 @@ impl Peers {
         let Some(record) = self.records.get_mut(&daemon).filter(|record| record.linked) else {
             return;
         };
-        // What is said again was not lost.
-        if std::mem::replace(&mut record.cut, !works) == !works || works {
+        let was_cut = std::mem::replace(&mut record.cut, !works);
+        // It is said again in case it was lost.
+        if works || was_cut {
             return;
         }
         record.ask_anew();
