@@ -69,7 +69,7 @@ mod tests {
             }
             other => panic!("{other:?}"),
         });
-        sent.last()
+        sent.collect::<Vec<_>>().last().copied()
     }
 
     fn answer(peers: &mut Peers, now: f64, nonce: [u8; 8]) {
