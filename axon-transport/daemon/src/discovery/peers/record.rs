@@ -247,12 +247,9 @@ impl Record {
         dial.in_flight = None;
         let doubled = BACKOFF_FIRST.saturating_mul(1 << dial.failures.min(16));
         dial.failures = dial.failures.saturating_add(1);
-        // Somebody who answers in its name keeps no other address out: that one is next.
-        let first = self.dials[standing as usize].first.filter(|_| self.cut);
-        if let Some(at) = self.sources.iter().position(|source| Some(source.address) == first) {
-            let last = self.sources.remove(at);
-            self.sources.push(last);
-            self.order();
+        let first = dial.first;
+        if self.cut {
+            self.put_last(first);
         }
         let stands = self.linked && !self.cut;
         let pause = if stands { DOUBT_AGAIN } else { doubled.min(BACKOFF_MOST) };
@@ -266,6 +263,16 @@ impl Record {
         let same = self.dials.iter().filter(|dial| dial.first.is_some() && dial.first == address);
         let last = same.filter_map(|dial| dial.last).chain(own).max();
         last.map_or(at, |last| at.max(last + DIAL_SPACING))
+    }
+
+    /// Puts an address behind the others of its standing. Somebody who answers there in the peer's name keeps none of
+    /// them out.
+    fn put_last(&mut self, address: Option<SocketAddr>) {
+        if let Some(at) = self.sources.iter().position(|source| Some(source.address) == address) {
+            let source = self.sources.remove(at);
+            self.sources.push(source);
+            self.order();
+        }
     }
 
     /// The path of its link is cut: where it answered before says nothing any more.

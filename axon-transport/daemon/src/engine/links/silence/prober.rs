@@ -124,6 +124,8 @@ pub(in crate::engine::links) struct Prober {
     asked: u32,
     /// When the first of them was sent.
     unanswered_since: Duration,
+    /// How many there were when the path was found cut last.
+    said_cut: Option<u32>,
     /// The last dial, and the pause after it.
     dialled: Option<(Duration, Duration)>,
 }
@@ -132,7 +134,8 @@ impl Prober {
     /// The link was found silent: a probe is due.
     pub(crate) fn new(side: Side) -> Self {
         let due = Duration::ZERO;
-        Self { side, next: Step::Probe, due, asked: 0, unanswered_since: due, dialled: None }
+        let next = Step::Probe;
+        Self { side, next, due, asked: 0, unanswered_since: due, said_cut: None, dialled: None }
     }
 
     /// Whether an answer to a probe counts.
@@ -153,11 +156,15 @@ impl Prober {
 
     /// Whether the path is taken for cut at the latest probe: those before were not answered, the first of them for two
     /// round trips. Said again from time to time, as long as that lasts.
-    pub(crate) fn finds_cut(&self, round_trip: Duration, now: Duration) -> bool {
+    pub(crate) fn find_cut(&mut self, round_trip: Duration, now: Duration) -> bool {
         let unanswered = self.asked.saturating_sub(1);
-        unanswered >= CUT
-            && (unanswered - CUT).is_multiple_of(CUT_AGAIN)
+        let cut = unanswered >= CUT
             && now.saturating_sub(self.unanswered_since) >= 2 * round_trip
+            && self.said_cut.is_none_or(|said| unanswered >= said + CUT_AGAIN);
+        if cut {
+            self.said_cut = Some(unanswered);
+        }
+        cut
     }
 
     /// When to call [`handle_timeout`](Self::handle_timeout).
@@ -177,7 +184,7 @@ impl Prober {
                     self.dialled = None;
                 }
                 if self.asked == 0 {
-                    self.unanswered_since = now;
+                    (self.unanswered_since, self.said_cut) = (now, None);
                 }
                 self.asked += 1;
             }

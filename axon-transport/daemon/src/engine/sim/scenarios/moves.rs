@@ -175,7 +175,7 @@ fn two_hosts_that_swap_their_addresses_flow_again_soon_with_a_third_and_lose_not
             .map(|(from, to, topic)| world.pair(from, to, topic, Qos::keep_all()));
         world.until(secs(20), World::is_whole);
         world.run_for(secs(1));
-        // Whoever answers a probe at the old address of one is the other one.
+        // Each of the two answers the probes that are sent to the old address of the other.
         world.swap_hosts(1, 2);
         for _ in 0..100 {
             pairs.iter().for_each(|pair| assert!(world.publish(*pair, 500), "the history is full"));
