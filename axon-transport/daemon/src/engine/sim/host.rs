@@ -22,13 +22,14 @@ use quinn_proto::{EcnCodepoint, Transmit};
 use rand::RngExt;
 
 use super::{
+    discovery::SimDiscovery,
     rings::{SimRings, session_key},
     rng::{Stream, stream},
 };
 use crate::{
     bridge::{ToControl, ToGateway, TrafficRules},
     daemon_key::DaemonKey,
-    discovery::{AddressConfidence, Interface},
+    discovery::Interface,
     engine::{
         Effect, Engine, EngineParts, credentials::Credentials, links::LinkParts, peer::MAX_ROUTES,
         transport::endpoint_config,
@@ -42,12 +43,6 @@ use crate::{
 
 /// The port of QUIC on each host.
 pub(super) const PORT: u16 = 61_300;
-/// Time between a failed dial, or the end of a link, and the next dial.
-const REDIAL: Duration = Duration::from_millis(250);
-
-/// A dial has come to an end after this time.
-const LONGEST_DIAL: Duration = Duration::from_secs(60);
-
 /// A simulated host.
 pub(super) struct Host {
     pub(super) number: usize,
@@ -62,15 +57,9 @@ pub(super) struct Host {
     engine: Option<Engine>,
     seed: u64,
     starts: u32,
-    /// Peers to be linked with, and when they are dialled next.
-    peers: BTreeMap<DaemonId, Wanted>,
+    discovery: SimDiscovery,
     /// The endpoints of each peer, as the control plane was told.
     pub(super) graph: BTreeMap<DaemonId, BTreeMap<Gid, RemoteEndpoint>>,
-    pub(super) linked: BTreeSet<DaemonId>,
-    /// Where links stand whose path does not work.
-    cut: BTreeMap<DaemonId, SocketAddr>,
-    /// Where links stand.
-    at: BTreeMap<DaemonId, SocketAddr>,
     pub(super) status: BTreeMap<String, LinkStatus>,
     pub(super) refusals: VecDeque<(Duration, String)>,
     pub(super) lost: BTreeMap<(String, &'static str), u64>,
@@ -90,14 +79,6 @@ pub(super) struct Host {
     rings_rang: bool,
     /// When the host has something to do, while nothing changed since that was asked.
     due: Cell<Option<Option<Duration>>>,
-    /// When dials began.
-    dialled: VecDeque<Duration>,
-}
-
-struct Wanted {
-    address: SocketAddr,
-    sae: Option<String>,
-    dial_at: Option<Duration>,
 }
 
 impl Host {
@@ -115,11 +96,8 @@ impl Host {
             engine: None,
             seed,
             starts: 0,
-            peers: BTreeMap::new(),
+            discovery: SimDiscovery::default(),
             graph: BTreeMap::new(),
-            linked: BTreeSet::new(),
-            cut: BTreeMap::new(),
-            at: BTreeMap::new(),
             status: BTreeMap::new(),
             refusals: VecDeque::new(),
             lost: BTreeMap::new(),
@@ -133,7 +111,6 @@ impl Host {
             rules: None,
             rings_rang: false,
             due: Cell::new(None),
-            dialled: VecDeque::new(),
         }
     }
 
@@ -181,22 +158,24 @@ impl Host {
             epoch_nanos: 1_000_000_000,
         };
         self.engine = Some(Engine::new(parts).unwrap());
-        (self.graph, self.linked) = (BTreeMap::new(), BTreeSet::new());
-        (self.cut, self.at) = (BTreeMap::new(), BTreeMap::new());
+        self.graph.clear();
         (self.requests, self.records) = (Vec::new(), Vec::new());
         self.interfaces_asked = false;
         self.status.clear();
-        for peer in self.peers.values_mut() {
-            peer.dial_at = Some(now);
-        }
+        self.discovery.start(self.daemon, now);
         self.graph_changed = true;
+    }
+
+    /// The peers that are linked.
+    pub(super) fn linked(&self) -> BTreeSet<DaemonId> {
+        self.discovery.linked()
     }
 
     /// Kills the daemon: it says nothing, and its state is gone.
     pub(super) fn kill(&mut self) {
         self.due.set(None);
         self.engine = None;
-        self.linked.clear();
+        self.discovery.kill();
         self.graph.clear();
     }
 
@@ -231,16 +210,13 @@ impl Host {
         now: Duration,
     ) {
         self.due.set(None);
-        let address = SocketAddr::from((address, PORT));
-        // The other one dials too, later, as discovery has it.
-        let wait = if self.daemon < daemon { Duration::ZERO } else { Duration::from_millis(300) };
-        self.peers.insert(daemon, Wanted { address, sae, dial_at: Some(now + wait) });
+        self.discovery.want(daemon, SocketAddr::from((address, PORT)), sae, now);
     }
 
     /// Forgets a peer that is gone.
     pub(super) fn unwant(&mut self, daemon: DaemonId) {
         self.due.set(None);
-        self.peers.remove(&daemon);
+        self.discovery.unwant(daemon);
     }
 
     /// Samples that wait for peers, in bytes.
@@ -297,10 +273,8 @@ impl Host {
 
     /// Checks that the host holds no more than it may.
     pub(super) fn check_held(&mut self, now: Duration) {
-        self.dialled.retain(|at| *at + LONGEST_DIAL >= now);
+        let dials = self.discovery.most_dials(now);
         if let Some(engine) = &self.engine {
-            // A silent link dials a successor again after 1, 2, 4 and 8 s, whatever became of the one before.
-            let dials = self.dialled.len() + 5 * self.peers.len();
             super::held::check(engine, self.config.reliable_queue as usize, dials);
         }
     }
@@ -308,18 +282,7 @@ impl Host {
     /// A peer has another address.
     pub(super) fn moved(&mut self, daemon: DaemonId, address: Ipv4Addr) {
         self.due.set(None);
-        if let Some(wanted) = self.peers.get_mut(&daemon) {
-            wanted.address = SocketAddr::from((address, PORT));
-            if self.cut.contains_key(&daemon) {
-                wanted.dial_at = Some(Duration::ZERO);
-            }
-        }
-    }
-
-    /// Whether a peer is looked for: it is not linked, or elsewhere than at the end of a path that does not work.
-    fn looks_for(&self, daemon: &DaemonId, wanted: &Wanted) -> bool {
-        !self.linked.contains(daemon)
-            || self.cut.get(daemon).is_some_and(|at| *at != wanted.address)
+        self.discovery.set_address(daemon, SocketAddr::from((address, PORT)));
     }
 
     /// The endpoints of the host changed.
@@ -397,18 +360,12 @@ impl Host {
             let came = came || !self.questions.is_empty();
             (came || self.interfaces_asked || !self.records.is_empty()).then_some(now)
         };
-        let dials = self.peers.iter().filter(|(daemon, wanted)| self.looks_for(daemon, wanted));
-        let dials = dials.filter_map(|(_, wanted)| wanted.dial_at).min();
-        [engine.poll_timeout(now), ready, dials].into_iter().flatten().min()
+        [engine.poll_timeout(now), ready, self.discovery.poll_timeout()].into_iter().flatten().min()
     }
 
     /// One pass of the host.
     pub(super) fn pass(&mut self, now: Duration) {
         self.due.set(None);
-        let looked_for = self.peers.iter().filter(|(daemon, wanted)| {
-            self.looks_for(daemon, wanted) && wanted.dial_at.is_some_and(|at| at <= now)
-        });
-        let looked_for: Vec<_> = looked_for.map(|(daemon, _)| *daemon).collect();
         let Some(engine) = &mut self.engine else { return };
         if std::mem::take(&mut self.graph_changed) {
             let range = EndpointRange { range: DiscoveryRange::Subnet, lists: Vec::new() };
@@ -439,13 +396,7 @@ impl Host {
             let first = self.used.insert(key_id);
             engine.handle_recorded(link, first, now);
         }
-        for daemon in looked_for {
-            let Some(wanted) = self.peers.get_mut(&daemon) else { continue };
-            wanted.dial_at = None;
-            self.dialled.push_back(now);
-            let (addresses, sae) = (vec![wanted.address], wanted.sae.clone());
-            let standing = AddressConfidence::Heard;
-            let dial = ToGateway::Dial { daemon, sae, addresses, listed: false, standing };
+        for dial in self.discovery.take_due(now) {
             engine.handle_order(dial, now);
         }
         if engine.poll_timeout(now).is_some_and(|due| due <= now) {
@@ -487,26 +438,17 @@ impl Host {
                 self.refusals.push_back((now, "silent".into()));
             }
             ToControl::LinkUp { daemon, address, .. } => {
-                self.linked.insert(daemon);
-                self.at.insert(daemon, address);
-                self.cut.remove(&daemon);
+                self.discovery.handle_link_up(daemon, address);
             }
-            ToControl::Path { daemon, works } => {
-                self.cut.remove(&daemon);
-                if let (false, Some(at)) = (works, self.at.get(&daemon)) {
-                    self.cut.insert(daemon, *at);
-                    self.redial(daemon, now);
-                }
-            }
+            ToControl::Path { daemon, works } => self.discovery.handle_path(daemon, works, now),
             ToControl::LinkDown { daemon, reason } => {
-                self.linked.remove(&daemon);
-                self.at.remove(&daemon);
-                self.cut.remove(&daemon);
                 self.graph.remove(&daemon);
                 self.refusals.push_back((now, format!("down: {reason}")));
-                self.redial(daemon, now);
+                self.discovery.handle_link_down(daemon, now);
             }
-            ToControl::DialFailed { daemon, .. } => self.redial(daemon, now),
+            ToControl::DialFailed { daemon, .. } => {
+                self.discovery.handle_dial_failed(daemon, now);
+            }
             ToControl::Refusal { peer, what, reason, .. } => {
                 self.refusals.push_back((now, format!("{peer}: {what}: {reason}")));
             }
@@ -532,13 +474,6 @@ impl Host {
                 self.status.insert(status.peer.clone(), *status);
             }
             _ => {}
-        }
-    }
-
-    fn redial(&mut self, daemon: DaemonId, now: Duration) {
-        if let Some(wanted) = self.peers.get_mut(&daemon) {
-            let wait = if self.daemon < daemon { REDIAL } else { 2 * REDIAL };
-            wanted.dial_at = Some(now + wait);
         }
     }
 

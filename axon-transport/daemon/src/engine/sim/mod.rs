@@ -2,10 +2,11 @@
 //!
 //! Everything follows from one seed, but for the bytes of TLS. [`network`] carries datagrams, [`script`] says which
 //! fault happens when, [`trace`] tells whether two runs were the same, and [`rng`] gives each part its own generator.
-//! [`rings`] models a host's rings, [`host`] a host with its engine, and [`world`] all hosts and the clock. [`run`] runs
-//! a script in a world. [`raw`] is a peer without an engine, and [`held`] checks that memory is bounded.
+//! [`rings`] models a host's rings, [`discovery`] whom it dials, [`host`] a host with its engine, and [`world`] all hosts
+//! and the clock. [`run`] runs a script in a world. [`raw`] is a peer without an engine, and [`held`] checks that memory is bounded.
 //! [`pair`] is less than all that: two QUIC connections alone.
 
+mod discovery;
 mod held;
 mod host;
 pub(crate) mod network;

@@ -397,7 +397,7 @@ impl World {
     pub(super) fn is_linked(&self) -> bool {
         let running = self.hosts.iter().filter(|host| host.is_running());
         running.clone().all(|host| {
-            running.clone().all(|o| o.number == host.number || host.linked.contains(&o.daemon))
+            running.clone().all(|o| o.number == host.number || host.linked().contains(&o.daemon))
         })
     }
 
@@ -419,7 +419,7 @@ impl World {
                 "host {} daemon {} linked {:?} lost {:?} waits for room {}",
                 host.number,
                 host.daemon,
-                host.linked.len(),
+                host.linked().len(),
                 host.lost,
                 host.rings.waits_for_room()
             );

@@ -64,11 +64,11 @@ fn hosts_beyond_the_links_of_a_daemon_are_refused_and_harm_no_link() {
     let beyond = if all_cases() { 40 } else { 3 };
     let hosts = 1 + MAX_LINKS + beyond;
     let mut world = World::apart(50, hosts, classic);
-    let first = |world: &World| world.hosts[0].linked.clone();
+    let first = |world: &World| world.hosts[0].linked();
     for host in 1..=MAX_LINKS {
         world.tell(host, 0);
     }
-    within(&mut world, secs(10), |world| world.hosts[0].linked.len() == MAX_LINKS);
+    within(&mut world, secs(10), |world| world.hosts[0].linked().len() == MAX_LINKS);
     let linked = first(&world);
     for host in MAX_LINKS + 1..hosts {
         world.tell(host, 0);
@@ -76,7 +76,7 @@ fn hosts_beyond_the_links_of_a_daemon_are_refused_and_harm_no_link() {
     world.run_for(secs(if all_cases() { 30 } else { 1 }));
     assert_eq!(first(&world), linked, "no link gave way: each address has one");
     for host in &world.hosts[MAX_LINKS + 1..] {
-        assert!(host.linked.is_empty());
+        assert!(host.linked().is_empty());
         let refused =
             host.refusals.iter().any(|(_, text)| text.contains("as many links as it may"));
         assert!(refused, "{:?}", host.refusals.front());
@@ -86,7 +86,7 @@ fn hosts_beyond_the_links_of_a_daemon_are_refused_and_harm_no_link() {
     // A link that ends makes place for one of those.
     world.kill(1, true);
     let place = |world: &World| {
-        world.hosts[MAX_LINKS + 1..].iter().filter(|host| !host.linked.is_empty()).count()
+        world.hosts[MAX_LINKS + 1..].iter().filter(|host| !host.linked().is_empty()).count()
     };
     world.until(secs(5), |world| place(world) == 1);
 }

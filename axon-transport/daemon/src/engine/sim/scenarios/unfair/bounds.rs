@@ -56,7 +56,7 @@ fn an_identity_has_16_links_under_whatever_ids() {
         assert!(why.contains("as many connections as it may"), "{why}");
     }
     linked_as(&mut world, 1, 0xf8);
-    assert_eq!(world.hosts[0].linked.len(), 17, "{}", world.describe());
+    assert_eq!(world.hosts[0].linked().len(), 17, "{}", world.describe());
     assert_eq!(open(&world), links);
     world.with_raw(0, |raw, now| raw.close(links[0], now));
     world.run_for(secs(1));

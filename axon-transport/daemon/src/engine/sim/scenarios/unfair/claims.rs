@@ -18,7 +18,7 @@ fn world(seed: u64, config: &Settings) -> World {
 }
 
 fn is_linked(world: &World, host: usize, with: usize) -> bool {
-    world.hosts[host].linked.contains(&world.hosts[with].daemon)
+    world.hosts[host].linked().contains(&world.hosts[with].daemon)
 }
 
 /// Samples cross from host 1 to host 0 for half a minute, and host 0 said who claimed the id.
