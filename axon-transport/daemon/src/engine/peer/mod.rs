@@ -2,6 +2,7 @@
 
 mod access;
 mod asking;
+mod control_queue;
 pub(super) mod kept;
 mod lanes;
 mod limits;
@@ -13,7 +14,7 @@ pub(super) mod stalls;
 mod surroundings;
 
 use std::{
-    collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
+    collections::{BTreeMap, BTreeSet, HashMap},
     rc::Rc,
     sync::Arc,
     time::{Duration, Instant},
@@ -36,6 +37,7 @@ use axon_transport::{
 use self::{
     access::PeerAccess,
     asking::{Asked, Attaching},
+    control_queue::ControlQueue,
     refused::RefusedRoutes,
     served::{Served, ServedRoutes},
     serving::DENIED_AGAIN,
@@ -68,8 +70,6 @@ use crate::{
 const POLL: Duration = Duration::from_millis(5);
 /// The same for each of them: thousands of pairs that wait leave time for samples.
 const POLL_EACH: Duration = Duration::from_micros(4);
-/// Links of which a peer is told again that they are closed: as many as may wait for their end.
-const SAID_CLOSED: usize = 8;
 /// Routes of a peer whose HELLO does not say how many it serves.
 pub(crate) const ROUTES_UNSAID: usize = 1024;
 
@@ -125,9 +125,7 @@ pub(crate) struct Peer {
     served: ServedRoutes,
     alive: Alive,
     answering: BTreeSet<Gid>,
-    messages: VecDeque<Message>,
-    /// Links with it that were closed while their packets did not arrive, the latest of them.
-    closed: Vec<LinkClosed>,
+    messages: ControlQueue,
 }
 
 /// The parts of a new peer.
@@ -195,15 +193,14 @@ impl Peer {
             served: ServedRoutes::default(),
             alive: Alive::default(),
             answering: BTreeSet::new(),
-            messages: VecDeque::new(),
-            closed: Vec::new(),
+            messages: ControlQueue::default(),
         }
     }
 
     /// A successor took over. The peer's routes stand; this side asks for its own again.
     pub(super) fn succeed(&mut self, link: u64, binding: Option<Binding>, local: &Local) {
         self.link = link;
-        self.messages.clear();
+        self.messages.succeed();
         self.prover.succeed(binding);
         self.remote.succeed();
         let visible = self.visible(local);
@@ -216,24 +213,19 @@ impl Peer {
         self.served.iter_mut().for_each(|(_, served)| served.repeated = false);
     }
 
-    /// Tells the peer which links are closed here, whose packets may not arrive. The one that takes over may have come
-    /// before those said earlier left: they are said again.
+    /// Tells the peer which links are closed here.
     pub(super) fn say_closed(&mut self, closed: Option<LinkClosed>) {
-        self.closed.extend(closed);
-        let before = self.closed.len().saturating_sub(SAID_CLOSED);
-        self.closed.drain(..before);
-        let all: Vec<_> = self.closed.iter().copied().map(Message::LinkClosed).collect();
-        all.into_iter().for_each(|message| self.say(message));
+        self.messages.say_closed(closed);
     }
 
     /// Queues a control message.
     pub(super) fn say(&mut self, message: Message) {
-        self.messages.push_back(message);
+        self.messages.say(message);
     }
 
     /// The next control message.
     pub(super) fn poll_message(&mut self) -> Option<Message> {
-        self.messages.pop_front()
+        self.messages.poll()
     }
 
     /// A message of the peer that concerns it alone.
@@ -402,7 +394,7 @@ impl Peer {
             Told { remote, denied }
         };
         let now: BTreeMap<_, _> = visible.into_iter().map(|(gid, e)| (gid, told(e))).collect();
-        self.messages.extend(self.told.tell(now, whole));
+        self.told.tell(now, whole).into_iter().for_each(|message| self.messages.say(message));
     }
 
     /// The peer asks for the whole graph.
@@ -449,7 +441,7 @@ impl Peer {
             Source::StandIn(_) => Vec::new(),
         });
         for publishers in self.alive.news(epoch + now, asserted) {
-            self.messages.push_back(Message::Asserted(Asserted { publishers }));
+            self.say(Message::Asserted(Asserted { publishers }));
         }
     }
 

@@ -1,0 +1,82 @@
+//! The control messages that wait to be sent to one peer.
+
+use std::collections::VecDeque;
+
+use crate::link::{LinkClosed, Message};
+
+/// Links of which a peer is told again that they are closed: as many as may wait for their end.
+const SAID_CLOSED: usize = 8;
+
+/// Control messages for one peer, in order.
+#[derive(Default)]
+pub(super) struct ControlQueue {
+    messages: VecDeque<Message>,
+    /// Links that were closed while their packets did not arrive, the latest of them.
+    closed: Vec<LinkClosed>,
+}
+
+impl ControlQueue {
+    /// Adds a message.
+    pub(super) fn say(&mut self, message: Message) {
+        self.messages.push_back(message);
+    }
+
+    /// The next message.
+    pub(super) fn poll(&mut self) -> Option<Message> {
+        self.messages.pop_front()
+    }
+
+    /// Another link takes over: what was not sent is not sent.
+    pub(super) fn succeed(&mut self) {
+        self.messages.clear();
+    }
+
+    /// Adds that a link is closed, whose packets may not arrive, and once more of those before it: the link that takes
+    /// over may have come before these messages left.
+    pub(super) fn say_closed(&mut self, closed: Option<LinkClosed>) {
+        self.closed.extend(closed);
+        let before = self.closed.len().saturating_sub(SAID_CLOSED);
+        self.closed.drain(..before);
+        self.messages.extend(self.closed.iter().copied().map(Message::LinkClosed));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn closed(number: u8) -> LinkClosed {
+        LinkClosed { link: [number; 16] }
+    }
+
+    /// The links that are said to be closed.
+    fn said(queue: &mut ControlQueue) -> Vec<LinkClosed> {
+        let messages = std::iter::from_fn(|| queue.poll()).map(|message| match message {
+            Message::LinkClosed(closed) => closed,
+            other => panic!("{other:?}"),
+        });
+        messages.collect()
+    }
+
+    #[test]
+    fn closed_links_are_said_again_over_each_link_that_takes_over() {
+        let mut queue = ControlQueue::default();
+        queue.say_closed(Some(closed(1)));
+        queue.say_closed(None);
+        assert_eq!(said(&mut queue), [closed(1), closed(1)]);
+        // The message about the second link is lost with the link over which it was to be sent.
+        queue.say_closed(Some(closed(2)));
+        queue.succeed();
+        queue.say_closed(Some(closed(3)));
+        assert_eq!(said(&mut queue), [1, 2, 3].map(closed));
+    }
+
+    #[test]
+    fn the_latest_closed_links_alone_are_remembered() {
+        let mut queue = ControlQueue::default();
+        (0..20).for_each(|number| queue.say_closed(Some(closed(number))));
+        queue.succeed();
+        queue.say_closed(None);
+        assert_eq!(said(&mut queue), [12, 13, 14, 15, 16, 17, 18, 19].map(closed));
+    }
+}
