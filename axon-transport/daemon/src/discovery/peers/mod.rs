@@ -7,21 +7,13 @@
 mod announcing;
 mod bucket;
 mod candidates;
-#[cfg(test)]
-mod claims;
 mod dialling;
 mod eviction;
-#[cfg(test)]
-mod flood;
-#[cfg(test)]
-mod goodbye;
 mod local;
 mod moved;
 mod probing;
 mod receiving;
 mod record;
-#[cfg(test)]
-mod simulation;
 #[cfg(test)]
 mod tests;
 

@@ -1,9 +1,6 @@
 //! Handles goodbyes, from daemons that end and from forgers.
 
-use super::{
-    tests::{HIGHER, LOWER, actions, beacon, dials, fail, from, hear, local, secs, settled},
-    *,
-};
+use super::*;
 use crate::wire::beacon::{Beacon, Datagram};
 
 #[test]

@@ -1,9 +1,6 @@
 //! Tests with forged beacons: an honest host is still found and dialled, and no forged record remains.
 
-use super::{
-    tests::{HIGHER, LOWER, OWN, beacon, from, local, secs, settled},
-    *,
-};
+use super::*;
 use crate::wire::beacon::{Beacon, Datagram};
 
 /// When the honest host starts; the forger began before it.

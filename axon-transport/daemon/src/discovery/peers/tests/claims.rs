@@ -1,9 +1,6 @@
 //! A link whose peer did not prove its id keeps nobody from being dialled who may have the id.
 
-use super::{
-    tests::{HIGHER, LOWER, actions, beacon, dials, from, hear, local, secs, settled},
-    *,
-};
+use super::*;
 use crate::wire::beacon::Datagram;
 
 const OWNER: &str = "10.0.0.2:61301";

@@ -1,5 +1,10 @@
 //! Tests one state machine with hand-made events.
 
+mod claims;
+mod flood;
+mod goodbye;
+mod simulation;
+
 use axon_transport::config::QkdPeers;
 use proptest::{collection::vec, prelude::*};
 
