@@ -60,8 +60,8 @@ pub(super) struct Taking {
     more: bool,
     /// After what time that is looked at again, where the last turn moved none.
     retry: Option<Duration>,
-    /// The relay whose losses are counted, and how many are.
-    counted: Option<(Gid, u64)>,
+    /// Samples that each relay is known to have lost.
+    known_lost: Vec<(Gid, u64)>,
     limit: RouteLimit,
     /// The limit that the last turn came to. What newer samples replaced in the ring since is lost for it.
     exceeded: Option<Exceeded>,
@@ -88,7 +88,7 @@ impl Taking {
             held: false,
             more: false,
             retry: None,
-            counted: None,
+            known_lost: Vec::new(),
             limit,
             exceeded: None,
             dropped: None,
@@ -279,25 +279,29 @@ impl Taking {
     }
 
     /// Counts the samples that newer ones replaced in the ring. The relay that asks for most loses the fewest: a sample
-    /// that it has is sent.
+    /// that it has is sent. What others lose meanwhile is noted, and does not count when one of them takes its place.
     pub(super) fn count_overwritten(
         &mut self,
         sources: &[Source],
         topic: &Arc<str>,
         counters: &Counters,
     ) {
-        let Some(first) = sources.iter().find(|source| source.reads(&self.of)) else { return };
-        let (relay, lost) = (first.gid(), first.lost_of(&self.of));
-        let before = self.counted.replace((relay, lost));
-        let counted = match before {
-            Some((before, counted)) if before == relay => counted,
-            // Another relay asked for more until now, and sent what this one lost.
-            Some(_) => lost,
-            // What a relay with history passes over when it begins is no loss.
-            None if first.qos().durability == Durability::TransientLocal => lost,
-            None => 0,
-        };
-        let lost = lost.saturating_sub(counted);
+        self.known_lost.retain(|(relay, _)| sources.iter().any(|source| source.gid() == *relay));
+        let mut first = None;
+        for source in sources.iter().filter(|source| source.reads(&self.of)) {
+            let (relay, lost) = (source.gid(), source.lost_of(&self.of));
+            let known = match self.known_lost.iter_mut().find(|(known, _)| *known == relay) {
+                Some((_, known)) => std::mem::replace(known, lost),
+                None => {
+                    self.known_lost.push((relay, lost));
+                    // What a relay with history passes over when it begins is no loss.
+                    let history = source.qos().durability == Durability::TransientLocal;
+                    if history { lost } else { 0 }
+                }
+            };
+            first = first.or(Some(lost.saturating_sub(known)));
+        }
+        let Some(lost) = first else { return };
         if let Some(limit) = &self.exceeded {
             limit.dropped(lost);
         }

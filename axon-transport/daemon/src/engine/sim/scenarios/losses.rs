@@ -44,6 +44,37 @@ fn counted(world: &World, topic: &str) -> u64 {
 }
 
 #[test]
+fn what_one_relay_lost_while_another_sent_it_is_not_counted() {
+    let (mut world, pair) = attached(60, Qos::keep_all(), Path::default());
+    // It has a relay of its own, which keeps the last samples alone.
+    let last = world.hosts[1].rings.create_subscription("/t", Qos::default(), None);
+    world.hosts[1].touch_graph();
+    world.run_for(secs(1));
+    let (host, publisher) = pair.publisher;
+    let (subscriber, subscription) = pair.subscription;
+    let burst = |world: &mut World| {
+        for _ in 0..200 {
+            assert!(world.hosts[host].rings.publish(publisher, 10));
+        }
+        world.hosts[host].ring();
+        world.run_for(secs(1));
+    };
+    burst(&mut world);
+    assert_eq!(world.received(pair).len(), 200);
+    // From now on the other relay is the one that asks for most.
+    world.hosts[subscriber].rings.end(subscription);
+    world.hosts[subscriber].touch_graph();
+    world.run_for(secs(2));
+    assert_eq!(counted(&world, "/t"), 0, "{}", world.describe());
+    // What it loses itself counts, from the first sample.
+    burst(&mut world);
+    let came = world.hosts[subscriber].rings.received(last, publisher);
+    let after = came.iter().filter(|number| **number > 200).count() as u64;
+    assert!(after < 200, "nothing is lost: the test shows nothing");
+    assert_eq!(counted(&world, "/t"), 200 - after, "{}", world.describe());
+}
+
+#[test]
 fn each_sample_that_does_not_arrive_is_counted_once() {
     let slow = Rate::new(2_000_000, millis(50));
     let slow = Path { delay: millis(2), rate: Some(slow), ..Path::default() };
