@@ -3,10 +3,11 @@
 use std::{
     collections::{BTreeMap, BTreeSet},
     rc::Rc,
+    sync::Arc,
     time::Instant,
 };
 
-use axon_shm::ids::DaemonId;
+use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::{
     access::{Permissions, Verb},
     graph::{Endpoint, EndpointKind},
@@ -18,7 +19,10 @@ use axon_transport::{
     status::{LinkStatus, PeerDecision},
 };
 
-use super::refused::shown;
+use super::{
+    judged::{Judged, Judgement},
+    refused::shown,
+};
 use crate::{
     bridge::RefusedRoute,
     engine::{
@@ -60,6 +64,7 @@ fn kind_of(verb: Verb) -> EndpointKind {
 /// The rules about one peer.
 pub(super) struct PeerAccess {
     permissions: Permissions,
+    judged: Judged,
     /// Uses by endpoints of the peer that are denied here, with what remembers them. The peer was told.
     here: BTreeMap<Use, (String, Charge)>,
     /// Uses by endpoints of this host that the peer's host denies, with what remembers them.
@@ -77,7 +82,8 @@ impl PeerAccess {
         let (here, there) = (BTreeMap::new(), BTreeMap::new());
         let (room, places) = (Rc::clone(&account.refusals), Rc::clone(&account.denied));
         let asked = BTreeMap::new();
-        Self { permissions, here, there, room, places, asked, logged: LogLimit::default() }
+        let (judged, logged) = (Judged::default(), LogLimit::default());
+        Self { permissions, judged, here, there, room, places, asked, logged }
     }
 
     pub(super) fn permissions(&self) -> &Permissions {
@@ -87,6 +93,17 @@ impl PeerAccess {
 
     pub(super) fn set_permissions(&mut self, permissions: Permissions) {
         self.permissions = permissions;
+        self.judged.clear();
+    }
+
+    /// What the peer may see and use of an endpoint of this host.
+    pub(super) fn judge(&mut self, endpoint: &Arc<Endpoint>) -> Judgement {
+        self.judged.judge(&self.permissions, endpoint)
+    }
+
+    /// Forgets endpoints of this host that are gone.
+    pub(super) fn retain_judged(&mut self, stands: impl Fn(&Gid) -> bool) {
+        self.judged.retain(stands);
     }
 
     /// Why the peer may not do this, if it may not.
@@ -246,7 +263,6 @@ fn parts(denied: Vec<DeniedUse>, lifted: Vec<DeniedUse>) -> Vec<Message> {
 
 #[cfg(test)]
 mod tests {
-    use axon_shm::ids::Gid;
     use axon_transport::access::{AccessRules, Party};
 
     use super::*;

@@ -3,6 +3,7 @@
 mod access;
 mod asking;
 mod control_queue;
+mod judged;
 pub(super) mod kept;
 mod lanes;
 mod limits;
@@ -26,11 +27,7 @@ use axon_transport::{
     access::{Permissions, Verb},
     config::{Config, DiscoveryRange},
     graph::EndpointKind,
-    internal::{
-        events::Alive,
-        graph::{RemoteEndpoint, permits_use, shows},
-        wire::session::CheckedUse,
-    },
+    internal::{events::Alive, graph::RemoteEndpoint, wire::session::CheckedUse},
     status::{LinkStatus, PeerDecision},
 };
 
@@ -278,7 +275,7 @@ impl Peer {
     }
 
     /// The endpoints of this host that the peer may see.
-    fn shown(&self, local: &Local) -> BTreeMap<Gid, RemoteEndpoint> {
+    fn shown(&mut self, local: &Local) -> BTreeMap<Gid, RemoteEndpoint> {
         let listed = self.remote.endpoints().any(|remote| remote.toward.lists);
         let shown = local.iter().filter_map(|(gid, (endpoint, reach))| {
             let toward = reach.toward(self.daemon);
@@ -293,8 +290,11 @@ impl Peer {
     }
 
     /// What access rules let the peer see of these.
-    fn permitted(&self, mut all: BTreeMap<Gid, RemoteEndpoint>) -> BTreeMap<Gid, RemoteEndpoint> {
-        all.retain(|_, e| shows(self.access.permissions(), &e.endpoint));
+    fn permitted(
+        &mut self,
+        mut all: BTreeMap<Gid, RemoteEndpoint>,
+    ) -> BTreeMap<Gid, RemoteEndpoint> {
+        all.retain(|_, e| self.access.judge(&e.endpoint).shown);
         all
     }
 
@@ -373,7 +373,7 @@ impl Peer {
         !self.ending.is_empty()
     }
 
-    fn visible(&self, local: &Local) -> BTreeMap<Gid, RemoteEndpoint> {
+    fn visible(&mut self, local: &Local) -> BTreeMap<Gid, RemoteEndpoint> {
         let mut visible = self.ending.clone();
         visible.extend(self.shown(local));
         visible
@@ -389,11 +389,12 @@ impl Peer {
     pub(super) fn send_graph(&mut self, local: &Local, whole: bool) {
         let visible = self.visible(local);
         self.prove(&visible);
-        let told = |remote: RemoteEndpoint| {
-            let denied = !permits_use(self.access.permissions(), &remote.endpoint);
+        let mut told = |remote: RemoteEndpoint| {
+            let denied = !self.access.judge(&remote.endpoint).usable;
             Told { remote, denied }
         };
         let now: BTreeMap<_, _> = visible.into_iter().map(|(gid, e)| (gid, told(e))).collect();
+        self.access.retain_judged(|gid| local.contains_key(gid) || self.ending.contains_key(gid));
         self.told.tell(now, whole).into_iter().for_each(|message| self.messages.say(message));
     }
 
