@@ -314,3 +314,69 @@ fn daemons_of_one_identity_have_its_rules_and_share_its_bucket() {
     }
     assert!((10..=20).contains(&came), "{came} of 200, {}", world.describe());
 }
+
+#[test]
+fn a_denied_peer_neither_speaks_for_an_endpoint_of_a_permitted_one_nor_keeps_it_out() {
+    for claims_first in [true, false] {
+        let mut world = World::apart(41, 2, |_| Config::default());
+        world.add_raw(Config::default(), LOWEST);
+        let pair = world.pair(1, 0, "/cmd_vel", Qos::keep_all());
+        let publisher = pair.publisher.1;
+        let subscription = pair.subscription.1;
+        world.hosts[0].rings.create_subscription("/open", Qos::keep_all(), None);
+        let denied_here = format!(
+            "[[deny]]\npeer = \"address:{}\"\npublish = \"/cmd_vel\"",
+            world.raws[0].address
+        );
+        world.hosts[0].set_access(&denied_here);
+        let link_owner = |world: &mut World| {
+            world.tell(1, 0);
+            world.until(secs(5), |world| world.hosts[0].linked().contains(&world.hosts[1].daemon));
+            world.run_for(secs(1));
+        };
+        if !claims_first {
+            link_owner(&mut world);
+        }
+        let on = dial(&mut world, 0);
+        greet(&mut world, on, None);
+        say(&mut world, on, &elect(1));
+        let Message::Graph(mut graph) = publishes("/cmd_vel", publisher, Qos::keep_all()) else {
+            unreachable!()
+        };
+        let Message::Graph(other) = publishes("/open", of_raw(2), Qos::keep_all()) else {
+            unreachable!()
+        };
+        graph.added.extend(other.added);
+        say(&mut world, on, &Message::Graph(graph));
+        let route = asked(&mut world, on, "/open");
+        let pretend = |world: &mut World, numbers: std::ops::RangeInclusive<u64>| {
+            for route in [route, route + 1, route + 2] {
+                open(world, on, samples(route, "/cmd_vel", publisher, numbers.clone()));
+            }
+            world.run_for(secs(1));
+        };
+        pretend(&mut world, 1..=3);
+        assert!(received(&world, subscription, publisher).is_empty(), "{claims_first}");
+        if claims_first {
+            link_owner(&mut world);
+        }
+        (0..5).for_each(|_| assert!(world.publish(pair, 10)));
+        world.run_for(secs(2));
+        assert_eq!(world.received(pair), [1, 2, 3, 4, 5], "{claims_first}: {}", world.describe());
+        pretend(&mut world, 6..=9);
+        // Also where the rules permit it by now: the endpoint has its host.
+        world.hosts[0].set_access(OPEN);
+        world.run_for(secs(2));
+        pretend(&mut world, 6..=9);
+        assert_eq!(world.received(pair), [1, 2, 3, 4, 5], "{claims_first}: {}", world.describe());
+        assert!(!asks(&world, on, "/cmd_vel"));
+        assert!(world.publish(pair, 10));
+        world.run_for(secs(2));
+        assert_eq!(
+            world.received(pair),
+            [1, 2, 3, 4, 5, 6],
+            "{claims_first}: {}",
+            world.describe()
+        );
+    }
+}
