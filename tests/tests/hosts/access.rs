@@ -8,7 +8,11 @@ mod odd_names;
 mod reload;
 mod users;
 
-use std::{fs, path::PathBuf, time::Duration};
+use std::{
+    fs,
+    path::PathBuf,
+    time::{Duration, Instant},
+};
 
 use axon_transport::{
     EndpointSpec, Event, Publisher, Session, Subscription,
@@ -207,11 +211,13 @@ fn a_daemon_takes_rules_that_changed_and_refuses_those_that_are_wrong() {
     assert!(report.changed.is_empty() && drive.matched().contains(&drives.gid()));
 
     hosts.write("default = \"deny\"\n[[allow]]\npeer = \"PEER\"\nsubscribe = \"/scan\"\n");
+    let asked = Instant::now();
     let report = hosts.reload();
     assert_eq!((report.changed, report.error), (vec!["access rules".to_owned()], None));
     until("the pair that is not allowed any more ends on both hosts", || {
         drive.matched().is_empty() && drives.matched().is_empty()
     });
+    eprintln!("the pair ends {:?} after its rules are read again", asked.elapsed());
     drives.publish(b"late").unwrap();
     scan.publish(b"still").unwrap();
     let mut bytes = Vec::new();
