@@ -280,6 +280,11 @@ impl Engine {
                 }
             }
             LinkEvent::Back(daemon) => self.back(daemon, now),
+            LinkEvent::Closed(daemon, closed) => {
+                if let Some(peer) = self.peers.get_mut(daemon) {
+                    peer.say_closed(Some(closed));
+                }
+            }
             LinkEvent::Gone(number, daemon) => {
                 if let Some(peer) = self.peers.get_mut(daemon) {
                     peer.inbound.link_over(number);

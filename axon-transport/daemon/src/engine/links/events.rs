@@ -33,6 +33,8 @@ pub(in crate::engine) enum LinkEvent {
     Silent(DaemonId),
     /// A peer that was silent is back, over the same link.
     Back(DaemonId),
+    /// A superseded link of this peer is given up, whose packets do not arrive. To be said over the link in use.
+    Closed(DaemonId, LinkClosed),
     /// A link that was not in use is over: nothing more of its streams can be read.
     Gone(u64, DaemonId),
     /// The last link of a peer is over.

@@ -41,6 +41,24 @@ impl Links {
         elected.filter(|_| silent).map(|elected| LinkClosed { link: elected.link })
     }
 
+    /// Gives up superseded links over which nothing comes although their peers are heard over the links in use. What is sent
+    /// again there waits for the streams of these.
+    pub(super) fn look_for_silent_leaving(&mut self) {
+        for (number, daemon) in self.leaving() {
+            let current = self.table.current_peer(daemon);
+            let Some(heard_at) = current.map(|peer| peer.silence.heard_at()) else { continue };
+            let Some(peer) = self.table.peer_mut(number) else { continue };
+            if peer.silence.handle_second_superseded(heard_at) {
+                tracing::debug!(link = number, "nothing comes over the superseded link");
+                if let Some(elected) = peer.elected {
+                    let closed = LinkClosed { link: elected.link };
+                    self.outbox.event(LinkEvent::Closed(daemon, closed));
+                }
+                self.connections.touch(number);
+            }
+        }
+    }
+
     fn leaving_of(&mut self, daemon: DaemonId) -> impl Iterator<Item = (u64, &mut Link)> {
         self.table.iter_mut().filter(move |(_, link)| {
             let of_peer =

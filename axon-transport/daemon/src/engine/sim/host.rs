@@ -171,6 +171,11 @@ impl Host {
         self.discovery.linked()
     }
 
+    /// How many superseded links it has.
+    pub(super) fn leaving(&self) -> usize {
+        self.engine.as_ref().map_or(0, |engine| engine.links.leaving().len())
+    }
+
     /// Kills the daemon: it says nothing, and its state is gone.
     pub(super) fn kill(&mut self) {
         self.due.set(None);

@@ -81,6 +81,7 @@ impl Links {
                 self.probe(number, now);
             }
         }
+        self.look_for_silent_leaving();
     }
 
     fn send_probe(&mut self, number: u64, to: SocketAddr, nonce: Nonce) {

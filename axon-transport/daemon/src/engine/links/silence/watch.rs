@@ -7,6 +7,9 @@ use crate::link::Side;
 
 /// A link over which nothing came for so long is probed, even if nothing was asked: two of QUIC's keep-alives are lost.
 const UNHEARD: Duration = Duration::from_secs(10);
+/// A superseded link over which nothing came for so long before the last that came over the link in use is silent. It may
+/// be idle as well: nothing is lost with it, since all that is not acknowledged was sent again over its successor.
+const OUTLIVED: Duration = Duration::from_secs(3);
 /// A peer that is silent for so long is taken for gone. Its link stands until QUIC gives it up.
 const GONE: Duration = Duration::from_secs(20);
 
@@ -144,6 +147,22 @@ impl Silence {
         self.silent &= !traffic.answered_since(self.traffic);
         self.probing = None;
         self.silent
+    }
+
+    /// When something came last.
+    pub(in crate::engine::links) fn heard_at(&self) -> Duration {
+        self.heard_at
+    }
+
+    /// Looks at a superseded link once a second. Over the link in use something came last at `heard_at`. Returns whether
+    /// this one is silent from now on.
+    pub(in crate::engine::links) fn handle_second_superseded(
+        &mut self,
+        heard_at: Duration,
+    ) -> bool {
+        let cut = !self.silent && heard_at.saturating_sub(self.heard_at) >= OUTLIVED;
+        self.silent |= cut;
+        cut
     }
 
     pub(in crate::engine::links) fn poll_timeout(&self) -> Option<Duration> {
@@ -316,6 +335,21 @@ mod tests {
         assert!(silence.is_gone());
         assert!(silence.handle_heard(traffic(2, 1, 1), second(23)));
         assert!(!silence.is_gone());
+    }
+
+    #[test]
+    fn a_superseded_link_is_silent_once_its_successor_is_heard_and_it_is_not() {
+        let mut silence = Silence::new(Side::Client, START);
+        silence.handle_heard(traffic(1, 1, 1), START);
+        assert!(!silence.handle_superseded(traffic(1, 1, 1)));
+        // The path may be cut for both.
+        assert!(!silence.handle_second_superseded(second(2)));
+        assert!(!silence.is_silent());
+        silence.handle_heard(traffic(2, 2, 2), second(4));
+        assert!(!silence.handle_second_superseded(second(6)));
+        assert!(silence.handle_second_superseded(second(7)));
+        assert!(!silence.handle_second_superseded(second(8)), "once");
+        assert!(silence.is_silent());
     }
 
     #[test]

@@ -9,12 +9,15 @@
 use std::time::Duration;
 
 use axon_shm::qos::Qos;
-use axon_transport::config::Config;
+use axon_transport::config::{Config, KeyMode, Security};
 
-use crate::engine::sim::{
-    network::{Filtering, Path},
-    tests::{millis, modes, secs},
-    world::{Pair, World},
+use crate::engine::{
+    keyring::tests::config as qkd,
+    sim::{
+        network::{Filtering, Path},
+        tests::{millis, modes, secs},
+        world::{Pair, World},
+    },
 };
 
 /// Two linked hosts with samples in both directions; the first is behind a NAT, if so.
@@ -47,10 +50,23 @@ impl Moving {
     fn publish(&mut self, time: Duration) {
         let end = self.world.now + time;
         while self.world.now < end {
-            for (pair, published) in self.pairs.iter().zip(&mut self.published) {
-                *published += u64::from(self.world.publish(*pair, 500));
-            }
+            self.publish_one();
             self.world.run_for(millis(20));
+        }
+    }
+
+    /// Publishes one sample in each direction.
+    fn publish_one(&mut self) {
+        for (pair, published) in self.pairs.iter().zip(&mut self.published) {
+            *published += u64::from(self.world.publish(*pair, 500));
+        }
+    }
+
+    /// Publishes a sample in each direction, for each of so many milliseconds.
+    fn publish_each(&mut self, milliseconds: u64) {
+        for _ in 0..milliseconds {
+            self.publish_one();
+            self.world.run_for(millis(1));
         }
     }
 
@@ -185,6 +201,39 @@ fn two_hosts_that_swap_their_addresses_flow_again_soon_with_a_third_and_lose_not
         for pair in pairs {
             let expected: Vec<u64> = (1..=100).collect();
             assert_eq!(world.received(pair), expected, "{mode}: {}", world.describe());
+        }
+    }
+}
+
+#[test]
+#[cfg_attr(debug_assertions, ignore = "a debug assertion of quinn-proto fails")]
+fn a_link_whose_path_is_cut_just_after_it_was_superseded_holds_nothing_up_for_long() {
+    for mode in [KeyMode::Session, KeyMode::Messages10] {
+        let config = |host: usize| {
+            let mut config = qkd(&format!("sae-{host}"), mode);
+            if let Security::Qkd(qkd) = &mut config.security {
+                // The successor is dialled after 900 s.
+                qkd.session_max_age = secs(1000);
+            }
+            config
+        };
+        for after in 0..16 {
+            let mut moving = Moving::new(46, &config, None);
+            moving.world.run_until(millis(899_500));
+            // Samples are under way on the old link when the successor takes over, and when both hosts move.
+            while moving.world.hosts[0].leaving() == 0 && moving.world.hosts[1].leaving() == 0 {
+                moving.publish_each(1);
+                assert!(moving.world.now < secs(920), "no successor: {}", moving.world.describe());
+            }
+            moving.publish_each(after);
+            (0..2).for_each(|host| moving.world.move_host(host));
+            moving.publish(secs(3));
+            moving.world.run_for(secs(25));
+            for (pair, published) in moving.pairs.iter().zip(moving.published) {
+                let expected: Vec<u64> = (1..=published).collect();
+                let received = moving.world.received(*pair);
+                assert_eq!(received, expected, "{mode:?}, {after} ms: {}", moving.world.describe());
+            }
         }
     }
 }
