@@ -237,6 +237,25 @@ impl RemoteWriter {
         }
     }
 
+    /// Of a server: how many requests of `client` it has not taken. Of a client, which `client` names: how many responses.
+    pub fn unread_of(&self, client: &Gid) -> u64 {
+        match self {
+            Self::Server(server) => server.unread_of(client),
+            Self::Client(own) if *client == own.gid() => own.unread(),
+            Self::Publisher(_) | Self::Client(_) => 0,
+        }
+    }
+
+    /// Of a server: how many requests of `client` found no room, if one that it has not taken is why the next one may not.
+    /// Of a client, which `client` names: the same of responses.
+    pub fn refused_of(&self, client: &Gid) -> Option<u64> {
+        match self {
+            Self::Server(server) => server.refused_of(client),
+            Self::Client(own) if *client == own.gid() => own.refused(),
+            Self::Publisher(_) | Self::Client(_) => None,
+        }
+    }
+
     /// Asserts its liveliness: the process that speaks for the writer says that it is alive.
     pub fn assert_alive(&self) {
         if let Self::Publisher(publisher) = self {

@@ -180,6 +180,20 @@ impl Server {
         }
     }
 
+    /// For a relay: how many requests of this client it has not taken.
+    pub(crate) fn unread_of(&self, client: &Gid) -> u64 {
+        if self.session.is_forked() { 0 } else { self.requests.lock().slots().undone_of(client) }
+    }
+
+    /// For a relay: how many requests of this client found no room, if one that it has not taken is why the next one may
+    /// not.
+    pub(crate) fn refused_of(&self, client: &Gid) -> Option<u64> {
+        if self.session.is_forked() {
+            return None;
+        }
+        self.requests.lock().slots().refused_of(client)
+    }
+
     /// Whether there is a request of this client to be taken.
     pub(crate) fn has_request_from(&self, client: &Gid) -> bool {
         !self.session.is_forked() && self.requests.lock().slots().has_from(client)
@@ -272,6 +286,26 @@ impl Client {
         if !self.session.is_forked() {
             self.responses.lock().take_back(false);
         }
+    }
+
+    /// For a relay: how many responses of all servers it has not taken.
+    pub(crate) fn unread(&self) -> u64 {
+        if self.session.is_forked() {
+            return 0;
+        }
+        self.responses.lock().slots().undone().into_values().fold(0, u64::saturating_add)
+    }
+
+    /// For a relay: how many responses of all servers found no room, if those that it has not taken are why the next ones
+    /// may not.
+    pub(crate) fn refused(&self) -> Option<u64> {
+        if self.session.is_forked() {
+            return None;
+        }
+        let responses = self.responses.lock();
+        let servers = responses.slots().undone().into_keys();
+        let refused = servers.filter_map(|server| responses.slots().refused_of(&server));
+        refused.reduce(u64::saturating_add)
     }
 
     /// Whether there is a response of this server to be taken.

@@ -3,6 +3,7 @@
 use std::{thread, time::Duration};
 
 use axon_daemon::internal::link::{Graph, Message, Received, ReceivedOf, Subscribe, Subscriber};
+use axon_envelope::inner::{Header, RequestId};
 use axon_shm::PublishError;
 use axon_tests::Sizes;
 use axon_tls::identity::{Auth, SigningKey};
@@ -22,6 +23,10 @@ use super::{
 };
 
 const TOPIC: &str = "/unread";
+const SERVICE: &str = "/unanswered";
+/// What routes of a service carry, as SUBSCRIBE says it.
+const REQUESTS: u8 = 1;
+const RESPONSES: u8 = 2;
 const TYPE: &str = "test/Bytes";
 /// The peer's subscription of the topic.
 pub(super) const SUBSCRIPTION: Gid = Gid([7; 16]);
@@ -193,4 +198,131 @@ fn a_host_that_falls_silent_holds_up_no_reader_of_another_one_for_long() {
     for node in [publisher, here, there] {
         node.finish();
     }
+}
+
+/// A service, as the sessions of the host have it.
+fn service() -> EndpointSpec {
+    EndpointSpec::new(SERVICE, TYPE, Qos::keep_all())
+}
+
+/// A peer that has this end of the service, and asks for what goes to it.
+fn at_service(host: &Host, kind: EndpointKind) -> (Stranger, Met) {
+    let (stranger, auth) = (Stranger::new(), Auth::None(SigningKey::generate().unwrap()));
+    let claim = Claim { host: "idle", daemon: DaemonId([0xff; 16]), auth: 0 };
+    let mut met = stranger.dial(host, &auth, &claim).expect("a link");
+    let end = Endpoint::new(SUBSCRIPTION, kind, SERVICE, TYPE)
+        .with_qos(Qos::keep_all())
+        .with_node("idle", "/");
+    let graph = Graph { version: 1, added: vec![end], ..Graph::default() };
+    stranger.say(&mut met, &Message::Graph(graph));
+    let subscribe = Subscribe {
+        route: 1,
+        topic: SERVICE.into(),
+        type_name: TYPE.into(),
+        kind: if kind == EndpointKind::Server { REQUESTS } else { RESPONSES },
+        subscribers: vec![Subscriber { gid: SUBSCRIPTION, qos: Qos::keep_all() }],
+        last: vec![],
+        acknowledges: Some(true),
+        short_headers: None,
+    };
+    stranger.say(&mut met, &Message::Subscribe(subscribe));
+    (stranger, met)
+}
+
+#[test]
+fn a_peer_whose_server_takes_no_request_holds_up_no_client_of_another_server_for_long() {
+    let [host, _other] = Plan { stalled_s: 3, ..Plan::new([classic(&[]), classic(&[])]) }.start();
+    let client = host.session("client").create_client(service()).unwrap();
+    let server = host.session("server").create_server(service()).unwrap();
+    assert!(client.wait_available(PATIENCE));
+    let (stranger, mut met) = at_service(&host, EndpointKind::Server);
+    until("it is served", || client.servers().len() == 2);
+    let server = thread::spawn(move || {
+        let (mut bytes, mut taken) = (Vec::new(), 0);
+        while server.recv_request(&mut bytes, Some(PATIENCE)).is_ok() {
+            taken += 1;
+            if bytes.is_empty() {
+                return taken;
+            }
+        }
+        panic!("no last request")
+    });
+    let request = vec![0x5a; 1 << 20];
+    let mut sent = 0;
+    loop {
+        match client.send_request(&request) {
+            Ok(_) => sent += 1,
+            Err(PublishError::Blocked { .. }) => break,
+            Err(error) => panic!("{error}"),
+        }
+    }
+    let told = stranger.hear(&mut met, refused).expect("it is told");
+    assert!(retry(told) > 0);
+    until("the client goes on", || client.send_request(&[]).is_ok());
+    assert_eq!(server.join().unwrap(), sent + 1, "the server here has it all");
+    host.wait_refusal("it is shown", |text| text.contains(SERVICE) && text.contains("stalled_s"));
+    let lost = || {
+        let topics = host.status().topics;
+        topics.iter().filter_map(|topic| topic.dropped.get("stalled")).sum::<u64>()
+    };
+    until("what it did not take is counted", || lost() > 0);
+    assert!(lost() <= sent, "{} of {sent}", lost());
+    assert!(client.servers().len() <= 1);
+}
+
+#[test]
+fn a_peer_whose_client_takes_no_response_holds_up_no_server_for_long() {
+    const REQUESTED: u64 = 60;
+    let [host, _other] = Plan { stalled_s: 3, ..Plan::new([classic(&[]), classic(&[])]) }.start();
+    let server = host.session("server").create_server(service()).unwrap();
+    let client = host.session("client").create_client(service()).unwrap();
+    assert!(client.wait_available(PATIENCE));
+    let (stranger, mut met) = at_service(&host, EndpointKind::Client);
+    let asks = |m: &Message| matches!(m, Message::Subscribe(s) if s.kind == REQUESTS);
+    let Message::Subscribe(asked) = stranger.hear(&mut met, asks).expect("it is asked") else {
+        unreachable!()
+    };
+    let mut requests = vec![1, 0, 0, 0];
+    requests.extend_from_slice(&asked.route.to_be_bytes());
+    requests.extend_from_slice(&SUBSCRIPTION.0);
+    for number in 1..=REQUESTED {
+        let header = Header {
+            gid: SUBSCRIPTION.0,
+            sequence: number,
+            source_timestamp: 0,
+            request_id: RequestId { client: SUBSCRIPTION.0, sequence: number as i64 },
+            compressed: false,
+            age_ms: 0,
+            uncompressed_len: 1,
+        };
+        let header = header.encode();
+        requests.extend_from_slice(&(header.len() as u32 + 1).to_be_bytes());
+        requests.extend_from_slice(&header);
+        requests.push(0x5a);
+    }
+    let mut stream = stranger.open(&met).expect("a stream");
+    assert!(stranger.write_for(&mut stream, &requests, PATIENCE), "a host takes requests");
+
+    // Each is answered with 1 MiB, and once more where there was no room.
+    let answer = vec![0xa5; 1 << 20];
+    let mut bytes = Vec::new();
+    let mut blocked = false;
+    for _ in 0..REQUESTED {
+        let request = server.recv_request(&mut bytes, Some(PATIENCE)).expect("a request");
+        until("there is room for the response, or nobody to get it", || {
+            let sent = server.send_response(request.publisher, request.sequence, &answer);
+            blocked |= matches!(sent, Err(PublishError::Blocked { .. }));
+            sent.is_ok()
+        });
+    }
+    assert!(blocked, "the peer held up the server: else the test shows nothing");
+    let told = stranger.hear(&mut met, refused).expect("it is told");
+    assert!(retry(told) > 0);
+    assert_eq!(server.clients(), [client.gid()]);
+    let number = client.send_request(b"still there?").unwrap();
+    let request = server.recv_request(&mut bytes, Some(PATIENCE)).expect("a request");
+    server.send_response(request.publisher, request.sequence, b"yes").unwrap();
+    let response = client.recv_response(&mut bytes, Some(PATIENCE)).expect("a response");
+    assert_eq!((response.sequence, &bytes[..]), (number, &b"yes"[..]));
+    host.wait_refusal("it is shown", |text| text.contains(SERVICE) && text.contains("stalled_s"));
 }

@@ -130,6 +130,14 @@ pub(crate) trait RingWriter {
     fn reads_calls_of(&self, client: &Gid) -> bool;
     /// Takes the next call, or response, of this client.
     fn take_call_of(&self, client: &Gid) -> Option<(MessageInfo, Vec<u8>)>;
+    /// How many calls, or responses, of this client wait to be taken.
+    fn calls_of(&self, _client: &Gid) -> u64 {
+        0
+    }
+    /// How many calls, or responses, of this client found no room, if those that wait here are why the next one may not.
+    fn refused_of(&self, _client: &Gid) -> Option<u64> {
+        None
+    }
 }
 
 /// A sample on its way to a peer.

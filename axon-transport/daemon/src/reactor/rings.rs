@@ -258,4 +258,12 @@ impl RingWriter for Writer {
             RemoteWriter::Server(server) => server.take_request_of(client),
         }
     }
+
+    fn calls_of(&self, client: &Gid) -> u64 {
+        self.0.unread_of(client)
+    }
+
+    fn refused_of(&self, client: &Gid) -> Option<u64> {
+        self.0.refused_of(client)
+    }
 }

@@ -268,6 +268,11 @@ impl Slots {
         undone
     }
 
+    /// Samples of `writer` that are not done with.
+    pub(in crate::session) fn undone_of(&self, writer: &Gid) -> u64 {
+        self.of(writer).map(|slot| slot.reader.undone()).fold(0, u64::saturating_add)
+    }
+
     /// Bytes of the samples of `writer` that are not done with.
     pub(in crate::session) fn undone_bytes_of(&self, writer: &Gid) -> u64 {
         self.of(writer).map(|slot| slot.reader.undone_bytes()).fold(0, u64::saturating_add)

@@ -203,7 +203,7 @@ impl Outbound {
     /// The peer does not read this route: as [`end_route`](Self::end_route), but the samples that are not
     /// acknowledged are given up. Returns how many.
     pub(crate) fn give_up_route(&mut self, number: u32) -> u64 {
-        let given_up = self.table.give_up(number);
+        let given_up = self.table.give_up(number, &self.counters);
         self.end_route(number);
         given_up
     }

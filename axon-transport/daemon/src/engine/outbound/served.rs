@@ -107,12 +107,12 @@ impl Served {
         self.source_of(of).is_some_and(|s| s.qos().reliability == Reliability::Reliable)
     }
 
-    /// Samples that KEEP_ALL relays have a publisher keep, if there are any.
+    /// Samples that KEEP_ALL relays have a publisher keep, or calls that a stand-in has a client keep, if there are any.
     pub(super) fn keeps(&self, of: &Gid) -> Option<u64> {
-        self.keeping(of).filter_map(|source| source.unacknowledged().get(of).copied()).max()
+        self.keeping(of).filter_map(|source| source.kept_of(of)).max()
     }
 
-    /// How many publishes of a publisher found no room, if a KEEP_ALL relay is why the next one may not.
+    /// How many publishes of a publisher found no room, if a KEEP_ALL relay is why the next one may not. The same of calls.
     pub(super) fn refused(&self, of: &Gid) -> Option<u64> {
         self.keeping(of).filter_map(|source| source.refused_of(of)).max()
     }

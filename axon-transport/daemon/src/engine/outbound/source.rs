@@ -170,6 +170,16 @@ impl Source {
         }
     }
 
+    /// How many samples of this publisher, calls or responses it has the publisher, client or server keep.
+    pub(super) fn kept_of(&self, of: &Gid) -> Option<u64> {
+        match self {
+            Self::Relay(..) => self.unacknowledged().get(of).copied(),
+            Self::StandIn(stand_in) => {
+                Some(stand_in.ring().calls_of(of)).filter(|calls| *calls > 0)
+            }
+        }
+    }
+
     /// Whether it has such samples of this publisher.
     pub(crate) fn has_unacknowledged(&self, of: &Gid) -> bool {
         self.reads(of) && self.unacknowledged().contains_key(of)
@@ -187,7 +197,7 @@ impl Source {
     pub(super) fn refused_of(&self, of: &Gid) -> Option<u64> {
         match self {
             Self::Relay(_, reader) => reader.refused_of(of),
-            Self::StandIn(_) => None,
+            Self::StandIn(stand_in) => stand_in.ring().refused_of(of),
         }
     }
 

@@ -1,7 +1,7 @@
 //! The routes that this host asks a peer for.
 
 use std::{
-    collections::{BTreeMap, HashMap, HashSet},
+    collections::{BTreeMap, BTreeSet, HashMap, HashSet},
     rc::Rc,
     time::Duration,
 };
@@ -15,7 +15,7 @@ use axon_transport::graph::{Endpoint, EndpointKind};
 
 use super::{
     Peer, Surroundings, poll_after,
-    refused::{NO_STAND_IN, TOO_MANY_ASKED, TOO_MANY_LANES, TOO_MANY_WRITERS},
+    refused::{NO_STAND_IN, NOT_TAKEN, TOO_MANY_ASKED, TOO_MANY_LANES, TOO_MANY_WRITERS},
 };
 use crate::{
     engine::{
@@ -101,8 +101,12 @@ impl Peer {
         });
         let own =
             with.local.values().map(|(endpoint, reach)| (&**endpoint, reach.toward(self.daemon)));
-        let wanted = routes::wanted(own, reachable);
-        self.want(wanted, with, now);
+        let mut wanted = routes::wanted(own, reachable);
+        let unanswered = self.leave_out_unanswered(&mut wanted, with, now);
+        self.want(wanted, &unanswered, with, now);
+        for key in &unanswered {
+            self.does_not_ask(key, NOT_TAKEN);
+        }
         self.feed_services(now);
     }
 
@@ -111,23 +115,22 @@ impl Peer {
         self.answering != self.now_answering()
     }
 
-    /// Asks for the routes that follow from services, if those changed.
-    pub(super) fn update_services(&mut self, with: &Surroundings<'_>, now: Duration) {
-        if self.services_changed() {
-            self.update(with, now);
-        }
-    }
-
     /// The servers of the peer to which requests of this host go: their responses are wanted.
-    fn now_answering(&self) -> std::collections::BTreeSet<Gid> {
+    fn now_answering(&self) -> BTreeSet<Gid> {
         let services = self.served.services().map(|(_, served)| served);
         let requests = services.filter(|served| served.key.kind == Kind::Request);
         requests.flat_map(|served| served.subscribers.iter().copied()).collect()
     }
 
-    fn want(&mut self, wanted: BTreeMap<RouteKey, Wanted>, with: &Surroundings<'_>, now: Duration) {
+    fn want(
+        &mut self,
+        wanted: BTreeMap<RouteKey, Wanted>,
+        unanswered: &BTreeSet<RouteKey>,
+        with: &Surroundings<'_>,
+        now: Duration,
+    ) {
         let gone: Vec<_> = self.asked.keys().filter(|k| !wanted.contains_key(k)).cloned().collect();
-        self.want_no_more(|key| wanted.contains_key(key));
+        self.want_no_more(|key| wanted.contains_key(key) || unanswered.contains(key));
         let given_up = gone.len();
         for key in gone {
             self.asks(&key);

@@ -13,6 +13,7 @@ mod served;
 mod serving;
 pub(super) mod stalls;
 mod surroundings;
+mod unanswered;
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap},
@@ -38,6 +39,7 @@ use self::{
     refused::RefusedRoutes,
     served::{Served, ServedRoutes},
     serving::DENIED_AGAIN,
+    unanswered::Unanswered,
 };
 pub(crate) use self::{
     lanes::WritersHere,
@@ -122,6 +124,7 @@ pub(crate) struct Peer {
     served: ServedRoutes,
     alive: Alive,
     answering: BTreeSet<Gid>,
+    unanswered: Unanswered,
     messages: ControlQueue,
 }
 
@@ -190,6 +193,7 @@ impl Peer {
             served: ServedRoutes::default(),
             alive: Alive::default(),
             answering: BTreeSet::new(),
+            unanswered: Unanswered::default(),
             messages: ControlQueue::default(),
         }
     }
@@ -461,7 +465,8 @@ impl Peer {
         let alive = self.alive_due(epoch, now);
         let (attaching, announcing) = (self.look_at_attaching, self.served.poll_timeout());
         let (resync, asks) = (self.told.poll_timeout(), self.refused.poll_timeout());
-        [attaching, announcing, alive, resync, asks].into_iter().flatten().min()
+        let unanswered = self.unanswered.poll_timeout();
+        [attaching, announcing, alive, resync, asks, unanswered].into_iter().flatten().min()
     }
 
     /// Does what is due.
@@ -470,6 +475,7 @@ impl Peer {
         self.announce_ready(now);
         self.tell_alive(with.epoch, now);
         self.ask_again(now);
+        self.look_at_unanswered(with, now);
         if self.told.owes_resync() {
             self.resync(with.local, now);
         }
@@ -484,7 +490,8 @@ impl Peer {
         now: Duration,
     ) -> Option<StalledRoute> {
         let stalled = self.give_up_stalled(route, why, with, now)?;
-        self.update_services(with, now);
+        // Of a service, the other direction ends with it.
+        self.update(with, now);
         Some(stalled)
     }
 

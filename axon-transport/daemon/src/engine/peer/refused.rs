@@ -55,6 +55,9 @@ struct Reason {
 pub(super) const NO_STAND_IN: &str =
     "the subscribers' host could not open a stand-in for a publisher; its log says why";
 
+/// Why requests of a peer are not asked for.
+pub(super) const NOT_TAKEN: &str = "clients of the service did not take its responses; they are asked again later ([link] stalled_s)";
+
 /// The routes that are refused, and why.
 pub(super) struct RefusedRoutes {
     /// What may be remembered, of all daemon ids of the peer's identity.

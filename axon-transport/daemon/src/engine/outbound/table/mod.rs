@@ -105,14 +105,18 @@ impl FlowTable {
     }
 
     /// Gives up the samples of a route that are not acknowledged. Returns how many.
-    pub(super) fn give_up(&mut self, number: u32) -> u64 {
+    pub(super) fn give_up(&mut self, number: u32, counters: &Counters) -> u64 {
         let Some(served) = self.routes.get(number) else { return 0 };
-        for id in served.flows.values() {
+        let mut calls = 0;
+        for (of, id) in &served.flows {
             if let Some(flow) = self.flows.get_mut(*id) {
                 flow.give_up();
+                if served.is_service() {
+                    calls += flow.end(counters) + served.keeps(of).unwrap_or(0);
+                }
             }
         }
-        served.give_up()
+        calls + served.give_up()
     }
 
     /// Removes at most `most` KEEP_ALL relays of a route. Returns them, and the flows that read them, which are gone.
