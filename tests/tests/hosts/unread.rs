@@ -272,7 +272,7 @@ fn a_peer_whose_server_takes_no_request_holds_up_no_client_of_another_server_for
 
 #[test]
 fn a_peer_whose_client_takes_no_response_holds_up_no_server_for_long() {
-    const REQUESTED: u64 = 60;
+    const REQUESTED: u64 = 150;
     let [host, _other] = Plan { stalled_s: 3, ..Plan::new([classic(&[]), classic(&[])]) }.start();
     let server = host.session("server").create_server(service()).unwrap();
     let client = host.session("client").create_client(service()).unwrap();

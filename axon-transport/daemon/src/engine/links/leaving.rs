@@ -47,8 +47,13 @@ impl Links {
         for (number, daemon) in self.leaving() {
             let current = self.table.current_peer(daemon);
             let Some(heard_at) = current.map(|peer| peer.silence.heard_at()) else { continue };
-            let Some(peer) = self.table.peer_mut(number) else { continue };
-            if peer.silence.handle_second_superseded(heard_at) {
+            let (Some(connection), Some(peer)) =
+                (self.connections.get_mut(number), self.table.peer_mut(number))
+            else {
+                continue;
+            };
+            if !all_is_sent(&mut connection.quic) && peer.silence.handle_second_superseded(heard_at)
+            {
                 tracing::debug!(link = number, "nothing comes over the superseded link");
                 if let Some(elected) = peer.elected {
                     let closed = LinkClosed { link: elected.link };
@@ -120,8 +125,7 @@ impl Links {
         };
         let silent = link.peer.as_ref().is_some_and(|peer| peer.silence.is_silent());
         let Phase::Leaving(leaving) = &mut link.phase else { return };
-        // The control stream is one of them.
-        let sent = connection.quic.streams().send_streams() <= 1;
+        let sent = all_is_sent(&mut connection.quic);
         match leaving.handle_progress(UnderWay { silent, sent, reading }, now) {
             Step::Wait => {}
             Step::Finish => {
@@ -150,4 +154,9 @@ impl Links {
             self.outbox.event(LinkEvent::Gone(number, peer.summary.hello.daemon));
         }
     }
+}
+
+/// Whether the peer has acknowledged all streams of this side but the control stream, which is one of them.
+fn all_is_sent(quic: &mut quinn_proto::Connection) -> bool {
+    quic.streams().send_streams() <= 1
 }

@@ -7,8 +7,8 @@ use crate::link::Side;
 
 /// A link over which nothing came for so long is probed, even if nothing was asked: two of QUIC's keep-alives are lost.
 const UNHEARD: Duration = Duration::from_secs(10);
-/// A superseded link over which nothing came for so long before the last that came over the link in use is silent. It may
-/// be idle as well: nothing is lost with it, since all that is not acknowledged was sent again over its successor.
+/// A superseded link that waits for acknowledgements is silent if nothing came over it for so long before the last that
+/// came over the link in use.
 const OUTLIVED: Duration = Duration::from_secs(3);
 /// A peer that is silent for so long is taken for gone. Its link stands until QUIC gives it up.
 const GONE: Duration = Duration::from_secs(20);
@@ -154,8 +154,8 @@ impl Silence {
         self.heard_at
     }
 
-    /// Looks at a superseded link once a second. Over the link in use something came last at `heard_at`. Returns whether
-    /// this one is silent from now on.
+    /// Looks once a second at a superseded link with streams that the peer has not acknowledged. Over the link in use
+    /// something came last at `heard_at`. Returns whether this one is silent from now on.
     pub(in crate::engine::links) fn handle_second_superseded(
         &mut self,
         heard_at: Duration,
