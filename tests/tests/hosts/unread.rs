@@ -205,8 +205,8 @@ fn service() -> EndpointSpec {
     EndpointSpec::new(SERVICE, TYPE, Qos::keep_all())
 }
 
-/// A peer that has this end of the service, and asks for what goes to it.
-fn at_service(host: &Host, kind: EndpointKind) -> (Stranger, Met) {
+/// A peer that has this end of the service, and `asks` for what goes to it.
+fn at_service(host: &Host, kind: EndpointKind, asks: bool) -> (Stranger, Met) {
     let (stranger, auth) = (Stranger::new(), Auth::None(SigningKey::generate().unwrap()));
     let claim = Claim { host: "idle", daemon: DaemonId([0xff; 16]), auth: 0 };
     let mut met = stranger.dial(host, &auth, &claim).expect("a link");
@@ -225,7 +225,9 @@ fn at_service(host: &Host, kind: EndpointKind) -> (Stranger, Met) {
         acknowledges: Some(true),
         short_headers: None,
     };
-    stranger.say(&mut met, &Message::Subscribe(subscribe));
+    if asks {
+        stranger.say(&mut met, &Message::Subscribe(subscribe));
+    }
     (stranger, met)
 }
 
@@ -235,7 +237,7 @@ fn a_peer_whose_server_takes_no_request_holds_up_no_client_of_another_server_for
     let client = host.session("client").create_client(service()).unwrap();
     let server = host.session("server").create_server(service()).unwrap();
     assert!(client.wait_available(PATIENCE));
-    let (stranger, mut met) = at_service(&host, EndpointKind::Server);
+    let (stranger, mut met) = at_service(&host, EndpointKind::Server, true);
     until("it is served", || client.servers().len() == 2);
     let server = thread::spawn(move || {
         let (mut bytes, mut taken) = (Vec::new(), 0);
@@ -272,14 +274,24 @@ fn a_peer_whose_server_takes_no_request_holds_up_no_client_of_another_server_for
 
 #[test]
 fn a_peer_whose_client_takes_no_response_holds_up_no_server_for_long() {
+    takes_no_response(true);
+}
+
+#[test]
+fn a_peer_that_never_asks_for_responses_holds_up_no_server_for_long() {
+    takes_no_response(false);
+}
+
+/// A peer's client sends requests and takes no response, whether it `asks` for them or not.
+fn takes_no_response(asks: bool) {
     const REQUESTED: u64 = 150;
     let [host, _other] = Plan { stalled_s: 3, ..Plan::new([classic(&[]), classic(&[])]) }.start();
     let server = host.session("server").create_server(service()).unwrap();
     let client = host.session("client").create_client(service()).unwrap();
     assert!(client.wait_available(PATIENCE));
-    let (stranger, mut met) = at_service(&host, EndpointKind::Client);
-    let asks = |m: &Message| matches!(m, Message::Subscribe(s) if s.kind == REQUESTS);
-    let Message::Subscribe(asked) = stranger.hear(&mut met, asks).expect("it is asked") else {
+    let (stranger, mut met) = at_service(&host, EndpointKind::Client, asks);
+    let is_asked = |m: &Message| matches!(m, Message::Subscribe(s) if s.kind == REQUESTS);
+    let Message::Subscribe(asked) = stranger.hear(&mut met, is_asked).expect("it is asked") else {
         unreachable!()
     };
     let mut requests = vec![1, 0, 0, 0];
@@ -316,13 +328,25 @@ fn a_peer_whose_client_takes_no_response_holds_up_no_server_for_long() {
         });
     }
     assert!(blocked, "the peer held up the server: else the test shows nothing");
-    let told = stranger.hear(&mut met, refused).expect("it is told");
-    assert!(retry(told) > 0);
+    if asks {
+        let told = stranger.hear(&mut met, refused).expect("it is told");
+        assert!(retry(told) > 0);
+    }
+    let unasked = |m: &Message| {
+        matches!(m, Message::RouteUnasked(u) if u.kind == REQUESTS
+            && u.reason.as_ref().is_some_and(|reason| reason.contains("stalled_s")))
+    };
+    stranger.hear(&mut met, unasked).expect("it is told");
     assert_eq!(server.clients(), [client.gid()]);
     let number = client.send_request(b"still there?").unwrap();
     let request = server.recv_request(&mut bytes, Some(PATIENCE)).expect("a request");
     server.send_response(request.publisher, request.sequence, b"yes").unwrap();
     let response = client.recv_response(&mut bytes, Some(PATIENCE)).expect("a response");
     assert_eq!((response.sequence, &bytes[..]), (number, &b"yes"[..]));
-    host.wait_refusal("it is shown", |text| text.contains(SERVICE) && text.contains("stalled_s"));
+    if asks {
+        let of_service = |text: &str| text.contains(SERVICE) && text.contains("stalled_s");
+        host.wait_refusal("it is shown", of_service);
+    }
+    // It is asked again later.
+    stranger.hear(&mut met, is_asked).expect("it is asked again");
 }
