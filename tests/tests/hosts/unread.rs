@@ -1,8 +1,13 @@
 //! A peer that asked for a topic and does not read it.
 
-use std::{thread, time::Duration};
+use std::{
+    thread,
+    time::{Duration, Instant},
+};
 
-use axon_daemon::internal::link::{Graph, Message, Received, ReceivedOf, Subscribe, Subscriber};
+use axon_daemon::internal::link::{
+    Graph, Message, Received, ReceivedOf, Subscribe, Subscriber, Unsubscribe,
+};
 use axon_envelope::inner::{Header, RequestId};
 use axon_shm::PublishError;
 use axon_tests::Sizes;
@@ -205,16 +210,19 @@ fn service() -> EndpointSpec {
     EndpointSpec::new(SERVICE, TYPE, Qos::keep_all())
 }
 
-/// A peer that has this end of the service, and `asks` for what goes to it.
-fn at_service(host: &Host, kind: EndpointKind, asks: bool) -> (Stranger, Met) {
-    let (stranger, auth) = (Stranger::new(), Auth::None(SigningKey::generate().unwrap()));
-    let claim = Claim { host: "idle", daemon: DaemonId([0xff; 16]), auth: 0 };
-    let mut met = stranger.dial(host, &auth, &claim).expect("a link");
-    let end = Endpoint::new(SUBSCRIPTION, kind, SERVICE, TYPE)
-        .with_qos(Qos::keep_all())
-        .with_node("idle", "/");
-    let graph = Graph { version: 1, added: vec![end], ..Graph::default() };
-    stranger.say(&mut met, &Message::Graph(graph));
+/// What a peer does that takes nothing.
+#[derive(Clone, Copy, PartialEq)]
+enum Idler {
+    /// It asks for the route.
+    Asks,
+    /// It asks for it again every second.
+    AsksAgain,
+    /// It never asks for it.
+    Silent,
+}
+
+/// Asks for what goes to this end of the service.
+fn ask(stranger: &Stranger, met: &mut Met, kind: EndpointKind) {
     let subscribe = Subscribe {
         route: 1,
         topic: SERVICE.into(),
@@ -225,8 +233,21 @@ fn at_service(host: &Host, kind: EndpointKind, asks: bool) -> (Stranger, Met) {
         acknowledges: Some(true),
         short_headers: None,
     };
-    if asks {
-        stranger.say(&mut met, &Message::Subscribe(subscribe));
+    stranger.say(met, &Message::Subscribe(subscribe));
+}
+
+/// A peer that has this end of the service.
+fn at_service(host: &Host, kind: EndpointKind, idler: Idler) -> (Stranger, Met) {
+    let (stranger, auth) = (Stranger::new(), Auth::None(SigningKey::generate().unwrap()));
+    let claim = Claim { host: "idle", daemon: DaemonId([0xff; 16]), auth: 0 };
+    let mut met = stranger.dial(host, &auth, &claim).expect("a link");
+    let end = Endpoint::new(SUBSCRIPTION, kind, SERVICE, TYPE)
+        .with_qos(Qos::keep_all())
+        .with_node("idle", "/");
+    let graph = Graph { version: 1, added: vec![end], ..Graph::default() };
+    stranger.say(&mut met, &Message::Graph(graph));
+    if idler != Idler::Silent {
+        ask(&stranger, &mut met, kind);
     }
     (stranger, met)
 }
@@ -237,7 +258,7 @@ fn a_peer_whose_server_takes_no_request_holds_up_no_client_of_another_server_for
     let client = host.session("client").create_client(service()).unwrap();
     let server = host.session("server").create_server(service()).unwrap();
     assert!(client.wait_available(PATIENCE));
-    let (stranger, mut met) = at_service(&host, EndpointKind::Server, true);
+    let (stranger, mut met) = at_service(&host, EndpointKind::Server, Idler::Asks);
     until("it is served", || client.servers().len() == 2);
     let server = thread::spawn(move || {
         let (mut bytes, mut taken) = (Vec::new(), 0);
@@ -274,22 +295,27 @@ fn a_peer_whose_server_takes_no_request_holds_up_no_client_of_another_server_for
 
 #[test]
 fn a_peer_whose_client_takes_no_response_holds_up_no_server_for_long() {
-    takes_no_response(true);
+    takes_no_response(Idler::Asks);
 }
 
 #[test]
 fn a_peer_that_never_asks_for_responses_holds_up_no_server_for_long() {
-    takes_no_response(false);
+    takes_no_response(Idler::Silent);
 }
 
-/// A peer's client sends requests and takes no response, whether it `asks` for them or not.
-fn takes_no_response(asks: bool) {
+#[test]
+fn a_peer_that_asks_again_and_again_for_responses_holds_up_no_server_for_long() {
+    takes_no_response(Idler::AsksAgain);
+}
+
+/// A peer's client sends requests and takes no response.
+fn takes_no_response(idler: Idler) {
     const REQUESTED: u64 = 150;
     let [host, _other] = Plan { stalled_s: 3, ..Plan::new([classic(&[]), classic(&[])]) }.start();
     let server = host.session("server").create_server(service()).unwrap();
     let client = host.session("client").create_client(service()).unwrap();
     assert!(client.wait_available(PATIENCE));
-    let (stranger, mut met) = at_service(&host, EndpointKind::Client, asks);
+    let (stranger, mut met) = at_service(&host, EndpointKind::Client, idler);
     let is_asked = |m: &Message| matches!(m, Message::Subscribe(s) if s.kind == REQUESTS);
     let Message::Subscribe(asked) = stranger.hear(&mut met, is_asked).expect("it is asked") else {
         unreachable!()
@@ -319,16 +345,22 @@ fn takes_no_response(asks: bool) {
     let answer = vec![0xa5; 1 << 20];
     let mut bytes = Vec::new();
     let mut blocked = false;
+    let mut asked_at = Instant::now();
     for _ in 0..REQUESTED {
         let request = server.recv_request(&mut bytes, Some(PATIENCE)).expect("a request");
         until("there is room for the response, or nobody to get it", || {
             let sent = server.send_response(request.publisher, request.sequence, &answer);
             blocked |= matches!(sent, Err(PublishError::Blocked { .. }));
+            if idler == Idler::AsksAgain && asked_at.elapsed() > Duration::from_secs(1) {
+                stranger.say(&mut met, &Message::Unsubscribe(Unsubscribe { route: 1 }));
+                ask(&stranger, &mut met, EndpointKind::Client);
+                asked_at = Instant::now();
+            }
             sent.is_ok()
         });
     }
     assert!(blocked, "the peer held up the server: else the test shows nothing");
-    if asks {
+    if idler != Idler::Silent {
         let told = stranger.hear(&mut met, refused).expect("it is told");
         assert!(retry(told) > 0);
     }
@@ -343,7 +375,7 @@ fn takes_no_response(asks: bool) {
     server.send_response(request.publisher, request.sequence, b"yes").unwrap();
     let response = client.recv_response(&mut bytes, Some(PATIENCE)).expect("a response");
     assert_eq!((response.sequence, &bytes[..]), (number, &b"yes"[..]));
-    if asks {
+    if idler != Idler::Silent {
         let of_service = |text: &str| text.contains(SERVICE) && text.contains("stalled_s");
         host.wait_refusal("it is shown", of_service);
     }

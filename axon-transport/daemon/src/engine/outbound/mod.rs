@@ -226,6 +226,16 @@ impl Outbound {
         (kept, unfinished)
     }
 
+    /// What is known of the flows of a service whose route is about to end: whatever follows it goes on with that, since
+    /// what it held is still there.
+    pub(crate) fn leave_service(&mut self, number: u32) -> UnfinishedFlows {
+        let flows = self.table.kept_flows(number).into_iter();
+        let known = flows.map(|(of, flow, furthest)| {
+            (of, Unfinished { progress: self.stalls.leave_at_look(&flow), furthest })
+        });
+        known.collect()
+    }
+
     /// Whether samples of a publisher are left that wait to be acknowledged, or for a limit.
     pub(crate) fn has_left(&self, number: u32, sources: &[Source], publisher: &Gid) -> bool {
         sources.iter().any(|source| source.has_unacknowledged(publisher))

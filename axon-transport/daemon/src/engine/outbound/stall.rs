@@ -97,6 +97,8 @@ pub(super) struct BusyFlow {
     pub(super) keeps: Option<u64>,
     /// How many publishes found no room, if that relay is why the next one may not.
     pub(super) refused: Option<u64>,
+    /// Whether it is of a service: calls may wait for a slow server as long as there is room for the next ones.
+    pub(super) is_service: bool,
     /// Whether it uses credit for which others may have to wait.
     pub(super) uses_credit: bool,
     /// Whether it waits for others: none of its samples is in flight.
@@ -159,6 +161,11 @@ impl Stalls {
             Some(progress) => progress.after(passed, flow, hearing, starves, self.limit),
             None => Progress::new(flow),
         }
+    }
+
+    /// As [`leave`](Self::leave), with the time of the last look.
+    pub(super) fn leave_at_look(&mut self, flow: &BusyFlow) -> Progress {
+        self.leave(flow, self.looked)
     }
 
     /// A flow that made this progress goes on with the samples of one that ended, and with what is known of that. If its
@@ -276,6 +283,7 @@ impl Progress {
         let waits_for_others = flow.waits_for_others && !starves;
         match hearing {
             _ if moved || flow.waits_for_limit => self.idle = Duration::ZERO,
+            _ if flow.is_service && !is_held && !starves => self.idle = Duration::ZERO,
             // What others have it wait for is no fault of it. What went before stays: there was no progress since.
             Hearing::Heard if waits_for_others => {}
             Hearing::Heard => self.idle += passed,

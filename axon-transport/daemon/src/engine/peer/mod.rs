@@ -489,9 +489,13 @@ impl Peer {
         with: &Surroundings<'_>,
         now: Duration,
     ) -> Option<StalledRoute> {
+        let key = self.served.get(route)?.key.clone();
         let stalled = self.give_up_stalled(route, why, with, now)?;
-        // Of a service, the other direction ends with it.
-        self.update(with, now);
+        if key.kind != Kind::Topic {
+            // The other direction of the service ends with it.
+            self.unanswered.handle_stalled(key);
+            self.update(with, now);
+        }
         Some(stalled)
     }
 

@@ -165,6 +165,11 @@ impl Peer {
         }
     }
 
+    /// Whether the peer refuses to serve a route.
+    pub(super) fn is_refused(&self, key: &RouteKey) -> bool {
+        self.refused.unserved.contains_key(key)
+    }
+
     /// This side asks for the route after all, or has no use for it.
     pub(super) fn asks(&mut self, key: &RouteKey) {
         if self.refused.unasked.remove(key).is_some() {

@@ -129,8 +129,8 @@ impl Peer {
             }
             Kind::Request | Kind::Response => {
                 let sources = self.sources_of_service(&key);
-                let (adopted, unfinished) = Default::default();
-                Relays { sources, adopted, unfinished, without: None }
+                let unfinished = self.unanswered.go_on(&key);
+                Relays { sources, adopted: Vec::new(), unfinished, without: None }
             }
         };
         let Relays { sources, adopted, unfinished, without } = relays;
@@ -218,6 +218,11 @@ impl Peer {
     /// The peer no longer wants a route.
     pub(super) fn unserve(&mut self, route: u32) {
         self.refused.forget(route);
+        if let Some(served) = self.served.get(route).filter(|served| served.key.kind != Kind::Topic)
+        {
+            let unfinished = self.outbound.leave_service(route);
+            self.unanswered.leave(&served.key, unfinished);
+        }
         self.served.remove(route);
         self.outbound.end_route(route);
     }

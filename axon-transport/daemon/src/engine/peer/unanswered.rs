@@ -10,21 +10,38 @@ use axon_envelope::Kind;
 
 use super::{
     Peer, Surroundings,
+    asking::Asked,
     routes::{RouteKey, Wanted},
 };
+use crate::engine::outbound::UnfinishedFlows;
 
 /// Between two looks at responses that the peer does not ask for.
 const LOOK: Duration = Duration::from_secs(1);
+/// Services of a peer whose routes ended while something waited for it. Of more than these nothing is remembered.
+const LEFT: usize = 256;
 
-/// The requests that a peer is not asked for, since it does not take what answers them.
+/// What is known of services whose requests or responses a peer does not take.
 #[derive(Default)]
 pub(super) struct Unanswered {
-    /// Until when it is not asked for them.
+    /// Requests that the peer is not asked for, and until when.
     closed: BTreeMap<RouteKey, Duration>,
-    /// Since when responses to them wait that the peer has not asked for.
-    awaited: BTreeMap<RouteKey, Duration>,
-    /// When that is looked at.
+    /// Routes of services that were given up since the peer did not take what they carried.
+    stalled: BTreeSet<RouteKey>,
+    /// Requests to which responses wait that the peer has not asked for.
+    awaited: BTreeMap<RouteKey, Awaited>,
+    /// What is known of routes that ended, until the peer asks for them again.
+    left: BTreeMap<RouteKey, UnfinishedFlows>,
+    /// When responses that the peer does not ask for are looked at.
     look: Option<Duration>,
+}
+
+/// Responses that wait for the peer to ask for them.
+#[derive(Clone, Copy, Debug)]
+struct Awaited {
+    /// Responses that had found no room when they were seen first.
+    refused: u64,
+    /// For how long they have waited since, look by look.
+    waited: Duration,
 }
 
 impl Unanswered {
@@ -32,10 +49,45 @@ impl Unanswered {
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         self.closed.values().copied().chain(self.look).min()
     }
+
+    /// A route of a service was given up.
+    pub(super) fn handle_stalled(&mut self, route: RouteKey) {
+        self.stalled.insert(route);
+    }
+
+    /// A route of a service ends. This is known of its flows.
+    pub(super) fn leave(&mut self, route: &RouteKey, unfinished: UnfinishedFlows) {
+        if !unfinished.is_empty() && self.left.len() < LEFT {
+            self.left.insert(route.clone(), unfinished);
+        }
+        if route.kind == Kind::Response {
+            self.look = Some(Duration::ZERO);
+        }
+    }
+
+    /// The peer asks for a route of a service. Returns what is known of flows that it had.
+    pub(super) fn go_on(&mut self, route: &RouteKey) -> UnfinishedFlows {
+        self.left.remove(route).unwrap_or_default()
+    }
+}
+
+impl Asked {
+    /// How many responses its clients have not taken, and how many more found no room.
+    fn responses(&self) -> (u64, u64) {
+        let clients = self.stand_ins.values();
+        clients.fold((0, 0), |(waiting, refused), client| {
+            let (ring, of) = (client.ring(), client.gid());
+            (
+                waiting + ring.calls_of(&of),
+                refused.saturating_add(ring.refused_of(&of).unwrap_or(0)),
+            )
+        })
+    }
 }
 
 impl Peer {
-    /// Takes out of what is wanted the requests whose responses the peer did not take lately. Returns them.
+    /// Takes out of what is wanted the requests whose responses the peer did not take lately. Returns them. Those that it
+    /// is asked for stay, if it was another daemon of its host that took nothing.
     pub(super) fn leave_out_unanswered(
         &mut self,
         wanted: &mut BTreeMap<RouteKey, Wanted>,
@@ -43,8 +95,13 @@ impl Peer {
         now: Duration,
     ) -> BTreeSet<RouteKey> {
         let stalls = with.stalls.borrow();
+        let stalled = std::mem::take(&mut self.unanswered.stalled);
         let left = |key: &RouteKey| {
-            stalls.left(&self.identity, &key.other_way(), with.instant(now)).map(|left| now + left)
+            let responses = key.other_way();
+            if self.asked.contains_key(key) && !stalled.contains(&responses) {
+                return None;
+            }
+            stalls.left(&self.identity, &responses, with.instant(now)).map(|left| now + left)
         };
         let requests = wanted.keys().filter(|key| key.kind == Kind::Request);
         let closed: BTreeMap<_, _> =
@@ -52,16 +109,8 @@ impl Peer {
         wanted.retain(|key, _| !closed.contains_key(key));
         let keys = closed.keys().cloned().collect();
         self.unanswered.closed = closed;
-        if self.unanswered.look.is_none() && self.has_unasked_responses() {
-            self.unanswered.look = Some(now + LOOK);
-        }
+        self.unanswered.look.get_or_insert(now + LOOK);
         keys
-    }
-
-    /// Whether this host asked for requests of a service whose responses the peer has not asked for.
-    fn has_unasked_responses(&self) -> bool {
-        let requests = self.asked.keys().filter(|key| key.kind == Kind::Request);
-        requests.map(RouteKey::other_way).any(|key| self.served.number_of(&key).is_none())
     }
 
     /// Looks for responses that the peer does not ask for, and asks again for requests whose time is over.
@@ -72,33 +121,59 @@ impl Peer {
         let looks = self.unanswered.look.is_some_and(|look| look <= now);
         let mut stalled = false;
         if looks {
-            self.unanswered.look = self.has_unasked_responses().then(|| now + LOOK);
-            stalled = self.find_unasked_responses(with, now);
+            let unasked = self.unasked_responses();
+            self.unanswered.look = (!unasked.is_empty()).then(|| now + LOOK);
+            stalled = self.find_unasked_responses(&unasked, with, now);
         }
         if is_over || stalled {
             self.update(with, now);
         }
     }
 
-    /// Whether responses have waited for the limit that the peer does not ask for. It counts as one that does not read
-    /// them.
-    fn find_unasked_responses(&mut self, with: &Surroundings<'_>, now: Duration) -> bool {
-        let waiting = self.asked.iter().filter(|(key, asked)| {
-            key.kind == Kind::Request
-                && self.served.number_of(&key.other_way()).is_none()
-                && asked.stand_ins.values().any(|client| client.ring().calls_of(&client.gid()) > 0)
+    /// Requests that this host asked for, and to which the peer has not asked for the responses. One whose server the peer
+    /// does not serve now is none of them: this host does not ask for its responses either.
+    fn unasked_responses(&self) -> BTreeSet<RouteKey> {
+        let requests = self.asked.keys().filter(|key| key.kind == Kind::Request);
+        let unasked = requests.filter(|key| {
+            self.served.number_of(&key.other_way()).is_none() && !self.is_refused(key)
         });
+        unasked.cloned().collect()
+    }
+
+    /// Whether responses have waited for the limit, and left no room for others, that the peer does not ask for. It counts
+    /// as one that does not read them. One that asks for them for a while and takes none begins where it was.
+    fn find_unasked_responses(
+        &mut self,
+        unasked: &BTreeSet<RouteKey>,
+        with: &Surroundings<'_>,
+        now: Duration,
+    ) -> bool {
         let before = std::mem::take(&mut self.unanswered.awaited);
-        let since = |key: &RouteKey| before.get(key).copied().unwrap_or(now);
-        let awaited: BTreeMap<_, _> = waiting.map(|(key, _)| (key.clone(), since(key))).collect();
         let limit = with.config.link.stalled;
-        let (stalled, awaited): (BTreeMap<_, _>, _) =
-            awaited.into_iter().partition(|(_, since)| now.saturating_sub(*since) >= limit);
-        self.unanswered.awaited = awaited;
-        for key in stalled.keys() {
-            let (who, instant) = (&self.identity, with.instant(now));
-            with.stalls.borrow_mut().add(who, &key.other_way(), limit, instant);
+        let mut found = false;
+        for (key, asked) in &self.asked {
+            let known = before.get(key).copied();
+            if key.kind != Kind::Request || known.is_none() && !unasked.contains(key) {
+                continue;
+            }
+            let (waiting, refused) = asked.responses();
+            if waiting == 0 {
+                continue;
+            }
+            let mut awaited = known.unwrap_or(Awaited { refused, waited: Duration::ZERO });
+            if refused != awaited.refused && unasked.contains(key) && !self.silent {
+                awaited.waited += LOOK;
+            }
+            if awaited.waited < limit {
+                self.unanswered.awaited.insert(key.clone(), awaited);
+                continue;
+            }
+            let responses = key.other_way();
+            with.stalls.borrow_mut().add(&self.identity, &responses, limit, with.instant(now));
+            self.counters.dropped("stalled", waiting);
+            self.unanswered.stalled.insert(responses);
+            found = true;
         }
-        !stalled.is_empty()
+        found
     }
 }

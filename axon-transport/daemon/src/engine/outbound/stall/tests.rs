@@ -8,6 +8,7 @@ const FLOW: BusyFlow = BusyFlow {
     progress: (0, 0),
     keeps: Some(1),
     refused: None,
+    is_service: false,
     uses_credit: false,
     waits_for_others: false,
     waits_for_limit: false,
@@ -338,4 +339,14 @@ fn nobody_looks_for_a_second_after_the_first_sample() {
     assert_eq!(stalls.poll_timeout(), now + LOOK);
     stalls.handle_first(Duration::ZERO);
     assert_eq!(stalls.poll_timeout(), now + LOOK);
+}
+
+#[test]
+fn a_server_that_takes_its_time_is_judged_once_a_client_finds_no_room() {
+    let service = |now: Duration| BusyFlow { is_service: true, ..held(now) };
+    // Calls wait, and there is room for more.
+    assert_eq!(look(false, |now| vec![BusyFlow { refused: Some(7), ..service(now) }], secs), None);
+    assert_eq!(look(false, |now| vec![BusyFlow { refused: None, ..service(now) }], secs), None);
+    let found = look(false, |now| vec![service(now)], secs);
+    assert_eq!(found, Some((LOOK + LIMIT, stalled(Stall::NothingRead))));
 }

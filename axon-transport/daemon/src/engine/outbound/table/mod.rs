@@ -230,6 +230,7 @@ fn busy_flow(id: FlowId, flow: &Flow, served: &Served) -> BusyFlow {
         progress: flow.progress(),
         keeps: served.keeps(&flow.info.of),
         refused: served.refused(&flow.info.of),
+        is_service: served.is_service(),
         uses_credit: flow.uses_credit(),
         waits_for_others: flow.waits_for_others(),
         waits_for_limit: flow.waits_for_limit(),
