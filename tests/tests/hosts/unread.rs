@@ -279,9 +279,10 @@ fn a_peer_whose_server_takes_no_request_holds_up_no_client_of_another_server_for
             Err(error) => panic!("{error}"),
         }
     }
+    // A peer is judged while a client tries in vain.
+    until("the client goes on", || client.send_request(&[]).is_ok());
     let told = stranger.hear(&mut met, refused).expect("it is told");
     assert!(retry(told) > 0);
-    until("the client goes on", || client.send_request(&[]).is_ok());
     assert_eq!(server.join().unwrap(), sent + 1, "the server here has it all");
     host.wait_refusal("it is shown", |text| text.contains(SERVICE) && text.contains("stalled_s"));
     let lost = || {
