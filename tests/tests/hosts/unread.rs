@@ -280,10 +280,11 @@ fn a_peer_whose_server_takes_no_request_holds_up_no_client_of_another_server_for
         }
     }
     // A peer is judged while a client tries in vain.
-    until("the client goes on", || client.send_request(&[]).is_ok());
+    until("the client goes on", || client.send_request(&request).is_ok());
+    client.send_request(&[]).unwrap();
     let told = stranger.hear(&mut met, refused).expect("it is told");
     assert!(retry(told) > 0);
-    assert_eq!(server.join().unwrap(), sent + 1, "the server here has it all");
+    assert_eq!(server.join().unwrap(), sent + 2, "the server here has it all");
     host.wait_refusal("it is shown", |text| text.contains(SERVICE) && text.contains("stalled_s"));
     let lost = || {
         let topics = host.status().topics;
