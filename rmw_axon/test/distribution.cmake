@@ -28,3 +28,9 @@ expect_warning(TRUE 7.30.0 4.6.5)
 expect_warning(TRUE 17.3.0 4.6.5)
 expect_warning(TRUE 7.3.1 5.1.4)
 expect_warning(TRUE 7.9.1 5.2.1)
+
+# The package's build asks.
+file(READ ${CMAKE_CURRENT_LIST_DIR}/../CMakeLists.txt lists)
+if(NOT lists MATCHES "\naxon_warn_of_distribution\\(")
+  message(SEND_ERROR "CMakeLists.txt does not call axon_warn_of_distribution")
+endif()

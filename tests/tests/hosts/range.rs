@@ -1,6 +1,8 @@
 //! The discovery range is each session's own: which session started the daemon does not matter, and both
 //! hosts decide for each pair.
 
+use std::time::Duration;
+
 use axon_tests::Sizes;
 use axon_tls::identity::{Auth, SigningKey};
 use axon_transport::{
@@ -149,6 +151,13 @@ fn localhost_beside_subnet(first: &[(&str, &str)]) {
     publish(&from_there);
     take_of(&here, from_there.gid());
     apart(&there, &from_there, &near, &far);
+
+    // The same holds for services.
+    let service = || EndpointSpec::new("/service", "test/Set", Qos::default());
+    let _server = near.create_server(service()).unwrap();
+    let [near_client, far_client] = [&wide, &there].map(|s| s.create_client(service()).unwrap());
+    assert!(near_client.wait_available(PATIENCE));
+    assert!(!far_client.wait_available(Duration::from_millis(500)));
 
     let status = a.status();
     let topic = status.topics.iter().find(|topic| topic.topic == TOPIC).unwrap();
