@@ -216,11 +216,7 @@ impl Outbound {
         most: usize,
         now: Duration,
     ) -> (Vec<Source>, UnfinishedFlows) {
-        let mut unfinished = UnfinishedFlows::new();
-        for (of, flow, furthest) in self.table.kept_flows(number) {
-            let progress = self.stalls.leave(&flow, now);
-            unfinished.insert(of, Unfinished { progress, furthest });
-        }
+        let unfinished = self.leave(number, now);
         let (kept, gone) = self.table.take_kept(number, most);
         self.forget(gone);
         (kept, unfinished)
@@ -229,9 +225,14 @@ impl Outbound {
     /// What is known of the flows of a service whose route is about to end: whatever follows it goes on with that, since
     /// what it held is still there.
     pub(crate) fn leave_service(&mut self, number: u32) -> UnfinishedFlows {
+        self.leave(number, self.stalls.looked())
+    }
+
+    /// What is known of the flows of a route that hold somebody up.
+    fn leave(&mut self, number: u32, now: Duration) -> UnfinishedFlows {
         let flows = self.table.kept_flows(number).into_iter();
         let known = flows.map(|(of, flow, furthest)| {
-            (of, Unfinished { progress: self.stalls.leave_at_look(&flow), furthest })
+            (of, Unfinished { progress: self.stalls.leave(&flow, now), furthest })
         });
         known.collect()
     }

@@ -163,9 +163,9 @@ impl Stalls {
         }
     }
 
-    /// As [`leave`](Self::leave), with the time of the last look.
-    pub(super) fn leave_at_look(&mut self, flow: &BusyFlow) -> Progress {
-        self.leave(flow, self.looked)
+    /// When time was counted last.
+    pub(super) fn looked(&self) -> Duration {
+        self.looked
     }
 
     /// A flow that made this progress goes on with the samples of one that ended, and with what is known of that. If its

@@ -2,9 +2,9 @@
 //!
 //! Everything follows from one seed, but for the bytes of TLS. [`network`] carries datagrams, [`script`] says which
 //! fault happens when, [`trace`] tells whether two runs were the same, and [`rng`] gives each part its own generator.
-//! [`rings`] models a host's rings, [`discovery`] whom it dials, [`host`] a host with its engine, and [`world`] all hosts
-//! and the clock. [`run`] runs a script in a world. [`raw`] is a peer without an engine, and [`held`] checks that memory is bounded.
-//! [`pair`] is less than all that: two QUIC connections alone.
+//! [`host`] runs the engine of one host. [`rings`] models its rings, and [`discovery`] decides whom it dials. [`world`]
+//! holds all hosts and the clock. [`run`] runs a script in a world. [`raw`] is a peer without an engine. [`held`] checks that
+//! memory is bounded. [`pair`] runs two QUIC connections without any of this.
 
 mod discovery;
 mod held;
