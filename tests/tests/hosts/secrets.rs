@@ -72,8 +72,9 @@ struct Sought {
 #[derive(Default)]
 struct Found {
     wrong: usize,
-    /// Those among them that are text of the KME's answers.
+    /// Those among them that are text of the KME's answers, and of how many keys one daemon has such text at most.
     texts: usize,
+    keys_in_text: usize,
     on_stacks: usize,
     /// KME keys that wait for their use, or that the cipher of envelopes has.
     held: BTreeSet<usize>,
@@ -91,6 +92,9 @@ const GHASH: &str = "GHASH key";
 /// Nobody ever needs it but for the moment in which an envelope is sealed or opened.
 const MASK: &str = "tag mask";
 const TEXT: &str = "KME key, base64";
+/// So many keys have their text in one daemon while messages flow, however many were drawn: those of the last answers of
+/// each connection to the KME.
+const KEYS_IN_TEXT: usize = 10;
 
 /// Keys that wait for their use are in locked memory alone. Ciphers and the secrets of a connection are in use.
 fn is_allowed(find: &Find) -> bool {
@@ -171,7 +175,10 @@ impl Hosts {
             let found = process.search(&sought.needles).unwrap();
             all.wrong += unexpected("a daemon", &found, is_allowed);
             all.of_connections.extend(found.iter().filter(|find| is_of_connection(find)).cloned());
-            all.texts += found.iter().filter(|find| find.secret.kind == TEXT).count();
+            let texts = || found.iter().filter(|find| find.secret.kind == TEXT);
+            let keys: BTreeSet<_> = texts().map(|find| find.secret.number).collect();
+            all.texts += texts().count();
+            all.keys_in_text = all.keys_in_text.max(keys.len());
             all.on_stacks += found.iter().filter(|find| find.on_stack).count();
             let of = |kinds: &[&str]| -> BTreeSet<usize> {
                 let allowed = found.iter().filter(|find| is_allowed(find));
@@ -209,6 +216,11 @@ impl Hosts {
             eprintln!(
                 "{drawn} keys were drawn, of {with_nonces} nonces were read, {connections} connections were \
                  recorded: {in_use:?}"
+            );
+            assert!(
+                found.keys_in_text <= KEYS_IN_TEXT,
+                "the text of {} keys of {drawn} is left",
+                found.keys_in_text
             );
             if (wrong, on_stacks, in_use) == (0, 0, (2, 2)) && with_nonces > 0 {
                 break;
