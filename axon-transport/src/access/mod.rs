@@ -38,6 +38,7 @@ mod pattern_set;
 mod permissions;
 pub(crate) mod ros;
 mod rules;
+mod starred_segments;
 #[cfg(test)]
 mod tests;
 

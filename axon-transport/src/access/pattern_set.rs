@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use super::pattern::{TopicPattern, segment_fits};
+use super::{pattern::TopicPattern, starred_segments::StarredSegments};
 
 /// Patterns, each with the line that it stands in, as a tree of their segments.
 #[derive(Debug)]
@@ -16,7 +16,7 @@ struct Node {
     /// The next segment, where it is plain text.
     literal: HashMap<Box<str>, usize>,
     /// The next segment, where it has a `*`.
-    starred: Vec<(Box<str>, usize)>,
+    starred: StarredSegments,
     /// The next segment, where it is `**`.
     any: Option<usize>,
     /// It is behind `**`, which takes any number of segments.
@@ -57,9 +57,7 @@ impl PatternSet {
         let node = &self.nodes[at];
         let known = match segment {
             "**" => node.any,
-            _ if segment.contains('*') => {
-                node.starred.iter().find(|(known, _)| **known == *segment).map(|(_, next)| *next)
-            }
+            _ if segment.contains('*') => node.starred.get(segment),
             _ => node.literal.get(segment).copied(),
         };
         if let Some(known) = known {
@@ -70,7 +68,7 @@ impl PatternSet {
         let node = &mut self.nodes[at];
         match segment {
             "**" => node.any = Some(next),
-            _ if segment.contains('*') => node.starred.push((segment.into(), next)),
+            _ if segment.contains('*') => node.starred.insert(segment, next),
             _ => drop(node.literal.insert(segment.into(), next)),
         }
         next
@@ -92,9 +90,7 @@ impl PatternSet {
                 if let Some(child) = literal.get(segment) {
                     self.enter(&mut next, *child);
                 }
-                for (_, child) in starred.iter().filter(|(star, _)| segment_fits(star, segment)) {
-                    self.enter(&mut next, *child);
-                }
+                starred.each_fit(segment, |child| self.enter(&mut next, child));
             }
             std::mem::swap(&mut at, &mut next);
             if at.is_empty() {
@@ -121,13 +117,33 @@ mod tests {
     use super::*;
 
     fn segments() -> impl Strategy<Value = String> {
-        let segment =
-            prop_oneof![Just("**"), Just("*"), Just("a"), Just("b"), Just("a*"), Just("*b")];
+        let segment = prop_oneof![
+            Just("**"),
+            Just("*"),
+            Just("a"),
+            Just("b"),
+            Just("a*"),
+            Just("*b"),
+            Just("a*b"),
+            Just("ab*a"),
+            Just("a*b*a"),
+            Just("\u{e9}*"),
+            Just("*\u{e9}a"),
+        ];
         prop::collection::vec(segment, 1..5).prop_map(|all| format!("/{}", all.join("/")))
     }
 
     fn names() -> impl Strategy<Value = String> {
-        let segment = prop_oneof![Just("a"), Just("b"), Just("ab"), Just("")];
+        let segment = prop_oneof![
+            Just("a"),
+            Just("b"),
+            Just("ab"),
+            Just("aba"),
+            Just("abba"),
+            Just("\u{e9}"),
+            Just("\u{e9}a"),
+            Just(""),
+        ];
         let absolute =
             prop::collection::vec(segment, 1..6).prop_map(|all| format!("/{}", all.join("/")));
         prop_oneof![absolute, Just(String::new()), Just("a".to_owned()), Just("/".to_owned())]
