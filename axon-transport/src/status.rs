@@ -35,6 +35,10 @@ pub struct Status {
     pub version: String,
     /// `ROS_DOMAIN_ID`.
     pub domain: u32,
+    /// Whether the rest is left out, except the state of the gateway: the daemon has access rules, and who asks is another user
+    /// of its host. False from a daemon of an earlier version.
+    #[serde(default)]
+    pub withheld: bool,
     /// The effective security settings, as sessions are compared with them: `AXON_` name and value
     /// or digest.
     pub settings: BTreeMap<String, String>,
@@ -333,11 +337,6 @@ impl RefusalStatus {
     pub fn new(at: SystemTime, peer: String, what: String, reason: String) -> Self {
         Self { at, peer, what, reason }
     }
-}
-
-/// Now, in milliseconds since the Unix epoch.
-pub fn unix_ms() -> u64 {
-    times::unix_ms(SystemTime::now())
 }
 
 /// What came of reading a daemon's settings again.

@@ -76,6 +76,12 @@ fn status() -> Option<Status> {
 
 /// The daemon may have been started with other settings than this process, or before the file was changed.
 fn warn_of_other_rules(status: &Status, rules: &AccessRules) {
+    if status.withheld {
+        return say(format_args!(
+            "axon: the daemon that runs belongs to another user and does not tell its access rules: the answer is \
+             about the rules here, and nothing is known of other hosts"
+        ));
+    }
     let daemon = status.settings.get("AXON_ACCESS_FILE").map_or("none", String::as_str);
     let own = Config::from_env().and_then(Config::with_rules_of_host);
     let own = own.ok().and_then(|config| config.access_file);

@@ -58,11 +58,28 @@ pub(crate) fn run(args: &cli::Status) -> Result<ExitCode, CliError> {
     Ok(ExitCode::SUCCESS)
 }
 
+/// What stands in place of what the daemon does not tell another user.
+const WITHHELD: &str = "\nThe daemon belongs to another user and has access rules: it tells no other user its settings, \
+                        rules, links, topics and sessions. Its own user sees them with `axon status`.\n";
+
 /// The status for people.
 fn render(status: &Status) -> String {
     let mut out = String::new();
     heading(&mut out, "Daemon");
     let uptime = text::duration(nanoseconds(status.uptime));
+    if status.withheld {
+        facts(
+            &mut out,
+            &[
+                ("id", status.daemon.clone()),
+                ("process", format!("{}, up {uptime}, version {}", status.pid, status.version)),
+                ("domain", status.domain.to_string()),
+                ("gateway", status.gateway.clone()),
+            ],
+        );
+        out.push_str(WITHHELD);
+        return out;
+    }
     let port = status.port.map_or_else(|| "none".to_owned(), |port| port.to_string());
     facts(
         &mut out,

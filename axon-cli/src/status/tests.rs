@@ -103,6 +103,20 @@ fn reader(pid: u32, waiting_ms: u64) -> ReaderStatus {
 }
 
 #[test]
+fn what_a_daemon_withholds_is_not_shown_as_nothing() {
+    let mut status = Status::default();
+    status.daemon = "00ff".to_owned();
+    status.gateway = "running".to_owned();
+    status.withheld = true;
+    let text = render(&status);
+    assert!(text.contains("00ff") && text.contains("running"), "{text}");
+    assert!(text.contains("tells no other user its settings"), "{text}");
+    for untrue in ["none", "no other host", "nobody", "nothing", "everything is allowed"] {
+        assert!(!text.contains(untrue), "{untrue}: {text}");
+    }
+}
+
+#[test]
 fn status_removes_control_characters_of_peer_names() {
     assert!(!render(&status()).contains('\x1b'));
 }

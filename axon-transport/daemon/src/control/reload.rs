@@ -201,7 +201,8 @@ fn unfit(old: &Config, new: &Config) -> Option<&'static str> {
     // Rules are checked against the mode that they are read with.
     if format!("{:?}", old.security) != format!("{:?}", new.security) {
         return Some(
-            "the settings of security differ from those in force: start the daemon again to change them",
+            "the settings of security differ from those in force (mode, files of keys and certificates, KME, \
+             AXON_QKD_PEERS): start the daemon again to change them",
         );
     }
     // A file that is being written, or replaced, is empty or absent for a moment.
@@ -289,7 +290,7 @@ mod tests {
         let key = tempfile::NamedTempFile::new().unwrap();
         let pinned = Config::builder().classic_key(key.path()).classic_trust(key.path());
         let report = control.take_settings(Ok(pinned.build().unwrap()));
-        assert!(report.error.unwrap().contains("security differ"));
+        assert!(report.error.unwrap().contains("security differ from those in force"));
         // Nor do limits.
         let mut limited = new.clone();
         let limits = format!("{rules}\n[[limit]]\npeer = \"*\"\nrate = 1");

@@ -12,11 +12,10 @@ use std::{
     path::{Path, PathBuf},
     sync::mpsc::{Receiver, SyncSender, sync_channel},
     thread,
-    time::Duration,
+    time::{Duration, SystemTime},
 };
 
 use axon_shm::ids::DaemonId;
-use axon_transport::status::unix_ms;
 
 use crate::{engine::qlog::Qlogs, link::Side};
 
@@ -85,7 +84,9 @@ impl Qlogs for QlogFiles {
         let daemon = &self.daemon.to_string()[..8];
         // The oldest is the first in the order of names.
         let (begin, end) = NAME;
-        let name = format!("{begin}{:014}-{daemon}-{number:08}-{role}{end}", unix_ms());
+        let since_epoch = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+        let unix_ms = since_epoch.map_or(0, |since| since.as_millis());
+        let name = format!("{begin}{unix_ms:014}-{daemon}-{number:08}-{role}{end}");
         self.orders.try_send(QlogOrder::Open(number, name)).ok()?;
         Some(Box::new(Writer::new(number, self.orders.clone())))
     }

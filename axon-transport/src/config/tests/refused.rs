@@ -335,6 +335,7 @@ fn rules_that_cannot_be_used_are_refused_with_their_place() {
     disk.put("/f/bad.toml", 0o644, "[[allow]]\npeer = \"base\"\npublish = \"x\"");
     disk.put("/f/axon.toml", 0o644, base);
     disk.put("/f/bad-axon.toml", 0o644, "[[deny]]\npeer = 3");
+    disk.put("/f/no.toml", 0o644, "log = 'info'\nring_buffer_size_mb = = 8");
     disk.put("/f/address.toml", 0o644, "[[allow]]\npeer = [\"local\", \"address:10.*\", \"*\"]");
     let resolve = |env: &[(&str, &str)]| {
         let env = env.iter().map(|(name, value)| (name.into(), value.into()));
@@ -359,6 +360,8 @@ fn rules_that_cannot_be_used_are_refused_with_their_place() {
     );
     let error = pinned(&[("AXON_CONFIG", "/f/bad-axon.toml")]).unwrap_err();
     assert!(error.starts_with("AXON_CONFIG (/f/bad-axon.toml): line 2, column 8: peer"), "{error}");
+    let error = pinned(&[("AXON_CONFIG", "/f/no.toml")]).unwrap_err();
+    assert!(error.contains("a file in TOML; line 2, column 23: "), "{error}");
     let both = pinned(&[("AXON_CONFIG", "/f/axon.toml"), ("AXON_ACCESS_FILE", "/f/good.toml")]);
     assert!(both.unwrap_err().contains("rules in one place"));
     // Where nobody proves a name, a rule for a name would protect nothing.

@@ -114,6 +114,17 @@ pub fn daemon_status_at(place: &DaemonPlace) -> Result<String, SessionError> {
 /// peers, trusted users and the log filter, from its own environment and files. Where something is wrong with them, nothing
 /// changes, and the report says what.
 ///
+/// ```no_run
+/// use axon_transport::{config::DaemonPlace, daemon_reload_at};
+///
+/// let report = daemon_reload_at(&DaemonPlace::from_env()?)?;
+/// match report.error {
+///     Some(error) => eprintln!("nothing changed: {error}"),
+///     None => println!("changed: {}", report.changed.join(", ")),
+/// }
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+///
 /// # Errors
 /// As [`daemon_status`]. A daemon of an earlier version does not answer.
 pub fn daemon_reload_at(place: &DaemonPlace) -> Result<ReloadReport, SessionError> {
@@ -129,6 +140,23 @@ pub fn daemon_reload_at(place: &DaemonPlace) -> Result<ReloadReport, SessionErro
 /// host may do there: at most 32 uses at a time, each a verb and the name of a topic, service or node. `peer` is the
 /// daemon that [`LinkStatus::peer`](crate::status::LinkStatus::peer) names. A question that the daemon cannot pass on, such as
 /// of a peer that is not linked, is answered by [`PeerDecisions::error`].
+///
+/// ```no_run
+/// use axon_transport::{
+///     access::Verb, config::DaemonPlace, daemon_check_access_at, daemon_status_at, status::Status,
+/// };
+///
+/// let place = DaemonPlace::from_env()?;
+/// let status: Status = serde_json::from_str(&daemon_status_at(&place)?)?;
+/// for link in &status.links {
+///     let uses = [(Verb::Publish, "/cmd_vel".to_owned())];
+///     let answer = daemon_check_access_at(&place, &link.peer, &uses)?;
+///     for decision in answer.decisions {
+///         println!("{}: {}", link.host, decision.reason);
+///     }
+/// }
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 ///
 /// # Errors
 /// As [`daemon_status`]. [`SessionError::Silent`] also where the peer does not answer, as a daemon of an earlier version.

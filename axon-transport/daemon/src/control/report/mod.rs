@@ -126,6 +126,7 @@ fn without_details(status: &Status) -> Status {
     public.version = status.version.clone();
     public.domain = status.domain;
     public.gateway = status.gateway.clone();
+    public.withheld = true;
     public
 }
 
