@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 
 pub use self::{
     limit::LimitStatus,
-    link::{LinkStatus, WaitingStatus},
+    link::{CompressedStatus, LinkStatus, WaitingStatus},
 };
 
 /// The whole status.
@@ -402,6 +402,7 @@ mod tests {
             r#""congestion_events":7,"mtu":1452,"mtu_black_holes":8,"waiting_bytes":9,"#,
             r#""waiting":{"control":1,"services":2,"small_reliable":3,"small_best_effort":4,"bulk":5},"#,
             r#""waiting_ms":88,"samples_in":10,"samples_out":11,"bytes_in":12,"bytes_out":13,"#,
+            r#""compressed":{"samples":19,"bytes":20,"bytes_sent":21},"#,
             r#""dropped":{"no_key":1},"routes_refused":{},"more_routes_refused":0,"denied":{},"more_denied":0,"limits":[],"more_limits":0,"endpoints":14,"#,
             r#""endpoints_left_out":15,"graph_bytes":16,"held_bytes":17,"held_limit":18}"#
         );

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use axon_transport::status::{LinkStatus, WaitingStatus};
+use axon_transport::status::{CompressedStatus, LinkStatus, WaitingStatus};
 
 use super::{dash, nanoseconds};
 use crate::text::{self, TextTable, grouped};
@@ -19,6 +19,7 @@ pub(super) fn paths(links: &[LinkStatus]) -> TextTable {
         ">lost",
         ">marked in",
         ">marked out",
+        "compressed",
         "waiting",
         ">oldest",
     ]);
@@ -34,11 +35,21 @@ pub(super) fn paths(links: &[LinkStatus]) -> TextTable {
             format!("{} ({})", grouped(link.packets_lost), text::bytes(link.bytes_lost)),
             grouped(link.ecn_marks_in),
             grouped(link.ecn_marks_out),
+            compressed(&link.compressed),
             waiting(&link.waiting),
             time(link.oldest_waits),
         ]);
     }
     table
+}
+
+/// How many samples were compressed, and their bytes before and after.
+fn compressed(compressed: &CompressedStatus) -> String {
+    let CompressedStatus { samples, bytes, bytes_sent, .. } = *compressed;
+    if samples == 0 {
+        return dash();
+    }
+    format!("{}: {} to {}", grouped(samples), text::bytes(bytes), text::bytes(bytes_sent))
 }
 
 /// The classes of which something waits, in the order in which they are served.

@@ -3,9 +3,9 @@
 use std::{fmt::Display, net::IpAddr, path::Path, time::Duration};
 
 use super::{
-    ClassicAuth, Config, ConfigError, Congestion, DaemonPolicy, DiscoveryRange, KeyMode, LinkPoll,
-    OsFiles, QkdKex, QkdPeers, QuicCipher, SecurityMode, daemon_env::DaemonEnv, names,
-    resolve::resolve, sources::Given, values::method,
+    ClassicAuth, Config, ConfigError, Congestion, DaemonPolicy, DiscoveryRange, KeyMode,
+    LinkCompression, LinkPoll, OsFiles, QkdKex, QkdPeers, QuicCipher, SecurityMode,
+    daemon_env::DaemonEnv, names, resolve::resolve, sources::Given, values::method,
 };
 
 /// Makes a [`Config`] in code. Each method gives the setting of `docs/configuration.md` that has its name:
@@ -398,5 +398,14 @@ impl ConfigBuilder {
             Congestion::Bbr => "bbr",
         };
         self.set("AXON_LINK_CONGESTION", word)
+    }
+
+    /// Whether samples are compressed for other hosts. Default [`LinkCompression::Auto`].
+    pub fn link_compression(self, compression: LinkCompression) -> Self {
+        let word = match compression {
+            LinkCompression::Auto => "auto",
+            LinkCompression::Never => "never",
+        };
+        self.set("AXON_LINK_COMPRESSION", word)
     }
 }

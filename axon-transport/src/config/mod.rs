@@ -41,8 +41,8 @@ pub use crate::access::TopicPattern;
 pub use files::{FileFacts, FileKind, Files, OsFiles};
 pub use model::{
     ClassicAuth, ClassicConfig, Config, Congestion, DaemonPolicy, DiscoveryRange, KeyMode,
-    LinkConfig, LinkPoll, PeerAddress, QkdConfig, QkdKex, QkdPeers, QuicCipher, Security,
-    SecurityMode,
+    LinkCompression, LinkConfig, LinkPoll, PeerAddress, QkdConfig, QkdKex, QkdPeers, QuicCipher,
+    Security, SecurityMode,
 };
 pub use place::DaemonPlace;
 pub use summary::security_settings;

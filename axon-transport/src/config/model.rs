@@ -73,6 +73,14 @@ impl Config {
         topics::first(&self.topics, name).map_or(TopicPriority::Normal, |rule| rule.priority)
     }
 
+    /// Whether the samples of a topic or service may be compressed for other hosts.
+    pub fn topic_compression(&self, name: &str) -> bool {
+        let of_topic = topics::first(&self.topics, name).map(|rule| rule.compression);
+        [Some(self.link.compression), of_topic]
+            .iter()
+            .all(|one| *one != Some(LinkCompression::Never))
+    }
+
     /// The limit that `max_hz` sets for the samples of a topic to each other host.
     pub fn topic_limit(&self, name: &str) -> Option<RateLimit> {
         topics::first(&self.topics, name)?.limit()
@@ -383,6 +391,8 @@ pub struct LinkConfig {
     pub qlog: Option<PathBuf>,
     /// How a link finds its share of the path.
     pub congestion: Congestion,
+    /// Whether samples are compressed.
+    pub compression: LinkCompression,
 }
 
 /// Whether the daemon looks for the next input before it sleeps (`AXON_LINK_POLL`).
@@ -411,6 +421,17 @@ pub enum Congestion {
     Bbr,
 }
 
+/// Whether samples are compressed for other hosts (`AXON_LINK_COMPRESSION`). A daemon decides for what it sends.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum LinkCompression {
+    /// Those of 1 KiB to 8 MiB by zstd, while the link carries less than waits for it and compression takes at most 0.3 of
+    /// the time for which the link is busy with the sample.
+    #[default]
+    Auto,
+    /// None.
+    Never,
+}
+
 impl Default for LinkConfig {
     fn default() -> Self {
         let ten = Duration::from_secs(10);
@@ -423,6 +444,7 @@ impl Default for LinkConfig {
             poll: LinkPoll::Adaptive,
             qlog: None,
             congestion: Congestion::Auto,
+            compression: LinkCompression::Auto,
         }
     }
 }

@@ -51,6 +51,7 @@ pub(super) const LINK: &[&str] = &[
     "AXON_LINK_POLL",
     QLOG,
     "AXON_LINK_CONGESTION",
+    "AXON_LINK_COMPRESSION",
 ];
 
 /// Settings that name files. A relative one is another file for a process in another directory.

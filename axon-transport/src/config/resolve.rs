@@ -8,7 +8,8 @@ use std::{
 
 use super::{
     ClassicAuth, ClassicConfig, Config, ConfigError, Congestion, DaemonPolicy, DiscoveryRange,
-    KeyMode, LinkConfig, LinkPoll, QkdConfig, QkdKex, QkdPeers, QuicCipher, Security, SecurityMode,
+    KeyMode, LinkCompression, LinkConfig, LinkPoll, QkdConfig, QkdKex, QkdPeers, QuicCipher,
+    Security, SecurityMode,
     daemon_env::DaemonEnv,
     files::Files,
     names, rules_file,
@@ -325,6 +326,25 @@ const CONGESTION: [(&str, Congestion); 4] = [
     ("bbr", Congestion::Bbr),
 ];
 
+/// The values of `AXON_LINK_COMPRESSION`.
+pub(super) const COMPRESSION: [(&str, LinkCompression); 2] =
+    [("auto", LinkCompression::Auto), ("never", LinkCompression::Never)];
+
+/// One of these words in the section `[link]`.
+fn word<T: Copy>(
+    name: &str,
+    value: &toml::Value,
+    place: &str,
+    words: &[(&str, T)],
+) -> Result<T, ConfigError> {
+    let read = value.as_str().unwrap_or_else(|| value.type_str());
+    let accepted = || words.iter().map(|(word, _)| *word).collect::<Vec<_>>().join(", ");
+    let known = words.iter().find(|(word, _)| *word == read);
+    known
+        .map(|(_, value)| *value)
+        .ok_or_else(|| ConfigError::value(name, read, accepted()).at(place))
+}
+
 fn link(values: &Values<'_, impl Files>) -> Result<LinkConfig, ConfigError> {
     let sources = values.sources;
     let mut link = LinkConfig::default();
@@ -347,25 +367,12 @@ fn link(values: &Values<'_, impl Files>) -> Result<LinkConfig, ConfigError> {
             "mtu" => link.mtu = number(1_200, 65_527, "bytes")? as u16,
             "graph_mb" => link.graph = (number(1, 1_024, "MiB")? as usize) << 20,
             "held_mb" => link.held = number(16, 1 << 20, "MiB")? << 20,
-            "poll" => {
-                let word = value.as_str().unwrap_or_else(|| value.type_str());
-                let known = POLL.iter().find(|(name, _)| *name == word);
-                let accepted = || POLL.map(|(word, _)| word).join(", ");
-                link.poll = known
-                    .map(|(_, poll)| *poll)
-                    .ok_or_else(|| ConfigError::value(&name, word, accepted()).at(&*place))?;
-            }
+            "poll" => link.poll = word(&name, value, &place, &POLL)?,
             "qlog" => link.qlog = Some(qlog(&name, value, &place, values.files)?),
-            "congestion" => {
-                let word = value.as_str().unwrap_or_else(|| value.type_str());
-                let known = CONGESTION.iter().find(|(name, _)| *name == word);
-                let accepted = || CONGESTION.map(|(word, _)| word).join(", ");
-                link.congestion = known
-                    .map(|(_, congestion)| *congestion)
-                    .ok_or_else(|| ConfigError::value(&name, word, accepted()).at(&*place))?;
-            }
+            "congestion" => link.congestion = word(&name, value, &place, &CONGESTION)?,
+            "compression" => link.compression = word(&name, value, &place, &COMPRESSION)?,
             _ => {
-                let known = "grace_s, stalled_s, mtu, graph_mb, held_mb, poll, qlog, congestion";
+                let known = "grace_s, stalled_s, mtu, graph_mb, held_mb, poll, qlog, congestion, compression";
                 return Err(ConfigError::name(&name, known).at(place));
             }
         }
@@ -394,6 +401,9 @@ fn link(values: &Values<'_, impl Files>) -> Result<LinkConfig, ConfigError> {
     }
     if let Some(congestion) = values.choice("AXON_LINK_CONGESTION", &CONGESTION)? {
         link.congestion = congestion;
+    }
+    if let Some(compression) = values.choice("AXON_LINK_COMPRESSION", &COMPRESSION)? {
+        link.compression = compression;
     }
     Ok(link)
 }

@@ -1,6 +1,6 @@
 //! `[[topic]]` of `axon.toml`: what the daemon does for topics of some names.
 
-use super::ConfigError;
+use super::{ConfigError, LinkCompression, resolve::COMPRESSION};
 use crate::access::{RateLimit, TopicPattern, parse::limit::rate};
 
 /// As many entries as a file may have. A topic is compared with each of them when it is matched.
@@ -19,12 +19,21 @@ pub struct TopicRule {
     pub priority: TopicPriority,
     /// Samples a second of each topic that go to each other host at most: the newest, and the rest is dropped.
     pub max_hz: Option<f64>,
+    /// Whether samples are compressed for other hosts, where `[link] compression` has them compressed.
+    pub compression: LinkCompression,
 }
 
 impl TopicRule {
     /// The topics and services whose names fit have this priority.
     pub const fn new(name: TopicPattern, priority: TopicPriority) -> Self {
-        Self { name, priority, max_hz: None }
+        Self { name, priority, max_hz: None, compression: LinkCompression::Auto }
+    }
+
+    /// Their samples are never compressed.
+    #[must_use]
+    pub const fn uncompressed(mut self) -> Self {
+        self.compression = LinkCompression::Never;
+        self
     }
 
     /// Of each topic so many samples a second go to each other host at most.
@@ -65,6 +74,7 @@ fn rule(entry: toml::Value, place: &str) -> Result<TopicRule, ConfigError> {
         return Err(ConfigError::name("topic", "entries that begin with [[topic]]").at(place));
     };
     let (mut name, mut priority, mut max_hz) = (None, TopicPriority::Normal, None);
+    let mut compression = LinkCompression::Auto;
     for (key, value) in entry {
         let read = value.as_str().unwrap_or_else(|| value.type_str());
         match key.as_str() {
@@ -91,14 +101,21 @@ fn rule(entry: toml::Value, place: &str) -> Result<TopicRule, ConfigError> {
                 let wrong = |what| ConfigError::value("topic.max_hz", &read, what).at(place);
                 max_hz = Some(rate(&read).map_err(wrong)?);
             }
+            "compression" => {
+                let known = COMPRESSION.iter().find(|(word, _)| *word == read);
+                let accepted = || COMPRESSION.map(|(word, _)| word).join(", ");
+                let wrong = || ConfigError::value("topic.compression", read, accepted()).at(place);
+                compression = known.map(|(_, compression)| *compression).ok_or_else(wrong)?;
+            }
             _ => {
                 let name = format!("topic.{key}");
-                return Err(ConfigError::name(&name, "name, priority, max_hz").at(place));
+                let known = "name, priority, max_hz, compression";
+                return Err(ConfigError::name(&name, known).at(place));
             }
         }
     }
     let missing = || ConfigError::missing("topic.name", "a topic's name, or a pattern").at(place);
-    Ok(TopicRule { name: name.ok_or_else(missing)?, priority, max_hz })
+    Ok(TopicRule { name: name.ok_or_else(missing)?, priority, max_hz, compression })
 }
 
 /// The first entry that the name of a topic or service fits.

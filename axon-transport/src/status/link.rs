@@ -86,6 +86,9 @@ pub struct LinkStatus {
     pub bytes_in: u64,
     /// Bytes sent.
     pub bytes_out: u64,
+    /// Samples that were compressed for the link.
+    #[serde(default)]
+    pub compressed: CompressedStatus,
     /// Samples dropped, by cause.
     pub dropped: BTreeMap<String, u64>,
     /// Topics and services that do not cross though they match, and why: the first 64.
@@ -124,8 +127,20 @@ pub struct LinkStatus {
     pub held_limit: u64,
 }
 
-/// Bytes that wait in the daemon until QUIC takes them, by class: a class goes before those below it, and bulk has every
-/// eighth turn. A flow counts as a whole for the class of its next sample. BEST_EFFORT and KEEP_ALL samples wait in their
+/// Samples that were compressed for a link, and that the link then carried or is to carry.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
+pub struct CompressedStatus {
+    /// How many.
+    pub samples: u64,
+    /// Their bytes, which [`bytes_out`](LinkStatus::bytes_out) counts.
+    pub bytes: u64,
+    /// Bytes of the frames that the link carries in their place.
+    pub bytes_sent: u64,
+}
+
+/// Bytes that wait in the daemon until QUIC takes them, by class: a class goes before those below it, of
+/// which each that waits has about an eighth of what is sent. A flow counts as a whole for the class of its next sample. BEST_EFFORT and KEEP_ALL samples wait in their
 /// publisher's ring: those that the daemon has not taken from there do not count.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]

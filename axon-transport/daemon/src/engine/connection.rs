@@ -11,6 +11,7 @@ use quinn_proto::{ConnectionHandle, StreamId, Transmit};
 use rustls_pki_types::CertificateDer;
 
 use super::{
+    compression::link_rate::LinkRate,
     control::Control,
     limits::{Egress, InterfaceLimits},
     marks::marks_reported,
@@ -58,6 +59,8 @@ pub(crate) struct Connection {
     pub(super) egress: Egress,
     /// How much is lost on the way.
     loss: Loss,
+    /// How much it carries.
+    rate: LinkRate,
     /// Whether it is in the list of connections with something to do.
     pub(super) is_dirty: bool,
     /// Whether it is in the list of connections that may transmit.
@@ -84,6 +87,7 @@ impl Connection {
             flows: HashMap::new(),
             egress: Egress::default(),
             loss: Loss::default(),
+            rate: LinkRate::default(),
             is_dirty: false,
             is_transmitting: false,
             deadline: None,
@@ -174,6 +178,8 @@ impl Connection {
             bulk,
             reserve: self.egress.window(RESERVE, RESERVE_TIME),
             loses: self.loss.share >= LOSES,
+            rate: self.rate.get(now),
+            measured: &mut self.rate,
         }
     }
 }
@@ -241,6 +247,9 @@ pub(crate) struct Carrier<'a> {
     reserve: u64,
     /// Whether the link loses packets.
     pub(super) loses: bool,
+    /// Bytes a second that the link carries, if it was full lately.
+    pub(super) rate: Option<f64>,
+    measured: &'a mut LinkRate,
 }
 
 impl Carrier<'_> {
@@ -273,7 +282,12 @@ impl Carrier<'_> {
     /// Ends the pass. QUIC says that it takes more once it would of each flow that is blocked: `least` is the least of
     /// their limits. It would say so at once, and again and again, if it took more of one while another cannot write,
     /// whose stream the peer does not read. A flow with a higher limit has samples in QUIC until then.
-    pub(super) fn rest(&mut self, least: Option<u64>) {
+    pub(super) fn rest(&mut self, least: Option<u64>, now: Duration) {
         self.quic.set_send_window(least.unwrap_or(self.bulk));
+        let left = || {
+            let stats = self.quic.stats();
+            stats.udp_tx.bytes.saturating_sub(stats.path.lost_bytes)
+        };
+        self.measured.handle_pass(least.is_some(), left, self.quic.rtt(), now);
     }
 }

@@ -7,7 +7,7 @@ use std::{
     sync::Arc,
 };
 
-use axon_transport::internal::text::plain;
+use axon_transport::{internal::text::plain, status::CompressedStatus};
 
 use crate::bridge::OTHER_TOPICS;
 
@@ -35,6 +35,7 @@ pub(crate) struct Counters {
     bytes_in: Cell<u64>,
     samples_out: Cell<u64>,
     bytes_out: Cell<u64>,
+    compressed: Cell<CompressedStatus>,
     dropped: RefCell<BTreeMap<&'static str, u64>>,
     /// What was dropped since it was looked at last.
     lost: RefCell<BTreeMap<Arc<str>, BTreeMap<&'static str, u64>>>,
@@ -51,6 +52,15 @@ impl Counters {
     pub(crate) fn sent(&self, bytes: usize) {
         self.samples_out.set(self.samples_out.get() + 1);
         self.bytes_out.set(self.bytes_out.get() + bytes as u64);
+    }
+
+    /// A sample of so many bytes was compressed to so few.
+    pub(crate) fn compressed(&self, length: usize, frame: usize) {
+        let mut compressed = self.compressed.get();
+        compressed.samples += 1;
+        compressed.bytes += length as u64;
+        compressed.bytes_sent += frame as u64;
+        self.compressed.set(compressed);
     }
 
     /// `count` samples were dropped for `cause`.
@@ -91,6 +101,7 @@ impl Counters {
         status.bytes_in = self.bytes_in.get();
         status.samples_out = self.samples_out.get();
         status.bytes_out = self.bytes_out.get();
+        status.compressed = self.compressed.get();
         status.dropped =
             self.dropped.borrow().iter().map(|(cause, n)| ((*cause).to_owned(), *n)).collect();
     }

@@ -5,6 +5,7 @@ use std::{collections::VecDeque, sync::Arc};
 use axon_shm::ids::DaemonId;
 
 use super::{
+    compression::CompressionOrder,
     counters::{self, Loss},
     links::LinkReport,
     peer::StalledRoute,
@@ -35,6 +36,9 @@ pub(crate) enum Effect {
     Interfaces,
     /// Give freed memory back to the system, after a while.
     ReturnMemory,
+    /// Compress a sample, on another thread; the answer comes back by
+    /// [`Engine::handle_compressed`](super::Engine::handle_compressed).
+    Compress(CompressionOrder),
 }
 
 /// Effects that the owner has not taken yet.

@@ -7,6 +7,7 @@
 #![forbid(unsafe_code)]
 
 pub(crate) mod account;
+pub(crate) mod compression;
 mod congestion;
 pub(crate) mod connection;
 pub(crate) mod control;
@@ -57,6 +58,7 @@ use quinn_proto::{Dir, EcnCodepoint, StreamEvent, Transmit};
 
 pub(crate) use self::effects::Effect;
 use self::{
+    compression::CompressionAnswer,
     effects::Effects,
     link::target::Target,
     links::{LinkEvent, LinkParts, Links},
@@ -203,6 +205,16 @@ impl Engine {
     /// The ledger of used keys recorded the key of a connection; `first` if it was new.
     pub(crate) fn handle_recorded(&mut self, link: u64, first: bool, now: Duration) {
         self.links.handle_recorded(link, first, now);
+    }
+
+    /// A sample was compressed, or does not become shorter.
+    pub(crate) fn handle_compressed(&mut self, answer: CompressionAnswer) {
+        for asker in self.factory.compression().handle_answer(&answer) {
+            if let Some(peer) = self.peers.get_mut(asker.daemon) {
+                let frame = answer.compressed.clone();
+                peer.outbound.handle_compressed(asker.flow, answer.number, frame);
+            }
+        }
     }
 
     /// Handles the list of this host's network interfaces.
@@ -454,6 +466,9 @@ impl Engine {
         }
         while let Some((origin, request)) = self.links.poll_request(now) {
             self.effects.push(Effect::Kme(origin, request));
+        }
+        while let Some(order) = self.factory.compression().poll_order() {
+            self.effects.push(Effect::Compress(order));
         }
         while let Some((link, key_id)) = self.links.poll_record() {
             self.effects.push(Effect::Record { link, key_id });

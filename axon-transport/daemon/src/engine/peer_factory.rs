@@ -1,4 +1,5 @@
-//! Makes the peers of this daemon. They share its memory for samples and the numbers of its responses.
+//! Makes the peers of this daemon. They share its memory for samples, the numbers of its responses, and what is
+//! compressed.
 
 use std::{rc::Rc, sync::Arc, time::Duration};
 
@@ -7,6 +8,7 @@ use axon_transport::{access::Permissions, config::Config};
 
 use super::{
     account::Account,
+    compression::{Compression, PeerCompression},
     counters::Counters,
     inbound::Inbound,
     outbound::{Outbound, ResponseNumbers, budget::Budget},
@@ -24,6 +26,7 @@ pub(super) struct PeerFactory {
     epoch_nanos: u64,
     budget: Rc<Budget>,
     responses: ResponseNumbers,
+    compression: Rc<Compression>,
 }
 
 /// The first link of a peer.
@@ -52,7 +55,8 @@ impl PeerFactory {
         epoch_nanos: u64,
     ) -> Self {
         let (budget, responses) = (Budget::new(config.reliable_queue), ResponseNumbers::default());
-        Self { config, daemon, session_keys, epoch_nanos, budget, responses }
+        let compression = Rc::new(Compression::new());
+        Self { config, daemon, session_keys, epoch_nanos, budget, responses, compression }
     }
 
     /// A peer with this link, whose graph is not known yet.
@@ -78,6 +82,7 @@ impl PeerFactory {
             self.budget.of_peer(),
             Rc::clone(&counters),
             self.responses.clone(),
+            PeerCompression::new(Rc::clone(&self.compression), daemon),
             self.config.link.stalled,
             now,
         );
@@ -93,6 +98,11 @@ impl PeerFactory {
             outbound,
             serves: routes.map_or(ROUTES_UNSAID, |routes| routes as usize),
         })
+    }
+
+    /// What is compressed for all peers.
+    pub(super) fn compression(&self) -> &Compression {
+        &self.compression
     }
 
     /// Samples that wait for all peers, in bytes, and how many bytes have left their queues since the start.

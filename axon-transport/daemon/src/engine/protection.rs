@@ -48,7 +48,8 @@ impl Seal<'_> {
         matches!(self, Self::Link).then(ShortHeaders::default)
     }
 
-    /// Adds a message to `frames`, behind its inner header or, in a stream that has such, a short one.
+    /// Adds a message to `frames`, behind its inner header or, in a stream that has such, a short one. That says nothing of
+    /// compression: a compressed sample is not sent over such a stream.
     ///
     /// # Errors
     /// There is no key for it. Nothing is added then.
@@ -63,6 +64,10 @@ impl Seal<'_> {
     ) -> Result<(), NoKey> {
         match (self, short) {
             (Self::Link, Some(short)) => {
+                debug_assert!(
+                    !sample.is_compressed(),
+                    "a short header says nothing of compression"
+                );
                 let header = short.write(Told {
                     sequence: sample.info.sequence,
                     source_timestamp: unix_nanos(sample.info.source_timestamp),
@@ -117,9 +122,9 @@ fn header(sample: &Sample, now: Duration) -> inner::Header {
         sequence: sample.info.sequence,
         source_timestamp: unix_nanos(sample.info.source_timestamp),
         request_id: sample.call.unwrap_or_default(),
-        compressed: false,
+        compressed: sample.is_compressed(),
         age_ms: age(sample, now),
-        uncompressed_len: u32::try_from(sample.payload.len()).unwrap_or(u32::MAX),
+        uncompressed_len: u32::try_from(sample.length()).unwrap_or(u32::MAX),
     }
 }
 

@@ -147,16 +147,34 @@ pub(crate) struct Sample {
     pub(crate) info: MessageInfo,
     /// The call that it is the request of, or answers.
     pub(crate) call: Option<RequestId>,
-    /// The serialized message.
+    /// The bytes that are sent: the serialized message, or the frame that it was compressed to.
     pub(crate) payload: Bytes,
+    /// Whether it is compressed.
+    form: Form,
     /// When the engine took it from its ring.
     pub(crate) taken: Duration,
+}
+
+/// Whether a sample is compressed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Form {
+    /// Nobody asked.
+    Undecided,
+    /// The answer to the order with this number will tell.
+    Asked(u64),
+    /// It is sent as it is.
+    Plain,
+    /// Into one zstd frame, of so many bytes.
+    Zstd {
+        /// Bytes of the serialized message.
+        from: usize,
+    },
 }
 
 impl Sample {
     /// A sample of a topic.
     pub(crate) fn new(info: MessageInfo, payload: Bytes, now: Duration) -> Self {
-        Self { info, call: None, payload, taken: now }
+        Self { info, call: None, payload, form: Form::Undecided, taken: now }
     }
 
     /// Time since it was published, as far as this host knows.
@@ -170,8 +188,49 @@ impl Sample {
         Some(self.info.lifetime?.lifespan.saturating_sub(self.age(now)))
     }
 
-    /// The memory that a queue counts for it, in bytes.
+    /// Bytes of the serialized message.
+    pub(crate) fn length(&self) -> usize {
+        match self.form {
+            Form::Zstd { from } => from,
+            _ => self.payload.len(),
+        }
+    }
+
+    /// The memory that a queue counts for it, in bytes, whether or not it is compressed: the peer needs as much for it.
     pub(crate) fn size(&self) -> usize {
-        self.payload.len() + size_of::<Self>()
+        self.length() + size_of::<Self>()
+    }
+
+    /// Whether nobody asked yet whether it becomes shorter.
+    pub(crate) fn is_undecided(&self) -> bool {
+        self.form == Form::Undecided
+    }
+
+    /// Whether it is being compressed.
+    pub(crate) fn is_asked(&self) -> bool {
+        matches!(self.form, Form::Asked(_))
+    }
+
+    /// Whether the order with this number is about it.
+    pub(crate) fn is_asked_by(&self, order: u64) -> bool {
+        self.form == Form::Asked(order)
+    }
+
+    /// Whether it is compressed.
+    pub(crate) fn is_compressed(&self) -> bool {
+        matches!(self.form, Form::Zstd { .. })
+    }
+
+    /// The order with this number will tell whether it becomes shorter.
+    pub(crate) fn set_asked(&mut self, order: u64) {
+        self.form = Form::Asked(order);
+    }
+
+    /// It is sent as this frame, or as it is.
+    pub(crate) fn set_compressed(&mut self, frame: Option<Bytes>) {
+        self.form = match frame {
+            Some(frame) => Form::Zstd { from: std::mem::replace(&mut self.payload, frame).len() },
+            None => Form::Plain,
+        };
     }
 }

@@ -16,6 +16,7 @@ use super::rings::ShmRings;
 use crate::{
     bridge::ToGateway,
     discovery::Interface,
+    engine::compression::CompressionAnswer,
     keys::{Event, Events, Statistics, UsedStatistics},
     watch::watch,
 };
@@ -33,6 +34,8 @@ pub(super) enum Done {
     Identity,
     /// This host's network interfaces.
     Interfaces(Vec<Interface>),
+    /// A sample was compressed, or does not become shorter.
+    Compressed(CompressionAnswer),
 }
 
 /// An input.

@@ -1,9 +1,11 @@
 //! The reactor: drives the [engine](crate::engine) with sockets, rings, clocks and the KME.
 //!
 //! One thread does all that concerns links. Each pass takes in what is ready, has the engine settle, sends its packets
-//! and carries out its effects. The KME client has a thread of its own, and files are read and written on others.
+//! and carries out its effects. The KME client and the compression of samples have a thread each, and files are read and
+//! written on others.
 
 mod bind;
+mod compressor;
 mod control_outbox;
 mod finishing;
 mod inputs;

@@ -19,6 +19,7 @@ use tokio::{
 };
 
 use super::{
+    compressor::CompressorThread,
     control_outbox::ControlOutbox,
     finishing::Finishing,
     inputs::{Done, Input, Inputs},
@@ -83,6 +84,7 @@ pub(super) struct Reactor {
     /// Answers that the KME client gave at once.
     answers: Vec<Event>,
     report_done: mpsc::UnboundedSender<Done>,
+    compressor: CompressorThread,
     buffer: Vec<u8>,
     /// The last datagrams were a flood of discovery's, and nothing else.
     is_flooded: bool,
@@ -118,6 +120,7 @@ impl Reactor {
             inputs,
             kme: parts.kme,
             answers: Vec::new(),
+            compressor: CompressorThread::new(report_done.clone()),
             report_done,
             buffer: Vec::new(),
             is_flooded: false,
@@ -243,6 +246,7 @@ impl Reactor {
             Done::Recorded(link, first) => self.engine.handle_recorded(link, first, now),
             Done::Identity => self.engine.handle_identity(now),
             Done::Interfaces(interfaces) => self.engine.handle_interfaces(interfaces),
+            Done::Compressed(answer) => self.engine.handle_compressed(answer),
             Done::Keys(statistics) => {
                 self.key_reports.handle_report();
                 let (kme, used) = *statistics;
@@ -267,6 +271,7 @@ impl Reactor {
                 }
                 Effect::Record { link, key_id } => self.record(link, key_id, now),
                 Effect::Interfaces => self.list_interfaces(),
+                Effect::Compress(order) => self.compressor.submit(order),
                 Effect::ReturnMemory => {
                     tokio::spawn(async {
                         sleep(RETURN).await;

@@ -48,6 +48,7 @@ fn all_of_qkd() -> ConfigBuilder {
         .link_poll(LinkPoll::Never)
         .link_qlog("/var/qlog")
         .link_congestion(Congestion::Cubic)
+        .link_compression(LinkCompression::Never)
 }
 
 fn all_of_classic() -> ConfigBuilder {
@@ -100,6 +101,7 @@ fn a_built_config_equals_that_of_its_environment() {
     assert_eq!(built.link.poll, LinkPoll::Never);
     assert_eq!(built.link.qlog.as_deref(), Some(Path::new("/var/qlog")));
     assert_eq!(built.link.congestion, Congestion::Cubic);
+    assert_eq!(built.link.compression, LinkCompression::Never);
     assert_eq!((built.domain, built.static_peers.len()), (232, 2));
     assert_eq!(built.range, DiscoveryRange::Localhost);
     let peer = crate::access::Party::Name("sae-b");

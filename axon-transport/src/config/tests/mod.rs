@@ -139,6 +139,7 @@ fn nothing_given_is_the_table_of_defaults() {
             poll: LinkPoll::Adaptive,
             qlog: None,
             congestion: Congestion::Auto,
+            compression: LinkCompression::Auto,
         }
     );
     assert!(config.warnings().iter().any(|w| w.contains("not authenticated")));
@@ -265,6 +266,7 @@ fn the_environment_wins_over_the_file() {
         poll = 'always'
         qlog = '/var/qlog'
         congestion = 'bbr'
+        compression = 'never'
     ";
     let config = with_file(&[], file).unwrap();
     assert_eq!(qkd(&config).peers.to_string(), "sae-b;sae-c");
@@ -283,6 +285,7 @@ fn the_environment_wins_over_the_file() {
             poll: LinkPoll::Always,
             qlog: Some("/var/qlog".into()),
             congestion: Congestion::Bbr,
+            compression: LinkCompression::Never,
         }
     );
 

@@ -289,6 +289,8 @@ fn files_that_are_not_a_configuration_are_refused() {
         ("[link]\ngrace_s = -1", "link.grace_s"),
         ("[link]\ncongestion = 'reno'", "link.congestion"),
         ("[link]\ncongestion = 3", "link.congestion"),
+        ("[link]\ncompression = 'zstd'", "link.compression"),
+        ("[link]\ncompression = true", "link.compression"),
         ("[link]\nstalled_s = 0", "link.stalled_s"),
         ("[link]\nspeed = 1", "link.speed"),
         ("[link]\npoll = 'often'", "link.poll"),

@@ -25,6 +25,7 @@ mod unfinished;
 use std::{collections::HashMap, rc::Rc, sync::Arc, time::Duration};
 
 use axon_shm::ids::Gid;
+use bytes::Bytes;
 use quinn_proto::{StreamId, VarInt};
 
 pub(crate) use self::{
@@ -46,7 +47,7 @@ use self::{
     table::FlowTable,
     turns::Turns,
 };
-use super::{congestion::let_probe_through, connection::Carrier};
+use super::{compression::PeerCompression, congestion::let_probe_through, connection::Carrier};
 use crate::{
     engine::{counters::Counters, limits::Limit},
     link::{CloseCode, Intake, ReceivedOf},
@@ -83,6 +84,7 @@ pub(crate) struct Outbound {
     budget: Rc<Budget>,
     counters: Rc<Counters>,
     responses: ResponseNumbers,
+    compression: PeerCompression,
     events: Vec<OutboundEvent>,
 }
 
@@ -92,6 +94,7 @@ impl Outbound {
         budget: Rc<Budget>,
         counters: Rc<Counters>,
         responses: ResponseNumbers,
+        compression: PeerCompression,
         stalled_after: Duration,
         now: Duration,
     ) -> Self {
@@ -104,6 +107,7 @@ impl Outbound {
             budget,
             counters,
             responses,
+            compression,
             events: Vec::new(),
         }
     }
@@ -118,6 +122,7 @@ impl Outbound {
             priority: route.priority,
             acknowledged: route.acknowledged,
             short_headers: route.short_headers,
+            compressed: route.compressed,
             limit: route.limit,
             responses: self.responses.clone(),
             credit: Rc::clone(self.turns.credit()),
@@ -280,7 +285,10 @@ impl Outbound {
             let mut done = Done::default();
             let pause = match flow.waits_for_credit && !carrier.is_open_to(turn.rank) {
                 true => Pause::NoCredit,
-                false => flow.write(&served.sources, carrier, &self.counters, &mut done, now),
+                false => {
+                    let (counters, compression) = (&self.counters, &self.compression);
+                    flow.write(&served.sources, carrier, counters, compression, &mut done, now)
+                }
             };
             flow.waits_for_credit = pause == Pause::NoCredit;
             served.done(flow.info.of, done);
@@ -305,12 +313,20 @@ impl Outbound {
             carrier.closed_from = self.turns.closed_from();
         }
         self.table.flows.finish_idle_streams(self.turns.take_wanted_streams(), carrier);
-        carrier.rest(blocked);
+        carrier.rest(blocked, now);
     }
 
     /// The peer says how much it takes in over this link.
     pub(crate) fn set_intake(&mut self, intake: &Intake) {
         self.turns.credit().set(Some(intake));
+    }
+
+    /// An order of this flow is answered: the sample is sent as this frame, or as it is.
+    pub(crate) fn handle_compressed(&mut self, id: FlowId, order: u64, frame: Option<Bytes>) {
+        if let Some(flow) = self.table.flows.get_mut(id) {
+            flow.handle_compressed(order, frame, &self.counters);
+            self.schedule(id);
+        }
     }
 
     /// QUIC takes more of this flow's stream.

@@ -160,6 +160,7 @@ pub(super) fn route(number: u32, priority: TopicPriority) -> FlowRoute {
         priority,
         acknowledged: true,
         short_headers: false,
+        compressed: true,
         limit: RouteLimit::default(),
         responses: ResponseNumbers::default(),
         credit: PeerCredit::new(),

@@ -12,6 +12,7 @@ use std::{collections::VecDeque, rc::Rc, time::Duration};
 
 use axon_envelope::Delivery;
 use axon_shm::qos::{History, Qos, Reliability};
+use bytes::Bytes;
 
 use super::{budget::Budget, burst::Burst, flow::Credit};
 use crate::engine::rings::Sample;
@@ -219,6 +220,47 @@ impl Queue {
     /// The next sample to send.
     pub(super) fn peek(&self) -> Option<&Sample> {
         self.waiting.front()
+    }
+
+    /// The first samples that wait, up to so many bytes, for their owner to ask whether they become shorter: where only the
+    /// newest samples are kept, the first alone.
+    pub(super) fn next_ones(
+        &mut self,
+        bytes: usize,
+        now: Duration,
+    ) -> impl Iterator<Item = &mut Sample> {
+        let one = match self.policy {
+            Policy::KeepAll => false,
+            Policy::KeepLast(_) => self.is_behind(now),
+            Policy::BestEffort(_) => true,
+        };
+        let most = if one { 1 } else { usize::MAX };
+        let mut left = bytes;
+        self.waiting.iter_mut().take(most).take_while(move |sample| {
+            let fits = left > 0;
+            left = left.saturating_sub(sample.payload.len());
+            fits
+        })
+    }
+
+    /// Whether the next sample is being compressed, or is compressed, and a newer one would take its place: it is sent before
+    /// that, or a publisher that is fast enough would have none of its samples sent.
+    pub(super) fn holds_next(&self, now: Duration) -> bool {
+        let is_replaced = match self.policy {
+            Policy::KeepAll => false,
+            Policy::KeepLast(_) => self.is_behind(now),
+            Policy::BestEffort(_) => true,
+        };
+        let is_held = |next: &Sample| next.is_asked() || next.is_compressed();
+        is_replaced && self.peek().is_some_and(is_held)
+    }
+
+    /// An order is answered: the sample that it is about is sent as this frame, or as it is. Returns its length, if it waits
+    /// here.
+    pub(super) fn set_compressed(&mut self, order: u64, frame: Option<Bytes>) -> Option<usize> {
+        let sample = self.waiting.iter_mut().find(|sample| sample.is_asked_by(order))?;
+        sample.set_compressed(frame);
+        Some(sample.length())
     }
 
     /// The next RELIABLE sample to send. It stays in the queue until it is acknowledged or written; there is none

@@ -29,6 +29,8 @@ pub(crate) struct RouteOut {
     pub(crate) acknowledged: bool,
     /// Whether the peer reads short headers.
     pub(crate) short_headers: bool,
+    /// Whether its samples may be compressed.
+    pub(crate) compressed: bool,
     /// The limits on what the peer gets of it.
     pub(crate) limit: RouteLimit,
     /// Where its samples are taken.
@@ -47,6 +49,7 @@ pub(super) struct FlowRoute {
     pub(super) priority: TopicPriority,
     pub(super) acknowledged: bool,
     pub(super) short_headers: bool,
+    pub(super) compressed: bool,
     pub(super) limit: RouteLimit,
     pub(super) responses: ResponseNumbers,
     pub(super) credit: Rc<PeerCredit>,

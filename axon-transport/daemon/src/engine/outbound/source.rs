@@ -96,7 +96,9 @@ impl Source {
                     && let Some((info, payload)) = stand_in.ring().take_call_of(of)
                 {
                     let call = Some(call(*of, info.sequence));
-                    each(Sample { call, ..Sample::new(info, payload.into(), now) });
+                    let mut sample = Sample::new(info, payload.into(), now);
+                    sample.call = call;
+                    each(sample);
                     taken += 1;
                 }
                 taken

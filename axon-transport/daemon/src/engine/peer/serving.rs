@@ -143,6 +143,7 @@ impl Peer {
             priority: with.config.topic_priority(&key.topic),
             acknowledged,
             short_headers,
+            compressed: with.config.topic_compression(&key.topic),
             limit: RouteLimit::new(self.outgoing_limits(&key, with.config)),
             sources: sources.clone(),
             seen,

@@ -31,7 +31,11 @@ use crate::{
     daemon_key::DaemonKey,
     discovery::Interface,
     engine::{
-        Effect, Engine, EngineParts, credentials::Credentials, links::LinkParts, peer::MAX_ROUTES,
+        Effect, Engine, EngineParts,
+        compression::{CompressionAnswer, Compressor},
+        credentials::Credentials,
+        links::LinkParts,
+        peer::MAX_ROUTES,
         transport::endpoint_config,
     },
     identity::Identity,
@@ -43,6 +47,9 @@ use crate::{
 
 /// The port of QUIC on each host.
 pub(super) const PORT: u16 = 61_300;
+/// What the thread that compresses samples takes in, in bytes a second.
+const COMPRESSOR: f64 = 300e6;
+
 /// A simulated host.
 pub(super) struct Host {
     pub(super) number: usize,
@@ -68,6 +75,10 @@ pub(super) struct Host {
     records: Vec<(u64, String)>,
     /// The engine asked for the host's network interfaces.
     interfaces_asked: bool,
+    /// Samples that were compressed, and when the answers are due.
+    compressed: VecDeque<(Duration, CompressionAnswer)>,
+    /// How many samples were compressed.
+    pub(super) compressions: u64,
     used: BTreeSet<String>,
     graph_changed: bool,
     /// Questions about the access rules of peers, as orders.
@@ -104,6 +115,8 @@ impl Host {
             requests: Vec::new(),
             records: Vec::new(),
             interfaces_asked: false,
+            compressed: VecDeque::new(),
+            compressions: 0,
             used: BTreeSet::new(),
             graph_changed: false,
             questions: Vec::new(),
@@ -161,6 +174,7 @@ impl Host {
         self.graph.clear();
         (self.requests, self.records) = (Vec::new(), Vec::new());
         self.interfaces_asked = false;
+        self.compressed.clear();
         self.status.clear();
         self.discovery.start(self.daemon, now);
         self.graph_changed = true;
@@ -365,7 +379,9 @@ impl Host {
             let came = came || !self.questions.is_empty();
             (came || self.interfaces_asked || !self.records.is_empty()).then_some(now)
         };
-        [engine.poll_timeout(now), ready, self.discovery.poll_timeout()].into_iter().flatten().min()
+        let compressed = self.compressed.front().map(|(due, _)| *due);
+        let parts = [engine.poll_timeout(now), ready, compressed, self.discovery.poll_timeout()];
+        parts.into_iter().flatten().min()
     }
 
     /// One pass of the host.
@@ -397,6 +413,9 @@ impl Host {
                 loopback: false,
             }]);
         }
+        while let Some((_, answer)) = self.compressed.pop_front_if(|(due, _)| *due <= now) {
+            engine.handle_compressed(answer);
+        }
         for (link, key_id) in std::mem::take(&mut self.records) {
             let first = self.used.insert(key_id);
             engine.handle_recorded(link, first, now);
@@ -425,6 +444,14 @@ impl Host {
             Effect::Record { link, key_id } => self.records.push((link, key_id)),
             Effect::Interfaces => self.interfaces_asked = true,
             Effect::ReturnMemory => {}
+            Effect::Compress(order) => {
+                let took = Duration::from_secs_f64(order.payload.len() as f64 / COMPRESSOR);
+                let answer = Compressor::new().compress(&order, || Duration::ZERO);
+                // One after the other.
+                let begun = self.compressed.back().map_or(now, |(due, _)| now.max(*due));
+                self.compressed.push_back((begun + took, CompressionAnswer { took, ..answer }));
+                self.compressions += 1;
+            }
         }
     }
 

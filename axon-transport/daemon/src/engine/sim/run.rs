@@ -10,6 +10,7 @@ use axon_transport::config::Config;
 
 use super::{
     network::{CutId, Path, Rate},
+    rings::COMPRESSIBLE,
     script::{Edge, Fault, Kind, KmeFailure, PathChange, Qos as ScriptQos, Script},
     world::World,
 };
@@ -249,5 +250,6 @@ impl Run<'_> {
 
 /// The name of a topic.
 pub(super) fn name(topic: usize) -> String {
-    format!("/topic{topic}")
+    let kind = if topic % 2 == 1 { COMPRESSIBLE } else { "/topic" };
+    format!("{kind}{topic}")
 }

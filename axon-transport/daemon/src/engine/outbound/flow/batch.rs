@@ -8,8 +8,8 @@ use bytes::Bytes;
 #[derive(Debug)]
 pub(super) struct Sealed {
     pub(super) sequence: u64,
-    /// Bytes of the sample.
-    pub(super) payload: usize,
+    /// Bytes of the serialized message.
+    pub(super) length: usize,
     /// Where its frame ends, in bytes of the batch.
     pub(super) end: u64,
 }
@@ -95,8 +95,8 @@ mod tests {
     #[test]
     fn a_message_is_sent_once_its_last_byte_is_taken() {
         let mut batch = Batch::default();
-        batch.add(Sealed { sequence: 1, payload: 5, end: 10 });
-        batch.add(Sealed { sequence: 2, payload: 5, end: 20 });
+        batch.add(Sealed { sequence: 1, length: 5, end: 10 });
+        batch.add(Sealed { sequence: 2, length: 5, end: 20 });
         batch.set_chunks([Bytes::from_static(&[0; 20])]);
         batch.put_before(&[0; 4]);
         assert_eq!(batch.left(), 24);

@@ -45,6 +45,8 @@ struct UnderWay {
     priority: i32,
     /// With header and envelope.
     bytes: u64,
+    /// Bytes of the serialized message, and of what is sent of it.
+    length: usize,
     payload: usize,
     begun: Duration,
     /// When it is given up.
@@ -85,6 +87,26 @@ impl BestEffort {
         Some(self.writing.take()?.stream)
     }
 
+    /// Whether QUIC may take the next sample now, once those are dropped that are too late.
+    pub(super) fn look_at_next(
+        &mut self,
+        info: &FlowInfo,
+        queue: &mut Queue,
+        carrier: &Carrier<'_>,
+        counters: &Counters,
+        now: Duration,
+    ) -> Option<Pause> {
+        if self.writing.is_some() {
+            return None;
+        }
+        let under_way: u64 = self.under_way.iter().map(|sample| sample.bytes).sum();
+        if self.under_way.len() >= ALWAYS && under_way >= carrier.window() {
+            return Some(Pause::Blocked);
+        }
+        counters.lost(&info.topic, "late", queue.drop_late(LIFE, self.took, now));
+        queue.peek().is_none().then_some(Pause::Empty)
+    }
+
     /// Hands the next sample, or a part of it, to QUIC. `None`: go on.
     #[expect(clippy::too_many_arguments, reason = "the parts of a flow, borrowed one by one")]
     pub(super) fn write(
@@ -99,11 +121,6 @@ impl BestEffort {
         now: Duration,
     ) -> Option<Pause> {
         if self.writing.is_none() {
-            let under_way: u64 = self.under_way.iter().map(|sample| sample.bytes).sum();
-            if self.under_way.len() >= ALWAYS && under_way >= carrier.window() {
-                return Some(Pause::Blocked);
-            }
-            counters.lost(&info.topic, "late", queue.drop_late(LIFE, self.took, now));
             let Some(next) = queue.peek() else { return Some(Pause::Empty) };
             let (length, uses) = (next.payload.len(), Credit::of(next.size(), next.size()));
             let is_open = carrier.is_open_to(info.best_effort_rank(length));
@@ -114,9 +131,11 @@ impl BestEffort {
                 return Some(Pause::NoStream);
             };
             let Some(sample) = queue.pop_best_effort() else { return Some(Pause::Empty) };
-            let (sequence, payload) = (sample.info.sequence, sample.payload.len());
+            let (sequence, length) = (sample.info.sequence, sample.length());
+            let payload = sample.payload.len();
             done.sequence = done.sequence.max(Some(sequence));
-            let mut headers = carrier.seal.short_headers().filter(|_| info.short_headers);
+            let mut headers = carrier.seal.short_headers();
+            headers = headers.filter(|_| info.short_headers && !sample.is_compressed());
             let short = headers.is_some();
             let (delivery, headers) = (Delivery::BestEffort, headers.as_mut());
             if carrier.seal.write(&sample, info.route, delivery, headers, frames, now).is_err() {
@@ -135,8 +154,16 @@ impl BestEffort {
             let bytes = pending.iter().map(|piece| piece.len() as u64).sum();
             credit.set(uses);
             let (begun, deadline) = (now, now + left);
-            let sample =
-                UnderWay { stream, priority, bytes, payload, begun, deadline, _credit: credit };
+            let sample = UnderWay {
+                stream,
+                priority,
+                bytes,
+                length,
+                payload,
+                begun,
+                deadline,
+                _credit: credit,
+            };
             self.writing = Some(Writing { stream, pending, sample });
         }
         let Writing { stream, pending, sample } = self.writing.as_mut()?;
@@ -176,7 +203,7 @@ impl BestEffort {
         let Some(sample) = self.under_way.remove(at) else { return };
         self.arrived += 1;
         self.took = now.saturating_sub(sample.begun);
-        counters.sent(sample.payload);
+        counters.sent(sample.length);
         if let Some(first) = self.under_way.front() {
             let _ = quic.send_stream(first.stream).set_priority(first.priority + 1);
         }
@@ -251,7 +278,7 @@ impl BestEffort {
             }
         }
         for sample in self.under_way.drain(..) {
-            counters.sent(sample.payload);
+            counters.sent(sample.length);
         }
     }
 

@@ -28,6 +28,8 @@ pub(in crate::engine::outbound) struct FlowInfo {
     pub(super) acknowledged: bool,
     /// Whether the peer reads short headers.
     pub(super) short_headers: bool,
+    /// Whether its samples may be compressed.
+    pub(super) compressed: bool,
 }
 
 impl FlowInfo {
@@ -41,6 +43,7 @@ impl FlowInfo {
             priority: route.priority,
             acknowledged: route.acknowledged,
             short_headers: route.short_headers,
+            compressed: route.compressed,
         }
     }
 

@@ -3,6 +3,7 @@
 
 mod batch;
 mod best_effort;
+mod compressing;
 mod credit;
 mod info;
 mod reliable;
@@ -14,11 +15,13 @@ use std::{rc::Rc, time::Duration};
 
 use axon_envelope::{Delivery, Kind};
 use axon_shm::{ids::Gid, qos::Qos};
+use bytes::Bytes;
 use quinn_proto::{Connection, StreamId};
 
 pub(super) use self::credit::{Credit, CreditQueue, PeerCredit};
 use self::{
     best_effort::BestEffort,
+    compressing::Compressing,
     info::FlowInfo,
     reliable::{ReliableStream, STREAM_IDLE, TOGETHER},
     taking::Taking,
@@ -31,7 +34,10 @@ use super::{
     served::FlowRoute,
     source::{Done, Source},
 };
-use crate::engine::{connection::Carrier, counters::Counters, frames::Frames};
+use crate::engine::{
+    compression::PeerCompression, connection::Carrier, counters::Counters, frames::Frames,
+    rings::Sample,
+};
 
 /// Bytes that one turn writes before other flows have theirs.
 const TURN: usize = 256 << 10;
@@ -50,6 +56,8 @@ pub(super) enum Pause {
     NoKey,
     /// The peer does not take in the next sample before others.
     NoCredit,
+    /// The next sample is being compressed.
+    Compressing,
 }
 
 /// One flow.
@@ -62,6 +70,7 @@ pub(super) struct Flow {
     frames: Frames,
     reliable: ReliableStream,
     best_effort: BestEffort,
+    compressing: Compressing,
     /// Whether QUIC said that it takes no more.
     pub(super) blocked: bool,
     /// Whether the peer did not take in its next sample when it had its last turn.
@@ -93,6 +102,7 @@ impl Flow {
             frames: Frames::default(),
             reliable: ReliableStream::new(route.credit.share()),
             best_effort: BestEffort::default(),
+            compressing: Compressing::default(),
             blocked: false,
             waits_for_credit: false,
             is_given_up: false,
@@ -207,15 +217,17 @@ impl Flow {
         sources: &[Source],
         carrier: &mut Carrier<'_>,
         counters: &Counters,
+        compression: &PeerCompression,
         done: &mut Done,
         now: Duration,
     ) -> Pause {
         let mut left = if carrier.lender.is_some() { TOGETHER } else { TURN };
         loop {
             if !self.reliable.is_writing() && !self.best_effort.is_writing() {
-                let queued =
-                    self.fill(sources, counters, now) + std::mem::take(&mut self.undemanded);
-                carrier.seal.demand(queued, now);
+                if !self.queue.holds_next(now) {
+                    self.undemanded += self.fill(sources, counters, now);
+                }
+                carrier.seal.demand(std::mem::take(&mut self.undemanded), now);
                 self.finish_dropped(done);
             }
             let before = carrier.taken;
@@ -223,9 +235,9 @@ impl Flow {
                 // What is left of a batch goes first, however the next sample is delivered.
                 Delivery::BestEffort if !self.reliable.is_writing() => {
                     self.reliable.finish(carrier);
-                    self.write_best_effort(carrier, counters, done, now)
+                    self.write_best_effort(carrier, counters, compression, done, now)
                 }
-                _ => self.write_reliable(carrier, counters, done, now),
+                _ => self.write_reliable(carrier, counters, compression, done, now),
             };
             left = left.saturating_sub((carrier.taken - before) as usize);
             if pause == Some(Pause::Empty)
@@ -255,10 +267,17 @@ impl Flow {
         &mut self,
         carrier: &mut Carrier<'_>,
         counters: &Counters,
+        compression: &PeerCompression,
         done: &mut Done,
         now: Duration,
     ) -> Option<Pause> {
-        let Self { info, queue, frames, .. } = self;
+        let Self { info, queue, frames, compressing, .. } = self;
+        if !self.reliable.is_writing() {
+            compressing.ask(info, queue, carrier, compression, counters, now);
+            if queue.peek().is_some_and(Sample::is_asked) {
+                return Some(Pause::Compressing);
+            }
+        }
         let before = carrier.taken;
         let pause = self.reliable.write(info, queue, frames, carrier, counters, done, now);
         if carrier.taken > before {
@@ -362,15 +381,37 @@ impl Flow {
         &mut self,
         carrier: &mut Carrier<'_>,
         counters: &Counters,
+        compression: &PeerCompression,
         done: &mut Done,
         now: Duration,
     ) -> Option<Pause> {
-        let Self { info, queue, frames, .. } = self;
+        let Self { info, queue, frames, compressing, .. } = self;
+        if let Some(pause) = self.best_effort.look_at_next(info, queue, carrier, counters, now) {
+            return Some(pause);
+        }
+        if !self.best_effort.is_writing() {
+            // Once QUIC may take it, and no sooner: a newer one would have taken its place.
+            compressing.ask(info, queue, carrier, compression, counters, now);
+            if queue.peek().is_some_and(Sample::is_asked) {
+                return Some(Pause::Compressing);
+            }
+        }
         let credit = self.reliable.credit().sibling();
         let pause =
             self.best_effort.write(info, credit, queue, frames, carrier, counters, done, now);
         self.set_timer(self.best_effort.poll_timeout());
         pause
+    }
+
+    /// An order is answered: the sample is sent as this frame, or as it is.
+    pub(super) fn handle_compressed(
+        &mut self,
+        order: u64,
+        frame: Option<Bytes>,
+        counters: &Counters,
+    ) {
+        let length = self.queue.set_compressed(order, frame.clone());
+        self.compressing.handle_answer(frame.as_ref(), length, counters);
     }
 
     /// The peer's QUIC has all of this best-effort stream.

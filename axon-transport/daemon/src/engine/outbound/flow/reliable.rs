@@ -25,6 +25,7 @@ use crate::{
             schedule::{Rank, SMALL},
             source::Done,
         },
+        rings::Sample,
         short_header::ShortHeaders,
     },
     keys::NoKey,
@@ -47,6 +48,8 @@ pub(super) struct ReliableStream {
     stream: Option<StreamId>,
     /// The headers of the stream, or of the one that the pending batch will open, if they are short.
     headers: Option<ShortHeaders>,
+    /// Whether its streams have no short headers since there were compressed samples, of which these say nothing.
+    compressed: bool,
     /// The priority that QUIC knows of the stream.
     priority: i32,
     batch: Batch,
@@ -65,6 +68,7 @@ impl ReliableStream {
         Self {
             stream: None,
             headers: None,
+            compressed: false,
             priority: 0,
             batch: Batch::default(),
             credit,
@@ -129,6 +133,13 @@ impl ReliableStream {
         if self.batch.is_empty() {
             if !self.has_credit(info, queue, carrier) {
                 return Some(Pause::NoCredit);
+            }
+            if !self.compressed && queue.peek().is_some_and(Sample::is_compressed) {
+                self.compressed = true;
+                if self.headers.is_some() {
+                    // The peer reads it to its end before the next one.
+                    self.finish(carrier);
+                }
             }
             let sealed = self.seal(info, queue, frames, carrier, now);
             self.note_sent(queue);
@@ -219,7 +230,7 @@ impl ReliableStream {
             if !is_whole {
                 return;
             }
-            counters.sent(sealed.payload);
+            counters.sent(sealed.length);
             if !info.acknowledged {
                 done.sequence = done.sequence.max(Some(sealed.sequence));
             }
@@ -243,7 +254,8 @@ impl ReliableStream {
         let (mut bytes, mut samples, mut end) = (0, 0, 0);
         self.batch.clear();
         if self.stream.is_none() {
-            self.headers = carrier.seal.short_headers().filter(|_| info.short_headers);
+            let short = info.short_headers && !self.compressed;
+            self.headers = carrier.seal.short_headers().filter(|_| short);
         }
         if queue.peek().is_some_and(|next| next.payload.len() <= COPIED) {
             // A sample takes more in the queue than its header does in the batch.
@@ -253,8 +265,15 @@ impl ReliableStream {
             if samples > 0 && !self.has_credit(info, queue, carrier) {
                 break;
             }
+            let is_next = |next: &Sample| {
+                !next.is_asked() && !(next.is_compressed() && self.headers.is_some())
+            };
+            if !queue.peek().is_some_and(is_next) {
+                break;
+            }
             let Some(sample) = queue.send() else { break };
-            let (sequence, payload) = (sample.info.sequence, sample.payload.len());
+            let (sequence, length) = (sample.info.sequence, sample.length());
+            let payload = sample.payload.len();
             let (delivery, headers) = (Delivery::Reliable, self.headers.as_mut());
             if let Err(why) = carrier.seal.write(sample, info.route, delivery, headers, frames, now)
             {
@@ -267,7 +286,7 @@ impl ReliableStream {
             end = frames.len() as u64;
             bytes += payload;
             samples += 1;
-            self.batch.add(Sealed { sequence, payload, end });
+            self.batch.add(Sealed { sequence, length, end });
         }
         debug_assert!(samples == 0 || end > 0, "a sealed message has bytes");
         self.batch.set_chunks(frames.take());
@@ -345,6 +364,7 @@ impl ReliableStream {
         let idle_at = self.active_at + STREAM_IDLE;
         if now >= idle_at && queue.is_empty() && self.batch.is_empty() {
             self.finish(carrier);
+            self.compressed = false;
             return None;
         }
         Some(idle_at.max(now + Duration::from_secs(1)))

@@ -144,7 +144,8 @@ impl Turns {
     ) {
         match pause {
             Pause::Turn => self.add_all([turn.flow], flows),
-            Pause::Empty => {}
+            // The answer of the compressor gives it its next turn.
+            Pause::Empty | Pause::Compressing => {}
             Pause::Blocked => self.lending.handle_blocked(turn.rank),
             Pause::NoStream => {
                 self.without.stream(turn.flow);

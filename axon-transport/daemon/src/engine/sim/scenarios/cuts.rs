@@ -63,8 +63,10 @@ impl Cut {
         let mut world = World::new(seed, 2, config);
         let rate = Some(Rate::new(54_000_000 / 8, millis(40)));
         world.network.set_default_path(Path { delay: millis(2), rate, ..Path::default() });
-        let pairs =
-            [world.pair(0, 1, "/out", Qos::keep_all()), world.pair(1, 0, "/in", Qos::keep_all())];
+        let pairs = [
+            world.pair(0, 1, "/text/out", Qos::keep_all()),
+            world.pair(1, 0, "/in", Qos::keep_all()),
+        ];
         world.until(secs(20), World::is_whole);
         world.run_for(secs(2));
         Self { world, pairs, published: [0; 2], load }

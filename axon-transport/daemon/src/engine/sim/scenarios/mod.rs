@@ -1,6 +1,7 @@
 //! Scenarios with many cases. `cargo test` runs a sample of them, `cargo xtask simulate --scenarios` all.
 
 mod best_effort;
+mod compression;
 mod cuts;
 mod hostile;
 mod kills;

@@ -1,0 +1,269 @@
+//! Compresses samples that wait for a slow link, on a thread of the owner, for all peers.
+//!
+//! Compression pays while it takes much less time than what it saves: that is judged for each sample by the rate of the
+//! link and by what the compressor did so far. A sample that goes to several peers is compressed once.
+
+pub(crate) mod link_rate;
+#[cfg(test)]
+mod tests;
+
+use std::{
+    cell::RefCell,
+    collections::{HashMap, VecDeque},
+    rc::Rc,
+    time::Duration,
+};
+
+use axon_shm::ids::{DaemonId, Gid};
+use bytes::Bytes;
+
+use super::outbound::FlowId;
+
+/// The level of zstd.
+const LEVEL: i32 = 1;
+/// Shorter samples are sent as they are.
+pub(crate) const SHORTEST: usize = 1 << 10;
+/// So are longer ones: the receiver decompresses a sample at once, and delivers no other meanwhile.
+pub(crate) const LONGEST: usize = 8 << 20;
+/// Compression may take this share of the time for which the link is busy with the sample.
+const SHARE: f64 = 0.3;
+/// What a sample takes to the compressor's thread and back.
+const THERE_AND_BACK: Duration = Duration::from_micros(100);
+/// The share of a sample that compression has to save, as a divisor.
+const SAVES: usize = 10;
+/// Bytes that are with the compressor at once, unless it is one sample.
+const MOST: usize = 4 << 20;
+/// Compressed samples that are kept for the other peers that will ask for them, in bytes.
+const KEPT: usize = 4 << 20;
+/// The compressor's speed is that of about so many last bytes.
+const MEASURED: f64 = (8 << 20) as f64;
+/// Its speed before the first sample, in bytes a second.
+const SPEED: f64 = 200e6;
+
+/// What the owner is to compress.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct CompressionOrder {
+    /// The number by which the answer names it.
+    pub(crate) number: u64,
+    /// The sample.
+    pub(crate) payload: Bytes,
+}
+
+/// What became of an order.
+#[derive(Clone, Debug)]
+pub(crate) struct CompressionAnswer {
+    /// The number of the order.
+    pub(crate) number: u64,
+    /// One zstd frame, or nothing where that would save too little.
+    pub(crate) compressed: Option<Bytes>,
+    /// What the thread took for it.
+    pub(crate) took: Duration,
+}
+
+/// Compresses samples, one after the other.
+pub(crate) struct Compressor(Option<zstd::bulk::Compressor<'static>>);
+
+impl Compressor {
+    /// One that has compressed nothing.
+    pub(crate) fn new() -> Self {
+        // Without memory for it, samples are sent as they are.
+        Self(zstd::bulk::Compressor::new(LEVEL).ok())
+    }
+
+    /// Carries out an order.
+    pub(crate) fn compress(
+        &mut self,
+        order: &CompressionOrder,
+        now: impl Fn() -> Duration,
+    ) -> CompressionAnswer {
+        let begun = now();
+        let most = order.payload.len() - order.payload.len().div_ceil(SAVES);
+        let compressed = self.0.as_mut().and_then(|zstd| {
+            let mut frame = Vec::with_capacity(most);
+            // An error: the frame would be longer.
+            zstd.compress_to_buffer(&order.payload, &mut frame).ok()?;
+            frame.shrink_to_fit();
+            Some(frame.into())
+        });
+        let took = now().saturating_sub(begun);
+        CompressionAnswer { number: order.number, compressed, took }
+    }
+}
+
+/// The flow that asks for a sample.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Asker {
+    /// The peer.
+    pub(crate) daemon: DaemonId,
+    /// The flow towards it.
+    pub(crate) flow: FlowId,
+}
+
+/// A sample of a topic: its publisher and its number.
+pub(crate) type SampleName = (Gid, u64);
+
+/// What there is of a sample that a flow asks for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Asked {
+    /// It is compressed already, or not worth it.
+    Known(Option<Bytes>),
+    /// The answer to the order with this number will tell.
+    Later(u64),
+}
+
+/// An order without an answer.
+#[derive(Debug)]
+struct Pending {
+    name: Option<SampleName>,
+    length: usize,
+    askers: Vec<Asker>,
+}
+
+#[derive(Debug)]
+struct State {
+    number: u64,
+    orders: VecDeque<CompressionOrder>,
+    pending: HashMap<u64, Pending>,
+    /// The orders of samples that other peers may ask for, too.
+    named: HashMap<SampleName, u64>,
+    pending_bytes: usize,
+    /// The last samples of topics, compressed or not worth it, and their order.
+    kept: HashMap<SampleName, Option<Bytes>>,
+    kept_order: VecDeque<SampleName>,
+    kept_bytes: usize,
+    /// Of the last orders: bytes, and seconds that they took.
+    measured: (f64, f64),
+}
+
+/// What is compressed for one of the peers.
+#[derive(Debug)]
+pub(crate) struct PeerCompression {
+    all: Rc<Compression>,
+    daemon: DaemonId,
+}
+
+impl PeerCompression {
+    /// The part of this peer.
+    pub(crate) fn new(all: Rc<Compression>, daemon: DaemonId) -> Self {
+        Self { all, daemon }
+    }
+
+    /// As [`Compression::pays`].
+    pub(crate) fn pays(&self, length: usize, rate: f64) -> bool {
+        self.all.pays(length, rate)
+    }
+
+    /// As [`Compression::ask`].
+    pub(crate) fn ask(
+        &self,
+        flow: FlowId,
+        name: Option<SampleName>,
+        payload: &Bytes,
+    ) -> Option<Asked> {
+        self.all.ask(Asker { daemon: self.daemon, flow }, name, payload)
+    }
+}
+
+/// What is compressed for the peers of one daemon.
+#[derive(Debug)]
+pub(crate) struct Compression(RefCell<State>);
+
+impl Compression {
+    /// Nothing was compressed yet.
+    pub(crate) fn new() -> Self {
+        Self(RefCell::new(State {
+            number: 0,
+            orders: VecDeque::new(),
+            pending: HashMap::new(),
+            named: HashMap::new(),
+            pending_bytes: 0,
+            kept: HashMap::new(),
+            kept_order: VecDeque::new(),
+            kept_bytes: 0,
+            measured: (SPEED / 100.0, 0.01),
+        }))
+    }
+
+    /// Whether a sample of this length is to be compressed for a link that carries so many bytes a second.
+    pub(crate) fn pays(&self, length: usize, rate: f64) -> bool {
+        let (bytes, seconds) = self.0.borrow().measured;
+        let takes = length as f64 * seconds / bytes + THERE_AND_BACK.as_secs_f64();
+        (SHORTEST..=LONGEST).contains(&length) && takes < SHARE * length as f64 / rate
+    }
+
+    /// A flow asks for a sample, which has a name if it is a topic's. `None`: too much is being compressed.
+    pub(crate) fn ask(
+        &self,
+        by: Asker,
+        name: Option<SampleName>,
+        payload: &Bytes,
+    ) -> Option<Asked> {
+        let mut state = self.0.borrow_mut();
+        if let Some(name) = name {
+            if let Some(known) = state.kept.get(&name) {
+                return Some(Asked::Known(known.clone()));
+            }
+            if let Some(number) = state.named.get(&name).copied() {
+                state.pending.get_mut(&number)?.askers.push(by);
+                return Some(Asked::Later(number));
+            }
+        }
+        let length = payload.len();
+        if state.pending_bytes > 0 && state.pending_bytes + length > MOST {
+            return None;
+        }
+        state.number += 1;
+        let number = state.number;
+        state.pending_bytes += length;
+        state.pending.insert(number, Pending { name, length, askers: vec![by] });
+        if let Some(name) = name {
+            state.named.insert(name, number);
+        }
+        state.orders.push_back(CompressionOrder { number, payload: payload.clone() });
+        Some(Asked::Later(number))
+    }
+
+    /// The next order for the owner.
+    pub(crate) fn poll_order(&self) -> Option<CompressionOrder> {
+        self.0.borrow_mut().orders.pop_front()
+    }
+
+    /// The owner answers an order. Returns the flows that asked.
+    pub(crate) fn handle_answer(&self, answer: &CompressionAnswer) -> Vec<Asker> {
+        let mut state = self.0.borrow_mut();
+        let Some(Pending { name, length, askers }) = state.pending.remove(&answer.number) else {
+            return Vec::new();
+        };
+        state.pending_bytes -= length;
+        let (bytes, seconds) = state.measured;
+        let left = (1.0 - length as f64 / MEASURED).max(0.0);
+        state.measured = (bytes * left + length as f64, seconds * left + answer.took.as_secs_f64());
+        if let Some(name) = name {
+            state.named.remove(&name);
+            state.keep(name, answer.compressed.clone());
+        }
+        askers
+    }
+}
+
+impl State {
+    fn keep(&mut self, name: SampleName, compressed: Option<Bytes>) {
+        self.kept_bytes += kept_size(&compressed);
+        if let Some(before) = self.kept.insert(name, compressed) {
+            self.kept_bytes -= kept_size(&before);
+        } else {
+            self.kept_order.push_back(name);
+        }
+        while self.kept_bytes > KEPT
+            && let Some(oldest) =
+                self.kept_order.pop_front().and_then(|name| self.kept.remove(&name))
+        {
+            self.kept_bytes -= kept_size(&oldest);
+        }
+    }
+}
+
+/// What a sample that is kept counts for: its name takes memory, too.
+fn kept_size(compressed: &Option<Bytes>) -> usize {
+    compressed.as_ref().map_or(0, Bytes::len) + SHORTEST
+}

@@ -1,0 +1,167 @@
+use super::*;
+
+fn asker(flow: FlowId) -> Asker {
+    Asker { daemon: DaemonId([1; 16]), flow }
+}
+
+fn name(number: u64) -> Option<SampleName> {
+    Some((Gid([2; 16]), number))
+}
+
+fn text(length: usize) -> Bytes {
+    b"a line of a log\n".iter().copied().cycle().take(length).collect::<Vec<_>>().into()
+}
+
+/// Bytes that no compressor makes shorter.
+fn noise(length: usize) -> Bytes {
+    let mut state = 1_u64;
+    let mut next = || {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        state as u8
+    };
+    (0..length).map(|_| next()).collect::<Vec<_>>().into()
+}
+
+fn order(number: u64, payload: Bytes) -> CompressionOrder {
+    CompressionOrder { number, payload }
+}
+
+fn compress(payload: Bytes) -> Option<Bytes> {
+    Compressor::new().compress(&order(1, payload), || Duration::ZERO).compressed
+}
+
+fn later(number: u64) -> Option<Asked> {
+    Some(Asked::Later(number))
+}
+
+#[test]
+fn what_becomes_shorter_comes_back_and_what_does_not_is_left_as_it_is() {
+    let mut compressor = Compressor::new();
+    for length in [SHORTEST, 100_000, LONGEST] {
+        let payload = text(length);
+        let answer = compressor.compress(&order(7, payload.clone()), || Duration::ZERO);
+        assert_eq!(answer.number, 7);
+        let frame = answer.compressed.unwrap();
+        assert!(frame.len() < length / 5, "{} of {length}", frame.len());
+        assert_eq!(zstd::bulk::decompress(&frame, length).unwrap(), payload);
+        assert!(
+            compressor.compress(&order(8, noise(length)), || Duration::ZERO).compressed.is_none()
+        );
+    }
+    // A part of it becomes shorter, but less than a tenth of it.
+    let mut mixed = noise(100_000).to_vec();
+    mixed.extend_from_slice(&text(10_000));
+    assert!(compress(mixed.clone().into()).is_none());
+    mixed.extend_from_slice(&text(10_000));
+    assert!(compress(mixed.into()).is_some());
+}
+
+#[test]
+fn a_slow_link_gets_what_is_worth_it_and_a_fast_one_nothing() {
+    let compression = Compression::new();
+    // 54 Mbit/s, 1 Gbit/s and 10 Gbit/s.
+    let [radio, cable, fast] = [54e6 / 8.0, 125e6, 1.25e9];
+    assert!(compression.pays(64 << 10, radio));
+    assert!(!compression.pays(64 << 10, cable) && !compression.pays(64 << 10, fast));
+    // A short sample takes longer to the thread and back than it saves.
+    assert!(!compression.pays(2_000, radio) && compression.pays(2_000, 1e6));
+    assert!(!compression.pays(SHORTEST - 1, 1.0) && !compression.pays(LONGEST + 1, 1.0));
+}
+
+#[test]
+fn the_speed_of_the_compressor_counts() {
+    let compression = Compression::new();
+    let run = |speed: f64| {
+        for _ in 0..40 {
+            let payload = text(1 << 20);
+            let Some(Asked::Later(number)) = compression.ask(asker(1), None, &payload) else {
+                panic!("too much is being compressed")
+            };
+            let took = Duration::from_secs_f64(payload.len() as f64 / speed);
+            let answer = CompressionAnswer { number, compressed: None, took };
+            assert_eq!(compression.handle_answer(&answer), [asker(1)]);
+        }
+    };
+    run(1e9);
+    assert!(compression.pays(1 << 20, 250e6));
+    run(1e7);
+    assert!(!compression.pays(1 << 20, 54e6 / 8.0));
+}
+
+#[test]
+fn a_sample_of_a_topic_is_compressed_once_for_all_peers() {
+    let compression = Compression::new();
+    let payload = text(10_000);
+    assert_eq!(compression.ask(asker(1), name(1), &payload), later(1));
+    assert_eq!(compression.ask(asker(2), name(1), &payload), later(1));
+    assert_eq!(compression.ask(asker(3), name(2), &payload), later(2));
+    assert_eq!(compression.poll_order(), Some(order(1, payload.clone())));
+    assert_eq!(compression.poll_order(), Some(order(2, payload.clone())));
+    assert_eq!(compression.poll_order(), None);
+    let compressed = compress(payload.clone());
+    let answer = |number| CompressionAnswer {
+        number,
+        compressed: compressed.clone(),
+        took: Duration::from_micros(20),
+    };
+    assert_eq!(compression.handle_answer(&answer(1)), [asker(1), asker(2)]);
+    assert_eq!(compression.handle_answer(&answer(1)), [], "it comes once");
+    assert_eq!(compression.handle_answer(&answer(9)), [], "nobody asked");
+    assert_eq!(compression.ask(asker(3), name(1), &payload), Some(Asked::Known(compressed)));
+    // Those of services have no name that is theirs alone.
+    assert_eq!(compression.ask(asker(1), None, &payload), later(3));
+    assert_eq!(compression.ask(asker(2), None, &payload), later(4));
+}
+
+#[test]
+fn what_is_not_worth_it_is_not_tried_for_another_peer() {
+    let compression = Compression::new();
+    let payload = noise(10_000);
+    assert_eq!(compression.ask(asker(1), name(1), &payload), later(1));
+    let answer = CompressionAnswer { number: 1, compressed: None, took: Duration::ZERO };
+    compression.handle_answer(&answer);
+    assert_eq!(compression.ask(asker(2), name(1), &payload), Some(Asked::Known(None)));
+}
+
+#[test]
+fn orders_and_answers_that_are_kept_take_bounded_memory() {
+    let compression = Compression::new();
+    let long = text(LONGEST);
+    assert_eq!(compression.ask(asker(1), None, &long), later(1), "one of any length");
+    assert_eq!(compression.ask(asker(1), None, &text(SHORTEST)), None);
+    compression.handle_answer(&CompressionAnswer {
+        number: 1,
+        compressed: None,
+        took: Duration::ZERO,
+    });
+    let payload = noise(1 << 20);
+    for number in 1..=100 {
+        let Some(Asked::Later(order)) = compression.ask(asker(1), name(number), &payload) else {
+            panic!("there is room")
+        };
+        let compressed = Some(payload.slice(..700_000));
+        compression.handle_answer(&CompressionAnswer {
+            number: order,
+            compressed,
+            took: Duration::ZERO,
+        });
+    }
+    let state = compression.0.borrow();
+    assert_eq!((state.pending_bytes, state.pending.len(), state.named.len()), (0, 0, 0));
+    assert!(state.kept_bytes <= KEPT && state.kept.len() == 5, "{}", state.kept.len());
+    drop(state);
+    for number in 101..=100_000 {
+        let Some(Asked::Later(order)) = compression.ask(asker(1), name(number), &text(SHORTEST))
+        else {
+            panic!("there is room")
+        };
+        compression.handle_answer(&CompressionAnswer {
+            number: order,
+            compressed: None,
+            took: Duration::ZERO,
+        });
+    }
+    assert_eq!(compression.0.borrow().kept.len(), KEPT / SHORTEST);
+}
