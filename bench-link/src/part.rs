@@ -12,6 +12,7 @@ use axon_shm::{
     qos::{History, Qos, Reliability},
 };
 use axon_transport::{DaemonCommand, EndpointSpec, Session, SessionOptions, config::Config};
+use rand::{Rng, SeedableRng, rngs::StdRng};
 use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
 
@@ -162,6 +163,13 @@ fn session() -> Result<Session> {
     Ok(Session::open(&Config::from_env()?, options)?)
 }
 
+/// Bytes that no compressor makes shorter: what crosses is what is published.
+fn incompressible(length: usize) -> Vec<u8> {
+    let mut bytes = vec![0; length];
+    StdRng::seed_from_u64(0).fill_bytes(&mut bytes);
+    bytes
+}
+
 fn publish(stream: &Stream, orders: &Receiver<()>) -> Result<()> {
     let session = session()?;
     let publisher = session.create_publisher(stream.spec())?;
@@ -170,7 +178,7 @@ fn publish(stream: &Stream, orders: &Receiver<()>) -> Result<()> {
     }
     say(&())?;
     orders.recv()?;
-    let mut bytes = vec![0x5a; stream.bytes.max(STAMP)];
+    let mut bytes = incompressible(stream.bytes.max(STAMP));
     let mut sent = Sent::default();
     paced(stream, orders, |number| {
         stamp(&mut bytes, number);
