@@ -282,12 +282,13 @@ impl Carrier<'_> {
     /// Ends the pass. QUIC says that it takes more once it would of each flow that is blocked: `least` is the least of
     /// their limits. It would say so at once, and again and again, if it took more of one while another cannot write,
     /// whose stream the peer does not read. A flow with a higher limit has samples in QUIC until then.
-    pub(super) fn rest(&mut self, least: Option<u64>, now: Duration) {
+    /// The link `is_full` while a flow waits for QUIC.
+    pub(super) fn rest(&mut self, least: Option<u64>, is_full: bool, now: Duration) {
         self.quic.set_send_window(least.unwrap_or(self.bulk));
         let left = || {
             let stats = self.quic.stats();
             stats.udp_tx.bytes.saturating_sub(stats.path.lost_bytes)
         };
-        self.measured.handle_pass(least.is_some(), left, self.quic.rtt(), now);
+        self.measured.handle_pass(is_full, left, self.window, self.quic.rtt(), now);
     }
 }

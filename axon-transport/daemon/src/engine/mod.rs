@@ -208,8 +208,8 @@ impl Engine {
     }
 
     /// A sample was compressed, or does not become shorter.
-    pub(crate) fn handle_compressed(&mut self, answer: CompressionAnswer) {
-        for asker in self.factory.compression().handle_answer(&answer) {
+    pub(crate) fn handle_compressed(&mut self, answer: CompressionAnswer, now: Duration) {
+        for asker in self.factory.compression().handle_answer(&answer, now) {
             if let Some(peer) = self.peers.get_mut(asker.daemon) {
                 let frame = answer.compressed.clone();
                 peer.outbound.handle_compressed(asker.flow, answer.number, frame);

@@ -246,7 +246,7 @@ impl Reactor {
             Done::Recorded(link, first) => self.engine.handle_recorded(link, first, now),
             Done::Identity => self.engine.handle_identity(now),
             Done::Interfaces(interfaces) => self.engine.handle_interfaces(interfaces),
-            Done::Compressed(answer) => self.engine.handle_compressed(answer),
+            Done::Compressed(answer) => self.engine.handle_compressed(answer, now),
             Done::Keys(statistics) => {
                 self.key_reports.handle_report();
                 let (kme, used) = *statistics;

@@ -122,11 +122,25 @@ fn what_is_beyond_a_limit_waits_or_is_dropped_and_counted_in_each_mode() {
 const LENGTH: usize = 10_000;
 
 fn publish_long(publisher: &Publisher) {
+    // A slow link carries as many bytes as there are.
+    let noise = noise(LENGTH);
     for number in 1..=SAMPLES {
-        let mut sample = number.to_be_bytes().to_vec();
-        sample.resize(LENGTH, 0x5a);
+        let mut sample = noise.clone();
+        sample[..8].copy_from_slice(&number.to_be_bytes());
         publisher.publish(&sample).unwrap();
     }
+}
+
+/// Bytes that no compressor makes shorter.
+fn noise(length: usize) -> Vec<u8> {
+    let mut state = 1_u64;
+    let mut next = || {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        state as u8
+    };
+    (0..length).map(|_| next()).collect()
 }
 
 /// The next long sample that comes.
@@ -176,6 +190,35 @@ fn bytes_beyond_a_limit_are_dropped_or_wait_in_both_directions() {
 #[test]
 fn an_egress_limit_slows_what_leaves_and_loses_nothing() {
     egress_is_limited("peer = \"PEER\"", "(all packets)");
+}
+
+/// In each mode. Each other sample becomes shorter, and all arrive as they were published, in order.
+#[test]
+fn a_link_that_a_limit_slows_carries_compressed_samples() {
+    Hosts::in_all(|hosts| {
+        let (here, there) = (hosts.robot.session("robot"), hosts.base.session("base"));
+        let (scan, scans) = (publisher(&here, "/scan"), subscription(&there, "/scan"));
+        meet(&scan, &scans);
+        let limited = "default = \"allow\"\n[[limit]]\npeer = \"PEER\"\negress = \"500 kB/s\"\n";
+        hosts.write(limited);
+        assert_eq!(hosts.reload().error, None);
+        let (text, noise) = (b"a line of a log\n".repeat(LENGTH / 16), noise(LENGTH));
+        let sample = |number: u64| {
+            let mut sample = if number % 2 == 0 { text.clone() } else { noise.clone() };
+            sample[..8].copy_from_slice(&number.to_be_bytes());
+            sample
+        };
+        (1..=SAMPLES).for_each(|number| drop(scan.publish(&sample(number)).unwrap()));
+        let mut bytes = Vec::new();
+        for number in 1..=SAMPLES {
+            scans.recv(&mut bytes, Some(PATIENCE)).expect("a sample");
+            assert!(bytes == sample(number), "number {number} of {SAMPLES}");
+        }
+        until("status shows what was compressed", || {
+            let compressed = hosts.robot.link().compressed;
+            compressed.samples > 0 && compressed.bytes_sent < compressed.bytes / 2
+        });
+    });
 }
 
 #[test]

@@ -4,6 +4,10 @@ use std::time::Duration;
 
 /// A measure takes so long at least, and so many round trips: what the window lets leave at once is a small part then.
 const SPAN: (Duration, u32) = (Duration::from_millis(50), 4);
+/// It counts where at least this share of the window left in each round trip: else the peer or the path let nothing pass.
+const OF_WINDOW: f64 = 0.5;
+/// And where the measure before it was nearly as high: a link begins slowly.
+const STEADY: f64 = 1.25;
 /// A rate is believed for so long. What is compressed may leave the link idle, so nothing would measure it again.
 const BELIEVED: Duration = Duration::from_secs(30);
 
@@ -12,6 +16,8 @@ const BELIEVED: Duration = Duration::from_secs(30);
 pub(crate) struct LinkRate {
     /// When the measure began, and how many bytes had left by then.
     begun: Option<(Duration, u64)>,
+    /// The rate of the measure before that.
+    before: f64,
     /// Bytes a second, and when they were measured.
     measured: Option<(f64, Duration)>,
 }
@@ -22,11 +28,12 @@ impl LinkRate {
         &mut self,
         is_full: bool,
         left: impl Fn() -> u64,
+        window: u64,
         rtt: Duration,
         now: Duration,
     ) {
         if !is_full {
-            self.begun = None;
+            (self.begun, self.before) = (None, 0.0);
             return;
         }
         let Some((since, before)) = self.begun else {
@@ -36,7 +43,13 @@ impl LinkRate {
         let span = now.saturating_sub(since);
         if span >= SPAN.0.max(rtt * SPAN.1) {
             let left = left();
-            self.measured = Some((left.saturating_sub(before) as f64 / span.as_secs_f64(), now));
+            let rate = left.saturating_sub(before) as f64 / span.as_secs_f64();
+            let is_used = rate * rtt.as_secs_f64() >= OF_WINDOW * window as f64;
+            let is_higher = self.measured.is_some_and(|(measured, _)| rate > measured);
+            if is_used && (is_higher || rate <= STEADY * self.before) {
+                self.measured = Some((rate, now));
+            }
+            self.before = if is_used { rate } else { 0.0 };
             self.begun = Some((now, left));
         }
     }
@@ -52,53 +65,85 @@ impl LinkRate {
 mod tests {
     use super::*;
 
-    const RTT: Duration = Duration::from_millis(3);
+    const RTT: Duration = Duration::from_millis(4);
+    /// Fits a megabyte a second.
+    const WINDOW: u64 = 4_000;
 
     fn ms(ms: u64) -> Duration {
         Duration::from_millis(ms)
     }
 
-    #[test]
-    fn the_rate_is_what_leaves_while_more_waits() {
-        let mut rate = LinkRate::default();
-        for at in 0..50 {
-            rate.handle_pass(true, || at * 1_000, RTT, ms(at));
-            assert_eq!(rate.get(ms(at)), None, "at {at} ms");
+    /// A link that is full from this time on and carries so many bytes in each of so many milliseconds.
+    fn run(rate: &mut LinkRate, from: u64, time: u64, left: &mut u64, each: u64) {
+        for at in from..=from + time {
+            rate.handle_pass(true, || *left, WINDOW, RTT, ms(at));
+            *left += each;
         }
-        rate.handle_pass(true, || 50_000, RTT, ms(50));
-        assert_eq!(rate.get(ms(50)), Some(1e6));
-        // Slower from then on.
-        rate.handle_pass(true, || 55_000, RTT, ms(100));
-        assert_eq!(rate.get(ms(100)), Some(1e5));
+    }
+
+    #[test]
+    fn the_rate_is_what_leaves_while_more_waits_once_it_is_steady() {
+        let (mut rate, mut left) = (LinkRate::default(), 0);
+        run(&mut rate, 0, 99, &mut left, 1_000);
+        assert_eq!(rate.get(ms(99)), None, "one measure");
+        run(&mut rate, 100, 0, &mut left, 1_000);
+        assert_eq!(rate.get(ms(100)), Some(1e6));
+        // Slower, but as its window says.
+        run(&mut rate, 101, 100, &mut left, 600);
+        let slower = rate.get(ms(201)).unwrap();
+        assert!((slower - 6e5).abs() < 1e4, "{slower}");
+        // Faster at once.
+        run(&mut rate, 202, 50, &mut left, 2_000);
+        assert!(rate.get(ms(252)).unwrap() > 1.9e6);
     }
 
     #[test]
     fn a_link_that_takes_all_is_not_measured() {
         let mut rate = LinkRate::default();
         for at in 0..1_000 {
-            rate.handle_pass(at % 40 != 0, || at * 1_000, RTT, ms(at));
+            rate.handle_pass(at % 40 != 0, || at * 1_000, WINDOW, RTT, ms(at));
         }
         assert_eq!(rate.get(ms(1_000)), None);
     }
 
     #[test]
+    fn what_a_peer_does_not_read_or_an_outage_holds_up_is_no_rate() {
+        for each in [0, 100, 499] {
+            let (mut rate, mut left) = (LinkRate::default(), 0);
+            run(&mut rate, 0, 1_000, &mut left, each);
+            assert_eq!(rate.get(ms(1_000)), None, "{each} of a window of 4,000 in 4 ms");
+        }
+    }
+
+    #[test]
+    fn a_link_that_begins_slowly_has_no_rate_until_it_does_not_grow() {
+        let (mut rate, mut left, mut each) = (LinkRate::default(), 0, 600);
+        let mut at = 0;
+        for _ in 0..4 {
+            run(&mut rate, at, 49, &mut left, each);
+            (at, each) = (at + 50, each * 2);
+            assert_eq!(rate.get(ms(at)), None, "at {at} ms");
+        }
+        run(&mut rate, at, 100, &mut left, each);
+        assert!(rate.get(ms(at + 100)).unwrap() > 9e6);
+    }
+
+    #[test]
     fn a_long_path_takes_a_longer_measure() {
-        let mut rate = LinkRate::default();
-        let rtt = ms(100);
-        rate.handle_pass(true, || 0, rtt, ms(0));
-        rate.handle_pass(true, || 1_000_000, rtt, ms(399));
-        assert_eq!(rate.get(ms(399)), None);
-        rate.handle_pass(true, || 1_000_000, rtt, ms(400));
-        assert_eq!(rate.get(ms(400)), Some(2.5e6));
+        let (mut rate, rtt, window) = (LinkRate::default(), ms(100), 250_000);
+        let mut pass = |at| rate.handle_pass(true, || at * 2_500, window, rtt, ms(at));
+        [0, 399, 400, 799].into_iter().for_each(&mut pass);
+        assert_eq!(rate.get(ms(799)), None);
+        rate.handle_pass(true, || 800 * 2_500, window, rtt, ms(800));
+        assert_eq!(rate.get(ms(800)), Some(2.5e6));
     }
 
     #[test]
     fn a_rate_is_forgotten_once_the_link_was_not_full_for_long() {
-        let mut rate = LinkRate::default();
-        rate.handle_pass(true, || 0, RTT, ms(0));
-        rate.handle_pass(true, || 50_000, RTT, ms(50));
-        rate.handle_pass(false, || 50_000, RTT, ms(60));
-        assert_eq!(rate.get(ms(30_049)), Some(1e6));
-        assert_eq!(rate.get(ms(30_050)), None);
+        let (mut rate, mut left) = (LinkRate::default(), 0);
+        run(&mut rate, 0, 100, &mut left, 1_000);
+        rate.handle_pass(false, || left, WINDOW, RTT, ms(101));
+        assert_eq!(rate.get(ms(30_099)), Some(1e6));
+        assert_eq!(rate.get(ms(30_100)), None);
     }
 }

@@ -14,6 +14,7 @@ use std::{
     time::Duration,
 };
 
+use axon_envelope::TopicHash;
 use axon_shm::ids::{DaemonId, Gid};
 use bytes::Bytes;
 
@@ -39,6 +40,8 @@ const KEPT: usize = 4 << 20;
 const MEASURED: f64 = (8 << 20) as f64;
 /// Its speed before the first sample, in bytes a second.
 const SPEED: f64 = 200e6;
+/// It is tried at that speed again where nothing was compressed for so long: it may have been held up.
+const TRIED_AGAIN: Duration = Duration::from_secs(5);
 
 /// What the owner is to compress.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -99,8 +102,17 @@ pub(crate) struct Asker {
     pub(crate) flow: FlowId,
 }
 
-/// A sample of a topic: its publisher and its number.
-pub(crate) type SampleName = (Gid, u64);
+/// A sample of a topic. Peers have relays of their own, which may read what a faulty publisher wrote under one number at
+/// different times: a frame is taken for a sample of the same length alone, or the peer would take it for malformed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub(crate) struct SampleName {
+    /// The topic and its type.
+    pub(crate) topic: TopicHash,
+    pub(crate) publisher: Gid,
+    pub(crate) sequence: u64,
+    /// Its bytes.
+    pub(crate) length: usize,
+}
 
 /// What there is of a sample that a flow asks for.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -131,8 +143,9 @@ struct State {
     kept: HashMap<SampleName, Option<Bytes>>,
     kept_order: VecDeque<SampleName>,
     kept_bytes: usize,
-    /// Of the last orders: bytes, and seconds that they took.
+    /// Of the last orders: bytes, and seconds that they took. When the last of them was given or answered.
     measured: (f64, f64),
+    used: Duration,
 }
 
 /// What is compressed for one of the peers.
@@ -149,8 +162,8 @@ impl PeerCompression {
     }
 
     /// As [`Compression::pays`].
-    pub(crate) fn pays(&self, length: usize, rate: f64) -> bool {
-        self.all.pays(length, rate)
+    pub(crate) fn pays(&self, length: usize, rate: f64, now: Duration) -> bool {
+        self.all.pays(length, rate, now)
     }
 
     /// As [`Compression::ask`].
@@ -181,13 +194,20 @@ impl Compression {
             kept_order: VecDeque::new(),
             kept_bytes: 0,
             measured: (SPEED / 100.0, 0.01),
+            used: Duration::ZERO,
         }))
     }
 
     /// Whether a sample of this length is to be compressed for a link that carries so many bytes a second.
-    pub(crate) fn pays(&self, length: usize, rate: f64) -> bool {
-        let (bytes, seconds) = self.0.borrow().measured;
-        let takes = length as f64 * seconds / bytes + THERE_AND_BACK.as_secs_f64();
+    pub(crate) fn pays(&self, length: usize, rate: f64, now: Duration) -> bool {
+        let state = self.0.borrow();
+        let (bytes, seconds) = match now.saturating_sub(state.used) > TRIED_AGAIN {
+            true => (SPEED, 1.0),
+            false => state.measured,
+        };
+        // Those that wait go first.
+        let all = (state.pending_bytes + length) as f64;
+        let takes = all * seconds / bytes + THERE_AND_BACK.as_secs_f64();
         (SHORTEST..=LONGEST).contains(&length) && takes < SHARE * length as f64 / rate
     }
 
@@ -229,8 +249,9 @@ impl Compression {
     }
 
     /// The owner answers an order. Returns the flows that asked.
-    pub(crate) fn handle_answer(&self, answer: &CompressionAnswer) -> Vec<Asker> {
+    pub(crate) fn handle_answer(&self, answer: &CompressionAnswer, now: Duration) -> Vec<Asker> {
         let mut state = self.0.borrow_mut();
+        state.used = now;
         let Some(Pending { name, length, askers }) = state.pending.remove(&answer.number) else {
             return Vec::new();
         };

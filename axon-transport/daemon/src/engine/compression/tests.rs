@@ -4,9 +4,13 @@ fn asker(flow: FlowId) -> Asker {
     Asker { daemon: DaemonId([1; 16]), flow }
 }
 
-fn name(number: u64) -> Option<SampleName> {
-    Some((Gid([2; 16]), number))
+/// A name of a sample of ten thousand bytes.
+fn name(sequence: u64) -> Option<SampleName> {
+    let topic = TopicHash([3; 16]);
+    Some(SampleName { topic, publisher: Gid([2; 16]), sequence, length: 10_000 })
 }
+
+const NOW: Duration = Duration::from_secs(7);
 
 fn text(length: usize) -> Bytes {
     b"a line of a log\n".iter().copied().cycle().take(length).collect::<Vec<_>>().into()
@@ -63,11 +67,11 @@ fn a_slow_link_gets_what_is_worth_it_and_a_fast_one_nothing() {
     let compression = Compression::new();
     // 54 Mbit/s, 1 Gbit/s and 10 Gbit/s.
     let [radio, cable, fast] = [54e6 / 8.0, 125e6, 1.25e9];
-    assert!(compression.pays(64 << 10, radio));
-    assert!(!compression.pays(64 << 10, cable) && !compression.pays(64 << 10, fast));
+    assert!(compression.pays(64 << 10, radio, NOW));
+    assert!(!compression.pays(64 << 10, cable, NOW) && !compression.pays(64 << 10, fast, NOW));
     // A short sample takes longer to the thread and back than it saves.
-    assert!(!compression.pays(2_000, radio) && compression.pays(2_000, 1e6));
-    assert!(!compression.pays(SHORTEST - 1, 1.0) && !compression.pays(LONGEST + 1, 1.0));
+    assert!(!compression.pays(2_000, radio, NOW) && compression.pays(2_000, 1e6, NOW));
+    assert!(!compression.pays(SHORTEST - 1, 1.0, NOW) && !compression.pays(LONGEST + 1, 1.0, NOW));
 }
 
 #[test]
@@ -81,13 +85,17 @@ fn the_speed_of_the_compressor_counts() {
             };
             let took = Duration::from_secs_f64(payload.len() as f64 / speed);
             let answer = CompressionAnswer { number, compressed: None, took };
-            assert_eq!(compression.handle_answer(&answer), [asker(1)]);
+            assert_eq!(compression.handle_answer(&answer, NOW), [asker(1)]);
         }
     };
     run(1e9);
-    assert!(compression.pays(1 << 20, 250e6));
+    assert!(compression.pays(1 << 20, 250e6, NOW));
     run(1e7);
-    assert!(!compression.pays(1 << 20, 54e6 / 8.0));
+    assert!(!compression.pays(1 << 20, 54e6 / 8.0, NOW));
+    // It may have been held up.
+    let later = NOW + TRIED_AGAIN;
+    assert!(!compression.pays(1 << 20, 54e6 / 8.0, later));
+    assert!(compression.pays(1 << 20, 54e6 / 8.0, later + Duration::from_nanos(1)));
 }
 
 #[test]
@@ -106,9 +114,9 @@ fn a_sample_of_a_topic_is_compressed_once_for_all_peers() {
         compressed: compressed.clone(),
         took: Duration::from_micros(20),
     };
-    assert_eq!(compression.handle_answer(&answer(1)), [asker(1), asker(2)]);
-    assert_eq!(compression.handle_answer(&answer(1)), [], "it comes once");
-    assert_eq!(compression.handle_answer(&answer(9)), [], "nobody asked");
+    assert_eq!(compression.handle_answer(&answer(1), NOW), [asker(1), asker(2)]);
+    assert_eq!(compression.handle_answer(&answer(1), NOW), [], "it comes once");
+    assert_eq!(compression.handle_answer(&answer(9), NOW), [], "nobody asked");
     assert_eq!(compression.ask(asker(3), name(1), &payload), Some(Asked::Known(compressed)));
     // Those of services have no name that is theirs alone.
     assert_eq!(compression.ask(asker(1), None, &payload), later(3));
@@ -121,7 +129,7 @@ fn what_is_not_worth_it_is_not_tried_for_another_peer() {
     let payload = noise(10_000);
     assert_eq!(compression.ask(asker(1), name(1), &payload), later(1));
     let answer = CompressionAnswer { number: 1, compressed: None, took: Duration::ZERO };
-    compression.handle_answer(&answer);
+    compression.handle_answer(&answer, NOW);
     assert_eq!(compression.ask(asker(2), name(1), &payload), Some(Asked::Known(None)));
 }
 
@@ -131,22 +139,20 @@ fn orders_and_answers_that_are_kept_take_bounded_memory() {
     let long = text(LONGEST);
     assert_eq!(compression.ask(asker(1), None, &long), later(1), "one of any length");
     assert_eq!(compression.ask(asker(1), None, &text(SHORTEST)), None);
-    compression.handle_answer(&CompressionAnswer {
-        number: 1,
-        compressed: None,
-        took: Duration::ZERO,
-    });
+    compression.handle_answer(
+        &CompressionAnswer { number: 1, compressed: None, took: Duration::ZERO },
+        NOW,
+    );
     let payload = noise(1 << 20);
     for number in 1..=100 {
         let Some(Asked::Later(order)) = compression.ask(asker(1), name(number), &payload) else {
             panic!("there is room")
         };
         let compressed = Some(payload.slice(..700_000));
-        compression.handle_answer(&CompressionAnswer {
-            number: order,
-            compressed,
-            took: Duration::ZERO,
-        });
+        compression.handle_answer(
+            &CompressionAnswer { number: order, compressed, took: Duration::ZERO },
+            NOW,
+        );
     }
     let state = compression.0.borrow();
     assert_eq!((state.pending_bytes, state.pending.len(), state.named.len()), (0, 0, 0));
@@ -157,11 +163,32 @@ fn orders_and_answers_that_are_kept_take_bounded_memory() {
         else {
             panic!("there is room")
         };
-        compression.handle_answer(&CompressionAnswer {
-            number: order,
-            compressed: None,
-            took: Duration::ZERO,
-        });
+        compression.handle_answer(
+            &CompressionAnswer { number: order, compressed: None, took: Duration::ZERO },
+            NOW,
+        );
     }
     assert_eq!(compression.0.borrow().kept.len(), KEPT / SHORTEST);
+}
+
+#[test]
+fn what_waits_for_the_compressor_counts_as_well() {
+    let compression = Compression::new();
+    assert!(compression.pays(20_000, 54e6 / 8.0, NOW));
+    for _ in 0..3 {
+        assert!(matches!(compression.ask(asker(1), None, &text(1 << 20)), Some(Asked::Later(_))));
+    }
+    assert!(!compression.pays(20_000, 54e6 / 8.0, NOW), "15 ms for a sample that takes 3 ms");
+}
+
+/// A faulty publisher may write two samples under one number, which the relays of two peers read.
+#[test]
+fn a_sample_of_another_length_or_topic_is_another_sample() {
+    let compression = Compression::new();
+    let payload = text(10_000);
+    assert_eq!(compression.ask(asker(1), name(1), &payload), later(1));
+    let longer = name(1).map(|name| SampleName { length: 12_000, ..name });
+    assert_eq!(compression.ask(asker(2), longer, &text(12_000)), later(2));
+    let elsewhere = name(1).map(|name| SampleName { topic: TopicHash([4; 16]), ..name });
+    assert_eq!(compression.ask(asker(2), elsewhere, &payload), later(3));
 }

@@ -313,7 +313,7 @@ impl Outbound {
             carrier.closed_from = self.turns.closed_from();
         }
         self.table.flows.finish_idle_streams(self.turns.take_wanted_streams(), carrier);
-        carrier.rest(blocked, now);
+        carrier.rest(blocked, self.turns.wait_for_quic(), now);
     }
 
     /// The peer says how much it takes in over this link.

@@ -243,16 +243,14 @@ impl Queue {
         })
     }
 
-    /// Whether the next sample is being compressed, or is compressed, and a newer one would take its place: it is sent before
-    /// that, or a publisher that is fast enough would have none of its samples sent.
-    pub(super) fn holds_next(&self, now: Duration) -> bool {
-        let is_replaced = match self.policy {
-            Policy::KeepAll => false,
-            Policy::KeepLast(_) => self.is_behind(now),
-            Policy::BestEffort(_) => true,
+    /// Whether the next sample is compressed, or is about to be, and a newer one would take its place: within its `life` it is
+    /// sent before that, or a publisher that is fast enough would have none of its samples sent. A KEEP_LAST flow leaves
+    /// newer ones in the ring.
+    pub(super) fn holds_next(&self, life: Duration, now: Duration) -> bool {
+        let is_held = |next: &Sample| {
+            (next.is_asked() || next.is_compressed()) && now.saturating_sub(next.taken) < life
         };
-        let is_held = |next: &Sample| next.is_asked() || next.is_compressed();
-        is_replaced && self.peek().is_some_and(is_held)
+        matches!(self.policy, Policy::BestEffort(_)) && self.peek().is_some_and(is_held)
     }
 
     /// An order is answered: the sample that it is about is sent as this frame, or as it is. Returns its length, if it waits

@@ -414,7 +414,7 @@ impl Host {
             }]);
         }
         while let Some((_, answer)) = self.compressed.pop_front_if(|(due, _)| *due <= now) {
-            engine.handle_compressed(answer);
+            engine.handle_compressed(answer, now);
         }
         for (link, key_id) in std::mem::take(&mut self.records) {
             let first = self.used.insert(key_id);

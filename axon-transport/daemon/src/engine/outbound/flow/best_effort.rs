@@ -24,7 +24,7 @@ use crate::{
 };
 
 /// A sample without a lifespan that is older than this once it has crossed the link is dropped for a newer one.
-const LIFE: Duration = Duration::from_millis(200);
+pub(super) const LIFE: Duration = Duration::from_millis(200);
 /// A sample that QUIC did not deliver within this time is given up.
 const LONGEST: Duration = Duration::from_secs(10);
 /// So many samples may be under way whatever the congestion window.
@@ -122,9 +122,9 @@ impl BestEffort {
     ) -> Option<Pause> {
         if self.writing.is_none() {
             let Some(next) = queue.peek() else { return Some(Pause::Empty) };
-            let (length, uses) = (next.payload.len(), Credit::of(next.size(), next.size()));
-            let is_open = carrier.is_open_to(info.best_effort_rank(length));
-            if length > SMALL && !(is_open && credit.may_use(uses)) {
+            let uses = Credit::of(next.size(), next.size());
+            let is_open = carrier.is_open_to(info.best_effort_rank(next.payload.len()));
+            if next.length() > SMALL && !(is_open && credit.may_use(uses)) {
                 return Some(Pause::NoCredit);
             }
             let Some(stream) = carrier.quic.streams().open(Dir::Uni) else {

@@ -6,11 +6,10 @@ use bytes::Bytes;
 
 use super::info::FlowInfo;
 use crate::engine::{
-    compression::{Asked, PeerCompression},
+    compression::{Asked, PeerCompression, SampleName},
     connection::Carrier,
     counters::Counters,
     outbound::queue::Queue,
-    rings::Sample,
 };
 
 /// Bytes of samples of a flow, and samples, that are compressed before the link takes them.
@@ -44,7 +43,7 @@ impl Compressing {
             if sample.is_asked() && !self.is_worth_it {
                 return;
             }
-            if !sample.is_undecided() || !compression.pays(sample.length(), rate) {
+            if !sample.is_undecided() || !compression.pays(sample.length(), rate, now) {
                 continue;
             }
             if self.passed > 0 {
@@ -53,7 +52,12 @@ impl Compressing {
                 continue;
             }
             // Responses of several servers have the same numbers.
-            let name = (!info.is_service()).then_some((info.of, sample.info.sequence));
+            let name = (!info.is_service()).then(|| SampleName {
+                topic: info.route.topic,
+                publisher: info.of,
+                sequence: sample.info.sequence,
+                length: sample.length(),
+            });
             match compression.ask(carrier.flow, name, &sample.payload) {
                 Some(Asked::Later(order)) => {
                     sample.set_asked(order);
@@ -61,29 +65,26 @@ impl Compressing {
                         return;
                     }
                 }
-                Some(Asked::Known(frame)) => self.set(sample, frame, counters),
+                Some(Asked::Known(frame)) => {
+                    self.handle_answer(frame.as_ref(), sample.length(), counters);
+                    sample.set_compressed(frame);
+                }
                 None => return,
             }
         }
     }
 
-    fn set(&mut self, sample: &mut Sample, frame: Option<Bytes>, counters: &Counters) {
-        self.handle_answer(frame.as_ref(), Some(sample.length()), counters);
-        sample.set_compressed(frame);
-    }
-
-    /// A sample of this length, if it still waits, became this frame or does not become shorter.
+    /// A sample of this length that waits became this frame, or does not become shorter.
     pub(super) fn handle_answer(
         &mut self,
         frame: Option<&Bytes>,
-        length: Option<usize>,
+        length: usize,
         counters: &Counters,
     ) {
         self.is_worth_it = frame.is_some();
-        match (frame, length) {
-            (None, _) => self.passed = PASSED,
-            (Some(frame), Some(length)) => counters.compressed(length, frame.len()),
-            (Some(_), None) => {}
+        match frame {
+            Some(frame) => counters.compressed(length, frame.len()),
+            None => self.passed = PASSED,
         }
     }
 }

@@ -28,7 +28,8 @@ pub(in crate::engine::outbound) struct FlowInfo {
     pub(super) acknowledged: bool,
     /// Whether the peer reads short headers.
     pub(super) short_headers: bool,
-    /// Whether its samples may be compressed.
+    /// Whether its samples may be compressed. Of a flow that is not acknowledged nothing says when a stream with short headers
+    /// may be followed by one without.
     pub(super) compressed: bool,
 }
 
@@ -43,7 +44,7 @@ impl FlowInfo {
             priority: route.priority,
             acknowledged: route.acknowledged,
             short_headers: route.short_headers,
-            compressed: route.compressed,
+            compressed: route.compressed && route.acknowledged,
         }
     }
 

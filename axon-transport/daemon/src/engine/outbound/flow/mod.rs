@@ -20,7 +20,7 @@ use quinn_proto::{Connection, StreamId};
 
 pub(super) use self::credit::{Credit, CreditQueue, PeerCredit};
 use self::{
-    best_effort::BestEffort,
+    best_effort::{BestEffort, LIFE},
     compressing::Compressing,
     info::FlowInfo,
     reliable::{ReliableStream, STREAM_IDLE, TOGETHER},
@@ -56,7 +56,7 @@ pub(super) enum Pause {
     NoKey,
     /// The peer does not take in the next sample before others.
     NoCredit,
-    /// The next sample is being compressed.
+    /// The next sample is being compressed, or is, and those before it have to be acknowledged first.
     Compressing,
 }
 
@@ -224,7 +224,7 @@ impl Flow {
         let mut left = if carrier.lender.is_some() { TOGETHER } else { TURN };
         loop {
             if !self.reliable.is_writing() && !self.best_effort.is_writing() {
-                if !self.queue.holds_next(now) {
+                if !self.queue.holds_next(LIFE, now) {
                     self.undemanded += self.fill(sources, counters, now);
                 }
                 carrier.seal.demand(std::mem::take(&mut self.undemanded), now);
@@ -403,15 +403,16 @@ impl Flow {
         pause
     }
 
-    /// An order is answered: the sample is sent as this frame, or as it is.
+    /// An order is answered: the sample is sent as this frame, or as it is. It may be gone, and the order an earlier flow's.
     pub(super) fn handle_compressed(
         &mut self,
         order: u64,
         frame: Option<Bytes>,
         counters: &Counters,
     ) {
-        let length = self.queue.set_compressed(order, frame.clone());
-        self.compressing.handle_answer(frame.as_ref(), length, counters);
+        if let Some(length) = self.queue.set_compressed(order, frame.clone()) {
+            self.compressing.handle_answer(frame.as_ref(), length, counters);
+        }
     }
 
     /// The peer's QUIC has all of this best-effort stream.

@@ -135,11 +135,14 @@ impl ReliableStream {
                 return Some(Pause::NoCredit);
             }
             if !self.compressed && queue.peek().is_some_and(Sample::is_compressed) {
-                self.compressed = true;
-                if self.headers.is_some() {
-                    // The peer reads it to its end before the next one.
+                if self.stream.is_some() && self.headers.is_some() {
+                    // The peer reads streams in the order in which it hears of them: it has to have heard of this one.
+                    if queue.has_sent() {
+                        return Some(Pause::Compressing);
+                    }
                     self.finish(carrier);
                 }
+                self.compressed = true;
             }
             let sealed = self.seal(info, queue, frames, carrier, now);
             self.note_sent(queue);
@@ -196,9 +199,10 @@ impl ReliableStream {
     fn has_credit(&self, info: &FlowInfo, queue: &Queue, carrier: &Carrier<'_>) -> bool {
         let Some(next) = queue.peek() else { return true };
         let credit = queue.credit_with(next);
-        let length = next.payload.len();
-        let is_small = length <= SMALL && credit.window <= ALWAYS;
-        is_small || (carrier.is_open_to(info.rank(true, length)) && self.credit.may_use(credit))
+        let is_small = next.length() <= SMALL && credit.window <= ALWAYS;
+        is_small
+            || (carrier.is_open_to(info.rank(true, next.payload.len()))
+                && self.credit.may_use(credit))
     }
 
     fn set_priority(&mut self, rank: Rank, stream: StreamId, carrier: &mut Carrier<'_>) {
@@ -266,7 +270,7 @@ impl ReliableStream {
                 break;
             }
             let is_next = |next: &Sample| {
-                !next.is_asked() && !(next.is_compressed() && self.headers.is_some())
+                !(next.is_asked() || next.is_compressed() && self.headers.is_some())
             };
             if !queue.peek().is_some_and(is_next) {
                 break;

@@ -3,7 +3,7 @@
 mod lending;
 mod without;
 
-use std::{rc::Rc, time::Duration};
+use std::{collections::HashSet, rc::Rc, time::Duration};
 
 use self::{lending::Lending, without::Without};
 use super::{
@@ -32,6 +32,8 @@ pub(super) struct Turns {
     /// The flows that wait for credit.
     for_credit: CreditQueue,
     budget: Rc<Budget>,
+    /// The flows whose last turn ended since QUIC took no more.
+    for_quic: HashSet<FlowId>,
     /// Streams may have become idle since a flow found none.
     frees_streams: bool,
 }
@@ -46,8 +48,14 @@ impl Turns {
             credit: PeerCredit::new(),
             for_credit: CreditQueue::default(),
             budget,
+            for_quic: HashSet::new(),
             frees_streams: false,
         }
+    }
+
+    /// Whether a flow waits for QUIC to take more.
+    pub(super) fn wait_for_quic(&self) -> bool {
+        !self.for_quic.is_empty()
     }
 
     /// The peer's credit.
@@ -78,6 +86,7 @@ impl Turns {
     /// A flow is gone. Its number is another's next.
     pub(super) fn forget(&mut self, id: FlowId) {
         self.schedule.remove(id);
+        self.for_quic.remove(&id);
         self.without.forget(id);
         self.for_credit.forget(id);
     }
@@ -143,8 +152,12 @@ impl Turns {
         now: Duration,
     ) {
         match pause {
+            Pause::Blocked => self.for_quic.insert(turn.flow),
+            _ => self.for_quic.remove(&turn.flow),
+        };
+        match pause {
             Pause::Turn => self.add_all([turn.flow], flows),
-            // The answer of the compressor gives it its next turn.
+            // The compressor's answer, or the peer's acknowledgement, gives it its next turn.
             Pause::Empty | Pause::Compressing => {}
             Pause::Blocked => self.lending.handle_blocked(turn.rank),
             Pause::NoStream => {

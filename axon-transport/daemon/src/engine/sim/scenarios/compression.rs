@@ -218,3 +218,57 @@ fn a_link_that_is_replaced_while_samples_are_compressed_loses_none() {
         }
     }
 }
+
+/// The first sample of a flow is short, and a packet with the beginning of its stream may be lost. The next one is compressed
+/// and needs a stream without short headers.
+#[test]
+fn a_compressed_sample_overtakes_no_short_one_before_it() {
+    let mut world = World::new(99, 2, classic);
+    let path = Path { loss: 0.2, ..radio(8, 0.0) };
+    world.network.set_default_path(path);
+    let every = millis(20);
+    let mut noise = [Stream::new(&mut world, "/noise", Qos::sensor_data(), 40_000, every)];
+    world.until(secs(60), World::is_whole);
+    world.run_for(secs(1));
+    drive(&mut world, &mut noise, secs(3));
+    let mut flows = Vec::new();
+    for number in 0..60 {
+        let pair = world.pair(0, 1, &format!("/text/{number}"), Qos::keep_all());
+        drive(&mut world, &mut noise, millis(700));
+        let before = compressions(&world);
+        assert!(world.publish(pair, 500) && world.publish(pair, 40_000));
+        drive(&mut world, &mut noise, millis(300));
+        flows.push((pair, compressions(&world) > before));
+    }
+    world.run_for(secs(20));
+    let compressed = flows.iter().filter(|(_, compressed)| *compressed).count();
+    println!("{compressed} of 60 were compressed");
+    assert!(compressed > 20, "{compressed} of 60");
+    for (number, (pair, _)) in flows.iter().enumerate() {
+        assert_eq!(world.received(*pair), [1, 2], "/text/{number}: {}", world.describe());
+    }
+}
+
+/// Other samples take their turns on the link, and QUIC takes them at once.
+#[test]
+fn samples_are_compressed_beside_those_of_a_topic_that_never_waits() {
+    let mut world = World::new(100, 2, classic);
+    world.network.set_default_path(radio(54, 0.0));
+    let every = millis(3);
+    let mut streams = [
+        Stream::new(&mut world, "/text", Qos::keep_all(), 40_000, every),
+        Stream::new(&mut world, "/tf", Qos::keep_all(), 100, millis(10)),
+    ];
+    world.until(secs(20), World::is_whole);
+    world.run_for(secs(1));
+    drive(&mut world, &mut streams, secs(2));
+    let (before, begun) = (compressions(&world), world.now);
+    drive(&mut world, &mut streams, secs(2));
+    let of_text = compressions(&world) - before;
+    let ages = streams[1].ages(begun);
+    println!(
+        "{of_text} were compressed; the other topic's median age is {:?}",
+        ages[ages.len() / 2]
+    );
+    assert!(of_text > 500, "{of_text}");
+}
