@@ -204,11 +204,13 @@ fn a_link_that_a_limit_slows_carries_compressed_samples() {
         assert_eq!(hosts.reload().error, None);
         let (text, noise) = (b"a line of a log\n".repeat(LENGTH / 16), noise(LENGTH));
         let sample = |number: u64| {
-            let mut sample = if number % 2 == 0 { text.clone() } else { noise.clone() };
+            let mut sample = if number.is_multiple_of(2) { text.clone() } else { noise.clone() };
             sample[..8].copy_from_slice(&number.to_be_bytes());
             sample
         };
-        (1..=SAMPLES).for_each(|number| drop(scan.publish(&sample(number)).unwrap()));
+        for number in 1..=SAMPLES {
+            scan.publish(&sample(number)).unwrap();
+        }
         let mut bytes = Vec::new();
         for number in 1..=SAMPLES {
             scans.recv(&mut bytes, Some(PATIENCE)).expect("a sample");
