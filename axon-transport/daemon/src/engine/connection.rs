@@ -178,7 +178,7 @@ impl Connection {
             bulk,
             reserve: self.egress.window(RESERVE, RESERVE_TIME),
             loses: self.loss.share >= LOSES,
-            rate: self.rate.get(now),
+            rate: self.rate.get(now).into_iter().chain(self.egress.rate()).reduce(f64::min),
             measured: &mut self.rate,
         }
     }
@@ -247,7 +247,7 @@ pub(crate) struct Carrier<'a> {
     reserve: u64,
     /// Whether the link loses packets.
     pub(super) loses: bool,
-    /// Bytes a second that the link carries, if it was full lately.
+    /// Bytes a second that the link carries, if it was full lately or a limit says it.
     pub(super) rate: Option<f64>,
     measured: &'a mut LinkRate,
 }

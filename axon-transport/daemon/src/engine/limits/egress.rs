@@ -110,11 +110,15 @@ impl Egress {
         }
     }
 
+    /// Bytes a second that the slowest limit lets leave.
+    pub(crate) fn rate(&self) -> Option<f64> {
+        self.caps().map(|cap| cap.limit.bytes).reduce(f64::min)
+    }
+
     /// The congestion window, or as much as the limits let leave in a round trip. QUIC holds no more, so that samples
     /// wait where newer ones replace them.
     pub(crate) fn window(&self, window: u64, rtt: Duration) -> u64 {
-        let slowest = self.caps().map(|cap| cap.limit.bytes).reduce(f64::min);
-        let most = slowest.map(|bytes| (bytes * (rtt + AHEAD).as_secs_f64()).max(2.0 * PACKET));
+        let most = self.rate().map(|bytes| (bytes * (rtt + AHEAD).as_secs_f64()).max(2.0 * PACKET));
         most.map_or(window, |most| window.min(most as u64))
     }
 }
