@@ -90,6 +90,11 @@ fn link() -> LinkStatus {
     (limit.limit, limit.place) = ("30 msg/s".to_owned(), "access.toml:12".to_owned());
     (limit.passed, limit.dropped) = (4_321, 98);
     link.limits = vec![limit];
+    link.more_limits = 1_234;
+    link.compressed = serde_json::from_value(
+        json!({"samples": 2_345, "bytes": 5_000_000, "bytes_sent": 1_700_000}),
+    )
+    .expect("a status");
     link
 }
 
@@ -152,6 +157,11 @@ fn every_part_is_shown() {
         "access.toml:12",
         "4,321",
         "98",
+        "\nDenied by access rules\n",
+        "and 3 more",
+        "\nLimits\n",
+        "and 1,234 more",
+        "2,345: 5.00 MB to 1.70 MB",
     ] {
         assert!(text.contains(part), "{part:?} is missing in:\n{text}");
     }

@@ -83,11 +83,12 @@ impl<F: Clone> Registry<F> {
         self.users.denial(user.filter(|_| role == EndpointRole::Application), endpoint)
     }
 
-    /// Has the status and the log say that an endpoint is denied. Its session is not told: for a session REFUSED is for
-    /// good, and other rules may allow the endpoint.
+    /// Has the status and the log say that an endpoint is denied, and tells its session. REFUSED does not name the endpoint:
+    /// for a session that would be for good, and other rules may allow the endpoint.
     pub(super) fn note_denied(&mut self, id: &SessionId, endpoint: &Endpoint, why: &str) {
         let refused = Refused::of(endpoint, why);
         self.sessions.note_refused(id, &refused.text);
+        self.push(id, &Message::Refused(Refused::because(refused.text)), Vec::new());
     }
 
     /// Forgets an endpoint, which its session's entry no longer lists.

@@ -116,6 +116,11 @@ impl Session {
     pub fn refused(&self) -> BTreeMap<Gid, String> {
         self.shared().state().refused.clone()
     }
+
+    /// What the daemon refused since the last call of no endpoint for good, where the options say that it is kept.
+    pub fn take_refusals(&self) -> Vec<String> {
+        std::mem::take(&mut self.shared().state().refusals)
+    }
 }
 
 #[doc(hidden)]
@@ -124,6 +129,13 @@ impl SessionOptions {
     #[must_use]
     pub fn role(mut self, role: SessionRole) -> Self {
         self.role = role;
+        self
+    }
+
+    /// Keeps what the daemon refuses of no endpoint for good.
+    #[must_use]
+    pub fn keep_refusals(mut self) -> Self {
+        self.keeps_refusals = true;
         self
     }
 

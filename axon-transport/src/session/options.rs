@@ -26,6 +26,8 @@ pub struct SessionOptions {
     pub(super) role: SessionRole,
     pub(super) daemon_command: Option<DaemonCommand>,
     pub(super) callers: usize,
+    /// It keeps what the daemon refuses of no endpoint in particular, for the process that it relays.
+    pub(super) keeps_refusals: bool,
     /// What its id is made of.
     pub(super) key: Option<Arc<SessionKey>>,
     #[cfg(feature = "sros2")]
@@ -45,6 +47,7 @@ impl SessionOptions {
             role,
             daemon_command: None,
             callers: usize::MAX,
+            keeps_refusals: false,
             key: None,
             #[cfg(feature = "sros2")]
             permissions: None,

@@ -63,6 +63,9 @@ pub enum SessionEvent {
     Refused(Gid),
 }
 
+/// Refusals that are kept for a process that is relayed. What is beyond is in the daemon's log alone.
+const REFUSALS: usize = 256;
+
 type Listener = Arc<dyn Fn(&SessionEvent) + Send + Sync>;
 
 pub(crate) struct SessionShared {
@@ -109,6 +112,8 @@ pub(super) struct SessionState {
     pub(super) graph: Arc<GraphView>,
     /// Own endpoints that the daemon refused, and why. No other session learns of them.
     pub(super) refused: BTreeMap<Gid, String>,
+    /// What else it refused, for the process that the session relays.
+    pub(super) refusals: Vec<String>,
     pub(super) daemon: Option<DaemonId>,
     pub(super) status: StatusAnswer,
     /// Deadline at which waiters check again without an event.
@@ -274,6 +279,19 @@ impl SessionShared {
         self.state().refuse(gid, why);
         self.notify(Some(&SessionEvent::Refused(gid)));
         self.wake();
+    }
+
+    /// The daemon refuses something for now: a process that the session relays is told.
+    pub(crate) fn refuse_for_now(&self, why: String) {
+        if !self.options.keeps_refusals {
+            return;
+        }
+        let mut state = self.state();
+        if state.refusals.len() < REFUSALS {
+            state.refusals.push(why);
+        }
+        drop(state);
+        self.notify(Some(&SessionEvent::Graph));
     }
 
     /// For a relay: so many samples of `writer` were lost on their way to the session's

@@ -15,7 +15,7 @@ use axon_transport::{
     GuardCondition, Session, SessionOptions,
     config::DaemonPolicy,
     graph::GraphView,
-    ids::DaemonId,
+    ids::{DaemonId, Gid},
     internal::graph::verb_of,
     status::{LinkStatus, Status},
 };
@@ -60,6 +60,13 @@ pub(super) fn run(args: &cli::Learn) -> Result<ExitCode, CliError> {
         say(format_args!(
             "axon acl learn: {} hosts left before their names were known: nothing of them is in the rules",
             watch.known.unnamed
+        ));
+    }
+    if watch.known.unowned > 0 {
+        say(format_args!(
+            "axon acl learn: {} sessions of this host ended before it was known whose they were: nothing of them is in \
+             the rules",
+            watch.known.unowned
         ));
     }
     if watch.session.daemon().is_none() {
@@ -117,11 +124,37 @@ struct Watch {
 struct Known {
     /// The names of other hosts, by their daemons. They stay known when a link ends.
     hosts: HashMap<DaemonId, Option<String>>,
-    /// The other users of this host, by what begins the GIDs of their sessions.
-    users: HashMap<String, u32>,
+    /// Whose the sessions of this host are, by what begins their GIDs. `None`: the daemon did not say yet.
+    sessions: HashMap<String, Option<LocalOwner>>,
     asked: Option<Instant>,
     /// Hosts that had endpoints and whose names were never known.
     unnamed: usize,
+    /// Sessions of this host that had endpoints, and of which it was never known whose they are.
+    unowned: usize,
+}
+
+/// Whose a session of this host is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum LocalOwner {
+    /// The daemon's user's.
+    Own,
+    /// Of the user with this id.
+    User(u32),
+}
+
+/// Characters of a GID in hexadecimal that all endpoints of a session share.
+const OF_SESSION: usize = 24;
+
+/// What begins the GIDs of an endpoint's session.
+fn session_of(gid: Gid) -> String {
+    let mut text = gid.to_string();
+    text.truncate(OF_SESSION);
+    text
+}
+
+/// The daemon of each endpoint, if it is another host's, and its GID.
+fn places(graph: &GraphView) -> impl Iterator<Item = (Option<DaemonId>, Gid)> {
+    graph.endpoints.iter().map(|(gid, entry)| (entry.daemon, *gid))
 }
 
 impl Watch {
@@ -138,10 +171,7 @@ impl Watch {
             }
             let graph = self.session.graph();
             let is_new = version != Some(graph.version);
-            let has_strangers = graph
-                .endpoints
-                .values()
-                .any(|entry| entry.daemon.is_some_and(|daemon| self.known.is_unnamed(&daemon)));
+            let has_strangers = self.known.has_strangers(places(&graph));
             // After a host's name is known its endpoints are looked at again.
             if is_new || has_strangers || self.known.asked.is_none() {
                 version = (!has_strangers).then_some(graph.version);
@@ -168,14 +198,14 @@ impl Watch {
         }
         let strangers = self.known.hosts.values().filter(|name| name.is_none());
         self.known.unnamed = strangers.count();
+        self.known.unowned = self.known.sessions.values().filter(|owner| owner.is_none()).count();
     }
 
-    /// Asks the daemon for its status, if it is time, or if there is a host of which nothing is known. Returns whether a host
-    /// or user became known: its endpoints are to be looked at again.
+    /// Asks the daemon for its status, if it is time, or if there is a host or session of which nothing is known. Returns
+    /// whether a host or session became known: its endpoints are to be looked at again.
     fn ask(&mut self) -> bool {
         let graph = self.session.graph();
-        let mut daemons = graph.endpoints.values().filter_map(|entry| entry.daemon);
-        let has_strangers = daemons.any(|daemon| self.known.is_unnamed(&daemon));
+        let has_strangers = self.known.has_strangers(places(&graph));
         let is_due = self.known.asked.is_none_or(|asked| asked.elapsed() >= STATUS);
         if !has_strangers && !is_due {
             return false;
@@ -185,7 +215,7 @@ impl Watch {
         let Ok(status) = serde_json::from_str::<Status>(&json) else { return false };
         self.known.asked = Some(Instant::now());
         let before = self.known.counts();
-        self.known.learn(&status, &graph);
+        self.known.learn(&status, places(&graph));
         for link in &status.links {
             if !link.party.is_empty() {
                 self.seen.observe_denied(&link.party, &link.denied, link.more_denied);
@@ -202,11 +232,10 @@ impl Watch {
                 let endpoint = &entry.endpoint;
                 let owner = match entry.daemon {
                     Some(daemon) => Owner::Host(self.known.hosts.get(&daemon)?.as_deref()?),
-                    None => {
-                        let gid = endpoint.gid.to_string();
-                        let user = self.known.users.iter().find(|(gids, _)| gid.starts_with(*gids));
-                        user.map_or(Owner::Own, |(_, uid)| Owner::User(*uid))
-                    }
+                    None => match (*self.known.sessions.get(&session_of(endpoint.gid))?)? {
+                        LocalOwner::Own => Owner::Own,
+                        LocalOwner::User(uid) => Owner::User(uid),
+                    },
                 };
                 let mut session = [0; 12];
                 session.copy_from_slice(&endpoint.gid.0[..12]);
@@ -223,31 +252,79 @@ impl Watch {
 }
 
 impl Known {
-    fn is_unnamed(&self, daemon: &DaemonId) -> bool {
-        self.hosts.get(daemon).is_none_or(Option::is_none)
+    /// Whether there are endpoints of a host without a name, or of a session of which nothing is known.
+    fn has_strangers(&self, endpoints: impl IntoIterator<Item = (Option<DaemonId>, Gid)>) -> bool {
+        endpoints.into_iter().any(|(daemon, gid)| match daemon {
+            Some(daemon) => self.hosts.get(&daemon).is_none_or(Option::is_none),
+            None => self.sessions.get(&session_of(gid)).is_none_or(Option::is_none),
+        })
     }
 
-    /// Hosts and users that are known.
+    /// Hosts and sessions that are known.
     fn counts(&self) -> (usize, usize) {
-        (self.hosts.values().flatten().count(), self.users.len())
+        (self.hosts.values().flatten().count(), self.sessions.values().flatten().count())
     }
 
-    fn learn(&mut self, status: &Status, graph: &GraphView) {
+    fn learn(
+        &mut self,
+        status: &Status,
+        endpoints: impl IntoIterator<Item = (Option<DaemonId>, Gid)>,
+    ) {
         let name = |daemon: &DaemonId| {
             let daemon = daemon.to_string();
             let of_daemon = |link: &&LinkStatus| link.peer == daemon && !link.party.is_empty();
             status.links.iter().find(of_daemon).map(|link| link.party.clone())
         };
-        for daemon in graph.endpoints.values().filter_map(|entry| entry.daemon) {
+        for (daemon, gid) in endpoints {
+            let Some(daemon) = daemon else {
+                self.sessions.entry(session_of(gid)).or_default();
+                continue;
+            };
             let known = self.hosts.entry(daemon).or_default();
             if known.is_none() {
                 *known = name(&daemon);
             }
         }
         for session in status.sessions.iter().filter(|session| !session.gids.is_empty()) {
-            if let Some(user) = session.user {
-                self.users.insert(session.gids.clone(), user);
-            }
+            let owner = session.user.map_or(LocalOwner::Own, LocalOwner::User);
+            self.sessions.insert(session.gids.clone(), Some(owner));
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use axon_transport::status::SessionStatus;
+
+    use super::*;
+
+    /// An endpoint of each of these sessions of this host.
+    fn of(sessions: &[u8]) -> Vec<(Option<DaemonId>, Gid)> {
+        sessions.iter().map(|session| (None, Gid([*session; 16]))).collect()
+    }
+
+    fn status(sessions: &[(u8, Option<u32>)]) -> Status {
+        let session_status = |(session, user): &(u8, Option<u32>)| {
+            let mut status = SessionStatus::default();
+            status.gids = session_of(Gid([*session; 16]));
+            status.user = *user;
+            status
+        };
+        let mut all = Status::default();
+        all.sessions = sessions.iter().map(session_status).collect();
+        all
+    }
+
+    /// A user's session may publish once and end between two looks at the status.
+    #[test]
+    fn a_session_that_ends_before_it_is_known_whose_it_is_counts_as_nobodys() {
+        let mut known = Known::default();
+        assert!(known.has_strangers(of(&[1])), "the daemon is asked at once");
+        known.learn(&status(&[(1, None), (2, Some(1001))]), of(&[1, 2, 3]));
+        assert!(!known.has_strangers(of(&[1, 2])) && known.has_strangers(of(&[3])));
+        let owner = |session: u8| known.sessions[&session_of(Gid([session; 16]))];
+        assert_eq!(owner(1), Some(LocalOwner::Own));
+        assert_eq!(owner(2), Some(LocalOwner::User(1001)));
+        assert_eq!((owner(3), known.counts()), (None, (0, 2)));
     }
 }

@@ -133,12 +133,16 @@ fn the_refusals_name_a_denied_endpoint_and_its_rule_and_its_session_keeps_it() {
     world.drain(3);
     world.own(3, Publisher, "/in");
     let told = world.drain(3);
-    assert!(!told.iter().any(|m| matches!(m, Message::Refused(_))), "REFUSED is for good");
+    let refused: Vec<_> = told.iter().filter(|m| matches!(m, Message::Refused(_))).collect();
+    let [Message::Refused(refused)] = refused[..] else { panic!("{told:?}") };
+    assert_eq!(refused.endpoint, None, "an endpoint would be refused for good");
+    assert!(refused.text.contains("denied by line 7 of access.toml"), "{}", refused.text);
     let said = world.0.take_refused();
     assert!(said.len() == 1 && said[0].1.contains("denied by line 7 of access.toml"), "{said:?}");
     // The same rules once more say nothing new; other ones do.
     world.set(&format!("{RULES}\n[[deny]]\npeer = \"local\"\npublish = \"/in\""));
     assert!(world.0.take_refused().is_empty());
+    assert!(!world.drain(3).iter().any(|m| matches!(m, Message::Refused(_))));
     world.set("default = \"allow\"");
     world.set("default = \"deny\"");
     assert!(world.0.take_refused()[0].1.contains("default = "));

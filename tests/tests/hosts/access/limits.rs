@@ -192,6 +192,43 @@ fn an_egress_limit_slows_what_leaves_and_loses_nothing() {
     egress_is_limited("peer = \"PEER\"", "(all packets)");
 }
 
+/// `max_hz` is of `[[topic]]`, in the settings' file of the host that sends.
+#[test]
+fn a_topic_crosses_as_often_as_its_max_hz_says_and_the_daemon_follows_the_file() {
+    let [mut robot, base] = Plan::new([classic(&[]), classic(&[])]).prepare();
+    let file = robot.dir.path().join("axon.toml");
+    let write = |hz: &str| {
+        fs::write(&file, format!("[[topic]]\nname = \"/scan\"\nmax_hz = {hz}\n")).unwrap();
+    };
+    write("0.01");
+    robot.set("AXON_CONFIG", file.to_str().unwrap());
+    robot.start();
+    base.start();
+    let (here, there) = (robot.session("robot"), base.session("base"));
+    let (scan, scans) = (publisher(&here, "/scan"), subscription(&there, "/scan"));
+    let (log, logs) = (publisher(&here, "/log"), subscription(&there, "/log"));
+    meet(&scan, &scans);
+    meet(&log, &logs);
+    for publisher in [&scan, &log] {
+        for number in 1..=SAMPLES {
+            publisher.publish(&number.to_be_bytes()).unwrap();
+        }
+    }
+    (1..=SAMPLES).for_each(|number| assert_eq!(next(&logs), number));
+    let dropped = || robot.link().dropped.get("max_hz").copied().unwrap_or_default();
+    until("the robot counts what does not cross", || dropped() > 0);
+    // The next one would cross after a hundred seconds.
+    write("1000");
+    let report = daemon_reload_at(&DaemonPlace::from(&robot.config())).unwrap();
+    assert_eq!((report.changed, report.error), (vec!["[[topic]]".to_owned()], None));
+    scan.publish(&(SAMPLES + 1).to_be_bytes()).unwrap();
+    let mut crossed = 0;
+    while next(&scans) <= SAMPLES {
+        crossed += 1;
+    }
+    assert!(crossed < SAMPLES / 2, "{crossed} of {SAMPLES} crossed");
+}
+
 /// In each mode. Each other sample becomes shorter, and all arrive as they were published, in order.
 #[test]
 fn a_link_that_a_limit_slows_carries_compressed_samples() {

@@ -98,7 +98,7 @@ impl DaemonRelay {
                 None
             }
         };
-        let options = SessionOptions::new(name).callers(MAX_CALLERS);
+        let options = SessionOptions::new(name).callers(MAX_CALLERS).keep_refusals();
         let session = match Session::over_as(id, inside, &config, options) {
             Ok(session) => session,
             Err(error) => {
@@ -488,6 +488,9 @@ impl RelayedSession {
             self.forget(&gid);
             let refused = Refused { endpoint: Some(gid), ..Refused::because(text) };
             self.pipe.say(&Message::Refused(refused))?;
+        }
+        for text in self.session.take_refusals() {
+            self.pipe.say(&Message::Refused(Refused::because(text)))?;
         }
         Ok(())
     }

@@ -64,6 +64,8 @@ fn kind_of(verb: Verb) -> EndpointKind {
 /// The rules about one peer.
 pub(super) struct PeerAccess {
     permissions: Permissions,
+    /// The rules changed since the denied uses were judged.
+    changed: bool,
     judged: Judged,
     /// Uses by endpoints of the peer that are denied here, with what remembers them. The peer was told.
     here: BTreeMap<Use, (String, Charge)>,
@@ -83,7 +85,7 @@ impl PeerAccess {
         let (room, places) = (Rc::clone(&account.refusals), Rc::clone(&account.denied));
         let asked = BTreeMap::new();
         let (judged, logged) = (Judged::default(), LogLimit::default());
-        Self { permissions, judged, here, there, room, places, asked, logged }
+        Self { permissions, changed: false, judged, here, there, room, places, asked, logged }
     }
 
     pub(super) fn permissions(&self) -> &Permissions {
@@ -93,6 +95,7 @@ impl PeerAccess {
 
     pub(super) fn set_permissions(&mut self, permissions: Permissions) {
         self.permissions = permissions;
+        self.changed = true;
         self.judged.clear();
     }
 
@@ -116,7 +119,8 @@ impl PeerAccess {
         (!decision.allowed()).then(|| decision.to_string())
     }
 
-    /// These endpoints of the peer are denied now. Returns what the peer is told.
+    /// These endpoints of the peer are denied now. Returns what the peer is told. The rules are asked about a use that is new,
+    /// and about all once they changed.
     pub(super) fn set_denied<'a>(
         &mut self,
         peer: DaemonId,
@@ -138,14 +142,13 @@ impl PeerAccess {
             let gone = |(verb, name): &&Use| !now.contains(&(*verb, name.as_str()));
             self.here.keys().filter(gone).cloned().collect()
         };
-        let (now, new): (Vec<Use>, Vec<Use>) = {
-            let owned = |(verb, name): (Verb, &str)| (verb, name.to_owned());
-            (now.into_iter().map(owned).collect(), new.into_iter().map(owned).collect())
-        };
+        let anew = std::mem::take(&mut self.changed).then_some(now).into_iter().flatten();
+        let judged: Vec<Use> = anew.chain(new).map(|(verb, name)| (verb, name.to_owned())).collect();
         // What goes makes room for what comes.
         lifted.iter().for_each(|used| drop(self.here.remove(used)));
         let mut denied = Vec::new();
-        for used in now.into_iter().chain(new) {
+        for used in judged {
+            note_look();
             let reason = self.permissions.check(used.0, &used.1).to_string();
             match self.here.get_mut(&used) {
                 Some((before, _)) if *before == reason => continue,

@@ -56,8 +56,9 @@ impl Control {
             }
             Message::Refused(Refused { endpoint, text: reason, .. }) => {
                 tracing::error!(reason, "the daemon refuses something of the session");
-                if let Some(gid) = endpoint {
-                    self.shared.refuse(gid, reason);
+                match endpoint {
+                    Some(gid) => self.shared.refuse(gid, reason),
+                    None => self.shared.refuse_for_now(reason),
                 }
             }
             // What a daemon never says is not worth more than not being heard.

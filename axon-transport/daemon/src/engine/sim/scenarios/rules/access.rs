@@ -298,7 +298,7 @@ fn a_peer_that_ignores_rules_receives_and_delivers_nothing() {
 
 #[test]
 fn rules_are_looked_at_for_endpoints_and_never_for_a_sample() {
-    const RULES: &str = "[[deny]]\npeer = \"*\"\npublish = \"/denied\"\n\
+    const RULES: &str = "[[deny]]\npeer = \"*\"\npublish = \"/denied*\"\n\
         [[limit]]\npeer = \"*\"\ntopic = \"/limited\"\nrate = 100000\n";
     let mut world = hosts(0, RULES);
     let qos = [Qos::keep_all(), Qos::keep_all(), Qos::sensor_data()];
@@ -322,16 +322,24 @@ fn rules_are_looked_at_for_endpoints_and_never_for_a_sample() {
     world.run_for(secs(2));
     assert_eq!(looks_at_rules(), matched, "for {} samples", 500 * pairs.len());
     assert!(pairs.iter().all(|pair| world.received(*pair).len() > 400));
-    // Of a hundred endpoints on either side, one more has itself alone checked, and its route.
+    // Of hundreds of endpoints, a third of them denied, one more has itself alone checked, and its route.
     for number in 0..100 {
         world.pair(0, 1, &format!("/topic_{number}"), qos[0]);
+        world.hosts[1].rings.create_publisher(&format!("/denied_{number}"), qos[0]);
     }
+    world.hosts[1].touch_graph();
     world.run_for(secs(5));
     let many = looks_at_rules();
     world.pair(0, 1, "/one_more", qos[0]);
     world.run_for(secs(2));
     let looks = looks_at_rules() - many;
     assert!((1..20).contains(&looks), "{looks} looks for one more endpoint");
+    let many = looks_at_rules();
+    world.hosts[1].rings.create_publisher("/denied_one_more", qos[0]);
+    world.hosts[1].touch_graph();
+    world.run_for(secs(2));
+    let looks = looks_at_rules() - many;
+    assert!((1..20).contains(&looks), "{looks} looks for one more endpoint that is denied");
 }
 
 #[test]
