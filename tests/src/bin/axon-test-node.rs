@@ -34,7 +34,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
     // What the daemon refuses is logged, in the log of the test's host.
-    let log = tracing_subscriber::fmt().with_max_level(tracing_subscriber::filter::LevelFilter::ERROR);
+    let log =
+        tracing_subscriber::fmt().with_max_level(tracing_subscriber::filter::LevelFilter::ERROR);
     log.with_ansi(false).with_writer(std::io::stderr).init();
     let session = Session::open(&Config::from_env()?, SessionOptions::new("test node"))?;
     let stdin = bytes_of_stdin();

@@ -207,6 +207,36 @@ impl Deaf {
     }
 }
 
+/// The peer takes all that there are keys for. It does not read slowly, and no topic to it is cut.
+#[test]
+fn a_kme_that_gives_no_keys_for_long_cuts_no_topic() {
+    const STALLED: &str = "2";
+    let kmes = Kmes::start();
+    let more = [("AXON_QKD_KEY_MODE", "messages10"), ("AXON_LINK_STALLED_S", STALLED)];
+    let hosts = Plan::new([0, 1].map(|host| kmes.settings(host, &more))).start();
+    let mut there = hosts[1].subscribe(Sizes::Small);
+    let mut publisher = hosts[0].publish(Sizes::Small, 1, None);
+    there.wait_taken(SOME);
+    kmes.plan(0, FaultPlan::new(Fault::Empty).on(Method::EncKeys));
+    let sending = || hosts[0].status().keys["peers"][SAE[1]]["sending"].clone();
+    let is_out = |keys: &serde_json::Value| keys["ready"] == 0 && keys["announced"] == 0;
+    until("all keys are used up", || is_out(&sending()));
+    let taken = there.tally().taken;
+    // The history is full long before, and its publisher waits.
+    sleep(4 * Duration::from_secs(STALLED.parse().unwrap()));
+    assert!(is_out(&sending()));
+    assert!(there.tally().taken <= taken + 10, "without a key nothing crosses");
+    kmes.clear_faults();
+    let now = publisher.published();
+    there.wait_taken(now + SOME);
+    let sent = publisher.stop();
+    there.wait_taken(sent);
+    assert_eq!(there.tally().lost, 0);
+    let link = hosts[0].link();
+    assert_eq!(link.dropped.get("stalled"), None, "{:?}", link.dropped);
+    assert_eq!(hosts[0].log_lines(&["stalled_s"]), 0);
+}
+
 #[test]
 fn a_kme_that_accepts_no_connection_is_given_up_at_the_limit_for_connecting() {
     let kmes = Kmes::start();

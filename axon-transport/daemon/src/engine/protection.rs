@@ -43,6 +43,11 @@ impl Seal<'_> {
         }
     }
 
+    /// Whether this host's KME gives no keys for the peer, and none is left.
+    pub(crate) fn lacks_keys_of_kme(&self) -> bool {
+        matches!(self, Self::Envelope { sender, .. } if sender.lacks_keys_of_kme())
+    }
+
     /// The short headers of a new stream, if its messages have such: within an envelope stands the inner header.
     pub(crate) fn short_headers(&self) -> Option<ShortHeaders> {
         matches!(self, Self::Link).then(ShortHeaders::default)

@@ -195,7 +195,7 @@ fn an_egress_limit_slows_what_leaves_and_loses_nothing() {
 /// `max_hz` is of `[[topic]]`, in the settings' file of the host that sends.
 #[test]
 fn a_topic_crosses_as_often_as_its_max_hz_says_and_the_daemon_follows_the_file() {
-    let [mut robot, base] = Plan::new([classic(&[]), classic(&[])]).prepare();
+    let [mut robot, mut base] = Plan::new([classic(&[]), classic(&[])]).prepare();
     let file = robot.dir.path().join("axon.toml");
     let write = |hz: &str| {
         fs::write(&file, format!("[[topic]]\nname = \"/scan\"\nmax_hz = {hz}\n")).unwrap();

@@ -82,7 +82,8 @@ fn another_user_of_the_host_publishes_what_rules_allow_it_and_nothing_else() {
         refusal.contains("\"/denied\": denied: no [[allow]] in access.toml permits this")
     });
     // So does the program itself, which does not see the daemon's log.
-    let said = ["the daemon refuses an endpoint", "/denied", "no [[allow]] in access.toml permits this"];
+    let said =
+        ["the daemon refuses an endpoint", "/denied", "no [[allow]] in access.toml permits this"];
     robot.wait_log(&said);
     assert!(!denied.has_data() && denied.matched().is_empty());
     assert!(

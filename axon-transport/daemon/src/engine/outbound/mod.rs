@@ -43,7 +43,7 @@ use self::{
     nudges::Nudges,
     served::{FlowRoute, Served},
     source::Done,
-    stall::{PeerActivity, Stalls},
+    stall::{BusyFlow, PeerActivity, Stalls},
     table::FlowTable,
     turns::Turns,
 };
@@ -455,6 +455,7 @@ impl Outbound {
         }
         self.turns.handle_timeout(&self.table.flows, now);
         let rtt = carrier.as_deref().map_or(NO_CARRIER, |carrier| carrier.quic.rtt());
+        let lacks_keys = carrier.as_deref().is_some_and(|carrier| carrier.seal.lacks_keys_of_kme());
         let is_on_the_way = |id| self.table.flows.get(id).is_some_and(Flow::is_on_the_way);
         if self.nudges.handle_timeout(rtt, now, is_on_the_way)
             && let Some(carrier) = carrier
@@ -463,7 +464,7 @@ impl Outbound {
             let_probe_through(carrier.quic);
         }
         self.look_at_endings(now);
-        self.look_at_stalls(heard, now);
+        self.look_at_stalls(heard, lacks_keys, now);
     }
 
     /// Reports the publishers of which nothing is left, and gives up the samples of those that make no progress.
@@ -495,11 +496,16 @@ impl Outbound {
         self.events.push(OutboundEvent::Lost { topic, cause: "publisher_ended", samples });
     }
 
-    /// Reports the routes that made no progress for the limit.
-    fn look_at_stalls(&mut self, heard: u64, now: Duration) {
+    /// Reports the routes that made no progress for the limit. While this host's KME gives no keys, flows of which nothing is
+    /// in flight wait for that.
+    fn look_at_stalls(&mut self, heard: u64, lacks_keys: bool, now: Duration) {
         let (returned, is_awaited) = (self.turns.credit().returned(), self.turns.wait_for_credit());
         let peer = PeerActivity { heard, returned, is_awaited };
-        let found = self.stalls.handle_timeout(peer, self.table.busy(), now);
+        let busy = self.table.busy().map(|flow| BusyFlow {
+            is_held_here: flow.is_held_here || lacks_keys && !flow.uses_credit,
+            ..flow
+        });
+        let found = self.stalls.handle_timeout(peer, busy, now);
         for (number, why) in found.stalled {
             if let Some(served) = self.table.routes.get_mut(number) {
                 served.stalled = true;

@@ -103,8 +103,8 @@ pub(super) struct BusyFlow {
     pub(super) uses_credit: bool,
     /// Whether it waits for others: none of its samples is in flight.
     pub(super) waits_for_others: bool,
-    /// Whether a limit of this host holds its samples.
-    pub(super) waits_for_limit: bool,
+    /// Whether a limit of this host, or the want of keys of its KME, holds its samples.
+    pub(super) is_held_here: bool,
     /// Whether nothing of it waits, or is not acknowledged.
     pub(super) is_quiet: bool,
 }
@@ -282,7 +282,7 @@ impl Progress {
         let moved = flow.progress != self.at;
         let waits_for_others = flow.waits_for_others && !starves;
         match hearing {
-            _ if moved || flow.waits_for_limit => self.idle = Duration::ZERO,
+            _ if moved || flow.is_held_here => self.idle = Duration::ZERO,
             _ if flow.is_service && !is_held && !starves => self.idle = Duration::ZERO,
             // What others have it wait for is no fault of it. What went before stays: there was no progress since.
             Hearing::Heard if waits_for_others => {}
@@ -294,8 +294,8 @@ impl Progress {
         let passed = passed + std::mem::take(&mut self.kept);
         self.pace.taken += flow.progress.0.saturating_sub(self.at.0);
         match is_held {
-            // The peer has all that passed.
-            true if flow.waits_for_limit => self.pace.pay_back(passed),
+            // The peer has all that this host let pass.
+            true if flow.is_held_here => self.pace.pay_back(passed),
             true if waits_for_others => self.pace.hold(passed / OTHERS, flow, limit),
             true => self.pace.hold(passed, flow, limit),
             false => self.pace.rest(passed, limit),

@@ -143,7 +143,8 @@ impl PeerAccess {
             self.here.keys().filter(gone).cloned().collect()
         };
         let anew = std::mem::take(&mut self.changed).then_some(now).into_iter().flatten();
-        let judged: Vec<Use> = anew.chain(new).map(|(verb, name)| (verb, name.to_owned())).collect();
+        let judged: Vec<Use> =
+            anew.chain(new).map(|(verb, name)| (verb, name.to_owned())).collect();
         // What goes makes room for what comes.
         lifted.iter().for_each(|used| drop(self.here.remove(used)));
         let mut denied = Vec::new();

@@ -49,6 +49,8 @@ pub(super) struct Pool {
     refused: Option<Duration>,
     /// READYs since a round was made up for.
     readied: u32,
+    /// Whether the KME's last answer about keys brought none.
+    fails: bool,
 }
 
 impl Pool {
@@ -60,7 +62,7 @@ impl Pool {
         // A key ages from its first use on, and that is the sender's to watch.
         settings.max_age = Duration::MAX;
         let (core, seen) = (Core::new(settings, jitter), Ledger::default());
-        Self { core, seen, rounds: 0, refused: None, readied: 0 }
+        Self { core, seen, rounds: 0, refused: None, readied: 0, fails: false }
     }
 
     /// `ahead` keys are to be on their way or ready, where `elsewhere` of them are the sender's.
@@ -105,15 +107,18 @@ impl Pool {
             }
             (Ask::Keys(number), Ok(Fetched::Keys(keys))) => {
                 let (usable, refused) = self.usable(asked, keys);
+                self.fails = usable.is_empty();
                 self.core.on_keys(now, number, usable);
                 refused
             }
             (ask, Ok(_)) => {
                 self.core.on_failure(now, ask, FailureClass::KeysLost);
+                self.fails = true;
                 Some("the KME answered another call".to_owned())
             }
             (ask, Err(failure)) => {
                 self.core.on_failure(now, ask, class(failure.kind));
+                self.fails = true;
                 if let Some(asked) = failure.retry_after {
                     self.core.retry_after(now, asked);
                 }
@@ -153,6 +158,11 @@ impl Pool {
             Ok(_) => Err(format!("the KME gave key_ID {key_id} twice")),
             Err(e) => Err(e.to_string()),
         }
+    }
+
+    /// Whether the KME's last answer brought no key.
+    pub(super) fn fails(&self) -> bool {
+        self.fails
     }
 
     /// Takes out the key to announce next.

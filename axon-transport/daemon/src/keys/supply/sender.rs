@@ -335,6 +335,11 @@ impl Sender {
         [used, unanswered, calls].into_iter().flatten().min()
     }
 
+    /// Whether nothing can be sealed since this host's KME gives no keys. Where the peer owes an answer for one, that is why.
+    pub fn lacks_keys_of_kme(&self) -> bool {
+        self.ready.is_empty() && self.announced.is_empty() && self.pool.fails()
+    }
+
     /// How it stands.
     pub fn statistics(&self, now: Duration) -> SenderStatistics {
         let pool = self.pool.status(now);

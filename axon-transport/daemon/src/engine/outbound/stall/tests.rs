@@ -11,7 +11,7 @@ const FLOW: BusyFlow = BusyFlow {
     is_service: false,
     uses_credit: false,
     waits_for_others: false,
-    waits_for_limit: false,
+    is_held_here: false,
     is_quiet: false,
 };
 
@@ -74,7 +74,7 @@ fn progress_waiting_for_others_and_limits_excuse() {
         vec![BusyFlow { waits_for_others: true, progress: (secs(now) / 90, 0), ..held(now) }]
     };
     assert_eq!(look(false, waits, secs), None);
-    let waits = |now| vec![BusyFlow { waits_for_limit: true, ..held(now) }];
+    let waits = |now| vec![BusyFlow { is_held_here: true, ..held(now) }];
     assert_eq!(look(false, waits, secs), None);
     assert_eq!(look(false, waits, |_| 0), None, "the peer has all that passed");
 }
@@ -302,7 +302,7 @@ fn an_excuse_now_and_then_is_no_way_out_of_the_pace() {
     // A limit of this host is no fault of the peer.
     let limited = |now: Duration| BusyFlow {
         progress: (secs(now) / 60, 0),
-        waits_for_limit: !secs(now).is_multiple_of(3),
+        is_held_here: !secs(now).is_multiple_of(3),
         waits_for_others: false,
         ..slow(now)
     };

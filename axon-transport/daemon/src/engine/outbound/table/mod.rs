@@ -233,7 +233,7 @@ fn busy_flow(id: FlowId, flow: &Flow, served: &Served) -> BusyFlow {
         is_service: served.is_service(),
         uses_credit: flow.uses_credit(),
         waits_for_others: flow.waits_for_others(),
-        waits_for_limit: flow.waits_for_limit(),
+        is_held_here: flow.waits_for_limit(),
         is_quiet: flow.is_quiet(),
     }
 }
