@@ -63,7 +63,7 @@ pub enum SessionEvent {
     Refused(Gid),
 }
 
-/// Refusals that are kept for a process that is relayed. What is beyond is in the daemon's log alone.
+/// Refusals that are kept for a process that is relayed, until it takes them. It is not told of those beyond.
 const REFUSALS: usize = 256;
 
 type Listener = Arc<dyn Fn(&SessionEvent) + Send + Sync>;
@@ -287,11 +287,15 @@ impl SessionShared {
             return;
         }
         let mut state = self.state();
+        let is_first = state.refusals.is_empty();
         if state.refusals.len() < REFUSALS {
             state.refusals.push(why);
         }
         drop(state);
-        self.notify(Some(&SessionEvent::Graph));
+        // Who has not taken the first one was woken for it.
+        if is_first {
+            self.notify(Some(&SessionEvent::Graph));
+        }
     }
 
     /// For a relay: so many samples of `writer` were lost on their way to the session's

@@ -28,7 +28,7 @@ use crate::{failure::CliError, interrupt, logging, say::say, session};
 const LOOK: Duration = Duration::from_millis(100);
 /// How long changes of the graph are collected.
 const MOMENT: Duration = Duration::from_millis(10);
-/// Between two looks at the daemon's status, if there is no new host.
+/// Between two looks at the daemon's status, if there is no new host or session.
 const STATUS: Duration = Duration::from_secs(2);
 /// Between two lines of progress on a terminal.
 const PROGRESS: Duration = Duration::from_secs(1);
@@ -47,13 +47,20 @@ pub(super) fn run(args: &cli::Learn) -> Result<ExitCode, CliError> {
     let session =
         Session::open(&config, SessionOptions::new("axon acl learn")).map_err(session::failure)?;
     let interrupt = interrupt::of(&session)?;
-    let mut watch = Watch { session, interrupt, known: Known::default(), seen: Seen::default() };
+    let (known, seen) = (Known::default(), Seen::default());
+    let mut watch = Watch { session, interrupt, known, seen, withheld: false };
     let until = match args.watch {
         Some(time) => format!("for {} s; Ctrl-C ends it earlier", time.as_secs_f64()),
         None => "until Ctrl-C".to_owned(),
     };
     say(format_args!("axon acl learn: watching other hosts and users {until}"));
     watch.run(args.watch);
+    if watch.withheld {
+        return Err(CliError::failed(
+            "the daemon belongs to another user and has access rules: it tells no other user whose endpoints are; run this \
+             as the daemon's user",
+        ));
+    }
     let (parties, uses) = watch.seen.counts();
     say(format_args!("axon acl learn: saw {uses} uses of {parties} hosts and users"));
     if watch.known.unnamed > 0 {
@@ -117,6 +124,8 @@ struct Watch {
     interrupt: GuardCondition,
     known: Known,
     seen: Seen,
+    /// The daemon tells this user nothing.
+    withheld: bool,
 }
 
 /// What the daemon says of whose endpoints are.
@@ -169,7 +178,11 @@ impl Watch {
             if self.ask() {
                 version = None;
             }
+            if self.withheld {
+                return;
+            }
             let graph = self.session.graph();
+            self.known.meet(places(&graph));
             let is_new = version != Some(graph.version);
             let has_strangers = self.known.has_strangers(places(&graph));
             // After a host's name is known its endpoints are looked at again.
@@ -206,14 +219,15 @@ impl Watch {
     fn ask(&mut self) -> bool {
         let graph = self.session.graph();
         let has_strangers = self.known.has_strangers(places(&graph));
-        let is_due = self.known.asked.is_none_or(|asked| asked.elapsed() >= STATUS);
-        if !has_strangers && !is_due {
+        let time = if has_strangers { MOMENT } else { STATUS };
+        if self.known.asked.is_some_and(|asked| asked.elapsed() < time) {
             return false;
         }
         // Without a daemon there is nothing to ask.
         let Ok(json) = self.session.status_json() else { return false };
         let Ok(status) = serde_json::from_str::<Status>(&json) else { return false };
         self.known.asked = Some(Instant::now());
+        self.withheld = status.withheld;
         let before = self.known.counts();
         self.known.learn(&status, places(&graph));
         for link in &status.links {
@@ -260,6 +274,14 @@ impl Known {
         })
     }
 
+    /// There are endpoints of these sessions of this host.
+    fn meet(&mut self, endpoints: impl IntoIterator<Item = (Option<DaemonId>, Gid)>) {
+        let local = endpoints.into_iter().filter(|(daemon, _)| daemon.is_none());
+        for (_, gid) in local {
+            self.sessions.entry(session_of(gid)).or_default();
+        }
+    }
+
     /// Hosts and sessions that are known.
     fn counts(&self) -> (usize, usize) {
         (self.hosts.values().flatten().count(), self.sessions.values().flatten().count())
@@ -277,7 +299,7 @@ impl Known {
         };
         for (daemon, gid) in endpoints {
             let Some(daemon) = daemon else {
-                self.sessions.entry(session_of(gid)).or_default();
+                self.meet([(None, gid)]);
                 continue;
             };
             let known = self.hosts.entry(daemon).or_default();

@@ -113,6 +113,7 @@ fn another_user_sees_no_details_where_there_are_rules_and_the_own_user_all() {
             let shown = status[details].as_array().is_some_and(|all| !all.is_empty());
             assert_eq!(shown, sees, "{details} of {status}");
         }
+        assert_eq!(status["withheld"], !sees, "{status}");
         let digest = status["access_digest"].as_str().is_some_and(|digest| !digest.is_empty());
         assert_eq!(digest, sees && !rules.is_empty(), "{status}");
     }

@@ -33,11 +33,8 @@ pub(super) fn send_status(control: &mut Control, id: &SessionId) {
     if !limited && control.registry.repeat_status(id) {
         return;
     }
-    let mut status = status(control);
-    // It shows all topics, sessions and peers.
-    if limited {
-        status = without_details(&status);
-    }
+    // The whole status shows all topics, sessions and peers.
+    let status = if limited { without_details(control) } else { status(control) };
     let text = match serde_json::to_vec(&status) {
         Ok(text) => text,
         Err(error) => {
@@ -87,13 +84,7 @@ fn status(control: &Control) -> Status {
         Some((link.host.as_str(), routes.as_slice()))
     });
     let refused: Vec<_> = refused.collect();
-    let mut status = Status::default();
-    status.daemon = control.id.to_string();
-    status.pid = std::process::id();
-    status.uptime = control.started.elapsed();
-    status.protocol = PROTOCOL;
-    status.version = env!("CARGO_PKG_VERSION").into();
-    status.domain = config.domain;
+    let mut status = of_daemon(control);
     status.mode = mode.into();
     status.key_mode = key_mode;
     status.kex = setting("AXON_QKD_KEX");
@@ -102,7 +93,6 @@ fn status(control: &Control) -> Status {
     status.socket = control.address.to_string();
     status.runtime_dir = config.runtime_dir.as_ref().map(|dir| dir.display().to_string());
     status.port = control.port;
-    status.gateway = control.gateway.clone();
     status.discovery = discovery(&control.wanted.borrow());
     status.traffic = control.traffic;
     status.descriptors = Some(descriptors(control));
@@ -117,17 +107,23 @@ fn status(control: &Control) -> Status {
 }
 
 /// What another user of the host may know of a daemon that has access rules.
-fn without_details(status: &Status) -> Status {
-    let mut public = Status::default();
-    public.daemon = status.daemon.clone();
-    public.pid = status.pid;
-    public.uptime = status.uptime;
-    public.protocol = status.protocol;
-    public.version = status.version.clone();
-    public.domain = status.domain;
-    public.gateway = status.gateway.clone();
-    public.withheld = true;
-    public
+fn without_details(control: &Control) -> Status {
+    let mut status = of_daemon(control);
+    status.withheld = true;
+    status
+}
+
+/// What the daemon itself is.
+fn of_daemon(control: &Control) -> Status {
+    let mut status = Status::default();
+    status.daemon = control.id.to_string();
+    status.pid = std::process::id();
+    status.uptime = control.started.elapsed();
+    status.protocol = PROTOCOL;
+    status.version = env!("CARGO_PKG_VERSION").into();
+    status.domain = control.config.domain;
+    status.gateway = control.gateway.clone();
+    status
 }
 
 fn descriptors(control: &Control) -> DescriptorStatus {

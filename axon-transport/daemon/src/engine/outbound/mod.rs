@@ -501,10 +501,10 @@ impl Outbound {
     fn look_at_stalls(&mut self, heard: u64, lacks_keys: bool, now: Duration) {
         let (returned, is_awaited) = (self.turns.credit().returned(), self.turns.wait_for_credit());
         let peer = PeerActivity { heard, returned, is_awaited };
-        let busy = self.table.busy().map(|flow| BusyFlow {
-            is_held_here: flow.is_held_here || lacks_keys && !flow.uses_credit,
-            ..flow
-        });
+        let busy = self
+            .table
+            .busy()
+            .map(|flow| BusyFlow { lacks_keys: lacks_keys && !flow.uses_credit, ..flow });
         let found = self.stalls.handle_timeout(peer, busy, now);
         for (number, why) in found.stalled {
             if let Some(served) = self.table.routes.get_mut(number) {

@@ -103,8 +103,10 @@ pub(super) struct BusyFlow {
     pub(super) uses_credit: bool,
     /// Whether it waits for others: none of its samples is in flight.
     pub(super) waits_for_others: bool,
-    /// Whether a limit of this host, or the want of keys of its KME, holds its samples.
-    pub(super) is_held_here: bool,
+    /// Whether a limit of this host holds its samples.
+    pub(super) waits_for_limit: bool,
+    /// Whether nothing of it is in flight, and this host's KME gives no keys for the next sample.
+    pub(super) lacks_keys: bool,
     /// Whether nothing of it waits, or is not acknowledged.
     pub(super) is_quiet: bool,
 }
@@ -116,6 +118,8 @@ pub(crate) enum Stall {
     NothingRead,
     /// A publisher was held up, and less than a [`SHARE`]th of what it keeps was read in [`PERIOD`] times the limit.
     TooSlow,
+    /// A publisher was held up for as long, last since this host's KME gave no keys.
+    NoKeys,
 }
 
 /// What a look found.
@@ -238,7 +242,8 @@ impl Stalls {
             if progress.idle >= self.limit {
                 found.stalled.push((flow.route, Stall::NothingRead));
             } else if progress.pace.held >= self.limit * PERIOD {
-                found.stalled.push((flow.route, Stall::TooSlow));
+                let why = if flow.lacks_keys { Stall::NoKeys } else { Stall::TooSlow };
+                found.stalled.push((flow.route, why));
             } else {
                 self.flows.insert(flow.id, progress);
             }
@@ -280,9 +285,10 @@ impl Progress {
         // Sticky until there is progress: not every look is soon after a publish.
         let is_held = flow.refused.is_some_and(|refused| refused != self.refused);
         let moved = flow.progress != self.at;
-        let waits_for_others = flow.waits_for_others && !starves;
+        // Another one may draw from the same store of keys, the peer among them: this counts as waiting for others.
+        let waits_for_others = (flow.waits_for_others && !starves) || flow.lacks_keys;
         match hearing {
-            _ if moved || flow.is_held_here => self.idle = Duration::ZERO,
+            _ if moved || flow.waits_for_limit => self.idle = Duration::ZERO,
             _ if flow.is_service && !is_held && !starves => self.idle = Duration::ZERO,
             // What others have it wait for is no fault of it. What went before stays: there was no progress since.
             Hearing::Heard if waits_for_others => {}
@@ -294,8 +300,8 @@ impl Progress {
         let passed = passed + std::mem::take(&mut self.kept);
         self.pace.taken += flow.progress.0.saturating_sub(self.at.0);
         match is_held {
-            // The peer has all that this host let pass.
-            true if flow.is_held_here => self.pace.pay_back(passed),
+            // The peer has all that passed.
+            true if flow.waits_for_limit => self.pace.pay_back(passed),
             true if waits_for_others => self.pace.hold(passed / OTHERS, flow, limit),
             true => self.pace.hold(passed, flow, limit),
             false => self.pace.rest(passed, limit),

@@ -149,14 +149,22 @@ impl PeerAccess {
         lifted.iter().for_each(|used| drop(self.here.remove(used)));
         let mut denied = Vec::new();
         for used in judged {
+            let mut place = None;
+            if !self.here.contains_key(&used) {
+                // Uses for which there is no place are not judged: a peer with many of them would have the rules asked at each
+                // change of its graph.
+                place = self.places.charge(1);
+                if place.is_none() {
+                    continue;
+                }
+            }
             note_look();
             let reason = self.permissions.check(used.0, &used.1).to_string();
             match self.here.get_mut(&used) {
                 Some((before, _)) if *before == reason => continue,
                 Some((before, _)) => before.clone_from(&reason),
                 None => {
-                    let Some(place) = self.places.charge(1) else { continue };
-                    self.here.insert(used.clone(), (reason.clone(), place));
+                    self.here.extend(place.map(|place| (used.clone(), (reason.clone(), place))))
                 }
             }
             denied.push(message(&used, &reason));

@@ -210,6 +210,7 @@ impl Peer {
         let what = match why {
             Stall::NothingRead => format!("nothing of {topic} was read for {} s", limit.as_secs()),
             Stall::TooSlow => format!("{topic} was read so slowly that its publisher waited"),
+            Stall::NoKeys => format!("a KME gave no keys for {topic}, and its publisher waited"),
         };
         let reason = format!("{what}; it is not sent for {again} s ([link] stalled_s)");
         self.refuse(route, key, reason.clone(), Some(wait));

@@ -49,7 +49,7 @@ pub(super) struct Pool {
     refused: Option<Duration>,
     /// READYs since a round was made up for.
     readied: u32,
-    /// Whether the KME's last answer about keys brought none.
+    /// Whether the last call for keys brought none, and the peer has refused none since.
     fails: bool,
 }
 
@@ -113,12 +113,12 @@ impl Pool {
             }
             (ask, Ok(_)) => {
                 self.core.on_failure(now, ask, FailureClass::KeysLost);
-                self.fails = true;
+                self.fails |= matches!(ask, Ask::Keys(_));
                 Some("the KME answered another call".to_owned())
             }
             (ask, Err(failure)) => {
                 self.core.on_failure(now, ask, class(failure.kind));
-                self.fails = true;
+                self.fails |= matches!(ask, Ask::Keys(_));
                 if let Some(asked) = failure.retry_after {
                     self.core.retry_after(now, asked);
                 }
@@ -160,7 +160,7 @@ impl Pool {
         }
     }
 
-    /// Whether the KME's last answer brought no key.
+    /// Whether the KME gives no keys, and the peer refused none since that it gave.
     pub(super) fn fails(&self) -> bool {
         self.fails
     }
@@ -183,6 +183,8 @@ impl Pool {
 
     /// The peer could not use a key that was `announced` then, or did not answer for it.
     pub(super) fn key_refused(&mut self, now: Duration, announced: Duration) {
+        // That there is no key is the peer's doing.
+        self.fails = false;
         if self.refused.is_some_and(|at| announced <= at) {
             return;
         }

@@ -55,7 +55,10 @@ impl Control {
                 }
             }
             Message::Refused(Refused { endpoint, text: reason, .. }) => {
-                tracing::error!(reason, "the daemon refuses something of the session");
+                // The process that is relayed logs it itself.
+                if !self.shared.options.keeps_refusals {
+                    tracing::error!(reason, "the daemon refuses something of the session");
+                }
                 match endpoint {
                     Some(gid) => self.shared.refuse(gid, reason),
                     None => self.shared.refuse_for_now(reason),

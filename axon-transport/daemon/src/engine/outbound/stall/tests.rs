@@ -11,7 +11,8 @@ const FLOW: BusyFlow = BusyFlow {
     is_service: false,
     uses_credit: false,
     waits_for_others: false,
-    is_held_here: false,
+    waits_for_limit: false,
+    lacks_keys: false,
     is_quiet: false,
 };
 
@@ -74,9 +75,26 @@ fn progress_waiting_for_others_and_limits_excuse() {
         vec![BusyFlow { waits_for_others: true, progress: (secs(now) / 90, 0), ..held(now) }]
     };
     assert_eq!(look(false, waits, secs), None);
-    let waits = |now| vec![BusyFlow { is_held_here: true, ..held(now) }];
+    let waits = |now| vec![BusyFlow { waits_for_limit: true, ..held(now) }];
     assert_eq!(look(false, waits, secs), None);
     assert_eq!(look(false, waits, |_| 0), None, "the peer has all that passed");
+}
+
+/// A peer whose KME draws from the same store can have this host's KME give none.
+#[test]
+fn a_kme_without_keys_excuses_for_longer_than_the_limit_and_not_for_good() {
+    let lacks = |now| vec![BusyFlow { lacks_keys: true, ..held(now) }];
+    let (at, found) = look(false, lacks, secs).expect("it is found");
+    assert_eq!(found, stalled(Stall::NoKeys));
+    assert!(at >= LIMIT * PERIOD * OTHERS && at <= LIMIT * PERIOD * OTHERS + LIMIT, "{at:?}");
+    // One that holds nobody up is not judged.
+    assert_eq!(look(false, |_| vec![BusyFlow { lacks_keys: true, ..FLOW }], secs), None);
+    // Nor does an outage that ends count for more than its share.
+    let comes = |now: Duration| {
+        let lacks_keys = !secs(now).is_multiple_of(100);
+        vec![BusyFlow { lacks_keys, progress: (secs(now) / 100, 0), ..held(now) }]
+    };
+    assert_eq!(look(false, comes, secs), None);
 }
 
 #[test]
@@ -302,7 +320,7 @@ fn an_excuse_now_and_then_is_no_way_out_of_the_pace() {
     // A limit of this host is no fault of the peer.
     let limited = |now: Duration| BusyFlow {
         progress: (secs(now) / 60, 0),
-        is_held_here: !secs(now).is_multiple_of(3),
+        waits_for_limit: !secs(now).is_multiple_of(3),
         waits_for_others: false,
         ..slow(now)
     };

@@ -233,7 +233,8 @@ fn busy_flow(id: FlowId, flow: &Flow, served: &Served) -> BusyFlow {
         is_service: served.is_service(),
         uses_credit: flow.uses_credit(),
         waits_for_others: flow.waits_for_others(),
-        is_held_here: flow.waits_for_limit(),
+        waits_for_limit: flow.waits_for_limit(),
+        lacks_keys: false,
         is_quiet: flow.is_quiet(),
     }
 }

@@ -3,7 +3,7 @@ use std::time::Duration;
 use axon_envelope::Delivery;
 
 use super::{Pair, ROUTE, id, ms, retire};
-use crate::keys::{KeyMessage, NoKey, Receiver};
+use crate::keys::{KeyMessage, NoKey, Receiver, Request, request::FailureKind};
 
 #[test]
 fn nothing_is_sealed_before_ready() {
@@ -73,6 +73,44 @@ fn one_wrong_key_is_reported_and_gone_from_both_ends_for_good() {
     assert!(!pair.log[before..].iter().any(again));
     assert_eq!(pair.sender.statistics(pair.now).ready, 4);
     assert_eq!(pair.sender.statistics(pair.now).disagreed, 1);
+}
+
+/// An outage of the own KME excuses a peer that takes nothing. What the peer brings about does not.
+#[test]
+fn keys_are_wanting_for_the_kme_only_where_no_key_is_left_or_was_refused_by_the_peer() {
+    let fail = |pair: &mut Pair| {
+        pair.kmes.left = Some(0);
+        pair.now += Duration::from_secs(30);
+        pair.draw();
+    };
+    let mut pair = Pair::new();
+    assert!(!pair.sender.lacks_keys_of_kme(), "nothing was asked for");
+    // A status that fails says nothing of keys.
+    pair.kmes.failures = vec![FailureKind::Unavailable];
+    let request = pair.sender.poll_request(pair.now).unwrap();
+    if matches!(request, Request::Status { .. }) {
+        let answer = pair.kmes.answer(request);
+        pair.sender.handle_answer(pair.now, answer);
+        assert!(!pair.sender.lacks_keys_of_kme());
+    }
+    let mut pair = Pair::new();
+    fail(&mut pair);
+    assert!(pair.sender.lacks_keys_of_kme());
+    // One that was given, and that the peer has not answered for.
+    pair.kmes.left = None;
+    pair.now += Duration::from_secs(30);
+    pair.draw();
+    let (conn, KeyMessage::Announce(key_ids)) = pair.sender.poll_message(pair.now).unwrap() else {
+        panic!()
+    };
+    fail(&mut pair);
+    assert!(!pair.sender.lacks_keys_of_kme());
+    // It fails them all, after the KME failed.
+    for key_id in key_ids {
+        let failed = KeyMessage::Failed { key_id, reason: String::new() };
+        pair.sender.handle_message(pair.now, conn, &failed).unwrap();
+    }
+    assert!(!pair.sender.lacks_keys_of_kme(), "the peer refused them");
 }
 
 #[test]

@@ -322,9 +322,12 @@ fn rules_are_looked_at_for_endpoints_and_never_for_a_sample() {
     world.run_for(secs(2));
     assert_eq!(looks_at_rules(), matched, "for {} samples", 500 * pairs.len());
     assert!(pairs.iter().all(|pair| world.received(*pair).len() > 400));
-    // Of hundreds of endpoints, a third of them denied, one more has itself alone checked, and its route.
+    // Of many endpoints, most of them denied, one more has itself alone checked, and its route.
     for number in 0..100 {
         world.pair(0, 1, &format!("/topic_{number}"), qos[0]);
+    }
+    // More than are remembered.
+    for number in 0..1_100 {
         world.hosts[1].rings.create_publisher(&format!("/denied_{number}"), qos[0]);
     }
     world.hosts[1].touch_graph();
