@@ -12,8 +12,9 @@ use crate::engine::account::{Charge, Meter};
 
 /// The longest wait.
 const LONGEST: Duration = Duration::from_secs(320);
-/// A peer that read for so long is as good as any.
-const FORGIVEN: Duration = Duration::from_secs(600);
+/// A peer that read for so long, and for so many limits, is as good as any. The longest hold that is not cut takes half of
+/// that, or waits would not double.
+const FORGIVEN: (Duration, u32) = (Duration::from_secs(600), 192);
 /// What is remembered of all peers, in bytes, and of one at most. Each gets half of what the others leave.
 const ROOM: (usize, usize) = (8 << 20, 1 << 20);
 /// Bytes that count for a stall besides its names.
@@ -45,6 +46,8 @@ struct OfPeer {
 struct Stall {
     wait: Duration,
     until: Instant,
+    /// When nothing is known of it any more.
+    forgiven: Instant,
 }
 
 impl Stall {
@@ -52,11 +55,12 @@ impl Stall {
     fn after(before: Option<Self>, limit: Duration, now: Instant) -> Self {
         let before = before.filter(|before| !before.is_forgiven(now));
         let wait = before.map_or(limit, |before| (before.wait * 2).min(LONGEST.max(limit)));
-        Self { wait, until: now + wait }
+        let until = now + wait;
+        Self { wait, until, forgiven: until + FORGIVEN.0.max(limit * FORGIVEN.1) }
     }
 
     fn is_forgiven(&self, now: Instant) -> bool {
-        now >= self.until + FORGIVEN
+        now >= self.forgiven
     }
 }
 
@@ -154,8 +158,22 @@ mod tests {
             waits.push(wait.as_secs());
         }
         assert_eq!(waits, [10, 20, 40, 80, 160, 320, 320]);
-        now += FORGIVEN;
+        now += ten * FORGIVEN.1;
         assert_eq!(stalls.add("pin arm", &key(0), ten, now), ten);
+    }
+
+    /// One that empties the store of keys is cut after 96 times the limit, each time.
+    #[test]
+    fn a_peer_that_holds_up_as_long_as_it_can_each_time_waits_longer_each_time() {
+        let (mut stalls, ten) = (Stalls::default(), Duration::from_secs(10));
+        let (mut now, mut waits) = (Instant::now(), Vec::new());
+        for _ in 0..7 {
+            now += ten * 97;
+            let wait = stalls.add("pin arm", &key(0), ten, now);
+            now += wait;
+            waits.push(wait.as_secs());
+        }
+        assert_eq!(waits, [10, 20, 40, 80, 160, 320, 320]);
     }
 
     #[test]
@@ -175,7 +193,7 @@ mod tests {
         assert_eq!(stalls.left("pin leg", &key(1), now), Some(ten));
         assert_eq!(stalls.left("pin leg", &key(2), now), None);
         // In time it is as good as any.
-        let later = now + LONGEST + FORGIVEN;
+        let later = now + LONGEST + ten * FORGIVEN.1;
         stalls.add("pin tail", &key(0), ten, later);
         assert_eq!((stalls.of.len(), stalls.left("pin arm", &key(5), later)), (1, None));
     }

@@ -78,39 +78,43 @@ fn one_wrong_key_is_reported_and_gone_from_both_ends_for_good() {
 /// An outage of the own KME excuses a peer that takes nothing. What the peer brings about does not.
 #[test]
 fn keys_are_wanting_for_the_kme_only_where_no_key_is_left_or_was_refused_by_the_peer() {
-    let fail = |pair: &mut Pair| {
-        pair.kmes.left = Some(0);
-        pair.now += Duration::from_secs(30);
-        pair.draw();
-    };
+    let failed = |pair: &Pair| pair.sender.statistics(pair.now).last_failure.is_some();
     let mut pair = Pair::new();
     assert!(!pair.sender.lacks_keys_of_kme(), "nothing was asked for");
     // A status that fails says nothing of keys.
     pair.kmes.failures = vec![FailureKind::Unavailable];
     let request = pair.sender.poll_request(pair.now).unwrap();
-    if matches!(request, Request::Status { .. }) {
-        let answer = pair.kmes.answer(request);
-        pair.sender.handle_answer(pair.now, answer);
-        assert!(!pair.sender.lacks_keys_of_kme());
-    }
+    assert!(matches!(request, Request::Status { .. }));
+    let answer = pair.kmes.answer(request);
+    pair.sender.handle_answer(pair.now, answer);
+    assert!(failed(&pair) && !pair.sender.lacks_keys_of_kme());
+
     let mut pair = Pair::new();
-    fail(&mut pair);
-    assert!(pair.sender.lacks_keys_of_kme());
-    // One that was given, and that the peer has not answered for.
-    pair.kmes.left = None;
-    pair.now += Duration::from_secs(30);
+    pair.kmes.left = Some(0);
     pair.draw();
-    let (conn, KeyMessage::Announce(key_ids)) = pair.sender.poll_message(pair.now).unwrap() else {
-        panic!()
-    };
-    fail(&mut pair);
-    assert!(!pair.sender.lacks_keys_of_kme());
+    assert!(failed(&pair) && pair.sender.lacks_keys_of_kme());
+
+    // The peer has not answered for those that the KME gave before.
+    let mut pair = Pair::new();
+    pair.draw();
+    let (conn, announced) = pair.sender.poll_message(pair.now).unwrap();
+    let KeyMessage::Announce(key_ids) = announced else { panic!("{announced:?}") };
+    pair.kmes.left = Some(0);
+    pair.now += Duration::from_secs(1);
+    pair.sender.demand(pair.now, 1_000);
+    pair.draw();
+    assert!(failed(&pair) && !pair.sender.lacks_keys_of_kme());
     // It fails them all, after the KME failed.
     for key_id in key_ids {
+        assert!(!pair.sender.lacks_keys_of_kme());
         let failed = KeyMessage::Failed { key_id, reason: String::new() };
         pair.sender.handle_message(pair.now, conn, &failed).unwrap();
     }
     assert!(!pair.sender.lacks_keys_of_kme(), "the peer refused them");
+    // Until the next call fails.
+    pair.now += Duration::from_secs(60);
+    pair.draw();
+    assert!(pair.sender.lacks_keys_of_kme());
 }
 
 #[test]
