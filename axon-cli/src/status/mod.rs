@@ -58,7 +58,7 @@ pub(crate) fn run(args: &cli::Status) -> Result<ExitCode, CliError> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// What stands in place of what the daemon does not tell another user.
+/// Printed in place of the details that the daemon does not tell another user.
 const WITHHELD: &str = "\nThe daemon belongs to another user and has access rules: it tells no other user its settings, \
                         rules, links, topics and sessions. Its own user sees them with `axon status`.\n";
 

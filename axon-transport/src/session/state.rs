@@ -281,8 +281,8 @@ impl SessionShared {
         self.wake();
     }
 
-    /// The daemon refuses something for now: a process that the session relays is told.
-    pub(crate) fn refuse_for_now(&self, why: String) {
+    /// The daemon refuses something that it may allow later. A session that relays a process keeps the reason for it.
+    pub(crate) fn keep_refusal(&self, why: String) {
         if !self.options.keeps_refusals {
             return;
         }
@@ -292,7 +292,7 @@ impl SessionShared {
             state.refusals.push(why);
         }
         drop(state);
-        // Who has not taken the first one was woken for it.
+        // The relay was woken for the first refusal. It takes all at once.
         if is_first {
             self.notify(Some(&SessionEvent::Graph));
         }

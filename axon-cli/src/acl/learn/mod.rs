@@ -133,7 +133,7 @@ struct Watch {
 struct Known {
     /// The names of other hosts, by their daemons. They stay known when a link ends.
     hosts: HashMap<DaemonId, Option<String>>,
-    /// Whose the sessions of this host are, by what begins their GIDs. `None`: the daemon did not say yet.
+    /// The owners of the sessions of this host, by the first characters of their GIDs. `None`: the daemon did not say yet.
     sessions: HashMap<String, Option<LocalOwner>>,
     asked: Option<Instant>,
     /// Hosts that had endpoints and whose names were never known.
@@ -142,7 +142,7 @@ struct Known {
     unowned: usize,
 }
 
-/// Whose a session of this host is.
+/// The owner of a session of this host.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum LocalOwner {
     /// The daemon's user's.
@@ -154,7 +154,7 @@ enum LocalOwner {
 /// Characters of a GID in hexadecimal that all endpoints of a session share.
 const OF_SESSION: usize = 24;
 
-/// What begins the GIDs of an endpoint's session.
+/// The first characters of all GIDs of an endpoint's session.
 fn session_of(gid: Gid) -> String {
     let mut text = gid.to_string();
     text.truncate(OF_SESSION);

@@ -114,7 +114,7 @@ pub(crate) struct SampleName {
     pub(crate) length: usize,
 }
 
-/// What there is of a sample that a flow asks for.
+/// The answer to a flow that asks for a sample.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Asked {
     /// It is compressed already, or not worth it.
@@ -143,7 +143,7 @@ struct State {
     kept: HashMap<SampleName, Option<Bytes>>,
     kept_order: VecDeque<SampleName>,
     kept_bytes: usize,
-    /// Of the last orders: bytes, and seconds that they took. When the last of them was given or answered.
+    /// Of the last orders: bytes, and seconds that they took. The time of the last answer.
     measured: (f64, f64),
     used: Duration,
 }

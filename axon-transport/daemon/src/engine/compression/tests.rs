@@ -1,3 +1,5 @@
+use rand::{Rng, SeedableRng, rngs::StdRng};
+
 use super::*;
 
 fn asker(flow: FlowId) -> Asker {
@@ -18,14 +20,9 @@ fn text(length: usize) -> Bytes {
 
 /// Bytes that no compressor makes shorter.
 fn noise(length: usize) -> Bytes {
-    let mut state = 1_u64;
-    let mut next = || {
-        state ^= state << 13;
-        state ^= state >> 7;
-        state ^= state << 17;
-        state as u8
-    };
-    (0..length).map(|_| next()).collect::<Vec<_>>().into()
+    let mut bytes = vec![0; length];
+    StdRng::seed_from_u64(1).fill_bytes(&mut bytes);
+    bytes.into()
 }
 
 fn order(number: u64, payload: Bytes) -> CompressionOrder {

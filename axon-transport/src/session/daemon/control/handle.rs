@@ -61,7 +61,7 @@ impl Control {
                 }
                 match endpoint {
                     Some(gid) => self.shared.refuse(gid, reason),
-                    None => self.shared.refuse_for_now(reason),
+                    None => self.shared.keep_refusal(reason),
                 }
             }
             // What a daemon never says is not worth more than not being heard.
