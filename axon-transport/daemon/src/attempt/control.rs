@@ -3,7 +3,7 @@
 use quinn::{RecvStream, SendStream};
 
 use crate::{
-    engine::control::FrameLimits,
+    engine::quic::control_stream::FrameLimits,
     link::{FrameError, Message, read_length},
 };
 

@@ -22,7 +22,6 @@ use super::{
 use crate::{
     engine::{
         credentials::Credentials,
-        endpoints::reaches,
         keyring::{Answered, Keyring},
         link::{
             dialling::{Action, Dialling},
@@ -30,9 +29,8 @@ use crate::{
             opening::{Handshake, Opened, Opening, Refused},
             target::{Target, UNKNOWN_PSK_IDENTITY},
         },
+        quic::{endpoints::reaches, tls_settings::tls_cipher, transport::endpoint_config},
         refusal::Refusal,
-        tls_settings::tls_cipher,
-        transport::endpoint_config,
     },
     error::{EndpointError, GatewayError},
     identity,

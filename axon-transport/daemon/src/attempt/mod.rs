@@ -27,8 +27,11 @@ use self::{
 };
 use crate::{
     engine::{
-        frames::Frames, inbound::StreamHeader, link::opening::Opened, protection::Seal,
-        refusal::Refusal, rings::Sample,
+        inbound::StreamHeader,
+        link::opening::Opened,
+        refusal::Refusal,
+        rings::Sample,
+        sample::{frames::Frames, protection::Seal},
     },
     error::GatewayError,
     link::{CloseCode, Elected, Graph, Message, Owners, Subscribe},

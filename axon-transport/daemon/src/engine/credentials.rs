@@ -18,11 +18,11 @@ use axon_transport::config::{Config, Security};
 use quinn_proto::{QlogStream, TimeSource, TransportConfig};
 use rustls_pki_types::CertificateDer;
 
+use super::quic::{
+    tls_settings::{psk_kex, tls_cipher},
+    transport::Transports,
+};
 use crate::{
-    engine::{
-        tls_settings::{psk_kex, tls_cipher},
-        transport::Transports,
-    },
     error::GatewayError,
     identity::Identity,
     keys::{Attempt, Resolver},

@@ -9,40 +9,29 @@
 pub(crate) mod account;
 pub(crate) mod compression;
 mod congestion;
-pub(crate) mod connection;
-pub(crate) mod control;
 pub(crate) mod counters;
 pub(crate) mod credentials;
-mod dropped;
 mod effects;
-pub(crate) mod endpoints;
-pub(crate) mod frames;
 mod graphs;
 pub(crate) mod inbound;
 pub(crate) mod keyring;
 pub(crate) mod limits;
 pub(crate) mod link;
 pub(crate) mod links;
-mod marks;
-mod numbers;
 pub(crate) mod outbound;
-mod pace;
 pub(crate) mod peer;
 mod peer_factory;
 pub(crate) mod peer_graph;
 mod peers;
-pub(crate) mod protection;
-pub(crate) mod qlog;
+pub(crate) mod quic;
 pub(crate) mod refusal;
 mod reports;
 pub(crate) mod rings;
-pub(crate) mod short_header;
+pub(crate) mod sample;
 #[cfg(test)]
 mod sim;
 pub(crate) mod stand_in;
 mod streams;
-pub(crate) mod tls_settings;
-pub(crate) mod transport;
 
 use std::{
     net::{IpAddr, SocketAddr},

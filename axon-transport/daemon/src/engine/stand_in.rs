@@ -15,9 +15,11 @@ use axon_transport::{
 };
 
 use super::{
-    dropped::{Before, DroppedRuns},
-    numbers::{FORGOTTEN, Numbers},
     rings::{RingError, RingWriter, Rings},
+    sample::{
+        dropped::{Before, DroppedRuns},
+        numbers::{FORGOTTEN, Numbers},
+    },
 };
 use crate::engine::account::{Account, Charge};
 

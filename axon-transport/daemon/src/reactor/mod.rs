@@ -42,8 +42,11 @@ use self::{
 use crate::{
     bridge::{GatewayParts, ToControl},
     engine::{
-        Engine, EngineParts, credentials::Credentials, links::LinkParts, peer::MAX_ROUTES,
-        qlog::Qlogs, transport::endpoint_config,
+        Engine, EngineParts,
+        credentials::Credentials,
+        links::LinkParts,
+        peer::MAX_ROUTES,
+        quic::{qlog::Qlogs, transport::endpoint_config},
     },
     error::GatewayError,
     identity,

@@ -17,7 +17,7 @@ use std::{
 
 use axon_shm::ids::DaemonId;
 
-use crate::{engine::qlog::Qlogs, link::Side};
+use crate::{engine::quic::qlog::Qlogs, link::Side};
 
 /// The longest file, in bytes.
 const LONGEST: usize = 16 << 20;

@@ -35,7 +35,7 @@ use growth::{Growth, TRIAL};
 use path::Path;
 use silence::Silence;
 
-use super::marks::wrapped;
+use super::quic::marks::wrapped;
 
 /// The queue that is wanted: half as long as the path, within these.
 const WANTED: (Duration, Duration) = (Duration::from_millis(2), Duration::from_millis(10));

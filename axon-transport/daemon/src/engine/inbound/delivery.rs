@@ -11,7 +11,7 @@ use super::{
     incoming::{Incoming, Message, Step, StreamHeader},
     reading::{Next, wait},
 };
-use crate::engine::{dropped::Before, rings::RingError, stand_in::StandIn};
+use crate::engine::{rings::RingError, sample::dropped::Before, stand_in::StandIn};
 
 /// A message waits for so long while other rings of its peer have the memory that it needs. Their readers may never take
 /// what these hold, and history stays for as long as its publisher. A ring that has samples itself is full, and waits for

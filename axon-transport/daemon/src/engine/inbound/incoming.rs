@@ -7,7 +7,7 @@ use axon_shm::ids::Gid;
 use bytes::{Bytes, BytesMut};
 use quinn_proto::{ReadError, ReadableError, StreamId};
 
-use crate::engine::{account::Charge, short_header::ShortHeaders};
+use crate::engine::{account::Charge, sample::short_header::ShortHeaders};
 
 /// Bytes of a stream's header.
 pub(super) const HEADER: usize = 24;

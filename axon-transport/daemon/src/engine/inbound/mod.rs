@@ -35,13 +35,13 @@ use self::{
     line::Line,
     receipts::Receipts,
 };
+use super::quic::transport::STREAM_WINDOW;
 use crate::{
     engine::{
         account::{MessageMemory, Meter},
         counters::Counters,
         limits::{Limit, RouteLimit},
         stand_in::StandIn,
-        transport::STREAM_WINDOW,
     },
     link::{CloseCode, Received},
 };

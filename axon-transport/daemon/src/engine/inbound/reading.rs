@@ -13,10 +13,12 @@ use super::{
 use crate::{
     engine::{
         account::Charge,
-        protection::{
-            MAX_OVERHEAD, Open, Opened, RefusedMessage, unpack, unpacked_length, writer_of,
+        sample::{
+            protection::{
+                MAX_OVERHEAD, Open, Opened, RefusedMessage, unpack, unpacked_length, writer_of,
+            },
+            short_header::{ShortHeaders, Told},
         },
-        short_header::{ShortHeaders, Told},
     },
     link::CloseCode,
 };

@@ -11,9 +11,11 @@ use super::{
     reading::{Next, malformed, permit_short, refused, told},
 };
 use crate::engine::{
-    dropped::Before,
-    protection::{MAX_OVERHEAD, Open, writer_of},
-    short_header::Told,
+    sample::{
+        dropped::Before,
+        protection::{MAX_OVERHEAD, Open, writer_of},
+        short_header::Told,
+    },
     stand_in::StandIn,
 };
 

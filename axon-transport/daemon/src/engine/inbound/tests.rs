@@ -25,9 +25,11 @@ use super::{
 use crate::{
     engine::{
         account::{Accounts, MessageMemory},
-        protection::Open,
         rings::{RingError, RingReader, RingWriter, Rings},
-        short_header::{ShortHeaders, Told},
+        sample::{
+            protection::Open,
+            short_header::{ShortHeaders, Told},
+        },
         stand_in::StandIns,
     },
     link::{CloseCode, ReceivedOf},

@@ -8,7 +8,10 @@ use quinn_proto::ConnectionError;
 use rustls_pki_types::CertificateDer;
 
 use crate::{
-    engine::{control::ControlError, refusal::Refusal, tls_settings::tls_cipher},
+    engine::{
+        quic::{control_stream::ControlError, tls_settings::tls_cipher},
+        refusal::Refusal,
+    },
     link::{CloseCode, Hello},
 };
 

@@ -17,9 +17,9 @@ use rustls_pki_types::CertificateDer;
 use super::proving::Proving;
 use crate::{
     engine::{
-        control::{ControlError, FrameLimits},
         keyring::Keyring,
         link::failure::{Failure, HELLO_TIMEOUT, admits, agreed, names_its_host, reused},
+        quic::control_stream::{ControlError, FrameLimits},
         refusal::Refusal,
     },
     keys::{Answer, Completion, Exporters, Origin, Request},

@@ -15,10 +15,12 @@ use quinn_proto::{
 
 use crate::{
     engine::{
-        connection::Connection,
-        endpoints::{Endpoints, Packet, Received},
         limits::InterfaceLimits,
         link::failure::close_text,
+        quic::{
+            connection::Connection,
+            endpoints::{Endpoints, Packet, Received},
+        },
     },
     link::CloseCode,
 };

@@ -26,8 +26,8 @@ use crate::{
             target::Target,
         },
         links::{link::Summary, who::Who},
+        quic::transport::{LINK_WINDOW, STREAMS_OPEN, window_credit},
         refusal::Refusal,
-        transport::{LINK_WINDOW, STREAMS_OPEN, window_credit},
     },
     link::{Candidate, CloseCode, Elected, Hello, Intake, Message, Side, keep},
 };

@@ -5,9 +5,9 @@ use std::{collections::HashSet, time::Duration};
 use super::{LinkEvent, Links, Phase};
 use crate::{
     engine::{
-        connection::Carrier,
         keyring::Answered,
-        protection::{Open, Seal},
+        quic::connection::Carrier,
+        sample::protection::{Open, Seal},
     },
     keys,
     link::Message,

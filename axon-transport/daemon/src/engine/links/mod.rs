@@ -50,18 +50,20 @@ use self::{
     unfinished::Unfinished,
 };
 use super::{
-    connection::Connection,
-    control::{ControlError, Input},
     credentials::Credentials,
-    endpoints::Endpoints,
     keyring::Keyring,
+    quic::{
+        connection::Connection,
+        control_stream::{ControlError, Input},
+        endpoints::Endpoints,
+        qlog::{self, Qlogs},
+    },
 };
 use crate::{
     daemon_key::DaemonKey,
     discovery::{Interface, is_discovery},
     engine::{
         account::{Accounts, Charge},
-        qlog::{self, Qlogs},
         refusal::Refusal,
     },
     error::GatewayError,

@@ -1,7 +1,7 @@
 //! Samples to one peer: from the rings of local publishers into QUIC streams.
 //!
 //! Samples wait here and not in QUIC, because QoS can act on them here. Of bulk, QUIC holds the congestion window and a
-//! little more ([`connection`](super::connection)), so that the newest sample is soon the next. A pass costs the flows
+//! little more ([`connection`](super::quic::connection)), so that the newest sample is soon the next. A pass costs the flows
 //! that have something to send, and no others.
 
 mod backlog;
@@ -47,7 +47,9 @@ use self::{
     table::FlowTable,
     turns::Turns,
 };
-use super::{compression::PeerCompression, congestion::let_probe_through, connection::Carrier};
+use super::{
+    compression::PeerCompression, congestion::let_probe_through, quic::connection::Carrier,
+};
 use crate::{
     engine::{counters::Counters, limits::Limit},
     link::{CloseCode, Intake, ReceivedOf},

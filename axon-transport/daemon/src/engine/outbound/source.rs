@@ -10,8 +10,8 @@ use axon_transport::internal::session::TakeLimit;
 
 use crate::engine::{
     peer::routes::RelaySpec,
-    protection::call,
     rings::{RingReader, Sample},
+    sample::protection::call,
     stand_in::StandIn,
 };
 

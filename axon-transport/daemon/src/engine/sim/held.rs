@@ -1,7 +1,7 @@
 //! That the memory of a host stays within its bounds, whatever its peers do: a look after each pass.
 
 use crate::{
-    engine::{Engine, transport::STREAMS_OPEN},
+    engine::{Engine, quic::transport::STREAMS_OPEN},
     link::MAX_FRAME,
 };
 

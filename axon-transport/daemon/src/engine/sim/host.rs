@@ -36,7 +36,7 @@ use crate::{
         credentials::Credentials,
         links::LinkParts,
         peer::MAX_ROUTES,
-        transport::endpoint_config,
+        quic::transport::endpoint_config,
     },
     identity::Identity,
     keys::{Origin, Request},

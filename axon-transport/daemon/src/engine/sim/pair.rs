@@ -12,9 +12,9 @@ use quinn_proto::{ConnectionHandle, DatagramEvent, Endpoint, EndpointConfig, Str
 
 use crate::{
     engine::{
-        connection::{Carrier, Connection},
         credentials::Credentials,
-        protection::Seal,
+        quic::connection::{Carrier, Connection},
+        sample::protection::Seal,
     },
     identity::Identity,
 };

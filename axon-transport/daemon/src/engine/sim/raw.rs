@@ -22,7 +22,7 @@ use super::{
     rng::{SimRng, Stream, stream},
 };
 use crate::{
-    engine::{credentials::Credentials, peer::MAX_ROUTES, transport::Transports},
+    engine::{credentials::Credentials, peer::MAX_ROUTES, quic::transport::Transports},
     identity::Identity,
     link::{CloseCode, Hello, MAX_FRAME, MAX_INFLATED, Message, read_length},
 };

@@ -13,7 +13,7 @@ use super::{
     script::{Recipe, Script, Weights},
     world::World,
 };
-use crate::engine::{keyring::tests::config as qkd, transport::STREAMS_OPEN};
+use crate::engine::{keyring::tests::config as qkd, quic::transport::STREAMS_OPEN};
 
 pub(super) fn secs(seconds: u64) -> Duration {
     Duration::from_secs(seconds)

@@ -6,7 +6,7 @@ use axon_shm::{ids::Gid, qos::Qos};
 use axon_transport::config::Config;
 
 use super::world::World;
-use crate::engine::transport::STREAMS_OPEN;
+use crate::engine::quic::transport::STREAMS_OPEN;
 
 const MANY: usize = 10_000;
 

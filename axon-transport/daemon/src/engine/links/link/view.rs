@@ -11,7 +11,7 @@ use quinn_proto::StreamId;
 use super::{LinkPeer, Summary};
 use crate::{
     engine::{
-        account::Account, connection::Connection, link::failure::peer_text, outbound::FlowId,
+        account::Account, link::failure::peer_text, outbound::FlowId, quic::connection::Connection,
     },
     owner::Binding,
 };

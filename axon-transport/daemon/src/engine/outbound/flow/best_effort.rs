@@ -15,10 +15,10 @@ use super::{
 };
 use crate::{
     engine::{
-        connection::Carrier,
         counters::Counters,
-        frames::Frames,
         outbound::{queue::Queue, schedule::SMALL, source::Done},
+        quic::connection::Carrier,
+        sample::frames::Frames,
     },
     link::CloseCode,
 };

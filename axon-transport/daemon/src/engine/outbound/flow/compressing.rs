@@ -7,9 +7,9 @@ use bytes::Bytes;
 use super::info::FlowInfo;
 use crate::engine::{
     compression::{Asked, PeerCompression, SampleName},
-    connection::Carrier,
     counters::Counters,
     outbound::queue::Queue,
+    quic::connection::Carrier,
 };
 
 /// Bytes of samples of a flow, and samples, that are compressed before the link takes them.

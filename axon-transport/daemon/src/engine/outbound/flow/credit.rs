@@ -12,8 +12,10 @@ use std::{
 };
 
 use crate::{
-    engine::outbound::schedule::{FlowId, RANKS},
-    engine::transport::{LINK_WINDOW, STREAM_WINDOW, window_credit},
+    engine::{
+        outbound::schedule::{FlowId, RANKS},
+        quic::transport::{LINK_WINDOW, STREAM_WINDOW, window_credit},
+    },
     link::Intake,
 };
 

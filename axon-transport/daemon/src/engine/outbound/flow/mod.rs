@@ -35,8 +35,8 @@ use super::{
     source::{Done, Source},
 };
 use crate::engine::{
-    compression::PeerCompression, connection::Carrier, counters::Counters, frames::Frames,
-    rings::Sample,
+    compression::PeerCompression, counters::Counters, quic::connection::Carrier, rings::Sample,
+    sample::frames::Frames,
 };
 
 /// Bytes that one turn writes before other flows have theirs.

@@ -16,17 +16,16 @@ use super::{
 };
 use crate::{
     engine::{
-        connection::Carrier,
         counters::Counters,
-        frames::Frames,
         outbound::{
             furthest::Furthest,
             queue::Queue,
             schedule::{Rank, SMALL},
             source::Done,
         },
+        quic::connection::Carrier,
         rings::Sample,
-        short_header::ShortHeaders,
+        sample::{frames::Frames, short_header::ShortHeaders},
     },
     keys::NoKey,
     link::CloseCode,

@@ -5,9 +5,8 @@ use std::{collections::BTreeSet, time::Duration};
 use quinn_proto::StreamId;
 
 use crate::engine::{
-    connection::Carrier,
     outbound::{flow::Flow, schedule::FlowId},
-    transport::STREAMS_OPEN,
+    quic::{connection::Carrier, transport::STREAMS_OPEN},
 };
 
 /// Flows that one search for idle streams looks at: all that have a stream. The peer may acknowledge all of them at

@@ -14,19 +14,21 @@ use axon_transport::{
 };
 use quinn_proto::VarInt;
 
-use crate::engine::sim::{
-    network::Path,
-    raw::RawLink,
-    rings::{FOREIGN, payload},
-    tests::{millis, secs},
-    world::World,
-};
 use crate::{
     engine::{
-        frames::Frames,
         inbound::StreamHeader,
-        protection::{Seal, call},
         rings::Sample,
+        sample::{
+            frames::Frames,
+            protection::{Seal, call},
+        },
+        sim::{
+            network::Path,
+            raw::RawLink,
+            rings::{FOREIGN, payload},
+            tests::{millis, secs},
+            world::World,
+        },
     },
     link::{CloseCode, Elected, Graph, Hello, Message, Subscribe, Subscriber, Unsubscribe},
 };

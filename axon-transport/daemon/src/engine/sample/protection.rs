@@ -7,11 +7,11 @@ use axon_shm::ids::Gid;
 use bytes::Bytes;
 
 use super::{
-    rings::Sample,
+    frames::Frames,
     short_header::{ShortHeaders, Told},
 };
 use crate::{
-    engine::frames::Frames,
+    engine::rings::Sample,
     keys::{NoKey, Receiver, Sender},
 };
 use axon_transport::internal::session::unix_nanos;

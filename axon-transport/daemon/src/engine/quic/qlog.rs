@@ -16,7 +16,7 @@ pub(crate) trait Qlogs {
 }
 
 /// The stream of a new connection's events, where they are written.
-pub(super) fn stream(
+pub(in crate::engine) fn stream(
     qlogs: Option<&dyn Qlogs>,
     side: Side,
     peer: SocketAddr,

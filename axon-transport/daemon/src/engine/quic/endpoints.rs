@@ -14,19 +14,19 @@ use quinn_proto::{
 };
 
 /// A packet of an endpoint, not of a connection.
-pub(super) struct Packet {
+pub(in crate::engine) struct Packet {
     /// The endpoint that sends it.
-    pub(super) endpoint: usize,
+    pub(in crate::engine) endpoint: usize,
     /// Where it goes.
-    pub(super) to: SocketAddr,
+    pub(in crate::engine) to: SocketAddr,
     /// The local address, if it matters.
-    pub(super) from: Option<IpAddr>,
-    pub(super) ecn: Option<EcnCodepoint>,
-    pub(super) bytes: Vec<u8>,
+    pub(in crate::engine) from: Option<IpAddr>,
+    pub(in crate::engine) ecn: Option<EcnCodepoint>,
+    pub(in crate::engine) bytes: Vec<u8>,
 }
 
 /// A datagram that was handed to an endpoint.
-pub(super) enum Received {
+pub(in crate::engine) enum Received {
     /// It is of this connection.
     Connection(ConnectionHandle, ConnectionEvent),
     /// It begins a connection.
@@ -43,7 +43,7 @@ pub(crate) fn reaches(local: SocketAddr, to: SocketAddr) -> bool {
 }
 
 /// The endpoints.
-pub(super) struct Endpoints {
+pub(in crate::engine) struct Endpoints {
     all: Vec<(SocketAddr, Endpoint)>,
     packets: VecDeque<Packet>,
 }
@@ -54,7 +54,7 @@ const MAX_PACKETS: usize = 1024;
 impl Endpoints {
     /// Endpoints at these local addresses. `server` gives the answer to packets of unknown connections; each
     /// connection has settings of its own.
-    pub(super) fn new(
+    pub(in crate::engine) fn new(
         addresses: &[SocketAddr],
         config: &Arc<EndpointConfig>,
         server: &Arc<ServerConfig>,
@@ -67,12 +67,12 @@ impl Endpoints {
     }
 
     /// The endpoint that reaches an address.
-    pub(super) fn towards(&self, to: SocketAddr) -> Option<usize> {
+    pub(in crate::engine) fn towards(&self, to: SocketAddr) -> Option<usize> {
         self.all.iter().position(|(address, _)| reaches(*address, to))
     }
 
     /// Handles a datagram.
-    pub(super) fn handle(
+    pub(in crate::engine) fn handle(
         &mut self,
         now: Instant,
         endpoint: usize,
@@ -100,7 +100,7 @@ impl Endpoints {
     ///
     /// # Errors
     /// QUIC refuses; `None` if no endpoint reaches the address.
-    pub(super) fn connect(
+    pub(in crate::engine) fn connect(
         &mut self,
         now: Instant,
         to: SocketAddr,
@@ -115,7 +115,7 @@ impl Endpoints {
     ///
     /// # Errors
     /// Why it failed at once. The peer has been told.
-    pub(super) fn accept(
+    pub(in crate::engine) fn accept(
         &mut self,
         now: Instant,
         endpoint: usize,
@@ -135,14 +135,14 @@ impl Endpoints {
     }
 
     /// Refuses a connection.
-    pub(super) fn refuse(&mut self, endpoint: usize, incoming: Incoming) {
+    pub(in crate::engine) fn refuse(&mut self, endpoint: usize, incoming: Incoming) {
         let mut buffer = Vec::new();
         let transmit = self.all[endpoint].1.refuse(incoming, &mut buffer);
         self.respond(endpoint, &transmit, buffer);
     }
 
     /// Has the peer prove that it receives at its address, or refuses it where that cannot be.
-    pub(super) fn retry(&mut self, endpoint: usize, incoming: Incoming) {
+    pub(in crate::engine) fn retry(&mut self, endpoint: usize, incoming: Incoming) {
         if !incoming.may_retry() {
             return self.refuse(endpoint, incoming);
         }
@@ -153,7 +153,7 @@ impl Endpoints {
     }
 
     /// Handles an event of a connection.
-    pub(super) fn handle_event(
+    pub(in crate::engine) fn handle_event(
         &mut self,
         endpoint: usize,
         handle: ConnectionHandle,
@@ -163,7 +163,7 @@ impl Endpoints {
     }
 
     /// Sends a datagram that is not QUIC's, from the port of QUIC. An address that no endpoint reaches drops it.
-    pub(super) fn send(&mut self, to: SocketAddr, bytes: Vec<u8>) {
+    pub(in crate::engine) fn send(&mut self, to: SocketAddr, bytes: Vec<u8>) {
         if let Some(endpoint) = self.towards(to) {
             self.push(Packet { endpoint, to, from: None, ecn: None, bytes });
         }
@@ -182,7 +182,7 @@ impl Endpoints {
     }
 
     /// The next packet that is not of a connection.
-    pub(super) fn poll_packet(&mut self) -> Option<Packet> {
+    pub(in crate::engine) fn poll_packet(&mut self) -> Option<Packet> {
         self.packets.pop_front()
     }
 }

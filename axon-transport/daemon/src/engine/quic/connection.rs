@@ -10,15 +10,16 @@ use axon_transport::status::LinkStatus;
 use quinn_proto::{ConnectionHandle, StreamId, Transmit};
 use rustls_pki_types::CertificateDer;
 
-use super::{
-    compression::link_rate::LinkRate,
-    control::Control,
-    limits::{Egress, InterfaceLimits},
-    marks::marks_reported,
-    outbound::{Class, FlowId, Priorities, Rank},
-    protection::Seal,
+use super::{control_stream::Control, marks::marks_reported};
+use crate::{
+    engine::{
+        compression::link_rate::LinkRate,
+        limits::{Egress, InterfaceLimits},
+        outbound::{Class, FlowId, Priorities, Rank},
+        sample::protection::Seal,
+    },
+    owner::{Binding, EXPORTER},
 };
-use crate::owner::{Binding, EXPORTER};
 
 /// Bulk that QUIC holds at most. Below that it is the congestion window and a little more: as much as may be on the
 /// way, and what leaves before the next pass. All else waits in the flows, where a newer sample can replace it.
@@ -42,37 +43,37 @@ const RESERVE_TIME: Duration = Duration::from_millis(80);
 /// A QUIC connection.
 pub(crate) struct Connection {
     /// The endpoint that it belongs to.
-    pub(super) endpoint: usize,
+    pub(in crate::engine) endpoint: usize,
     /// Its name at the endpoint.
-    pub(super) handle: ConnectionHandle,
+    pub(in crate::engine) handle: ConnectionHandle,
     /// Where the peer was when the connection began: there it received what the handshake needs.
-    pub(super) began_at: SocketAddr,
+    pub(in crate::engine) began_at: SocketAddr,
     /// The address of this host that packets leave from, as far as it is known.
     local: Option<IpAddr>,
     /// The connection.
-    pub(super) quic: quinn_proto::Connection,
+    pub(in crate::engine) quic: quinn_proto::Connection,
     /// Its control stream.
-    pub(super) control: Control,
+    pub(in crate::engine) control: Control,
     /// The flow of each data stream that this side opened.
-    pub(super) flows: HashMap<StreamId, FlowId>,
+    pub(in crate::engine) flows: HashMap<StreamId, FlowId>,
     /// The limits on what it sends.
-    pub(super) egress: Egress,
+    pub(in crate::engine) egress: Egress,
     /// How much is lost on the way.
     loss: Loss,
     /// How much it carries.
     rate: LinkRate,
     /// Whether it is in the list of connections with something to do.
-    pub(super) is_dirty: bool,
+    pub(in crate::engine) is_dirty: bool,
     /// Whether it is in the list of connections that may transmit.
-    pub(super) is_transmitting: bool,
+    pub(in crate::engine) is_transmitting: bool,
     /// The deadline under which the engine knows it.
-    pub(super) deadline: Option<std::time::Instant>,
+    pub(in crate::engine) deadline: Option<std::time::Instant>,
     /// Datagrams that came with an ECN mark.
-    pub(super) ecn_marks: u64,
+    pub(in crate::engine) ecn_marks: u64,
 }
 
 impl Connection {
-    pub(super) fn new(
+    pub(in crate::engine) fn new(
         endpoint: usize,
         handle: ConnectionHandle,
         quic: quinn_proto::Connection,
@@ -97,7 +98,11 @@ impl Connection {
 
     /// A datagram came to this address of this host. A server's packets leave from the address that the connection began
     /// at; where those of a client leave, the kernel decides, and it is taken for the interface that the peer's come by.
-    pub(super) fn set_local(&mut self, came_to: Option<IpAddr>, limits: &mut InterfaceLimits) {
+    pub(in crate::engine) fn set_local(
+        &mut self,
+        came_to: Option<IpAddr>,
+        limits: &mut InterfaceLimits,
+    ) {
         let local = self.quic.local_ip().or(came_to);
         if local.is_some() && self.local != local {
             self.local = local;
@@ -107,7 +112,7 @@ impl Connection {
     }
 
     /// Keeps to the limits on the interface that packets leave by.
-    pub(super) fn limit_interface(&mut self, limits: &InterfaceLimits) {
+    pub(in crate::engine) fn limit_interface(&mut self, limits: &InterfaceLimits) {
         let Some(local) = self.local else { return };
         self.egress.set_interface(limits, local);
         if limits.misses(local) {
@@ -117,13 +122,13 @@ impl Connection {
     }
 
     /// The certificates, or the raw public key, that the peer showed.
-    pub(super) fn peer_chain(&self) -> Vec<CertificateDer<'static>> {
+    pub(in crate::engine) fn peer_chain(&self) -> Vec<CertificateDer<'static>> {
         let shown = self.quic.crypto_session().peer_identity();
         shown.and_then(|shown| shown.downcast().ok()).map(|shown| *shown).unwrap_or_default()
     }
 
     /// Bytes that both ends of the connection share and no other connection has.
-    pub(super) fn binding(&self) -> Option<Binding> {
+    pub(in crate::engine) fn binding(&self) -> Option<Binding> {
         let mut binding = [0; 32];
         let session = self.quic.crypto_session();
         session.export_keying_material(&mut binding, EXPORTER, b"").ok()?;
@@ -131,7 +136,7 @@ impl Connection {
     }
 
     /// Adds what QUIC measures to the link's status.
-    pub(super) fn fill(&self, status: &mut LinkStatus) {
+    pub(in crate::engine) fn fill(&self, status: &mut LinkStatus) {
         let path = self.quic.stats().path;
         status.address = self.quic.remote_address().to_string();
         status.rtt = self.quic.rtt();
@@ -150,7 +155,7 @@ impl Connection {
     }
 
     /// These packets leave: they count with the headers of IP and UDP.
-    pub(super) fn count_sent(&self, transmit: &Transmit, now: Duration) {
+    pub(in crate::engine) fn count_sent(&self, transmit: &Transmit, now: Duration) {
         let each = transmit.segment_size.unwrap_or(transmit.size).max(1);
         let packets = transmit.size.div_ceil(each) as u64;
         let headers = if transmit.destination.is_ipv4() { 28 } else { 48 };
@@ -158,7 +163,11 @@ impl Connection {
     }
 
     /// The connection as a carrier of samples.
-    pub(super) fn carrier<'a>(&'a mut self, seal: Seal<'a>, now: Duration) -> Carrier<'a> {
+    pub(in crate::engine) fn carrier<'a>(
+        &'a mut self,
+        seal: Seal<'a>,
+        now: Duration,
+    ) -> Carrier<'a> {
         let window = self.quic.congestion_state().window();
         let window = self.egress.window(window, self.quic.rtt());
         self.loss.measure(&self.quic, now);
@@ -226,56 +235,56 @@ impl Loss {
 /// A connection that carries samples, for one pass.
 pub(crate) struct Carrier<'a> {
     /// The connection.
-    pub(super) quic: &'a mut quinn_proto::Connection,
+    pub(in crate::engine) quic: &'a mut quinn_proto::Connection,
     /// Protects the messages.
-    pub(super) seal: Seal<'a>,
+    pub(in crate::engine) seal: Seal<'a>,
     /// The flow of each stream.
-    pub(super) streams: &'a mut HashMap<StreamId, FlowId>,
+    pub(in crate::engine) streams: &'a mut HashMap<StreamId, FlowId>,
     /// The flow whose turn it is.
-    pub(super) flow: FlowId,
+    pub(in crate::engine) flow: FlowId,
     /// The priorities of the routes.
-    pub(super) priorities: Priorities,
+    pub(in crate::engine) priorities: Priorities,
     /// The rank as which the flow sends, where that is another one than its own.
-    pub(super) lender: Option<Rank>,
+    pub(in crate::engine) lender: Option<Rank>,
     /// The place of the highest rank of which flows wait for credit.
-    pub(super) closed_from: Option<usize>,
+    pub(in crate::engine) closed_from: Option<usize>,
     /// Bytes that QUIC took in this pass.
-    pub(super) taken: u64,
+    pub(in crate::engine) taken: u64,
     window: u64,
     bulk: u64,
     /// What QUIC may hold more of all other classes.
     reserve: u64,
     /// Whether the link loses packets.
-    pub(super) loses: bool,
+    pub(in crate::engine) loses: bool,
     /// Bytes a second that the link carries, if it was full lately or a limit says it.
-    pub(super) rate: Option<f64>,
+    pub(in crate::engine) rate: Option<f64>,
     measured: &'a mut LinkRate,
 }
 
 impl Carrier<'_> {
     /// The congestion window in bytes.
-    pub(super) fn window(&self) -> u64 {
+    pub(in crate::engine) fn window(&self) -> u64 {
         self.window
     }
 
     /// What QUIC may hold while a flow of this rank writes. What others filled is no obstacle to a higher priority.
-    pub(super) fn limit_of(&self, rank: Rank) -> u64 {
+    pub(in crate::engine) fn limit_of(&self, rank: Rank) -> u64 {
         let reserve = if rank.class == Class::Bulk { 0 } else { self.reserve };
         (1 + self.priorities.below(rank.priority)) * self.bulk + reserve
     }
 
     /// The rank as which a flow of this rank writes.
-    pub(super) fn rank(&self, own: Rank) -> Rank {
+    pub(in crate::engine) fn rank(&self, own: Rank) -> Rank {
         self.lender.unwrap_or(own)
     }
 
     /// Whether a flow of this rank may use credit: none of its rank or a higher one waits for some.
-    pub(super) fn is_open_to(&self, own: Rank) -> bool {
+    pub(in crate::engine) fn is_open_to(&self, own: Rank) -> bool {
         self.closed_from.is_none_or(|place| self.rank(own).place() < place)
     }
 
     /// Lets QUIC take what it may hold while a flow of this rank writes.
-    pub(super) fn limit(&mut self, rank: Rank) {
+    pub(in crate::engine) fn limit(&mut self, rank: Rank) {
         self.quic.set_send_window(self.limit_of(rank));
     }
 
@@ -283,7 +292,7 @@ impl Carrier<'_> {
     /// their limits. It would say so at once, and again and again, if it took more of one while another cannot write,
     /// whose stream the peer does not read. A flow with a higher limit has samples in QUIC until then.
     /// The link `is_full` while a flow waits for QUIC.
-    pub(super) fn rest(&mut self, least: Option<u64>, is_full: bool, now: Duration) {
+    pub(in crate::engine) fn rest(&mut self, least: Option<u64>, is_full: bool, now: Duration) {
         self.quic.set_send_window(least.unwrap_or(self.bulk));
         let left = || {
             let stats = self.quic.stats();

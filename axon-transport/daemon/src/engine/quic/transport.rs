@@ -11,7 +11,8 @@ use quinn_proto::{
     crypto::{CryptoError, HmacKey},
 };
 
-use super::{congestion::DelayConfig, marks::CountingFactory};
+use super::marks::CountingFactory;
+use crate::engine::congestion::DelayConfig;
 
 /// A link whose peer is silent ends after this. Until then its flows and routes stand, and a successor takes them over.
 const IDLE_TIMEOUT_MS: u32 = 120_000;

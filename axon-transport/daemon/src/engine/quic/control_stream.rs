@@ -124,24 +124,24 @@ impl Default for Control {
 
 impl Control {
     /// Uses this stream.
-    pub(super) fn open(&mut self, stream: StreamId, quic: &mut quinn_proto::Connection) {
+    pub(in crate::engine) fn open(&mut self, stream: StreamId, quic: &mut quinn_proto::Connection) {
         self.stream = Some(stream);
         self.readable = true;
         let _ = quic.send_stream(stream).set_priority(PRIORITY);
     }
 
     /// The stream, once there is one.
-    pub(super) fn stream(&self) -> Option<StreamId> {
+    pub(in crate::engine) fn stream(&self) -> Option<StreamId> {
         self.stream
     }
 
     /// What may be read from now on.
-    pub(super) fn set_limits(&mut self, limits: FrameLimits) {
+    pub(in crate::engine) fn set_limits(&mut self, limits: FrameLimits) {
         self.limits = limits;
     }
 
     /// Messages that wait, to be sent or to be handled, count on this account from now on.
-    pub(super) fn charge_to(&mut self, account: &Account) {
+    pub(in crate::engine) fn charge_to(&mut self, account: &Account) {
         self.meter = Some(Rc::clone(&account.unsent));
         self.decoded = Some(Rc::clone(&account.decoded));
     }
@@ -150,7 +150,7 @@ impl Control {
     ///
     /// # Errors
     /// The message is too large, or the peer does not read.
-    pub(super) fn send(&mut self, message: &Message) -> Result<(), ControlError> {
+    pub(in crate::engine) fn send(&mut self, message: &Message) -> Result<(), ControlError> {
         if self.finishing {
             return Ok(());
         }
@@ -165,34 +165,34 @@ impl Control {
     }
 
     /// Nothing is sent after the messages that wait.
-    pub(super) fn finish(&mut self) {
+    pub(in crate::engine) fn finish(&mut self) {
         self.finishing = true;
     }
 
     /// The connection is closed: nothing is read any more.
-    pub(super) fn close(&mut self) {
+    pub(in crate::engine) fn close(&mut self) {
         self.paused_until = None;
         self.ended = true;
     }
 
     /// Bytes that wait to be sent, and that came and are not handled.
     #[cfg(test)]
-    pub(super) fn held(&self) -> (usize, usize) {
+    pub(in crate::engine) fn held(&self) -> (usize, usize) {
         (self.queued, self.piece.len() + self.frame.len())
     }
 
     /// Whether frames wait.
-    pub(super) fn has_output(&self) -> bool {
+    pub(in crate::engine) fn has_output(&self) -> bool {
         !self.out.is_empty() || self.finishing && !self.finished
     }
 
     /// Bytes of messages that wait for QUIC.
-    pub(super) fn queued(&self) -> usize {
+    pub(in crate::engine) fn queued(&self) -> usize {
         self.queued
     }
 
     /// Hands frames to QUIC. Returns whether it took any.
-    pub(super) fn write(&mut self, quic: &mut quinn_proto::Connection) -> bool {
+    pub(in crate::engine) fn write(&mut self, quic: &mut quinn_proto::Connection) -> bool {
         let Some(stream) = self.stream else { return false };
         // Control is small, and goes first whatever else QUIC holds.
         quic.set_send_window(u64::MAX);
@@ -224,17 +224,17 @@ impl Control {
     }
 
     /// QUIC has more of the stream.
-    pub(super) fn handle_readable(&mut self) {
+    pub(in crate::engine) fn handle_readable(&mut self) {
         self.readable = true;
     }
 
     /// When reading goes on, if the peer said as much as it may.
-    pub(super) fn poll_timeout(&self) -> Option<Duration> {
+    pub(in crate::engine) fn poll_timeout(&self) -> Option<Duration> {
         self.paused_until
     }
 
     /// Whether there may be a message.
-    pub(super) fn has_input(&self, now: Duration) -> bool {
+    pub(in crate::engine) fn has_input(&self, now: Duration) -> bool {
         !self.ended
             && (self.readable || !self.piece.is_empty() || self.paid.is_some())
             && self.paused_until.is_none_or(|until| until <= now)
@@ -244,7 +244,7 @@ impl Control {
     ///
     /// # Errors
     /// Nothing more comes.
-    pub(super) fn read(
+    pub(in crate::engine) fn read(
         &mut self,
         quic: &mut quinn_proto::Connection,
         mut owe: impl FnMut(u32) -> Duration,

@@ -34,11 +34,11 @@ pub(crate) enum Before {
 /// of that part. Therefore runs that are long ago are joined to longer ones than new runs: a link that breaks has the
 /// newest numbers sent again, and the part is a share of what is sent that does not grow.
 #[derive(Debug, Default)]
-pub(super) struct DroppedRuns(VecDeque<Run>);
+pub(in crate::engine) struct DroppedRuns(VecDeque<Run>);
 
 impl DroppedRuns {
     /// A sample was dropped. One whose number does not rise is not remembered.
-    pub(super) fn add(&mut self, sequence: u64) {
+    pub(in crate::engine) fn add(&mut self, sequence: u64) {
         match self.0.back_mut() {
             Some(newest) if newest.last >= sequence => return,
             Some(newest) if newest.last + 1 == sequence => {
@@ -70,7 +70,7 @@ impl DroppedRuns {
     }
 
     /// What became of a sample that comes again.
-    pub(super) fn find(&self, sequence: u64) -> Before {
+    pub(in crate::engine) fn find(&self, sequence: u64) -> Before {
         let at = self.0.partition_point(|run| run.last < sequence);
         match self.0.get(at) {
             // The last ones of a run are told as dropped, whichever were: so a part of it tells no fewer than there were.

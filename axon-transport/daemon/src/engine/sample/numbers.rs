@@ -14,7 +14,7 @@ const SLACK: u64 = 1 << 20;
 /// The longest time that a sample is on its way before a later one comes with it: as long as a silent link stands.
 const ON_THE_WAY: Duration = Duration::from_secs(120);
 /// After this time nothing is refused that a reader would count: it ignores larger gaps.
-pub(super) const FORGOTTEN: Duration = Duration::from_secs((1 << 32) / RATE + 1);
+pub(in crate::engine) const FORGOTTEN: Duration = Duration::from_secs((1 << 32) / RATE + 1);
 
 /// So many samples a publisher can publish in this time.
 fn samples_in(time: Duration) -> u64 {
@@ -23,7 +23,7 @@ fn samples_in(time: Duration) -> u64 {
 
 /// The numbers of one publisher.
 #[derive(Debug)]
-pub(super) struct Numbers {
+pub(in crate::engine) struct Numbers {
     /// The highest number that was written; 0 is none.
     last: Cell<u64>,
     /// By how much the next number may exceed it, as it was at `at`.
@@ -33,12 +33,12 @@ pub(super) struct Numbers {
 
 impl Numbers {
     /// None came yet.
-    pub(super) fn new(now: Duration) -> Self {
+    pub(in crate::engine) fn new(now: Duration) -> Self {
         Self { last: Cell::new(0), ahead: Cell::new(SLACK), at: Cell::new(now) }
     }
 
     /// The highest number that was written; 0 is none.
-    pub(super) fn last(&self) -> u64 {
+    pub(in crate::engine) fn last(&self) -> u64 {
         self.last.get()
     }
 
@@ -58,7 +58,7 @@ impl Numbers {
     ///
     /// # Errors
     /// It cannot; the text says why.
-    pub(super) fn judge(&self, sequence: u64, now: Duration) -> Result<(), String> {
+    pub(in crate::engine) fn judge(&self, sequence: u64, now: Duration) -> Result<(), String> {
         let most = self.most(now);
         if sequence <= most {
             return Ok(());
@@ -70,7 +70,7 @@ impl Numbers {
     }
 
     /// A sample of this number was written.
-    pub(super) fn pass(&self, sequence: u64, now: Duration) {
+    pub(in crate::engine) fn pass(&self, sequence: u64, now: Duration) {
         let last = self.last.replace(sequence.max(self.last.get()));
         // This one may have been on its way for so long, and a later one comes with it.
         let most = SLACK + samples_in(ON_THE_WAY);
@@ -80,7 +80,7 @@ impl Numbers {
     }
 
     /// When its last number came, or when it began.
-    pub(super) fn at(&self) -> Duration {
+    pub(in crate::engine) fn at(&self) -> Duration {
         self.at.get()
     }
 }

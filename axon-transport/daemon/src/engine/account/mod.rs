@@ -4,6 +4,7 @@
 //! network share what they may take, as a host may have any of them. A [`Charge`] holds what counts for a [`Meter`], and
 //! gives it back when it is dropped.
 
+pub(in crate::engine) mod pace;
 #[cfg(test)]
 mod tests;
 
@@ -18,11 +19,8 @@ use std::{
 
 use axon_shm::internal::Allowance;
 
-use super::{
-    limits::Limits,
-    pace::{Bucket, Turns},
-    peer::routes::RouteKey,
-};
+use self::pace::{Bucket, Turns};
+use super::{limits::Limits, peer::routes::RouteKey};
 use crate::{
     keys::KeyMessage,
     link::{MAX_INFLATED, Message, is_known, unpacked_length},
@@ -42,7 +40,7 @@ const OF_ALL: usize = 1 << 17;
 /// route has more to it than an endpoint.
 const ROUTES_TO_GRAPH: usize = 4;
 /// Unread stream data of one identity, in bytes. Each of its links has
-/// [`LINK_WINDOW`](super::transport::LINK_WINDOW) more.
+/// [`LINK_WINDOW`](super::quic::transport::LINK_WINDOW) more.
 const UNREAD: usize = 64 << 20;
 /// Messages of one identity that are being read, in bytes: long ones, of which one may always be read, and short ones,
 /// which therefore never wait for those.

@@ -17,7 +17,7 @@ struct Counting {
 }
 
 /// Makes [`Counting`] controllers around those of another factory.
-pub(super) struct CountingFactory<F>(pub(super) Arc<F>);
+pub(in crate::engine) struct CountingFactory<F>(pub(super) Arc<F>);
 
 impl<F: ControllerFactory> ControllerFactory for CountingFactory<F> {
     fn build(self: Arc<Self>, now: Instant, current_mtu: u16) -> Box<dyn Controller> {
@@ -26,14 +26,14 @@ impl<F: ControllerFactory> ControllerFactory for CountingFactory<F> {
 }
 
 /// How often the peer of a connection reported new marks. A connection starts again at a new address of its peer.
-pub(super) fn marks_reported(quic: &quinn_proto::Connection) -> u64 {
+pub(in crate::engine) fn marks_reported(quic: &quinn_proto::Connection) -> u64 {
     // A copy is the only way to it. It is made for status, once a second.
     let controller = quic.congestion_state().clone_box().into_any();
     controller.downcast_ref::<Counting>().map_or(0, |counting| counting.marks)
 }
 
 /// A copy of the controller that is wrapped.
-pub(super) fn wrapped(quic: &quinn_proto::Connection) -> Option<Box<dyn Any>> {
+pub(in crate::engine) fn wrapped(quic: &quinn_proto::Connection) -> Option<Box<dyn Any>> {
     let counting = quic.congestion_state().clone_box().into_any().downcast::<Counting>().ok()?;
     Some(counting.inner.into_any())
 }

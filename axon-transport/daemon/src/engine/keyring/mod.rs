@@ -16,12 +16,10 @@ use std::{
 use axon_envelope::{KeyId, KmeKey};
 use axon_transport::config::{Config, KeyMode, QkdConfig, Security};
 
-use crate::{
-    engine::tls_settings::tls_cipher,
-    keys::{
-        Acceptor, Answer, Clock, Completion, Dial, Dialler, Event, Exporters, KeyMessage, Origin,
-        Receiver, Request, Resolver, Sender, Statistics, SupplyError, UsedStatistics,
-    },
+use super::quic::tls_settings::tls_cipher;
+use crate::keys::{
+    Acceptor, Answer, Clock, Completion, Dial, Dialler, Event, Exporters, KeyMessage, Origin,
+    Receiver, Request, Resolver, Sender, Statistics, SupplyError, UsedStatistics,
 };
 
 #[cfg(test)]

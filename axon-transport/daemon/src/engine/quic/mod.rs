@@ -1,0 +1,9 @@
+//! QUIC as the engine uses it: endpoints, connections with their control stream, and the settings of both.
+
+pub(crate) mod connection;
+pub(crate) mod control_stream;
+pub(crate) mod endpoints;
+mod marks;
+pub(crate) mod qlog;
+pub(crate) mod tls_settings;
+pub(crate) mod transport;
