@@ -75,7 +75,7 @@ async fn accept_at(
         Err(error) => return tracing::error!(%error, "the session socket cannot be watched"),
     };
     let spare = Rc::clone(&control.borrow().spare);
-    let (mut full, failures) = (false, LogLimit::default());
+    let (mut full, failures, begun) = (false, LogLimit::default(), Instant::now());
     loop {
         let Ok(mut ready) = listener.readable().await else { return };
         if descriptors::close_queue_is_full() {
@@ -109,7 +109,7 @@ async fn accept_at(
             }
             Ok(Err(error)) => {
                 // Out of descriptors, or the caller has gone: neither ends the daemon.
-                if let Some(times) = failures.count(Instant::now()) {
+                if let Some(times) = failures.count(begun.elapsed()) {
                     tracing::warn!(%error, times, "a session could not be accepted");
                 }
                 tokio::time::sleep(PAUSE).await;

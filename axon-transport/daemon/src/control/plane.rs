@@ -252,7 +252,7 @@ impl Control {
     pub(super) fn refused_for_room(&mut self, peer: String, reason: String) {
         const WHAT: &str = "descriptors";
         self.crowded_out += 1;
-        if let Some(sessions) = self.crowded_log.count(Instant::now()) {
+        if let Some(sessions) = self.crowded_log.count(self.started.elapsed()) {
             tracing::warn!(peer, reason, sessions, "sessions are refused for want of descriptors");
         }
         // The numbers in the reason change.

@@ -133,19 +133,20 @@ impl Credentials {
     }
 
     /// Why a peer with a link, of which this host is the `side`, would not be accepted now: its pin was removed or
-    /// ended, or its certificate ended or was revoked. `chain` is `None` where certificates need not be checked,
+    /// ended at `wall`, or its certificate ended or was revoked. `chain` is `None` where certificates need not be checked,
     /// since that costs signatures.
     pub(crate) fn distrust(
         &self,
         negotiated: &Negotiated,
         side: Side,
         chain: Option<&[CertificateDer<'static>]>,
+        wall: SystemTime,
     ) -> Option<String> {
         match (self.auth()?, chain) {
             (Auth::Pinned { trust, .. }, _) => {
                 let pin = negotiated.peer.and_then(|key| trust.pin_of(&key));
                 match pin {
-                    Some(pin) if pin.holds(SystemTime::now()) => None,
+                    Some(pin) if pin.holds(wall) => None,
                     Some(pin) => Some(format!(
                         "its pin in AXON_CLASSIC_TRUST, of {}, ended: its last day is {} (UTC)",
                         pin.name(),

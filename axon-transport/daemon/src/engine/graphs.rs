@@ -46,7 +46,7 @@ impl Engine {
             let Some(permissions) = permissions else { continue };
             self.links.limit_egress(link, &permissions);
             self.peers.with(daemon, |peer, with| {
-                peer.set_permissions(permissions, with.config);
+                peer.set_permissions(permissions, with.config, now);
                 peer.stirred = false;
             });
             self.follow_graph(daemon, now);

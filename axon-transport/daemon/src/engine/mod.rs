@@ -288,12 +288,12 @@ impl Engine {
             }
             LinkEvent::Gone(number, daemon) => {
                 if let Some(peer) = self.peers.get_mut(daemon) {
-                    peer.inbound.link_over(number);
+                    peer.inbound.link_over(number, now);
                 }
             }
             LinkEvent::Down { number, daemon, peer: text, reason, restarted } => {
                 if let Some(mut peer) = self.peers.remove(daemon) {
-                    peer.inbound.link_over(number);
+                    peer.inbound.link_over(number, now);
                     if restarted {
                         self.peers.keep_relays(&mut peer, now);
                     }
@@ -328,7 +328,7 @@ impl Engine {
             let old = self.links.connection(old).map(|connection| &mut connection.quic);
             self.peers.with(daemon, |peer, with| {
                 // Before anything is said of this host's graph.
-                peer.set_permissions(permissions, with.config);
+                peer.set_permissions(permissions, with.config, now);
                 peer.succeed(number, binding, with.local);
                 peer.outbound.succeed(old);
             });
@@ -365,7 +365,7 @@ impl Engine {
             },
             Message::Owners(owners) => {
                 if let Some(binding) = self.links.view(number).and_then(|link| link.binding()) {
-                    peer.remote.prove(&owners.proofs, &binding, daemon);
+                    peer.remote.prove(&owners.proofs, &binding, daemon, now);
                 }
             }
             Message::AccessDecisions(answer) => {

@@ -25,7 +25,7 @@ use std::{
     path::Path,
     rc::Rc,
     sync::Arc,
-    time::{Duration, Instant},
+    time::{Duration, Instant, SystemTime},
 };
 
 use axon_shm::{ids::DaemonId, internal::monotonic};
@@ -106,6 +106,7 @@ async fn serve(
             endpoint: Arc::new(endpoint_config(&reset)),
             qlogs: qlogs.map(|files| Rc::new(files) as Rc<dyn Qlogs>),
             epoch,
+            wall: Rc::new(SystemTime::now),
             config,
         },
         rings: rings.clone(),

@@ -4,7 +4,7 @@ use std::{
     collections::{BTreeMap, VecDeque},
     os::fd::BorrowedFd,
     sync::Arc,
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use axon_shm::{
@@ -28,7 +28,7 @@ use crate::{
     log_limit::LogLimit,
     registry::RelayCounters,
     session::{
-        RemoteWriter, Written,
+        RemoteWriter, Written, clock,
         daemon::socket::{self, Received, SocketError},
     },
     wire::session::{Credit, Message},
@@ -317,7 +317,9 @@ impl Pipe {
                     Err(error) => {
                         last = self.written.get(channel).map_or(0, |before| before.last);
                         lost(gid, LossReport::Unwritten);
-                        if let Some(samples) = self.losses.count(Instant::now()) {
+                        if let Some(samples) =
+                            self.losses.count(Duration::from_nanos(clock::monotonic()))
+                        {
                             tracing::error!(%gid, %error, samples, "relayed samples are lost");
                         }
                     }

@@ -4,7 +4,6 @@
 use std::{
     collections::{BTreeMap, BTreeSet},
     sync::Arc,
-    time::Instant,
 };
 
 use axon_shm::{
@@ -155,7 +154,7 @@ impl RelayedSession {
         if samples > 0 {
             self.losses.add(topic, ENDED, samples);
         }
-        if let Some(writers) = self.given_up.count(Instant::now()) {
+        if let Some(writers) = self.given_up.count(self.begun.elapsed()) {
             let (session, limit) = (&self.id, MAX_LEFT);
             tracing::warn!(
                 %session, %other, topic, writers, limit,

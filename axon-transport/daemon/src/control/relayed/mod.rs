@@ -131,6 +131,7 @@ impl DaemonRelay {
             graph: Arc::default(),
             left: VecDeque::new(),
             given_up: LogLimit::default(),
+            begun: Instant::now(),
             leader,
             change_signal,
             process,
@@ -189,6 +190,8 @@ struct RelayedSession {
     left: VecDeque<(Gid, Gid)>,
     /// Those of them that were given up.
     given_up: LogLimit,
+    /// When the session began: log lines are limited by the time since then.
+    begun: Instant,
     leader: ExternalLeader,
     change_signal: Arc<ChangeSignal>,
     process: Option<OwnedFd>,

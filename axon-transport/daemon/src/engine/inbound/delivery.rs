@@ -164,11 +164,11 @@ impl Inbound {
                 if header.reliable {
                     stand_in.drop_sample(meta.sequence);
                 }
-                self.lost("held", header, &why);
+                self.lost("held", header, &why, now);
                 Some(false)
             }
             Err(RingError::Lost(why)) => {
-                self.lost("ring", header, &why);
+                self.lost("ring", header, &why, now);
                 Some(false)
             }
         }

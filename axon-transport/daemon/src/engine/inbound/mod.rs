@@ -20,7 +20,7 @@ use std::{
     collections::{BTreeSet, HashMap, HashSet, VecDeque},
     rc::Rc,
     sync::Arc,
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use axon_envelope::{Kind, Route};
@@ -55,6 +55,8 @@ const LONG: usize = 32 << 10;
 const TURN: usize = 1 << 20;
 /// A stream whose ring was full tries again after this time, if no reader said that it made room.
 const FULL_RETRY: Duration = Duration::from_millis(100);
+/// Why samples are lost that a link had not carried whole.
+const ENDED: &str = "the link ended before they were read";
 /// What a stream is told whose route there is not.
 const NO_ROUTE: VarInt = VarInt::from_u32(CloseCode::OutOfOrder as u32);
 
@@ -274,14 +276,14 @@ impl Inbound {
     }
 
     /// A link is over: what of its streams was not read is lost.
-    pub(crate) fn link_over(&mut self, link: u64) {
+    pub(crate) fn link_over(&mut self, link: u64, now: Duration) {
         let keys: Vec<_> = self.streams.keys().filter(|(of, _)| *of == link).copied().collect();
         for key in keys {
             let stream = self.streams.get(&key);
             let lost = stream
                 .filter(|s| matches!(s.step, Step::Ring(_) | Step::Writer(..) | Step::Unpack(..)));
             if let Some((header, _)) = lost.and_then(|stream| stream.header) {
-                self.lost("no_link", header, "the link ended before they were read");
+                self.lost("no_link", header, ENDED, now);
             }
             self.forget(key);
         }
@@ -328,10 +330,10 @@ impl Inbound {
         route.map_or_else(|| "(a route that ended)".into(), |route| Arc::clone(&route.topic))
     }
 
-    fn lost(&self, cause: &'static str, header: StreamHeader, why: &str) {
+    fn lost(&self, cause: &'static str, header: StreamHeader, why: &str, now: Duration) {
         let topic = self.topic(header.route);
         self.counters.lost(&topic, cause, 1);
-        if let Some(samples) = self.losses.count(Instant::now()) {
+        if let Some(samples) = self.losses.count(now) {
             tracing::warn!(%topic, publisher = %header.of, why, samples, "samples from a peer are lost");
         }
     }

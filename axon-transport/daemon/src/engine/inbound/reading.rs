@@ -7,7 +7,7 @@ use axon_shm::{Meta, ids::Gid};
 use bytes::Bytes;
 
 use super::{
-    ARRIVAL, Inbound, Key, LONG, NO_ROUTE, TURN, Violation,
+    ARRIVAL, ENDED, Inbound, Key, LONG, NO_ROUTE, TURN, Violation,
     incoming::{HEADER, Incoming, Message, Piece, Step, StreamHeader},
 };
 use crate::{
@@ -222,7 +222,7 @@ impl Inbound {
             return Ok(Next::Go);
         }
         let Some((opened, payload)) = open_body(open, body, route, now).map_err(refused)? else {
-            self.lost("no_link", header, "the link ended before they were read");
+            self.lost("no_link", header, ENDED, now);
             self.release(stream);
             return Ok(Next::Go);
         };

@@ -6,7 +6,7 @@ use axon_envelope::{Kind, Route};
 use bytes::{Buf, Bytes};
 
 use super::{
-    Inbound, Key, LONG, RouteIn, Violation,
+    ENDED, Inbound, Key, LONG, RouteIn, Violation,
     incoming::{Incoming, Message, Step, StreamHeader},
     reading::{Next, malformed, permit_short, refused, told},
 };
@@ -107,7 +107,7 @@ impl Inbound {
                     envelope.extend_from_slice(body);
                     let opened = open.open(envelope, to.route, now).map_err(refused)?;
                     let Some(opened) = opened else {
-                        self.lost("no_link", to.header, "the link ended before they were read");
+                        self.lost("no_link", to.header, ENDED, now);
                         chunk.advance(LENGTH + body.len());
                         continue;
                     };

@@ -1,9 +1,6 @@
 //! Which of several connections with a peer becomes its link, and when a link is renewed.
 
-use std::{
-    net::IpAddr,
-    time::{Duration, SystemTime},
-};
+use std::{net::IpAddr, time::Duration};
 
 use axon_shm::ids::DaemonId;
 use quinn_proto::{Dir, StreamEvent, VarInt};
@@ -58,7 +55,8 @@ impl Links {
             return self.turn_away(number, &hello, why, now);
         }
         let chain = connection.peer_chain();
-        if let Some(why) = self.credentials.distrust(&negotiated, side, Some(&chain)) {
+        if let Some(why) = self.credentials.distrust(&negotiated, side, Some(&chain), (self.wall)())
+        {
             return self.turn_away(number, &hello, why, now);
         }
         let auth = self.credentials.auth();
@@ -128,7 +126,7 @@ impl Links {
             sealing,
             elected: None,
             age: Age::default(),
-            since: SystemTime::now(),
+            since: (self.wall)(),
             unread: account.unread.nothing(),
             account,
             chain,
@@ -372,7 +370,12 @@ impl Links {
         for (number, link) in self.table.iter() {
             let Some(peer) = &link.peer else { continue };
             let chain = certificates.then_some(&peer.chain[..]);
-            let why = self.credentials.distrust(&peer.summary.negotiated, link.side, chain);
+            let why = self.credentials.distrust(
+                &peer.summary.negotiated,
+                link.side,
+                chain,
+                (self.wall)(),
+            );
             let why = why.or_else(|| peer.summary.who.renamed(self.credentials.auth().as_ref()));
             untrusted.extend(why.map(|why| (number, why)));
         }

@@ -25,7 +25,7 @@ use std::{
     net::{IpAddr, SocketAddr},
     rc::Rc,
     sync::Arc,
-    time::{Duration, Instant},
+    time::{Duration, Instant, SystemTime},
 };
 
 use axon_shm::ids::DaemonId;
@@ -79,6 +79,7 @@ pub(super) struct Links {
     daemon_key: Option<Arc<DaemonKey>>,
     qlogs: Option<Rc<dyn Qlogs>>,
     epoch: Instant,
+    wall: WallClock,
     accounts: Accounts,
     connections: Connections,
     table: Table,
@@ -94,6 +95,9 @@ pub(super) struct Links {
     outbox: Outbox,
     looks: Looks,
 }
+
+/// Tells the wall-clock time.
+pub(crate) type WallClock = Rc<dyn Fn() -> SystemTime>;
 
 /// The parts of [`Links`] that the daemon, or a simulation, makes.
 pub(crate) struct LinkParts {
@@ -113,6 +117,8 @@ pub(crate) struct LinkParts {
     pub(crate) qlogs: Option<Rc<dyn Qlogs>>,
     /// When the engine's time was zero.
     pub(crate) epoch: Instant,
+    /// The wall clock. It dates the beginnings of links and ends pins, and decides nothing else.
+    pub(crate) wall: WallClock,
 }
 
 impl Links {
@@ -123,7 +129,7 @@ impl Links {
     pub(super) fn new(parts: LinkParts) -> Result<Self, GatewayError> {
         let LinkParts { config, credentials, hello, daemon_key, .. } = parts;
         let (addresses, endpoint) = (parts.addresses, parts.endpoint);
-        let (qlogs, epoch) = (parts.qlogs, parts.epoch);
+        let (qlogs, epoch, wall) = (parts.qlogs, parts.epoch, parts.wall);
         let keyring = Keyring::new(&config);
         let unspecified = IpAddr::from([0, 0, 0, 0]);
         let resolver = keyring.as_ref().map(|keys| keys.resolver(Duration::ZERO, unspecified));
@@ -137,6 +143,7 @@ impl Links {
             daemon_key,
             qlogs,
             epoch,
+            wall,
             connections: Connections::new(Endpoints::new(&addresses, &endpoint, &server), epoch),
             table: Table::default(),
             dials: Dials::default(),

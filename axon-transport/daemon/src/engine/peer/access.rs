@@ -4,7 +4,7 @@ use std::{
     collections::{BTreeMap, BTreeSet},
     rc::Rc,
     sync::Arc,
-    time::Instant,
+    time::Duration,
 };
 
 use axon_shm::ids::{DaemonId, Gid};
@@ -125,24 +125,25 @@ impl PeerAccess {
         &mut self,
         peer: DaemonId,
         endpoints: impl Iterator<Item = &'a Endpoint>,
+        now: Duration,
     ) -> Vec<Message> {
         let uses = endpoints.filter_map(|e| Some((verb_of(e.kind)?, e.topic.as_str())));
         // Those that the peer was told of stay: it would take one that is not named any more for allowed.
         let told: BTreeSet<_> =
             self.here.keys().map(|(verb, name)| (*verb, name.as_str())).collect();
-        let (mut now, mut new) = (BTreeSet::new(), BTreeSet::new());
+        let (mut known, mut new) = (BTreeSet::new(), BTreeSet::new());
         for used in uses {
             if told.contains(&used) {
-                now.insert(used);
+                known.insert(used);
             } else if new.len() < self.places.most() {
                 new.insert(used);
             }
         }
         let lifted: Vec<Use> = {
-            let gone = |(verb, name): &&Use| !now.contains(&(*verb, name.as_str()));
+            let gone = |(verb, name): &&Use| !known.contains(&(*verb, name.as_str()));
             self.here.keys().filter(gone).cloned().collect()
         };
-        let anew = std::mem::take(&mut self.changed).then_some(now).into_iter().flatten();
+        let anew = std::mem::take(&mut self.changed).then_some(known).into_iter().flatten();
         let judged: Vec<Use> =
             anew.chain(new).map(|(verb, name)| (verb, name.to_owned())).collect();
         // What goes makes room for what comes.
@@ -170,7 +171,7 @@ impl PeerAccess {
             denied.push(message(&used, &reason));
         }
         if let Some(first) = denied.first()
-            && let Some(uses) = self.logged.count(Instant::now())
+            && let Some(uses) = self.logged.count(now)
         {
             let (verb, name) = (VERBS[usize::from(first.verb)].name(), &first.name);
             tracing::warn!(%peer, verb, name, why = first.reason, uses,
@@ -186,12 +187,17 @@ impl PeerAccess {
     }
 
     /// The peer tells what is denied there. Returns what is not any more.
-    pub(super) fn handle_denied(&mut self, peer: DaemonId, denied: Denied) -> Vec<Use> {
+    pub(super) fn handle_denied(
+        &mut self,
+        peer: DaemonId,
+        denied: Denied,
+        now: Duration,
+    ) -> Vec<Use> {
         let used = |of: DeniedUse| (VERBS[usize::from(of.verb.min(3))], of.name);
         for mut denied in denied.denied {
             let reason = shown(&std::mem::take(&mut denied.reason));
             let used = used(denied);
-            if let Some(uses) = self.logged.count(Instant::now()) {
+            if let Some(uses) = self.logged.count(now) {
                 let (verb, name) = (used.0.name(), &used.1);
                 tracing::warn!(%peer, verb, name, why = reason, uses,
                     "access rules of a peer deny endpoints of this host; `axon status` names them");
@@ -300,7 +306,7 @@ mod tests {
         let [mut one, mut other] = [(); 2].map(|()| PeerAccess::new(permissions.clone(), &account));
         let daemons = [DaemonId([1; 16]), DaemonId([2; 16])];
         let set = |access: &mut PeerAccess, daemon, names| {
-            said(&access.set_denied(daemon, publishers(names).iter()))
+            said(&access.set_denied(daemon, publishers(names).iter(), Duration::ZERO))
         };
         assert_eq!(set(&mut one, daemons[0], 0..700), (700, 0));
         assert_eq!(set(&mut other, daemons[1], 0..700), (324, 0));

@@ -105,7 +105,7 @@ impl Peer {
         let unanswered = self.leave_out_unanswered(&mut wanted, with, now);
         self.want(wanted, &unanswered, with, now);
         for key in &unanswered {
-            self.does_not_ask(key, NOT_TAKEN);
+            self.does_not_ask(key, NOT_TAKEN, now);
         }
         self.feed_services(now);
     }
@@ -144,7 +144,7 @@ impl Peer {
         }
         for (key, wanted) in wanted {
             if self.asked.len() >= self.serves && !self.asked.contains_key(&key) {
-                self.does_not_ask(&key, TOO_MANY_ASKED);
+                self.does_not_ask(&key, TOO_MANY_ASKED, now);
                 continue;
             }
             self.want_one(key, wanted, with, now);
@@ -237,12 +237,12 @@ impl Peer {
                 continue;
             }
             let Some(place) = asked.room.charge(1) else {
-                self.does_not_ask(key, TOO_MANY_WRITERS);
+                self.does_not_ask(key, TOO_MANY_WRITERS, now);
                 asked.incomplete = true;
                 break;
             };
             let Some(lanes) = asked.lanes.more(with.writers.read_by_stand_in(key)) else {
-                self.does_not_ask(key, TOO_MANY_LANES);
+                self.does_not_ask(key, TOO_MANY_LANES, now);
                 asked.incomplete = true;
                 break;
             };
@@ -254,7 +254,7 @@ impl Peer {
                     fresh = true;
                 }
                 Err(NoStandIn::TooMany) => {
-                    self.does_not_ask(key, TOO_MANY_WRITERS);
+                    self.does_not_ask(key, TOO_MANY_WRITERS, now);
                     asked.incomplete = true;
                     break;
                 }
@@ -262,7 +262,7 @@ impl Peer {
                     asked.incomplete = true;
                     let topic = &key.topic;
                     tracing::error!(topic, error, "could not open a stand-in for a remote writer");
-                    self.does_not_ask(key, NO_STAND_IN);
+                    self.does_not_ask(key, NO_STAND_IN, now);
                 }
             }
         }

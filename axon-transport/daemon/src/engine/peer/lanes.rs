@@ -73,12 +73,12 @@ impl Peer {
         for (number, had, key, sources) in without {
             let why = missing(had - sources.len(), had, TOO_MANY_LANES);
             self.outbound.set_sources(number, sources, now);
-            self.refuse(number, &key, why, Some(ASK_AGAIN));
+            self.refuse(number, &key, why, Some(ASK_AGAIN), now);
         }
-        self.fit_stand_ins(with);
+        self.fit_stand_ins(with, now);
     }
 
-    fn fit_stand_ins(&mut self, with: &Surroundings<'_>) {
+    fn fit_stand_ins(&mut self, with: &Surroundings<'_>, now: Duration) {
         let mut without = Vec::new();
         for (key, asked) in &mut self.asked {
             let (each, had) = (with.writers.read_by_stand_in(key), asked.stand_ins.len());
@@ -94,7 +94,7 @@ impl Peer {
             {
                 route.writers.retain(|gid, _| asked.stand_ins.contains_key(gid));
             }
-            self.does_not_ask(&key, TOO_MANY_LANES);
+            self.does_not_ask(&key, TOO_MANY_LANES, now);
             self.inbound.handle_routes();
         }
     }

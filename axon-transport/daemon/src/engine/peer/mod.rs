@@ -260,14 +260,14 @@ impl Peer {
             Message::Received(received) => self.outbound.handle_received(&received.flows),
             Message::RouteRefused(refused) => self.handle_route_refused(refused, now),
             Message::Denied(denied) => {
-                let allowed = self.access.handle_denied(self.daemon, denied);
+                let allowed = self.access.handle_denied(self.daemon, denied, now);
                 self.ask_for_allowed(&allowed);
             }
             Message::AccessCheck(check) => {
                 let answer = self.access.answer(&check);
                 self.say(answer);
             }
-            Message::RouteUnasked(unasked) => self.handle_route_unasked(unasked),
+            Message::RouteUnasked(unasked) => self.handle_route_unasked(unasked, now),
             Message::RouteReady(ready) => {
                 self.handle_route_ready(ready.route);
                 tracing::debug!(peer = %self.daemon, route = ready.route,
@@ -303,7 +303,12 @@ impl Peer {
     }
 
     /// Replaces the access rules. Routes that they deny end at once; the graphs follow.
-    pub(super) fn set_permissions(&mut self, permissions: Permissions, config: &Config) {
+    pub(super) fn set_permissions(
+        &mut self,
+        permissions: Permissions,
+        config: &Config,
+        now: Duration,
+    ) {
         self.access.set_permissions(permissions.clone());
         self.remote.set_permissions(permissions);
         let ending = std::mem::take(&mut self.ending);
@@ -315,7 +320,7 @@ impl Peer {
         let ended = self.served.iter().filter_map(|(route, s)| Some((route, denied(s)?)));
         for (route, (key, why)) in ended.collect::<Vec<_>>() {
             self.unserve(route);
-            self.refuse(route, &key, why, Some(DENIED_AGAIN));
+            self.refuse(route, &key, why, Some(DENIED_AGAIN), now);
         }
         self.renew_limits(config);
     }
@@ -332,8 +337,8 @@ impl Peer {
     }
 
     /// Tells the peer which of its endpoints access rules deny, if that changed.
-    fn tell_denied(&mut self) {
-        let messages = self.access.set_denied(self.daemon, self.remote.denied());
+    fn tell_denied(&mut self, now: Duration) {
+        let messages = self.access.set_denied(self.daemon, self.remote.denied(), now);
         messages.into_iter().for_each(|message| self.say(message));
     }
 
@@ -421,7 +426,7 @@ impl Peer {
 
     /// The peer's graph changed, and this host follows.
     pub(super) fn handle_remote_graph(&mut self, with: &Surroundings<'_>, now: Duration) {
-        self.tell_denied();
+        self.tell_denied(now);
         // Sessions there may list this host now, or no longer.
         self.send_graph(with.local, false);
         self.update(with, now);

@@ -3,7 +3,7 @@
 use std::{
     collections::{BTreeMap, BTreeSet},
     rc::Rc,
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use axon_envelope::Kind;
@@ -95,8 +95,8 @@ impl RefusedRoutes {
         Some(Reason { text, _charge: Some(charge) })
     }
 
-    fn log(&self, key: &RouteKey, why: &str) {
-        if let Some(routes) = self.logged.count(Instant::now()) {
+    fn log(&self, key: &RouteKey, why: &str, now: Duration) {
+        if let Some(routes) = self.logged.count(now) {
             let topic = &key.topic;
             tracing::warn!(topic, why, routes, "routes are refused; `axon status` names them");
         }
@@ -158,9 +158,9 @@ impl RefusedRoutes {
 
 impl Peer {
     /// This side does not ask for a route, or not for all of it. The peer is told why.
-    pub(super) fn does_not_ask(&mut self, key: &RouteKey, why: &'static str) {
+    pub(super) fn does_not_ask(&mut self, key: &RouteKey, why: &'static str, now: Duration) {
         if self.refused.unasked.insert(key.clone(), why) != Some(why) {
-            self.refused.log(key, why);
+            self.refused.log(key, why, now);
             self.say(unasked(key, Some(why)));
         }
     }
@@ -193,14 +193,14 @@ impl Peer {
     }
 
     /// The peer does not ask for a route, or asks for it after all.
-    pub(super) fn handle_route_unasked(&mut self, message: RouteUnasked) {
+    pub(super) fn handle_route_unasked(&mut self, message: RouteUnasked, now: Duration) {
         let RouteUnasked { topic, type_name, kind, reason } = message;
         let Some(kind) = kind_of(kind) else { return };
         let key = RouteKey { kind, topic, type_name };
         self.refused.unwanted.remove(&key);
         if let Some(reason) = reason {
             let reason = shown(&reason);
-            self.refused.log(&key, &reason);
+            self.refused.log(&key, &reason, now);
             let reason = self.refused.remember(&key, reason);
             self.refused.unwanted.extend(reason.map(|reason| (key, reason)));
         }
@@ -213,13 +213,14 @@ impl Peer {
         key: &RouteKey,
         reason: String,
         retry: Option<Duration>,
+        now: Duration,
     ) {
         self.say(Message::RouteRefused(RouteRefused {
             route: number,
             reason: reason.clone(),
             retry_s: retry.map(|retry| u32::try_from(retry.as_secs().max(1)).unwrap_or(u32::MAX)),
         }));
-        self.refused.log(key, &reason);
+        self.refused.log(key, &reason, now);
         self.refused.refused(number, key, reason);
     }
 
@@ -228,7 +229,7 @@ impl Peer {
         let RouteRefused { route, reason, retry_s } = refused;
         let Some(key) = self.numbers.get(&route).cloned() else { return };
         let reason = shown(&reason);
-        self.refused.log(&key, &reason);
+        self.refused.log(&key, &reason, now);
         let again = retry_s.map(|seconds| now + Duration::from_secs(seconds.into()));
         self.refused.unserved(key, reason, again);
     }

@@ -98,7 +98,7 @@ impl Peer {
             None => {
                 if self.served.len() >= MAX_ROUTES {
                     let why = format!("a peer is served {MAX_ROUTES} routes at most, and has them");
-                    self.refuse(number, &key, why, None);
+                    self.refuse(number, &key, why, None, now);
                     return Ok(());
                 }
                 (Vec::new(), account.relays.nothing(), account.lanes.nothing())
@@ -106,12 +106,12 @@ impl Peer {
         };
         if let Some(why) = self.access.denial(reader_of(kind), &key.topic) {
             self.outbound.end_route(number);
-            self.refuse(number, &key, why, Some(DENIED_AGAIN));
+            self.refuse(number, &key, why, Some(DENIED_AGAIN), now);
             return Ok(());
         }
         if let Some(left) = with.stalls.borrow().left(&self.identity, &key, with.instant(now)) {
             self.outbound.end_route(number);
-            self.refuse(number, &key, "it was not read".into(), Some(left));
+            self.refuse(number, &key, "it was not read".into(), Some(left), now);
             return Ok(());
         }
         let room = &self.remote.account().routes;
@@ -119,7 +119,7 @@ impl Peer {
         let Some(charge) = charge else {
             self.outbound.end_route(number);
             let why = format!("what a peer asks for takes more than {most} MiB ([link] graph_mb)");
-            self.refuse(number, &key, why, None);
+            self.refuse(number, &key, why, None, now);
             return Ok(());
         };
         self.refused.forget(number);
@@ -213,7 +213,7 @@ impl Peer {
             Stall::NoKeys => format!("a KME gave no keys for {topic}, and its publisher waited"),
         };
         let reason = format!("{what}; it is not sent for {again} s ([link] stalled_s)");
-        self.refuse(route, key, reason.clone(), Some(wait));
+        self.refuse(route, key, reason.clone(), Some(wait), now);
         Some(StalledRoute { topic: served.key.topic.clone(), reason, samples })
     }
 
@@ -360,7 +360,7 @@ impl Peer {
                 && let Some((reason, again)) = served.without.clone()
             {
                 let key = served.key.clone();
-                self.refuse(number, &key, reason, again);
+                self.refuse(number, &key, reason, again, now);
             }
         }
     }

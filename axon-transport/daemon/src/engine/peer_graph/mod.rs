@@ -11,6 +11,7 @@ use std::{
     collections::{BTreeMap, BTreeSet},
     rc::Rc,
     sync::Arc,
+    time::Duration,
 };
 
 use axon_shm::ids::{DaemonId, Gid};
@@ -175,7 +176,13 @@ impl Remote {
     }
 
     /// Takes what the peer's daemon proves on the connection that `binding` is of.
-    pub(crate) fn prove(&mut self, proofs: &[Proof], binding: &Binding, from: DaemonId) {
+    pub(crate) fn prove(
+        &mut self,
+        proofs: &[Proof],
+        binding: &Binding,
+        from: DaemonId,
+        now: Duration,
+    ) {
         let all = &self.all;
         let used = |session: &Prefix| {
             let mut first = [0; 16];
@@ -183,7 +190,7 @@ impl Remote {
             let next = all.range(Gid(first)..).next();
             next.is_some_and(|(gid, _)| prefix_of(gid) == *session)
         };
-        self.proven.take(proofs, binding, from, used);
+        self.proven.take(proofs, binding, from, used, now);
     }
 
     /// Whether the peer may speak for an endpoint of this GID.
@@ -322,6 +329,8 @@ mod tests {
 
     use crate::{engine::account::Accounts, owner::prove};
 
+    const NOW: Duration = Duration::from_secs(1000);
+
     fn endpoint(number: u8, name: &str) -> Endpoint {
         Endpoint::new(Gid([number; 16]), EndpointKind::Publisher, name, "T").with_node("n", "/")
     }
@@ -364,16 +373,16 @@ mod tests {
                 false,
             )
         };
-        remote.prove(&[prove(&key, &first, from).unwrap()], &first, from);
+        remote.prove(&[prove(&key, &first, from).unwrap()], &first, from, NOW);
         remote.take(all());
         assert_eq!((remote.left_out(), changes(&mut remote).0.len()), (0, 1));
         remote.succeed();
         assert!(!remote.owns(&own));
         // The old proof is of the other connection.
-        remote.prove(&[prove(&key, &first, from).unwrap()], &second, from);
+        remote.prove(&[prove(&key, &first, from).unwrap()], &second, from, NOW);
         remote.take(all());
         assert_eq!((remote.left_out(), changes(&mut remote).1.len()), (1, 1));
-        remote.prove(&[prove(&key, &second, from).unwrap()], &second, from);
+        remote.prove(&[prove(&key, &second, from).unwrap()], &second, from, NOW);
         remote.take(all());
         assert_eq!((remote.left_out(), changes(&mut remote).0.len()), (0, 1));
     }
@@ -466,9 +475,9 @@ mod tests {
         let (binding, here) = ([7; 32], DaemonId([1; 16]));
         let mut remote =
             Remote::new(Accounts::new(1 << 20, 1 << 20).of_one("a"), true, Permissions::default());
-        remote.prove(&[prove(&own, &binding, here).unwrap()], &binding, here);
+        remote.prove(&[prove(&own, &binding, here).unwrap()], &binding, here, NOW);
         // The proof of another host, for another connection.
-        remote.prove(&[prove(&others, &[8; 32], here).unwrap()], &binding, here);
+        remote.prove(&[prove(&others, &[8; 32], here).unwrap()], &binding, here, NOW);
         let of = |key: &SessionKey, topic| {
             let mut endpoint = endpoint(0, topic);
             endpoint.gid = Gid::new(key.id(), 1);

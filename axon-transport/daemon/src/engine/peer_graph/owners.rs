@@ -5,7 +5,7 @@ use std::{
     collections::{BTreeSet, HashMap, HashSet},
     rc::Rc,
     sync::Arc,
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use axon_shm::ids::{DaemonId, Gid};
@@ -116,7 +116,7 @@ pub(crate) struct Proven {
     sessions: HashMap<Prefix, Charge>,
     /// Those that were proved since the last GRAPH, which may bring their endpoints.
     fresh: HashMap<Prefix, Charge>,
-    swept: Option<Instant>,
+    swept: Option<Duration>,
 }
 
 impl Proven {
@@ -132,6 +132,7 @@ impl Proven {
         binding: &Binding,
         from: DaemonId,
         used: impl Fn(&Prefix) -> bool,
+        now: Duration,
     ) {
         if !self.needed {
             return;
@@ -142,8 +143,10 @@ impl Proven {
             if self.has(&session) {
                 continue;
             }
-            if self.room.left() == 0 && self.swept.is_none_or(|swept| swept.elapsed() >= SWEEP) {
-                self.swept = Some(Instant::now());
+            if self.room.left() == 0
+                && self.swept.is_none_or(|swept| now.saturating_sub(swept) >= SWEEP)
+            {
+                self.swept = Some(now);
                 self.sessions.retain(|session, _| used(session));
             }
             if let Some(charge) = self.room.charge(1)
@@ -191,6 +194,8 @@ mod tests {
         Gid::new(key.id(), 3)
     }
 
+    const NOW: Duration = Duration::from_secs(1000);
+
     fn proof(key: &SessionKey) -> Proof {
         prove(key, &BINDING, HERE).unwrap()
     }
@@ -220,10 +225,10 @@ mod tests {
         let mut one = full_of([]);
         let mut other = Proven::new(true, Rc::clone(&one.room));
         let (first, second) = (key(), key());
-        other.take(&[proof(&first)], &BINDING, HERE, |_| true);
+        other.take(&[proof(&first)], &BINDING, HERE, |_| true, NOW);
         assert!(!other.owns(&gid(&first)), "the other id has them all");
         one.succeed();
-        other.take(&[proof(&second)], &BINDING, HERE, |_| true);
+        other.take(&[proof(&second)], &BINDING, HERE, |_| true, NOW);
         assert!(other.owns(&gid(&second)));
         assert_eq!(one.room.held(), 1);
     }
@@ -233,7 +238,7 @@ mod tests {
         let (used, new) = (key(), key());
         let mut proven = full_of([prefix(&used.id())]);
         let is_used = |session: &Prefix| *session == prefix(&used.id());
-        proven.take(&[proof(&new)], &BINDING, HERE, is_used);
+        proven.take(&[proof(&new)], &BINDING, HERE, is_used, NOW);
         assert!(proven.owns(&gid(&used)) && proven.owns(&gid(&new)));
         assert_eq!(proven.sessions.len(), 1);
     }
@@ -243,7 +248,7 @@ mod tests {
         let (used, new) = (key(), key());
         let mut proven = full_of([prefix(&used.id())]);
         for _ in 0..3 {
-            proven.take(&[proof(&new)], &BINDING, HERE, |_| true);
+            proven.take(&[proof(&new)], &BINDING, HERE, |_| true, NOW);
         }
         assert!(proven.owns(&gid(&used)) && !proven.owns(&gid(&new)));
         assert_eq!(proven.sessions.len() + proven.fresh.len(), MAX_PROVEN);
@@ -253,10 +258,10 @@ mod tests {
     fn what_is_proved_before_its_endpoints_come_is_not_swept() {
         let (first, second) = (key(), key());
         let mut proven = full_of([]);
-        proven.take(&[proof(&first), proof(&second)], &BINDING, HERE, |_| false);
+        proven.take(&[proof(&first), proof(&second)], &BINDING, HERE, |_| false, NOW);
         proven.swept = None;
         fill(&mut proven);
-        proven.take(&[proof(&key())], &BINDING, HERE, |_| false);
+        proven.take(&[proof(&key())], &BINDING, HERE, |_| false, NOW);
         assert!(proven.owns(&gid(&first)) && proven.owns(&gid(&second)));
         proven.settle();
         assert!(proven.fresh.is_empty() && proven.owns(&gid(&first)));
@@ -265,7 +270,7 @@ mod tests {
     #[test]
     fn where_nothing_is_proved_nothing_is_kept() {
         let mut proven = Proven::new(false, Meter::new(MAX_PROVEN));
-        proven.take(&[proof(&key())], &BINDING, HERE, |_| true);
+        proven.take(&[proof(&key())], &BINDING, HERE, |_| true, NOW);
         assert!(proven.sessions.is_empty() && proven.fresh.is_empty());
         assert!(proven.owns(&gid(&key())));
     }

@@ -3,7 +3,7 @@
 pub(crate) mod connection;
 pub(crate) mod control_stream;
 pub(crate) mod endpoints;
-mod marks;
+pub(super) mod marks;
 pub(crate) mod qlog;
 pub(crate) mod tls_settings;
 pub(crate) mod transport;

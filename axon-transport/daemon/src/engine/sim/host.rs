@@ -160,6 +160,10 @@ impl Host {
             endpoint: Arc::new(endpoint),
             qlogs: None,
             epoch: self.epoch,
+            wall: {
+                let wall = Rc::clone(&self.rings.wall);
+                Rc::new(move || wall.get())
+            },
         };
         let session_keys = SessionKeys::default();
         session_keys.insert(self.rings.key());

@@ -2,7 +2,10 @@
 
 #![allow(clippy::print_stdout, reason = "a scenario prints its figures")]
 
-use std::time::Duration;
+use std::{
+    rc::Rc,
+    time::{Duration, UNIX_EPOCH},
+};
 
 use axon_shm::qos::Qos;
 use axon_transport::config::{Config, KeyMode};
@@ -191,16 +194,48 @@ fn a_partition_that_outlasts_the_links_heals() {
 }
 
 #[test]
-fn a_clock_that_jumps_changes_nothing() {
-    // The engine is given monotonic time alone: a host whose time starts elsewhere behaves alike.
-    let mut world = World::new(10, 2, classic);
-    world.run_until(secs(10_000));
-    let pair = world.pair(0, 1, "/t", Qos::keep_all());
-    world.until(secs(5), World::is_whole);
-    world.run_for(secs(1));
-    (0..50).for_each(|_| assert!(world.publish(pair, 10)));
-    world.run_for(secs(2));
-    assert_eq!(world.received(pair).len(), 50);
+fn a_wall_clock_that_jumps_on_one_host_changes_nothing() {
+    let year = Duration::from_secs(365 * 24 * 3600);
+    for (mode, config) in modes() {
+        let mut world = World::new(10, 2, config);
+        // Monotonic time begins elsewhere than at zero, too.
+        world.run_until(secs(10_000));
+        let mut short_lived = Qos::keep_all();
+        short_lived.lifespan = Some(secs(1));
+        let pairs = [
+            world.pair(0, 1, "/a", Qos::keep_all()),
+            world.pair(1, 0, "/b", Qos::keep_all()),
+            world.pair(0, 1, "/c", short_lived),
+            world.pair(1, 0, "/d", short_lived),
+        ];
+        world.until(secs(5), World::is_whole);
+        world.run_for(secs(1));
+        let wall = Rc::clone(&world.hosts[1].rings.wall);
+        let today = wall.get();
+        let jumps = [today + year, today, today - year, UNIX_EPOCH, today + year];
+        for (number, time) in (1..).zip(jumps) {
+            let publish = |world: &mut World| {
+                pairs.iter().for_each(|pair| assert!(world.publish(*pair, 10), "{mode}"));
+            };
+            publish(&mut world);
+            wall.set(time);
+            publish(&mut world);
+            world.run_for(secs(2));
+            let arrived = pairs.map(|pair| world.received(pair).len());
+            assert_eq!(arrived, [2 * number; 4], "{mode}, jump {number}: {}", world.describe());
+        }
+        // A handshake between two hosts whose clocks differ by a year.
+        let cut = world.network.partition(&[0], None);
+        world.run_for(secs(150));
+        assert!(!world.is_linked(), "{mode}");
+        world.network.heal(cut);
+        world.until(secs(10), World::is_whole);
+        let since = |host: usize| {
+            let links = world.hosts[host].status.values();
+            links.filter_map(|link| link.since).collect::<Vec<_>>()
+        };
+        assert_eq!((since(0), since(1)), (vec![today], vec![today + year]), "{mode}");
+    }
 }
 
 /// The script of a seed: mixed faults of so many hosts.

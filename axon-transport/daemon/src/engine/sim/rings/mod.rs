@@ -7,6 +7,7 @@ use std::{
     collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
     rc::Rc,
     sync::Arc,
+    time::{Duration, SystemTime, UNIX_EPOCH},
 };
 
 use axon_shm::{
@@ -97,8 +98,12 @@ pub(super) struct SimRings {
     session: SessionId,
     key: Arc<SessionKey>,
     state: Rc<RefCell<State>>,
+    /// What the wall clock of the host shows. Samples are stamped with it.
+    pub(super) wall: Rc<Cell<SystemTime>>,
 }
 
+/// What the wall clock of a new host shows, since 1970: a day in 2026.
+const TODAY: Duration = Duration::from_secs(1_790_000_000);
 /// GIDs of endpoints of a peer without an engine begin with this. Nobody vouches for their samples.
 pub(super) const FOREIGN: [u8; 12] = [0xaa; 12];
 
@@ -147,7 +152,8 @@ impl SimRings {
         let mut seed = [0x51; 32];
         seed[24..].copy_from_slice(&(host as u64).to_be_bytes());
         let key = Arc::new(session_key(&seed));
-        Self { session: key.id(), key, state: Rc::default() }
+        let wall = Rc::new(Cell::new(UNIX_EPOCH + TODAY));
+        Self { session: key.id(), key, state: Rc::default(), wall }
     }
 
     /// The key of the session that has the endpoints.

@@ -107,6 +107,7 @@ impl RingReader for SimReader {
             }
             (samples, bytes) = (samples + 1, bytes + payload.len());
             let mut info = MessageInfo::of(*publisher, sequence);
+            info.source_timestamp = self.rings.wall.get();
             info.lifetime = lifespan.map(|lifespan| Lifetime::new(Duration::ZERO, lifespan));
             each(info, payload.into());
         }
