@@ -17,6 +17,7 @@ mod owner;
 mod reactor;
 #[cfg(test)]
 mod residue;
+mod token_bucket;
 mod watch;
 mod wire;
 

@@ -28,7 +28,7 @@ mod wanted;
 pub(crate) use confidence::AddressConfidence;
 pub(crate) use datagrams::Datagrams;
 pub(crate) use interfaces::{Interface, interfaces};
-pub(crate) use peers::{Arrival, Bucket, Local, Output, Peers};
+pub(crate) use peers::{Arrival, Local, Output, Peers};
 pub(crate) use run::{Event, run};
 pub(crate) use wanted::Wanted;
 

@@ -17,9 +17,11 @@ use tokio::{
 use tracing::{debug, warn};
 
 use super::{
-    Action, AddressConfidence, Arrival, Bucket, Datagrams, Local, Output, Peers, Wanted,
-    interfaces, socket::SharedSocket,
+    Action, AddressConfidence, Arrival, Datagrams, Local, Output, Peers, Wanted, interfaces,
+    socket::SharedSocket,
 };
+
+use crate::token_bucket::TokenBucket;
 
 /// How often interfaces are looked at.
 const INTERFACES_EVERY: Duration = Duration::from_secs(3);
@@ -163,7 +165,7 @@ struct DiscoveryIo {
     peers: Peers,
     socket: Option<SharedSocket>,
     /// What may be looked at there at once.
-    at_once: Bucket,
+    at_once: TokenBucket,
     /// Whether the shared port is used at all.
     multicast: bool,
     domain: u32,
@@ -181,7 +183,7 @@ impl DiscoveryIo {
             start: Instant::now(),
             peers: Peers::new(Local::of(config, daemon), rand::random()),
             socket: None,
-            at_once: Bucket::new(AT_ONCE.0, AT_ONCE.1),
+            at_once: TokenBucket::new(AT_ONCE.0, AT_ONCE.1),
             multicast: false,
             domain: config.domain,
             bind: config.bind_addrs.clone(),

@@ -23,13 +23,13 @@ impl Engine {
         for daemon in stirred {
             let Some(peer) = self.peers.get_mut(daemon) else { continue };
             let account = Rc::clone(peer.remote.account());
-            if !account.turns.borrow_mut().take(self.epoch + now) {
+            if !account.turns.borrow_mut().take(now) {
                 continue;
             }
             peer.stirred = false;
             let endpoints = self.follow_graph(daemon, now) + self.peers.local().len();
             let took = ENDPOINT * u32::try_from(endpoints).unwrap_or(u32::MAX);
-            account.turns.borrow_mut().over(self.epoch + now, self.epoch + now + took);
+            account.turns.borrow_mut().over(now, now + took);
         }
     }
 

@@ -37,7 +37,7 @@ use std::{
     net::{IpAddr, SocketAddr},
     rc::Rc,
     sync::Arc,
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use axon_shm::ids::DaemonId;
@@ -92,7 +92,6 @@ pub(crate) struct Engine {
     peers: Peers,
     factory: PeerFactory,
     session: [u8; 12],
-    epoch: Instant,
     effects: Effects,
     /// A peer let go of endpoints that another one may have claimed.
     freed: bool,
@@ -106,17 +105,16 @@ impl Engine {
     /// The settings make no TLS server.
     pub(crate) fn new(parts: EngineParts) -> Result<Self, GatewayError> {
         let EngineParts { links, rings, session_keys, session, epoch_nanos } = parts;
-        let (config, daemon, epoch) = (Arc::clone(&links.config), links.hello.daemon, links.epoch);
+        let (config, daemon) = (Arc::clone(&links.config), links.hello.daemon);
         let access = config.access.clone();
         let mut links = Links::new(links)?;
         links.set_interface_rules(&access);
         Ok(Self {
-            peers: Peers::new(Arc::clone(&config), rings, epoch),
+            peers: Peers::new(Arc::clone(&config), rings),
             access,
             factory: PeerFactory::new(config, daemon, session_keys, epoch_nanos),
             links,
             session,
-            epoch,
             effects: Effects::default(),
             freed: false,
             reports: Reports::new(),

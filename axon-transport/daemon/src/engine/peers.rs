@@ -5,7 +5,7 @@ use std::{
     collections::{HashMap, hash_map},
     rc::Rc,
     sync::Arc,
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use axon_shm::ids::{DaemonId, Gid};
@@ -33,7 +33,6 @@ pub(super) struct Peers {
     kept: RefCell<KeptRelays>,
     local: Local,
     writers: WritersHere,
-    epoch: Instant,
     waiting_for_room: bool,
     /// Readers with samples to take; kept for its memory.
     active: Vec<(Gid, Gid)>,
@@ -42,8 +41,8 @@ pub(super) struct Peers {
 }
 
 impl Peers {
-    /// No peers yet, and nothing on this host. The engine's time was zero at `epoch`.
-    pub(super) fn new(config: Arc<Config>, rings: Rc<dyn Rings>, epoch: Instant) -> Self {
+    /// No peers yet, and nothing on this host.
+    pub(super) fn new(config: Arc<Config>, rings: Rc<dyn Rings>) -> Self {
         Self {
             all: HashMap::new(),
             config,
@@ -53,7 +52,6 @@ impl Peers {
             kept: RefCell::default(),
             local: Local::new(),
             writers: WritersHere::default(),
-            epoch,
             waiting_for_room: false,
             active: Vec::new(),
             follow_local_at: Duration::ZERO,
@@ -119,17 +117,15 @@ impl Peers {
         daemon: DaemonId,
         act: impl FnOnce(&mut Peer, &Surroundings<'_>) -> T,
     ) -> Option<T> {
-        let Self { all, config, rings, stand_ins, stalls, kept, local, writers, epoch, .. } = self;
-        let with =
-            surroundings(config, &**rings, stand_ins, (stalls, kept), (local, writers), *epoch);
+        let Self { all, config, rings, stand_ins, stalls, kept, local, writers, .. } = self;
+        let with = surroundings(config, &**rings, stand_ins, (stalls, kept), (local, writers));
         all.get_mut(&daemon).map(|peer| act(peer, &with))
     }
 
     /// Has each peer act with what all peers use.
     pub(super) fn with_each(&mut self, mut each: impl FnMut(&mut Peer, &Surroundings<'_>)) {
-        let Self { all, config, rings, stand_ins, stalls, kept, local, writers, epoch, .. } = self;
-        let with =
-            surroundings(config, &**rings, stand_ins, (stalls, kept), (local, writers), *epoch);
+        let Self { all, config, rings, stand_ins, stalls, kept, local, writers, .. } = self;
+        let with = surroundings(config, &**rings, stand_ins, (stalls, kept), (local, writers));
         all.values_mut().for_each(|peer| each(peer, &with));
     }
 
@@ -195,11 +191,11 @@ impl Peers {
         let due = self.all.values().flat_map(|peer| {
             let turn = peer.stirred.then(|| {
                 let account = peer.remote.account();
-                now + account.turns.borrow_mut().wait(self.epoch + now)
+                now + account.turns.borrow_mut().wait(now)
             });
             let more = peer.inbound.has_work().then_some(now);
             let samples = [peer.inbound.poll_timeout(), peer.outbound.poll_timeout()];
-            samples.into_iter().chain([peer.poll_timeout(self.epoch, now), turn, more])
+            samples.into_iter().chain([peer.poll_timeout(now), turn, more])
         });
         due.flatten().chain(self.kept.borrow().poll_timeout()).min()
     }
@@ -208,7 +204,7 @@ impl Peers {
     pub(super) fn handle_timeout(&mut self, now: Duration) {
         self.with_each(|peer, with| {
             peer.inbound.handle_timeout(now);
-            if peer.poll_timeout(with.epoch, now).is_some_and(|due| due <= now) {
+            if peer.poll_timeout(now).is_some_and(|due| due <= now) {
                 peer.handle_timeout(with, now);
             }
         });
@@ -221,7 +217,6 @@ fn surroundings<'a>(
     stand_ins: &'a StandIns,
     (stalls, kept): (&'a RefCell<Stalls>, &'a RefCell<KeptRelays>),
     (local, writers): (&'a Local, &'a WritersHere),
-    epoch: Instant,
 ) -> Surroundings<'a> {
-    Surroundings { rings, stand_ins, local, writers, config, stalls, kept, epoch }
+    Surroundings { rings, stand_ins, local, writers, config, stalls, kept }
 }

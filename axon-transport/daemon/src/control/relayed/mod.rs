@@ -190,7 +190,7 @@ struct RelayedSession {
     left: VecDeque<(Gid, Gid)>,
     /// Those of them that were given up.
     given_up: LogLimit,
-    /// When the session began: log lines are limited by the time since then.
+    /// When the session began: leases and log lines count from there.
     begun: Instant,
     leader: ExternalLeader,
     change_signal: Arc<ChangeSignal>,
@@ -225,7 +225,7 @@ impl RelayedSession {
                 self.match_up()?;
             }
             let leased = self.subscriptions.values().flat_map(Subscription::assertions);
-            for publishers in self.alive.news(Instant::now(), leased) {
+            for publishers in self.alive.news(self.begun.elapsed(), leased) {
                 self.pipe.say(&Message::Asserted(Asserted { publishers }))?;
             }
             self.write()?;
@@ -251,7 +251,7 @@ impl RelayedSession {
                 continue;
             }
             let process = self.process.as_ref().map(AsFd::as_fd);
-            let left = self.alive.left(Instant::now());
+            let left = self.alive.left(self.begun.elapsed());
             self.pipe.sleep(&self.leader, &self.change_signal, process, left);
         }
     }

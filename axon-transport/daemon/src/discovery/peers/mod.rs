@@ -5,7 +5,6 @@
 //! rate-limited. No received datagram closes a link, or prevents a link to a peer that was acceptable before.
 
 mod announcing;
-mod bucket;
 mod candidates;
 mod dialling;
 mod eviction;
@@ -29,7 +28,7 @@ use rand::{RngExt, SeedableRng, rngs::StdRng};
 
 #[cfg(test)]
 use self::dialling::MOST_IN_FLIGHT;
-pub(crate) use self::{bucket::Bucket, local::Local};
+pub(crate) use self::local::Local;
 use self::{
     candidates::LocalAddresses,
     eviction::Victims,
@@ -37,6 +36,8 @@ use self::{
     record::{DialAddress, Record},
 };
 use super::{Action, AddressConfidence, Interface};
+
+use crate::token_bucket::TokenBucket;
 
 /// Most records of peers that are not linked.
 const MOST_UNAUTHENTICATED: usize = 256;
@@ -75,22 +76,22 @@ pub(crate) struct Peers {
     /// When the next beacon goes, and how many of the burst are still to go.
     next_beacon: Option<Duration>,
     burst_left: usize,
-    answers: Bucket,
+    answers: TokenBucket,
     /// For those at addresses that this host knows.
-    known_answers: Bucket,
-    echoes: Bucket,
-    known_echoes: Bucket,
+    known_answers: TokenBucket,
+    echoes: TokenBucket,
+    known_echoes: TokenBucket,
     /// Beacons and goodbyes that are looked at, of strangers and of hosts that this one knows.
-    heard: Bucket,
-    known_heard: Bucket,
-    probes: Bucket,
-    known_probes: Bucket,
+    heard: TokenBucket,
+    known_heard: TokenBucket,
+    probes: TokenBucket,
+    known_probes: TokenBucket,
     asked: Probes,
     /// When a dial became due since they were looked at.
     dials_due: Option<Duration>,
     /// Where links stood, the latest last.
     met: VecDeque<IpAddr>,
-    reports: Bucket,
+    reports: TokenBucket,
     random: StdRng,
     outputs: VecDeque<Output>,
 }
@@ -109,18 +110,18 @@ impl Peers {
             graph: 0,
             next_beacon: None,
             burst_left: 0,
-            answers: Bucket::new(64, 64),
-            known_answers: Bucket::new(64, 64),
-            echoes: Bucket::new(1024, 1024),
-            known_echoes: Bucket::new(1024, 1024),
-            heard: Bucket::new(1024, 1024),
-            known_heard: Bucket::new(1024, 1024),
-            probes: Bucket::new(1024, 1024),
-            known_probes: Bucket::new(1024, 1024),
+            answers: TokenBucket::new(64, 64),
+            known_answers: TokenBucket::new(64, 64),
+            echoes: TokenBucket::new(1024, 1024),
+            known_echoes: TokenBucket::new(1024, 1024),
+            heard: TokenBucket::new(1024, 1024),
+            known_heard: TokenBucket::new(1024, 1024),
+            probes: TokenBucket::new(1024, 1024),
+            known_probes: TokenBucket::new(1024, 1024),
             asked: Probes::new(),
             dials_due: None,
             met: VecDeque::new(),
-            reports: Bucket::new(32, 1),
+            reports: TokenBucket::new(32, 1),
             random: StdRng::seed_from_u64(seed),
             outputs: VecDeque::new(),
         }

@@ -14,16 +14,17 @@ use std::{
     iter,
     rc::{Rc, Weak},
     sync::{Arc, Weak as SharedWeak},
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use axon_shm::internal::Allowance;
 
-use self::pace::{Bucket, Turns};
+use self::pace::Turns;
 use super::{limits::Limits, peer::routes::RouteKey};
 use crate::{
     keys::KeyMessage,
     link::{MAX_INFLATED, Message, is_known, unpacked_length},
+    token_bucket::TokenBucket,
 };
 
 /// Relays that one identity may have here: those of 20,000 topics, and more. Each takes some 4 KiB, and a lane for each
@@ -303,7 +304,7 @@ pub(crate) struct Account {
     pub(crate) limits: Rc<Limits>,
     /// When its changes are followed up.
     pub(crate) turns: Rc<RefCell<Turns>>,
-    said: Rc<RefCell<Bucket>>,
+    said: Rc<RefCell<TokenBucket>>,
 }
 
 impl Account {
@@ -332,7 +333,7 @@ impl Account {
             writers: Rc::default(),
             limits,
             turns: Rc::default(),
-            said: Rc::new(RefCell::new(Bucket::new(SAID.0, SAID.1))),
+            said: Rc::new(RefCell::new(TokenBucket::new(SAID.1, SAID.0))),
         }
     }
 
@@ -352,7 +353,7 @@ impl Account {
     }
 
     /// Counts a control message of this cost. Returns how long the identity has to wait before its next one.
-    pub(crate) fn owe(&self, cost: u32, now: Instant) -> Duration {
+    pub(crate) fn owe(&self, cost: u32, now: Duration) -> Duration {
         self.said.borrow_mut().owe(cost, now)
     }
 }

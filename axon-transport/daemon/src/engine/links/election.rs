@@ -87,8 +87,7 @@ impl Links {
             None
         };
         if let Some(text) = too_many {
-            let instant = self.instant(now);
-            if self.admission.is_news(address.ip(), instant) {
+            if self.admission.is_news(address.ip(), now) {
                 return self.turn_away(number, &hello, text.into(), now);
             }
             self.table.remove(number);
@@ -178,9 +177,8 @@ impl Links {
         let text = "a host at an address that has fewer links takes its place";
         tracing::info!(%newcomer, "{text}");
         let address = links.iter().find(|(_, other)| *other == number).map(|(ip, _)| *ip);
-        let instant = self.instant(now);
         if let Some(address) = address
-            && self.admission.is_news(address, instant)
+            && self.admission.is_news(address, now)
         {
             let peer = self.peer_text(number);
             let kind = self.authenticated(address);

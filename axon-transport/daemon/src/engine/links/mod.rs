@@ -307,9 +307,8 @@ impl Links {
             if matches!(link.phase, Phase::Handshake(..)) {
                 return;
             }
-            let (instant, account) =
-                (self.epoch + now, link.peer.as_ref().map(|peer| Rc::clone(&peer.account)));
-            let owe = |cost| account.as_ref().map_or(Duration::ZERO, |a| a.owe(cost, instant));
+            let account = link.peer.as_ref().map(|peer| Rc::clone(&peer.account));
+            let owe = |cost| account.as_ref().map_or(Duration::ZERO, |a| a.owe(cost, now));
             match connection.control.read(&mut connection.quic, owe, now) {
                 Ok(Input::Message(message, room)) => {
                     self.handle_message(number, *message, room, now);

@@ -19,7 +19,7 @@ use std::{
     collections::{BTreeMap, BTreeSet, HashMap},
     rc::Rc,
     sync::Arc,
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use axon_envelope::Kind;
@@ -440,17 +440,17 @@ impl Peer {
     }
 
     /// When its publishers' liveliness is told.
-    fn alive_due(&self, with_epoch: Instant, now: Duration) -> Option<Duration> {
-        self.alive.left(with_epoch + now).map(|left| now + left)
+    fn alive_due(&self, now: Duration) -> Option<Duration> {
+        self.alive.left(now).map(|left| now + left)
     }
 
-    fn tell_alive(&mut self, epoch: Instant, now: Duration) {
+    fn tell_alive(&mut self, now: Duration) {
         let sources = self.served.iter().flat_map(|(_, served)| &served.sources);
         let asserted = sources.flat_map(|source| match source {
             Source::Relay(_, reader) => reader.assertions(),
             Source::StandIn(_) => Vec::new(),
         });
-        for publishers in self.alive.news(epoch + now, asserted) {
+        for publishers in self.alive.news(now, asserted) {
             self.say(Message::Asserted(Asserted { publishers }));
         }
     }
@@ -466,8 +466,8 @@ impl Peer {
     }
 
     /// When [`handle_timeout`](Self::handle_timeout) is due, besides its samples.
-    pub(super) fn poll_timeout(&self, epoch: Instant, now: Duration) -> Option<Duration> {
-        let alive = self.alive_due(epoch, now);
+    pub(super) fn poll_timeout(&self, now: Duration) -> Option<Duration> {
+        let alive = self.alive_due(now);
         let (attaching, announcing) = (self.look_at_attaching, self.served.poll_timeout());
         let (resync, asks) = (self.told.poll_timeout(), self.refused.poll_timeout());
         let unanswered = self.unanswered.poll_timeout();
@@ -478,7 +478,7 @@ impl Peer {
     pub(super) fn handle_timeout(&mut self, with: &Surroundings<'_>, now: Duration) {
         self.ask_for_attached(now);
         self.announce_ready(now);
-        self.tell_alive(with.epoch, now);
+        self.tell_alive(now);
         self.ask_again(now);
         self.look_at_unanswered(with, now);
         if self.told.owes_resync() {

@@ -109,7 +109,7 @@ impl Peer {
             self.refuse(number, &key, why, Some(DENIED_AGAIN), now);
             return Ok(());
         }
-        if let Some(left) = with.stalls.borrow().left(&self.identity, &key, with.instant(now)) {
+        if let Some(left) = with.stalls.borrow().left(&self.identity, &key, now) {
             self.outbound.end_route(number);
             self.refuse(number, &key, "it was not read".into(), Some(left), now);
             return Ok(());
@@ -204,8 +204,7 @@ impl Peer {
         let served = self.served.remove(route)?;
         let samples = self.outbound.give_up_route(route);
         let (limit, key) = (with.config.link.stalled, &served.key);
-        let instant = with.instant(now);
-        let wait = with.stalls.borrow_mut().add(&self.identity, key, limit, instant);
+        let wait = with.stalls.borrow_mut().add(&self.identity, key, limit, now);
         let (topic, again) = (&key.topic, wait.as_secs());
         let what = match why {
             Stall::NothingRead => format!("nothing of {topic} was read for {} s", limit.as_secs()),

@@ -1,11 +1,7 @@
 //! Remembers peers that asked for a topic and stopped reading it, and how long they wait before they are
 //! served again. Plain data in, data out.
 
-use std::{
-    collections::HashMap,
-    rc::Rc,
-    time::{Duration, Instant},
-};
+use std::{collections::HashMap, rc::Rc, time::Duration};
 
 use super::routes::RouteKey;
 use crate::engine::account::{Charge, Meter};
@@ -30,7 +26,7 @@ const SWEEP: Duration = Duration::from_secs(1);
 pub(crate) struct Stalls {
     of: HashMap<String, OfPeer>,
     room: Rc<Meter>,
-    swept: Option<Instant>,
+    swept: Option<Duration>,
 }
 
 /// The stalls of one peer.
@@ -45,21 +41,21 @@ struct OfPeer {
 #[derive(Clone, Copy, Debug)]
 struct Stall {
     wait: Duration,
-    until: Instant,
+    until: Duration,
     /// When nothing is known of it any more.
-    forgiven: Instant,
+    forgiven: Duration,
 }
 
 impl Stall {
     /// A peer stalled, and this is what was known of it.
-    fn after(before: Option<Self>, limit: Duration, now: Instant) -> Self {
+    fn after(before: Option<Self>, limit: Duration, now: Duration) -> Self {
         let before = before.filter(|before| !before.is_forgiven(now));
         let wait = before.map_or(limit, |before| (before.wait * 2).min(LONGEST.max(limit)));
         let until = now + wait;
         Self { wait, until, forgiven: until + FORGIVEN.0.max(limit * FORGIVEN.1) }
     }
 
-    fn is_forgiven(&self, now: Instant) -> bool {
+    fn is_forgiven(&self, now: Duration) -> bool {
         now >= self.forgiven
     }
 }
@@ -71,7 +67,7 @@ impl OfPeer {
     }
 
     /// When the last wait is over.
-    fn until(&self) -> Option<Instant> {
+    fn until(&self) -> Option<Duration> {
         let routes = self.routes.values().map(|(stall, _)| stall);
         routes.chain(&self.others).map(|stall| stall.until).max()
     }
@@ -90,7 +86,7 @@ impl Stalls {
         who: &str,
         key: &RouteKey,
         limit: Duration,
-        now: Instant,
+        now: Duration,
     ) -> Duration {
         self.sweep(now);
         if self.of.len() >= PEERS && !self.of.contains_key(who) {
@@ -115,7 +111,7 @@ impl Stalls {
     }
 
     /// Forgets what is forgiven.
-    fn sweep(&mut self, now: Instant) {
+    fn sweep(&mut self, now: Duration) {
         if self.swept.is_some_and(|swept| now < swept + SWEEP) {
             return;
         }
@@ -128,9 +124,9 @@ impl Stalls {
     }
 
     /// How long this peer is not served this yet.
-    pub(crate) fn left(&self, who: &str, key: &RouteKey, now: Instant) -> Option<Duration> {
+    pub(crate) fn left(&self, who: &str, key: &RouteKey, now: Duration) -> Option<Duration> {
         let stall = self.of.get(who)?.get(key)?;
-        Some(stall.until.saturating_duration_since(now)).filter(|left| !left.is_zero())
+        Some(stall.until.saturating_sub(now)).filter(|left| !left.is_zero())
     }
 }
 
@@ -140,6 +136,8 @@ mod tests {
 
     use super::*;
 
+    const NOW: Duration = Duration::from_secs(1000);
+
     fn key(number: usize) -> RouteKey {
         RouteKey { kind: Kind::Topic, topic: format!("/{number}"), type_name: "T".into() }
     }
@@ -147,7 +145,7 @@ mod tests {
     #[test]
     fn a_peer_that_stalls_again_waits_twice_as_long_up_to_a_limit_and_is_forgiven() {
         let (mut stalls, ten) = (Stalls::default(), Duration::from_secs(10));
-        let (mut now, mut waits) = (Instant::now(), Vec::new());
+        let (mut now, mut waits) = (NOW, Vec::new());
         for _ in 0..7 {
             let wait = stalls.add("pin arm", &key(0), ten, now);
             assert_eq!(stalls.left("pin arm", &key(0), now), Some(wait));
@@ -166,7 +164,7 @@ mod tests {
     #[test]
     fn a_peer_that_holds_up_as_long_as_it_can_each_time_waits_longer_each_time() {
         let (mut stalls, ten) = (Stalls::default(), Duration::from_secs(10));
-        let (mut now, mut waits) = (Instant::now(), Vec::new());
+        let (mut now, mut waits) = (NOW, Vec::new());
         for _ in 0..7 {
             now += ten * 97;
             let wait = stalls.add("pin arm", &key(0), ten, now);
@@ -178,7 +176,7 @@ mod tests {
 
     #[test]
     fn a_peer_that_stalls_on_very_many_topics_waits_on_all_and_no_other_is_served_sooner() {
-        let (mut stalls, ten, now) = (Stalls::default(), Duration::from_secs(10), Instant::now());
+        let (mut stalls, ten, now) = (Stalls::default(), Duration::from_secs(10), NOW);
         stalls.add("pin leg", &key(0), ten, now);
         for number in 0..60_000 {
             stalls.add("pin arm", &key(number), ten, now);
@@ -200,7 +198,7 @@ mod tests {
 
     #[test]
     fn of_very_many_addresses_those_whose_wait_ends_last_are_remembered() {
-        let (mut stalls, now) = (Stalls::default(), Instant::now());
+        let (mut stalls, now) = (Stalls::default(), NOW);
         for number in 0..PEERS + 10 {
             let at = now + Duration::from_millis(number as u64);
             stalls.add(&format!("address {number}"), &key(0), Duration::from_secs(60), at);

@@ -1,11 +1,6 @@
 //! The parts of the engine that all peers use.
 
-use std::{
-    cell::RefCell,
-    collections::BTreeMap,
-    sync::Arc,
-    time::{Duration, Instant},
-};
+use std::{cell::RefCell, collections::BTreeMap, sync::Arc};
 
 use axon_shm::ids::Gid;
 use axon_transport::{config::Config, graph::Endpoint, internal::graph::EndpointRange};
@@ -32,13 +27,4 @@ pub(crate) struct Surroundings<'a> {
     pub(crate) stalls: &'a RefCell<Stalls>,
     /// Relays that are kept for daemons that are restarted.
     pub(crate) kept: &'a RefCell<KeptRelays>,
-    /// When the engine's time was zero.
-    pub(crate) epoch: Instant,
-}
-
-impl Surroundings<'_> {
-    /// The same time as an instant.
-    pub(super) fn instant(&self, now: Duration) -> Instant {
-        self.epoch + now
-    }
 }

@@ -101,7 +101,7 @@ impl Peer {
             if self.asked.contains_key(key) && !stalled.contains(&responses) {
                 return None;
             }
-            stalls.left(&self.identity, &responses, with.instant(now)).map(|left| now + left)
+            stalls.left(&self.identity, &responses, now).map(|left| now + left)
         };
         let requests = wanted.keys().filter(|key| key.kind == Kind::Request);
         let closed: BTreeMap<_, _> =
@@ -169,7 +169,7 @@ impl Peer {
                 continue;
             }
             let responses = key.other_way();
-            with.stalls.borrow_mut().add(&self.identity, &responses, limit, with.instant(now));
+            with.stalls.borrow_mut().add(&self.identity, &responses, limit, now);
             self.counters.dropped("stalled", waiting);
             self.unanswered.stalled.insert(responses);
             found = true;

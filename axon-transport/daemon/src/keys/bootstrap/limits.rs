@@ -6,6 +6,8 @@ use std::{
     time::Duration,
 };
 
+use crate::token_bucket::TokenBucket;
+
 /// Calls in flight for handshakes.
 pub(super) const IN_FLIGHT: usize = 16;
 /// Those of them that only addresses which authenticated before may use.
@@ -13,9 +15,9 @@ pub(super) const KEPT: usize = 8;
 /// Calls in flight for one source and SAE.
 pub(super) const PER_SOURCE: usize = 2;
 /// Calls a second for one SAE.
-const RATE: f64 = 5.0;
+const RATE: u32 = 5;
 /// Calls at once for one SAE.
-const BURST: f64 = 10.0;
+const BURST: u32 = 10;
 
 /// Where a handshake comes from. An IPv6 host has a whole /64 to choose from, so that counts as
 /// one.
@@ -92,42 +94,20 @@ impl ProofBackoff {
 
 /// Token buckets by name. A bucket that is full again is no different from none.
 #[derive(Default)]
-pub(super) struct Buckets(HashMap<String, Bucket>);
-
-struct Bucket {
-    tokens: f64,
-    at: Duration,
-}
+pub(super) struct Buckets(HashMap<String, TokenBucket>);
 
 impl Buckets {
     /// Whether `name` may make another call now. The caller bounds the set of names.
     pub(super) fn take(&mut self, now: Duration, name: &str) -> bool {
-        if !self.0.contains_key(name) {
-            self.0.insert(name.to_owned(), Bucket { tokens: BURST, at: now });
+        if let Some(bucket) = self.0.get_mut(name) {
+            return bucket.take(now);
         }
-        let Some(bucket) = self.0.get_mut(name) else { return false };
-        bucket.refill(now);
-        let allowed = bucket.tokens >= 1.0;
-        if allowed {
-            bucket.tokens -= 1.0;
-        }
-        allowed
+        self.0.entry(name.to_owned()).or_insert(TokenBucket::new(BURST, RATE)).take(now)
     }
 
     /// Drops the full ones.
     pub(super) fn expire(&mut self, now: Duration) {
-        self.0.retain(|_, bucket| {
-            bucket.refill(now);
-            bucket.tokens < BURST
-        });
-    }
-}
-
-impl Bucket {
-    fn refill(&mut self, now: Duration) {
-        let gained = now.saturating_sub(self.at).as_secs_f64() * RATE;
-        self.tokens = (self.tokens + gained).min(BURST);
-        self.at = now;
+        self.0.retain(|_, bucket| !bucket.is_full(now));
     }
 }
 

@@ -39,7 +39,7 @@ use crate::{
     ids::{DaemonId, Gid},
     registry::RelayCounters,
     session::{
-        Session, SessionError, SessionShared,
+        Session, SessionError, SessionShared, clock,
         daemon::{connect::Connected, socket::SocketError},
         local::LocalRegistry,
     },
@@ -232,7 +232,7 @@ impl<'a> RelayConnection<'a> {
                 self.update()?;
             }
             let leased = self.relays.values().flat_map(Relay::assertions);
-            for publishers in self.alive.news(Instant::now(), leased) {
+            for publishers in self.alive.news(Duration::from_nanos(clock::monotonic()), leased) {
                 self.pipe.say(&Message::Asserted(Asserted { publishers }))?;
             }
             let stand_ins = &self.stand_ins;
@@ -276,7 +276,7 @@ impl<'a> RelayConnection<'a> {
             let end = finish_by.map(|by| by.saturating_duration_since(Instant::now()));
             let left = self
                 .alive
-                .left(Instant::now())
+                .left(Duration::from_nanos(clock::monotonic()))
                 .into_iter()
                 .chain(self.settled_in())
                 .chain(self.kept_for())

@@ -2,7 +2,7 @@
 
 mod shares;
 
-use std::{collections::BTreeSet, net::IpAddr, rc::Rc, time::Instant};
+use std::{collections::BTreeSet, net::IpAddr, rc::Rc, time::Duration};
 
 pub(super) use self::shares::Place;
 pub(crate) use self::shares::place;
@@ -45,7 +45,7 @@ impl Admission {
     }
 
     /// Whether a refusal at this address is to be said, which it then was.
-    pub(super) fn is_news(&mut self, address: IpAddr, now: Instant) -> bool {
+    pub(super) fn is_news(&mut self, address: IpAddr, now: Duration) -> bool {
         self.said.is_news(address, now)
     }
 

@@ -8,7 +8,7 @@ use std::{
     collections::{HashMap, VecDeque},
     net::{IpAddr, Ipv6Addr},
     rc::Rc,
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 /// What may be under way beyond that to listed peers.
@@ -105,12 +105,12 @@ pub(crate) fn gives_way(
 
 /// Of which addresses a refusal was said just now.
 #[derive(Debug, Default)]
-pub(crate) struct Said(VecDeque<(IpAddr, Instant)>);
+pub(crate) struct Said(VecDeque<(IpAddr, Duration)>);
 
 impl Said {
     /// Whether it is to be said, which it then was.
-    pub(crate) fn is_news(&mut self, address: IpAddr, now: Instant) -> bool {
-        self.0.retain(|(_, at)| now.saturating_duration_since(*at) < SAID_AGAIN);
+    pub(crate) fn is_news(&mut self, address: IpAddr, now: Duration) -> bool {
+        self.0.retain(|(_, at)| now.saturating_sub(*at) < SAID_AGAIN);
         let at = place(address);
         if self.0.iter().any(|(said, _)| *said == at) || self.0.len() >= MOST_SAID {
             return false;
@@ -123,6 +123,8 @@ impl Said {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    const NOW: Duration = Duration::from_secs(1000);
 
     fn at(last: u8) -> IpAddr {
         [10, 0, 0, last].into()
@@ -168,7 +170,7 @@ mod tests {
 
     #[test]
     fn a_refusal_is_said_once_for_each_address() {
-        let (mut said, now) = (Said::default(), Instant::now());
+        let (mut said, now) = (Said::default(), NOW);
         assert!(said.is_news(at(1), now) && said.is_news(at(2), now));
         assert!(!said.is_news(at(1), now));
         assert!(said.is_news(at(1), now + SAID_AGAIN));
