@@ -26,15 +26,15 @@ use crate::{
         link::{
             dialling::{Action, Dialling},
             failure::{HELLO_TIMEOUT, close_text},
-            opening::{Handshake, Opened, Opening, Refused},
-            target::{Target, UNKNOWN_PSK_IDENTITY},
+            opening::{Handshake, Opened, Opening, RefusedConnection},
+            target::{DialTarget, UNKNOWN_PSK_IDENTITY},
         },
         quic::{endpoints::reaches, tls_settings::tls_cipher, transport::endpoint_config},
         refusal::Refusal,
     },
     error::{EndpointError, GatewayError},
     identity,
-    keys::{Attempt, Exporters},
+    keys::{DialKey, Exporters},
     link::{CloseCode, Hello, Message, Side},
     reactor::bind_daemon,
 };
@@ -49,11 +49,11 @@ const TRIES_UNKNOWN: u32 = 3;
 const TRY_AGAIN: Duration = Duration::from_millis(200);
 
 /// The client's side of an attempt.
-pub(super) struct Dialler {
+pub(super) struct AttemptDialler {
     config: Arc<Config>,
     credentials: Credentials,
     hello: Hello,
-    target: Target,
+    target: DialTarget,
     /// `None` if no bound address reaches the target.
     endpoint: Option<quinn::Endpoint>,
     keys: Option<Keys>,
@@ -61,7 +61,7 @@ pub(super) struct Dialler {
     epoch: Instant,
 }
 
-impl Dialler {
+impl AttemptDialler {
     /// Binds a port and starts the KME client. Must run within a tokio runtime.
     ///
     /// # Errors
@@ -87,7 +87,7 @@ impl Dialler {
             endpoint: bind(&config, target)?,
             config,
             hello,
-            target: Target {
+            target: DialTarget {
                 daemon: None,
                 sae: sae.map(Into::into),
                 addresses: vec![target],
@@ -123,7 +123,7 @@ impl Dialler {
     /// Dials the target: in qkd under a key from the KME, or under this `forged` one.
     pub(super) async fn connect(
         &mut self,
-        forged: Option<&Attempt>,
+        forged: Option<&DialKey>,
     ) -> Result<Connection, Refusal> {
         let own_keys = forged.is_none();
         let (now, target) = (self.now(), self.target.clone());
@@ -196,7 +196,7 @@ impl Dialler {
     }
 
     /// A PSK that the target must refuse.
-    async fn forge(&mut self, bootstrap: Bootstrap) -> Result<Attempt, Refusal> {
+    async fn forge(&mut self, bootstrap: Bootstrap) -> Result<DialKey, Refusal> {
         let now = self.now();
         let (Security::Qkd(qkd), Some(keys), Some(peer)) =
             (&self.config.security, &mut self.keys, &self.target.sae)
@@ -218,7 +218,7 @@ impl Dialler {
         let id = String::from_utf8_lossy(key_id.as_bytes()).into_owned();
         let cipher = tls_cipher(self.config.cipher);
         let psk = derive_psk(key.expose_secret(), &id, &qkd.sae_id, peer, cipher);
-        Ok(Attempt { key_id, psk: Arc::new(psk.map_err(internal)?) })
+        Ok(DialKey { key_id, psk: Arc::new(psk.map_err(internal)?) })
     }
 
     /// Carries a connection through HELLO and the proof of this side's name. Closes it if that fails.
@@ -257,7 +257,7 @@ impl Dialler {
                     let _ = tokio::time::timeout(HELLO_TIMEOUT, control.flush()).await;
                     return Ok((opened, control));
                 }
-                Some(Err(Refused { refusal, close: told })) => {
+                Some(Err(RefusedConnection { refusal, close: told })) => {
                     if let Some((code, told)) = told {
                         close(connection, code, &told);
                     }

@@ -7,7 +7,9 @@ use axon_transport::config::{Config, Security};
 
 use crate::{
     engine::keyring::{Answered, Keyring},
-    keys::{Event, Events, Fetched, Kme, KmeError, Origin, Purpose, Request, UsedKeys},
+    keys::{
+        Event, Events, Fetched, KeyPurpose, Kme, KmeError, KmeRequest, RequestOrigin, UsedKeys,
+    },
 };
 
 /// The keyring and its KME client.
@@ -33,7 +35,7 @@ impl Keys {
     }
 
     /// Hands a request to the KME client.
-    pub(super) fn submit(&mut self, (origin, request): (Origin, Request)) {
+    pub(super) fn submit(&mut self, (origin, request): (RequestOrigin, KmeRequest)) {
         if let Err(answer) = self.kme.submit(origin, request) {
             self.refused.push_back(*answer);
         }
@@ -68,9 +70,9 @@ impl Keys {
         slave: &str,
     ) -> Result<(KeyId, KmeKey), String> {
         let slave = slave.to_owned();
-        let request = Request::Enc { slave, number: 1, purpose: Purpose::Bootstrap };
+        let request = KmeRequest::Enc { slave, number: 1, purpose: KeyPurpose::Bootstrap };
         // The origin of an opening: the keyring passes the answer on. No opening is under way.
-        self.submit((Origin::Proof(0), request));
+        self.submit((RequestOrigin::Proof(0), request));
         loop {
             let event = self.answer().await;
             let Answered::Opening(_, answer) = self.keyring.handle_answer(now, event) else {

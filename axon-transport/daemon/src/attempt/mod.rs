@@ -23,14 +23,14 @@ use quinn::{Connection, SendStream};
 
 use self::{
     control::{Control, Unreadable},
-    dialler::{Dialler, LINK, close},
+    dialler::{AttemptDialler, LINK, close},
 };
 use crate::{
     engine::{
         inbound::StreamHeader,
         link::opening::Opened,
         refusal::Refusal,
-        rings::Sample,
+        rings::RingSample,
         sample::{frames::Frames, protection::Seal},
     },
     error::GatewayError,
@@ -69,16 +69,16 @@ pub enum Tamper {
 }
 
 /// A link that a daemon accepted. It takes messages and keys only during a call.
-pub struct Link {
+pub struct AcceptedLink {
     connection: Connection,
     control: Control,
     opened: Opened,
-    dialler: Dialler,
+    dialler: AttemptDialler,
 }
 
-impl fmt::Debug for Link {
+impl fmt::Debug for AcceptedLink {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Link").field("opened", &self.opened).finish_non_exhaustive()
+        f.debug_struct("AcceptedLink").field("opened", &self.opened).finish_non_exhaustive()
     }
 }
 
@@ -93,18 +93,18 @@ pub async fn link(
     target: SocketAddr,
     sae: Option<&str>,
     bootstrap: Bootstrap,
-) -> Result<Link, Refusal> {
+) -> Result<AcceptedLink, Refusal> {
     let here = |e: GatewayError| Refusal::here(CloseCode::Internal, e);
-    let mut dialler = Dialler::start(config, target, sae).map_err(here)?;
+    let mut dialler = AttemptDialler::start(config, target, sae).map_err(here)?;
     let connection = match bootstrap {
         Bootstrap::Genuine => dialler.connect(None).await?,
         _ => dialler.connect_forged(bootstrap).await?,
     };
     let (opened, control) = dialler.open(&connection).await?;
-    Ok(Link { connection, control, opened, dialler })
+    Ok(AcceptedLink { connection, control, opened, dialler })
 }
 
-impl Link {
+impl AcceptedLink {
     /// What the handshake agreed on.
     pub fn negotiated(&self) -> &Negotiated {
         &self.opened.negotiated
@@ -222,7 +222,7 @@ impl Link {
         let hash = TopicHash::new(domain, topic, type_name).map_err(internal)?;
         let route = Route { kind: Kind::Topic, topic: hash };
         let sample =
-            Sample::new(MessageInfo::of(publisher, 1), b"an attempt".as_slice().into(), now);
+            RingSample::new(MessageInfo::of(publisher, 1), b"an attempt".as_slice().into(), now);
         loop {
             let (now, mut frames) = (self.dialler.now(), Frames::default());
             if let Some(mut seal) = self.protection()

@@ -22,7 +22,7 @@ use tokio::{io::unix::AsyncFd, sync::Notify};
 use super::{
     plane::Control,
     report::send_status,
-    room::{Room, Spare},
+    room::{DescriptorRoom, SpareDescriptors},
     turns::{PART, Turn},
 };
 
@@ -185,7 +185,7 @@ fn send_packets(
 /// Receives one packet. Where descriptors are short, the spare ones make room for those that come with it, so that the
 /// daemon can refuse what the packet asks for.
 pub(super) fn receive(
-    spare: &Spare,
+    spare: &SpareDescriptors,
     socket: &PassedFd,
     buffer: &mut Vec<u8>,
 ) -> Result<Received, SocketError> {
@@ -272,7 +272,7 @@ fn receive_some(
 /// Why the daemon has no descriptor for another segment of a session, if so.
 fn no_room_for_segment(control: &Control, id: &SessionId) -> Option<String> {
     let pid = control.registry.session(id)?.pid;
-    Room::of(&control.registry, pid)?.refuses_segment()
+    DescriptorRoom::of(&control.registry, pid)?.refuses_segment()
 }
 
 async fn ended(death: Option<&AsyncFd<Arc<PassedFd>>>) {

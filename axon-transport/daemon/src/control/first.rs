@@ -15,7 +15,7 @@ use zeroize::Zeroize;
 use super::{
     admission::unshared,
     conversation::{receive, say},
-    room::Spare,
+    room::SpareDescriptors,
 };
 
 /// Messages of unknown types that may come before HELLO.
@@ -47,7 +47,7 @@ impl First {
 /// Waits for HELLO; `None` when something else comes. Where descriptors are short and there is no room for another
 /// session, those of HELLO stay in the socket: its sender could make their closing last.
 pub(super) async fn first(
-    spare: &Spare,
+    spare: &SpareDescriptors,
     socket: &AsyncFd<PassedFd>,
     has_room: impl Fn() -> bool,
 ) -> Option<First> {

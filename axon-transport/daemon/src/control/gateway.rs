@@ -35,13 +35,13 @@ const GOODBYE: Duration = Duration::from_secs(2);
 const STEADY: Duration = Duration::from_secs(60);
 
 /// A gateway that runs, or ran.
-pub(super) struct Running {
+pub(super) struct RunningGateway {
     orders: mpsc::Sender<ToGateway>,
     events: mpsc::Receiver<ToControl>,
     end: oneshot::Receiver<String>,
 }
 
-impl Running {
+impl RunningGateway {
     /// Starts one.
     pub(super) fn start(
         control: &Rc<RefCell<Control>>,

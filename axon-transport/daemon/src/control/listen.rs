@@ -38,7 +38,7 @@ use super::{
     first::{First, first},
     pending::{MOST, MOST_WHERE_SHORT, PendingConnections, Stranger},
     plane::Control,
-    room::Room,
+    room::DescriptorRoom,
     turns::Turn,
 };
 use crate::{
@@ -231,7 +231,7 @@ fn refuse_for_room(
 
 /// Why there are no descriptors for a session, if so. What a tool needs is its connection.
 fn no_room(control: &Control, role: SessionRole, pid: u32, is_relayed: bool) -> Option<String> {
-    let room = Room::of(&control.registry, pid)?;
+    let room = DescriptorRoom::of(&control.registry, pid)?;
     match role {
         SessionRole::Gateway => None,
         SessionRole::Application => room.refuses_session(is_relayed),

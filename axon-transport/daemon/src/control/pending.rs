@@ -17,10 +17,10 @@ pub(super) const MOST_WHERE_SHORT: usize = 8;
 /// Those of all processes. Of too many the process goes short that has the most of them, by the one
 /// that has said nothing for longest: a process that speaks as it connects is not held up by others.
 #[derive(Clone, Debug, Default)]
-pub(super) struct PendingConnections(Rc<RefCell<Waiting>>);
+pub(super) struct PendingConnections(Rc<RefCell<SilentConnection>>);
 
 #[derive(Debug, Default)]
-struct Waiting {
+struct SilentConnection {
     next: u64,
     /// By the order in which they came: the process, and what tells that another one takes its place.
     connections: BTreeMap<u64, (u32, Rc<Notify>)>,
@@ -52,7 +52,7 @@ impl PendingConnections {
     }
 }
 
-impl Waiting {
+impl SilentConnection {
     fn victim(&self) -> Option<u64> {
         let mut of: HashMap<u32, usize> = HashMap::new();
         for (pid, _) in self.connections.values() {

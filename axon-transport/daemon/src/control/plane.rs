@@ -37,13 +37,13 @@ use super::{
         questions::{AccessQuestions, NOT_LINKED},
         waiting::Told,
     },
-    room::Spare,
+    room::SpareDescriptors,
     turns::Turns,
 };
 use crate::{
     bridge::{RefusalKind, RefusedRoute, ToControl, TrafficRules},
     daemon_key::DaemonKey,
-    discovery::Wanted,
+    discovery::DiscoveryNeeds,
     owner::SessionKeys,
 };
 
@@ -63,7 +63,7 @@ pub(super) struct Control {
     told: Told,
     pub(super) refusals: Refusals,
     /// Descriptors for callers that are refused for want of any.
-    pub(super) spare: Rc<Spare>,
+    pub(super) spare: Rc<SpareDescriptors>,
     /// Sessions that were refused for want of descriptors.
     pub(super) crowded_out: u64,
     crowded_log: LogLimit,
@@ -92,7 +92,7 @@ pub(super) struct Control {
     /// Questions about the access rules of peers.
     pub(super) questions: AccessQuestions,
     /// The range and the hosts of discovery: what the widest session needs.
-    pub(super) wanted: watch::Sender<Wanted>,
+    pub(super) wanted: watch::Sender<DiscoveryNeeds>,
     /// The addresses that names of static peers have.
     names: BTreeMap<String, Vec<IpAddr>>,
     /// Where linked peers are.
@@ -107,7 +107,11 @@ pub(super) struct Control {
 }
 
 impl Control {
-    pub(super) fn new(config: Arc<Config>, settings: Vec<(String, String)>, spare: Spare) -> Self {
+    pub(super) fn new(
+        config: Arc<Config>,
+        settings: Vec<(String, String)>,
+        spare: SpareDescriptors,
+    ) -> Self {
         let mut registry = Registry::default();
         registry.set_access(config.access.clone());
         let daemon_key = DaemonKey::generate().map(Arc::new);
@@ -148,7 +152,7 @@ impl Control {
             reload: Rc::default(),
             reload_asked: Vec::new(),
             questions: AccessQuestions::default(),
-            wanted: watch::Sender::new(Wanted::of(&config, [])),
+            wanted: watch::Sender::new(DiscoveryNeeds::of(&config, [])),
             names: BTreeMap::new(),
             linked: BTreeMap::new(),
             wakers: HashMap::new(),
@@ -227,7 +231,7 @@ impl Control {
 
     /// Tells discovery which hosts the sessions that there are want.
     pub(super) fn look_for_hosts(&self) {
-        let wanted = Wanted::of(&self.config, self.registry.scopes());
+        let wanted = DiscoveryNeeds::of(&self.config, self.registry.scopes());
         self.wanted.send_if_modified(|known| std::mem::replace(known, wanted.clone()) != wanted);
     }
 

@@ -249,7 +249,7 @@ fn differing(old: &Named, new: &Named) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
-    use super::{super::room::Spare, *};
+    use super::{super::room::SpareDescriptors, *};
     use crate::bridge::ToControl;
     use axon_transport::{
         access::{Party, Verb},
@@ -258,7 +258,7 @@ mod tests {
 
     fn control(config: Config) -> Control {
         let settings = vec![("AXON_QUIC_CIPHER".into(), "x".into())];
-        Control::new(Arc::new(config), settings, Spare::default())
+        Control::new(Arc::new(config), settings, SpareDescriptors::default())
     }
 
     #[test]

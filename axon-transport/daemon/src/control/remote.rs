@@ -18,12 +18,12 @@ use tokio::{
 };
 
 use super::{
-    gateway::{GatewayEntry, Pause, Running},
+    gateway::{GatewayEntry, Pause, RunningGateway},
     plane::Control,
 };
 use crate::{
     bridge::{CHANNEL, RefusalKind, ToControl, ToGateway, TrafficRules},
-    discovery::{self, Action, Event},
+    discovery::{self, DiscoveryAction, DiscoveryEvent},
 };
 
 /// Between two attempts to give an order to a gateway that is busy.
@@ -38,7 +38,7 @@ pub(super) const GATEWAY: Option<GatewayEntry> =
 /// The gateway and discovery of a running daemon.
 pub(super) struct Remote {
     entry: Option<GatewayEntry>,
-    running: Option<Running>,
+    running: Option<RunningGateway>,
     pause: Pause,
     discovery: Option<Discovery>,
     /// Whether the id was proven.
@@ -53,8 +53,8 @@ pub(super) struct Remote {
 }
 
 struct Discovery {
-    events: mpsc::Sender<Event>,
-    actions: mpsc::Receiver<Action>,
+    events: mpsc::Sender<DiscoveryEvent>,
+    actions: mpsc::Receiver<DiscoveryAction>,
     task: JoinHandle<()>,
 }
 
@@ -79,19 +79,19 @@ impl Remote {
             rules_due: None,
         };
         let Some(entry) = entry else { return Ok(remote) };
-        let mut running = Running::start(control, entry).map_err(|e| e.to_string())?;
+        let mut running = RunningGateway::start(control, entry).map_err(|e| e.to_string())?;
         running.stands(control).await?;
         remote.running = Some(running);
         let discovery = Discovery::start(&control.borrow());
         if let Some(port) = control.borrow().port {
-            discovery.tell(Event::QuicPort(port));
+            discovery.tell(DiscoveryEvent::QuicPort(port));
         }
         remote.discovery = Some(discovery);
         Ok(remote)
     }
 
     /// Who is told of changes of this host's graph.
-    pub(super) fn digests(&self) -> Option<mpsc::Sender<Event>> {
+    pub(super) fn digests(&self) -> Option<mpsc::Sender<DiscoveryEvent>> {
         self.discovery.as_ref().map(|discovery| discovery.events.clone())
     }
 
@@ -124,7 +124,7 @@ impl Remote {
                         tracing::error!(why, "the gateway failed; it is started again");
                         self.gateway_ended(control, &why);
                         self.pause.wait().await;
-                        match Running::start(control, entry) {
+                        match RunningGateway::start(control, entry) {
                             Ok(running) => self.running = Some(running),
                             Err(error) => tracing::error!(%error, "could not start the gateway's thread"),
                         }
@@ -171,57 +171,57 @@ impl Remote {
                 self.order(ToGateway::Listed(self.listed.clone()));
                 // They may have changed since it was started. It says that they count.
                 self.order_rules();
-                self.tell(Event::QuicPort(*port));
+                self.tell(DiscoveryEvent::QuicPort(*port));
             }
             ToControl::LinkUp { daemon, address, proven } => {
                 let (daemon, address, proven) = (*daemon, *address, *proven);
                 self.linked.insert(daemon, proven);
-                self.tell(Event::LinkUp { daemon, address, proven });
+                self.tell(DiscoveryEvent::LinkUp { daemon, address, proven });
             }
             ToControl::LinkDown { daemon, .. } => {
                 self.linked.remove(daemon);
-                self.tell(Event::LinkDown { daemon: *daemon });
+                self.tell(DiscoveryEvent::LinkDown { daemon: *daemon });
             }
             ToControl::DialFailed { daemon, standing } => {
-                self.tell(Event::DialFailed { daemon: *daemon, standing: *standing });
+                self.tell(DiscoveryEvent::DialFailed { daemon: *daemon, standing: *standing });
             }
             ToControl::Path { daemon, works } => {
-                self.tell(Event::Path { daemon: *daemon, works: *works });
+                self.tell(DiscoveryEvent::Path { daemon: *daemon, works: *works });
             }
             ToControl::Finished => self.finished = true,
             _ => {}
         }
         match event {
-            ToControl::Datagrams(datagrams) => self.tell(Event::Datagrams(datagrams)),
+            ToControl::Datagrams(datagrams) => self.tell(DiscoveryEvent::Datagrams(datagrams)),
             other => control.borrow_mut().gateway_says(other),
         }
     }
 
-    fn action(&mut self, control: &Rc<RefCell<Control>>, action: Action) {
+    fn action(&mut self, control: &Rc<RefCell<Control>>, action: DiscoveryAction) {
         match action {
-            Action::Dial { daemon, sae, addrs: addresses, listed, standing } => {
+            DiscoveryAction::Dial { daemon, sae, addrs: addresses, listed, standing } => {
                 let dial = ToGateway::Dial { daemon, sae, addresses, listed, standing };
                 if !self.order(dial) {
-                    self.tell(Event::DialFailed { daemon, standing });
+                    self.tell(DiscoveryEvent::DialFailed { daemon, standing });
                 }
             }
-            Action::SendFromQuicPort { to, bytes } => {
+            DiscoveryAction::SendFromQuicPort { to, bytes } => {
                 self.order(ToGateway::SendDatagram { to, bytes });
             }
-            Action::Mismatch(mismatch) => {
+            DiscoveryAction::PeerMismatch(mismatch) => {
                 let peer = format!("{} at {}", mismatch.peer, mismatch.address);
                 let what = mismatch.setting.to_owned();
                 let reason =
                     format!("{what} is {} here and {} there", mismatch.ours, mismatch.theirs);
                 control.borrow_mut().refused(RefusalKind::Beacon, peer, what, reason);
             }
-            Action::Named(names) => {
+            DiscoveryAction::Named(names) => {
                 self.listed = names.values().flatten().copied().collect();
                 self.order(ToGateway::Listed(self.listed.clone()));
                 control.borrow_mut().named(names);
             }
             // In a flood of beacons a thousand times a second.
-            Action::Gone { daemon } => tracing::trace!(%daemon, "a peer is gone"),
+            DiscoveryAction::Gone { daemon } => tracing::trace!(%daemon, "a peer is gone"),
         }
     }
 
@@ -230,7 +230,7 @@ impl Remote {
         self.running.as_ref().is_some_and(|running| running.order(order))
     }
 
-    fn tell(&self, event: Event) {
+    fn tell(&self, event: DiscoveryEvent) {
         if let Some(discovery) = &self.discovery {
             discovery.tell(event);
         }
@@ -240,7 +240,7 @@ impl Remote {
         self.running = None;
         control.borrow_mut().gateway_ended(why);
         for daemon in std::mem::take(&mut self.linked).into_keys() {
-            self.tell(Event::LinkDown { daemon });
+            self.tell(DiscoveryEvent::LinkDown { daemon });
         }
     }
 
@@ -248,12 +248,12 @@ impl Remote {
         let control = control.borrow();
         let discovery = Discovery::start(&control);
         if let Some(port) = control.port {
-            discovery.tell(Event::QuicPort(port));
+            discovery.tell(DiscoveryEvent::QuicPort(port));
         }
         for link in control.links.values() {
             let peer = self.linked.iter().find(|(daemon, _)| daemon.to_string() == link.peer);
             if let (Some((&daemon, &proven)), Ok(address)) = (peer, link.address.parse()) {
-                discovery.tell(Event::LinkUp { daemon, address, proven });
+                discovery.tell(DiscoveryEvent::LinkUp { daemon, address, proven });
             }
         }
         self.discovery = Some(discovery);
@@ -265,7 +265,7 @@ impl Remote {
             drop(events);
             let goodbye = async {
                 while let Some(action) = actions.recv().await {
-                    if let Action::SendFromQuicPort { to, bytes } = action {
+                    if let DiscoveryAction::SendFromQuicPort { to, bytes } = action {
                         self.order(ToGateway::SendDatagram { to, bytes });
                     }
                 }
@@ -293,10 +293,10 @@ impl Discovery {
         Self { events, actions, task }
     }
 
-    fn tell(&self, event: Event) {
+    fn tell(&self, event: DiscoveryEvent) {
         // Anybody can send datagrams: they leave room for what the gateway says of links.
         let crowded = self.events.capacity() < CHANNEL / 4;
-        if matches!(event, Event::Datagrams(_)) && crowded {
+        if matches!(event, DiscoveryEvent::Datagrams(_)) && crowded {
             return;
         }
         if self.events.try_send(event).is_err() {
@@ -306,7 +306,7 @@ impl Discovery {
 }
 
 /// What the gateway says next, or why it says nothing any more.
-async fn said(running: Option<&mut Running>) -> Result<ToControl, String> {
+async fn said(running: Option<&mut RunningGateway>) -> Result<ToControl, String> {
     match running {
         Some(running) => running.next().await,
         None => Err("it has no thread".to_owned()),
@@ -322,7 +322,7 @@ async fn due(at: Option<Instant>) {
 }
 
 /// What discovery wants next.
-async fn wanted(discovery: Option<&mut Discovery>) -> Option<Action> {
+async fn wanted(discovery: Option<&mut Discovery>) -> Option<DiscoveryAction> {
     match discovery {
         Some(discovery) => discovery.actions.recv().await,
         None => std::future::pending().await,

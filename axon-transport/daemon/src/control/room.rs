@@ -25,7 +25,7 @@ const SPARE: u64 = 24;
 
 /// What the daemon's descriptors are used for.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Room {
+pub(super) struct DescriptorRoom {
     /// The soft RLIMIT_NOFILE.
     limit: u64,
     /// Those that are open.
@@ -38,7 +38,7 @@ pub(super) struct Room {
     held: u64,
 }
 
-impl Room {
+impl DescriptorRoom {
     /// The room for process `pid`. `None` where there is no limit.
     pub(super) fn of<F: Clone>(registry: &Registry<F>, pid: u32) -> Option<Self> {
         let limit = descriptors::limit()?;
@@ -114,9 +114,9 @@ impl Room {
 /// Descriptors that are kept so that there are some when none can be opened: with them the daemon accepts and answers a
 /// caller. Opened first, they have low numbers, and so are of use as well after the limit was lowered.
 #[derive(Debug, Default)]
-pub(super) struct Spare(RefCell<Vec<OwnedFd>>);
+pub(super) struct SpareDescriptors(RefCell<Vec<OwnedFd>>);
 
-impl Spare {
+impl SpareDescriptors {
     /// Opens those that are missing.
     pub(super) fn fill(&self) {
         let limit = descriptors::limit().unwrap_or(u64::MAX);
@@ -130,9 +130,9 @@ impl Spare {
     }
 
     /// Gives them up until what is returned is dropped.
-    pub(super) fn lend(&self) -> Lent<'_> {
+    pub(super) fn lend(&self) -> LentDescriptors<'_> {
         self.0.borrow_mut().clear();
-        Lent(self)
+        LentDescriptors(self)
     }
 
     /// Whether a caller may keep the one that it was answered with.
@@ -142,10 +142,10 @@ impl Spare {
     }
 }
 
-/// See [`Spare::lend`].
-pub(super) struct Lent<'a>(&'a Spare);
+/// See [`SpareDescriptors::lend`].
+pub(super) struct LentDescriptors<'a>(&'a SpareDescriptors);
 
-impl Drop for Lent<'_> {
+impl Drop for LentDescriptors<'_> {
     fn drop(&mut self) {
         self.0.fill();
     }
@@ -155,8 +155,8 @@ impl Drop for Lent<'_> {
 mod tests {
     use super::*;
 
-    fn room(limit: u64, open: u64, held: u64) -> Room {
-        Room { limit, open, owed: 0, sessions: 9, held }
+    fn room(limit: u64, open: u64, held: u64) -> DescriptorRoom {
+        DescriptorRoom { limit, open, owed: 0, sessions: 9, held }
     }
 
     #[test]
@@ -166,7 +166,7 @@ mod tests {
         let text = room(1024, last + 1, 0).refuses_session(false).unwrap();
         assert!(text.contains("of its 1024 file descriptors open, for 9 sessions"), "{text}");
         assert!(room(1024, last, 0).refuses_session(true).is_some(), "a relayed one takes more");
-        let owed = Room { owed: 1, ..room(1024, last, 0) };
+        let owed = DescriptorRoom { owed: 1, ..room(1024, last, 0) };
         assert!(owed.refuses_session(false).is_some(), "the gateway needs it");
         assert!(room(20, 60, 0).refuses_segment().is_some(), "the limit was lowered");
         assert_eq!(room(u64::MAX, 60, 1 << 20).refuses_segment(), None);
@@ -193,7 +193,7 @@ mod tests {
 
     #[test]
     fn spare_descriptors_are_back_after_they_were_lent() {
-        let spare = Spare::default();
+        let spare = SpareDescriptors::default();
         spare.fill();
         let all = spare.0.borrow().len();
         assert!(all > 1 && spare.can_keep_caller());

@@ -32,9 +32,9 @@ use super::{
     plane::Control,
     reload::{SettingsSource, reload},
     remote::{GATEWAY, Remote},
-    room::Spare,
+    room::SpareDescriptors,
 };
-use crate::discovery::Event;
+use crate::discovery::DiscoveryEvent;
 
 /// Changes of the graph within this time go out together.
 const COALESCE: Duration = Duration::from_millis(5);
@@ -240,7 +240,7 @@ fn start(config: Config, _options: &DaemonOptions) -> Result<Started, DaemonErro
     let config = config.with_rules_of_host()?;
     let settings = security_settings(&config)?;
     // Before anything else takes their low numbers.
-    let spare = Spare::default();
+    let spare = SpareDescriptors::default();
     spare.fill();
     let address = Address::of(&config);
     let (listeners, lock) = match address.bind() {
@@ -352,7 +352,7 @@ async fn keep_left_memory(control: Rc<RefCell<Control>>) {
 
 /// Sends changes of the graph a moment after they happened, and tells discovery, whose beacons say
 /// whether a peer has missed some.
-async fn flush(control: Rc<RefCell<Control>>, digests: Option<mpsc::Sender<Event>>) {
+async fn flush(control: Rc<RefCell<Control>>, digests: Option<mpsc::Sender<DiscoveryEvent>>) {
     loop {
         if control.borrow().registry.needs_flush() {
             tokio::time::sleep(COALESCE).await;
@@ -361,7 +361,7 @@ async fn flush(control: Rc<RefCell<Control>>, digests: Option<mpsc::Sender<Event
             control.settle();
             if let Some(digests) = &digests {
                 // One that is dropped is overtaken by the next.
-                let _ = digests.try_send(Event::GraphDigest(control.registry.digest()));
+                let _ = digests.try_send(DiscoveryEvent::GraphDigest(control.registry.digest()));
             }
         }
         let changed = control.borrow().changed.clone();

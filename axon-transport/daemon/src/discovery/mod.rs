@@ -29,8 +29,8 @@ pub(crate) use confidence::AddressConfidence;
 pub(crate) use datagrams::Datagrams;
 pub(crate) use interfaces::{Interface, interfaces};
 pub(crate) use peers::{Arrival, Local, Output, Peers};
-pub(crate) use run::{Event, run};
-pub(crate) use wanted::Wanted;
+pub(crate) use run::{DiscoveryEvent, run};
+pub(crate) use wanted::DiscoveryNeeds;
 
 /// The UDP ports that daemons of `domain` take their QUIC port from, the first that is free.
 ///
@@ -62,8 +62,8 @@ pub(crate) const fn is_discovery(first_byte: u8) -> bool {
 
 /// What discovery asks of the daemon.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) enum Action {
-    /// Dial this daemon. To be answered with [`Event::LinkUp`] or [`Event::DialFailed`]; without
+pub(crate) enum DiscoveryAction {
+    /// Dial this daemon. To be answered with [`DiscoveryEvent::LinkUp`] or [`DiscoveryEvent::DialFailed`]; without
     /// an answer it counts as failed after 30 s.
     Dial {
         /// Whom to expect there.
@@ -85,7 +85,7 @@ pub(crate) enum Action {
         bytes: Vec<u8>,
     },
     /// This peer is not dialled, and why. Said once a peer; after 32 of them one a second.
-    Mismatch(Mismatch),
+    PeerMismatch(PeerMismatch),
     /// The addresses that the names of static peers have.
     Named(BTreeMap<String, Vec<IpAddr>>),
     /// Nothing was heard of this peer for long, or it said goodbye.
@@ -97,7 +97,7 @@ pub(crate) enum Action {
 
 /// A setting that keeps this daemon and a peer apart.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Mismatch {
+pub(crate) struct PeerMismatch {
     /// The peer, as it calls itself.
     pub peer: DaemonId,
     /// Where its beacon came from.
@@ -110,7 +110,7 @@ pub(crate) struct Mismatch {
     pub theirs: String,
 }
 
-impl std::fmt::Display for Mismatch {
+impl std::fmt::Display for PeerMismatch {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let Self { peer, address, setting, ours, theirs } = self;
         write!(f, "peer {peer} at {address} not dialled: {setting} is {theirs} there, {ours} here")

@@ -17,8 +17,8 @@ use tokio::{
 use tracing::{debug, warn};
 
 use super::{
-    Action, AddressConfidence, Arrival, Datagrams, Local, Output, Peers, Wanted, interfaces,
-    socket::SharedSocket,
+    AddressConfidence, Arrival, Datagrams, DiscoveryAction, DiscoveryNeeds, Local, Output, Peers,
+    interfaces, socket::SharedSocket,
 };
 
 use crate::token_bucket::TokenBucket;
@@ -42,7 +42,7 @@ const MOST_OF_A_NAME: usize = 4;
 /// What the daemon tells discovery.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
-pub(crate) enum Event {
+pub(crate) enum DiscoveryEvent {
     /// Datagrams came to the QUIC port whose first byte [is discovery's](super::is_discovery).
     Datagrams(Datagrams),
     /// The QUIC port is bound. Discovery says nothing before.
@@ -68,7 +68,7 @@ pub(crate) enum Event {
         /// Whether it does.
         works: bool,
     },
-    /// An [`Action::Dial`] became no link.
+    /// An [`DiscoveryAction::Dial`] became no link.
     DialFailed {
         /// To whom.
         daemon: DaemonId,
@@ -88,9 +88,9 @@ pub(crate) enum Event {
 pub(crate) async fn run(
     config: &Config,
     daemon: DaemonId,
-    mut wanted: watch::Receiver<Wanted>,
-    mut events: mpsc::Receiver<Event>,
-    actions: mpsc::Sender<Action>,
+    mut wanted: watch::Receiver<DiscoveryNeeds>,
+    mut events: mpsc::Receiver<DiscoveryEvent>,
+    actions: mpsc::Sender<DiscoveryAction>,
 ) {
     let mut shell = DiscoveryIo::new(config, daemon, actions);
     let mut look = interval(INTERFACES_EVERY);
@@ -170,7 +170,7 @@ struct DiscoveryIo {
     multicast: bool,
     domain: u32,
     bind: Vec<IpAddr>,
-    actions: mpsc::Sender<Action>,
+    actions: mpsc::Sender<DiscoveryAction>,
     /// The addresses of static peers. A name keeps those that it had while its look-up fails.
     names: BTreeMap<String, Vec<IpAddr>>,
     /// The last failure to open the shared port, so that it is said once.
@@ -178,7 +178,7 @@ struct DiscoveryIo {
 }
 
 impl DiscoveryIo {
-    fn new(config: &Config, daemon: DaemonId, actions: mpsc::Sender<Action>) -> Self {
+    fn new(config: &Config, daemon: DaemonId, actions: mpsc::Sender<DiscoveryAction>) -> Self {
         Self {
             start: Instant::now(),
             peers: Peers::new(Local::of(config, daemon), rand::random()),
@@ -203,7 +203,7 @@ impl DiscoveryIo {
         self.peers.set_range(now, range);
     }
 
-    fn set_found(&mut self, found: Found) {
+    fn set_found(&mut self, found: ResolvedHosts) {
         let now = self.start.elapsed();
         let mut listed = Vec::new();
         let mut names: BTreeMap<String, Vec<IpAddr>> = BTreeMap::new();
@@ -218,7 +218,7 @@ impl DiscoveryIo {
         self.peers.set_listed(now, listed);
         self.names.clone_from(&names);
         // One that is dropped is overtaken by the next.
-        let _ = self.actions.try_send(Action::Named(names));
+        let _ = self.actions.try_send(DiscoveryAction::Named(names));
     }
 
     /// A datagram came to the shared port: it is looked at, with those that wait there. Returns whether these were so
@@ -236,24 +236,24 @@ impl DiscoveryIo {
         !at_once
     }
 
-    fn event(&mut self, event: Event) {
+    fn event(&mut self, event: DiscoveryEvent) {
         let now = self.start.elapsed();
         match event {
-            Event::Datagrams(datagrams) => {
+            DiscoveryEvent::Datagrams(datagrams) => {
                 for (from, bytes) in datagrams.iter() {
                     self.peers.handle_datagram(now, from, Arrival::Quic, bytes);
                 }
             }
-            Event::QuicPort(port) => self.peers.set_port(now, port),
-            Event::LinkUp { daemon, address, proven } => {
+            DiscoveryEvent::QuicPort(port) => self.peers.set_port(now, port),
+            DiscoveryEvent::LinkUp { daemon, address, proven } => {
                 self.peers.handle_link_up(now, daemon, address, proven);
             }
-            Event::LinkDown { daemon } => self.peers.handle_link_down(now, daemon),
-            Event::Path { daemon, works } => self.peers.handle_path(now, daemon, works),
-            Event::DialFailed { daemon, standing } => {
+            DiscoveryEvent::LinkDown { daemon } => self.peers.handle_link_down(now, daemon),
+            DiscoveryEvent::Path { daemon, works } => self.peers.handle_path(now, daemon, works),
+            DiscoveryEvent::DialFailed { daemon, standing } => {
                 self.peers.handle_dial_failed(now, daemon, standing);
             }
-            Event::GraphDigest(digest) => self.peers.set_graph(digest),
+            DiscoveryEvent::GraphDigest(digest) => self.peers.set_graph(digest),
         }
     }
 
@@ -289,7 +289,9 @@ impl DiscoveryIo {
                 }
                 Output::Action(action) => {
                     let dial = match &action {
-                        Action::Dial { daemon, standing, .. } => Some((*daemon, *standing)),
+                        DiscoveryAction::Dial { daemon, standing, .. } => {
+                            Some((*daemon, *standing))
+                        }
                         _ => None,
                     };
                     if let (Err(_), Some((daemon, standing))) =
@@ -328,9 +330,9 @@ async fn sleep_until_some(at: Option<Instant>) {
 }
 
 /// Hosts, with a port where one was given, and their addresses.
-type Found = Vec<((String, Option<u16>), Vec<IpAddr>)>;
+type ResolvedHosts = Vec<((String, Option<u16>), Vec<IpAddr>)>;
 
-async fn look_up(hosts: BTreeSet<(String, Option<u16>)>) -> Found {
+async fn look_up(hosts: BTreeSet<(String, Option<u16>)>) -> ResolvedHosts {
     // At once: a name server that does not answer for one host holds up no other.
     let mut lookups = JoinSet::new();
     for (host, port) in hosts {

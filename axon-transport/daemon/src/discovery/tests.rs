@@ -25,9 +25,9 @@ fn config(domain: u32, env: &[(&str, &str)]) -> Config {
 struct Daemon {
     id: DaemonId,
     address: SocketAddr,
-    events: mpsc::Sender<Event>,
+    events: mpsc::Sender<DiscoveryEvent>,
     /// All but the datagrams, which are carried.
-    actions: mpsc::Receiver<Action>,
+    actions: mpsc::Receiver<DiscoveryAction>,
 }
 
 impl Daemon {
@@ -45,17 +45,17 @@ impl Daemon {
         let (events, of_events) = mpsc::channel(64);
         let (of_actions, actions) = mpsc::channel(1024);
         let (others, of_others) = mpsc::channel(64);
-        events.send(Event::QuicPort(address.port())).await.unwrap();
+        events.send(DiscoveryEvent::QuicPort(address.port())).await.unwrap();
         tokio::spawn(async move {
             // Held: there is one for as long as there is a daemon.
-            let wanted = watch::Sender::new(Wanted::of(&config, []));
+            let wanted = watch::Sender::new(DiscoveryNeeds::of(&config, []));
             run(&config, id, wanted.subscribe(), of_events, of_actions).await;
         });
         tokio::spawn(carry(quic, events.downgrade(), actions, others));
         Self { id, address, events, actions: of_others }
     }
 
-    async fn next(&mut self) -> Option<Action> {
+    async fn next(&mut self) -> Option<DiscoveryAction> {
         timeout(PATIENCE, self.actions.recv()).await.expect("something is to happen")
     }
 }
@@ -63,18 +63,18 @@ impl Daemon {
 /// What a gateway does for discovery, until discovery ends.
 async fn carry(
     quic: UdpSocket,
-    events: mpsc::WeakSender<Event>,
-    mut actions: mpsc::Receiver<Action>,
-    others: mpsc::Sender<Action>,
+    events: mpsc::WeakSender<DiscoveryEvent>,
+    mut actions: mpsc::Receiver<DiscoveryAction>,
+    others: mpsc::Sender<DiscoveryAction>,
 ) {
     let mut buffer = [0; 2048];
     loop {
         tokio::select! {
             action = actions.recv() => match action {
-                Some(Action::SendFromQuicPort { to, bytes }) => {
+                Some(DiscoveryAction::SendFromQuicPort { to, bytes }) => {
                     let _ = quic.send_to(&bytes, to).await;
                 }
-                Some(Action::Named(_)) => {}
+                Some(DiscoveryAction::Named(_)) => {}
                 Some(other) => drop(others.send(other).await),
                 None => return,
             },
@@ -83,7 +83,7 @@ async fn carry(
                     assert!(is_discovery(buffer[0]));
                     let mut datagrams = Datagrams::default();
                     datagrams.push(from, &buffer[..length]);
-                    let _ = events.try_send(Event::Datagrams(datagrams));
+                    let _ = events.try_send(DiscoveryEvent::Datagrams(datagrams));
                 }
             }
         }
@@ -97,7 +97,7 @@ async fn two_daemons_find_each_other_by_multicast_and_part_with_a_goodbye() {
     let (of_a, of_b) = (a.next().await.unwrap(), b.next().await.unwrap());
     for (action, peer) in [(of_a, &b), (of_b, &a)] {
         match action {
-            Action::Dial { daemon, sae, addrs, listed, .. } => {
+            DiscoveryAction::Dial { daemon, sae, addrs, listed, .. } => {
                 assert_eq!((daemon, sae, listed), (peer.id, None, false));
                 assert_eq!(addrs, [peer.address]);
             }
@@ -105,20 +105,20 @@ async fn two_daemons_find_each_other_by_multicast_and_part_with_a_goodbye() {
         }
     }
     for (one, other) in [(&a, &b), (&b, &a)] {
-        let up = Event::LinkUp { daemon: other.id, address: other.address, proven: true };
+        let up = DiscoveryEvent::LinkUp { daemon: other.id, address: other.address, proven: true };
         one.events.send(up).await.unwrap();
     }
     drop(b.events);
     assert_eq!(timeout(PATIENCE, b.actions.recv()).await.unwrap(), None, "it ends");
 
-    a.events.send(Event::LinkDown { daemon: b.id }).await.unwrap();
+    a.events.send(DiscoveryEvent::LinkDown { daemon: b.id }).await.unwrap();
     let mut action = a.next().await;
-    if let Some(Action::Dial { daemon, standing, .. }) = action {
+    if let Some(DiscoveryAction::Dial { daemon, standing, .. }) = action {
         // The event overtook the datagram.
-        a.events.send(Event::DialFailed { daemon, standing }).await.unwrap();
+        a.events.send(DiscoveryEvent::DialFailed { daemon, standing }).await.unwrap();
         action = a.next().await;
     }
-    assert_eq!(action, Some(Action::Gone { daemon: b.id }));
+    assert_eq!(action, Some(DiscoveryAction::Gone { daemon: b.id }));
 }
 
 #[tokio::test]
@@ -143,7 +143,7 @@ async fn listed_daemons_find_each_other_without_multicast_and_say_why_they_do_no
     let (mut a, mut b) = (Daemon::start(a).await, Daemon::start(b).await);
     let (of_a, of_b) = (a.next().await.unwrap(), b.next().await.unwrap());
     for (action, peer, theirs) in [(of_a, &b, "aes-256-gcm"), (of_b, &a, "chacha20-poly1305")] {
-        let Action::Mismatch(mismatch) = action else { panic!("{action:?}") };
+        let DiscoveryAction::PeerMismatch(mismatch) = action else { panic!("{action:?}") };
         assert_eq!((mismatch.peer, mismatch.setting), (peer.id, "AXON_QUIC_CIPHER"));
         assert_eq!((mismatch.address, &*mismatch.theirs), (peer.address, theirs));
     }
@@ -180,14 +180,14 @@ async fn actions_nobody_takes_hold_nothing_up() {
     let config =
         config(214, &[("AXON_BIND_ADDRS", "127.0.0.2"), ("AXON_DAEMON_PEERS", "127.0.0.3")]);
     let task = tokio::spawn(async move {
-        let wanted = watch::Sender::new(Wanted::of(&config, []));
+        let wanted = watch::Sender::new(DiscoveryNeeds::of(&config, []));
         run(&config, DaemonId::random(), wanted.subscribe(), of_events, of_actions).await;
     });
     for n in 0..100_u8 {
-        events.send(Event::QuicPort(64_000 + u16::from(n))).await.unwrap();
+        events.send(DiscoveryEvent::QuicPort(64_000 + u16::from(n))).await.unwrap();
         let mut noise = Datagrams::default();
         noise.push(([127, 0, 0, 1], 9).into(), &[n; 9]);
-        events.send(Event::Datagrams(noise)).await.unwrap();
+        events.send(DiscoveryEvent::Datagrams(noise)).await.unwrap();
     }
     drop(events);
     timeout(PATIENCE, task).await.unwrap().unwrap();

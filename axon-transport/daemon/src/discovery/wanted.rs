@@ -12,14 +12,14 @@ const MOST_HOSTS: usize = 128;
 
 /// What the sessions of a daemon need of discovery together.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Wanted {
+pub(crate) struct DiscoveryNeeds {
     /// The widest range of any: multicast in SUBNET alone, silence in OFF.
     pub range: DiscoveryRange,
     /// Hosts to look for, each with a port where one was given.
     pub hosts: BTreeSet<(String, Option<u16>)>,
 }
 
-impl Wanted {
+impl DiscoveryNeeds {
     /// What sessions with the given `scopes` need. A daemon without a session does what its own settings say,
     /// so that one that was started by hand is linked before its first session comes.
     ///

@@ -22,7 +22,7 @@ const NAMED: usize = 20;
 
 /// Samples of one topic that were dropped for one cause.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Loss {
+pub(crate) struct TopicLoss {
     pub(crate) topic: Arc<str>,
     pub(crate) cause: &'static str,
     pub(crate) samples: u64,
@@ -84,12 +84,12 @@ impl Counters {
     }
 
     /// What was lost since the last call, by topic and cause: each sample once.
-    pub(crate) fn take_lost(&self) -> Vec<Loss> {
+    pub(crate) fn take_lost(&self) -> Vec<TopicLoss> {
         let lost = self.lost.take();
         let each = lost.into_iter().flat_map(|(topic, causes)| {
             causes.into_iter().map(move |(cause, samples)| {
                 let topic = Arc::clone(&topic);
-                Loss { topic, cause, samples }
+                TopicLoss { topic, cause, samples }
             })
         });
         each.collect()
@@ -129,7 +129,7 @@ pub(crate) fn by_topic<'a>(samples: impl IntoIterator<Item = (&'a str, u64)>) ->
 
 /// Logs what was lost on the way to or from a peer, in one line: the topic that lost most by name. What `max_hz` leaves
 /// out is what its author wants.
-pub(crate) fn log(losses: &[Loss], peer: &str) {
+pub(crate) fn log(losses: &[TopicLoss], peer: &str) {
     let unwanted: Vec<_> = losses.iter().filter(|loss| loss.cause != "max_hz").cloned().collect();
     let losses = &unwanted;
     let Some((topic, causes, samples, others)) = worst(losses) else { return };
@@ -142,8 +142,9 @@ pub(crate) fn log(losses: &[Loss], peer: &str) {
 }
 
 /// The topic that lost most, why, how many samples, and how many were lost of others.
-fn worst(losses: &[Loss]) -> Option<(&str, String, u64, u64)> {
-    let sum = |losses: &[Loss]| losses.iter().fold(0_u64, |all, l| all.saturating_add(l.samples));
+fn worst(losses: &[TopicLoss]) -> Option<(&str, String, u64, u64)> {
+    let sum =
+        |losses: &[TopicLoss]| losses.iter().fold(0_u64, |all, l| all.saturating_add(l.samples));
     // Those of a topic are together.
     let topics = losses.chunk_by(|one, other| one.topic == other.topic);
     let worst = topics.max_by_key(|losses| sum(losses))?;
@@ -166,7 +167,8 @@ mod tests {
         counters.lost(&image, "late", 1);
         counters.lost(&scan, "queue", 2);
         counters.lost(&scan, "no_key", 1);
-        let loss = |topic: &Arc<str>, cause, samples| Loss { topic: topic.clone(), cause, samples };
+        let loss =
+            |topic: &Arc<str>, cause, samples| TopicLoss { topic: topic.clone(), cause, samples };
         let all = [loss(&image, "late", 1), loss(&scan, "no_key", 1), loss(&scan, "queue", 5)];
         let lost = counters.take_lost();
         assert_eq!(lost, all);

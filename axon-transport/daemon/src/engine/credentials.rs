@@ -25,7 +25,7 @@ use super::quic::{
 use crate::{
     error::GatewayError,
     identity::Identity,
-    keys::{Attempt, Resolver},
+    keys::{DialKey, Resolver},
     link::Side,
 };
 
@@ -91,7 +91,7 @@ impl Credentials {
     /// The settings, or the key, make no TLS client.
     pub(crate) fn client(
         &self,
-        attempt: Option<&Attempt>,
+        attempt: Option<&DialKey>,
         address: IpAddr,
     ) -> Result<quinn_proto::ClientConfig, GatewayError> {
         let mut client = match (&self.config.security, attempt, self.auth()) {

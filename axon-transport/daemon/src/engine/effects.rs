@@ -6,14 +6,14 @@ use axon_shm::ids::DaemonId;
 
 use super::{
     compression::CompressionOrder,
-    counters::{self, Loss},
+    counters::{self, TopicLoss},
     links::LinkReport,
     peer::StalledRoute,
     refusal::{Refusal, RefusedBy},
 };
 use crate::{
     bridge::{RefusalKind, ToControl},
-    keys::{Origin, Request},
+    keys::{KmeRequest, RequestOrigin},
 };
 
 /// What the engine has its owner do.
@@ -22,7 +22,7 @@ pub(crate) enum Effect {
     /// Tell the control plane.
     Tell(ToControl),
     /// Ask the KME; the answer comes back by [`Engine::handle_key_event`](super::Engine::handle_key_event).
-    Kme(Origin, Request),
+    Kme(RequestOrigin, KmeRequest),
     /// Record a key in the ledger of used keys; the result comes back by
     /// [`Engine::handle_recorded`](super::Engine::handle_recorded).
     Record {
@@ -68,9 +68,9 @@ impl Effects {
     }
 
     /// Logs losses, and tells the control plane.
-    pub(super) fn tell_lost(&mut self, peer: &str, losses: Vec<Loss>) {
+    pub(super) fn tell_lost(&mut self, peer: &str, losses: Vec<TopicLoss>) {
         counters::log(&losses, peer);
-        for Loss { topic, cause, samples } in losses {
+        for TopicLoss { topic, cause, samples } in losses {
             self.tell(ToControl::Lost { topic: topic.to_string(), cause, samples });
         }
     }
@@ -82,7 +82,7 @@ impl Effects {
         daemon: DaemonId,
         peer: &str,
         unacknowledged: &[(Arc<str>, u64)],
-        counted: Vec<Loss>,
+        counted: Vec<TopicLoss>,
     ) {
         if !unacknowledged.is_empty() {
             let all = unacknowledged.iter().map(|(topic, samples)| (&**topic, *samples));
@@ -184,7 +184,7 @@ mod tests {
     fn a_loss_is_told_once_however_it_came_about() {
         let mut effects = Effects::default();
         let unacknowledged = [("/t".into(), 2)];
-        let counted = vec![Loss { topic: "/t".into(), cause: "link_ended", samples: 2 }];
+        let counted = vec![TopicLoss { topic: "/t".into(), cause: "link_ended", samples: 2 }];
         effects.tell_link_over(DaemonId([1; 16]), "peer", &unacknowledged, counted);
         effects.tell_relays_given_up(vec![("/u".into(), 3)]);
         assert_eq!(told(&mut effects), ["/t: 2 link_ended", "/u: 3 link_ended"]);

@@ -5,7 +5,7 @@ use std::{rc::Rc, time::Duration};
 use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::internal::graph::RemoteEndpoint;
 
-use super::{Engine, peer_graph::GraphChange};
+use super::{Engine, peer_graph::PeerGraphChange};
 use crate::{
     bridge::{ToControl, TrafficRules},
     link::{GraphResync, Message, Subscribe},
@@ -66,7 +66,7 @@ impl Engine {
             self.effects.tell(ToControl::Refusal { kind, peer, what, reason });
         }
         let Some(peer) = self.peers.get_mut(daemon) else { return 0 };
-        let GraphChange { reset, mut added, removed } = peer.remote.changes();
+        let PeerGraphChange { reset, mut added, removed } = peer.remote.changes();
         // An endpoint is its host's: no other host speaks for one of ours, or for the engine.
         let ours: Vec<Gid> = added
             .iter()

@@ -49,13 +49,13 @@ pub(crate) use self::effects::Effect;
 use self::{
     compression::CompressionAnswer,
     effects::Effects,
-    link::target::Target,
+    link::target::DialTarget,
     links::{LinkEvent, LinkParts, Links},
     outbound::OutboundEvent,
-    peer::{Local, Peer},
+    peer::{LocalEndpoints, Peer},
     peer_factory::{FirstLink, PeerFactory},
     peer_graph::GraphTaken,
-    peers::Peers,
+    peers::LinkedPeers,
     reports::Reports,
     rings::Rings,
 };
@@ -89,7 +89,7 @@ pub(crate) struct EngineParts {
 pub(crate) struct Engine {
     access: AccessRules,
     links: Links,
-    peers: Peers,
+    peers: LinkedPeers,
     factory: PeerFactory,
     session: [u8; 12],
     effects: Effects,
@@ -110,7 +110,7 @@ impl Engine {
         let mut links = Links::new(links)?;
         links.set_interface_rules(&access);
         Ok(Self {
-            peers: Peers::new(Arc::clone(&config), rings),
+            peers: LinkedPeers::new(Arc::clone(&config), rings),
             access,
             factory: PeerFactory::new(config, daemon, session_keys, epoch_nanos),
             links,
@@ -149,7 +149,7 @@ impl Engine {
                 }
                 let replaces = self.links.cut_link(daemon);
                 let (daemon, standing) = (Some(daemon), Some(standing));
-                let target = Target { daemon, sae, addresses, listed, standing, replaces };
+                let target = DialTarget { daemon, sae, addresses, listed, standing, replaces };
                 self.links.dial(target, now);
             }
             ToGateway::SendDatagram { to, bytes } => self.links.send_datagram(to, bytes),
@@ -168,7 +168,7 @@ impl Engine {
     }
 
     /// The graph of this host changed.
-    pub(crate) fn handle_local_graph(&mut self, local: Local, now: Duration) {
+    pub(crate) fn handle_local_graph(&mut self, local: LocalEndpoints, now: Duration) {
         self.peers.handle_local_graph(local, now);
         self.effects.tell_draining(self.peers.are_draining());
     }

@@ -12,7 +12,9 @@ use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::config::{Config, TopicRule};
 
 use super::{
-    peer::{Local, Peer, Surroundings, WritersHere, kept::KeptRelays, stalls::Stalls},
+    peer::{
+        LocalEndpoints, Peer, PeerContext, WritersHere, kept::KeptRelays, stalls::StallHistory,
+    },
     rings::Rings,
     stand_in::StandIns,
 };
@@ -24,14 +26,14 @@ const OTHERS: u32 = 9;
 const LONGEST_PAUSE: Duration = Duration::from_millis(200);
 
 /// All peers.
-pub(super) struct Peers {
+pub(super) struct LinkedPeers {
     all: HashMap<DaemonId, Peer>,
     config: Arc<Config>,
     rings: Rc<dyn Rings>,
     stand_ins: StandIns,
-    stalls: RefCell<Stalls>,
+    stalls: RefCell<StallHistory>,
     kept: RefCell<KeptRelays>,
-    local: Local,
+    local: LocalEndpoints,
     writers: WritersHere,
     waiting_for_room: bool,
     /// Readers with samples to take; kept for its memory.
@@ -40,7 +42,7 @@ pub(super) struct Peers {
     follow_local_at: Duration,
 }
 
-impl Peers {
+impl LinkedPeers {
     /// No peers yet, and nothing on this host.
     pub(super) fn new(config: Arc<Config>, rings: Rc<dyn Rings>) -> Self {
         Self {
@@ -50,7 +52,7 @@ impl Peers {
             stand_ins: StandIns::default(),
             stalls: RefCell::default(),
             kept: RefCell::default(),
-            local: Local::new(),
+            local: LocalEndpoints::new(),
             writers: WritersHere::default(),
             waiting_for_room: false,
             active: Vec::new(),
@@ -59,7 +61,7 @@ impl Peers {
     }
 
     /// The endpoints of this host.
-    pub(super) fn local(&self) -> &Local {
+    pub(super) fn local(&self) -> &LocalEndpoints {
         &self.local
     }
 
@@ -115,7 +117,7 @@ impl Peers {
     pub(super) fn with<T>(
         &mut self,
         daemon: DaemonId,
-        act: impl FnOnce(&mut Peer, &Surroundings<'_>) -> T,
+        act: impl FnOnce(&mut Peer, &PeerContext<'_>) -> T,
     ) -> Option<T> {
         let Self { all, config, rings, stand_ins, stalls, kept, local, writers, .. } = self;
         let with = surroundings(config, &**rings, stand_ins, (stalls, kept), (local, writers));
@@ -123,14 +125,14 @@ impl Peers {
     }
 
     /// Has each peer act with what all peers use.
-    pub(super) fn with_each(&mut self, mut each: impl FnMut(&mut Peer, &Surroundings<'_>)) {
+    pub(super) fn with_each(&mut self, mut each: impl FnMut(&mut Peer, &PeerContext<'_>)) {
         let Self { all, config, rings, stand_ins, stalls, kept, local, writers, .. } = self;
         let with = surroundings(config, &**rings, stand_ins, (stalls, kept), (local, writers));
         all.values_mut().for_each(|peer| each(peer, &with));
     }
 
     /// The graph of this host changed.
-    pub(super) fn handle_local_graph(&mut self, local: Local, now: Duration) {
+    pub(super) fn handle_local_graph(&mut self, local: LocalEndpoints, now: Duration) {
         self.writers = WritersHere::of(&local);
         self.local = local;
         let endpoints = self.all.values().map(|peer| peer.remote.len() + self.local.len());
@@ -215,8 +217,8 @@ fn surroundings<'a>(
     config: &'a Config,
     rings: &'a dyn Rings,
     stand_ins: &'a StandIns,
-    (stalls, kept): (&'a RefCell<Stalls>, &'a RefCell<KeptRelays>),
-    (local, writers): (&'a Local, &'a WritersHere),
-) -> Surroundings<'a> {
-    Surroundings { rings, stand_ins, local, writers, config, stalls, kept }
+    (stalls, kept): (&'a RefCell<StallHistory>, &'a RefCell<KeptRelays>),
+    (local, writers): (&'a LocalEndpoints, &'a WritersHere),
+) -> PeerContext<'a> {
+    PeerContext { rings, stand_ins, local, writers, config, stalls, kept }
 }

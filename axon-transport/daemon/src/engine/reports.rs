@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::{effects::Effects, links::Links, peers::Peers};
+use super::{effects::Effects, links::Links, peers::LinkedPeers};
 use crate::bridge::ToControl;
 
 /// Between two reports.
@@ -41,7 +41,7 @@ impl Reports {
 }
 
 /// Reports losses and the status of each link.
-pub(super) fn report(peers: &mut Peers, links: &Links, effects: &mut Effects, now: Duration) {
+pub(super) fn report(peers: &mut LinkedPeers, links: &Links, effects: &mut Effects, now: Duration) {
     report_excess(peers, links, effects);
     for (_, peer) in peers.iter() {
         effects.tell_lost(&links.peer_text(peer.link), peer.counters.take_lost());
@@ -55,7 +55,7 @@ pub(super) fn report(peers: &mut Peers, links: &Links, effects: &mut Effects, no
 }
 
 /// Names the peers that have more long messages in flight than they may: their links may stand still.
-fn report_excess(peers: &mut Peers, links: &Links, effects: &mut Effects) {
+fn report_excess(peers: &mut LinkedPeers, links: &Links, effects: &mut Effects) {
     for peer in peers.values_mut() {
         let Some(most) = links.window_credit(peer.link) else { continue };
         let Some(bytes) = peer.inbound.find_excess(peer.link, most) else { continue };

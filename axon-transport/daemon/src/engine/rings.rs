@@ -142,7 +142,7 @@ pub(crate) trait RingWriter {
 
 /// A sample on its way to a peer.
 #[derive(Clone, Debug)]
-pub(crate) struct Sample {
+pub(crate) struct RingSample {
     /// Its publisher, number and times.
     pub(crate) info: MessageInfo,
     /// The call that it is the request of, or answers.
@@ -171,7 +171,7 @@ enum Form {
     },
 }
 
-impl Sample {
+impl RingSample {
     /// A sample of a topic.
     pub(crate) fn new(info: MessageInfo, payload: Bytes, now: Duration) -> Self {
         Self { info, call: None, payload, form: Form::Undecided, taken: now }

@@ -17,8 +17,8 @@ use axon_transport::{
 use super::{
     rings::{RingError, RingWriter, Rings},
     sample::{
-        dropped::{Before, DroppedRuns},
-        numbers::{FORGOTTEN, Numbers},
+        dropped::{DroppedRuns, EarlierFate},
+        numbers::{FORGOTTEN, PublisherNumbers},
     },
 };
 use crate::engine::account::{Account, Charge};
@@ -34,7 +34,7 @@ pub(crate) struct StandIn {
     /// The newest that were dropped here.
     dropped: RefCell<DroppedRuns>,
     /// What its publisher can have published.
-    numbers: Rc<Numbers>,
+    numbers: Rc<PublisherNumbers>,
     _place: Charge,
 }
 
@@ -91,7 +91,7 @@ impl StandIn {
     }
 
     /// What became of a sample that may have been dropped here before: a publisher whose link broke sends it again.
-    pub(crate) fn dropped(&self, sequence: u64) -> Before {
+    pub(crate) fn dropped(&self, sequence: u64) -> EarlierFate {
         self.dropped.borrow().find(sequence)
     }
 }
@@ -115,7 +115,7 @@ pub(crate) enum NoStandIn {
 #[derive(Debug)]
 struct Known {
     stand_in: Weak<StandIn>,
-    numbers: Rc<Numbers>,
+    numbers: Rc<PublisherNumbers>,
     /// Whose it is.
     identity: Rc<str>,
 }
@@ -154,7 +154,8 @@ impl StandIns {
             }
             return Err(NoStandIn::Failed(format!("{} stands for another endpoint", remote.gid)));
         }
-        let numbers = before.map_or_else(|| Rc::new(Numbers::new(now)), |b| Rc::clone(&b.numbers));
+        let numbers =
+            before.map_or_else(|| Rc::new(PublisherNumbers::new(now)), |b| Rc::clone(&b.numbers));
         let Some(place) = account.stand_ins.charge(1) else { return Err(NoStandIn::TooMany) };
         let stand_in = Rc::new(StandIn {
             ring: rings.open_writer(remote, &account.held).map_err(NoStandIn::Failed)?,
@@ -223,7 +224,7 @@ mod tests {
     }
 
     fn departed(identity: &Rc<str>, number: u8, at: u64) -> (Gid, Known) {
-        let numbers = Rc::new(Numbers::new(Duration::ZERO));
+        let numbers = Rc::new(PublisherNumbers::new(Duration::ZERO));
         numbers.pass(1, Duration::from_secs(at));
         let mut gid = Gid::default();
         gid.0[0] = number;

@@ -11,13 +11,13 @@ pub(super) use crate::files::FileStamp;
 
 /// A file that a setting names.
 #[derive(Clone, Debug)]
-pub(super) struct Named {
+pub(super) struct NamedFile {
     pub(super) variable: &'static str,
     pub(super) path: PathBuf,
     demands: FileRules,
 }
 
-impl Named {
+impl NamedFile {
     /// The file at `path`, if the setting is given.
     ///
     /// # Errors

@@ -8,21 +8,21 @@ use axon_tls::{
 };
 use axon_transport::config::{ClassicAuth, ClassicConfig};
 
-use super::file::Named;
+use super::file::NamedFile;
 use crate::error::GatewayError;
 
 /// The files that `classic` names.
-pub(super) struct Sources {
+pub(super) struct IdentityFiles {
     kind: Kind,
 }
 
 enum Kind {
     None,
-    Pinned { key: Named, trust: Named },
-    Ca { roots: Named, chain: Named, key: Named, crl: Option<Named> },
+    Pinned { key: NamedFile, trust: NamedFile },
+    Ca { roots: NamedFile, chain: NamedFile, key: NamedFile, crl: Option<NamedFile> },
 }
 
-impl Sources {
+impl IdentityFiles {
     /// Which files there are.
     ///
     /// # Errors
@@ -32,15 +32,15 @@ impl Sources {
         let kind = match classic.auth {
             ClassicAuth::None => Kind::None,
             ClassicAuth::Pinned => Kind::Pinned {
-                key: Named::new("AXON_CLASSIC_KEY", key.as_deref())?,
-                trust: Named::new("AXON_CLASSIC_TRUST", trust.as_deref())?,
+                key: NamedFile::new("AXON_CLASSIC_KEY", key.as_deref())?,
+                trust: NamedFile::new("AXON_CLASSIC_TRUST", trust.as_deref())?,
             },
             ClassicAuth::Ca => Kind::Ca {
-                roots: Named::new("AXON_CLASSIC_CA", ca.as_deref())?,
-                chain: Named::new("AXON_CLASSIC_CERT", cert.as_deref())?,
-                key: Named::new("AXON_CLASSIC_KEY", key.as_deref())?,
+                roots: NamedFile::new("AXON_CLASSIC_CA", ca.as_deref())?,
+                chain: NamedFile::new("AXON_CLASSIC_CERT", cert.as_deref())?,
+                key: NamedFile::new("AXON_CLASSIC_KEY", key.as_deref())?,
                 crl: match crl {
-                    Some(path) => Some(Named::new("AXON_CLASSIC_CRL", Some(path))?),
+                    Some(path) => Some(NamedFile::new("AXON_CLASSIC_CRL", Some(path))?),
                     None => None,
                 },
             },
@@ -49,7 +49,7 @@ impl Sources {
     }
 
     /// Each of them.
-    pub(super) fn files(&self) -> Vec<Named> {
+    pub(super) fn files(&self) -> Vec<NamedFile> {
         match &self.kind {
             Kind::None => Vec::new(),
             Kind::Pinned { key, trust } => vec![key.clone(), trust.clone()],
@@ -84,7 +84,7 @@ impl Sources {
             }
             (Kind::Ca { roots, chain, key, crl }, _) => {
                 let [root_bytes, chain_bytes, pem] = [roots.read()?, chain.read()?, key.read()?];
-                let list_bytes = crl.as_ref().map(Named::read).transpose()?;
+                let list_bytes = crl.as_ref().map(NamedFile::read).transpose()?;
                 let lists = match (crl, &list_bytes) {
                     (Some(crl), Some(bytes)) => Some(text(crl, bytes)?),
                     _ => None,
@@ -183,6 +183,6 @@ impl Loaded {
     }
 }
 
-fn text<'a>(file: &Named, bytes: &'a [u8]) -> Result<&'a str, GatewayError> {
+fn text<'a>(file: &NamedFile, bytes: &'a [u8]) -> Result<&'a str, GatewayError> {
     std::str::from_utf8(bytes).map_err(|_| file.unusable("it is not text in UTF-8"))
 }

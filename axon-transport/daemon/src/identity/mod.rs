@@ -18,7 +18,7 @@ use axon_tls::identity::Auth;
 use axon_transport::config::{ClassicAuth, ClassicConfig};
 
 use self::{
-    load::Sources,
+    load::IdentityFiles,
     watch::{FilesChange, Watch},
 };
 use crate::error::GatewayError;
@@ -28,12 +28,12 @@ use crate::error::GatewayError;
 /// # Errors
 /// A file that cannot, by the name of its variable.
 pub(crate) fn check(classic: &ClassicConfig) -> Result<(), GatewayError> {
-    Sources::of(classic)?.load(None).map(drop)
+    IdentityFiles::of(classic)?.load(None).map(drop)
 }
 
 /// What this host is, and whom it trusts, as its files say.
 pub(crate) struct Identity {
-    sources: Sources,
+    sources: IdentityFiles,
     host: String,
     in_force: RwLock<InForce>,
     watch: Mutex<Watch>,
@@ -52,7 +52,7 @@ impl Identity {
     /// A file that cannot be used, by the name of its variable; or a certificate that does not say
     /// which host this is.
     pub(crate) fn load(classic: &ClassicConfig, node: &str) -> Result<Self, GatewayError> {
-        let sources = Sources::of(classic)?;
+        let sources = IdentityFiles::of(classic)?;
         // Before they are read: what is written meanwhile is read again.
         let watch = Watch::new(sources.files());
         let auth = sources.load(None)?.put_in_force();

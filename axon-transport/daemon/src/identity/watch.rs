@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use super::file::{FileStamp, Named};
+use super::file::{FileStamp, NamedFile};
 
 /// Somebody who writes for so long is not waited for.
 const LONGEST_WRITE: Duration = Duration::from_secs(5);
@@ -23,7 +23,7 @@ pub(super) enum FilesChange {
 /// Files, and what was seen of them.
 #[derive(Debug)]
 pub(super) struct Watch {
-    files: Vec<Named>,
+    files: Vec<NamedFile>,
     /// As they were when they were read.
     read: Option<Vec<Seen>>,
     /// As they were at the last look.
@@ -36,8 +36,8 @@ type Seen = Result<FileStamp, String>;
 
 impl Watch {
     /// Files that are about to be read for the first time.
-    pub(super) fn new(files: Vec<Named>) -> Self {
-        let seen: Vec<_> = files.iter().map(Named::stamp).collect();
+    pub(super) fn new(files: Vec<NamedFile>) -> Self {
+        let seen: Vec<_> = files.iter().map(NamedFile::stamp).collect();
         Self { files, read: Some(seen.clone()), seen, restless_since: None }
     }
 
@@ -82,6 +82,6 @@ impl Watch {
     }
 
     fn stamps(&self) -> Vec<Seen> {
-        self.files.iter().map(Named::stamp).collect()
+        self.files.iter().map(NamedFile::stamp).collect()
     }
 }

@@ -58,7 +58,7 @@ mod tests {
 
     use super::*;
     use crate::{
-        keys::{ClientProof, ProofResponder, Receiver, Sender},
+        keys::{ClientProof, KeyReceiver, KeySender, ProofResponder},
         residue::left_on_the_stack,
     };
 
@@ -75,9 +75,9 @@ mod tests {
         let work = || {
             let Ok(exporters) = Exporters::derive(export);
             let now = Duration::ZERO;
-            let mut sender = Sender::new("sae-a", "sae-b").unwrap();
+            let mut sender = KeySender::new("sae-a", "sae-b").unwrap();
             sender.attach(now, 1, &exporters).unwrap();
-            let mut receiver = Receiver::new("sae-a", "sae-b").unwrap();
+            let mut receiver = KeyReceiver::new("sae-a", "sae-b").unwrap();
             receiver.attach(now, 1, &exporters).unwrap();
             receiver.elect(1);
             let proofs = (

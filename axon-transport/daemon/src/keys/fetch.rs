@@ -4,7 +4,7 @@ use std::{collections::VecDeque, time::Duration};
 
 use axon_envelope::{KeyId, KmeKey};
 
-use super::request::{Answer, Failure, FailureKind, Fetched, Purpose, Request};
+use super::request::{Answer, Failure, FailureKind, Fetched, KeyPurpose, KmeRequest};
 
 /// How often a batch is asked for.
 const TRIES: u8 = 3;
@@ -23,14 +23,14 @@ const REFUSALS_PER_SECOND: f64 = 5.0;
 /// The keys of one master that are being fetched. Bounded by its caller.
 pub(super) struct Fetches {
     master: String,
-    purpose: Purpose,
-    waiting: VecDeque<Batch>,
-    in_flight: Vec<Batch>,
+    purpose: KeyPurpose,
+    waiting: VecDeque<KeyBatch>,
+    in_flight: Vec<KeyBatch>,
     /// Refused calls that may still come at once, as of a time.
     refusals: (f64, Duration),
 }
 
-struct Batch {
+struct KeyBatch {
     key_ids: Vec<KeyId>,
     tries_left: u8,
     /// When it may be asked for; once asked, when it may be asked for again.
@@ -41,7 +41,7 @@ struct Batch {
 pub(super) type FetchOutcome = (KeyId, Result<KmeKey, Failure>);
 
 impl Fetches {
-    pub(super) fn new(master: &str, purpose: Purpose) -> Self {
+    pub(super) fn new(master: &str, purpose: KeyPurpose) -> Self {
         let (waiting, in_flight) = Default::default();
         let refusals = (REFUSALS, Duration::ZERO);
         Self { master: master.to_owned(), purpose, waiting, in_flight, refusals }
@@ -49,10 +49,10 @@ impl Fetches {
 
     /// Starts fetching `key_ids`, which must not be empty or under way already.
     pub(super) fn start(&mut self, now: Duration, key_ids: Vec<KeyId>) {
-        self.waiting.push_back(Batch { key_ids, tries_left: TRIES, not_before: now });
+        self.waiting.push_back(KeyBatch { key_ids, tries_left: TRIES, not_before: now });
     }
 
-    pub(super) fn poll_request(&mut self, now: Duration) -> Option<Request> {
+    pub(super) fn poll_request(&mut self, now: Duration) -> Option<KmeRequest> {
         if self.in_flight.len() >= IN_FLIGHT || now < self.refusals_allow() {
             return None;
         }
@@ -63,12 +63,12 @@ impl Fetches {
         let key_ids = batch.key_ids.clone();
         self.in_flight.push(batch);
         let (master, purpose) = (self.master.clone(), self.purpose);
-        Some(Request::Dec { master, key_ids, purpose })
+        Some(KmeRequest::Dec { master, key_ids, purpose })
     }
 
     /// What became of the keys that `answer` settles; none where they are asked for again.
     pub(super) fn handle_answer(&mut self, now: Duration, answer: Answer) -> Vec<FetchOutcome> {
-        let Request::Dec { key_ids, .. } = answer.request else { return Vec::new() };
+        let KmeRequest::Dec { key_ids, .. } = answer.request else { return Vec::new() };
         let Some(i) = self.in_flight.iter().position(|b| b.key_ids == key_ids) else {
             return Vec::new();
         };
@@ -88,7 +88,7 @@ impl Fetches {
         match failure.kind {
             FailureKind::Refused if batch.key_ids.len() > 1 => {
                 // One unknown key_ID spoils a batch: the others may still be had.
-                let single = |key_id| Batch {
+                let single = |key_id| KeyBatch {
                     key_ids: vec![key_id],
                     tries_left: TRIES,
                     not_before: Duration::ZERO,

@@ -19,11 +19,11 @@ mod used;
 pub mod verifier;
 
 pub use crate::wire::keys::{KeyMessage, MessageError, Violation};
-pub use bootstrap::{Acceptor, Attempt, Completion, Dial, DialRefusal, Dialler, Lookup, Resolver};
+pub use bootstrap::{Acceptor, Completion, Dial, DialKey, DialRefusal, Dialler, Lookup, Resolver};
 pub use clock::Clock;
 pub use exporters::{ENVELOPE_EXPORTER, Exporters, READY_EXPORTER};
-pub use kme::{Event, Events, Kme, KmeError, Origin, Statistics};
-pub use request::{Answer, Failure, FailureKind, Fetched, Purpose, Request, Stock};
-pub use supply::{Disagreement, NoKey, Receiver, Sender, SupplyError};
+pub use kme::{Event, Events, Kme, KmeError, RequestOrigin, Statistics};
+pub use request::{Answer, Failure, FailureKind, Fetched, KeyPurpose, KmeRequest, Stock};
+pub use supply::{Disagreement, KeyReceiver, KeySender, NoKey, SupplyError};
 pub use used::{UsedKeys, UsedStatistics};
 pub use verifier::{ClientProof, ProofFailure, ProofResponder, ProofState};

@@ -8,7 +8,7 @@ pub use etsi_qkd014::pool::Stock;
 
 /// What a key is fetched for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Purpose {
+pub enum KeyPurpose {
     /// A dialler's TLS external PSK.
     Bootstrap,
     /// The same key at the server, for a handshake that named it.
@@ -21,7 +21,7 @@ pub enum Purpose {
 
 /// One call to the KME.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Request {
+pub enum KmeRequest {
     /// `enc_keys`: fresh 256-bit keys shared with `slave`. A failed call may have consumed keys and
     /// is never repeated as such.
     Enc {
@@ -30,7 +30,7 @@ pub enum Request {
         /// How many keys.
         number: u32,
         /// What for.
-        purpose: Purpose,
+        purpose: KeyPurpose,
     },
     /// `dec_keys`: the keys that `master` named.
     Dec {
@@ -39,7 +39,7 @@ pub enum Request {
         /// Their names.
         key_ids: Vec<KeyId>,
         /// What for.
-        purpose: Purpose,
+        purpose: KeyPurpose,
     },
     /// `status`: what is in stock with `slave`.
     Status {
@@ -48,27 +48,27 @@ pub enum Request {
     },
 }
 
-/// A [`Request`] and how it ended.
+/// A [`KmeRequest`] and how it ended.
 #[derive(Debug)]
 pub struct Answer {
     /// As it was asked.
-    pub request: Request,
+    pub request: KmeRequest,
     /// From asking to the end.
     pub took: Duration,
     /// What came of it.
     pub outcome: Result<Fetched, Failure>,
 }
 
-/// What a successful [`Request`] gave.
+/// What a successful [`KmeRequest`] gave.
 pub enum Fetched {
     /// Keys, in the order asked for. All that were asked for, or it is a [`Failure`]; of
     /// `enc_keys` for messages without those that were used before.
     Keys(Vec<(KeyId, KmeKey)>),
-    /// The answer to [`Request::Status`].
+    /// The answer to [`KmeRequest::Status`].
     Stock(Stock),
 }
 
-/// Why a [`Request`] failed. Never holds anything of a key.
+/// Why a [`KmeRequest`] failed. Never holds anything of a key.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Failure {
     /// What can be done about it.

@@ -4,7 +4,7 @@ use axon_shm::ids::DaemonId;
 use axon_transport::config::{Config, Security};
 
 use super::CloseCode;
-use crate::wire::{Terms, link::Hello};
+use crate::wire::{SecurityTerms, link::Hello};
 
 /// The protocol version of this build; it speaks no other.
 pub const PROTOCOL: u8 = 1;
@@ -26,7 +26,7 @@ pub struct Mismatch {
 impl Hello {
     /// What `config` says of this daemon.
     pub fn new(config: &Config, daemon: DaemonId) -> Self {
-        let Terms { mode, key_mode, kex, cipher, auth } = Terms::of(config);
+        let SecurityTerms { mode, key_mode, kex, cipher, auth } = SecurityTerms::of(config);
         let sae = match &config.security {
             Security::Classic(_) => None,
             Security::Qkd(qkd) => Some(qkd.sae_id.clone()),
@@ -53,8 +53,8 @@ impl Hello {
     }
 
     /// What both sides must have in common.
-    fn terms(&self) -> Terms {
-        Terms {
+    fn terms(&self) -> SecurityTerms {
+        SecurityTerms {
             mode: self.mode,
             key_mode: self.key_mode,
             kex: self.kex,

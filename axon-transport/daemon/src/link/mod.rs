@@ -12,7 +12,7 @@ pub use crate::wire::link::{
     AccessCheck, AccessDecisions, Asserted, CloseCode, Denied, DeniedUse, Elected, FrameError,
     Graph, GraphResync, Hello, Intake, LastSeen, LinkClosed, MAX_DENIED, MAX_FRAME,
     MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, MAX_PROOFS, Message, Owners, Received, ReceivedOf,
-    RouteReady, RouteRefused, RouteUnasked, Subscribe, Subscriber, Unsubscribe, UseDecision,
+    RouteReady, RouteRefused, RouteSubscriber, RouteUnasked, Subscribe, Unsubscribe, UseDecision,
     read_length, unpacked_length,
 };
 pub use election::{Candidate, keep};

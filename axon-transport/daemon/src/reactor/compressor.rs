@@ -8,18 +8,18 @@ use std::{
 
 use tokio::sync::mpsc;
 
-use super::inputs::Done;
+use super::inputs::TaskResult;
 use crate::engine::compression::{CompressionAnswer, CompressionOrder, Compressor};
 
 /// The thread, as the reactor has it.
 pub(super) struct CompressorThread {
     orders: Option<Sender<CompressionOrder>>,
-    report: mpsc::UnboundedSender<Done>,
+    report: mpsc::UnboundedSender<TaskResult>,
 }
 
 impl CompressorThread {
     /// A thread that has not begun. Its answers go to `report`.
-    pub(super) fn new(report: mpsc::UnboundedSender<Done>) -> Self {
+    pub(super) fn new(report: mpsc::UnboundedSender<TaskResult>) -> Self {
         Self { orders: None, report }
     }
 
@@ -30,13 +30,13 @@ impl CompressorThread {
             // Without a thread samples are sent as they are.
             let number = unsent.0.number;
             let answer = CompressionAnswer { number, compressed: None, took: Duration::ZERO };
-            let _ = self.report.send(Done::Compressed(answer));
+            let _ = self.report.send(TaskResult::Compressed(answer));
         }
     }
 }
 
 /// Starts the thread. It ends with the sender of its orders, or with the receiver of its answers.
-fn start(report: mpsc::UnboundedSender<Done>) -> Sender<CompressionOrder> {
+fn start(report: mpsc::UnboundedSender<TaskResult>) -> Sender<CompressionOrder> {
     let (orders, taken) = channel();
     let started = thread::Builder::new()
         .name("axon-zstd".into())
@@ -47,11 +47,11 @@ fn start(report: mpsc::UnboundedSender<Done>) -> Sender<CompressionOrder> {
     orders
 }
 
-fn compress_all(orders: &Receiver<CompressionOrder>, report: &mpsc::UnboundedSender<Done>) {
+fn compress_all(orders: &Receiver<CompressionOrder>, report: &mpsc::UnboundedSender<TaskResult>) {
     let (mut compressor, started) = (Compressor::new(), Instant::now());
     while let Ok(order) = orders.recv() {
         let answer = compressor.compress(&order, || started.elapsed());
-        if report.send(Done::Compressed(answer)).is_err() {
+        if report.send(TaskResult::Compressed(answer)).is_err() {
             return;
         }
     }
@@ -73,7 +73,9 @@ mod tests {
             thread.submit(order(number, vec![number as u8; 10_000]));
         }
         for number in 1..=100 {
-            let Some(Done::Compressed(answer)) = done.blocking_recv() else { panic!("no answer") };
+            let Some(TaskResult::Compressed(answer)) = done.blocking_recv() else {
+                panic!("no answer")
+            };
             assert_eq!(answer.number, number);
             let frame = answer.compressed.unwrap();
             let payload = zstd::bulk::decompress(&frame, 10_000).unwrap();
@@ -88,7 +90,9 @@ mod tests {
         drop(taken);
         let mut thread = CompressorThread { orders: Some(orders), report };
         thread.submit(order(7, vec![0; 10_000]));
-        let Some(Done::Compressed(answer)) = done.blocking_recv() else { panic!("no answer") };
+        let Some(TaskResult::Compressed(answer)) = done.blocking_recv() else {
+            panic!("no answer")
+        };
         assert_eq!((answer.number, answer.compressed), (7, None));
     }
 }

@@ -25,7 +25,7 @@ use crate::{
 const BATCH: usize = 256;
 
 /// A result from another thread.
-pub(super) enum Done {
+pub(super) enum TaskResult {
     /// The ledger of used keys recorded the key of a connection; true if it was new.
     Recorded(u64, bool),
     /// Counters for the status of the keys.
@@ -45,14 +45,14 @@ pub(super) enum Input {
     /// The KME answered.
     Key(Event),
     /// Another thread did something.
-    Done(Done),
+    TaskResult(TaskResult),
 }
 
 /// Channels and the doorbell.
 pub(super) struct Inputs {
     orders: mpsc::Receiver<ToGateway>,
     key_events: Option<Events>,
-    done: mpsc::UnboundedReceiver<Done>,
+    done: mpsc::UnboundedReceiver<TaskResult>,
     doorbell: AsyncFd<PassedFd>,
     rang: bool,
     /// Inputs that woke the loop.
@@ -67,7 +67,7 @@ impl Inputs {
     pub(super) fn new(
         orders: mpsc::Receiver<ToGateway>,
         key_events: Option<Events>,
-        done: mpsc::UnboundedReceiver<Done>,
+        done: mpsc::UnboundedReceiver<TaskResult>,
         rings: &ShmRings,
     ) -> io::Result<Self> {
         let doorbell = watch(rings.doorbell().as_fd().try_clone_to_owned()?)?;
@@ -98,7 +98,7 @@ impl Inputs {
             inputs.push(Input::Key(event));
         }
         while let Ok(done) = self.done.try_recv() {
-            inputs.push(Input::Done(done));
+            inputs.push(Input::TaskResult(done));
         }
         inputs
     }
@@ -123,7 +123,7 @@ impl Inputs {
             }
         }
         if let Poll::Ready(Some(done)) = self.done.poll_recv(cx) {
-            self.taken.push(Input::Done(done));
+            self.taken.push(Input::TaskResult(done));
         }
         if self.rang || !self.taken.is_empty() { Poll::Ready(()) } else { Poll::Pending }
     }

@@ -22,12 +22,12 @@ use super::{
     compressor::CompressorThread,
     control_outbox::ControlOutbox,
     finishing::Finishing,
-    inputs::{Done, Input, Inputs},
+    inputs::{Input, Inputs, TaskResult},
     key_reports::KeyReports,
     looks::{Looks, PollDecision},
     rings::ShmRings,
     session::{Notices, local_graph},
-    sockets::{Datagram, Sockets},
+    sockets::{ReceivedDatagram, Sockets},
     timer::Timer,
 };
 use crate::{
@@ -83,7 +83,7 @@ pub(super) struct Reactor {
     kme: Option<(Kme, UsedKeys)>,
     /// Answers that the KME client gave at once.
     answers: Vec<Event>,
-    report_done: mpsc::UnboundedSender<Done>,
+    report_done: mpsc::UnboundedSender<TaskResult>,
     compressor: CompressorThread,
     buffer: Vec<u8>,
     /// The last datagrams were a flood of discovery's, and nothing else.
@@ -203,7 +203,7 @@ impl Reactor {
         if !self.told.is_behind() {
             let (engine, mut of_quic) = (&mut self.engine, false);
             let (any, drained) = self.sockets.receive(|datagram| {
-                let Datagram { socket, from, local, ecn, bytes } = datagram;
+                let ReceivedDatagram { socket, from, local, ecn, bytes } = datagram;
                 of_quic |= !bytes.first().is_some_and(|first| is_discovery(*first));
                 engine.handle_datagram(socket, from, local, ecn, bytes, now);
             });
@@ -215,7 +215,7 @@ impl Reactor {
             match input {
                 Input::Order(order) => self.handle_order(order, now),
                 Input::Key(event) => self.engine.handle_key_event(event, now),
-                Input::Done(done) => self.handle_done(done, now),
+                Input::TaskResult(done) => self.handle_done(done, now),
             }
         }
         if self.engine.follow_local_at() <= now && self.notices.take_graph() {
@@ -241,13 +241,13 @@ impl Reactor {
         }
     }
 
-    fn handle_done(&mut self, done: Done, now: Duration) {
+    fn handle_done(&mut self, done: TaskResult, now: Duration) {
         match done {
-            Done::Recorded(link, first) => self.engine.handle_recorded(link, first, now),
-            Done::Identity => self.engine.handle_identity(now),
-            Done::Interfaces(interfaces) => self.engine.handle_interfaces(interfaces),
-            Done::Compressed(answer) => self.engine.handle_compressed(answer, now),
-            Done::Keys(statistics) => {
+            TaskResult::Recorded(link, first) => self.engine.handle_recorded(link, first, now),
+            TaskResult::Identity => self.engine.handle_identity(now),
+            TaskResult::Interfaces(interfaces) => self.engine.handle_interfaces(interfaces),
+            TaskResult::Compressed(answer) => self.engine.handle_compressed(answer, now),
+            TaskResult::Keys(statistics) => {
                 self.key_reports.handle_report();
                 let (kme, used) = *statistics;
                 if let Some(status) = self.engine.key_status(&kme, &used, now) {
@@ -290,7 +290,7 @@ impl Reactor {
         spawn_blocking(move || {
             let first = used.record(&[key_id]) == [true];
             // An error: the reactor is gone.
-            let _ = report.send(Done::Recorded(link, first));
+            let _ = report.send(TaskResult::Recorded(link, first));
         });
     }
 
@@ -302,7 +302,7 @@ impl Reactor {
                 Vec::new()
             });
             // An error: the reactor is gone.
-            let _ = report.send(Done::Interfaces(found));
+            let _ = report.send(TaskResult::Interfaces(found));
         });
     }
 
@@ -340,7 +340,7 @@ impl Reactor {
         }
         let (kme, used, report) = (kme.clone(), used.clone(), self.report_done.clone());
         spawn_blocking(move || {
-            let _ = report.send(Done::Keys(Box::new((kme.statistics(), used.statistics()))));
+            let _ = report.send(TaskResult::Keys(Box::new((kme.statistics(), used.statistics()))));
         });
     }
 
@@ -428,7 +428,7 @@ impl Reactor {
 }
 
 /// Looks at the files of the identity until the reactor is gone.
-async fn watch_files(identity: Arc<Identity>, report: mpsc::UnboundedSender<Done>) {
+async fn watch_files(identity: Arc<Identity>, report: mpsc::UnboundedSender<TaskResult>) {
     let mut looks = tokio::time::interval(LOOK);
     // After a stall, two looks at once would miss a write in between.
     looks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
@@ -437,7 +437,7 @@ async fn watch_files(identity: Arc<Identity>, report: mpsc::UnboundedSender<Done
         let identity = Arc::clone(&identity);
         // On another thread: a file system can hang.
         let changed = spawn_blocking(move || identity.look(Instant::now())).await;
-        if changed.unwrap_or(false) && report.send(Done::Identity).is_err() {
+        if changed.unwrap_or(false) && report.send(TaskResult::Identity).is_err() {
             return;
         }
     }

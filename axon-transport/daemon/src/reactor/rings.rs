@@ -72,7 +72,7 @@ impl Rings for ShmRings {
     ) -> Result<Rc<dyn RingReader>, String> {
         let subscription = self.session.create_relay(spec, stands_for);
         let subscription = subscription.map_err(|error| error.to_string())?;
-        Ok(Rc::new(Relay { subscription, taken: RefCell::default() }))
+        Ok(Rc::new(RelayReader { subscription, taken: RefCell::default() }))
     }
 
     fn open_writer(
@@ -95,13 +95,13 @@ impl Rings for ShmRings {
 }
 
 /// A relay subscription.
-struct Relay {
+struct RelayReader {
     subscription: Subscription,
     /// The samples of one take, and where their payloads are.
     taken: RefCell<Vec<(MessageInfo, Range<usize>)>>,
 }
 
-impl RingReader for Relay {
+impl RingReader for RelayReader {
     fn gid(&self) -> Gid {
         self.subscription.gid()
     }

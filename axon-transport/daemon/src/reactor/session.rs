@@ -15,7 +15,7 @@ use axon_transport::{
 };
 use tokio::sync::Notify;
 
-use crate::engine::peer::Local;
+use crate::engine::peer::LocalEndpoints;
 
 /// Events of the session, which its own thread reports.
 #[derive(Debug, Default)]
@@ -73,7 +73,7 @@ pub(super) fn open(
 }
 
 /// The endpoints of applications on this host whose discovery range is known.
-pub(super) fn local_graph(session: &Session) -> Local {
+pub(super) fn local_graph(session: &Session) -> LocalEndpoints {
     let view = session.graph();
     let local = view.endpoints.values().filter(|e| e.daemon.is_none());
     let local = local

@@ -24,7 +24,7 @@ const CALLS: usize = 8;
 const MAX_SENT: usize = 65_000;
 
 /// A datagram that was received.
-pub(super) struct Datagram {
+pub(super) struct ReceivedDatagram {
     /// The index of the socket.
     pub(super) socket: usize,
     pub(super) from: SocketAddr,
@@ -81,7 +81,7 @@ impl Sockets {
     }
 
     /// Receives datagrams that have arrived, up to a bound. Returns whether there was any, and whether there are no more.
-    pub(super) fn receive(&mut self, mut each: impl FnMut(Datagram)) -> (bool, bool) {
+    pub(super) fn receive(&mut self, mut each: impl FnMut(ReceivedDatagram)) -> (bool, bool) {
         let (mut any, mut drained) = (false, true);
         for (index, socket) in self.all.iter().enumerate() {
             for call in 1..=CALLS {
@@ -96,7 +96,7 @@ impl Sockets {
                     let mut bytes = BytesMut::from(&message[..meta.len]);
                     while !bytes.is_empty() {
                         let one = bytes.split_to(meta.stride.clamp(1, bytes.len()));
-                        each(Datagram {
+                        each(ReceivedDatagram {
                             socket: index,
                             from: meta.addr,
                             local: meta.dst_ip,

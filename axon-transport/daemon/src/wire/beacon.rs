@@ -10,7 +10,7 @@ use minicbor::{
     encode::{Error as EncodeError, Write},
 };
 
-use super::Terms;
+use super::SecurityTerms;
 
 /// The protocol versions that this release speaks.
 pub const PROTOCOLS: RangeInclusive<u8> = 1..=1;
@@ -62,7 +62,7 @@ pub struct Beacon {
     /// The sender.
     pub daemon: DaemonId,
     /// What it takes to link with it.
-    pub terms: Terms,
+    pub terms: SecurityTerms,
     /// Its SAE ID in qkd: 1 to 63 visible ASCII characters.
     pub sae: Option<String>,
     /// Its QUIC port, not 0.
@@ -287,7 +287,7 @@ impl Beacon {
 
     fn from_wire(wire: Wire<'_>) -> Result<Self, DatagramError> {
         let need = |value: Option<u8>, key| value.ok_or(DatagramError::Key(key));
-        let terms = Terms {
+        let terms = SecurityTerms {
             mode: need(wire.mode, 4)?,
             key_mode: need(wire.key_mode, 5)?,
             kex: need(wire.kex, 6)?,
@@ -298,7 +298,7 @@ impl Beacon {
             (1..=LONGEST_SAE_ID).contains(&sae.len()) && sae.bytes().all(|b| b.is_ascii_graphic())
         };
         // In qkd nobody can be dialled without a name for the KME.
-        if wire.sae.map_or(terms.mode == Terms::QKD, |sae| !visible(sae)) {
+        if wire.sae.map_or(terms.mode == SecurityTerms::QKD, |sae| !visible(sae)) {
             return Err(DatagramError::Key(8));
         }
         Ok(Self {
@@ -342,7 +342,7 @@ mod tests {
             protocols: (1, 1),
             domain: 7,
             daemon: DaemonId([0xda; 16]),
-            terms: Terms { mode: 1, key_mode: 2, kex: 1, cipher: 0, auth: None },
+            terms: SecurityTerms { mode: 1, key_mode: 2, kex: 1, cipher: 0, auth: None },
             sae: Some("sae-a".to_owned()),
             port: 61412,
             addresses: vec!["192.0.2.1".parse().unwrap(), "2001:db8::1".parse().unwrap()],
@@ -443,8 +443,8 @@ mod tests {
                         protocols: (1, 3),
                         domain,
                         daemon: DaemonId(daemon),
-                        terms: Terms { mode, key_mode, kex, cipher, auth },
-                        sae: (mode == Terms::QKD).then_some(sae),
+                        terms: SecurityTerms { mode, key_mode, kex, cipher, auth },
+                        sae: (mode == SecurityTerms::QKD).then_some(sae),
                         port,
                         addresses,
                         graph,

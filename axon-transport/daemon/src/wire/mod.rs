@@ -7,4 +7,4 @@ pub mod keys;
 pub mod link;
 mod terms;
 
-pub use terms::{Difference, Terms};
+pub use terms::{Difference, SecurityTerms};

@@ -7,7 +7,7 @@ use axon_transport::config::{ClassicAuth, Config, KeyMode, QkdKex, QuicCipher, S
 /// Codes rather than enums: a peer of a later release may send one that this release has no name
 /// for, which is a difference to report and not a datagram to drop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Terms {
+pub struct SecurityTerms {
     /// 0 classic, 1 qkd.
     pub mode: u8,
     /// 0 none, 1 session, 2 messages10.
@@ -37,7 +37,7 @@ const KEXES: &[&str] = &["X25519MLKEM768", "psk_ke", "psk_dhe_ke"];
 const CIPHERS: &[&str] = &["chacha20-poly1305", "aes-256-gcm"];
 const AUTHS: &[&str] = &["none", "pinned", "ca"];
 
-impl Terms {
+impl SecurityTerms {
     /// The code of `qkd` in [`mode`](Self::mode).
     pub const QKD: u8 = 1;
 
@@ -73,10 +73,10 @@ impl Terms {
     /// The first setting in which the two differ, the one that explains most first.
     ///
     /// ```
-    /// use axon_daemon::internal::wire::Terms;
+    /// use axon_daemon::internal::wire::SecurityTerms;
     ///
-    /// let classic = Terms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(1) };
-    /// let qkd = Terms { mode: 1, key_mode: 2, kex: 1, cipher: 0, auth: None };
+    /// let classic = SecurityTerms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(1) };
+    /// let qkd = SecurityTerms { mode: 1, key_mode: 2, kex: 1, cipher: 0, auth: None };
     /// assert_eq!(classic.first_difference(&classic), None);
     ///
     /// let difference = classic.first_difference(&qkd).unwrap();

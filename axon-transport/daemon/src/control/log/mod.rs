@@ -33,7 +33,7 @@ pub fn start(config: &Config) {
         // What cannot be written is dropped; the default prints that to standard error, and panics
         // where that fails as well.
         .log_internal_errors(false)
-        .event_format(Lines { format: Format::default(), throttle: Throttle::default() })
+        .event_format(LineFormat { format: Format::default(), throttle: Throttle::default() })
         .with_filter_reloading();
     let filter = lines.reload_handle();
     let set = lines.try_init();
@@ -56,13 +56,13 @@ pub(super) fn set_filter(text: &str) {
 }
 
 /// One line for each event, of plain characters, and not too many of a kind.
-struct Lines {
+struct LineFormat {
     format: Format,
     /// By the place in the code, and not by the text: the cause of a flood may choose the text.
     throttle: Throttle<callsite::Identifier>,
 }
 
-impl<S, N> FormatEvent<S, N> for Lines
+impl<S, N> FormatEvent<S, N> for LineFormat
 where
     S: Subscriber + for<'a> LookupSpan<'a>,
     N: for<'a> FormatFields<'a> + 'static,

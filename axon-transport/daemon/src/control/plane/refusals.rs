@@ -29,9 +29,9 @@ impl Refusals {
         self.0.retain(|(_, old)| {
             old.what != new.what || old.reason != new.reason || without_ports(&old.peer) != peer
         });
-        let share = Share::of(kind);
-        let own = self.0.iter().filter(|(kind, _)| Share::of(*kind) == share).count();
-        if share == Share::Unproven && own >= MOST_UNPROVEN {
+        let share = RefusalShare::of(kind);
+        let own = self.0.iter().filter(|(kind, _)| RefusalShare::of(*kind) == share).count();
+        if share == RefusalShare::Unproven && own >= MOST_UNPROVEN {
             self.make_room(share, source(&new));
         } else if self.0.len() >= MOST {
             self.make_room(self.largest(share), source(&new));
@@ -50,20 +50,21 @@ impl Refusals {
     }
 
     /// The share that has most of the room, once `newcomer` has one more.
-    fn largest(&self, newcomer: Share) -> Share {
+    fn largest(&self, newcomer: RefusalShare) -> RefusalShare {
         let mut held = HashMap::from([(newcomer, 1)]);
         for (kind, _) in &self.0 {
-            *held.entry(Share::of(*kind)).or_default() += 1;
+            *held.entry(RefusalShare::of(*kind)).or_default() += 1;
         }
         let most = held.into_iter().max_by_key(|(share, held)| (*held, *share == newcomer));
         most.map_or(newcomer, |(share, _)| share)
     }
 
     /// Removes the oldest refusal of the source that has the most in this share, once `newcomer` has one more.
-    fn make_room(&mut self, share: Share, newcomer: Option<IpAddr>) {
+    fn make_room(&mut self, share: RefusalShare, newcomer: Option<IpAddr>) {
         let mut held = HashMap::from([(newcomer, 1)]);
-        let all =
-            || self.0.iter().enumerate().filter(move |(_, (kind, _))| Share::of(*kind) == share);
+        let all = || {
+            self.0.iter().enumerate().filter(move |(_, (kind, _))| RefusalShare::of(*kind) == share)
+        };
         for (_, (_, refusal)) in all() {
             *held.entry(source(refusal)).or_default() += 1;
         }
@@ -77,14 +78,14 @@ impl Refusals {
 
 /// Who shares a part of the room.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-enum Share {
+enum RefusalShare {
     Unproven,
     Listed,
     Peer,
     Local,
 }
 
-impl Share {
+impl RefusalShare {
     fn of(kind: RefusalKind) -> Self {
         match kind {
             RefusalKind::Beacon | RefusalKind::Unproven => Self::Unproven,

@@ -17,7 +17,7 @@ const SESSION: SessionId = SessionId([1; 16]);
 const DAEMON: DaemonId = DaemonId([2; 16]);
 
 fn control() -> Control {
-    Control::new(Arc::new(Config::default()), Vec::new(), Spare::default())
+    Control::new(Arc::new(Config::default()), Vec::new(), SpareDescriptors::default())
 }
 
 /// A link over which a route of topic /t does not cross.
@@ -69,7 +69,7 @@ fn with_users(rules: &str) -> Control {
         config.access = AccessRules::parse(rules, "access.toml").unwrap();
     }
     config.trusted_uids = vec![7];
-    let mut control = Control::new(Arc::new(config), Vec::new(), Spare::default());
+    let mut control = Control::new(Arc::new(config), Vec::new(), SpareDescriptors::default());
     for session in [SESSION, OWN] {
         connect(&mut control, session, false);
         let endpoint = Endpoint::new(Gid::new(session, 1), EndpointKind::Subscription, "/t", "T");

@@ -19,7 +19,7 @@ use axon_transport::{
 
 use self::topics::topics;
 use super::plane::Control;
-use crate::discovery::Wanted;
+use crate::discovery::DiscoveryNeeds;
 
 /// Characters of a GID in hexadecimal that its session decides.
 const GID_PREFIX: usize = 24;
@@ -134,7 +134,7 @@ fn descriptors(control: &Control) -> DescriptorStatus {
     shown
 }
 
-fn discovery(wanted: &Wanted) -> DiscoveryStatus {
+fn discovery(wanted: &DiscoveryNeeds) -> DiscoveryStatus {
     let host = |(host, port): &(String, Option<u16>)| match port {
         Some(port) if host.contains(':') => format!("[{host}]:{port}"),
         Some(port) => format!("{host}:{port}"),

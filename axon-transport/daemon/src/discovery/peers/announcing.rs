@@ -9,7 +9,7 @@ use std::{
 use axon_transport::config::DiscoveryRange;
 use rand::RngExt;
 
-use super::{Output, Peers, record::Record};
+use super::{Output, Peers, record::DaemonRecord};
 use crate::{
     discovery::quic_ports,
     wire::beacon::{Beacon, Datagram, PROTOCOLS},
@@ -45,7 +45,7 @@ impl Peers {
         let others = || self.records.values().filter(|record| !record.linked);
         // An address that answers under many ids is one host.
         let answered = others().filter(|record| record.has_answered());
-        let answered = answered.filter_map(Record::host).collect::<BTreeSet<_>>().len();
+        let answered = answered.filter_map(DaemonRecord::host).collect::<BTreeSet<_>>().len();
         let heard = others().filter(|record| !record.has_answered()).count();
         let hosts = linked + answered + heard.min(MOST_HEARD_COUNT) + 1;
         let hosts = u32::try_from(hosts).unwrap_or(u32::MAX);

@@ -5,8 +5,8 @@ use std::{net::IpAddr, time::Duration};
 use axon_shm::ids::DaemonId;
 use rand::RngExt;
 
-use super::{Peers, record::Record};
-use crate::discovery::{Action, AddressConfidence};
+use super::{Peers, record::DaemonRecord};
+use crate::discovery::{AddressConfidence, DiscoveryAction};
 
 /// Most dials at once.
 pub(super) const MOST_IN_FLIGHT: usize = 8;
@@ -51,7 +51,7 @@ impl Peers {
     }
 
     pub(super) fn dials_in_flight(&self) -> InFlight {
-        let dials = self.records.values().flat_map(Record::in_flight);
+        let dials = self.records.values().flat_map(DaemonRecord::in_flight);
         InFlight(dials.map(|(standing, dial)| (standing, dial.first.map(|a| a.ip()))).collect())
     }
 
@@ -122,7 +122,7 @@ impl Peers {
             record.failed(standing, now, jitter);
             return false;
         }
-        self.act(Action::Dial { daemon, sae, addrs, listed, standing });
+        self.act(DiscoveryAction::Dial { daemon, sae, addrs, listed, standing });
         true
     }
 }

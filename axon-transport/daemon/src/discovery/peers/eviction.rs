@@ -4,8 +4,8 @@ use std::{cmp::Reverse, collections::BTreeMap, net::IpAddr, time::Duration};
 
 use axon_shm::ids::DaemonId;
 
-use super::{MOST_UNAUTHENTICATED, Peers, record::Record};
-use crate::discovery::{Action, AddressConfidence};
+use super::{MOST_UNAUTHENTICATED, Peers, record::DaemonRecord};
+use crate::discovery::{AddressConfidence, DiscoveryAction};
 
 /// Most records of daemons that are known by a beacon alone. The remaining records are for other daemons.
 const MOST_HEARD: usize = 192;
@@ -19,7 +19,7 @@ const CHOSEN: usize = 16;
 
 /// Records that are dropped for new ones. To choose one takes a look at all, so some are chosen at a time.
 #[derive(Debug, Default)]
-pub(super) struct Victims {
+pub(super) struct EvictionCandidates {
     /// The last one goes first. Each with when it was last heard of.
     chosen: Vec<(DaemonId, Duration)>,
     /// Whether they are known by beacons alone.
@@ -37,7 +37,7 @@ struct OfHost {
 }
 
 /// Whether a daemon is known by beacons alone.
-fn is_heard(record: &Record) -> bool {
+fn is_heard(record: &DaemonRecord) -> bool {
     record.standing() == AddressConfidence::Heard
 }
 
@@ -90,7 +90,7 @@ impl Peers {
     /// The next of the victims that were chosen, unless something was heard of it since.
     fn chosen_victim(&mut self) -> Option<DaemonId> {
         while let Some((victim, seen)) = self.victims.chosen.pop() {
-            let still = |record: &Record| {
+            let still = |record: &DaemonRecord| {
                 record.last_seen == seen
                     && record.may_be_forgotten()
                     && !record.has_answered()
@@ -124,7 +124,8 @@ impl Peers {
             chosen.extend(oldest.map(|(seen, id)| (id, seen.0)));
         }
         chosen.reverse();
-        self.victims = Victims { chosen, heard: heard_goes, records: self.records.len() };
+        self.victims =
+            EvictionCandidates { chosen, heard: heard_goes, records: self.records.len() };
     }
 
     /// Whether a peer at this address is listed, or one stood linked there.
@@ -143,7 +144,7 @@ impl Peers {
 
     pub(super) fn forget(&mut self, daemon: DaemonId) {
         if self.records.remove(&daemon).is_some() {
-            self.act(Action::Gone { daemon });
+            self.act(DiscoveryAction::Gone { daemon });
         }
     }
 

@@ -5,7 +5,7 @@ use std::net::IpAddr;
 use axon_shm::ids::DaemonId;
 use axon_transport::config::{Config, DiscoveryRange, QkdPeers, Security};
 
-use crate::wire::Terms;
+use crate::wire::SecurityTerms;
 
 /// This daemon, as others are to see it and as it judges others.
 #[derive(Clone, Debug)]
@@ -15,7 +15,7 @@ pub(crate) struct Local {
     /// `ROS_DOMAIN_ID`.
     pub domain: u32,
     /// Its security settings.
-    pub terms: Terms,
+    pub terms: SecurityTerms,
     /// In qkd its SAE ID and those it accepts.
     pub sae: Option<(String, QkdPeers)>,
     /// How far it looks, at first.
@@ -36,7 +36,7 @@ impl Local {
         Self {
             daemon,
             domain: config.domain,
-            terms: Terms::of(config),
+            terms: SecurityTerms::of(config),
             sae,
             // Sessions say more: `Peers::set_range`.
             range: DiscoveryRange::Off,

@@ -31,11 +31,11 @@ use self::dialling::MOST_IN_FLIGHT;
 pub(crate) use self::local::Local;
 use self::{
     candidates::LocalAddresses,
-    eviction::Victims,
+    eviction::EvictionCandidates,
     probing::Probes,
-    record::{DialAddress, Record},
+    record::{DaemonRecord, DialAddress},
 };
-use super::{Action, AddressConfidence, Interface};
+use super::{AddressConfidence, DiscoveryAction, Interface};
 
 use crate::token_bucket::TokenBucket;
 
@@ -59,7 +59,7 @@ pub(crate) enum Output {
     /// To the group, on every interface.
     Multicast(Vec<u8>),
     /// For the daemon.
-    Action(Action),
+    Action(DiscoveryAction),
 }
 
 /// The state machine of discovery.
@@ -67,8 +67,8 @@ pub(crate) enum Output {
 pub(crate) struct Peers {
     local: Local,
     here: LocalAddresses,
-    records: BTreeMap<DaemonId, Record>,
-    victims: Victims,
+    records: BTreeMap<DaemonId, DaemonRecord>,
+    victims: EvictionCandidates,
     /// Addresses of listed peers, with a port where one was given.
     listed: Vec<(IpAddr, Option<u16>)>,
     port: Option<u16>,
@@ -104,7 +104,7 @@ impl Peers {
             local,
             here,
             records: BTreeMap::new(),
-            victims: Victims::default(),
+            victims: EvictionCandidates::default(),
             listed: Vec::new(),
             port: None,
             graph: 0,
@@ -214,7 +214,7 @@ impl Peers {
         }
         self.here.interfaces = interfaces;
         let dials = self.records.values_mut().flat_map(|record| &mut record.dials);
-        dials.for_each(record::Dial::reset);
+        dials.for_each(record::DialTime::reset);
         self.dial_all(now);
         if self.port.is_some() {
             self.start_burst(now);
@@ -299,7 +299,8 @@ impl Peers {
     ) {
         let jitter = self.random.random_range(0.5..1.5);
         let record = self.records.get_mut(&daemon);
-        let under_way = |record: &&mut Record| record.dials[standing as usize].in_flight.is_some();
+        let under_way =
+            |record: &&mut DaemonRecord| record.dials[standing as usize].in_flight.is_some();
         if let Some(record) = record.filter(under_way) {
             record.failed(standing, now, jitter);
             if record.may_be_forgotten() && record.left(now) {
@@ -312,7 +313,7 @@ impl Peers {
     }
 
     /// Whether a dial would make sense, and the range lets this daemon look for the peer.
-    fn wants_dial(&self, record: &Record, standing: AddressConfidence) -> bool {
+    fn wants_dial(&self, record: &DaemonRecord, standing: AddressConfidence) -> bool {
         let in_range = match self.local.range {
             DiscoveryRange::Off => false,
             DiscoveryRange::Localhost => record.near || record.listed,
@@ -326,10 +327,10 @@ impl Peers {
     }
 
     fn send(&mut self, to: SocketAddr, bytes: Vec<u8>) {
-        self.act(Action::SendFromQuicPort { to, bytes });
+        self.act(DiscoveryAction::SendFromQuicPort { to, bytes });
     }
 
-    fn act(&mut self, action: Action) {
+    fn act(&mut self, action: DiscoveryAction) {
         self.outputs.push_back(Output::Action(action));
     }
 }

@@ -37,7 +37,7 @@ mod tests {
         },
         *,
     };
-    use crate::{discovery::Action, wire::beacon::Datagram};
+    use crate::{discovery::DiscoveryAction, wire::beacon::Datagram};
 
     const OLD: &str = "10.0.0.2:61301";
     const NEW: &str = "10.0.0.7:61301";
@@ -61,7 +61,7 @@ mod tests {
     /// The probe of the new address among what is to be done, which is nothing else.
     fn probe(peers: &mut Peers) -> Option<[u8; 8]> {
         let sent = actions(peers).into_iter().map(|action| match action {
-            Action::SendFromQuicPort { to, bytes } if to == from(NEW) => {
+            DiscoveryAction::SendFromQuicPort { to, bytes } if to == from(NEW) => {
                 match Datagram::decode(&bytes) {
                     Ok(Datagram::Probe { nonce, .. }) => nonce,
                     other => panic!("{other:?}"),
@@ -91,7 +91,7 @@ mod tests {
             };
             answer(&mut peers, 8.0, nonce.unwrap());
             let dial = actions(&mut peers);
-            let [Action::Dial { daemon: HIGHER, addrs, .. }] = &dial[..] else {
+            let [DiscoveryAction::Dial { daemon: HIGHER, addrs, .. }] = &dial[..] else {
                 panic!("{dial:?}")
             };
             assert_eq!(addrs[..], [from(NEW)]);
@@ -138,7 +138,7 @@ mod tests {
         while now < secs(66.1) {
             peers.handle_timeout(now);
             for action in actions(&mut peers) {
-                if let Action::Dial { standing, .. } = action {
+                if let DiscoveryAction::Dial { standing, .. } = action {
                     at.push(now);
                     peers.handle_dial_failed(now, HIGHER, standing);
                 }

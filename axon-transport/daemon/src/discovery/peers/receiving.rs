@@ -9,7 +9,7 @@ use tracing::{debug, info};
 
 use super::{Arrival, Peers, record::DialAddress};
 use crate::{
-    discovery::{Action, Mismatch},
+    discovery::{DiscoveryAction, PeerMismatch},
     wire::{
         Difference,
         beacon::{Beacon, Datagram, Foreign, PROTOCOLS},
@@ -172,8 +172,8 @@ impl Peers {
         }
         record.reported = true;
         let Difference { setting, ours, theirs } = what;
-        let mismatch = Mismatch { peer: daemon, address: from, setting, ours, theirs };
-        self.act(Action::Mismatch(mismatch));
+        let mismatch = PeerMismatch { peer: daemon, address: from, setting, ours, theirs };
+        self.act(DiscoveryAction::PeerMismatch(mismatch));
     }
 
     fn in_range(&self, from: SocketAddr, arrival: Arrival, theirs: bool, listed: bool) -> bool {

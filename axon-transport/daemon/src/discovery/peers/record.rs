@@ -56,7 +56,7 @@ impl DialAddress {
 
 /// One daemon, by its id.
 #[derive(Debug, Default)]
-pub(super) struct Record {
+pub(super) struct DaemonRecord {
     /// Where beacons came from: by standing, and the latest first.
     pub(super) sources: Vec<DialAddress>,
     /// A beacon of it was acceptable; later ones that are not may be forged.
@@ -81,18 +81,18 @@ pub(super) struct Record {
     /// The path of its link does not work: it may have other addresses.
     pub(super) cut: bool,
     /// The peer of the link did not prove that the id is its own: another one may have the id.
-    pub(super) doubt: Option<Doubt>,
+    pub(super) doubt: Option<UnprovenAddresses>,
     /// One for each standing: a dial to an address where nobody is holds up no better one.
-    pub(super) dials: [Dial; AddressConfidence::COUNT],
+    pub(super) dials: [DialTime; AddressConfidence::COUNT],
 }
 
 /// Where the peer of a link is that did not prove its id, and the other addresses where it was found.
 #[derive(Debug, Default)]
-pub(super) struct Doubt(Vec<SocketAddr>);
+pub(super) struct UnprovenAddresses(Vec<SocketAddr>);
 
 /// When to dial.
 #[derive(Debug, Default)]
-pub(super) struct Dial {
+pub(super) struct DialTime {
     pub(super) due: Option<Duration>,
     /// Until when an outcome is awaited.
     pub(super) in_flight: Option<Duration>,
@@ -102,7 +102,7 @@ pub(super) struct Dial {
     failures: u32,
 }
 
-impl Record {
+impl DaemonRecord {
     /// A beacon came from there; or the peer answered there.
     pub(super) fn saw(&mut self, mut source: DialAddress) {
         let mut place = 0;
@@ -219,7 +219,7 @@ impl Record {
     pub(super) fn wants_dial(&self, standing: AddressConfidence) -> bool {
         let Some(source) = self.to_dial(standing).next() else { return false };
         let elsewhere =
-            |dial: &Dial| dial.in_flight.is_none() || dial.first != Some(source.address);
+            |dial: &DialTime| dial.in_flight.is_none() || dial.first != Some(source.address);
         // While a link's path is cut one dial after the other: each would succeed the link.
         let alone = !self.cut || self.in_flight().next().is_none();
         self.compatible
@@ -229,7 +229,7 @@ impl Record {
             && self.dials.iter().all(elsewhere)
     }
 
-    pub(super) fn in_flight(&self) -> impl Iterator<Item = (AddressConfidence, &Dial)> {
+    pub(super) fn in_flight(&self) -> impl Iterator<Item = (AddressConfidence, &DialTime)> {
         let dials = AddressConfidence::ALL.into_iter().zip(&self.dials);
         dials.filter(|(_, dial)| dial.in_flight.is_some())
     }
@@ -315,7 +315,7 @@ impl Record {
     }
 }
 
-impl Dial {
+impl DialTime {
     pub(super) fn start(&mut self, now: Duration, first: Option<SocketAddr>) {
         self.due = None;
         self.last = Some(now);

@@ -20,7 +20,7 @@ use std::{
 use axon_shm::internal::Allowance;
 
 use self::pace::Turns;
-use super::{limits::Limits, peer::routes::RouteKey};
+use super::{limits::IdentityLimits, peer::routes::RouteKey};
 use crate::{
     keys::KeyMessage,
     link::{MAX_INFLATED, Message, is_known, unpacked_length},
@@ -301,7 +301,7 @@ pub(crate) struct Account {
     /// Its publishers, or clients, that each route shows.
     writers: Rc<RefCell<HashMap<RouteKey, Weak<Meter>>>>,
     /// How much of which topic may pass.
-    pub(crate) limits: Rc<Limits>,
+    pub(crate) limits: Rc<IdentityLimits>,
     /// When its changes are followed up.
     pub(crate) turns: Rc<RefCell<Turns>>,
     said: Rc<RefCell<TokenBucket>>,
@@ -313,7 +313,7 @@ impl Account {
         graph: usize,
         [relays, lanes, stand_ins]: [&Rc<Meter>; 3],
         held: Arc<Allowance>,
-        limits: Rc<Limits>,
+        limits: Rc<IdentityLimits>,
     ) -> Self {
         Self {
             budget: budget.into(),
@@ -423,7 +423,7 @@ pub(crate) struct Accounts {
     held: (Arc<Allowance>, u64),
     open: HashMap<String, Weak<Account>>,
     /// What passed of late, also of identities without a link: a new link gives them no more.
-    limits: HashMap<String, Rc<Limits>>,
+    limits: HashMap<String, Rc<IdentityLimits>>,
     /// What the stand-ins of a budget hold. Readers may be at it when its last link is over.
     held_by: HashMap<String, SharedWeak<Allowance>>,
 }

@@ -132,7 +132,7 @@ struct Pending {
 }
 
 #[derive(Debug)]
-struct State {
+struct OrderState {
     number: u64,
     orders: VecDeque<CompressionOrder>,
     pending: HashMap<u64, Pending>,
@@ -179,12 +179,12 @@ impl PeerCompression {
 
 /// What is compressed for the peers of one daemon.
 #[derive(Debug)]
-pub(crate) struct Compression(RefCell<State>);
+pub(crate) struct Compression(RefCell<OrderState>);
 
 impl Compression {
     /// Nothing was compressed yet.
     pub(crate) fn new() -> Self {
-        Self(RefCell::new(State {
+        Self(RefCell::new(OrderState {
             number: 0,
             orders: VecDeque::new(),
             pending: HashMap::new(),
@@ -267,7 +267,7 @@ impl Compression {
     }
 }
 
-impl State {
+impl OrderState {
     fn keep(&mut self, name: SampleName, compressed: Option<Bytes>) {
         self.kept_bytes += kept_size(&compressed);
         if let Some(before) = self.kept.insert(name, compressed) {

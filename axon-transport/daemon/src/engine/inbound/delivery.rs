@@ -8,10 +8,10 @@ use axon_transport::internal::session::Written;
 
 use super::{
     FULL_RETRY, Inbound, Key, RouteIn,
-    incoming::{Incoming, Message, Step, StreamHeader},
+    incoming::{IncomingStream, Message, Step, StreamHeader},
     reading::{Next, wait},
 };
-use crate::engine::{rings::RingError, sample::dropped::Before, stand_in::StandIn};
+use crate::engine::{rings::RingError, sample::dropped::EarlierFate, stand_in::StandIn};
 
 /// A message waits for so long while other rings of its peer have the memory that it needs. Their readers may never take
 /// what these hold, and history stays for as long as its publisher. A ring that has samples itself is full, and waits for
@@ -23,7 +23,7 @@ impl Inbound {
     pub(super) fn deliver(
         &mut self,
         key: Key,
-        stream: &mut Incoming,
+        stream: &mut IncomingStream,
         message: Message,
         until: Duration,
         now: Duration,
@@ -54,12 +54,12 @@ impl Inbound {
             Kind::Response => found.and_then(|route| route.clients.get(&header.of)).copied(),
         };
         let before = stand_in.dropped(sequence);
-        if acknowledged && before == Before::Dropped {
+        if acknowledged && before == EarlierFate::Dropped {
             self.receipts.dropped_again(flow, sequence, now);
             self.release(stream);
             return Next::Go;
         }
-        if acknowledged && (before == Before::Passed || last >= Some(sequence)) {
+        if acknowledged && (before == EarlierFate::Passed || last >= Some(sequence)) {
             self.receipts.came(flow, sequence, length, now);
             self.release(stream);
             return Next::Go;
@@ -112,7 +112,7 @@ impl Inbound {
     /// Goes on after a message that was dropped and counted. The peer is told where it waits to hear of it.
     fn after_drop(
         &mut self,
-        stream: &mut Incoming,
+        stream: &mut IncomingStream,
         acknowledged: bool,
         sequence: u64,
         now: Duration,
@@ -184,7 +184,7 @@ impl Inbound {
     pub(super) fn wait_for_room(
         &mut self,
         key: Key,
-        stream: &mut Incoming,
+        stream: &mut IncomingStream,
         message: Message,
         now: Duration,
     ) -> Next {

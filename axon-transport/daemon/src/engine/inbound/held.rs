@@ -5,7 +5,7 @@ use super::Inbound;
 impl Inbound {
     /// Streams that are being read, and the bytes that were read from QUIC and are not delivered.
     pub(in crate::engine) fn held(&self) -> (usize, usize) {
-        let bytes = self.streams.values().map(super::incoming::Incoming::held).sum();
+        let bytes = self.streams.values().map(super::incoming::IncomingStream::held).sum();
         (self.streams.len(), bytes)
     }
 

@@ -92,7 +92,7 @@ pub(super) enum Piece {
     /// Not all have arrived.
     Later,
     /// The stream ended before.
-    End,
+    StreamEnd,
 }
 
 /// What a stream waits for.
@@ -130,7 +130,7 @@ pub(super) struct Message {
 
 /// A data stream.
 #[derive(Debug)]
-pub(super) struct Incoming {
+pub(super) struct IncomingStream {
     pub(super) step: Step,
     pub(super) header: Option<(StreamHeader, Option<Route>)>,
     /// The last short header, where the messages have such.
@@ -148,7 +148,7 @@ pub(super) struct Incoming {
     pub(super) is_ready: bool,
 }
 
-impl Default for Incoming {
+impl Default for IncomingStream {
     fn default() -> Self {
         Self {
             step: Step::Header,
@@ -164,7 +164,7 @@ impl Default for Incoming {
     }
 }
 
-impl Incoming {
+impl IncomingStream {
     /// Whether the next `length` bytes were read from QUIC already.
     pub(super) fn has(&self, length: usize) -> bool {
         self.gathered.len() + self.chunk.len() >= length
@@ -197,7 +197,7 @@ impl Incoming {
                     self.chunk = chunk;
                 }
                 Ok(None) => return Piece::Later,
-                Err(End) => return Piece::End,
+                Err(StreamEnd) => return Piece::StreamEnd,
             }
         }
     }
@@ -208,7 +208,7 @@ impl Incoming {
     pub(super) fn is_over(&mut self, id: StreamId, quic: &mut quinn_proto::Connection) -> bool {
         (self.chunk, self.gathered) = (Bytes::new(), BytesMut::new());
         match next_chunk(id, quic) {
-            Err(End) => true,
+            Err(StreamEnd) => true,
             Ok(Some(_)) => {
                 let _ = quic.recv_stream(id).stop(super::NO_ROUTE);
                 true
@@ -219,7 +219,7 @@ impl Incoming {
 }
 
 #[cfg(test)]
-impl Incoming {
+impl IncomingStream {
     /// Bytes of samples that were read from QUIC and are not delivered.
     pub(super) fn held(&self) -> usize {
         let message = match &self.step {
@@ -232,20 +232,25 @@ impl Incoming {
 }
 
 /// A stream that ended, was reset, or was stopped.
-struct End;
+struct StreamEnd;
 
-fn next_chunk(id: StreamId, quic: &mut quinn_proto::Connection) -> Result<Option<Bytes>, End> {
+fn next_chunk(
+    id: StreamId,
+    quic: &mut quinn_proto::Connection,
+) -> Result<Option<Bytes>, StreamEnd> {
     let mut stream = quic.recv_stream(id);
     let mut chunks = match stream.read(true) {
         Ok(chunks) => chunks,
-        Err(ReadableError::ClosedStream | ReadableError::IllegalOrderedRead) => return Err(End),
+        Err(ReadableError::ClosedStream | ReadableError::IllegalOrderedRead) => {
+            return Err(StreamEnd);
+        }
     };
     let next = chunks.next(usize::MAX);
     // The window that it wants to announce leaves with the pass.
     let _ = chunks.finalize();
     match next {
         Ok(Some(chunk)) => Ok(Some(chunk.bytes)),
-        Ok(None) | Err(ReadError::Reset(_)) => Err(End),
+        Ok(None) | Err(ReadError::Reset(_)) => Err(StreamEnd),
         Err(ReadError::Blocked) => Ok(None),
     }
 }

@@ -10,7 +10,7 @@ use axon_transport::access::Over;
 
 use super::{
     Inbound, Key,
-    incoming::{Incoming, Message, Step},
+    incoming::{IncomingStream, Message, Step},
     reading::{Next, wait},
 };
 use crate::engine::limits::RouteLimit;
@@ -70,7 +70,7 @@ impl Inbound {
     pub(super) fn pass_limit(
         &mut self,
         key: Key,
-        stream: &mut Incoming,
+        stream: &mut IncomingStream,
         limit: &RouteLimit,
         message: Message,
         now: Duration,

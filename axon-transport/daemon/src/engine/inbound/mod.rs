@@ -30,7 +30,7 @@ use quinn_proto::{StreamId, VarInt};
 
 pub(crate) use self::incoming::StreamHeader;
 use self::{
-    incoming::{Incoming, Step},
+    incoming::{IncomingStream, Step},
     limited::Limited,
     line::Line,
     receipts::Receipts,
@@ -64,7 +64,7 @@ const NO_ROUTE: VarInt = VarInt::from_u32(CloseCode::OutOfOrder as u32);
 type Key = (u64, StreamId);
 
 /// The peer broke a rule: the code that ends its link, and why.
-pub(crate) type Violation = (CloseCode, String);
+pub(crate) type LinkViolation = (CloseCode, String);
 
 /// A route that this host asked for.
 pub(crate) struct RouteIn {
@@ -107,7 +107,7 @@ impl RouteIn {
 /// The samples from one peer.
 pub(crate) struct Inbound {
     routes: HashMap<u32, RouteIn>,
-    streams: HashMap<Key, Incoming>,
+    streams: HashMap<Key, IncomingStream>,
     /// The streams of each flow, in the order in which they came.
     turns: HashMap<(u32, Gid), VecDeque<Key>>,
     ready: VecDeque<Key>,

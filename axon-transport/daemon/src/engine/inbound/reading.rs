@@ -7,15 +7,16 @@ use axon_shm::{Meta, ids::Gid};
 use bytes::Bytes;
 
 use super::{
-    ARRIVAL, ENDED, Inbound, Key, LONG, NO_ROUTE, TURN, Violation,
-    incoming::{HEADER, Incoming, Message, Piece, Step, StreamHeader},
+    ARRIVAL, ENDED, Inbound, Key, LONG, LinkViolation, NO_ROUTE, TURN,
+    incoming::{HEADER, IncomingStream, Message, Piece, Step, StreamHeader},
 };
 use crate::{
     engine::{
         account::Charge,
         sample::{
             protection::{
-                MAX_OVERHEAD, Open, Opened, RefusedMessage, unpack, unpacked_length, writer_of,
+                MAX_OVERHEAD, Open, OpenedSample, RefusedMessage, unpack, unpacked_length,
+                writer_of,
             },
             short_header::{ShortHeaders, Told},
         },
@@ -34,7 +35,7 @@ impl Inbound {
         quic: &mut quinn_proto::Connection,
         open: &mut Open<'_>,
         now: Duration,
-    ) -> Result<usize, Violation> {
+    ) -> Result<usize, LinkViolation> {
         let read = self.read_turn(key, quic, open, now);
         if let Some(written) = self.written.take() {
             written.announce();
@@ -48,7 +49,7 @@ impl Inbound {
         quic: &mut quinn_proto::Connection,
         open: &mut Open<'_>,
         now: Duration,
-    ) -> Result<usize, Violation> {
+    ) -> Result<usize, LinkViolation> {
         let Some(mut stream) = self.streams.remove(&key) else { return Ok(0) };
         let mut read = 0;
         loop {
@@ -86,18 +87,18 @@ impl Inbound {
     fn step(
         &mut self,
         key: Key,
-        stream: &mut Incoming,
+        stream: &mut IncomingStream,
         quic: &mut quinn_proto::Connection,
         open: &mut Open<'_>,
         read: &mut usize,
         now: Duration,
-    ) -> Result<Next, Violation> {
+    ) -> Result<Next, LinkViolation> {
         match std::mem::replace(&mut stream.step, Step::Length) {
             Step::Header => {
                 let header = match stream.take(HEADER, key.1, quic, read) {
                     Piece::Whole(header) => header,
                     Piece::Later => return Ok(wait(stream, Step::Header)),
-                    Piece::End => return Ok(Next::Over),
+                    Piece::StreamEnd => return Ok(Next::Over),
                 };
                 let header = StreamHeader::parse(&header).map_err(malformed)?;
                 stream.header = Some((header, None));
@@ -116,7 +117,7 @@ impl Inbound {
                 let prefix = match stream.take(4, key.1, quic, read) {
                     Piece::Whole(prefix) => prefix,
                     Piece::Later => return Ok(wait(stream, Step::Length)),
-                    Piece::End => return Ok(Next::Over),
+                    Piece::StreamEnd => return Ok(Next::Over),
                 };
                 let mut bytes = [0; 4];
                 bytes.copy_from_slice(&prefix);
@@ -155,7 +156,7 @@ impl Inbound {
                 let body = match stream.take(length, key.1, quic, read) {
                     Piece::Whole(body) => body,
                     Piece::Later => return Ok(wait(stream, Step::Body(length))),
-                    Piece::End => {
+                    Piece::StreamEnd => {
                         self.release(stream);
                         return Ok(Next::Over);
                     }
@@ -173,7 +174,7 @@ impl Inbound {
     fn begin(
         &mut self,
         key: Key,
-        stream: &mut Incoming,
+        stream: &mut IncomingStream,
         quic: &mut quinn_proto::Connection,
         until: Duration,
         now: Duration,
@@ -206,11 +207,11 @@ impl Inbound {
     /// Opens a message that has arrived.
     fn open(
         &mut self,
-        stream: &mut Incoming,
+        stream: &mut IncomingStream,
         body: Bytes,
         open: &mut Open<'_>,
         now: Duration,
-    ) -> Result<Next, Violation> {
+    ) -> Result<Next, LinkViolation> {
         let Some((header, Some(route))) = stream.header else { return Ok(Next::Over) };
         if let Some(short) = &mut stream.headers {
             permit_short(route, open)?;
@@ -242,12 +243,12 @@ impl Inbound {
     fn unpack(
         &mut self,
         key: Key,
-        stream: &mut Incoming,
+        stream: &mut IncomingStream,
         header: inner::Header,
         sent: Bytes,
         read: &mut usize,
         now: Duration,
-    ) -> Result<Next, Violation> {
+    ) -> Result<Next, LinkViolation> {
         let length = unpacked_length(&header, self.max_message).map_err(refused)?;
         let has = stream.room.as_ref().map_or(0, Charge::amount);
         let is_long = length > LONG;
@@ -303,7 +304,7 @@ impl Inbound {
     }
 
     /// Gives back the memory of a message, which another stream may wait for.
-    pub(super) fn release(&mut self, stream: &mut Incoming) {
+    pub(super) fn release(&mut self, stream: &mut IncomingStream) {
         let room = [stream.room.take(), stream.unpacked.take()];
         if room.iter().any(Option::is_some) {
             drop(room);
@@ -311,7 +312,7 @@ impl Inbound {
         }
     }
 
-    pub(super) fn end_turn(&mut self, key: Key, stream: &Incoming) {
+    pub(super) fn end_turn(&mut self, key: Key, stream: &IncomingStream) {
         let Some((header, _)) = stream.header else { return };
         let flow = (header.route, header.of);
         let Some(turns) = self.turns.get_mut(&flow) else { return };
@@ -336,7 +337,7 @@ pub(super) enum Next {
     Over,
 }
 
-pub(super) fn wait(stream: &mut Incoming, step: Step) -> Next {
+pub(super) fn wait(stream: &mut IncomingStream, step: Step) -> Next {
     stream.step = step;
     Next::Wait
 }
@@ -345,7 +346,7 @@ pub(super) fn wait(stream: &mut Incoming, step: Step) -> Next {
 ///
 /// # Errors
 /// The peer broke the format.
-pub(super) fn permit_short(route: Route, open: &Open<'_>) -> Result<(), Violation> {
+pub(super) fn permit_short(route: Route, open: &Open<'_>) -> Result<(), LinkViolation> {
     match (route.kind, open) {
         (Kind::Topic, Open::Link) => Ok(()),
         _ => Err(malformed("a data stream has short headers that may not have them")),
@@ -358,11 +359,11 @@ pub(super) fn told(header: &inner::Header) -> Told {
     Told { sequence, source_timestamp, age_ms }
 }
 
-pub(super) fn malformed(reason: &str) -> Violation {
+pub(super) fn malformed(reason: &str) -> LinkViolation {
     (CloseCode::Malformed, reason.to_owned())
 }
 
-pub(super) fn refused(error: RefusedMessage) -> Violation {
+pub(super) fn refused(error: RefusedMessage) -> LinkViolation {
     let code = match error {
         RefusedMessage::Envelope { .. } => CloseCode::Envelope,
         RefusedMessage::Malformed(_) => CloseCode::Malformed,
@@ -380,7 +381,7 @@ fn open_body(
     // An envelope is opened in place, so in memory of its own.
     match open {
         Open::Link => {
-            let opened = Opened::plain(&body)?;
+            let opened = OpenedSample::plain(&body)?;
             let (header, sent) = (opened.header, body.slice_ref(opened.sent()));
             Ok(Some((header, sent)))
         }

@@ -14,14 +14,14 @@ const BYTES: u64 = 256 << 10;
 const FLOWS: usize = 4096;
 
 #[derive(Debug, Default)]
-struct Due {
+struct DueReceipt {
     /// The first that was noted.
     first: Option<u64>,
     sequence: u64,
     dropped: u64,
 }
 
-impl Due {
+impl DueReceipt {
     /// Notes a sample of this number.
     fn note(&mut self, sequence: u64) {
         self.first.get_or_insert(sequence);
@@ -32,7 +32,7 @@ impl Due {
 /// What is to be acknowledged.
 #[derive(Debug, Default)]
 pub(super) struct Receipts {
-    due: HashMap<(u32, Gid), Due>,
+    due: HashMap<(u32, Gid), DueReceipt>,
     samples: u64,
     bytes: u64,
     /// When the next message leaves.
@@ -93,7 +93,7 @@ impl Receipts {
         if self.at.is_none_or(|at| at > now) {
             return None;
         }
-        let of = |(route, publisher): (u32, Gid), due: Due| ReceivedOf {
+        let of = |(route, publisher): (u32, Gid), due: DueReceipt| ReceivedOf {
             route,
             publisher,
             sequence: due.sequence,

@@ -6,13 +6,13 @@ use axon_envelope::{Kind, Route};
 use bytes::{Buf, Bytes};
 
 use super::{
-    ENDED, Inbound, Key, LONG, RouteIn, Violation,
-    incoming::{Incoming, Message, Step, StreamHeader},
+    ENDED, Inbound, Key, LONG, LinkViolation, RouteIn,
+    incoming::{IncomingStream, Message, Step, StreamHeader},
     reading::{Next, malformed, permit_short, refused, told},
 };
 use crate::engine::{
     sample::{
-        dropped::Before,
+        dropped::EarlierFate,
         protection::{MAX_OVERHEAD, Open, writer_of},
         short_header::Told,
     },
@@ -23,7 +23,7 @@ use crate::engine::{
 const LENGTH: usize = 4;
 
 /// Where the samples of a run go.
-struct To {
+struct RunTarget {
     header: StreamHeader,
     route: Route,
     stand_in: Rc<StandIn>,
@@ -34,7 +34,7 @@ struct To {
 
 /// What is to be acknowledged after a run.
 #[derive(Default)]
-struct Came {
+struct RunProgress {
     newest: Option<u64>,
     samples: u64,
     bytes: usize,
@@ -49,10 +49,10 @@ impl Inbound {
     pub(super) fn run(
         &mut self,
         key: Key,
-        stream: &mut Incoming,
+        stream: &mut IncomingStream,
         open: &mut Open<'_>,
         now: Duration,
-    ) -> Result<Option<Next>, Violation> {
+    ) -> Result<Option<Next>, LinkViolation> {
         let Some((header, Some(route))) = stream.header else { return Ok(None) };
         if !header.reliable || route.kind != Kind::Topic || !stream.gathered.is_empty() {
             return Ok(None);
@@ -65,7 +65,8 @@ impl Inbound {
             return Ok(None);
         };
         let most = self.max_message + MAX_OVERHEAD as u64;
-        let (to, mut came) = (To { header, route, stand_in, most, now }, Came::default());
+        let (to, mut came) =
+            (RunTarget { header, route, stand_in, most, now }, RunProgress::default());
         let mut envelope = std::mem::take(&mut self.envelope);
         let next = self.deliver_all(&to, stream, open, &mut envelope, &mut came);
         self.envelope = envelope;
@@ -87,14 +88,14 @@ impl Inbound {
     /// stream goes on with.
     fn deliver_all(
         &mut self,
-        to: &To,
-        stream: &mut Incoming,
+        to: &RunTarget,
+        stream: &mut IncomingStream,
         open: &mut Open<'_>,
         envelope: &mut Vec<u8>,
-        came: &mut Came,
-    ) -> Result<Option<Step>, Violation> {
+        came: &mut RunProgress,
+    ) -> Result<Option<Step>, LinkViolation> {
         let now = to.now;
-        let Incoming { chunk, headers, short_since, .. } = stream;
+        let IncomingStream { chunk, headers, short_since, .. } = stream;
         while let Some(body) = next_body(chunk, to.most) {
             let (told, payload): (Told, &[u8]) = match headers {
                 Some(headers) => {
@@ -124,13 +125,13 @@ impl Inbound {
             let (length, bytes) = (LENGTH + body.len(), payload.len());
             let flow = (to.header.route, to.header.of);
             let before = to.stand_in.dropped(told.sequence);
-            if before == Before::Dropped {
+            if before == EarlierFate::Dropped {
                 self.receipts.dropped_again(flow, told.sequence, now);
                 chunk.advance(length);
                 continue;
             }
             let is_new = to.stand_in.last_sequence() < Some(told.sequence);
-            if is_new && before == Before::Unknown {
+            if is_new && before == EarlierFate::Unknown {
                 let meta = self.meta(told, now);
                 match self.write(&to.stand_in, to.header, meta, payload, short_since, now) {
                     Some(true) => {}

@@ -19,7 +19,7 @@ use quinn_proto::{Dir, Side, StreamId};
 
 use super::{
     Inbound, RouteIn,
-    incoming::{Incoming, Message, Step, StreamHeader},
+    incoming::{IncomingStream, Message, Step, StreamHeader},
     reading::Next,
 };
 use crate::{
@@ -118,7 +118,7 @@ impl Rings for One {
 struct Way {
     ring: Rc<Ring>,
     inbound: Inbound,
-    stream: Incoming,
+    stream: IncomingStream,
     written: ShortHeaders,
 }
 
@@ -148,11 +148,11 @@ impl Way {
             route: ROUTE,
             of: PUBLISHER,
         };
-        let stream = Incoming {
+        let stream = IncomingStream {
             step: Step::Length,
             header: Some((header, Some(route))),
             headers: short.then(ShortHeaders::default),
-            ..Incoming::default()
+            ..IncomingStream::default()
         };
         Self { ring, inbound, stream, written: ShortHeaders::default() }
     }

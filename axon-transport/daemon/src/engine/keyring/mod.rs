@@ -18,8 +18,8 @@ use axon_transport::config::{Config, KeyMode, QkdConfig, Security};
 
 use super::quic::tls_settings::tls_cipher;
 use crate::keys::{
-    Acceptor, Answer, Clock, Completion, Dial, Dialler, Event, Exporters, KeyMessage, Origin,
-    Receiver, Request, Resolver, Sender, Statistics, SupplyError, UsedStatistics,
+    Acceptor, Answer, Clock, Completion, Dial, Dialler, Event, Exporters, KeyMessage, KeyReceiver,
+    KeySender, KmeRequest, RequestOrigin, Resolver, Statistics, SupplyError, UsedStatistics,
 };
 
 #[cfg(test)]
@@ -50,7 +50,7 @@ pub(crate) struct Keyring {
     connections: HashMap<u64, usize>,
     /// Peers whose machines may have requests or messages.
     touched: Vec<usize>,
-    requests: VecDeque<(Origin, Request)>,
+    requests: VecDeque<(RequestOrigin, KmeRequest)>,
     messages: VecDeque<(u64, KeyMessage)>,
     records: VecDeque<(u64, String)>,
     changed: VecDeque<u64>,
@@ -61,8 +61,8 @@ pub(crate) struct Keyring {
 /// The message keys of both directions with one peer SAE.
 struct PeerKeys {
     sae: String,
-    sender: Sender,
-    receiver: Receiver,
+    sender: KeySender,
+    receiver: KeyReceiver,
     /// Whether it is in [`Keyring::touched`].
     touched: bool,
     /// When its machines have to be polled without other cause.
@@ -248,21 +248,21 @@ impl Keyring {
         self.set_time(now);
         let Event { origin, answer } = event;
         match origin {
-            Origin::Dialler => {
+            RequestOrigin::Dialler => {
                 self.dialler().handle_answer(now, answer);
                 return Answered::Dialler;
             }
-            Origin::Acceptor => self.acceptor.handle_answer(answer),
-            Origin::Proof(link) | Origin::Responder(link) => {
+            RequestOrigin::Acceptor => self.acceptor.handle_answer(answer),
+            RequestOrigin::Proof(link) | RequestOrigin::Responder(link) => {
                 return Answered::Opening(link, answer);
             }
-            Origin::Sender(number) => {
+            RequestOrigin::Sender(number) => {
                 if let Some(number) = self.known(number) {
                     self.peers[number].sender.handle_answer(now, answer);
                     self.touch(number);
                 }
             }
-            Origin::Receiver(number) => {
+            RequestOrigin::Receiver(number) => {
                 if let Some(number) = self.known(number) {
                     self.peers[number].receiver.handle_answer(now, answer);
                     self.touch(number);
@@ -274,7 +274,7 @@ impl Keyring {
 
     /// The sender that seals for `connection`. `None` before
     /// [`attach_sender`](Self::attach_sender), and from the time at which a successor has the keys.
-    pub(crate) fn sender(&mut self, connection: u64) -> Option<&mut Sender> {
+    pub(crate) fn sender(&mut self, connection: u64) -> Option<&mut KeySender> {
         let number = self.attached(connection).ok()?;
         if self.peers[number].sender.attached() != Some(connection) {
             return None;
@@ -284,17 +284,17 @@ impl Keyring {
     }
 
     /// The receiver that opens messages of `connection`, `None` once the connection has ended.
-    pub(crate) fn receiver(&mut self, connection: u64) -> Option<&mut Receiver> {
+    pub(crate) fn receiver(&mut self, connection: u64) -> Option<&mut KeyReceiver> {
         let number = self.attached(connection).ok()?;
         self.touch(number);
         Some(&mut self.peers[number].receiver)
     }
 
     /// The next call to the KME, if any.
-    pub(crate) fn poll_request(&mut self, now: Duration) -> Option<(Origin, Request)> {
+    pub(crate) fn poll_request(&mut self, now: Duration) -> Option<(RequestOrigin, KmeRequest)> {
         self.drain(now);
         if let Some(request) = self.acceptor.poll_request() {
-            return Some((Origin::Acceptor, request));
+            return Some((RequestOrigin::Acceptor, request));
         }
         self.requests.pop_front()
     }
@@ -381,8 +381,8 @@ impl Keyring {
         let number = self.peers.len();
         self.peers.push(PeerKeys {
             sae: sae.to_owned(),
-            sender: Sender::new(&self.config.sae_id, sae)?,
-            receiver: Receiver::new(&self.config.sae_id, sae)?,
+            sender: KeySender::new(&self.config.sae_id, sae)?,
+            receiver: KeyReceiver::new(&self.config.sae_id, sae)?,
             touched: false,
             due: None,
         });
@@ -396,7 +396,7 @@ impl Keyring {
         number.ok_or(SupplyError::Unattached(connection))
     }
 
-    /// The number in an [`Origin`], if it is a peer's.
+    /// The number in an [`RequestOrigin`], if it is a peer's.
     fn known(&self, number: u64) -> Option<usize> {
         usize::try_from(number).ok().filter(|number| *number < self.peers.len())
     }
@@ -412,7 +412,7 @@ impl Keyring {
         self.set_time(now);
         if mem::take(&mut self.dialler_touched) {
             while let Some(request) = self.dialler.poll_request(now) {
-                self.requests.push_back((Origin::Dialler, request));
+                self.requests.push_back((RequestOrigin::Dialler, request));
             }
         }
         while let Some(number) = self.touched.pop() {
@@ -421,7 +421,7 @@ impl Keyring {
             // Small: the number of peers that have or had a link.
             let origin = number as u64;
             while let Some(request) = peer.receiver.poll_request(now) {
-                self.requests.push_back((Origin::Receiver(origin), request));
+                self.requests.push_back((RequestOrigin::Receiver(origin), request));
             }
             while let Some((connection, message)) = peer.receiver.poll_message() {
                 if matches!(message, KeyMessage::Ready { .. }) {
@@ -430,7 +430,7 @@ impl Keyring {
                 self.messages.push_back((connection, message));
             }
             while let Some(request) = peer.sender.poll_request(now) {
-                self.requests.push_back((Origin::Sender(origin), request));
+                self.requests.push_back((RequestOrigin::Sender(origin), request));
             }
             while let Some(message) = peer.sender.poll_message(now) {
                 self.messages.push_back(message);

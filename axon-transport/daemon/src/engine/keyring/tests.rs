@@ -5,7 +5,7 @@ use axon_tls::qkd::{PskIdentity, PskResolver};
 use axon_transport::config::QkdPeers;
 
 use super::*;
-use crate::keys::{Failure, FailureKind, Fetched, Lookup, NoKey, Purpose};
+use crate::keys::{Failure, FailureKind, Fetched, KeyPurpose, Lookup, NoKey};
 
 const ROUTE: Route = Route { kind: Kind::Topic, topic: TopicHash([7; 16]) };
 
@@ -50,20 +50,20 @@ pub(crate) struct Kmes {
     /// Whether `dec_keys` gives other keys than `enc_keys` did.
     pub(crate) disagree: bool,
     /// All requests that were answered.
-    pub(crate) asked: Vec<Request>,
+    pub(crate) asked: Vec<KmeRequest>,
 }
 
 impl Kmes {
-    pub(crate) fn answer(&mut self, request: Request) -> Answer {
+    pub(crate) fn answer(&mut self, request: KmeRequest) -> Answer {
         self.asked.push(request.clone());
         let failure = |kind| Err(Failure::new(kind, format!("{kind:?}")));
         let outcome = match (&request, self.failures.pop()) {
             (_, Some(kind)) => failure(kind),
-            (Request::Status { .. }, None) => failure(FailureKind::Unavailable),
-            (Request::Enc { number, .. }, None) => {
+            (KmeRequest::Status { .. }, None) => failure(FailureKind::Unavailable),
+            (KmeRequest::Enc { number, .. }, None) => {
                 Ok(Fetched::Keys((0..*number).map(|_| self.issue()).collect()))
             }
-            (Request::Dec { key_ids, .. }, None) => {
+            (KmeRequest::Dec { key_ids, .. }, None) => {
                 if key_ids.iter().all(|key_id| self.stored.contains_key(key_id)) {
                     Ok(Fetched::Keys(key_ids.iter().map(|key_id| self.take(key_id)).collect()))
                 } else {
@@ -207,8 +207,8 @@ fn psk_is_spent_once_and_its_key_id_is_recorded_once() {
 #[test]
 fn answer_for_an_unknown_peer_is_ignored() {
     let mut ring = keyring("sae-a", KeyMode::Messages10);
-    for origin in [Origin::Sender(0), Origin::Receiver(u64::MAX)] {
-        let request = Request::Status { slave: "sae-b".to_owned() };
+    for origin in [RequestOrigin::Sender(0), RequestOrigin::Receiver(u64::MAX)] {
+        let request = KmeRequest::Status { slave: "sae-b".to_owned() };
         let answer = Kmes::default().answer(request);
         assert!(matches!(ring.handle_answer(s(0), Event { origin, answer }), Answered::Here));
     }
@@ -229,12 +229,12 @@ fn answers_reach_the_machine_that_asked() {
         let answered = ring.handle_answer(s(0), Event { origin, answer });
         origins.push((origin, matches!(answered, Answered::Dialler)));
     }
-    assert_eq!(origins, [(Origin::Acceptor, false), (Origin::Dialler, true)]);
+    assert_eq!(origins, [(RequestOrigin::Acceptor, false), (RequestOrigin::Dialler, true)]);
     assert!(resolver.resolve(&bytes).is_some());
-    assert!(matches!(ring.dial(s(0), "sae-c"), Dial::Attempt(_)));
+    assert!(matches!(ring.dial(s(0), "sae-c"), Dial::DialKey(_)));
 
-    let request = Request::Enc { slave: "sae-a".into(), number: 1, purpose: Purpose::Proof };
-    for origin in [Origin::Proof(5), Origin::Responder(5)] {
+    let request = KmeRequest::Enc { slave: "sae-a".into(), number: 1, purpose: KeyPurpose::Proof };
+    for origin in [RequestOrigin::Proof(5), RequestOrigin::Responder(5)] {
         let event = Event { origin, answer: kmes.answer(request.clone()) };
         assert!(matches!(ring.handle_answer(s(0), event), Answered::Opening(5, _)));
     }

@@ -126,12 +126,12 @@ impl Egress {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::engine::limits::{Limits, tests::permissions};
+    use crate::engine::limits::{IdentityLimits, tests::permissions};
 
     #[test]
     fn packets_leave_at_the_rate_of_the_slowest_limit_over_all_connections_of_an_identity() {
         let rules = "[[limit]]\npeer = \"*\"\negress = \"1 MB/s\"\n[[limit]]\npeer = \"*\"\negress = \"9 MB/s\"";
-        let all = Limits::default();
+        let all = IdentityLimits::default();
         let connections = [0, 1].map(|_| {
             let mut egress = Egress::default();
             all.limit_egress(&mut egress, &permissions(rules));

@@ -9,9 +9,9 @@ const GRACE: Duration = Duration::from_millis(20);
 
 /// The flows that wait, each with the time of its turn. The first one is the next to pass.
 #[derive(Debug, Default)]
-pub(super) struct Line(VecDeque<(Gid, Duration)>);
+pub(super) struct FlowQueue(VecDeque<(Gid, Duration)>);
 
-impl Line {
+impl FlowQueue {
     /// How many flows pass before this one: all that wait, if it does not wait itself.
     pub(super) fn ahead_of(&mut self, flow: &Gid, now: Duration) -> usize {
         self.0.retain(|(waiting, turn)| waiting == flow || *turn + GRACE >= now);
@@ -41,7 +41,7 @@ mod tests {
 
     #[test]
     fn flows_pass_in_the_order_in_which_they_began_to_wait() {
-        let (mut line, now) = (Line::default(), Duration::from_secs(9));
+        let (mut line, now) = (FlowQueue::default(), Duration::from_secs(9));
         let [a, b, c] = [1, 2, 3].map(|n| Gid([n; 16]));
         assert_eq!(line.ahead_of(&a, now), 0);
         line.wait(&a, now);

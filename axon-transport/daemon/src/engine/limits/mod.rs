@@ -21,7 +21,7 @@ use axon_transport::{
     status::{LimitStatus, LinkStatus},
 };
 
-use self::{bucket::Bucket, egress::EgressCap, line::Line};
+use self::{bucket::LeakyBucket, egress::EgressCap, line::FlowQueue};
 pub(crate) use self::{egress::Egress, interfaces::InterfaceLimits};
 
 /// Limits that status lists.
@@ -38,7 +38,7 @@ const SHOWN: usize = 80;
 
 /// What a limit is about.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
-struct Scope {
+struct LimitScope {
     verb: Verb,
     topics: Topics,
 }
@@ -68,28 +68,28 @@ impl Topics {
 #[derive(Debug)]
 pub(crate) struct Limit {
     rate: RateLimit,
-    scope: Scope,
+    scope: LimitScope,
     /// Where it is written.
     place: RefCell<String>,
     /// The cause under which what it drops is counted.
     cause: &'static str,
-    bucket: RefCell<Bucket>,
+    bucket: RefCell<LeakyBucket>,
     /// The flows that wait for it.
-    line: RefCell<Line>,
+    line: RefCell<FlowQueue>,
     passed: Cell<u64>,
     dropped: Cell<u64>,
 }
 
 /// The limits of one identity, over all of its daemon ids and links.
 #[derive(Debug, Default)]
-pub(crate) struct Limits {
-    uses: RefCell<HashMap<Scope, Vec<Rc<Limit>>>>,
+pub(crate) struct IdentityLimits {
+    uses: RefCell<HashMap<LimitScope, Vec<Rc<Limit>>>>,
     /// How many topics there were after those without a route were forgotten last.
     kept: Cell<usize>,
     egress: RefCell<Vec<Rc<EgressCap>>>,
 }
 
-impl Limits {
+impl IdentityLimits {
     /// The limits on what a peer does with a topic or service; those that it has already stay as full as they are.
     pub(crate) fn of(
         &self,
@@ -105,10 +105,12 @@ impl Limits {
                 true => Topics::Together(Arc::clone(names)),
                 false => Topics::One(topic.into()),
             };
-            self.find(Scope { verb, topics }, limit, "limit", || format!("line {line} of {file}"))
+            self.find(LimitScope { verb, topics }, limit, "limit", || {
+                format!("line {line} of {file}")
+            })
         });
         let max_hz = config.topic_limit(topic).filter(|_| verb == Verb::Subscribe).map(|limit| {
-            let scope = Scope { verb, topics: Topics::One(topic.into()) };
+            let scope = LimitScope { verb, topics: Topics::One(topic.into()) };
             self.find(scope, &limit, "max_hz", || "max_hz of [[topic]]".into())
         });
         let mut limits: Vec<Rc<Limit>> = Vec::new();
@@ -123,7 +125,7 @@ impl Limits {
 
     fn find(
         &self,
-        scope: Scope,
+        scope: LimitScope,
         rate: &RateLimit,
         cause: &'static str,
         place: impl Fn() -> String,
@@ -144,7 +146,7 @@ impl Limits {
         // Those that are not in force any more.
         limits.retain(|limit| Rc::strong_count(limit) > 1);
         let limit = Rc::new(Limit {
-            bucket: RefCell::new(Bucket::new(rate)),
+            bucket: RefCell::new(LeakyBucket::new(rate)),
             line: RefCell::default(),
             rate: rate.clone(),
             scope,
@@ -315,10 +317,15 @@ pub(crate) mod tests {
     /// The limits that the text of a `[[limit]]` sets on what a peer gets of a topic.
     pub(crate) fn limits(text: &str) -> Vec<Rc<Limit>> {
         let rules = format!("[[limit]]\npeer = \"*\"\n{text}");
-        Limits::default().of(Verb::Subscribe, "/t", &permissions(&rules), &Config::default())
+        IdentityLimits::default().of(
+            Verb::Subscribe,
+            "/t",
+            &permissions(&rules),
+            &Config::default(),
+        )
     }
 
-    fn of(all: &Limits, verb: Verb, topic: &str, rules: &str) -> RouteLimit {
+    fn of(all: &IdentityLimits, verb: Verb, topic: &str, rules: &str) -> RouteLimit {
         RouteLimit::new(all.of(verb, topic, &permissions(rules), &Config::default()))
     }
 
@@ -327,7 +334,7 @@ pub(crate) mod tests {
         let each = "[[limit]]\npeer = \"b*\"\ntopic = \"/**\"\nrate = 1\nburst = 1";
         let together = "[[limit]]\npeer = \"b*\"\nrate = 1\nburst = 1";
         for (rules, same) in [(each, false), (together, true)] {
-            let all = Limits::default();
+            let all = IdentityLimits::default();
             let one = of(&all, Verb::Publish, "/a", rules);
             one.pass(&OF, 1, Duration::ZERO);
             let is_full = |verb, topic| {
@@ -347,7 +354,7 @@ pub(crate) mod tests {
         };
         let entries = ["", "topic = [\"/b\", \"/c\"]\n", "topic = \"/d\"\n"].map(entry);
         let rules = entries.concat();
-        let all = Limits::default();
+        let all = IdentityLimits::default();
         let limits = |topic| all.of(Verb::Publish, topic, &permissions(&rules), &Config::default());
         let [b, c, d] = ["/b", "/c", "/d"].map(limits);
         assert!(Rc::ptr_eq(&b[0], &c[0]) && Rc::ptr_eq(&b[0], &d[0]), "the entry of all topics");
@@ -368,7 +375,7 @@ pub(crate) mod tests {
     fn every_limit_that_fits_counts_and_the_longest_wait_decides() {
         let rules = "[[limit]]\npeer = \"*\"\ntopic = \"/a\"\nrate = 10\nburst = 1\nover = \"hold\"\n\
                      [[limit]]\npeer = \"*\"\ntopic = \"/**\"\nrate = 2\nburst = 1\nover = \"drop-newest\"";
-        let limit = of(&Limits::default(), Verb::Subscribe, "/a", rules);
+        let limit = of(&IdentityLimits::default(), Verb::Subscribe, "/a", rules);
         limit.pass(&OF, 1, Duration::ZERO);
         let exceeded = limit.exceeded_by(&OF, |_| false, Duration::ZERO).unwrap();
         assert_eq!(exceeded.over(), Over::DropNewest);
@@ -381,7 +388,7 @@ pub(crate) mod tests {
     #[test]
     fn a_limit_stays_as_full_as_it_is_when_its_rule_is_read_again() {
         let rules = "[[limit]]\npeer = \"*\"\ntopic = \"/a\"\nrate = 1\nburst = 1";
-        let all = Limits::default();
+        let all = IdentityLimits::default();
         let limit = of(&all, Verb::Subscribe, "/a", rules);
         limit.pass(&OF, 1, Duration::ZERO);
         limit.set(all.of(Verb::Subscribe, "/a", &permissions(rules), &Config::default()));
@@ -394,7 +401,7 @@ pub(crate) mod tests {
     #[test]
     fn a_route_that_is_made_anew_has_no_full_bucket_and_the_memory_for_that_is_bounded() {
         let rules = "[[limit]]\npeer = \"*\"\ntopic = \"/**\"\nrate = 1\nburst = 1";
-        let all = Limits::default();
+        let all = IdentityLimits::default();
         of(&all, Verb::Subscribe, "/a", rules).pass(&OF, 1, Duration::ZERO);
         assert!(
             of(&all, Verb::Subscribe, "/a", rules)
@@ -410,7 +417,7 @@ pub(crate) mod tests {
     #[test]
     fn two_entries_that_say_the_same_count_once() {
         let one = "[[limit]]\npeer = \"*\"\ntopic = \"/a\"\nrate = 10\nburst = 1\n";
-        let limit = of(&Limits::default(), Verb::Subscribe, "/a", &one.repeat(2));
+        let limit = of(&IdentityLimits::default(), Verb::Subscribe, "/a", &one.repeat(2));
         limit.pass(&OF, 1, Duration::ZERO);
         assert_eq!(
             limit.exceeded_by(&OF, |_| false, Duration::ZERO).unwrap().wait.as_millis(),
@@ -422,7 +429,7 @@ pub(crate) mod tests {
     /// and when its turn comes. How many samples of each pass in ten seconds.
     fn share(flows: &[u64], text: &str) -> Vec<u64> {
         let rules = format!("[[limit]]\npeer = \"*\"\ntogether = true\n{text}");
-        let all = Limits::default();
+        let all = IdentityLimits::default();
         let limit = of(&all, Verb::Subscribe, "/a", &rules);
         let mut passed = vec![0; flows.len()];
         let mut waits: Vec<Option<Duration>> = vec![None; flows.len()];
@@ -466,7 +473,7 @@ pub(crate) mod tests {
     fn a_flow_that_another_limit_holds_takes_nothing_of_a_limit_that_it_shares() {
         let rules = "[[limit]]\npeer = \"*\"\nsubscribe = \"/**\"\nrate = 100\nburst = 1\ntogether = true\n\
                      [[limit]]\npeer = \"*\"\nsubscribe = \"/imu\"\nrate = 1\nburst = 1";
-        let all = Limits::default();
+        let all = IdentityLimits::default();
         let [imu, camera] =
             ["/imu", "/camera"].map(|topic| of(&all, Verb::Subscribe, topic, rules));
         let flows = [1, 2].map(|n| Gid([n; 16]));
@@ -487,7 +494,7 @@ pub(crate) mod tests {
     fn status_names_those_first_that_dropped_most() {
         let rules =
             "[[limit]]\npeer = \"*\"\ntopic = \"/**\"\nrate = 1.5\nburst = 1\nbytes = \"4 MB/s\"";
-        let all = Limits::default();
+        let all = IdentityLimits::default();
         let routes: Vec<_> =
             (0..70).map(|n| of(&all, Verb::Subscribe, &format!("/{n}"), rules)).collect();
         routes[42].pass(&OF, 1, Duration::ZERO);

@@ -12,11 +12,11 @@ use crate::{
     engine::{
         keyring::{Keyring, warn_disagreement},
         link::target::{
-            DECRYPT_ERROR, HANDSHAKE_TIMEOUT, Target, UNKNOWN_PSK_IDENTITY, dial_limit,
+            DECRYPT_ERROR, DialTarget, HANDSHAKE_TIMEOUT, UNKNOWN_PSK_IDENTITY, dial_limit,
         },
         refusal::Refusal,
     },
-    keys::{Attempt, Completion, Dial},
+    keys::{Completion, Dial, DialKey},
     link::CloseCode,
 };
 
@@ -30,7 +30,7 @@ const LONGEST_WAIT: Duration = Duration::from_secs(2);
 
 /// One dial of one peer.
 pub(crate) struct Dialling {
-    target: Target,
+    target: DialTarget,
     /// The whole dial ends at this time, `limit` after its start.
     deadline: Duration,
     limit: Duration,
@@ -45,11 +45,11 @@ enum State {
     /// No key can be used before this time, or before the dialler has an answer.
     WaitForKey(Duration),
     /// The addresses from `next` on are to be tried.
-    Try(Round),
+    Try(DialRound),
     /// A handshake with the address before `next` is under way until this time.
-    Connecting(Round, Duration),
+    Connecting(DialRound, Duration),
     /// That handshake ended.
-    Ended(Round, Outcome),
+    Ended(DialRound, Outcome),
     /// The connection is given up: the dial ends with the next poll.
     Ending(Refusal),
     /// The dial ended.
@@ -57,15 +57,15 @@ enum State {
 }
 
 /// One pass over the addresses, in qkd under one key.
-struct Round {
-    attempt: Option<Arc<Attempt>>,
+struct DialRound {
+    attempt: Option<Arc<DialKey>>,
     next: usize,
     /// Why the last address is no connection.
     last: String,
 }
 
-impl Round {
-    fn new(attempt: Option<Arc<Attempt>>) -> Self {
+impl DialRound {
+    fn new(attempt: Option<Arc<DialKey>>) -> Self {
         Self { attempt, next: 0, last: "no address to dial".into() }
     }
 }
@@ -88,7 +88,7 @@ pub(crate) enum Action {
         /// The address.
         address: SocketAddr,
         /// The PSK, in qkd.
-        attempt: Option<Arc<Attempt>>,
+        attempt: Option<Arc<DialKey>>,
     },
     /// Close the connection of the last [`Connect`](Self::Connect). The dial takes no event of it any
     /// more.
@@ -116,14 +116,14 @@ impl fmt::Debug for Dialling {
 
 impl Dialling {
     /// Dials `target`, in qkd with the keys of this daemon.
-    pub(crate) fn new(now: Duration, target: Target, keyring: Option<&Keyring>) -> Self {
+    pub(crate) fn new(now: Duration, target: DialTarget, keyring: Option<&Keyring>) -> Self {
         let limit = dial_limit(keyring.map(|keyring| keyring.config.kme_answer_timeout));
         let (state, waited_for) = (State::Choose, String::new());
         Self { target, deadline: now + limit, limit, state, waited_for }
     }
 
     /// The peer that is dialled.
-    pub(crate) fn target(&self) -> &Target {
+    pub(crate) fn target(&self) -> &DialTarget {
         &self.target
     }
 
@@ -244,7 +244,7 @@ impl Dialling {
     /// Chooses the key of the next round.
     fn choose(&mut self, now: Duration, keyring: Option<&mut Keyring>) -> Option<Action> {
         let Some(keyring) = keyring else {
-            self.state = State::Try(Round::new(None));
+            self.state = State::Try(DialRound::new(None));
             return None;
         };
         let Some(sae) = self.target.sae.as_deref() else {
@@ -268,8 +268,8 @@ impl Dialling {
                 self.state = State::WaitForKey(until.map_or(again, |until| until.min(again)));
                 None
             }
-            Dial::Attempt(attempt) => {
-                self.state = State::Try(Round::new(Some(Arc::new(attempt))));
+            Dial::DialKey(attempt) => {
+                self.state = State::Try(DialRound::new(Some(Arc::new(attempt))));
                 None
             }
         }
@@ -279,7 +279,7 @@ impl Dialling {
     fn ended(
         &mut self,
         now: Duration,
-        mut round: Round,
+        mut round: DialRound,
         outcome: Outcome,
         keyring: Option<&mut Keyring>,
     ) -> Option<Action> {
@@ -303,14 +303,19 @@ impl Dialling {
     }
 
     /// The address before `next` did not answer.
-    fn silent(&mut self, mut round: Round) {
+    fn silent(&mut self, mut round: DialRound) {
         let address = self.target.addresses[round.next - 1];
         round.last = format!("{address} does not answer");
         self.state = State::Try(round);
     }
 
     /// The handshake is complete: in qkd its key is spent.
-    fn connected(&mut self, now: Duration, round: &Round, keyring: Option<&mut Keyring>) -> Action {
+    fn connected(
+        &mut self,
+        now: Duration,
+        round: &DialRound,
+        keyring: Option<&mut Keyring>,
+    ) -> Action {
         let spent = |(keyring, sae, key_id): (&mut Keyring, &str, &KeyId)| {
             keyring.dialler().succeeded(now, sae, key_id) == Completion::First
         };
@@ -326,7 +331,7 @@ impl Dialling {
     fn refused(
         &mut self,
         now: Duration,
-        round: &Round,
+        round: &DialRound,
         refusal: Refusal,
         keyring: Option<&mut Keyring>,
     ) -> Option<Action> {
@@ -357,7 +362,7 @@ impl Dialling {
     /// The key of a round, and the peer that it is for.
     fn key<'a>(
         &'a self,
-        round: &'a Round,
+        round: &'a DialRound,
         keyring: Option<&'a mut Keyring>,
     ) -> Option<(&'a mut Keyring, &'a str, &'a KeyId)> {
         let (keyring, attempt) = (keyring?, round.attempt.as_deref()?);

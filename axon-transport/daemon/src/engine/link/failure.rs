@@ -36,7 +36,7 @@ pub(crate) fn close_text(reason: &str) -> &[u8] {
 }
 
 /// What went wrong on the way.
-pub(crate) enum Failure {
+pub(crate) enum LinkFailure {
     /// This side refuses.
     Ours(CloseCode, String),
     /// This side refuses, and tells the peer less than its own people.
@@ -47,7 +47,7 @@ pub(crate) enum Failure {
     Control(ControlError),
 }
 
-impl Failure {
+impl LinkFailure {
     /// The refusal for log and status, and the code and text with which this side closes, if it does.
     /// `ended` is why the connection ended, if it did.
     pub(crate) fn into_refusal(
@@ -74,7 +74,7 @@ impl Failure {
     }
 }
 
-impl From<ControlError> for Failure {
+impl From<ControlError> for LinkFailure {
     fn from(error: ControlError) -> Self {
         Self::Control(error)
     }
@@ -85,8 +85,8 @@ impl From<ControlError> for Failure {
 pub(crate) fn agreed(
     config: &Config,
     negotiated: Option<Negotiated>,
-) -> Result<Negotiated, Failure> {
-    let internal = |text: &str| Failure::Ours(CloseCode::Internal, text.into());
+) -> Result<Negotiated, LinkFailure> {
+    let internal = |text: &str| LinkFailure::Ours(CloseCode::Internal, text.into());
     let negotiated = negotiated.ok_or_else(|| internal("the handshake is not complete"))?;
     let wanted = match &config.security {
         Security::Classic(_) => KeyExchange::X25519MlKem768,
@@ -105,17 +105,20 @@ pub(crate) fn agreed(
 }
 
 /// Refuses a peer while this host does not know whom to trust; `closed` says why.
-pub(crate) fn admits(closed: Option<String>) -> Result<(), Failure> {
+pub(crate) fn admits(closed: Option<String>) -> Result<(), LinkFailure> {
     let told = "this host cannot read whom it trusts, and takes nobody; its log says more";
     match closed {
-        Some(why) => Err(Failure::Quietly { code: CloseCode::NotAllowed, told, why }),
+        Some(why) => Err(LinkFailure::Quietly { code: CloseCode::NotAllowed, told, why }),
         None => Ok(()),
     }
 }
 
 /// In `ca` a certificate stands for the hosts that it names: the peer must be one of them. In
 /// `pinned` the pin has the peer's name, and what it calls itself counts for nothing.
-pub(crate) fn names_its_host(chain: &[CertificateDer<'_>], theirs: &Hello) -> Result<(), Failure> {
+pub(crate) fn names_its_host(
+    chain: &[CertificateDer<'_>],
+    theirs: &Hello,
+) -> Result<(), LinkFailure> {
     if chain.first().is_some_and(|c| CaMaterial::is_for_host(c, &theirs.host)) {
         return Ok(());
     }
@@ -123,13 +126,13 @@ pub(crate) fn names_its_host(chain: &[CertificateDer<'_>], theirs: &Hello) -> Re
         "its certificate does not name the host {:?}; give it one with that DNS name (no wildcard)",
         theirs.host
     );
-    Err(Failure::Ours(CloseCode::NotAllowed, text))
+    Err(LinkFailure::Ours(CloseCode::NotAllowed, text))
 }
 
 /// The PSK of the handshake was spent before.
-pub(crate) fn reused() -> Failure {
+pub(crate) fn reused() -> LinkFailure {
     let text = "this PSK has completed a handshake before; a KME key is used once";
-    Failure::Ours(CloseCode::KeyReused, text.into())
+    LinkFailure::Ours(CloseCode::KeyReused, text.into())
 }
 
 /// Where a peer is, for log and status.

@@ -18,11 +18,11 @@ use super::proving::Proving;
 use crate::{
     engine::{
         keyring::Keyring,
-        link::failure::{Failure, HELLO_TIMEOUT, admits, agreed, names_its_host, reused},
+        link::failure::{HELLO_TIMEOUT, LinkFailure, admits, agreed, names_its_host, reused},
         quic::control_stream::{ControlError, FrameLimits},
         refusal::Refusal,
     },
-    keys::{Answer, Completion, Exporters, Origin, Request},
+    keys::{Answer, Completion, Exporters, KmeRequest, RequestOrigin},
     link::{CloseCode, FrameError, Hello, Message, Order, Side, check},
 };
 
@@ -68,7 +68,7 @@ pub(crate) struct Opening {
     /// The opening succeeded.
     opened: bool,
     messages: VecDeque<Message>,
-    outcome: Option<Result<Opened, Refused>>,
+    outcome: Option<Result<Opened, RefusedConnection>>,
 }
 
 enum Step {
@@ -103,7 +103,7 @@ pub(crate) struct Sealing {
 
 /// Why a connection does not become a link. The keyring has let go of it.
 #[derive(Debug)]
-pub(crate) struct Refused {
+pub(crate) struct RefusedConnection {
     /// For log and status.
     pub(crate) refusal: Refusal,
     /// The code and text with which this side closes the connection, if it does. The text may be longer
@@ -200,7 +200,7 @@ impl Opening {
             self.take(now, message, keyring.as_deref_mut())
         } else {
             let text = "a message was read before its time";
-            Err(Failure::Ours(CloseCode::Internal, text.into()))
+            Err(LinkFailure::Ours(CloseCode::Internal, text.into()))
         };
         match taken {
             Ok(()) => self.advance(now, keyring),
@@ -230,7 +230,7 @@ impl Opening {
         error: &ConnectionError,
         keyring: Option<&mut Keyring>,
     ) {
-        self.fail(now, Failure::Connection, Some(error), keyring);
+        self.fail(now, LinkFailure::Connection, Some(error), keyring);
     }
 
     /// The KME's answer to a request of this opening.
@@ -267,7 +267,7 @@ impl Opening {
     }
 
     /// The next call to the KME, if any.
-    pub(crate) fn poll_request(&mut self, now: Duration) -> Option<(Origin, Request)> {
+    pub(crate) fn poll_request(&mut self, now: Duration) -> Option<(RequestOrigin, KmeRequest)> {
         match &mut self.step {
             Step::Proof(proving, _) => proving.poll_request(now),
             _ => None,
@@ -280,7 +280,7 @@ impl Opening {
         &mut self,
         now: Duration,
         keyring: Option<&mut Keyring>,
-    ) -> Option<Result<Opened, Refused>> {
+    ) -> Option<Result<Opened, RefusedConnection>> {
         self.advance(now, keyring);
         self.outcome.take()
     }
@@ -304,10 +304,12 @@ impl Opening {
             return;
         }
         let late = match &self.step {
-            Step::Hello(_) => Failure::Ours(CloseCode::OutOfOrder, "no HELLO within 5 s".into()),
+            Step::Hello(_) => {
+                LinkFailure::Ours(CloseCode::OutOfOrder, "no HELLO within 5 s".into())
+            }
             Step::Proof(proving, _) => {
                 let text = format!("no proof within {:?}", proving.limit());
-                Failure::Ours(CloseCode::KeySupply, text)
+                LinkFailure::Ours(CloseCode::KeySupply, text)
             }
             Step::Recording(_) | Step::Over => return,
         };
@@ -322,20 +324,20 @@ impl Opening {
         negotiated: Negotiated,
         dialled: Option<String>,
         keyring: Option<&mut Keyring>,
-    ) -> Result<(), Failure> {
+    ) -> Result<(), LinkFailure> {
         if !self.qkd {
             self.negotiated = Some(negotiated);
             self.greet(now, None);
             return Ok(());
         }
-        let without_keys = || Failure::Ours(CloseCode::Internal, "no keys in qkd".into());
+        let without_keys = || LinkFailure::Ours(CloseCode::Internal, "no keys in qkd".into());
         let keyring = keyring.ok_or_else(without_keys)?;
         match self.side {
             Side::Client => self.greet(now, dialled),
             Side::Server => {
                 let identity = negotiated.psk_identity.as_deref().unwrap_or_default();
                 let parsed = PskIdentity::parse(identity)
-                    .map_err(|e| Failure::Ours(CloseCode::Internal, e.to_string()))?;
+                    .map_err(|e| LinkFailure::Ours(CloseCode::Internal, e.to_string()))?;
                 match keyring.spent(now, self.connection, identity, parsed.key_id()) {
                     Completion::First => {
                         self.step = Step::Recording(parsed.client_sae().to_owned());
@@ -363,13 +365,13 @@ impl Opening {
         now: Duration,
         message: &Message,
         keyring: Option<&mut Keyring>,
-    ) -> Result<(), Failure> {
-        let out_of_order = |text: String| Failure::Ours(CloseCode::OutOfOrder, text);
+    ) -> Result<(), LinkFailure> {
+        let out_of_order = |text: String| LinkFailure::Ours(CloseCode::OutOfOrder, text);
         self.order.accept(message).map_err(|e| out_of_order(e.to_string()))?;
         match (&mut self.step, message, keyring) {
             (Step::Hello(psk_sae), Message::Hello(theirs), keyring) => {
                 check(&self.ours, theirs, psk_sae.as_deref())
-                    .map_err(|m| Failure::Ours(m.code, m.to_string()))?;
+                    .map_err(|m| LinkFailure::Ours(m.code, m.to_string()))?;
                 if let Some(chain) = &self.chain {
                     names_its_host(chain, theirs)?;
                 }
@@ -390,7 +392,7 @@ impl Opening {
         now: Duration,
         theirs: &Hello,
         keyring: Option<&mut Keyring>,
-    ) -> Result<(), Failure> {
+    ) -> Result<(), LinkFailure> {
         if self.side == Side::Server {
             self.messages.push_back(Message::Hello(self.ours.clone()));
         }
@@ -400,7 +402,7 @@ impl Opening {
             self.open(theirs.clone(), None);
             return Ok(());
         }
-        let internal = |text: &str| Failure::Ours(CloseCode::Internal, text.into());
+        let internal = |text: &str| LinkFailure::Ours(CloseCode::Internal, text.into());
         let keyring = keyring.ok_or_else(|| internal("no keys to prove the client's name with"))?;
         let sae = theirs.sae.as_deref().ok_or_else(|| internal("no SAE ID to prove"))?;
         let exporters = self.exporters.as_ref().ok_or_else(|| internal("no TLS exporter"))?;
@@ -450,7 +452,7 @@ impl Opening {
     fn fail(
         &mut self,
         now: Duration,
-        failure: Failure,
+        failure: LinkFailure,
         ended: Option<&ConnectionError>,
         keyring: Option<&mut Keyring>,
     ) {
@@ -458,7 +460,7 @@ impl Opening {
             return;
         }
         let (refusal, close) = failure.into_refusal(ended);
-        self.outcome = Some(Err(Refused { refusal, close }));
+        self.outcome = Some(Err(RefusedConnection { refusal, close }));
         self.until = None;
         if let Some(keyring) = keyring {
             // Before the proof is dropped, which counts at this time.

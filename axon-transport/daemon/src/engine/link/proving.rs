@@ -8,11 +8,11 @@ use axon_transport::config::QkdConfig;
 use crate::{
     engine::{
         keyring::Keyring,
-        link::failure::{Failure, proof_limit},
+        link::failure::{LinkFailure, proof_limit},
     },
     keys::{
-        Acceptor, Answer, ClientProof, Exporters, KeyMessage, Origin, ProofFailure, ProofResponder,
-        ProofState, Request,
+        Acceptor, Answer, ClientProof, Exporters, KeyMessage, KmeRequest, ProofFailure,
+        ProofResponder, ProofState, RequestOrigin,
     },
     link::CloseCode,
 };
@@ -86,7 +86,7 @@ impl Proving {
         sae: &str,
         exporters: &Exporters,
         keyring: &mut Keyring,
-    ) -> Result<Self, Failure> {
+    ) -> Result<Self, LinkFailure> {
         let role = if keyring.seals_messages() {
             attach(now, connection, sae, exporters, keyring)?;
             Role::Announcement
@@ -120,7 +120,7 @@ impl Proving {
         now: Duration,
         message: &KeyMessage,
         keyring: &mut Keyring,
-    ) -> Result<(), Failure> {
+    ) -> Result<(), LinkFailure> {
         match mem::replace(&mut self.role, Role::Over) {
             Role::Demand(mut proof, tried) => {
                 proof.handle_message(now, message);
@@ -128,23 +128,26 @@ impl Proving {
                 self.role = Role::Demand(proof, tried);
                 if pending {
                     let text = "the message is no answer to the announced key";
-                    return Err(Failure::Ours(CloseCode::OutOfOrder, text.into()));
+                    return Err(LinkFailure::Ours(CloseCode::OutOfOrder, text.into()));
                 }
             }
             Role::Answer(mut responder) => {
                 responder.handle_message(now, message).map_err(|violation| {
                     let code = CloseCode::from_code(violation.code());
                     let code = code.unwrap_or(CloseCode::Malformed);
-                    Failure::Ours(code, violation.to_string())
+                    LinkFailure::Ours(code, violation.to_string())
                 })?;
                 self.role = Role::Fetch(responder);
             }
             Role::Announcement => {
                 keyring
                     .handle_message(now, self.connection, message)
-                    .map_err(|e| Failure::Ours(CloseCode::Malformed, e.to_string()))?;
+                    .map_err(|e| LinkFailure::Ours(CloseCode::Malformed, e.to_string()))?;
                 let KeyMessage::Announce(key_ids) = message else {
-                    return Err(Failure::Ours(CloseCode::OutOfOrder, "ANNOUNCE was due".into()));
+                    return Err(LinkFailure::Ours(
+                        CloseCode::OutOfOrder,
+                        "ANNOUNCE was due".into(),
+                    ));
                 };
                 self.role = Role::Hold(key_ids.clone());
             }
@@ -163,12 +166,14 @@ impl Proving {
     }
 
     /// The next call to the KME, if any.
-    pub(super) fn poll_request(&mut self, now: Duration) -> Option<(Origin, Request)> {
+    pub(super) fn poll_request(&mut self, now: Duration) -> Option<(RequestOrigin, KmeRequest)> {
         let connection = self.connection;
         match &mut self.role {
-            Role::Demand(proof, _) => Some((Origin::Proof(connection), proof.poll_request(now)?)),
+            Role::Demand(proof, _) => {
+                Some((RequestOrigin::Proof(connection), proof.poll_request(now)?))
+            }
             Role::Fetch(responder) => {
-                Some((Origin::Responder(connection), responder.poll_request(now)?))
+                Some((RequestOrigin::Responder(connection), responder.poll_request(now)?))
             }
             _ => None,
         }
@@ -206,7 +211,7 @@ impl Proving {
         now: Duration,
         exporters: &Exporters,
         keyring: &mut Keyring,
-    ) -> Option<Result<Option<(KeyId, KmeKey)>, Failure>> {
+    ) -> Option<Result<Option<(KeyId, KmeKey)>, LinkFailure>> {
         match &mut self.role {
             Role::Demand(proof, tried) => match proof.state() {
                 ProofState::Pending => None,
@@ -224,7 +229,7 @@ impl Proving {
                 let answered = responder.answered()?;
                 Some(match answered {
                     Ok(()) => Ok(None),
-                    Err(reason) => Err(Failure::Ours(CloseCode::KeySupply, reason)),
+                    Err(reason) => Err(LinkFailure::Ours(CloseCode::KeySupply, reason)),
                 })
             }
             Role::Hold(key_ids) => {
@@ -242,7 +247,7 @@ impl Proving {
         now: Duration,
         exporters: &Exporters,
         keyring: &mut Keyring,
-    ) -> Result<Option<(KeyId, KmeKey)>, Failure> {
+    ) -> Result<Option<(KeyId, KmeKey)>, LinkFailure> {
         keyring.authenticated(now, self.source, &self.sae);
         let Role::Demand(proof, _tried) = mem::replace(&mut self.role, Role::Over) else {
             return Ok(None);
@@ -261,16 +266,16 @@ fn attach(
     sae: &str,
     exporters: &Exporters,
     keyring: &mut Keyring,
-) -> Result<(), Failure> {
-    let internal = |e| Failure::Ours(CloseCode::Internal, format!("message keys: {e}"));
+) -> Result<(), LinkFailure> {
+    let internal = |e| LinkFailure::Ours(CloseCode::Internal, format!("message keys: {e}"));
     keyring.attach_receiver(now, connection, sae, exporters).map_err(internal)
 }
 
 /// What the peer is told, and what the log says: there is more in it where keys differ.
-fn unproven(config: &QkdConfig, failure: &ProofFailure) -> Failure {
+fn unproven(config: &QkdConfig, failure: &ProofFailure) -> LinkFailure {
     let code = CloseCode::from_code(failure.code()).unwrap_or(CloseCode::Proof);
     if !matches!(failure, ProofFailure::WrongProof(_)) {
-        return Failure::Ours(code, failure.to_string());
+        return LinkFailure::Ours(code, failure.to_string());
     }
     let told = "the proof does not fit the announced key";
     let why = format!(
@@ -279,5 +284,5 @@ fn unproven(config: &QkdConfig, failure: &ProofFailure) -> Failure {
          poses as that SAE",
         config.sae_id, config.kme_url,
     );
-    Failure::Quietly { code, told, why }
+    LinkFailure::Quietly { code, told, why }
 }

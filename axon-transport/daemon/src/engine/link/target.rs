@@ -20,7 +20,7 @@ pub(crate) const DECRYPT_ERROR: u8 = 51;
 
 /// Whom to dial.
 #[derive(Clone, Debug)]
-pub(crate) struct Target {
+pub(crate) struct DialTarget {
     /// The daemon expected there, `None` when any will do.
     pub(crate) daemon: Option<DaemonId>,
     /// Its SAE ID, in qkd.
@@ -35,7 +35,7 @@ pub(crate) struct Target {
     pub(crate) replaces: Option<[u8; 16]>,
 }
 
-impl Target {
+impl DialTarget {
     /// For log and status.
     pub(crate) fn text(&self) -> String {
         let addresses: Vec<_> = self.addresses.iter().map(ToString::to_string).collect();

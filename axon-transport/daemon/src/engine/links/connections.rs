@@ -19,7 +19,7 @@ use crate::{
         link::failure::close_text,
         quic::{
             connection::Connection,
-            endpoints::{Endpoints, Packet, Received},
+            endpoints::{EndpointPacket, QuicEndpoints, Received},
         },
     },
     link::CloseCode,
@@ -28,7 +28,7 @@ use crate::{
 /// All connections of all endpoints. Each has a number that no other one of this daemon ever has.
 pub(super) struct Connections {
     epoch: Instant,
-    endpoints: Endpoints,
+    endpoints: QuicEndpoints,
     all: HashMap<u64, Connection>,
     handles: HashMap<(usize, ConnectionHandle), u64>,
     next_number: u64,
@@ -47,7 +47,7 @@ pub(super) struct Connections {
 
 impl Connections {
     /// No connections yet. The engine's time was zero at `epoch`.
-    pub(super) fn new(endpoints: Endpoints, epoch: Instant) -> Self {
+    pub(super) fn new(endpoints: QuicEndpoints, epoch: Instant) -> Self {
         Self {
             epoch,
             endpoints,
@@ -64,7 +64,7 @@ impl Connections {
     }
 
     /// The endpoints.
-    pub(super) fn endpoints(&mut self) -> &mut Endpoints {
+    pub(super) fn endpoints(&mut self) -> &mut QuicEndpoints {
         &mut self.endpoints
     }
 
@@ -301,7 +301,9 @@ impl Connections {
         now: Instant,
     ) -> Option<(usize, Transmit)> {
         buffer.clear();
-        if let Some(Packet { endpoint, to, from, ecn, bytes }) = self.endpoints.poll_packet() {
+        if let Some(EndpointPacket { endpoint, to, from, ecn, bytes }) =
+            self.endpoints.poll_packet()
+        {
             let size = bytes.len();
             *buffer = bytes;
             let transmit =

@@ -15,7 +15,7 @@ use crate::{
         keyring::Keyring,
         link::{
             dialling::{Action, Dialling},
-            target::Target,
+            target::DialTarget,
         },
     },
 };
@@ -40,7 +40,7 @@ pub(super) struct Dial {
 
 impl Dials {
     /// Begins to dial a peer.
-    pub(super) fn begin(&mut self, target: Target, keyring: Option<&Keyring>, now: Duration) {
+    pub(super) fn begin(&mut self, target: DialTarget, keyring: Option<&Keyring>, now: Duration) {
         let dialling = Dialling::new(now, target, keyring);
         let number = self.next_number;
         self.next_number += 1;

@@ -8,10 +8,10 @@ use quinn_proto::{Dir, StreamEvent, VarInt};
 use super::{
     LinkEvent, LinkReport, Links,
     link::{
-        LinkPeer, Phase,
+        LinkPeer, LinkPhase,
         age::{Age, Due},
     },
-    silence::{Silence, Traffic},
+    silence::{LinkSilence, Traffic},
 };
 use crate::{
     daemon_key::DaemonProof,
@@ -20,9 +20,9 @@ use crate::{
         link::{
             failure::peer_text,
             opening::{Opened, Sealing},
-            target::Target,
+            target::DialTarget,
         },
-        links::{link::Summary, who::Who},
+        links::{link::Summary, who::PeerIdentity},
         quic::transport::{LINK_WINDOW, STREAMS_OPEN, window_credit},
         refusal::Refusal,
     },
@@ -61,7 +61,12 @@ impl Links {
         }
         let auth = self.credentials.auth();
         // The pins may have changed since they were looked at.
-        let who = match Who::of(self.keyring.is_some(), auth.as_ref(), &hello, negotiated.peer) {
+        let who = match PeerIdentity::of(
+            self.keyring.is_some(),
+            auth.as_ref(),
+            &hello,
+            negotiated.peer,
+        ) {
             Ok(who) => who,
             Err(why) => return self.turn_away(number, &hello, why, now),
         };
@@ -115,7 +120,7 @@ impl Links {
         connection.control.charge_to(&account);
         let Some(link) = self.table.get_mut(number) else { return };
         link.place = None;
-        link.phase = Phase::Electing(now + ELECTION_TIMEOUT);
+        link.phase = LinkPhase::Electing(now + ELECTION_TIMEOUT);
         link.peer = Some(LinkPeer {
             summary: Summary { hello, negotiated, who },
             proven,
@@ -129,7 +134,7 @@ impl Links {
             unread: account.unread.nothing(),
             account,
             chain,
-            silence: Silence::new(side, now),
+            silence: LinkSilence::new(side, now),
         });
         if we_elect {
             let elected = Elected { link: rand::random(), election: self.next_election };
@@ -212,7 +217,7 @@ impl Links {
         if let Some(age) = age {
             peer.age = Age::new(age, side == Side::Client, now);
         }
-        link.phase = Phase::Open;
+        link.phase = LinkPhase::Open;
         if let Some(connection) = self.connections.get_mut(number) {
             let streams = VarInt::from_u32(STREAMS_OPEN);
             connection.quic.set_max_concurrent_streams(Dir::Uni, streams);
@@ -256,7 +261,7 @@ impl Links {
     fn claim(
         &mut self,
         daemon: DaemonId,
-        who: &Who,
+        who: &PeerIdentity,
         proven: bool,
         now: Duration,
     ) -> Result<(), String> {
@@ -336,7 +341,7 @@ impl Links {
         else {
             return;
         };
-        let target = Target {
+        let target = DialTarget {
             daemon: Some(peer.summary.hello.daemon),
             sae: peer.summary.hello.sae.clone(),
             addresses: vec![connection.quic.remote_address()],

@@ -4,7 +4,7 @@ use std::{net::IpAddr, time::Duration};
 
 use quinn_proto::ConnectionError;
 
-use super::{LinkEvent, LinkReport, Links, explained::explained, link::Phase};
+use super::{LinkEvent, LinkReport, Links, explained::explained, link::LinkPhase};
 use crate::{
     bridge::RefusalKind,
     engine::refusal::{Refusal, RefusedBy},
@@ -27,11 +27,11 @@ impl Links {
     pub(super) fn handle_lost(&mut self, number: u64, reason: &ConnectionError, now: Duration) {
         let Some(link) = self.table.get_mut(number) else { return };
         match &mut link.phase {
-            Phase::Handshake(_, Some(dial)) => {
+            LinkPhase::Handshake(_, Some(dial)) => {
                 self.dials.handle_failed(*dial, reason);
                 self.table.remove(number);
             }
-            Phase::Handshake(_, None) => {
+            LinkPhase::Handshake(_, None) => {
                 let link = self.table.remove(number);
                 let resolver = link.and_then(|link| link.resolver);
                 let address = self.connections.address(number);
@@ -42,11 +42,11 @@ impl Links {
                     self.refused_incoming(kind, address, resolver.as_deref(), refusal);
                 }
             }
-            Phase::Opening(opening) => {
+            LinkPhase::Opening(opening) => {
                 opening.handle_lost(now, reason, self.keyring.as_mut());
                 self.go_on_opening(number, now);
             }
-            Phase::Electing(_) | Phase::Open | Phase::Leaving(_) => {
+            LinkPhase::Electing(_) | LinkPhase::Open | LinkPhase::Leaving(_) => {
                 let refusal = Refusal::of(reason);
                 let text = refusal.to_string();
                 // A stateless reset: another daemon has the peer's port.

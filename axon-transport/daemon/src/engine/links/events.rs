@@ -65,12 +65,12 @@ pub(in crate::engine) enum LinkReport {
 
 /// Events and reports that were not taken yet, in order.
 #[derive(Default)]
-pub(super) struct Outbox {
+pub(super) struct LinkOutbox {
     events: VecDeque<LinkEvent>,
     reports: VecDeque<LinkReport>,
 }
 
-impl Outbox {
+impl LinkOutbox {
     /// Adds an event.
     pub(super) fn event(&mut self, event: LinkEvent) {
         self.events.push_back(event);

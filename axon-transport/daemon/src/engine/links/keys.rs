@@ -2,7 +2,7 @@
 
 use std::{collections::HashSet, time::Duration};
 
-use super::{LinkEvent, Links, Phase};
+use super::{LinkEvent, LinkPhase, Links};
 use crate::{
     engine::{
         keyring::Answered,
@@ -61,10 +61,10 @@ impl Links {
     pub(in crate::engine) fn poll_request(
         &mut self,
         now: Duration,
-    ) -> Option<(keys::Origin, keys::Request)> {
+    ) -> Option<(keys::RequestOrigin, keys::KmeRequest)> {
         self.keyring.as_mut()?;
         for (_, link) in self.table.iter_mut() {
-            if let Phase::Opening(opening) = &mut link.phase
+            if let LinkPhase::Opening(opening) = &mut link.phase
                 && let Some(request) = opening.poll_request(now)
             {
                 return Some(request);

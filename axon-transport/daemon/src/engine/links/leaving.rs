@@ -7,8 +7,8 @@ use axon_shm::ids::DaemonId;
 use super::{
     LinkEvent, Links,
     link::{
-        Link, Phase,
-        hand_over::{Leaving, Step, UnderWay},
+        Link, LinkPhase,
+        hand_over::{HandOverProgress, HandOverStep, Leaving},
     },
     silence::Traffic,
 };
@@ -28,7 +28,7 @@ impl Links {
         let silent = peer.silence.handle_superseded(Traffic::from(&stats));
         let succeeded = ours > peer.summary.hello.daemon;
         let (who, elected) = (peer.summary.who.clone(), peer.elected);
-        link.phase = Phase::Leaving(Leaving::new(peer.age.until(), succeeded, now));
+        link.phase = LinkPhase::Leaving(Leaving::new(peer.age.until(), succeeded, now));
         self.nonces.retain(|_, number| *number != old);
         tracing::debug!(link = old, silent, "the link is superseded");
         let of_identity = self.table.leaving().filter(|(_, peer)| peer.summary.who.is(&who));
@@ -68,14 +68,14 @@ impl Links {
         self.table.iter_mut().filter(move |(_, link)| {
             let of_peer =
                 link.peer.as_ref().is_some_and(|peer| peer.summary.hello.daemon == daemon);
-            of_peer && matches!(link.phase, Phase::Leaving(_))
+            of_peer && matches!(link.phase, LinkPhase::Leaving(_))
         })
     }
 
     /// The peer sends over the successor.
     pub(super) fn succeeded(&mut self, daemon: DaemonId) {
         for (_, link) in self.leaving_of(daemon) {
-            if let Phase::Leaving(leaving) = &mut link.phase {
+            if let LinkPhase::Leaving(leaving) = &mut link.phase {
                 leaving.handle_succeeded();
             }
         }
@@ -86,7 +86,7 @@ impl Links {
         for (_, link) in self.leaving_of(daemon) {
             let elected = link.peer.as_ref().and_then(|peer| peer.elected);
             if elected.is_some_and(|elected| elected.link == closed.link)
-                && let Phase::Leaving(leaving) = &mut link.phase
+                && let LinkPhase::Leaving(leaving) = &mut link.phase
             {
                 leaving.handle_closed();
             }
@@ -101,7 +101,7 @@ impl Links {
 
     /// The peer's control stream of a superseded link ended.
     pub(super) fn leaving_ended(&mut self, number: u64) {
-        if let Some(Link { phase: Phase::Leaving(leaving), .. }) = self.table.get_mut(number) {
+        if let Some(Link { phase: LinkPhase::Leaving(leaving), .. }) = self.table.get_mut(number) {
             leaving.handle_ended();
         }
     }
@@ -124,21 +124,21 @@ impl Links {
             return;
         };
         let silent = link.peer.as_ref().is_some_and(|peer| peer.silence.is_silent());
-        let Phase::Leaving(leaving) = &mut link.phase else { return };
+        let LinkPhase::Leaving(leaving) = &mut link.phase else { return };
         let sent = all_is_sent(&mut connection.quic);
-        match leaving.handle_progress(UnderWay { silent, sent, reading }, now) {
-            Step::Wait => {}
-            Step::Finish => {
+        match leaving.handle_progress(HandOverProgress { silent, sent, reading }, now) {
+            HandOverStep::Wait => {}
+            HandOverStep::Finish => {
                 connection.control.finish();
                 self.connections.touch(number);
             }
-            Step::Close => self.close_leaving(number, now),
+            HandOverStep::Close => self.close_leaving(number, now),
         }
     }
 
     /// The time of a superseded link is over.
     pub(super) fn leaving_timeout(&mut self, number: u64, now: Duration) {
-        let Some(Link { phase: Phase::Leaving(leaving), .. }) = self.table.get(number) else {
+        let Some(Link { phase: LinkPhase::Leaving(leaving), .. }) = self.table.get(number) else {
             return;
         };
         if leaving.is_over(now) {

@@ -39,23 +39,23 @@ use quinn_proto::{Dir, EcnCodepoint, Event, StreamEvent, Transmit, TransportConf
 pub(crate) use self::admission::place;
 pub(super) use self::events::{LinkEvent, LinkReport};
 use self::{
-    admission::Admission,
+    admission::AddressAdmission,
     connections::Connections,
     dials::Dials,
-    events::Outbox,
+    events::LinkOutbox,
     inbox::DiscoveryInbox,
-    link::{Link, Phase, view::LinkView},
-    silence::{Looks, Nonce, frames_came},
+    link::{Link, LinkPhase, view::LinkView},
+    silence::{LookTimes, Nonce, frames_came},
     table::Table,
-    unfinished::Unfinished,
+    unfinished::UnfinishedConnections,
 };
 use super::{
     credentials::Credentials,
     keyring::Keyring,
     quic::{
         connection::Connection,
-        control_stream::{ControlError, Input},
-        endpoints::Endpoints,
+        control_stream::{ControlError, ControlInput},
+        endpoints::QuicEndpoints,
         qlog::{self, Qlogs},
     },
 };
@@ -84,16 +84,16 @@ pub(super) struct Links {
     connections: Connections,
     table: Table,
     dials: Dials,
-    admission: Admission,
+    admission: AddressAdmission,
     next_election: u64,
     /// Whether the daemon ends: no link begins any more.
     closing: bool,
-    unfinished: Unfinished,
+    unfinished: UnfinishedConnections,
     /// The silent links that are probed, by the nonces of the probes.
     nonces: HashMap<Nonce, u64>,
     inbox: DiscoveryInbox,
-    outbox: Outbox,
-    looks: Looks,
+    outbox: LinkOutbox,
+    looks: LookTimes,
 }
 
 /// Tells the wall-clock time.
@@ -144,17 +144,20 @@ impl Links {
             qlogs,
             epoch,
             wall,
-            connections: Connections::new(Endpoints::new(&addresses, &endpoint, &server), epoch),
+            connections: Connections::new(
+                QuicEndpoints::new(&addresses, &endpoint, &server),
+                epoch,
+            ),
             table: Table::default(),
             dials: Dials::default(),
-            admission: Admission::new(),
+            admission: AddressAdmission::new(),
             next_election: 1,
             closing: false,
-            unfinished: Unfinished::default(),
+            unfinished: UnfinishedConnections::default(),
             nonces: HashMap::new(),
             inbox: DiscoveryInbox::new(),
-            outbox: Outbox::default(),
-            looks: Looks::new(),
+            outbox: LinkOutbox::default(),
+            looks: LookTimes::new(),
         })
     }
 
@@ -299,22 +302,22 @@ impl Links {
             else {
                 return;
             };
-            if let Phase::Opening(opening) = &link.phase
+            if let LinkPhase::Opening(opening) = &link.phase
                 && !opening.reads()
             {
                 return;
             }
-            if matches!(link.phase, Phase::Handshake(..)) {
+            if matches!(link.phase, LinkPhase::Handshake(..)) {
                 return;
             }
             let account = link.peer.as_ref().map(|peer| Rc::clone(&peer.account));
             let owe = |cost| account.as_ref().map_or(Duration::ZERO, |a| a.owe(cost, now));
             match connection.control.read(&mut connection.quic, owe, now) {
-                Ok(Input::Message(message, room)) => {
+                Ok(ControlInput::Message(message, room)) => {
                     self.handle_message(number, *message, room, now);
                 }
-                Ok(Input::Nothing) => return,
-                Ok(Input::NoRoom) => return self.unfinished.add_blocked(number),
+                Ok(ControlInput::Nothing) => return,
+                Ok(ControlInput::NoRoom) => return self.unfinished.add_blocked(number),
                 Err(error) => return self.handle_control_error(number, error, now),
             }
             // A message is handled before the next is decoded, so that a peer fills no queue here.
@@ -326,7 +329,7 @@ impl Links {
 
     fn handle_control_error(&mut self, number: u64, error: ControlError, now: Duration) {
         let Some(link) = self.table.get_mut(number) else { return };
-        if let Phase::Opening(opening) = &mut link.phase {
+        if let LinkPhase::Opening(opening) = &mut link.phase {
             match error {
                 ControlError::Frame(error) => {
                     opening.handle_unreadable(now, error, self.keyring.as_mut());
@@ -341,7 +344,7 @@ impl Links {
                 self.violation(number, CloseCode::TooLarge, &text, now);
             }
             ControlError::Frame(_) => self.violation(number, CloseCode::Malformed, &text, now),
-            _ if matches!(link.phase, Phase::Leaving(_)) => self.leaving_ended(number),
+            _ if matches!(link.phase, LinkPhase::Leaving(_)) => self.leaving_ended(number),
             _ => self.end_link(number, &text, None, now),
         }
     }
@@ -354,7 +357,7 @@ impl Links {
         now: Duration,
     ) {
         let Some(link) = self.table.get_mut(number) else { return };
-        if let Phase::Opening(opening) = &mut link.phase {
+        if let LinkPhase::Opening(opening) = &mut link.phase {
             opening.handle_message(now, &message, self.keyring.as_mut());
             return self.go_on_opening(number, now);
         }
@@ -484,7 +487,7 @@ impl Links {
     fn link_timeout(&mut self, number: u64, now: Duration) {
         let Some(link) = self.table.get_mut(number) else { return };
         match &mut link.phase {
-            Phase::Handshake(..) => {
+            LinkPhase::Handshake(..) => {
                 let resolver = link.resolver.take();
                 self.table.remove(number);
                 let address = self.connections.address(number);
@@ -496,17 +499,17 @@ impl Links {
                     self.refused_incoming(kind, address, resolver.as_deref(), refusal);
                 }
             }
-            Phase::Opening(opening) => {
+            LinkPhase::Opening(opening) => {
                 opening.handle_timeout(now, self.keyring.as_mut());
                 self.go_on_opening(number, now);
             }
-            Phase::Electing(until) if *until <= now => {
+            LinkPhase::Electing(until) if *until <= now => {
                 self.close_connection(number, CloseCode::Duplicate, "not elected within 10 s", now);
                 self.end_link(number, "not elected", None, now);
             }
-            Phase::Leaving(_) => self.leaving_timeout(number, now),
-            Phase::Electing(_) => {}
-            Phase::Open => self.open_timeout(number, now),
+            LinkPhase::Leaving(_) => self.leaving_timeout(number, now),
+            LinkPhase::Electing(_) => {}
+            LinkPhase::Open => self.open_timeout(number, now),
         }
     }
 

@@ -9,7 +9,7 @@ use super::{
     LinkReport, Links,
     dials::Dial,
     explained::explained,
-    link::{Link, Phase},
+    link::{Link, LinkPhase},
 };
 use crate::{
     bridge::RefusalKind,
@@ -17,8 +17,8 @@ use crate::{
         link::{
             dialling::Action,
             failure::peer_text,
-            opening::{Handshake, Opening, Refused},
-            target::Target,
+            opening::{Handshake, Opening, RefusedConnection},
+            target::DialTarget,
         },
         refusal::Refusal,
     },
@@ -31,7 +31,7 @@ const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
 
 impl Links {
     /// Begins to dial a peer.
-    pub(in crate::engine) fn dial(&mut self, target: Target, now: Duration) {
+    pub(in crate::engine) fn dial(&mut self, target: DialTarget, now: Duration) {
         if self.closing {
             return;
         }
@@ -103,7 +103,7 @@ impl Links {
     /// The TLS handshake of a connection is complete.
     pub(super) fn handle_connected(&mut self, number: u64, now: Duration) {
         let Some(link) = self.table.get_mut(number) else { return };
-        let Phase::Handshake(_, dial) = link.phase else { return };
+        let LinkPhase::Handshake(_, dial) = link.phase else { return };
         match dial {
             Some(dial) => self.dials.handle_connected(dial),
             None => {
@@ -149,7 +149,7 @@ impl Links {
         let closed = self.credentials.closed();
         let opening =
             Opening::new(now, handshake, ours, &self.config, closed, self.keyring.as_mut());
-        link.phase = Phase::Opening(Box::new(opening));
+        link.phase = LinkPhase::Opening(Box::new(opening));
         self.go_on_opening(number, now);
         self.connections.touch(number);
     }
@@ -161,7 +161,7 @@ impl Links {
         else {
             return;
         };
-        let Phase::Opening(opening) = &mut link.phase else { return };
+        let LinkPhase::Opening(opening) = &mut link.phase else { return };
         let outcome = opening.poll_outcome(now, self.keyring.as_mut());
         while let Some(message) = opening.poll_message() {
             // HELLO and proofs always fit.
@@ -176,9 +176,9 @@ impl Links {
         }
     }
 
-    fn opening_refused(&mut self, number: u64, refused: Refused, now: Duration) {
+    fn opening_refused(&mut self, number: u64, refused: RefusedConnection, now: Duration) {
         let Some(link) = self.table.remove(number) else { return };
-        let Refused { refusal, close } = refused;
+        let RefusedConnection { refusal, close } = refused;
         let address = self.connections.address(number);
         if let Some((code, told)) = close {
             self.close_connection(number, code, &told, now);

@@ -5,8 +5,8 @@ use std::{collections::HashMap, time::Duration};
 use axon_shm::ids::DaemonId;
 
 use super::{
-    link::{Link, LinkPeer, Phase},
-    who::Who,
+    link::{Link, LinkPeer, LinkPhase},
+    who::PeerIdentity,
 };
 use crate::engine::link::opening::Opening;
 
@@ -66,7 +66,7 @@ impl Table {
     /// The opening of a link, while it has one.
     pub(super) fn opening_mut(&mut self, number: u64) -> Option<&mut Opening> {
         match &mut self.links.get_mut(&number)?.phase {
-            Phase::Opening(opening) => Some(opening),
+            LinkPhase::Opening(opening) => Some(opening),
             _ => None,
         }
     }
@@ -87,7 +87,7 @@ impl Table {
     }
 
     /// How many links one identity has.
-    pub(super) fn of_identity(&self, who: &Who) -> usize {
+    pub(super) fn of_identity(&self, who: &PeerIdentity) -> usize {
         self.peers().filter(|(_, peer)| peer.summary.who.is(who)).count()
     }
 
@@ -99,7 +99,7 @@ impl Table {
     /// The links that a successor took over from.
     pub(super) fn leaving(&self) -> impl Iterator<Item = (u64, &LinkPeer)> {
         self.iter()
-            .filter(|(_, link)| matches!(link.phase, Phase::Leaving(_)))
+            .filter(|(_, link)| matches!(link.phase, LinkPhase::Leaving(_)))
             .filter_map(|(number, link)| Some((number, link.peer.as_ref()?)))
     }
 

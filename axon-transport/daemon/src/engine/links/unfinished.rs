@@ -7,7 +7,7 @@ use quinn_proto::ConnectionError;
 
 /// Connections, by the numbers of their links.
 #[derive(Default)]
-pub(super) struct Unfinished {
+pub(super) struct UnfinishedConnections {
     /// Their control streams have more, once the events that came are handled.
     unread: Vec<u64>,
     /// The same, and there was no room for their next message: they go first.
@@ -16,7 +16,7 @@ pub(super) struct Unfinished {
     lost: VecDeque<(u64, ConnectionError)>,
 }
 
-impl Unfinished {
+impl UnfinishedConnections {
     /// The control stream of a connection has more.
     pub(super) fn add_unread(&mut self, number: u64) {
         self.unread.push(number);
@@ -61,7 +61,7 @@ mod tests {
 
     #[test]
     fn lost_connections_end_in_order_and_stand_until_then() {
-        let mut unfinished = Unfinished::default();
+        let mut unfinished = UnfinishedConnections::default();
         unfinished.add_lost(3, ConnectionError::TimedOut);
         unfinished.add_lost(1, ConnectionError::Reset);
         assert!(unfinished.is_lost(3) && unfinished.is_lost(1) && !unfinished.is_lost(2));
@@ -73,7 +73,7 @@ mod tests {
 
     #[test]
     fn streams_whose_message_found_no_room_go_first() {
-        let mut unfinished = Unfinished::default();
+        let mut unfinished = UnfinishedConnections::default();
         unfinished.add_unread(1);
         [3, 2].into_iter().for_each(|number| unfinished.add_blocked(number));
         assert!(unfinished.has_unread());
@@ -83,7 +83,7 @@ mod tests {
 
     #[test]
     fn unread_streams_are_taken_once() {
-        let mut unfinished = Unfinished::default();
+        let mut unfinished = UnfinishedConnections::default();
         unfinished.add_lost(7, ConnectionError::Reset);
         assert!(!unfinished.has_unread(), "a lost connection is another matter");
         [5, 2].into_iter().for_each(|number| unfinished.add_unread(number));

@@ -1,4 +1,4 @@
-//! Who a peer is.
+//! The identity of a peer.
 
 use std::{fmt, net::SocketAddr};
 
@@ -11,7 +11,7 @@ use crate::link::Hello;
 
 /// As whom a peer proved itself.
 #[derive(Clone, Debug)]
-pub(crate) enum Who {
+pub(crate) enum PeerIdentity {
     /// By a KME key.
     Sae(String),
     /// By a key that is pinned under this name.
@@ -22,7 +22,7 @@ pub(crate) enum Who {
     Somebody(Option<SpkiDigest>),
 }
 
-impl Who {
+impl PeerIdentity {
     /// The peer of a link whose HELLO was checked. `key` is the one that it proved to have.
     ///
     /// # Errors
@@ -109,7 +109,7 @@ impl Who {
     }
 }
 
-impl fmt::Display for Who {
+impl fmt::Display for PeerIdentity {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Sae(sae) => write!(f, "SAE {sae} (KME key)"),
@@ -133,7 +133,7 @@ mod tests {
         let pins = |text: &str| TrustFile::parse(text).unwrap();
         let trust = Trust::new(pins(&format!("arm {key}\n")));
         let auth = Auth::Pinned { key: SigningKey::generate().unwrap(), trust: trust.clone() };
-        let of = |auth, key| Who::of(false, auth, &hello(), key);
+        let of = |auth, key| PeerIdentity::of(false, auth, &hello(), key);
         let who = of(Some(&auth), Some(key)).unwrap();
         assert_eq!(who.party(([127, 0, 0, 1], 1).into()), Party::Name("arm"));
         // Between the handshake and HELLO.
@@ -144,12 +144,12 @@ mod tests {
         }
         of(Some(&auth), None).unwrap_err();
         let none = Auth::None(SigningKey::generate().unwrap());
-        assert!(matches!(of(Some(&none), Some(key)), Ok(Who::Somebody(Some(_)))));
+        assert!(matches!(of(Some(&none), Some(key)), Ok(PeerIdentity::Somebody(Some(_)))));
     }
 
     #[test]
     fn neighbours_that_prove_nothing_share_a_budget_and_are_two_hosts() {
-        let somebody = Who::Somebody(Some(SpkiDigest([1; 32])));
+        let somebody = PeerIdentity::Somebody(Some(SpkiDigest([1; 32])));
         let at = |address: &str| address.parse().unwrap();
         let same = |one: &str, other: &str| {
             let [one, other] = [one, other].map(at);
@@ -162,9 +162,9 @@ mod tests {
         assert_eq!(same("[2001:db8::1]:1", "[2001:db8:0:1::1]:1"), [false, false]);
         assert_eq!(same("10.0.0.1:1", "10.0.0.2:1"), [false, false]);
         assert_eq!(same("10.0.0.1:1", "[::ffff:10.0.0.1]:2"), [true, true]);
-        let arm = Who::Sae("arm".into());
+        let arm = PeerIdentity::Sae("arm".into());
         assert_eq!(arm.budget(at("10.0.0.1:1")), arm.host_identity(at("10.0.0.2:1")));
-        let base = Who::Sae("base".into());
+        let base = PeerIdentity::Sae("base".into());
         assert_ne!(arm.budget(at("[::1]:1")), base.budget(at("[::1]:1")));
     }
 
@@ -173,14 +173,14 @@ mod tests {
         let [one, two] = [1, 2].map(|byte| SpkiDigest([byte; 32]));
         let name = "arm".to_owned();
         let all = [
-            Who::Sae(name.clone()),
-            Who::Pinned(name.clone(), one),
-            Who::Pinned("UNAUTHENTICATED".into(), one),
-            Who::Host(name.clone(), one),
-            Who::Host("UNAUTHENTICATED".into(), one),
-            Who::Somebody(Some(one)),
-            Who::Somebody(Some(two)),
-            Who::Somebody(None),
+            PeerIdentity::Sae(name.clone()),
+            PeerIdentity::Pinned(name.clone(), one),
+            PeerIdentity::Pinned("UNAUTHENTICATED".into(), one),
+            PeerIdentity::Host(name.clone(), one),
+            PeerIdentity::Host("UNAUTHENTICATED".into(), one),
+            PeerIdentity::Somebody(Some(one)),
+            PeerIdentity::Somebody(Some(two)),
+            PeerIdentity::Somebody(None),
         ];
         let here = ([127, 0, 0, 1], 1).into();
         for (i, a) in all.iter().enumerate() {
@@ -190,7 +190,9 @@ mod tests {
                 assert_eq!(a.host_identity(here) == b.host_identity(here), i == j || nobodies);
             }
         }
-        assert!(Who::Pinned(name.clone(), one).is(&Who::Pinned(name.clone(), two)));
-        assert!(Who::Host(name.clone(), one).is(&Who::Host(name, two)));
+        assert!(
+            PeerIdentity::Pinned(name.clone(), one).is(&PeerIdentity::Pinned(name.clone(), two))
+        );
+        assert!(PeerIdentity::Host(name.clone(), one).is(&PeerIdentity::Host(name, two)));
     }
 }

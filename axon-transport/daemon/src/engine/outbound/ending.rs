@@ -47,7 +47,7 @@ impl Ending {
 
 /// What is left of a publisher that ended.
 #[derive(Debug)]
-pub(super) struct Left {
+pub(super) struct EndedFlow {
     /// Its route now.
     pub(super) route: u32,
     /// Samples that are not acknowledged.
@@ -60,32 +60,32 @@ pub(super) struct Left {
 
 /// A publisher of which nothing is sent any more.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) struct Over {
+pub(super) struct FinishedPublisher {
     pub(super) publisher: Gid,
     /// What is given up; `None`: nothing was left.
-    pub(super) given_up: Option<GivenUp>,
+    pub(super) given_up: Option<GivenUpSamples>,
 }
 
 /// Samples that are given up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct GivenUp {
+pub(super) struct GivenUpSamples {
     /// Their route.
     pub(super) route: u32,
     /// How many.
     pub(super) samples: u64,
-    pub(super) why: Why,
+    pub(super) why: GivenUpCause,
 }
 
 /// Why samples are given up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Why {
+pub(super) enum GivenUpCause {
     /// They made no progress.
     Stuck,
     /// Together with those of publishers that ended later they exceed the bound.
     Bound,
 }
 
-impl Why {
+impl GivenUpCause {
     /// Logs that samples of a publisher that ended are lost. Each reason has its own line: the log's rate limit is by line
     /// of code.
     pub(super) fn warn(self, topic: &str, publisher: &Gid, samples: u64) {
@@ -143,9 +143,9 @@ impl Endings {
     pub(super) fn handle_timeout(
         &mut self,
         now: Duration,
-        left_of: impl Fn(u32, &Gid) -> Option<Left>,
+        left_of: impl Fn(u32, &Gid) -> Option<EndedFlow>,
         bytes_of: impl Fn(u32, &Gid) -> u64,
-    ) -> Vec<Over> {
+    ) -> Vec<FinishedPublisher> {
         let (mut over, mut waiting) = (Vec::new(), Vec::new());
         if self.poll_timeout().is_none_or(|due| due > now) {
             return over;
@@ -153,10 +153,10 @@ impl Endings {
         self.next = Some(now + LOOK);
         self.publishers.retain(|publisher, ending| {
             let Some(left) = left_of(ending.route, publisher) else {
-                over.push(Over { publisher: *publisher, given_up: None });
+                over.push(FinishedPublisher { publisher: *publisher, given_up: None });
                 return false;
             };
-            let Left { route, samples, progress, is_excused } = left;
+            let EndedFlow { route, samples, progress, is_excused } = left;
             ending.route = route;
             if progress != ending.progress || is_excused {
                 (ending.progress, ending.since) = (progress, now);
@@ -167,8 +167,8 @@ impl Endings {
                 let bytes = ending.bytes_of(samples, || bytes_of(route, &publisher));
                 waiting.push(Waiting { number, publisher, route, samples, bytes });
             } else {
-                let given_up = Some(GivenUp { route, samples, why: Why::Stuck });
-                over.push(Over { publisher: *publisher, given_up });
+                let given_up = Some(GivenUpSamples { route, samples, why: GivenUpCause::Stuck });
+                over.push(FinishedPublisher { publisher: *publisher, given_up });
             }
             waits
         });
@@ -177,7 +177,7 @@ impl Endings {
     }
 
     /// Forgets the publishers that ended first, until the others fit the bound. The last one stays.
-    fn give_up_beyond(&mut self, mut waiting: Vec<Waiting>) -> Vec<Over> {
+    fn give_up_beyond(&mut self, mut waiting: Vec<Waiting>) -> Vec<FinishedPublisher> {
         let mut bytes = waiting.iter().fold(0u64, |sum, of| sum.saturating_add(of.bytes));
         let most = self.most;
         let fits = |bytes: u64, publishers: usize| {
@@ -197,8 +197,8 @@ impl Endings {
             }
             bytes = bytes.saturating_sub(of);
             self.publishers.remove(&publisher);
-            let given_up = Some(GivenUp { route, samples, why: Why::Bound });
-            over.push(Over { publisher, given_up });
+            let given_up = Some(GivenUpSamples { route, samples, why: GivenUpCause::Bound });
+            over.push(FinishedPublisher { publisher, given_up });
         }
         over
     }
@@ -219,16 +219,18 @@ mod tests {
         0
     }
 
-    fn stuck(route: u32, samples: u64) -> Option<GivenUp> {
-        Some(GivenUp { route, samples, why: Why::Stuck })
+    fn stuck(route: u32, samples: u64) -> Option<GivenUpSamples> {
+        Some(GivenUpSamples { route, samples, why: GivenUpCause::Stuck })
     }
 
-    fn left(samples: u64, progress: u64, is_excused: bool) -> Option<Left> {
-        Some(Left { route: 1, samples, progress: (progress, 0), is_excused })
+    fn left(samples: u64, progress: u64, is_excused: bool) -> Option<EndedFlow> {
+        Some(EndedFlow { route: 1, samples, progress: (progress, 0), is_excused })
     }
 
     /// Looks until the publisher is over, `left` after the given time being what is left. Returns when it is over.
-    fn over_after(left: impl Fn(Duration) -> Option<Left>) -> (Duration, Vec<Over>) {
+    fn over_after(
+        left: impl Fn(Duration) -> Option<EndedFlow>,
+    ) -> (Duration, Vec<FinishedPublisher>) {
         let mut endings = endings();
         assert_eq!(endings.poll_timeout(), None);
         endings.add(1, PUBLISHER, Duration::ZERO);
@@ -244,13 +246,13 @@ mod tests {
 
     #[test]
     fn a_publisher_whose_samples_are_acknowledged_is_over_at_once() {
-        let over = Over { publisher: PUBLISHER, given_up: None };
+        let over = FinishedPublisher { publisher: PUBLISHER, given_up: None };
         assert_eq!(over_after(|_| None), (Duration::ZERO, vec![over]));
     }
 
     #[test]
     fn samples_without_progress_are_given_up() {
-        let given_up = Over { publisher: PUBLISHER, given_up: stuck(1, 5) };
+        let given_up = FinishedPublisher { publisher: PUBLISHER, given_up: stuck(1, 5) };
         let (at, over) = over_after(|_| left(5, 0, false));
         assert_eq!((at, over), (PATIENCE, vec![given_up]));
     }
@@ -268,7 +270,7 @@ mod tests {
     fn a_route_that_was_asked_for_anew_is_remembered() {
         let mut endings = endings();
         endings.add(1, PUBLISHER, Duration::ZERO);
-        let moved = |route: u32| Left { route, ..left(5, 0, false).unwrap() };
+        let moved = |route: u32| EndedFlow { route, ..left(5, 0, false).unwrap() };
         assert!(endings.handle_timeout(Duration::ZERO, |_, _| Some(moved(2)), no_bytes).is_empty());
         let given_up = endings.handle_timeout(PATIENCE, |route, _| Some(moved(route)), no_bytes);
         assert_eq!(given_up[0].given_up, stuck(2, 5));
@@ -293,7 +295,7 @@ mod tests {
         };
         numbers.iter().for_each(|number| endings.add(1, gid(*number), Duration::ZERO));
         let over = endings.handle_timeout(Duration::ZERO, |_, _| left(5, 0, false), |_, _| bytes);
-        let bound = Some(GivenUp { route: 1, samples: 5, why: Why::Bound });
+        let bound = Some(GivenUpSamples { route: 1, samples: 5, why: GivenUpCause::Bound });
         assert!(over.iter().all(|over| over.given_up == bound), "{over:?}");
         over.iter().map(|over| over.publisher.0[1]).collect()
     }

@@ -3,12 +3,12 @@
 /// The newest number of which QUIC took anything, and how many bytes of that sample. What it takes again over another link
 /// is no progress, whether the same flow sends it or the one that follows it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct Furthest {
+pub(super) struct SentProgress {
     sequence: u64,
     bytes: u64,
 }
 
-impl Furthest {
+impl SentProgress {
     /// QUIC has so many bytes of a sample. Returns how many of them it took for the first time.
     pub(super) fn advance(&mut self, sequence: u64, bytes: u64) -> u64 {
         let known = if sequence == self.sequence { self.bytes } else { 0 };
@@ -27,12 +27,12 @@ mod tests {
 
     #[test]
     fn bytes_that_were_taken_before_do_not_count_again() {
-        let mut furthest = Furthest::default();
+        let mut furthest = SentProgress::default();
         let taken = [(1, 10), (1, 30), (2, 5), (1, 40), (2, 5), (2, 3), (2, 7), (9, 0), (9, 1)];
         let new = taken.map(|(sequence, bytes)| furthest.advance(sequence, bytes));
         assert_eq!(new, [10, 20, 5, 0, 0, 0, 2, 0, 1]);
         // A flow that follows goes on from there.
-        let mut next = Furthest::default().max(furthest);
+        let mut next = SentProgress::default().max(furthest);
         assert_eq!([(1, 50), (9, 4)].map(|(s, b)| next.advance(s, b)), [0, 3]);
     }
 }

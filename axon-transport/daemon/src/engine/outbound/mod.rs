@@ -33,19 +33,19 @@ pub(crate) use self::{
     schedule::{Class, FlowId, Priorities, Rank},
     served::{ResponseNumbers, RouteOut},
     source::Source,
-    stall::Stall,
+    stall::StallCause,
     unfinished::{Unfinished, UnfinishedFlows},
 };
 use self::{
     budget::Budget,
-    ending::{Endings, GivenUp, Over},
-    flow::{Flow, Pause},
+    ending::{Endings, FinishedPublisher, GivenUpSamples},
+    flow::{Flow, FlowPause},
     nudges::Nudges,
-    served::{FlowRoute, Served},
+    served::{FlowRoute, ServedFlows},
     source::Done,
     stall::{BusyFlow, PeerActivity, Stalls},
     table::FlowTable,
-    turns::Turns,
+    turns::FlowTurns,
 };
 use super::{
     compression::PeerCompression, congestion::let_probe_through, quic::connection::Carrier,
@@ -73,13 +73,13 @@ pub(crate) enum OutboundEvent {
         samples: u64,
     },
     /// The peer does not read what it asked for over this route.
-    Stalled(u32, Stall),
+    Stalled(u32, StallCause),
 }
 
 /// The samples to one peer.
 pub(crate) struct Outbound {
     table: FlowTable,
-    turns: Turns,
+    turns: FlowTurns,
     endings: Endings,
     stalls: Stalls,
     nudges: Nudges,
@@ -102,7 +102,7 @@ impl Outbound {
     ) -> Self {
         Self {
             table: FlowTable::default(),
-            turns: Turns::new(Rc::clone(&budget)),
+            turns: FlowTurns::new(Rc::clone(&budget)),
             endings: Endings::new(budget.of_daemon()),
             stalls: Stalls::new(stalled_after, now),
             nudges: Nudges::default(),
@@ -158,7 +158,7 @@ impl Outbound {
             self.schedule(id);
         }
         // Samples may wait in any of its rings.
-        let waiting = self.table.routes.get(number).map_or_else(Vec::new, Served::with_data);
+        let waiting = self.table.routes.get(number).map_or_else(Vec::new, ServedFlows::with_data);
         waiting.into_iter().for_each(|of| self.take_in(number, of, now));
     }
 
@@ -286,13 +286,13 @@ impl Outbound {
             let before = carrier.taken;
             let mut done = Done::default();
             let pause = match flow.waits_for_credit && !carrier.is_open_to(turn.rank) {
-                true => Pause::NoCredit,
+                true => FlowPause::NoCredit,
                 false => {
                     let (counters, compression) = (&self.counters, &self.compression);
                     flow.write(&served.sources, carrier, counters, compression, &mut done, now)
                 }
             };
-            flow.waits_for_credit = pause == Pause::NoCredit;
+            flow.waits_for_credit = pause == FlowPause::NoCredit;
             served.done(flow.info.of, done);
             let taken = carrier.taken - before;
             if carrier.loses && taken > 0 {
@@ -302,11 +302,11 @@ impl Outbound {
             if flow.is_held() {
                 self.turns.handle_held(turn);
             }
-            if matches!(pause, Pause::Blocked | Pause::NoCredit) {
+            if matches!(pause, FlowPause::Blocked | FlowPause::NoCredit) {
                 flow.blocked = true;
                 flow.take_burst(&served.sources, &self.counters, now);
             }
-            if pause == Pause::Blocked {
+            if pause == FlowPause::Blocked {
                 let limit = carrier.limit_of(turn.rank);
                 blocked = Some(blocked.map_or(limit, |least: u64| least.min(limit)));
             }
@@ -475,7 +475,7 @@ impl Outbound {
         let left_of = |route, of: &Gid| self.table.left_of(route, of, starves);
         let bytes_of = |route, of: &Gid| self.table.bytes_left_of(route, of);
         let over = self.endings.handle_timeout(now, left_of, bytes_of);
-        for Over { publisher, given_up } in over {
+        for FinishedPublisher { publisher, given_up } in over {
             if let Some(given_up) = given_up {
                 self.give_up_ended(publisher, given_up);
             }
@@ -483,8 +483,8 @@ impl Outbound {
         }
     }
 
-    fn give_up_ended(&mut self, of: Gid, given_up: GivenUp) {
-        let GivenUp { route: number, samples, why } = given_up;
+    fn give_up_ended(&mut self, of: Gid, given_up: GivenUpSamples) {
+        let GivenUpSamples { route: number, samples, why } = given_up;
         let Some(served) = self.table.routes.get(number) else { return };
         let topic = Arc::clone(&served.shared.topic);
         // What BEST_EFFORT samples are left in the rings shows when they are taken.

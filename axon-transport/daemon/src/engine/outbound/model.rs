@@ -21,7 +21,7 @@ use super::{
 use crate::engine::{limits::RouteLimit, peer::routes::RelaySpec, rings::RingReader};
 
 /// The ring of one publisher, with its one reader. It keeps every sample.
-pub(super) struct Ring {
+pub(super) struct ModelRing {
     reader: Gid,
     publisher: Gid,
     samples: RefCell<VecDeque<(u64, usize)>>,
@@ -34,7 +34,7 @@ pub(super) struct Ring {
     pub(super) meanwhile: Cell<(u64, u64)>,
 }
 
-impl Ring {
+impl ModelRing {
     /// The ring of `publisher`, which is empty.
     pub(super) fn new(reader: Gid, publisher: Gid) -> Rc<Self> {
         Rc::new(Self {
@@ -65,7 +65,7 @@ impl Ring {
     }
 }
 
-impl RingReader for Ring {
+impl RingReader for ModelRing {
     fn gid(&self) -> Gid {
         self.reader
     }

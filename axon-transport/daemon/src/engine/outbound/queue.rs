@@ -14,8 +14,8 @@ use axon_envelope::Delivery;
 use axon_shm::qos::{History, Qos, Reliability};
 use bytes::Bytes;
 
-use super::{budget::Budget, burst::Burst, flow::Credit};
-use crate::engine::rings::Sample;
+use super::{budget::Budget, burst::Burst, flow::UsedCredit};
+use crate::engine::rings::RingSample;
 
 /// What became of a sample that was offered.
 #[derive(Debug)]
@@ -26,7 +26,7 @@ pub(super) enum Offered {
         dropped: u64,
     },
     /// There is no room, and nothing may be dropped.
-    Full(Sample),
+    Full(RingSample),
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -59,9 +59,9 @@ impl Policy {
 pub(super) struct Queue {
     policy: Policy,
     budget: Rc<Budget>,
-    waiting: VecDeque<Sample>,
+    waiting: VecDeque<RingSample>,
     /// RELIABLE samples that were sent and are not acknowledged, oldest first.
-    sent: VecDeque<Sample>,
+    sent: VecDeque<RingSample>,
     /// Bytes of all samples, waiting and sent.
     bytes: usize,
     sent_bytes: usize,
@@ -157,7 +157,7 @@ impl Queue {
     }
 
     /// Adds a sample.
-    pub(super) fn offer(&mut self, sample: Sample, now: Duration) -> Offered {
+    pub(super) fn offer(&mut self, sample: RingSample, now: Duration) -> Offered {
         self.burst.handle_waiting(now);
         let most = match self.policy {
             Policy::KeepAll => usize::MAX,
@@ -210,7 +210,7 @@ impl Queue {
     }
 
     /// Removes the oldest waiting sample.
-    fn pop(&mut self) -> Option<Sample> {
+    fn pop(&mut self) -> Option<RingSample> {
         let sample = self.waiting.pop_front()?;
         self.bytes -= sample.size();
         self.release(sample.size());
@@ -218,7 +218,7 @@ impl Queue {
     }
 
     /// The next sample to send.
-    pub(super) fn peek(&self) -> Option<&Sample> {
+    pub(super) fn peek(&self) -> Option<&RingSample> {
         self.waiting.front()
     }
 
@@ -228,7 +228,7 @@ impl Queue {
         &mut self,
         bytes: usize,
         now: Duration,
-    ) -> impl Iterator<Item = &mut Sample> {
+    ) -> impl Iterator<Item = &mut RingSample> {
         let one = match self.policy {
             Policy::KeepAll => false,
             Policy::KeepLast(_) => self.is_behind(now),
@@ -247,7 +247,7 @@ impl Queue {
     /// sent before that, or a publisher that is fast enough would have none of its samples sent. A KEEP_LAST flow leaves
     /// newer ones in the ring.
     pub(super) fn holds_next(&self, life: Duration, now: Duration) -> bool {
-        let is_held = |next: &Sample| {
+        let is_held = |next: &RingSample| {
             (next.is_asked() || next.is_compressed()) && now.saturating_sub(next.taken) < life
         };
         matches!(self.policy, Policy::BestEffort(_)) && self.peek().is_some_and(is_held)
@@ -263,7 +263,7 @@ impl Queue {
 
     /// The next RELIABLE sample to send. It stays in the queue until it is acknowledged or written; there is none
     /// while several such samples fill the flow's share.
-    pub(super) fn send(&mut self) -> Option<&Sample> {
+    pub(super) fn send(&mut self) -> Option<&RingSample> {
         let size = self.waiting.front()?.size();
         if self.sent.len() > 1 && self.sent_bytes + size > self.budget.of_flow() {
             return None;
@@ -277,13 +277,13 @@ impl Queue {
     }
 
     /// The credit that the samples use that were sent and are not acknowledged.
-    pub(super) fn credit(&self) -> Credit {
-        Credit::of(self.sent_bytes, self.longest_sent())
+    pub(super) fn credit(&self) -> UsedCredit {
+        UsedCredit::of(self.sent_bytes, self.longest_sent())
     }
 
     /// The credit that they will use if this sample is sent, too.
-    pub(super) fn credit_with(&self, next: &Sample) -> Credit {
-        Credit::of(self.sent_bytes + next.size(), self.longest_sent().max(next.size()))
+    pub(super) fn credit_with(&self, next: &RingSample) -> UsedCredit {
+        UsedCredit::of(self.sent_bytes + next.size(), self.longest_sent().max(next.size()))
     }
 
     fn longest_sent(&self) -> usize {
@@ -299,7 +299,7 @@ impl Queue {
     }
 
     /// Takes the next best-effort sample to send.
-    pub(super) fn pop_best_effort(&mut self) -> Option<Sample> {
+    pub(super) fn pop_best_effort(&mut self) -> Option<RingSample> {
         self.pop()
     }
 
@@ -334,7 +334,7 @@ impl Queue {
     /// number that was never sent acknowledges nothing.
     pub(super) fn acknowledge(&mut self, sequence: u64) -> (u64, Option<u64>) {
         let most = sequence.min(self.newest_sent);
-        let is_taken = |sample: &&Sample| sample.info.sequence <= most;
+        let is_taken = |sample: &&RingSample| sample.info.sequence <= most;
         let (mut samples, mut newest) = (0, None);
         loop {
             let taken = if self.sent.is_empty() {
@@ -348,7 +348,7 @@ impl Queue {
         }
     }
 
-    fn pop_sent(&mut self) -> Option<Sample> {
+    fn pop_sent(&mut self) -> Option<RingSample> {
         let sample = self.sent.pop_front()?;
         self.sent_bytes -= sample.size();
         self.bytes -= sample.size();

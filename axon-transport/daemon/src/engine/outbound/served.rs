@@ -69,7 +69,7 @@ impl ResponseNumbers {
 }
 
 /// A route and its flows.
-pub(super) struct Served {
+pub(super) struct ServedFlows {
     pub(super) shared: FlowRoute,
     /// Its peer reads nothing, as its owner knows.
     pub(super) stalled: bool,
@@ -78,7 +78,7 @@ pub(super) struct Served {
     pub(super) flows: HashMap<Gid, FlowId>,
 }
 
-impl Served {
+impl ServedFlows {
     /// A route without sources.
     pub(super) fn new(shared: FlowRoute) -> Self {
         Self {

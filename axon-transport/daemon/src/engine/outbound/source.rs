@@ -10,7 +10,7 @@ use axon_transport::internal::session::TakeLimit;
 
 use crate::engine::{
     peer::routes::RelaySpec,
-    rings::{RingReader, Sample},
+    rings::{RingReader, RingSample},
     sample::protection::call,
     stand_in::StandIn,
 };
@@ -73,7 +73,7 @@ impl Source {
     }
 
     /// Takes the next sample of a publisher or client.
-    pub(super) fn take_of(&self, of: &Gid, now: Duration) -> Option<Sample> {
+    pub(super) fn take_of(&self, of: &Gid, now: Duration) -> Option<RingSample> {
         let mut taken = None;
         self.take_many(of, ONE, now, &mut |sample| taken = Some(sample));
         taken
@@ -85,18 +85,19 @@ impl Source {
         of: &Gid,
         most: TakeLimit,
         now: Duration,
-        each: &mut dyn FnMut(Sample),
+        each: &mut dyn FnMut(RingSample),
     ) -> usize {
         match self {
-            Self::Relay(_, reader) => reader
-                .take_many(of, most, &mut |info, payload| each(Sample::new(info, payload, now))),
+            Self::Relay(_, reader) => reader.take_many(of, most, &mut |info, payload| {
+                each(RingSample::new(info, payload, now))
+            }),
             Self::StandIn(stand_in) => {
                 let mut taken = 0;
                 while taken < most.samples
                     && let Some((info, payload)) = stand_in.ring().take_call_of(of)
                 {
                     let call = Some(call(*of, info.sequence));
-                    let mut sample = Sample::new(info, payload.into(), now);
+                    let mut sample = RingSample::new(info, payload.into(), now);
                     sample.call = call;
                     each(sample);
                     taken += 1;

@@ -113,7 +113,7 @@ pub(super) struct BusyFlow {
 
 /// Why a route counts as stalled.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Stall {
+pub(crate) enum StallCause {
     /// Nothing of it was read for the limit.
     NothingRead,
     /// A publisher was held up, and less than a [`SHARE`]th of what it keeps was read in [`PERIOD`] times the limit.
@@ -126,7 +126,7 @@ pub(crate) enum Stall {
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct Found {
     /// Routes that made no progress for the limit, or too little.
-    pub(super) stalled: Vec<(u32, Stall)>,
+    pub(super) stalled: Vec<(u32, StallCause)>,
     /// Flows that are busy no more.
     pub(super) quiet: Vec<FlowId>,
 }
@@ -240,9 +240,9 @@ impl Stalls {
                 None => Progress::new(&flow),
             };
             if progress.idle >= self.limit {
-                found.stalled.push((flow.route, Stall::NothingRead));
+                found.stalled.push((flow.route, StallCause::NothingRead));
             } else if progress.pace.held >= self.limit * PERIOD {
-                let why = if flow.lacks_keys { Stall::NoKeys } else { Stall::TooSlow };
+                let why = if flow.lacks_keys { StallCause::NoKeys } else { StallCause::TooSlow };
                 found.stalled.push((flow.route, why));
             } else {
                 self.flows.insert(flow.id, progress);

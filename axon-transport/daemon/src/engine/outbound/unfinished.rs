@@ -4,7 +4,7 @@ use std::{collections::HashMap, time::Duration};
 
 use axon_shm::ids::Gid;
 
-use super::{furthest::Furthest, stall::Progress};
+use super::{furthest::SentProgress, stall::Progress};
 
 /// The flow of a publisher that ended with samples that are not acknowledged. It is no larger than a few words, and there
 /// is one at most for each lane of the relays that are kept.
@@ -13,7 +13,7 @@ pub(crate) struct Unfinished {
     /// What the peer did, and did not do.
     pub(super) progress: Progress,
     /// How far QUIC took its samples.
-    pub(super) furthest: Furthest,
+    pub(super) furthest: SentProgress,
 }
 
 /// Those of one route, by publisher.

@@ -20,7 +20,7 @@ use axon_transport::{
 };
 
 use super::{
-    judged::{Judged, Judgement},
+    judged::{EndpointRights, JudgedEndpoints},
     refused::shown,
 };
 use crate::{
@@ -42,7 +42,7 @@ const ENTRY: usize = 200;
 const UNANSWERED: usize = 64;
 
 /// What somebody does with a topic or service.
-pub(super) type Use = (Verb, String);
+pub(super) type AccessUse = (Verb, String);
 
 /// The verbs that need an endpoint, as DENIED numbers them.
 const VERBS: [Verb; 4] = [Verb::Publish, Verb::Subscribe, Verb::Serve, Verb::Call];
@@ -66,11 +66,11 @@ pub(super) struct PeerAccess {
     permissions: Permissions,
     /// The rules changed since the denied uses were judged.
     changed: bool,
-    judged: Judged,
+    judged: JudgedEndpoints,
     /// Uses by endpoints of the peer that are denied here, with what remembers them. The peer was told.
-    here: BTreeMap<Use, (String, Charge)>,
+    here: BTreeMap<AccessUse, (String, Charge)>,
     /// Uses by endpoints of this host that the peer's host denies, with what remembers them.
-    there: BTreeMap<Use, (String, Charge)>,
+    there: BTreeMap<AccessUse, (String, Charge)>,
     /// What may be remembered of those there, and of those here, of all daemon ids of the peer's identity.
     room: Rc<Meter>,
     places: Rc<Meter>,
@@ -84,7 +84,7 @@ impl PeerAccess {
         let (here, there) = (BTreeMap::new(), BTreeMap::new());
         let (room, places) = (Rc::clone(&account.refusals), Rc::clone(&account.denied));
         let asked = BTreeMap::new();
-        let (judged, logged) = (Judged::default(), LogLimit::default());
+        let (judged, logged) = (JudgedEndpoints::default(), LogLimit::default());
         Self { permissions, changed: false, judged, here, there, room, places, asked, logged }
     }
 
@@ -100,7 +100,7 @@ impl PeerAccess {
     }
 
     /// What the peer may see and use of an endpoint of this host.
-    pub(super) fn judge(&mut self, endpoint: &Arc<Endpoint>) -> Judgement {
+    pub(super) fn judge(&mut self, endpoint: &Arc<Endpoint>) -> EndpointRights {
         self.judged.judge(&self.permissions, endpoint)
     }
 
@@ -139,12 +139,12 @@ impl PeerAccess {
                 new.insert(used);
             }
         }
-        let lifted: Vec<Use> = {
-            let gone = |(verb, name): &&Use| !known.contains(&(*verb, name.as_str()));
+        let lifted: Vec<AccessUse> = {
+            let gone = |(verb, name): &&AccessUse| !known.contains(&(*verb, name.as_str()));
             self.here.keys().filter(gone).cloned().collect()
         };
         let anew = std::mem::take(&mut self.changed).then_some(known).into_iter().flatten();
-        let judged: Vec<Use> =
+        let judged: Vec<AccessUse> =
             anew.chain(new).map(|(verb, name)| (verb, name.to_owned())).collect();
         // What goes makes room for what comes.
         lifted.iter().for_each(|used| drop(self.here.remove(used)));
@@ -192,7 +192,7 @@ impl PeerAccess {
         peer: DaemonId,
         denied: Denied,
         now: Duration,
-    ) -> Vec<Use> {
+    ) -> Vec<AccessUse> {
         let used = |of: DeniedUse| (VERBS[usize::from(of.verb.min(3))], of.name);
         for mut denied in denied.denied {
             let reason = shown(&std::mem::take(&mut denied.reason));
@@ -240,7 +240,7 @@ impl PeerAccess {
     }
 
     /// Each denied use, the host that denies it, and the reason.
-    fn all(&self) -> impl Iterator<Item = (&Use, &'static str, &str)> {
+    fn all(&self) -> impl Iterator<Item = (&AccessUse, &'static str, &str)> {
         let there = self.there.iter().map(|(used, (why, _))| (used, "by the peer", &**why));
         there.chain(self.here.iter().map(|(used, (why, _))| (used, "here", &**why)))
     }
@@ -266,7 +266,7 @@ impl PeerAccess {
     }
 }
 
-fn message((verb, name): &Use, reason: &str) -> DeniedUse {
+fn message((verb, name): &AccessUse, reason: &str) -> DeniedUse {
     let number = VERBS.iter().position(|known| known == verb).unwrap_or_default();
     DeniedUse { verb: number as u8, name: name.clone(), reason: reason.to_owned() }
 }

@@ -14,7 +14,7 @@ use axon_shm::{
 use axon_transport::graph::{Endpoint, EndpointKind};
 
 use super::{
-    Peer, Surroundings, poll_after,
+    Peer, PeerContext, poll_after,
     refused::{NO_STAND_IN, NOT_TAKEN, TOO_MANY_ASKED, TOO_MANY_LANES, TOO_MANY_WRITERS},
 };
 use crate::{
@@ -31,7 +31,7 @@ use crate::{
 const ATTACH_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// A route that this host asked for.
-pub(super) struct Asked {
+pub(super) struct AskedRoute {
     pub(super) number: u32,
     route: Route,
     /// The readers and writers that it was last asked for.
@@ -52,7 +52,7 @@ pub(super) struct Attaching {
     awaited: Vec<(Rc<StandIn>, usize)>,
 }
 
-impl Asked {
+impl AskedRoute {
     /// Keeps so many of its stand-ins, and gives up the others until there are lanes for them again.
     pub(super) fn leave(&mut self, stand_ins: usize) {
         let mut left = stand_ins;
@@ -87,7 +87,7 @@ impl Asked {
 
 impl Peer {
     /// Asks for the routes that follow from the graphs of both hosts.
-    pub(super) fn update(&mut self, with: &Surroundings<'_>, now: Duration) {
+    pub(super) fn update(&mut self, with: &PeerContext<'_>, now: Duration) {
         if self.stirred {
             return;
         }
@@ -126,7 +126,7 @@ impl Peer {
         &mut self,
         wanted: BTreeMap<RouteKey, Wanted>,
         unanswered: &BTreeSet<RouteKey>,
-        with: &Surroundings<'_>,
+        with: &PeerContext<'_>,
         now: Duration,
     ) {
         let gone: Vec<_> = self.asked.keys().filter(|k| !wanted.contains_key(k)).cloned().collect();
@@ -155,7 +155,7 @@ impl Peer {
         }
     }
 
-    fn want_one(&mut self, key: RouteKey, wanted: Wanted, with: &Surroundings<'_>, now: Duration) {
+    fn want_one(&mut self, key: RouteKey, wanted: Wanted, with: &PeerContext<'_>, now: Duration) {
         let known = self.asked.get(&key);
         if known.is_some_and(|asked| asked.wanted == wanted && !asked.incomplete) {
             return;
@@ -168,7 +168,7 @@ impl Peer {
                 let Ok(topic) = hash else { return };
                 self.next_route += 1;
                 let room = self.remote.account().writers_of(&key);
-                Asked {
+                AskedRoute {
                     places: room.nothing(),
                     lanes: self.remote.account().lanes.nothing(),
                     room,
@@ -225,9 +225,9 @@ impl Peer {
     fn show(
         &mut self,
         key: &RouteKey,
-        asked: &mut Asked,
+        asked: &mut AskedRoute,
         writers: &[(Endpoint, usize)],
-        with: &Surroundings<'_>,
+        with: &PeerContext<'_>,
         now: Duration,
     ) -> bool {
         let mut fresh = false;

@@ -13,7 +13,7 @@ use crate::engine::peer_graph::decisions::note_look;
 
 /// What rules say of an endpoint of this host.
 #[derive(Clone, Copy)]
-pub(super) struct Judgement {
+pub(super) struct EndpointRights {
     /// The peer is shown it.
     pub(super) shown: bool,
     /// The peer may be at its other end.
@@ -22,13 +22,17 @@ pub(super) struct Judgement {
 
 /// The endpoints of this host that rules about the peer were asked about.
 #[derive(Default)]
-pub(super) struct Judged(HashMap<Gid, (Arc<Endpoint>, Judgement)>);
+pub(super) struct JudgedEndpoints(HashMap<Gid, (Arc<Endpoint>, EndpointRights)>);
 
-impl Judged {
+impl JudgedEndpoints {
     /// What the rules say. They are asked about an endpoint that is new, or is not what it was.
-    pub(super) fn judge(&mut self, rules: &Permissions, endpoint: &Arc<Endpoint>) -> Judgement {
+    pub(super) fn judge(
+        &mut self,
+        rules: &Permissions,
+        endpoint: &Arc<Endpoint>,
+    ) -> EndpointRights {
         if rules.are_unrestricted() {
-            return Judgement { shown: true, usable: true };
+            return EndpointRights { shown: true, usable: true };
         }
         if let Some((known, judgement)) = self.0.get(&endpoint.gid)
             && (Arc::ptr_eq(known, endpoint) || known == endpoint)
@@ -37,7 +41,7 @@ impl Judged {
         }
         note_look();
         let judgement =
-            Judgement { shown: shows(rules, endpoint), usable: permits_use(rules, endpoint) };
+            EndpointRights { shown: shows(rules, endpoint), usable: permits_use(rules, endpoint) };
         self.0.insert(endpoint.gid, (Arc::clone(endpoint), judgement));
         judgement
     }
@@ -75,7 +79,7 @@ mod tests {
     #[test]
     fn an_endpoint_is_judged_once_until_it_or_the_rules_change_or_it_is_gone() {
         let closed = rules("[[deny]]\npeer = \"*\"\nsubscribe = \"/closed\"");
-        let mut judged = Judged::default();
+        let mut judged = JudgedEndpoints::default();
         let mut judge = |rules: &Permissions, topic| {
             let before = looks_at_rules();
             let judgement = judged.judge(rules, &publisher(topic));
@@ -96,7 +100,7 @@ mod tests {
 
     #[test]
     fn nothing_is_remembered_where_there_are_no_rules() {
-        let mut judged = Judged::default();
+        let mut judged = JudgedEndpoints::default();
         let none = AccessRules::default().permissions(Party::Name("base"));
         let judgement = judged.judge(&none, &publisher("/t"));
         assert!(judgement.shown && judgement.usable && judged.0.is_empty());

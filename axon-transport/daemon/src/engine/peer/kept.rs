@@ -22,13 +22,13 @@ const MOST: usize = 2048;
 
 /// The relays that are kept.
 pub(crate) struct KeptRelays {
-    all: Vec<Kept>,
+    all: Vec<KeptRelay>,
     room: Rc<Meter>,
     /// That of each identity.
     rooms: HashMap<String, Weak<Meter>>,
 }
 
-struct Kept {
+struct KeptRelay {
     /// The identity that the peer proved.
     identity: String,
     key: RouteKey,
@@ -44,7 +44,7 @@ struct Kept {
     lanes: Charge,
 }
 
-impl Kept {
+impl KeptRelay {
     /// Whether a peer with this identity may adopt it for a relay of this kind.
     fn fits(&self, key: &RouteKey, spec: &RelaySpec, identity: &str) -> bool {
         let same = |gid| self.spec.stands_for.contains(gid);
@@ -86,7 +86,7 @@ impl KeptRelays {
                 let (key, since, until) = (served.key.clone(), now, now + PATIENCE);
                 let unfinished = Rc::clone(&unfinished);
                 let lanes = served.lanes.split(lanes);
-                self.all.push(Kept {
+                self.all.push(KeptRelay {
                     identity,
                     key,
                     spec,
@@ -138,7 +138,7 @@ impl KeptRelays {
         now: Duration,
     ) -> Option<(Rc<dyn RingReader>, UnfinishedFlows)> {
         let at = self.all.iter().position(|kept| kept.fits(key, spec, identity))?;
-        let Kept { reader, since, unfinished, .. } = self.all.swap_remove(at);
+        let KeptRelay { reader, since, unfinished, .. } = self.all.swap_remove(at);
         reader.take_back();
         reader.set_stands_for(spec.stands_for.clone());
         let kept = now.saturating_sub(since).min(PATIENCE);
@@ -162,7 +162,7 @@ impl KeptRelays {
     /// Gives up what relays hold that were kept until now. Returns the samples, by topic.
     pub(crate) fn give_up(&mut self, now: Duration) -> Vec<(String, u64)> {
         let mut lost = Vec::new();
-        for Kept { key, reader, .. } in self.all.extract_if(.., |kept| kept.until <= now) {
+        for KeptRelay { key, reader, .. } in self.all.extract_if(.., |kept| kept.until <= now) {
             let mut all = 0;
             for (publisher, samples) in reader.unacknowledged() {
                 reader.give_up(publisher, samples);

@@ -7,7 +7,7 @@ use std::{collections::HashMap, time::Duration};
 use axon_envelope::Kind;
 
 use super::{
-    Local, Peer, Surroundings,
+    LocalEndpoints, Peer, PeerContext,
     refused::TOO_MANY_LANES,
     routes::RouteKey,
     serving::{ASK_AGAIN, missing},
@@ -20,7 +20,7 @@ pub(crate) struct WritersHere(HashMap<RouteKey, usize>);
 
 impl WritersHere {
     /// Counts those among the endpoints of this host.
-    pub(crate) fn of(local: &Local) -> Self {
+    pub(crate) fn of(local: &LocalEndpoints) -> Self {
         let mut writers = HashMap::new();
         for key in local.values().filter_map(|(endpoint, _)| RouteKey::of(endpoint)) {
             *writers.entry(key).or_default() += 1;
@@ -56,7 +56,7 @@ fn fit(charge: &mut Charge, readers: usize, each: usize) -> usize {
 impl Peer {
     /// The writers of this host changed: relays and stand-ins for which there are not enough lanes any more are given
     /// up.
-    pub(super) fn fit_lanes(&mut self, with: &Surroundings<'_>, now: Duration) {
+    pub(super) fn fit_lanes(&mut self, with: &PeerContext<'_>, now: Duration) {
         let mut without = Vec::new();
         for (number, served) in self.served.iter_mut() {
             if served.key.kind != Kind::Topic {
@@ -78,7 +78,7 @@ impl Peer {
         self.fit_stand_ins(with, now);
     }
 
-    fn fit_stand_ins(&mut self, with: &Surroundings<'_>, now: Duration) {
+    fn fit_stand_ins(&mut self, with: &PeerContext<'_>, now: Duration) {
         let mut without = Vec::new();
         for (key, asked) in &mut self.asked {
             let (each, had) = (with.writers.read_by_stand_in(key), asked.stand_ins.len());

@@ -34,21 +34,21 @@ use axon_transport::{
 
 use self::{
     access::PeerAccess,
-    asking::{Asked, Attaching},
+    asking::{AskedRoute, Attaching},
     control_queue::ControlQueue,
     refused::RefusedRoutes,
     served::{Served, ServedRoutes},
     serving::DENIED_AGAIN,
-    unanswered::Unanswered,
+    unanswered::UnansweredServices,
 };
 pub(crate) use self::{
     lanes::WritersHere,
     serving::{MAX_ROUTES, StalledRoute},
-    surroundings::{Local, Surroundings},
+    surroundings::{LocalEndpoints, PeerContext},
 };
 use super::{
     inbound::Inbound,
-    outbound::{Outbound, Source, Stall},
+    outbound::{Outbound, Source, StallCause},
 };
 use crate::{
     engine::{
@@ -56,9 +56,9 @@ use crate::{
         counters::Counters,
         peer::routes::RouteKey,
         peer_graph::{
-            GraphTaken, Remote,
+            GraphTaken, PeerGraph,
             owners::Prover,
-            told::{Told, ToldGraph},
+            told::{ShownEndpoint, ShownGraph},
         },
     },
     link::{AccessDecisions, Asserted, CloseCode, Graph, LinkClosed, Message},
@@ -95,14 +95,14 @@ pub(crate) struct Peer {
     identity: String,
     pub(super) counters: Rc<Counters>,
     /// Its graph.
-    pub(super) remote: Remote,
+    pub(super) remote: PeerGraph,
     prover: Prover,
     /// What it may do here.
     access: PeerAccess,
     /// Endpoints of it were ignored, since another peer had them.
     pub(super) displaced: bool,
     /// The graph that it was sent.
-    told: ToldGraph,
+    told: ShownGraph,
     /// It has been silent for so long that the control plane takes it for gone.
     pub(super) silent: bool,
     /// Its graph changed, and what follows was not done.
@@ -111,7 +111,7 @@ pub(crate) struct Peer {
     next_route: u32,
     /// Routes that it serves at most.
     serves: usize,
-    asked: BTreeMap<RouteKey, Asked>,
+    asked: BTreeMap<RouteKey, AskedRoute>,
     /// The routes of `asked`, by number.
     numbers: HashMap<u32, RouteKey>,
     attaching: BTreeMap<u32, Attaching>,
@@ -124,7 +124,7 @@ pub(crate) struct Peer {
     served: ServedRoutes,
     alive: Alive,
     answering: BTreeSet<Gid>,
-    unanswered: Unanswered,
+    unanswered: UnansweredServices,
     messages: ControlQueue,
 }
 
@@ -174,10 +174,10 @@ impl Peer {
             counters,
             refused: RefusedRoutes::new(Rc::clone(&account.refusals)),
             access: PeerAccess::new(permissions.clone(), &account),
-            remote: Remote::new(account, prover.is_needed(), permissions),
+            remote: PeerGraph::new(account, prover.is_needed(), permissions),
             prover,
             displaced: false,
-            told: ToldGraph::default(),
+            told: ShownGraph::default(),
             silent: false,
             stirred: false,
             refusal_said: false,
@@ -193,13 +193,13 @@ impl Peer {
             served: ServedRoutes::default(),
             alive: Alive::default(),
             answering: BTreeSet::new(),
-            unanswered: Unanswered::default(),
+            unanswered: UnansweredServices::default(),
             messages: ControlQueue::default(),
         }
     }
 
     /// A successor took over. The peer's routes stand; this side asks for its own again.
-    pub(super) fn succeed(&mut self, link: u64, binding: Option<Binding>, local: &Local) {
+    pub(super) fn succeed(&mut self, link: u64, binding: Option<Binding>, local: &LocalEndpoints) {
         self.link = link;
         self.messages.succeed();
         self.prover.succeed(binding);
@@ -236,7 +236,7 @@ impl Peer {
     pub(super) fn handle_message(
         &mut self,
         message: Message,
-        with: &Surroundings<'_>,
+        with: &PeerContext<'_>,
         now: Duration,
     ) -> Result<(), (CloseCode, String)> {
         match message {
@@ -279,7 +279,7 @@ impl Peer {
     }
 
     /// The endpoints of this host that the peer may see.
-    fn shown(&mut self, local: &Local) -> BTreeMap<Gid, RemoteEndpoint> {
+    fn shown(&mut self, local: &LocalEndpoints) -> BTreeMap<Gid, RemoteEndpoint> {
         let listed = self.remote.endpoints().any(|remote| remote.toward.lists);
         let shown = local.iter().filter_map(|(gid, (endpoint, reach))| {
             let toward = reach.toward(self.daemon);
@@ -343,7 +343,7 @@ impl Peer {
     }
 
     /// The graph of this host changed: the peer is told, and routes follow.
-    pub(super) fn handle_local_graph(&mut self, with: &Surroundings<'_>, now: Duration) {
+    pub(super) fn handle_local_graph(&mut self, with: &PeerContext<'_>, now: Duration) {
         self.keep_ending(with.local, now);
         self.fit_lanes(with, now);
         self.send_graph(with.local, false);
@@ -351,13 +351,13 @@ impl Peer {
     }
 
     /// Publishers that ended stay in the graph that the peer sees until their samples have arrived.
-    fn keep_ending(&mut self, local: &Local, now: Duration) {
+    fn keep_ending(&mut self, local: &LocalEndpoints, now: Duration) {
         let ended = self.told.iter().filter(|(gid, shown)| {
             shown.remote.endpoint.kind == EndpointKind::Publisher
                 && !local.contains_key(gid)
                 && !self.ending.contains_key(gid)
         });
-        let carried = |gid: &Gid, shown: &Told| {
+        let carried = |gid: &Gid, shown: &ShownEndpoint| {
             let number = self.served.number_of(&RouteKey::of(&shown.remote.endpoint)?)?;
             let sources = &self.served.get(number)?.sources;
             self.outbound.has_left(number, sources, gid).then_some(number)
@@ -371,7 +371,7 @@ impl Peer {
     }
 
     /// Nothing is left of a publisher that ended.
-    pub(super) fn handle_drained(&mut self, gid: &Gid, local: &Local) {
+    pub(super) fn handle_drained(&mut self, gid: &Gid, local: &LocalEndpoints) {
         if self.ending.remove(gid).is_some() {
             self.send_graph(local, false);
         }
@@ -382,7 +382,7 @@ impl Peer {
         !self.ending.is_empty()
     }
 
-    fn visible(&mut self, local: &Local) -> BTreeMap<Gid, RemoteEndpoint> {
+    fn visible(&mut self, local: &LocalEndpoints) -> BTreeMap<Gid, RemoteEndpoint> {
         let mut visible = self.ending.clone();
         visible.extend(self.shown(local));
         visible
@@ -395,12 +395,12 @@ impl Peer {
     }
 
     /// Tells the peer what changed in the graph of this host, or all of it.
-    pub(super) fn send_graph(&mut self, local: &Local, whole: bool) {
+    pub(super) fn send_graph(&mut self, local: &LocalEndpoints, whole: bool) {
         let visible = self.visible(local);
         self.prove(&visible);
         let mut told = |remote: RemoteEndpoint| {
             let denied = !self.access.judge(&remote.endpoint).usable;
-            Told { remote, denied }
+            ShownEndpoint { remote, denied }
         };
         let now: BTreeMap<_, _> = visible.into_iter().map(|(gid, e)| (gid, told(e))).collect();
         self.access.retain_judged(|gid| local.contains_key(gid) || self.ending.contains_key(gid));
@@ -408,7 +408,7 @@ impl Peer {
     }
 
     /// The peer asks for the whole graph.
-    fn resync(&mut self, local: &Local, now: Duration) {
+    fn resync(&mut self, local: &LocalEndpoints, now: Duration) {
         if self.told.handle_resync(now) {
             self.prover.forget();
             self.send_graph(local, true);
@@ -425,7 +425,7 @@ impl Peer {
     }
 
     /// The peer's graph changed, and this host follows.
-    pub(super) fn handle_remote_graph(&mut self, with: &Surroundings<'_>, now: Duration) {
+    pub(super) fn handle_remote_graph(&mut self, with: &PeerContext<'_>, now: Duration) {
         self.tell_denied(now);
         // Sessions there may list this host now, or no longer.
         self.send_graph(with.local, false);
@@ -475,7 +475,7 @@ impl Peer {
     }
 
     /// Does what is due.
-    pub(super) fn handle_timeout(&mut self, with: &Surroundings<'_>, now: Duration) {
+    pub(super) fn handle_timeout(&mut self, with: &PeerContext<'_>, now: Duration) {
         self.ask_for_attached(now);
         self.announce_ready(now);
         self.tell_alive(now);
@@ -490,8 +490,8 @@ impl Peer {
     pub(super) fn handle_stalled(
         &mut self,
         route: u32,
-        why: Stall,
-        with: &Surroundings<'_>,
+        why: StallCause,
+        with: &PeerContext<'_>,
         now: Duration,
     ) -> Option<StalledRoute> {
         let key = self.served.get(route)?.key.clone();

@@ -13,7 +13,7 @@ use axon_transport::{
     status::LinkStatus,
 };
 
-use super::{Peer, access::Use, serving::kind_of};
+use super::{Peer, access::AccessUse, serving::kind_of};
 use crate::{
     bridge::RefusedRoute,
     engine::{
@@ -46,7 +46,7 @@ pub(super) const TOO_MANY_LANES: &str = "what a peer reads here takes as many co
      servers as a peer may have, or all peers";
 
 /// A reason that is remembered.
-struct Reason {
+struct RefusalReason {
     text: String,
     _charge: Option<Charge>,
 }
@@ -65,13 +65,13 @@ pub(super) struct RefusedRoutes {
     /// Routes that this side does not ask for.
     unasked: BTreeMap<RouteKey, &'static str>,
     /// Routes that the peer does not ask for, though it could.
-    unwanted: BTreeMap<RouteKey, Reason>,
+    unwanted: BTreeMap<RouteKey, RefusalReason>,
     /// Routes that the peer does not serve, and when to ask again.
-    unserved: BTreeMap<RouteKey, (Reason, Option<Duration>)>,
+    unserved: BTreeMap<RouteKey, (RefusalReason, Option<Duration>)>,
     /// Those of them that are asked for again, by that time.
     again: BTreeSet<(Duration, RouteKey)>,
     /// Routes that the peer asked for and does not get, by its number.
-    theirs: BTreeMap<u32, (RouteKey, Reason)>,
+    theirs: BTreeMap<u32, (RouteKey, RefusalReason)>,
     logged: LogLimit,
 }
 
@@ -90,9 +90,9 @@ impl RefusedRoutes {
     }
 
     /// A reason with what it takes to remember it; `None`: there is no room.
-    fn remember(&self, key: &RouteKey, text: String) -> Option<Reason> {
+    fn remember(&self, key: &RouteKey, text: String) -> Option<RefusalReason> {
         let charge = self.room.charge(ENTRY + key.bytes() + text.len())?;
-        Some(Reason { text, _charge: Some(charge) })
+        Some(RefusalReason { text, _charge: Some(charge) })
     }
 
     fn log(&self, key: &RouteKey, why: &str, now: Duration) {
@@ -113,7 +113,7 @@ impl RefusedRoutes {
     fn unserved(&mut self, key: RouteKey, reason: String, again: Option<Duration>) {
         self.served(&key);
         self.again.extend(again.map(|again| (again, key.clone())));
-        let unremembered = || Reason { text: UNREMEMBERED.into(), _charge: None };
+        let unremembered = || RefusalReason { text: UNREMEMBERED.into(), _charge: None };
         let reason = self.remember(&key, reason).unwrap_or_else(unremembered);
         self.unserved.insert(key, (reason, again));
     }
@@ -235,10 +235,10 @@ impl Peer {
     }
 
     /// The peer lets this host do what it denied: routes that wait for it are asked for again.
-    pub(super) fn ask_for_allowed(&mut self, uses: &[Use]) {
+    pub(super) fn ask_for_allowed(&mut self, uses: &[AccessUse]) {
         let keys = self.refused.unserved.keys();
         let allowed = |key: &&RouteKey| {
-            let verb = verb_of(By::Peer.waits(key.kind));
+            let verb = verb_of(RefusedSide::Peer.waits(key.kind));
             uses.iter().any(|(used, name)| Some(*used) == verb && *name == key.topic)
         };
         let keys: Vec<_> = keys.filter(allowed).cloned().collect();
@@ -277,12 +277,13 @@ impl Peer {
     }
 
     /// Each refused route, with the host that refuses it and the reason.
-    fn all_refused(&self) -> impl Iterator<Item = (&RouteKey, By, &str)> {
+    fn all_refused(&self) -> impl Iterator<Item = (&RouteKey, RefusedSide, &str)> {
         let RefusedRoutes { unasked, unwanted, unserved, theirs, .. } = &self.refused;
-        let unasked = unasked.iter().map(|(key, why)| (key, By::NotAsked, *why));
-        let unserved = unserved.iter().map(|(key, (why, _))| (key, By::Peer, &*why.text));
-        let theirs = theirs.values().map(|(key, why)| (key, By::Here, &*why.text));
-        let unwanted = unwanted.iter().map(|(key, why)| (key, By::NotAskedByPeer, &*why.text));
+        let unasked = unasked.iter().map(|(key, why)| (key, RefusedSide::NotAsked, *why));
+        let unserved = unserved.iter().map(|(key, (why, _))| (key, RefusedSide::Peer, &*why.text));
+        let theirs = theirs.values().map(|(key, why)| (key, RefusedSide::Here, &*why.text));
+        let unwanted =
+            unwanted.iter().map(|(key, why)| (key, RefusedSide::NotAskedByPeer, &*why.text));
         unasked.chain(unserved).chain(theirs).chain(unwanted)
     }
 
@@ -315,7 +316,7 @@ impl Peer {
 
 /// Who does not have a route cross.
 #[derive(Clone, Copy)]
-enum By {
+enum RefusedSide {
     /// This host, which reads.
     NotAsked,
     /// The peer, which writes.
@@ -326,7 +327,7 @@ enum By {
     NotAskedByPeer,
 }
 
-impl By {
+impl RefusedSide {
     fn text(self) -> &'static str {
         match self {
             Self::NotAsked => "not asked for",

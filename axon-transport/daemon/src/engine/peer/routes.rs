@@ -17,7 +17,7 @@ use axon_transport::{
     internal::graph::{Pairing, RangeToHost, RemoteEndpoint, out_of_range, pairing, reads, writes},
 };
 
-use crate::link::Subscriber;
+use crate::link::RouteSubscriber;
 
 /// What a route carries: samples, requests or responses, of one name and type.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -74,7 +74,7 @@ impl RouteKey {
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Wanted {
     /// Readers here that some writer there serves.
-    pub(crate) subscribers: Vec<Subscriber>,
+    pub(crate) subscribers: Vec<RouteSubscriber>,
     /// Writers there, and how many readers here each serves.
     pub(crate) writers: Vec<(Endpoint, usize)>,
 }
@@ -102,7 +102,7 @@ pub(crate) fn wanted<'a>(
         let route = routes.entry(key).or_default();
         for reader in &served {
             if counted.insert(reader.gid) {
-                route.subscribers.push(Subscriber { gid: reader.gid, qos: reader.qos });
+                route.subscribers.push(RouteSubscriber { gid: reader.gid, qos: reader.qos });
             }
         }
         route.writers.push((writer.clone(), served.len()));
@@ -150,7 +150,10 @@ impl RelaySpec {
 /// publisher back; and by how much they keep, because which relay stands for a subscription must not
 /// change when others come or go: it would miss what is published meanwhile. So a publisher may be read
 /// by several; [`axon_transport::internal::session::merge`] sends each sample once.
-pub(crate) fn relays(subscribers: &[Subscriber], hash: impl Fn(&Gid) -> Vec<u8>) -> Vec<RelaySpec> {
+pub(crate) fn relays(
+    subscribers: &[RouteSubscriber],
+    hash: impl Fn(&Gid) -> Vec<u8>,
+) -> Vec<RelaySpec> {
     let mut groups: BTreeMap<_, RelaySpec> = BTreeMap::new();
     for subscriber in subscribers {
         let (offered, type_hash) = (subscriber.qos, hash(&subscriber.gid));
@@ -291,8 +294,8 @@ mod tests {
         assert_eq!(key.other_way().kind, Kind::Request);
     }
 
-    fn subscriber(number: u8, qos: Qos) -> Subscriber {
-        Subscriber { gid: Gid([number; 16]), qos }
+    fn subscriber(number: u8, qos: Qos) -> RouteSubscriber {
+        RouteSubscriber { gid: Gid([number; 16]), qos }
     }
 
     #[test]

@@ -7,7 +7,7 @@ use axon_shm::ids::Gid;
 use axon_transport::EndpointSpec;
 
 use super::{
-    Peer, Surroundings, reader_of,
+    Peer, PeerContext, reader_of,
     refused::TOO_MANY_LANES,
     served::{Served, Without},
 };
@@ -15,10 +15,10 @@ use crate::{
     engine::{
         account::Charge,
         limits::RouteLimit,
-        outbound::{RouteOut, Source, Stall, UnfinishedFlows},
+        outbound::{RouteOut, Source, StallCause, UnfinishedFlows},
         peer::routes::{MAX_RELAYS_OF_ROUTE, RelaySpec, RouteKey, admit, relays},
     },
-    link::{Message, Subscribe, Subscriber},
+    link::{Message, RouteSubscriber, Subscribe},
 };
 
 /// A peer that lacks relays may ask for them again after this time.
@@ -69,7 +69,7 @@ impl Peer {
     pub(super) fn serve(
         &mut self,
         subscribe: Subscribe,
-        with: &Surroundings<'_>,
+        with: &PeerContext<'_>,
         now: Duration,
     ) -> Result<(), String> {
         let bytes = ROUTE + COPIES * subscribe.bytes();
@@ -183,7 +183,11 @@ impl Peer {
     }
 
     /// The subscribers that are of the peer's own sessions.
-    fn proven_only(&mut self, mut subscribers: Vec<Subscriber>, topic: &str) -> Vec<Subscriber> {
+    fn proven_only(
+        &mut self,
+        mut subscribers: Vec<RouteSubscriber>,
+        topic: &str,
+    ) -> Vec<RouteSubscriber> {
         let others = subscribers.extract_if(.., |reader| !self.remote.owns(&reader.gid));
         let others: Vec<_> = others.map(|reader| reader.gid).collect();
         for gid in others {
@@ -197,8 +201,8 @@ impl Peer {
     pub(super) fn give_up_stalled(
         &mut self,
         route: u32,
-        why: Stall,
-        with: &Surroundings<'_>,
+        why: StallCause,
+        with: &PeerContext<'_>,
         now: Duration,
     ) -> Option<StalledRoute> {
         let served = self.served.remove(route)?;
@@ -207,9 +211,13 @@ impl Peer {
         let wait = with.stalls.borrow_mut().add(&self.identity, key, limit, now);
         let (topic, again) = (&key.topic, wait.as_secs());
         let what = match why {
-            Stall::NothingRead => format!("nothing of {topic} was read for {} s", limit.as_secs()),
-            Stall::TooSlow => format!("{topic} was read so slowly that its publisher waited"),
-            Stall::NoKeys => format!("a KME gave no keys for {topic}, and its publisher waited"),
+            StallCause::NothingRead => {
+                format!("nothing of {topic} was read for {} s", limit.as_secs())
+            }
+            StallCause::TooSlow => format!("{topic} was read so slowly that its publisher waited"),
+            StallCause::NoKeys => {
+                format!("a KME gave no keys for {topic}, and its publisher waited")
+            }
         };
         let reason = format!("{what}; it is not sent for {again} s ([link] stalled_s)");
         self.refuse(route, key, reason.clone(), Some(wait), now);
@@ -240,10 +248,10 @@ impl Peer {
     fn open_relays(
         &self,
         key: &RouteKey,
-        subscribers: &[Subscriber],
+        subscribers: &[RouteSubscriber],
         old: &[Source],
         (places, lanes): (&mut Charge, &mut Charge),
-        with: &Surroundings<'_>,
+        with: &PeerContext<'_>,
         now: Duration,
     ) -> Relays {
         let hash = |gid: &Gid| self.remote.get(gid).map_or_else(Vec::new, |e| e.type_hash.clone());

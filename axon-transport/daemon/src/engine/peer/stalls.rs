@@ -23,7 +23,7 @@ const SWEEP: Duration = Duration::from_secs(1);
 /// What is known of peers that stalled, by who they proved to be, so that a new link or daemon id is no
 /// way around it.
 #[derive(Debug)]
-pub(crate) struct Stalls {
+pub(crate) struct StallHistory {
     of: HashMap<String, OfPeer>,
     room: Rc<Meter>,
     swept: Option<Duration>,
@@ -73,13 +73,13 @@ impl OfPeer {
     }
 }
 
-impl Default for Stalls {
+impl Default for StallHistory {
     fn default() -> Self {
         Self { of: HashMap::new(), room: Meter::new(ROOM.0), swept: None }
     }
 }
 
-impl Stalls {
+impl StallHistory {
     /// A peer was disconnected from a topic after it read nothing for `limit`. How long it waits.
     pub(crate) fn add(
         &mut self,
@@ -144,7 +144,7 @@ mod tests {
 
     #[test]
     fn a_peer_that_stalls_again_waits_twice_as_long_up_to_a_limit_and_is_forgiven() {
-        let (mut stalls, ten) = (Stalls::default(), Duration::from_secs(10));
+        let (mut stalls, ten) = (StallHistory::default(), Duration::from_secs(10));
         let (mut now, mut waits) = (NOW, Vec::new());
         for _ in 0..7 {
             let wait = stalls.add("pin arm", &key(0), ten, now);
@@ -163,7 +163,7 @@ mod tests {
     /// One that empties the store of keys is cut after 96 times the limit, each time.
     #[test]
     fn a_peer_that_holds_up_as_long_as_it_can_each_time_waits_longer_each_time() {
-        let (mut stalls, ten) = (Stalls::default(), Duration::from_secs(10));
+        let (mut stalls, ten) = (StallHistory::default(), Duration::from_secs(10));
         let (mut now, mut waits) = (NOW, Vec::new());
         for _ in 0..7 {
             now += ten * 97;
@@ -176,7 +176,7 @@ mod tests {
 
     #[test]
     fn a_peer_that_stalls_on_very_many_topics_waits_on_all_and_no_other_is_served_sooner() {
-        let (mut stalls, ten, now) = (Stalls::default(), Duration::from_secs(10), NOW);
+        let (mut stalls, ten, now) = (StallHistory::default(), Duration::from_secs(10), NOW);
         stalls.add("pin leg", &key(0), ten, now);
         for number in 0..60_000 {
             stalls.add("pin arm", &key(number), ten, now);
@@ -198,7 +198,7 @@ mod tests {
 
     #[test]
     fn of_very_many_addresses_those_whose_wait_ends_last_are_remembered() {
-        let (mut stalls, now) = (Stalls::default(), NOW);
+        let (mut stalls, now) = (StallHistory::default(), NOW);
         for number in 0..PEERS + 10 {
             let at = now + Duration::from_millis(number as u64);
             stalls.add(&format!("address {number}"), &key(0), Duration::from_secs(60), at);

@@ -5,26 +5,26 @@ use std::{cell::RefCell, collections::BTreeMap, sync::Arc};
 use axon_shm::ids::Gid;
 use axon_transport::{config::Config, graph::Endpoint, internal::graph::EndpointRange};
 
-use super::{kept::KeptRelays, lanes::WritersHere, stalls::Stalls};
+use super::{kept::KeptRelays, lanes::WritersHere, stalls::StallHistory};
 use crate::engine::{rings::Rings, stand_in::StandIns};
 
 /// The endpoints of applications on this host, and how far their sessions are discovered.
-pub(crate) type Local = BTreeMap<Gid, (Arc<Endpoint>, EndpointRange)>;
+pub(crate) type LocalEndpoints = BTreeMap<Gid, (Arc<Endpoint>, EndpointRange)>;
 
 /// The parts of the engine that all peers use.
-pub(crate) struct Surroundings<'a> {
+pub(crate) struct PeerContext<'a> {
     /// The rings of this host.
     pub(crate) rings: &'a dyn Rings,
     /// All stand-ins.
     pub(crate) stand_ins: &'a StandIns,
     /// The endpoints of this host.
-    pub(crate) local: &'a Local,
+    pub(crate) local: &'a LocalEndpoints,
     /// How many writers of each route are among them.
     pub(crate) writers: &'a WritersHere,
     /// The settings of this host.
     pub(crate) config: &'a Config,
     /// Routes that were given up.
-    pub(crate) stalls: &'a RefCell<Stalls>,
+    pub(crate) stalls: &'a RefCell<StallHistory>,
     /// Relays that are kept for daemons that are restarted.
     pub(crate) kept: &'a RefCell<KeptRelays>,
 }

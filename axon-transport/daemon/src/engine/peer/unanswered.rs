@@ -9,8 +9,8 @@ use std::{
 use axon_envelope::Kind;
 
 use super::{
-    Peer, Surroundings,
-    asking::Asked,
+    Peer, PeerContext,
+    asking::AskedRoute,
     routes::{RouteKey, Wanted},
 };
 use crate::engine::outbound::UnfinishedFlows;
@@ -22,13 +22,13 @@ const LEFT: usize = 256;
 
 /// What is known of services whose requests or responses a peer does not take.
 #[derive(Default)]
-pub(super) struct Unanswered {
+pub(super) struct UnansweredServices {
     /// Requests that the peer is not asked for, and until when.
     closed: BTreeMap<RouteKey, Duration>,
     /// Routes of services that were given up since the peer did not take what they carried.
     stalled: BTreeSet<RouteKey>,
     /// Requests to which responses wait that the peer has not asked for.
-    awaited: BTreeMap<RouteKey, Awaited>,
+    awaited: BTreeMap<RouteKey, AwaitedResponses>,
     /// What is known of routes that ended, until the peer asks for them again.
     left: BTreeMap<RouteKey, UnfinishedFlows>,
     /// When responses that the peer does not ask for are looked at.
@@ -37,14 +37,14 @@ pub(super) struct Unanswered {
 
 /// Responses that wait for the peer to ask for them.
 #[derive(Clone, Copy, Debug)]
-struct Awaited {
+struct AwaitedResponses {
     /// Responses that had found no room when they were seen first.
     refused: u64,
     /// For how long they have waited since, look by look.
     waited: Duration,
 }
 
-impl Unanswered {
+impl UnansweredServices {
     /// When something is due.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         self.closed.values().copied().chain(self.look).min()
@@ -71,7 +71,7 @@ impl Unanswered {
     }
 }
 
-impl Asked {
+impl AskedRoute {
     /// How many responses its clients have not taken, and how many more found no room.
     fn responses(&self) -> (u64, u64) {
         let clients = self.stand_ins.values();
@@ -91,7 +91,7 @@ impl Peer {
     pub(super) fn leave_out_unanswered(
         &mut self,
         wanted: &mut BTreeMap<RouteKey, Wanted>,
-        with: &Surroundings<'_>,
+        with: &PeerContext<'_>,
         now: Duration,
     ) -> BTreeSet<RouteKey> {
         let stalls = with.stalls.borrow();
@@ -114,7 +114,7 @@ impl Peer {
     }
 
     /// Looks for responses that the peer does not ask for, and asks again for requests whose time is over.
-    pub(super) fn look_at_unanswered(&mut self, with: &Surroundings<'_>, now: Duration) {
+    pub(super) fn look_at_unanswered(&mut self, with: &PeerContext<'_>, now: Duration) {
         let closed = self.unanswered.closed.len();
         self.unanswered.closed.retain(|_, until| *until > now);
         let is_over = self.unanswered.closed.len() < closed;
@@ -145,7 +145,7 @@ impl Peer {
     fn find_unasked_responses(
         &mut self,
         unasked: &BTreeSet<RouteKey>,
-        with: &Surroundings<'_>,
+        with: &PeerContext<'_>,
         now: Duration,
     ) -> bool {
         let before = std::mem::take(&mut self.unanswered.awaited);
@@ -160,7 +160,7 @@ impl Peer {
             if waiting == 0 {
                 continue;
             }
-            let mut awaited = known.unwrap_or(Awaited { refused, waited: Duration::ZERO });
+            let mut awaited = known.unwrap_or(AwaitedResponses { refused, waited: Duration::ZERO });
             if refused != awaited.refused && unasked.contains(key) && !self.silent {
                 awaited.waited += LOOK;
             }

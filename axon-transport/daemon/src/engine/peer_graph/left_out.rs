@@ -6,13 +6,13 @@ use axon_transport::graph::{Endpoint, EndpointKind};
 /// Endpoints that were left out since the peer said its whole graph: the first of them, and how many there were.
 #[derive(Debug, Default)]
 pub(super) struct LeftOut {
-    first: Option<First>,
+    first: Option<FirstLeftOut>,
     count: u64,
 }
 
 /// An endpoint that was left out.
 #[derive(Debug)]
-struct First {
+struct FirstLeftOut {
     /// It by name, and why.
     text: String,
     /// Bytes that it would take; `None` when bytes are not what is missing.
@@ -54,7 +54,7 @@ impl LeftOut {
 
     fn add(&mut self, bytes: Option<usize>, text: impl FnOnce() -> String) {
         self.count += 1;
-        self.first.get_or_insert_with(|| First { text: text(), bytes });
+        self.first.get_or_insert_with(|| FirstLeftOut { text: text(), bytes });
     }
 
     /// The first endpoint, and why it was left out.

@@ -30,7 +30,7 @@ use crate::{
 
 /// What changed in a peer's graph.
 #[derive(Debug)]
-pub(crate) struct GraphChange {
+pub(crate) struct PeerGraphChange {
     /// Whether it replaces everything that was known of the peer.
     pub(crate) reset: bool,
     /// Endpoints that came or changed.
@@ -52,7 +52,7 @@ pub(crate) enum GraphTaken {
 
 /// An endpoint of the peer.
 #[derive(Clone, Debug)]
-struct Held {
+struct HeldEndpoint {
     remote: RemoteEndpoint,
     /// Access rules deny it: for all others on this host it is not there.
     denied: bool,
@@ -63,14 +63,14 @@ struct Held {
 
 /// The graph of one peer.
 #[derive(Debug)]
-pub(crate) struct Remote {
+pub(crate) struct PeerGraph {
     account: Rc<Account>,
     proven: Proven,
     permissions: Permissions,
-    all: BTreeMap<Gid, Held>,
+    all: BTreeMap<Gid, HeldEndpoint>,
     version: u64,
     /// What came of a whole graph so far.
-    gathered: Option<BTreeMap<Gid, Held>>,
+    gathered: Option<BTreeMap<Gid, HeldEndpoint>>,
     /// Endpoints that came, changed or went since the last [`changes`](Self::changes).
     changed: BTreeSet<Gid>,
     /// Nothing was told of it yet.
@@ -78,7 +78,7 @@ pub(crate) struct Remote {
     left_out: LeftOut,
 }
 
-impl Remote {
+impl PeerGraph {
     /// That of a peer which must prove its sessions, if `proofs`, and which may do what the permissions say.
     pub(crate) fn new(account: Rc<Account>, proofs: bool, permissions: Permissions) -> Self {
         let proven = Proven::new(proofs, Rc::clone(&account.sessions));
@@ -115,7 +115,7 @@ impl Remote {
                 return GraphTaken::Part;
             }
             let old = std::mem::replace(&mut self.all, gathered);
-            let same = |held: &Held, other: Option<&Held>| {
+            let same = |held: &HeldEndpoint, other: Option<&HeldEndpoint>| {
                 other.is_some_and(|other| {
                     let (held, other) = (&held.remote, &other.remote);
                     Arc::ptr_eq(&held.endpoint, &other.endpoint) && held.toward == other.toward
@@ -153,7 +153,12 @@ impl Remote {
     }
 
     /// One more endpoint of a whole graph. One that is known already takes nothing more.
-    fn gather(&mut self, gathered: &mut BTreeMap<Gid, Held>, endpoint: Endpoint, terms: &Terms) {
+    fn gather(
+        &mut self,
+        gathered: &mut BTreeMap<Gid, HeldEndpoint>,
+        endpoint: Endpoint,
+        terms: &Terms,
+    ) {
         let gid = endpoint.gid;
         let held = match self.all.get(&gid) {
             _ if !self.proven.owns(&gid) => {
@@ -162,7 +167,7 @@ impl Remote {
             }
             Some(known) if *known.remote.endpoint == endpoint => {
                 let remote = RemoteEndpoint { toward: terms.toward(&gid), ..known.remote.clone() };
-                Some(Held { remote, closed: terms.denies(&gid), ..known.clone() })
+                Some(HeldEndpoint { remote, closed: terms.denies(&gid), ..known.clone() })
             }
             _ => self.hold(endpoint, terms, gathered.len()),
         };
@@ -203,7 +208,7 @@ impl Remote {
         self.left_out.add_unproven_reader(gid, topic);
     }
 
-    fn hold(&mut self, endpoint: Endpoint, terms: &Terms, beside: usize) -> Option<Held> {
+    fn hold(&mut self, endpoint: Endpoint, terms: &Terms, beside: usize) -> Option<HeldEndpoint> {
         let bytes = endpoint.bytes();
         if beside < LIMITS.endpoints
             && let Some(charge) = self.account.graph.charge(bytes)
@@ -212,7 +217,7 @@ impl Remote {
             let remote = RemoteEndpoint { endpoint: Arc::new(endpoint), toward };
             note_look();
             let denied = !permits(&self.permissions, &remote.endpoint);
-            return Some(Held { remote, denied, closed, _charge: Rc::new(charge) });
+            return Some(HeldEndpoint { remote, denied, closed, _charge: Rc::new(charge) });
         }
         if beside < LIMITS.endpoints {
             let most = self.account.graph.most() >> 20;
@@ -232,7 +237,7 @@ impl Remote {
     }
 
     /// What changed since the last call.
-    pub(crate) fn changes(&mut self) -> GraphChange {
+    pub(crate) fn changes(&mut self) -> PeerGraphChange {
         let reset = std::mem::replace(&mut self.fresh, false);
         let (mut added, mut removed) = (Vec::new(), Vec::new());
         for gid in std::mem::take(&mut self.changed) {
@@ -241,7 +246,7 @@ impl Remote {
                 None => removed.push(gid),
             }
         }
-        GraphChange { reset, added, removed }
+        PeerGraphChange { reset, added, removed }
     }
 
     /// The first endpoint that was left out of the graph, and why; `None` when it is complete.
@@ -345,8 +350,8 @@ mod tests {
     }
 
     /// GIDs of what came and went.
-    fn changes(remote: &mut Remote) -> (Vec<u8>, Vec<u8>) {
-        let GraphChange { added, removed, .. } = remote.changes();
+    fn changes(remote: &mut PeerGraph) -> (Vec<u8>, Vec<u8>) {
+        let PeerGraphChange { added, removed, .. } = remote.changes();
         let first = |gid: &Gid| gid.0[0];
         (
             added.iter().map(|e| first(&e.endpoint.gid)).collect(),
@@ -357,7 +362,7 @@ mod tests {
     #[test]
     fn what_was_proved_on_one_connection_counts_for_nothing_on_the_next() {
         let account = Accounts::new(10 * one(), 1 << 20).of_one("a");
-        let mut remote = Remote::new(account, true, Permissions::default());
+        let mut remote = PeerGraph::new(account, true, Permissions::default());
         let key = SessionKey::generate().unwrap();
         let (own, from) = (Gid::new(key.id(), 1), DaemonId([7; 16]));
         let [first, second] = [[1; 32], [2; 32]];
@@ -391,8 +396,8 @@ mod tests {
     fn what_there_is_no_room_for_is_left_out_by_name_and_the_rest_counts() {
         let account = Accounts::new(2 * one(), 1 << 20).of_one("a");
         let (mut remote, mut other) = (
-            Remote::new(Rc::clone(&account), false, Permissions::default()),
-            Remote::new(Rc::clone(&account), false, Permissions::default()),
+            PeerGraph::new(Rc::clone(&account), false, Permissions::default()),
+            PeerGraph::new(Rc::clone(&account), false, Permissions::default()),
         );
         assert_eq!(
             remote.take(graph(0, vec![endpoint(1, "/t")], vec![], false)),
@@ -416,7 +421,7 @@ mod tests {
     #[test]
     fn a_whole_graph_that_is_said_again_takes_no_more_and_changes_nothing() {
         let account = Accounts::new(3 * one(), 1 << 20).of_one("a");
-        let mut remote = Remote::new(Rc::clone(&account), false, Permissions::default());
+        let mut remote = PeerGraph::new(Rc::clone(&account), false, Permissions::default());
         let all = || (1..=3).map(|n| endpoint(n, "/t")).collect::<Vec<_>>();
         remote.take(graph(0, all(), vec![], false));
         assert_eq!(changes(&mut remote), (vec![1, 2, 3], vec![]));
@@ -434,11 +439,14 @@ mod tests {
 
     #[test]
     fn an_endpoint_whose_use_the_peer_denies_is_told_of_and_not_usable() {
-        let mut remote =
-            Remote::new(Accounts::new(1 << 20, 1 << 30).of_one("a"), false, Permissions::default());
+        let mut remote = PeerGraph::new(
+            Accounts::new(1 << 20, 1 << 30).of_one("a"),
+            false,
+            Permissions::default(),
+        );
         let both = || vec![endpoint(1, "/t"), endpoint(2, "/t")];
         let usable =
-            |remote: &Remote| remote.usable().map(|e| e.endpoint.gid.0[0]).collect::<Vec<_>>();
+            |remote: &PeerGraph| remote.usable().map(|e| e.endpoint.gid.0[0]).collect::<Vec<_>>();
         for (before, denied, left) in [(0, 1, 2), (1, 2, 1), (0, 1, 2)] {
             let denied = Some(vec![Gid([denied; 16])]);
             remote.take(Graph { denied, ..graph(before, both(), vec![], false) });
@@ -451,8 +459,11 @@ mod tests {
 
     #[test]
     fn the_newest_state_of_an_endpoint_counts_once() {
-        let mut remote =
-            Remote::new(Accounts::new(1 << 20, 1 << 20).of_one("a"), false, Permissions::default());
+        let mut remote = PeerGraph::new(
+            Accounts::new(1 << 20, 1 << 20).of_one("a"),
+            false,
+            Permissions::default(),
+        );
         remote.take(graph(0, vec![endpoint(1, "/t")], vec![], false));
         changes(&mut remote);
         for before in (1..100).step_by(2) {
@@ -473,8 +484,11 @@ mod tests {
     fn an_endpoint_of_a_session_that_is_not_proven_is_left_out_and_one_that_is_counts() {
         let (own, others) = (SessionKey::generate().unwrap(), SessionKey::generate().unwrap());
         let (binding, here) = ([7; 32], DaemonId([1; 16]));
-        let mut remote =
-            Remote::new(Accounts::new(1 << 20, 1 << 20).of_one("a"), true, Permissions::default());
+        let mut remote = PeerGraph::new(
+            Accounts::new(1 << 20, 1 << 20).of_one("a"),
+            true,
+            Permissions::default(),
+        );
         remote.prove(&[prove(&own, &binding, here).unwrap()], &binding, here, NOW);
         // The proof of another host, for another connection.
         remote.prove(&[prove(&others, &[8; 32], here).unwrap()], &binding, here, NOW);

@@ -10,7 +10,7 @@ use axon_transport::status::LinkStatus;
 use quinn_proto::{ConnectionHandle, StreamId, Transmit};
 use rustls_pki_types::CertificateDer;
 
-use super::{control_stream::Control, marks::marks_reported};
+use super::{control_stream::ControlStream, marks::marks_reported};
 use crate::{
     engine::{
         compression::link_rate::LinkRate,
@@ -53,7 +53,7 @@ pub(crate) struct Connection {
     /// The connection.
     pub(in crate::engine) quic: quinn_proto::Connection,
     /// Its control stream.
-    pub(in crate::engine) control: Control,
+    pub(in crate::engine) control: ControlStream,
     /// The flow of each data stream that this side opened.
     pub(in crate::engine) flows: HashMap<StreamId, FlowId>,
     /// The limits on what it sends.
@@ -84,7 +84,7 @@ impl Connection {
             began_at: quic.remote_address(),
             local: None,
             quic,
-            control: Control::default(),
+            control: ControlStream::default(),
             flows: HashMap::new(),
             egress: Egress::default(),
             loss: Loss::default(),

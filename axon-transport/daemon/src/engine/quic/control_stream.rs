@@ -66,7 +66,7 @@ impl FrameLimits {
 
 /// What is read of a control stream.
 #[derive(Debug)]
-pub(crate) enum Input {
+pub(crate) enum ControlInput {
     /// A message, with what it weighs on the account until it is handled.
     Message(Box<Message>, Option<Charge>),
     /// No whole message has come, or the peer has to wait.
@@ -77,7 +77,7 @@ pub(crate) enum Input {
 
 /// The control stream.
 #[derive(Debug)]
-pub(crate) struct Control {
+pub(crate) struct ControlStream {
     stream: Option<StreamId>,
     limits: FrameLimits,
     /// Frames that wait, with what they weigh on the account.
@@ -101,7 +101,7 @@ pub(crate) struct Control {
     ended: bool,
 }
 
-impl Default for Control {
+impl Default for ControlStream {
     fn default() -> Self {
         Self {
             stream: None,
@@ -122,7 +122,7 @@ impl Default for Control {
     }
 }
 
-impl Control {
+impl ControlStream {
     /// Uses this stream.
     pub(in crate::engine) fn open(&mut self, stream: StreamId, quic: &mut quinn_proto::Connection) {
         self.stream = Some(stream);
@@ -249,7 +249,7 @@ impl Control {
         quic: &mut quinn_proto::Connection,
         mut owe: impl FnMut(u32) -> Duration,
         now: Duration,
-    ) -> Result<Input, ControlError> {
+    ) -> Result<ControlInput, ControlError> {
         let result = self.try_read(quic, &mut owe, now);
         self.ended |= result.is_err();
         result
@@ -260,14 +260,14 @@ impl Control {
         quic: &mut quinn_proto::Connection,
         owe: &mut impl FnMut(u32) -> Duration,
         now: Duration,
-    ) -> Result<Input, ControlError> {
+    ) -> Result<ControlInput, ControlError> {
         if !self.has_input(now) {
-            return Ok(Input::Nothing);
+            return Ok(ControlInput::Nothing);
         }
         self.paused_until = None;
         loop {
             if !self.gather(quic)? {
-                return Ok(Input::Nothing);
+                return Ok(ControlInput::Nothing);
             }
             let paid = match self.paid {
                 Some(paid) => paid,
@@ -275,7 +275,7 @@ impl Control {
                     let cost = cost_of_frame(&self.frame[4..]);
                     self.paid = Some(cost);
                     if self.pause(owe(cost), now) {
-                        return Ok(Input::Nothing);
+                        return Ok(ControlInput::Nothing);
                     }
                     cost
                 }
@@ -284,7 +284,7 @@ impl Control {
             let room = match &self.decoded {
                 Some(decoded) => {
                     let Some(room) = decoded.charge(decoded_length(body)) else {
-                        return Ok(Input::NoRoom);
+                        return Ok(ControlInput::NoRoom);
                     };
                     Some(room)
                 }
@@ -299,7 +299,7 @@ impl Control {
                 if let more @ 1.. = cost(&message).saturating_sub(paid) {
                     self.pause(owe(more), now);
                 }
-                return Ok(Input::Message(Box::new(message), room));
+                return Ok(ControlInput::Message(Box::new(message), room));
             }
         }
     }

@@ -14,7 +14,7 @@ use quinn_proto::{
 };
 
 /// A packet of an endpoint, not of a connection.
-pub(in crate::engine) struct Packet {
+pub(in crate::engine) struct EndpointPacket {
     /// The endpoint that sends it.
     pub(in crate::engine) endpoint: usize,
     /// Where it goes.
@@ -43,15 +43,15 @@ pub(crate) fn reaches(local: SocketAddr, to: SocketAddr) -> bool {
 }
 
 /// The endpoints.
-pub(in crate::engine) struct Endpoints {
+pub(in crate::engine) struct QuicEndpoints {
     all: Vec<(SocketAddr, Endpoint)>,
-    packets: VecDeque<Packet>,
+    packets: VecDeque<EndpointPacket>,
 }
 
 /// Packets of endpoints that wait at most; more are dropped, as a full socket drops them.
 const MAX_PACKETS: usize = 1024;
 
-impl Endpoints {
+impl QuicEndpoints {
     /// Endpoints at these local addresses. `server` gives the answer to packets of unknown connections; each
     /// connection has settings of its own.
     pub(in crate::engine) fn new(
@@ -165,24 +165,24 @@ impl Endpoints {
     /// Sends a datagram that is not QUIC's, from the port of QUIC. An address that no endpoint reaches drops it.
     pub(in crate::engine) fn send(&mut self, to: SocketAddr, bytes: Vec<u8>) {
         if let Some(endpoint) = self.towards(to) {
-            self.push(Packet { endpoint, to, from: None, ecn: None, bytes });
+            self.push(EndpointPacket { endpoint, to, from: None, ecn: None, bytes });
         }
     }
 
     fn respond(&mut self, endpoint: usize, transmit: &Transmit, mut bytes: Vec<u8>) {
         bytes.truncate(transmit.size);
         let Transmit { destination: to, ecn, src_ip: from, .. } = *transmit;
-        self.push(Packet { endpoint, to, from, ecn, bytes });
+        self.push(EndpointPacket { endpoint, to, from, ecn, bytes });
     }
 
-    fn push(&mut self, packet: Packet) {
+    fn push(&mut self, packet: EndpointPacket) {
         if self.packets.len() < MAX_PACKETS {
             self.packets.push_back(packet);
         }
     }
 
     /// The next packet that is not of a connection.
-    pub(in crate::engine) fn poll_packet(&mut self) -> Option<Packet> {
+    pub(in crate::engine) fn poll_packet(&mut self) -> Option<EndpointPacket> {
         self.packets.pop_front()
     }
 }

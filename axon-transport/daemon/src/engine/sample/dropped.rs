@@ -17,7 +17,7 @@ struct Run {
 
 /// What became of a sample when it came before.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Before {
+pub(crate) enum EarlierFate {
     /// It was dropped, as far as is known.
     Dropped,
     /// It was dealt with, and is not told as dropped.
@@ -70,13 +70,13 @@ impl DroppedRuns {
     }
 
     /// What became of a sample that comes again.
-    pub(in crate::engine) fn find(&self, sequence: u64) -> Before {
+    pub(in crate::engine) fn find(&self, sequence: u64) -> EarlierFate {
         let at = self.0.partition_point(|run| run.last < sequence);
         match self.0.get(at) {
             // The last ones of a run are told as dropped, whichever were: so a part of it tells no fewer than there were.
-            Some(run) if run.last - sequence < run.dropped => Before::Dropped,
-            Some(run) if sequence >= run.first => Before::Passed,
-            _ => Before::Unknown,
+            Some(run) if run.last - sequence < run.dropped => EarlierFate::Dropped,
+            Some(run) if sequence >= run.first => EarlierFate::Passed,
+            _ => EarlierFate::Unknown,
         }
     }
 }
@@ -90,22 +90,22 @@ mod tests {
         let mut dropped = DroppedRuns::default();
         [3, 4, 5, 9].into_iter().for_each(|number| dropped.add(number));
         let has: Vec<_> =
-            (0..12).filter(|number| dropped.find(*number) == Before::Dropped).collect();
+            (0..12).filter(|number| dropped.find(*number) == EarlierFate::Dropped).collect();
         assert_eq!((has, dropped.0.len()), (vec![3, 4, 5, 9], 2));
-        assert!((0..12).all(|number| dropped.find(number) != Before::Passed));
+        assert!((0..12).all(|number| dropped.find(number) != EarlierFate::Passed));
     }
 
     #[test]
     fn numbers_that_do_not_rise_are_not_remembered_and_none_overflows() {
         let mut dropped = DroppedRuns::default();
         [u64::MAX - 1, u64::MAX, u64::MAX, 0].into_iter().for_each(|number| dropped.add(number));
-        assert_eq!((dropped.0.len(), dropped.find(0)), (1, Before::Unknown));
-        assert_eq!(dropped.find(u64::MAX), Before::Dropped);
+        assert_eq!((dropped.0.len(), dropped.find(0)), (1, EarlierFate::Unknown));
+        assert_eq!(dropped.find(u64::MAX), EarlierFate::Dropped);
         let mut first = DroppedRuns::default();
         [0, 1].into_iter().for_each(|number| first.add(number));
         assert_eq!(
             [0, 1, 2].map(|n| first.find(n)),
-            [Before::Dropped, Before::Dropped, Before::Unknown]
+            [EarlierFate::Dropped, EarlierFate::Dropped, EarlierFate::Unknown]
         );
     }
 
@@ -118,14 +118,15 @@ mod tests {
         let (mut truth, mut told) = (0, 0);
         for number in (1..=newest).rev() {
             truth += u64::from(is(number));
-            told += u64::from(dropped.find(number) == Before::Dropped);
+            told += u64::from(dropped.find(number) == EarlierFate::Dropped);
             let all = newest - number + 1;
             assert!(told >= truth, "from {number} of {newest}: {told} of {truth}");
             assert!(told <= truth + all / 3 + 2, "from {number} of {newest}: {told} of {truth}");
         }
         assert_eq!(told, truth, "all");
         // None that was dropped is delivered when it comes again.
-        let mut delivered = (1..=newest).filter(|n| is(*n) && dropped.find(*n) == Before::Unknown);
+        let mut delivered =
+            (1..=newest).filter(|n| is(*n) && dropped.find(*n) == EarlierFate::Unknown);
         assert_eq!(delivered.next(), None);
     }
 

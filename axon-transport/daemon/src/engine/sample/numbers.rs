@@ -23,7 +23,7 @@ fn samples_in(time: Duration) -> u64 {
 
 /// The numbers of one publisher.
 #[derive(Debug)]
-pub(in crate::engine) struct Numbers {
+pub(in crate::engine) struct PublisherNumbers {
     /// The highest number that was written; 0 is none.
     last: Cell<u64>,
     /// By how much the next number may exceed it, as it was at `at`.
@@ -31,7 +31,7 @@ pub(in crate::engine) struct Numbers {
     at: Cell<Duration>,
 }
 
-impl Numbers {
+impl PublisherNumbers {
     /// None came yet.
     pub(in crate::engine) fn new(now: Duration) -> Self {
         Self { last: Cell::new(0), ahead: Cell::new(SLACK), at: Cell::new(now) }
@@ -95,7 +95,7 @@ mod tests {
 
     #[test]
     fn a_number_may_be_ahead_of_the_last_by_what_can_have_been_published_since() {
-        let numbers = Numbers::new(at(0));
+        let numbers = PublisherNumbers::new(at(0));
         numbers.judge(MAX_FIRST, at(0)).unwrap();
         numbers.judge(MAX_FIRST + 1, at(0)).unwrap_err();
         numbers.pass(7, at(0));
@@ -109,7 +109,7 @@ mod tests {
 
     #[test]
     fn many_numbers_are_together_no_further_ahead_than_one() {
-        let numbers = Numbers::new(at(0));
+        let numbers = PublisherNumbers::new(at(0));
         numbers.pass(1, at(0));
         for step in 1..=4 {
             let sequence = 1 + step * SLACK / 4;
@@ -121,7 +121,7 @@ mod tests {
 
     #[test]
     fn a_sample_that_was_on_its_way_for_long_leaves_the_next_one_its_number() {
-        let numbers = Numbers::new(at(0));
+        let numbers = PublisherNumbers::new(at(0));
         // A link was cut for 100 s: the sample from before comes with the newest one.
         numbers.pass(1, at(0));
         numbers.pass(2, at(100));
@@ -133,7 +133,7 @@ mod tests {
 
     #[test]
     fn an_older_number_changes_nothing() {
-        let numbers = Numbers::new(at(0));
+        let numbers = PublisherNumbers::new(at(0));
         numbers.pass(10, at(0));
         numbers.judge(3, at(0)).unwrap();
         numbers.pass(3, at(0));

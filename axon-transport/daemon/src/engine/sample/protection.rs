@@ -11,8 +11,8 @@ use super::{
     short_header::{ShortHeaders, Told},
 };
 use crate::{
-    engine::rings::Sample,
-    keys::{NoKey, Receiver, Sender},
+    engine::rings::RingSample,
+    keys::{KeyReceiver, KeySender, NoKey},
 };
 use axon_transport::internal::session::unix_nanos;
 
@@ -29,7 +29,7 @@ pub(crate) enum Seal<'a> {
     /// Each message is sealed under a KME key.
     Envelope {
         /// The keys towards the peer.
-        sender: &'a mut Sender,
+        sender: &'a mut KeySender,
         /// The connection.
         connection: u64,
     },
@@ -60,7 +60,7 @@ impl Seal<'_> {
     /// There is no key for it. Nothing is added then.
     pub(crate) fn write(
         &mut self,
-        sample: &Sample,
+        sample: &RingSample,
         route: Route,
         delivery: Delivery,
         short: Option<&mut ShortHeaders>,
@@ -116,12 +116,12 @@ fn plain(header: &[u8], payload: &Bytes, frames: &mut Frames) {
 }
 
 /// A sample's age in milliseconds.
-fn age(sample: &Sample, now: Duration) -> u32 {
+fn age(sample: &RingSample, now: Duration) -> u32 {
     u32::try_from(sample.age(now).as_millis()).unwrap_or(u32::MAX)
 }
 
 /// The header of a message.
-fn header(sample: &Sample, now: Duration) -> inner::Header {
+fn header(sample: &RingSample, now: Duration) -> inner::Header {
     inner::Header {
         gid: sample.info.publisher.0,
         sequence: sample.info.sequence,
@@ -145,20 +145,20 @@ pub(crate) enum Open<'a> {
     /// Each message is an envelope.
     Envelope {
         /// The keys of the peer.
-        receiver: &'a mut Receiver,
+        receiver: &'a mut KeyReceiver,
         /// The connection.
         connection: u64,
     },
 }
 
 /// A message that was opened.
-pub(crate) struct Opened<'a> {
+pub(crate) struct OpenedSample<'a> {
     /// Its header.
     pub(crate) header: inner::Header,
     sent: &'a [u8],
 }
 
-impl<'a> Opened<'a> {
+impl<'a> OpenedSample<'a> {
     /// A message without an envelope.
     ///
     /// # Errors
@@ -209,13 +209,13 @@ impl Open<'_> {
         body: &'a mut [u8],
         route: Route,
         now: Duration,
-    ) -> Result<Option<Opened<'a>>, RefusedMessage> {
+    ) -> Result<Option<OpenedSample<'a>>, RefusedMessage> {
         let Self::Envelope { receiver, connection } = self else {
-            return Opened::plain(body).map(Some);
+            return OpenedSample::plain(body).map(Some);
         };
         let Some(opener) = receiver.opener(*connection) else { return Ok(None) };
         match opener.open_in_place(now, route, body) {
-            Ok(plain) => Opened::plain(plain).map(Some),
+            Ok(plain) => OpenedSample::plain(plain).map(Some),
             Err(error) => Err(RefusedMessage::of_envelope(&error)),
         }
     }

@@ -39,7 +39,7 @@ use crate::{
         quic::transport::endpoint_config,
     },
     identity::Identity,
-    keys::{Origin, Request},
+    keys::{KmeRequest, RequestOrigin},
     link::Hello,
     owner::SessionKeys,
     wire::beacon::Datagram,
@@ -71,7 +71,7 @@ pub(super) struct Host {
     pub(super) refusals: VecDeque<(Duration, String)>,
     pub(super) lost: BTreeMap<(String, &'static str), u64>,
     /// Requests to the KME that wait for an answer.
-    pub(super) requests: Vec<(Origin, Request)>,
+    pub(super) requests: Vec<(RequestOrigin, KmeRequest)>,
     records: Vec<(u64, String)>,
     /// The engine asked for the host's network interfaces.
     interfaces_asked: bool,

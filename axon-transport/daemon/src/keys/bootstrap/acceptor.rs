@@ -24,7 +24,7 @@ use super::{
 };
 use crate::keys::{
     Clock,
-    request::{Answer, FailureKind, Fetched, Purpose, Request},
+    request::{Answer, FailureKind, Fetched, KeyPurpose, KmeRequest},
 };
 
 /// Unspent PSKs kept for one SAE.
@@ -219,19 +219,19 @@ impl Acceptor {
     }
 
     /// The next call to the KME, if any.
-    pub fn poll_request(&self) -> Option<Request> {
+    pub fn poll_request(&self) -> Option<KmeRequest> {
         let mut state = self.state();
         let pending = state.pending.iter_mut().find(|p| !p.asked)?;
         pending.asked = true;
-        Some(Request::Dec {
+        Some(KmeRequest::Dec {
             master: pending.identity.client_sae().to_owned(),
             key_ids: vec![pending.key_id.clone()],
-            purpose: Purpose::Accept,
+            purpose: KeyPurpose::Accept,
         })
     }
 
     /// The next call to the KME, when there is one. Cancel safe; for one caller at a time.
-    pub async fn next_request(&self) -> Request {
+    pub async fn next_request(&self) -> KmeRequest {
         loop {
             if let Some(request) = self.poll_request() {
                 return request;
@@ -243,7 +243,7 @@ impl Acceptor {
     /// The KME's answer to one of our requests.
     pub fn handle_answer(&self, answer: Answer) {
         let now = self.0.clock.now();
-        let Request::Dec { master, key_ids, .. } = answer.request else { return };
+        let KmeRequest::Dec { master, key_ids, .. } = answer.request else { return };
         let mut state = self.state();
         let Some(i) = state
             .pending

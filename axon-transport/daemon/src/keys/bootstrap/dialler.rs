@@ -11,7 +11,7 @@ use axon_transport::config::QkdPeers;
 use secrecy::ExposeSecret;
 
 use super::Completion;
-use crate::keys::request::{Answer, Fetched, Purpose, Request};
+use crate::keys::request::{Answer, Fetched, KeyPurpose, KmeRequest};
 
 /// How long a key is kept without being spent.
 const KEY_MAX_AGE: Duration = Duration::from_secs(600);
@@ -40,7 +40,7 @@ const IN_FLIGHT: usize = 8;
 #[derive(Debug)]
 pub enum Dial {
     /// Dial it with this key.
-    Attempt(Attempt),
+    DialKey(DialKey),
     /// Ask again later.
     Wait {
         /// When; `None`: when the KME has answered.
@@ -53,16 +53,16 @@ pub enum Dial {
 }
 
 /// The key of a dial. Attempts may overlap: the first that succeeds spends the key for all.
-pub struct Attempt {
+pub struct DialKey {
     /// Names the key in what is reported back about this attempt.
     pub key_id: KeyId,
     /// The PSK, for [`axon_tls::quic::qkd_client`].
     pub psk: Arc<Psk>,
 }
 
-impl fmt::Debug for Attempt {
+impl fmt::Debug for DialKey {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Attempt").field("key_id", &self.key_id).finish_non_exhaustive()
+        f.debug_struct("DialKey").field("key_id", &self.key_id).finish_non_exhaustive()
     }
 }
 
@@ -88,10 +88,10 @@ pub struct Dialler {
     cipher: Cipher,
     /// How long a KME may take.
     answer: Duration,
-    peers: HashMap<String, Peer>,
+    peers: HashMap<String, DialPeer>,
 }
 
-struct Peer {
+struct DialPeer {
     state: DialState,
     /// Keys and calls that failed since the last success.
     failures: u32,
@@ -146,7 +146,7 @@ impl Dialler {
         if !self.peers.contains_key(sae) && !self.make_room(now) {
             return Dial::Refused(DialRefusal::TooMany);
         }
-        let peer = self.peers.entry(sae.to_owned()).or_insert_with(Peer::new);
+        let peer = self.peers.entry(sae.to_owned()).or_insert_with(DialPeer::new);
         match &peer.state {
             DialState::Empty { not_before, why } if *not_before > now => {
                 return Dial::Wait { until: Some(*not_before), why: why.clone() };
@@ -160,7 +160,7 @@ impl Dialler {
             }
             DialState::UnspentKey(held) => {
                 let psk = Arc::clone(&held.psk);
-                return Dial::Attempt(Attempt { key_id: held.key_id.clone(), psk });
+                return Dial::DialKey(DialKey { key_id: held.key_id.clone(), psk });
             }
             DialState::Wanted | DialState::Asked => {}
         }
@@ -172,7 +172,7 @@ impl Dialler {
         let Some(peer) = self.peers.get_mut(sae) else { return Completion::Reused };
         match &peer.state {
             DialState::UnspentKey(held) if held.key_id == *key_id => {
-                *peer = Peer::new();
+                *peer = DialPeer::new();
                 Completion::First
             }
             _ => Completion::Reused,
@@ -224,7 +224,7 @@ impl Dialler {
 
     /// Nothing came back about `key_id`. It stays; silence says nothing of the key.
     pub fn silent(&mut self, _now: Duration, sae: &str, key_id: &KeyId) {
-        if let Some(Peer { state: DialState::UnspentKey(held), .. }) = self.peers.get_mut(sae)
+        if let Some(DialPeer { state: DialState::UnspentKey(held), .. }) = self.peers.get_mut(sae)
             && held.key_id == *key_id
         {
             held.last_refusal = None;
@@ -232,7 +232,7 @@ impl Dialler {
     }
 
     /// The next call to the KME, if any.
-    pub fn poll_request(&mut self, now: Duration) -> Option<Request> {
+    pub fn poll_request(&mut self, now: Duration) -> Option<KmeRequest> {
         self.expire(now);
         let asked = self.peers.values().filter(|p| matches!(p.state, DialState::Asked)).count();
         if asked >= IN_FLIGHT {
@@ -241,12 +241,12 @@ impl Dialler {
         let (sae, peer) =
             self.peers.iter_mut().find(|(_, p)| matches!(p.state, DialState::Wanted))?;
         peer.state = DialState::Asked;
-        Some(Request::Enc { slave: sae.clone(), number: 1, purpose: Purpose::Bootstrap })
+        Some(KmeRequest::Enc { slave: sae.clone(), number: 1, purpose: KeyPurpose::Bootstrap })
     }
 
     /// The KME's answer to one of our requests.
     pub fn handle_answer(&mut self, now: Duration, answer: Answer) {
-        let Request::Enc { slave, .. } = answer.request else { return };
+        let KmeRequest::Enc { slave, .. } = answer.request else { return };
         let Some(peer) = self.peers.get_mut(&slave) else { return };
         if !matches!(peer.state, DialState::Asked) {
             return;
@@ -275,7 +275,7 @@ impl Dialler {
 
     /// When to poll again without other cause: a key ends.
     pub fn poll_timeout(&self) -> Option<Duration> {
-        let end = |p: &Peer| match &p.state {
+        let end = |p: &DialPeer| match &p.state {
             DialState::UnspentKey(held) => Some(held.since + KEY_MAX_AGE),
             _ => None,
         };
@@ -296,8 +296,7 @@ impl Dialler {
         if self.peers.len() < MAX_PEERS {
             return true;
         }
-        let idle =
-            |p: &Peer| matches!(p.state, DialState::Empty { not_before, .. } if not_before <= now);
+        let idle = |p: &DialPeer| matches!(p.state, DialState::Empty { not_before, .. } if not_before <= now);
         let Some(sae) = self.peers.iter().find(|(_, p)| idle(p)).map(|(sae, _)| sae.clone()) else {
             return false;
         };
@@ -306,7 +305,7 @@ impl Dialler {
     }
 }
 
-impl Peer {
+impl DialPeer {
     fn new() -> Self {
         Self {
             state: DialState::Empty { not_before: Duration::ZERO, why: String::new() },

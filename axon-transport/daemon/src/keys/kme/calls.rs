@@ -14,7 +14,7 @@ use super::{
     statistics::{Recorder, Statistics},
 };
 use crate::keys::{
-    request::{Failure, FailureKind, Fetched, Purpose, Request, Stock},
+    request::{Failure, FailureKind, Fetched, KeyPurpose, KmeRequest, Stock},
     used::UsedKeys,
 };
 
@@ -22,26 +22,26 @@ use crate::keys::{
 const KEY_SIZE: u32 = 256;
 
 /// Makes calls, and keeps account of them.
-pub(super) struct Caller {
+pub(super) struct KmeCaller {
     client: Client,
     recorder: Recorder,
     used: UsedKeys,
     outages: Mutex<Outages>,
 }
 
-impl Caller {
+impl KmeCaller {
     pub(super) fn new(client: Client, config: &QkdConfig, used: UsedKeys) -> Self {
         let outages = Mutex::new(Outages::new(&config.kme_url, &config.sae_id));
         Self { client, recorder: Recorder::default(), used, outages }
     }
 
     /// Runs `request` and records how it went.
-    pub(super) async fn run(&self, request: &Request) -> Result<Fetched, Failure> {
+    pub(super) async fn run(&self, request: &KmeRequest) -> Result<Fetched, Failure> {
         let start = Instant::now();
         // The client keeps to AXON_KME_ANSWER_TIMEOUT by itself.
         let outcome = call(&self.client, request).await;
         let (outcome, repeated) = match (request, outcome) {
-            (Request::Enc { purpose, .. }, Ok(Fetched::Keys(keys))) => {
+            (KmeRequest::Enc { purpose, .. }, Ok(Fetched::Keys(keys))) => {
                 self.unused(*purpose, keys).await
             }
             (_, outcome) => (outcome, None),
@@ -65,7 +65,7 @@ impl Caller {
     /// messages make do with some of those asked for.
     async fn unused(
         &self,
-        purpose: Purpose,
+        purpose: KeyPurpose,
         keys: Vec<(KeyId, KmeKey)>,
     ) -> (Result<Fetched, Failure>, Option<Failure>) {
         let names: Vec<_> =
@@ -88,7 +88,7 @@ impl Caller {
             Failure::new(FailureKind::Repeated, text)
         });
         match failure {
-            Some(failure) if unused.is_empty() || purpose != Purpose::Messages => {
+            Some(failure) if unused.is_empty() || purpose != KeyPurpose::Messages => {
                 (Err(failure.clone()), Some(failure))
             }
             failure => (Ok(Fetched::Keys(unused)), failure),
@@ -100,13 +100,13 @@ impl Caller {
     }
 }
 
-async fn call(client: &Client, request: &Request) -> Result<Fetched, Failure> {
+async fn call(client: &Client, request: &KmeRequest) -> Result<Fetched, Failure> {
     match request {
-        Request::Enc { slave, number, .. } => {
+        KmeRequest::Enc { slave, number, .. } => {
             let enc = client.enc_keys(slave).number(*number).size(KEY_SIZE);
             keys(enc.send().await.map_err(|e| failure(&e))?)
         }
-        Request::Dec { master, key_ids, .. } => {
+        KmeRequest::Dec { master, key_ids, .. } => {
             let mut names = Vec::with_capacity(key_ids.len());
             for key_id in key_ids {
                 names.push(std::str::from_utf8(key_id.as_bytes()).map_err(|_| {
@@ -116,7 +116,7 @@ async fn call(client: &Client, request: &Request) -> Result<Fetched, Failure> {
             let dec = client.dec_keys(master).key_ids(names).size(KEY_SIZE);
             keys(dec.send().await.map_err(|e| failure(&e))?)
         }
-        Request::Status { slave } => {
+        KmeRequest::Status { slave } => {
             let status = client.status(slave).await.map_err(|e| failure(&e))?;
             Ok(Fetched::Stock(Stock::from(&status)))
         }

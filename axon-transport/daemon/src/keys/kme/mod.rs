@@ -1,4 +1,4 @@
-//! Runs the key state machines' [`Request`]s at the KME, with limits, and answers every one of them. No other module
+//! Runs the key state machines' [`KmeRequest`]s at the KME, with limits, and answers every one of them. No other module
 //! talks to the KME.
 //!
 //! Calls for links (bootstrap, handshakes, proofs) and calls for messages wait in two queues with separate limits,
@@ -24,13 +24,13 @@ use tokio::{
 use zeroize::Zeroizing;
 
 use super::{
-    request::{Answer, Failure, FailureKind, Fetched, Purpose, Request, Stock},
+    request::{Answer, Failure, FailureKind, Fetched, KeyPurpose, KmeRequest, Stock},
     used::UsedKeys,
 };
 
 pub use statistics::{CallStatistics, Statistics};
 
-use calls::Caller;
+use calls::KmeCaller;
 
 /// Requests that wait, for links and for messages each.
 const QUEUE: usize = 256;
@@ -41,7 +41,7 @@ const MESSAGE_CALLS: usize = 16;
 
 /// Who asked, and so who gets the answer. The numbers are the caller's own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Origin {
+pub enum RequestOrigin {
     /// The [`Dialler`](super::Dialler).
     Dialler,
     /// The [`Acceptor`](super::Acceptor).
@@ -60,7 +60,7 @@ pub enum Origin {
 #[derive(Debug)]
 pub struct Event {
     /// Who asked.
-    pub origin: Origin,
+    pub origin: RequestOrigin,
     /// The answer.
     pub answer: Answer,
 }
@@ -94,7 +94,7 @@ pub enum KmeError {
 pub struct Kme(Arc<KmeShared>);
 
 struct KmeShared {
-    caller: Arc<Caller>,
+    caller: Arc<KmeCaller>,
     links: mpsc::Sender<Job>,
     messages: mpsc::Sender<Job>,
 }
@@ -103,8 +103,8 @@ struct KmeShared {
 pub struct Events(mpsc::Receiver<Event>);
 
 struct Job {
-    origin: Origin,
-    request: Request,
+    origin: RequestOrigin,
+    request: KmeRequest,
     since: Instant,
 }
 
@@ -129,7 +129,7 @@ impl Kme {
         if let Err(error) = secrets::prepare() {
             tracing::warn!(%error, "there is no memory for keys yet");
         }
-        let caller = Arc::new(Caller::new(client(config)?, config, used));
+        let caller = Arc::new(KmeCaller::new(client(config)?, config, used));
         let (events, receiver) = mpsc::channel(QUEUE);
         let serve = |limit: usize| {
             let (sender, jobs) = mpsc::channel(QUEUE);
@@ -144,11 +144,11 @@ impl Kme {
     ///
     /// # Errors
     /// The queue is full: the answer, to be given to the machine as if it had come out of there.
-    pub fn submit(&self, origin: Origin, request: Request) -> Result<(), Box<Event>> {
+    pub fn submit(&self, origin: RequestOrigin, request: KmeRequest) -> Result<(), Box<Event>> {
         let queue = match &request {
-            Request::Enc { purpose: Purpose::Messages, .. }
-            | Request::Dec { purpose: Purpose::Messages, .. }
-            | Request::Status { .. } => &self.0.messages,
+            KmeRequest::Enc { purpose: KeyPurpose::Messages, .. }
+            | KmeRequest::Dec { purpose: KeyPurpose::Messages, .. }
+            | KmeRequest::Status { .. } => &self.0.messages,
             _ => &self.0.links,
         };
         queue.try_send(Job { origin, request, since: Instant::now() }).map_err(|e| {
@@ -164,7 +164,7 @@ impl Kme {
     /// # Errors
     /// Why not.
     pub async fn probe(&self, slave: &str) -> Result<Stock, Failure> {
-        let request = Request::Status { slave: slave.to_owned() };
+        let request = KmeRequest::Status { slave: slave.to_owned() };
         match self.0.caller.run(&request).await? {
             Fetched::Stock(stock) => Ok(stock),
             Fetched::Keys(_) => {
@@ -198,7 +198,7 @@ impl Events {
 
 /// Runs the jobs of one queue, `limit` at a time, and answers each.
 async fn serve(
-    caller: Arc<Caller>,
+    caller: Arc<KmeCaller>,
     limit: usize,
     mut jobs: mpsc::Receiver<Job>,
     events: mpsc::Sender<Event>,

@@ -5,7 +5,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use crate::keys::request::{Failure, FailureKind, Purpose, Request};
+use crate::keys::request::{Failure, FailureKind, KeyPurpose, KmeRequest};
 
 /// Time between two lines about one call and SAE: a KME that comes and goes is not worth more.
 const EVERY: Duration = Duration::from_secs(10);
@@ -48,19 +48,19 @@ impl Outages {
     pub(super) fn record(
         &mut self,
         now: Instant,
-        request: &Request,
+        request: &KmeRequest,
         failure: Option<&Failure>,
     ) -> Option<Notice> {
         let (call, peer) = match request {
-            Request::Enc { slave, .. } => ("enc_keys", slave),
-            Request::Dec { master, .. } => ("dec_keys", master),
-            Request::Status { slave } => ("status", slave),
+            KmeRequest::Enc { slave, .. } => ("enc_keys", slave),
+            KmeRequest::Dec { master, .. } => ("dec_keys", master),
+            KmeRequest::Status { slave } => ("status", slave),
         };
         let key = (call, peer.clone());
         let Some(failure) = failure else { return self.works(now, &key) };
         let refused = call == "dec_keys" && failure.kind == FailureKind::Refused;
         // Names that a stranger made up are nothing of the KME's.
-        if refused && matches!(request, Request::Dec { purpose: Purpose::Accept, .. })
+        if refused && matches!(request, KmeRequest::Dec { purpose: KeyPurpose::Accept, .. })
             || failure.kind == FailureKind::Busy
             || self.watched.len() >= MAX && !self.watched.contains_key(&key)
         {
@@ -147,12 +147,12 @@ fn advice(kind: FailureKind) -> &'static str {
 mod tests {
     use super::*;
 
-    fn enc(slave: &str) -> Request {
-        Request::Enc { slave: slave.to_owned(), number: 1, purpose: Purpose::Messages }
+    fn enc(slave: &str) -> KmeRequest {
+        KmeRequest::Enc { slave: slave.to_owned(), number: 1, purpose: KeyPurpose::Messages }
     }
 
-    fn dec(master: &str, purpose: Purpose) -> Request {
-        Request::Dec { master: master.to_owned(), key_ids: Vec::new(), purpose }
+    fn dec(master: &str, purpose: KeyPurpose) -> KmeRequest {
+        KmeRequest::Dec { master: master.to_owned(), key_ids: Vec::new(), purpose }
     }
 
     fn says(notice: Option<Notice>, parts: &[&str]) {
@@ -173,7 +173,7 @@ mod tests {
             assert_eq!(outages.record(start + s(i), &enc("sae-b"), Some(&gone)), None);
         }
         // One direction says nothing of the other, nor one SAE of another.
-        assert_eq!(outages.record(start, &dec("sae-b", Purpose::Messages), None), None);
+        assert_eq!(outages.record(start, &dec("sae-b", KeyPurpose::Messages), None), None);
         assert_eq!(outages.record(start, &enc("sae-c"), None), None);
         let slow = Failure::new(FailureKind::Ambiguous, "no answer");
         says(
@@ -207,12 +207,12 @@ mod tests {
         let now = Instant::now();
         let unknown = Failure::new(FailureKind::Refused, "KME answered 400");
         for _ in 0..100 {
-            let request = dec("sae-b", Purpose::Accept);
+            let request = dec("sae-b", KeyPurpose::Accept);
             assert_eq!(outages.record(now, &request, Some(&unknown)), None);
         }
         let lines: Vec<_> = (0..100)
             .filter(|_| {
-                outages.record(now, &dec("sae-b", Purpose::Messages), Some(&unknown)).is_some()
+                outages.record(now, &dec("sae-b", KeyPurpose::Messages), Some(&unknown)).is_some()
             })
             .collect();
         assert_eq!(lines, [19]);

@@ -8,7 +8,7 @@ use std::{
 
 use serde::Serialize;
 
-use crate::keys::request::{Failure, FailureKind, Fetched, Purpose, Request};
+use crate::keys::request::{Failure, FailureKind, Fetched, KeyPurpose, KmeRequest};
 
 /// Peers whose stock is shown.
 const MAX_PEERS: usize = 256;
@@ -65,16 +65,16 @@ pub(super) struct Recorder(Mutex<Statistics>);
 impl Recorder {
     pub(super) fn record(
         &self,
-        request: &Request,
+        request: &KmeRequest,
         took: Duration,
         outcome: &Result<Fetched, Failure>,
     ) {
         let mut guard = self.lock();
         let s = &mut *guard;
         let call = match request {
-            Request::Enc { .. } => &mut s.enc_keys,
-            Request::Dec { .. } => &mut s.dec_keys,
-            Request::Status { .. } => &mut s.status,
+            KmeRequest::Enc { .. } => &mut s.enc_keys,
+            KmeRequest::Dec { .. } => &mut s.dec_keys,
+            KmeRequest::Status { .. } => &mut s.status,
         };
         call.calls += 1;
         match outcome {
@@ -88,18 +88,21 @@ impl Recorder {
             }
         }
         match (request, outcome) {
-            (Request::Enc { purpose, .. } | Request::Dec { purpose, .. }, Ok(Fetched::Keys(k))) => {
+            (
+                KmeRequest::Enc { purpose, .. } | KmeRequest::Dec { purpose, .. },
+                Ok(Fetched::Keys(k)),
+            ) => {
                 *match purpose {
-                    Purpose::Bootstrap => &mut s.keys_bootstrap,
-                    Purpose::Accept => &mut s.keys_accept,
-                    Purpose::Proof => &mut s.keys_proof,
-                    Purpose::Messages => &mut s.keys_messages,
+                    KeyPurpose::Bootstrap => &mut s.keys_bootstrap,
+                    KeyPurpose::Accept => &mut s.keys_accept,
+                    KeyPurpose::Proof => &mut s.keys_proof,
+                    KeyPurpose::Messages => &mut s.keys_messages,
                 } += k.len() as u64;
             }
-            (Request::Enc { number, .. }, Err(f)) if f.kind == FailureKind::Ambiguous => {
+            (KmeRequest::Enc { number, .. }, Err(f)) if f.kind == FailureKind::Ambiguous => {
                 s.keys_possibly_lost += u64::from(*number);
             }
-            (Request::Status { slave }, Ok(Fetched::Stock(stock)))
+            (KmeRequest::Status { slave }, Ok(Fetched::Stock(stock)))
                 if s.stored_key_count.contains_key(slave)
                     || s.stored_key_count.len() < MAX_PEERS =>
             {

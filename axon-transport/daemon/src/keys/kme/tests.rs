@@ -7,10 +7,10 @@ use axon_transport::config::{QkdConfig, QkdPeers};
 use etsi_qkd014::sim::{Fault, Network};
 use secrecy::ExposeSecret;
 
-use super::{Kme, KmeError, Origin};
+use super::{Kme, KmeError, RequestOrigin};
 use crate::keys::{
     UsedKeys,
-    request::{FailureKind, Fetched, Purpose, Request},
+    request::{FailureKind, Fetched, KeyPurpose, KmeRequest},
 };
 
 async fn network() -> Network {
@@ -39,8 +39,8 @@ fn config(network: &Network, sae: &str, dir: &Path) -> QkdConfig {
     config
 }
 
-fn enc(number: u32) -> Request {
-    Request::Enc { slave: "sae-b".to_owned(), number, purpose: Purpose::Messages }
+fn enc(number: u32) -> KmeRequest {
+    KmeRequest::Enc { slave: "sae-b".to_owned(), number, purpose: KeyPurpose::Messages }
 }
 
 const LONG: Duration = Duration::from_secs(30);
@@ -83,18 +83,18 @@ async fn keys_reach_both_sides_and_are_counted() {
         Kme::start(&config(&network, "sae-b", dir.path()), UsedKeys::in_memory()).unwrap();
     assert!(a.probe("sae-b").await.is_ok());
 
-    a.submit(Origin::Sender(7), enc(3)).unwrap();
+    a.submit(RequestOrigin::Sender(7), enc(3)).unwrap();
     let event = a_events.recv().await.unwrap();
-    assert_eq!(event.origin, Origin::Sender(7));
+    assert_eq!(event.origin, RequestOrigin::Sender(7));
     let Ok(Fetched::Keys(masters)) = event.answer.outcome else { panic!() };
     assert_eq!(masters.len(), 3);
 
     let key_ids: Vec<KeyId> = masters.iter().map(|(id, _)| id.clone()).collect();
-    let (master, purpose) = ("sae-a".to_owned(), Purpose::Accept);
-    let dec = Request::Dec { master, key_ids, purpose };
-    b.submit(Origin::Acceptor, dec.clone()).unwrap();
+    let (master, purpose) = ("sae-a".to_owned(), KeyPurpose::Accept);
+    let dec = KmeRequest::Dec { master, key_ids, purpose };
+    b.submit(RequestOrigin::Acceptor, dec.clone()).unwrap();
     let event = b_events.recv().await.unwrap();
-    assert_eq!(event.origin, Origin::Acceptor);
+    assert_eq!(event.origin, RequestOrigin::Acceptor);
     let Ok(Fetched::Keys(slaves)) = event.answer.outcome else { panic!() };
     for ((master_id, master), (slave_id, slave)) in masters.iter().zip(&slaves) {
         assert_eq!(master_id, slave_id);
@@ -102,9 +102,9 @@ async fn keys_reach_both_sides_and_are_counted() {
     }
 
     let unknown = KeyId::new("00000000-0000-4000-8000-000000000000").unwrap();
-    let Request::Dec { master, purpose, .. } = dec else { unreachable!() };
-    let dec = Request::Dec { master, key_ids: vec![unknown], purpose };
-    b.submit(Origin::Acceptor, dec).unwrap();
+    let KmeRequest::Dec { master, purpose, .. } = dec else { unreachable!() };
+    let dec = KmeRequest::Dec { master, key_ids: vec![unknown], purpose };
+    b.submit(RequestOrigin::Acceptor, dec).unwrap();
     let failure = b_events.recv().await.unwrap().answer.outcome.expect_err("no such key");
     assert_eq!(failure.kind, FailureKind::Refused, "{failure}");
 
@@ -130,7 +130,7 @@ async fn failures_say_whether_keys_may_be_lost() {
     ] {
         let name = format!("{fault:?}");
         sim.inject(fault, 1);
-        kme.submit(Origin::Sender(0), enc(2)).unwrap();
+        kme.submit(RequestOrigin::Sender(0), enc(2)).unwrap();
         let failure = events.recv().await.unwrap().answer.outcome.expect_err("a fault");
         assert_eq!(failure.kind, kind, "{name}: {failure}");
         assert_eq!(kme.statistics().last_failure, Some(failure.text));
@@ -138,7 +138,7 @@ async fn failures_say_whether_keys_may_be_lost() {
     assert_eq!(kme.statistics().keys_possibly_lost, 8);
 
     sim.inject(Fault::Busy(7), 1);
-    kme.submit(Origin::Sender(0), enc(2)).unwrap();
+    kme.submit(RequestOrigin::Sender(0), enc(2)).unwrap();
     let failure = events.recv().await.unwrap().answer.outcome.expect_err("busy");
     assert_eq!(failure.kind, FailureKind::Unavailable, "{failure}");
     assert_eq!(failure.retry_after, Some(Duration::from_secs(7)));
@@ -147,7 +147,7 @@ async fn failures_say_whether_keys_may_be_lost() {
     let mut hurried = settings.clone();
     hurried.kme_answer_timeout = Duration::from_secs(1);
     let (kme, mut events) = Kme::start(&hurried, UsedKeys::in_memory()).unwrap();
-    kme.submit(Origin::Sender(0), enc(2)).unwrap();
+    kme.submit(RequestOrigin::Sender(0), enc(2)).unwrap();
     let failure = events.recv().await.unwrap().answer.outcome.expect_err("too slow");
     assert_eq!(failure.kind, FailureKind::Ambiguous, "{failure}");
 
@@ -167,7 +167,7 @@ async fn a_stuck_kme_holds_no_more_than_its_bounds_and_links_go_first() {
     let sim = network.kme("kme-a").unwrap();
     sim.inject(Fault::Silence, 16);
     for _ in 0..16 {
-        kme.submit(Origin::Sender(0), enc(1)).unwrap();
+        kme.submit(RequestOrigin::Sender(0), enc(1)).unwrap();
     }
     // All sixteen calls for messages hang once the faults are used up. Nothing leaves the queue from then on.
     while !sim.plans().is_empty() {
@@ -175,22 +175,22 @@ async fn a_stuck_kme_holds_no_more_than_its_bounds_and_links_go_first() {
     }
     let mut queued = 0;
     let refused = loop {
-        match kme.submit(Origin::Sender(4), enc(1)) {
+        match kme.submit(RequestOrigin::Sender(4), enc(1)) {
             Ok(()) => queued += 1,
             Err(refused) => break refused,
         }
         assert!(queued <= 2000, "unbounded");
         tokio::task::yield_now().await;
     };
-    assert_eq!(refused.origin, Origin::Sender(4));
+    assert_eq!(refused.origin, RequestOrigin::Sender(4));
     assert_eq!(refused.answer.outcome.err().unwrap().kind, FailureKind::Busy);
 
     // A link still gets in.
-    let (slave, purpose) = ("sae-b".to_owned(), Purpose::Bootstrap);
-    let bootstrap = Request::Enc { slave, number: 1, purpose };
-    kme.submit(Origin::Dialler, bootstrap).unwrap();
+    let (slave, purpose) = ("sae-b".to_owned(), KeyPurpose::Bootstrap);
+    let bootstrap = KmeRequest::Enc { slave, number: 1, purpose };
+    kme.submit(RequestOrigin::Dialler, bootstrap).unwrap();
     let event = events.recv().await.unwrap();
-    assert_eq!(event.origin, Origin::Dialler);
+    assert_eq!(event.origin, RequestOrigin::Dialler);
     assert!(event.answer.outcome.is_ok());
 }
 
@@ -202,18 +202,18 @@ async fn request_does_not_wait_for_one_that_the_kme_never_answers() {
     let (kme, mut events) =
         Kme::start(&config(&network, "sae-a", dir.path()), UsedKeys::in_memory()).unwrap();
     let sim = network.kme("kme-a").unwrap();
-    let (slave, purpose) = ("sae-b".to_owned(), Purpose::Bootstrap);
-    let for_a_link = Request::Enc { slave, number: 1, purpose };
+    let (slave, purpose) = ("sae-b".to_owned(), KeyPurpose::Bootstrap);
+    let for_a_link = KmeRequest::Enc { slave, number: 1, purpose };
     for request in [enc(1), for_a_link] {
         sim.inject(Fault::Silence, 1);
-        kme.submit(Origin::Sender(1), request.clone()).unwrap();
+        kme.submit(RequestOrigin::Sender(1), request.clone()).unwrap();
         // The KME has the request, and says nothing to it.
         while !sim.plans().is_empty() {
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
-        kme.submit(Origin::Sender(2), request).unwrap();
+        kme.submit(RequestOrigin::Sender(2), request).unwrap();
         let event = events.recv().await.unwrap();
-        assert_eq!(event.origin, Origin::Sender(2), "the first one's end was waited for");
+        assert_eq!(event.origin, RequestOrigin::Sender(2), "the first one's end was waited for");
         assert!(event.answer.outcome.is_ok());
     }
 }
@@ -235,7 +235,7 @@ async fn silent_kme_is_given_up_after_the_answer_limit_of_the_settings() {
         sim.inject(Fault::Silence, 1);
         tokio::time::pause();
         let begun = tokio::time::Instant::now();
-        kme.submit(Origin::Sender(0), enc(1)).unwrap();
+        kme.submit(RequestOrigin::Sender(0), enc(1)).unwrap();
         let failure = events.recv().await.unwrap().answer.outcome.expect_err("silence");
         let took = begun.elapsed();
         tokio::time::resume();
@@ -274,7 +274,7 @@ async fn events_end_when_the_last_handle_is_dropped() {
     let dir = tempfile::tempdir().unwrap();
     let (kme, mut events) =
         Kme::start(&config(&network, "sae-a", dir.path()), UsedKeys::in_memory()).unwrap();
-    kme.submit(Origin::Dialler, enc(1)).unwrap();
+    kme.submit(RequestOrigin::Dialler, enc(1)).unwrap();
     drop(kme);
     assert!(events.recv().await.is_some(), "what was asked is answered");
     assert!(events.recv().await.is_none());
@@ -289,7 +289,7 @@ async fn keys_that_come_again_after_a_restart_are_not_given_out() {
     network.note_state();
     let draw = async |number| {
         let (kme, mut events) = start();
-        kme.submit(Origin::Sender(0), enc(number)).unwrap();
+        kme.submit(RequestOrigin::Sender(0), enc(number)).unwrap();
         let outcome = events.recv().await.unwrap().answer.outcome;
         // The file is let go with the last of it.
         drop(kme);

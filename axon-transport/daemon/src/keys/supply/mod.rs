@@ -1,7 +1,7 @@
 //! Keys for `messages10`: ten messages each, fetched ahead, announced, proven, used, retired (docs/formats.md,
 //! section 4).
 //!
-//! Each host is master for the messages that it sends: its [`Sender`] requests keys, and the peer's [`Receiver`]
+//! Each host is master for the messages that it sends: its [`KeySender`] requests keys, and the peer's [`KeyReceiver`]
 //! fetches the same keys. There is one pair for each peer SAE, and it outlives connections. The rules of
 //! [`etsi_qkd014::pool`] decide when to draw from the KME, and how many keys.
 
@@ -18,8 +18,8 @@ use axon_envelope::{ChannelError, RandomError};
 
 pub use demand::SupplyWarning;
 pub use disagreement::Disagreement;
-pub use receiver::{Receiver, ReceiverStatistics};
-pub use sender::{NoKey, Sender, SenderStatistics};
+pub use receiver::{KeyReceiver, ReceiverStatistics};
+pub use sender::{KeySender, NoKey, SenderStatistics};
 
 use super::Violation;
 

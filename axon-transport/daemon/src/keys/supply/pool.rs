@@ -1,5 +1,5 @@
 //! Keys that were drawn from the KME and are not announced yet. The rules of [`etsi_qkd014::pool`] decide when to
-//! draw, and how many keys. This module turns their calls into [`Request`]s, and reports the results to them.
+//! draw, and how many keys. This module turns their calls into [`KmeRequest`]s, and reports the results to them.
 
 use std::time::Duration;
 
@@ -7,7 +7,7 @@ use axon_envelope::{KeyId, KmeKey};
 use etsi_qkd014::pool::{Ask, Core, FailureClass, Ledger, PoolStatus, Settings};
 
 use crate::{
-    keys::request::{Answer, FailureKind, Fetched, Purpose, Request},
+    keys::request::{Answer, FailureKind, Fetched, KeyPurpose, KmeRequest},
     wire::keys::announceable,
 };
 
@@ -39,7 +39,7 @@ pub(super) struct UnusedKey {
 }
 
 /// The keys of one sending direction before they are announced.
-pub(super) struct Pool {
+pub(super) struct KeyStock {
     core: Core<UnusedKey>,
     /// Key_IDs of this direction, so that a KME that repeats itself has no key used twice.
     seen: Ledger,
@@ -53,7 +53,7 @@ pub(super) struct Pool {
     fails: bool,
 }
 
-impl Pool {
+impl KeyStock {
     /// `jitter` gives a random byte for each pause after a failure.
     pub(super) fn new(jitter: impl FnMut() -> u8 + Send + 'static) -> Self {
         let mut settings = Settings::default();
@@ -78,12 +78,12 @@ impl Pool {
     }
 
     /// The next call, if any.
-    pub(super) fn poll(&mut self, now: Duration, peer: &str) -> Option<Request> {
+    pub(super) fn poll(&mut self, now: Duration, peer: &str) -> Option<KmeRequest> {
         let ask = self.core.poll(now)?;
         let slave = peer.to_owned();
         Some(match ask {
-            Ask::Status => Request::Status { slave },
-            Ask::Keys(number) => Request::Enc { slave, number, purpose: Purpose::Messages },
+            Ask::Status => KmeRequest::Status { slave },
+            Ask::Keys(number) => KmeRequest::Enc { slave, number, purpose: KeyPurpose::Messages },
         })
     }
 
@@ -96,9 +96,9 @@ impl Pool {
     pub(super) fn handle_answer(&mut self, now: Duration, answer: Answer) -> Option<String> {
         let asked = now.saturating_sub(answer.took);
         let ask = match answer.request {
-            Request::Status { .. } => Ask::Status,
-            Request::Enc { number, .. } => Ask::Keys(number),
-            Request::Dec { .. } => return None,
+            KmeRequest::Status { .. } => Ask::Status,
+            KmeRequest::Enc { number, .. } => Ask::Keys(number),
+            KmeRequest::Dec { .. } => return None,
         };
         match (ask, answer.outcome) {
             (Ask::Status, Ok(Fetched::Stock(stock))) => {

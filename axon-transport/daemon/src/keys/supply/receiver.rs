@@ -15,7 +15,7 @@ use crate::keys::{
     exporters::Exporter,
     fetch::Fetches,
     proof,
-    request::{Answer, Purpose, Request},
+    request::{Answer, KeyPurpose, KmeRequest},
 };
 
 /// How long unused keys of a lost connection wait to be announced on the next one.
@@ -24,7 +24,7 @@ const KEPT_FOR: Duration = Duration::from_secs(120);
 const KEPT: usize = 512;
 
 /// The keys of one peer's messages to this host.
-pub struct Receiver {
+pub struct KeyReceiver {
     local: String,
     peer: String,
     links: HashMap<u64, Link>,
@@ -62,7 +62,7 @@ impl Counts {
     }
 }
 
-/// How a [`Receiver`] stands, for status.
+/// How a [`KeyReceiver`] stands, for status.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct ReceiverStatistics {
@@ -82,7 +82,7 @@ pub struct ReceiverStatistics {
     pub messages_missing: u64,
 }
 
-impl Receiver {
+impl KeyReceiver {
     /// For what `peer_sae` sends to `local_sae`.
     ///
     /// # Errors
@@ -95,7 +95,7 @@ impl Receiver {
             links: HashMap::new(),
             elected: 0,
             wanted: HashMap::new(),
-            fetches: Fetches::new(peer_sae, Purpose::Messages),
+            fetches: Fetches::new(peer_sae, KeyPurpose::Messages),
             kept: VecDeque::new(),
             outbox: VecDeque::new(),
             counts: Counts::default(),
@@ -186,7 +186,7 @@ impl Receiver {
     }
 
     /// The next call to the KME, if any.
-    pub fn poll_request(&mut self, now: Duration) -> Option<Request> {
+    pub fn poll_request(&mut self, now: Duration) -> Option<KmeRequest> {
         self.fetches.poll_request(now)
     }
 

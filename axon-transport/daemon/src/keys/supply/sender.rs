@@ -16,14 +16,14 @@ use super::{
     Disagreement, MAX_UNRETIRED, SupplyError, SupplyWarning,
     demand::{self, Demand},
     disagreement::Disagreements,
-    pool::{Pool, UnusedKey},
+    pool::{KeyStock, UnusedKey},
 };
 use crate::{
     keys::{
         Exporters, KeyMessage, Violation,
         exporters::Exporter,
         proof,
-        request::{Answer, Request},
+        request::{Answer, KmeRequest},
     },
     wire::keys::MAX_ANNOUNCED,
 };
@@ -33,12 +33,12 @@ use crate::{
 const ANSWER_WITHIN: Duration = Duration::from_secs(60);
 
 /// The keys of this host's messages to one peer.
-pub struct Sender {
+pub struct KeySender {
     local: String,
     peer: String,
     link: Option<Link>,
     /// Drawn or being drawn, to be announced.
-    pool: Pool,
+    pool: KeyStock,
     announced: HashMap<KeyId, Announced>,
     /// READY, in the order of use. Only the first may have sealed anything.
     ready: VecDeque<Sealer>,
@@ -47,7 +47,7 @@ pub struct Sender {
     outbox: VecDeque<(u64, KeyMessage)>,
     demand: Demand,
     disagreements: Disagreements,
-    counts: Counts,
+    counts: SenderCounts,
 }
 
 struct Link {
@@ -64,7 +64,7 @@ struct Announced {
 }
 
 #[derive(Default)]
-struct Counts {
+struct SenderCounts {
     sealed: u64,
     retired: u64,
     failed: u64,
@@ -88,7 +88,7 @@ pub enum NoKey {
     Detached,
 }
 
-/// How a [`Sender`] stands, for status. Rates are keys a second.
+/// How a [`KeySender`] stands, for status. Rates are keys a second.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[non_exhaustive]
 pub struct SenderStatistics {
@@ -120,7 +120,7 @@ pub struct SenderStatistics {
     pub last_failure: Option<String>,
 }
 
-impl Sender {
+impl KeySender {
     /// For what `local_sae` sends to `peer_sae`.
     ///
     /// # Errors
@@ -140,14 +140,14 @@ impl Sender {
             local: local_sae.to_owned(),
             peer: peer_sae.to_owned(),
             link: None,
-            pool: Pool::new(jitter),
+            pool: KeyStock::new(jitter),
             announced: HashMap::new(),
             ready: VecDeque::new(),
             begun: None,
             outbox: VecDeque::new(),
             demand: Demand::new(),
             disagreements: Disagreements::default(),
-            counts: Counts::default(),
+            counts: SenderCounts::default(),
         };
         sender.plan(Duration::ZERO);
         Ok(sender)
@@ -313,7 +313,7 @@ impl Sender {
     }
 
     /// The next call to the KME, if any.
-    pub fn poll_request(&mut self, now: Duration) -> Option<Request> {
+    pub fn poll_request(&mut self, now: Duration) -> Option<KmeRequest> {
         self.settle(now);
         self.plan(now);
         self.link.as_ref()?;

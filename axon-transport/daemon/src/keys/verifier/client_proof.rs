@@ -9,7 +9,7 @@ use crate::{
         Exporters, KeyMessage,
         exporters::Exporter,
         proof,
-        request::{Answer, Failure, FailureKind, Fetched, Purpose, Request},
+        request::{Answer, Failure, FailureKind, Fetched, KeyPurpose, KmeRequest},
     },
     wire::keys::announceable,
 };
@@ -111,14 +111,18 @@ impl ClientProof {
     }
 
     /// The next call to the KME, if any.
-    pub fn poll_request(&mut self, now: Duration) -> Option<Request> {
+    pub fn poll_request(&mut self, now: Duration) -> Option<KmeRequest> {
         match self.step {
             ProofStep::Ask { not_before } if not_before <= now => {}
             _ => return None,
         }
         self.step = ProofStep::Asked;
         self.tries -= 1;
-        Some(Request::Enc { slave: self.client_sae.clone(), number: 1, purpose: Purpose::Proof })
+        Some(KmeRequest::Enc {
+            slave: self.client_sae.clone(),
+            number: 1,
+            purpose: KeyPurpose::Proof,
+        })
     }
 
     /// The KME's answer to our request.

@@ -8,7 +8,7 @@ use crate::keys::{
     exporters::Exporter,
     fetch::Fetches,
     proof,
-    request::{Answer, Purpose, Request},
+    request::{Answer, KeyPurpose, KmeRequest},
 };
 
 /// Fetches the one key that the server announces and answers READY with its proof.
@@ -25,7 +25,7 @@ impl ProofResponder {
     pub fn new(server_sae: &str, exporters: &Exporters) -> Self {
         Self {
             ready: Arc::clone(exporters.ready()),
-            fetches: Fetches::new(server_sae, Purpose::Proof),
+            fetches: Fetches::new(server_sae, KeyPurpose::Proof),
             announced: false,
             outbox: None,
             answered: None,
@@ -48,7 +48,7 @@ impl ProofResponder {
     }
 
     /// The next call to the KME, if any.
-    pub fn poll_request(&mut self, now: Duration) -> Option<Request> {
+    pub fn poll_request(&mut self, now: Duration) -> Option<KmeRequest> {
         self.fetches.poll_request(now)
     }
 

@@ -6,7 +6,7 @@ use secrecy::ExposeSecret;
 use super::{ClientProof, ProofFailure, ProofResponder, ProofState};
 use crate::keys::{
     Exporters, KeyMessage, proof,
-    request::{Answer, Failure, FailureKind, Fetched, Request},
+    request::{Answer, Failure, FailureKind, Fetched, KmeRequest},
 };
 
 const NOW: Duration = Duration::from_secs(5);
@@ -23,12 +23,12 @@ fn key(byte: u8) -> KmeKey {
     KmeKey::from_slice(&[byte; 32]).unwrap()
 }
 
-fn given(request: Request, byte: u8) -> Answer {
+fn given(request: KmeRequest, byte: u8) -> Answer {
     let keys = vec![(id("k1"), key(byte))];
     Answer { request, took: Duration::ZERO, outcome: Ok(Fetched::Keys(keys)) }
 }
 
-fn failed(request: Request, kind: FailureKind) -> Answer {
+fn failed(request: KmeRequest, kind: FailureKind) -> Answer {
     let outcome = Err(Failure::new(kind, "no"));
     Answer { request, took: Duration::ZERO, outcome }
 }
@@ -122,7 +122,7 @@ fn the_client_answers_one_announcement_of_one_key() {
     client.handle_message(NOW, &KeyMessage::Announce(vec![id("k1")])).unwrap();
     assert!(client.handle_message(NOW, &KeyMessage::Announce(vec![id("k2")])).is_err());
     let request = client.poll_request(NOW).unwrap();
-    assert!(matches!(&request, Request::Dec { master, .. } if master == "sae-b"));
+    assert!(matches!(&request, KmeRequest::Dec { master, .. } if master == "sae-b"));
     assert_eq!(client.answered(), None);
     client.handle_answer(NOW, given(request, 1));
     assert_eq!(client.answered(), Some(Ok(())));

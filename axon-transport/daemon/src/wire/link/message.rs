@@ -134,7 +134,7 @@ pub struct GraphResync {
 /// One subscription on the asking side of a route.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
-pub struct Subscriber {
+pub struct RouteSubscriber {
     /// Its GID.
     #[n(0)]
     pub gid: Gid,
@@ -173,7 +173,7 @@ pub struct Subscribe {
     pub kind: u8,
     /// The subscriptions that the route serves.
     #[n(4)]
-    pub subscribers: Vec<Subscriber>,
+    pub subscribers: Vec<RouteSubscriber>,
     /// Where to resume.
     #[n(5)]
     pub last: Vec<LastSeen>,

@@ -16,5 +16,5 @@ pub use frame::{
 pub use message::{
     AccessCheck, AccessDecisions, Asserted, Denied, DeniedUse, Elected, Graph, GraphResync, Hello,
     Intake, LastSeen, LinkClosed, MAX_DENIED, MAX_PROOFS, Message, Owners, Received, ReceivedOf,
-    RouteReady, RouteRefused, RouteUnasked, Subscribe, Subscriber, Unsubscribe, UseDecision,
+    RouteReady, RouteRefused, RouteSubscriber, RouteUnasked, Subscribe, Unsubscribe, UseDecision,
 };

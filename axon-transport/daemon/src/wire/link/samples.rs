@@ -70,7 +70,7 @@ pub(crate) fn messages() -> Vec<Message> {
             topic: "/scan".into(),
             type_name: "sensor_msgs/msg/LaserScan".into(),
             kind: 0,
-            subscribers: vec![Subscriber { gid: Gid([6; 16]), qos }],
+            subscribers: vec![RouteSubscriber { gid: Gid([6; 16]), qos }],
             last: vec![LastSeen { publisher: Gid([7; 16]), sequence: 42 }],
             acknowledges: Some(true),
             short_headers: Some(true),

@@ -12,14 +12,14 @@ fn hear_and_answer(peers: &mut Peers, now: f64) -> Vec<DaemonId> {
     let mut dialled = Vec::new();
     for action in actions(peers) {
         match action {
-            Action::SendFromQuicPort { to, bytes } => {
+            DiscoveryAction::SendFromQuicPort { to, bytes } => {
                 let Ok(Datagram::Probe { nonce, .. }) = Datagram::decode(&bytes) else { continue };
                 assert_eq!(to, from(OWNER));
                 let echo = Datagram::Echo { daemon: HIGHER, nonce }.encode();
                 peers.handle_datagram(secs(now), to, Arrival::Quic, &echo);
                 dialled.extend(dials(peers));
             }
-            Action::Dial { daemon, addrs, .. } => {
+            DiscoveryAction::Dial { daemon, addrs, .. } => {
                 assert_eq!(addrs, [from(OWNER)]);
                 dialled.push(daemon);
             }

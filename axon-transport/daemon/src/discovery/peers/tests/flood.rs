@@ -108,11 +108,13 @@ impl Scene {
         }
         while let Some(output) = self.peers.poll_output() {
             match output {
-                Output::Action(Action::Dial { daemon, addrs, .. }) => {
+                Output::Action(DiscoveryAction::Dial { daemon, addrs, .. }) => {
                     // An address that does not answer takes 5 s; the first is what counts.
                     dialled |= daemon == self.honest && addrs[0] == self.address;
                 }
-                Output::Action(Action::SendFromQuicPort { to, bytes }) if to == self.address => {
+                Output::Action(DiscoveryAction::SendFromQuicPort { to, bytes })
+                    if to == self.address =>
+                {
                     if let Ok(Datagram::Probe { nonce, .. }) = Datagram::decode(&bytes) {
                         self.probes += 1;
                         let echo = Datagram::Echo { daemon: self.honest, nonce }.encode();
@@ -320,7 +322,7 @@ fn an_answer_is_asked_of_no_flood() {
     let bytes = Datagram::Beacon(ask).encode();
     scene.peers.handle_datagram(scene.time(), scene.address, Arrival::Quic, &bytes);
     let answered = std::iter::from_fn(|| scene.peers.poll_output()).any(|output| match output {
-        Output::Action(Action::SendFromQuicPort { to, bytes }) => {
+        Output::Action(DiscoveryAction::SendFromQuicPort { to, bytes }) => {
             let said = Datagram::decode(&bytes);
             to == scene.address && matches!(said, Ok(Datagram::Beacon(b)) if b.daemon == OWN)
         }
@@ -335,7 +337,7 @@ fn an_answer_is_asked_of_no_flood() {
 fn probed(peers: &mut Peers) -> BTreeMap<IpAddr, usize> {
     let mut hosts = BTreeMap::new();
     while let Some(output) = peers.poll_output() {
-        if let Output::Action(Action::SendFromQuicPort { to, bytes }) = output
+        if let Output::Action(DiscoveryAction::SendFromQuicPort { to, bytes }) = output
             && matches!(Datagram::decode(&bytes), Ok(Datagram::Probe { .. }))
         {
             *hosts.entry(to.ip()).or_default() += 1;
@@ -407,7 +409,8 @@ fn no_more_beacons_of_strangers_are_looked_at_than_a_second_has_time_for() {
         scene.peers.handle_datagram(now, source, arrival, &datagram.encode());
     }
     let outputs = std::iter::from_fn(|| scene.peers.poll_output());
-    let gone = outputs.filter(|o| matches!(o, Output::Action(Action::Gone { .. }))).count();
+    let gone =
+        outputs.filter(|o| matches!(o, Output::Action(DiscoveryAction::Gone { .. }))).count();
     let heard = gone + scene.peers.records.len();
     assert!((500..=1_024).contains(&heard), "{heard}");
     scene.honest_speaks();

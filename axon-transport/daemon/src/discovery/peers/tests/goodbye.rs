@@ -17,7 +17,7 @@ fn a_goodbye_counts_once_the_link_is_down_and_only_from_where_the_peer_is() {
     peers.handle_timeout(secs(7.0));
     assert_eq!(actions(&mut peers), []);
     peers.handle_timeout(secs(7.2));
-    assert_eq!(actions(&mut peers), [Action::Gone { daemon: HIGHER }]);
+    assert_eq!(actions(&mut peers), [DiscoveryAction::Gone { daemon: HIGHER }]);
 
     let at = |host: &str| format!("10.0.0.{host}:4000").parse().unwrap();
     let heard = Beacon { port: 61301, ..beacon(LOWER) };
@@ -28,7 +28,7 @@ fn a_goodbye_counts_once_the_link_is_down_and_only_from_where_the_peer_is() {
     peers.handle_datagram(secs(8.2), at("3"), Arrival::Shared, &goodbye);
     assert_eq!(probes(&mut peers).len(), 1);
     peers.handle_timeout(secs(11.3));
-    assert_eq!(actions(&mut peers), [Action::Gone { daemon: LOWER }]);
+    assert_eq!(actions(&mut peers), [DiscoveryAction::Gone { daemon: LOWER }]);
 }
 
 #[test]
@@ -99,7 +99,7 @@ fn an_address_of_several_that_does_not_answer_after_a_goodbye_is_forgotten_alone
 /// The probes that are to be sent, with their nonces; nothing else is.
 fn probes(peers: &mut Peers) -> Vec<(SocketAddr, [u8; 8])> {
     let sent = actions(peers).into_iter().map(|action| match action {
-        Action::SendFromQuicPort { to, bytes } => match Datagram::decode(&bytes) {
+        DiscoveryAction::SendFromQuicPort { to, bytes } => match Datagram::decode(&bytes) {
             Ok(Datagram::Probe { nonce, .. }) => (to, nonce),
             other => panic!("{other:?}"),
         },

@@ -10,15 +10,16 @@ use proptest::{collection::vec, prelude::*};
 
 use super::*;
 use crate::{
-    discovery::Mismatch,
+    discovery::PeerMismatch,
     wire::{
-        Terms,
+        SecurityTerms,
         beacon::{Beacon, Datagram, Foreign},
     },
 };
 
-const CLASSIC: Terms = Terms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(1) };
-const QKD: Terms = Terms { mode: 1, key_mode: 2, kex: 1, cipher: 0, auth: None };
+const CLASSIC: SecurityTerms =
+    SecurityTerms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(1) };
+const QKD: SecurityTerms = SecurityTerms { mode: 1, key_mode: 2, kex: 1, cipher: 0, auth: None };
 pub(super) const OWN: DaemonId = DaemonId([0x80; 16]);
 pub(super) const LOWER: DaemonId = DaemonId([0x01; 16]);
 pub(super) const HIGHER: DaemonId = DaemonId([0xf0; 16]);
@@ -67,7 +68,7 @@ pub(super) fn settled(local: Local) -> Peers {
     peers
 }
 
-pub(super) fn actions(peers: &mut Peers) -> Vec<Action> {
+pub(super) fn actions(peers: &mut Peers) -> Vec<DiscoveryAction> {
     std::iter::from_fn(|| peers.poll_output())
         .filter_map(|output| match output {
             Output::Action(action) => Some(action),
@@ -78,7 +79,7 @@ pub(super) fn actions(peers: &mut Peers) -> Vec<Action> {
 
 pub(super) fn dials(peers: &mut Peers) -> Vec<DaemonId> {
     let dialled = actions(peers).into_iter().filter_map(|action| match action {
-        Action::Dial { daemon, .. } => Some(daemon),
+        DiscoveryAction::Dial { daemon, .. } => Some(daemon),
         _ => None,
     });
     dialled.collect()
@@ -115,10 +116,10 @@ pub(super) fn fail(peers: &mut Peers, now: Duration, daemon: DaemonId) {
         .for_each(|standing| peers.handle_dial_failed(now, daemon, standing));
 }
 
-fn mismatches(peers: &mut Peers) -> Vec<Mismatch> {
+fn mismatches(peers: &mut Peers) -> Vec<PeerMismatch> {
     let told = actions(peers).into_iter().filter_map(|action| match action {
-        Action::Mismatch(mismatch) => Some(mismatch),
-        Action::Dial { daemon, .. } => panic!("dialled {daemon}"),
+        DiscoveryAction::PeerMismatch(mismatch) => Some(mismatch),
+        DiscoveryAction::Dial { daemon, .. } => panic!("dialled {daemon}"),
         _ => None,
     });
     told.collect()
@@ -141,13 +142,14 @@ fn a_peer_of_other_terms_is_told_apart_once_and_never_dialled() {
         peers.handle_timeout(secs(3.5 + f64::from(n)));
     }
     let all = actions(&mut peers);
-    let told: Vec<_> = all.iter().filter(|a| matches!(a, Action::Mismatch(_))).collect();
-    let Action::Mismatch(mismatch) = told[0] else { unreachable!() };
+    let told: Vec<_> =
+        all.iter().filter(|a| matches!(a, DiscoveryAction::PeerMismatch(_))).collect();
+    let DiscoveryAction::PeerMismatch(mismatch) = told[0] else { unreachable!() };
     assert_eq!(told.len(), 1);
     assert_eq!((mismatch.peer, mismatch.setting), (LOWER, "AXON_SECURITY_MODE"));
     assert_eq!((&*mismatch.ours, &*mismatch.theirs), ("classic", "qkd"));
-    assert!(!all.iter().any(|action| matches!(action, Action::Dial { .. })));
-    let answer = |a: &&Action| matches!(a, Action::SendFromQuicPort { to, .. } if *to == from("10.0.0.2:61301"));
+    assert!(!all.iter().any(|action| matches!(action, DiscoveryAction::Dial { .. })));
+    let answer = |a: &&DiscoveryAction| matches!(a, DiscoveryAction::SendFromQuicPort { to, .. } if *to == from("10.0.0.2:61301"));
     assert_eq!(all.iter().filter(answer).count(), 20, "it is answered, so that it can say why too");
 }
 
@@ -181,7 +183,7 @@ fn qkd_peers_must_be_listed_and_other_than_we() {
     // SAE IDs decide who dials first: sae-a is below sae-b whatever their daemons' ids.
     hear(&mut peers, 4.0, qkd(DaemonId([2; 16]), "sae-b"));
     match &actions(&mut peers)[..] {
-        [Action::Dial { sae: Some(sae), .. }] => assert_eq!(sae, "sae-b"),
+        [DiscoveryAction::Dial { sae: Some(sae), .. }] => assert_eq!(sae, "sae-b"),
         other => panic!("{other:?}"),
     }
 }
@@ -214,7 +216,7 @@ fn forged_beacons_change_nothing_for_a_peer_that_was_acceptable() {
     let goodbye = Datagram::Goodbye { domain: 0, daemon: HIGHER }.encode();
     peers.handle_datagram(secs(5.2), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
     peers.handle_timeout(secs(500.0));
-    let quiet = |a: &Action| matches!(a, Action::SendFromQuicPort { .. });
+    let quiet = |a: &DiscoveryAction| matches!(a, DiscoveryAction::SendFromQuicPort { .. });
     assert!(actions(&mut peers).iter().all(quiet), "a link is neither closed nor forgotten");
     peers.handle_link_down(secs(501.0), HIGHER);
     assert_eq!(dials(&mut peers), [HIGHER]);
@@ -311,7 +313,7 @@ fn answers_are_rationed() {
         hear(&mut peers, 3.0, Beacon { answer_wanted: true, ..beacon(DaemonId(id)) });
     }
     let sent = actions(&mut peers).into_iter().filter(|action| match action {
-        Action::SendFromQuicPort { bytes, .. } => {
+        DiscoveryAction::SendFromQuicPort { bytes, .. } => {
             matches!(Datagram::decode(bytes), Ok(Datagram::Beacon(_)))
         }
         _ => false,
@@ -407,7 +409,7 @@ fn probes_are_echoed_and_own_beacons_ignored() {
     peers.handle_datagram(secs(3.0), from("[::ffff:10.0.0.2]:61301"), Arrival::Quic, &probe);
     let echo = Datagram::Echo { daemon: OWN, nonce: [7; 8] }.encode();
     let to = from("10.0.0.2:61301");
-    assert_eq!(actions(&mut peers), [Action::SendFromQuicPort { to, bytes: echo }]);
+    assert_eq!(actions(&mut peers), [DiscoveryAction::SendFromQuicPort { to, bytes: echo }]);
     peers.handle_datagram(secs(3.0), to, Arrival::Shared, &probe);
     assert_eq!(actions(&mut peers), [], "to the shared port nobody probes");
 }
@@ -421,7 +423,7 @@ fn listed_peers_are_tried_on_every_port_or_the_one_given() {
     let to: Vec<_> = actions(&mut peers)
         .into_iter()
         .map(|action| match action {
-            Action::SendFromQuicPort { to, .. } => to,
+            DiscoveryAction::SendFromQuicPort { to, .. } => to,
             other => panic!("{other:?}"),
         })
         .collect();
@@ -455,7 +457,7 @@ proptest! {
                 6 => peers.set_interfaces(now, Vec::new()),
                 _ => {
                     let sae = Some(format!("sae-{}", char::from(b'a' + who)));
-                    let terms = Terms { cipher: seed as u8 % 3, ..QKD };
+                    let terms = SecurityTerms { cipher: seed as u8 % 3, ..QKD };
                     let answer_wanted = seed % 2 == 0;
                     let heard = Beacon { terms, sae, answer_wanted, ..beacon(daemon) };
                     peers.handle_datagram(now, at, quic, &Datagram::Beacon(heard).encode());
@@ -467,7 +469,7 @@ proptest! {
             }
             prop_assert!(peers.in_flight() <= MOST_IN_FLIGHT);
             for action in actions(&mut peers) {
-                if let Action::Dial { addrs, sae, .. } = action {
+                if let DiscoveryAction::Dial { addrs, sae, .. } = action {
                     prop_assert!(!addrs.is_empty() && addrs.len() <= 8);
                     prop_assert_eq!(sae.as_deref(), Some("sae-b"));
                 }

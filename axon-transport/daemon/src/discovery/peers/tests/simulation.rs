@@ -10,16 +10,18 @@ use axon_transport::config::QkdPeers;
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
 use super::*;
-use crate::{discovery::quic_ports, wire::Terms};
+use crate::{discovery::quic_ports, wire::SecurityTerms};
 
-const CLASSIC: Terms = Terms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(0) };
-const CLASSIC_AES: Terms = Terms { cipher: 1, ..CLASSIC };
-const SESSION: Terms = Terms { mode: 1, key_mode: 1, kex: 1, cipher: 0, auth: None };
-const MESSAGES10: Terms = Terms { key_mode: 2, ..SESSION };
+const CLASSIC: SecurityTerms =
+    SecurityTerms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(0) };
+const CLASSIC_AES: SecurityTerms = SecurityTerms { cipher: 1, ..CLASSIC };
+const SESSION: SecurityTerms =
+    SecurityTerms { mode: 1, key_mode: 1, kex: 1, cipher: 0, auth: None };
+const MESSAGES10: SecurityTerms = SecurityTerms { key_mode: 2, ..SESSION };
 
 struct Host {
     peers: Peers,
-    terms: Terms,
+    terms: SecurityTerms,
     address: SocketAddr,
     links: BTreeSet<usize>,
     dials: BTreeMap<usize, Duration>,
@@ -50,7 +52,7 @@ fn id(host: usize) -> DaemonId {
 }
 
 impl Subnet {
-    fn new(seed: u64, terms: &[Terms], loss: f64) -> Self {
+    fn new(seed: u64, terms: &[SecurityTerms], loss: f64) -> Self {
         let hosts = terms.iter().enumerate().map(|(host, terms)| {
             let ip = IpAddr::from(Ipv4Addr::new(10, 0, 0, host as u8 + 1));
             let sae = |host: usize| format!("sae-{host:02}");
@@ -59,7 +61,7 @@ impl Subnet {
                 daemon: id(host),
                 domain: 3,
                 terms: *terms,
-                sae: (terms.mode == Terms::QKD).then(|| (sae(host), QkdPeers::Listed(all))),
+                sae: (terms.mode == SecurityTerms::QKD).then(|| (sae(host), QkdPeers::Listed(all))),
                 range: DiscoveryRange::Subnet,
                 bind: vec![ip],
                 advertise: Vec::new(),
@@ -137,15 +139,15 @@ impl Subnet {
                         self.transmit(host, to, Arrival::Shared, &bytes);
                     }
                 }
-                Output::Action(Action::SendFromQuicPort { to, bytes }) => {
+                Output::Action(DiscoveryAction::SendFromQuicPort { to, bytes }) => {
                     let to = self.hosts.iter().position(|h| h.address == to);
                     self.transmit(host, to.expect("a host's address"), Arrival::Quic, &bytes);
                 }
-                Output::Action(Action::Dial { daemon, addrs, sae, listed, standing }) => {
+                Output::Action(DiscoveryAction::Dial { daemon, addrs, sae, listed, standing }) => {
                     let to = self.hosts.iter().position(|h| h.address == addrs[0]).unwrap();
                     assert_eq!((id(to), listed), (daemon, false));
                     assert_eq!(self.hosts[host].terms, self.hosts[to].terms, "dialled a mismatch");
-                    assert_eq!(sae.is_some(), self.hosts[to].terms.mode == Terms::QKD);
+                    assert_eq!(sae.is_some(), self.hosts[to].terms.mode == SecurityTerms::QKD);
                     let last = self.hosts[host].dials.insert(to, self.now);
                     let spaced = last.is_none_or(|last| last + Duration::from_secs(1) <= self.now);
                     assert!(spaced, "{host} dialled {to} at {last:?} and again at {:?}", self.now);
@@ -156,12 +158,14 @@ impl Subnet {
                     let wait = Duration::from_millis(self.random.random_range(5..200));
                     self.later(wait, What::DialEnds { from: host, to, standing });
                 }
-                Output::Action(Action::Mismatch(mismatch)) => {
+                Output::Action(DiscoveryAction::PeerMismatch(mismatch)) => {
                     self.hosts[host].mismatches.push((mismatch.peer, mismatch.setting));
                 }
-                Output::Action(Action::Named(names)) => panic!("it looks no names up: {names:?}"),
+                Output::Action(DiscoveryAction::Named(names)) => {
+                    panic!("it looks no names up: {names:?}")
+                }
                 // So many beacons were lost in a row that it seemed gone; it is told of anew.
-                Output::Action(Action::Gone { daemon }) => {
+                Output::Action(DiscoveryAction::Gone { daemon }) => {
                     let gone = self.hosts.iter().position(|h| h.peers.local.daemon == daemon);
                     assert!(!self.hosts[host].links.contains(&gone.unwrap()), "it is linked");
                     self.hosts[host].gone.push(daemon);
@@ -236,7 +240,7 @@ impl Subnet {
     }
 }
 
-fn four_kinds() -> Vec<Terms> {
+fn four_kinds() -> Vec<SecurityTerms> {
     [(CLASSIC, 10), (SESSION, 10), (MESSAGES10, 5), (CLASSIC_AES, 5)]
         .into_iter()
         .flat_map(|(terms, count)| std::iter::repeat_n(terms, count))

@@ -3,7 +3,7 @@
 use axon_transport::access::Verb;
 
 use super::*;
-use crate::engine::limits::{Limits, tests::permissions};
+use crate::engine::limits::{IdentityLimits, tests::permissions};
 
 fn key() -> (u64, StreamId) {
     (1, StreamId::new(Side::Client, Dir::Uni, 0))
@@ -18,7 +18,7 @@ fn way(over: &str, room: usize) -> Way {
     let rules =
         format!("[[limit]]\npeer = \"*\"\ntopic = \"/t\"\nrate = 10\nburst = 2\nover = \"{over}\"");
     let config = axon_transport::config::Config::default();
-    let limits = Limits::default().of(Verb::Publish, "/t", &permissions(&rules), &config);
+    let limits = IdentityLimits::default().of(Verb::Publish, "/t", &permissions(&rules), &config);
     let mut way = Way::new(Kind::Topic, false, room);
     way.inbound.routes().get_mut(&ROUTE).unwrap().limit.set(limits);
     way

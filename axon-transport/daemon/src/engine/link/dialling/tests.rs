@@ -20,8 +20,8 @@ fn address(number: u8) -> SocketAddr {
     SocketAddr::from(([10, 0, 0, number], 61300))
 }
 
-fn target(sae: Option<&str>, addresses: u8) -> Target {
-    Target {
+fn target(sae: Option<&str>, addresses: u8) -> DialTarget {
+    DialTarget {
         daemon: None,
         sae: sae.map(Into::into),
         addresses: (1..=addresses).map(address).collect(),
@@ -87,7 +87,7 @@ impl Dialled {
         panic!("no action")
     }
 
-    fn connects(&mut self) -> (SocketAddr, Option<Arc<Attempt>>) {
+    fn connects(&mut self) -> (SocketAddr, Option<Arc<DialKey>>) {
         match self.next() {
             Action::Connect { address, attempt } => (address, attempt),
             other => panic!("{other:?}"),

@@ -118,7 +118,7 @@ struct End {
     ring: Option<Keyring>,
     /// Messages on their way to it.
     inbox: VecDeque<Message>,
-    outcome: Option<Result<Opened, Refused>>,
+    outcome: Option<Result<Opened, RefusedConnection>>,
     /// The key that it announced, where the test noted it.
     announced: Option<KeyId>,
 }
@@ -179,12 +179,12 @@ impl End {
         self.opening.handle_message(now, message, self.ring.as_mut());
     }
 
-    fn outcome(&mut self, now: Duration) -> Option<Result<Opened, Refused>> {
+    fn outcome(&mut self, now: Duration) -> Option<Result<Opened, RefusedConnection>> {
         self.opening.poll_outcome(now, self.ring.as_mut())
     }
 
     #[track_caller]
-    fn refused(&mut self, now: Duration) -> Refused {
+    fn refused(&mut self, now: Duration) -> RefusedConnection {
         let refused = self.outcome(now).expect("the opening ended").expect_err("refused");
         assert!(self.outcome(now).is_none(), "an opening ends once");
         assert!(!self.opening.reads());
@@ -196,7 +196,7 @@ impl End {
     /// It refuses with this name, and closes with the code of that name and the reason.
     #[track_caller]
     fn refuses(&mut self, now: Duration, name: &str) -> String {
-        let Refused { refusal, close } = self.refused(now);
+        let RefusedConnection { refusal, close } = self.refused(now);
         assert_eq!((refusal.by, &*refusal.name), (RefusedBy::Here, name), "{refusal}");
         let (code, told) = close.expect("this side closes");
         assert_eq!((code.name(), &*told), (name, &*refusal.reason));

@@ -4,28 +4,28 @@ mod shares;
 
 use std::{collections::BTreeSet, net::IpAddr, rc::Rc, time::Duration};
 
-pub(super) use self::shares::Place;
+pub(super) use self::shares::HandshakePlace;
 pub(crate) use self::shares::place;
-use self::shares::{Handshakes, Said, gives_way};
+use self::shares::{Handshakes, LoggedRefusals, gives_way};
 
 /// Handshakes under way at once, but for those of listed peers; further dials are refused and come again.
 const MAX_HANDSHAKES: usize = 64;
 
 /// What the addresses of peers have, and what they may have.
-pub(super) struct Admission {
+pub(super) struct AddressAdmission {
     handshakes: Rc<Handshakes>,
     /// Addresses of listed peers.
     listed: BTreeSet<IpAddr>,
-    said: Said,
+    said: LoggedRefusals,
 }
 
-impl Admission {
+impl AddressAdmission {
     /// Nobody has anything yet.
     pub(super) fn new() -> Self {
         Self {
             handshakes: Handshakes::new(MAX_HANDSHAKES),
             listed: BTreeSet::new(),
-            said: Said::default(),
+            said: LoggedRefusals::default(),
         }
     }
 
@@ -40,7 +40,7 @@ impl Admission {
     }
 
     /// A place for a handshake from this address.
-    pub(super) fn enter(&self, address: IpAddr) -> Option<Place> {
+    pub(super) fn enter(&self, address: IpAddr) -> Option<HandshakePlace> {
         self.handshakes.enter(address, self.listed.contains(&address.to_canonical()))
     }
 

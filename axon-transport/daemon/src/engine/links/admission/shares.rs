@@ -38,7 +38,7 @@ pub(crate) struct Handshakes {
 
 /// A handshake that counts until this is dropped.
 #[derive(Debug)]
-pub(crate) struct Place {
+pub(crate) struct HandshakePlace {
     of: Rc<Handshakes>,
     at: IpAddr,
 }
@@ -50,7 +50,7 @@ impl Handshakes {
 
     /// A place for one more from this address: it may have as many as are free, so that another
     /// address always finds one. A listed peer has some that nobody else gets.
-    pub(crate) fn enter(self: &Rc<Self>, address: IpAddr, listed: bool) -> Option<Place> {
+    pub(crate) fn enter(self: &Rc<Self>, address: IpAddr, listed: bool) -> Option<HandshakePlace> {
         let at = place(address);
         let mut under_way = self.under_way.borrow_mut();
         let all: usize = under_way.values().sum();
@@ -61,11 +61,11 @@ impl Handshakes {
             return None;
         }
         *under_way.entry(at).or_default() += 1;
-        Some(Place { of: Rc::clone(self), at })
+        Some(HandshakePlace { of: Rc::clone(self), at })
     }
 }
 
-impl Drop for Place {
+impl Drop for HandshakePlace {
     fn drop(&mut self) {
         let mut under_way = self.of.under_way.borrow_mut();
         if let Some(count) = under_way.get_mut(&self.at) {
@@ -105,9 +105,9 @@ pub(crate) fn gives_way(
 
 /// Of which addresses a refusal was said just now.
 #[derive(Debug, Default)]
-pub(crate) struct Said(VecDeque<(IpAddr, Duration)>);
+pub(crate) struct LoggedRefusals(VecDeque<(IpAddr, Duration)>);
 
-impl Said {
+impl LoggedRefusals {
     /// Whether it is to be said, which it then was.
     pub(crate) fn is_news(&mut self, address: IpAddr, now: Duration) -> bool {
         self.0.retain(|(_, at)| now.saturating_sub(*at) < SAID_AGAIN);
@@ -170,7 +170,7 @@ mod tests {
 
     #[test]
     fn a_refusal_is_said_once_for_each_address() {
-        let (mut said, now) = (Said::default(), NOW);
+        let (mut said, now) = (LoggedRefusals::default(), NOW);
         assert!(said.is_news(at(1), now) && said.is_news(at(2), now));
         assert!(!said.is_news(at(1), now));
         assert!(said.is_news(at(1), now + SAID_AGAIN));

@@ -26,7 +26,7 @@ pub(in crate::engine::links) struct Leaving {
 
 /// What goes over a superseded link.
 #[derive(Clone, Copy, Debug)]
-pub(in crate::engine::links) struct UnderWay {
+pub(in crate::engine::links) struct HandOverProgress {
     /// The peer does not answer over it.
     pub(in crate::engine::links) silent: bool,
     /// Whether all of this side's streams but the control stream are sent.
@@ -37,7 +37,7 @@ pub(in crate::engine::links) struct UnderWay {
 
 /// What to do with a superseded link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(in crate::engine::links) enum Step {
+pub(in crate::engine::links) enum HandOverStep {
     Wait,
     /// End this side's control stream.
     Finish,
@@ -81,24 +81,24 @@ impl Leaving {
 
     pub(in crate::engine::links) fn handle_progress(
         &mut self,
-        under_way: UnderWay,
+        under_way: HandOverProgress,
         now: Duration,
-    ) -> Step {
-        let UnderWay { silent, sent, reading } = under_way;
+    ) -> HandOverStep {
+        let HandOverProgress { silent, sent, reading } = under_way;
         if self.closed || (silent && self.succeeded) {
-            return Step::Close;
+            return HandOverStep::Close;
         }
         if silent || !self.succeeded || !(sent || self.wait.is_some()) {
-            return Step::Wait;
+            return HandOverStep::Wait;
         }
         let wait = *self.wait.get_or_insert(now + HAND_OVER);
         if reading == 0 && (self.ended || now >= wait) {
-            return Step::Close;
+            return HandOverStep::Close;
         }
         if now >= wait {
             self.wait = Some(now + HAND_OVER);
         }
-        Step::Finish
+        HandOverStep::Finish
     }
 }
 
@@ -107,46 +107,54 @@ mod tests {
     use super::*;
 
     const NOW: Duration = Duration::from_secs(1000);
-    const BUSY: UnderWay = UnderWay { silent: false, sent: false, reading: 1 };
-    const SENT: UnderWay = UnderWay { sent: true, ..BUSY };
-    const READ: UnderWay = UnderWay { reading: 0, ..SENT };
-    const SILENT: UnderWay = UnderWay { silent: true, ..BUSY };
+    const BUSY: HandOverProgress = HandOverProgress { silent: false, sent: false, reading: 1 };
+    const SENT: HandOverProgress = HandOverProgress { sent: true, ..BUSY };
+    const READ: HandOverProgress = HandOverProgress { reading: 0, ..SENT };
+    const SILENT: HandOverProgress = HandOverProgress { silent: true, ..BUSY };
 
     #[test]
     fn it_closes_when_both_sides_have_sent_and_read_everything() {
         let mut leaving = Leaving::new(None, false, NOW);
-        assert_eq!(leaving.handle_progress(READ, NOW), Step::Wait, "the peer sends over it still");
+        assert_eq!(
+            leaving.handle_progress(READ, NOW),
+            HandOverStep::Wait,
+            "the peer sends over it still"
+        );
         leaving.handle_succeeded();
-        assert_eq!(leaving.handle_progress(BUSY, NOW), Step::Wait);
-        assert_eq!(leaving.handle_progress(SENT, NOW), Step::Finish);
-        assert_eq!(leaving.handle_progress(READ, NOW), Step::Finish, "the peer's streams go on");
+        assert_eq!(leaving.handle_progress(BUSY, NOW), HandOverStep::Wait);
+        assert_eq!(leaving.handle_progress(SENT, NOW), HandOverStep::Finish);
+        assert_eq!(
+            leaving.handle_progress(READ, NOW),
+            HandOverStep::Finish,
+            "the peer's streams go on"
+        );
         leaving.handle_ended();
-        assert_eq!(leaving.handle_progress(SENT, NOW), Step::Finish);
-        assert_eq!(leaving.handle_progress(READ, NOW), Step::Close);
+        assert_eq!(leaving.handle_progress(SENT, NOW), HandOverStep::Finish);
+        assert_eq!(leaving.handle_progress(READ, NOW), HandOverStep::Close);
     }
 
     #[test]
     fn a_peer_that_ends_no_control_stream_is_waited_for_some_seconds_at_a_time() {
         let mut leaving = Leaving::new(None, true, NOW);
-        assert_eq!(leaving.handle_progress(SENT, NOW), Step::Finish);
+        assert_eq!(leaving.handle_progress(SENT, NOW), HandOverStep::Finish);
         assert_eq!(leaving.poll_timeout(), Some(NOW + HAND_OVER));
         // A stream is being read when the time is over: as long again.
         let later = NOW + HAND_OVER;
-        assert_eq!(leaving.handle_progress(SENT, later), Step::Finish);
+        assert_eq!(leaving.handle_progress(SENT, later), HandOverStep::Finish);
         assert_eq!(leaving.poll_timeout(), Some(later + HAND_OVER));
-        assert_eq!(leaving.handle_progress(READ, later), Step::Finish);
-        assert_eq!(leaving.handle_progress(READ, later + HAND_OVER), Step::Close);
+        assert_eq!(leaving.handle_progress(READ, later), HandOverStep::Finish);
+        assert_eq!(leaving.handle_progress(READ, later + HAND_OVER), HandOverStep::Close);
     }
 
     #[test]
     fn a_silent_link_closes_once_the_peer_sends_over_the_successor() {
         let mut leaving = Leaving::new(None, false, NOW);
-        assert_eq!(leaving.handle_progress(SILENT, NOW), Step::Wait);
+        assert_eq!(leaving.handle_progress(SILENT, NOW), HandOverStep::Wait);
         leaving.handle_succeeded();
-        assert_eq!(leaving.handle_progress(SILENT, NOW), Step::Close);
+        assert_eq!(leaving.handle_progress(SILENT, NOW), HandOverStep::Close);
         let mut closed = Leaving::new(None, false, NOW);
         closed.handle_closed();
-        assert_eq!(closed.handle_progress(BUSY, NOW), Step::Close, "the peer said so");
+        assert_eq!(closed.handle_progress(BUSY, NOW), HandOverStep::Close, "the peer said so");
     }
 
     #[test]

@@ -19,14 +19,14 @@ use crate::{
     engine::{
         account::{Account, Charge},
         link::opening::{Opening, Sealing},
-        links::{admission::Place, silence::Silence, who::Who},
+        links::{admission::HandshakePlace, silence::LinkSilence, who::PeerIdentity},
     },
     keys::Resolver,
     link::{Candidate, Elected, Hello, Order, Side},
 };
 
 /// How far a link has come.
-pub(super) enum Phase {
+pub(super) enum LinkPhase {
     /// The TLS handshake is under way, until this time; this side's by a dial of this number.
     Handshake(Duration, Option<u64>),
     /// HELLO, and in qkd the proof.
@@ -42,13 +42,13 @@ pub(super) enum Phase {
 /// A link.
 pub(super) struct Link {
     pub(super) side: Side,
-    pub(super) phase: Phase,
+    pub(super) phase: LinkPhase,
     /// The link that it replaces, as its dialler said.
     pub(super) replaces: Option<[u8; 16]>,
     /// The peer, once HELLO was checked and its name proven.
     pub(super) peer: Option<LinkPeer>,
     /// The place of its handshake among those under way.
-    pub(super) place: Option<Place>,
+    pub(super) place: Option<HandshakePlace>,
     /// Tells why a PSK was not found.
     pub(super) resolver: Option<Arc<Resolver>>,
 }
@@ -61,7 +61,7 @@ pub(crate) struct Summary {
     /// What the handshake agreed on.
     pub(crate) negotiated: Negotiated,
     /// As whom the peer proved itself.
-    pub(crate) who: Who,
+    pub(crate) who: PeerIdentity,
 }
 
 impl Summary {
@@ -99,7 +99,7 @@ pub(super) struct LinkPeer {
     pub(super) unread: Charge,
     /// The certificates that it showed.
     pub(super) chain: Vec<CertificateDer<'static>>,
-    pub(super) silence: Silence,
+    pub(super) silence: LinkSilence,
 }
 
 impl Link {
@@ -107,7 +107,7 @@ impl Link {
     pub(super) fn new(side: Side, until: Duration, dial: Option<u64>) -> Self {
         Self {
             side,
-            phase: Phase::Handshake(until, dial),
+            phase: LinkPhase::Handshake(until, dial),
             replaces: None,
             peer: None,
             place: None,
@@ -118,11 +118,11 @@ impl Link {
     /// When something is due.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         let phase = match &self.phase {
-            Phase::Handshake(until, dial) => dial.is_none().then_some(*until),
-            Phase::Opening(opening) => opening.poll_timeout(),
-            Phase::Electing(until) => Some(*until),
-            Phase::Open => None,
-            Phase::Leaving(leaving) => leaving.poll_timeout(),
+            LinkPhase::Handshake(until, dial) => dial.is_none().then_some(*until),
+            LinkPhase::Opening(opening) => opening.poll_timeout(),
+            LinkPhase::Electing(until) => Some(*until),
+            LinkPhase::Open => None,
+            LinkPhase::Leaving(leaving) => leaving.poll_timeout(),
         };
         let peer = self.peer.as_ref();
         let age = peer.filter(|_| self.is_open()).and_then(|peer| peer.age.poll_timeout());
@@ -132,11 +132,11 @@ impl Link {
 
     /// Whether data may come over it: it is, or was, elected.
     pub(super) fn carries(&self) -> bool {
-        matches!(self.phase, Phase::Open | Phase::Leaving(_))
+        matches!(self.phase, LinkPhase::Open | LinkPhase::Leaving(_))
     }
 
     /// Whether it carries samples.
     pub(super) fn is_open(&self) -> bool {
-        matches!(self.phase, Phase::Open)
+        matches!(self.phase, LinkPhase::Open)
     }
 }

@@ -9,19 +9,19 @@ const MINUTE: u32 = 60;
 
 /// What a look is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(in crate::engine::links) struct Look {
+pub(in crate::engine::links) struct LookKind {
     /// Whether certificates are checked, too: that costs signatures.
     pub(in crate::engine::links) at_certificates: bool,
 }
 
 /// When the next look is due.
 #[derive(Debug)]
-pub(in crate::engine::links) struct Looks {
+pub(in crate::engine::links) struct LookTimes {
     next: Duration,
     passed: u32,
 }
 
-impl Looks {
+impl LookTimes {
     /// The first look is due a second after the engine's start.
     pub(in crate::engine::links) fn new() -> Self {
         Self { next: EVERY, passed: 0 }
@@ -33,13 +33,13 @@ impl Looks {
     }
 
     /// The look that is due, if one is.
-    pub(in crate::engine::links) fn take_due(&mut self, now: Duration) -> Option<Look> {
+    pub(in crate::engine::links) fn take_due(&mut self, now: Duration) -> Option<LookKind> {
         if now < self.next {
             return None;
         }
         self.next = now + EVERY;
         self.passed = self.passed.wrapping_add(1);
-        Some(Look { at_certificates: self.passed.is_multiple_of(MINUTE) })
+        Some(LookKind { at_certificates: self.passed.is_multiple_of(MINUTE) })
     }
 }
 
@@ -49,7 +49,7 @@ mod tests {
 
     #[test]
     fn each_second_has_a_look_and_each_minute_one_at_certificates() {
-        let mut looks = Looks::new();
+        let mut looks = LookTimes::new();
         let mut at_certificates = Vec::new();
         for second in 1..=120 {
             assert_eq!(looks.poll_timeout(), Duration::from_secs(second));
@@ -62,9 +62,9 @@ mod tests {
 
     #[test]
     fn looks_that_were_missed_are_not_made_up_for() {
-        let mut looks = Looks::new();
+        let mut looks = LookTimes::new();
         let now = Duration::from_secs(100);
-        assert_eq!(looks.take_due(now), Some(Look { at_certificates: false }));
+        assert_eq!(looks.take_due(now), Some(LookKind { at_certificates: false }));
         assert_eq!((looks.take_due(now), looks.poll_timeout()), (None, now + EVERY));
     }
 }

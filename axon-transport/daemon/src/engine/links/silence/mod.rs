@@ -10,9 +10,9 @@ use bytes::BytesMut;
 
 use self::watch::Action;
 pub(super) use self::{
-    looks::Looks,
+    looks::LookTimes,
     prober::{Traffic, frames_came},
-    watch::{Nonce, Silence},
+    watch::{LinkSilence, Nonce},
 };
 use crate::{
     engine::links::{LinkEvent, LinkReport, Links},

@@ -19,7 +19,7 @@ const GONE: Duration = Duration::from_secs(20);
 /// once its path was found cut or a successor was dialled, and its peer is *gone* after a longer time. An acknowledgement
 /// ends all of that.
 #[derive(Debug)]
-pub(in crate::engine::links) struct Silence {
+pub(in crate::engine::links) struct LinkSilence {
     side: Side,
     /// What came and went at the last look.
     traffic: Traffic,
@@ -73,7 +73,7 @@ pub(super) enum Action {
     Replace,
 }
 
-impl Silence {
+impl LinkSilence {
     pub(in crate::engine::links) fn new(side: Side, now: Duration) -> Self {
         let (traffic, heard) = (Traffic::default(), Traffic::default());
         Self { side, traffic, heard, heard_at: now, probing: None, silent: false, gone: None }
@@ -217,7 +217,7 @@ mod tests {
 
     #[test]
     fn a_link_that_is_asked_nothing_is_not_silent() {
-        let mut silence = Silence::new(Side::Client, START);
+        let mut silence = LinkSilence::new(Side::Client, START);
         assert!(!silence.handle_heard(traffic(1, 1, 1), START));
         for number in 1..10 {
             assert_eq!(
@@ -232,7 +232,7 @@ mod tests {
 
     #[test]
     fn a_question_without_an_answer_is_probed_and_an_echo_brings_a_successor() {
-        let mut silence = Silence::new(Side::Client, START);
+        let mut silence = LinkSilence::new(Side::Client, START);
         silence.handle_heard(traffic(1, 1, 1), START);
         silence.handle_second(traffic(1, 1, 1), || NONCE, second(1));
         let look = silence.handle_second(traffic(1, 1, 2), || NONCE, second(2));
@@ -263,10 +263,10 @@ mod tests {
 
     #[test]
     fn a_path_whose_probes_nobody_answers_is_said_to_be_cut_and_to_work_again() {
-        let mut silence = Silence::new(Side::Client, START);
+        let mut silence = LinkSilence::new(Side::Client, START);
         silence.handle_second(traffic(0, 0, 1), || NONCE, second(1));
         let asked = traffic(0, 0, 1);
-        let probe = |silence: &mut Silence| {
+        let probe = |silence: &mut LinkSilence| {
             let due = silence.poll_timeout().unwrap();
             (due, silence.handle_timeout(asked, ROUND_TRIP, due).unwrap())
         };
@@ -299,7 +299,7 @@ mod tests {
     fn a_path_is_not_cut_while_an_echo_may_be_on_its_way() {
         let slow = Duration::from_millis(900);
         let cut = slow * 2;
-        let mut silence = Silence::new(Side::Client, START);
+        let mut silence = LinkSilence::new(Side::Client, START);
         silence.handle_second(traffic(0, 0, 1), || NONCE, second(1));
         let begin = silence.poll_timeout().unwrap();
         loop {
@@ -316,7 +316,7 @@ mod tests {
 
     #[test]
     fn an_echo_of_no_probe_changes_nothing() {
-        let mut silence = Silence::new(Side::Server, START);
+        let mut silence = LinkSilence::new(Side::Server, START);
         assert!(!silence.handle_echo(START));
         silence.handle_second(traffic(0, 0, 1), || NONCE, second(1));
         let due = silence.poll_timeout();
@@ -326,7 +326,7 @@ mod tests {
 
     #[test]
     fn a_peer_is_gone_after_a_time_and_back_with_an_acknowledgement() {
-        let mut silence = Silence::new(Side::Client, START);
+        let mut silence = LinkSilence::new(Side::Client, START);
         let before = (1..20).map(|n| silence.handle_second(traffic(0, 0, 1), || NONCE, second(n)));
         assert!(before.collect::<Vec<_>>().iter().all(|look| !look.gone));
         assert!(silence.handle_second(traffic(0, 0, 1), || NONCE, second(20)).gone);
@@ -339,7 +339,7 @@ mod tests {
 
     #[test]
     fn a_superseded_link_is_silent_once_its_successor_is_heard_and_it_is_not() {
-        let mut silence = Silence::new(Side::Client, START);
+        let mut silence = LinkSilence::new(Side::Client, START);
         silence.handle_heard(traffic(1, 1, 1), START);
         assert!(!silence.handle_superseded(traffic(1, 1, 1)));
         // The path may be cut for both.
@@ -354,7 +354,7 @@ mod tests {
 
     #[test]
     fn a_superseded_link_is_probed_no_more() {
-        let mut silence = Silence::new(Side::Client, START);
+        let mut silence = LinkSilence::new(Side::Client, START);
         silence.handle_second(traffic(0, 0, 1), || NONCE, second(1));
         silence.handle_timeout(traffic(0, 0, 1), ROUND_TRIP, second(1));
         silence.handle_echo(second(1));

@@ -9,8 +9,8 @@ use bytes::Bytes;
 use quinn_proto::{Connection, Dir, StreamId, VarInt, WriteError};
 
 use super::{
-    Pause,
-    credit::{Credit, CreditShare},
+    FlowPause,
+    credit::{CreditShare, UsedCredit},
     info::FlowInfo,
 };
 use crate::{
@@ -95,16 +95,16 @@ impl BestEffort {
         carrier: &Carrier<'_>,
         counters: &Counters,
         now: Duration,
-    ) -> Option<Pause> {
+    ) -> Option<FlowPause> {
         if self.writing.is_some() {
             return None;
         }
         let under_way: u64 = self.under_way.iter().map(|sample| sample.bytes).sum();
         if self.under_way.len() >= ALWAYS && under_way >= carrier.window() {
-            return Some(Pause::Blocked);
+            return Some(FlowPause::Blocked);
         }
         counters.lost(&info.topic, "late", queue.drop_late(LIFE, self.took, now));
-        queue.peek().is_none().then_some(Pause::Empty)
+        queue.peek().is_none().then_some(FlowPause::Empty)
     }
 
     /// Hands the next sample, or a part of it, to QUIC. `None`: go on.
@@ -119,18 +119,18 @@ impl BestEffort {
         counters: &Counters,
         done: &mut Done,
         now: Duration,
-    ) -> Option<Pause> {
+    ) -> Option<FlowPause> {
         if self.writing.is_none() {
-            let Some(next) = queue.peek() else { return Some(Pause::Empty) };
-            let uses = Credit::of(next.size(), next.size());
+            let Some(next) = queue.peek() else { return Some(FlowPause::Empty) };
+            let uses = UsedCredit::of(next.size(), next.size());
             let is_open = carrier.is_open_to(info.best_effort_rank(next.payload.len()));
             if next.length() > SMALL && !(is_open && credit.may_use(uses)) {
-                return Some(Pause::NoCredit);
+                return Some(FlowPause::NoCredit);
             }
             let Some(stream) = carrier.quic.streams().open(Dir::Uni) else {
-                return Some(Pause::NoStream);
+                return Some(FlowPause::NoStream);
             };
-            let Some(sample) = queue.pop_best_effort() else { return Some(Pause::Empty) };
+            let Some(sample) = queue.pop_best_effort() else { return Some(FlowPause::Empty) };
             let (sequence, length) = (sample.info.sequence, sample.length());
             let payload = sample.payload.len();
             done.sequence = done.sequence.max(Some(sequence));
@@ -179,7 +179,7 @@ impl BestEffort {
                 }
                 None
             }
-            Err(WriteError::Blocked) => Some(Pause::Blocked),
+            Err(WriteError::Blocked) => Some(FlowPause::Blocked),
             Err(WriteError::Stopped(_) | WriteError::ClosedStream) => {
                 let _ = quic.reset(goodbye());
                 counters.lost(&info.topic, "no_route", 1);

@@ -34,14 +34,14 @@ pub(in crate::engine::outbound) const ALWAYS: u64 = 256 << 10;
 
 /// The part of the credit that samples in flight use.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(in crate::engine::outbound) struct Credit {
+pub(in crate::engine::outbound) struct UsedCredit {
     /// Bytes of the connection window.
     pub(in crate::engine::outbound) window: u64,
     /// Bytes of memory for messages.
     memory: u64,
 }
 
-impl Credit {
+impl UsedCredit {
     /// What samples of one stream use: `bytes` in all, the longest of `longest` bytes.
     pub(in crate::engine::outbound) fn of(bytes: usize, longest: usize) -> Self {
         let memory = if longest > LONG { longest as u64 + OVERHEAD } else { 0 };
@@ -52,8 +52,8 @@ impl Credit {
 /// The credit of one peer.
 #[derive(Debug)]
 pub(in crate::engine::outbound) struct PeerCredit {
-    most: Cell<Credit>,
-    used: Cell<Credit>,
+    most: Cell<UsedCredit>,
+    used: Cell<UsedCredit>,
     /// Counts the changes after which a flow that had too little may have enough.
     grown: Cell<u64>,
     /// Counts how often some came back.
@@ -64,7 +64,7 @@ pub(in crate::engine::outbound) struct PeerCredit {
 #[derive(Debug)]
 pub(in crate::engine::outbound) struct CreditShare {
     of: Rc<PeerCredit>,
-    used: Credit,
+    used: UsedCredit,
 }
 
 impl PeerCredit {
@@ -94,12 +94,12 @@ impl PeerCredit {
 
     /// An unused share.
     pub(in crate::engine::outbound) fn share(self: &Rc<Self>) -> CreditShare {
-        CreditShare { of: Rc::clone(self), used: Credit::default() }
+        CreditShare { of: Rc::clone(self), used: UsedCredit::default() }
     }
 
-    fn change(&self, before: Credit, after: Credit) {
+    fn change(&self, before: UsedCredit, after: UsedCredit) {
         let used = self.used.get();
-        self.used.set(Credit {
+        self.used.set(UsedCredit {
             window: used.window - before.window + after.window,
             memory: used.memory - before.memory + after.memory,
         });
@@ -113,7 +113,7 @@ impl PeerCredit {
 impl CreditShare {
     /// Whether it uses any.
     pub(in crate::engine::outbound) fn is_used(&self) -> bool {
-        self.used != Credit::default()
+        self.used != UsedCredit::default()
     }
 
     /// Another share of the same peer, unused.
@@ -123,10 +123,12 @@ impl CreditShare {
 
     /// Whether it may use this much. It may use any amount while the others use little: one sample may always be in
     /// flight, however long it is.
-    pub(in crate::engine::outbound) fn may_use(&self, after: Credit) -> bool {
+    pub(in crate::engine::outbound) fn may_use(&self, after: UsedCredit) -> bool {
         let (most, all) = (self.of.most.get(), self.of.used.get());
-        let others =
-            Credit { window: all.window - self.used.window, memory: all.memory - self.used.memory };
+        let others = UsedCredit {
+            window: all.window - self.used.window,
+            memory: all.memory - self.used.memory,
+        };
         let fits = |others: u64, after: u64, most: u64| {
             others <= most / LITTLE || others.saturating_add(after) <= most
         };
@@ -135,7 +137,7 @@ impl CreditShare {
     }
 
     /// Uses this much from now on.
-    pub(in crate::engine::outbound) fn set(&mut self, used: Credit) {
+    pub(in crate::engine::outbound) fn set(&mut self, used: UsedCredit) {
         self.of.change(self.used, used);
         self.used = used;
     }
@@ -143,14 +145,14 @@ impl CreditShare {
 
 impl Drop for CreditShare {
     fn drop(&mut self) {
-        self.set(Credit::default());
+        self.set(UsedCredit::default());
     }
 }
 
 /// What samples in flight may use at a peer that has this much. One that says nearly nothing is taken to have [`LEAST`].
-fn limit(intake: &Intake) -> Credit {
+fn limit(intake: &Intake) -> UsedCredit {
     let (unread, memory) = (intake.unread.max(LEAST), intake.messages.max(LEAST));
-    Credit { window: window_credit(unread), memory }
+    UsedCredit { window: window_credit(unread), memory }
 }
 
 /// Flows that wait for credit, in order. A flow that came later does not overtake one of its own rank or a higher one,
@@ -230,15 +232,15 @@ mod tests {
     fn samples_in_flight_use_at_most_three_quarters_of_the_window() {
         let credit = credit(32 << 20, u64::MAX);
         let mut shares: Vec<_> = (0..7).map(|_| credit.share()).collect();
-        let sample = Credit::of(16 << 20, 16 << 20);
+        let sample = UsedCredit::of(16 << 20, 16 << 20);
         assert_eq!(sample.window, 4 << 20, "as much as the window of a stream");
         for share in &mut shares[..6] {
             assert!(share.may_use(sample));
             share.set(sample);
         }
         assert!(!shares[6].may_use(sample));
-        assert!(shares[6].may_use(Credit::default()));
-        assert!(shares[5].may_use(Credit::of(20 << 20, 16 << 20)), "its stream has no more");
+        assert!(shares[6].may_use(UsedCredit::default()));
+        assert!(shares[5].may_use(UsedCredit::of(20 << 20, 16 << 20)), "its stream has no more");
         shares.remove(0);
         assert!(shares[5].may_use(sample));
     }
@@ -247,15 +249,15 @@ mod tests {
     fn samples_in_flight_use_no_more_memory_than_there_is() {
         let credit = credit(u64::from(u32::MAX), 64 << 20);
         let [mut one, mut two] = [credit.share(), credit.share()];
-        one.set(Credit::of(60 << 20, 60 << 20));
-        assert!(!two.may_use(Credit::of(8 << 20, 8 << 20)));
-        assert!(two.may_use(Credit::of(8 << 20, 16 << 10)), "short ones need none");
+        one.set(UsedCredit::of(60 << 20, 60 << 20));
+        assert!(!two.may_use(UsedCredit::of(8 << 20, 8 << 20)));
+        assert!(two.may_use(UsedCredit::of(8 << 20, 16 << 10)), "short ones need none");
         drop(one);
-        let longest = Credit::of(256 << 20, 256 << 20);
+        let longest = UsedCredit::of(256 << 20, 256 << 20);
         assert!(two.may_use(longest), "one is always in flight");
         two.set(longest);
         assert!(two.may_use(longest));
-        assert!(!credit.share().may_use(Credit::of(40 << 10, 40 << 10)));
+        assert!(!credit.share().may_use(UsedCredit::of(40 << 10, 40 << 10)));
     }
 
     #[test]
@@ -265,7 +267,7 @@ mod tests {
             let credit = PeerCredit::new();
             credit.set(Some(&intake));
             let (mut one, two) = (credit.share(), credit.share());
-            let sample = Credit::of(1 << 21, 1 << 21);
+            let sample = UsedCredit::of(1 << 21, 1 << 21);
             assert!(one.may_use(sample));
             one.set(sample);
             assert!(!two.may_use(sample));
@@ -277,12 +279,12 @@ mod tests {
         let credit = credit(32 << 20, 64 << 20);
         let mut queue = CreditQueue::default();
         let mut share = credit.share();
-        share.set(Credit::of(1 << 20, 1 << 20));
+        share.set(UsedCredit::of(1 << 20, 1 << 20));
         queue.take(&credit);
         [(3, 7), (1, 5), (2, 7), (3, 7)].iter().for_each(|(flow, place)| queue.add(*flow, *place));
         assert_eq!((queue.len(), queue.closed_from()), (3, Some(5)));
         assert!(!queue.is_due(&credit));
-        share.set(Credit::default());
+        share.set(UsedCredit::default());
         assert!(queue.is_due(&credit));
         assert_eq!(queue.take(&credit), [3, 1, 2]);
         assert!(!queue.is_due(&credit) && queue.closed_from().is_none());

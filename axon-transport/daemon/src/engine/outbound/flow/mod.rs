@@ -18,24 +18,24 @@ use axon_shm::{ids::Gid, qos::Qos};
 use bytes::Bytes;
 use quinn_proto::{Connection, StreamId};
 
-pub(super) use self::credit::{Credit, CreditQueue, PeerCredit};
+pub(super) use self::credit::{CreditQueue, PeerCredit, UsedCredit};
 use self::{
     best_effort::{BestEffort, LIFE},
     compressing::Compressing,
     info::FlowInfo,
     reliable::{ReliableStream, STREAM_IDLE, TOGETHER},
-    taking::Taking,
+    taking::FlowRings,
 };
 use super::{
     budget::Budget,
-    furthest::Furthest,
+    furthest::SentProgress,
     queue::Queue,
     schedule::{Class, Rank},
     served::FlowRoute,
     source::{Done, Source},
 };
 use crate::engine::{
-    compression::PeerCompression, counters::Counters, quic::connection::Carrier, rings::Sample,
+    compression::PeerCompression, counters::Counters, quic::connection::Carrier, rings::RingSample,
     sample::frames::Frames,
 };
 
@@ -43,7 +43,7 @@ use crate::engine::{
 const TURN: usize = 256 << 10;
 /// Why a flow has nothing to write now.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Pause {
+pub(super) enum FlowPause {
     /// Its turn is over. More waits.
     Turn,
     /// It has nothing to send.
@@ -63,7 +63,7 @@ pub(super) enum Pause {
 /// One flow.
 pub(super) struct Flow {
     pub(super) info: FlowInfo,
-    taking: Taking,
+    taking: FlowRings,
     /// Samples for which the sender of message keys was not told that it will need keys.
     undemanded: u32,
     queue: Queue,
@@ -90,7 +90,7 @@ impl Flow {
         // Each response has a number that rises, so that the peer can acknowledge it and drop a second copy.
         let is_numbered = info.acknowledged && kind == Kind::Response;
         Self {
-            taking: Taking::new(
+            taking: FlowRings::new(
                 of,
                 kind,
                 is_numbered.then(|| route.responses.clone()),
@@ -220,7 +220,7 @@ impl Flow {
         compression: &PeerCompression,
         done: &mut Done,
         now: Duration,
-    ) -> Pause {
+    ) -> FlowPause {
         let mut left = if carrier.lender.is_some() { TOGETHER } else { TURN };
         loop {
             if !self.reliable.is_writing() && !self.best_effort.is_writing() {
@@ -240,23 +240,23 @@ impl Flow {
                 _ => self.write_reliable(carrier, counters, compression, done, now),
             };
             left = left.saturating_sub((carrier.taken - before) as usize);
-            if pause == Some(Pause::Empty)
+            if pause == Some(FlowPause::Empty)
                 && let Some(wait) = self.taking.take_retry()
             {
                 // In a pass of its own, so that other flows and links have their turn.
                 self.set_timer(Some(now + wait));
-                return Pause::Empty;
+                return FlowPause::Empty;
             }
             match pause {
-                None if left == 0 => return Pause::Turn,
+                None if left == 0 => return FlowPause::Turn,
                 None => {}
                 // All that it looked at in this turn was sent before.
-                Some(Pause::Empty) if self.taking.goes_on() && self.queue.peek().is_none() => {
-                    return Pause::Turn;
+                Some(FlowPause::Empty) if self.taking.goes_on() && self.queue.peek().is_none() => {
+                    return FlowPause::Turn;
                 }
-                Some(Pause::Empty) if !self.taking.has_more() => {
+                Some(FlowPause::Empty) if !self.taking.has_more() => {
                     self.queue.handle_empty_ring(now);
-                    return Pause::Empty;
+                    return FlowPause::Empty;
                 }
                 Some(pause) => return pause,
             }
@@ -270,12 +270,12 @@ impl Flow {
         compression: &PeerCompression,
         done: &mut Done,
         now: Duration,
-    ) -> Option<Pause> {
+    ) -> Option<FlowPause> {
         let Self { info, queue, frames, compressing, .. } = self;
         if !self.reliable.is_writing() {
             compressing.ask(info, queue, carrier, compression, counters, now);
-            if queue.peek().is_some_and(Sample::is_asked) {
-                return Some(Pause::Compressing);
+            if queue.peek().is_some_and(RingSample::is_asked) {
+                return Some(FlowPause::Compressing);
             }
         }
         let before = carrier.taken;
@@ -318,12 +318,12 @@ impl Flow {
     }
 
     /// How far QUIC took its samples.
-    pub(super) fn furthest(&self) -> Furthest {
+    pub(super) fn furthest(&self) -> SentProgress {
         self.reliable.furthest()
     }
 
     /// Goes on with the samples of a flow that ended.
-    pub(super) fn go_on(&mut self, furthest: Furthest) {
+    pub(super) fn go_on(&mut self, furthest: SentProgress) {
         self.reliable.go_on(furthest);
     }
 
@@ -384,7 +384,7 @@ impl Flow {
         compression: &PeerCompression,
         done: &mut Done,
         now: Duration,
-    ) -> Option<Pause> {
+    ) -> Option<FlowPause> {
         let Self { info, queue, frames, compressing, .. } = self;
         if let Some(pause) = self.best_effort.look_at_next(info, queue, carrier, counters, now) {
             return Some(pause);
@@ -392,8 +392,8 @@ impl Flow {
         if !self.best_effort.is_writing() {
             // Once QUIC may take it, and no sooner: a newer one would have taken its place.
             compressing.ask(info, queue, carrier, compression, counters, now);
-            if queue.peek().is_some_and(Sample::is_asked) {
-                return Some(Pause::Compressing);
+            if queue.peek().is_some_and(RingSample::is_asked) {
+                return Some(FlowPause::Compressing);
             }
         }
         let credit = self.reliable.credit().sibling();

@@ -9,7 +9,7 @@ use axon_envelope::Delivery;
 use quinn_proto::{Connection, Dir, StreamId, VarInt, WriteError};
 
 use super::{
-    Pause,
+    FlowPause,
     batch::{Batch, Sealed},
     credit::{ALWAYS, CreditShare},
     info::FlowInfo,
@@ -18,13 +18,13 @@ use crate::{
     engine::{
         counters::Counters,
         outbound::{
-            furthest::Furthest,
+            furthest::SentProgress,
             queue::Queue,
             schedule::{Rank, SMALL},
             source::Done,
         },
         quic::connection::Carrier,
-        rings::Sample,
+        rings::RingSample,
         sample::{frames::Frames, short_header::ShortHeaders},
     },
     keys::NoKey,
@@ -58,7 +58,7 @@ pub(super) struct ReliableStream {
     active_at: Duration,
     /// Bytes that QUIC took for the first time, and how far.
     new_bytes: u64,
-    furthest: Furthest,
+    furthest: SentProgress,
 }
 
 impl ReliableStream {
@@ -73,7 +73,7 @@ impl ReliableStream {
             credit,
             active_at: Duration::ZERO,
             new_bytes: 0,
-            furthest: Furthest::default(),
+            furthest: SentProgress::default(),
         }
     }
 
@@ -108,12 +108,12 @@ impl ReliableStream {
     }
 
     /// How far QUIC took the samples.
-    pub(super) fn furthest(&self) -> Furthest {
+    pub(super) fn furthest(&self) -> SentProgress {
         self.furthest
     }
 
     /// QUIC took them so far over a link before.
-    pub(super) fn go_on(&mut self, furthest: Furthest) {
+    pub(super) fn go_on(&mut self, furthest: SentProgress) {
         self.furthest = self.furthest.max(furthest);
     }
 
@@ -128,16 +128,16 @@ impl ReliableStream {
         counters: &Counters,
         done: &mut Done,
         now: Duration,
-    ) -> Option<Pause> {
+    ) -> Option<FlowPause> {
         if self.batch.is_empty() {
             if !self.has_credit(info, queue, carrier) {
-                return Some(Pause::NoCredit);
+                return Some(FlowPause::NoCredit);
             }
-            if !self.compressed && queue.peek().is_some_and(Sample::is_compressed) {
+            if !self.compressed && queue.peek().is_some_and(RingSample::is_compressed) {
                 if self.stream.is_some() && self.headers.is_some() {
                     // The peer reads streams in the order in which it hears of them: it has to have heard of this one.
                     if queue.has_sent() {
-                        return Some(Pause::Compressing);
+                        return Some(FlowPause::Compressing);
                     }
                     self.finish(carrier);
                 }
@@ -146,17 +146,17 @@ impl ReliableStream {
             let sealed = self.seal(info, queue, frames, carrier, now);
             self.note_sent(queue);
             match sealed {
-                Ok(0) => return Some(Pause::Empty),
+                Ok(0) => return Some(FlowPause::Empty),
                 Ok(_) => {}
-                Err(NoKey::Detached) => return Some(Pause::Blocked),
-                Err(_) => return Some(Pause::NoKey),
+                Err(NoKey::Detached) => return Some(FlowPause::Blocked),
+                Err(_) => return Some(FlowPause::NoKey),
             }
         }
         let stream = match self.stream {
             Some(stream) => stream,
             None => {
                 let Some(id) = carrier.quic.streams().open(Dir::Uni) else {
-                    return Some(Pause::NoStream);
+                    return Some(FlowPause::NoStream);
                 };
                 self.batch.put_before(&info.reliable_header(self.headers.is_some()).encode());
                 carrier.streams.insert(id, carrier.flow);
@@ -181,7 +181,7 @@ impl ReliableStream {
                 self.handle_taken(taken.bytes as u64, info, queue, counters, done, now);
                 None
             }
-            Err(WriteError::Blocked) => Some(Pause::Blocked),
+            Err(WriteError::Blocked) => Some(FlowPause::Blocked),
             Err(WriteError::Stopped(_)) => {
                 self.stop(info, queue, counters, done);
                 None
@@ -268,7 +268,7 @@ impl ReliableStream {
             if samples > 0 && !self.has_credit(info, queue, carrier) {
                 break;
             }
-            let is_next = |next: &Sample| {
+            let is_next = |next: &RingSample| {
                 !(next.is_asked() || next.is_compressed() && self.headers.is_some())
             };
             if !queue.peek().is_some_and(is_next) {

@@ -23,7 +23,7 @@ use crate::engine::{
         served::ResponseNumbers,
         source::Source,
     },
-    rings::Sample,
+    rings::RingSample,
 };
 
 /// Samples, and bytes, that one turn moves from the rings.
@@ -44,16 +44,16 @@ const HELD_UP: Duration = Duration::from_millis(1);
 const BURST: usize = 4;
 
 /// The samples of a flow that are in its rings.
-pub(super) struct Taking {
+pub(super) struct FlowRings {
     /// The publisher, or the client of a service.
     of: Gid,
     kind: Kind,
     /// The numbers that responses get, where they are acknowledged.
     responses: Option<ResponseNumbers>,
     /// The samples of all sources, in one order.
-    merge: Merge<Sample>,
+    merge: Merge<RingSample>,
     /// Samples that were taken and are not in the queue.
-    taken: VecDeque<Sample>,
+    taken: VecDeque<RingSample>,
     /// Whether the queue had no room for the first of them.
     held: bool,
     /// Whether the rings may hold more samples than the last turn moved.
@@ -71,7 +71,7 @@ pub(super) struct Taking {
     given_up: u64,
 }
 
-impl Taking {
+impl FlowRings {
     /// Takes from nothing yet.
     pub(super) fn new(
         of: Gid,
@@ -447,7 +447,7 @@ impl Taking {
         if let [source] = sources
             && merge.is_of_one()
         {
-            let mut each = |sample: Sample| {
+            let mut each = |sample: RingSample| {
                 if merge.give(sample.info.sequence) {
                     taken.push_back(sample);
                 }
@@ -472,7 +472,7 @@ impl Taking {
 fn limit(room: usize, samples: usize, bytes: usize) -> TakeLimit {
     let half = room / 2;
     TakeLimit {
-        samples: samples.min(half / size_of::<Sample>()).max(1),
+        samples: samples.min(half / size_of::<RingSample>()).max(1),
         bytes: bytes.min(half).min(SHARED),
     }
 }

@@ -3,11 +3,11 @@ use std::{rc::Rc, sync::Arc, time::Duration};
 use axon_envelope::Kind;
 use axon_shm::{ids::Gid, qos::Qos};
 
-use super::taking::Taking;
+use super::taking::FlowRings;
 use crate::engine::{
     counters::Counters,
     limits::{RouteLimit, tests::limits},
-    outbound::{budget::Budget, model::Ring, queue::Queue, source::Source},
+    outbound::{budget::Budget, model::ModelRing, queue::Queue, source::Source},
 };
 
 const PUBLISHER: Gid = Gid([1; 16]);
@@ -18,10 +18,10 @@ fn at(millis: u64) -> Duration {
 
 /// The way of one publisher's samples from its ring to QUIC.
 struct Way {
-    ring: Rc<Ring>,
+    ring: Rc<ModelRing>,
     sources: Vec<Source>,
     queue: Queue,
-    taking: Taking,
+    taking: FlowRings,
     topic: Arc<str>,
     counters: Counters,
 }
@@ -32,9 +32,9 @@ impl Way {
     }
 
     fn limited(qos: Qos, limit: RouteLimit) -> Self {
-        let ring = Ring::new(Gid([2; 16]), PUBLISHER);
+        let ring = ModelRing::new(Gid([2; 16]), PUBLISHER);
         let sources = vec![ring.source(qos)];
-        let mut taking = Taking::new(PUBLISHER, Kind::Topic, None, limit);
+        let mut taking = FlowRings::new(PUBLISHER, Kind::Topic, None, limit);
         taking.set_sources(&sources, None);
         Self {
             ring,
@@ -277,7 +277,7 @@ fn of_two_relays_the_newest_sample_passes_when_the_limit_opens() {
     for qos in [keep_last(10), Qos::keep_all()] {
         let limit = limits("topic = \"/t\"\nrate = 10\nburst = 1\nover = \"drop-oldest\"");
         let mut way = Way::limited(qos, RouteLimit::new(limit));
-        let second = Ring::new(Gid([3; 16]), PUBLISHER);
+        let second = ModelRing::new(Gid([3; 16]), PUBLISHER);
         way.sources.push(second.source(keep_last(1)));
         way.taking.set_sources(&way.sources, None);
         let mut sent = Vec::new();

@@ -9,8 +9,8 @@ fn at(millis: u64) -> Duration {
     Duration::from_millis(millis)
 }
 
-fn sample(sequence: u64, length: usize, now: Duration) -> Sample {
-    Sample::new(MessageInfo::of(Gid([1; 16]), sequence), vec![0; length].into(), now)
+fn sample(sequence: u64, length: usize, now: Duration) -> RingSample {
+    RingSample::new(MessageInfo::of(Gid([1; 16]), sequence), vec![0; length].into(), now)
 }
 
 fn keep_last(depth: u32) -> Qos {

@@ -43,7 +43,7 @@ fn held(now: Duration) -> BusyFlow {
     BusyFlow { refused: Some(10 * now.as_secs()), ..FLOW }
 }
 
-fn stalled(why: Stall) -> Found {
+fn stalled(why: StallCause) -> Found {
     Found { stalled: vec![(1, why)], quiet: Vec::new() }
 }
 
@@ -54,14 +54,14 @@ fn a_peer_that_lets_bytes_pass_and_takes_none_of_few_samples_is_too_slow() {
         vec![BusyFlow { progress: (0, parts), keeps: Some(30), ..held(now) }]
     };
     let (at, found) = look(false, busy, secs).expect("it is found");
-    assert_eq!(found, stalled(Stall::TooSlow));
+    assert_eq!(found, stalled(StallCause::TooSlow));
     assert!(at >= LIMIT * PERIOD, "{at:?}");
 }
 
 #[test]
 fn a_route_without_progress_is_stalled_after_the_limit_and_told_of_once() {
     let two = [FLOW, BusyFlow { id: 4, ..FLOW }];
-    let found = Some((LOOK + LIMIT, stalled(Stall::NothingRead)));
+    let found = Some((LOOK + LIMIT, stalled(StallCause::NothingRead)));
     assert_eq!(look(false, |_| two.into(), secs), found);
     assert_eq!(look(false, |now| vec![held(now)], secs), found);
     assert_eq!(look(false, |_| vec![BusyFlow { is_stalled: true, ..FLOW }], secs), None);
@@ -85,7 +85,7 @@ fn progress_waiting_for_others_and_limits_excuse() {
 fn a_kme_without_keys_excuses_for_longer_than_the_limit_and_not_for_good() {
     let lacks = |now| vec![BusyFlow { lacks_keys: true, ..held(now) }];
     let (at, found) = look(false, lacks, secs).expect("it is found");
-    assert_eq!(found, stalled(Stall::NoKeys));
+    assert_eq!(found, stalled(StallCause::NoKeys));
     assert!(at >= LIMIT * PERIOD * OTHERS && at <= LIMIT * PERIOD * OTHERS + LIMIT, "{at:?}");
     // One that holds nobody up is not judged.
     assert_eq!(look(false, |_| vec![BusyFlow { lacks_keys: true, ..FLOW }], secs), None);
@@ -110,7 +110,7 @@ fn a_peer_that_sends_something_now_and_then_holds_no_publisher_up_for_long() {
     for every in [5, 6, 7, 8, 9, 15, 19] {
         let heard = |now: Duration| secs(now) / every;
         let (at, found) = look(false, |now| vec![held(now)], heard).expect("it is found");
-        assert_eq!(found, stalled(Stall::NothingRead));
+        assert_eq!(found, stalled(StallCause::NothingRead));
         // It is heard for five seconds at least in each of these times.
         assert!(at <= LOOK + Duration::from_secs(2 * every) + GONE, "{every}: {at:?}");
     }
@@ -119,7 +119,7 @@ fn a_peer_that_sends_something_now_and_then_holds_no_publisher_up_for_long() {
 #[test]
 fn a_host_that_is_switched_off_holds_a_publisher_up_until_it_is_gone_and_the_limit_is_over() {
     let (at, found) = look(false, |now| vec![held(now)], |_| 0).expect("it is found");
-    assert_eq!(found, stalled(Stall::NothingRead));
+    assert_eq!(found, stalled(StallCause::NothingRead));
     assert!(at >= GONE && at <= GONE + LIMIT, "{at:?}");
     // If it holds nobody up before it is gone, the limit begins then.
     let late = |now: Duration| vec![BusyFlow { refused: Some(secs(now).max(60)), ..FLOW }];
@@ -131,7 +131,7 @@ fn a_host_that_is_switched_off_holds_a_publisher_up_until_it_is_gone_and_the_lim
 fn waiting_for_others_excuses_nobody_while_the_peer_is_gone() {
     let waits = |now| vec![BusyFlow { waits_for_others: true, ..held(now) }];
     let (at, found) = look(true, waits, |_| 0).expect("it is found");
-    assert_eq!(found, stalled(Stall::NothingRead));
+    assert_eq!(found, stalled(StallCause::NothingRead));
     assert!(at <= GONE + LIMIT, "{at:?}");
 }
 
@@ -145,7 +145,7 @@ fn a_peer_that_holds_a_publisher_up_takes_its_share_or_is_found_too_slow() {
     };
     // One sample in nine seconds, of 8,192 and of 64.
     let (at, found) = look(false, taking(9, 8192), secs).expect("it is found");
-    assert_eq!(found, stalled(Stall::TooSlow));
+    assert_eq!(found, stalled(StallCause::TooSlow));
     assert!(at >= period && at <= period + LIMIT, "{at:?}");
     assert_eq!(look(false, taking(9, 64 * 13), secs), None);
     // Two in a second.
@@ -165,7 +165,7 @@ fn a_moment_in_which_the_publisher_waits_for_nobody_is_no_way_out() {
         vec![BusyFlow { progress: (secs(now) / 9, 0), keeps: Some(8192), refused, ..FLOW }]
     };
     let (_, found) = look(false, slow, secs).expect("it is found");
-    assert_eq!(found, stalled(Stall::TooSlow));
+    assert_eq!(found, stalled(StallCause::TooSlow));
     let rest = |now: Duration| {
         let refused = (secs(now) % 60 < 30).then(|| 10 * secs(now));
         vec![BusyFlow { progress: (secs(now) / 9, 0), keeps: Some(8192), refused, ..FLOW }]
@@ -177,10 +177,18 @@ fn a_moment_in_which_the_publisher_waits_for_nobody_is_no_way_out() {
 fn a_flow_that_waits_for_credit_is_judged_once_none_comes_back() {
     let waits = BusyFlow { waits_for_others: true, ..FLOW };
     let (at, found) = look(true, |_| vec![waits], secs).unwrap();
-    assert_eq!((at, found), (2 * LIMIT - LOOK, stalled(Stall::NothingRead)), "the last excuse");
+    assert_eq!(
+        (at, found),
+        (2 * LIMIT - LOOK, stalled(StallCause::NothingRead)),
+        "the last excuse"
+    );
     let uses = BusyFlow { keeps: None, uses_credit: true, ..FLOW };
     let (at, found) = look(true, |_| vec![uses], secs).unwrap();
-    assert_eq!((at, found), (2 * LIMIT, stalled(Stall::NothingRead)), "from when it is judged");
+    assert_eq!(
+        (at, found),
+        (2 * LIMIT, stalled(StallCause::NothingRead)),
+        "from when it is judged"
+    );
     assert_eq!(look(false, |_| vec![uses], secs), None);
     // What is heard now and then is no way out of that either.
     let (at, _) = look(
@@ -254,7 +262,7 @@ fn one_daemon_after_another_is_no_way_around_the_limit() {
     for (life, kept) in [(9000, 500), (700, 100), (300, 5000), (1500, 9000)] {
         let [life, kept] = [life, kept].map(Duration::from_millis);
         let (at, found) = one_after_another(life, kept, held, |_| (0, 0)).expect("it is found");
-        assert_eq!(found, stalled(Stall::NothingRead));
+        assert_eq!(found, stalled(StallCause::NothingRead));
         // Without what is kept, and without the first second of the first life.
         let lives = LIMIT.as_millis().div_ceil(life.as_millis()) as u32 + 4;
         assert!(at <= lives * (life + kept), "{life:?} {kept:?}: {at:?}");
@@ -273,7 +281,7 @@ fn the_pace_goes_on_over_all_daemons_of_a_host() {
         let [life, kept] = [life, kept].map(Duration::from_millis);
         let one = |since: Duration| (u64::from(since * 2 > life), 0);
         let (at, found) = one_after_another(life, kept, busy, one).expect("it is found");
-        assert_eq!(found, stalled(Stall::TooSlow), "{life:?} {kept:?}");
+        assert_eq!(found, stalled(StallCause::TooSlow), "{life:?} {kept:?}");
         assert!(at <= period + 3 * (life + kept) + LOOK, "{life:?} {kept:?}: {at:?}");
         // One that takes its share goes on.
         let many = |since: Duration| (since.as_millis() as u64 * 2, 0);
@@ -292,7 +300,7 @@ fn a_flow_goes_on_with_the_worse_of_what_is_known() {
         stalls.inherit(FLOW.id, (3, 0), known(LOOK), now);
         stalls.handle_timeout(peer(1), [flow].into_iter(), now + LOOK)
     };
-    assert_eq!(after(BusyFlow { progress: (3, 0), ..FLOW }), stalled(Stall::NothingRead));
+    assert_eq!(after(BusyFlow { progress: (3, 0), ..FLOW }), stalled(StallCause::NothingRead));
     assert_eq!(after(BusyFlow { progress: (4, 0), ..FLOW }), Found::default());
 }
 
@@ -305,17 +313,17 @@ fn an_excuse_now_and_then_is_no_way_out_of_the_pace() {
         ..held(now)
     };
     let (at, found) = look(false, |now| vec![slow(now)], secs).expect("it is found");
-    assert_eq!(found, stalled(Stall::TooSlow));
+    assert_eq!(found, stalled(StallCause::TooSlow));
     assert!(at <= LIMIT * PERIOD * 5 / 4 + LIMIT, "{at:?}");
     // Nor is it one out of the limit.
     let busy = |now| vec![BusyFlow { progress: (0, 0), ..slow(now) }];
     let (at, found) = look(false, busy, secs).expect("it is found");
-    assert_eq!(found, stalled(Stall::NothingRead));
+    assert_eq!(found, stalled(StallCause::NothingRead));
     assert!(at <= LIMIT * 5 / 4 + 3 * LOOK, "{at:?}");
     // One that always waits for others of its peer, which takes those as slowly as it likes.
     let others = |now| vec![BusyFlow { waits_for_others: true, ..slow(now) }];
     let (at, found) = look(false, others, secs).expect("it is found");
-    assert_eq!(found, stalled(Stall::TooSlow));
+    assert_eq!(found, stalled(StallCause::TooSlow));
     assert!(at <= LIMIT * PERIOD * OTHERS + LIMIT, "{at:?}");
     // A limit of this host is no fault of the peer.
     let limited = |now: Duration| BusyFlow {
@@ -334,7 +342,7 @@ fn silence_now_and_then_is_no_way_out_of_the_pace() {
             vec![BusyFlow { progress: (secs(now) / every, 0), keeps: Some(8192), ..held(now) }]
         };
         let (at, found) = look(false, slow, |now| secs(now) / every).expect("it is found");
-        assert_eq!(found, stalled(Stall::TooSlow), "{every}");
+        assert_eq!(found, stalled(StallCause::TooSlow), "{every}");
         assert!(at <= LIMIT * PERIOD + LIMIT, "{every}: {at:?}");
     }
 }
@@ -366,5 +374,5 @@ fn a_server_that_takes_its_time_is_judged_once_a_client_finds_no_room() {
     assert_eq!(look(false, |now| vec![BusyFlow { refused: Some(7), ..service(now) }], secs), None);
     assert_eq!(look(false, |now| vec![BusyFlow { refused: None, ..service(now) }], secs), None);
     let found = look(false, |now| vec![service(now)], secs);
-    assert_eq!(found, Some((LOOK + LIMIT, stalled(Stall::NothingRead))));
+    assert_eq!(found, Some((LOOK + LIMIT, stalled(StallCause::NothingRead))));
 }

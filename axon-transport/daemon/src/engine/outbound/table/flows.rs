@@ -14,7 +14,7 @@ use crate::engine::{
 const SEARCHED: usize = STREAMS_OPEN as usize;
 
 /// A flow, and when its timer is due as `timers` has it.
-struct Slot {
+struct FlowSlot {
     flow: Flow,
     due: Option<Duration>,
 }
@@ -22,7 +22,7 @@ struct Slot {
 /// All flows. A number is used again once its flow is removed.
 #[derive(Default)]
 pub(in crate::engine::outbound) struct Flows {
-    slots: Vec<Option<Slot>>,
+    slots: Vec<Option<FlowSlot>>,
     free: Vec<FlowId>,
     timers: BTreeSet<(Duration, FlowId)>,
     /// Flows with samples that are not acknowledged. The others cost nothing.
@@ -34,7 +34,7 @@ pub(in crate::engine::outbound) struct Flows {
 impl Flows {
     /// Adds a flow. Returns its number.
     pub(in crate::engine::outbound) fn insert(&mut self, flow: Flow) -> FlowId {
-        let slot = Some(Slot { flow, due: None });
+        let slot = Some(FlowSlot { flow, due: None });
         match self.free.pop() {
             Some(id) => {
                 self.slots[id] = slot;
@@ -49,7 +49,7 @@ impl Flows {
 
     /// Removes a flow. Returns whether it existed. The caller forgets its number first.
     pub(in crate::engine::outbound) fn remove(&mut self, id: FlowId) -> bool {
-        let Some(Slot { mut flow, due }) = self.slots.get_mut(id).and_then(Option::take) else {
+        let Some(FlowSlot { mut flow, due }) = self.slots.get_mut(id).and_then(Option::take) else {
             return false;
         };
         self.ended.extend(flow.take_streams());
@@ -78,7 +78,7 @@ impl Flows {
 
     /// The timer of a flow may have changed.
     pub(in crate::engine::outbound) fn note_timer(&mut self, id: FlowId) {
-        let Some(Slot { flow, due }) = self.slots.get_mut(id).and_then(Option::as_mut) else {
+        let Some(FlowSlot { flow, due }) = self.slots.get_mut(id).and_then(Option::as_mut) else {
             return;
         };
         if flow.timer == *due {

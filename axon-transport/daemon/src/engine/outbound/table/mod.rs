@@ -10,8 +10,8 @@ use axon_shm::{ids::Gid, qos::Qos};
 pub(super) use self::flows::Flows;
 use self::routes::Routes;
 use super::{
-    backlog::Backlog, budget::Budget, ending::Left, flow::Flow, furthest::Furthest,
-    schedule::FlowId, served::Served, source::Source, stall::BusyFlow,
+    backlog::Backlog, budget::Budget, ending::EndedFlow, flow::Flow, furthest::SentProgress,
+    schedule::FlowId, served::ServedFlows, source::Source, stall::BusyFlow,
 };
 use crate::engine::counters::Counters;
 
@@ -34,7 +34,7 @@ pub(super) struct Changed {
 
 impl FlowTable {
     /// A flow with its route.
-    pub(super) fn get_mut(&mut self, id: FlowId) -> Option<(&mut Flow, &Served)> {
+    pub(super) fn get_mut(&mut self, id: FlowId) -> Option<(&mut Flow, &ServedFlows)> {
         let flow = self.flows.get_mut(id)?;
         let served = self.routes.get(flow.info.route_number)?;
         Some((flow, served))
@@ -136,7 +136,7 @@ impl FlowTable {
 
     /// What is left of a publisher that ended, whose route had this number. While the link `starves`, no flow that waits
     /// for others is excused.
-    pub(super) fn left_of(&self, number: u32, of: &Gid, starves: bool) -> Option<Left> {
+    pub(super) fn left_of(&self, number: u32, of: &Gid, starves: bool) -> Option<EndedFlow> {
         let route = self.routes.successor_of(number, of);
         let flow = self.find(route, of).and_then(|id| self.flows.get(id));
         let (samples, progress) = match self.routes.get(route)?.unacknowledged().get(of) {
@@ -144,7 +144,7 @@ impl FlowTable {
             None => flow.and_then(Flow::best_effort_left).map(|(left, sent)| (left, (sent, 0)))?,
         };
         let is_excused = !starves && flow.is_some_and(Flow::waits_for_others);
-        Some(Left { route, samples, progress, is_excused })
+        Some(EndedFlow { route, samples, progress, is_excused })
     }
 
     /// Bytes of its ring that the samples of a publisher take that are not acknowledged.
@@ -160,7 +160,7 @@ impl FlowTable {
     }
 
     /// The flows of a route that have KEEP_ALL relays keep samples, by publisher, and how far QUIC took these.
-    pub(super) fn kept_flows(&self, number: u32) -> Vec<(Gid, BusyFlow, Furthest)> {
+    pub(super) fn kept_flows(&self, number: u32) -> Vec<(Gid, BusyFlow, SentProgress)> {
         let Some(served) = self.routes.get(number) else { return Vec::new() };
         let flows = served.flows.iter().filter_map(|(of, id)| {
             let flow = self.flows.get(*id)?;
@@ -222,7 +222,7 @@ impl FlowTable {
     }
 }
 
-fn busy_flow(id: FlowId, flow: &Flow, served: &Served) -> BusyFlow {
+fn busy_flow(id: FlowId, flow: &Flow, served: &ServedFlows) -> BusyFlow {
     BusyFlow {
         id,
         route: flow.info.route_number,
@@ -246,7 +246,7 @@ mod tests {
     use axon_transport::config::TopicPriority;
 
     use super::*;
-    use crate::engine::outbound::model::{Ring, route};
+    use crate::engine::outbound::model::{ModelRing, route};
 
     const NOW: Duration = Duration::ZERO;
 
@@ -257,14 +257,14 @@ mod tests {
     /// A table with route 1, which reads the rings of publishers 11 and 12, and two rings.
     struct Fixture {
         table: FlowTable,
-        rings: [Rc<Ring>; 2],
+        rings: [Rc<ModelRing>; 2],
         budget: Rc<Budget>,
         counters: Counters,
     }
 
     impl Fixture {
         fn new(qos: Qos) -> Self {
-            let rings = [1, 2].map(|number| Ring::new(gid(number), gid(10 + number)));
+            let rings = [1, 2].map(|number| ModelRing::new(gid(number), gid(10 + number)));
             let mut table = FlowTable::default();
             table.routes.add(1, route(1, TopicPriority::Normal));
             let sources = rings.iter().map(|ring| ring.source(qos)).collect();

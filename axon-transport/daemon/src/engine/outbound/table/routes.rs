@@ -6,14 +6,14 @@ use axon_shm::ids::Gid;
 
 use crate::engine::outbound::{
     schedule::{FlowId, Priorities},
-    served::{FlowRoute, Served},
+    served::{FlowRoute, ServedFlows},
     source::Source,
 };
 
 /// The routes of one peer. `by_source` names each source that a route has, and no other.
 #[derive(Default)]
 pub(in crate::engine::outbound) struct Routes {
-    served: HashMap<u32, Served>,
+    served: HashMap<u32, ServedFlows>,
     by_source: HashMap<Gid, u32>,
     priorities: Priorities,
 }
@@ -23,7 +23,7 @@ impl Routes {
     pub(in crate::engine::outbound) fn add(&mut self, number: u32, shared: FlowRoute) {
         self.served.entry(number).or_insert_with(|| {
             self.priorities.add(shared.priority);
-            Served::new(shared)
+            ServedFlows::new(shared)
         });
     }
 
@@ -34,7 +34,7 @@ impl Routes {
         number: u32,
         sources: Vec<Source>,
         seen: HashMap<Gid, u64>,
-    ) -> Option<&Served> {
+    ) -> Option<&ServedFlows> {
         let served = self.served.get_mut(&number)?;
         for gone in &served.sources {
             self.by_source.remove(&gone.gid());
@@ -45,7 +45,7 @@ impl Routes {
     }
 
     /// Removes a route with its sources.
-    pub(in crate::engine::outbound) fn remove(&mut self, number: u32) -> Option<Served> {
+    pub(in crate::engine::outbound) fn remove(&mut self, number: u32) -> Option<ServedFlows> {
         let served = self.served.remove(&number)?;
         self.priorities.remove(served.shared.priority);
         for source in &served.sources {
@@ -71,17 +71,17 @@ impl Routes {
     }
 
     /// A route.
-    pub(in crate::engine::outbound) fn get(&self, number: u32) -> Option<&Served> {
+    pub(in crate::engine::outbound) fn get(&self, number: u32) -> Option<&ServedFlows> {
         self.served.get(&number)
     }
 
     /// A route. The caller changes no source.
-    pub(in crate::engine::outbound) fn get_mut(&mut self, number: u32) -> Option<&mut Served> {
+    pub(in crate::engine::outbound) fn get_mut(&mut self, number: u32) -> Option<&mut ServedFlows> {
         self.served.get_mut(&number)
     }
 
     /// All routes.
-    pub(in crate::engine::outbound) fn values(&self) -> impl Iterator<Item = &Served> {
+    pub(in crate::engine::outbound) fn values(&self) -> impl Iterator<Item = &ServedFlows> {
         self.served.values()
     }
 
@@ -113,7 +113,7 @@ mod tests {
     use axon_transport::config::TopicPriority;
 
     use super::*;
-    use crate::engine::outbound::model::{Ring, route};
+    use crate::engine::outbound::model::{ModelRing, route};
 
     fn gid(number: u8) -> Gid {
         Gid([number; 16])
@@ -121,7 +121,7 @@ mod tests {
 
     /// The source with this GID, which reads `publisher`.
     fn source(number: u8, publisher: u8, qos: Qos) -> Source {
-        Ring::new(gid(number), gid(publisher)).source(qos)
+        ModelRing::new(gid(number), gid(publisher)).source(qos)
     }
 
     fn numbers(sources: &[Source]) -> Vec<Gid> {

@@ -5,17 +5,17 @@ mod without;
 
 use std::{collections::HashSet, rc::Rc, time::Duration};
 
-use self::{lending::Lending, without::Without};
+use self::{lending::Lending, without::HeldBackFlows};
 use super::{
     budget::Budget,
-    flow::{CreditQueue, Flow, Pause, PeerCredit},
+    flow::{CreditQueue, Flow, FlowPause, PeerCredit},
     schedule::{FlowId, Rank, Schedule},
     table::Flows,
 };
 
 /// The turn of one flow.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Turn {
+pub(super) struct FlowTurn {
     pub(super) flow: FlowId,
     /// The rank under which it has the turn.
     pub(super) rank: Rank,
@@ -24,10 +24,10 @@ pub(super) struct Turn {
 }
 
 /// The turns of the flows towards one peer.
-pub(super) struct Turns {
+pub(super) struct FlowTurns {
     schedule: Schedule,
     lending: Lending,
-    without: Without,
+    without: HeldBackFlows,
     credit: Rc<PeerCredit>,
     /// The flows that wait for credit.
     for_credit: CreditQueue,
@@ -38,13 +38,13 @@ pub(super) struct Turns {
     frees_streams: bool,
 }
 
-impl Turns {
+impl FlowTurns {
     /// No flow has a turn.
     pub(super) fn new(budget: Rc<Budget>) -> Self {
         Self {
             schedule: Schedule::default(),
             lending: Lending::default(),
-            without: Without::new(&budget),
+            without: HeldBackFlows::new(&budget),
             credit: PeerCredit::new(),
             for_credit: CreditQueue::default(),
             budget,
@@ -123,13 +123,13 @@ impl Turns {
     }
 
     /// The next turn.
-    pub(super) fn next(&mut self) -> Option<Turn> {
+    pub(super) fn next(&mut self) -> Option<FlowTurn> {
         let (flow, rank) = self.schedule.pop(|at| self.lending.borrows(at))?;
-        Some(Turn { flow, rank, lender: self.lending.borrow(rank) })
+        Some(FlowTurn { flow, rank, lender: self.lending.borrow(rank) })
     }
 
     /// A flow handed so many bytes to QUIC in its turn.
-    pub(super) fn handle_sent(&mut self, turn: Turn, bytes: u64) {
+    pub(super) fn handle_sent(&mut self, turn: FlowTurn, bytes: u64) {
         match (bytes, turn.lender) {
             (0, _) => {}
             (bytes, Some(_)) => self.lending.handle_borrowed(turn.rank, bytes),
@@ -138,7 +138,7 @@ impl Turns {
     }
 
     /// A flow found no room for a sample in its turn.
-    pub(super) fn handle_held(&mut self, turn: Turn) {
+    pub(super) fn handle_held(&mut self, turn: FlowTurn) {
         self.without.room(turn.flow);
     }
 
@@ -146,26 +146,26 @@ impl Turns {
     /// it are tried again if there is no other turn.
     pub(super) fn handle_over(
         &mut self,
-        turn: Turn,
-        pause: Pause,
+        turn: FlowTurn,
+        pause: FlowPause,
         flows: &mut Flows,
         now: Duration,
     ) {
         match pause {
-            Pause::Blocked => self.for_quic.insert(turn.flow),
+            FlowPause::Blocked => self.for_quic.insert(turn.flow),
             _ => self.for_quic.remove(&turn.flow),
         };
         match pause {
-            Pause::Turn => self.add_all([turn.flow], flows),
+            FlowPause::Turn => self.add_all([turn.flow], flows),
             // The compressor's answer, or the peer's acknowledgement, gives it its next turn.
-            Pause::Empty | Pause::Compressing => {}
-            Pause::Blocked => self.lending.handle_blocked(turn.rank),
-            Pause::NoStream => {
+            FlowPause::Empty | FlowPause::Compressing => {}
+            FlowPause::Blocked => self.lending.handle_blocked(turn.rank),
+            FlowPause::NoStream => {
                 self.without.stream(turn.flow);
                 self.frees_streams = true;
             }
-            Pause::NoKey => self.without.key(turn.flow, now),
-            Pause::NoCredit => {
+            FlowPause::NoKey => self.without.key(turn.flow, now),
+            FlowPause::NoCredit => {
                 // What the flow took from its rings may have another rank.
                 let rank = flows.get(turn.flow).and_then(Flow::rank).unwrap_or(turn.rank);
                 self.for_credit.add(turn.flow, rank.place());
@@ -223,14 +223,14 @@ impl Turns {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::engine::outbound::{flow::Credit, model::flow};
+    use crate::engine::outbound::{flow::UsedCredit, model::flow};
 
     const NOW: Duration = Duration::from_secs(1);
 
     /// So many flows, each of which has something to send, and their turns.
-    fn turns(count: usize) -> (Turns, Flows) {
+    fn turns(count: usize) -> (FlowTurns, Flows) {
         let mut flows = Flows::default();
-        let mut turns = Turns::new(Budget::new(1 << 20).of_peer());
+        let mut turns = FlowTurns::new(Budget::new(1 << 20).of_peer());
         for number in 0..count {
             let id = flows.insert(flow(number as u8));
             flows.get_mut(id).unwrap().handle_samples();
@@ -239,12 +239,12 @@ mod tests {
         (turns, flows)
     }
 
-    fn next(turns: &mut Turns) -> Option<FlowId> {
+    fn next(turns: &mut FlowTurns) -> Option<FlowId> {
         turns.next().map(|turn| turn.flow)
     }
 
     /// The next flow pauses so, and loses its turn.
-    fn pause(turns: &mut Turns, flows: &mut Flows, pause: Pause) -> FlowId {
+    fn pause(turns: &mut FlowTurns, flows: &mut Flows, pause: FlowPause) -> FlowId {
         let turn = turns.next().unwrap();
         turns.handle_over(turn, pause, flows, NOW);
         turn.flow
@@ -253,8 +253,8 @@ mod tests {
     #[test]
     fn a_flow_whose_turn_is_over_goes_on_after_the_others() {
         let (mut turns, mut flows) = turns(2);
-        assert_eq!(pause(&mut turns, &mut flows, Pause::Turn), 0);
-        assert_eq!(pause(&mut turns, &mut flows, Pause::Empty), 1);
+        assert_eq!(pause(&mut turns, &mut flows, FlowPause::Turn), 0);
+        assert_eq!(pause(&mut turns, &mut flows, FlowPause::Empty), 1);
         assert_eq!((next(&mut turns), next(&mut turns)), (Some(0), None));
         assert!(!turns.has_work());
     }
@@ -275,8 +275,8 @@ mod tests {
     #[test]
     fn flows_go_on_once_what_they_lack_is_there() {
         let (mut turns, mut flows) = turns(2);
-        assert_eq!(pause(&mut turns, &mut flows, Pause::NoStream), 0);
-        assert_eq!(pause(&mut turns, &mut flows, Pause::NoKey), 1);
+        assert_eq!(pause(&mut turns, &mut flows, FlowPause::NoStream), 0);
+        assert_eq!(pause(&mut turns, &mut flows, FlowPause::NoKey), 1);
         turns.handle_timeout(&flows, NOW);
         assert_eq!(next(&mut turns), None, "not at once");
         turns.handle_streams_available(&flows);
@@ -291,7 +291,7 @@ mod tests {
         let (mut turns, mut flows) = turns(1);
         turns.handle_acknowledged();
         assert!(turns.take_wanted_streams() == 0, "no flow waits for one");
-        pause(&mut turns, &mut flows, Pause::NoStream);
+        pause(&mut turns, &mut flows, FlowPause::NoStream);
         assert!(turns.has_work());
         assert_eq!((turns.take_wanted_streams(), turns.take_wanted_streams()), (1, 0));
         turns.handle_acknowledged();
@@ -303,12 +303,12 @@ mod tests {
         let (mut turns, mut flows) = turns(4);
         for id in 0..3 {
             flows.get_mut(id).unwrap().blocked = true;
-            assert_eq!(pause(&mut turns, &mut flows, Pause::NoCredit), id);
+            assert_eq!(pause(&mut turns, &mut flows, FlowPause::NoCredit), id);
         }
         assert!(turns.wait_for_credit() && turns.closed_from().is_some());
         turns.forget(1);
         let mut share = turns.credit().share();
-        share.set(Credit::of(1, 1));
+        share.set(UsedCredit::of(1, 1));
         drop(share);
         turns.retry(&mut flows);
         assert!(!turns.wait_for_credit() && turns.closed_from().is_none());
@@ -320,20 +320,20 @@ mod tests {
     #[test]
     fn credit_that_the_last_turn_gave_back_is_used_in_the_same_pass() {
         let (mut turns, mut flows) = turns(2);
-        pause(&mut turns, &mut flows, Pause::NoCredit);
+        pause(&mut turns, &mut flows, FlowPause::NoCredit);
         let mut share = turns.credit().share();
-        share.set(Credit::of(1, 1));
+        share.set(UsedCredit::of(1, 1));
         let turn = turns.next().unwrap();
         drop(share);
-        turns.handle_over(turn, Pause::Empty, &mut flows, NOW);
+        turns.handle_over(turn, FlowPause::Empty, &mut flows, NOW);
         assert_eq!(next(&mut turns), Some(0));
     }
 
     #[test]
     fn a_flow_that_is_gone_has_no_turn_and_waits_for_nothing() {
         let (mut turns, mut flows) = turns(3);
-        pause(&mut turns, &mut flows, Pause::NoStream);
-        pause(&mut turns, &mut flows, Pause::NoKey);
+        pause(&mut turns, &mut flows, FlowPause::NoStream);
+        pause(&mut turns, &mut flows, FlowPause::NoKey);
         (0..3).for_each(|id| turns.forget(id));
         turns.handle_streams_available(&flows);
         turns.handle_keys(&flows);

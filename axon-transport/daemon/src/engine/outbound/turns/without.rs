@@ -9,7 +9,7 @@ const KEY_RETRY: Duration = Duration::from_millis(250);
 
 /// The flows, by what they are without.
 #[derive(Debug)]
-pub(super) struct Without {
+pub(super) struct HeldBackFlows {
     stream: BTreeSet<FlowId>,
     key: BTreeSet<FlowId>,
     key_retry: Option<Duration>,
@@ -18,7 +18,7 @@ pub(super) struct Without {
     released: usize,
 }
 
-impl Without {
+impl HeldBackFlows {
     /// No flow lacks anything.
     pub(super) fn new(budget: &Budget) -> Self {
         Self {

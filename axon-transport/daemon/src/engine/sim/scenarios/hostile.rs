@@ -17,7 +17,7 @@ use quinn_proto::VarInt;
 use crate::{
     engine::{
         inbound::StreamHeader,
-        rings::Sample,
+        rings::RingSample,
         sample::{
             frames::Frames,
             protection::{Seal, call},
@@ -30,7 +30,7 @@ use crate::{
             world::World,
         },
     },
-    link::{CloseCode, Elected, Graph, Hello, Message, Subscribe, Subscriber, Unsubscribe},
+    link::{CloseCode, Elected, Graph, Hello, Message, RouteSubscriber, Subscribe, Unsubscribe},
 };
 
 pub(super) const LOWEST: DaemonId = DaemonId([0; 16]);
@@ -79,7 +79,7 @@ pub(super) fn subscribe(route: u32, topic: &str, qos: Qos) -> Message {
         topic: topic.into(),
         type_name: "T".into(),
         kind: 0,
-        subscribers: vec![Subscriber { gid: of_raw(200), qos }],
+        subscribers: vec![RouteSubscriber { gid: of_raw(200), qos }],
         last: Vec::new(),
         acknowledges: Some(true),
         short_headers: None,
@@ -141,7 +141,7 @@ pub(super) fn messages(
     let mut frames = Frames::default();
     for number in numbers {
         let info = MessageInfo::of(writer, number);
-        let mut sample = Sample::new(info, payload(writer, number, 10).into(), Duration::ZERO);
+        let mut sample = RingSample::new(info, payload(writer, number, 10).into(), Duration::ZERO);
         sample.call = (kind != Kind::Topic).then(|| call(of, number));
         let of = Route { kind, topic: hash };
         Seal::Link

@@ -23,7 +23,7 @@ use crate::{
             world::World,
         },
     },
-    link::{Graph, Hello, Message, RouteReady, Subscribe, Subscriber},
+    link::{Graph, Hello, Message, RouteReady, RouteSubscriber, Subscribe},
 };
 
 /// Publishers of one topic of the hostile peer: as many as one route shows.
@@ -191,7 +191,7 @@ fn subscribe(route: u32, topic: &str, subscriber: Gid) -> Message {
         topic: topic.into(),
         type_name: "T".into(),
         kind: 0,
-        subscribers: vec![Subscriber { gid: subscriber, qos: Qos::keep_all() }],
+        subscribers: vec![RouteSubscriber { gid: subscriber, qos: Qos::keep_all() }],
         last: Vec::new(),
         acknowledges: Some(true),
         short_headers: None,
@@ -281,7 +281,7 @@ fn subscribe_in_many_ways(world: &mut World, peer: usize, link: usize, id: u8, r
         [1, 100, 1000].map(|depth| qos.with_depth(depth)).into_iter().chain([keeps_all])
     });
     let subscribers =
-        (0..).zip(kinds).map(|(n, qos)| Subscriber { gid: gid(id, route << 4 | n), qos });
+        (0..).zip(kinds).map(|(n, qos)| RouteSubscriber { gid: gid(id, route << 4 | n), qos });
     let message = Message::Subscribe(Subscribe {
         route,
         topic: format!("/topic_{route}"),

@@ -40,7 +40,7 @@ fn a_miss_asks_once_and_the_next_look_up_finds_the_clients_psk() {
     assert_eq!(look_up(&acceptor, "10.0.0.1", &bytes), Lookup::Fetching);
     let request = acceptor.poll_request().unwrap();
     assert!(acceptor.poll_request().is_none(), "one call for one key");
-    let Request::Dec { master, key_ids, .. } = &request else { panic!() };
+    let KmeRequest::Dec { master, key_ids, .. } = &request else { panic!() };
     assert_eq!((master.as_str(), &key_ids[..]), ("sae-a", &[id("k1")][..]));
     acceptor.handle_answer(key(request, "k1", 9));
 
@@ -202,7 +202,7 @@ async fn a_waiting_caller_is_woken_by_a_look_up() {
         .join()
         .map(|psk| assert!(psk.is_none()))
         .unwrap();
-    assert!(matches!(waiting.await.unwrap(), Request::Dec { .. }));
+    assert!(matches!(waiting.await.unwrap(), KmeRequest::Dec { .. }));
 }
 
 /// Handshakes under way keep the PSK that they looked up: letting go of it erases nothing.

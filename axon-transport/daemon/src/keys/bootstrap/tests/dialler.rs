@@ -19,7 +19,7 @@ fn give(dialler: &mut Dialler, now: Duration, name: &str) {
 
 fn attempt(dialler: &mut Dialler, now: Duration) -> Option<KeyId> {
     match dialler.dial(now, "sae-b") {
-        Dial::Attempt(attempt) => Some(attempt.key_id),
+        Dial::DialKey(attempt) => Some(attempt.key_id),
         _ => None,
     }
 }
@@ -169,7 +169,7 @@ fn made_up_names_under_a_star_are_bounded() {
 #[test]
 fn answers_nobody_waits_for_are_dropped() {
     let mut dialler = holding(s(0), "k1");
-    let request = Request::Status { slave: "sae-b".to_owned() };
+    let request = KmeRequest::Status { slave: "sae-b".to_owned() };
     dialler.handle_answer(s(1), failed(request, FailureKind::Refused));
     let mut other = new();
     other.dial(s(1), "sae-b");
@@ -182,7 +182,7 @@ fn answers_nobody_waits_for_are_dropped() {
 #[test]
 fn an_expired_refused_mismatched_or_spent_psk_is_erased_in_attempts_under_way() {
     let psk = |dialler: &mut Dialler| match dialler.dial(s(0), "sae-b") {
-        Dial::Attempt(attempt) => attempt.psk,
+        Dial::DialKey(attempt) => attempt.psk,
         other => panic!("{other:?}"),
     };
     type End = fn(&mut Dialler);

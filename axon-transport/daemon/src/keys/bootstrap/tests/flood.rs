@@ -28,7 +28,7 @@ proptest! {
     fn calls_stay_within_bounds(steps in steps(), star: bool) {
         let peers = if star { QkdPeers::Any } else { listed(&["sae-0", "sae-1"]) };
         let (acceptor, clock) = new(peers);
-        let mut in_flight = Vec::<Request>::new();
+        let mut in_flight = Vec::<KmeRequest>::new();
         let mut asked_at = Vec::<(String, Duration)>::new();
         let mut spent = std::collections::HashSet::new();
         for step in steps {
@@ -42,7 +42,7 @@ proptest! {
                 }
                 Step::Answer { which, kind } if !in_flight.is_empty() => {
                     let request = in_flight.swap_remove(which % in_flight.len());
-                    let Request::Dec { key_ids, .. } = &request else { unreachable!() };
+                    let KmeRequest::Dec { key_ids, .. } = &request else { unreachable!() };
                     let name = key_ids[0].to_string();
                     acceptor.handle_answer(match kind {
                         0 => failed(request, FailureKind::Refused),
@@ -60,7 +60,7 @@ proptest! {
                 Step::Pass(millis) => clock.advance(ms(millis.into())),
             }
             while let Some(request) = acceptor.poll_request() {
-                let Request::Dec { master, key_ids, .. } = &request else { unreachable!() };
+                let KmeRequest::Dec { master, key_ids, .. } = &request else { unreachable!() };
                 prop_assert!(star || ["sae-0", "sae-1"].contains(&master.as_str()));
                 prop_assert_eq!(key_ids.len(), 1);
                 asked_at.push((if star { String::new() } else { master.clone() }, clock.now()));

@@ -15,7 +15,7 @@ use proptest::prelude::*;
 use super::{Acceptor, Completion, Dial, DialRefusal, Dialler, Lookup};
 use crate::keys::{
     Clock,
-    request::{Answer, Failure, FailureKind, Fetched, Request},
+    request::{Answer, Failure, FailureKind, Fetched, KmeRequest},
 };
 
 fn ms(millis: u64) -> Duration {
@@ -38,12 +38,12 @@ fn listed(saes: &[&str]) -> QkdPeers {
     QkdPeers::Listed(saes.iter().map(|s| s.to_string()).collect())
 }
 
-fn failed(request: Request, kind: FailureKind) -> Answer {
+fn failed(request: KmeRequest, kind: FailureKind) -> Answer {
     let outcome = Err(Failure::new(kind, "as the test says"));
     Answer { request, took: ms(5), outcome }
 }
 
-fn key(request: Request, name: &str, byte: u8) -> Answer {
+fn key(request: KmeRequest, name: &str, byte: u8) -> Answer {
     let keys = vec![(id(name), KmeKey::from_slice(&[byte; 32]).unwrap())];
     Answer { request, took: ms(5), outcome: Ok(Fetched::Keys(keys)) }
 }

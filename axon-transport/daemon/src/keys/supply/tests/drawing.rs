@@ -7,12 +7,12 @@ use axon_envelope::{Delivery, KmeKey};
 use super::{Pair, id, ms};
 use crate::keys::{
     KeyMessage,
-    request::{Answer, Failure, FailureKind, Fetched, Request},
+    request::{Answer, Failure, FailureKind, Fetched, KmeRequest},
 };
 
 /// The number of a call for keys.
-fn number(request: &Request) -> u32 {
-    let Request::Enc { number, .. } = request else { panic!("{request:?}") };
+fn number(request: &KmeRequest) -> u32 {
+    let KmeRequest::Enc { number, .. } = request else { panic!("{request:?}") };
     *number
 }
 
@@ -24,7 +24,7 @@ fn an_empty_store_is_asked_for_less_and_less_often() {
     let mut asked = Vec::new();
     for _ in 0..10_000 {
         while let Some(request) = pair.sender.poll_request(pair.now) {
-            if let Request::Enc { number, .. } = request {
+            if let KmeRequest::Enc { number, .. } = request {
                 asked.push(number);
             }
             let answer = pair.kmes.answer(request);
@@ -56,7 +56,11 @@ fn a_kme_that_asks_for_a_pause_has_it_but_not_for_ever() {
         pair.sender.handle_answer(pair.now, Answer { request, took: ms(10), outcome: Err(busy) });
         while pair.now < pause {
             if let Some(request) = pair.sender.poll_request(pair.now) {
-                assert!(matches!(request, Request::Status { .. }), "{:?}: {request:?}", pair.now);
+                assert!(
+                    matches!(request, KmeRequest::Status { .. }),
+                    "{:?}: {request:?}",
+                    pair.now
+                );
                 let answer = pair.kmes.answer(request);
                 pair.sender.handle_answer(pair.now, answer);
             }

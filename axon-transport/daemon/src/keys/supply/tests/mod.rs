@@ -1,4 +1,4 @@
-//! Tests a [`Sender`] and a [`Receiver`] with two KMEs between them, and a clock that stands still.
+//! Tests a [`KeySender`] and a [`KeyReceiver`] with two KMEs between them, and a clock that stands still.
 
 mod any_order;
 mod drawing;
@@ -9,10 +9,10 @@ use std::{collections::HashMap, time::Duration};
 
 use axon_envelope::{Delivery, IndexMask, KeyId, Kind, KmeKey, OpenError, Route, TopicHash};
 
-use super::{NoKey, Receiver, Sender};
+use super::{KeyReceiver, KeySender, NoKey};
 use crate::keys::{
     Exporters, KeyMessage,
-    request::{Answer, Failure, FailureKind, Fetched, Request, Stock},
+    request::{Answer, Failure, FailureKind, Fetched, KmeRequest, Stock},
 };
 
 const ROUTE: Route = Route { kind: Kind::Topic, topic: TopicHash([7; 16]) };
@@ -43,14 +43,14 @@ struct Kmes {
 }
 
 impl Kmes {
-    fn answer(&mut self, request: Request) -> Answer {
+    fn answer(&mut self, request: KmeRequest) -> Answer {
         let failure = |kind| Err(Failure::new(kind, format!("{kind:?}")));
         let outcome = match (&request, self.failures.pop()) {
             (_, Some(kind)) => failure(kind),
-            (Request::Status { .. }, _) => {
+            (KmeRequest::Status { .. }, _) => {
                 Ok(Fetched::Stock(Stock { stored_key_count: self.stock, max_key_per_request: 128 }))
             }
-            (Request::Enc { number, .. }, _) => {
+            (KmeRequest::Enc { number, .. }, _) => {
                 if self.left.is_some_and(|left| left < *number) {
                     failure(FailureKind::Unavailable)
                 } else {
@@ -58,7 +58,7 @@ impl Kmes {
                     Ok(Fetched::Keys((0..*number).map(|_| self.issue()).collect()))
                 }
             }
-            (Request::Dec { key_ids, .. }, _) => {
+            (KmeRequest::Dec { key_ids, .. }, _) => {
                 if key_ids.iter().all(|id| self.stored.contains_key(id)) {
                     let take = |id: &KeyId| {
                         let bytes = self.stored.remove(id).unwrap();
@@ -86,8 +86,8 @@ impl Kmes {
 struct Pair {
     now: Duration,
     kmes: Kmes,
-    sender: Sender,
-    receiver: Receiver,
+    sender: KeySender,
+    receiver: KeyReceiver,
     conn: u64,
     /// What was said in either direction.
     log: Vec<KeyMessage>,
@@ -107,8 +107,8 @@ impl Pair {
             now: ms(0),
             kmes: Kmes::default(),
             // Every pause at its full length.
-            sender: Sender::with_jitter("sae-a", "sae-b", || 255).unwrap(),
-            receiver: Receiver::new("sae-b", "sae-a").unwrap(),
+            sender: KeySender::with_jitter("sae-a", "sae-b", || 255).unwrap(),
+            receiver: KeyReceiver::new("sae-b", "sae-a").unwrap(),
             conn: 0,
             log: Vec::new(),
         };
@@ -146,7 +146,7 @@ impl Pair {
     fn run(&mut self) {
         loop {
             if let Some(request) = self.sender.poll_request(self.now) {
-                if let Request::Enc { number, .. } = request {
+                if let KmeRequest::Enc { number, .. } = request {
                     assert!(number <= 8, "a lost call loses at most eight keys");
                 }
                 let answer = self.kmes.answer(request);

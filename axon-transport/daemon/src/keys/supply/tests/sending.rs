@@ -3,7 +3,7 @@ use std::time::Duration;
 use axon_envelope::Delivery;
 
 use super::{Pair, ROUTE, id, ms, retire};
-use crate::keys::{KeyMessage, NoKey, Receiver, Request, request::FailureKind};
+use crate::keys::{KeyMessage, KeyReceiver, KmeRequest, NoKey, request::FailureKind};
 
 #[test]
 fn nothing_is_sealed_before_ready() {
@@ -84,7 +84,7 @@ fn keys_are_wanting_for_the_kme_only_where_no_key_is_left_or_was_refused_by_the_
     // A status that fails says nothing of keys.
     pair.kmes.failures = vec![FailureKind::Unavailable];
     let request = pair.sender.poll_request(pair.now).unwrap();
-    assert!(matches!(request, Request::Status { .. }));
+    assert!(matches!(request, KmeRequest::Status { .. }));
     let answer = pair.kmes.answer(request);
     pair.sender.handle_answer(pair.now, answer);
     assert!(failed(&pair) && !pair.sender.lacks_keys_of_kme());
@@ -208,7 +208,7 @@ fn a_restarted_receiver_costs_the_keys_and_no_more() {
     let mut pair = Pair::new();
     pair.run();
     pair.close(1);
-    pair.receiver = Receiver::new("sae-b", "sae-a").unwrap();
+    pair.receiver = KeyReceiver::new("sae-b", "sae-a").unwrap();
     pair.connect();
     pair.run();
     assert_eq!(pair.failures(), 4, "the KME gave them to the receiver before");

@@ -192,7 +192,7 @@ fn bytes_that_are_no_frame_end_the_opening() {
 fn control_stream_that_ends_closes_the_connection() {
     let mut end = End::awaiting_hello(NOW, Side::Client, None);
     end.opening.handle_ended(NOW, "stream finished early", None);
-    let Refused { refusal, close } = end.refused(NOW);
+    let RefusedConnection { refusal, close } = end.refused(NOW);
     assert_eq!((refusal.by, &*refusal.name), (RefusedBy::Network, "unreachable"));
     assert_eq!(refusal.reason, "the control stream ended: stream finished early");
     assert!(matches!(close, Some((CloseCode::Internal, _))));
@@ -208,7 +208,7 @@ fn connection_that_the_peer_closed_is_not_closed_again() {
         for side in [Side::Client, Side::Server] {
             let mut end = End::new(NOW, side, key_mode);
             end.opening.handle_lost(NOW, &closed, end.ring.as_mut());
-            let Refused { refusal, close } = end.refused(NOW);
+            let RefusedConnection { refusal, close } = end.refused(NOW);
             assert_eq!((refusal.by, &*refusal.name), (RefusedBy::Peer, "DOMAIN_MISMATCH"));
             assert_eq!((&*refusal.reason, close), ("another domain", None));
         }
@@ -227,7 +227,7 @@ fn events_after_the_end_change_nothing() {
     end.opening.handle_timeout(NOW + s(100), end.ring.as_mut());
     end.opening.handle_unreadable(NOW, FrameError::Empty, end.ring.as_mut());
     end.opening.handle_lost(NOW, &ConnectionError::Reset, end.ring.as_mut());
-    let request = Request::Status { slave: "sae-a".to_owned() };
+    let request = KmeRequest::Status { slave: "sae-a".to_owned() };
     end.opening.handle_answer(NOW, Kmes::default().answer(request), end.ring.as_mut());
     assert!(end.outcome(NOW).is_none());
 }

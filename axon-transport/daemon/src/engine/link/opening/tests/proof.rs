@@ -100,7 +100,7 @@ fn nothing_but_the_right_proof_opens() {
         for (key, exporter) in [([9; 32], EXPORTER), (first_key(), [!2; 32])] {
             let mut end = announced();
             end.hears(NOW, &ready("key-1", key, exporter));
-            let Refused { refusal, close } = end.refused(NOW);
+            let RefusedConnection { refusal, close } = end.refused(NOW);
             assert_eq!(refusal.name, "PROOF_FAILED");
             assert!(refusal.reason.contains("https://kme-of-sae-b"), "{refusal}");
             let (code, told) = close.unwrap();

@@ -8,11 +8,11 @@ use crate::engine::{
     inbound::StreamHeader,
     outbound::{
         budget::Budget,
-        flow::{Credit, PeerCredit},
+        flow::{PeerCredit, UsedCredit},
         model::route,
         queue::Offered,
     },
-    rings::Sample,
+    rings::RingSample,
     sim::pair::Pair,
 };
 
@@ -53,14 +53,14 @@ impl Way {
             self.offered += 1;
             let info = MessageInfo::of(PUBLISHER, self.offered);
             let sample =
-                Sample::new(info, vec![self.offered as u8; length].into(), self.pair.now());
+                RingSample::new(info, vec![self.offered as u8; length].into(), self.pair.now());
             let offered = self.queue.offer(sample, self.pair.now());
             assert!(matches!(offered, Offered::Queued { dropped: 0 }));
         }
     }
 
     /// Writes until there is a reason to pause.
-    fn write(&mut self) -> Pause {
+    fn write(&mut self) -> FlowPause {
         let (now, mut frames) = (self.pair.now(), Frames::default());
         let mut carrier = self.pair.carrier();
         let Self { info, queue, counters, done, .. } = self;
@@ -76,7 +76,7 @@ impl Way {
 
     /// Writes, and lets the packets go, until nothing waits.
     fn write_all(&mut self) {
-        while self.write() == Pause::Blocked {
+        while self.write() == FlowPause::Blocked {
             self.pair.exchange();
         }
         self.pair.exchange();
@@ -84,7 +84,7 @@ impl Way {
 
     /// The same towards a peer that reads what comes.
     fn write_and_read_all(&mut self) {
-        while self.write() == Pause::Blocked {
+        while self.write() == FlowPause::Blocked {
             self.pair.exchange();
             let _ = self.pair.read(self.stream());
         }
@@ -105,7 +105,7 @@ impl Way {
 #[test]
 fn samples_follow_the_header_on_one_stream_and_stay_until_they_are_acknowledged() {
     let mut way = Way::new(true);
-    assert_eq!(way.write(), Pause::Empty);
+    assert_eq!(way.write(), FlowPause::Empty);
     assert!(!way.reliable.is_open(), "nothing was to send");
     way.offer(3, 10);
     way.write_all();
@@ -133,7 +133,7 @@ fn samples_follow_the_header_on_one_stream_and_stay_until_they_are_acknowledged(
 fn samples_that_nobody_acknowledges_are_done_with_once_quic_has_them() {
     let mut way = Way::new(false);
     way.offer(3, 10);
-    assert_eq!(way.write(), Pause::Empty);
+    assert_eq!(way.write(), FlowPause::Empty);
     assert_eq!(way.done, Done { sequence: Some(3), given_up: 0 });
     assert!(way.queue.is_empty() && !way.reliable.credit().is_used());
 }
@@ -142,11 +142,11 @@ fn samples_that_nobody_acknowledges_are_done_with_once_quic_has_them() {
 fn a_long_sample_makes_progress_while_quic_takes_it() {
     let mut way = Way::new(true);
     way.offer(1, 1 << 20);
-    assert_eq!(way.write(), Pause::Blocked);
+    assert_eq!(way.write(), FlowPause::Blocked);
     assert!(way.reliable.is_writing() && way.reliable.left() > 0);
     assert_eq!(way.timeout(), Some(STREAM_IDLE + way.pair.now()), "it was not idle");
     let mut read = 0;
-    while way.write() == Pause::Blocked {
+    while way.write() == FlowPause::Blocked {
         way.pair.exchange();
         read += way.pair.read(way.stream()).unwrap().0.len();
     }
@@ -185,14 +185,14 @@ fn what_is_sent_again_over_another_link_is_no_progress() {
 fn a_long_sample_waits_for_credit_and_a_short_one_does_not() {
     let mut way = Way::new(true);
     let mut other = way.credit.share();
-    other.set(Credit::of(usize::MAX, usize::MAX >> 1));
+    other.set(UsedCredit::of(usize::MAX, usize::MAX >> 1));
     way.offer(1, 100);
-    assert_eq!(way.write(), Pause::Empty);
+    assert_eq!(way.write(), FlowPause::Empty);
     way.offer(1, 1 << 20);
-    assert_eq!(way.write(), Pause::NoCredit);
+    assert_eq!(way.write(), FlowPause::NoCredit);
     assert_eq!(way.queue.waiting(), 1);
     drop(other);
-    assert_eq!(way.write(), Pause::Blocked);
+    assert_eq!(way.write(), FlowPause::Blocked);
     assert_eq!(way.queue.waiting(), 0);
 }
 
@@ -220,7 +220,7 @@ fn a_stop_that_quic_tells_while_a_sample_is_written_is_the_same() {
     way.write_all();
     way.pair.stop(way.stream());
     way.offer(1, 10);
-    assert_eq!(way.write(), Pause::Empty);
+    assert_eq!(way.write(), FlowPause::Empty);
     assert_eq!(way.done, Done { sequence: Some(2), given_up: 2 });
     assert!(!way.reliable.is_open());
 }

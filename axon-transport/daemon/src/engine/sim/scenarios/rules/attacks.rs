@@ -27,7 +27,7 @@ use crate::{
         tests::{millis, secs},
         world::World,
     },
-    link::{Graph, Message, Subscribe, Subscriber},
+    link::{Graph, Message, RouteSubscriber, Subscribe},
 };
 
 /// A host with rules, and a peer without a daemon of ours.
@@ -89,7 +89,7 @@ fn calls_and_answers_that_rules_deny_reach_nobody_whatever_the_peer_sends() {
             topic: name.into(),
             type_name: "T".into(),
             kind,
-            subscribers: vec![Subscriber { gid: reader, qos: Qos::keep_all() }],
+            subscribers: vec![RouteSubscriber { gid: reader, qos: Qos::keep_all() }],
             last: Vec::new(),
             acknowledges: Some(true),
             short_headers: None,

@@ -18,7 +18,7 @@ use crate::{
         tests::{millis, secs},
         world::{Pair, World},
     },
-    link::{Graph, Hello, Message, Subscribe, Subscriber},
+    link::{Graph, Hello, Message, RouteSubscriber, Subscribe},
 };
 
 /// Between two samples.
@@ -83,7 +83,7 @@ impl Held {
             topic: "/t".into(),
             type_name: "T".into(),
             kind: 0,
-            subscribers: vec![Subscriber { gid: SUBSCRIPTION, qos: Qos::keep_all() }],
+            subscribers: vec![RouteSubscriber { gid: SUBSCRIPTION, qos: Qos::keep_all() }],
             last: Vec::new(),
             acknowledges: Some(true),
             short_headers: None,
