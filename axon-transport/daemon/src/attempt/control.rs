@@ -4,7 +4,7 @@ use quinn::{RecvStream, SendStream};
 
 use crate::{
     engine::quic::control_stream::FrameLimits,
-    link::{FrameError, Message, read_length},
+    link::{FrameError, LinkMessage, read_length},
 };
 
 /// Bytes that one read takes from the stream.
@@ -20,20 +20,20 @@ pub(super) enum Unreadable {
 }
 
 /// Both directions of the control stream.
-pub(super) struct Control {
+pub(super) struct AttemptControl {
     sending: SendStream,
     /// Frames that wait to be written.
     out: Vec<u8>,
     receiving: RecvStream,
-    incoming: Incoming,
+    incoming: ReceivedBytes,
 }
 
-impl Control {
+impl AttemptControl {
     /// Uses the streams of one bidirectional stream.
     pub(super) fn new((sending, receiving): (SendStream, RecvStream)) -> Self {
         // Before all data.
         let _ = sending.set_priority(i32::MAX);
-        Self { sending, out: Vec::new(), receiving, incoming: Incoming::default() }
+        Self { sending, out: Vec::new(), receiving, incoming: ReceivedBytes::default() }
     }
 
     /// Bounds the frames that are read from now on.
@@ -45,7 +45,7 @@ impl Control {
     ///
     /// # Errors
     /// The message is too large.
-    pub(super) fn send(&mut self, message: &Message) -> Result<(), FrameError> {
+    pub(super) fn send(&mut self, message: &LinkMessage) -> Result<(), FrameError> {
         self.out.extend(message.to_frame()?);
         Ok(())
     }
@@ -65,7 +65,7 @@ impl Control {
     ///
     /// # Errors
     /// No further message comes.
-    pub(super) async fn next(&mut self, reads: bool) -> Result<Message, Unreadable> {
+    pub(super) async fn next(&mut self, reads: bool) -> Result<LinkMessage, Unreadable> {
         loop {
             if reads && let Some(message) = self.incoming.take().map_err(Unreadable::Frame)? {
                 return Ok(message);
@@ -93,24 +93,24 @@ async fn write(sending: &mut SendStream, out: &mut Vec<u8>) -> Result<(), Unread
 }
 
 /// Bytes of the daemon that are not yet a message.
-struct Incoming {
+struct ReceivedBytes {
     bytes: Vec<u8>,
     limits: FrameLimits,
 }
 
-impl Default for Incoming {
+impl Default for ReceivedBytes {
     fn default() -> Self {
         Self { bytes: Vec::new(), limits: FrameLimits::BEFORE_HELLO }
     }
 }
 
-impl Incoming {
+impl ReceivedBytes {
     /// The next message of a known type, if it is complete.
-    fn take(&mut self) -> Result<Option<Message>, FrameError> {
+    fn take(&mut self) -> Result<Option<LinkMessage>, FrameError> {
         while let Some(prefix) = self.bytes.first_chunk::<4>() {
             let end = 4 + read_length(*prefix, self.limits.frame)?;
             let Some(frame) = self.bytes.get(4..end) else { return Ok(None) };
-            let message = Message::from_frame(frame, self.limits.inflated)?;
+            let message = LinkMessage::from_frame(frame, self.limits.inflated)?;
             self.bytes.drain(..end);
             if message.is_some() {
                 return Ok(message);
@@ -127,8 +127,8 @@ mod tests {
     use super::*;
     use crate::link::{Elected, RouteReady};
 
-    fn elected(election: u64) -> Message {
-        Message::Elected(Elected { link: [7; 16], election })
+    fn elected(election: u64) -> LinkMessage {
+        LinkMessage::Elected(Elected { link: [7; 16], election })
     }
 
     #[test]
@@ -136,7 +136,7 @@ mod tests {
         let unknown = [0, 0, 0, 3, 0x7f, 1, 2];
         let frames =
             [&elected(1).to_frame().unwrap()[..], &unknown, &elected(2).to_frame().unwrap()];
-        let mut incoming = Incoming::default();
+        let mut incoming = ReceivedBytes::default();
         let mut read = Vec::new();
         for byte in frames.concat() {
             incoming.bytes.push(byte);
@@ -154,7 +154,7 @@ mod tests {
     fn frame_beyond_its_limit_is_refused_before_it_has_arrived() {
         let length = u32::try_from(FrameLimits::BEFORE_HELLO.frame).unwrap() + 1;
         let bytes = length.to_be_bytes().to_vec();
-        let mut incoming = Incoming { bytes, ..Incoming::default() };
+        let mut incoming = ReceivedBytes { bytes, ..ReceivedBytes::default() };
         assert!(matches!(incoming.take(), Err(FrameError::TooLarge { .. })));
         incoming.limits = FrameLimits::UNPROVEN;
         assert_eq!(incoming.take().unwrap(), None);
@@ -163,9 +163,9 @@ mod tests {
     #[test]
     fn long_map_is_not_decompressed_before_the_proof() {
         let ready = RouteReady { route: 1, publishers: vec![Gid::default(); 1000] };
-        let ready = Message::RouteReady(ready);
+        let ready = LinkMessage::RouteReady(ready);
         let mut incoming =
-            Incoming { bytes: ready.to_frame().unwrap(), limits: FrameLimits::UNPROVEN };
+            ReceivedBytes { bytes: ready.to_frame().unwrap(), limits: FrameLimits::UNPROVEN };
         assert!(matches!(incoming.take(), Err(FrameError::TooLarge { .. })));
         incoming.limits = FrameLimits::PROVEN;
         assert_eq!(incoming.take().unwrap(), Some(ready));

@@ -15,7 +15,7 @@ use secrecy::ExposeSecret;
 
 use super::{
     Bootstrap,
-    control::{Control, Unreadable},
+    control::{AttemptControl, Unreadable},
     internal,
     keys::Keys,
 };
@@ -26,7 +26,7 @@ use crate::{
         link::{
             dialling::{Action, Dialling},
             failure::{HELLO_TIMEOUT, close_text},
-            opening::{Handshake, Opened, Opening, RefusedConnection},
+            opening::{Handshake, OpenedConnection, Opening, RefusedConnection},
             target::{DialTarget, UNKNOWN_PSK_IDENTITY},
         },
         quic::{endpoints::reaches, tls_settings::tls_cipher, transport::endpoint_config},
@@ -35,7 +35,7 @@ use crate::{
     error::{EndpointError, GatewayError},
     identity,
     keys::{DialKey, Exporters},
-    link::{CloseCode, Hello, Message, Side},
+    link::{CloseCode, LinkHello, LinkMessage, Side},
     reactor::bind_daemon,
 };
 
@@ -52,7 +52,7 @@ const TRY_AGAIN: Duration = Duration::from_millis(200);
 pub(super) struct AttemptDialler {
     config: Arc<Config>,
     credentials: Credentials,
-    hello: Hello,
+    hello: LinkHello,
     target: DialTarget,
     /// `None` if no bound address reaches the target.
     endpoint: Option<quinn::Endpoint>,
@@ -74,7 +74,7 @@ impl AttemptDialler {
         let config = Arc::new(config.clone());
         let keys = Keys::start(&config)?;
         // The lowest id: this side elects.
-        let mut hello = Hello::new(&config, DaemonId::default());
+        let mut hello = LinkHello::new(&config, DaemonId::default());
         let identity = match &config.security {
             Security::Classic(classic) => Some(identity::load(classic, &hello.host)?),
             Security::Qkd(_) => None,
@@ -225,9 +225,9 @@ impl AttemptDialler {
     pub(super) async fn open(
         &mut self,
         connection: &Connection,
-    ) -> Result<(Opened, Control), Refusal> {
+    ) -> Result<(OpenedConnection, AttemptControl), Refusal> {
         let mut control = match tokio::time::timeout(HELLO_TIMEOUT, connection.open_bi()).await {
-            Ok(Ok(streams)) => Control::new(streams),
+            Ok(Ok(streams)) => AttemptControl::new(streams),
             Ok(Err(error)) => return Err(Refusal::of(&error)),
             Err(_) => {
                 let text = "no HELLO within 5 s";
@@ -315,12 +315,12 @@ impl AttemptDialler {
     }
 
     /// Queues the keyring's announcements on the control stream.
-    pub(super) fn say_keys(&mut self, control: &mut Control) {
+    pub(super) fn say_keys(&mut self, control: &mut AttemptControl) {
         let now = self.now();
         let Some(keyring) = self.keyring() else { return };
         while let Some((_, message)) = keyring.poll_message(now) {
             // Key announcements always fit.
-            let _ = control.send(&Message::Keys(message));
+            let _ = control.send(&LinkMessage::Keys(message));
         }
         // The caller looks at its keys after each wait.
         while keyring.poll_changed(now).is_some() {}

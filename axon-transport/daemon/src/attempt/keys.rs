@@ -8,7 +8,7 @@ use axon_transport::config::{Config, Security};
 use crate::{
     engine::keyring::{Answered, Keyring},
     keys::{
-        Event, Events, Fetched, KeyPurpose, Kme, KmeError, KmeRequest, RequestOrigin, UsedKeys,
+        Events, Fetched, KeyPurpose, Kme, KmeAnswer, KmeError, KmeRequest, RequestOrigin, UsedKeys,
     },
 };
 
@@ -18,7 +18,7 @@ pub(super) struct Keys {
     kme: Kme,
     events: Events,
     /// Answers to requests that the full KME client did not take.
-    refused: VecDeque<Event>,
+    refused: VecDeque<KmeAnswer>,
 }
 
 impl Keys {
@@ -49,7 +49,7 @@ impl Keys {
     }
 
     /// The next answer. Cancel safe.
-    pub(super) async fn answer(&mut self) -> Event {
+    pub(super) async fn answer(&mut self) -> KmeAnswer {
         if let Some(event) = self.refused.pop_front() {
             return event;
         }

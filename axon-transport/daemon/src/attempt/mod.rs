@@ -22,19 +22,19 @@ use axon_transport::{
 use quinn::{Connection, SendStream};
 
 use self::{
-    control::{Control, Unreadable},
+    control::{AttemptControl, Unreadable},
     dialler::{AttemptDialler, LINK, close},
 };
 use crate::{
     engine::{
         inbound::StreamHeader,
-        link::opening::Opened,
+        link::opening::OpenedConnection,
         refusal::Refusal,
         rings::RingSample,
         sample::{frames::Frames, protection::Seal},
     },
     error::GatewayError,
-    link::{CloseCode, Elected, Graph, Message, Owners, Subscribe},
+    link::{CloseCode, Elected, GraphUpdate, LinkMessage, Owners, Subscribe},
     owner::{Binding, EXPORTER, prove},
 };
 
@@ -71,8 +71,8 @@ pub enum Tamper {
 /// A link that a daemon accepted. It takes messages and keys only during a call.
 pub struct AcceptedLink {
     connection: Connection,
-    control: Control,
-    opened: Opened,
+    control: AttemptControl,
+    opened: OpenedConnection,
     dialler: AttemptDialler,
 }
 
@@ -174,7 +174,8 @@ impl AcceptedLink {
     ) -> Result<(), Refusal> {
         let endpoint = Endpoint::new(publisher, EndpointKind::Publisher, topic, type_name)
             .with_qos(Qos::keep_all());
-        let graph = Graph { version: 1, before: 0, added: vec![endpoint], ..Graph::default() };
+        let graph =
+            GraphUpdate { version: 1, before: 0, added: vec![endpoint], ..GraphUpdate::default() };
         let mut binding = Binding::default();
         self.connection
             .export_keying_material(&mut binding, EXPORTER, b"")
@@ -182,9 +183,9 @@ impl AcceptedLink {
         let proof = prove(session, &binding, self.dialler.daemon())
             .ok_or_else(|| internal("the session cannot be proved"))?;
         let messages = [
-            Message::Elected(Elected { link: rand::random(), election: 1 }),
-            Message::Owners(Owners { proofs: vec![proof] }),
-            Message::Graph(graph),
+            LinkMessage::Elected(Elected { link: rand::random(), election: 1 }),
+            LinkMessage::Owners(Owners { proofs: vec![proof] }),
+            LinkMessage::GraphUpdate(graph),
         ];
         messages.iter().try_for_each(|message| self.control.send(message)).map_err(internal)
     }
@@ -193,7 +194,7 @@ impl AcceptedLink {
     async fn subscription(&mut self, topic: &str) -> Result<Subscribe, Refusal> {
         loop {
             match self.next().await {
-                Ok(Some(Message::Subscribe(subscribe))) if subscribe.topic == topic => {
+                Ok(Some(LinkMessage::Subscribe(subscribe))) if subscribe.topic == topic => {
                     return Ok(subscribe);
                 }
                 Ok(_) => {}
@@ -244,11 +245,11 @@ impl AcceptedLink {
 
     /// Waits until something happens on the link, or to its keys. Returns the message that came, if it is not
     /// about keys.
-    async fn next(&mut self) -> Result<Option<Message>, Unreadable> {
+    async fn next(&mut self) -> Result<Option<LinkMessage>, Unreadable> {
         self.dialler.say_keys(&mut self.control);
         tokio::select! {
             message = self.control.next(true) => match message? {
-                Message::Keys(message) => {
+                LinkMessage::Keys(message) => {
                     let now = self.dialler.now();
                     if let Some(keyring) = self.dialler.keyring() {
                         // An error: session has no message keys, or the daemon broke a rule. It shows by a key that

@@ -23,7 +23,7 @@ use super::{
     plane::Control,
     report::send_status,
     room::{DescriptorRoom, SpareDescriptors},
-    turns::{PART, Turn},
+    turns::{PART, ProcessTurn},
 };
 
 /// Packets that may wait for a session whose own are taken: its endpoints may make more of them than
@@ -38,7 +38,7 @@ pub(super) async fn converse(
     socket: &AsyncFd<PassedFd>,
     id: SessionId,
     bell: &Rc<Notify>,
-    turn: &Turn,
+    turn: &ProcessTurn,
     death: Option<&AsyncFd<Arc<PassedFd>>>,
 ) -> String {
     let mut buffer = Vec::new();
@@ -112,7 +112,7 @@ async fn take_rest(
     socket: &AsyncFd<PassedFd>,
     id: &SessionId,
     bell: &Rc<Notify>,
-    turn: &Turn,
+    turn: &ProcessTurn,
 ) {
     let mut buffer = Vec::new();
     // Bounded: a child that inherited the socket may send without end.

@@ -22,7 +22,7 @@ use super::{
 const UNKNOWN: u32 = 8;
 
 /// What a connection begins with.
-pub(super) struct First {
+pub(super) struct FirstMessage {
     pub(super) hello: Hello,
     pub(super) descriptors: Vec<PassedFd>,
     /// What came before: the key that the session's id is made of.
@@ -31,7 +31,7 @@ pub(super) struct First {
     pub(super) is_crowded: bool,
 }
 
-impl First {
+impl FirstMessage {
     /// Whether the key that came, if one did, is that of the id.
     pub(super) fn is_its_own(&self) -> Result<(), Box<Refused>> {
         match &self.key {
@@ -50,7 +50,7 @@ pub(super) async fn first(
     spare: &SpareDescriptors,
     socket: &AsyncFd<PassedFd>,
     has_room: impl Fn() -> bool,
-) -> Option<First> {
+) -> Option<FirstMessage> {
     let mut buffer = Vec::new();
     let mut unknown = 0;
     let mut key = None;
@@ -60,11 +60,11 @@ pub(super) async fn first(
         if descriptors::is_tight() && descriptors::carries_descriptors(fd) && !has_room() {
             let Ok(Message::Hello(hello)) = socket::look(fd, &mut buffer) else { return None };
             let descriptors = Vec::new();
-            return Some(First { hello, descriptors, key, is_crowded: true });
+            return Some(FirstMessage { hello, descriptors, key, is_crowded: true });
         }
         match receive(spare, fd, &mut buffer) {
             Ok(Received { message: Message::Hello(hello), descriptors }) => {
-                return Some(First { hello, descriptors, key, is_crowded: false });
+                return Some(FirstMessage { hello, descriptors, key, is_crowded: false });
             }
             Ok(Received { message: Message::Unknown(OWNER), descriptors })
                 if key.is_none() && descriptors.is_empty() =>

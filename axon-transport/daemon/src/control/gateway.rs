@@ -139,12 +139,12 @@ impl RunningGateway {
 
 /// The pause before a gateway that failed is started again.
 #[derive(Debug)]
-pub(super) struct Pause {
+pub(super) struct RestartPause {
     next: Duration,
     since: std::time::Instant,
 }
 
-impl Pause {
+impl RestartPause {
     pub(super) fn new() -> Self {
         Self { next: Duration::from_millis(200), since: std::time::Instant::now() }
     }

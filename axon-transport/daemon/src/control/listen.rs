@@ -35,11 +35,11 @@ use tokio::{io::unix::AsyncFd, sync::Notify, task::spawn_local, time::timeout};
 
 use super::{
     conversation::{converse, say},
-    first::{First, first},
+    first::{FirstMessage, first},
     pending::{MOST, MOST_WHERE_SHORT, PendingConnections, Stranger},
     plane::Control,
     room::DescriptorRoom,
-    turns::Turn,
+    turns::ProcessTurn,
 };
 use crate::{
     bridge::RefusalKind,
@@ -249,11 +249,11 @@ fn shown(name: &str) -> String {
 fn relay(
     control: &Rc<RefCell<Control>>,
     socket: AsyncFd<PassedFd>,
-    first: First,
+    first: FirstMessage,
     peer: PeerProcess,
 ) {
     let its_own = first.is_its_own();
-    let First { mut hello, descriptors, key, .. } = first;
+    let FirstMessage { mut hello, descriptors, key, .. } = first;
     hello.name = shown(&hello.name);
     let mut state = control.borrow_mut();
     let reason = hello.relay.clone().unwrap_or_default();
@@ -325,7 +325,7 @@ struct Admitted {
     id: SessionId,
     bell: Rc<Notify>,
     /// Its process's.
-    turn: Turn,
+    turn: ProcessTurn,
     /// Tells that its process ended.
     death: Option<AsyncFd<Arc<PassedFd>>>,
 }
@@ -333,12 +333,12 @@ struct Admitted {
 fn admit(
     control: &Rc<RefCell<Control>>,
     socket: &AsyncFd<PassedFd>,
-    first: First,
+    first: FirstMessage,
     peer: PeerProcess,
     inside: &InternalPeer,
 ) -> Option<Admitted> {
     let its_own = first.is_its_own();
-    let First { mut hello, descriptors, mut key, is_crowded } = first;
+    let FirstMessage { mut hello, descriptors, mut key, is_crowded } = first;
     hello.name = shown(&hello.name);
     let control = &mut *control.borrow_mut();
     let gateway = matches!(inside, InternalPeer::Gateway);

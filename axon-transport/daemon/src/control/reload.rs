@@ -217,9 +217,9 @@ fn unfit(old: &Config, new: &Config) -> Option<&'static str> {
 }
 
 /// Settings by name, as text that differs where they do.
-type Named = Vec<(&'static str, String)>;
+type NamedSettings = Vec<(&'static str, String)>;
 
-fn variable(config: &Config) -> Named {
+fn variable(config: &Config) -> NamedSettings {
     vec![
         ("access rules", format!("{:?} {:?}", config.access_file, config.access)),
         ("AXON_DAEMON_PEERS", format!("{:?}", config.daemon_peers)),
@@ -229,7 +229,7 @@ fn variable(config: &Config) -> Named {
     ]
 }
 
-fn fixed(config: &Config) -> Named {
+fn fixed(config: &Config) -> NamedSettings {
     vec![
         ("security", format!("{:?}", config.security)),
         ("AXON_QUIC_CIPHER", config.cipher.name().to_owned()),
@@ -242,7 +242,7 @@ fn fixed(config: &Config) -> Named {
     ]
 }
 
-fn differing(old: &Named, new: &Named) -> Vec<String> {
+fn differing(old: &NamedSettings, new: &NamedSettings) -> Vec<String> {
     let pairs = old.iter().zip(new).filter(|(old, new)| old.1 != new.1);
     pairs.map(|((name, _), _)| (*name).to_owned()).collect()
 }

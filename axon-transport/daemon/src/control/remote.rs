@@ -18,7 +18,7 @@ use tokio::{
 };
 
 use super::{
-    gateway::{GatewayEntry, Pause, RunningGateway},
+    gateway::{GatewayEntry, RestartPause, RunningGateway},
     plane::Control,
 };
 use crate::{
@@ -36,10 +36,10 @@ pub(super) const GATEWAY: Option<GatewayEntry> =
     Some(|parts| crate::reactor::run(parts).map_err(|error| error.to_string()));
 
 /// The gateway and discovery of a running daemon.
-pub(super) struct Remote {
+pub(super) struct DaemonGateway {
     entry: Option<GatewayEntry>,
     running: Option<RunningGateway>,
-    pause: Pause,
+    pause: RestartPause,
     discovery: Option<Discovery>,
     /// Whether the id was proven.
     linked: BTreeMap<DaemonId, bool>,
@@ -58,7 +58,7 @@ struct Discovery {
     task: JoinHandle<()>,
 }
 
-impl Remote {
+impl DaemonGateway {
     /// Starts the gateway, waits until it stands, and starts discovery.
     ///
     /// # Errors
@@ -70,7 +70,7 @@ impl Remote {
         let mut remote = Self {
             entry,
             running: None,
-            pause: Pause::new(),
+            pause: RestartPause::new(),
             discovery: None,
             linked: BTreeMap::new(),
             listed: BTreeSet::new(),

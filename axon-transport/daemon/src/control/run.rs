@@ -31,7 +31,7 @@ use super::{
     log,
     plane::Control,
     reload::{SettingsSource, reload},
-    remote::{GATEWAY, Remote},
+    remote::{DaemonGateway, GATEWAY},
     room::SpareDescriptors,
 };
 use crate::discovery::DiscoveryEvent;
@@ -300,7 +300,7 @@ async fn serve(
     };
     let (mut terminate, mut interrupt, hangup) =
         signals().map_err(|source| DaemonError::System { what: "watching signals", source })?;
-    let mut remote = match Remote::start(&control, options.gateway).await {
+    let mut remote = match DaemonGateway::start(&control, options.gateway).await {
         Ok(remote) => remote,
         Err(text) => {
             options.report.error(&format!("the gateway: {text}"));

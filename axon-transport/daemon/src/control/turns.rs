@@ -15,7 +15,7 @@ use tokio::sync::Mutex;
 pub(super) const PART: Duration = Duration::from_millis(1);
 
 /// What a session's task holds while it does a part of its process's work. First come, first served.
-pub(super) type Turn = Rc<Mutex<()>>;
+pub(super) type ProcessTurn = Rc<Mutex<()>>;
 
 /// The turns of all processes that have sessions.
 #[derive(Debug, Default)]
@@ -23,12 +23,12 @@ pub(super) struct Turns(HashMap<u32, Weak<Mutex<()>>>);
 
 impl Turns {
     /// That of the sessions of process `pid`.
-    pub(super) fn of(&mut self, pid: u32) -> Turn {
+    pub(super) fn of(&mut self, pid: u32) -> ProcessTurn {
         if let Some(turn) = self.0.get(&pid).and_then(Weak::upgrade) {
             return turn;
         }
         self.0.retain(|_, turn| turn.strong_count() > 0);
-        let turn = Turn::default();
+        let turn = ProcessTurn::default();
         self.0.insert(pid, Rc::downgrade(&turn));
         turn
     }

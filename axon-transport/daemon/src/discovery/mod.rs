@@ -1,6 +1,6 @@
 //! Discovery: which daemons exist, and which of them to dial.
 //!
-//! [`wire::beacon`](crate::wire::beacon) is the wire format, [`Peers`] the state machine, [`socket`] the shared
+//! [`wire::beacon`](crate::wire::beacon) is the wire format, [`PeerDiscovery`] the state machine, [`socket`] the shared
 //! UDP port, and [`run`] the task that ties them together. Discovery sends from QUIC ports through the gateway,
 //! whose `DemuxSocket` takes received discovery datagrams out of QUIC's. Discovery is unauthenticated: it selects
 //! addresses to dial and proves nothing.
@@ -28,7 +28,7 @@ mod wanted;
 pub(crate) use confidence::AddressConfidence;
 pub(crate) use datagrams::Datagrams;
 pub(crate) use interfaces::{Interface, interfaces};
-pub(crate) use peers::{Arrival, Local, Output, Peers};
+pub(crate) use peers::{Arrival, LocalDaemon, PeerDiscovery, PeersOutput};
 pub(crate) use run::{DiscoveryEvent, run};
 pub(crate) use wanted::DiscoveryNeeds;
 

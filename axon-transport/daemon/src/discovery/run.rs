@@ -1,4 +1,4 @@
-//! The task that supplies [`Peers`] with its clock, its sockets and its events.
+//! The task that supplies [`PeerDiscovery`] with its clock, its sockets and its events.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -17,8 +17,8 @@ use tokio::{
 use tracing::{debug, warn};
 
 use super::{
-    AddressConfidence, Arrival, Datagrams, DiscoveryAction, DiscoveryNeeds, Local, Output, Peers,
-    interfaces, socket::SharedSocket,
+    AddressConfidence, Arrival, Datagrams, DiscoveryAction, DiscoveryNeeds, LocalDaemon,
+    PeerDiscovery, PeersOutput, interfaces, socket::SharedSocket,
 };
 
 use crate::token_bucket::TokenBucket;
@@ -162,7 +162,7 @@ pub(crate) async fn run(
 
 struct DiscoveryIo {
     start: Instant,
-    peers: Peers,
+    peers: PeerDiscovery,
     socket: Option<SharedSocket>,
     /// What may be looked at there at once.
     at_once: TokenBucket,
@@ -181,7 +181,7 @@ impl DiscoveryIo {
     fn new(config: &Config, daemon: DaemonId, actions: mpsc::Sender<DiscoveryAction>) -> Self {
         Self {
             start: Instant::now(),
-            peers: Peers::new(Local::of(config, daemon), rand::random()),
+            peers: PeerDiscovery::new(LocalDaemon::of(config, daemon), rand::random()),
             socket: None,
             at_once: TokenBucket::new(AT_ONCE.0, AT_ONCE.1),
             multicast: false,
@@ -282,12 +282,12 @@ impl DiscoveryIo {
     fn carry_out(&mut self) {
         while let Some(output) = self.peers.poll_output() {
             match output {
-                Output::Multicast(bytes) => {
+                PeersOutput::Multicast(bytes) => {
                     if let Some(socket) = &mut self.socket {
                         socket.send(&bytes);
                     }
                 }
-                Output::Action(action) => {
+                PeersOutput::Action(action) => {
                     let dial = match &action {
                         DiscoveryAction::Dial { daemon, standing, .. } => {
                             Some((*daemon, *standing))

@@ -27,11 +27,11 @@ pub(crate) struct SharedSocket {
     bind: Vec<IpAddr>,
     /// Interfaces whose group the receiver is a member of, by the kernel's number.
     joined: Vec<u32>,
-    senders: Vec<Sender>,
+    senders: Vec<DatagramSender>,
 }
 
 #[derive(Debug)]
-struct Sender {
+struct DatagramSender {
     interface: Interface,
     from: Ipv4Addr,
     /// Not tokio's, which would not send before it once waited for readiness. It never blocks.
@@ -84,7 +84,7 @@ impl SharedSocket {
             if self.senders.iter().any(|s| s.interface == interface && s.from == from) {
                 continue;
             }
-            match Sender::open(interface, from) {
+            match DatagramSender::open(interface, from) {
                 Ok(sender) => self.senders.push(sender),
                 Err(error) => warn!(%from, %error, "cannot send beacons from this address"),
             }
@@ -124,7 +124,7 @@ impl SharedSocket {
     }
 }
 
-impl Sender {
+impl DatagramSender {
     fn open(interface: Interface, from: Ipv4Addr) -> io::Result<Self> {
         let socket = udp()?;
         socket.set_multicast_ttl_v4(1)?;

@@ -8,7 +8,7 @@ use axon_transport::internal::graph::RemoteEndpoint;
 use super::{Engine, peer_graph::PeerGraphChange};
 use crate::{
     bridge::{ToControl, TrafficRules},
-    link::{GraphResync, Message, Subscribe},
+    link::{GraphResync, LinkMessage, Subscribe},
 };
 
 /// What following a change costs for each endpoint of both graphs, as an estimate: other peers have nine times as long
@@ -164,7 +164,7 @@ impl Engine {
             let displaced = freed && std::mem::take(&mut peer.displaced);
             if displaced || peer.remote.has_room_again() {
                 let version = peer.remote.version();
-                peer.say(Message::GraphResync(GraphResync { version }));
+                peer.say(LinkMessage::GraphResync(GraphResync { version }));
             }
         }
     }

@@ -64,7 +64,7 @@ use crate::{
     discovery::Interface,
     error::GatewayError,
     keys,
-    link::{GraphResync, Message},
+    link::{GraphResync, LinkMessage},
     owner::SessionKeys,
 };
 
@@ -185,7 +185,7 @@ impl Engine {
     }
 
     /// The KME answered.
-    pub(crate) fn handle_key_event(&mut self, event: keys::Event, now: Duration) {
+    pub(crate) fn handle_key_event(&mut self, event: keys::KmeAnswer, now: Duration) {
         self.links.handle_key_event(event, now);
     }
 
@@ -348,32 +348,38 @@ impl Engine {
         self.peers.insert(daemon, self.factory.make(link, now));
     }
 
-    fn handle_message(&mut self, number: u64, daemon: DaemonId, message: Message, now: Duration) {
+    fn handle_message(
+        &mut self,
+        number: u64,
+        daemon: DaemonId,
+        message: LinkMessage,
+        now: Duration,
+    ) {
         let Some(peer) = self.peers.get_mut(daemon).filter(|peer| peer.link == number) else {
             return;
         };
         match message {
-            Message::Graph(graph) => match peer.take_graph(graph) {
+            LinkMessage::GraphUpdate(graph) => match peer.take_graph(graph) {
                 GraphTaken::Changed { .. } => peer.stirred = true,
                 GraphTaken::Part => {}
                 GraphTaken::Gap => {
                     let version = peer.remote.version();
-                    peer.say(Message::GraphResync(GraphResync { version }));
+                    peer.say(LinkMessage::GraphResync(GraphResync { version }));
                 }
             },
-            Message::Owners(owners) => {
+            LinkMessage::Owners(owners) => {
                 if let Some(binding) = self.links.view(number).and_then(|link| link.binding()) {
                     peer.remote.prove(&owners.proofs, &binding, daemon, now);
                 }
             }
-            Message::AccessDecisions(answer) => {
+            LinkMessage::AccessDecisions(answer) => {
                 let number = answer.number;
                 if let Some(decisions) = peer.take_decisions(answer) {
                     self.effects.tell(ToControl::Decisions { number, decisions: Some(decisions) });
                 }
             }
             message => {
-                if let Message::Subscribe(asks) = &message {
+                if let LinkMessage::Subscribe(asks) = &message {
                     self.take_over_route(daemon, asks, now);
                 }
                 let handled =
@@ -390,7 +396,7 @@ impl Engine {
         let mut messages = Vec::new();
         for peer in self.peers.values_mut() {
             while let Some(receipt) = peer.inbound.poll_receipt(now) {
-                peer.say(Message::Received(receipt));
+                peer.say(LinkMessage::ReceivedUpTo(receipt));
             }
             while let Some(message) = peer.poll_message() {
                 messages.push((peer.link, message));

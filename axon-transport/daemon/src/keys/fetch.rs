@@ -4,7 +4,7 @@ use std::{collections::VecDeque, time::Duration};
 
 use axon_envelope::{KeyId, KmeKey};
 
-use super::request::{Answer, Failure, FailureKind, Fetched, KeyPurpose, KmeRequest};
+use super::request::{Answer, FailureKind, Fetched, KeyPurpose, KmeRequest, RequestFailure};
 
 /// How often a batch is asked for.
 const TRIES: u8 = 3;
@@ -38,7 +38,7 @@ struct KeyBatch {
 }
 
 /// How one key_ID ended.
-pub(super) type FetchOutcome = (KeyId, Result<KmeKey, Failure>);
+pub(super) type FetchOutcome = (KeyId, Result<KmeKey, RequestFailure>);
 
 impl Fetches {
     pub(super) fn new(master: &str, purpose: KeyPurpose) -> Self {
@@ -128,10 +128,10 @@ fn given(asked: Vec<KeyId>, mut keys: Vec<(KeyId, KmeKey)>) -> Vec<FetchOutcome>
     asked.into_iter().map(outcome).collect()
 }
 
-fn failed(key_ids: Vec<KeyId>, failure: Failure) -> Vec<FetchOutcome> {
+fn failed(key_ids: Vec<KeyId>, failure: RequestFailure) -> Vec<FetchOutcome> {
     key_ids.into_iter().map(|key_id| (key_id, Err(failure.clone()))).collect()
 }
 
-fn invalid(text: &str) -> Failure {
-    Failure::new(FailureKind::Invalid, text)
+fn invalid(text: &str) -> RequestFailure {
+    RequestFailure::new(FailureKind::Invalid, text)
 }

@@ -18,12 +18,14 @@ pub mod supply;
 mod used;
 pub mod verifier;
 
-pub use crate::wire::keys::{KeyMessage, MessageError, Violation};
-pub use bootstrap::{Acceptor, Completion, Dial, DialKey, DialRefusal, Dialler, Lookup, Resolver};
+pub use crate::wire::keys::{KeyMessage, KeyViolation, MessageError};
+pub use bootstrap::{
+    Acceptor, BootstrapDialler, Completion, Dial, DialKey, DialRefusal, Lookup, Resolver,
+};
 pub use clock::Clock;
 pub use exporters::{ENVELOPE_EXPORTER, Exporters, READY_EXPORTER};
-pub use kme::{Event, Events, Kme, KmeError, RequestOrigin, Statistics};
-pub use request::{Answer, Failure, FailureKind, Fetched, KeyPurpose, KmeRequest, Stock};
+pub use kme::{Events, Kme, KmeAnswer, KmeError, RequestOrigin, Statistics};
+pub use request::{Answer, FailureKind, Fetched, KeyPurpose, KmeRequest, RequestFailure, Stock};
 pub use supply::{Disagreement, KeyReceiver, KeySender, NoKey, SupplyError};
 pub use used::{UsedKeys, UsedStatistics};
 pub use verifier::{ClientProof, ProofFailure, ProofResponder, ProofState};

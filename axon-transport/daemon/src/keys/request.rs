@@ -56,12 +56,12 @@ pub struct Answer {
     /// From asking to the end.
     pub took: Duration,
     /// What came of it.
-    pub outcome: Result<Fetched, Failure>,
+    pub outcome: Result<Fetched, RequestFailure>,
 }
 
 /// What a successful [`KmeRequest`] gave.
 pub enum Fetched {
-    /// Keys, in the order asked for. All that were asked for, or it is a [`Failure`]; of
+    /// Keys, in the order asked for. All that were asked for, or it is a [`RequestFailure`]; of
     /// `enc_keys` for messages without those that were used before.
     Keys(Vec<(KeyId, KmeKey)>),
     /// The answer to [`KmeRequest::Status`].
@@ -70,7 +70,7 @@ pub enum Fetched {
 
 /// Why a [`KmeRequest`] failed. Never holds anything of a key.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Failure {
+pub struct RequestFailure {
     /// What can be done about it.
     pub kind: FailureKind,
     /// For log and status.
@@ -79,7 +79,7 @@ pub struct Failure {
     pub retry_after: Option<Duration>,
 }
 
-/// What can be done about a [`Failure`].
+/// What can be done about a [`RequestFailure`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum FailureKind {
     /// No connection; nothing was asked. Try later.
@@ -101,7 +101,7 @@ pub enum FailureKind {
     Invalid,
 }
 
-impl Failure {
+impl RequestFailure {
     /// One after which the KME asked for no pause.
     pub fn new(kind: FailureKind, text: impl Into<String>) -> Self {
         Self { kind, text: text.into(), retry_after: None }
@@ -138,10 +138,10 @@ impl FailureKind {
     }
 }
 
-impl fmt::Display for Failure {
+impl fmt::Display for RequestFailure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&self.text)
     }
 }
 
-impl std::error::Error for Failure {}
+impl std::error::Error for RequestFailure {}

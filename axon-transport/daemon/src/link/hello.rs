@@ -4,7 +4,7 @@ use axon_shm::ids::DaemonId;
 use axon_transport::config::{Config, Security};
 
 use super::CloseCode;
-use crate::wire::{SecurityTerms, link::Hello};
+use crate::wire::{SecurityTerms, link::LinkHello};
 
 /// The protocol version of this build; it speaks no other.
 pub const PROTOCOL: u8 = 1;
@@ -12,7 +12,7 @@ pub const PROTOCOL: u8 = 1;
 /// A setting in which two daemons differ.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{setting} is {ours} on the side that refuses, {theirs} on the other")]
-pub struct Mismatch {
+pub struct TermMismatch {
     /// The code that closes the link.
     pub code: CloseCode,
     /// The variable or field.
@@ -23,7 +23,7 @@ pub struct Mismatch {
     pub theirs: String,
 }
 
-impl Hello {
+impl LinkHello {
     /// What `config` says of this daemon.
     pub fn new(config: &Config, daemon: DaemonId) -> Self {
         let SecurityTerms { mode, key_mode, kex, cipher, auth } = SecurityTerms::of(config);
@@ -68,12 +68,17 @@ impl Hello {
 /// classic.
 ///
 /// # Errors
-/// The first [`Mismatch`].
-pub fn check(ours: &Hello, theirs: &Hello, psk_sae: Option<&str>) -> Result<(), Mismatch> {
-    let differ =
-        |code, setting, ours: String, theirs: String| Err(Mismatch { code, setting, ours, theirs });
+/// The first [`TermMismatch`].
+pub fn check(
+    ours: &LinkHello,
+    theirs: &LinkHello,
+    psk_sae: Option<&str>,
+) -> Result<(), TermMismatch> {
+    let differ = |code, setting, ours: String, theirs: String| {
+        Err(TermMismatch { code, setting, ours, theirs })
+    };
     if theirs.protocol_min > ours.protocol_max || theirs.protocol_max < ours.protocol_min {
-        let range = |h: &Hello| format!("{}..={}", h.protocol_min, h.protocol_max);
+        let range = |h: &LinkHello| format!("{}..={}", h.protocol_min, h.protocol_max);
         return differ(CloseCode::Protocol, "protocol version", range(ours), range(theirs));
     }
     if theirs.daemon == ours.daemon {

@@ -9,14 +9,14 @@ mod order;
 
 pub(crate) use crate::wire::link::is_known;
 pub use crate::wire::link::{
-    AccessCheck, AccessDecisions, Asserted, CloseCode, Denied, DeniedUse, Elected, FrameError,
-    Graph, GraphResync, Hello, Intake, LastSeen, LinkClosed, MAX_DENIED, MAX_FRAME,
-    MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, MAX_PROOFS, Message, Owners, Received, ReceivedOf,
-    RouteReady, RouteRefused, RouteSubscriber, RouteUnasked, Subscribe, Unsubscribe, UseDecision,
-    read_length, unpacked_length,
+    AccessDecisions, CloseCode, DeniedUse, DeniedUses, Elected, FrameError, GraphResync,
+    GraphUpdate, Intake, LastSeen, LinkAccessCheck, LinkClosed, LinkHello, LinkMessage,
+    LivelinessAsserted, MAX_DENIED, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, MAX_PROOFS,
+    Owners, ReceivedOf, ReceivedUpTo, RouteReady, RouteRefused, RouteSubscriber, RouteUnasked,
+    Subscribe, Unsubscribe, UseDecision, read_length, unpacked_length,
 };
 pub use election::{Candidate, keep};
-pub use hello::{Mismatch, PROTOCOL, check};
+pub use hello::{PROTOCOL, TermMismatch, check};
 pub use order::{Order, OutOfOrder, Side};
 
 #[cfg(test)]

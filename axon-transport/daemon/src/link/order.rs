@@ -3,7 +3,7 @@
 //! Both sides send HELLO. In qkd the client proves its name. The side with the lower daemon id sends ELECTED. Only
 //! after that may graph, routes, data and ordinary keys follow (`docs/formats.md`, section 6).
 
-use crate::wire::{keys::KeyMessage, link::Message};
+use crate::wire::{keys::KeyMessage, link::LinkMessage};
 
 /// Which end of the TLS handshake this side is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -79,21 +79,25 @@ impl Order {
     ///
     /// # Errors
     /// [`OutOfOrder`]; the connection is then closed.
-    pub fn accept(&mut self, message: &Message) -> Result<(), OutOfOrder> {
+    pub fn accept(&mut self, message: &LinkMessage) -> Result<(), OutOfOrder> {
         let allowed = match (message, self.step) {
-            (Message::Hello(_), OrderStep::Hello) => !std::mem::replace(&mut self.hello_seen, true),
-            (Message::Hello(_), _) => false,
+            (LinkMessage::LinkHello(_), OrderStep::Hello) => {
+                !std::mem::replace(&mut self.hello_seen, true)
+            }
+            (LinkMessage::LinkHello(_), _) => false,
             // The server announces the key that proves the client's name.
-            (Message::Keys(KeyMessage::Announce(_)), OrderStep::Proof) => self.side == Side::Client,
+            (LinkMessage::Keys(KeyMessage::Announce(_)), OrderStep::Proof) => {
+                self.side == Side::Client
+            }
             (
-                Message::Keys(KeyMessage::Ready { .. } | KeyMessage::Failed { .. }),
+                LinkMessage::Keys(KeyMessage::Ready { .. } | KeyMessage::Failed { .. }),
                 OrderStep::Proof,
             ) => self.side == Side::Server,
-            (Message::Elected(_), OrderStep::Election) => self.peer_elects,
-            (Message::Keepalive, step) => step != OrderStep::Hello,
+            (LinkMessage::Elected(_), OrderStep::Election) => self.peer_elects,
+            (LinkMessage::Keepalive, step) => step != OrderStep::Hello,
             // Key announcements exist in qkd alone.
-            (Message::Keys(_), OrderStep::Open) => self.qkd,
-            (Message::Elected(_), OrderStep::Open) => false,
+            (LinkMessage::Keys(_), OrderStep::Open) => self.qkd,
+            (LinkMessage::Elected(_), OrderStep::Open) => false,
             (_, OrderStep::Open) => true,
             _ => false,
         };
@@ -110,27 +114,27 @@ impl Order {
     }
 }
 
-impl Message {
+impl LinkMessage {
     /// The message's name in `docs/formats.md`.
     pub fn name(&self) -> &'static str {
         match self {
-            Self::Hello(_) => "HELLO",
+            Self::LinkHello(_) => "HELLO",
             Self::Elected(_) => "ELECTED",
-            Self::Graph(_) => "GRAPH",
+            Self::GraphUpdate(_) => "GRAPH",
             Self::GraphResync(_) => "GRAPH_RESYNC",
             Self::Subscribe(_) => "SUBSCRIBE",
             Self::Unsubscribe(_) => "UNSUBSCRIBE",
             Self::RouteReady(_) => "ROUTE_READY",
             Self::Keepalive => "KEEPALIVE",
-            Self::Asserted(_) => "ASSERTED",
-            Self::Received(_) => "RECEIVED",
+            Self::LivelinessAsserted(_) => "ASSERTED",
+            Self::ReceivedUpTo(_) => "RECEIVED",
             Self::RouteRefused(_) => "ROUTE_REFUSED",
             Self::RouteUnasked(_) => "ROUTE_UNASKED",
             Self::Owners(_) => "OWNERS",
             Self::LinkClosed(_) => "LINK_CLOSED",
             Self::Intake(_) => "INTAKE",
-            Self::Denied(_) => "DENIED",
-            Self::AccessCheck(_) => "ACCESS_CHECK",
+            Self::DeniedUses(_) => "DENIED",
+            Self::LinkAccessCheck(_) => "ACCESS_CHECK",
             Self::AccessDecisions(_) => "ACCESS_DECISIONS",
             Self::Keys(m) => m.name(),
         }

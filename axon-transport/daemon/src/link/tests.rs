@@ -12,16 +12,16 @@ fn a_hello_that_differs_is_refused_by_name() {
     assert_eq!(check(&ours, &peer(), Some("sae-b")), Ok(()));
     let claimed = check(&ours, &peer(), None).unwrap_err();
     assert_eq!(claimed.code, CloseCode::Sae, "an SAE that no PSK names");
-    let cases: [(Hello, CloseCode); 9] = [
-        (Hello { protocol_min: 2, protocol_max: 3, ..peer() }, CloseCode::Protocol),
-        (Hello { daemon: ours.daemon, ..peer() }, CloseCode::Self_),
-        (Hello { domain: 5, ..peer() }, CloseCode::Domain),
-        (Hello { mode: 0, ..peer() }, CloseCode::Mode),
-        (Hello { key_mode: 1, ..peer() }, CloseCode::KeyMode),
-        (Hello { kex: 2, ..peer() }, CloseCode::Kex),
-        (Hello { cipher: 200, ..peer() }, CloseCode::Cipher),
-        (Hello { auth: Some(0), ..peer() }, CloseCode::Auth),
-        (Hello { sae: Some("sae-c".into()), ..peer() }, CloseCode::Sae),
+    let cases: [(LinkHello, CloseCode); 9] = [
+        (LinkHello { protocol_min: 2, protocol_max: 3, ..peer() }, CloseCode::Protocol),
+        (LinkHello { daemon: ours.daemon, ..peer() }, CloseCode::Self_),
+        (LinkHello { domain: 5, ..peer() }, CloseCode::Domain),
+        (LinkHello { mode: 0, ..peer() }, CloseCode::Mode),
+        (LinkHello { key_mode: 1, ..peer() }, CloseCode::KeyMode),
+        (LinkHello { kex: 2, ..peer() }, CloseCode::Kex),
+        (LinkHello { cipher: 200, ..peer() }, CloseCode::Cipher),
+        (LinkHello { auth: Some(0), ..peer() }, CloseCode::Auth),
+        (LinkHello { sae: Some("sae-c".into()), ..peer() }, CloseCode::Sae),
     ];
     for (theirs, code) in cases {
         assert_eq!(check(&ours, &theirs, Some("sae-b")).unwrap_err().code, code);
@@ -41,19 +41,22 @@ fn nothing_precedes_hello_proof_and_election() {
         order.hello_checked(true);
         for m in &others {
             let proof = match side {
-                Side::Client => matches!(m, Message::Keys(KeyMessage::Announce(_))),
+                Side::Client => matches!(m, LinkMessage::Keys(KeyMessage::Announce(_))),
                 Side::Server => {
-                    matches!(m, Message::Keys(KeyMessage::Ready { .. } | KeyMessage::Failed { .. }))
+                    matches!(
+                        m,
+                        LinkMessage::Keys(KeyMessage::Ready { .. } | KeyMessage::Failed { .. })
+                    )
                 }
             };
-            let allowed = proof || matches!(m, Message::Keepalive);
+            let allowed = proof || matches!(m, LinkMessage::Keepalive);
             assert_eq!(order.accept(m).is_ok(), allowed, "{} before the proof", m.name());
         }
         order.proven();
-        assert!(order.accept(&Message::Graph(Graph::default())).is_err());
+        assert!(order.accept(&LinkMessage::GraphUpdate(GraphUpdate::default())).is_err());
         order.accept(&elected()).unwrap();
         order.elected();
-        order.accept(&Message::Graph(Graph::default())).unwrap();
+        order.accept(&LinkMessage::GraphUpdate(GraphUpdate::default())).unwrap();
         assert!(order.accept(&elected()).is_err(), "a second ELECTED");
     }
 }
@@ -65,5 +68,5 @@ fn the_higher_id_cannot_elect_and_classic_knows_no_keys() {
     order.hello_checked(false);
     assert!(order.accept(&elected()).is_err());
     order.elected();
-    assert!(order.accept(&Message::Keys(KeyMessage::Announce(vec![key_id("k")]))).is_err());
+    assert!(order.accept(&LinkMessage::Keys(KeyMessage::Announce(vec![key_id("k")]))).is_err());
 }

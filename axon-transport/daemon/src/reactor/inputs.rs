@@ -17,7 +17,7 @@ use crate::{
     bridge::ToGateway,
     discovery::Interface,
     engine::compression::CompressionAnswer,
-    keys::{Event, Events, Statistics, UsedStatistics},
+    keys::{Events, KmeAnswer, Statistics, UsedStatistics},
     watch::watch,
 };
 
@@ -39,11 +39,11 @@ pub(super) enum TaskResult {
 }
 
 /// An input.
-pub(super) enum Input {
+pub(super) enum ReactorInput {
     /// An order of the control plane.
     Order(ToGateway),
     /// The KME answered.
-    Key(Event),
+    Key(KmeAnswer),
     /// Another thread did something.
     TaskResult(TaskResult),
 }
@@ -56,7 +56,7 @@ pub(super) struct Inputs {
     doorbell: AsyncFd<PassedFd>,
     rang: bool,
     /// Inputs that woke the loop.
-    taken: Vec<Input>,
+    taken: Vec<ReactorInput>,
 }
 
 impl Inputs {
@@ -81,24 +81,24 @@ impl Inputs {
     }
 
     /// The inputs that are there, up to a bound.
-    pub(super) fn take(&mut self) -> Vec<Input> {
+    pub(super) fn take(&mut self) -> Vec<ReactorInput> {
         let mut inputs = std::mem::take(&mut self.taken);
         for _ in 0..BATCH {
             match self.orders.try_recv() {
-                Ok(order) => inputs.push(Input::Order(order)),
+                Ok(order) => inputs.push(ReactorInput::Order(order)),
                 Err(TryRecvError::Empty) => break,
                 Err(TryRecvError::Disconnected) => {
-                    inputs.push(Input::Order(ToGateway::Shutdown));
+                    inputs.push(ReactorInput::Order(ToGateway::Shutdown));
                     break;
                 }
             }
         }
         for _ in 0..BATCH {
             let Some(event) = self.key_events.as_mut().and_then(Events::try_recv) else { break };
-            inputs.push(Input::Key(event));
+            inputs.push(ReactorInput::Key(event));
         }
         while let Ok(done) = self.done.try_recv() {
-            inputs.push(Input::TaskResult(done));
+            inputs.push(ReactorInput::TaskResult(done));
         }
         inputs
     }
@@ -112,18 +112,18 @@ impl Inputs {
             }
         }
         if let Poll::Ready(order) = self.orders.poll_recv(cx) {
-            self.taken.push(Input::Order(order.unwrap_or(ToGateway::Shutdown)));
+            self.taken.push(ReactorInput::Order(order.unwrap_or(ToGateway::Shutdown)));
         }
         if let Some(events) = &mut self.key_events {
             match events.poll_recv(cx) {
-                Poll::Ready(Some(event)) => self.taken.push(Input::Key(event)),
+                Poll::Ready(Some(event)) => self.taken.push(ReactorInput::Key(event)),
                 // The KME client ended. Its last answers were taken.
                 Poll::Ready(None) => self.key_events = None,
                 Poll::Pending => {}
             }
         }
         if let Poll::Ready(Some(done)) = self.done.poll_recv(cx) {
-            self.taken.push(Input::TaskResult(done));
+            self.taken.push(ReactorInput::TaskResult(done));
         }
         if self.rang || !self.taken.is_empty() { Poll::Ready(()) } else { Poll::Pending }
     }

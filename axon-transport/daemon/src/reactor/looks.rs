@@ -30,7 +30,7 @@ pub(super) enum PollDecision {
 
 /// The rule, and what looking brought.
 #[derive(Debug)]
-pub(super) struct Looks {
+pub(super) struct PollRule {
     poll: LinkPoll,
     /// Looks of this trial, and those among them that found an input.
     made: u32,
@@ -41,7 +41,7 @@ pub(super) struct Looks {
     pause: u32,
 }
 
-impl Looks {
+impl PollRule {
     /// Nothing was looked for yet. On a host with one processor a look would keep the sender of the input from it.
     pub(super) fn new(poll: LinkPoll, processors: usize) -> Self {
         let poll = match poll {
@@ -87,7 +87,7 @@ mod tests {
     use super::*;
 
     /// Looks made in so many busy passes, the input following a look in time if `comes` says so.
-    fn looks(looks: &mut Looks, passes: u32, comes: impl Fn(u32) -> bool) -> u32 {
+    fn looks(looks: &mut PollRule, passes: u32, comes: impl Fn(u32) -> bool) -> u32 {
         let mut made = 0;
         for pass in 0..passes {
             if looks.after_pass(true) != PollDecision::Not {
@@ -100,7 +100,7 @@ mod tests {
 
     #[test]
     fn a_daemon_whose_looks_find_nothing_nearly_stops_looking() {
-        let mut adaptive = Looks::new(LinkPoll::Adaptive, 2);
+        let mut adaptive = PollRule::new(LinkPoll::Adaptive, 2);
         assert_eq!(looks(&mut adaptive, 13, |_| false), 13, "a trial");
         assert_eq!(looks(&mut adaptive, 64, |_| false), 0, "and a pause");
         looks(&mut adaptive, 20_000, |_| false);
@@ -109,7 +109,7 @@ mod tests {
 
     #[test]
     fn a_daemon_whose_inputs_follow_each_other_looks_after_each_pass() {
-        let mut adaptive = Looks::new(LinkPoll::Adaptive, 2);
+        let mut adaptive = PollRule::new(LinkPoll::Adaptive, 2);
         assert_eq!(looks(&mut adaptive, 10_000, |_| true), 10_000);
         assert_eq!(looks(&mut adaptive, 10_000, |pass| pass % PAYS == 0), 10_000);
         // It notices that they stopped, and soon that they began again.
@@ -119,7 +119,7 @@ mod tests {
 
     #[test]
     fn a_pass_without_work_is_not_followed_by_a_look() {
-        let mut adaptive = Looks::new(LinkPoll::Adaptive, 2);
+        let mut adaptive = PollRule::new(LinkPoll::Adaptive, 2);
         assert_eq!(adaptive.after_pass(false), PollDecision::Not);
         assert_eq!(adaptive.after_pass(true), PollDecision::For(LOOK));
         // Nor does it shorten a pause.
@@ -132,7 +132,7 @@ mod tests {
     #[test]
     fn always_and_never_are_what_they_say_and_one_processor_is_left_to_the_others() {
         for busy in [false, true] {
-            let after = |poll, processors| Looks::new(poll, processors).after_pass(busy);
+            let after = |poll, processors| PollRule::new(poll, processors).after_pass(busy);
             assert_eq!(after(LinkPoll::Always, 1), PollDecision::On);
             assert_eq!(after(LinkPoll::Never, 64), PollDecision::Not);
             assert_eq!(after(LinkPoll::Adaptive, 1), PollDecision::Not);

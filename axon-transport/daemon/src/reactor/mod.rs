@@ -51,7 +51,7 @@ use crate::{
     error::GatewayError,
     identity,
     keys::Events,
-    link::Hello,
+    link::LinkHello,
 };
 
 /// Tasks on other threads, such as a write to the ledger of used keys, are waited for so long at the end.
@@ -78,7 +78,7 @@ async fn serve(
     key_events: Option<Events>,
 ) -> Result<(), GatewayError> {
     let GatewayParts { config, daemon, daemon_key, keys, socket, control, orders } = parts;
-    let mut hello = Hello::new(&config, daemon);
+    let mut hello = LinkHello::new(&config, daemon);
     hello.routes = u32::try_from(MAX_ROUTES).ok();
     let identity = match &config.security {
         Security::Classic(classic) => Some(Arc::new(identity::load(classic, &hello.host)?)),

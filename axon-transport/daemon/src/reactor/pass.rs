@@ -22,9 +22,9 @@ use super::{
     compressor::CompressorThread,
     control_outbox::ControlOutbox,
     finishing::Finishing,
-    inputs::{Input, Inputs, TaskResult},
+    inputs::{Inputs, ReactorInput, TaskResult},
     key_reports::KeyReports,
-    looks::{Looks, PollDecision},
+    looks::{PollDecision, PollRule},
     rings::ShmRings,
     session::{Notices, local_graph},
     sockets::{ReceivedDatagram, Sockets},
@@ -36,7 +36,7 @@ use crate::{
     engine::{Effect, Engine},
     error::GatewayError,
     identity::Identity,
-    keys::{Event, Events, Kme, UsedKeys},
+    keys::{Events, Kme, KmeAnswer, UsedKeys},
 };
 
 /// Packets that one pass sends before it takes in what has come, in system calls.
@@ -82,7 +82,7 @@ pub(super) struct Reactor {
     inputs: Inputs,
     kme: Option<(Kme, UsedKeys)>,
     /// Answers that the KME client gave at once.
-    answers: Vec<Event>,
+    answers: Vec<KmeAnswer>,
     report_done: mpsc::UnboundedSender<TaskResult>,
     compressor: CompressorThread,
     buffer: Vec<u8>,
@@ -93,7 +93,7 @@ pub(super) struct Reactor {
     finishing: Option<Finishing>,
     shutdown: bool,
     key_reports: KeyReports,
-    looks: Looks,
+    looks: PollRule,
     timer: Timer,
 }
 
@@ -128,7 +128,7 @@ impl Reactor {
             finishing: None,
             shutdown: false,
             key_reports: KeyReports::default(),
-            looks: Looks::new(parts.poll, processors),
+            looks: PollRule::new(parts.poll, processors),
             timer: Timer::new(),
         })
     }
@@ -213,9 +213,9 @@ impl Reactor {
         for input in self.inputs.take() {
             busy = true;
             match input {
-                Input::Order(order) => self.handle_order(order, now),
-                Input::Key(event) => self.engine.handle_key_event(event, now),
-                Input::TaskResult(done) => self.handle_done(done, now),
+                ReactorInput::Order(order) => self.handle_order(order, now),
+                ReactorInput::Key(event) => self.engine.handle_key_event(event, now),
+                ReactorInput::TaskResult(done) => self.handle_done(done, now),
             }
         }
         if self.engine.follow_local_at() <= now && self.notices.take_graph() {

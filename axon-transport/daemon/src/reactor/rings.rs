@@ -81,7 +81,7 @@ impl Rings for ShmRings {
         held: &Arc<Allowance>,
     ) -> Result<Rc<dyn RingWriter>, String> {
         let writer = RemoteWriter::stand_in(&self.session, remote.clone(), held);
-        Ok(Rc::new(Writer(writer.map_err(|error| error.to_string())?)))
+        Ok(Rc::new(StandInWriter(writer.map_err(|error| error.to_string())?)))
     }
 
     fn take_active(&self, found: &mut Vec<(Gid, Gid)>) {
@@ -197,9 +197,9 @@ impl RingReader for RelayReader {
 }
 
 /// A stand-in.
-struct Writer(RemoteWriter);
+struct StandInWriter(RemoteWriter);
 
-impl RingWriter for Writer {
+impl RingWriter for StandInWriter {
     fn endpoint(&self) -> &Endpoint {
         self.0.endpoint()
     }

@@ -79,7 +79,7 @@ impl From<minicbor::decode::Error> for MessageError {
 /// What a peer did against the rules for key announcements. The link is closed for it.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
-pub enum Violation {
+pub enum KeyViolation {
     /// RETIRE with masks that contradict each other, or what has opened.
     #[error("RETIRE for key_ID {0}: {1}")]
     Masks(KeyId, String),
@@ -88,7 +88,7 @@ pub enum Violation {
     Unexpected(&'static str),
 }
 
-impl Violation {
+impl KeyViolation {
     /// The application error code to close the connection with (docs/formats.md, section 6).
     pub fn code(&self) -> u64 {
         match self {

@@ -14,10 +14,10 @@ const INTERVAL: Duration = Duration::from_secs(1);
 
 /// A token bucket for each kind of line.
 #[derive(Debug)]
-pub(super) struct Throttle<K>(Mutex<HashMap<K, Bucket>>);
+pub(super) struct Throttle<K>(Mutex<HashMap<K, LineBucket>>);
 
 #[derive(Debug)]
-struct Bucket {
+struct LineBucket {
     tokens: u32,
     filled: Instant,
     left_out: u64,
@@ -34,7 +34,7 @@ impl<K: Eq + Hash> Throttle<K> {
     pub(super) fn admit(&self, kind: K, now: Instant) -> Option<u64> {
         let mut buckets = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let bucket =
-            buckets.entry(kind).or_insert(Bucket { tokens: BURST, filled: now, left_out: 0 });
+            buckets.entry(kind).or_insert(LineBucket { tokens: BURST, filled: now, left_out: 0 });
         let intervals = now.saturating_duration_since(bucket.filled).as_secs() / INTERVAL.as_secs();
         if intervals > 0 {
             let more = u32::try_from(intervals).unwrap_or(u32::MAX);

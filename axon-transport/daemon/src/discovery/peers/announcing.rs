@@ -9,7 +9,7 @@ use std::{
 use axon_transport::config::DiscoveryRange;
 use rand::RngExt;
 
-use super::{Output, Peers, record::DaemonRecord};
+use super::{PeerDiscovery, PeersOutput, record::DaemonRecord};
 use crate::{
     discovery::quic_ports,
     wire::beacon::{Beacon, Datagram, PROTOCOLS},
@@ -28,7 +28,7 @@ const INTERVAL_PER_HOST: Duration = Duration::from_millis(250);
 /// Most hosts that count without anything being known of them but a beacon.
 const MOST_HEARD_COUNT: usize = 32;
 
-impl Peers {
+impl PeerDiscovery {
     /// This daemon ends: tells those who would otherwise dial it.
     pub(crate) fn say_goodbye(&mut self) {
         if self.port.is_none() || self.local.range == DiscoveryRange::Off {
@@ -98,7 +98,7 @@ impl Peers {
     fn announce(&mut self, bytes: &[u8]) {
         let mut targets = Vec::new();
         if self.local.range == DiscoveryRange::Subnet {
-            self.outputs.push_back(Output::Multicast(bytes.to_vec()));
+            self.outputs.push_back(PeersOutput::Multicast(bytes.to_vec()));
             targets.push((IpAddr::from(Ipv4Addr::LOCALHOST), None));
         }
         targets.extend(&self.listed);

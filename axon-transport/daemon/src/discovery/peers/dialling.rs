@@ -5,7 +5,7 @@ use std::{net::IpAddr, time::Duration};
 use axon_shm::ids::DaemonId;
 use rand::RngExt;
 
-use super::{Peers, record::DaemonRecord};
+use super::{PeerDiscovery, record::DaemonRecord};
 use crate::discovery::{AddressConfidence, DiscoveryAction};
 
 /// Most dials at once.
@@ -34,7 +34,7 @@ impl InFlight {
     }
 }
 
-impl Peers {
+impl PeerDiscovery {
     pub(super) fn give_up_lost_dials(&mut self, now: Duration) {
         let lost = self.records.iter().flat_map(|(id, record)| {
             let lost = record.in_flight().filter(|(_, d)| d.in_flight.is_some_and(|at| at <= now));

@@ -4,7 +4,7 @@ use std::{cmp::Reverse, collections::BTreeMap, net::IpAddr, time::Duration};
 
 use axon_shm::ids::DaemonId;
 
-use super::{MOST_UNAUTHENTICATED, Peers, record::DaemonRecord};
+use super::{MOST_UNAUTHENTICATED, PeerDiscovery, record::DaemonRecord};
 use crate::discovery::{AddressConfidence, DiscoveryAction};
 
 /// Most records of daemons that are known by a beacon alone. The remaining records are for other daemons.
@@ -41,7 +41,7 @@ fn is_heard(record: &DaemonRecord) -> bool {
     record.standing() == AddressConfidence::Heard
 }
 
-impl Peers {
+impl PeerDiscovery {
     /// Makes room for a record of `daemon`, if it has none. If there are too many, the oldest record of the host with
     /// most records is dropped.
     pub(super) fn make_room(&mut self, daemon: DaemonId, from: IpAddr) {

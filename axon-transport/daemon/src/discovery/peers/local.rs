@@ -9,7 +9,7 @@ use crate::wire::SecurityTerms;
 
 /// This daemon, as others are to see it and as it judges others.
 #[derive(Clone, Debug)]
-pub(crate) struct Local {
+pub(crate) struct LocalDaemon {
     /// Its id.
     pub daemon: DaemonId,
     /// `ROS_DOMAIN_ID`.
@@ -26,7 +26,7 @@ pub(crate) struct Local {
     pub advertise: Vec<IpAddr>,
 }
 
-impl Local {
+impl LocalDaemon {
     /// The daemon that `config` describes.
     pub(crate) fn of(config: &Config, daemon: DaemonId) -> Self {
         let sae = match &config.security {

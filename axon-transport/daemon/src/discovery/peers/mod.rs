@@ -28,7 +28,7 @@ use rand::{RngExt, SeedableRng, rngs::StdRng};
 
 #[cfg(test)]
 use self::dialling::MOST_IN_FLIGHT;
-pub(crate) use self::local::Local;
+pub(crate) use self::local::LocalDaemon;
 use self::{
     candidates::LocalAddresses,
     eviction::EvictionCandidates,
@@ -53,9 +53,9 @@ pub(crate) enum Arrival {
     Quic,
 }
 
-/// What [`Peers`] wants done.
+/// What [`PeerDiscovery`] wants done.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) enum Output {
+pub(crate) enum PeersOutput {
     /// To the group, on every interface.
     Multicast(Vec<u8>),
     /// For the daemon.
@@ -64,8 +64,8 @@ pub(crate) enum Output {
 
 /// The state machine of discovery.
 #[derive(Debug)]
-pub(crate) struct Peers {
-    local: Local,
+pub(crate) struct PeerDiscovery {
+    local: LocalDaemon,
     here: LocalAddresses,
     records: BTreeMap<DaemonId, DaemonRecord>,
     victims: EvictionCandidates,
@@ -93,12 +93,12 @@ pub(crate) struct Peers {
     met: VecDeque<IpAddr>,
     reports: TokenBucket,
     random: StdRng,
-    outputs: VecDeque<Output>,
+    outputs: VecDeque<PeersOutput>,
 }
 
-impl Peers {
+impl PeerDiscovery {
     /// A daemon that knows nobody. It is silent until its [QUIC port](Self::set_port) is known.
-    pub(crate) fn new(local: Local, seed: u64) -> Self {
+    pub(crate) fn new(local: LocalDaemon, seed: u64) -> Self {
         let here = LocalAddresses { bind: local.bind.clone(), interfaces: Vec::new() };
         Self {
             local,
@@ -128,7 +128,7 @@ impl Peers {
     }
 
     /// The next thing to do; ask until it says `None`.
-    pub(crate) fn poll_output(&mut self) -> Option<Output> {
+    pub(crate) fn poll_output(&mut self) -> Option<PeersOutput> {
         // Once for all datagrams that came together.
         if let Some(now) = self.dials_due.take() {
             self.dial_due(now);
@@ -331,6 +331,6 @@ impl Peers {
     }
 
     fn act(&mut self, action: DiscoveryAction) {
-        self.outputs.push_back(Output::Action(action));
+        self.outputs.push_back(PeersOutput::Action(action));
     }
 }

@@ -5,10 +5,10 @@ use std::time::Duration;
 
 use axon_shm::ids::DaemonId;
 
-use super::Peers;
+use super::PeerDiscovery;
 use crate::discovery::AddressConfidence;
 
-impl Peers {
+impl PeerDiscovery {
     /// The path of the link with `daemon` works, or does not: then the daemon is looked for at other addresses.
     pub(crate) fn handle_path(&mut self, now: Duration, daemon: DaemonId, works: bool) {
         let Some(record) = self.records.get_mut(&daemon).filter(|record| record.linked) else {
@@ -43,7 +43,7 @@ mod tests {
     const NEW: &str = "10.0.0.7:61301";
 
     /// Linked with a peer at the old address.
-    fn linked() -> Peers {
+    fn linked() -> PeerDiscovery {
         let mut peers = settled(local());
         hear(&mut peers, 3.0, beacon(HIGHER));
         assert_eq!(dials(&mut peers), [HIGHER]);
@@ -52,14 +52,14 @@ mod tests {
     }
 
     /// A beacon comes from the new address. The probe of it, if one is sent.
-    fn hear_new(peers: &mut Peers, now: f64) -> Option<[u8; 8]> {
+    fn hear_new(peers: &mut PeerDiscovery, now: f64) -> Option<[u8; 8]> {
         let bytes = Datagram::Beacon(beacon(HIGHER)).encode();
         peers.handle_datagram(secs(now), from(NEW), Arrival::Shared, &bytes);
         probe(peers)
     }
 
     /// The probe of the new address among what is to be done, which is nothing else.
-    fn probe(peers: &mut Peers) -> Option<[u8; 8]> {
+    fn probe(peers: &mut PeerDiscovery) -> Option<[u8; 8]> {
         let sent = actions(peers).into_iter().map(|action| match action {
             DiscoveryAction::SendFromQuicPort { to, bytes } if to == from(NEW) => {
                 match Datagram::decode(&bytes) {
@@ -72,7 +72,7 @@ mod tests {
         sent.collect::<Vec<_>>().last().copied()
     }
 
-    fn answer(peers: &mut Peers, now: f64, nonce: [u8; 8]) {
+    fn answer(peers: &mut PeerDiscovery, now: f64, nonce: [u8; 8]) {
         let echo = Datagram::Echo { daemon: HIGHER, nonce }.encode();
         peers.handle_datagram(secs(now), from(NEW), Arrival::Quic, &echo);
     }

@@ -12,7 +12,7 @@ use std::{
 use axon_shm::ids::DaemonId;
 use rand::RngExt;
 
-use super::{Peers, record::DialAddress};
+use super::{PeerDiscovery, record::DialAddress};
 use crate::{
     discovery::{AddressConfidence, quic_ports},
     wire::beacon::Datagram,
@@ -44,7 +44,7 @@ pub(super) struct ProbeInFlight {
 /// The probes whose answers are awaited, the oldest first.
 pub(super) type Probes = VecDeque<ProbeInFlight>;
 
-impl Peers {
+impl PeerDiscovery {
     /// Asks the addresses of this standing that were not asked since their latest beacon.
     pub(super) fn ask_whether_there(
         &mut self,

@@ -7,7 +7,7 @@ use axon_transport::config::DiscoveryRange;
 use rand::RngExt;
 use tracing::{debug, info};
 
-use super::{Arrival, Peers, record::DialAddress};
+use super::{Arrival, PeerDiscovery, record::DialAddress};
 use crate::{
     discovery::{DiscoveryAction, PeerMismatch},
     wire::{
@@ -19,7 +19,7 @@ use crate::{
 /// A peer is answered at most this often.
 const ANSWER_SPACING: Duration = Duration::from_secs(1);
 
-impl Peers {
+impl PeerDiscovery {
     /// A datagram came.
     pub(crate) fn handle_datagram(
         &mut self,

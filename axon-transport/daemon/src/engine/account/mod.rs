@@ -19,11 +19,11 @@ use std::{
 
 use axon_shm::internal::Allowance;
 
-use self::pace::Turns;
+use self::pace::ChangeTurns;
 use super::{limits::IdentityLimits, peer::routes::RouteKey};
 use crate::{
     keys::KeyMessage,
-    link::{MAX_INFLATED, Message, is_known, unpacked_length},
+    link::{LinkMessage, MAX_INFLATED, is_known, unpacked_length},
     token_bucket::TokenBucket,
 };
 
@@ -303,7 +303,7 @@ pub(crate) struct Account {
     /// How much of which topic may pass.
     pub(crate) limits: Rc<IdentityLimits>,
     /// When its changes are followed up.
-    pub(crate) turns: Rc<RefCell<Turns>>,
+    pub(crate) turns: Rc<RefCell<ChangeTurns>>,
     said: Rc<RefCell<TokenBucket>>,
 }
 
@@ -366,34 +366,36 @@ pub(crate) fn cost_of_frame(frame: &[u8]) -> u32 {
 }
 
 /// What a message costs: about as many changes as it says.
-pub(crate) fn cost(message: &Message) -> u32 {
+pub(crate) fn cost(message: &LinkMessage) -> u32 {
     costs(match message {
-        Message::Graph(graph) => {
+        LinkMessage::GraphUpdate(graph) => {
             let toward = [&graph.localhost, &graph.listing, &graph.denied].into_iter().flatten();
             let toward = toward.map(Vec::len).sum::<usize>() / LOOKED_UP;
             graph.added.len() + graph.removed.len() + toward
         }
-        Message::Subscribe(subscribe) => 7 + subscribe.subscribers.len() + subscribe.last.len(),
+        LinkMessage::Subscribe(subscribe) => 7 + subscribe.subscribers.len() + subscribe.last.len(),
         // Flows that wait are tried again.
-        Message::Intake(_) => 63,
-        Message::Unsubscribe(_) | Message::RouteRefused(_) | Message::RouteUnasked(_) => 7,
-        Message::Denied(uses) => 7 * (uses.denied.len() + uses.lifted.len()),
-        Message::AccessCheck(check) => 7 + 7 * check.uses.len(),
-        Message::AccessDecisions(decisions) => decisions.decisions.len(),
-        Message::Asserted(asserted) => asserted.publishers.len() / 8,
-        Message::Owners(owners) => 7 * owners.proofs.len(),
-        Message::Received(received) => received.flows.len() / LOOKED_UP,
-        Message::RouteReady(ready) => ready.publishers.len() / LOOKED_UP,
+        LinkMessage::Intake(_) => 63,
+        LinkMessage::Unsubscribe(_)
+        | LinkMessage::RouteRefused(_)
+        | LinkMessage::RouteUnasked(_) => 7,
+        LinkMessage::DeniedUses(uses) => 7 * (uses.denied.len() + uses.lifted.len()),
+        LinkMessage::LinkAccessCheck(check) => 7 + 7 * check.uses.len(),
+        LinkMessage::AccessDecisions(decisions) => decisions.decisions.len(),
+        LinkMessage::LivelinessAsserted(asserted) => asserted.publishers.len() / 8,
+        LinkMessage::Owners(owners) => 7 * owners.proofs.len(),
+        LinkMessage::ReceivedUpTo(received) => received.flows.len() / LOOKED_UP,
+        LinkMessage::RouteReady(ready) => ready.publishers.len() / LOOKED_UP,
         // Keys are bounded where they are kept.
-        Message::Keys(KeyMessage::Announce(key_ids)) => key_ids.len() / 8,
-        Message::Keys(
+        LinkMessage::Keys(KeyMessage::Announce(key_ids)) => key_ids.len() / 8,
+        LinkMessage::Keys(
             KeyMessage::Ready { .. } | KeyMessage::Failed { .. } | KeyMessage::Retire { .. },
         ) => 0,
-        Message::Hello(_)
-        | Message::Elected(_)
-        | Message::GraphResync(_)
-        | Message::Keepalive
-        | Message::LinkClosed(_) => 0,
+        LinkMessage::LinkHello(_)
+        | LinkMessage::Elected(_)
+        | LinkMessage::GraphResync(_)
+        | LinkMessage::Keepalive
+        | LinkMessage::LinkClosed(_) => 0,
     })
 }
 

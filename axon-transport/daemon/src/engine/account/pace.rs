@@ -13,18 +13,18 @@ const OTHERS: u32 = 9;
 /// When what follows from a peer's changes is worked out next. What changes in between is taken
 /// together: the newest state counts.
 #[derive(Debug)]
-pub(crate) struct Turns {
+pub(crate) struct ChangeTurns {
     bucket: TokenBucket,
     not_before: Option<Duration>,
 }
 
-impl Default for Turns {
+impl Default for ChangeTurns {
     fn default() -> Self {
         Self { bucket: TokenBucket::new(TURNS.0, TURNS.1), not_before: None }
     }
 }
 
-impl Turns {
+impl ChangeTurns {
     /// How long it is until the next one.
     pub(crate) fn wait(&mut self, now: Duration) -> Duration {
         self.rest(now).max(self.bucket.wait(now))
@@ -57,7 +57,7 @@ mod tests {
 
     #[test]
     fn single_changes_follow_at_once_and_those_of_a_flood_together() {
-        let (mut turns, start) = (Turns::default(), NOW);
+        let (mut turns, start) = (ChangeTurns::default(), NOW);
         for _ in 0..TURNS.0 {
             assert!(turns.take(start));
             turns.over(start, start);
@@ -70,7 +70,7 @@ mod tests {
 
     #[test]
     fn a_turn_that_takes_long_leaves_the_others_nine_times_as_long() {
-        let (mut turns, start) = (Turns::default(), NOW);
+        let (mut turns, start) = (ChangeTurns::default(), NOW);
         assert!(turns.take(start));
         turns.over(start, start + second(50));
         assert!(!turns.take(start + second(499)));

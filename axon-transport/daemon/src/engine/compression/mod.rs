@@ -116,7 +116,7 @@ pub(crate) struct SampleName {
 
 /// The answer to a flow that asks for a sample.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) enum Asked {
+pub(crate) enum CompressionReply {
     /// It is compressed already, or not worth it.
     Known(Option<Bytes>),
     /// The answer to the order with this number will tell.
@@ -172,7 +172,7 @@ impl PeerCompression {
         flow: FlowId,
         name: Option<SampleName>,
         payload: &Bytes,
-    ) -> Option<Asked> {
+    ) -> Option<CompressionReply> {
         self.all.ask(Asker { daemon: self.daemon, flow }, name, payload)
     }
 }
@@ -217,15 +217,15 @@ impl Compression {
         by: Asker,
         name: Option<SampleName>,
         payload: &Bytes,
-    ) -> Option<Asked> {
+    ) -> Option<CompressionReply> {
         let mut state = self.0.borrow_mut();
         if let Some(name) = name {
             if let Some(known) = state.kept.get(&name) {
-                return Some(Asked::Known(known.clone()));
+                return Some(CompressionReply::Known(known.clone()));
             }
             if let Some(number) = state.named.get(&name).copied() {
                 state.pending.get_mut(&number)?.askers.push(by);
-                return Some(Asked::Later(number));
+                return Some(CompressionReply::Later(number));
             }
         }
         let length = payload.len();
@@ -240,7 +240,7 @@ impl Compression {
             state.named.insert(name, number);
         }
         state.orders.push_back(CompressionOrder { number, payload: payload.clone() });
-        Some(Asked::Later(number))
+        Some(CompressionReply::Later(number))
     }
 
     /// The next order for the owner.

@@ -33,8 +33,8 @@ fn compress(payload: Bytes) -> Option<Bytes> {
     Compressor::new().compress(&order(1, payload), || Duration::ZERO).compressed
 }
 
-fn later(number: u64) -> Option<Asked> {
-    Some(Asked::Later(number))
+fn later(number: u64) -> Option<CompressionReply> {
+    Some(CompressionReply::Later(number))
 }
 
 #[test]
@@ -77,7 +77,8 @@ fn the_speed_of_the_compressor_counts() {
     let run = |speed: f64| {
         for _ in 0..40 {
             let payload = text(1 << 20);
-            let Some(Asked::Later(number)) = compression.ask(asker(1), None, &payload) else {
+            let Some(CompressionReply::Later(number)) = compression.ask(asker(1), None, &payload)
+            else {
                 panic!("too much is being compressed")
             };
             let took = Duration::from_secs_f64(payload.len() as f64 / speed);
@@ -114,7 +115,10 @@ fn a_sample_of_a_topic_is_compressed_once_for_all_peers() {
     assert_eq!(compression.handle_answer(&answer(1), NOW), [asker(1), asker(2)]);
     assert_eq!(compression.handle_answer(&answer(1), NOW), [], "it comes once");
     assert_eq!(compression.handle_answer(&answer(9), NOW), [], "nobody asked");
-    assert_eq!(compression.ask(asker(3), name(1), &payload), Some(Asked::Known(compressed)));
+    assert_eq!(
+        compression.ask(asker(3), name(1), &payload),
+        Some(CompressionReply::Known(compressed))
+    );
     // Those of services have no name that is theirs alone.
     assert_eq!(compression.ask(asker(1), None, &payload), later(3));
     assert_eq!(compression.ask(asker(2), None, &payload), later(4));
@@ -127,7 +131,7 @@ fn what_is_not_worth_it_is_not_tried_for_another_peer() {
     assert_eq!(compression.ask(asker(1), name(1), &payload), later(1));
     let answer = CompressionAnswer { number: 1, compressed: None, took: Duration::ZERO };
     compression.handle_answer(&answer, NOW);
-    assert_eq!(compression.ask(asker(2), name(1), &payload), Some(Asked::Known(None)));
+    assert_eq!(compression.ask(asker(2), name(1), &payload), Some(CompressionReply::Known(None)));
 }
 
 #[test]
@@ -142,7 +146,9 @@ fn orders_and_answers_that_are_kept_take_bounded_memory() {
     );
     let payload = noise(1 << 20);
     for number in 1..=100 {
-        let Some(Asked::Later(order)) = compression.ask(asker(1), name(number), &payload) else {
+        let Some(CompressionReply::Later(order)) =
+            compression.ask(asker(1), name(number), &payload)
+        else {
             panic!("there is room")
         };
         let compressed = Some(payload.slice(..700_000));
@@ -156,7 +162,8 @@ fn orders_and_answers_that_are_kept_take_bounded_memory() {
     assert!(state.kept_bytes <= KEPT && state.kept.len() == 5, "{}", state.kept.len());
     drop(state);
     for number in 101..=100_000 {
-        let Some(Asked::Later(order)) = compression.ask(asker(1), name(number), &text(SHORTEST))
+        let Some(CompressionReply::Later(order)) =
+            compression.ask(asker(1), name(number), &text(SHORTEST))
         else {
             panic!("there is room")
         };
@@ -173,7 +180,10 @@ fn what_waits_for_the_compressor_counts_as_well() {
     let compression = Compression::new();
     assert!(compression.pays(20_000, 54e6 / 8.0, NOW));
     for _ in 0..3 {
-        assert!(matches!(compression.ask(asker(1), None, &text(1 << 20)), Some(Asked::Later(_))));
+        assert!(matches!(
+            compression.ask(asker(1), None, &text(1 << 20)),
+            Some(CompressionReply::Later(_))
+        ));
     }
     assert!(!compression.pays(20_000, 54e6 / 8.0, NOW), "15 ms for a sample that takes 3 ms");
 }

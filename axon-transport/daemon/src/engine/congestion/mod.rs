@@ -33,7 +33,7 @@ use quinn_proto::{
 use competition::{Competition, Outcome, Standing};
 use growth::{Growth, TRIAL};
 use path::Path;
-use silence::Silence;
+use silence::UnansweredTime;
 
 use super::quic::marks::wrapped;
 
@@ -86,7 +86,7 @@ pub(crate) fn let_probe_through(quic: &quinn_proto::Connection) {
 
 /// What the window follows.
 #[derive(Debug, Clone)]
-enum Phase {
+enum WindowPhase {
     /// It doubles each round until a queue is seen, or until that does not pay.
     Start {
         /// The most bytes a second that a round brought through.
@@ -102,7 +102,7 @@ enum Phase {
 
 /// What a round has shown so far.
 #[derive(Debug, Clone)]
-struct Round {
+struct WindowRound {
     started: Instant,
     /// The packet whose acknowledgement ends it.
     last_packet: u64,
@@ -113,7 +113,7 @@ struct Round {
     most_in_flight: u64,
 }
 
-impl Round {
+impl WindowRound {
     fn new(started: Instant, last_packet: u64) -> Self {
         Self {
             started,
@@ -139,15 +139,15 @@ impl Round {
 pub(crate) struct Delay {
     window: u64,
     mtu: u64,
-    phase: Phase,
+    phase: WindowPhase,
     path: Path,
     /// Times that the window shrank on this path.
     drains: u32,
-    round: Round,
+    round: WindowRound,
     growth: Growth,
     /// A queue that has stood since the window began to shrink.
     standing: Option<Standing>,
-    silence: Silence,
+    silence: UnansweredTime,
     last_sent: u64,
     /// What shortest round trips of rounds differ by chance.
     jitter: Duration,
@@ -173,13 +173,13 @@ impl Delay {
         Self {
             window,
             mtu,
-            phase: Phase::Start { best: 0.0, idle: 0 },
+            phase: WindowPhase::Start { best: 0.0, idle: 0 },
             path: Path::new(now),
             drains: 0,
-            round: Round::new(now, 0),
+            round: WindowRound::new(now, 0),
             growth: Growth::new(window),
             standing: None,
-            silence: Silence::new(now),
+            silence: UnansweredTime::new(now),
             last_sent: 0,
             jitter: Duration::ZERO,
             last_shortest: None,
@@ -228,7 +228,7 @@ impl Delay {
     }
 
     fn end_round(&mut self, now: Instant, is_app_limited: bool) {
-        let round = std::mem::replace(&mut self.round, Round::new(now, self.last_sent));
+        let round = std::mem::replace(&mut self.round, WindowRound::new(now, self.last_sent));
         self.silence.add_round(round.acknowledged, round.lost);
         let Some(shortest) = round.shortest else { return };
         self.silence.set_round_trip(shortest);
@@ -245,10 +245,10 @@ impl Delay {
             self.rate = rate.max(self.rate * 0.8);
         }
         match &self.phase {
-            Phase::Start { .. } if is_app_limited => {}
-            Phase::Start { .. } => self.end_round_of_start(&round, rate, queue),
-            Phase::Compete(_) => self.end_round_of_competition(now, shortest),
-            Phase::Steady => {
+            WindowPhase::Start { .. } if is_app_limited => {}
+            WindowPhase::Start { .. } => self.end_round_of_start(&round, rate, queue),
+            WindowPhase::Compete(_) => self.end_round_of_competition(now, shortest),
+            WindowPhase::Steady => {
                 if queue <= self.wanted() / 2 {
                     self.standing = None;
                 }
@@ -273,14 +273,14 @@ impl Delay {
     /// Whether the window doubles and the first packets of this round were in a queue already: at its end it would have
     /// doubled once more.
     fn starts_too_fast(&self) -> bool {
-        let is_start = matches!(self.phase, Phase::Start { .. });
+        let is_start = matches!(self.phase, WindowPhase::Start { .. });
         let queue = self.round.shortest.unwrap_or_default().saturating_sub(self.path.get());
         is_start && self.round.packets >= TELLING && queue > self.wanted()
     }
 
-    fn end_round_of_start(&mut self, round: &Round, rate: f64, queue: Duration) {
+    fn end_round_of_start(&mut self, round: &WindowRound, rate: f64, queue: Duration) {
         let wanted = self.wanted();
-        let Phase::Start { best, idle } = &mut self.phase else { return };
+        let WindowPhase::Start { best, idle } = &mut self.phase else { return };
         let lost = round.lost as f64 / (round.lost + round.acknowledged).max(1) as f64;
         if rate > *best * TRIAL {
             *idle = 0;
@@ -292,7 +292,7 @@ impl Delay {
         if queue > wanted || *idle >= IDLE {
             // The last round doubled the window, and nobody has seen yet what that does.
             let held = self.growth.held(*best, self.path.get() + queue);
-            self.phase = Phase::Steady;
+            self.phase = WindowPhase::Steady;
             self.set_window(self.window.min(held.max(self.window / 4)));
         }
     }
@@ -302,7 +302,7 @@ impl Delay {
         let standing = self.standing.get_or_insert_with(|| Standing::new(now, window, rate));
         if let Some(peak) = standing.shrink(now, window, rate, FLOOR * self.mtu) {
             self.standing = None;
-            self.phase = Phase::Compete(Competition::new(now, peak, self.mtu, shortest));
+            self.phase = WindowPhase::Compete(Competition::new(now, peak, self.mtu, shortest));
         } else {
             self.drain(queue);
         }
@@ -311,15 +311,15 @@ impl Delay {
     fn end_round_of_competition(&mut self, now: Instant, shortest: Duration) {
         // A small share of the path makes the rate small, and would make any queue look like one of two packets.
         let (path, wanted) = (self.path.get(), self.wanted_at_any_rate());
-        let Phase::Compete(competition) = &mut self.phase else { return };
+        let WindowPhase::Compete(competition) = &mut self.phase else { return };
         let share = competition.share();
         match competition.end_round(now, shortest, path, wanted) {
             Outcome::Goes => return,
-            Outcome::Over => self.phase = Phase::Steady,
+            Outcome::Over => self.phase = WindowPhase::Steady,
             Outcome::Longer(rtt) => {
                 self.path = Path::of(now, rtt);
                 self.drains = 0;
-                self.phase = Phase::Start { best: 0.0, idle: 0 };
+                self.phase = WindowPhase::Start { best: 0.0, idle: 0 };
             }
         }
         self.set_window(share);
@@ -355,7 +355,7 @@ impl Controller for Delay {
     fn on_sent(&mut self, now: Instant, bytes: u64, last_packet_number: u64) {
         self.last_sent = last_packet_number;
         self.silence.handle_sent(now, bytes);
-        if let Phase::Compete(competition) = &mut self.phase {
+        if let WindowPhase::Compete(competition) = &mut self.phase {
             competition.cubic_always().on_sent(now, bytes, last_packet_number);
         }
     }
@@ -376,8 +376,8 @@ impl Controller for Delay {
         self.round.packets += 1;
         self.acknowledged_now += bytes;
         match &mut self.phase {
-            Phase::Start { .. } if !app_limited => self.window += bytes,
-            Phase::Compete(competition) => {
+            WindowPhase::Start { .. } if !app_limited => self.window += bytes,
+            WindowPhase::Compete(competition) => {
                 if let Some(cubic) = competition.cubic() {
                     cubic.on_ack(now, sent, bytes, app_limited, rtt);
                 }
@@ -402,14 +402,14 @@ impl Controller for Delay {
         let on_the_way = in_flight + std::mem::take(&mut self.acknowledged_now);
         self.round.most_in_flight = self.round.most_in_flight.max(on_the_way);
         let (in_a_row, shortest) = self.urgent;
-        let is_competing = matches!(self.phase, Phase::Compete(_));
+        let is_competing = matches!(self.phase, WindowPhase::Compete(_));
         let may_drain = self.settling == 0 && !app_limited && !is_competing;
         if in_a_row >= URGENT_IN_A_ROW && may_drain {
-            self.phase = Phase::Steady;
+            self.phase = WindowPhase::Steady;
             let queue = shortest.saturating_sub(self.path.get());
             let rate = self.round.acknowledged as f64 / self.round.time(now).as_secs_f64();
             self.end_round_of_queue(now, rate, shortest, queue);
-            self.round = Round::new(now, self.last_sent);
+            self.round = WindowRound::new(now, self.last_sent);
         } else if largest_packet_num_acked.is_some_and(|largest| largest >= self.round.last_packet)
             || self.starts_too_fast()
         {
@@ -426,7 +426,7 @@ impl Controller for Delay {
     ) {
         self.round.lost += lost_bytes;
         self.silence.handle_lost(lost_bytes);
-        if let Phase::Compete(competition) = &mut self.phase {
+        if let WindowPhase::Compete(competition) = &mut self.phase {
             let cubic = competition.cubic_always();
             return cubic.on_congestion_event(now, sent, is_persistent_congestion, lost_bytes);
         }
@@ -440,7 +440,7 @@ impl Controller for Delay {
         };
         if self.obeyed.is_none_or(|obeyed| sent > obeyed) && self.window > least {
             self.obeyed = Some(now);
-            self.phase = Phase::Steady;
+            self.phase = WindowPhase::Steady;
             self.shrink(share);
         }
     }
@@ -448,7 +448,7 @@ impl Controller for Delay {
     fn on_mtu_update(&mut self, new_mtu: u16) {
         self.mtu = u64::from(new_mtu);
         self.window = self.window.max(FLOOR * self.mtu);
-        if let Phase::Compete(competition) = &mut self.phase {
+        if let WindowPhase::Compete(competition) = &mut self.phase {
             competition.cubic_always().on_mtu_update(new_mtu);
         }
     }
@@ -457,7 +457,7 @@ impl Controller for Delay {
         let floor = FLOOR * self.mtu;
         match &self.phase {
             // It looks at the queue with few packets on the way.
-            Phase::Compete(competition) => competition.window().unwrap_or(floor).max(floor),
+            WindowPhase::Compete(competition) => competition.window().unwrap_or(floor).max(floor),
             _ => self.silence.widen(self.window, self.mtu),
         }
     }

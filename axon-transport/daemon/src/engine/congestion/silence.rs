@@ -26,7 +26,7 @@ const LATE: Duration = Duration::from_millis(3);
 
 /// The time since the peer acknowledged something.
 #[derive(Debug, Clone)]
-pub(super) struct Silence {
+pub(super) struct UnansweredTime {
     /// When the peer was last heard, or sent something after it had acknowledged all.
     since: Instant,
     /// The shortest round trip of the last round.
@@ -46,7 +46,7 @@ pub(super) struct Silence {
     loss: f64,
 }
 
-impl Silence {
+impl UnansweredTime {
     pub(super) fn new(now: Instant) -> Self {
         Self {
             since: now,
@@ -126,8 +126,8 @@ mod tests {
     const WINDOW: u64 = 20 * MTU;
 
     /// A window that is sent at once.
-    fn full(start: Instant, lost: u64) -> Silence {
-        let mut silence = Silence::new(start);
+    fn full(start: Instant, lost: u64) -> UnansweredTime {
+        let mut silence = UnansweredTime::new(start);
         for _ in 0..4 {
             silence.add_round(1_000 - lost, lost);
         }

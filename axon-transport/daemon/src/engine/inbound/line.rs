@@ -6,12 +6,12 @@ use super::Key;
 
 /// A line of streams.
 #[derive(Debug, Default)]
-pub(super) struct Line {
+pub(super) struct StreamQueue {
     order: VecDeque<Key>,
     all: HashSet<Key>,
 }
 
-impl Line {
+impl StreamQueue {
     /// Adds a stream behind the others, unless it is in line.
     pub(super) fn add(&mut self, key: Key) {
         if self.all.insert(key) {

@@ -32,7 +32,7 @@ pub(crate) use self::incoming::StreamHeader;
 use self::{
     incoming::{IncomingStream, Step},
     limited::Limited,
-    line::Line,
+    line::StreamQueue,
     receipts::Receipts,
 };
 use super::quic::transport::STREAM_WINDOW;
@@ -43,7 +43,7 @@ use crate::{
         limits::{Limit, RouteLimit},
         stand_in::StandIn,
     },
-    link::{CloseCode, Received},
+    link::{CloseCode, ReceivedUpTo},
 };
 
 /// A stream may come before the route that it belongs to.
@@ -116,7 +116,7 @@ pub(crate) struct Inbound {
     /// Streams that wait for room in a ring.
     full: HashSet<Key>,
     /// Streams that wait for memory.
-    without_room: Line,
+    without_room: StreamQueue,
     limited: Limited,
     /// Memory for one short message where the identity has none left: those that have come whole are read one after the
     /// other.
@@ -155,7 +155,7 @@ impl Inbound {
             ready: VecDeque::new(),
             waiting: BTreeSet::new(),
             full: HashSet::new(),
-            without_room: Line::default(),
+            without_room: StreamQueue::default(),
             limited: Limited::default(),
             spare: Meter::new(LONG),
             full_retry: None,
@@ -321,7 +321,7 @@ impl Inbound {
     }
 
     /// The next acknowledgement that is due.
-    pub(crate) fn poll_receipt(&mut self, now: Duration) -> Option<Received> {
+    pub(crate) fn poll_receipt(&mut self, now: Duration) -> Option<ReceivedUpTo> {
         self.receipts.poll_message(now)
     }
 

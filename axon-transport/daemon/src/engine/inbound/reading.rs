@@ -18,7 +18,7 @@ use crate::{
                 MAX_OVERHEAD, Open, OpenedSample, RefusedMessage, unpack, unpacked_length,
                 writer_of,
             },
-            short_header::{ShortHeaders, Told},
+            short_header::{ShortHeader, ShortHeaders},
         },
     },
     link::CloseCode,
@@ -291,7 +291,7 @@ impl Inbound {
     }
 
     /// What the ring gets to know of a sample.
-    pub(super) fn meta(&self, told: Told, now: Duration) -> Meta {
+    pub(super) fn meta(&self, told: ShortHeader, now: Duration) -> Meta {
         Meta::at_nanos(told.sequence, told.source_timestamp)
             .with_published(self.published(told.age_ms, now))
     }
@@ -354,9 +354,9 @@ pub(super) fn permit_short(route: Route, open: &Open<'_>) -> Result<(), LinkViol
 }
 
 /// What a message's inner header tells besides its writer.
-pub(super) fn told(header: &inner::Header) -> Told {
+pub(super) fn told(header: &inner::Header) -> ShortHeader {
     let inner::Header { sequence, source_timestamp, age_ms, .. } = *header;
-    Told { sequence, source_timestamp, age_ms }
+    ShortHeader { sequence, source_timestamp, age_ms }
 }
 
 pub(super) fn malformed(reason: &str) -> LinkViolation {

@@ -5,7 +5,7 @@ use std::{collections::HashMap, time::Duration};
 
 use axon_shm::ids::Gid;
 
-use crate::link::{Received, ReceivedOf};
+use crate::link::{ReceivedOf, ReceivedUpTo};
 
 const DELAY: Duration = Duration::from_millis(10);
 const SAMPLES: u64 = 64;
@@ -89,7 +89,7 @@ impl Receipts {
     }
 
     /// The next message that is due.
-    pub(super) fn poll_message(&mut self, now: Duration) -> Option<Received> {
+    pub(super) fn poll_message(&mut self, now: Duration) -> Option<ReceivedUpTo> {
         if self.at.is_none_or(|at| at > now) {
             return None;
         }
@@ -108,7 +108,7 @@ impl Receipts {
         if self.due.is_empty() {
             (self.at, self.samples, self.bytes) = (None, 0, 0);
         }
-        Some(Received { flows })
+        Some(ReceivedUpTo { flows })
     }
 }
 
@@ -130,7 +130,7 @@ mod tests {
         assert_eq!(receipts.poll_timeout(), Some(at(10)));
         assert_eq!(receipts.poll_message(at(9)), None);
         let of = ReceivedOf { route: 1, publisher: FLOW.1, sequence: 4, dropped: 1 };
-        assert_eq!(receipts.poll_message(at(10)), Some(Received { flows: vec![of] }));
+        assert_eq!(receipts.poll_message(at(10)), Some(ReceivedUpTo { flows: vec![of] }));
         assert_eq!((receipts.poll_message(at(20)), receipts.poll_timeout()), (None, None));
     }
 

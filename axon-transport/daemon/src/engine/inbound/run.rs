@@ -14,7 +14,7 @@ use crate::engine::{
     sample::{
         dropped::EarlierFate,
         protection::{MAX_OVERHEAD, Open, writer_of},
-        short_header::Told,
+        short_header::ShortHeader,
     },
     stand_in::StandIn,
 };
@@ -97,7 +97,7 @@ impl Inbound {
         let now = to.now;
         let IncomingStream { chunk, headers, short_since, .. } = stream;
         while let Some(body) = next_body(chunk, to.most) {
-            let (told, payload): (Told, &[u8]) = match headers {
+            let (told, payload): (ShortHeader, &[u8]) = match headers {
                 Some(headers) => {
                     permit_short(to.route, open)?;
                     headers.read(body).map_err(malformed)?

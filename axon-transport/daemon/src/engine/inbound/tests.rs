@@ -28,7 +28,7 @@ use crate::{
         rings::{RingError, RingReader, RingWriter, Rings},
         sample::{
             protection::Open,
-            short_header::{ShortHeaders, Told},
+            short_header::{ShortHeader, ShortHeaders},
         },
         stand_in::StandIns,
     },
@@ -161,7 +161,7 @@ impl Way {
     fn message(&mut self, sequence: u64, payload: &[u8]) -> Vec<u8> {
         let header = match self.stream.headers {
             Some(_) => {
-                let told = Told { sequence, source_timestamp: 1000, age_ms: 5 };
+                let told = ShortHeader { sequence, source_timestamp: 1000, age_ms: 5 };
                 self.written.write(told).as_slice().to_vec()
             }
             None => inner::Header {
@@ -296,7 +296,8 @@ fn a_call_of_a_client_that_is_gone_is_acknowledged_as_dropped() {
     let mut way = Way::new(Kind::Request, false, 1000);
     let (header, _) = way.stream.header.as_mut().unwrap();
     header.acknowledged = true;
-    let meta = way.inbound.meta(Told { sequence: 4, source_timestamp: 1000, age_ms: 5 }, NOW);
+    let meta =
+        way.inbound.meta(ShortHeader { sequence: 4, source_timestamp: 1000, age_ms: 5 }, NOW);
     let message = Message { writer: Gid([9; 16]), number: 4, meta, payload: Bytes::new() };
     let key = (1, StreamId::new(Side::Client, Dir::Uni, 0));
     let next = way.inbound.deliver(key, &mut way.stream, message, NOW, NOW);
@@ -313,7 +314,8 @@ fn deliver_in_time(
     ring: impl Fn(&Ring, Duration),
 ) -> Duration {
     let key = (1, StreamId::new(Side::Client, Dir::Uni, 0));
-    let meta = way.inbound.meta(Told { sequence: number, source_timestamp: 1000, age_ms: 5 }, NOW);
+    let meta =
+        way.inbound.meta(ShortHeader { sequence: number, source_timestamp: 1000, age_ms: 5 }, NOW);
     let mut message =
         Some(Message { writer: PUBLISHER, number, meta, payload: vec![0; length].into() });
     let mut waited = Duration::ZERO;

@@ -18,8 +18,9 @@ use axon_transport::config::{Config, KeyMode, QkdConfig, Security};
 
 use super::quic::tls_settings::tls_cipher;
 use crate::keys::{
-    Acceptor, Answer, Clock, Completion, Dial, Dialler, Event, Exporters, KeyMessage, KeyReceiver,
-    KeySender, KmeRequest, RequestOrigin, Resolver, Statistics, SupplyError, UsedStatistics,
+    Acceptor, Answer, BootstrapDialler, Clock, Completion, Dial, Exporters, KeyMessage,
+    KeyReceiver, KeySender, KmeAnswer, KmeRequest, RequestOrigin, Resolver, Statistics,
+    SupplyError, UsedStatistics,
 };
 
 #[cfg(test)]
@@ -39,7 +40,7 @@ pub(crate) struct Keyring {
     pub(crate) acceptor: Acceptor,
     /// The time of the acceptor: the engine's, as of the last call.
     clock: Clock,
-    dialler: Dialler,
+    dialler: BootstrapDialler,
     /// Whether the dialler may have a request.
     dialler_touched: bool,
     /// By number. A peer stays: its keys outlive connections.
@@ -95,7 +96,7 @@ impl Keyring {
         let allowed = qkd.peers.clone();
         Some(Self {
             acceptor: Acceptor::new(&qkd.sae_id, allowed.clone(), cipher, clock.clone()),
-            dialler: Dialler::new(&qkd.sae_id, allowed, cipher, qkd.kme_answer_timeout),
+            dialler: BootstrapDialler::new(&qkd.sae_id, allowed, cipher, qkd.kme_answer_timeout),
             clock,
             dialler_touched: false,
             peers: Vec::new(),
@@ -134,7 +135,7 @@ impl Keyring {
     }
 
     /// The dialler, for how a dial ended.
-    pub(crate) fn dialler(&mut self) -> &mut Dialler {
+    pub(crate) fn dialler(&mut self) -> &mut BootstrapDialler {
         self.dialler_touched = true;
         &mut self.dialler
     }
@@ -244,9 +245,9 @@ impl Keyring {
     }
 
     /// An answer of the KME.
-    pub(crate) fn handle_answer(&mut self, now: Duration, event: Event) -> Answered {
+    pub(crate) fn handle_answer(&mut self, now: Duration, event: KmeAnswer) -> Answered {
         self.set_time(now);
-        let Event { origin, answer } = event;
+        let KmeAnswer { origin, answer } = event;
         match origin {
             RequestOrigin::Dialler => {
                 self.dialler().handle_answer(now, answer);

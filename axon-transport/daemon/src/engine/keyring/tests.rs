@@ -5,7 +5,7 @@ use axon_tls::qkd::{PskIdentity, PskResolver};
 use axon_transport::config::QkdPeers;
 
 use super::*;
-use crate::keys::{Failure, FailureKind, Fetched, KeyPurpose, Lookup, NoKey};
+use crate::keys::{FailureKind, Fetched, KeyPurpose, Lookup, NoKey, RequestFailure};
 
 const ROUTE: Route = Route { kind: Kind::Topic, topic: TopicHash([7; 16]) };
 
@@ -56,7 +56,7 @@ pub(crate) struct Kmes {
 impl Kmes {
     pub(crate) fn answer(&mut self, request: KmeRequest) -> Answer {
         self.asked.push(request.clone());
-        let failure = |kind| Err(Failure::new(kind, format!("{kind:?}")));
+        let failure = |kind| Err(RequestFailure::new(kind, format!("{kind:?}")));
         let outcome = match (&request, self.failures.pop()) {
             (_, Some(kind)) => failure(kind),
             (KmeRequest::Status { .. }, None) => failure(FailureKind::Unavailable),
@@ -120,7 +120,7 @@ impl Pair {
             let mut quiet = true;
             for at in [0, 1] {
                 while let Some((origin, request)) = self.rings[at].poll_request(self.now) {
-                    let event = Event { origin, answer: self.kmes.answer(request) };
+                    let event = KmeAnswer { origin, answer: self.kmes.answer(request) };
                     assert!(matches!(
                         self.rings[at].handle_answer(self.now, event),
                         Answered::Here
@@ -210,7 +210,7 @@ fn answer_for_an_unknown_peer_is_ignored() {
     for origin in [RequestOrigin::Sender(0), RequestOrigin::Receiver(u64::MAX)] {
         let request = KmeRequest::Status { slave: "sae-b".to_owned() };
         let answer = Kmes::default().answer(request);
-        assert!(matches!(ring.handle_answer(s(0), Event { origin, answer }), Answered::Here));
+        assert!(matches!(ring.handle_answer(s(0), KmeAnswer { origin, answer }), Answered::Here));
     }
 }
 
@@ -226,7 +226,7 @@ fn answers_reach_the_machine_that_asked() {
     let mut origins = Vec::new();
     while let Some((origin, request)) = ring.poll_request(s(0)) {
         let answer = kmes.answer(request);
-        let answered = ring.handle_answer(s(0), Event { origin, answer });
+        let answered = ring.handle_answer(s(0), KmeAnswer { origin, answer });
         origins.push((origin, matches!(answered, Answered::Dialler)));
     }
     assert_eq!(origins, [(RequestOrigin::Acceptor, false), (RequestOrigin::Dialler, true)]);
@@ -235,7 +235,7 @@ fn answers_reach_the_machine_that_asked() {
 
     let request = KmeRequest::Enc { slave: "sae-a".into(), number: 1, purpose: KeyPurpose::Proof };
     for origin in [RequestOrigin::Proof(5), RequestOrigin::Responder(5)] {
-        let event = Event { origin, answer: kmes.answer(request.clone()) };
+        let event = KmeAnswer { origin, answer: kmes.answer(request.clone()) };
         assert!(matches!(ring.handle_answer(s(0), event), Answered::Opening(5, _)));
     }
 }
@@ -248,7 +248,7 @@ fn acceptor_has_the_time_of_the_engine_which_never_goes_back() {
     let resolver = ring.resolver(s(100), [10, 0, 0, 1].into());
     assert!(Arc::clone(&resolver).resolve(&bytes).is_none());
     let (origin, request) = ring.poll_request(s(50)).unwrap();
-    let _ = ring.handle_answer(s(100), Event { origin, answer: kmes.answer(request) });
+    let _ = ring.handle_answer(s(100), KmeAnswer { origin, answer: kmes.answer(request) });
     ring.handle_timeout(s(159));
     let psk = Arc::clone(&resolver).resolve(&bytes).expect("kept for a minute");
     assert_eq!(resolver.outcome(), Some(Lookup::Found));
@@ -319,7 +319,7 @@ fn adopted_key_seals_before_any_other_key_comes() {
     }
     pair.rings[1].handle_message(pair.now, 1, &announce).unwrap();
     let (origin, request) = pair.rings[1].poll_request(pair.now).unwrap();
-    let event = Event { origin, answer: pair.kmes.answer(request) };
+    let event = KmeAnswer { origin, answer: pair.kmes.answer(request) };
     let _ = pair.rings[1].handle_answer(pair.now, event);
     assert_eq!(pair.changed(1), [1], "the key came");
     pair.rings[0].attach_sender(pair.now, 1, &exporters(1), Some((key_id, key))).unwrap();
@@ -341,7 +341,7 @@ fn failed_call_is_repeated_by_the_timer() {
     for _ in 0..1000 {
         if let Some((origin, request)) = ring.poll_request(now) {
             times.push(now);
-            let _ = ring.handle_answer(now, Event { origin, answer: kmes.answer(request) });
+            let _ = ring.handle_answer(now, KmeAnswer { origin, answer: kmes.answer(request) });
             continue;
         }
         if matches!(ring.poll_message(now), Some((1, KeyMessage::Ready { .. }))) {
@@ -396,7 +396,7 @@ fn longest_pause(hangs: usize, begin: Duration) -> (Duration, usize) {
     pair.run();
     let hang = begin..begin + s(5);
     let (mut given_up, mut last, mut longest) = (0, pair.now, Duration::ZERO);
-    let mut answers: Vec<(Duration, usize, Event)> = Vec::new();
+    let mut answers: Vec<(Duration, usize, KmeAnswer)> = Vec::new();
     while pair.now < hang.end + s(20) {
         let now = pair.now;
         for at in [0, 1] {
@@ -417,7 +417,11 @@ fn longest_pause(hangs: usize, begin: Duration) -> (Duration, usize) {
                         given_up += 1;
                         pair.kmes.failures.push(FailureKind::Unavailable);
                     }
-                    answers.push((due, at, Event { origin, answer: pair.kmes.answer(request) }));
+                    answers.push((
+                        due,
+                        at,
+                        KmeAnswer { origin, answer: pair.kmes.answer(request) },
+                    ));
                     quiet = false;
                 }
                 while let Some((connection, message)) = pair.rings[at].poll_message(now) {

@@ -34,12 +34,12 @@ pub(crate) struct Dialling {
     /// The whole dial ends at this time, `limit` after its start.
     deadline: Duration,
     limit: Duration,
-    state: State,
+    state: DialPhase,
     /// Why the dial last waited: logged once.
     waited_for: String,
 }
 
-enum State {
+enum DialPhase {
     /// The key of the next attempt has to be chosen, in classic none.
     Choose,
     /// No key can be used before this time, or before the dialler has an answer.
@@ -118,7 +118,7 @@ impl Dialling {
     /// Dials `target`, in qkd with the keys of this daemon.
     pub(crate) fn new(now: Duration, target: DialTarget, keyring: Option<&Keyring>) -> Self {
         let limit = dial_limit(keyring.map(|keyring| keyring.config.kme_answer_timeout));
-        let (state, waited_for) = (State::Choose, String::new());
+        let (state, waited_for) = (DialPhase::Choose, String::new());
         Self { target, deadline: now + limit, limit, state, waited_for }
     }
 
@@ -140,7 +140,7 @@ impl Dialling {
     /// No handshake could be started with the address: no local address reaches it, or QUIC refused with
     /// this error.
     pub(crate) fn handle_unreachable(&mut self, error: Option<&ConnectError>) {
-        let State::Connecting(round, _) = &self.state else { return };
+        let DialPhase::Connecting(round, _) = &self.state else { return };
         let address = self.target.addresses[round.next - 1];
         self.end(Outcome::Unreachable(match error {
             None => {
@@ -157,16 +157,16 @@ impl Dialling {
 
     /// The dialler took an answer of the KME: a dial that waits for a key asks for it again.
     pub(crate) fn handle_key(&mut self) {
-        if let State::WaitForKey(_) = self.state {
-            self.state = State::Choose;
+        if let DialPhase::WaitForKey(_) = self.state {
+            self.state = DialPhase::Choose;
         }
     }
 
     /// When to call [`poll_action`](Self::poll_action) without other cause.
     pub(crate) fn poll_timeout(&self) -> Option<Duration> {
         match &self.state {
-            State::Over => None,
-            State::WaitForKey(until) | State::Connecting(_, until) => {
+            DialPhase::Over => None,
+            DialPhase::WaitForKey(until) | DialPhase::Connecting(_, until) => {
                 Some((*until).min(self.deadline))
             }
             // At once.
@@ -181,10 +181,10 @@ impl Dialling {
         mut keyring: Option<&mut Keyring>,
     ) -> Option<Action> {
         loop {
-            match std::mem::replace(&mut self.state, State::Over) {
-                State::Over => return None,
-                State::Ending(refusal) => return Some(Action::Failed(refusal)),
-                State::Ended(round, outcome) => {
+            match std::mem::replace(&mut self.state, DialPhase::Over) {
+                DialPhase::Over => return None,
+                DialPhase::Ending(refusal) => return Some(Action::Failed(refusal)),
+                DialPhase::Ended(round, outcome) => {
                     let action = self.ended(now, round, outcome, keyring.as_deref_mut());
                     if action.is_some() {
                         return action;
@@ -192,31 +192,31 @@ impl Dialling {
                 }
                 state if now >= self.deadline => {
                     let late = Refusal::network(format!("no answer within {:?}", self.limit));
-                    if let State::Connecting(..) = state {
-                        self.state = State::Ending(late);
+                    if let DialPhase::Connecting(..) = state {
+                        self.state = DialPhase::Ending(late);
                         return Some(ABANDON);
                     }
                     return Some(Action::Failed(late));
                 }
-                State::Connecting(round, until) if now < until => {
-                    self.state = State::Connecting(round, until);
+                DialPhase::Connecting(round, until) if now < until => {
+                    self.state = DialPhase::Connecting(round, until);
                     return None;
                 }
-                State::Connecting(round, _) => {
+                DialPhase::Connecting(round, _) => {
                     self.silent(round);
                     return Some(ABANDON);
                 }
-                State::WaitForKey(until) if now < until => {
-                    self.state = State::WaitForKey(until);
+                DialPhase::WaitForKey(until) if now < until => {
+                    self.state = DialPhase::WaitForKey(until);
                     return None;
                 }
-                State::WaitForKey(_) | State::Choose => {
+                DialPhase::WaitForKey(_) | DialPhase::Choose => {
                     let action = self.choose(now, keyring.as_deref_mut());
                     if action.is_some() {
                         return action;
                     }
                 }
-                State::Try(mut round) => {
+                DialPhase::Try(mut round) => {
                     let Some(address) = self.target.addresses.get(round.next).copied() else {
                         let refusal = Refusal::network(&round.last);
                         match self.refused(now, &round, refusal, keyring.as_deref_mut()) {
@@ -226,7 +226,7 @@ impl Dialling {
                     };
                     round.next += 1;
                     let attempt = round.attempt.clone();
-                    self.state = State::Connecting(round, now + HANDSHAKE_TIMEOUT);
+                    self.state = DialPhase::Connecting(round, now + HANDSHAKE_TIMEOUT);
                     return Some(Action::Connect { address, attempt });
                 }
             }
@@ -234,8 +234,8 @@ impl Dialling {
     }
 
     fn end(&mut self, outcome: Outcome) {
-        match std::mem::replace(&mut self.state, State::Over) {
-            State::Connecting(round, _) => self.state = State::Ended(round, outcome),
+        match std::mem::replace(&mut self.state, DialPhase::Over) {
+            DialPhase::Connecting(round, _) => self.state = DialPhase::Ended(round, outcome),
             // An event of a connection that the dial gave up.
             other => self.state = other,
         }
@@ -244,7 +244,7 @@ impl Dialling {
     /// Chooses the key of the next round.
     fn choose(&mut self, now: Duration, keyring: Option<&mut Keyring>) -> Option<Action> {
         let Some(keyring) = keyring else {
-            self.state = State::Try(DialRound::new(None));
+            self.state = DialPhase::Try(DialRound::new(None));
             return None;
         };
         let Some(sae) = self.target.sae.as_deref() else {
@@ -265,11 +265,11 @@ impl Dialling {
                     self.waited_for = why;
                 }
                 let again = now + ASK_AGAIN;
-                self.state = State::WaitForKey(until.map_or(again, |until| until.min(again)));
+                self.state = DialPhase::WaitForKey(until.map_or(again, |until| until.min(again)));
                 None
             }
             Dial::DialKey(attempt) => {
-                self.state = State::Try(DialRound::new(Some(Arc::new(attempt))));
+                self.state = DialPhase::Try(DialRound::new(Some(Arc::new(attempt))));
                 None
             }
         }
@@ -290,7 +290,7 @@ impl Dialling {
             }
             Outcome::Unreachable(reason) => {
                 round.last = reason;
-                self.state = State::Try(round);
+                self.state = DialPhase::Try(round);
                 None
             }
             Outcome::Failed(ConnectionError::TimedOut) => {
@@ -306,7 +306,7 @@ impl Dialling {
     fn silent(&mut self, mut round: DialRound) {
         let address = self.target.addresses[round.next - 1];
         round.last = format!("{address} does not answer");
-        self.state = State::Try(round);
+        self.state = DialPhase::Try(round);
     }
 
     /// The handshake is complete: in qkd its key is spent.
@@ -323,7 +323,7 @@ impl Dialling {
             return Action::Open;
         }
         let (code, reason) = (CloseCode::KeyReused, "this PSK has completed a handshake before");
-        self.state = State::Ending(Refusal::here(code, reason));
+        self.state = DialPhase::Ending(Refusal::here(code, reason));
         Action::Close { code, reason }
     }
 
@@ -355,7 +355,7 @@ impl Dialling {
                 return Some(Action::Failed(refusal));
             }
         }
-        self.state = State::Choose;
+        self.state = DialPhase::Choose;
         None
     }
 

@@ -12,7 +12,7 @@ use crate::{
         quic::{control_stream::ControlError, tls_settings::tls_cipher},
         refusal::Refusal,
     },
-    link::{CloseCode, Hello},
+    link::{CloseCode, LinkHello},
 };
 
 /// HELLO must be done in this time.
@@ -117,7 +117,7 @@ pub(crate) fn admits(closed: Option<String>) -> Result<(), LinkFailure> {
 /// `pinned` the pin has the peer's name, and what it calls itself counts for nothing.
 pub(crate) fn names_its_host(
     chain: &[CertificateDer<'_>],
-    theirs: &Hello,
+    theirs: &LinkHello,
 ) -> Result<(), LinkFailure> {
     if chain.first().is_some_and(|c| CaMaterial::is_for_host(c, &theirs.host)) {
         return Ok(());

@@ -23,7 +23,7 @@ use crate::{
         refusal::Refusal,
     },
     keys::{Answer, Completion, Exporters, KmeRequest, RequestOrigin},
-    link::{CloseCode, FrameError, Hello, Message, Order, Side, check},
+    link::{CloseCode, FrameError, LinkHello, LinkMessage, Order, Side, check},
 };
 
 #[cfg(test)]
@@ -52,7 +52,7 @@ pub(crate) struct Opening {
     connection: u64,
     side: Side,
     remote: SocketAddr,
-    ours: Hello,
+    ours: LinkHello,
     /// Whether the settings are those of qkd.
     qkd: bool,
     /// In `ca`: the certificates that have to name the peer's host.
@@ -60,31 +60,31 @@ pub(crate) struct Opening {
     negotiated: Option<Negotiated>,
     exporters: Option<Exporters>,
     order: Order,
-    step: Step,
+    step: OpeningStep,
     /// When the step ends at the latest.
     until: Option<Duration>,
     /// Both HELLOs were checked.
     greeted: bool,
     /// The opening succeeded.
     opened: bool,
-    messages: VecDeque<Message>,
-    outcome: Option<Result<Opened, RefusedConnection>>,
+    messages: VecDeque<LinkMessage>,
+    outcome: Option<Result<OpenedConnection, RefusedConnection>>,
 }
 
-enum Step {
+enum OpeningStep {
     /// Server in qkd: the ledger of used keys is asked about the PSK of this SAE.
     Recording(String),
     /// The peer's HELLO is due, in qkd with this SAE.
     Hello(Option<String>),
     /// The client's name is being proven, and HELLO was this.
-    Proof(Box<Proving>, Box<Hello>),
+    Proof(Box<Proving>, Box<LinkHello>),
     Over,
 }
 
 /// A connection whose peer said HELLO and, in qkd, proved its name.
-pub(crate) struct Opened {
+pub(crate) struct OpenedConnection {
     /// The peer's HELLO.
-    pub(crate) hello: Hello,
+    pub(crate) hello: LinkHello,
     /// What the handshake agreed on.
     pub(crate) negotiated: Negotiated,
     /// Judges the next messages.
@@ -111,9 +111,9 @@ pub(crate) struct RefusedConnection {
     pub(crate) close: Option<(CloseCode, String)>,
 }
 
-impl fmt::Debug for Opened {
+impl fmt::Debug for OpenedConnection {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Opened").field("hello", &self.hello).finish_non_exhaustive()
+        f.debug_struct("OpenedConnection").field("hello", &self.hello).finish_non_exhaustive()
     }
 }
 
@@ -133,7 +133,7 @@ impl Opening {
     pub(crate) fn new(
         now: Duration,
         handshake: Handshake,
-        ours: Hello,
+        ours: LinkHello,
         config: &Config,
         closed: Option<String>,
         mut keyring: Option<&mut Keyring>,
@@ -152,7 +152,7 @@ impl Opening {
             negotiated: None,
             exporters,
             order: Order::new(side, qkd),
-            step: Step::Hello(None),
+            step: OpeningStep::Hello(None),
             until: None,
             greeted: false,
             opened: false,
@@ -173,9 +173,9 @@ impl Opening {
     /// meanwhile waits in the stream.
     pub(crate) fn reads(&self) -> bool {
         match &self.step {
-            Step::Hello(_) => true,
-            Step::Proof(proving, _) => proving.reads(),
-            Step::Recording(_) | Step::Over => false,
+            OpeningStep::Hello(_) => true,
+            OpeningStep::Proof(proving, _) => proving.reads(),
+            OpeningStep::Recording(_) | OpeningStep::Over => false,
         }
     }
 
@@ -193,7 +193,7 @@ impl Opening {
     pub(crate) fn handle_message(
         &mut self,
         now: Duration,
-        message: &Message,
+        message: &LinkMessage,
         mut keyring: Option<&mut Keyring>,
     ) {
         let taken = if self.reads() {
@@ -240,7 +240,7 @@ impl Opening {
         answer: Answer,
         keyring: Option<&mut Keyring>,
     ) {
-        if let Step::Proof(proving, _) = &mut self.step {
+        if let OpeningStep::Proof(proving, _) = &mut self.step {
             proving.handle_answer(now, answer);
         }
         self.advance(now, keyring);
@@ -253,7 +253,7 @@ impl Opening {
         first: bool,
         keyring: Option<&mut Keyring>,
     ) {
-        let Step::Recording(sae) = &mut self.step else { return };
+        let OpeningStep::Recording(sae) = &mut self.step else { return };
         let sae = mem::take(sae);
         match first {
             true => self.greet(now, Some(sae)),
@@ -262,14 +262,14 @@ impl Opening {
     }
 
     /// The next message for the control stream.
-    pub(crate) fn poll_message(&mut self) -> Option<Message> {
+    pub(crate) fn poll_message(&mut self) -> Option<LinkMessage> {
         self.messages.pop_front()
     }
 
     /// The next call to the KME, if any.
     pub(crate) fn poll_request(&mut self, now: Duration) -> Option<(RequestOrigin, KmeRequest)> {
         match &mut self.step {
-            Step::Proof(proving, _) => proving.poll_request(now),
+            OpeningStep::Proof(proving, _) => proving.poll_request(now),
             _ => None,
         }
     }
@@ -280,7 +280,7 @@ impl Opening {
         &mut self,
         now: Duration,
         keyring: Option<&mut Keyring>,
-    ) -> Option<Result<Opened, RefusedConnection>> {
+    ) -> Option<Result<OpenedConnection, RefusedConnection>> {
         self.advance(now, keyring);
         self.outcome.take()
     }
@@ -288,7 +288,7 @@ impl Opening {
     /// When to call [`handle_timeout`](Self::handle_timeout).
     pub(crate) fn poll_timeout(&self) -> Option<Duration> {
         let proof = match &self.step {
-            Step::Proof(proving, _) => proving.poll_timeout(),
+            OpeningStep::Proof(proving, _) => proving.poll_timeout(),
             _ => None,
         };
         [self.until, proof].into_iter().flatten().min()
@@ -296,7 +296,7 @@ impl Opening {
 
     /// Ends a step whose time is over, and asks the KME again where that is due.
     pub(crate) fn handle_timeout(&mut self, now: Duration, mut keyring: Option<&mut Keyring>) {
-        if let Step::Proof(proving, _) = &mut self.step {
+        if let OpeningStep::Proof(proving, _) = &mut self.step {
             proving.handle_timeout(now);
         }
         self.advance(now, keyring.as_deref_mut());
@@ -304,14 +304,14 @@ impl Opening {
             return;
         }
         let late = match &self.step {
-            Step::Hello(_) => {
+            OpeningStep::Hello(_) => {
                 LinkFailure::Ours(CloseCode::OutOfOrder, "no HELLO within 5 s".into())
             }
-            Step::Proof(proving, _) => {
+            OpeningStep::Proof(proving, _) => {
                 let text = format!("no proof within {:?}", proving.limit());
                 LinkFailure::Ours(CloseCode::KeySupply, text)
             }
-            Step::Recording(_) | Step::Over => return,
+            OpeningStep::Recording(_) | OpeningStep::Over => return,
         };
         self.fail(now, late, None, keyring);
     }
@@ -340,7 +340,7 @@ impl Opening {
                     .map_err(|e| LinkFailure::Ours(CloseCode::Internal, e.to_string()))?;
                 match keyring.spent(now, self.connection, identity, parsed.key_id()) {
                     Completion::First => {
-                        self.step = Step::Recording(parsed.client_sae().to_owned());
+                        self.step = OpeningStep::Recording(parsed.client_sae().to_owned());
                     }
                     Completion::Reused => return Err(reused()),
                 }
@@ -353,9 +353,9 @@ impl Opening {
     /// The client says HELLO, and both sides wait for the peer's.
     fn greet(&mut self, now: Duration, psk_sae: Option<String>) {
         if self.side == Side::Client {
-            self.messages.push_back(Message::Hello(self.ours.clone()));
+            self.messages.push_back(LinkMessage::LinkHello(self.ours.clone()));
         }
-        self.step = Step::Hello(psk_sae);
+        self.step = OpeningStep::Hello(psk_sae);
         self.until = Some(now + HELLO_TIMEOUT);
     }
 
@@ -363,13 +363,13 @@ impl Opening {
     fn take(
         &mut self,
         now: Duration,
-        message: &Message,
+        message: &LinkMessage,
         keyring: Option<&mut Keyring>,
     ) -> Result<(), LinkFailure> {
         let out_of_order = |text: String| LinkFailure::Ours(CloseCode::OutOfOrder, text);
         self.order.accept(message).map_err(|e| out_of_order(e.to_string()))?;
         match (&mut self.step, message, keyring) {
-            (Step::Hello(psk_sae), Message::Hello(theirs), keyring) => {
+            (OpeningStep::Hello(psk_sae), LinkMessage::LinkHello(theirs), keyring) => {
                 check(&self.ours, theirs, psk_sae.as_deref())
                     .map_err(|m| LinkFailure::Ours(m.code, m.to_string()))?;
                 if let Some(chain) = &self.chain {
@@ -377,8 +377,8 @@ impl Opening {
                 }
                 self.greeted(now, theirs, keyring)
             }
-            (Step::Hello(_), ..) => Err(out_of_order("HELLO must come first".into())),
-            (Step::Proof(proving, _), Message::Keys(message), Some(keyring)) => {
+            (OpeningStep::Hello(_), ..) => Err(out_of_order("HELLO must come first".into())),
+            (OpeningStep::Proof(proving, _), LinkMessage::Keys(message), Some(keyring)) => {
                 proving.handle_message(now, message, keyring)
             }
             // KEEPALIVE.
@@ -390,11 +390,11 @@ impl Opening {
     fn greeted(
         &mut self,
         now: Duration,
-        theirs: &Hello,
+        theirs: &LinkHello,
         keyring: Option<&mut Keyring>,
     ) -> Result<(), LinkFailure> {
         if self.side == Side::Server {
-            self.messages.push_back(Message::Hello(self.ours.clone()));
+            self.messages.push_back(LinkMessage::LinkHello(self.ours.clone()));
         }
         self.greeted = true;
         self.order.hello_checked(theirs.daemon < self.ours.daemon);
@@ -412,17 +412,17 @@ impl Opening {
             Side::Client => Proving::give(now, connection, source, sae, exporters, keyring)?,
         };
         self.until = Some(now + proving.limit());
-        self.step = Step::Proof(Box::new(proving), Box::new(theirs.clone()));
+        self.step = OpeningStep::Proof(Box::new(proving), Box::new(theirs.clone()));
         Ok(())
     }
 
     /// Takes from the proof what it has to say, and its end.
     fn advance(&mut self, now: Duration, keyring: Option<&mut Keyring>) {
-        let (Step::Proof(proving, hello), Some(keyring)) = (&mut self.step, keyring) else {
+        let (OpeningStep::Proof(proving, hello), Some(keyring)) = (&mut self.step, keyring) else {
             return;
         };
         while let Some(message) = proving.poll_message() {
-            self.messages.push_back(Message::Keys(message));
+            self.messages.push_back(LinkMessage::Keys(message));
         }
         let Some(exporters) = &self.exporters else { return };
         match proving.poll_outcome(now, exporters, keyring) {
@@ -438,13 +438,13 @@ impl Opening {
     }
 
     /// The connection awaits its election.
-    fn open(&mut self, hello: Hello, sealing: Option<Sealing>) {
-        self.step = Step::Over;
+    fn open(&mut self, hello: LinkHello, sealing: Option<Sealing>) {
+        self.step = OpeningStep::Over;
         self.until = None;
         self.opened = true;
         let order = self.order.clone();
         if let Some(negotiated) = self.negotiated.take() {
-            self.outcome = Some(Ok(Opened { hello, negotiated, order, sealing }));
+            self.outcome = Some(Ok(OpenedConnection { hello, negotiated, order, sealing }));
         }
     }
 
@@ -456,7 +456,7 @@ impl Opening {
         ended: Option<&ConnectionError>,
         keyring: Option<&mut Keyring>,
     ) {
-        if matches!(self.step, Step::Over) && !matches!(self.outcome, Some(Ok(_))) {
+        if matches!(self.step, OpeningStep::Over) && !matches!(self.outcome, Some(Ok(_))) {
             return;
         }
         let (refusal, close) = failure.into_refusal(ended);
@@ -467,6 +467,6 @@ impl Opening {
             keyring.set_time(now);
             keyring.forget_connection(now, self.connection);
         }
-        self.step = Step::Over;
+        self.step = OpeningStep::Over;
     }
 }

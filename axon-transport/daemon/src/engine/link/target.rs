@@ -4,7 +4,7 @@ use std::{net::SocketAddr, time::Duration};
 
 use axon_shm::ids::DaemonId;
 
-use crate::{discovery::AddressConfidence, link::Hello};
+use crate::{discovery::AddressConfidence, link::LinkHello};
 
 /// One address is given this long to complete the handshake.
 pub(crate) const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);
@@ -46,8 +46,8 @@ impl DialTarget {
     }
 
     /// This side's HELLO to it.
-    pub(crate) fn hello(&self, ours: &Hello) -> Hello {
-        Hello {
+    pub(crate) fn hello(&self, ours: &LinkHello) -> LinkHello {
+        LinkHello {
             expects: self.daemon,
             static_peer: self.listed,
             replaces: self.replaces,

@@ -23,7 +23,7 @@ use crate::{
 /// The dials of this host. Each has a number.
 #[derive(Default)]
 pub(super) struct Dials {
-    under_way: HashMap<u64, Dial>,
+    under_way: HashMap<u64, LinkDial>,
     next_number: u64,
     /// Dials that may go on.
     stirred: HashSet<u64>,
@@ -32,7 +32,7 @@ pub(super) struct Dials {
 }
 
 /// One dial.
-pub(super) struct Dial {
+pub(super) struct LinkDial {
     pub(super) dialling: Dialling,
     /// The connection whose handshake is under way.
     pub(super) connection: Option<u64>,
@@ -44,7 +44,7 @@ impl Dials {
         let dialling = Dialling::new(now, target, keyring);
         let number = self.next_number;
         self.next_number += 1;
-        self.under_way.insert(number, Dial { dialling, connection: None });
+        self.under_way.insert(number, LinkDial { dialling, connection: None });
         self.stirred.insert(number);
     }
 
@@ -55,12 +55,12 @@ impl Dials {
     }
 
     /// A dial.
-    pub(super) fn get_mut(&mut self, number: u64) -> Option<&mut Dial> {
+    pub(super) fn get_mut(&mut self, number: u64) -> Option<&mut LinkDial> {
         self.under_way.get_mut(&number)
     }
 
     /// Ends a dial.
-    pub(super) fn remove(&mut self, number: u64) -> Option<Dial> {
+    pub(super) fn remove(&mut self, number: u64) -> Option<LinkDial> {
         self.under_way.remove(&number)
     }
 

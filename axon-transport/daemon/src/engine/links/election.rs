@@ -9,7 +9,7 @@ use super::{
     LinkEvent, LinkReport, Links,
     link::{
         LinkPeer, LinkPhase,
-        age::{Age, Due},
+        age::{Age, AgeStep},
     },
     silence::{LinkSilence, Traffic},
 };
@@ -19,14 +19,14 @@ use crate::{
         account::MESSAGES,
         link::{
             failure::peer_text,
-            opening::{Opened, Sealing},
+            opening::{OpenedConnection, Sealing},
             target::DialTarget,
         },
         links::{link::Summary, who::PeerIdentity},
         quic::transport::{LINK_WINDOW, STREAMS_OPEN, window_credit},
         refusal::Refusal,
     },
-    link::{Candidate, CloseCode, Elected, Hello, Intake, Message, Side, keep},
+    link::{Candidate, CloseCode, Elected, Intake, LinkHello, LinkMessage, Side, keep},
 };
 
 /// The peer elects one of its connections within this time.
@@ -40,12 +40,12 @@ const OTHERS: &str = "this daemon id is that of another host";
 
 impl Links {
     /// A connection's peer said HELLO and proved its name.
-    pub(super) fn established(&mut self, number: u64, opened: Opened, now: Duration) {
+    pub(super) fn established(&mut self, number: u64, opened: OpenedConnection, now: Duration) {
         let (Some(connection), Some(link)) = (self.connections.get(number), self.table.get(number))
         else {
             return;
         };
-        let Opened { hello, negotiated, order, sealing } = opened;
+        let OpenedConnection { hello, negotiated, order, sealing } = opened;
         let (side, address) = (link.side, connection.quic.remote_address());
         let replaces = if side == Side::Server { hello.replaces } else { link.replaces };
         let (daemon, ours) = (hello.daemon, self.hello.daemon);
@@ -139,7 +139,7 @@ impl Links {
         if we_elect {
             let elected = Elected { link: rand::random(), election: self.next_election };
             self.next_election += 1;
-            self.send(number, &Message::Elected(elected), now);
+            self.send(number, &LinkMessage::Elected(elected), now);
             if let Some(peer) = self.table.peer_mut(number) {
                 peer.order.elected();
             }
@@ -148,7 +148,7 @@ impl Links {
         self.connections.touch(number);
     }
 
-    fn turn_away(&mut self, number: u64, hello: &Hello, why: String, now: Duration) {
+    fn turn_away(&mut self, number: u64, hello: &LinkHello, why: String, now: Duration) {
         self.turn_away_told(number, hello, why.clone(), &why, now);
     }
 
@@ -156,7 +156,7 @@ impl Links {
     fn turn_away_told(
         &mut self,
         number: u64,
-        hello: &Hello,
+        hello: &LinkHello,
         why: String,
         told: &str,
         now: Duration,
@@ -303,7 +303,7 @@ impl Links {
     fn tell_intake(&mut self, number: u64, now: Duration) {
         let Some(peer) = self.table.peer(number) else { return };
         let (unread, messages) = (window(peer).into(), MESSAGES.0 as u64);
-        self.send(number, &Message::Intake(Intake { unread, messages }), now);
+        self.send(number, &LinkMessage::Intake(Intake { unread, messages }), now);
     }
 
     /// Bytes of long samples that the peer may have in flight over a link.
@@ -323,12 +323,12 @@ impl Links {
     pub(super) fn open_timeout(&mut self, number: u64, now: Duration) {
         let Some(peer) = self.table.peer_mut(number) else { return };
         match peer.age.handle_timeout(now) {
-            Some(Due::End) => {
+            Some(AgeStep::End) => {
                 let text = "AXON_QKD_SESSION_MAX_AGE is reached and no successor came";
                 self.close_connection(number, CloseCode::KeySupply, text, now);
                 return self.end_link(number, text, None, now);
             }
-            Some(Due::Renew) => self.dial_successor(number, now),
+            Some(AgeStep::Renew) => self.dial_successor(number, now),
             None => {}
         }
         self.probe(number, now);

@@ -9,7 +9,7 @@ use crate::{
     bridge::RefusalKind,
     discovery::{AddressConfidence, Datagrams},
     engine::{account::Charge, refusal::Refusal},
-    link::{LinkClosed, Message},
+    link::{LinkClosed, LinkMessage},
 };
 
 /// What came of the links, for the owner of the peers.
@@ -24,7 +24,7 @@ pub(in crate::engine) enum LinkEvent {
         closed: Option<LinkClosed>,
     },
     /// A message on the link in use, with what it weighs on the peer's account until it is handled.
-    Message(u64, DaemonId, Message, Option<Charge>),
+    Message(u64, DaemonId, LinkMessage, Option<Charge>),
     /// An event of a data stream of any link of this peer.
     Stream(u64, DaemonId, StreamEvent),
     /// The keys of this link changed.

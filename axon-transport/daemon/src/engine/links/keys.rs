@@ -10,7 +10,7 @@ use crate::{
         sample::protection::{Open, Seal},
     },
     keys,
-    link::Message,
+    link::LinkMessage,
 };
 
 impl Links {
@@ -19,7 +19,7 @@ impl Links {
         let mut changed = HashSet::new();
         while let Some(keyring) = &mut self.keyring {
             if let Some((connection, message)) = keyring.poll_message(now) {
-                self.send(connection, &Message::Keys(message), now);
+                self.send(connection, &LinkMessage::Keys(message), now);
             } else if let Some(connection) = keyring.poll_changed(now) {
                 changed.insert(connection);
             } else {
@@ -35,7 +35,7 @@ impl Links {
     }
 
     /// The KME answered, or the ledger of used keys.
-    pub(in crate::engine) fn handle_key_event(&mut self, event: keys::Event, now: Duration) {
+    pub(in crate::engine) fn handle_key_event(&mut self, event: keys::KmeAnswer, now: Duration) {
         let Some(keyring) = &mut self.keyring else { return };
         match keyring.handle_answer(now, event) {
             Answered::Here => {}

@@ -67,7 +67,7 @@ use crate::{
         refusal::Refusal,
     },
     error::GatewayError,
-    link::{CloseCode, FrameError, Hello, Message, Side},
+    link::{CloseCode, FrameError, LinkHello, LinkMessage, Side},
 };
 
 /// All links.
@@ -75,7 +75,7 @@ pub(super) struct Links {
     pub(super) config: Arc<Config>,
     pub(super) credentials: Credentials,
     pub(super) keyring: Option<Keyring>,
-    hello: Hello,
+    hello: LinkHello,
     daemon_key: Option<Arc<DaemonKey>>,
     qlogs: Option<Rc<dyn Qlogs>>,
     epoch: Instant,
@@ -106,7 +106,7 @@ pub(crate) struct LinkParts {
     /// Identity and TLS settings.
     pub(crate) credentials: Credentials,
     /// This side's HELLO.
-    pub(crate) hello: Hello,
+    pub(crate) hello: LinkHello,
     /// The key of which this side's id is made.
     pub(crate) daemon_key: Option<Arc<DaemonKey>>,
     /// The addresses that the endpoints are bound to.
@@ -352,7 +352,7 @@ impl Links {
     fn handle_message(
         &mut self,
         number: u64,
-        message: Message,
+        message: LinkMessage,
         room: Option<Charge>,
         now: Duration,
     ) {
@@ -367,11 +367,11 @@ impl Links {
         }
         let daemon = peer.summary.hello.daemon;
         match message {
-            Message::Elected(elected) => {
+            LinkMessage::Elected(elected) => {
                 peer.order.elected();
                 self.open(number, elected, now);
             }
-            Message::Keys(keys) => {
+            LinkMessage::Keys(keys) => {
                 let Some(keyring) = self.keyring.as_mut().filter(|_| peer.seals) else { return };
                 if let Err(error) = keyring.handle_message(now, number, &keys) {
                     let code = CloseCode::from_code(error.code()).unwrap_or(CloseCode::Internal);
@@ -379,11 +379,11 @@ impl Links {
                 }
             }
             // Over whichever link it comes: another one may have taken over meanwhile.
-            Message::LinkClosed(closed) => self.closed_by_peer(daemon, closed),
+            LinkMessage::LinkClosed(closed) => self.closed_by_peer(daemon, closed),
             // A predecessor's are old.
             _ if self.current(daemon) != Some(number) => {}
             message => {
-                if let Message::Graph(_) = &message {
+                if let LinkMessage::GraphUpdate(_) = &message {
                     self.succeeded(daemon);
                 }
                 self.outbox.event(LinkEvent::Message(number, daemon, message, room));
@@ -392,7 +392,7 @@ impl Links {
     }
 
     /// Queues a control message.
-    pub(super) fn send(&mut self, number: u64, message: &Message, now: Duration) {
+    pub(super) fn send(&mut self, number: u64, message: &LinkMessage, now: Duration) {
         let Some(connection) = self.connections.get_mut(number) else { return };
         match connection.control.send(message) {
             Ok(()) => self.connections.touch(number),

@@ -7,7 +7,7 @@ use quinn_proto::{Dir, Incoming};
 
 use super::{
     LinkReport, Links,
-    dials::Dial,
+    dials::LinkDial,
     explained::explained,
     link::{Link, LinkPhase},
 };
@@ -23,7 +23,7 @@ use crate::{
         refusal::Refusal,
     },
     keys::{self, Exporters},
-    link::{CloseCode, Hello, Side},
+    link::{CloseCode, LinkHello, Side},
 };
 
 /// A dialler that has its Retry is given this long for the rest of the handshake.
@@ -117,7 +117,7 @@ impl Links {
     fn begin_opening(
         &mut self,
         number: u64,
-        mut ours: Hello,
+        mut ours: LinkHello,
         dialled: Option<String>,
         now: Duration,
     ) {
@@ -209,7 +209,7 @@ impl Links {
             Action::Connect { address, .. } => self.logged(Side::Client, address, now),
             _ => None,
         };
-        let Some(Dial { dialling, connection }) = self.dials.get_mut(dial) else { return };
+        let Some(LinkDial { dialling, connection }) = self.dials.get_mut(dial) else { return };
         match action {
             Action::Connect { address, attempt } => {
                 let mut client = match self.credentials.client(attempt.as_deref(), address.ip()) {
@@ -236,7 +236,7 @@ impl Links {
                 }
             }
             Action::Open => {
-                let Some(Dial { dialling, connection: Some(number) }) = self.dials.remove(dial)
+                let Some(LinkDial { dialling, connection: Some(number) }) = self.dials.remove(dial)
                 else {
                     return;
                 };
@@ -259,7 +259,7 @@ impl Links {
                 }
             }
             Action::Failed(refusal) => {
-                let Some(Dial { dialling, .. }) = self.dials.remove(dial) else { return };
+                let Some(LinkDial { dialling, .. }) = self.dials.remove(dial) else { return };
                 let target = dialling.target();
                 // A successor is dialled where a peer with a link is, unless discovery says where it may be.
                 let kind = match target.replaces {

@@ -7,7 +7,7 @@ use axon_tls::identity::{Auth, SpkiDigest};
 use axon_transport::access::Party;
 
 use super::admission::place;
-use crate::link::Hello;
+use crate::link::LinkHello;
 
 /// As whom a peer proved itself.
 #[derive(Clone, Debug)]
@@ -31,7 +31,7 @@ impl PeerIdentity {
     pub(crate) fn of(
         qkd: bool,
         auth: Option<&Auth>,
-        hello: &Hello,
+        hello: &LinkHello,
         key: Option<SpkiDigest>,
     ) -> Result<Self, String> {
         if let (true, Some(sae)) = (qkd, &hello.sae) {

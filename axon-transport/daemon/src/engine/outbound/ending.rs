@@ -109,7 +109,7 @@ impl GivenUpCause {
 }
 
 /// A publisher whose samples are sent on.
-struct Waiting {
+struct DrainingPublisher {
     number: u64,
     publisher: Gid,
     route: u32,
@@ -165,7 +165,7 @@ impl Endings {
             if waits {
                 let (number, publisher) = (ending.number, *publisher);
                 let bytes = ending.bytes_of(samples, || bytes_of(route, &publisher));
-                waiting.push(Waiting { number, publisher, route, samples, bytes });
+                waiting.push(DrainingPublisher { number, publisher, route, samples, bytes });
             } else {
                 let given_up = Some(GivenUpSamples { route, samples, why: GivenUpCause::Stuck });
                 over.push(FinishedPublisher { publisher: *publisher, given_up });
@@ -177,7 +177,7 @@ impl Endings {
     }
 
     /// Forgets the publishers that ended first, until the others fit the bound. The last one stays.
-    fn give_up_beyond(&mut self, mut waiting: Vec<Waiting>) -> Vec<FinishedPublisher> {
+    fn give_up_beyond(&mut self, mut waiting: Vec<DrainingPublisher>) -> Vec<FinishedPublisher> {
         let mut bytes = waiting.iter().fold(0u64, |sum, of| sum.saturating_add(of.bytes));
         let most = self.most;
         let fits = |bytes: u64, publishers: usize| {
@@ -189,7 +189,7 @@ impl Endings {
         waiting.sort_unstable_by_key(|of| of.number);
         let publishers = waiting.len();
         let mut over = Vec::new();
-        for (at, Waiting { publisher, route, samples, bytes: of, .. }) in
+        for (at, DrainingPublisher { publisher, route, samples, bytes: of, .. }) in
             waiting.into_iter().enumerate()
         {
             if fits(bytes, publishers - at) {

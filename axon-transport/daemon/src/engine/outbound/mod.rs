@@ -34,7 +34,7 @@ pub(crate) use self::{
     served::{ResponseNumbers, RouteOut},
     source::Source,
     stall::StallCause,
-    unfinished::{Unfinished, UnfinishedFlows},
+    unfinished::{UnfinishedFlow, UnfinishedFlows},
 };
 use self::{
     budget::Budget,
@@ -42,8 +42,8 @@ use self::{
     flow::{Flow, FlowPause},
     nudges::Nudges,
     served::{FlowRoute, ServedFlows},
-    source::Done,
-    stall::{BusyFlow, PeerActivity, Stalls},
+    source::FlowProgress,
+    stall::{BusyFlow, FlowStalls, PeerActivity},
     table::FlowTable,
     turns::FlowTurns,
 };
@@ -81,7 +81,7 @@ pub(crate) struct Outbound {
     table: FlowTable,
     turns: FlowTurns,
     endings: Endings,
-    stalls: Stalls,
+    stalls: FlowStalls,
     nudges: Nudges,
     budget: Rc<Budget>,
     counters: Rc<Counters>,
@@ -104,7 +104,7 @@ impl Outbound {
             table: FlowTable::default(),
             turns: FlowTurns::new(Rc::clone(&budget)),
             endings: Endings::new(budget.of_daemon()),
-            stalls: Stalls::new(stalled_after, now),
+            stalls: FlowStalls::new(stalled_after, now),
             nudges: Nudges::default(),
             budget,
             counters,
@@ -131,7 +131,7 @@ impl Outbound {
         };
         self.table.routes.add(number, shared);
         self.update_sources(number, sources, seen, now);
-        for (of, Unfinished { progress, furthest }) in unfinished {
+        for (of, UnfinishedFlow { progress, furthest }) in unfinished {
             let Some(id) = self.table.find(number, &of) else { continue };
             let Some(flow) = self.table.flows.get_mut(id) else { continue };
             flow.go_on(furthest);
@@ -239,7 +239,7 @@ impl Outbound {
     fn leave(&mut self, number: u32, now: Duration) -> UnfinishedFlows {
         let flows = self.table.kept_flows(number).into_iter();
         let known = flows.map(|(of, flow, furthest)| {
-            (of, Unfinished { progress: self.stalls.leave(&flow, now), furthest })
+            (of, UnfinishedFlow { progress: self.stalls.leave(&flow, now), furthest })
         });
         known.collect()
     }
@@ -284,7 +284,7 @@ impl Outbound {
             let Some((flow, served)) = self.table.get_mut(turn.flow) else { continue };
             (carrier.flow, carrier.lender) = (turn.flow, turn.lender);
             let before = carrier.taken;
-            let mut done = Done::default();
+            let mut done = FlowProgress::default();
             let pause = match flow.waits_for_credit && !carrier.is_open_to(turn.rank) {
                 true => FlowPause::NoCredit,
                 false => {
@@ -372,7 +372,7 @@ impl Outbound {
         quic: &mut quinn_proto::Connection,
     ) {
         let Some((flow, served)) = self.table.get_mut(id) else { return };
-        let mut done = Done::default();
+        let mut done = FlowProgress::default();
         flow.handle_stopped(stream, quic, &self.counters, &mut done);
         flow.blocked = false;
         served.done(flow.info.of, done);

@@ -12,7 +12,7 @@ use axon_transport::config::TopicPriority;
 use super::{
     flow::PeerCredit,
     schedule::FlowId,
-    source::{Done, Source},
+    source::{FlowProgress, Source},
     unfinished::UnfinishedFlows,
 };
 use crate::engine::limits::RouteLimit;
@@ -136,7 +136,7 @@ impl ServedFlows {
     }
 
     /// Tells the sources up to which number they may forget the samples of a publisher.
-    pub(super) fn done(&self, of: Gid, Done { sequence, given_up }: Done) {
+    pub(super) fn done(&self, of: Gid, FlowProgress { sequence, given_up }: FlowProgress) {
         if given_up > 0
             && let Some(source) = self.source_of(&of)
         {

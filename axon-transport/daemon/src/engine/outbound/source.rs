@@ -17,7 +17,7 @@ use crate::engine::{
 
 /// Samples that one flow sent, dropped, or has done with since they were taken up last.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) struct Done {
+pub(super) struct FlowProgress {
     /// The sources may forget the samples up to this number.
     pub(super) sequence: Option<u64>,
     /// Samples among them that will never reach the peer.

@@ -32,7 +32,7 @@ const OTHERS: u32 = 8;
 
 /// KEEP_ALL flows with samples that are not acknowledged.
 #[derive(Debug)]
-pub(super) struct Stalls {
+pub(super) struct FlowStalls {
     limit: Duration,
     flows: HashMap<FlowId, Progress>,
     /// Frames of the peer, and when there was a new one.
@@ -124,7 +124,7 @@ pub(crate) enum StallCause {
 
 /// What a look found.
 #[derive(Debug, Default, PartialEq, Eq)]
-pub(super) struct Found {
+pub(super) struct StallReport {
     /// Routes that made no progress for the limit, or too little.
     pub(super) stalled: Vec<(u32, StallCause)>,
     /// Flows that are busy no more.
@@ -139,7 +139,7 @@ enum Hearing {
     Gone,
 }
 
-impl Stalls {
+impl FlowStalls {
     pub(super) fn new(limit: Duration, now: Duration) -> Self {
         Self {
             limit,
@@ -211,8 +211,8 @@ impl Stalls {
         peer: PeerActivity,
         busy: impl Iterator<Item = BusyFlow>,
         now: Duration,
-    ) -> Found {
-        let mut found = Found::default();
+    ) -> StallReport {
+        let mut found = StallReport::default();
         if now < self.next {
             return found;
         }

@@ -9,7 +9,7 @@ use super::{furthest::SentProgress, stall::Progress};
 /// The flow of a publisher that ended with samples that are not acknowledged. It is no larger than a few words, and there
 /// is one at most for each lane of the relays that are kept.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Unfinished {
+pub(crate) struct UnfinishedFlow {
     /// What the peer did, and did not do.
     pub(super) progress: Progress,
     /// How far QUIC took its samples.
@@ -17,9 +17,9 @@ pub(crate) struct Unfinished {
 }
 
 /// Those of one route, by publisher.
-pub(crate) type UnfinishedFlows = HashMap<Gid, Unfinished>;
+pub(crate) type UnfinishedFlows = HashMap<Gid, UnfinishedFlow>;
 
-impl Unfinished {
+impl UnfinishedFlow {
     /// The worse of two flows of one publisher, which go on as one.
     pub(crate) fn and(self, other: Self) -> Self {
         Self {

@@ -29,7 +29,10 @@ use crate::{
         account::{Account, Charge, Meter},
         peer_graph::decisions::note_look,
     },
-    link::{AccessCheck, AccessDecisions, Denied, DeniedUse, MAX_DENIED, Message, UseDecision},
+    link::{
+        AccessDecisions, DeniedUse, DeniedUses, LinkAccessCheck, LinkMessage, MAX_DENIED,
+        UseDecision,
+    },
 };
 
 /// Uses that status lists.
@@ -126,7 +129,7 @@ impl PeerAccess {
         peer: DaemonId,
         endpoints: impl Iterator<Item = &'a Endpoint>,
         now: Duration,
-    ) -> Vec<Message> {
+    ) -> Vec<LinkMessage> {
         let uses = endpoints.filter_map(|e| Some((verb_of(e.kind)?, e.topic.as_str())));
         // Those that the peer was told of stay: it would take one that is not named any more for allowed.
         let told: BTreeSet<_> =
@@ -181,7 +184,7 @@ impl PeerAccess {
     }
 
     /// Another connection takes over: what was said and not heard is said again, by both sides.
-    pub(super) fn succeed(&mut self) -> Vec<Message> {
+    pub(super) fn succeed(&mut self) -> Vec<LinkMessage> {
         self.there.clear();
         parts(self.here.iter().map(|(used, (why, _))| message(used, why)).collect(), Vec::new())
     }
@@ -190,7 +193,7 @@ impl PeerAccess {
     pub(super) fn handle_denied(
         &mut self,
         peer: DaemonId,
-        denied: Denied,
+        denied: DeniedUses,
         now: Duration,
     ) -> Vec<AccessUse> {
         let used = |of: DeniedUse| (VERBS[usize::from(of.verb.min(3))], of.name);
@@ -211,23 +214,23 @@ impl PeerAccess {
     }
 
     /// Answers what the peer may do here. It learns no more than by announcing such endpoints, of which DENIED speaks.
-    pub(super) fn answer(&self, check: &AccessCheck) -> Message {
+    pub(super) fn answer(&self, check: &LinkAccessCheck) -> LinkMessage {
         let decisions = check.uses.iter().map(|used| {
             let decision =
                 self.permissions.check(CHECKED[usize::from(used.verb.min(4))], &used.name);
             UseDecision { allowed: decision.allowed(), reason: decision.to_string() }
         });
         let decisions = decisions.collect();
-        Message::AccessDecisions(AccessDecisions { number: check.number, decisions })
+        LinkMessage::AccessDecisions(AccessDecisions { number: check.number, decisions })
     }
 
     /// Asks the peer what it lets this host do.
-    pub(super) fn ask(&mut self, number: u64, uses: Vec<CheckedUse>) -> Message {
+    pub(super) fn ask(&mut self, number: u64, uses: Vec<CheckedUse>) -> LinkMessage {
         while self.asked.len() >= UNANSWERED {
             self.asked.pop_first();
         }
         self.asked.insert(number, uses.len());
-        Message::AccessCheck(AccessCheck { number, uses })
+        LinkMessage::LinkAccessCheck(LinkAccessCheck { number, uses })
     }
 
     /// The peer's answer, if this host asked. Each question has one.
@@ -271,9 +274,9 @@ fn message((verb, name): &AccessUse, reason: &str) -> DeniedUse {
     DeniedUse { verb: number as u8, name: name.clone(), reason: reason.to_owned() }
 }
 
-fn parts(denied: Vec<DeniedUse>, lifted: Vec<DeniedUse>) -> Vec<Message> {
+fn parts(denied: Vec<DeniedUse>, lifted: Vec<DeniedUse>) -> Vec<LinkMessage> {
     let part = |denied: &[DeniedUse], lifted: &[DeniedUse]| {
-        Message::Denied(Denied { denied: denied.to_vec(), lifted: lifted.to_vec() })
+        LinkMessage::DeniedUses(DeniedUses { denied: denied.to_vec(), lifted: lifted.to_vec() })
     };
     let lifted = lifted.chunks(MAX_DENIED).map(|lifted| part(&[], lifted));
     lifted.chain(denied.chunks(MAX_DENIED).map(|denied| part(denied, &[]))).collect()
@@ -291,9 +294,11 @@ mod tests {
         names.map(of).collect()
     }
 
-    fn said(messages: &[Message]) -> (usize, usize) {
+    fn said(messages: &[LinkMessage]) -> (usize, usize) {
         messages.iter().fold((0, 0), |(denied, lifted), message| match message {
-            Message::Denied(uses) => (denied + uses.denied.len(), lifted + uses.lifted.len()),
+            LinkMessage::DeniedUses(uses) => {
+                (denied + uses.denied.len(), lifted + uses.lifted.len())
+            }
             other => panic!("{other:?}"),
         })
     }

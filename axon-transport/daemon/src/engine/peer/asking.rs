@@ -21,10 +21,10 @@ use crate::{
     engine::{
         account::{Charge, Meter},
         inbound::RouteIn,
-        peer::routes::{self, RouteKey, Wanted},
+        peer::routes::{self, RouteKey, WantedRoute},
         stand_in::{NoStandIn, StandIn},
     },
-    link::{LastSeen, Message, Subscribe, Unsubscribe},
+    link::{LastSeen, LinkMessage, Subscribe, Unsubscribe},
 };
 
 /// The peer is asked for a route once the local readers are attached, or after this time.
@@ -35,7 +35,7 @@ pub(super) struct AskedRoute {
     pub(super) number: u32,
     route: Route,
     /// The readers and writers that it was last asked for.
-    wanted: Wanted,
+    wanted: WantedRoute,
     /// Whether a writer of it is not shown.
     incomplete: bool,
     pub(super) stand_ins: HashMap<Gid, Rc<StandIn>>,
@@ -68,11 +68,11 @@ impl AskedRoute {
     }
 
     /// Asks for it.
-    pub(super) fn message(&self, key: &RouteKey) -> Message {
+    pub(super) fn message(&self, key: &RouteKey) -> LinkMessage {
         let last = self.stand_ins.iter().filter_map(|(gid, stand_in)| {
             Some(LastSeen { publisher: *gid, sequence: stand_in.last_sequence()? })
         });
-        Message::Subscribe(Subscribe {
+        LinkMessage::Subscribe(Subscribe {
             route: self.number,
             topic: key.topic.clone(),
             type_name: key.type_name.clone(),
@@ -124,7 +124,7 @@ impl Peer {
 
     fn want(
         &mut self,
-        wanted: BTreeMap<RouteKey, Wanted>,
+        wanted: BTreeMap<RouteKey, WantedRoute>,
         unanswered: &BTreeSet<RouteKey>,
         with: &PeerContext<'_>,
         now: Duration,
@@ -139,7 +139,7 @@ impl Peer {
                 self.numbers.remove(&asked.number);
                 self.attaching.remove(&asked.number);
                 self.inbound.routes().remove(&asked.number);
-                self.say(Message::Unsubscribe(Unsubscribe { route: asked.number }));
+                self.say(LinkMessage::Unsubscribe(Unsubscribe { route: asked.number }));
             }
         }
         for (key, wanted) in wanted {
@@ -155,7 +155,13 @@ impl Peer {
         }
     }
 
-    fn want_one(&mut self, key: RouteKey, wanted: Wanted, with: &PeerContext<'_>, now: Duration) {
+    fn want_one(
+        &mut self,
+        key: RouteKey,
+        wanted: WantedRoute,
+        with: &PeerContext<'_>,
+        now: Duration,
+    ) {
         let known = self.asked.get(&key);
         if known.is_some_and(|asked| asked.wanted == wanted && !asked.incomplete) {
             return;
@@ -174,7 +180,7 @@ impl Peer {
                     room,
                     number: self.next_route - 1,
                     route: Route { kind: key.kind, topic },
-                    wanted: Wanted::default(),
+                    wanted: WantedRoute::default(),
                     incomplete: false,
                     stand_ins: HashMap::new(),
                 }

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use crate::link::{LinkClosed, Message};
+use crate::link::{LinkClosed, LinkMessage};
 
 /// Links of which a peer is told again that they are closed: as many as may wait for their end.
 const SAID_CLOSED: usize = 8;
@@ -10,19 +10,19 @@ const SAID_CLOSED: usize = 8;
 /// Control messages for one peer, in order.
 #[derive(Default)]
 pub(super) struct ControlQueue {
-    messages: VecDeque<Message>,
+    messages: VecDeque<LinkMessage>,
     /// Links that were closed while their packets did not arrive, the latest of them.
     closed: Vec<LinkClosed>,
 }
 
 impl ControlQueue {
     /// Adds a message.
-    pub(super) fn say(&mut self, message: Message) {
+    pub(super) fn say(&mut self, message: LinkMessage) {
         self.messages.push_back(message);
     }
 
     /// The next message.
-    pub(super) fn poll(&mut self) -> Option<Message> {
+    pub(super) fn poll(&mut self) -> Option<LinkMessage> {
         self.messages.pop_front()
     }
 
@@ -37,7 +37,7 @@ impl ControlQueue {
         self.closed.extend(closed);
         let before = self.closed.len().saturating_sub(SAID_CLOSED);
         self.closed.drain(..before);
-        self.messages.extend(self.closed.iter().copied().map(Message::LinkClosed));
+        self.messages.extend(self.closed.iter().copied().map(LinkMessage::LinkClosed));
     }
 }
 
@@ -52,7 +52,7 @@ mod tests {
     /// The links that are said to be closed.
     fn said(queue: &mut ControlQueue) -> Vec<LinkClosed> {
         let messages = std::iter::from_fn(|| queue.poll()).map(|message| match message {
-            Message::LinkClosed(closed) => closed,
+            LinkMessage::LinkClosed(closed) => closed,
             other => panic!("{other:?}"),
         });
         messages.collect()

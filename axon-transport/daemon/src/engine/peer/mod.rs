@@ -37,7 +37,7 @@ use self::{
     asking::{AskedRoute, Attaching},
     control_queue::ControlQueue,
     refused::RefusedRoutes,
-    served::{Served, ServedRoutes},
+    served::{ServedRoute, ServedRoutes},
     serving::DENIED_AGAIN,
     unanswered::UnansweredServices,
 };
@@ -61,7 +61,7 @@ use crate::{
             told::{ShownEndpoint, ShownGraph},
         },
     },
-    link::{AccessDecisions, Asserted, CloseCode, Graph, LinkClosed, Message},
+    link::{AccessDecisions, CloseCode, GraphUpdate, LinkClosed, LinkMessage, LivelinessAsserted},
     owner::Binding,
 };
 
@@ -220,12 +220,12 @@ impl Peer {
     }
 
     /// Queues a control message.
-    pub(super) fn say(&mut self, message: Message) {
+    pub(super) fn say(&mut self, message: LinkMessage) {
         self.messages.say(message);
     }
 
     /// The next control message.
-    pub(super) fn poll_message(&mut self) -> Option<Message> {
+    pub(super) fn poll_message(&mut self) -> Option<LinkMessage> {
         self.messages.poll()
     }
 
@@ -235,13 +235,13 @@ impl Peer {
     /// The peer broke a rule.
     pub(super) fn handle_message(
         &mut self,
-        message: Message,
+        message: LinkMessage,
         with: &PeerContext<'_>,
         now: Duration,
     ) -> Result<(), (CloseCode, String)> {
         match message {
-            Message::GraphResync(_) => self.resync(with.local, now),
-            Message::Subscribe(subscribe) => {
+            LinkMessage::GraphResync(_) => self.resync(with.local, now),
+            LinkMessage::Subscribe(subscribe) => {
                 let services = self.served.service_count();
                 let of_service = subscribe.kind != Kind::Topic as u8;
                 let served = self.serve(subscribe, with, now);
@@ -250,25 +250,25 @@ impl Peer {
                 }
                 return served.map_err(|reason| (CloseCode::Malformed, reason));
             }
-            Message::Unsubscribe(unsubscribe) => {
+            LinkMessage::Unsubscribe(unsubscribe) => {
                 let of_service = self.served.is_service(unsubscribe.route);
                 self.unserve(unsubscribe.route);
                 self.stirred |= of_service && self.services_changed();
             }
-            Message::Asserted(asserted) => self.handle_asserted(&asserted),
-            Message::Intake(intake) => self.outbound.set_intake(&intake),
-            Message::Received(received) => self.outbound.handle_received(&received.flows),
-            Message::RouteRefused(refused) => self.handle_route_refused(refused, now),
-            Message::Denied(denied) => {
+            LinkMessage::LivelinessAsserted(asserted) => self.handle_asserted(&asserted),
+            LinkMessage::Intake(intake) => self.outbound.set_intake(&intake),
+            LinkMessage::ReceivedUpTo(received) => self.outbound.handle_received(&received.flows),
+            LinkMessage::RouteRefused(refused) => self.handle_route_refused(refused, now),
+            LinkMessage::DeniedUses(denied) => {
                 let allowed = self.access.handle_denied(self.daemon, denied, now);
                 self.ask_for_allowed(&allowed);
             }
-            Message::AccessCheck(check) => {
+            LinkMessage::LinkAccessCheck(check) => {
                 let answer = self.access.answer(&check);
                 self.say(answer);
             }
-            Message::RouteUnasked(unasked) => self.handle_route_unasked(unasked, now),
-            Message::RouteReady(ready) => {
+            LinkMessage::RouteUnasked(unasked) => self.handle_route_unasked(unasked, now),
+            LinkMessage::RouteReady(ready) => {
                 self.handle_route_ready(ready.route);
                 tracing::debug!(peer = %self.daemon, route = ready.route,
                     publishers = ready.publishers.len(), "route ready");
@@ -313,7 +313,7 @@ impl Peer {
         self.remote.set_permissions(permissions);
         let ending = std::mem::take(&mut self.ending);
         self.ending = self.permitted(ending);
-        let denied = |served: &Served| {
+        let denied = |served: &ServedRoute| {
             let why = self.access.denial(reader_of(served.key.kind), &served.key.topic)?;
             Some((served.key.clone(), why))
         };
@@ -416,7 +416,7 @@ impl Peer {
     }
 
     /// A part of the peer's graph.
-    pub(super) fn take_graph(&mut self, graph: Graph) -> GraphTaken {
+    pub(super) fn take_graph(&mut self, graph: GraphUpdate) -> GraphTaken {
         let taken = self.remote.take(graph);
         if taken == (GraphTaken::Changed { whole: true }) {
             self.unserve_unrepeated();
@@ -451,11 +451,11 @@ impl Peer {
             Source::StandIn(_) => Vec::new(),
         });
         for publishers in self.alive.news(now, asserted) {
-            self.say(Message::Asserted(Asserted { publishers }));
+            self.say(LinkMessage::LivelinessAsserted(LivelinessAsserted { publishers }));
         }
     }
 
-    fn handle_asserted(&self, asserted: &Asserted) {
+    fn handle_asserted(&self, asserted: &LivelinessAsserted) {
         let known = asserted.publishers.iter().filter_map(|gid| self.remote.get(gid));
         // Its topic names the one route that may have a stand-in of it.
         let stand_ins = known.take(MAX_STAND_INS).filter_map(|publisher| {

@@ -20,7 +20,7 @@ use crate::{
         account::{Charge, Meter},
         peer::routes::RouteKey,
     },
-    link::{Message, RouteRefused, RouteUnasked},
+    link::{LinkMessage, RouteRefused, RouteUnasked},
 };
 
 /// Names that status lists.
@@ -215,7 +215,7 @@ impl Peer {
         retry: Option<Duration>,
         now: Duration,
     ) {
-        self.say(Message::RouteRefused(RouteRefused {
+        self.say(LinkMessage::RouteRefused(RouteRefused {
             route: number,
             reason: reason.clone(),
             retry_s: retry.map(|retry| u32::try_from(retry.as_secs().max(1)).unwrap_or(u32::MAX)),
@@ -354,8 +354,8 @@ pub(super) fn shown(reason: &str) -> String {
     reason.chars().filter(|c| !c.is_control()).take(REASON).collect()
 }
 
-fn unasked(key: &RouteKey, reason: Option<&str>) -> Message {
-    Message::RouteUnasked(RouteUnasked {
+fn unasked(key: &RouteKey, reason: Option<&str>) -> LinkMessage {
+    LinkMessage::RouteUnasked(RouteUnasked {
         topic: key.topic.clone(),
         type_name: key.type_name.clone(),
         kind: key.kind as u8,

@@ -72,7 +72,7 @@ impl RouteKey {
 
 /// What one route needs from one peer.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Wanted {
+pub(crate) struct WantedRoute {
     /// Readers here that some writer there serves.
     pub(crate) subscribers: Vec<RouteSubscriber>,
     /// Writers there, and how many readers here each serves.
@@ -83,12 +83,12 @@ pub(crate) struct Wanted {
 pub(crate) fn wanted<'a>(
     local: impl IntoIterator<Item = (&'a Endpoint, RangeToHost)>,
     remote: impl IntoIterator<Item = &'a RemoteEndpoint>,
-) -> BTreeMap<RouteKey, Wanted> {
+) -> BTreeMap<RouteKey, WantedRoute> {
     let mut readers: BTreeMap<&str, Vec<(&Endpoint, RangeToHost)>> = BTreeMap::new();
     for (endpoint, toward) in local.into_iter().filter(|(e, _)| reads(e.kind)) {
         readers.entry(&endpoint.topic).or_default().push((endpoint, toward));
     }
-    let mut routes: BTreeMap<RouteKey, Wanted> = BTreeMap::new();
+    let mut routes: BTreeMap<RouteKey, WantedRoute> = BTreeMap::new();
     let mut counted = BTreeSet::new();
     for remote in remote.into_iter().filter(|remote| writes(remote.endpoint.kind)) {
         let writer: &Endpoint = &remote.endpoint;
@@ -209,7 +209,7 @@ mod tests {
         Endpoint::new(Gid([number; 16]), kind, topic, "t").with_qos(qos)
     }
 
-    fn wanted(local: &[Endpoint], remote: &[Endpoint]) -> BTreeMap<RouteKey, Wanted> {
+    fn wanted(local: &[Endpoint], remote: &[Endpoint]) -> BTreeMap<RouteKey, WantedRoute> {
         let remote: Vec<RemoteEndpoint> = remote.iter().cloned().map(Into::into).collect();
         super::wanted(local.iter().map(|e| (e, SUBNET)), &remote)
     }

@@ -18,7 +18,7 @@ use crate::{
 const READY_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// A route that the peer asked for.
-pub(super) struct Served {
+pub(super) struct ServedRoute {
     pub(super) key: RouteKey,
     pub(super) subscribers: Vec<Gid>,
     pub(super) sources: Vec<Source>,
@@ -28,18 +28,18 @@ pub(super) struct Served {
     /// One for each relay and each publisher here that it may read.
     pub(super) lanes: Charge,
     /// Why some of the subscribers get nothing, and when the peer may ask again.
-    pub(super) without: Option<Without>,
+    pub(super) without: Option<MissingRelay>,
     /// Whether the peer asked for it over the link in use.
     pub(super) repeated: bool,
 }
 
 /// Why subscribers of a route have no relay, and after what time one may be had.
-pub(super) type Without = (String, Option<Duration>);
+pub(super) type MissingRelay = (String, Option<Duration>);
 
 /// Routes by number and by what they carry.
 #[derive(Default)]
 pub(super) struct ServedRoutes {
-    routes: HashMap<u32, Served>,
+    routes: HashMap<u32, ServedRoute>,
     numbers: HashMap<RouteKey, u32>,
     /// The routes of services.
     services: BTreeSet<u32>,
@@ -53,11 +53,11 @@ impl ServedRoutes {
         self.routes.len()
     }
 
-    pub(super) fn get(&self, number: u32) -> Option<&Served> {
+    pub(super) fn get(&self, number: u32) -> Option<&ServedRoute> {
         self.routes.get(&number)
     }
 
-    pub(super) fn get_mut(&mut self, number: u32) -> Option<&mut Served> {
+    pub(super) fn get_mut(&mut self, number: u32) -> Option<&mut ServedRoute> {
         self.routes.get_mut(&number)
     }
 
@@ -66,16 +66,16 @@ impl ServedRoutes {
         self.numbers.get(key).copied()
     }
 
-    pub(super) fn iter(&self) -> impl Iterator<Item = (u32, &Served)> {
+    pub(super) fn iter(&self) -> impl Iterator<Item = (u32, &ServedRoute)> {
         self.routes.iter().map(|(number, served)| (*number, served))
     }
 
-    pub(super) fn iter_mut(&mut self) -> impl Iterator<Item = (u32, &mut Served)> {
+    pub(super) fn iter_mut(&mut self) -> impl Iterator<Item = (u32, &mut ServedRoute)> {
         self.routes.iter_mut().map(|(number, served)| (*number, served))
     }
 
     /// The routes of services, by number.
-    pub(super) fn services(&self) -> impl Iterator<Item = (u32, &Served)> {
+    pub(super) fn services(&self) -> impl Iterator<Item = (u32, &ServedRoute)> {
         self.services.iter().filter_map(|number| Some((*number, self.routes.get(number)?)))
     }
 
@@ -90,7 +90,7 @@ impl ServedRoutes {
     }
 
     /// Adds a route, in place of what [`take`](Self::take) took.
-    pub(super) fn insert(&mut self, number: u32, served: Served) {
+    pub(super) fn insert(&mut self, number: u32, served: ServedRoute) {
         self.numbers.insert(served.key.clone(), number);
         if served.key.kind != Kind::Topic {
             self.services.insert(number);
@@ -99,7 +99,7 @@ impl ServedRoutes {
     }
 
     /// Takes a route out, to be changed. The peer may still be waiting to be told that it is ready.
-    pub(super) fn take(&mut self, number: u32) -> Option<Served> {
+    pub(super) fn take(&mut self, number: u32) -> Option<ServedRoute> {
         self.services.remove(&number);
         let served = self.routes.remove(&number)?;
         self.numbers.remove(&served.key);
@@ -107,7 +107,7 @@ impl ServedRoutes {
     }
 
     /// Ends a route.
-    pub(super) fn remove(&mut self, number: u32) -> Option<Served> {
+    pub(super) fn remove(&mut self, number: u32) -> Option<ServedRoute> {
         self.announcing.remove(&number);
         self.take(number)
     }
@@ -149,9 +149,9 @@ mod tests {
     use super::*;
     use crate::engine::account::Accounts;
 
-    fn served(kind: Kind, topic: &str) -> Served {
+    fn served(kind: Kind, topic: &str) -> ServedRoute {
         let account = Accounts::new(1 << 20, 1 << 20).of_one("a");
-        Served {
+        ServedRoute {
             key: RouteKey { kind, topic: topic.into(), type_name: "T".into() },
             subscribers: Vec::new(),
             sources: Vec::new(),

@@ -9,7 +9,7 @@ use axon_transport::EndpointSpec;
 use super::{
     Peer, PeerContext, reader_of,
     refused::TOO_MANY_LANES,
-    served::{Served, Without},
+    served::{MissingRelay, ServedRoute},
 };
 use crate::{
     engine::{
@@ -18,7 +18,7 @@ use crate::{
         outbound::{RouteOut, Source, StallCause, UnfinishedFlows},
         peer::routes::{MAX_RELAYS_OF_ROUTE, RelaySpec, RouteKey, admit, relays},
     },
-    link::{Message, RouteSubscriber, Subscribe},
+    link::{LinkMessage, RouteSubscriber, Subscribe},
 };
 
 /// A peer that lacks relays may ask for them again after this time.
@@ -38,7 +38,7 @@ struct Relays {
     adopted: Vec<Gid>,
     /// The flows that these had.
     unfinished: UnfinishedFlows,
-    without: Option<Without>,
+    without: Option<MissingRelay>,
 }
 
 /// That some of the relays of a route are not there, and why.
@@ -158,7 +158,7 @@ impl Peer {
                 self.outbound.handle_publisher_ended(number, of, now);
             }
         }
-        let served = Served {
+        let served = ServedRoute {
             key,
             subscribers: subscribers.iter().map(|subscriber| subscriber.gid).collect(),
             sources,
@@ -361,7 +361,7 @@ impl Peer {
     pub(super) fn announce_ready(&mut self, now: Duration) {
         for ready in self.served.take_ready(now) {
             let number = ready.route;
-            self.say(Message::RouteReady(ready));
+            self.say(LinkMessage::RouteReady(ready));
             // What is ready is not refused: it is said in this order.
             if let Some(served) = self.served.get(number)
                 && let Some((reason, again)) = served.without.clone()

@@ -33,20 +33,20 @@ pub(crate) struct StallHistory {
 #[derive(Debug)]
 struct OfPeer {
     room: Rc<Meter>,
-    routes: HashMap<RouteKey, (Stall, Charge)>,
+    routes: HashMap<RouteKey, (RouteStall, Charge)>,
     /// That of all routes for which there was no room. A peer gains nothing by stalling very many.
-    others: Option<Stall>,
+    others: Option<RouteStall>,
 }
 
 #[derive(Clone, Copy, Debug)]
-struct Stall {
+struct RouteStall {
     wait: Duration,
     until: Duration,
     /// When nothing is known of it any more.
     forgiven: Duration,
 }
 
-impl Stall {
+impl RouteStall {
     /// A peer stalled, and this is what was known of it.
     fn after(before: Option<Self>, limit: Duration, now: Duration) -> Self {
         let before = before.filter(|before| !before.is_forgiven(now));
@@ -62,7 +62,7 @@ impl Stall {
 
 impl OfPeer {
     /// What is known of a route.
-    fn get(&self, key: &RouteKey) -> Option<Stall> {
+    fn get(&self, key: &RouteKey) -> Option<RouteStall> {
         self.routes.get(key).map(|(stall, _)| *stall).or(self.others)
     }
 
@@ -99,7 +99,7 @@ impl StallHistory {
             routes: HashMap::new(),
             others: None,
         });
-        let stall = Stall::after(of.get(key), limit.max(Duration::from_secs(1)), now);
+        let stall = RouteStall::after(of.get(key), limit.max(Duration::from_secs(1)), now);
         if let Some((known, _)) = of.routes.get_mut(key) {
             *known = stall;
         } else if let Some(charge) = of.room.charge(ENTRY + key.bytes()) {

@@ -11,7 +11,7 @@ use axon_envelope::Kind;
 use super::{
     Peer, PeerContext,
     asking::AskedRoute,
-    routes::{RouteKey, Wanted},
+    routes::{RouteKey, WantedRoute},
 };
 use crate::engine::outbound::UnfinishedFlows;
 
@@ -90,7 +90,7 @@ impl Peer {
     /// is asked for stay, if it was another daemon of its host that took nothing.
     pub(super) fn leave_out_unanswered(
         &mut self,
-        wanted: &mut BTreeMap<RouteKey, Wanted>,
+        wanted: &mut BTreeMap<RouteKey, WantedRoute>,
         with: &PeerContext<'_>,
         now: Duration,
     ) -> BTreeSet<RouteKey> {

@@ -21,10 +21,10 @@ use axon_transport::{
     internal::graph::{LIMITS, RemoteEndpoint, permits},
 };
 
-use self::{decisions::note_look, left_out::LeftOut, owners::Proven, terms::Terms};
+use self::{decisions::note_look, left_out::LeftOut, owners::Proven, terms::GraphTerms};
 use crate::{
     engine::account::{Account, Charge},
-    link::Graph,
+    link::GraphUpdate,
     owner::{Binding, Prefix, Proof, prefix_of},
 };
 
@@ -96,9 +96,10 @@ impl PeerGraph {
     }
 
     /// Takes a GRAPH in, as far as there is room.
-    pub(crate) fn take(&mut self, graph: Graph) -> GraphTaken {
-        let Graph { version, before, added, removed, more, localhost, listing, denied } = graph;
-        let terms = Terms::new([localhost, listing, denied]);
+    pub(crate) fn take(&mut self, graph: GraphUpdate) -> GraphTaken {
+        let GraphUpdate { version, before, added, removed, more, localhost, listing, denied } =
+            graph;
+        let terms = GraphTerms::new([localhost, listing, denied]);
         if before == 0 {
             self.gathered = Some(BTreeMap::new());
             self.left_out = LeftOut::default();
@@ -157,7 +158,7 @@ impl PeerGraph {
         &mut self,
         gathered: &mut BTreeMap<Gid, HeldEndpoint>,
         endpoint: Endpoint,
-        terms: &Terms,
+        terms: &GraphTerms,
     ) {
         let gid = endpoint.gid;
         let held = match self.all.get(&gid) {
@@ -208,7 +209,12 @@ impl PeerGraph {
         self.left_out.add_unproven_reader(gid, topic);
     }
 
-    fn hold(&mut self, endpoint: Endpoint, terms: &Terms, beside: usize) -> Option<HeldEndpoint> {
+    fn hold(
+        &mut self,
+        endpoint: Endpoint,
+        terms: &GraphTerms,
+        beside: usize,
+    ) -> Option<HeldEndpoint> {
         let bytes = endpoint.bytes();
         if beside < LIMITS.endpoints
             && let Some(charge) = self.account.graph.charge(bytes)
@@ -340,9 +346,9 @@ mod tests {
         Endpoint::new(Gid([number; 16]), EndpointKind::Publisher, name, "T").with_node("n", "/")
     }
 
-    fn graph(before: u64, added: Vec<Endpoint>, removed: Vec<Gid>, more: bool) -> Graph {
+    fn graph(before: u64, added: Vec<Endpoint>, removed: Vec<Gid>, more: bool) -> GraphUpdate {
         let version = before + 1;
-        Graph { version, before, added, removed, more, ..Graph::default() }
+        GraphUpdate { version, before, added, removed, more, ..GraphUpdate::default() }
     }
 
     fn one() -> usize {
@@ -449,7 +455,7 @@ mod tests {
             |remote: &PeerGraph| remote.usable().map(|e| e.endpoint.gid.0[0]).collect::<Vec<_>>();
         for (before, denied, left) in [(0, 1, 2), (1, 2, 1), (0, 1, 2)] {
             let denied = Some(vec![Gid([denied; 16])]);
-            remote.take(Graph { denied, ..graph(before, both(), vec![], false) });
+            remote.take(GraphUpdate { denied, ..graph(before, both(), vec![], false) });
             assert_eq!((usable(&remote), remote.endpoints().count()), (vec![left], 2));
         }
         assert_eq!(changes(&mut remote), (vec![1, 2], vec![]));

@@ -13,7 +13,7 @@ use axon_transport::internal::SessionKey;
 
 use crate::{
     engine::account::{Charge, Meter},
-    link::{MAX_PROOFS, Message, Owners},
+    link::{LinkMessage, MAX_PROOFS, Owners},
     owner::{Binding, Prefix, Proof, SessionKeys, prefix, prefix_of, prove},
 };
 
@@ -75,7 +75,7 @@ impl Prover {
     }
 
     /// The proofs that the peer lacks for endpoints of these GIDs.
-    pub(crate) fn owed<'a>(&mut self, gids: impl Iterator<Item = &'a Gid>) -> Vec<Message> {
+    pub(crate) fn owed<'a>(&mut self, gids: impl Iterator<Item = &'a Gid>) -> Vec<LinkMessage> {
         let Some(binding) = self.binding else { return Vec::new() };
         let sessions: BTreeSet<Prefix> = gids.map(prefix_of).collect();
         self.proved.retain(|session| sessions.contains(session));
@@ -102,7 +102,7 @@ impl Prover {
             }
         }
         let parts = proofs.chunks(MAX_PROOFS);
-        parts.map(|part| Message::Owners(Owners { proofs: part.to_vec() })).collect()
+        parts.map(|part| LinkMessage::Owners(Owners { proofs: part.to_vec() })).collect()
     }
 }
 
@@ -287,9 +287,9 @@ mod tests {
         }
     }
 
-    fn proved(messages: &[Message]) -> usize {
-        let count = |message: &Message| match message {
-            Message::Owners(owners) => owners.proofs.len(),
+    fn proved(messages: &[LinkMessage]) -> usize {
+        let count = |message: &LinkMessage| match message {
+            LinkMessage::Owners(owners) => owners.proofs.len(),
             other => panic!("{other:?}"),
         };
         messages.iter().map(count).sum()

@@ -6,13 +6,13 @@ use axon_shm::ids::Gid;
 use axon_transport::{config::DiscoveryRange, internal::graph::RangeToHost};
 
 /// The endpoints of a GRAPH message that the message says more about.
-pub(super) struct Terms {
+pub(super) struct GraphTerms {
     localhost: BTreeSet<Gid>,
     listing: BTreeSet<Gid>,
     denied: BTreeSet<Gid>,
 }
 
-impl Terms {
+impl GraphTerms {
     /// What the fields of a message say: endpoints with the range LOCALHOST, of sessions that list this host as a static
     /// peer, and whose other end access rules of the peer deny this host.
     pub(super) fn new(fields: [Option<Vec<Gid>>; 3]) -> Self {
@@ -41,13 +41,13 @@ mod tests {
     #[test]
     fn an_endpoint_that_no_field_names_is_for_the_subnet_and_denied_nobody() {
         let gids = [1, 2, 3].map(|number| Gid([number; 16]));
-        let terms = Terms::new([Some(vec![gids[0]]), Some(vec![gids[0], gids[1]]), None]);
+        let terms = GraphTerms::new([Some(vec![gids[0]]), Some(vec![gids[0], gids[1]]), None]);
         let toward = gids.map(|gid| terms.toward(&gid));
         assert_eq!(toward.map(|to| to.lists), [true, true, false]);
         let (near, subnet) = (DiscoveryRange::Localhost, DiscoveryRange::Subnet);
         assert_eq!(toward.map(|to| to.range), [near, subnet, subnet]);
         assert!(!gids.iter().any(|gid| terms.denies(gid)));
-        let terms = Terms::new([None, None, Some(vec![gids[2]])]);
+        let terms = GraphTerms::new([None, None, Some(vec![gids[2]])]);
         assert_eq!(gids.map(|gid| terms.denies(&gid)), [false, false, true]);
     }
 }

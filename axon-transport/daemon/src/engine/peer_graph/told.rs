@@ -5,7 +5,7 @@ use std::{collections::BTreeMap, time::Duration};
 use axon_shm::ids::Gid;
 use axon_transport::{config::DiscoveryRange, graph::Endpoint, internal::graph::RemoteEndpoint};
 
-use crate::link::{Graph, Message};
+use crate::link::{GraphUpdate, LinkMessage};
 
 /// Endpoints in one message of a graph.
 const GRAPH_PART: usize = 512;
@@ -64,7 +64,7 @@ impl ShownGraph {
         &mut self,
         now: BTreeMap<Gid, ShownEndpoint>,
         whole: bool,
-    ) -> Vec<Message> {
+    ) -> Vec<LinkMessage> {
         let before = if whole { BTreeMap::new() } else { std::mem::take(&mut self.endpoints) };
         let new: Vec<_> = now
             .iter()
@@ -83,7 +83,7 @@ impl ShownGraph {
             let last = parts.len() - 1;
             for (index, part) in parts.into_iter().enumerate() {
                 self.version += 1;
-                messages.push(Message::Graph(Graph {
+                messages.push(LinkMessage::GraphUpdate(GraphUpdate {
                     version: self.version,
                     before,
                     removed: removed.take().unwrap_or_default(),
@@ -99,17 +99,17 @@ impl ShownGraph {
 }
 
 /// A GRAPH that adds these. Its versions and what it removes are the caller's.
-fn added(part: &[&ShownEndpoint]) -> Graph {
+fn added(part: &[&ShownEndpoint]) -> GraphUpdate {
     let named = |is: fn(&ShownEndpoint) -> bool| {
         let gids = part.iter().filter(|told| is(told)).map(|told| told.remote.endpoint.gid);
         Some(gids.collect::<Vec<Gid>>()).filter(|gids| !gids.is_empty())
     };
-    Graph {
+    GraphUpdate {
         localhost: named(|told| told.remote.toward.range != DiscoveryRange::Subnet),
         listing: named(|told| told.remote.toward.lists),
         denied: named(|told| told.denied),
         added: part.iter().map(|told| Endpoint::clone(&told.remote.endpoint)).collect(),
-        ..Graph::default()
+        ..GraphUpdate::default()
     }
 }
 
@@ -129,9 +129,11 @@ mod tests {
     }
 
     /// Version, version before, and how many endpoints come and go, with whether more follows.
-    fn said(messages: Vec<Message>) -> Vec<(u64, u64, usize, usize, bool)> {
+    fn said(messages: Vec<LinkMessage>) -> Vec<(u64, u64, usize, usize, bool)> {
         let of = |message| match message {
-            Message::Graph(g) => (g.version, g.before, g.added.len(), g.removed.len(), g.more),
+            LinkMessage::GraphUpdate(g) => {
+                (g.version, g.before, g.added.len(), g.removed.len(), g.more)
+            }
             other => panic!("{other:?}"),
         };
         messages.into_iter().map(of).collect()

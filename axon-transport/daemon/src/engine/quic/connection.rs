@@ -59,7 +59,7 @@ pub(crate) struct Connection {
     /// The limits on what it sends.
     pub(in crate::engine) egress: Egress,
     /// How much is lost on the way.
-    loss: Loss,
+    loss: PacketLoss,
     /// How much it carries.
     rate: LinkRate,
     /// Whether it is in the list of connections with something to do.
@@ -87,7 +87,7 @@ impl Connection {
             control: ControlStream::default(),
             flows: HashMap::new(),
             egress: Egress::default(),
-            loss: Loss::default(),
+            loss: PacketLoss::default(),
             rate: LinkRate::default(),
             is_dirty: false,
             is_transmitting: false,
@@ -195,7 +195,7 @@ impl Connection {
 
 /// The share of packets that are lost lately.
 #[derive(Debug, Default)]
-struct Loss {
+struct PacketLoss {
     /// When it is measured again.
     due: Duration,
     /// Packets sent and lost at the last measure.
@@ -204,7 +204,7 @@ struct Loss {
     share: f64,
 }
 
-impl Loss {
+impl PacketLoss {
     fn measure(&mut self, quic: &quinn_proto::Connection, now: Duration) {
         if now < self.due {
             return;

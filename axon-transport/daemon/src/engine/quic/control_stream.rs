@@ -9,8 +9,8 @@ use quinn_proto::{ReadError, ReadableError, StreamId, WriteError};
 use crate::{
     engine::account::{Account, Charge, Meter, cost, cost_of_frame, decoded_length},
     link::{
-        CloseCode, FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, Message, is_known,
-        read_length,
+        CloseCode, FrameError, LinkMessage, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED,
+        is_known, read_length,
     },
 };
 
@@ -68,7 +68,7 @@ impl FrameLimits {
 #[derive(Debug)]
 pub(crate) enum ControlInput {
     /// A message, with what it weighs on the account until it is handled.
-    Message(Box<Message>, Option<Charge>),
+    Message(Box<LinkMessage>, Option<Charge>),
     /// No whole message has come, or the peer has to wait.
     Nothing,
     /// One has come, and is decompressed once messages of the same identity are handled.
@@ -150,7 +150,7 @@ impl ControlStream {
     ///
     /// # Errors
     /// The message is too large, or the peer does not read.
-    pub(in crate::engine) fn send(&mut self, message: &Message) -> Result<(), ControlError> {
+    pub(in crate::engine) fn send(&mut self, message: &LinkMessage) -> Result<(), ControlError> {
         if self.finishing {
             return Ok(());
         }
@@ -291,7 +291,7 @@ impl ControlStream {
                 None => None,
             };
             let message = match is_known(body) {
-                true => Message::from_frame(body, self.limits.inflated)?,
+                true => LinkMessage::from_frame(body, self.limits.inflated)?,
                 false => None,
             };
             (self.frame, self.paid) = (Vec::new(), None);

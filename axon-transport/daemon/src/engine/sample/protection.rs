@@ -8,7 +8,7 @@ use bytes::Bytes;
 
 use super::{
     frames::Frames,
-    short_header::{ShortHeaders, Told},
+    short_header::{ShortHeader, ShortHeaders},
 };
 use crate::{
     engine::rings::RingSample,
@@ -73,7 +73,7 @@ impl Seal<'_> {
                     !sample.is_compressed(),
                     "a short header says nothing of compression"
                 );
-                let header = short.write(Told {
+                let header = short.write(ShortHeader {
                     sequence: sample.info.sequence,
                     source_timestamp: unix_nanos(sample.info.source_timestamp),
                     age_ms: age(sample, now),

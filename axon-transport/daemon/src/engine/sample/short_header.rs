@@ -9,7 +9,7 @@ const MOST: usize = 10 + 10 + 5;
 
 /// What is told of a sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Told {
+pub(crate) struct ShortHeader {
     pub(crate) sequence: u64,
     /// Nanoseconds since the Unix epoch.
     pub(crate) source_timestamp: i64,
@@ -51,7 +51,7 @@ impl Encoded {
 
 impl ShortHeaders {
     /// Writes the header of the next sample.
-    pub(crate) fn write(&mut self, told: Told) -> Encoded {
+    pub(crate) fn write(&mut self, told: ShortHeader) -> Encoded {
         let mut encoded = Encoded { bytes: [0; MOST], length: 0 };
         // Differences wrap: a number or time of any value can follow any other.
         encoded.put(told.sequence.wrapping_sub(self.sequence));
@@ -66,7 +66,10 @@ impl ShortHeaders {
     ///
     /// # Errors
     /// The peer broke the format.
-    pub(crate) fn read<'a>(&mut self, message: &'a [u8]) -> Result<(Told, &'a [u8]), &'static str> {
+    pub(crate) fn read<'a>(
+        &mut self,
+        message: &'a [u8],
+    ) -> Result<(ShortHeader, &'a [u8]), &'static str> {
         let mut rest = message;
         let sequence = self.sequence.wrapping_add(take(&mut rest)?);
         let later = take(&mut rest)?;
@@ -75,7 +78,7 @@ impl ShortHeaders {
         let age_ms = take(&mut rest)?;
         let age_ms = u32::try_from(age_ms).map_err(|_| "a short header with too great an age")?;
         *self = Self { sequence, source_timestamp };
-        Ok((Told { sequence, source_timestamp, age_ms }, rest))
+        Ok((ShortHeader { sequence, source_timestamp, age_ms }, rest))
     }
 }
 
@@ -102,8 +105,8 @@ fn take(from: &mut &[u8]) -> Result<u64, &'static str> {
 mod tests {
     use super::*;
 
-    fn told(sequence: u64, source_timestamp: i64, age_ms: u32) -> Told {
-        Told { sequence, source_timestamp, age_ms }
+    fn told(sequence: u64, source_timestamp: i64, age_ms: u32) -> ShortHeader {
+        ShortHeader { sequence, source_timestamp, age_ms }
     }
 
     #[test]

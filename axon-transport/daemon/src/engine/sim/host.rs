@@ -40,7 +40,7 @@ use crate::{
     },
     identity::Identity,
     keys::{KmeRequest, RequestOrigin},
-    link::Hello,
+    link::LinkHello,
     owner::SessionKeys,
     wire::beacon::Datagram,
 };
@@ -146,10 +146,10 @@ impl Host {
             }
             axon_transport::config::Security::Qkd(_) => None,
         };
-        let hello = Hello {
+        let hello = LinkHello {
             routes: Some(MAX_ROUTES as u32),
             host: format!("host{}", self.number),
-            ..Hello::new(&self.config, self.daemon)
+            ..LinkHello::new(&self.config, self.daemon)
         };
         let links = LinkParts {
             config: Arc::clone(&self.config),
@@ -362,7 +362,7 @@ impl Host {
     }
 
     /// The KME answered.
-    pub(super) fn handle_key_event(&mut self, event: crate::keys::Event, now: Duration) {
+    pub(super) fn handle_key_event(&mut self, event: crate::keys::KmeAnswer, now: Duration) {
         self.due.set(None);
         if let Some(engine) = &mut self.engine {
             engine.handle_key_event(event, now);

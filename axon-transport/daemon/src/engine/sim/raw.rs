@@ -24,7 +24,7 @@ use super::{
 use crate::{
     engine::{credentials::Credentials, peer::MAX_ROUTES, quic::transport::Transports},
     identity::Identity,
-    link::{CloseCode, Hello, MAX_FRAME, MAX_INFLATED, Message, read_length},
+    link::{CloseCode, LinkHello, LinkMessage, MAX_FRAME, MAX_INFLATED, read_length},
 };
 
 /// A peer that a test speaks for, in classic mode.
@@ -52,7 +52,7 @@ pub(super) struct RawLink {
     /// What came on the control stream and is no whole frame yet.
     partial: Vec<u8>,
     /// The messages that came on the control stream.
-    pub(super) messages: Vec<Message>,
+    pub(super) messages: Vec<LinkMessage>,
     /// It reads nothing more of the control stream.
     pub(super) is_deaf: bool,
     /// The data streams that the other side opened. Nobody reads them but a test.
@@ -121,15 +121,15 @@ impl Raw {
     }
 
     /// The HELLO of an honest peer.
-    pub(super) fn hello(&self) -> Hello {
+    pub(super) fn hello(&self) -> LinkHello {
         let routes = Some(MAX_ROUTES as u32);
-        Hello { routes, host: "raw".into(), ..Hello::new(&self.config, self.daemon) }
+        LinkHello { routes, host: "raw".into(), ..LinkHello::new(&self.config, self.daemon) }
     }
 
     /// Says HELLO on a link.
     pub(super) fn say_hello(&mut self, link: usize) {
         let hello = self.hello();
-        self.links[link].say(&Message::Hello(hello));
+        self.links[link].say(&LinkMessage::LinkHello(hello));
     }
 
     /// Closes a link.
@@ -251,7 +251,7 @@ impl RawLink {
                 return;
             }
             let frame: Vec<u8> = self.partial.drain(..4 + length).collect();
-            let message = Message::from_frame(&frame[4..], MAX_INFLATED);
+            let message = LinkMessage::from_frame(&frame[4..], MAX_INFLATED);
             self.messages.extend(message.expect("a message of the engine"));
         }
     }
@@ -269,7 +269,7 @@ impl RawLink {
     }
 
     /// Says a message on the control stream.
-    pub(super) fn say(&mut self, message: &Message) {
+    pub(super) fn say(&mut self, message: &LinkMessage) {
         self.say_bytes(message.to_frame().unwrap().into());
     }
 
@@ -324,11 +324,11 @@ impl RawLink {
 
     /// Whether the other side's HELLO came.
     pub(super) fn is_greeted(&self) -> bool {
-        self.messages.iter().any(|message| matches!(message, Message::Hello(_)))
+        self.messages.iter().any(|message| matches!(message, LinkMessage::LinkHello(_)))
     }
 
     /// Whether the other side elected it.
     pub(super) fn is_elected(&self) -> bool {
-        self.messages.iter().any(|message| matches!(message, Message::Elected(_)))
+        self.messages.iter().any(|message| matches!(message, LinkMessage::Elected(_)))
     }
 }

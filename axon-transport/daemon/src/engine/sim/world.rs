@@ -20,7 +20,7 @@ use super::{
     network::Network,
     raw::Raw,
 };
-use crate::{engine::keyring::tests::Kmes, keys::Event};
+use crate::{engine::keyring::tests::Kmes, keys::KmeAnswer};
 
 /// A KME answers after this time.
 const KME: Duration = Duration::from_millis(20);
@@ -37,7 +37,7 @@ pub(super) struct World {
     pub(super) raws: Vec<Raw>,
     epoch: Instant,
     pub(super) kmes: Kmes,
-    answers: Vec<(Duration, usize, Event)>,
+    answers: Vec<(Duration, usize, KmeAnswer)>,
     stopped: Vec<bool>,
     /// Passes of each host since the start.
     pub(super) passes: Vec<u64>,
@@ -359,7 +359,7 @@ impl World {
         let host = &mut self.hosts[number];
         for (origin, request) in std::mem::take(&mut host.requests) {
             let answer = self.kmes.answer(request);
-            self.answers.push((now + KME, number, Event { origin, answer }));
+            self.answers.push((now + KME, number, KmeAnswer { origin, answer }));
         }
         self.check(number);
     }

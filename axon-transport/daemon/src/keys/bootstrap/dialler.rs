@@ -82,7 +82,7 @@ pub enum DialRefusal {
 }
 
 /// The keys with which this host dials. One for the daemon.
-pub struct Dialler {
+pub struct BootstrapDialler {
     sae_id: String,
     allowed: QkdPeers,
     cipher: Cipher,
@@ -128,7 +128,7 @@ impl Drop for UnspentKey {
     }
 }
 
-impl Dialler {
+impl BootstrapDialler {
     /// For the host `sae_id`, which may dial `allowed`. A KME may take as long as `answer`.
     pub fn new(sae_id: &str, allowed: QkdPeers, cipher: Cipher, answer: Duration) -> Self {
         Self { sae_id: sae_id.to_owned(), allowed, cipher, answer, peers: HashMap::new() }

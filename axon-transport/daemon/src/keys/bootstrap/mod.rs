@@ -9,7 +9,7 @@ mod seen_set;
 mod tests;
 
 pub use acceptor::{Acceptor, Lookup, Resolver};
-pub use dialler::{Dial, DialKey, DialRefusal, Dialler};
+pub use dialler::{BootstrapDialler, Dial, DialKey, DialRefusal};
 
 /// Whether a completed handshake was the first under its key.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

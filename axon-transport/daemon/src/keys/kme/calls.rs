@@ -14,7 +14,7 @@ use super::{
     statistics::{Recorder, Statistics},
 };
 use crate::keys::{
-    request::{Failure, FailureKind, Fetched, KeyPurpose, KmeRequest, Stock},
+    request::{FailureKind, Fetched, KeyPurpose, KmeRequest, RequestFailure, Stock},
     used::UsedKeys,
 };
 
@@ -36,7 +36,7 @@ impl KmeCaller {
     }
 
     /// Runs `request` and records how it went.
-    pub(super) async fn run(&self, request: &KmeRequest) -> Result<Fetched, Failure> {
+    pub(super) async fn run(&self, request: &KmeRequest) -> Result<Fetched, RequestFailure> {
         let start = Instant::now();
         // The client keeps to AXON_KME_ANSWER_TIMEOUT by itself.
         let outcome = call(&self.client, request).await;
@@ -67,7 +67,7 @@ impl KmeCaller {
         &self,
         purpose: KeyPurpose,
         keys: Vec<(KeyId, KmeKey)>,
-    ) -> (Result<Fetched, Failure>, Option<Failure>) {
+    ) -> (Result<Fetched, RequestFailure>, Option<RequestFailure>) {
         let names: Vec<_> =
             keys.iter().map(|(id, _)| String::from_utf8_lossy(id.as_bytes()).into()).collect();
         let used = self.used.clone();
@@ -85,7 +85,7 @@ impl KmeCaller {
         }
         let failure = again.map(|key_id| {
             let text = format!("the KME gave key_ID {key_id} again, which this host had before");
-            Failure::new(FailureKind::Repeated, text)
+            RequestFailure::new(FailureKind::Repeated, text)
         });
         match failure {
             Some(failure) if unused.is_empty() || purpose != KeyPurpose::Messages => {
@@ -100,7 +100,7 @@ impl KmeCaller {
     }
 }
 
-async fn call(client: &Client, request: &KmeRequest) -> Result<Fetched, Failure> {
+async fn call(client: &Client, request: &KmeRequest) -> Result<Fetched, RequestFailure> {
     match request {
         KmeRequest::Enc { slave, number, .. } => {
             let enc = client.enc_keys(slave).number(*number).size(KEY_SIZE);
@@ -110,7 +110,7 @@ async fn call(client: &Client, request: &KmeRequest) -> Result<Fetched, Failure>
             let mut names = Vec::with_capacity(key_ids.len());
             for key_id in key_ids {
                 names.push(std::str::from_utf8(key_id.as_bytes()).map_err(|_| {
-                    Failure::new(FailureKind::Invalid, format!("key_ID {key_id} is no text"))
+                    RequestFailure::new(FailureKind::Invalid, format!("key_ID {key_id} is no text"))
                 })?);
             }
             let dec = client.dec_keys(master).key_ids(names).size(KEY_SIZE);
@@ -124,8 +124,8 @@ async fn call(client: &Client, request: &KmeRequest) -> Result<Fetched, Failure>
 }
 
 /// Moves the keys to locked memory; the client erases its own copies.
-fn keys(container: KeyContainer) -> Result<Fetched, Failure> {
-    let ambiguous = |text: String| Failure::new(FailureKind::Ambiguous, text);
+fn keys(container: KeyContainer) -> Result<Fetched, RequestFailure> {
+    let ambiguous = |text: String| RequestFailure::new(FailureKind::Ambiguous, text);
     let keys = container.keys.iter().map(|key| {
         let key_id = KeyId::new(key.key_id()).map_err(|e| ambiguous(format!("key_ID: {e}")))?;
         let bytes = key
@@ -138,7 +138,7 @@ fn keys(container: KeyContainer) -> Result<Fetched, Failure> {
     keys.collect::<Result<_, _>>().map(Fetched::Keys)
 }
 
-fn failure(e: &Error) -> Failure {
+fn failure(e: &Error) -> RequestFailure {
     let kind = match e {
         Error::KeyPossiblyConsumed { .. } | Error::Interrupted { .. } => FailureKind::Ambiguous,
         Error::Unreachable { .. } | Error::Timeout { phase: "connect", .. } => {
@@ -154,5 +154,5 @@ fn failure(e: &Error) -> Failure {
         Error::Unavailable { retry_after, .. } => *retry_after,
         _ => None,
     };
-    Failure { kind, text: e.to_string(), retry_after }
+    RequestFailure { kind, text: e.to_string(), retry_after }
 }

@@ -24,7 +24,7 @@ use tokio::{
 use zeroize::Zeroizing;
 
 use super::{
-    request::{Answer, Failure, FailureKind, Fetched, KeyPurpose, KmeRequest, Stock},
+    request::{Answer, FailureKind, Fetched, KeyPurpose, KmeRequest, RequestFailure, Stock},
     used::UsedKeys,
 };
 
@@ -58,7 +58,7 @@ pub enum RequestOrigin {
 
 /// An answer, and who asked.
 #[derive(Debug)]
-pub struct Event {
+pub struct KmeAnswer {
     /// Who asked.
     pub origin: RequestOrigin,
     /// The answer.
@@ -100,7 +100,7 @@ struct KmeShared {
 }
 
 /// Gives the answers.
-pub struct Events(mpsc::Receiver<Event>);
+pub struct Events(mpsc::Receiver<KmeAnswer>);
 
 struct Job {
     origin: RequestOrigin,
@@ -144,7 +144,7 @@ impl Kme {
     ///
     /// # Errors
     /// The queue is full: the answer, to be given to the machine as if it had come out of there.
-    pub fn submit(&self, origin: RequestOrigin, request: KmeRequest) -> Result<(), Box<Event>> {
+    pub fn submit(&self, origin: RequestOrigin, request: KmeRequest) -> Result<(), Box<KmeAnswer>> {
         let queue = match &request {
             KmeRequest::Enc { purpose: KeyPurpose::Messages, .. }
             | KmeRequest::Dec { purpose: KeyPurpose::Messages, .. }
@@ -154,8 +154,11 @@ impl Kme {
         queue.try_send(Job { origin, request, since: Instant::now() }).map_err(|e| {
             let Job { origin, request, .. } = e.into_inner();
             let text = format!("{QUEUE} calls wait for the KME already");
-            let outcome = Err(Failure::new(FailureKind::Busy, text));
-            Box::new(Event { origin, answer: Answer { request, took: Duration::ZERO, outcome } })
+            let outcome = Err(RequestFailure::new(FailureKind::Busy, text));
+            Box::new(KmeAnswer {
+                origin,
+                answer: Answer { request, took: Duration::ZERO, outcome },
+            })
         })
     }
 
@@ -163,12 +166,12 @@ impl Kme {
     ///
     /// # Errors
     /// Why not.
-    pub async fn probe(&self, slave: &str) -> Result<Stock, Failure> {
+    pub async fn probe(&self, slave: &str) -> Result<Stock, RequestFailure> {
         let request = KmeRequest::Status { slave: slave.to_owned() };
         match self.0.caller.run(&request).await? {
             Fetched::Stock(stock) => Ok(stock),
             Fetched::Keys(_) => {
-                Err(Failure::new(FailureKind::Invalid, "status answered with keys"))
+                Err(RequestFailure::new(FailureKind::Invalid, "status answered with keys"))
             }
         }
     }
@@ -181,17 +184,20 @@ impl Kme {
 
 impl Events {
     /// The next answer; `None` when the last [`Kme`] is dropped and all is answered. Cancel safe.
-    pub async fn recv(&mut self) -> Option<Event> {
+    pub async fn recv(&mut self) -> Option<KmeAnswer> {
         self.0.recv().await
     }
 
     /// As [`recv`](Self::recv), for a task that polls.
-    pub fn poll_recv(&mut self, cx: &mut std::task::Context<'_>) -> std::task::Poll<Option<Event>> {
+    pub fn poll_recv(
+        &mut self,
+        cx: &mut std::task::Context<'_>,
+    ) -> std::task::Poll<Option<KmeAnswer>> {
         self.0.poll_recv(cx)
     }
 
     /// The next answer, if there is one now.
-    pub fn try_recv(&mut self) -> Option<Event> {
+    pub fn try_recv(&mut self) -> Option<KmeAnswer> {
         self.0.try_recv().ok()
     }
 }
@@ -201,7 +207,7 @@ async fn serve(
     caller: Arc<KmeCaller>,
     limit: usize,
     mut jobs: mpsc::Receiver<Job>,
-    events: mpsc::Sender<Event>,
+    events: mpsc::Sender<KmeAnswer>,
 ) {
     let free = Arc::new(Semaphore::new(limit));
     let mut running = JoinSet::new();
@@ -223,7 +229,7 @@ async fn serve(
             let took = job.since.elapsed();
             let answer = Answer { request: job.request, took, outcome };
             // A failed send: nobody is left to listen.
-            let _ = events.send(Event { origin: job.origin, answer }).await;
+            let _ = events.send(KmeAnswer { origin: job.origin, answer }).await;
         });
     }
     drop(caller);
@@ -234,7 +240,7 @@ async fn serve(
 async fn next(
     jobs: &mut mpsc::Receiver<Job>,
     running: &mut JoinSet<()>,
-    events: &mpsc::Sender<Event>,
+    events: &mpsc::Sender<KmeAnswer>,
 ) -> Option<Job> {
     loop {
         tokio::select! {

@@ -5,7 +5,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use crate::keys::request::{Failure, FailureKind, KeyPurpose, KmeRequest};
+use crate::keys::request::{FailureKind, KeyPurpose, KmeRequest, RequestFailure};
 
 /// Time between two lines about one call and SAE: a KME that comes and goes is not worth more.
 const EVERY: Duration = Duration::from_secs(10);
@@ -49,7 +49,7 @@ impl Outages {
         &mut self,
         now: Instant,
         request: &KmeRequest,
-        failure: Option<&Failure>,
+        failure: Option<&RequestFailure>,
     ) -> Option<Notice> {
         let (call, peer) = match request {
             KmeRequest::Enc { slave, .. } => ("enc_keys", slave),
@@ -166,7 +166,7 @@ mod tests {
     fn a_failure_is_said_once_by_name_and_so_is_its_end() {
         let mut outages = Outages::new("https://kme-a:1", "sae-a");
         let (start, s) = (Instant::now(), Duration::from_secs);
-        let gone = Failure::new(FailureKind::Unreachable, "connection refused");
+        let gone = RequestFailure::new(FailureKind::Unreachable, "connection refused");
         let all = ["https://kme-a:1", "sae-a", "sae-b", "enc_keys", "refused", "AXON_KME_URL"];
         says(outages.record(start, &enc("sae-b"), Some(&gone)), &all);
         for i in 1..100 {
@@ -175,7 +175,7 @@ mod tests {
         // One direction says nothing of the other, nor one SAE of another.
         assert_eq!(outages.record(start, &dec("sae-b", KeyPurpose::Messages), None), None);
         assert_eq!(outages.record(start, &enc("sae-c"), None), None);
-        let slow = Failure::new(FailureKind::Ambiguous, "no answer");
+        let slow = RequestFailure::new(FailureKind::Ambiguous, "no answer");
         says(
             outages.record(start + s(100), &enc("sae-b"), Some(&slow)),
             &["ANSWER_TIMEOUT", "101"],
@@ -191,7 +191,7 @@ mod tests {
     fn a_kme_that_comes_and_goes_is_worth_a_line_in_ten_seconds() {
         let mut outages = Outages::new("kme", "sae-a");
         let start = Instant::now();
-        let gone = Failure::new(FailureKind::Unreachable, "refused");
+        let gone = RequestFailure::new(FailureKind::Unreachable, "refused");
         let mut lines = 0;
         for i in 0..600 {
             let now = start + Duration::from_millis(100 * i);
@@ -205,7 +205,7 @@ mod tests {
     fn refused_names_are_the_kmes_failure_only_in_numbers_and_never_a_strangers() {
         let mut outages = Outages::new("kme", "sae-a");
         let now = Instant::now();
-        let unknown = Failure::new(FailureKind::Refused, "KME answered 400");
+        let unknown = RequestFailure::new(FailureKind::Refused, "KME answered 400");
         for _ in 0..100 {
             let request = dec("sae-b", KeyPurpose::Accept);
             assert_eq!(outages.record(now, &request, Some(&unknown)), None);

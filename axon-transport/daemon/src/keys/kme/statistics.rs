@@ -8,7 +8,7 @@ use std::{
 
 use serde::Serialize;
 
-use crate::keys::request::{Failure, FailureKind, Fetched, KeyPurpose, KmeRequest};
+use crate::keys::request::{FailureKind, Fetched, KeyPurpose, KmeRequest, RequestFailure};
 
 /// Peers whose stock is shown.
 const MAX_PEERS: usize = 256;
@@ -67,7 +67,7 @@ impl Recorder {
         &self,
         request: &KmeRequest,
         took: Duration,
-        outcome: &Result<Fetched, Failure>,
+        outcome: &Result<Fetched, RequestFailure>,
     ) {
         let mut guard = self.lock();
         let s = &mut *guard;

@@ -21,7 +21,7 @@ pub use disagreement::Disagreement;
 pub use receiver::{KeyReceiver, ReceiverStatistics};
 pub use sender::{KeySender, NoKey, SenderStatistics};
 
-use super::Violation;
+use super::KeyViolation;
 
 /// Most keys of one direction that are announced and not retired.
 pub const MAX_UNRETIRED: usize = 4096;
@@ -32,7 +32,7 @@ pub const MAX_UNRETIRED: usize = 4096;
 pub enum SupplyError {
     /// The peer broke a rule.
     #[error(transparent)]
-    Violation(#[from] Violation),
+    Violation(#[from] KeyViolation),
     /// The SAE IDs make no channel.
     #[error(transparent)]
     Channel(#[from] ChannelError),

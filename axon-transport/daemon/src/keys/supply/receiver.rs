@@ -11,7 +11,7 @@ use serde::Serialize;
 
 use super::{MAX_UNRETIRED, SupplyError};
 use crate::keys::{
-    Exporters, KeyMessage, Violation,
+    Exporters, KeyMessage, KeyViolation,
     exporters::Exporter,
     fetch::Fetches,
     proof,
@@ -27,7 +27,7 @@ const KEPT: usize = 512;
 pub struct KeyReceiver {
     local: String,
     peer: String,
-    links: HashMap<u64, Link>,
+    links: HashMap<u64, ReceiverLink>,
     /// Connections that were elected so far.
     elected: u64,
     /// Being fetched, with the connection that last announced it. The answer goes there.
@@ -36,10 +36,10 @@ pub struct KeyReceiver {
     /// Never used, from connections that are gone.
     kept: VecDeque<(Duration, KeyId, KmeKey)>,
     outbox: VecDeque<(u64, KeyMessage)>,
-    counts: Counts,
+    counts: ReceiverCounts,
 }
 
-struct Link {
+struct ReceiverLink {
     /// Its place in the order in which connections were elected, which is the same on both hosts; 0 is none.
     order: u64,
     opener: Opener,
@@ -47,7 +47,7 @@ struct Link {
 }
 
 #[derive(Default)]
-struct Counts {
+struct ReceiverCounts {
     ready: u64,
     failed: u64,
     retired: u64,
@@ -55,7 +55,7 @@ struct Counts {
     missing: u64,
 }
 
-impl Counts {
+impl ReceiverCounts {
     fn add(&mut self, expired: Expired) {
         self.expired += expired.keys as u64;
         self.missing += expired.messages_missing as u64;
@@ -98,7 +98,7 @@ impl KeyReceiver {
             fetches: Fetches::new(peer_sae, KeyPurpose::Messages),
             kept: VecDeque::new(),
             outbox: VecDeque::new(),
-            counts: Counts::default(),
+            counts: ReceiverCounts::default(),
         })
     }
 
@@ -116,7 +116,7 @@ impl KeyReceiver {
         let channel = Channel::new(&self.peer, &self.local, exporters.envelope())?;
         let opener = Opener::new(channel)?;
         let ready = Arc::clone(exporters.ready());
-        self.links.insert(conn, Link { order: 0, opener, ready });
+        self.links.insert(conn, ReceiverLink { order: 0, opener, ready });
         Ok(())
     }
 
@@ -170,13 +170,13 @@ impl KeyReceiver {
             KeyMessage::Retire { key_id, used, reliable } => {
                 link.opener
                     .retire(now, key_id.as_bytes(), *used, *reliable)
-                    .map_err(|e| Violation::Masks(key_id.clone(), e.to_string()))?;
+                    .map_err(|e| KeyViolation::Masks(key_id.clone(), e.to_string()))?;
                 self.counts.retired += 1;
                 self.wanted.remove(key_id);
                 self.kept.retain(|(_, id, _)| id != key_id);
                 Ok(())
             }
-            other => Err(Violation::Unexpected(other.name()).into()),
+            other => Err(KeyViolation::Unexpected(other.name()).into()),
         }
     }
 
@@ -237,7 +237,7 @@ impl KeyReceiver {
         }
         let order = |conn: &u64| self.links.get(conn).map_or(0, |link| link.order);
         let (this, waiting) = (order(&conn), self.wanted.get(key_id).map(order));
-        let holds = |link: &&Link| link.opener.contains(key_id.as_bytes());
+        let holds = |link: &&ReceiverLink| link.opener.contains(key_id.as_bytes());
         let held = self.links.values().find(holds).map(|link| link.order);
         // The sender announced it on a later connection meanwhile, and seals for that one.
         if held.max(waiting).is_some_and(|order| order > this) {

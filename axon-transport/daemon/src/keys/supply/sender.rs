@@ -20,7 +20,7 @@ use super::{
 };
 use crate::{
     keys::{
-        Exporters, KeyMessage, Violation,
+        Exporters, KeyMessage, KeyViolation,
         exporters::Exporter,
         proof,
         request::{Answer, KmeRequest},
@@ -299,7 +299,7 @@ impl KeySender {
                 }
                 Ok(())
             }
-            other => Err(Violation::Unexpected(other.name()).into()),
+            other => Err(KeyViolation::Unexpected(other.name()).into()),
         }
     }
 

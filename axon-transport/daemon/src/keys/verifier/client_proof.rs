@@ -9,7 +9,7 @@ use crate::{
         Exporters, KeyMessage,
         exporters::Exporter,
         proof,
-        request::{Answer, Failure, FailureKind, Fetched, KeyPurpose, KmeRequest},
+        request::{Answer, FailureKind, Fetched, KeyPurpose, KmeRequest, RequestFailure},
     },
     wire::keys::announceable,
 };
@@ -61,7 +61,7 @@ pub enum ProofFailure {
         /// The client.
         sae: String,
         /// Why.
-        failure: Failure,
+        failure: RequestFailure,
     },
     /// Its KME gave it no key.
     #[error("SAE {sae:?} could not fetch the key announced to it: {reason}")]
@@ -130,7 +130,7 @@ impl ClientProof {
         if !matches!(self.step, ProofStep::Asked) {
             return;
         }
-        let invalid = |text: &str| Failure::new(FailureKind::Invalid, text);
+        let invalid = |text: &str| RequestFailure::new(FailureKind::Invalid, text);
         let failure = match answer.outcome {
             Ok(Fetched::Keys(mut keys)) => match keys.pop() {
                 Some((key_id, key)) if keys.is_empty() && announceable(&key_id).is_some() => {

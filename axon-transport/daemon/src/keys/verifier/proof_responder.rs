@@ -4,7 +4,7 @@
 use std::{sync::Arc, time::Duration};
 
 use crate::keys::{
-    Exporters, KeyMessage, Violation,
+    Exporters, KeyMessage, KeyViolation,
     exporters::Exporter,
     fetch::Fetches,
     proof,
@@ -36,14 +36,18 @@ impl ProofResponder {
     ///
     /// # Errors
     /// Anything but one ANNOUNCE of one key.
-    pub fn handle_message(&mut self, now: Duration, message: &KeyMessage) -> Result<(), Violation> {
+    pub fn handle_message(
+        &mut self,
+        now: Duration,
+        message: &KeyMessage,
+    ) -> Result<(), KeyViolation> {
         match message {
             KeyMessage::Announce(key_ids) if !self.announced && key_ids.len() == 1 => {
                 self.announced = true;
                 self.fetches.start(now, key_ids.clone());
                 Ok(())
             }
-            other => Err(Violation::Unexpected(other.name())),
+            other => Err(KeyViolation::Unexpected(other.name())),
         }
     }
 

@@ -6,7 +6,7 @@ use secrecy::ExposeSecret;
 use super::{ClientProof, ProofFailure, ProofResponder, ProofState};
 use crate::keys::{
     Exporters, KeyMessage, proof,
-    request::{Answer, Failure, FailureKind, Fetched, KmeRequest},
+    request::{Answer, FailureKind, Fetched, KmeRequest, RequestFailure},
 };
 
 const NOW: Duration = Duration::from_secs(5);
@@ -29,7 +29,7 @@ fn given(request: KmeRequest, byte: u8) -> Answer {
 }
 
 fn failed(request: KmeRequest, kind: FailureKind) -> Answer {
-    let outcome = Err(Failure::new(kind, "no"));
+    let outcome = Err(RequestFailure::new(kind, "no"));
     Answer { request, took: Duration::ZERO, outcome }
 }
 
@@ -136,7 +136,7 @@ fn a_client_without_the_key_says_so() {
     let mut client = ProofResponder::new("sae-b", &exporters());
     client.handle_message(NOW, &KeyMessage::Announce(vec![id("k1")])).unwrap();
     let request = client.poll_request(NOW).unwrap();
-    let outcome = Err(Failure::new(FailureKind::Refused, "kme.lan:8443 says 400"));
+    let outcome = Err(RequestFailure::new(FailureKind::Refused, "kme.lan:8443 says 400"));
     client.handle_answer(NOW, Answer { request, took: Duration::ZERO, outcome });
     assert_eq!(client.answered(), Some(Err("kme.lan:8443 says 400".to_owned())), "for the log");
     let message = client.poll_message().unwrap();

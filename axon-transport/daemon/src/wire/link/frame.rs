@@ -2,7 +2,7 @@
 
 use minicbor::{Decode, Encode};
 
-use super::Message;
+use super::LinkMessage;
 
 /// Largest frame before both HELLOs were checked, in bytes after the length.
 pub const MAX_FRAME_BEFORE_HELLO: usize = 4 * 1024;
@@ -58,7 +58,7 @@ pub fn read_length(prefix: [u8; 4], limit: usize) -> Result<usize, FrameError> {
 
 /// Whether `frame` (without its length) has a type that this version knows.
 pub(crate) fn is_known(frame: &[u8]) -> bool {
-    frame.first().is_some_and(|kind| Message::is_known(kind & !COMPRESSED))
+    frame.first().is_some_and(|kind| LinkMessage::is_known(kind & !COMPRESSED))
 }
 
 /// Bytes of the map in `frame` (without its length) once it is decompressed, as the frame says.
@@ -71,7 +71,7 @@ pub fn unpacked_length(frame: &[u8]) -> usize {
     }
 }
 
-impl Message {
+impl LinkMessage {
     /// The frame of this message with its length in front.
     ///
     /// # Errors

@@ -19,7 +19,7 @@ use crate::{daemon_key::DaemonProof, owner::Proof, wire::keys::KeyMessage};
 /// Who a daemon is and how it is set up: the first message in each direction.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
-pub struct Hello {
+pub struct LinkHello {
     /// Lowest protocol version spoken.
     #[n(0)]
     pub protocol_min: u8,
@@ -95,7 +95,7 @@ pub struct LinkClosed {
 /// What changed in the sender's graph.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
-pub struct Graph {
+pub struct GraphUpdate {
     /// Version after this message.
     #[n(0)]
     pub version: u64,
@@ -218,7 +218,7 @@ pub struct RouteReady {
 /// published: of those that have a lease and feed a route.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
-pub struct Asserted {
+pub struct LivelinessAsserted {
     /// Their GIDs.
     #[n(0)]
     pub publishers: Vec<Gid>,
@@ -227,7 +227,7 @@ pub struct Asserted {
 /// How far the samples of publishers came: a message of one.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
-pub struct Received {
+pub struct ReceivedUpTo {
     /// One element a publisher and route.
     #[n(0)]
     pub flows: Vec<ReceivedOf>,
@@ -300,7 +300,7 @@ pub struct Intake {
 /// What the receiver may not do at the sender's host, of what the sender knows from the receiver's graph.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
-pub struct Denied {
+pub struct DeniedUses {
     /// What is denied now.
     #[n(0)]
     pub denied: Vec<DeniedUse>,
@@ -330,7 +330,7 @@ pub const MAX_DENIED: usize = 512;
 /// The sender asks what access rules at the receiver's host let it do there.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
-pub struct AccessCheck {
+pub struct LinkAccessCheck {
     /// The sender's number for the question.
     #[n(0)]
     pub number: u64,
@@ -339,7 +339,7 @@ pub struct AccessCheck {
     pub uses: Vec<CheckedUse>,
 }
 
-/// Answers an [`AccessCheck`].
+/// Answers a [`LinkAccessCheck`].
 #[derive(Clone, Debug, Default, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct AccessDecisions {
@@ -378,7 +378,7 @@ pub const MAX_PROOFS: usize = 128;
 /// KEEPALIVE carries nothing.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
-struct Nothing {}
+struct NoContent {}
 
 const MAX_HOST: usize = 255;
 const MAX_SAE: usize = 63;
@@ -387,13 +387,13 @@ const MAX_REASON: usize = 1024;
 /// A control message.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
-pub enum Message {
+pub enum LinkMessage {
     /// Who I am.
-    Hello(Hello),
+    LinkHello(LinkHello),
     /// This connection stays.
     Elected(Elected),
     /// Graph changes.
-    Graph(Graph),
+    GraphUpdate(GraphUpdate),
     /// Send the whole graph.
     GraphResync(GraphResync),
     /// Send a topic.
@@ -405,9 +405,9 @@ pub enum Message {
     /// Still here.
     Keepalive,
     /// These publishers, too.
-    Asserted(Asserted),
+    LivelinessAsserted(LivelinessAsserted),
     /// So far samples came.
-    Received(Received),
+    ReceivedUpTo(ReceivedUpTo),
     /// This route is not served.
     RouteRefused(RouteRefused),
     /// This route is not asked for.
@@ -419,36 +419,36 @@ pub enum Message {
     /// This is how much I take in.
     Intake(Intake),
     /// These are things that you may not do here.
-    Denied(Denied),
+    DeniedUses(DeniedUses),
     /// May I do this at your host?
-    AccessCheck(AccessCheck),
+    LinkAccessCheck(LinkAccessCheck),
     /// These rules decide.
     AccessDecisions(AccessDecisions),
     /// About keys.
     Keys(KeyMessage),
 }
 
-impl Message {
+impl LinkMessage {
     /// Type byte and CBOR map.
     pub(super) fn encode(&self) -> (u8, Vec<u8>) {
         match self {
-            Self::Hello(m) => (1, to_map(m)),
+            Self::LinkHello(m) => (1, to_map(m)),
             Self::Elected(m) => (2, to_map(m)),
-            Self::Graph(m) => (3, to_map(m)),
+            Self::GraphUpdate(m) => (3, to_map(m)),
             Self::GraphResync(m) => (4, to_map(m)),
             Self::Subscribe(m) => (5, to_map(m)),
             Self::Unsubscribe(m) => (6, to_map(m)),
             Self::RouteReady(m) => (7, to_map(m)),
-            Self::Keepalive => (8, to_map(&Nothing {})),
-            Self::Asserted(m) => (9, to_map(m)),
-            Self::Received(m) => (10, to_map(m)),
+            Self::Keepalive => (8, to_map(&NoContent {})),
+            Self::LivelinessAsserted(m) => (9, to_map(m)),
+            Self::ReceivedUpTo(m) => (10, to_map(m)),
             Self::RouteRefused(m) => (11, to_map(m)),
             Self::Owners(m) => (12, to_map(m)),
             Self::LinkClosed(m) => (13, to_map(m)),
             Self::RouteUnasked(m) => (14, to_map(m)),
             Self::Intake(m) => (15, to_map(m)),
-            Self::Denied(m) => (20, to_map(m)),
-            Self::AccessCheck(m) => (21, to_map(m)),
+            Self::DeniedUses(m) => (20, to_map(m)),
+            Self::LinkAccessCheck(m) => (21, to_map(m)),
             Self::AccessDecisions(m) => (22, to_map(m)),
             Self::Keys(m) => {
                 let mut map = Vec::new();
@@ -466,16 +466,16 @@ impl Message {
     /// The message of type `kind`, `None` for an unknown type.
     pub(super) fn decode(kind: u8, map: &[u8]) -> Result<Option<Self>, FrameError> {
         let message = match kind {
-            1 => Self::Hello(from_map(kind, map)?),
+            1 => Self::LinkHello(from_map(kind, map)?),
             2 => Self::Elected(from_map(kind, map)?),
-            3 => Self::Graph(from_map(kind, map)?),
+            3 => Self::GraphUpdate(from_map(kind, map)?),
             4 => Self::GraphResync(from_map(kind, map)?),
             5 => Self::Subscribe(from_map(kind, map)?),
             6 => Self::Unsubscribe(from_map(kind, map)?),
             7 => Self::RouteReady(from_map(kind, map)?),
-            8 => from_map::<Nothing>(kind, map).map(|_| Self::Keepalive)?,
-            9 => Self::Asserted(from_map(kind, map)?),
-            10 => Self::Received(from_map(kind, map)?),
+            8 => from_map::<NoContent>(kind, map).map(|_| Self::Keepalive)?,
+            9 => Self::LivelinessAsserted(from_map(kind, map)?),
+            10 => Self::ReceivedUpTo(from_map(kind, map)?),
             11 => Self::RouteRefused(from_map(kind, map)?),
             12 => Self::Owners(from_map(kind, map)?),
             13 => Self::LinkClosed(from_map(kind, map)?),
@@ -485,8 +485,8 @@ impl Message {
                 KeyMessage::decode(kind, map)
                     .map_err(|e| FrameError::Malformed { kind, reason: e.to_string() })?,
             ),
-            20 => Self::Denied(from_map(kind, map)?),
-            21 => Self::AccessCheck(from_map(kind, map)?),
+            20 => Self::DeniedUses(from_map(kind, map)?),
+            21 => Self::LinkAccessCheck(from_map(kind, map)?),
             22 => Self::AccessDecisions(from_map(kind, map)?),
             _ => return Ok(None),
         };
@@ -500,11 +500,11 @@ impl Message {
     fn bounds(&self) -> Result<(), &'static str> {
         let ok = |condition: bool, reason| if condition { Ok(()) } else { Err(reason) };
         match self {
-            Self::Hello(m) => ok(
+            Self::LinkHello(m) => ok(
                 m.host.len() <= MAX_HOST && m.sae.as_ref().is_none_or(|s| s.len() <= MAX_SAE),
                 "a name is too long",
             ),
-            Self::Graph(m) => ok(
+            Self::GraphUpdate(m) => ok(
                 m.added.len() <= LIMITS.endpoints
                     && m.removed.len() <= LIMITS.endpoints
                     && [&m.localhost, &m.listing, &m.denied]
@@ -513,11 +513,11 @@ impl Message {
                     && m.added.iter().all(Endpoint::is_sane),
                 "an endpoint is out of bounds",
             ),
-            Self::Asserted(Asserted { publishers })
+            Self::LivelinessAsserted(LivelinessAsserted { publishers })
             | Self::RouteReady(RouteReady { publishers, .. }) => {
                 ok(publishers.len() <= LIMITS.endpoints, "more publishers than there can be")
             }
-            Self::Received(m) => {
+            Self::ReceivedUpTo(m) => {
                 ok(m.flows.len() <= LIMITS.endpoints, "more publishers than there can be")
             }
             Self::RouteRefused(m) => ok(m.reason.len() <= MAX_REASON, "a reason is too long"),
@@ -528,7 +528,7 @@ impl Message {
                     && m.reason.as_ref().is_none_or(|reason| reason.len() <= MAX_REASON),
                 "a route is out of bounds",
             ),
-            Self::Denied(Denied { denied, lifted }) => ok(
+            Self::DeniedUses(DeniedUses { denied, lifted }) => ok(
                 denied.len() <= MAX_DENIED
                     && lifted.len() <= MAX_DENIED
                     && denied.iter().chain(lifted).all(|denied| {
@@ -538,7 +538,7 @@ impl Message {
                     }),
                 "a denied use is out of bounds",
             ),
-            Self::AccessCheck(m) => ok(
+            Self::LinkAccessCheck(m) => ok(
                 m.uses.len() <= MOST_CHECKED
                     && m.uses.iter().all(|used| used.verb <= 4 && used.name.len() <= LIMITS.name),
                 "a use that is asked about is out of bounds",

@@ -14,7 +14,8 @@ pub use frame::{
     FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, read_length, unpacked_length,
 };
 pub use message::{
-    AccessCheck, AccessDecisions, Asserted, Denied, DeniedUse, Elected, Graph, GraphResync, Hello,
-    Intake, LastSeen, LinkClosed, MAX_DENIED, MAX_PROOFS, Message, Owners, Received, ReceivedOf,
-    RouteReady, RouteRefused, RouteSubscriber, RouteUnasked, Subscribe, Unsubscribe, UseDecision,
+    AccessDecisions, DeniedUse, DeniedUses, Elected, GraphResync, GraphUpdate, Intake, LastSeen,
+    LinkAccessCheck, LinkClosed, LinkHello, LinkMessage, LivelinessAsserted, MAX_DENIED,
+    MAX_PROOFS, Owners, ReceivedOf, ReceivedUpTo, RouteReady, RouteRefused, RouteSubscriber,
+    RouteUnasked, Subscribe, Unsubscribe, UseDecision,
 };

@@ -14,8 +14,8 @@ pub(crate) fn key_id(id: &str) -> KeyId {
     KeyId::new(id).unwrap()
 }
 
-pub(crate) fn hello() -> Hello {
-    Hello {
+pub(crate) fn hello() -> LinkHello {
+    LinkHello {
         protocol_min: 1,
         protocol_max: 1,
         domain: 0,
@@ -35,26 +35,26 @@ pub(crate) fn hello() -> Hello {
     }
 }
 
-pub(crate) fn peer() -> Hello {
-    Hello { daemon: DaemonId([2; 16]), sae: Some("sae-b".into()), ..hello() }
+pub(crate) fn peer() -> LinkHello {
+    LinkHello { daemon: DaemonId([2; 16]), sae: Some("sae-b".into()), ..hello() }
 }
 
-pub(crate) fn elected() -> Message {
-    Message::Elected(Elected { link: [9; 16], election: 3 })
+pub(crate) fn elected() -> LinkMessage {
+    LinkMessage::Elected(Elected { link: [9; 16], election: 3 })
 }
 
 /// HELLO first.
-pub(crate) fn messages() -> Vec<Message> {
+pub(crate) fn messages() -> Vec<LinkMessage> {
     let qos = Qos::keep_all().with_lifespan(std::time::Duration::from_nanos(7));
     vec![
-        Message::Hello(Hello {
+        LinkMessage::LinkHello(LinkHello {
             replaces: Some([3; 16]),
             expects: Some(DaemonId([4; 16])),
             proof: Some(DaemonProof { key: [5; 32], signature: [6; 64] }),
             ..hello()
         }),
         elected(),
-        Message::Graph(Graph {
+        LinkMessage::GraphUpdate(GraphUpdate {
             version: 2,
             before: 1,
             added: vec![],
@@ -64,8 +64,8 @@ pub(crate) fn messages() -> Vec<Message> {
             listing: None,
             denied: Some(vec![]),
         }),
-        Message::GraphResync(GraphResync { version: 2 }),
-        Message::Subscribe(Subscribe {
+        LinkMessage::GraphResync(GraphResync { version: 2 }),
+        LinkMessage::Subscribe(Subscribe {
             route: 1,
             topic: "/scan".into(),
             type_name: "sensor_msgs/msg/LaserScan".into(),
@@ -75,39 +75,45 @@ pub(crate) fn messages() -> Vec<Message> {
             acknowledges: Some(true),
             short_headers: Some(true),
         }),
-        Message::Received(Received {
+        LinkMessage::ReceivedUpTo(ReceivedUpTo {
             flows: vec![ReceivedOf { route: 1, publisher: Gid([7; 16]), sequence: 43, dropped: 1 }],
         }),
-        Message::RouteRefused(RouteRefused { route: 1, reason: "why".into(), retry_s: Some(10) }),
-        Message::RouteUnasked(RouteUnasked {
+        LinkMessage::RouteRefused(RouteRefused {
+            route: 1,
+            reason: "why".into(),
+            retry_s: Some(10),
+        }),
+        LinkMessage::RouteUnasked(RouteUnasked {
             topic: "/chatter".into(),
             type_name: "std_msgs/msg/String".into(),
             kind: 0,
             reason: Some("why".into()),
         }),
-        Message::Unsubscribe(Unsubscribe { route: 1 }),
-        Message::RouteReady(RouteReady { route: 1, publishers: vec![Gid([7; 16])] }),
-        Message::Keepalive,
-        Message::Asserted(Asserted { publishers: vec![Gid([7; 16]), Gid([8; 16])] }),
-        Message::Owners(Owners { proofs: vec![Proof { key: [1; 32], signature: [2; 64] }; 2] }),
-        Message::LinkClosed(LinkClosed { link: [3; 16] }),
-        Message::Intake(Intake { unread: 33 << 20, messages: 64 << 20 }),
-        Message::Denied(Denied {
+        LinkMessage::Unsubscribe(Unsubscribe { route: 1 }),
+        LinkMessage::RouteReady(RouteReady { route: 1, publishers: vec![Gid([7; 16])] }),
+        LinkMessage::Keepalive,
+        LinkMessage::LivelinessAsserted(LivelinessAsserted {
+            publishers: vec![Gid([7; 16]), Gid([8; 16])],
+        }),
+        LinkMessage::Owners(Owners { proofs: vec![Proof { key: [1; 32], signature: [2; 64] }; 2] }),
+        LinkMessage::LinkClosed(LinkClosed { link: [3; 16] }),
+        LinkMessage::Intake(Intake { unread: 33 << 20, messages: 64 << 20 }),
+        LinkMessage::DeniedUses(DeniedUses {
             denied: vec![DeniedUse { verb: 0, name: "/cmd_vel".into(), reason: "line 4".into() }],
             lifted: vec![DeniedUse { verb: 3, name: "/dock".into(), reason: String::new() }],
         }),
-        Message::AccessCheck(AccessCheck {
+        LinkMessage::LinkAccessCheck(LinkAccessCheck {
             number: 5,
             uses: vec![CheckedUse { verb: 4, name: "/scan".into() }],
         }),
-        Message::AccessDecisions(AccessDecisions {
+        LinkMessage::AccessDecisions(AccessDecisions {
             number: 5,
             decisions: vec![UseDecision { allowed: true, reason: "line 4".into() }],
         }),
-        Message::Keys(KeyMessage::Announce(vec![key_id("k1"), key_id("k2")])),
-        Message::Keys(KeyMessage::Ready { key_id: key_id("k1"), proof: [8; 32] }),
-        Message::Keys(KeyMessage::Failed { key_id: key_id("k2"), reason: "unknown".into() }),
-        Message::Keys(KeyMessage::Retire {
+        LinkMessage::Keys(KeyMessage::Announce(vec![key_id("k1"), key_id("k2")])),
+        LinkMessage::Keys(KeyMessage::Ready { key_id: key_id("k1"), proof: [8; 32] }),
+        LinkMessage::Keys(KeyMessage::Failed { key_id: key_id("k2"), reason: "unknown".into() }),
+        LinkMessage::Keys(KeyMessage::Retire {
             key_id: key_id("k1"),
             used: IndexMask::from_bits(0x3ff).unwrap(),
             reliable: IndexMask::from_bits(0x155).unwrap(),

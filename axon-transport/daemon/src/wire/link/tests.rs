@@ -5,8 +5,8 @@ use proptest::prelude::*;
 
 use super::{samples::messages, *};
 
-fn decode(frame: &[u8]) -> Result<Option<Message>, FrameError> {
-    Message::from_frame(frame, MAX_INFLATED)
+fn decode(frame: &[u8]) -> Result<Option<LinkMessage>, FrameError> {
+    LinkMessage::from_frame(frame, MAX_INFLATED)
 }
 
 fn body(frame: &[u8]) -> &[u8] {
@@ -26,7 +26,8 @@ fn every_message_survives_its_frame() {
 #[test]
 fn a_large_graph_is_compressed_and_comes_back() {
     let removed = (0..4096u32).map(|n| Gid::new(axon_shm::ids::SessionId([1; 16]), n)).collect();
-    let message = Message::Graph(Graph { version: 1, removed, ..Graph::default() });
+    let message =
+        LinkMessage::GraphUpdate(GraphUpdate { version: 1, removed, ..GraphUpdate::default() });
     let frame = message.to_frame().unwrap();
     assert!(frame.len() < 4096 * 16 / 2, "{} bytes", frame.len());
     assert_eq!(frame[4] & 0x80, 0x80);
@@ -38,7 +39,7 @@ fn unknown_types_and_keys_are_skipped() {
     assert_eq!(decode(&[0x7f, 0xa0]).unwrap(), None);
     // UNSUBSCRIBE {0: 1, 99: "new"}
     let map = [6, 0xa2, 0x00, 0x01, 0x18, 99, 0x63, b'n', b'e', b'w'];
-    let expected = Message::Unsubscribe(Unsubscribe { route: 1 });
+    let expected = LinkMessage::Unsubscribe(Unsubscribe { route: 1 });
     assert_eq!(decode(&map).unwrap(), Some(expected));
 }
 
@@ -50,17 +51,18 @@ fn an_unknown_type_is_skipped_without_decompression() {
         assert_eq!(decode(&frame).unwrap(), None);
     }
     for kind in 0..0x80 {
-        let skipped = matches!(Message::decode(kind, &[0xa0]), Ok(None));
-        assert_eq!(skipped, !Message::is_known(kind), "type {kind}");
+        let skipped = matches!(LinkMessage::decode(kind, &[0xa0]), Ok(None));
+        assert_eq!(skipped, !LinkMessage::is_known(kind), "type {kind}");
     }
 }
 
 #[test]
 fn a_list_of_more_publishers_than_there_can_be_is_refused() {
     let gids = |count| vec![Gid::default(); count];
-    let ready = |count| Message::RouteReady(RouteReady { route: 1, publishers: gids(count) });
-    let asserted = |count| Message::Asserted(Asserted { publishers: gids(count) });
-    let taken = |message: Message| decode(body(&message.to_frame().unwrap())).is_ok();
+    let ready = |count| LinkMessage::RouteReady(RouteReady { route: 1, publishers: gids(count) });
+    let asserted =
+        |count| LinkMessage::LivelinessAsserted(LivelinessAsserted { publishers: gids(count) });
+    let taken = |message: LinkMessage| decode(body(&message.to_frame().unwrap())).is_ok();
     assert!(taken(ready(65_536)) && taken(asserted(65_536)));
     assert!(!taken(ready(65_537)) && !taken(asserted(65_537)));
 }

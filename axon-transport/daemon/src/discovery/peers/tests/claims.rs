@@ -7,7 +7,7 @@ const OWNER: &str = "10.0.0.2:61301";
 const OTHER: &str = "10.0.0.9:61301";
 
 /// The peer's beacon comes, and it answers the probe that follows, if one does.
-fn hear_and_answer(peers: &mut Peers, now: f64) -> Vec<DaemonId> {
+fn hear_and_answer(peers: &mut PeerDiscovery, now: f64) -> Vec<DaemonId> {
     hear(peers, now, beacon(HIGHER));
     let mut dialled = Vec::new();
     for action in actions(peers) {

@@ -17,7 +17,7 @@ type Forger = fn(u64) -> Vec<(SocketAddr, Arrival, Datagram)>;
 
 /// An honest host at its address, and a forger.
 struct Scene {
-    peers: Peers,
+    peers: PeerDiscovery,
     honest: DaemonId,
     address: SocketAddr,
     arrival: Arrival,
@@ -108,11 +108,11 @@ impl Scene {
         }
         while let Some(output) = self.peers.poll_output() {
             match output {
-                Output::Action(DiscoveryAction::Dial { daemon, addrs, .. }) => {
+                PeersOutput::Action(DiscoveryAction::Dial { daemon, addrs, .. }) => {
                     // An address that does not answer takes 5 s; the first is what counts.
                     dialled |= daemon == self.honest && addrs[0] == self.address;
                 }
-                Output::Action(DiscoveryAction::SendFromQuicPort { to, bytes })
+                PeersOutput::Action(DiscoveryAction::SendFromQuicPort { to, bytes })
                     if to == self.address =>
                 {
                     if let Ok(Datagram::Probe { nonce, .. }) = Datagram::decode(&bytes) {
@@ -121,7 +121,7 @@ impl Scene {
                         self.echoes.push_back((self.now + ROUND_TRIP, echo));
                     }
                 }
-                Output::Action(_) | Output::Multicast(_) => {}
+                PeersOutput::Action(_) | PeersOutput::Multicast(_) => {}
             }
         }
         dialled
@@ -322,7 +322,7 @@ fn an_answer_is_asked_of_no_flood() {
     let bytes = Datagram::Beacon(ask).encode();
     scene.peers.handle_datagram(scene.time(), scene.address, Arrival::Quic, &bytes);
     let answered = std::iter::from_fn(|| scene.peers.poll_output()).any(|output| match output {
-        Output::Action(DiscoveryAction::SendFromQuicPort { to, bytes }) => {
+        PeersOutput::Action(DiscoveryAction::SendFromQuicPort { to, bytes }) => {
             let said = Datagram::decode(&bytes);
             to == scene.address && matches!(said, Ok(Datagram::Beacon(b)) if b.daemon == OWN)
         }
@@ -334,10 +334,10 @@ fn an_answer_is_asked_of_no_flood() {
 }
 
 /// Probes that were sent since the last look, by host.
-fn probed(peers: &mut Peers) -> BTreeMap<IpAddr, usize> {
+fn probed(peers: &mut PeerDiscovery) -> BTreeMap<IpAddr, usize> {
     let mut hosts = BTreeMap::new();
     while let Some(output) = peers.poll_output() {
-        if let Output::Action(DiscoveryAction::SendFromQuicPort { to, bytes }) = output
+        if let PeersOutput::Action(DiscoveryAction::SendFromQuicPort { to, bytes }) = output
             && matches!(Datagram::decode(&bytes), Ok(Datagram::Probe { .. }))
         {
             *hosts.entry(to.ip()).or_default() += 1;
@@ -410,7 +410,7 @@ fn no_more_beacons_of_strangers_are_looked_at_than_a_second_has_time_for() {
     }
     let outputs = std::iter::from_fn(|| scene.peers.poll_output());
     let gone =
-        outputs.filter(|o| matches!(o, Output::Action(DiscoveryAction::Gone { .. }))).count();
+        outputs.filter(|o| matches!(o, PeersOutput::Action(DiscoveryAction::Gone { .. }))).count();
     let heard = gone + scene.peers.records.len();
     assert!((500..=1_024).contains(&heard), "{heard}");
     scene.honest_speaks();

@@ -57,7 +57,7 @@ fn a_peer_that_answers_after_a_goodbye_in_its_name_stays() {
 }
 
 /// Two addresses claim a daemon's id, neither of which could be dialled; then the first says goodbye.
-fn contested(now: f64) -> Peers {
+fn contested(now: f64) -> PeerDiscovery {
     let mut peers = settled(local());
     hear(&mut peers, now, beacon(HIGHER));
     let elsewhere = Datagram::Beacon(beacon(HIGHER)).encode();
@@ -97,7 +97,7 @@ fn an_address_of_several_that_does_not_answer_after_a_goodbye_is_forgotten_alone
 }
 
 /// The probes that are to be sent, with their nonces; nothing else is.
-fn probes(peers: &mut Peers) -> Vec<(SocketAddr, [u8; 8])> {
+fn probes(peers: &mut PeerDiscovery) -> Vec<(SocketAddr, [u8; 8])> {
     let sent = actions(peers).into_iter().map(|action| match action {
         DiscoveryAction::SendFromQuicPort { to, bytes } => match Datagram::decode(&bytes) {
             Ok(Datagram::Probe { nonce, .. }) => (to, nonce),

@@ -28,8 +28,8 @@ pub(super) fn secs(seconds: f64) -> Duration {
     Duration::from_secs_f64(seconds)
 }
 
-pub(super) fn local() -> Local {
-    Local {
+pub(super) fn local() -> LocalDaemon {
+    LocalDaemon {
         daemon: OWN,
         domain: 0,
         terms: CLASSIC,
@@ -40,14 +40,14 @@ pub(super) fn local() -> Local {
     }
 }
 
-fn in_qkd() -> Local {
+fn in_qkd() -> LocalDaemon {
     let peers = QkdPeers::Listed(vec!["sae-b".to_owned()]);
-    Local { terms: QKD, sae: Some(("sae-a".to_owned(), peers)), ..local() }
+    LocalDaemon { terms: QKD, sae: Some(("sae-a".to_owned(), peers)), ..local() }
 }
 
 /// Past its first beacons, so that what it says next is about its peers.
-pub(super) fn settled(local: Local) -> Peers {
-    let mut peers = Peers::new(local, 1);
+pub(super) fn settled(local: LocalDaemon) -> PeerDiscovery {
+    let mut peers = PeerDiscovery::new(local, 1);
     let interface = Interface {
         name: "eth0".to_owned(),
         index: 2,
@@ -68,16 +68,16 @@ pub(super) fn settled(local: Local) -> Peers {
     peers
 }
 
-pub(super) fn actions(peers: &mut Peers) -> Vec<DiscoveryAction> {
+pub(super) fn actions(peers: &mut PeerDiscovery) -> Vec<DiscoveryAction> {
     std::iter::from_fn(|| peers.poll_output())
         .filter_map(|output| match output {
-            Output::Action(action) => Some(action),
-            Output::Multicast(_) => None,
+            PeersOutput::Action(action) => Some(action),
+            PeersOutput::Multicast(_) => None,
         })
         .collect()
 }
 
-pub(super) fn dials(peers: &mut Peers) -> Vec<DaemonId> {
+pub(super) fn dials(peers: &mut PeerDiscovery) -> Vec<DaemonId> {
     let dialled = actions(peers).into_iter().filter_map(|action| match action {
         DiscoveryAction::Dial { daemon, .. } => Some(daemon),
         _ => None,
@@ -104,19 +104,19 @@ pub(super) fn from(text: &str) -> SocketAddr {
     text.parse().unwrap()
 }
 
-pub(super) fn hear(peers: &mut Peers, now: f64, beacon: Beacon) {
+pub(super) fn hear(peers: &mut PeerDiscovery, now: f64, beacon: Beacon) {
     let bytes = Datagram::Beacon(beacon).encode();
     peers.handle_datagram(secs(now), from("10.0.0.2:4000"), Arrival::Shared, &bytes);
 }
 
 /// Whatever dial to the peer is under way fails.
-pub(super) fn fail(peers: &mut Peers, now: Duration, daemon: DaemonId) {
+pub(super) fn fail(peers: &mut PeerDiscovery, now: Duration, daemon: DaemonId) {
     AddressConfidence::ALL
         .into_iter()
         .for_each(|standing| peers.handle_dial_failed(now, daemon, standing));
 }
 
-fn mismatches(peers: &mut Peers) -> Vec<PeerMismatch> {
+fn mismatches(peers: &mut PeerDiscovery) -> Vec<PeerMismatch> {
     let told = actions(peers).into_iter().filter_map(|action| match action {
         DiscoveryAction::PeerMismatch(mismatch) => Some(mismatch),
         DiscoveryAction::Dial { daemon, .. } => panic!("dialled {daemon}"),
@@ -325,7 +325,7 @@ fn answers_are_rationed() {
 #[test]
 fn ranges_are_kept() {
     let heard = |range, from: &str, arrival, localhost| {
-        let mut peers = settled(Local { range, ..local() });
+        let mut peers = settled(LocalDaemon { range, ..local() });
         let bytes = Datagram::Beacon(Beacon { localhost, ..beacon(HIGHER) }).encode();
         peers.handle_datagram(secs(3.0), from.parse().unwrap(), arrival, &bytes);
         dials(&mut peers) == [HIGHER]
@@ -340,14 +340,15 @@ fn ranges_are_kept() {
     assert!(heard(Localhost, there, Quic, false), "it lists us");
     assert!(heard(Localhost, here, Shared, true));
 
-    let mut off = Peers::new(Local { range: DiscoveryRange::Off, ..local() }, 1);
+    let mut off = PeerDiscovery::new(LocalDaemon { range: DiscoveryRange::Off, ..local() }, 1);
     off.set_port(Duration::ZERO, 61300);
     off.set_listed(Duration::ZERO, vec![("10.0.0.2".parse().unwrap(), None)]);
     hear(&mut off, 1.0, beacon(HIGHER));
     off.handle_timeout(secs(1.0));
     assert_eq!(off.poll_output(), None);
 
-    let mut alone = Peers::new(Local { range: Localhost, bind: Vec::new(), ..local() }, 1);
+    let mut alone =
+        PeerDiscovery::new(LocalDaemon { range: Localhost, bind: Vec::new(), ..local() }, 1);
     alone.set_port(Duration::ZERO, 61300);
     alone.handle_timeout(Duration::ZERO);
     assert_eq!((alone.poll_output(), alone.poll_timeout()), (None, None), "it lists nobody");
@@ -355,18 +356,18 @@ fn ranges_are_kept() {
     alone.handle_timeout(secs(1.0));
     let sent: Vec<_> = std::iter::from_fn(|| alone.poll_output()).collect();
     assert_eq!(sent.len(), 16, "the QUIC ports of the host that it lists");
-    assert!(!sent.iter().any(|output| matches!(output, Output::Multicast(_))));
+    assert!(!sent.iter().any(|output| matches!(output, PeersOutput::Multicast(_))));
 }
 
 #[test]
 fn a_range_that_changes_is_followed() {
     use DiscoveryRange::{Localhost, Off, Subnet};
-    let multicasts = |peers: &mut Peers, now: f64| {
+    let multicasts = |peers: &mut PeerDiscovery, now: f64| {
         peers.handle_timeout(secs(now));
         let sent: Vec<_> = std::iter::from_fn(|| peers.poll_output()).collect();
-        sent.iter().filter(|output| matches!(output, Output::Multicast(_))).count()
+        sent.iter().filter(|output| matches!(output, PeersOutput::Multicast(_))).count()
     };
-    let mut peers = Peers::new(Local { range: Off, ..local() }, 1);
+    let mut peers = PeerDiscovery::new(LocalDaemon { range: Off, ..local() }, 1);
     peers.set_port(Duration::ZERO, 61300);
     assert_eq!(peers.poll_timeout(), None, "it is silent");
     assert_eq!(multicasts(&mut peers, 0.0), 0);

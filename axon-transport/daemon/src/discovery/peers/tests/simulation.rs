@@ -20,7 +20,7 @@ const SESSION: SecurityTerms =
 const MESSAGES10: SecurityTerms = SecurityTerms { key_mode: 2, ..SESSION };
 
 struct Host {
-    peers: Peers,
+    peers: PeerDiscovery,
     terms: SecurityTerms,
     address: SocketAddr,
     links: BTreeSet<usize>,
@@ -57,7 +57,7 @@ impl Subnet {
             let ip = IpAddr::from(Ipv4Addr::new(10, 0, 0, host as u8 + 1));
             let sae = |host: usize| format!("sae-{host:02}");
             let all = (0..100).map(sae).filter(|s| *s != sae(host)).collect();
-            let local = Local {
+            let local = LocalDaemon {
                 daemon: id(host),
                 domain: 3,
                 terms: *terms,
@@ -67,7 +67,7 @@ impl Subnet {
                 advertise: Vec::new(),
             };
             Host {
-                peers: Peers::new(local, seed ^ host as u64),
+                peers: PeerDiscovery::new(local, seed ^ host as u64),
                 terms: *terms,
                 address: SocketAddr::new(ip, *quic_ports(3).start()),
                 links: BTreeSet::new(),
@@ -134,16 +134,22 @@ impl Subnet {
         self.hosts[host].peers.handle_timeout(self.now);
         while let Some(output) = self.hosts[host].peers.poll_output() {
             match output {
-                Output::Multicast(bytes) => {
+                PeersOutput::Multicast(bytes) => {
                     for to in (0..self.hosts.len()).filter(|to| *to != host) {
                         self.transmit(host, to, Arrival::Shared, &bytes);
                     }
                 }
-                Output::Action(DiscoveryAction::SendFromQuicPort { to, bytes }) => {
+                PeersOutput::Action(DiscoveryAction::SendFromQuicPort { to, bytes }) => {
                     let to = self.hosts.iter().position(|h| h.address == to);
                     self.transmit(host, to.expect("a host's address"), Arrival::Quic, &bytes);
                 }
-                Output::Action(DiscoveryAction::Dial { daemon, addrs, sae, listed, standing }) => {
+                PeersOutput::Action(DiscoveryAction::Dial {
+                    daemon,
+                    addrs,
+                    sae,
+                    listed,
+                    standing,
+                }) => {
                     let to = self.hosts.iter().position(|h| h.address == addrs[0]).unwrap();
                     assert_eq!((id(to), listed), (daemon, false));
                     assert_eq!(self.hosts[host].terms, self.hosts[to].terms, "dialled a mismatch");
@@ -158,14 +164,14 @@ impl Subnet {
                     let wait = Duration::from_millis(self.random.random_range(5..200));
                     self.later(wait, What::DialEnds { from: host, to, standing });
                 }
-                Output::Action(DiscoveryAction::PeerMismatch(mismatch)) => {
+                PeersOutput::Action(DiscoveryAction::PeerMismatch(mismatch)) => {
                     self.hosts[host].mismatches.push((mismatch.peer, mismatch.setting));
                 }
-                Output::Action(DiscoveryAction::Named(names)) => {
+                PeersOutput::Action(DiscoveryAction::Named(names)) => {
                     panic!("it looks no names up: {names:?}")
                 }
                 // So many beacons were lost in a row that it seemed gone; it is told of anew.
-                Output::Action(DiscoveryAction::Gone { daemon }) => {
+                PeersOutput::Action(DiscoveryAction::Gone { daemon }) => {
                     let gone = self.hosts.iter().position(|h| h.peers.local.daemon == daemon);
                     assert!(!self.hosts[host].links.contains(&gone.unwrap()), "it is linked");
                     self.hosts[host].gone.push(daemon);

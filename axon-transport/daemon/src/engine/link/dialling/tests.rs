@@ -13,7 +13,7 @@ use crate::{
         },
         refusal::RefusedBy,
     },
-    keys::{Event, FailureKind},
+    keys::{FailureKind, KmeAnswer},
 };
 
 fn address(number: u8) -> SocketAddr {
@@ -68,7 +68,7 @@ impl Dialled {
             let Some((origin, request)) = ring.poll_request(self.now) else { return action };
             assert!(action.is_none());
             let answer = self.kmes.answer(request);
-            let answered = ring.handle_answer(self.now, Event { origin, answer });
+            let answered = ring.handle_answer(self.now, KmeAnswer { origin, answer });
             assert!(matches!(answered, Answered::Dialler));
             self.dial.handle_key();
         }

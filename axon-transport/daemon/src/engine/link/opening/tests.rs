@@ -27,7 +27,7 @@ use crate::{
         },
         refusal::RefusedBy,
     },
-    keys::{Event, KeyMessage},
+    keys::{KeyMessage, KmeAnswer},
 };
 
 /// The number of the connection, at both ends.
@@ -94,12 +94,12 @@ fn facts(side: Side, key_mode: Option<KeyMode>) -> Handshake {
     }
 }
 
-fn ours(side: Side, settings: &Config) -> Hello {
-    Hello::new(settings, if side == Side::Client { CLIENT } else { SERVER })
+fn ours(side: Side, settings: &Config) -> LinkHello {
+    LinkHello::new(settings, if side == Side::Client { CLIENT } else { SERVER })
 }
 
 /// The HELLO that the peer of `side` says.
-fn theirs(side: Side, key_mode: Option<KeyMode>) -> Hello {
+fn theirs(side: Side, key_mode: Option<KeyMode>) -> LinkHello {
     ours(side.peer(), &settings(side.peer(), key_mode))
 }
 
@@ -117,8 +117,8 @@ struct End {
     opening: Opening,
     ring: Option<Keyring>,
     /// Messages on their way to it.
-    inbox: VecDeque<Message>,
-    outcome: Option<Result<Opened, RefusedConnection>>,
+    inbox: VecDeque<LinkMessage>,
+    outcome: Option<Result<OpenedConnection, RefusedConnection>>,
     /// The key that it announced, where the test noted it.
     announced: Option<KeyId>,
 }
@@ -130,7 +130,7 @@ impl End {
 
     fn greeting(
         now: Duration,
-        ours: Hello,
+        ours: LinkHello,
         facts: Handshake,
         settings: &Config,
         mut ring: Option<Keyring>,
@@ -157,7 +157,7 @@ impl End {
     /// An end that has the peer's HELLO, in qkd.
     fn greeted(now: Duration, side: Side, key_mode: KeyMode) -> Self {
         let mut end = Self::awaiting_hello(now, side, Some(key_mode));
-        end.hears(now, &Message::Hello(theirs(side, Some(key_mode))));
+        end.hears(now, &LinkMessage::LinkHello(theirs(side, Some(key_mode))));
         end
     }
 
@@ -167,7 +167,8 @@ impl End {
         end.ask(now, kmes);
         assert!(end.outcome(now).is_none());
         let messages: Vec<_> = std::iter::from_fn(|| end.opening.poll_message()).collect();
-        let [Message::Hello(_), Message::Keys(KeyMessage::Announce(key_ids))] = &messages[..]
+        let [LinkMessage::LinkHello(_), LinkMessage::Keys(KeyMessage::Announce(key_ids))] =
+            &messages[..]
         else {
             panic!("{messages:?}");
         };
@@ -175,11 +176,11 @@ impl End {
         end
     }
 
-    fn hears(&mut self, now: Duration, message: &Message) {
+    fn hears(&mut self, now: Duration, message: &LinkMessage) {
         self.opening.handle_message(now, message, self.ring.as_mut());
     }
 
-    fn outcome(&mut self, now: Duration) -> Option<Result<Opened, RefusedConnection>> {
+    fn outcome(&mut self, now: Duration) -> Option<Result<OpenedConnection, RefusedConnection>> {
         self.opening.poll_outcome(now, self.ring.as_mut())
     }
 
@@ -212,7 +213,7 @@ impl End {
         }
         let any = !asked.is_empty();
         for (origin, request) in asked {
-            let event = Event { origin, answer: kmes.answer(request) };
+            let event = KmeAnswer { origin, answer: kmes.answer(request) };
             let Some(ring) = &mut self.ring else { unreachable!() };
             if let Answered::Opening(link, answer) = ring.handle_answer(now, event) {
                 assert_eq!(link, LINK);
@@ -223,7 +224,7 @@ impl End {
     }
 
     /// Polls it until nothing happens: whether anything did, and what it says.
-    fn step(&mut self, now: Duration, kmes: &mut Kmes) -> (bool, Vec<Message>) {
+    fn step(&mut self, now: Duration, kmes: &mut Kmes) -> (bool, Vec<LinkMessage>) {
         let mut busy = false;
         while self.opening.reads()
             && let Some(message) = self.inbox.pop_front()
@@ -242,7 +243,7 @@ impl End {
         let mut said: Vec<_> = std::iter::from_fn(|| self.opening.poll_message()).collect();
         if let Some(ring) = &mut self.ring {
             let messages = std::iter::from_fn(|| ring.poll_message(now));
-            said.extend(messages.map(|(_, message)| Message::Keys(message)));
+            said.extend(messages.map(|(_, message)| LinkMessage::Keys(message)));
         }
         if let Some(outcome) = self.outcome(now) {
             assert!(self.outcome.is_none());
@@ -251,7 +252,7 @@ impl End {
         (busy || !said.is_empty(), said)
     }
 
-    fn opened(&mut self) -> Opened {
+    fn opened(&mut self) -> OpenedConnection {
         self.outcome.take().expect("the opening ended").unwrap()
     }
 }

@@ -15,7 +15,7 @@ pub(in crate::engine::links) struct Age {
 
 /// What is due of a link that ages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(in crate::engine::links) enum Due {
+pub(in crate::engine::links) enum AgeStep {
     /// No successor came: the link ends.
     End,
     /// A successor is to be dialled.
@@ -41,13 +41,13 @@ impl Age {
         [self.renew_at, self.until].into_iter().flatten().min()
     }
 
-    pub(in crate::engine::links) fn handle_timeout(&mut self, now: Duration) -> Option<Due> {
+    pub(in crate::engine::links) fn handle_timeout(&mut self, now: Duration) -> Option<AgeStep> {
         if self.until.is_some_and(|until| until <= now) {
-            return Some(Due::End);
+            return Some(AgeStep::End);
         }
         self.renew_at.filter(|renew| *renew <= now)?;
         self.renew_at = Some(now + self.again);
-        Some(Due::Renew)
+        Some(AgeStep::Renew)
     }
 }
 
@@ -81,12 +81,12 @@ mod tests {
             let renew = NOW + seconds(renewed);
             assert_eq!(age.poll_timeout(), Some(renew), "{max}");
             assert_eq!(age.handle_timeout(renew - seconds(1)), None);
-            assert_eq!(age.handle_timeout(renew), Some(Due::Renew));
+            assert_eq!(age.handle_timeout(renew), Some(AgeStep::Renew));
             assert_eq!(age.handle_timeout(renew), None, "once");
             let next = age.poll_timeout().unwrap();
             assert!(next >= renew + seconds(again.min(1)) && next < NOW + seconds(max), "{max}");
-            assert_eq!(age.handle_timeout(next), Some(Due::Renew));
-            assert_eq!(age.handle_timeout(NOW + seconds(max)), Some(Due::End));
+            assert_eq!(age.handle_timeout(next), Some(AgeStep::Renew));
+            assert_eq!(age.handle_timeout(NOW + seconds(max)), Some(AgeStep::End));
         }
     }
 
@@ -95,6 +95,6 @@ mod tests {
         let mut age = Age::new(seconds(60), false, NOW);
         assert_eq!(age.poll_timeout(), Some(NOW + seconds(60)));
         assert_eq!(age.handle_timeout(NOW + seconds(59)), None);
-        assert_eq!(age.handle_timeout(NOW + seconds(60)), Some(Due::End));
+        assert_eq!(age.handle_timeout(NOW + seconds(60)), Some(AgeStep::End));
     }
 }

@@ -22,7 +22,7 @@ use crate::{
         links::{admission::HandshakePlace, silence::LinkSilence, who::PeerIdentity},
     },
     keys::Resolver,
-    link::{Candidate, Elected, Hello, Order, Side},
+    link::{Candidate, Elected, LinkHello, Order, Side},
 };
 
 /// How far a link has come.
@@ -57,7 +57,7 @@ pub(super) struct Link {
 #[derive(Clone)]
 pub(crate) struct Summary {
     /// The peer's HELLO.
-    pub(crate) hello: Hello,
+    pub(crate) hello: LinkHello,
     /// What the handshake agreed on.
     pub(crate) negotiated: Negotiated,
     /// As whom the peer proved itself.

@@ -8,7 +8,7 @@ use std::{net::SocketAddr, time::Duration};
 
 use bytes::BytesMut;
 
-use self::watch::Action;
+use self::watch::ProbeAction;
 pub(super) use self::{
     looks::LookTimes,
     prober::{Traffic, frames_came},
@@ -101,18 +101,18 @@ impl Links {
         let (traffic, round_trip) =
             (Traffic::from(&connection.quic.stats()), connection.quic.rtt());
         match peer.silence.handle_timeout(traffic, round_trip, now) {
-            Some(Action::Answered(nonce, was_cut)) => {
+            Some(ProbeAction::Answered(nonce, was_cut)) => {
                 self.nonces.remove(&nonce);
                 if was_cut {
                     self.outbox.report(LinkReport::Path { daemon, works: true });
                 }
             }
-            Some(Action::Probe(nonce)) => self.send_probe(number, address, nonce),
-            Some(Action::ProbeCut(nonce)) => {
+            Some(ProbeAction::Probe(nonce)) => self.send_probe(number, address, nonce),
+            Some(ProbeAction::ProbeCut(nonce)) => {
                 self.send_probe(number, address, nonce);
                 self.outbox.report(LinkReport::Path { daemon, works: false });
             }
-            Some(Action::Replace) => {
+            Some(ProbeAction::Replace) => {
                 tracing::info!(peer = %daemon, %address,
                     "the link is silent though its path works: dialling a successor");
                 self.dial_successor(number, now);

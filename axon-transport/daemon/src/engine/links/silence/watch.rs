@@ -53,7 +53,7 @@ pub(in crate::engine::links) type Nonce = [u8; 8];
 
 /// What a look at a link found.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) struct Look {
+pub(super) struct LookResult {
     /// The peer is taken for gone from now on.
     pub(super) gone: bool,
     /// The link's path is probed from now on.
@@ -62,7 +62,7 @@ pub(super) struct Look {
 
 /// What to do for a link that is probed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Action {
+pub(super) enum ProbeAction {
     /// Send a probe.
     Probe(Nonce),
     /// Send a probe, and say that the path is cut: those before were not answered.
@@ -108,7 +108,7 @@ impl LinkSilence {
         traffic: Traffic,
         nonce: impl FnOnce() -> Nonce,
         now: Duration,
-    ) -> Look {
+    ) -> LookResult {
         let before = std::mem::replace(&mut self.traffic, traffic);
         // It is no longer silent: what is under way arrives.
         self.silent &= !traffic.answered_since(before);
@@ -123,7 +123,7 @@ impl LinkSilence {
             let (prober, nonce) = (Prober::new(self.side), nonce());
             self.probing = Some(Probing { prober, nonce, begun: now, traffic, said_cut: false });
         }
-        Look { gone, probed }
+        LookResult { gone, probed }
     }
 
     /// A probe was answered. Returns whether it was said that the path is cut.
@@ -175,10 +175,10 @@ impl LinkSilence {
         traffic: Traffic,
         round_trip: Duration,
         now: Duration,
-    ) -> Option<Action> {
+    ) -> Option<ProbeAction> {
         let probing = self.probing.as_mut()?;
         if traffic.answered_since(probing.traffic) {
-            let answered = Action::Answered(probing.nonce, probing.said_cut);
+            let answered = ProbeAction::Answered(probing.nonce, probing.said_cut);
             self.probing = None;
             return Some(answered);
         }
@@ -187,12 +187,12 @@ impl LinkSilence {
                 let cut = probing.prober.find_cut(round_trip, now.saturating_sub(probing.begun));
                 probing.said_cut |= cut;
                 self.silent |= cut;
-                let action = if cut { Action::ProbeCut } else { Action::Probe };
+                let action = if cut { ProbeAction::ProbeCut } else { ProbeAction::Probe };
                 Some(action(probing.nonce))
             }
             Step::Replace => {
                 self.silent = true;
-                Some(Action::Replace)
+                Some(ProbeAction::Replace)
             }
         }
     }
@@ -222,12 +222,12 @@ mod tests {
         for number in 1..10 {
             assert_eq!(
                 silence.handle_second(traffic(1, 1, 1), || NONCE, second(number)),
-                Look::default()
+                LookResult::default()
             );
         }
         assert_eq!(silence.poll_timeout(), None);
         let look = silence.handle_second(traffic(1, 1, 1), || NONCE, second(10));
-        assert_eq!(look, Look { gone: false, probed: true }, "keep-alives are lost");
+        assert_eq!(look, LookResult { gone: false, probed: true }, "keep-alives are lost");
     }
 
     #[test]
@@ -236,22 +236,25 @@ mod tests {
         silence.handle_heard(traffic(1, 1, 1), START);
         silence.handle_second(traffic(1, 1, 1), || NONCE, second(1));
         let look = silence.handle_second(traffic(1, 1, 2), || NONCE, second(2));
-        assert_eq!(look, Look { gone: false, probed: true });
-        assert_eq!(silence.handle_second(traffic(1, 1, 2), || [9; 8], second(3)), Look::default());
+        assert_eq!(look, LookResult { gone: false, probed: true });
+        assert_eq!(
+            silence.handle_second(traffic(1, 1, 2), || [9; 8], second(3)),
+            LookResult::default()
+        );
         let asked = traffic(1, 1, 2);
         assert_eq!(
             silence.handle_timeout(asked, ROUND_TRIP, second(3)),
-            Some(Action::Probe(NONCE))
+            Some(ProbeAction::Probe(NONCE))
         );
         silence.handle_echo(second(3));
         let due = silence.poll_timeout().unwrap();
-        assert_eq!(silence.handle_timeout(asked, ROUND_TRIP, due), Some(Action::Replace));
+        assert_eq!(silence.handle_timeout(asked, ROUND_TRIP, due), Some(ProbeAction::Replace));
         assert!(silence.is_silent());
         // An acknowledgement ends it.
         let answered = traffic(2, 2, 2);
         assert_eq!(
             silence.handle_timeout(answered, ROUND_TRIP, due),
-            Some(Action::Answered(NONCE, false))
+            Some(ProbeAction::Answered(NONCE, false))
         );
         assert_eq!(
             (silence.poll_timeout(), silence.handle_timeout(answered, ROUND_TRIP, due)),
@@ -273,7 +276,7 @@ mod tests {
         for answered in [false, true] {
             let found: Vec<_> = (0..20).map(|_| probe(&mut silence).1).collect();
             // Three are not answered when the fourth is sent. It is said again after a while.
-            let said = |action: &Action| *action == Action::ProbeCut(NONCE);
+            let said = |action: &ProbeAction| *action == ProbeAction::ProbeCut(NONCE);
             let said: Vec<_> = (0..).zip(&found).filter(|(_, a)| said(a)).map(|(n, _)| n).collect();
             assert_eq!(said, [3, 19]);
             assert!(silence.is_cut(asked) && !silence.is_cut(traffic(1, 1, 1)));
@@ -282,14 +285,14 @@ mod tests {
                 let more = traffic(1, 1, 1);
                 assert_eq!(
                     silence.handle_timeout(more, ROUND_TRIP, due),
-                    Some(Action::Answered(NONCE, true))
+                    Some(ProbeAction::Answered(NONCE, true))
                 );
             } else {
                 let due = silence.poll_timeout().unwrap();
                 assert!(silence.handle_echo(due), "it was said");
                 assert!(!silence.handle_echo(due), "once");
                 let (_, action) = probe(&mut silence);
-                assert_eq!(action, Action::Replace);
+                assert_eq!(action, ProbeAction::Replace);
             }
             assert!(!silence.is_cut(asked));
         }
@@ -306,10 +309,10 @@ mod tests {
             let due = silence.poll_timeout().unwrap();
             let action = silence.handle_timeout(traffic(0, 0, 1), slow, due).unwrap();
             if due >= begin + cut {
-                assert_eq!(action, Action::ProbeCut(NONCE), "at once");
+                assert_eq!(action, ProbeAction::ProbeCut(NONCE), "at once");
                 break;
             }
-            assert_eq!(action, Action::Probe(NONCE));
+            assert_eq!(action, ProbeAction::Probe(NONCE));
             assert!(!silence.is_cut(traffic(0, 0, 1)));
         }
     }
@@ -361,7 +364,7 @@ mod tests {
         let due = silence.poll_timeout().unwrap();
         assert_eq!(
             silence.handle_timeout(traffic(0, 0, 1), ROUND_TRIP, due),
-            Some(Action::Replace)
+            Some(ProbeAction::Replace)
         );
         assert!(silence.handle_superseded(traffic(0, 0, 1)));
         assert_eq!(silence.poll_timeout(), None);

@@ -16,7 +16,7 @@ use super::{
 use crate::{
     engine::{
         counters::Counters,
-        outbound::{queue::Queue, schedule::SMALL, source::Done},
+        outbound::{queue::Queue, schedule::SMALL, source::FlowProgress},
         quic::connection::Carrier,
         sample::frames::Frames,
     },
@@ -35,12 +35,12 @@ const ALWAYS: usize = 2;
 struct Writing {
     stream: StreamId,
     pending: VecDeque<Bytes>,
-    sample: UnderWay,
+    sample: SampleInFlight,
 }
 
 /// A sample on its way.
 #[derive(Debug)]
-struct UnderWay {
+struct SampleInFlight {
     stream: StreamId,
     priority: i32,
     /// With header and envelope.
@@ -59,7 +59,7 @@ struct UnderWay {
 #[derive(Debug, Default)]
 pub(super) struct BestEffort {
     writing: Option<Writing>,
-    under_way: VecDeque<UnderWay>,
+    under_way: VecDeque<SampleInFlight>,
     /// Samples that arrived.
     arrived: u64,
     /// What the last sample took to arrive.
@@ -117,7 +117,7 @@ impl BestEffort {
         frames: &mut Frames,
         carrier: &mut Carrier<'_>,
         counters: &Counters,
-        done: &mut Done,
+        done: &mut FlowProgress,
         now: Duration,
     ) -> Option<FlowPause> {
         if self.writing.is_none() {
@@ -154,7 +154,7 @@ impl BestEffort {
             let bytes = pending.iter().map(|piece| piece.len() as u64).sum();
             credit.set(uses);
             let (begun, deadline) = (now, now + left);
-            let sample = UnderWay {
+            let sample = SampleInFlight {
                 stream,
                 priority,
                 bytes,

@@ -6,7 +6,7 @@ use bytes::Bytes;
 
 use super::info::FlowInfo;
 use crate::engine::{
-    compression::{Asked, PeerCompression, SampleName},
+    compression::{CompressionReply, PeerCompression, SampleName},
     counters::Counters,
     outbound::queue::Queue,
     quic::connection::Carrier,
@@ -59,13 +59,13 @@ impl Compressing {
                 length: sample.length(),
             });
             match compression.ask(carrier.flow, name, &sample.payload) {
-                Some(Asked::Later(order)) => {
+                Some(CompressionReply::Later(order)) => {
                     sample.set_asked(order);
                     if !self.is_worth_it {
                         return;
                     }
                 }
-                Some(Asked::Known(frame)) => {
+                Some(CompressionReply::Known(frame)) => {
                     self.handle_answer(frame.as_ref(), sample.length(), counters);
                     sample.set_compressed(frame);
                 }

@@ -32,7 +32,7 @@ use super::{
     queue::Queue,
     schedule::{Class, Rank},
     served::FlowRoute,
-    source::{Done, Source},
+    source::{FlowProgress, Source},
 };
 use crate::engine::{
     compression::PeerCompression, counters::Counters, quic::connection::Carrier, rings::RingSample,
@@ -218,7 +218,7 @@ impl Flow {
         carrier: &mut Carrier<'_>,
         counters: &Counters,
         compression: &PeerCompression,
-        done: &mut Done,
+        done: &mut FlowProgress,
         now: Duration,
     ) -> FlowPause {
         let mut left = if carrier.lender.is_some() { TOGETHER } else { TURN };
@@ -268,7 +268,7 @@ impl Flow {
         carrier: &mut Carrier<'_>,
         counters: &Counters,
         compression: &PeerCompression,
-        done: &mut Done,
+        done: &mut FlowProgress,
         now: Duration,
     ) -> Option<FlowPause> {
         let Self { info, queue, frames, compressing, .. } = self;
@@ -353,19 +353,20 @@ impl Flow {
     }
 
     /// The peer has the samples up to this number, and dropped some of them.
-    pub(super) fn acknowledge(&mut self, sequence: u64, dropped: u64) -> Option<Done> {
+    pub(super) fn acknowledge(&mut self, sequence: u64, dropped: u64) -> Option<FlowProgress> {
         let (samples, newest) = self.queue.acknowledge(sequence);
         self.reliable.note_sent(&self.queue);
         self.acknowledged_samples += samples;
         let given_up = samples.min(dropped);
-        let mut done = newest.map(|sequence| Done { sequence: Some(sequence), given_up })?;
+        let mut done =
+            newest.map(|sequence| FlowProgress { sequence: Some(sequence), given_up })?;
         self.finish_dropped(&mut done);
         Some(done)
     }
 
     /// Tells the sources of samples that a limit dropped: at once that they will not arrive, and that they may be
     /// forgotten once the peer has all before them.
-    fn finish_dropped(&mut self, done: &mut Done) {
+    fn finish_dropped(&mut self, done: &mut FlowProgress) {
         done.given_up += self.taking.take_given_up();
         if self.queue.is_empty() {
             done.sequence = done.sequence.max(self.taking.take_dropped());
@@ -382,7 +383,7 @@ impl Flow {
         carrier: &mut Carrier<'_>,
         counters: &Counters,
         compression: &PeerCompression,
-        done: &mut Done,
+        done: &mut FlowProgress,
         now: Duration,
     ) -> Option<FlowPause> {
         let Self { info, queue, frames, compressing, .. } = self;
@@ -432,7 +433,7 @@ impl Flow {
         stream: StreamId,
         quic: &mut Connection,
         counters: &Counters,
-        done: &mut Done,
+        done: &mut FlowProgress,
     ) {
         if self.reliable.is(stream) {
             self.reliable.handle_stopped(quic, &self.info, &mut self.queue, counters, done);

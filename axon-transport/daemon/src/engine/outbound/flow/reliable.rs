@@ -21,7 +21,7 @@ use crate::{
             furthest::SentProgress,
             queue::Queue,
             schedule::{Rank, SMALL},
-            source::Done,
+            source::FlowProgress,
         },
         quic::connection::Carrier,
         rings::RingSample,
@@ -126,7 +126,7 @@ impl ReliableStream {
         frames: &mut Frames,
         carrier: &mut Carrier<'_>,
         counters: &Counters,
-        done: &mut Done,
+        done: &mut FlowProgress,
         now: Duration,
     ) -> Option<FlowPause> {
         if self.batch.is_empty() {
@@ -216,7 +216,7 @@ impl ReliableStream {
         info: &FlowInfo,
         queue: &mut Queue,
         counters: &Counters,
-        done: &mut Done,
+        done: &mut FlowProgress,
         now: Duration,
     ) {
         self.active_at = now;
@@ -308,7 +308,7 @@ impl ReliableStream {
         info: &FlowInfo,
         queue: &mut Queue,
         counters: &Counters,
-        done: &mut Done,
+        done: &mut FlowProgress,
     ) {
         if let Some(stream) = self.stream {
             let code = VarInt::from_u32(CloseCode::Goodbye.code());
@@ -318,7 +318,13 @@ impl ReliableStream {
     }
 
     /// The peer takes no more of this route: the samples that it was sent are given up.
-    fn stop(&mut self, info: &FlowInfo, queue: &mut Queue, counters: &Counters, done: &mut Done) {
+    fn stop(
+        &mut self,
+        info: &FlowInfo,
+        queue: &mut Queue,
+        counters: &Counters,
+        done: &mut FlowProgress,
+    ) {
         self.stream = None;
         self.batch.clear();
         let (given_up, newest) = queue.give_up_sent();

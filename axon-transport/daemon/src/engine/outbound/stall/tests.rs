@@ -21,13 +21,13 @@ fn look(
     is_awaited: bool,
     busy: impl Fn(Duration) -> Vec<BusyFlow>,
     heard: impl Fn(Duration) -> u64,
-) -> Option<(Duration, Found)> {
-    let mut stalls = Stalls::new(LIMIT, Duration::ZERO);
+) -> Option<(Duration, StallReport)> {
+    let mut stalls = FlowStalls::new(LIMIT, Duration::ZERO);
     while stalls.poll_timeout() < Duration::from_secs(1200) {
         let now = stalls.poll_timeout();
         let peer = PeerActivity { heard: heard(now), returned: 0, is_awaited };
         let found = stalls.handle_timeout(peer, busy(now).into_iter(), now);
-        if found != Found::default() {
+        if found != StallReport::default() {
             return Some((now, found));
         }
     }
@@ -43,8 +43,8 @@ fn held(now: Duration) -> BusyFlow {
     BusyFlow { refused: Some(10 * now.as_secs()), ..FLOW }
 }
 
-fn stalled(why: StallCause) -> Found {
-    Found { stalled: vec![(1, why)], quiet: Vec::new() }
+fn stalled(why: StallCause) -> StallReport {
+    StallReport { stalled: vec![(1, why)], quiet: Vec::new() }
 }
 
 #[test]
@@ -203,7 +203,7 @@ fn a_flow_that_waits_for_credit_is_judged_once_none_comes_back() {
 #[test]
 fn a_quiet_flow_is_busy_no_more_unless_it_is_judged() {
     let quiet = BusyFlow { keeps: None, is_quiet: true, ..FLOW };
-    let found = Found { stalled: Vec::new(), quiet: vec![3] };
+    let found = StallReport { stalled: Vec::new(), quiet: vec![3] };
     assert_eq!(look(false, |_| vec![quiet], secs), Some((LOOK, found)));
     let (_, found) = look(false, |_| vec![BusyFlow { is_quiet: true, ..FLOW }], secs).unwrap();
     assert!(found.quiet.is_empty(), "it is judged");
@@ -215,7 +215,7 @@ fn peer(heard: u64) -> PeerActivity {
 
 #[test]
 fn a_number_that_was_forgotten_is_judged_anew() {
-    let mut stalls = Stalls::new(LIMIT, Duration::ZERO);
+    let mut stalls = FlowStalls::new(LIMIT, Duration::ZERO);
     for second in 1..=5 {
         stalls.handle_timeout(peer(second), [FLOW].into_iter(), LOOK * second as u32);
     }
@@ -223,7 +223,7 @@ fn a_number_that_was_forgotten_is_judged_anew() {
     stalls.forget(FLOW.id);
     stalls.forget(FLOW.id);
     let found = stalls.handle_timeout(peer(6), [FLOW].into_iter(), LOOK + LIMIT);
-    assert_eq!(found, Found::default());
+    assert_eq!(found, StallReport::default());
 }
 
 /// Daemons of one host take over from each other. Each is there for `life` and has its samples kept for `kept` after it;
@@ -233,11 +233,11 @@ fn one_after_another(
     kept: Duration,
     flow: impl Fn(Duration) -> BusyFlow,
     progress: impl Fn(Duration) -> (u64, u64),
-) -> Option<(Duration, Found)> {
+) -> Option<(Duration, StallReport)> {
     let (mut now, mut known) = (Duration::ZERO, None::<Progress>);
     while now < Duration::from_secs(1200) {
         let (begin, end) = (now, now + life);
-        let mut stalls = Stalls::new(LIMIT, begin);
+        let mut stalls = FlowStalls::new(LIMIT, begin);
         if let Some(known) = known {
             stalls.inherit(FLOW.id, (0, 0), known, begin);
         }
@@ -246,7 +246,7 @@ fn one_after_another(
             now = stalls.poll_timeout();
             let found =
                 stalls.handle_timeout(peer(now.as_millis() as u64), [is(now)].into_iter(), now);
-            if found != Found::default() {
+            if found != StallReport::default() {
                 return Some((now, found));
             }
         }
@@ -294,14 +294,14 @@ fn a_flow_goes_on_with_the_worse_of_what_is_known() {
     let (now, idle) = (Duration::from_secs(5), LIMIT - LOOK);
     let known = |idle| Progress { idle, ..Progress::default() };
     let after = |flow: BusyFlow| {
-        let mut stalls = Stalls::new(LIMIT, now);
+        let mut stalls = FlowStalls::new(LIMIT, now);
         stalls.flows.insert(FLOW.id, known(LOOK));
         stalls.inherit(FLOW.id, (3, 0), known(idle), now);
         stalls.inherit(FLOW.id, (3, 0), known(LOOK), now);
         stalls.handle_timeout(peer(1), [flow].into_iter(), now + LOOK)
     };
     assert_eq!(after(BusyFlow { progress: (3, 0), ..FLOW }), stalled(StallCause::NothingRead));
-    assert_eq!(after(BusyFlow { progress: (4, 0), ..FLOW }), Found::default());
+    assert_eq!(after(BusyFlow { progress: (4, 0), ..FLOW }), StallReport::default());
 }
 
 #[test]
@@ -349,17 +349,17 @@ fn silence_now_and_then_is_no_way_out_of_the_pace() {
 
 #[test]
 fn one_look_counts_for_two_seconds_at_most() {
-    let mut stalls = Stalls::new(LIMIT, Duration::ZERO);
+    let mut stalls = FlowStalls::new(LIMIT, Duration::ZERO);
     stalls.handle_timeout(peer(1), [FLOW].into_iter(), LOOK);
     let after = Duration::from_secs(60);
     let found = stalls.handle_timeout(peer(2), [FLOW].into_iter(), after);
-    assert_eq!(found, Found::default(), "this host was stopped");
+    assert_eq!(found, StallReport::default(), "this host was stopped");
     assert_eq!(stalls.flows[&FLOW.id].idle, LONGEST_LOOK);
 }
 
 #[test]
 fn nobody_looks_for_a_second_after_the_first_sample() {
-    let mut stalls = Stalls::new(LIMIT, Duration::ZERO);
+    let mut stalls = FlowStalls::new(LIMIT, Duration::ZERO);
     let now = Duration::from_secs(100);
     stalls.handle_first(now);
     assert_eq!(stalls.poll_timeout(), now + LOOK);

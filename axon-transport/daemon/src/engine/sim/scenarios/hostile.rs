@@ -30,7 +30,10 @@ use crate::{
             world::World,
         },
     },
-    link::{CloseCode, Elected, Graph, Hello, Message, RouteSubscriber, Subscribe, Unsubscribe},
+    link::{
+        CloseCode, Elected, GraphUpdate, LinkHello, LinkMessage, RouteSubscriber, Subscribe,
+        Unsubscribe,
+    },
 };
 
 pub(super) const LOWEST: DaemonId = DaemonId([0; 16]);
@@ -59,22 +62,22 @@ pub(super) fn dial(world: &mut World, host: usize) -> usize {
 /// Says HELLO, and waits for the other side's.
 pub(super) fn greet(world: &mut World, of: usize, replaces: Option<[u8; 16]>) {
     world.with_raw(0, |raw, _| {
-        let hello = Hello { replaces, ..raw.hello() };
-        raw.links[of].say(&Message::Hello(hello));
+        let hello = LinkHello { replaces, ..raw.hello() };
+        raw.links[of].say(&LinkMessage::LinkHello(hello));
     });
     world.until(secs(5), |world| link(world, of).is_greeted());
 }
 
-pub(super) fn say(world: &mut World, on: usize, message: &Message) {
+pub(super) fn say(world: &mut World, on: usize, message: &LinkMessage) {
     world.with_raw(0, |raw, _| raw.links[on].say(message));
 }
 
-pub(super) fn elect(election: u64) -> Message {
-    Message::Elected(Elected { link: [election as u8; 16], election })
+pub(super) fn elect(election: u64) -> LinkMessage {
+    LinkMessage::Elected(Elected { link: [election as u8; 16], election })
 }
 
-pub(super) fn subscribe(route: u32, topic: &str, qos: Qos) -> Message {
-    Message::Subscribe(Subscribe {
+pub(super) fn subscribe(route: u32, topic: &str, qos: Qos) -> LinkMessage {
+    LinkMessage::Subscribe(Subscribe {
         route,
         topic: topic.into(),
         type_name: "T".into(),
@@ -94,18 +97,22 @@ pub(super) fn of_raw(number: u8) -> Gid {
 }
 
 /// A graph of one publisher.
-pub(super) fn publishes(topic: &str, gid: Gid, qos: Qos) -> Message {
+pub(super) fn publishes(topic: &str, gid: Gid, qos: Qos) -> LinkMessage {
     let endpoint = Endpoint::new(gid, EndpointKind::Publisher, topic, "T")
         .with_qos(qos)
         .with_node("node", "/");
-    Message::Graph(Graph { version: 1, added: vec![endpoint], ..Graph::default() })
+    LinkMessage::GraphUpdate(GraphUpdate {
+        version: 1,
+        added: vec![endpoint],
+        ..GraphUpdate::default()
+    })
 }
 
 /// Waits until a host asked for a topic or service. Returns the number of its route.
 pub(super) fn asked(world: &mut World, on: usize, topic: &str) -> u32 {
     let route = |world: &World| {
         link(world, on).messages.iter().find_map(|message| match message {
-            Message::Subscribe(subscribe) if subscribe.topic == topic => Some(subscribe.route),
+            LinkMessage::Subscribe(subscribe) if subscribe.topic == topic => Some(subscribe.route),
             _ => None,
         })
     };
@@ -210,7 +217,7 @@ fn streams_of_an_ended_route_are_finished_on_their_own_connection() {
     // One pass of the host ends the route, and then moves to the successor.
     world.run_for(millis(50));
     world.stop(0, true);
-    say(&mut world, 0, &Message::Unsubscribe(Unsubscribe { route: 1 }));
+    say(&mut world, 0, &LinkMessage::Unsubscribe(Unsubscribe { route: 1 }));
     world.run_for(millis(1));
     say(&mut world, successor, &elect(2));
     world.run_for(millis(1));
@@ -284,8 +291,8 @@ fn a_peer_of_another_protocol_version_is_refused_in_words_and_harms_nothing() {
     for (protocol_min, protocol_max) in [(0, 0), (2, 2), (2, 1)] {
         let refused = dial(&mut world, 0);
         world.with_raw(0, |raw, _| {
-            let hello = Hello { protocol_min, protocol_max, ..raw.hello() };
-            raw.links[refused].say(&Message::Hello(hello));
+            let hello = LinkHello { protocol_min, protocol_max, ..raw.hello() };
+            raw.links[refused].say(&LinkMessage::LinkHello(hello));
         });
         world.publish(pair, 10);
         world.until(secs(5), |world| link(world, refused).closed.is_some());
@@ -300,8 +307,8 @@ fn a_peer_of_another_protocol_version_is_refused_in_words_and_harms_nothing() {
     // A later version that speaks ours, too, is a peer.
     let accepted = dial(&mut world, 0);
     world.with_raw(0, |raw, _| {
-        let hello = Hello { protocol_max: 2, ..raw.hello() };
-        raw.links[accepted].say(&Message::Hello(hello));
+        let hello = LinkHello { protocol_max: 2, ..raw.hello() };
+        raw.links[accepted].say(&LinkMessage::LinkHello(hello));
     });
     world.until(secs(5), |world| link(world, accepted).is_elected());
     world.run_for(secs(1));
@@ -353,12 +360,15 @@ fn a_publisher_that_is_announced_again_does_not_begin_with_any_number() {
     let bytes = samples(route, "/t", of_raw(1), 1..=2);
     world.with_raw(0, |raw, _| raw.links[on].open(bytes));
     world.run_for(secs(1));
-    let gone = Graph { version: 2, before: 1, removed: vec![of_raw(1)], ..Graph::default() };
-    say(&mut world, on, &Message::Graph(gone));
+    let gone =
+        GraphUpdate { version: 2, before: 1, removed: vec![of_raw(1)], ..GraphUpdate::default() };
+    say(&mut world, on, &LinkMessage::GraphUpdate(gone));
     world.run_for(secs(1));
     link_messages(&mut world, on).clear();
-    let Message::Graph(graph) = publishes("/t", of_raw(1), Qos::keep_all()) else { return };
-    say(&mut world, on, &Message::Graph(Graph { version: 3, before: 2, ..graph }));
+    let LinkMessage::GraphUpdate(graph) = publishes("/t", of_raw(1), Qos::keep_all()) else {
+        return;
+    };
+    say(&mut world, on, &LinkMessage::GraphUpdate(GraphUpdate { version: 3, before: 2, ..graph }));
     let route = asked(&mut world, on, "/t");
     let bytes = samples(route, "/t", of_raw(1), [1 << 31, 3]);
     world.with_raw(0, |raw, _| raw.links[on].open(bytes));
@@ -368,6 +378,6 @@ fn a_publisher_that_is_announced_again_does_not_begin_with_any_number() {
     assert_eq!(refused_numbers(&world), 1);
 }
 
-fn link_messages(world: &mut World, link: usize) -> &mut Vec<Message> {
+fn link_messages(world: &mut World, link: usize) -> &mut Vec<LinkMessage> {
     &mut world.raws[0].links[link].messages
 }

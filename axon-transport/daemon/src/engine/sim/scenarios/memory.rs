@@ -23,7 +23,7 @@ use crate::{
             world::World,
         },
     },
-    link::{Graph, Hello, Message, RouteReady, RouteSubscriber, Subscribe},
+    link::{GraphUpdate, LinkHello, LinkMessage, RouteReady, RouteSubscriber, Subscribe},
 };
 
 /// Publishers of one topic of the hostile peer: as many as one route shows.
@@ -38,8 +38,8 @@ pub(super) fn linked_as(world: &mut World, peer: usize, id: u8) -> usize {
     let number = world.with_raw(peer, |raw, now| raw.dial(to, now));
     world.until(secs(5), |world| world.raws[peer].links[number].connected);
     world.with_raw(peer, |raw, _| {
-        let hello = Hello { daemon: DaemonId([id; 16]), ..raw.hello() };
-        raw.links[number].say(&Message::Hello(hello));
+        let hello = LinkHello { daemon: DaemonId([id; 16]), ..raw.hello() };
+        raw.links[number].say(&LinkMessage::LinkHello(hello));
     });
     world.until(secs(5), |world| world.raws[peer].links[number].is_elected());
     number
@@ -61,7 +61,8 @@ fn endpoint(kind: EndpointKind, gid: Gid, topic: &str) -> Endpoint {
 fn publishes(world: &mut World, link: usize, id: u8, topic: &str, count: u32) {
     let publisher = |n| endpoint(EndpointKind::Publisher, gid(id, n), topic);
     let added = (0..count).map(publisher).collect();
-    let graph = Message::Graph(Graph { version: 1, added, ..Graph::default() });
+    let graph =
+        LinkMessage::GraphUpdate(GraphUpdate { version: 1, added, ..GraphUpdate::default() });
     world.with_raw(0, |raw, _| raw.links[link].say(&graph));
 }
 
@@ -69,7 +70,7 @@ fn publishes(world: &mut World, link: usize, id: u8, topic: &str, count: u32) {
 fn asked(world: &mut World, link: usize, topic: &str) -> u32 {
     let route = |world: &World| {
         world.raws[0].links[link].messages.iter().find_map(|message| match message {
-            Message::Subscribe(subscribe) if subscribe.topic == topic => Some(subscribe.route),
+            LinkMessage::Subscribe(subscribe) if subscribe.topic == topic => Some(subscribe.route),
             _ => None,
         })
     };
@@ -185,8 +186,8 @@ fn messages_of_many_publishers_at_once_arrive_however_long_they_are() {
     all_arrive(82, 2_200, 31 << 10, 1);
 }
 
-fn subscribe(route: u32, topic: &str, subscriber: Gid) -> Message {
-    Message::Subscribe(Subscribe {
+fn subscribe(route: u32, topic: &str, subscriber: Gid) -> LinkMessage {
+    LinkMessage::Subscribe(Subscribe {
         route,
         topic: topic.into(),
         type_name: "T".into(),
@@ -214,7 +215,7 @@ fn refused_routes_that_are_remembered_are_bounded_in_bytes_over_all_ids_of_an_id
             world.with_raw(0, |raw, _| raw.links[number].say(&message));
         }
         world.run_for(secs(5));
-        let refused = |m: &&Message| matches!(m, Message::RouteRefused(_));
+        let refused = |m: &&LinkMessage| matches!(m, LinkMessage::RouteRefused(_));
         assert!(world.raws[0].links[number].messages.iter().filter(refused).count() > 3_000);
     }
     let held = world.hosts[0].held_of_refusals();
@@ -246,16 +247,16 @@ fn publishers_of_a_topic_are_bounded_over_all_ids_of_an_identity() {
 /// The daemon of a peer is killed that had KEEP_ALL relays for so many topics, and the next one says so.
 fn restarts(world: &mut World, peer: usize, id: u8, topics: u32) {
     let subscription = endpoint(EndpointKind::Subscription, gid(id, 0), "/moved");
-    let graph = Graph { version: 1, added: vec![subscription], ..Graph::default() };
+    let graph = GraphUpdate { version: 1, added: vec![subscription], ..GraphUpdate::default() };
     let number = linked_as(world, peer, id);
-    world.with_raw(peer, |raw, _| raw.links[number].say(&Message::Graph(graph.clone())));
+    world.with_raw(peer, |raw, _| raw.links[number].say(&LinkMessage::GraphUpdate(graph.clone())));
     for route in 0..topics {
         let message = subscribe(route, &format!("/topic_{route}"), gid(id, 1 + route));
         world.with_raw(peer, |raw, _| raw.links[number].say(&message));
     }
     world.run_for(secs(3));
     let next = linked_as(world, peer, id + 1);
-    world.with_raw(peer, |raw, _| raw.links[next].say(&Message::Graph(graph)));
+    world.with_raw(peer, |raw, _| raw.links[next].say(&LinkMessage::GraphUpdate(graph)));
     world.run_for(secs(1));
 }
 
@@ -282,7 +283,7 @@ fn subscribe_in_many_ways(world: &mut World, peer: usize, link: usize, id: u8, r
     });
     let subscribers =
         (0..).zip(kinds).map(|(n, qos)| RouteSubscriber { gid: gid(id, route << 4 | n), qos });
-    let message = Message::Subscribe(Subscribe {
+    let message = LinkMessage::Subscribe(Subscribe {
         route,
         topic: format!("/topic_{route}"),
         type_name: "T".into(),
@@ -299,7 +300,7 @@ fn subscribe_in_many_ways(world: &mut World, peer: usize, link: usize, id: u8, r
 fn without_lanes(world: &World, peer: usize, link: usize) -> Vec<u32> {
     let refused =
         world.raws[peer].links[link].messages.iter().filter_map(|message| match message {
-            Message::RouteRefused(refused) if refused.reason.contains("connections") => {
+            LinkMessage::RouteRefused(refused) if refused.reason.contains("connections") => {
                 Some(refused.route)
             }
             _ => None,
@@ -367,11 +368,15 @@ fn the_lanes_of_a_relay_that_is_kept_stay_charged_where_the_next_daemon_finds_no
         world.hosts[0].touch_graph();
     };
     (0..22).for_each(|topic| publish(&mut world, topic, PUBLISHERS));
-    let says = |world: &mut World, link: usize, message: &Message| {
+    let says = |world: &mut World, link: usize, message: &LinkMessage| {
         world.with_raw(0, |raw, _| raw.links[link].say(message));
     };
     let moved = endpoint(EndpointKind::Subscription, gid(0xf0, 0), "/moved");
-    let graph = Message::Graph(Graph { version: 1, added: vec![moved], ..Graph::default() });
+    let graph = LinkMessage::GraphUpdate(GraphUpdate {
+        version: 1,
+        added: vec![moved],
+        ..GraphUpdate::default()
+    });
     let asks = subscribe(21, "/topic_21", gid(0xf0, 1));
     let first = linked_as(&mut world, 0, 0xf0);
     says(&mut world, first, &graph);
@@ -412,7 +417,7 @@ fn control_messages_that_are_not_handled_are_bounded_over_all_links_of_an_identi
     world.run_for(secs(1));
     // 1.1 MB after decompression, and nearly nothing before. All come while the host stands still.
     let long =
-        Message::RouteReady(RouteReady { route: 9, publishers: vec![Gid::default(); 65_536] });
+        LinkMessage::RouteReady(RouteReady { route: 9, publishers: vec![Gid::default(); 65_536] });
     world.stop(0, true);
     for (n, link) in (0..).zip(&links) {
         world.with_raw(0, |raw, _| {
@@ -423,7 +428,8 @@ fn control_messages_that_are_not_handled_are_bounded_over_all_links_of_an_identi
     world.run_for(millis(100));
     world.stop(0, false);
     let served = |world: &World| {
-        let ready = |m: &Message| matches!(m, Message::RouteReady(ready) if ready.route == 1);
+        let ready =
+            |m: &LinkMessage| matches!(m, LinkMessage::RouteReady(ready) if ready.route == 1);
         links.iter().filter(|link| world.raws[0].links[**link].messages.iter().any(ready)).count()
     };
     // All are handled, one after the other.

@@ -17,7 +17,7 @@ use crate::engine::sim::{
 };
 use crate::{
     engine::inbound::StreamHeader,
-    link::{CloseCode, Elected, Hello, LastSeen, Message},
+    link::{CloseCode, Elected, LastSeen, LinkHello, LinkMessage},
     wire::link::samples,
 };
 
@@ -76,13 +76,13 @@ impl Torture {
     }
 
     /// Any message, with numbers and GIDs that mean something here.
-    fn message(&mut self) -> Message {
+    fn message(&mut self) -> LinkMessage {
         let mut all = samples::messages();
         let mut message = all.swap_remove(self.rng.random_range(0..all.len()));
         let (gid, number, route) = (self.gid(), self.number(), self.number() as u32);
         let hello = self.world.raws[0].hello();
         match &mut message {
-            Message::Hello(m) => {
+            LinkMessage::LinkHello(m) => {
                 *m = hello;
                 match self.rng.random_range(0..6) {
                     0 => m.domain = route,
@@ -93,8 +93,8 @@ impl Torture {
                     _ => {}
                 }
             }
-            Message::Elected(m) => *m = Elected { link: gid.0, election: number },
-            Message::Graph(m) => {
+            LinkMessage::Elected(m) => *m = Elected { link: gid.0, election: number },
+            LinkMessage::GraphUpdate(m) => {
                 (m.version, m.before) = (self.number(), if number == 1 { 0 } else { number });
                 m.more = self.rng.random_bool(0.2);
                 m.removed = vec![gid];
@@ -109,7 +109,7 @@ impl Torture {
                     m.added.push(endpoint);
                 }
             }
-            Message::Subscribe(m) => {
+            LinkMessage::Subscribe(m) => {
                 m.route = route;
                 m.kind = self.rng.random_range(0..3);
                 m.topic = if self.rng.random_bool(0.5) { "/scan".into() } else { "/t".into() };
@@ -117,16 +117,18 @@ impl Torture {
                 m.subscribers.iter_mut().for_each(|s| s.gid = gid);
                 m.last = vec![LastSeen { publisher: gid, sequence: number }];
             }
-            Message::Unsubscribe(m) => m.route = route,
-            Message::RouteRefused(m) => m.route = route,
-            Message::RouteUnasked(m) => (m.topic, m.type_name) = ("/t".into(), "T".into()),
-            Message::Denied(m) => m.denied.iter_mut().for_each(|denied| denied.name = "/t".into()),
-            Message::AccessCheck(m) => m.number = number,
-            Message::AccessDecisions(m) => m.number = number,
-            Message::RouteReady(m) => (m.route, m.publishers) = (route, vec![gid]),
-            Message::Asserted(m) => m.publishers = vec![gid],
-            Message::GraphResync(m) => m.version = number,
-            Message::Received(m) => {
+            LinkMessage::Unsubscribe(m) => m.route = route,
+            LinkMessage::RouteRefused(m) => m.route = route,
+            LinkMessage::RouteUnasked(m) => (m.topic, m.type_name) = ("/t".into(), "T".into()),
+            LinkMessage::DeniedUses(m) => {
+                m.denied.iter_mut().for_each(|denied| denied.name = "/t".into())
+            }
+            LinkMessage::LinkAccessCheck(m) => m.number = number,
+            LinkMessage::AccessDecisions(m) => m.number = number,
+            LinkMessage::RouteReady(m) => (m.route, m.publishers) = (route, vec![gid]),
+            LinkMessage::LivelinessAsserted(m) => m.publishers = vec![gid],
+            LinkMessage::GraphResync(m) => m.version = number,
+            LinkMessage::ReceivedUpTo(m) => {
                 for flow in &mut m.flows {
                     (flow.route, flow.publisher) = (route, gid);
                     (flow.sequence, flow.dropped) = (number, number);
@@ -271,10 +273,10 @@ fn honest(raw: &mut Raw, on: usize, greeted: bool) {
     if !greeted || raw.links[on].messages.len() == 1 && raw.daemon == HIGHEST {
         return raw.say_hello(on);
     }
-    let hello = Hello { replaces: Some([1; 16]), ..raw.hello() };
+    let hello = LinkHello { replaces: Some([1; 16]), ..raw.hello() };
     match raw.daemon {
-        LOWEST => raw.links[on].say(&Message::Elected(Elected { link: [1; 16], election: 1 })),
-        _ => raw.links[on].say(&Message::Hello(hello)),
+        LOWEST => raw.links[on].say(&LinkMessage::Elected(Elected { link: [1; 16], election: 1 })),
+        _ => raw.links[on].say(&LinkMessage::LinkHello(hello)),
     }
 }
 

@@ -1,23 +1,23 @@
 use super::*;
 
-fn new() -> Dialler {
-    Dialler::new("sae-a", listed(&["sae-b", "sae-c"]), Cipher::default(), s(3))
+fn new() -> BootstrapDialler {
+    BootstrapDialler::new("sae-a", listed(&["sae-b", "sae-c"]), Cipher::default(), s(3))
 }
 
 /// A dialler that holds key `name` for sae-b since `now`.
-fn holding(now: Duration, name: &str) -> Dialler {
+fn holding(now: Duration, name: &str) -> BootstrapDialler {
     let mut dialler = new();
     give(&mut dialler, now, name);
     dialler
 }
 
-fn give(dialler: &mut Dialler, now: Duration, name: &str) {
+fn give(dialler: &mut BootstrapDialler, now: Duration, name: &str) {
     assert!(matches!(dialler.dial(now, "sae-b"), Dial::Wait { until: None, .. }));
     let request = dialler.poll_request(now).expect("asks for a key");
     dialler.handle_answer(now, key(request, name, 1));
 }
 
-fn attempt(dialler: &mut Dialler, now: Duration) -> Option<KeyId> {
+fn attempt(dialler: &mut BootstrapDialler, now: Duration) -> Option<KeyId> {
     match dialler.dial(now, "sae-b") {
         Dial::DialKey(attempt) => Some(attempt.key_id),
         _ => None,
@@ -32,7 +32,7 @@ fn no_kme_call_for_who_is_no_peer() {
     }
     assert!(dialler.poll_request(s(1)).is_none());
     // Not even under `*`.
-    let mut dialler = Dialler::new("sae-a", QkdPeers::Any, Cipher::default(), s(3));
+    let mut dialler = BootstrapDialler::new("sae-a", QkdPeers::Any, Cipher::default(), s(3));
     let dial = dialler.dial(s(1), "sae-a");
     assert!(matches!(dial, Dial::Refused(DialRefusal::OwnSaeId(_))));
     assert!(dialler.poll_request(s(1)).is_none());
@@ -155,7 +155,7 @@ fn failed_calls_are_spaced_out_up_to_a_minute() {
 
 #[test]
 fn made_up_names_under_a_star_are_bounded() {
-    let mut dialler = Dialler::new("sae-a", QkdPeers::Any, Cipher::default(), s(3));
+    let mut dialler = BootstrapDialler::new("sae-a", QkdPeers::Any, Cipher::default(), s(3));
     let mut asked = 0;
     for i in 0..2000 {
         dialler.dial(s(0), &format!("made-up-{i}"));
@@ -181,11 +181,11 @@ fn answers_nobody_waits_for_are_dropped() {
 /// Attempts and the connections that they lead to keep the PSK: letting go of it erases nothing.
 #[test]
 fn an_expired_refused_mismatched_or_spent_psk_is_erased_in_attempts_under_way() {
-    let psk = |dialler: &mut Dialler| match dialler.dial(s(0), "sae-b") {
+    let psk = |dialler: &mut BootstrapDialler| match dialler.dial(s(0), "sae-b") {
         Dial::DialKey(attempt) => attempt.psk,
         other => panic!("{other:?}"),
     };
-    type End = fn(&mut Dialler);
+    type End = fn(&mut BootstrapDialler);
     let ends: [(&str, End); 5] = [
         ("expired", |dialler| {
             dialler.dial(s(600), "sae-c");

@@ -12,10 +12,10 @@ use axon_tls::{
 use axon_transport::config::QkdPeers;
 use proptest::prelude::*;
 
-use super::{Acceptor, Completion, Dial, DialRefusal, Dialler, Lookup};
+use super::{Acceptor, BootstrapDialler, Completion, Dial, DialRefusal, Lookup};
 use crate::keys::{
     Clock,
-    request::{Answer, Failure, FailureKind, Fetched, KmeRequest},
+    request::{Answer, FailureKind, Fetched, KmeRequest, RequestFailure},
 };
 
 fn ms(millis: u64) -> Duration {
@@ -39,7 +39,7 @@ fn listed(saes: &[&str]) -> QkdPeers {
 }
 
 fn failed(request: KmeRequest, kind: FailureKind) -> Answer {
-    let outcome = Err(Failure::new(kind, "as the test says"));
+    let outcome = Err(RequestFailure::new(kind, "as the test says"));
     Answer { request, took: ms(5), outcome }
 }
 

@@ -7,7 +7,7 @@ use axon_envelope::{Delivery, KmeKey};
 use super::{Pair, id, ms};
 use crate::keys::{
     KeyMessage,
-    request::{Answer, Failure, FailureKind, Fetched, KmeRequest},
+    request::{Answer, FailureKind, Fetched, KmeRequest, RequestFailure},
 };
 
 /// The number of a call for keys.
@@ -49,9 +49,9 @@ fn a_kme_that_asks_for_a_pause_has_it_but_not_for_ever() {
         let answer = pair.kmes.answer(status);
         pair.sender.handle_answer(pair.now, answer);
         let request = pair.sender.poll_request(pair.now).unwrap();
-        let busy = Failure {
+        let busy = RequestFailure {
             retry_after: Some(asked),
-            ..Failure::new(FailureKind::Unavailable, "the KME is busy")
+            ..RequestFailure::new(FailureKind::Unavailable, "the KME is busy")
         };
         pair.sender.handle_answer(pair.now, Answer { request, took: ms(10), outcome: Err(busy) });
         while pair.now < pause {

@@ -12,7 +12,7 @@ use axon_envelope::{Delivery, IndexMask, KeyId, Kind, KmeKey, OpenError, Route, 
 use super::{KeyReceiver, KeySender, NoKey};
 use crate::keys::{
     Exporters, KeyMessage,
-    request::{Answer, Failure, FailureKind, Fetched, KmeRequest, Stock},
+    request::{Answer, FailureKind, Fetched, KmeRequest, RequestFailure, Stock},
 };
 
 const ROUTE: Route = Route { kind: Kind::Topic, topic: TopicHash([7; 16]) };
@@ -44,7 +44,7 @@ struct Kmes {
 
 impl Kmes {
     fn answer(&mut self, request: KmeRequest) -> Answer {
-        let failure = |kind| Err(Failure::new(kind, format!("{kind:?}")));
+        let failure = |kind| Err(RequestFailure::new(kind, format!("{kind:?}")));
         let outcome = match (&request, self.failures.pop()) {
             (_, Some(kind)) => failure(kind),
             (KmeRequest::Status { .. }, _) => {

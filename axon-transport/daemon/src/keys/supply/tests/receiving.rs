@@ -5,7 +5,7 @@ use axon_envelope::{Delivery, KeyId};
 use super::{Pair, exporters, id, ms, retire};
 use crate::keys::{
     KeyMessage,
-    request::{Answer, Failure, FailureKind},
+    request::{Answer, FailureKind, RequestFailure},
 };
 
 #[test]
@@ -112,9 +112,9 @@ fn the_next_try_of_dec_keys_is_when_the_kme_says() {
         let (key_id, _) = pair.kmes.issue();
         pair.receiver.handle_message(pair.now, 1, &KeyMessage::Announce(vec![key_id])).unwrap();
         let request = pair.receiver.poll_request(pair.now).unwrap();
-        let busy = Failure {
+        let busy = RequestFailure {
             retry_after: Some(asked),
-            ..Failure::new(FailureKind::Unavailable, "the KME is busy")
+            ..RequestFailure::new(FailureKind::Unavailable, "the KME is busy")
         };
         pair.receiver.handle_answer(pair.now, Answer { request, took: ms(10), outcome: Err(busy) });
         assert_eq!(pair.receiver.poll_timeout(), Some(pause));

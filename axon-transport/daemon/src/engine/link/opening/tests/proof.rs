@@ -18,14 +18,14 @@ const LIMIT: Duration = Duration::from_secs(15);
 const EXPORTER: [u8; 32] = [!1; 32];
 
 /// The READY of a client that has this key, on the connection with this exporter.
-fn ready(key_id: &str, key: [u8; 32], exporter: [u8; 32]) -> Message {
+fn ready(key_id: &str, key: [u8; 32], exporter: [u8; 32]) -> LinkMessage {
     let (key_id, key) = (id(key_id), KmeKey::from_slice(&key).unwrap());
     let proof = proof::compute(&key, &key_id, &exporter);
-    Message::Keys(KeyMessage::Ready { key_id, proof })
+    LinkMessage::Keys(KeyMessage::Ready { key_id, proof })
 }
 
-fn announce(key_ids: &[&str]) -> Message {
-    Message::Keys(KeyMessage::Announce(key_ids.iter().map(|key_id| id(key_id)).collect()))
+fn announce(key_ids: &[&str]) -> LinkMessage {
+    LinkMessage::Keys(KeyMessage::Announce(key_ids.iter().map(|key_id| id(key_id)).collect()))
 }
 
 /// `key-1` of the fake KMEs.
@@ -53,7 +53,7 @@ fn counts(key_mode: KeyMode, fail: impl Fn(&mut End, &mut Kmes)) -> bool {
         facts.negotiated = Some(psk(&format!("bootstrap-{number}")));
         let mut end = End::with(NOW, facts, &settings, Some(ring));
         end.opening.handle_recorded(NOW, true, end.ring.as_mut());
-        end.hears(NOW, &Message::Hello(theirs(Side::Server, Some(key_mode))));
+        end.hears(NOW, &LinkMessage::LinkHello(theirs(Side::Server, Some(key_mode))));
         fail(&mut end, &mut kmes);
         let End { opening, ring: after, .. } = end;
         drop(opening);
@@ -70,9 +70,9 @@ fn nothing_but_key_messages_and_keepalives_comes_during_the_proof() {
                 let mut end = End::greeted(NOW, side, key_mode);
                 end.hears(NOW, &message);
                 match message {
-                    Message::Keepalive => assert!(end.outcome(NOW).is_none()),
+                    LinkMessage::Keepalive => assert!(end.outcome(NOW).is_none()),
                     // Of two keys, which the test below looks at.
-                    Message::Keys(KeyMessage::Announce(_)) if side == Side::Client => {}
+                    LinkMessage::Keys(KeyMessage::Announce(_)) if side == Side::Client => {}
                     _ => drop(end.refuses(NOW, "OUT_OF_ORDER")),
                 }
             }
@@ -159,7 +159,7 @@ fn failed_proofs_make_further_handshakes_wait() {
             ("FAILED", |end| {
                 let Some(key_id) = end.announced.clone() else { unreachable!() };
                 let failed = KeyMessage::Failed { key_id, reason: "no".into() };
-                end.hears(NOW, &Message::Keys(failed));
+                end.hears(NOW, &LinkMessage::Keys(failed));
                 end.refuses(NOW, "KEY_SUPPLY");
             }),
             ("the connection was lost", |end| {
@@ -180,9 +180,9 @@ fn failed_proofs_make_further_handshakes_wait() {
 }
 
 /// The key that a message announces.
-fn key_of(message: Message) -> Option<KeyId> {
+fn key_of(message: LinkMessage) -> Option<KeyId> {
     match message {
-        Message::Keys(KeyMessage::Announce(key_ids)) => key_ids.into_iter().next(),
+        LinkMessage::Keys(KeyMessage::Announce(key_ids)) => key_ids.into_iter().next(),
         _ => None,
     }
 }
@@ -271,7 +271,7 @@ fn connection_without_exporters_is_refused() {
             let facts = Handshake { exporters: None, ..facts(side, Some(key_mode)) };
             let mut end = End::with(NOW, facts, &settings, Keyring::new(&settings));
             end.opening.handle_recorded(NOW, true, end.ring.as_mut());
-            end.hears(NOW, &Message::Hello(theirs(side, Some(key_mode))));
+            end.hears(NOW, &LinkMessage::LinkHello(theirs(side, Some(key_mode))));
             assert_eq!(end.refuses(NOW, "INTERNAL"), "no TLS exporter");
         }
     }

@@ -5,7 +5,7 @@ use axon_tls::qkd::PskResolver;
 
 use super::*;
 use crate::link::{MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED};
-use crate::{keys::Lookup, link::Graph, wire::link::samples::elected};
+use crate::{keys::Lookup, link::GraphUpdate, wire::link::samples::elected};
 
 const PROOF: [(Side, &str); 4] = [
     (Side::Client, "HELLO"),
@@ -15,10 +15,10 @@ const PROOF: [(Side, &str); 4] = [
 ];
 
 /// The daemon with the lower id elects, and nothing else comes before.
-fn awaits_election(client: &mut Opened, server: &mut Opened) {
+fn awaits_election(client: &mut OpenedConnection, server: &mut OpenedConnection) {
     assert_eq!((client.hello.daemon, server.hello.daemon), (SERVER, CLIENT));
     assert!(client.order.accept(&elected()).is_err(), "the client has the lower id");
-    let graph = Message::Graph(Graph::default());
+    let graph = LinkMessage::GraphUpdate(GraphUpdate::default());
     assert!(server.order.accept(&graph).is_err());
     server.order.accept(&elected()).unwrap();
     server.order.elected();
@@ -112,7 +112,7 @@ fn limits_of_frames_grow_with_the_trust() {
 
     let mut end = End::awaiting_hello(s(1), Side::Server, None);
     assert_eq!(end.opening.limits(), limits(least, least));
-    end.hears(s(1), &Message::Hello(theirs(Side::Server, None)));
+    end.hears(s(1), &LinkMessage::LinkHello(theirs(Side::Server, None)));
     assert_eq!(end.opening.limits(), most);
 
     let end = End::announced(s(1), KeyMode::Session, &mut Kmes::default());
@@ -132,7 +132,7 @@ fn keepalives_during_the_proof_are_skipped() {
             pair.pass();
         }
         for end in [&mut pair.client, &mut pair.server] {
-            end.inbox.push_back(Message::Keepalive);
+            end.inbox.push_back(LinkMessage::Keepalive);
         }
         pair.run();
         pair.server.opened();
@@ -143,7 +143,7 @@ fn keepalives_during_the_proof_are_skipped() {
 #[test]
 fn hello_of_a_dial_names_the_expected_daemon() {
     let settings = Config::default();
-    let dialled = Hello { expects: Some(SERVER), ..ours(Side::Client, &settings) };
+    let dialled = LinkHello { expects: Some(SERVER), ..ours(Side::Client, &settings) };
     let client = End::greeting(s(1), dialled, facts(Side::Client, None), &settings, None);
     let mut pair = Pair { client, ..Pair::new(None) };
     pair.run();

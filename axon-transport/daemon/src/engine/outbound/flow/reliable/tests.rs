@@ -26,7 +26,7 @@ struct Way {
     credit: Rc<PeerCredit>,
     reliable: ReliableStream,
     counters: Counters,
-    done: Done,
+    done: FlowProgress,
     offered: u64,
 }
 
@@ -42,7 +42,7 @@ impl Way {
             reliable: ReliableStream::new(credit.share()),
             credit,
             counters: Counters::default(),
-            done: Done::default(),
+            done: FlowProgress::default(),
             offered: 0,
         }
     }
@@ -123,7 +123,7 @@ fn samples_follow_the_header_on_one_stream_and_stay_until_they_are_acknowledged(
     let last: Vec<_> = bytes[header.len()..].chunks(each).map(|frame| frame[each - 1]).collect();
     assert_eq!((last, is_finished), (vec![1, 2, 3, 4, 5], false));
     assert!(way.queue.has_sent() && way.reliable.credit().is_used());
-    assert_eq!(way.done, Done::default(), "the peer says what it has");
+    assert_eq!(way.done, FlowProgress::default(), "the peer says what it has");
     way.queue.acknowledge(5);
     way.reliable.note_sent(&way.queue);
     assert!(!way.reliable.credit().is_used());
@@ -134,7 +134,7 @@ fn samples_that_nobody_acknowledges_are_done_with_once_quic_has_them() {
     let mut way = Way::new(false);
     way.offer(3, 10);
     assert_eq!(way.write(), FlowPause::Empty);
-    assert_eq!(way.done, Done { sequence: Some(3), given_up: 0 });
+    assert_eq!(way.done, FlowProgress { sequence: Some(3), given_up: 0 });
     assert!(way.queue.is_empty() && !way.reliable.credit().is_used());
 }
 
@@ -205,7 +205,7 @@ fn a_peer_that_stops_the_stream_gets_no_sample_of_it_again() {
     way.pair.stop(stream);
     let Way { pair, info, queue, counters, done, reliable, .. } = &mut way;
     reliable.handle_stopped(pair.client(), info, queue, counters, done);
-    assert_eq!(way.done, Done { sequence: Some(3), given_up: 3 });
+    assert_eq!(way.done, FlowProgress { sequence: Some(3), given_up: 3 });
     assert!(!way.reliable.is_open() && way.queue.is_empty());
     assert_eq!(way.counters.take_lost().iter().map(|loss| loss.samples).sum::<u64>(), 3);
     way.offer(1, 10);
@@ -221,7 +221,7 @@ fn a_stop_that_quic_tells_while_a_sample_is_written_is_the_same() {
     way.pair.stop(way.stream());
     way.offer(1, 10);
     assert_eq!(way.write(), FlowPause::Empty);
-    assert_eq!(way.done, Done { sequence: Some(2), given_up: 2 });
+    assert_eq!(way.done, FlowProgress { sequence: Some(2), given_up: 2 });
     assert!(!way.reliable.is_open());
 }
 

@@ -22,7 +22,7 @@ use crate::{
             world::{Pair, World},
         },
     },
-    link::{AccessCheck, AccessDecisions, Message, UseDecision},
+    link::{AccessDecisions, LinkAccessCheck, LinkMessage, UseDecision},
 };
 
 /// Rules that deny nothing.
@@ -270,24 +270,24 @@ fn a_peer_that_ignores_rules_receives_and_delivers_nothing() {
     world.run_for(secs(3));
     let heard = &world.raws[0].links[on].messages;
     let refused = heard.iter().find_map(|message| match message {
-        Message::RouteRefused(refused) if refused.route == 3 => Some(&refused.reason),
+        LinkMessage::RouteRefused(refused) if refused.route == 3 => Some(&refused.reason),
         _ => None,
     });
     assert_eq!(refused.unwrap(), "denied by line 4 of access.toml");
     let told = heard.iter().find_map(|message| match message {
-        Message::Denied(denied) => Some(denied.denied.clone()),
+        LinkMessage::DeniedUses(denied) => Some(denied.denied.clone()),
         _ => None,
     });
     let told = told.unwrap();
     assert_eq!((told.len(), told[0].verb, &*told[0].name), (1, 0, "/in"));
     for message in heard {
         match message {
-            Message::Graph(graph) => {
+            LinkMessage::GraphUpdate(graph) => {
                 let topics: Vec<_> = graph.added.iter().map(|e| e.topic.as_str()).collect();
                 assert!(!topics.contains(&"/out") && !topics.contains(&"/in"), "{topics:?}");
             }
-            Message::Subscribe(subscribe) => panic!("asked for {subscribe:?}"),
-            Message::RouteReady(ready) => panic!("served {ready:?}"),
+            LinkMessage::Subscribe(subscribe) => panic!("asked for {subscribe:?}"),
+            LinkMessage::RouteReady(ready) => panic!("served {ready:?}"),
             _ => {}
         }
     }
@@ -382,7 +382,7 @@ fn answers_that_nobody_asked_for_and_questions_out_of_bounds_change_nothing() {
     world.run_for(millis(200));
     let decision = |reason: &str| UseDecision { allowed: true, reason: reason.to_owned() };
     let answer =
-        |number, decisions| Message::AccessDecisions(AccessDecisions { number, decisions });
+        |number, decisions| LinkMessage::AccessDecisions(AccessDecisions { number, decisions });
     say(&mut world, on, &answer(1, vec![decision("unasked")]));
     world.run_for(millis(200));
     assert!(world.hosts[0].decisions.is_empty());
@@ -404,18 +404,18 @@ fn answers_that_nobody_asked_for_and_questions_out_of_bounds_change_nothing() {
     // A flood of questions is answered at the rate of control messages, and the link stands.
     for number in 0..FLOOD {
         let uses = vec![used.clone(); MOST_CHECKED];
-        say(&mut world, on, &Message::AccessCheck(AccessCheck { number, uses }));
+        say(&mut world, on, &LinkMessage::LinkAccessCheck(LinkAccessCheck { number, uses }));
     }
     world.run_for(secs(1));
     let answers = |world: &World| {
         let heard = &world.raws[0].links[on].messages;
-        heard.iter().filter(|message| matches!(message, Message::AccessDecisions(_))).count()
+        heard.iter().filter(|message| matches!(message, LinkMessage::AccessDecisions(_))).count()
     };
     let first = answers(&world);
     assert!((1..FLOOD as usize).contains(&first), "{first} at once");
     world.until(secs(120), |world| answers(world) == FLOOD as usize);
     let uses = vec![used; MOST_CHECKED + 1];
-    say(&mut world, on, &Message::AccessCheck(AccessCheck { number: 0, uses }));
+    say(&mut world, on, &LinkMessage::LinkAccessCheck(LinkAccessCheck { number: 0, uses }));
     world.run_for(secs(1));
     assert!(world.hosts[0].refusals.iter().any(|(_, why)| why.contains("out of bounds")));
 }

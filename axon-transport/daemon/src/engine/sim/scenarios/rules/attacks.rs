@@ -27,7 +27,7 @@ use crate::{
         tests::{millis, secs},
         world::World,
     },
-    link::{Graph, Message, RouteSubscriber, Subscribe},
+    link::{GraphUpdate, LinkMessage, RouteSubscriber, Subscribe},
 };
 
 /// A host with rules, and a peer without a daemon of ours.
@@ -48,7 +48,7 @@ fn open(world: &mut World, on: usize, bytes: Vec<u8>) -> Option<quinn_proto::Str
 
 /// Whether the host asks for this topic on a link.
 fn asks(world: &World, on: usize, topic: &str) -> bool {
-    let asks = |m: &Message| matches!(m, Message::Subscribe(s) if s.topic == topic);
+    let asks = |m: &LinkMessage| matches!(m, LinkMessage::Subscribe(s) if s.topic == topic);
     world.raws[0].links[on].messages.iter().any(asks)
 }
 
@@ -78,13 +78,17 @@ fn calls_and_answers_that_rules_deny_reach_nobody_whatever_the_peer_sends() {
     });
     let added: Vec<_> = endpoints.collect();
     let gids: Vec<_> = added.iter().map(|endpoint| endpoint.gid).collect();
-    say(&mut world, on, &Message::Graph(Graph { version: 1, added, ..Graph::default() }));
+    say(
+        &mut world,
+        on,
+        &LinkMessage::GraphUpdate(GraphUpdate { version: 1, added, ..GraphUpdate::default() }),
+    );
     // It also asks for what it may not have: requests of the client, and responses of the server. A host takes the
     // responses of servers that take its requests.
     let asks_for =
         [("/open", 100, 1, gids[1]), ("/closed", 101, 1, gids[3]), ("/closed", 102, 2, gids[2])];
     for (name, route, kind, reader) in asks_for {
-        let message = Message::Subscribe(Subscribe {
+        let message = LinkMessage::Subscribe(Subscribe {
             route,
             topic: name.into(),
             type_name: "T".into(),
@@ -117,7 +121,7 @@ fn calls_and_answers_that_rules_deny_reach_nobody_whatever_the_peer_sends() {
     assert!(!asks(&world, on, "/closed"));
     let messages = &world.raws[0].links[on].messages;
     let refused = messages.iter().filter_map(|message| match message {
-        Message::RouteRefused(refused) => Some((refused.route, &*refused.reason)),
+        LinkMessage::RouteRefused(refused) => Some((refused.route, &*refused.reason)),
         _ => None,
     });
     let refused: Vec<_> = refused.collect();
@@ -169,7 +173,7 @@ fn samples_and_requests_that_go_on_after_rules_deny_them_reach_nobody() {
         assert_eq!(world.raws[0].links[on].opened.len(), before, "no sample was sent");
         assert!(!asks(&world, on, "/t"));
         let messages = &world.raws[0].links[on].messages;
-        assert!(messages.iter().any(|message| matches!(message, Message::RouteRefused(_))));
+        assert!(messages.iter().any(|message| matches!(message, LinkMessage::RouteRefused(_))));
         assert!(denied(&world, 0).contains("publish /t"), "{}", denied(&world, 0));
 
         world.hosts[0].set_access(OPEN);
@@ -197,8 +201,8 @@ fn requests_that_a_limit_holds_reach_nobody_once_rules_deny_them() {
         let client = Endpoint::new(of_raw(1), EndpointKind::Client, "/set", "T")
             .with_qos(Qos::keep_all())
             .with_node("node", "/");
-        let graph = Graph { version: 1, added: vec![client], ..Graph::default() };
-        say(&mut world, on, &Message::Graph(graph));
+        let graph = GraphUpdate { version: 1, added: vec![client], ..GraphUpdate::default() };
+        say(&mut world, on, &LinkMessage::GraphUpdate(graph));
         let route = asked(&mut world, on, "/set");
         let requests = messages(Kind::Request, route, "/set", (of_raw(1), of_raw(1)), 1..=4);
         open(&mut world, on, requests);
@@ -226,11 +230,14 @@ fn rules_that_change_between_handshake_and_election_or_within_a_succession_count
     world.run_for(millis(1));
     say(&mut world, first, &elect(1));
     let publish = |world: &mut World, on: usize, version: u64| {
-        let Message::Graph(mut graph) = publishes("/t", of_raw(1), Qos::keep_all()) else { return };
+        let LinkMessage::GraphUpdate(mut graph) = publishes("/t", of_raw(1), Qos::keep_all())
+        else {
+            return;
+        };
         let other = publishes("/other", of_raw(2), Qos::keep_all());
-        let Message::Graph(other) = other else { return };
+        let LinkMessage::GraphUpdate(other) = other else { return };
         graph.added.extend(other.added);
-        say(world, on, &Message::Graph(Graph { version, ..graph }));
+        say(world, on, &LinkMessage::GraphUpdate(GraphUpdate { version, ..graph }));
     };
     publish(&mut world, first, 1);
     asked(&mut world, first, "/other");
@@ -295,13 +302,19 @@ fn daemons_of_one_identity_have_its_rules_and_share_its_bucket() {
         let on = linked_as(&mut world, 0, id);
         let publisher = gid(id, 1);
         let graph = |topic, number| {
-            let Message::Graph(graph) = publishes(topic, gid(id, number), Qos::keep_all()) else {
+            let LinkMessage::GraphUpdate(graph) =
+                publishes(topic, gid(id, number), Qos::keep_all())
+            else {
                 unreachable!()
             };
             graph.added
         };
         let added = [graph("/t", 1), graph("/closed", 2)].concat();
-        say(&mut world, on, &Message::Graph(Graph { version: 1, added, ..Graph::default() }));
+        say(
+            &mut world,
+            on,
+            &LinkMessage::GraphUpdate(GraphUpdate { version: 1, added, ..GraphUpdate::default() }),
+        );
         let route = asked(&mut world, on, "/t");
         open(&mut world, on, samples(route, "/t", publisher, 1..=50));
         for route in route..route + 3 {
@@ -340,14 +353,15 @@ fn a_denied_peer_neither_speaks_for_an_endpoint_of_a_permitted_one_nor_keeps_it_
         let on = dial(&mut world, 0);
         greet(&mut world, on, None);
         say(&mut world, on, &elect(1));
-        let Message::Graph(mut graph) = publishes("/cmd_vel", publisher, Qos::keep_all()) else {
+        let LinkMessage::GraphUpdate(mut graph) = publishes("/cmd_vel", publisher, Qos::keep_all())
+        else {
             unreachable!()
         };
-        let Message::Graph(other) = publishes("/open", of_raw(2), Qos::keep_all()) else {
+        let LinkMessage::GraphUpdate(other) = publishes("/open", of_raw(2), Qos::keep_all()) else {
             unreachable!()
         };
         graph.added.extend(other.added);
-        say(&mut world, on, &Message::Graph(graph));
+        say(&mut world, on, &LinkMessage::GraphUpdate(graph));
         let route = asked(&mut world, on, "/open");
         let pretend = |world: &mut World, numbers: std::ops::RangeInclusive<u64>| {
             for route in [route, route + 1, route + 2] {

@@ -14,7 +14,7 @@ use crate::{
             world::World,
         },
     },
-    link::{CloseCode, GraphResync, Hello, Message},
+    link::{CloseCode, GraphResync, LinkHello, LinkMessage},
 };
 
 /// A host, and so many hand-driven peers.
@@ -32,8 +32,8 @@ fn greets(world: &mut World, id: u8, replaces: Option<[u8; 16]>) -> usize {
     let number = world.with_raw(0, |raw, now| raw.dial(to, now));
     world.until(secs(5), |world| world.raws[0].links[number].connected);
     world.with_raw(0, |raw, _| {
-        let hello = Hello { daemon: DaemonId([id; 16]), replaces, ..raw.hello() };
-        raw.links[number].say(&Message::Hello(hello));
+        let hello = LinkHello { daemon: DaemonId([id; 16]), replaces, ..raw.hello() };
+        raw.links[number].say(&LinkMessage::LinkHello(hello));
     });
     number
 }
@@ -72,7 +72,7 @@ fn of_the_superseded_links_of_an_identity_the_newest_eight_stand() {
     for _ in 0..RENEWED {
         let old = &world.raws[0].links[*links.last().unwrap()];
         let elected = old.messages.iter().find_map(|message| match message {
-            Message::Elected(elected) => Some(elected.link),
+            LinkMessage::Elected(elected) => Some(elected.link),
             _ => None,
         });
         let number = greets(&mut world, 0xff, elected);
@@ -114,7 +114,7 @@ fn most_unread(seed: u64, links: u8) -> usize {
         assert!(world.now < secs(200), "as much as it likes: {most} bytes");
         for link in &links {
             world.with_raw(0, |raw, _| {
-                raw.links[*link].say(&Message::GraphResync(GraphResync { version: 0 }));
+                raw.links[*link].say(&LinkMessage::GraphResync(GraphResync { version: 0 }));
             });
         }
         world.run_for(millis(1_100));
@@ -164,7 +164,7 @@ fn a_daemon_id_is_served_as_many_routes_as_hello_says_and_no_more() {
     let refused = |world: &World| -> Vec<(u32, String)> {
         let messages = world.raws[0].links[number].messages.iter();
         let refused = messages.filter_map(|message| match message {
-            Message::RouteRefused(refused) => Some((refused.route, refused.reason.clone())),
+            LinkMessage::RouteRefused(refused) => Some((refused.route, refused.reason.clone())),
             _ => None,
         });
         refused.collect()
@@ -188,12 +188,12 @@ fn a_whole_graph_is_sent_once_a_second_however_often_it_is_asked_for() {
     world.run_for(secs(5));
     let whole = |world: &World| {
         let graphs = world.raws[0].links[number].messages.iter();
-        graphs.filter(|m| matches!(m, Message::Graph(graph) if graph.before == 0)).count()
+        graphs.filter(|m| matches!(m, LinkMessage::GraphUpdate(graph) if graph.before == 0)).count()
     };
     let before = whole(&world);
     for _ in 0..100 {
         world.with_raw(0, |raw, _| {
-            raw.links[number].say(&Message::GraphResync(GraphResync { version: 0 }));
+            raw.links[number].say(&LinkMessage::GraphResync(GraphResync { version: 0 }));
         });
         world.run_for(millis(50));
     }

@@ -17,7 +17,7 @@ use crate::{
         tests::{millis, secs},
         world::World,
     },
-    link::{Graph, Message},
+    link::{GraphUpdate, LinkMessage},
 };
 
 /// Endpoints that the peer announces, each with four names of 500 bytes: 24 MB.
@@ -51,14 +51,14 @@ fn a_stream_of_another_host_goes_on_while_a_peer_announces_12_000_long_endpoints
     // All parts are there at once, as far as QUIC takes them.
     for from in (0..MANY).step_by(PART as usize) {
         let to = MANY.min(from + PART);
-        let graph = Graph {
+        let graph = GraphUpdate {
             version: to.into(),
             before: from.into(),
             added: (from..to).map(long).collect(),
             more: to < MANY,
-            ..Graph::default()
+            ..GraphUpdate::default()
         };
-        world.with_raw(0, |raw, _| raw.links[number].say(&Message::Graph(graph)));
+        world.with_raw(0, |raw, _| raw.links[number].say(&LinkMessage::GraphUpdate(graph)));
     }
     let heard = |world: &World| world.hosts[0].heard_endpoints();
     let (before, start) = (world.hosts[0].handled(), world.now);

@@ -18,7 +18,7 @@ use crate::{
         tests::{millis, secs},
         world::{Pair, World},
     },
-    link::{Graph, Hello, Message, RouteSubscriber, Subscribe},
+    link::{GraphUpdate, LinkHello, LinkMessage, RouteSubscriber, Subscribe},
 };
 
 /// Between two samples.
@@ -70,14 +70,14 @@ impl Held {
             // Higher than any other, so that elections are the other side's.
             let mut daemon = DaemonId([0xff; 16]);
             daemon.0[15] = id;
-            let hello = Hello { daemon, replaces, ..raw.hello() };
-            raw.links[link].say(&Message::Hello(hello));
+            let hello = LinkHello { daemon, replaces, ..raw.hello() };
+            raw.links[link].say(&LinkMessage::LinkHello(hello));
         });
         world.until(secs(5), |world| world.raws[0].links[link].is_elected());
         let endpoint = Endpoint::new(SUBSCRIPTION, EndpointKind::Subscription, "/t", "T")
             .with_qos(Qos::keep_all())
             .with_node("idle", "/");
-        let graph = Graph { version: 1, added: vec![endpoint], ..Graph::default() };
+        let graph = GraphUpdate { version: 1, added: vec![endpoint], ..GraphUpdate::default() };
         let subscribe = Subscribe {
             route: 1,
             topic: "/t".into(),
@@ -88,7 +88,7 @@ impl Held {
             acknowledges: Some(true),
             short_headers: None,
         };
-        let mut says = [Message::Graph(graph), Message::Subscribe(subscribe)];
+        let mut says = [LinkMessage::GraphUpdate(graph), LinkMessage::Subscribe(subscribe)];
         if replaces.is_some() {
             // A route that is asked for before the graph goes on.
             says.reverse();
@@ -100,7 +100,7 @@ impl Held {
     /// What host 0 calls a link of the peer.
     fn name(&self, link: usize) -> Option<[u8; 16]> {
         self.world.raws[0].links[link].messages.iter().find_map(|message| match message {
-            Message::Elected(elected) => Some(elected.link),
+            LinkMessage::Elected(elected) => Some(elected.link),
             _ => None,
         })
     }
