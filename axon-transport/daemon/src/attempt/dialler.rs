@@ -24,7 +24,7 @@ use crate::{
         credentials::Credentials,
         keyring::{Answered, Keyring},
         link::{
-            dialling::{Action, Dialling},
+            dialling::{DialAction, Dialling},
             failure::{HELLO_TIMEOUT, close_text},
             opening::{Handshake, OpenedConnection, Opening, RefusedConnection},
             target::{DialTarget, UNKNOWN_PSK_IDENTITY},
@@ -136,7 +136,7 @@ impl AttemptDialler {
             while let Some(action) = dialling.poll_action(now, self.keyring().filter(|_| own_keys))
             {
                 match action {
-                    Action::Connect { address, attempt } => {
+                    DialAction::Connect { address, attempt } => {
                         match self.credentials.client(forged.or(attempt.as_deref()), address.ip()) {
                             Ok(client) => match self.begin(client, address) {
                                 Ok(begun) => connecting = Some(begun),
@@ -145,17 +145,17 @@ impl AttemptDialler {
                             Err(error) => dialling.handle_unusable(error),
                         }
                     }
-                    Action::Close { code, reason } => {
+                    DialAction::Close { code, reason } => {
                         connecting = None;
                         if let Some(connection) = connected.take() {
                             close(&connection, code, reason);
                         }
                     }
-                    Action::Open => {
+                    DialAction::Open => {
                         let none = || internal("the dial ended without a connection");
                         return connected.ok_or_else(none);
                     }
-                    Action::Failed(refusal) => return Err(refusal),
+                    DialAction::Failed(refusal) => return Err(refusal),
                 }
             }
             tokio::select! {

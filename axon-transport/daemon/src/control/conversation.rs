@@ -20,7 +20,7 @@ use axon_transport::internal::{
 use tokio::{io::unix::AsyncFd, sync::Notify};
 
 use super::{
-    plane::Control,
+    plane::ControlPlane,
     report::send_status,
     room::{DescriptorRoom, SpareDescriptors},
     turns::{PART, ProcessTurn},
@@ -34,7 +34,7 @@ const REST: usize = 1000;
 
 /// Moves packets both ways until the session ends; why it did.
 pub(super) async fn converse(
-    control: &Rc<RefCell<Control>>,
+    control: &Rc<RefCell<ControlPlane>>,
     socket: &AsyncFd<PassedFd>,
     id: SessionId,
     bell: &Rc<Notify>,
@@ -108,7 +108,7 @@ pub(super) async fn converse(
 /// Takes what a session sent before its process or its connection ended: memory in which its readers find
 /// the last samples.
 async fn take_rest(
-    control: &Rc<RefCell<Control>>,
+    control: &Rc<RefCell<ControlPlane>>,
     socket: &AsyncFd<PassedFd>,
     id: &SessionId,
     bell: &Rc<Notify>,
@@ -137,7 +137,7 @@ enum Sent {
 
 /// Sends what waits for a session, for as long as a turn is.
 fn send_some(
-    control: &Rc<RefCell<Control>>,
+    control: &Rc<RefCell<ControlPlane>>,
     socket: &AsyncFd<PassedFd>,
     id: &SessionId,
     bell: &Rc<Notify>,
@@ -155,7 +155,7 @@ fn send_some(
 }
 
 fn send_packets(
-    control: &mut Control,
+    control: &mut ControlPlane,
     socket: &AsyncFd<PassedFd>,
     id: &SessionId,
 ) -> Result<Sent, SocketError> {
@@ -208,7 +208,7 @@ pub(super) fn receive(
 /// Takes packets for as long as a turn is, or until as many as `unread` wait for the session to read them;
 /// whether the socket is empty now.
 fn receive_some(
-    control: &Rc<RefCell<Control>>,
+    control: &Rc<RefCell<ControlPlane>>,
     socket: &AsyncFd<PassedFd>,
     id: &SessionId,
     bell: &Rc<Notify>,
@@ -220,7 +220,7 @@ fn receive_some(
         return Err("it came back on another connection".into());
     }
     let (mut outcome, begin) = (Ok(false), Instant::now());
-    let queued = |c: &Control| c.registry.session(id).map_or(0, SessionEntry::queued);
+    let queued = |c: &ControlPlane| c.registry.session(id).map_or(0, SessionEntry::queued);
     while begin.elapsed() < PART && queued(control) < unread {
         match receive(&control.spare, socket.get_ref(), buffer) {
             Ok(Received { message: Message::StatusRequest, .. }) => send_status(control, id),
@@ -270,7 +270,7 @@ fn receive_some(
 }
 
 /// Why the daemon has no descriptor for another segment of a session, if so.
-fn no_room_for_segment(control: &Control, id: &SessionId) -> Option<String> {
+fn no_room_for_segment(control: &ControlPlane, id: &SessionId) -> Option<String> {
     let pid = control.registry.session(id)?.pid;
     DescriptorRoom::of(&control.registry, pid)?.refuses_segment()
 }

@@ -20,7 +20,7 @@ use tokio::{
 
 use super::{
     listen::{InternalPeer, serve},
-    plane::Control,
+    plane::ControlPlane,
 };
 use crate::bridge::{CHANNEL, GatewayParts, ToControl, ToGateway};
 
@@ -44,7 +44,7 @@ pub(super) struct RunningGateway {
 impl RunningGateway {
     /// Starts one.
     pub(super) fn start(
-        control: &Rc<RefCell<Control>>,
+        control: &Rc<RefCell<ControlPlane>>,
         entry: GatewayEntry,
     ) -> std::io::Result<Self> {
         let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
@@ -81,7 +81,10 @@ impl RunningGateway {
     ///
     /// # Errors
     /// Why it does not.
-    pub(super) async fn stands(&mut self, control: &Rc<RefCell<Control>>) -> Result<(), String> {
+    pub(super) async fn stands(
+        &mut self,
+        control: &Rc<RefCell<ControlPlane>>,
+    ) -> Result<(), String> {
         let started = async {
             tokio::select! {
                 // One that stood and failed since then did stand.

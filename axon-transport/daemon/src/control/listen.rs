@@ -37,7 +37,7 @@ use super::{
     conversation::{converse, say},
     first::{FirstMessage, first},
     pending::{MOST, MOST_WHERE_SHORT, PendingConnections, Stranger},
-    plane::Control,
+    plane::ControlPlane,
     room::DescriptorRoom,
     turns::ProcessTurn,
 };
@@ -53,7 +53,7 @@ const HELLO: Duration = Duration::from_secs(5);
 const PAUSE: Duration = Duration::from_millis(50);
 
 /// Accepts sessions for as long as it is polled.
-pub(super) async fn accept(control: Rc<RefCell<Control>>, listeners: Vec<OwnedFd>) {
+pub(super) async fn accept(control: Rc<RefCell<ControlPlane>>, listeners: Vec<OwnedFd>) {
     let strangers = PendingConnections::default();
     let mut listeners = listeners.into_iter();
     // A path, a name, or both.
@@ -66,7 +66,7 @@ pub(super) async fn accept(control: Rc<RefCell<Control>>, listeners: Vec<OwnedFd
 }
 
 async fn accept_at(
-    control: Rc<RefCell<Control>>,
+    control: Rc<RefCell<ControlPlane>>,
     listener: OwnedFd,
     strangers: PendingConnections,
 ) {
@@ -134,7 +134,7 @@ const AWAIT_PROCESS: Duration = Duration::from_secs(1);
 
 /// Serves one connection to its end. It is a `stranger` until it said HELLO.
 pub(super) async fn serve(
-    control: Rc<RefCell<Control>>,
+    control: Rc<RefCell<ControlPlane>>,
     socket: PassedFd,
     inside: InternalPeer,
     stranger: Option<Stranger>,
@@ -193,7 +193,11 @@ pub(super) async fn serve(
 
 /// Waits until the process of a session that hung up has ended, if readers are to be handed what it left. It may come
 /// back before.
-async fn await_process(control: &RefCell<Control>, id: &SessionId, death: &AsyncFd<Arc<PassedFd>>) {
+async fn await_process(
+    control: &RefCell<ControlPlane>,
+    id: &SessionId,
+    death: &AsyncFd<Arc<PassedFd>>,
+) {
     while control.borrow().registry.awaits_process(id) {
         if timeout(AWAIT_PROCESS, death.readable()).await.is_ok() {
             let control = &mut *control.borrow_mut();
@@ -205,7 +209,7 @@ async fn await_process(control: &RefCell<Control>, id: &SessionId, death: &Async
 
 /// Refuses somebody, and shows it.
 fn refuse(
-    control: &mut Control,
+    control: &mut ControlPlane,
     socket: &AsyncFd<PassedFd>,
     name: &str,
     peer: PeerProcess,
@@ -219,7 +223,7 @@ fn refuse(
 
 /// Refuses a session for want of descriptors.
 fn refuse_for_room(
-    control: &mut Control,
+    control: &mut ControlPlane,
     socket: &AsyncFd<PassedFd>,
     name: &str,
     peer: PeerProcess,
@@ -230,7 +234,12 @@ fn refuse_for_room(
 }
 
 /// Why there are no descriptors for a session, if so. What a tool needs is its connection.
-fn no_room(control: &Control, role: SessionRole, pid: u32, is_relayed: bool) -> Option<String> {
+fn no_room(
+    control: &ControlPlane,
+    role: SessionRole,
+    pid: u32,
+    is_relayed: bool,
+) -> Option<String> {
     let room = DescriptorRoom::of(&control.registry, pid)?;
     match role {
         SessionRole::Gateway => None,
@@ -247,7 +256,7 @@ fn shown(name: &str) -> String {
 
 /// Has a session relayed whose memory is not shared.
 fn relay(
-    control: &Rc<RefCell<Control>>,
+    control: &Rc<RefCell<ControlPlane>>,
     socket: AsyncFd<PassedFd>,
     first: FirstMessage,
     peer: PeerProcess,
@@ -331,7 +340,7 @@ struct Admitted {
 }
 
 fn admit(
-    control: &Rc<RefCell<Control>>,
+    control: &Rc<RefCell<ControlPlane>>,
     socket: &AsyncFd<PassedFd>,
     first: FirstMessage,
     peer: PeerProcess,
@@ -422,7 +431,7 @@ fn admit(
 
 /// The process of a session whose endpoints have the same GIDs as those of `session`, of process
 /// `pid`, would have. The session itself may come back.
-fn taken_by(control: &Control, session: &SessionId, pid: u32) -> Option<u32> {
+fn taken_by(control: &ControlPlane, session: &SessionId, pid: u32) -> Option<u32> {
     let alike = |id: &SessionId| Gid::new(*id, 0) == Gid::new(*session, 0);
     let mut others = control.registry.sessions();
     others

@@ -35,10 +35,10 @@ use super::{
     losses::Losses,
     report::{
         questions::{AccessQuestions, NOT_LINKED},
-        waiting::Told,
+        waiting::NotifiedEndpoints,
     },
     room::SpareDescriptors,
-    turns::Turns,
+    turns::ProcessTurns,
 };
 use crate::{
     bridge::{RefusalKind, RefusedRoute, ToControl, TrafficRules},
@@ -47,7 +47,7 @@ use crate::{
     owner::SessionKeys,
 };
 
-pub(super) struct Control {
+pub(super) struct ControlPlane {
     pub(super) config: Arc<Config>,
     pub(super) admission: Admission,
     pub(super) id: DaemonId,
@@ -60,7 +60,7 @@ pub(super) struct Control {
     /// Routes that do not cross these links.
     pub(super) refused_routes: BTreeMap<String, Vec<RefusedRoute>>,
     /// The sessions that were told of them.
-    told: Told,
+    told: NotifiedEndpoints,
     pub(super) refusals: Refusals,
     /// Descriptors for callers that are refused for want of any.
     pub(super) spare: Rc<SpareDescriptors>,
@@ -98,7 +98,7 @@ pub(super) struct Control {
     /// Where linked peers are.
     linked: BTreeMap<DaemonId, IpAddr>,
     wakers: HashMap<SessionId, Rc<Notify>>,
-    pub(super) turns: Turns,
+    pub(super) turns: ProcessTurns,
     /// Wakes the task that flushes the graph.
     pub(super) changed: Rc<Notify>,
     /// Whether there is an application, and what wakes the task that waits for that to change.
@@ -106,7 +106,7 @@ pub(super) struct Control {
     pub(super) need: Rc<Notify>,
 }
 
-impl Control {
+impl ControlPlane {
     pub(super) fn new(
         config: Arc<Config>,
         settings: Vec<(String, String)>,
@@ -129,7 +129,7 @@ impl Control {
             registry,
             links: BTreeMap::new(),
             refused_routes: BTreeMap::new(),
-            told: Told::default(),
+            told: NotifiedEndpoints::default(),
             refusals: Refusals::default(),
             spare: Rc::new(spare),
             crowded_out: 0,
@@ -156,7 +156,7 @@ impl Control {
             names: BTreeMap::new(),
             linked: BTreeMap::new(),
             wakers: HashMap::new(),
-            turns: Turns::default(),
+            turns: ProcessTurns::default(),
             config,
             changed: Rc::default(),
             needed: false,
@@ -365,7 +365,7 @@ impl Control {
         self.links.clear();
         self.linked.clear();
         self.refused_routes.clear();
-        self.told = Told::default();
+        self.told = NotifiedEndpoints::default();
         self.forget_questions(None);
         self.relist();
         let daemons: BTreeSet<DaemonId> =

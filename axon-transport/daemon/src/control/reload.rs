@@ -11,7 +11,7 @@ use axon_transport::{
 };
 use tokio::{signal::unix::Signal, time::timeout};
 
-use super::{log, plane::Control};
+use super::{log, plane::ControlPlane};
 use crate::bridge::TrafficRules;
 
 /// How long the gateway may take to have new rules.
@@ -42,7 +42,7 @@ impl SettingsSource {
 /// Reads the settings whenever SIGHUP comes or a session asks. A daemon that was given its configuration by a program
 /// has no `source`.
 pub(super) async fn reload(
-    control: Rc<RefCell<Control>>,
+    control: Rc<RefCell<ControlPlane>>,
     mut hangup: Signal,
     source: Option<SettingsSource>,
 ) {
@@ -85,7 +85,7 @@ pub(super) async fn reload(
 ///
 /// # Errors
 /// It did not say so in time.
-async fn wait_in_force(control: &Rc<RefCell<Control>>) -> Result<(), String> {
+async fn wait_in_force(control: &Rc<RefCell<ControlPlane>>) -> Result<(), String> {
     let (number, mut in_force) = {
         let control = control.borrow();
         if control.gateway == "off" {
@@ -117,7 +117,7 @@ fn log_report(report: &ReloadReport) {
     }
 }
 
-impl Control {
+impl ControlPlane {
     /// A session asks for the settings to be read again. Other users may not.
     pub(super) fn ask_reload(&mut self, id: &SessionId) {
         let user = self.registry.session(id).and_then(|entry| entry.user);
@@ -179,7 +179,7 @@ impl Control {
     }
 }
 
-impl Control {
+impl ControlPlane {
     /// Ends the sessions of users who are not trusted any more, and those that share memory and would not be let in with
     /// it now.
     fn end_excluded(&mut self) {
@@ -256,9 +256,9 @@ mod tests {
         config::{TopicPattern, TopicPriority, TopicRule},
     };
 
-    fn control(config: Config) -> Control {
+    fn control(config: Config) -> ControlPlane {
         let settings = vec![("AXON_QUIC_CIPHER".into(), "x".into())];
-        Control::new(Arc::new(config), settings, SpareDescriptors::default())
+        ControlPlane::new(Arc::new(config), settings, SpareDescriptors::default())
     }
 
     #[test]
@@ -305,7 +305,7 @@ mod tests {
     }
 
     /// A daemon whose gateway stands and has not taken the rules that were read.
-    fn reloaded() -> Rc<RefCell<Control>> {
+    fn reloaded() -> Rc<RefCell<ControlPlane>> {
         let mut control = control(Config::default());
         control.gateway_says(ToControl::Started { port: 1 });
         let rules = "[[allow]]\npeer = \"a\"\npublish = \"/x\"";

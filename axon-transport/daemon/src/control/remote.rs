@@ -19,7 +19,7 @@ use tokio::{
 
 use super::{
     gateway::{GatewayEntry, RestartPause, RunningGateway},
-    plane::Control,
+    plane::ControlPlane,
 };
 use crate::{
     bridge::{CHANNEL, RefusalKind, ToControl, ToGateway, TrafficRules},
@@ -64,7 +64,7 @@ impl DaemonGateway {
     /// # Errors
     /// Why the gateway does not stand.
     pub(super) async fn start(
-        control: &Rc<RefCell<Control>>,
+        control: &Rc<RefCell<ControlPlane>>,
         entry: Option<GatewayEntry>,
     ) -> Result<Self, String> {
         let mut remote = Self {
@@ -96,7 +96,7 @@ impl DaemonGateway {
     }
 
     /// The daemon is to end: has what waits for other hosts arrive first, as far as that gets on.
-    pub(super) async fn finish(&mut self, control: &Rc<RefCell<Control>>) {
+    pub(super) async fn finish(&mut self, control: &Rc<RefCell<ControlPlane>>) {
         // An order that finds the channel full is dropped: this one is given again.
         let finish = async {
             while self.running.is_some() && !self.order(ToGateway::Finish) {
@@ -113,7 +113,7 @@ impl DaemonGateway {
 
     /// Passes on what the gateway and discovery say, and starts a gateway that failed again, until it
     /// [has finished](Self::finish).
-    pub(super) async fn run(&mut self, control: &Rc<RefCell<Control>>) {
+    pub(super) async fn run(&mut self, control: &Rc<RefCell<ControlPlane>>) {
         let Some(entry) = self.entry else { return std::future::pending().await };
         let questions = control.borrow().questions.bell();
         while !self.finished {
@@ -154,7 +154,7 @@ impl DaemonGateway {
     }
 
     /// Gives the gateway the questions of tools about the rules of peers.
-    fn pass_questions(&mut self, control: &Rc<RefCell<Control>>) {
+    fn pass_questions(&mut self, control: &Rc<RefCell<ControlPlane>>) {
         let mut control = control.borrow_mut();
         while let Some((number, daemon, uses)) = control.questions.poll() {
             if !self.order(ToGateway::CheckAccess { daemon, number, uses }) {
@@ -165,7 +165,7 @@ impl DaemonGateway {
         control.settle();
     }
 
-    fn event(&mut self, control: &Rc<RefCell<Control>>, event: ToControl) {
+    fn event(&mut self, control: &Rc<RefCell<ControlPlane>>, event: ToControl) {
         match &event {
             ToControl::Started { port } => {
                 self.order(ToGateway::Listed(self.listed.clone()));
@@ -197,7 +197,7 @@ impl DaemonGateway {
         }
     }
 
-    fn action(&mut self, control: &Rc<RefCell<Control>>, action: DiscoveryAction) {
+    fn action(&mut self, control: &Rc<RefCell<ControlPlane>>, action: DiscoveryAction) {
         match action {
             DiscoveryAction::Dial { daemon, sae, addrs: addresses, listed, standing } => {
                 let dial = ToGateway::Dial { daemon, sae, addresses, listed, standing };
@@ -236,7 +236,7 @@ impl DaemonGateway {
         }
     }
 
-    fn gateway_ended(&mut self, control: &Rc<RefCell<Control>>, why: &str) {
+    fn gateway_ended(&mut self, control: &Rc<RefCell<ControlPlane>>, why: &str) {
         self.running = None;
         control.borrow_mut().gateway_ended(why);
         for daemon in std::mem::take(&mut self.linked).into_keys() {
@@ -244,7 +244,7 @@ impl DaemonGateway {
         }
     }
 
-    fn restart_discovery(&mut self, control: &Rc<RefCell<Control>>) {
+    fn restart_discovery(&mut self, control: &Rc<RefCell<ControlPlane>>) {
         let control = control.borrow();
         let discovery = Discovery::start(&control);
         if let Some(port) = control.port {
@@ -282,7 +282,7 @@ impl DaemonGateway {
 }
 
 impl Discovery {
-    fn start(control: &Control) -> Self {
+    fn start(control: &ControlPlane) -> Self {
         let (events, inbox) = mpsc::channel(CHANNEL);
         let (outbox, actions) = mpsc::channel(CHANNEL);
         let (config, daemon) = (Arc::clone(&control.config), control.id);

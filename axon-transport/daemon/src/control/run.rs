@@ -29,7 +29,7 @@ use super::{
     gateway::GatewayEntry,
     listen::accept,
     log,
-    plane::Control,
+    plane::ControlPlane,
     reload::{SettingsSource, reload},
     remote::{DaemonGateway, GATEWAY},
     room::SpareDescriptors,
@@ -231,7 +231,8 @@ pub fn run(config: Config, mut options: DaemonOptions) -> Result<(), DaemonError
     outcome
 }
 
-type Started = (Control, Vec<OwnedFd>, axon_transport::internal::session::daemon::address::Lock);
+type Started =
+    (ControlPlane, Vec<OwnedFd>, axon_transport::internal::session::daemon::address::Lock);
 
 /// Everything before the runtime: the socket first, since it is the lock.
 fn start(config: Config, _options: &DaemonOptions) -> Result<Started, DaemonError> {
@@ -255,7 +256,7 @@ fn start(config: Config, _options: &DaemonOptions) -> Result<Started, DaemonErro
         tracing::warn!(%error, "nothing is kept across restarts");
         config.runtime_dir = None;
     }
-    Ok((Control::new(Arc::new(config), settings, spare), listeners, lock))
+    Ok((ControlPlane::new(Arc::new(config), settings, spare), listeners, lock))
 }
 
 /// Keys live in this process: no core file, no debugger of the same user. And a robot has many
@@ -289,7 +290,7 @@ fn harden() {
 }
 
 async fn serve(
-    control: Rc<RefCell<Control>>,
+    control: Rc<RefCell<ControlPlane>>,
     listeners: Vec<OwnedFd>,
     mut options: DaemonOptions,
 ) -> Result<(), DaemonError> {
@@ -344,7 +345,7 @@ async fn serve(
 }
 
 /// Keeps what sessions leave that end, until those that read it have come from the daemon before.
-async fn keep_left_memory(control: Rc<RefCell<Control>>) {
+async fn keep_left_memory(control: Rc<RefCell<ControlPlane>>) {
     control.borrow_mut().registry.keep_left_memory(LEFT.min(descriptors::share() / 4));
     tokio::time::sleep(RETURN).await;
     control.borrow_mut().registry.keep_left_memory(0);
@@ -352,7 +353,7 @@ async fn keep_left_memory(control: Rc<RefCell<Control>>) {
 
 /// Sends changes of the graph a moment after they happened, and tells discovery, whose beacons say
 /// whether a peer has missed some.
-async fn flush(control: Rc<RefCell<Control>>, digests: Option<mpsc::Sender<DiscoveryEvent>>) {
+async fn flush(control: Rc<RefCell<ControlPlane>>, digests: Option<mpsc::Sender<DiscoveryEvent>>) {
     loop {
         if control.borrow().registry.needs_flush() {
             tokio::time::sleep(COALESCE).await;
@@ -370,7 +371,7 @@ async fn flush(control: Rc<RefCell<Control>>, digests: Option<mpsc::Sender<Disco
 }
 
 /// Ends when there was no application for the grace time.
-async fn unneeded(control: &Rc<RefCell<Control>>) {
+async fn unneeded(control: &Rc<RefCell<ControlPlane>>) {
     let grace = control.borrow().config.link.grace;
     let changed = control.borrow().need.clone();
     // The session that started this daemon has yet to come, however short the grace time is.

@@ -20,7 +20,7 @@ pub mod verifier;
 
 pub use crate::wire::keys::{KeyMessage, KeyViolation, MessageError};
 pub use bootstrap::{
-    Acceptor, BootstrapDialler, Completion, Dial, DialKey, DialRefusal, Lookup, Resolver,
+    Acceptor, BootstrapDialler, Completion, DialDecision, DialKey, DialRefusal, Lookup, Resolver,
 };
 pub use clock::Clock;
 pub use exporters::{ENVELOPE_EXPORTER, Exporters, READY_EXPORTER};

@@ -88,12 +88,12 @@ impl Qlogs for QlogFiles {
         let unix_ms = since_epoch.map_or(0, |since| since.as_millis());
         let name = format!("{begin}{unix_ms:014}-{daemon}-{number:08}-{role}{end}");
         self.orders.try_send(QlogOrder::Open(number, name)).ok()?;
-        Some(Box::new(Writer::new(number, self.orders.clone())))
+        Some(Box::new(EventWriter::new(number, self.orders.clone())))
     }
 }
 
 /// Collects the events of one connection.
-struct Writer {
+struct EventWriter {
     number: u64,
     orders: SyncSender<QlogOrder>,
     buffer: Vec<u8>,
@@ -104,7 +104,7 @@ struct Writer {
     is_over: bool,
 }
 
-impl Writer {
+impl EventWriter {
     fn new(number: u64, orders: SyncSender<QlogOrder>) -> Self {
         Self { number, orders, buffer: Vec::new(), whole: 0, left: LONGEST, is_over: false }
     }
@@ -120,7 +120,7 @@ impl Writer {
     }
 }
 
-impl Write for Writer {
+impl Write for EventWriter {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         if self.buffer.len() + bytes.len() > self.left {
             self.hand_on();
@@ -147,7 +147,7 @@ impl Write for Writer {
     }
 }
 
-impl Drop for Writer {
+impl Drop for EventWriter {
     fn drop(&mut self) {
         self.hand_on();
         // If the queue is full, the file closes for a later one.
@@ -270,7 +270,7 @@ mod tests {
     #[test]
     fn a_file_ends_with_a_whole_record_before_it_is_too_long() {
         let (orders, taken) = sync_channel(2 * LONGEST / TOGETHER);
-        let mut writer = Writer::new(1, orders);
+        let mut writer = EventWriter::new(1, orders);
         let record = [&[b'x'; 999][..], b"\n"].concat();
         (0..2 * LONGEST / record.len()).for_each(|_| writer.write_all(&record).unwrap());
         drop(writer);
@@ -347,7 +347,7 @@ mod tests {
     #[test]
     fn a_disk_that_hangs_costs_events_and_no_time() {
         let (orders, hanging) = sync_channel(2);
-        let mut writer = Writer::new(1, orders);
+        let mut writer = EventWriter::new(1, orders);
         let record = [&[b'x'; TOGETHER - 1][..], b"\n"].concat();
         (0..100).for_each(|_| writer.write_all(&record).unwrap());
         assert!(writer.is_over && writer.buffer.is_empty());

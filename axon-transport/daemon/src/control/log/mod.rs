@@ -29,7 +29,7 @@ pub fn start(config: &Config) {
     let filter = EnvFilter::try_new(&config.log).unwrap_or_else(|_| EnvFilter::new("warn"));
     let lines = tracing_subscriber::fmt()
         .with_env_filter(filter)
-        .with_writer(|| output::Output)
+        .with_writer(|| output::LogOutput)
         // What cannot be written is dropped; the default prints that to standard error, and panics
         // where that fails as well.
         .log_internal_errors(false)

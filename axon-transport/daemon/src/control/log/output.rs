@@ -31,9 +31,9 @@ fn open(path: &Path) -> io::Result<File> {
 
 /// Standard error. Writing to it never fails: what cannot be written is dropped.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Output;
+pub(super) struct LogOutput;
 
-impl Write for Output {
+impl Write for LogOutput {
     fn write(&mut self, line: &[u8]) -> io::Result<usize> {
         let kept = KEPT.get().map(|kept| kept.lock().unwrap_or_else(PoisonError::into_inner));
         if let Some(path) = &kept {

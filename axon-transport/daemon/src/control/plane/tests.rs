@@ -16,12 +16,12 @@ use super::{super::report::send_status, *};
 const SESSION: SessionId = SessionId([1; 16]);
 const DAEMON: DaemonId = DaemonId([2; 16]);
 
-fn control() -> Control {
-    Control::new(Arc::new(Config::default()), Vec::new(), SpareDescriptors::default())
+fn control() -> ControlPlane {
+    ControlPlane::new(Arc::new(Config::default()), Vec::new(), SpareDescriptors::default())
 }
 
 /// A link over which a route of topic /t does not cross.
-fn link(control: &mut Control) {
+fn link(control: &mut ControlPlane) {
     let mut status = LinkStatus::default();
     status.peer = DAEMON.to_string();
     let refused = RefusedRoute {
@@ -34,7 +34,7 @@ fn link(control: &mut Control) {
 }
 
 /// How often the session is told that a route does not cross.
-fn told(control: &mut Control) -> usize {
+fn told(control: &mut ControlPlane) -> usize {
     let packets = std::iter::from_fn(|| control.registry.poll_output(&SESSION));
     packets.filter(|out| matches!(Message::decode(&out.packet), Ok(Message::Refused(_)))).count()
 }
@@ -63,13 +63,13 @@ fn a_gateway_that_ended_leaves_no_refused_route_and_sessions_are_told_by_the_nex
 const RULES: &str = "[[allow]]\npeer = \"uid:7\"\npublish = \"/x\"";
 
 /// A daemon with access rules, or without, and a session of another user, and one of its own, with an endpoint each.
-fn with_users(rules: &str) -> Control {
+fn with_users(rules: &str) -> ControlPlane {
     let mut config = Config::default();
     if !rules.is_empty() {
         config.access = AccessRules::parse(rules, "access.toml").unwrap();
     }
     config.trusted_uids = vec![7];
-    let mut control = Control::new(Arc::new(config), Vec::new(), SpareDescriptors::default());
+    let mut control = ControlPlane::new(Arc::new(config), Vec::new(), SpareDescriptors::default());
     for session in [SESSION, OWN] {
         connect(&mut control, session, false);
         let endpoint = Endpoint::new(Gid::new(session, 1), EndpointKind::Subscription, "/t", "T");
@@ -84,7 +84,7 @@ fn with_users(rules: &str) -> Control {
 
 const OWN: SessionId = SessionId([3; 16]);
 
-fn connect(control: &mut Control, session: SessionId, shares_memory: bool) {
+fn connect(control: &mut ControlPlane, session: SessionId, shares_memory: bool) {
     let descriptor = || Arc::new(PassedFd::from(OwnedFd::from(File::open("/dev/null").unwrap())));
     let descriptors = shares_memory.then(|| [(); 3].map(|()| descriptor()));
     let (role, name) = (SessionRole::Application, String::new());
@@ -92,7 +92,7 @@ fn connect(control: &mut Control, session: SessionId, shares_memory: bool) {
 }
 
 /// The report that a session is given next.
-fn report(control: &mut Control, session: SessionId) -> Value {
+fn report(control: &mut ControlPlane, session: SessionId) -> Value {
     let mut text = Vec::new();
     while let Some(output) = control.registry.poll_output(&session) {
         if let Ok(Message::Status(part)) = Message::decode(&output.packet) {
@@ -140,7 +140,7 @@ fn settings_that_changed_end_the_sessions_of_other_users_that_they_exclude() {
     let mut control = with_users("");
     connect(&mut control, SHARES, true);
     control.registry.set_user(&SHARES, 7);
-    let is_there = |control: &Control, id| control.registry.session(&id).is_some();
+    let is_there = |control: &ControlPlane, id| control.registry.session(&id).is_some();
     let mut config = Config::clone(&control.config);
     config.access = AccessRules::parse(RULES, "access.toml").unwrap();
     control.set_config(config.clone());

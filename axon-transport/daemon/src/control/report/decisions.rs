@@ -9,9 +9,9 @@ use axon_transport::{
     status::{PeerDecision, PeerDecisions},
 };
 
-use super::{super::plane::Control, questions::NOT_LINKED};
+use super::{super::plane::ControlPlane, questions::NOT_LINKED};
 
-impl Control {
+impl ControlPlane {
     /// A session asks what a peer lets this host do. Other users may not.
     pub(in crate::control) fn ask_decisions(&mut self, id: &SessionId, check: AccessCheck) {
         let user = self.registry.session(id).and_then(|entry| entry.user);

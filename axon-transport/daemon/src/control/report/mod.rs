@@ -18,7 +18,7 @@ use axon_transport::{
 };
 
 use self::topics::topics;
-use super::plane::Control;
+use super::plane::ControlPlane;
 use crate::discovery::DiscoveryNeeds;
 
 /// Characters of a GID in hexadecimal that its session decides.
@@ -26,7 +26,7 @@ const GID_PREFIX: usize = 24;
 
 /// Answers a session that asks for the status. One that asks again before it has taken the
 /// answer gets the same one from its beginning.
-pub(super) fn send_status(control: &mut Control, id: &SessionId) {
+pub(super) fn send_status(control: &mut ControlPlane, id: &SessionId) {
     // Another user may have begun to read a status before there were rules.
     let user = control.registry.session(id).and_then(|entry| entry.user);
     let limited = user.is_some() && !control.config.access.is_empty();
@@ -45,7 +45,7 @@ pub(super) fn send_status(control: &mut Control, id: &SessionId) {
     control.registry.tell_status(id, text.into());
 }
 
-fn status(control: &Control) -> Status {
+fn status(control: &ControlPlane) -> Status {
     let config = &control.config;
     let settings: BTreeMap<String, String> = control.admission.settings().iter().cloned().collect();
     let setting = |name: &str| settings.get(name).cloned();
@@ -107,14 +107,14 @@ fn status(control: &Control) -> Status {
 }
 
 /// What another user of the host may know of a daemon that has access rules.
-fn without_details(control: &Control) -> Status {
+fn without_details(control: &ControlPlane) -> Status {
     let mut status = of_daemon(control);
     status.withheld = true;
     status
 }
 
 /// What the daemon itself is.
-fn of_daemon(control: &Control) -> Status {
+fn of_daemon(control: &ControlPlane) -> Status {
     let mut status = Status::default();
     status.daemon = control.id.to_string();
     status.pid = std::process::id();
@@ -126,7 +126,7 @@ fn of_daemon(control: &Control) -> Status {
     status
 }
 
-fn descriptors(control: &Control) -> DescriptorStatus {
+fn descriptors(control: &ControlPlane) -> DescriptorStatus {
     let mut shown = DescriptorStatus::default();
     shown.open = descriptors::open();
     shown.limit = descriptors::limit();

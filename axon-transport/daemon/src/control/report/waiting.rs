@@ -47,9 +47,9 @@ pub(super) fn waiting<'a, 'r>(
 
 /// The endpoints whose sessions were told, by peer: each is told once while the peer is linked.
 #[derive(Debug, Default)]
-pub(in crate::control) struct Told(BTreeMap<String, HashSet<Gid>>);
+pub(in crate::control) struct NotifiedEndpoints(BTreeMap<String, HashSet<Gid>>);
 
-impl Told {
+impl NotifiedEndpoints {
     /// A peer's link is over.
     pub(in crate::control) fn forget(&mut self, peer: &str) {
         self.0.remove(peer);
@@ -146,7 +146,7 @@ mod tests {
 
     #[test]
     fn session_of_an_endpoint_that_waits_is_told_once_while_the_peer_is_linked() {
-        let (mut registry, mut told) = (registry(), Told::default());
+        let (mut registry, mut told) = (registry(), NotifiedEndpoints::default());
         announce(&mut registry, 1, "/a");
         announce(&mut registry, 2, "/b");
         let routes = [route("/a", Some("T")), route("/a", Some("other")), route("/c", None)];

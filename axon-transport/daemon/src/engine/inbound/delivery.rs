@@ -8,7 +8,7 @@ use axon_transport::internal::session::Written;
 
 use super::{
     FULL_RETRY, Inbound, Key, RouteIn,
-    incoming::{IncomingStream, Message, Step, StreamHeader},
+    incoming::{IncomingStream, OpenedMessage, StreamHeader, StreamStep},
     reading::{Next, wait},
 };
 use crate::engine::{rings::RingError, sample::dropped::EarlierFate, stand_in::StandIn};
@@ -24,7 +24,7 @@ impl Inbound {
         &mut self,
         key: Key,
         stream: &mut IncomingStream,
-        message: Message,
+        message: OpenedMessage,
         until: Duration,
         now: Duration,
     ) -> Next {
@@ -33,7 +33,7 @@ impl Inbound {
         let Some(stand_in) = found.and_then(|route| route.writers.get(&message.writer)) else {
             if found.is_some() && now < until {
                 self.waiting.insert((until, key));
-                return wait(stream, Step::Writer(message, until));
+                return wait(stream, StreamStep::Writer(message, until));
             }
             self.waiting.remove(&(until, key));
             self.counters.lost(&self.topic(header.route), "no_route", 1);
@@ -85,7 +85,7 @@ impl Inbound {
             },
             None => message,
         };
-        let Message { meta, payload, .. } = &message;
+        let OpenedMessage { meta, payload, .. } = &message;
         let since = &mut stream.short_since;
         let Some(there) = self.write(&stand_in, header, *meta, payload, since, now) else {
             return self.wait_for_room(key, stream, message, now);
@@ -185,11 +185,11 @@ impl Inbound {
         &mut self,
         key: Key,
         stream: &mut IncomingStream,
-        message: Message,
+        message: OpenedMessage,
         now: Duration,
     ) -> Next {
         self.full.insert(key);
         self.full_retry.get_or_insert(now + FULL_RETRY);
-        wait(stream, Step::Ring(message))
+        wait(stream, StreamStep::Ring(message))
     }
 }

@@ -97,7 +97,7 @@ pub(super) enum Piece {
 
 /// What a stream waits for.
 #[derive(Debug)]
-pub(super) enum Step {
+pub(super) enum StreamStep {
     /// Its header.
     Header,
     /// The route, or the turn, of its flow, until this time.
@@ -111,16 +111,16 @@ pub(super) enum Step {
     /// Memory for a message of this header, to decompress it.
     Unpack(inner::Header, Bytes),
     /// The stand-in of the message's writer, until this time.
-    Writer(Message, Duration),
+    Writer(OpenedMessage, Duration),
     /// Room in the ring.
-    Ring(Message),
+    Ring(OpenedMessage),
     /// Its end: nothing more is wanted from it.
     Over,
 }
 
 /// A message that was read and opened.
 #[derive(Debug)]
-pub(super) struct Message {
+pub(super) struct OpenedMessage {
     pub(super) writer: Gid,
     /// Its number in its flow, which rises. Of a topic, and of requests, it is the sample's own.
     pub(super) number: u64,
@@ -131,7 +131,7 @@ pub(super) struct Message {
 /// A data stream.
 #[derive(Debug)]
 pub(super) struct IncomingStream {
-    pub(super) step: Step,
+    pub(super) step: StreamStep,
     pub(super) header: Option<(StreamHeader, Option<Route>)>,
     /// The last short header, where the messages have such.
     pub(super) headers: Option<ShortHeaders>,
@@ -151,7 +151,7 @@ pub(super) struct IncomingStream {
 impl Default for IncomingStream {
     fn default() -> Self {
         Self {
-            step: Step::Header,
+            step: StreamStep::Header,
             header: None,
             headers: None,
             chunk: Bytes::new(),
@@ -223,8 +223,8 @@ impl IncomingStream {
     /// Bytes of samples that were read from QUIC and are not delivered.
     pub(super) fn held(&self) -> usize {
         let message = match &self.step {
-            Step::Writer(message, _) | Step::Ring(message) => message.payload.len(),
-            Step::Unpack(_, sent) => sent.len(),
+            StreamStep::Writer(message, _) | StreamStep::Ring(message) => message.payload.len(),
+            StreamStep::Unpack(_, sent) => sent.len(),
             _ => 0,
         };
         self.chunk.len() + self.gathered.len() + message

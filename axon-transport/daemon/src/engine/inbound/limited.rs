@@ -10,7 +10,7 @@ use axon_transport::access::Over;
 
 use super::{
     Inbound, Key,
-    incoming::{IncomingStream, Message, Step},
+    incoming::{IncomingStream, OpenedMessage, StreamStep},
     reading::{Next, wait},
 };
 use crate::engine::limits::RouteLimit;
@@ -72,9 +72,9 @@ impl Inbound {
         key: Key,
         stream: &mut IncomingStream,
         limit: &RouteLimit,
-        message: Message,
+        message: OpenedMessage,
         now: Duration,
-    ) -> Result<Message, Option<Next>> {
+    ) -> Result<OpenedMessage, Option<Next>> {
         let Some((header, Some(route))) = stream.header else { return Err(Some(Next::Over)) };
         let keeps_all = self.routes.get(&header.route).is_some_and(|route| route.keeps_all);
         let may_wait = route.kind == Kind::Request || header.reliable && keeps_all;
@@ -85,7 +85,7 @@ impl Inbound {
         };
         if waits(exceeded.over()) {
             self.limited.hold(key, now + exceeded.wait);
-            return Err(Some(wait(stream, Step::Ring(message))));
+            return Err(Some(wait(stream, StreamStep::Ring(message))));
         }
         exceeded.dropped(1);
         self.counters.lost(&self.topic(header.route), exceeded.cause(), 1);

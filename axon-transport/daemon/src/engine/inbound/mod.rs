@@ -30,7 +30,7 @@ use quinn_proto::{StreamId, VarInt};
 
 pub(crate) use self::incoming::StreamHeader;
 use self::{
-    incoming::{IncomingStream, Step},
+    incoming::{IncomingStream, StreamStep},
     limited::Limited,
     line::StreamQueue,
     receipts::Receipts,
@@ -229,7 +229,7 @@ impl Inbound {
         }
         let streams = self.without_room.iter().filter(|key| key.0 == link);
         let lengths = streams.filter_map(|key| match self.streams.get(key)?.step {
-            Step::Room(length) => Some((length as u64).min(STREAM_WINDOW.1)),
+            StreamStep::Room(length) => Some((length as u64).min(STREAM_WINDOW.1)),
             _ => None,
         });
         let waits: u64 = lengths.sum();
@@ -280,8 +280,12 @@ impl Inbound {
         let keys: Vec<_> = self.streams.keys().filter(|(of, _)| *of == link).copied().collect();
         for key in keys {
             let stream = self.streams.get(&key);
-            let lost = stream
-                .filter(|s| matches!(s.step, Step::Ring(_) | Step::Writer(..) | Step::Unpack(..)));
+            let lost = stream.filter(|s| {
+                matches!(
+                    s.step,
+                    StreamStep::Ring(_) | StreamStep::Writer(..) | StreamStep::Unpack(..)
+                )
+            });
             if let Some((header, _)) = lost.and_then(|stream| stream.header) {
                 self.lost("no_link", header, ENDED, now);
             }
@@ -296,7 +300,7 @@ impl Inbound {
         self.full.remove(&key);
         self.without_room.remove(&key);
         self.limited.forget(&key);
-        if let Step::Turn(until) | Step::Writer(_, until) = stream.step {
+        if let StreamStep::Turn(until) | StreamStep::Writer(_, until) = stream.step {
             self.waiting.remove(&(until, key));
         }
     }

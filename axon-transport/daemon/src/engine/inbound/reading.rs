@@ -8,7 +8,7 @@ use bytes::Bytes;
 
 use super::{
     ARRIVAL, ENDED, Inbound, Key, LONG, LinkViolation, NO_ROUTE, TURN,
-    incoming::{HEADER, IncomingStream, Message, Piece, Step, StreamHeader},
+    incoming::{HEADER, IncomingStream, OpenedMessage, Piece, StreamHeader, StreamStep},
 };
 use crate::{
     engine::{
@@ -75,7 +75,7 @@ impl Inbound {
                     if stream.is_over(key.1, quic) {
                         return Ok(read);
                     }
-                    stream.step = Step::Over;
+                    stream.step = StreamStep::Over;
                     break;
                 }
             }
@@ -93,11 +93,11 @@ impl Inbound {
         read: &mut usize,
         now: Duration,
     ) -> Result<Next, LinkViolation> {
-        match std::mem::replace(&mut stream.step, Step::Length) {
-            Step::Header => {
+        match std::mem::replace(&mut stream.step, StreamStep::Length) {
+            StreamStep::Header => {
                 let header = match stream.take(HEADER, key.1, quic, read) {
                     Piece::Whole(header) => header,
-                    Piece::Later => return Ok(wait(stream, Step::Header)),
+                    Piece::Later => return Ok(wait(stream, StreamStep::Header)),
                     Piece::StreamEnd => return Ok(Next::Over),
                 };
                 let header = StreamHeader::parse(&header).map_err(malformed)?;
@@ -106,17 +106,17 @@ impl Inbound {
                 let turns = self.turns.entry((header.route, header.of)).or_default();
                 turns.push_back(key);
                 self.waiting.insert((now + ARRIVAL, key));
-                stream.step = Step::Turn(now + ARRIVAL);
+                stream.step = StreamStep::Turn(now + ARRIVAL);
                 Ok(Next::Go)
             }
-            Step::Turn(until) => Ok(self.begin(key, stream, quic, until, now)),
-            Step::Length => {
+            StreamStep::Turn(until) => Ok(self.begin(key, stream, quic, until, now)),
+            StreamStep::Length => {
                 if let Some(next) = self.run(key, stream, open, now)? {
                     return Ok(next);
                 }
                 let prefix = match stream.take(4, key.1, quic, read) {
                     Piece::Whole(prefix) => prefix,
-                    Piece::Later => return Ok(wait(stream, Step::Length)),
+                    Piece::Later => return Ok(wait(stream, StreamStep::Length)),
                     Piece::StreamEnd => return Ok(Next::Over),
                 };
                 let mut bytes = [0; 4];
@@ -127,35 +127,35 @@ impl Inbound {
                     let text = format!("a message of {length} bytes, at most {limit} are allowed");
                     return Err((CloseCode::TooLarge, text));
                 }
-                stream.step = Step::Room(length as usize);
+                stream.step = StreamStep::Room(length as usize);
                 Ok(Next::Go)
             }
-            Step::Room(length) => {
+            StreamStep::Room(length) => {
                 if length > LONG {
                     // One message may always be read, however long.
                     let Some(room) = self.intake.long.charge(length.min(self.intake.long.most()))
                     else {
                         self.without_room.add(key);
-                        return Ok(wait(stream, Step::Room(length)));
+                        return Ok(wait(stream, StreamStep::Room(length)));
                     };
                     stream.room = Some(room);
                 }
-                stream.step = Step::Body(length);
+                stream.step = StreamStep::Body(length);
                 Ok(Next::Go)
             }
-            Step::Body(length) => {
+            StreamStep::Body(length) => {
                 // One that has come whole is held by nobody.
                 if stream.room.is_none() && !stream.has(length) {
                     let room = self.intake.short.charge(length);
                     let Some(room) = room.or_else(|| self.spare.charge(length)) else {
                         self.without_room.add(key);
-                        return Ok(wait(stream, Step::Body(length)));
+                        return Ok(wait(stream, StreamStep::Body(length)));
                     };
                     stream.room = Some(room);
                 }
                 let body = match stream.take(length, key.1, quic, read) {
                     Piece::Whole(body) => body,
-                    Piece::Later => return Ok(wait(stream, Step::Body(length))),
+                    Piece::Later => return Ok(wait(stream, StreamStep::Body(length))),
                     Piece::StreamEnd => {
                         self.release(stream);
                         return Ok(Next::Over);
@@ -163,10 +163,12 @@ impl Inbound {
                 };
                 self.open(stream, body, open, now)
             }
-            Step::Unpack(header, sent) => self.unpack(key, stream, header, sent, read, now),
-            Step::Over => Ok(Next::Over),
-            Step::Writer(message, until) => Ok(self.deliver(key, stream, message, until, now)),
-            Step::Ring(message) => Ok(self.deliver(key, stream, message, now, now)),
+            StreamStep::Unpack(header, sent) => self.unpack(key, stream, header, sent, read, now),
+            StreamStep::Over => Ok(Next::Over),
+            StreamStep::Writer(message, until) => {
+                Ok(self.deliver(key, stream, message, until, now))
+            }
+            StreamStep::Ring(message) => Ok(self.deliver(key, stream, message, now, now)),
         }
     }
 
@@ -186,7 +188,7 @@ impl Inbound {
             let until = if until == Duration::MAX { now + ARRIVAL } else { until };
             if route.is_some() && now < until {
                 self.waiting.insert((until, key));
-                return wait(stream, Step::Turn(until));
+                return wait(stream, StreamStep::Turn(until));
             }
             self.waiting.remove(&(until, key));
             self.counters.lost(&self.topic(header.route), "no_route", 1);
@@ -198,9 +200,9 @@ impl Inbound {
         let turns = self.turns.get(&(header.route, header.of));
         if turns.is_some_and(|turns| turns.front() != Some(&key)) {
             // The stream before it ends at some time, and then it is ready.
-            return wait(stream, Step::Turn(Duration::MAX));
+            return wait(stream, StreamStep::Turn(Duration::MAX));
         }
-        stream.step = Step::Length;
+        stream.step = StreamStep::Length;
         Next::Go
     }
 
@@ -218,8 +220,8 @@ impl Inbound {
             let (told, payload) = short.read(&body).map_err(malformed)?;
             let meta = self.meta(told, now);
             let (writer, number, payload) = (header.of, meta.sequence, body.slice_ref(payload));
-            let message = Message { writer, number, meta, payload };
-            stream.step = Step::Writer(message, now + ARRIVAL);
+            let message = OpenedMessage { writer, number, meta, payload };
+            stream.step = StreamStep::Writer(message, now + ARRIVAL);
             return Ok(Next::Go);
         }
         let Some((opened, payload)) = open_body(open, body, route, now).map_err(refused)? else {
@@ -230,11 +232,11 @@ impl Inbound {
         let numbered = header.acknowledged && route.kind == Kind::Response;
         writer_of(route.kind, header.of, numbered, &opened).map_err(malformed)?;
         if opened.compressed {
-            stream.step = Step::Unpack(opened, payload);
+            stream.step = StreamStep::Unpack(opened, payload);
             return Ok(Next::Go);
         }
         let message = self.message(header, route, &opened, payload, now);
-        stream.step = Step::Writer(message, now + ARRIVAL);
+        stream.step = StreamStep::Writer(message, now + ARRIVAL);
         Ok(Next::Go)
     }
 
@@ -261,7 +263,7 @@ impl Inbound {
             };
             let Some(room) = room else {
                 self.without_room.add(key);
-                return Ok(wait(stream, Step::Unpack(header, sent)));
+                return Ok(wait(stream, StreamStep::Unpack(header, sent)));
             };
             stream.unpacked = Some(room);
         }
@@ -269,7 +271,7 @@ impl Inbound {
         *read += length;
         let Some((of_stream, Some(route))) = stream.header else { return Ok(Next::Over) };
         let message = self.message(of_stream, route, &header, payload, now);
-        stream.step = Step::Writer(message, now + ARRIVAL);
+        stream.step = StreamStep::Writer(message, now + ARRIVAL);
         Ok(Next::Go)
     }
 
@@ -281,13 +283,13 @@ impl Inbound {
         header: &inner::Header,
         payload: Bytes,
         now: Duration,
-    ) -> Message {
+    ) -> OpenedMessage {
         let mut meta = self.meta(told(header), now);
         let number = meta.sequence;
         if of_stream.acknowledged && route.kind == Kind::Response {
             meta.sequence = header.request_id.sequence.unsigned_abs();
         }
-        Message { writer: Gid(header.gid), number, meta, payload }
+        OpenedMessage { writer: Gid(header.gid), number, meta, payload }
     }
 
     /// What the ring gets to know of a sample.
@@ -337,7 +339,7 @@ pub(super) enum Next {
     Over,
 }
 
-pub(super) fn wait(stream: &mut IncomingStream, step: Step) -> Next {
+pub(super) fn wait(stream: &mut IncomingStream, step: StreamStep) -> Next {
     stream.step = step;
     Next::Wait
 }

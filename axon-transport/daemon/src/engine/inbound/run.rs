@@ -7,7 +7,7 @@ use bytes::{Buf, Bytes};
 
 use super::{
     ENDED, Inbound, Key, LONG, LinkViolation, RouteIn,
-    incoming::{IncomingStream, Message, Step, StreamHeader},
+    incoming::{IncomingStream, OpenedMessage, StreamHeader, StreamStep},
     reading::{Next, malformed, permit_short, refused, told},
 };
 use crate::engine::{
@@ -76,7 +76,9 @@ impl Inbound {
         }
         match next? {
             None => Ok(None),
-            Some(Step::Ring(message)) => Ok(Some(self.wait_for_room(key, stream, message, now))),
+            Some(StreamStep::Ring(message)) => {
+                Ok(Some(self.wait_for_room(key, stream, message, now)))
+            }
             Some(step) => {
                 stream.step = step;
                 Ok(Some(Next::Go))
@@ -93,7 +95,7 @@ impl Inbound {
         open: &mut Open<'_>,
         envelope: &mut Vec<u8>,
         came: &mut RunProgress,
-    ) -> Result<Option<Step>, LinkViolation> {
+    ) -> Result<Option<StreamStep>, LinkViolation> {
         let now = to.now;
         let IncomingStream { chunk, headers, short_since, .. } = stream;
         while let Some(body) = next_body(chunk, to.most) {
@@ -117,7 +119,7 @@ impl Inbound {
                     if opened.header.compressed {
                         let sent = Bytes::copy_from_slice(opened.sent());
                         chunk.advance(LENGTH + body.len());
-                        return Ok(Some(Step::Unpack(opened.header, sent)));
+                        return Ok(Some(StreamStep::Unpack(opened.header, sent)));
                     }
                     (told(&opened.header), opened.sent())
                 }
@@ -144,8 +146,8 @@ impl Inbound {
                         let payload = Bytes::copy_from_slice(payload);
                         chunk.advance(length);
                         let (writer, number) = (to.header.of, meta.sequence);
-                        let message = Message { writer, number, meta, payload };
-                        return Ok(Some(Step::Ring(message)));
+                        let message = OpenedMessage { writer, number, meta, payload };
+                        return Ok(Some(StreamStep::Ring(message)));
                     }
                 }
             }

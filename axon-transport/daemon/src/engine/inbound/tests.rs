@@ -19,7 +19,7 @@ use quinn_proto::{Dir, Side, StreamId};
 
 use super::{
     Inbound, RouteIn,
-    incoming::{IncomingStream, Message, Step, StreamHeader},
+    incoming::{IncomingStream, OpenedMessage, StreamHeader, StreamStep},
     reading::Next,
 };
 use crate::{
@@ -149,7 +149,7 @@ impl Way {
             of: PUBLISHER,
         };
         let stream = IncomingStream {
-            step: Step::Length,
+            step: StreamStep::Length,
             header: Some((header, Some(route))),
             headers: short.then(ShortHeaders::default),
             ..IncomingStream::default()
@@ -233,7 +233,7 @@ fn a_full_ring_keeps_the_sample_that_has_no_room() {
         let piece = way.messages(1..=5);
         assert!(matches!(way.read(piece), Ok(Some(Next::Wait))));
         assert_eq!(way.numbers(), [1, 2, 3]);
-        let Step::Ring(message) = &way.stream.step else { panic!("{:?}", way.stream.step) };
+        let StreamStep::Ring(message) = &way.stream.step else { panic!("{:?}", way.stream.step) };
         assert_eq!((message.meta.sequence, message.writer), (4, PUBLISHER));
         assert_eq!(message.payload[..], 4_u64.to_be_bytes());
         assert!(way.inbound.waits_for_room());
@@ -241,7 +241,7 @@ fn a_full_ring_keeps_the_sample_that_has_no_room() {
         // Number 5 is next.
         let rest = way.stream.chunk.to_vec();
         way.ring.room.set(1);
-        way.stream.step = Step::Length;
+        way.stream.step = StreamStep::Length;
         assert!(matches!(way.read(rest), Ok(None)));
         assert_eq!(way.numbers(), [1, 2, 3, 5]);
     }
@@ -298,7 +298,7 @@ fn a_call_of_a_client_that_is_gone_is_acknowledged_as_dropped() {
     header.acknowledged = true;
     let meta =
         way.inbound.meta(ShortHeader { sequence: 4, source_timestamp: 1000, age_ms: 5 }, NOW);
-    let message = Message { writer: Gid([9; 16]), number: 4, meta, payload: Bytes::new() };
+    let message = OpenedMessage { writer: Gid([9; 16]), number: 4, meta, payload: Bytes::new() };
     let key = (1, StreamId::new(Side::Client, Dir::Uni, 0));
     let next = way.inbound.deliver(key, &mut way.stream, message, NOW, NOW);
     assert!(matches!(next, Next::Go));
@@ -317,13 +317,14 @@ fn deliver_in_time(
     let meta =
         way.inbound.meta(ShortHeader { sequence: number, source_timestamp: 1000, age_ms: 5 }, NOW);
     let mut message =
-        Some(Message { writer: PUBLISHER, number, meta, payload: vec![0; length].into() });
+        Some(OpenedMessage { writer: PUBLISHER, number, meta, payload: vec![0; length].into() });
     let mut waited = Duration::ZERO;
     while let Some(next) = message.take() {
         assert!(waited < Duration::from_secs(300), "it waits for ever");
         ring(&way.ring, waited);
         way.inbound.deliver(key, &mut way.stream, next, NOW, NOW + waited);
-        if let Step::Ring(waits) = std::mem::replace(&mut way.stream.step, Step::Length) {
+        if let StreamStep::Ring(waits) = std::mem::replace(&mut way.stream.step, StreamStep::Length)
+        {
             message = Some(waits);
             waited += super::FULL_RETRY;
         }

@@ -18,7 +18,7 @@ use axon_transport::config::{Config, KeyMode, QkdConfig, Security};
 
 use super::quic::tls_settings::tls_cipher;
 use crate::keys::{
-    Acceptor, Answer, BootstrapDialler, Clock, Completion, Dial, Exporters, KeyMessage,
+    Acceptor, Answer, BootstrapDialler, Clock, Completion, DialDecision, Exporters, KeyMessage,
     KeyReceiver, KeySender, KmeAnswer, KmeRequest, RequestOrigin, Resolver, Statistics,
     SupplyError, UsedStatistics,
 };
@@ -130,7 +130,7 @@ impl Keyring {
     }
 
     /// Whether and with which key to dial `sae` now.
-    pub(crate) fn dial(&mut self, now: Duration, sae: &str) -> Dial {
+    pub(crate) fn dial(&mut self, now: Duration, sae: &str) -> DialDecision {
         self.dialler().dial(now, sae)
     }
 

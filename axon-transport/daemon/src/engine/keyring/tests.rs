@@ -222,7 +222,7 @@ fn answers_reach_the_machine_that_asked() {
     let resolver = ring.resolver(s(0), [10, 0, 0, 1].into());
     let bytes = identity("sae-a", "key-1");
     assert!(Arc::clone(&resolver).resolve(&bytes).is_none());
-    assert!(matches!(ring.dial(s(0), "sae-c"), Dial::Wait { .. }));
+    assert!(matches!(ring.dial(s(0), "sae-c"), DialDecision::Wait { .. }));
     let mut origins = Vec::new();
     while let Some((origin, request)) = ring.poll_request(s(0)) {
         let answer = kmes.answer(request);
@@ -231,7 +231,7 @@ fn answers_reach_the_machine_that_asked() {
     }
     assert_eq!(origins, [(RequestOrigin::Acceptor, false), (RequestOrigin::Dialler, true)]);
     assert!(resolver.resolve(&bytes).is_some());
-    assert!(matches!(ring.dial(s(0), "sae-c"), Dial::DialKey(_)));
+    assert!(matches!(ring.dial(s(0), "sae-c"), DialDecision::DialKey(_)));
 
     let request = KmeRequest::Enc { slave: "sae-a".into(), number: 1, purpose: KeyPurpose::Proof };
     for origin in [RequestOrigin::Proof(5), RequestOrigin::Responder(5)] {

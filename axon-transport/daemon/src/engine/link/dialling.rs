@@ -16,7 +16,7 @@ use crate::{
         },
         refusal::Refusal,
     },
-    keys::{Completion, Dial, DialKey},
+    keys::{Completion, DialDecision, DialKey},
     link::CloseCode,
 };
 
@@ -82,7 +82,7 @@ enum Outcome {
 
 /// What the owner has to do next.
 #[derive(Debug)]
-pub(crate) enum Action {
+pub(crate) enum DialAction {
     /// Start a handshake with this address, in qkd under this key.
     Connect {
         /// The address.
@@ -106,7 +106,7 @@ pub(crate) enum Action {
 }
 
 /// Ends a handshake that takes too long, as a dropped connection ends.
-const ABANDON: Action = Action::Close { code: CloseCode::Goodbye, reason: "" };
+const ABANDON: DialAction = DialAction::Close { code: CloseCode::Goodbye, reason: "" };
 
 impl fmt::Debug for Dialling {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -179,11 +179,11 @@ impl Dialling {
         &mut self,
         now: Duration,
         mut keyring: Option<&mut Keyring>,
-    ) -> Option<Action> {
+    ) -> Option<DialAction> {
         loop {
             match std::mem::replace(&mut self.state, DialPhase::Over) {
                 DialPhase::Over => return None,
-                DialPhase::Ending(refusal) => return Some(Action::Failed(refusal)),
+                DialPhase::Ending(refusal) => return Some(DialAction::Failed(refusal)),
                 DialPhase::Ended(round, outcome) => {
                     let action = self.ended(now, round, outcome, keyring.as_deref_mut());
                     if action.is_some() {
@@ -196,7 +196,7 @@ impl Dialling {
                         self.state = DialPhase::Ending(late);
                         return Some(ABANDON);
                     }
-                    return Some(Action::Failed(late));
+                    return Some(DialAction::Failed(late));
                 }
                 DialPhase::Connecting(round, until) if now < until => {
                     self.state = DialPhase::Connecting(round, until);
@@ -227,7 +227,7 @@ impl Dialling {
                     round.next += 1;
                     let attempt = round.attempt.clone();
                     self.state = DialPhase::Connecting(round, now + HANDSHAKE_TIMEOUT);
-                    return Some(Action::Connect { address, attempt });
+                    return Some(DialAction::Connect { address, attempt });
                 }
             }
         }
@@ -242,23 +242,23 @@ impl Dialling {
     }
 
     /// Chooses the key of the next round.
-    fn choose(&mut self, now: Duration, keyring: Option<&mut Keyring>) -> Option<Action> {
+    fn choose(&mut self, now: Duration, keyring: Option<&mut Keyring>) -> Option<DialAction> {
         let Some(keyring) = keyring else {
             self.state = DialPhase::Try(DialRound::new(None));
             return None;
         };
         let Some(sae) = self.target.sae.as_deref() else {
             let text = "the peer states no SAE ID: it is not in qkd";
-            return Some(Action::Failed(Refusal::here(CloseCode::Mode, text)));
+            return Some(DialAction::Failed(Refusal::here(CloseCode::Mode, text)));
         };
         match keyring.dial(now, sae) {
-            Dial::Refused(reason) => {
-                Some(Action::Failed(Refusal::here(CloseCode::NotAllowed, reason)))
+            DialDecision::Refused(reason) => {
+                Some(DialAction::Failed(Refusal::here(CloseCode::NotAllowed, reason)))
             }
-            Dial::Wait { until, why } => {
+            DialDecision::Wait { until, why } => {
                 // Given up until the next dial: the dialler is in its backoff.
                 if until.is_some_and(|until| until > now + LONGEST_WAIT) {
-                    return Some(Action::Failed(Refusal::here(CloseCode::KeySupply, why)));
+                    return Some(DialAction::Failed(Refusal::here(CloseCode::KeySupply, why)));
                 }
                 if self.waited_for != why {
                     tracing::debug!(peer = sae, why, "dial waits");
@@ -268,7 +268,7 @@ impl Dialling {
                 self.state = DialPhase::WaitForKey(until.map_or(again, |until| until.min(again)));
                 None
             }
-            Dial::DialKey(attempt) => {
+            DialDecision::DialKey(attempt) => {
                 self.state = DialPhase::Try(DialRound::new(Some(Arc::new(attempt))));
                 None
             }
@@ -282,11 +282,11 @@ impl Dialling {
         mut round: DialRound,
         outcome: Outcome,
         keyring: Option<&mut Keyring>,
-    ) -> Option<Action> {
+    ) -> Option<DialAction> {
         match outcome {
             Outcome::Connected => Some(self.connected(now, &round, keyring)),
             Outcome::Unusable(error) => {
-                Some(Action::Failed(Refusal::here(CloseCode::Internal, error)))
+                Some(DialAction::Failed(Refusal::here(CloseCode::Internal, error)))
             }
             Outcome::Unreachable(reason) => {
                 round.last = reason;
@@ -315,16 +315,16 @@ impl Dialling {
         now: Duration,
         round: &DialRound,
         keyring: Option<&mut Keyring>,
-    ) -> Action {
+    ) -> DialAction {
         let spent = |(keyring, sae, key_id): (&mut Keyring, &str, &KeyId)| {
             keyring.dialler().succeeded(now, sae, key_id) == Completion::First
         };
         if round.attempt.is_none() || self.key(round, keyring).is_some_and(spent) {
-            return Action::Open;
+            return DialAction::Open;
         }
         let (code, reason) = (CloseCode::KeyReused, "this PSK has completed a handshake before");
         self.state = DialPhase::Ending(Refusal::here(code, reason));
-        Action::Close { code, reason }
+        DialAction::Close { code, reason }
     }
 
     /// A round failed: in qkd the key may be dialled again.
@@ -334,9 +334,9 @@ impl Dialling {
         round: &DialRound,
         refusal: Refusal,
         keyring: Option<&mut Keyring>,
-    ) -> Option<Action> {
+    ) -> Option<DialAction> {
         let Some((keyring, sae, key_id)) = self.key(round, keyring) else {
-            return Some(Action::Failed(refusal));
+            return Some(DialAction::Failed(refusal));
         };
         match refusal.alert {
             Some(UNKNOWN_PSK_IDENTITY) => {
@@ -352,7 +352,7 @@ impl Dialling {
             }
             _ => {
                 keyring.dialler().silent(now, sae, key_id);
-                return Some(Action::Failed(refusal));
+                return Some(DialAction::Failed(refusal));
             }
         }
         self.state = DialPhase::Choose;

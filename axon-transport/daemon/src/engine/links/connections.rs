@@ -19,7 +19,7 @@ use crate::{
         link::failure::close_text,
         quic::{
             connection::Connection,
-            endpoints::{EndpointPacket, QuicEndpoints, Received},
+            endpoints::{EndpointInput, EndpointPacket, QuicEndpoints},
         },
     },
     link::CloseCode,
@@ -110,7 +110,7 @@ impl Connections {
         now: Instant,
     ) -> Option<Incoming> {
         match self.endpoints.handle(now, endpoint, from, local, ecn, bytes) {
-            Received::Connection(handle, event) => {
+            EndpointInput::Connection(handle, event) => {
                 let number = self.handles.get(&(endpoint, handle)).copied()?;
                 if let Some(connection) = self.all.get_mut(&number) {
                     connection.ecn_marks += u64::from(ecn == Some(EcnCodepoint::Ce));
@@ -120,8 +120,8 @@ impl Connections {
                 }
                 None
             }
-            Received::Incoming(incoming) => Some(incoming),
-            Received::Done => None,
+            EndpointInput::Incoming(incoming) => Some(incoming),
+            EndpointInput::Done => None,
         }
     }
 

@@ -14,7 +14,7 @@ use crate::{
     engine::{
         keyring::Keyring,
         link::{
-            dialling::{Action, Dialling},
+            dialling::{DialAction, Dialling},
             target::DialTarget,
         },
     },
@@ -104,7 +104,7 @@ impl Dials {
         number: u64,
         now: Duration,
         keyring: Option<&mut Keyring>,
-    ) -> Option<Action> {
+    ) -> Option<DialAction> {
         self.under_way.get_mut(&number)?.dialling.poll_action(now, keyring)
     }
 

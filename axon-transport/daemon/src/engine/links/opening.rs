@@ -15,7 +15,7 @@ use crate::{
     bridge::RefusalKind,
     engine::{
         link::{
-            dialling::Action,
+            dialling::DialAction,
             failure::peer_text,
             opening::{Handshake, Opening, RefusedConnection},
             target::DialTarget,
@@ -203,15 +203,15 @@ impl Links {
         }
     }
 
-    fn act(&mut self, dial: u64, action: Action, now: Duration) {
+    fn act(&mut self, dial: u64, action: DialAction, now: Duration) {
         let instant = self.instant(now);
         let logged = match action {
-            Action::Connect { address, .. } => self.logged(Side::Client, address, now),
+            DialAction::Connect { address, .. } => self.logged(Side::Client, address, now),
             _ => None,
         };
         let Some(LinkDial { dialling, connection }) = self.dials.get_mut(dial) else { return };
         match action {
-            Action::Connect { address, attempt } => {
+            DialAction::Connect { address, attempt } => {
                 let mut client = match self.credentials.client(attempt.as_deref(), address.ip()) {
                     Ok(client) => client,
                     Err(error) => return dialling.handle_unusable(error),
@@ -229,13 +229,13 @@ impl Links {
                     Err(error) => dialling.handle_unreachable(error.as_ref()),
                 }
             }
-            Action::Close { code, reason } => {
+            DialAction::Close { code, reason } => {
                 if let Some(number) = connection.take() {
                     self.table.remove(number);
                     self.close_connection(number, code, reason, now);
                 }
             }
-            Action::Open => {
+            DialAction::Open => {
                 let Some(LinkDial { dialling, connection: Some(number) }) = self.dials.remove(dial)
                 else {
                     return;
@@ -258,7 +258,7 @@ impl Links {
                     self.opening_failed(number);
                 }
             }
-            Action::Failed(refusal) => {
+            DialAction::Failed(refusal) => {
                 let Some(LinkDial { dialling, .. }) = self.dials.remove(dial) else { return };
                 let target = dialling.target();
                 // A successor is dialled where a peer with a link is, unless discovery says where it may be.

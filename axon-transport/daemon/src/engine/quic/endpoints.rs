@@ -26,7 +26,7 @@ pub(in crate::engine) struct EndpointPacket {
 }
 
 /// A datagram that was handed to an endpoint.
-pub(in crate::engine) enum Received {
+pub(in crate::engine) enum EndpointInput {
     /// It is of this connection.
     Connection(ConnectionHandle, ConnectionEvent),
     /// It begins a connection.
@@ -80,19 +80,19 @@ impl QuicEndpoints {
         local: Option<IpAddr>,
         ecn: Option<EcnCodepoint>,
         bytes: BytesMut,
-    ) -> Received {
+    ) -> EndpointInput {
         let mut buffer = Vec::new();
-        let Some((_, quic)) = self.all.get_mut(endpoint) else { return Received::Done };
+        let Some((_, quic)) = self.all.get_mut(endpoint) else { return EndpointInput::Done };
         match quic.handle(now, from, local, ecn, bytes, &mut buffer) {
             Some(DatagramEvent::ConnectionEvent(handle, event)) => {
-                Received::Connection(handle, event)
+                EndpointInput::Connection(handle, event)
             }
-            Some(DatagramEvent::NewConnection(incoming)) => Received::Incoming(incoming),
+            Some(DatagramEvent::NewConnection(incoming)) => EndpointInput::Incoming(incoming),
             Some(DatagramEvent::Response(transmit)) => {
                 self.respond(endpoint, &transmit, buffer);
-                Received::Done
+                EndpointInput::Done
             }
-            None => Received::Done,
+            None => EndpointInput::Done,
         }
     }
 

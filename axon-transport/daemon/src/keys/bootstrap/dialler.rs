@@ -38,7 +38,7 @@ const IN_FLIGHT: usize = 8;
 
 /// What to do about a peer that is to be dialled.
 #[derive(Debug)]
-pub enum Dial {
+pub enum DialDecision {
     /// Dial it with this key.
     DialKey(DialKey),
     /// Ask again later.
@@ -135,36 +135,36 @@ impl BootstrapDialler {
     }
 
     /// Whether and with which key to dial `sae` now. Asks the KME for one where there is none.
-    pub fn dial(&mut self, now: Duration, sae: &str) -> Dial {
+    pub fn dial(&mut self, now: Duration, sae: &str) -> DialDecision {
         if sae == self.sae_id {
-            return Dial::Refused(DialRefusal::OwnSaeId(sae.to_owned()));
+            return DialDecision::Refused(DialRefusal::OwnSaeId(sae.to_owned()));
         }
         if !self.allowed.allows(sae) {
-            return Dial::Refused(DialRefusal::NotAPeer(sae.to_owned()));
+            return DialDecision::Refused(DialRefusal::NotAPeer(sae.to_owned()));
         }
         self.expire(now);
         if !self.peers.contains_key(sae) && !self.make_room(now) {
-            return Dial::Refused(DialRefusal::TooMany);
+            return DialDecision::Refused(DialRefusal::TooMany);
         }
         let peer = self.peers.entry(sae.to_owned()).or_insert_with(DialPeer::new);
         match &peer.state {
             DialState::Empty { not_before, why } if *not_before > now => {
-                return Dial::Wait { until: Some(*not_before), why: why.clone() };
+                return DialDecision::Wait { until: Some(*not_before), why: why.clone() };
             }
             DialState::Empty { .. } => peer.state = DialState::Wanted,
             DialState::UnspentKey(held) if held.not_before > now => {
-                return Dial::Wait {
+                return DialDecision::Wait {
                     until: Some(held.not_before),
                     why: format!("peer does not know key_ID {} yet", held.key_id),
                 };
             }
             DialState::UnspentKey(held) => {
                 let psk = Arc::clone(&held.psk);
-                return Dial::DialKey(DialKey { key_id: held.key_id.clone(), psk });
+                return DialDecision::DialKey(DialKey { key_id: held.key_id.clone(), psk });
             }
             DialState::Wanted | DialState::Asked => {}
         }
-        Dial::Wait { until: None, why: "waiting for the KME's enc_keys answer".to_owned() }
+        DialDecision::Wait { until: None, why: "waiting for the KME's enc_keys answer".to_owned() }
     }
 
     /// The handshake under `key_id` is complete: the key is spent, and erased.

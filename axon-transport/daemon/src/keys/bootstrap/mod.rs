@@ -9,7 +9,7 @@ mod seen_set;
 mod tests;
 
 pub use acceptor::{Acceptor, Lookup, Resolver};
-pub use dialler::{BootstrapDialler, Dial, DialKey, DialRefusal};
+pub use dialler::{BootstrapDialler, DialDecision, DialKey, DialRefusal};
 
 /// Whether a completed handshake was the first under its key.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

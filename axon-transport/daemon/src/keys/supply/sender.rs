@@ -36,7 +36,7 @@ const ANSWER_WITHIN: Duration = Duration::from_secs(60);
 pub struct KeySender {
     local: String,
     peer: String,
-    link: Option<Link>,
+    link: Option<SenderLink>,
     /// Drawn or being drawn, to be announced.
     pool: KeyStock,
     announced: HashMap<KeyId, Announced>,
@@ -50,7 +50,7 @@ pub struct KeySender {
     counts: SenderCounts,
 }
 
-struct Link {
+struct SenderLink {
     conn: u64,
     channel: Channel,
     ready: Exporter,
@@ -169,7 +169,7 @@ impl KeySender {
         self.unbind(now);
         let retire = |(_, m): &(u64, KeyMessage)| matches!(m, KeyMessage::Retire { .. });
         let owed = self.outbox.drain(..).filter(retire).collect();
-        self.link = Some(Link { conn, channel, ready: Arc::clone(exporters.ready()) });
+        self.link = Some(SenderLink { conn, channel, ready: Arc::clone(exporters.ready()) });
         Ok(owed)
     }
 

@@ -29,7 +29,7 @@ impl Way {
     fn come(&mut self, number: u64, now: Duration) -> Next {
         let payload = Bytes::copy_from_slice(&number.to_be_bytes());
         let meta = Meta::at_nanos(number, 1000);
-        let message = Message { writer: PUBLISHER, number, meta, payload };
+        let message = OpenedMessage { writer: PUBLISHER, number, meta, payload };
         self.inbound.deliver(key(), &mut self.stream, message, now, now)
     }
 
@@ -92,7 +92,7 @@ fn the_stream_of_a_keep_all_topic_is_read_on_when_its_sample_may_pass() {
         assert!(matches!(way.come(number, NOW), Next::Go));
     }
     assert!(matches!(way.come(3, NOW), Next::Wait));
-    assert!(matches!(way.stream.step, Step::Ring(_)));
+    assert!(matches!(way.stream.step, StreamStep::Ring(_)));
     way.inbound.streams.insert(key(), std::mem::take(&mut way.stream));
     way.inbound.handle_timeout(at(99));
     assert!(!way.inbound.has_work());

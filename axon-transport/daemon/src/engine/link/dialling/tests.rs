@@ -61,7 +61,7 @@ impl Dialled {
     }
 
     /// The next action, now.
-    fn poll(&mut self) -> Option<Action> {
+    fn poll(&mut self) -> Option<DialAction> {
         loop {
             let action = self.dial.poll_action(self.now, self.ring.as_mut());
             let Some(ring) = &mut self.ring else { return action };
@@ -75,7 +75,7 @@ impl Dialled {
     }
 
     /// The next action, whenever it comes.
-    fn next(&mut self) -> Action {
+    fn next(&mut self) -> DialAction {
         for _ in 0..1000 {
             if let Some(action) = self.poll() {
                 return action;
@@ -89,14 +89,14 @@ impl Dialled {
 
     fn connects(&mut self) -> (SocketAddr, Option<Arc<DialKey>>) {
         match self.next() {
-            Action::Connect { address, attempt } => (address, attempt),
+            DialAction::Connect { address, attempt } => (address, attempt),
             other => panic!("{other:?}"),
         }
     }
 
     fn abandons(&mut self) {
         match self.next() {
-            Action::Close { code: CloseCode::Goodbye, reason: "" } => {}
+            DialAction::Close { code: CloseCode::Goodbye, reason: "" } => {}
             other => panic!("{other:?}"),
         }
     }
@@ -104,7 +104,7 @@ impl Dialled {
     #[track_caller]
     fn fails(&mut self) -> Refusal {
         match self.next() {
-            Action::Failed(refusal) => {
+            DialAction::Failed(refusal) => {
                 assert!(self.poll().is_none(), "a dial fails once");
                 assert_eq!(self.dial.poll_timeout(), None);
                 refusal
@@ -199,7 +199,7 @@ fn events_of_a_connection_that_was_given_up_are_ignored() {
     assert_eq!(dialled.connects().0, address(2));
     dialled.dial.handle_connected();
     dialled.dial.handle_failed(&alert(40));
-    assert!(matches!(dialled.next(), Action::Open));
+    assert!(matches!(dialled.next(), DialAction::Open));
     dialled.dial.handle_failed(&alert(40));
     assert!(dialled.poll().is_none());
     assert_eq!(dialled.dial.poll_timeout(), None);
@@ -269,7 +269,7 @@ fn peer_that_has_no_key_yet_is_dialled_again_with_the_same_key() {
     let psk: Arc<Psk> = Arc::clone(&attempt.unwrap().psk);
     assert!(!psk.is_erased());
     dialled.dial.handle_connected();
-    assert!(matches!(dialled.next(), Action::Open));
+    assert!(matches!(dialled.next(), DialAction::Open));
     assert!(psk.is_erased(), "spent");
     assert_eq!(dialled.kmes.asked.len(), 1);
 }
@@ -335,13 +335,16 @@ fn second_handshake_under_one_key_is_closed() {
     let mut other = Dialling::new(s(0), target(Some("sae-b"), 1), dialled.ring.as_ref());
     dialled.connects();
     let action = other.poll_action(dialled.now, dialled.ring.as_mut());
-    assert!(matches!(action, Some(Action::Connect { attempt: Some(_), .. })), "{action:?}");
+    assert!(matches!(action, Some(DialAction::Connect { attempt: Some(_), .. })), "{action:?}");
     other.handle_connected();
-    assert!(matches!(other.poll_action(dialled.now, dialled.ring.as_mut()), Some(Action::Open)));
+    assert!(matches!(
+        other.poll_action(dialled.now, dialled.ring.as_mut()),
+        Some(DialAction::Open)
+    ));
 
     dialled.dial.handle_connected();
     match dialled.next() {
-        Action::Close { code: CloseCode::KeyReused, reason } => assert!(!reason.is_empty()),
+        DialAction::Close { code: CloseCode::KeyReused, reason } => assert!(!reason.is_empty()),
         other => panic!("{other:?}"),
     }
     assert_eq!(dialled.fails().name, "KEY_REUSED");
@@ -356,7 +359,7 @@ fn classic_dial_opens_at_the_first_address_that_answers() {
     dialled.dial.handle_connected();
     // It came in time, although the poll is late.
     dialled.now = s(100);
-    assert!(matches!(dialled.next(), Action::Open));
+    assert!(matches!(dialled.next(), DialAction::Open));
     assert_eq!(dialled.dial.target().addresses.len(), 3);
     assert!(Keyring::new(&Config::default()).is_none());
 }

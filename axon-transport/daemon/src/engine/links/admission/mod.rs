@@ -6,14 +6,14 @@ use std::{collections::BTreeSet, net::IpAddr, rc::Rc, time::Duration};
 
 pub(super) use self::shares::HandshakePlace;
 pub(crate) use self::shares::place;
-use self::shares::{Handshakes, LoggedRefusals, gives_way};
+use self::shares::{HandshakeShares, LoggedRefusals, gives_way};
 
 /// Handshakes under way at once, but for those of listed peers; further dials are refused and come again.
 const MAX_HANDSHAKES: usize = 64;
 
 /// What the addresses of peers have, and what they may have.
 pub(super) struct AddressAdmission {
-    handshakes: Rc<Handshakes>,
+    handshakes: Rc<HandshakeShares>,
     /// Addresses of listed peers.
     listed: BTreeSet<IpAddr>,
     said: LoggedRefusals,
@@ -23,7 +23,7 @@ impl AddressAdmission {
     /// Nobody has anything yet.
     pub(super) fn new() -> Self {
         Self {
-            handshakes: Handshakes::new(MAX_HANDSHAKES),
+            handshakes: HandshakeShares::new(MAX_HANDSHAKES),
             listed: BTreeSet::new(),
             said: LoggedRefusals::default(),
         }

@@ -31,7 +31,7 @@ pub(crate) fn place(address: IpAddr) -> IpAddr {
 
 /// Handshakes under way, by address.
 #[derive(Debug)]
-pub(crate) struct Handshakes {
+pub(crate) struct HandshakeShares {
     most: usize,
     under_way: RefCell<HashMap<IpAddr, usize>>,
 }
@@ -39,11 +39,11 @@ pub(crate) struct Handshakes {
 /// A handshake that counts until this is dropped.
 #[derive(Debug)]
 pub(crate) struct HandshakePlace {
-    of: Rc<Handshakes>,
+    of: Rc<HandshakeShares>,
     at: IpAddr,
 }
 
-impl Handshakes {
+impl HandshakeShares {
     pub(crate) fn new(most: usize) -> Rc<Self> {
         Rc::new(Self { most, under_way: RefCell::default() })
     }
@@ -132,7 +132,7 @@ mod tests {
 
     #[test]
     fn one_address_takes_at_most_what_it_leaves_and_listed_peers_have_places_of_their_own() {
-        let handshakes = Handshakes::new(64);
+        let handshakes = HandshakeShares::new(64);
         let take = |host, listed| {
             std::iter::from_fn(|| handshakes.enter(at(host), listed)).collect::<Vec<_>>()
         };

@@ -12,14 +12,14 @@ fn holding(now: Duration, name: &str) -> BootstrapDialler {
 }
 
 fn give(dialler: &mut BootstrapDialler, now: Duration, name: &str) {
-    assert!(matches!(dialler.dial(now, "sae-b"), Dial::Wait { until: None, .. }));
+    assert!(matches!(dialler.dial(now, "sae-b"), DialDecision::Wait { until: None, .. }));
     let request = dialler.poll_request(now).expect("asks for a key");
     dialler.handle_answer(now, key(request, name, 1));
 }
 
 fn attempt(dialler: &mut BootstrapDialler, now: Duration) -> Option<KeyId> {
     match dialler.dial(now, "sae-b") {
-        Dial::DialKey(attempt) => Some(attempt.key_id),
+        DialDecision::DialKey(attempt) => Some(attempt.key_id),
         _ => None,
     }
 }
@@ -28,13 +28,13 @@ fn attempt(dialler: &mut BootstrapDialler, now: Duration) -> Option<KeyId> {
 fn no_kme_call_for_who_is_no_peer() {
     let mut dialler = new();
     for sae in ["sae-a", "sae-x", "", "SAE-B", "sae-b ", "*"] {
-        assert!(matches!(dialler.dial(s(1), sae), Dial::Refused(_)), "{sae}");
+        assert!(matches!(dialler.dial(s(1), sae), DialDecision::Refused(_)), "{sae}");
     }
     assert!(dialler.poll_request(s(1)).is_none());
     // Not even under `*`.
     let mut dialler = BootstrapDialler::new("sae-a", QkdPeers::Any, Cipher::default(), s(3));
     let dial = dialler.dial(s(1), "sae-a");
-    assert!(matches!(dial, Dial::Refused(DialRefusal::OwnSaeId(_))));
+    assert!(matches!(dial, DialDecision::Refused(DialRefusal::OwnSaeId(_))));
     assert!(dialler.poll_request(s(1)).is_none());
 }
 
@@ -60,7 +60,7 @@ fn a_key_is_tried_again_with_growing_pauses_and_given_up_after_ten_seconds() {
     while attempt(&mut dialler, now).is_some() {
         dialler.refused(now, "sae-b", &id("k1"));
         match dialler.dial(now, "sae-b") {
-            Dial::Wait { until: Some(until), .. } => {
+            DialDecision::Wait { until: Some(until), .. } => {
                 pauses.push((until - now).as_millis());
                 assert!(attempt(&mut dialler, until - ms(1)).is_none());
                 now = until;
@@ -75,7 +75,7 @@ fn a_key_is_tried_again_with_growing_pauses_and_given_up_after_ten_seconds() {
     assert_eq!(pauses.pop(), Some(1000), "given up: back-off before the KME is asked again");
     let tried: u128 = pauses.iter().sum();
     assert!((10_000..=11_600).contains(&tried), "{tried}");
-    assert!(matches!(dialler.dial(now, "sae-b"), Dial::Wait { until: None, .. }));
+    assert!(matches!(dialler.dial(now, "sae-b"), DialDecision::Wait { until: None, .. }));
     assert!(dialler.poll_request(now).is_some());
 }
 
@@ -138,11 +138,13 @@ fn failed_calls_are_spaced_out_up_to_a_minute() {
     let mut dialler = new();
     let (mut now, mut pauses) = (s(0), Vec::new());
     for _ in 0..9 {
-        assert!(matches!(dialler.dial(now, "sae-b"), Dial::Wait { until: None, .. }));
+        assert!(matches!(dialler.dial(now, "sae-b"), DialDecision::Wait { until: None, .. }));
         let request = dialler.poll_request(now).unwrap();
         assert!(dialler.poll_request(now).is_none(), "never two calls for one peer");
         dialler.handle_answer(now, failed(request, FailureKind::Ambiguous));
-        let Dial::Wait { until: Some(until), why } = dialler.dial(now, "sae-b") else { panic!() };
+        let DialDecision::Wait { until: Some(until), why } = dialler.dial(now, "sae-b") else {
+            panic!()
+        };
         assert!(why.contains("as the test says"), "{why}");
         pauses.push((until - now).as_secs());
         now = until;
@@ -163,7 +165,7 @@ fn made_up_names_under_a_star_are_bounded() {
     }
     assert_eq!(asked, 8, "in flight");
     let dial = dialler.dial(s(0), "one-more");
-    assert!(matches!(dial, Dial::Refused(DialRefusal::TooMany)));
+    assert!(matches!(dial, DialDecision::Refused(DialRefusal::TooMany)));
 }
 
 #[test]
@@ -182,7 +184,7 @@ fn answers_nobody_waits_for_are_dropped() {
 #[test]
 fn an_expired_refused_mismatched_or_spent_psk_is_erased_in_attempts_under_way() {
     let psk = |dialler: &mut BootstrapDialler| match dialler.dial(s(0), "sae-b") {
-        Dial::DialKey(attempt) => attempt.psk,
+        DialDecision::DialKey(attempt) => attempt.psk,
         other => panic!("{other:?}"),
     };
     type End = fn(&mut BootstrapDialler);

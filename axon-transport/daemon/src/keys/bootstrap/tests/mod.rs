@@ -12,7 +12,7 @@ use axon_tls::{
 use axon_transport::config::QkdPeers;
 use proptest::prelude::*;
 
-use super::{Acceptor, BootstrapDialler, Completion, Dial, DialRefusal, Lookup};
+use super::{Acceptor, BootstrapDialler, Completion, DialDecision, DialRefusal, Lookup};
 use crate::keys::{
     Clock,
     request::{Answer, FailureKind, Fetched, KmeRequest, RequestFailure},
