@@ -6,7 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use axon_daemon::internal::wire::Terms;
+use axon_daemon::internal::wire::SecurityTerms;
 use axon_transport::config::{Config, FileFacts, FileKind, Files, Security};
 
 /// A file system in which every file exists and is `axon.toml`.
@@ -62,7 +62,7 @@ pub fn config(data: &[u8]) -> bool {
     assert!(config.max_message <= u64::from(u32::MAX));
     assert!(config.daemon_peers.len() <= 64 && config.static_peers.len() <= 32);
     assert!(config.warnings().iter().all(|warning| !warning.contains('\n')));
-    let terms = Terms::of(&config);
+    let terms = SecurityTerms::of(&config);
     assert_eq!(terms.first_difference(&terms), None);
 
     let given = |prefix: &str| env.keys().any(|name| name.starts_with(prefix));

@@ -7,7 +7,7 @@ use axon_daemon::internal::{
     keys::KeyMessage,
     link::{self, FrameError},
     wire::{
-        Terms,
+        SecurityTerms,
         beacon::{self, Beacon, Datagram},
     },
 };
@@ -23,7 +23,7 @@ use axon_transport::{
     qos::Qos,
 };
 
-const TERMS: Terms = Terms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(1) };
+const TERMS: SecurityTerms = SecurityTerms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(1) };
 
 /// What decodes encodes to a datagram within bounds that decodes to the same.
 pub fn beacon(data: &[u8]) -> bool {
@@ -43,12 +43,12 @@ pub fn beacon(data: &[u8]) -> bool {
 
 /// What decodes encodes to a frame that decodes to the same, and compression changes nothing.
 pub fn link_frame(data: &[u8]) -> bool {
-    let decoded = link::Message::from_frame(data, link::MAX_INFLATED);
+    let decoded = link::LinkMessage::from_frame(data, link::MAX_INFLATED);
     if let Some((&kind, map)) = data.split_first().filter(|(kind, _)| **kind & 0x80 == 0) {
         let body = zstd::bulk::compress(map, 1).expect("zstd takes any bytes");
         let length = u32::try_from(map.len()).expect("inputs are short").to_be_bytes();
         let frame = [&[kind | 0x80][..], &length, &body].concat();
-        let inflated = link::Message::from_frame(&frame, link::MAX_INFLATED);
+        let inflated = link::LinkMessage::from_frame(&frame, link::MAX_INFLATED);
         assert_eq!(inflated.as_ref().ok(), decoded.as_ref().ok(), "compression matters");
     }
     let Ok(Some(message)) = decoded else { return false };
@@ -57,7 +57,7 @@ pub fn link_frame(data: &[u8]) -> bool {
             let (prefix, body) = frame.split_first_chunk::<4>().expect("a frame has a length");
             let length = link::read_length(*prefix, link::MAX_FRAME).expect("the length is right");
             assert_eq!(length, body.len());
-            let again = link::Message::from_frame(body, link::MAX_INFLATED)
+            let again = link::LinkMessage::from_frame(body, link::MAX_INFLATED)
                 .expect("what was encoded decodes");
             assert_eq!(again, Some(message));
         }
@@ -150,7 +150,7 @@ pub fn beacon_seeds() -> Vec<Vec<u8>> {
         answer_wanted: true,
         localhost: false,
     };
-    let qkd = Terms { mode: Terms::QKD, key_mode: 2, kex: 1, cipher: 0, auth: None };
+    let qkd = SecurityTerms { mode: SecurityTerms::QKD, key_mode: 2, kex: 1, cipher: 0, auth: None };
     let qkd = Beacon { terms: qkd, sae: Some("sae-a".into()), localhost: true, ..beacon.clone() };
     let foreign = beacon::Foreign { protocols: (2, 9), domain: 7, daemon };
     [
@@ -179,8 +179,8 @@ fn endpoint() -> Endpoint {
 
 /// Every message of the control stream, one of them large enough to be compressed.
 pub fn link_frame_seeds() -> Vec<Vec<u8>> {
-    use link::Message;
-    let hello = link::Hello {
+    use link::LinkMessage;
+    let hello = link::LinkHello {
         protocol_min: 1,
         protocol_max: 1,
         domain: 0,
@@ -200,7 +200,7 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
     };
     let gid = Gid([6; 16]);
     let key_id = KeyId::new("bc490419-7d60-487f-adc1-4ddcc177c139").unwrap();
-    let graph = |endpoints| link::Graph {
+    let graph = |endpoints| link::GraphUpdate {
         version: 2,
         before: 1,
         added: vec![endpoint(); endpoints],
@@ -212,45 +212,45 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
     };
     let mask = |bits| IndexMask::from_bits(bits).unwrap();
     let messages = [
-        Message::Hello(hello),
-        Message::Elected(link::Elected { link: [9; 16], election: 3 }),
-        Message::Graph(graph(1)),
-        Message::Graph(graph(64)),
-        Message::GraphResync(link::GraphResync { version: 2 }),
-        Message::Asserted(link::Asserted { publishers: vec![gid] }),
-        Message::Owners(link::Owners {
+        LinkMessage::LinkHello(hello),
+        LinkMessage::Elected(link::Elected { link: [9; 16], election: 3 }),
+        LinkMessage::GraphUpdate(graph(1)),
+        LinkMessage::GraphUpdate(graph(64)),
+        LinkMessage::GraphResync(link::GraphResync { version: 2 }),
+        LinkMessage::LivelinessAsserted(link::LivelinessAsserted { publishers: vec![gid] }),
+        LinkMessage::Owners(link::Owners {
             proofs: vec![axon_daemon::internal::owner::Proof { key: [1; 32], signature: [2; 64] }],
         }),
-        Message::Subscribe(link::Subscribe {
+        LinkMessage::Subscribe(link::Subscribe {
             route: 1,
             topic: "/scan".into(),
             type_name: "sensor_msgs/msg/LaserScan".into(),
             kind: 0,
-            subscribers: vec![link::Subscriber { gid, qos: Qos::default() }],
+            subscribers: vec![link::RouteSubscriber { gid, qos: Qos::default() }],
             last: vec![link::LastSeen { publisher: gid, sequence: 42 }],
             acknowledges: Some(true),
             short_headers: None,
         }),
-        Message::Received(link::Received {
+        LinkMessage::ReceivedUpTo(link::ReceivedUpTo {
             flows: vec![link::ReceivedOf { route: 1, publisher: gid, sequence: 43, dropped: 1 }],
         }),
-        Message::RouteRefused(link::RouteRefused {
+        LinkMessage::RouteRefused(link::RouteRefused {
             route: 1,
             reason: "why".into(),
             retry_s: Some(10),
         }),
-        Message::RouteUnasked(link::RouteUnasked {
+        LinkMessage::RouteUnasked(link::RouteUnasked {
             topic: "/scan".into(),
             type_name: "sensor_msgs/msg/LaserScan".into(),
             kind: 0,
             reason: Some("why".into()),
         }),
-        Message::Unsubscribe(link::Unsubscribe { route: 1 }),
-        Message::RouteReady(link::RouteReady { route: 1, publishers: vec![gid] }),
-        Message::Keepalive,
-        Message::LinkClosed(link::LinkClosed { link: [3; 16] }),
-        Message::Intake(link::Intake { unread: 33 << 20, messages: 64 << 20 }),
-        Message::Denied(link::Denied {
+        LinkMessage::Unsubscribe(link::Unsubscribe { route: 1 }),
+        LinkMessage::RouteReady(link::RouteReady { route: 1, publishers: vec![gid] }),
+        LinkMessage::Keepalive,
+        LinkMessage::LinkClosed(link::LinkClosed { link: [3; 16] }),
+        LinkMessage::Intake(link::Intake { unread: 33 << 20, messages: 64 << 20 }),
+        LinkMessage::DeniedUses(link::DeniedUses {
             denied: vec![link::DeniedUse {
                 verb: 0,
                 name: "/cmd_vel".into(),
@@ -258,18 +258,18 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
             }],
             lifted: vec![link::DeniedUse { verb: 3, name: "/dock".into(), reason: String::new() }],
         }),
-        Message::AccessCheck(link::AccessCheck {
+        LinkMessage::LinkAccessCheck(link::LinkAccessCheck {
             number: 5,
             uses: vec![session::CheckedUse { verb: 4, name: "/scan".into() }],
         }),
-        Message::AccessDecisions(link::AccessDecisions {
+        LinkMessage::AccessDecisions(link::AccessDecisions {
             number: 5,
             decisions: vec![link::UseDecision { allowed: true, reason: "line 4".into() }],
         }),
-        Message::Keys(KeyMessage::Announce(vec![key_id.clone(), KeyId::new("k2").unwrap()])),
-        Message::Keys(KeyMessage::Ready { key_id: key_id.clone(), proof: [8; 32] }),
-        Message::Keys(KeyMessage::Failed { key_id: key_id.clone(), reason: "unknown".into() }),
-        Message::Keys(KeyMessage::Retire { key_id, used: mask(0x3ff), reliable: mask(0x155) }),
+        LinkMessage::Keys(KeyMessage::Announce(vec![key_id.clone(), KeyId::new("k2").unwrap()])),
+        LinkMessage::Keys(KeyMessage::Ready { key_id: key_id.clone(), proof: [8; 32] }),
+        LinkMessage::Keys(KeyMessage::Failed { key_id: key_id.clone(), reason: "unknown".into() }),
+        LinkMessage::Keys(KeyMessage::Retire { key_id, used: mask(0x3ff), reliable: mask(0x155) }),
     ];
     messages.iter().map(|message| message.to_frame().unwrap().split_off(4)).collect()
 }

@@ -9,7 +9,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_daemon::internal::link::{Graph, Message};
+use axon_daemon::internal::link::{GraphUpdate, LinkMessage};
 use axon_transport::{
     EndpointSpec, Publisher, Subscription,
     graph::{Endpoint, EndpointKind},
@@ -69,8 +69,8 @@ impl Churn {
         let removed = before.map(|number| Gid::new(self.session, number)).collect();
         let added = (self.made + 1..=self.made + AT_A_TIME).map(endpoint).collect();
         let (version, before) = (self.version + 1, self.version);
-        let graph = Graph { version, before, added, removed, ..Graph::default() };
-        camera.stranger.say(&mut self.link, &Message::Graph(graph));
+        let graph = GraphUpdate { version, before, added, removed, ..GraphUpdate::default() };
+        camera.stranger.say(&mut self.link, &LinkMessage::GraphUpdate(graph));
         (self.version, self.made) = (version, self.made + AT_A_TIME);
     }
 }

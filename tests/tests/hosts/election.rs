@@ -3,7 +3,9 @@
 
 use std::net::SocketAddr;
 
-use axon_daemon::internal::link::{Elected, Graph, GraphResync, Message, Subscribe, Subscriber};
+use axon_daemon::internal::link::{
+    Elected, GraphResync, GraphUpdate, LinkMessage, RouteSubscriber, Subscribe,
+};
 use axon_tls::identity::{Auth, SigningKey};
 use axon_transport::{
     EndpointSpec,
@@ -52,12 +54,13 @@ impl Elector {
 
     fn elect(&self, met: &mut Met, election: u64) {
         let elected = Elected { link: [election as u8; 16], election };
-        self.stranger.say(met, &Message::Elected(elected));
+        self.stranger.say(met, &LinkMessage::Elected(elected));
     }
 
     /// Until the host says its graph on it, as it does first on a link.
     fn linked(&self, met: &mut Met) {
-        let whole = |m: &Message| matches!(m, Message::Graph(Graph { before: 0, .. }));
+        let whole =
+            |m: &LinkMessage| matches!(m, LinkMessage::GraphUpdate(GraphUpdate { before: 0, .. }));
         self.stranger.hear(met, whole).expect("the host's graph");
     }
 
@@ -75,8 +78,8 @@ impl Elector {
     fn say_subscription(&self, met: &mut Met) {
         let subscription = Endpoint::new(SUBSCRIPTION, EndpointKind::Subscription, TOPIC, TYPE)
             .with_node("one", "/");
-        let graph = Graph { version: 1, added: vec![subscription], ..Graph::default() };
-        self.stranger.say(met, &Message::Graph(graph));
+        let graph = GraphUpdate { version: 1, added: vec![subscription], ..GraphUpdate::default() };
+        self.stranger.say(met, &LinkMessage::GraphUpdate(graph));
     }
 
     /// Says a whole graph of 600 publishers in two parts; the last is of the topic.
@@ -94,14 +97,15 @@ impl Elector {
             let version = version + u64::from(!more);
             let before = if more { 0 } else { version - 1 };
             let (added, removed) = (part.map(publisher).collect(), Vec::new());
-            let graph = Graph { version, before, added, removed, more, ..Graph::default() };
-            self.stranger.say(met, &Message::Graph(graph));
+            let graph =
+                GraphUpdate { version, before, added, removed, more, ..GraphUpdate::default() };
+            self.stranger.say(met, &LinkMessage::GraphUpdate(graph));
         }
     }
 
     /// Asks for the topic under this route number.
     fn subscribe(&self, met: &mut Met, route: u32) {
-        let subscribers = vec![Subscriber { gid: SUBSCRIPTION, qos: Qos::default() }];
+        let subscribers = vec![RouteSubscriber { gid: SUBSCRIPTION, qos: Qos::default() }];
         let (topic, type_name) = (TOPIC.into(), TYPE.into());
         let subscribe = Subscribe {
             route,
@@ -113,7 +117,7 @@ impl Elector {
             acknowledges: None,
             short_headers: None,
         };
-        self.stranger.say(met, &Message::Subscribe(subscribe));
+        self.stranger.say(met, &LinkMessage::Subscribe(subscribe));
     }
 
     fn links(&self) -> usize {
@@ -135,7 +139,7 @@ fn the_last_elected_stands_when_it_is_heard_of_first() {
     assert_eq!(last.connection.close_reason(), None);
     assert_eq!(elector.links(), 1);
     // It is the link still: what is asked on it is answered.
-    elector.stranger.say(&mut last, &Message::GraphResync(GraphResync { version: 0 }));
+    elector.stranger.say(&mut last, &LinkMessage::GraphResync(GraphResync { version: 0 }));
     elector.linked(&mut last);
 }
 
@@ -179,7 +183,7 @@ fn a_route_whose_end_was_lost_with_a_link_ends_or_gives_way_to_its_successor() {
     elector.elect(&mut next, 2);
     elector.linked(&mut next);
     elector.subscribe(&mut next, 2);
-    let ready = |m: &Message| matches!(m, Message::RouteReady(ready) if ready.route == 2);
+    let ready = |m: &LinkMessage| matches!(m, LinkMessage::RouteReady(ready) if ready.route == 2);
     elector.stranger.hear(&mut next, ready).expect("the route");
     assert_eq!(publisher.matched().len(), 1);
 
@@ -220,17 +224,16 @@ fn a_whole_graph_in_parts_ends_no_route_in_between() {
     elector.elect(&mut link, 1);
     elector.linked(&mut link);
     elector.say_graph(&mut link, 1);
-    let asked =
-        |m: &Message| matches!(m, Message::Subscribe(subscribe) if subscribe.topic == TOPIC);
+    let asked = |m: &LinkMessage| matches!(m, LinkMessage::Subscribe(subscribe) if subscribe.topic == TOPIC);
     elector.stranger.hear(&mut link, asked).expect("the host asks for the topic");
     until("it is matched", || !subscription.matched().is_empty());
 
     elector.say_graph(&mut link, 3);
-    elector.stranger.say(&mut link, &Message::GraphResync(GraphResync { version: 0 }));
+    elector.stranger.say(&mut link, &LinkMessage::GraphResync(GraphResync { version: 0 }));
     let ended = std::cell::Cell::new(false);
-    let next = |m: &Message| {
-        ended.set(ended.get() || matches!(m, Message::Unsubscribe(_)));
-        matches!(m, Message::Graph(Graph { before: 0, .. }))
+    let next = |m: &LinkMessage| {
+        ended.set(ended.get() || matches!(m, LinkMessage::Unsubscribe(_)));
+        matches!(m, LinkMessage::GraphUpdate(GraphUpdate { before: 0, .. }))
     };
     elector.stranger.hear(&mut link, next).expect("the host's graph");
     assert!(!ended.get() && !subscription.matched().is_empty());

@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use axon_daemon::internal::link::{Graph, Message};
+use axon_daemon::internal::link::{GraphUpdate, LinkMessage};
 use axon_tls::identity::{Auth, KeyAlgorithm, SigningKey, Trust, TrustFile};
 use axon_transport::{
     Session, SessionOptions,
@@ -83,8 +83,8 @@ fn a_flood_of_strangers_hides_no_refused_session_and_no_claim_of_a_pinned_peer()
     }
     let gid = Gid::new(SessionId([7; 16]), 1);
     let claim = Endpoint::new(gid, EndpointKind::Publisher, "/claimed", "test/Text");
-    let graph = Graph { version: 1, added: vec![claim], ..Graph::default() };
-    camera.stranger.say(&mut link, &Message::Graph(graph));
+    let graph = GraphUpdate { version: 1, added: vec![claim], ..GraphUpdate::default() };
+    camera.stranger.say(&mut link, &LinkMessage::GraphUpdate(graph));
     camera.a.wait_refusal("the claim", |text| text.contains("did not prove"));
     flood(60);
     let strangers = |text: &str| text.contains("trust");

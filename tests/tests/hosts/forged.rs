@@ -11,7 +11,7 @@ use std::{
 };
 
 use axon_daemon::internal::wire::{
-    Terms,
+    SecurityTerms,
     beacon::{Beacon, Datagram},
 };
 use axon_transport::{ids::DaemonId, status::Status};
@@ -65,7 +65,7 @@ impl Forged {
             protocols: (1, 1),
             domain,
             daemon,
-            terms: Terms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(auth) },
+            terms: SecurityTerms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(auth) },
             sae: None,
             port: address.port(),
             addresses: vec![address.ip()],

@@ -7,7 +7,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_daemon::internal::link::{Graph, Message, Subscribe, Subscriber};
+use axon_daemon::internal::link::{GraphUpdate, LinkMessage, RouteSubscriber, Subscribe};
 use axon_tests::Sizes;
 use axon_tls::identity::{Auth, KeyAlgorithm, SigningKey, Trust, TrustFile};
 use axon_transport::{
@@ -92,8 +92,8 @@ impl Camera {
             let added = (from..to).map(|number| long(session, number)).collect();
             let (version, before) = (u64::from(to), u64::from(from));
             let more = to < count;
-            let graph = Graph { version, before, added, more, ..Graph::default() };
-            self.stranger.say(met, &Message::Graph(graph));
+            let graph = GraphUpdate { version, before, added, more, ..GraphUpdate::default() };
+            self.stranger.say(met, &LinkMessage::GraphUpdate(graph));
         }
     }
 
@@ -101,7 +101,8 @@ impl Camera {
     fn heard(&self, met: &mut Met, route: u32) {
         let topic = format!("/asked_{route}");
         self.stranger.say(met, &subscribe(route, topic, Vec::new()));
-        let ready = |m: &Message| matches!(m, Message::RouteReady(ready) if ready.route == route);
+        let ready =
+            |m: &LinkMessage| matches!(m, LinkMessage::RouteReady(ready) if ready.route == route);
         self.stranger.hear(met, ready).expect("an answer");
     }
 
@@ -131,8 +132,8 @@ fn long(session: SessionId, number: u32) -> Endpoint {
     .with_node(format!("{:0<500}", name("node")), format!("{:0<500}", name("space")))
 }
 
-fn subscribe(route: u32, topic: String, subscribers: Vec<Subscriber>) -> Message {
-    Message::Subscribe(Subscribe {
+fn subscribe(route: u32, topic: String, subscribers: Vec<RouteSubscriber>) -> LinkMessage {
+    LinkMessage::Subscribe(Subscribe {
         route,
         topic,
         type_name: "t".into(),
@@ -233,7 +234,13 @@ fn a_graph_has_a_bound_for_all_daemon_ids_of_a_peer_and_the_rest_of_the_link_goe
     let [first, second] = &mut links;
     let change = |before: u64, added, removed| {
         let version = before + 1;
-        Message::Graph(Graph { version, before, added, removed, ..Graph::default() })
+        LinkMessage::GraphUpdate(GraphUpdate {
+            version,
+            before,
+            added,
+            removed,
+            ..GraphUpdate::default()
+        })
     };
     let version = u64::from(MANY);
     let gone = vec![Gid::new(sessions[0], 0)];
@@ -292,8 +299,8 @@ fn a_flood_of_changes_holds_up_nobody_and_ends_in_the_newest_state() {
                 version += 1;
                 let before = version - 1;
                 let added = vec![short(session, 1, &topic(version))];
-                let graph = Graph { version, before, added, ..Graph::default() };
-                camera.stranger.say(link, &Message::Graph(graph));
+                let graph = GraphUpdate { version, before, added, ..GraphUpdate::default() };
+                camera.stranger.say(link, &LinkMessage::GraphUpdate(graph));
                 said.store(version, Relaxed);
                 // More than the daemon takes, and no more than its socket does: QUIC closes a connection for many lost
                 // packets of a stream that nobody reads.
@@ -305,8 +312,8 @@ fn a_flood_of_changes_holds_up_nobody_and_ends_in_the_newest_state() {
             // The newest is like no other.
             version += 1;
             let (before, added) = (version - 1, vec![short(session, 1, &topic(version))]);
-            let graph = Graph { version, before, added, ..Graph::default() };
-            camera.stranger.say(link, &Message::Graph(graph));
+            let graph = GraphUpdate { version, before, added, ..GraphUpdate::default() };
+            camera.stranger.say(link, &LinkMessage::GraphUpdate(graph));
             version
         });
         let end = OnDrop(|| enough.store(true, Relaxed));
@@ -353,8 +360,8 @@ fn a_flood_of_changes_holds_up_nobody_and_ends_in_the_newest_state() {
     camera.stranger.say(&mut link, &subscribe(1, "/asked".into(), Vec::new()));
     let asked = AtomicU64::new(0);
     let last = camera.stranger.hear(&mut link, |message| {
-        asked.fetch_add(u64::from(matches!(message, Message::Subscribe(_))), Relaxed);
-        matches!(message, Message::RouteReady(_))
+        asked.fetch_add(u64::from(matches!(message, LinkMessage::Subscribe(_))), Relaxed);
+        matches!(message, LinkMessage::RouteReady(_))
     });
     last.expect("an answer");
     let asked = asked.into_inner();
@@ -371,13 +378,14 @@ fn routes_that_take_more_than_a_peer_may_are_refused_by_name_and_the_others_serv
     // Each says 4 MB at most; it is kept three times. Routes may take four times as much as a graph.
     let key = SessionKey::generate().unwrap();
     camera.stranger.prove(&mut link, DaemonId([0xff; 16]), &[&key]);
-    let readers: Vec<_> =
-        (0..40_000).map(|number| Subscriber { gid: Gid::new(key.id(), number), qos }).collect();
+    let readers: Vec<_> = (0..40_000)
+        .map(|number| RouteSubscriber { gid: Gid::new(key.id(), number), qos })
+        .collect();
     for route in 100..108 {
         let (topic, subscribers) = (format!("/read_{route}"), readers.clone());
         camera.stranger.say(&mut link, &subscribe(route, topic, subscribers));
     }
-    let refused = |m: &Message| matches!(m, Message::RouteRefused(r) if r.route == 107);
+    let refused = |m: &LinkMessage| matches!(m, LinkMessage::RouteRefused(r) if r.route == 107);
     camera.stranger.hear(&mut link, refused).expect("a refusal");
     camera.heard(&mut link, 1);
     until("the route, by name and why", || {

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use axon_daemon::internal::link::{Graph, Message};
+use axon_daemon::internal::link::{GraphUpdate, LinkMessage};
 use axon_transport::{
     EndpointSpec, Session,
     graph::{Endpoint, EndpointKind},
@@ -45,11 +45,11 @@ fn all_published(camera: &Camera, met: &mut Met, topic: &str, all: &[Gid]) -> u3
             .with_node("hoard", "/")
     };
     let added = all.iter().map(publisher).collect();
-    let graph = Graph { version: 1, added, ..Graph::default() };
-    camera.stranger.say(met, &Message::Graph(graph));
-    let asked = |m: &Message| matches!(m, Message::Subscribe(s) if s.topic == topic);
+    let graph = GraphUpdate { version: 1, added, ..GraphUpdate::default() };
+    camera.stranger.say(met, &LinkMessage::GraphUpdate(graph));
+    let asked = |m: &LinkMessage| matches!(m, LinkMessage::Subscribe(s) if s.topic == topic);
     match camera.stranger.hear(met, asked) {
-        Ok(Message::Subscribe(subscribe)) => subscribe.route,
+        Ok(LinkMessage::Subscribe(subscribe)) => subscribe.route,
         other => panic!("{other:?}"),
     }
 }

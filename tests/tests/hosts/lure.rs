@@ -11,7 +11,7 @@ use std::{
 };
 
 use axon_daemon::internal::wire::{
-    Terms,
+    SecurityTerms,
     beacon::{Beacon, Datagram},
 };
 use axon_transport::ids::DaemonId;
@@ -27,7 +27,7 @@ struct Lure(Arc<AtomicBool>);
 
 impl Lure {
     /// Beacons that say that a daemon with these terms is at `at`, which the daemon of `host` lists.
-    fn new(host: &Host, at: SocketAddr, terms: Terms, sae: Option<&str>) -> Self {
+    fn new(host: &Host, at: SocketAddr, terms: SecurityTerms, sae: Option<&str>) -> Self {
         let beacon = Datagram::Beacon(Beacon {
             protocols: (1, 1),
             domain: host.domain(),
@@ -74,7 +74,7 @@ pub(crate) async fn accept_dial(
     server: &Endpoint,
     host: &Host,
     at: SocketAddr,
-    terms: Terms,
+    terms: SecurityTerms,
     sae: Option<&str>,
 ) -> Connection {
     let lure = Lure::new(host, at, terms, sae);

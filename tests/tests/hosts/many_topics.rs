@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axon_daemon::internal::link::{Message, Subscribe, Subscriber, Unsubscribe};
+use axon_daemon::internal::link::{LinkMessage, RouteSubscriber, Subscribe, Unsubscribe};
 use axon_tls::identity::{Auth, SigningKey};
 use axon_transport::{
     EndpointSpec, Publisher, Session, Subscription,
@@ -30,13 +30,13 @@ fn spec(number: u32) -> EndpointSpec {
     EndpointSpec::new(format!("/crowd_{number:05}"), TYPE, Qos::default())
 }
 
-fn subscribe(route: u32) -> Message {
-    Message::Subscribe(Subscribe {
+fn subscribe(route: u32) -> LinkMessage {
+    LinkMessage::Subscribe(Subscribe {
         route,
         topic: format!("/crowd_{route:05}"),
         type_name: TYPE.into(),
         kind: 0,
-        subscribers: vec![Subscriber { gid: Gid([7; 16]), qos: Qos::default() }],
+        subscribers: vec![RouteSubscriber { gid: Gid([7; 16]), qos: Qos::default() }],
         last: vec![],
         acknowledges: None,
         short_headers: None,
@@ -64,13 +64,14 @@ fn a_peer_that_asks_for_too_many_routes_is_refused_those_by_name_and_keeps_its_l
     for route in 0..CROWD {
         stranger.say(&mut met, &subscribe(route));
     }
-    let is_refused = |m: &Message| matches!(m, Message::RouteRefused(_));
-    let Ok(Message::RouteRefused(first)) = stranger.hear(&mut met, is_refused) else {
+    let is_refused = |m: &LinkMessage| matches!(m, LinkMessage::RouteRefused(_));
+    let Ok(LinkMessage::RouteRefused(first)) = stranger.hear(&mut met, is_refused) else {
         panic!("nothing is refused")
     };
     assert!(first.route > 1024 && first.reason.contains("graph_mb"), "{first:?}");
     for route in first.route + 1..CROWD {
-        let refused = |m: &Message| matches!(m, Message::RouteRefused(r) if r.route == route);
+        let refused =
+            |m: &LinkMessage| matches!(m, LinkMessage::RouteRefused(r) if r.route == route);
         stranger.hear(&mut met, refused).expect("it is refused");
     }
     let more = (CROWD - first.route) as usize;
@@ -79,9 +80,10 @@ fn a_peer_that_asks_for_too_many_routes_is_refused_those_by_name_and_keeps_its_l
     let name = format!("/crowd_{:05}", first.route);
     assert!(shown.routes_refused.keys().any(|topic| topic.contains(&name)), "{shown:?}");
     // Where there is room it gets it.
-    stranger.say(&mut met, &Message::Unsubscribe(Unsubscribe { route: 0 }));
+    stranger.say(&mut met, &LinkMessage::Unsubscribe(Unsubscribe { route: 0 }));
     stranger.say(&mut met, &subscribe(first.route));
-    let ready = |m: &Message| matches!(m, Message::RouteReady(ready) if ready.route == first.route);
+    let ready =
+        |m: &LinkMessage| matches!(m, LinkMessage::RouteReady(ready) if ready.route == first.route);
     stranger.hear(&mut met, ready).expect("it is served");
     assert_eq!(met.connection.close_reason(), None);
     until("it is shown no more", || refused(&host) == more - 1);

@@ -1,7 +1,7 @@
 //! A peer that announces the endpoints of another host as its own.
 
 use axon_daemon::internal::{
-    link::{Graph, Message, Owners},
+    link::{GraphUpdate, LinkMessage, Owners},
     owner::{Proof, prove},
 };
 use axon_tls::identity::{Auth, SigningKey};
@@ -68,8 +68,8 @@ fn a_pinned_peer_that_announces_gids_first_does_not_keep_their_owner_out() {
 
     let mut link = camera.link(0xff);
     let added = (0..64).map(|number| claim(first.gid(), number)).collect();
-    let graph = Graph { version: 1, added, ..Graph::default() };
-    camera.stranger.say(&mut link, &Message::Graph(graph));
+    let graph = GraphUpdate { version: 1, added, ..GraphUpdate::default() };
+    camera.stranger.say(&mut link, &LinkMessage::GraphUpdate(graph));
     camera.a.wait_refusal("the claim, by name", |text| {
         ["camera", TOPIC, "did not prove", "session"].iter().all(|part| text.contains(part))
     });
@@ -101,12 +101,12 @@ fn a_pinned_peer_that_announces_gids_later_takes_nothing_away() {
     claimed.gid = publisher.gid();
     let added = vec![claimed];
     for version in 1..100 {
-        let graph = Graph { version, added: added.clone(), ..Graph::default() };
-        camera.stranger.say(&mut link, &Message::Graph(graph));
+        let graph = GraphUpdate { version, added: added.clone(), ..GraphUpdate::default() };
+        camera.stranger.say(&mut link, &LinkMessage::GraphUpdate(graph));
         let removed = vec![publisher.gid()];
         let (before, version) = (version, version + 1);
-        let graph = Graph { version, before, removed, ..Graph::default() };
-        camera.stranger.say(&mut link, &Message::Graph(graph));
+        let graph = GraphUpdate { version, before, removed, ..GraphUpdate::default() };
+        camera.stranger.say(&mut link, &LinkMessage::GraphUpdate(graph));
     }
     camera.a.wait_refusal("the claim, by name", |text| {
         text.contains("camera") && text.contains("did not prove")
@@ -122,8 +122,8 @@ fn a_proof_of_another_connection_or_daemon_is_worth_nothing_and_one_of_its_own_c
     let key = SessionKey::generate().unwrap();
     let gid = Gid::new(key.id(), 0);
     let announce = |link: &mut _, version: u64| {
-        let graph = Graph { version, added: vec![claim(gid, 0)], ..Graph::default() };
-        camera.stranger.say(link, &Message::Graph(graph));
+        let graph = GraphUpdate { version, added: vec![claim(gid, 0)], ..GraphUpdate::default() };
+        camera.stranger.say(link, &LinkMessage::GraphUpdate(graph));
     };
     let left_out = |text: &str| text.contains("did not prove") && text.contains(&gid.to_string());
     let mut link = camera.link(0xff);
@@ -131,7 +131,7 @@ fn a_proof_of_another_connection_or_daemon_is_worth_nothing_and_one_of_its_own_c
     let daemon = DaemonId([0xff; 16]);
     let replayed = prove(&key, &[7; 32], daemon).unwrap();
     let torn = Proof { signature: [3; 64], ..replayed.clone() };
-    camera.stranger.say(&mut link, &Message::Owners(Owners { proofs: vec![replayed, torn] }));
+    camera.stranger.say(&mut link, &LinkMessage::Owners(Owners { proofs: vec![replayed, torn] }));
     camera.stranger.prove(&mut link, DaemonId([0xfe; 16]), &[&key]);
     announce(&mut link, 1);
     camera.a.wait_refusal("the claim, by name", left_out);
@@ -151,7 +151,7 @@ fn a_flood_of_proofs_holds_up_nobody() {
     let proof = prove(&key, &[7; 32], DaemonId([0xff; 16])).unwrap();
     let proofs = vec![proof; axon_daemon::internal::link::MAX_PROOFS];
     for _ in 0..32 {
-        camera.stranger.say(&mut link, &Message::Owners(Owners { proofs: proofs.clone() }));
+        camera.stranger.say(&mut link, &LinkMessage::Owners(Owners { proofs: proofs.clone() }));
     }
     let (reader, owner) = (camera.a.session("reader"), camera.b.session("owner"));
     let subscription = reader.create_subscription(spec(TOPIC)).unwrap();
@@ -177,8 +177,8 @@ fn where_nothing_is_proved_the_first_address_has_a_gid_until_it_leaves() {
     let used = u32::from_be_bytes(first.gid().0[12..].try_into().unwrap());
     let added: Vec<_> = (used + 1..used + 64).map(|number| claim(first.gid(), number)).collect();
     let last = added.last().unwrap().gid;
-    let graph = Graph { version: 1, added, ..Graph::default() };
-    stranger.say(&mut link, &Message::Graph(graph));
+    let graph = GraphUpdate { version: 1, added, ..GraphUpdate::default() };
+    stranger.say(&mut link, &LinkMessage::GraphUpdate(graph));
     until("the squatter is first", || node_of(&reader, last).is_some());
 
     let publisher = owner.create_publisher(spec(TOPIC)).unwrap();

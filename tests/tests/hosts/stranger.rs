@@ -7,7 +7,7 @@ use std::{
 };
 
 use axon_daemon::internal::{
-    link::{Elected, Hello, MAX_FRAME, Message, Owners, read_length},
+    link::{Elected, LinkHello, LinkMessage, MAX_FRAME, Owners, read_length},
     owner::{EXPORTER, prove},
 };
 use axon_tls::{
@@ -73,7 +73,7 @@ impl Stranger {
         claim: &Claim<'_>,
     ) -> Result<Met, String> {
         let mut met = self.meet(to, domain, auth, claim)?;
-        self.hear(&mut met, |message| matches!(message, Message::Elected(_)))?;
+        self.hear(&mut met, |message| matches!(message, LinkMessage::Elected(_)))?;
         Ok(met)
     }
 
@@ -88,10 +88,10 @@ impl Stranger {
         let to = SocketAddr::from((host.address, status.port.unwrap()));
         let mut met = self.meet(to, host.domain(), auth, claim)?;
         if claim.daemon.to_string() < status.daemon {
-            self.say(&mut met, &Message::Elected(Elected { link: [7; 16], election: 1 }));
-            self.hear(&mut met, |message| !matches!(message, Message::Elected(_)))?;
+            self.say(&mut met, &LinkMessage::Elected(Elected { link: [7; 16], election: 1 }));
+            self.hear(&mut met, |message| !matches!(message, LinkMessage::Elected(_)))?;
         } else {
-            self.hear(&mut met, |message| matches!(message, Message::Elected(_)))?;
+            self.hear(&mut met, |message| matches!(message, LinkMessage::Elected(_)))?;
         }
         Ok(met)
     }
@@ -119,8 +119,8 @@ impl Stranger {
                 Err(error) => Err(error.to_string()),
             }
         })?;
-        self.say(&mut met, &Message::Hello(hello(domain, claim)));
-        self.hear(&mut met, |message| matches!(message, Message::Hello(_)))?;
+        self.say(&mut met, &LinkMessage::LinkHello(hello(domain, claim)));
+        self.hear(&mut met, |message| matches!(message, LinkMessage::LinkHello(_)))?;
         Ok(met)
     }
 
@@ -129,11 +129,11 @@ impl Stranger {
         let mut binding = [0; 32];
         met.connection.export_keying_material(&mut binding, EXPORTER, b"").unwrap();
         let proofs = sessions.iter().map(|key| prove(key, &binding, daemon).unwrap()).collect();
-        self.say(met, &Message::Owners(Owners { proofs }));
+        self.say(met, &LinkMessage::Owners(Owners { proofs }));
     }
 
     /// Says something; whether it arrives is for what comes next to tell.
-    pub(crate) fn say(&self, met: &mut Met, message: &Message) {
+    pub(crate) fn say(&self, met: &mut Met, message: &LinkMessage) {
         let frame = message.to_frame().unwrap();
         let _ = self.limited(met.send.write_all(&frame));
     }
@@ -142,8 +142,8 @@ impl Stranger {
     pub(crate) fn hear(
         &self,
         met: &mut Met,
-        awaited: impl Fn(&Message) -> bool,
-    ) -> Result<Message, String> {
+        awaited: impl Fn(&LinkMessage) -> bool,
+    ) -> Result<LinkMessage, String> {
         self.limited(async {
             loop {
                 match next(&mut met.receive).await {
@@ -211,8 +211,8 @@ impl Stranger {
     }
 }
 
-fn hello(domain: u32, claim: &Claim<'_>) -> Hello {
-    Hello {
+fn hello(domain: u32, claim: &Claim<'_>) -> LinkHello {
+    LinkHello {
         protocol_min: 1,
         protocol_max: 1,
         domain,
@@ -233,13 +233,13 @@ fn hello(domain: u32, claim: &Claim<'_>) -> Hello {
 }
 
 /// The next message of a known type, `None` at the end of the stream.
-async fn next(receive: &mut RecvStream) -> Option<Message> {
+async fn next(receive: &mut RecvStream) -> Option<LinkMessage> {
     loop {
         let mut length = [0; 4];
         receive.read_exact(&mut length).await.ok()?;
         let mut frame = vec![0; read_length(length, MAX_FRAME).unwrap()];
         receive.read_exact(&mut frame).await.ok()?;
-        if let Some(message) = Message::from_frame(&frame, MAX_FRAME).unwrap() {
+        if let Some(message) = LinkMessage::from_frame(&frame, MAX_FRAME).unwrap() {
             return Some(message);
         }
     }

@@ -6,7 +6,7 @@ use std::{
 };
 
 use axon_daemon::internal::link::{
-    Graph, Message, Received, ReceivedOf, Subscribe, Subscriber, Unsubscribe,
+    GraphUpdate, LinkMessage, ReceivedOf, ReceivedUpTo, RouteSubscriber, Subscribe, Unsubscribe,
 };
 use axon_envelope::inner::{Header, RequestId};
 use axon_shm::PublishError;
@@ -41,27 +41,27 @@ pub(super) fn subscribe(stranger: &Stranger, met: &mut Met, topic: &str) {
     let subscription = Endpoint::new(SUBSCRIPTION, EndpointKind::Subscription, topic, TYPE)
         .with_qos(Qos::keep_all())
         .with_node("idle", "/");
-    let graph = Graph { version: 1, added: vec![subscription], ..Graph::default() };
-    stranger.say(met, &Message::Graph(graph));
+    let graph = GraphUpdate { version: 1, added: vec![subscription], ..GraphUpdate::default() };
+    stranger.say(met, &LinkMessage::GraphUpdate(graph));
     let subscribe = Subscribe {
         route: 1,
         topic: topic.into(),
         type_name: TYPE.into(),
         kind: 0,
-        subscribers: vec![Subscriber { gid: SUBSCRIPTION, qos: Qos::keep_all() }],
+        subscribers: vec![RouteSubscriber { gid: SUBSCRIPTION, qos: Qos::keep_all() }],
         last: vec![],
         acknowledges: Some(true),
         short_headers: None,
     };
-    stranger.say(met, &Message::Subscribe(subscribe));
+    stranger.say(met, &LinkMessage::Subscribe(subscribe));
 }
 
-fn refused(message: &Message) -> bool {
-    matches!(message, Message::RouteRefused(refused) if refused.route == 1)
+fn refused(message: &LinkMessage) -> bool {
+    matches!(message, LinkMessage::RouteRefused(refused) if refused.route == 1)
 }
 
-fn retry(message: Message) -> u32 {
-    let Message::RouteRefused(refused) = message else { panic!("{message:?}") };
+fn retry(message: LinkMessage) -> u32 {
+    let LinkMessage::RouteRefused(refused) = message else { panic!("{message:?}") };
     refused.retry_s.expect("it may ask again")
 }
 
@@ -133,7 +133,7 @@ fn claims_to_have_dropped(host: &Host, session: &Session) {
     until("it is served", || publisher.matched().len() == 1);
     let mut say = |sequence, dropped| {
         let flow = ReceivedOf { route: 1, publisher: publisher.gid(), sequence, dropped };
-        stranger.say(&mut met, &Message::Received(Received { flows: vec![flow] }));
+        stranger.say(&mut met, &LinkMessage::ReceivedUpTo(ReceivedUpTo { flows: vec![flow] }));
     };
     for given_up in 1..=2 {
         let sequence = publisher.publish(b"sample").unwrap();
@@ -228,12 +228,12 @@ fn ask(stranger: &Stranger, met: &mut Met, kind: EndpointKind) {
         topic: SERVICE.into(),
         type_name: TYPE.into(),
         kind: if kind == EndpointKind::Server { REQUESTS } else { RESPONSES },
-        subscribers: vec![Subscriber { gid: SUBSCRIPTION, qos: Qos::keep_all() }],
+        subscribers: vec![RouteSubscriber { gid: SUBSCRIPTION, qos: Qos::keep_all() }],
         last: vec![],
         acknowledges: Some(true),
         short_headers: None,
     };
-    stranger.say(met, &Message::Subscribe(subscribe));
+    stranger.say(met, &LinkMessage::Subscribe(subscribe));
 }
 
 /// A peer that has this end of the service.
@@ -244,8 +244,8 @@ fn at_service(host: &Host, kind: EndpointKind, idler: Idler) -> (Stranger, Met) 
     let end = Endpoint::new(SUBSCRIPTION, kind, SERVICE, TYPE)
         .with_qos(Qos::keep_all())
         .with_node("idle", "/");
-    let graph = Graph { version: 1, added: vec![end], ..Graph::default() };
-    stranger.say(&mut met, &Message::Graph(graph));
+    let graph = GraphUpdate { version: 1, added: vec![end], ..GraphUpdate::default() };
+    stranger.say(&mut met, &LinkMessage::GraphUpdate(graph));
     if idler != Idler::Silent {
         ask(&stranger, &mut met, kind);
     }
@@ -318,8 +318,9 @@ fn takes_no_response(idler: Idler) {
     let client = host.session("client").create_client(service()).unwrap();
     assert!(client.wait_available(PATIENCE));
     let (stranger, mut met) = at_service(&host, EndpointKind::Client, idler);
-    let is_asked = |m: &Message| matches!(m, Message::Subscribe(s) if s.kind == REQUESTS);
-    let Message::Subscribe(asked) = stranger.hear(&mut met, is_asked).expect("it is asked") else {
+    let is_asked = |m: &LinkMessage| matches!(m, LinkMessage::Subscribe(s) if s.kind == REQUESTS);
+    let LinkMessage::Subscribe(asked) = stranger.hear(&mut met, is_asked).expect("it is asked")
+    else {
         unreachable!()
     };
     let mut requests = vec![1, 0, 0, 0];
@@ -354,7 +355,7 @@ fn takes_no_response(idler: Idler) {
             let sent = server.send_response(request.publisher, request.sequence, &answer);
             blocked |= matches!(sent, Err(PublishError::Blocked { .. }));
             if idler == Idler::AsksAgain && asked_at.elapsed() > Duration::from_secs(2) {
-                stranger.say(&mut met, &Message::Unsubscribe(Unsubscribe { route: 1 }));
+                stranger.say(&mut met, &LinkMessage::Unsubscribe(Unsubscribe { route: 1 }));
                 ask(&stranger, &mut met, EndpointKind::Client);
                 asked_at = Instant::now();
             }
@@ -366,8 +367,8 @@ fn takes_no_response(idler: Idler) {
         let told = stranger.hear(&mut met, refused).expect("it is told");
         assert!(retry(told) > 0);
     }
-    let unasked = |m: &Message| {
-        matches!(m, Message::RouteUnasked(u) if u.kind == REQUESTS
+    let unasked = |m: &LinkMessage| {
+        matches!(m, LinkMessage::RouteUnasked(u) if u.kind == REQUESTS
             && u.reason.as_ref().is_some_and(|reason| reason.contains("stalled_s")))
     };
     stranger.hear(&mut met, unasked).expect("it is told");

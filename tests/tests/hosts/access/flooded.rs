@@ -6,7 +6,7 @@ use std::{
     time::Instant,
 };
 
-use axon_daemon::internal::link::{Graph, Message};
+use axon_daemon::internal::link::{GraphUpdate, LinkMessage};
 use axon_transport::{
     graph::{Endpoint, EndpointKind},
     ids::{DaemonId, Gid},
@@ -44,8 +44,8 @@ fn flood(camera: &Camera, over: &AtomicBool, said: &AtomicU64) {
             removed = gids.collect();
         }
         let (before, next) = (version, version + 1);
-        let graph = Graph { version: next, before, added, removed, ..Graph::default() };
-        camera.stranger.say(&mut link, &Message::Graph(graph));
+        let graph = GraphUpdate { version: next, before, added, removed, ..GraphUpdate::default() };
+        camera.stranger.say(&mut link, &LinkMessage::GraphUpdate(graph));
         version = next;
         said.store(version, Relaxed);
     }

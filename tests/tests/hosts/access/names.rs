@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use axon_daemon::internal::link::{Graph, Message};
+use axon_daemon::internal::link::{GraphUpdate, LinkMessage};
 use axon_tls::identity::{Auth, CaMaterial};
 use axon_transport::{
     graph::{Endpoint, EndpointKind},
@@ -33,12 +33,15 @@ fn asked(
         endpoint(1, EndpointKind::Publisher, "/cmd_vel"),
         endpoint(2, EndpointKind::Publisher, "/status"),
     ];
-    stranger.say(met, &Message::Graph(Graph { version: 1, added, ..Graph::default() }));
+    stranger.say(
+        met,
+        &LinkMessage::GraphUpdate(GraphUpdate { version: 1, added, ..GraphUpdate::default() }),
+    );
     let mut asked = Vec::new();
     while !awaited.iter().all(|topic| asked.iter().any(|asked| asked == topic)) {
-        let subscribe = |message: &Message| matches!(message, Message::Subscribe(_));
+        let subscribe = |message: &LinkMessage| matches!(message, LinkMessage::Subscribe(_));
         match stranger.hear(met, subscribe) {
-            Ok(Message::Subscribe(subscribe)) => asked.push(subscribe.topic),
+            Ok(LinkMessage::Subscribe(subscribe)) => asked.push(subscribe.topic),
             other => panic!("{other:?}"),
         }
     }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use axon_daemon::internal::link::{Graph, Message, Subscribe, Subscriber};
+use axon_daemon::internal::link::{GraphUpdate, LinkMessage, RouteSubscriber, Subscribe};
 use axon_transport::{
     graph::{Endpoint, EndpointKind},
     ids::{DaemonId, Gid},
@@ -74,13 +74,13 @@ fn endpoints<'a>(
     (0..).zip(names).map(of).collect()
 }
 
-fn subscribe(route: u32, topic: &str, gid: Gid) -> Message {
-    Message::Subscribe(Subscribe {
+fn subscribe(route: u32, topic: &str, gid: Gid) -> LinkMessage {
+    LinkMessage::Subscribe(Subscribe {
         route,
         topic: topic.into(),
         type_name: "test/Bytes".into(),
         kind: 0,
-        subscribers: vec![Subscriber { gid, qos: Qos::keep_all() }],
+        subscribers: vec![RouteSubscriber { gid, qos: Qos::keep_all() }],
         last: Vec::new(),
         acknowledges: Some(true),
         short_headers: None,
@@ -102,7 +102,8 @@ fn a_name_that_looks_like_one_that_rules_permit_is_another_name() {
     let mut link = camera.link(0xff);
     camera.stranger.prove(&mut link, DaemonId([0xff; 16]), &[&key]);
     let added = endpoints(&key, all.iter().copied(), EndpointKind::Publisher, 1);
-    let announced = Message::Graph(Graph { version: 1, added, ..Graph::default() });
+    let announced =
+        LinkMessage::GraphUpdate(GraphUpdate { version: 1, added, ..GraphUpdate::default() });
     camera.stranger.say(&mut link, &announced);
     // It asks for all topics, and last for one that it may have.
     for (route, topic) in (100..).zip(&all) {
@@ -112,15 +113,17 @@ fn a_name_that_looks_like_one_that_rules_permit_is_another_name() {
     let (mut refused, mut shown) = (BTreeSet::new(), BTreeSet::new());
     while asked.len() < PERMITTED.len() || served.len() + refused.len() < all.len() {
         match camera.stranger.hear(&mut link, |_| true).expect("the link stands") {
-            Message::Subscribe(subscribe) => drop(asked.insert(subscribe.topic)),
-            Message::RouteReady(ready) => {
+            LinkMessage::Subscribe(subscribe) => drop(asked.insert(subscribe.topic)),
+            LinkMessage::RouteReady(ready) => {
                 served.insert(all[ready.route as usize - 100].to_owned());
             }
-            Message::RouteRefused(no) => {
+            LinkMessage::RouteRefused(no) => {
                 assert_eq!(no.reason, "denied: no [[allow]] in access.toml permits this");
                 refused.insert(all[no.route as usize - 100].to_owned());
             }
-            Message::Graph(graph) => shown.extend(graph.added.into_iter().map(|e| e.topic)),
+            LinkMessage::GraphUpdate(graph) => {
+                shown.extend(graph.added.into_iter().map(|e| e.topic))
+            }
             _ => {}
         }
     }
@@ -152,7 +155,11 @@ fn names_that_are_too_long_end_the_link_that_they_come_over_and_no_other() {
                     node.node = name.to_owned();
                 }
             }
-            let announced = Message::Graph(Graph { version: 1, added, ..Graph::default() });
+            let announced = LinkMessage::GraphUpdate(GraphUpdate {
+                version: 1,
+                added,
+                ..GraphUpdate::default()
+            });
             camera.stranger.say(&mut link, &announced);
             let why = camera.stranger.hear(&mut link, |_| false).expect_err("it is closed");
             assert!(!why.is_empty());

@@ -110,7 +110,7 @@ impl Link {
             Cipher::ChaCha20Poly1305 => 0,
             Cipher::Aes256Gcm => 1,
         };
-        let terms = wire::Terms { mode: 1, key_mode: 1, kex: 2, cipher: suite, auth: None };
+        let terms = wire::SecurityTerms { mode: 1, key_mode: 1, kex: 2, cipher: suite, auth: None };
         let _session = host.session("searched");
         self.runtime.block_on(async {
             let endpoint = lure::server(config, Ipv4Addr::LOCALHOST);

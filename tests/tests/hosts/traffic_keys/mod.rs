@@ -116,7 +116,11 @@ async fn dial(host: &Host, config: quinn::ClientConfig) -> Stands {
 }
 
 /// The daemon of the first host dials this process.
-async fn accept(hosts: &[Host; 2], config: quinn::ServerConfig, terms: wire::Terms) -> Stands {
+async fn accept(
+    hosts: &[Host; 2],
+    config: quinn::ServerConfig,
+    terms: wire::SecurityTerms,
+) -> Stands {
     let endpoint = lure::server(config, hosts[1].address);
     let at = endpoint.local_addr().unwrap();
     let connection = lure::accept_dial(&endpoint, &hosts[0], at, terms, None).await;
@@ -160,8 +164,13 @@ fn of_a_link(auth: Auth, cipher: Cipher, daemon_dials: bool) {
     let learnt = Learnt::default();
     let session = daemon_dials.then(|| hosts[0].session("searched"));
     let cipher_number = u8::from(cipher == Cipher::Aes256Gcm);
-    let terms =
-        wire::Terms { mode: 0, key_mode: 0, kex: 0, cipher: cipher_number, auth: Some(auth as u8) };
+    let terms = wire::SecurityTerms {
+        mode: 0,
+        key_mode: 0,
+        kex: 0,
+        cipher: cipher_number,
+        auth: Some(auth as u8),
+    };
     let Stands { endpoint, connection, control } = runtime.block_on(async {
         if daemon_dials {
             accept(&hosts, tapped::server(cipher, &own, &learnt), terms).await
