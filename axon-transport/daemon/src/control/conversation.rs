@@ -20,9 +20,9 @@ use axon_transport::internal::{
 use tokio::{io::unix::AsyncFd, sync::Notify};
 
 use super::{
+    descriptors::{DescriptorRoom, SpareDescriptors},
     plane::ControlPlane,
     report::send_status,
-    room::{DescriptorRoom, SpareDescriptors},
     turns::{PART, ProcessTurn},
 };
 

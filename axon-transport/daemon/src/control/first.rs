@@ -15,7 +15,7 @@ use zeroize::Zeroize;
 use super::{
     admission::unshared,
     conversation::{receive, say},
-    room::SpareDescriptors,
+    descriptors::SpareDescriptors,
 };
 
 /// Messages of unknown types that may come before HELLO.

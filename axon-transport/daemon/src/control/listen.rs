@@ -35,10 +35,10 @@ use tokio::{io::unix::AsyncFd, sync::Notify, task::spawn_local, time::timeout};
 
 use super::{
     conversation::{converse, say},
+    descriptors::DescriptorRoom,
     first::{FirstMessage, first},
     pending::{MOST, MOST_WHERE_SHORT, PendingConnections, Stranger},
     plane::ControlPlane,
-    room::DescriptorRoom,
     turns::ProcessTurn,
 };
 use crate::{

@@ -6,6 +6,7 @@
 
 mod admission;
 mod conversation;
+mod descriptors;
 mod detach;
 mod first;
 mod gateway;
@@ -18,7 +19,6 @@ mod relayed;
 mod reload;
 mod remote;
 mod report;
-mod room;
 mod run;
 mod turns;
 

@@ -32,12 +32,12 @@ use tokio::sync::{Notify, watch};
 use self::refusals::Refusals;
 use super::{
     admission::Admission,
+    descriptors::SpareDescriptors,
     losses::Losses,
     report::{
         questions::{AccessQuestions, NOT_LINKED},
         waiting::NotifiedEndpoints,
     },
-    room::SpareDescriptors,
     turns::ProcessTurns,
 };
 use crate::{

@@ -249,8 +249,9 @@ fn differing(old: &NamedSettings, new: &NamedSettings) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
-    use super::{super::room::SpareDescriptors, *};
+    use super::*;
     use crate::bridge::ToControl;
+    use crate::control::descriptors::SpareDescriptors;
     use axon_transport::{
         access::{Party, Verb},
         config::{TopicPattern, TopicPriority, TopicRule},

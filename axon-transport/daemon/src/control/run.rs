@@ -25,6 +25,7 @@ use tokio::{
 };
 
 use super::{
+    descriptors::SpareDescriptors,
     detach::{Report, detach, start_detached},
     gateway::GatewayEntry,
     listen::accept,
@@ -32,7 +33,6 @@ use super::{
     plane::ControlPlane,
     reload::{SettingsSource, reload},
     remote::{DaemonGateway, GATEWAY},
-    room::SpareDescriptors,
 };
 use crate::discovery::DiscoveryEvent;
 

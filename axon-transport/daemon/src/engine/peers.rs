@@ -13,7 +13,8 @@ use axon_transport::config::{Config, TopicRule};
 
 use super::{
     peer::{
-        LocalEndpoints, Peer, PeerContext, WritersHere, kept::KeptRelays, stalls::StallHistory,
+        LocalEndpoints, Peer, PeerContext, WritersHere, kept_relays::KeptRelays,
+        stalls::StallHistory,
     },
     rings::Rings,
     stand_in::StandIns,

@@ -9,10 +9,10 @@ mod delivery;
 mod held;
 mod incoming;
 mod limited;
-mod line;
 mod reading;
 mod receipts;
 mod run;
+mod stream_queue;
 #[cfg(test)]
 mod tests;
 
@@ -32,8 +32,8 @@ pub(crate) use self::incoming::StreamHeader;
 use self::{
     incoming::{IncomingStream, StreamStep},
     limited::Limited,
-    line::StreamQueue,
     receipts::Receipts,
+    stream_queue::StreamQueue,
 };
 use super::quic::transport::STREAM_WINDOW;
 use crate::{

@@ -9,7 +9,7 @@ use std::{
 
 use axon_transport::{access::EgressLimit, status::LimitStatus};
 
-use super::{bucket::Level, interfaces::InterfaceLimits};
+use super::{interfaces::InterfaceLimits, leaky_bucket::Level};
 
 /// What may leave at once, in seconds of the limit, and at least in bytes: a few packets.
 const AT_ONCE: (f64, f64) = (0.005, 6000.0);

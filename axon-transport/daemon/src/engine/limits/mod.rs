@@ -1,10 +1,10 @@
 //! How much of which topic may pass between this host and one identity: `[[limit]]` of the access rules and `max_hz` of
 //! `[[topic]]`.
 
-mod bucket;
 mod egress;
+mod flow_queue;
 mod interfaces;
-mod line;
+mod leaky_bucket;
 
 use std::{
     cell::{Cell, RefCell},
@@ -21,8 +21,8 @@ use axon_transport::{
     status::{LimitStatus, LinkStatus},
 };
 
-use self::{bucket::LeakyBucket, egress::EgressCap, line::FlowQueue};
 pub(crate) use self::{egress::Egress, interfaces::InterfaceLimits};
+use self::{egress::EgressCap, flow_queue::FlowQueue, leaky_bucket::LeakyBucket};
 
 /// Limits that status lists.
 const LISTED: usize = 64;

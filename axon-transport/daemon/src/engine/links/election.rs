@@ -5,6 +5,7 @@ use std::{net::IpAddr, time::Duration};
 use axon_shm::ids::DaemonId;
 use quinn_proto::{Dir, StreamEvent, VarInt};
 
+use super::identity::PeerIdentity;
 use super::{
     LinkEvent, LinkReport, Links,
     link::{
@@ -22,7 +23,7 @@ use crate::{
             opening::{OpenedConnection, Sealing},
             target::DialTarget,
         },
-        links::{link::Summary, who::PeerIdentity},
+        links::link::Summary,
         quic::transport::{LINK_WINDOW, STREAMS_OPEN, window_credit},
         refusal::Refusal,
     },

@@ -4,7 +4,7 @@ use std::{net::IpAddr, time::Duration};
 
 use quinn_proto::ConnectionError;
 
-use super::{LinkEvent, LinkReport, Links, explained::explained, link::LinkPhase};
+use super::{LinkEvent, LinkReport, Links, handshake_failure::explained, link::LinkPhase};
 use crate::{
     bridge::RefusalKind,
     engine::refusal::{Refusal, RefusedBy},

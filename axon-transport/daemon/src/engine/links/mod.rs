@@ -7,9 +7,10 @@ mod dials;
 mod election;
 mod ending;
 mod events;
-mod explained;
+mod handshake_failure;
 #[cfg(test)]
 mod held;
+mod identity;
 mod inbox;
 mod keys;
 mod leaving;
@@ -18,7 +19,6 @@ mod opening;
 mod silence;
 mod table;
 mod unfinished;
-mod who;
 
 use std::{
     collections::{BTreeSet, HashMap},

@@ -8,7 +8,7 @@ use quinn_proto::{Dir, Incoming};
 use super::{
     LinkReport, Links,
     dials::LinkDial,
-    explained::explained,
+    handshake_failure::explained,
     link::{Link, LinkPhase},
 };
 use crate::{

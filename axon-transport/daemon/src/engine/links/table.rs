@@ -5,8 +5,8 @@ use std::{collections::HashMap, time::Duration};
 use axon_shm::ids::DaemonId;
 
 use super::{
+    identity::PeerIdentity,
     link::{Link, LinkPeer, LinkPhase},
-    who::PeerIdentity,
 };
 use crate::engine::link::opening::Opening;
 

@@ -9,10 +9,10 @@ pub(crate) mod budget;
 mod burst;
 mod ending;
 mod flow;
-mod furthest;
 #[cfg(test)]
 mod model;
-mod nudges;
+mod pings;
+mod progress;
 mod queue;
 mod schedule;
 mod served;
@@ -40,7 +40,7 @@ use self::{
     budget::Budget,
     ending::{Endings, FinishedPublisher, GivenUpSamples},
     flow::{Flow, FlowPause},
-    nudges::Nudges,
+    pings::Nudges,
     served::{FlowRoute, ServedFlows},
     source::FlowProgress,
     stall::{BusyFlow, FlowStalls, PeerActivity},

@@ -4,7 +4,7 @@ use std::{collections::HashMap, time::Duration};
 
 use axon_shm::ids::Gid;
 
-use super::{furthest::SentProgress, stall::Progress};
+use super::{progress::SentProgress, stall::Progress};
 
 /// The flow of a publisher that ended with samples that are not acknowledged. It is no larger than a few words, and there
 /// is one at most for each lane of the relays that are kept.

@@ -20,8 +20,8 @@ use axon_transport::{
 };
 
 use super::{
-    judged::{EndpointRights, JudgedEndpoints},
     refused::shown,
+    rights::{EndpointRights, JudgedEndpoints},
 };
 use crate::{
     bridge::RefusedRoute,

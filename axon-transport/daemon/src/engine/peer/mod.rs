@@ -2,17 +2,17 @@
 
 mod access;
 mod asking;
+mod context;
 mod control_queue;
-mod judged;
-pub(super) mod kept;
+pub(super) mod kept_relays;
 mod lanes;
 mod limits;
 mod refused;
+mod rights;
 pub(super) mod routes;
 mod served;
 mod serving;
 pub(super) mod stalls;
-mod surroundings;
 mod unanswered;
 
 use std::{
@@ -42,10 +42,11 @@ use self::{
     unanswered::UnansweredServices,
 };
 pub(crate) use self::{
+    context::{LocalEndpoints, PeerContext},
     lanes::WritersHere,
     serving::{MAX_ROUTES, StalledRoute},
-    surroundings::{LocalEndpoints, PeerContext},
 };
+use super::peer_graph::shown::{ShownEndpoint, ShownGraph};
 use super::{
     inbound::Inbound,
     outbound::{Outbound, Source, StallCause},
@@ -55,11 +56,7 @@ use crate::{
         account::{Account, MAX_STAND_INS},
         counters::Counters,
         peer::routes::RouteKey,
-        peer_graph::{
-            GraphTaken, PeerGraph,
-            owners::Prover,
-            told::{ShownEndpoint, ShownGraph},
-        },
+        peer_graph::{GraphTaken, PeerGraph, owners::Prover},
     },
     link::{AccessDecisions, CloseCode, GraphUpdate, LinkClosed, LinkMessage, LivelinessAsserted},
     owner::Binding,

@@ -4,8 +4,8 @@
 pub(super) mod decisions;
 mod left_out;
 pub(super) mod owners;
+pub(super) mod shown;
 mod terms;
-pub(super) mod told;
 
 use std::{
     collections::{BTreeMap, BTreeSet},

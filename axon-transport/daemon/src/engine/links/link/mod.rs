@@ -15,11 +15,12 @@ use axon_transport::status::LinkStatus;
 use rustls_pki_types::CertificateDer;
 
 use self::{age::Age, hand_over::Leaving};
+use super::identity::PeerIdentity;
 use crate::{
     engine::{
         account::{Account, Charge},
         link::opening::{Opening, Sealing},
-        links::{admission::HandshakePlace, silence::LinkSilence, who::PeerIdentity},
+        links::{admission::HandshakePlace, silence::LinkSilence},
     },
     keys::Resolver,
     link::{Candidate, Elected, LinkHello, Order, Side},

@@ -28,7 +28,7 @@ use self::{
 };
 use super::{
     budget::Budget,
-    furthest::SentProgress,
+    progress::SentProgress,
     queue::Queue,
     schedule::{Class, Rank},
     served::FlowRoute,

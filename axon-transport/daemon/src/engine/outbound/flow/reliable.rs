@@ -18,7 +18,7 @@ use crate::{
     engine::{
         counters::Counters,
         outbound::{
-            furthest::SentProgress,
+            progress::SentProgress,
             queue::Queue,
             schedule::{Rank, SMALL},
             source::FlowProgress,

@@ -1,11 +1,11 @@
 //! Which flow sends next, and what the flows that cannot send wait for: QUIC, a stream, a key, room or credit.
 
+mod held_back;
 mod lending;
-mod without;
 
 use std::{collections::HashSet, rc::Rc, time::Duration};
 
-use self::{lending::Lending, without::HeldBackFlows};
+use self::{held_back::HeldBackFlows, lending::Lending};
 use super::{
     budget::Budget,
     flow::{CreditQueue, Flow, FlowPause, PeerCredit},
