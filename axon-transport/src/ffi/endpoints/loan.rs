@@ -2,13 +2,13 @@
 
 use std::sync::{Mutex, PoisonError};
 
-use super::{
+use super::publisher::time;
+use crate::ffi::{
     error::{AXON_RET_INVALID_HANDLE, CallFailure, axon_ret_t},
     guarded,
-    handle::{axon_loan_t, axon_publisher_t, give, named, revoke},
+    handles::NamedLoan,
+    handles::{axon_loan_t, axon_publisher_t, give, named, revoke},
     memory::{present, present_if_wanted, store, store_if_wanted},
-    named_loan::NamedLoan,
-    publisher::time,
 };
 
 /// Lends `len` bytes to be written and then published: in shared memory where they are more than

@@ -21,17 +21,17 @@ const GENERATIONS: u32 = u32::MAX >> (PLACE + KIND + PROCESS - 32);
 
 /// The bits by which handles of different processes in a line of forks are told apart.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Process(u16);
+pub(in crate::ffi) struct Process(u16);
 
 impl Process {
-    pub(super) const fn new(number: u64) -> Self {
+    pub(in crate::ffi) const fn new(number: u64) -> Self {
         Self((number & ((1 << PROCESS) - 1)) as u16)
     }
 }
 
 /// Why a handle names nothing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Unknown {
+pub(in crate::ffi) enum Unknown {
     /// It is 0.
     Null,
     /// It is of this kind.
@@ -44,7 +44,7 @@ pub(super) enum Unknown {
 
 /// Objects of one kind, by handle. A look-up takes no lock but the place's own, which only the
 /// object's creation and destruction hold for writing.
-pub(super) struct HandleTable<T> {
+pub(in crate::ffi) struct HandleTable<T> {
     kind: u8,
     process: Process,
     blocks: [OnceLock<Box<[HandleSlot<T>]>>; BLOCKS],
@@ -67,7 +67,7 @@ struct Free {
 }
 
 impl<T> HandleTable<T> {
-    pub(super) const fn new(kind: u8, process: Process) -> Self {
+    pub(in crate::ffi) const fn new(kind: u8, process: Process) -> Self {
         assert!(kind < 1 << KIND);
         Self {
             kind,
@@ -78,7 +78,7 @@ impl<T> HandleTable<T> {
     }
 
     /// A handle for `object`, never 0. `None` when the table is full.
-    pub(super) fn insert(&self, object: T) -> Option<u64> {
+    pub(in crate::ffi) fn insert(&self, object: T) -> Option<u64> {
         let index = {
             let mut free = self.free.lock().unwrap_or_else(PoisonError::into_inner);
             match free.places.pop() {
@@ -103,7 +103,7 @@ impl<T> HandleTable<T> {
     }
 
     /// What `handle` names.
-    pub(super) fn get(&self, handle: u64) -> Result<Arc<T>, Unknown> {
+    pub(in crate::ffi) fn get(&self, handle: u64) -> Result<Arc<T>, Unknown> {
         let (place, generation) = self.place(handle)?;
         let content = place.0.read().unwrap_or_else(PoisonError::into_inner);
         match &content.object {
@@ -114,7 +114,11 @@ impl<T> HandleTable<T> {
 
     /// Does something with what `handle` names: for a signal handler, as it takes no memory, gives
     /// none back and waits for nobody. What is being created or destroyed right now names nothing.
-    pub(super) fn visit<R>(&self, handle: u64, visit: impl FnOnce(&T) -> R) -> Result<R, Unknown> {
+    pub(in crate::ffi) fn visit<R>(
+        &self,
+        handle: u64,
+        visit: impl FnOnce(&T) -> R,
+    ) -> Result<R, Unknown> {
         let (place, generation) = self.place(handle)?;
         let Ok(content) = place.0.try_read() else { return Err(Unknown::Gone) };
         match &content.object {
@@ -124,7 +128,7 @@ impl<T> HandleTable<T> {
     }
 
     /// Gives the handle up and returns what it named, which ends when nobody uses it any more.
-    pub(super) fn remove(&self, handle: u64) -> Result<Arc<T>, Unknown> {
+    pub(in crate::ffi) fn remove(&self, handle: u64) -> Result<Arc<T>, Unknown> {
         let (place, generation) = self.place(handle)?;
         let mut content = place.0.write().unwrap_or_else(PoisonError::into_inner);
         if content.generation != generation {

@@ -4,17 +4,19 @@ use std::{ffi::c_void, mem::MaybeUninit, slice};
 
 use axon_shm::Sample;
 
-use super::{
-    callback::axon_callback_t,
-    endpoint::{axon_endpoint_options_t, axon_gid_t, describe, end, matched, set_callback, spec},
-    error::{AXON_RET_BAD_ALLOC, CallFailure, axon_ret_t},
-    guarded,
-    handle::{axon_node_t, axon_sample_t, axon_subscription_t, give, named, revoke},
-    memory::{present, present_if_wanted, store, store_if_wanted},
-    qos::axon_qos_t,
-    wait::duration,
+use super::endpoint::{
+    axon_endpoint_options_t, axon_gid_t, describe, end, matched, set_callback, spec,
 };
 use crate::{
+    ffi::{
+        callback::axon_callback_t,
+        error::{AXON_RET_BAD_ALLOC, CallFailure, axon_ret_t},
+        guarded,
+        handles::{axon_node_t, axon_sample_t, axon_subscription_t, give, named, revoke},
+        memory::{present, present_if_wanted, store, store_if_wanted},
+        qos::axon_qos_t,
+        wait::duration,
+    },
     graph::{Endpoint, EndpointKind},
     qos::Qos,
     session::{MessageInfo, unix_nanos},

@@ -8,15 +8,17 @@ use axon_shm::{
 };
 
 use super::{
-    error::{
-        AXON_RET_BAD_ALLOC, AXON_RET_FORKED, AXON_RET_INVALID_HANDLE, CallFailure, axon_ret_t,
-    },
-    memory::store,
     named_loan::NamedLoan,
     table::{HandleTable, Process, Unknown},
 };
-use crate::session::{
-    Client, Event, GuardCondition, Node, Publisher, Server, Session, Subscription,
+use crate::{
+    ffi::{
+        error::{
+            AXON_RET_BAD_ALLOC, AXON_RET_FORKED, AXON_RET_INVALID_HANDLE, CallFailure, axon_ret_t,
+        },
+        memory::store,
+    },
+    session::{Client, Event, GuardCondition, Node, Publisher, Server, Session, Subscription},
 };
 
 /// A session: a process's membership of a domain. Destroyed by `axon_session_close`.
@@ -100,7 +102,7 @@ pub struct axon_loan_t {
 }
 
 /// A type of handle, and what it names.
-pub(super) trait Handle: Copy {
+pub(in crate::ffi) trait Handle: Copy {
     type Object;
     const WHAT: &'static str;
 
@@ -112,7 +114,7 @@ pub(super) trait Handle: Copy {
 macro_rules! handles {
     ($($number:literal $table:ident: $handle:ident => $object:ty, $what:literal;)+) => {
         /// What the handles of a process name.
-        pub(super) struct Tables {
+        pub(in crate::ffi) struct Tables {
             process: Process,
             $($table: HandleTable<$object>,)+
         }
@@ -173,11 +175,11 @@ fn current() -> Result<&'static Made<Tables>, CallFailure> {
 }
 
 /// What a handle names.
-pub(super) fn named<H: Handle>(handle: H) -> Result<Arc<H::Object>, CallFailure> {
+pub(in crate::ffi) fn named<H: Handle>(handle: H) -> Result<Arc<H::Object>, CallFailure> {
     let tables = current()?;
     let found = H::table(tables.value()).get(handle.id());
     #[cfg(test)]
-    super::tests::found();
+    crate::ffi::tests::found();
     found.map_err(|why| unknown(tables, handle, why))
 }
 
@@ -185,7 +187,10 @@ pub(super) fn named<H: Handle>(handle: H) -> Result<Arc<H::Object>, CallFailure>
 ///
 /// # Safety
 /// As [`store`].
-pub(super) unsafe fn give<H: Handle>(object: H::Object, out: *mut H) -> Result<(), CallFailure> {
+pub(in crate::ffi) unsafe fn give<H: Handle>(
+    object: H::Object,
+    out: *mut H,
+) -> Result<(), CallFailure> {
     let id = H::table(current()?.value()).insert(object).ok_or_else(|| {
         let what = H::WHAT;
         CallFailure::new(AXON_RET_BAD_ALLOC, format_args!("no {what} more: there are a million"))
@@ -195,13 +200,13 @@ pub(super) unsafe fn give<H: Handle>(object: H::Object, out: *mut H) -> Result<(
 }
 
 /// Gives a handle up: what it named ends when no call uses it any more.
-pub(super) fn revoke<H: Handle>(handle: H) -> Result<Arc<H::Object>, CallFailure> {
+pub(in crate::ffi) fn revoke<H: Handle>(handle: H) -> Result<Arc<H::Object>, CallFailure> {
     let tables = current()?;
     H::table(tables.value()).remove(handle.id()).map_err(|why| unknown(tables, handle, why))
 }
 
 /// Does something with what a handle names, as a signal handler may: see [`HandleTable::visit`].
-pub(super) fn visit<H: Handle>(
+pub(in crate::ffi) fn visit<H: Handle>(
     handle: H,
     visit: impl FnOnce(&H::Object),
 ) -> Result<(), axon_ret_t> {

@@ -2,14 +2,14 @@
 
 use std::{ffi::c_void, os::raw::c_char};
 
-use super::{
-    callback::{axon_callback_t, told},
-    error::CallFailure,
-    handle::{Handle, named, revoke},
-    memory::{elements, present_if_wanted, store, store_if_wanted, text, value},
-    qos::{axon_qos_t, store_qos},
-};
 use crate::{
+    ffi::{
+        callback::{axon_callback_t, told},
+        error::CallFailure,
+        handles::{Handle, named, revoke},
+        memory::{elements, present_if_wanted, store, store_if_wanted, text, value},
+        qos::{axon_qos_t, store_qos},
+    },
     graph::Endpoint,
     ids::Gid,
     qos::QosRequest,

@@ -3,14 +3,16 @@
 use std::ffi::c_void;
 
 use super::{
-    callback::axon_callback_t,
     endpoint::{axon_endpoint_options_t, axon_gid_t, describe, end, matched, set_callback, spec},
+    subscription::{CopyTarget, SamplePlace, axon_message_info_t, axon_room_t},
+};
+use crate::ffi::{
+    callback::axon_callback_t,
     error::{CallFailure, axon_ret_t},
     guarded,
-    handle::{axon_client_t, axon_node_t, axon_sample_t, give, named},
+    handles::{axon_client_t, axon_node_t, axon_sample_t, give, named},
     memory::{elements, present, present_if_wanted, store_if_wanted},
     qos::axon_qos_t,
-    subscription::{CopyTarget, SamplePlace, axon_message_info_t, axon_room_t},
     wait::duration,
 };
 

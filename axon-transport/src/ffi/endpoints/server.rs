@@ -3,16 +3,20 @@
 use std::ffi::c_void;
 
 use super::{
-    callback::axon_callback_t,
     endpoint::{axon_endpoint_options_t, axon_gid_t, describe, end, matched, set_callback, spec},
-    error::{CallFailure, axon_ret_t},
-    guarded,
-    handle::{axon_node_t, axon_sample_t, axon_server_t, give, named},
-    memory::{elements, present, value},
-    qos::axon_qos_t,
     subscription::{CopyTarget, SamplePlace, axon_message_info_t, axon_room_t},
 };
-use crate::ids::Gid;
+use crate::{
+    ffi::{
+        callback::axon_callback_t,
+        error::{CallFailure, axon_ret_t},
+        guarded,
+        handles::{axon_node_t, axon_sample_t, axon_server_t, give, named},
+        memory::{elements, present, value},
+        qos::axon_qos_t,
+    },
+    ids::Gid,
+};
 
 /// A server of a node: `topic` in the options is the service's name. Of requests that were not taken
 /// a KEEP_LAST server keeps the newest of each client, as many as its depth, and a KEEP_ALL one all.

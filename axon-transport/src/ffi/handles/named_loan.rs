@@ -5,9 +5,9 @@ use std::sync::{Mutex, Weak};
 use crate::session::{OwnedLoan, Publisher};
 
 /// A loan, and the publisher that lent it.
-pub(super) struct NamedLoan {
-    pub(super) len: usize,
-    pub(super) loan: Mutex<Option<OwnedLoan>>,
+pub(in crate::ffi) struct NamedLoan {
+    pub(in crate::ffi) len: usize,
+    pub(in crate::ffi) loan: Mutex<Option<OwnedLoan>>,
     /// It must be there for the loan to be published.
-    pub(super) publisher: Weak<Publisher>,
+    pub(in crate::ffi) publisher: Weak<Publisher>,
 }

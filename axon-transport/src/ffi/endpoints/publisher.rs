@@ -1,15 +1,19 @@
 //! Publishers.
 
-use super::{
-    endpoint::{axon_endpoint_options_t, axon_gid_t, describe, matched, spec},
-    error::{CallFailure, axon_ret_t},
-    guarded,
-    handle::{axon_node_t, axon_publisher_t, give, named, revoke},
-    memory::{elements, present, present_if_wanted, store, store_if_wanted},
-    qos::axon_qos_t,
-    wait::duration,
+use super::endpoint::{axon_endpoint_options_t, axon_gid_t, describe, matched, spec};
+use crate::{
+    ffi::{
+        error::{CallFailure, axon_ret_t},
+        guarded,
+        handles::{axon_node_t, axon_publisher_t, give, named, revoke},
+        memory::{elements, present, present_if_wanted, store, store_if_wanted},
+        qos::axon_qos_t,
+        wait::duration,
+    },
+    graph::EndpointKind,
+    qos::Qos,
+    session::from_unix_nanos,
 };
-use crate::{graph::EndpointKind, qos::Qos, session::from_unix_nanos};
 
 /// The time at which the call is made, as a sample's source timestamp.
 pub const AXON_TIME_NOW: i64 = i64::MIN;
