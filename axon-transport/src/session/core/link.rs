@@ -161,3 +161,75 @@ impl DaemonLink {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{ids::SessionId, wire::session::Unmet};
+
+    fn gid(number: u32) -> Gid {
+        Gid::new(SessionId([1; 16]), number)
+    }
+
+    fn fence(number: u64) -> Outgoing {
+        Outgoing::Fence(Fence { writer: gid(1), number })
+    }
+
+    fn told(outgoing: impl IntoIterator<Item = Outgoing>) -> Vec<String> {
+        outgoing.into_iter().map(|outgoing| format!("{outgoing:?}")).collect()
+    }
+
+    #[test]
+    fn a_new_daemon_is_told_nothing_that_was_queued_for_the_last_one() {
+        let link = DaemonLink::default();
+        link.queue(Outgoing::gone(gid(1)));
+        link.connected(DaemonId([2; 16]), vec![Outgoing::Announce(gid(2))]);
+        link.queue(fence(3));
+        assert_eq!(link.daemon(), Some(DaemonId([2; 16])));
+        assert_eq!(told(link.take()), told([Outgoing::Announce(gid(2)), fence(3)]));
+        assert!(link.take().is_empty());
+    }
+
+    #[test]
+    fn what_is_put_back_is_ahead_of_what_came_meanwhile() {
+        let link = DaemonLink::default();
+        link.queue(fence(2));
+        link.put_back([fence(1)]);
+        assert_eq!(told(link.take()), told([fence(1), fence(2)]));
+    }
+
+    #[test]
+    fn only_the_messages_that_are_asked_for_are_taken() {
+        let link = DaemonLink::default();
+        let unmet = || Message::Unmet(Unmet { reader: gid(1), writer: gid(2), samples: 3 });
+        link.queue(Outgoing::gone(gid(1)));
+        link.queue(Outgoing::message(unmet()));
+        link.queue(fence(4));
+        let taken = link.take_messages(|message| matches!(message, Message::Unmet(_)));
+        assert_eq!(taken, [unmet()]);
+        assert_eq!(told(link.take()), told([Outgoing::gone(gid(1)), fence(4)]));
+    }
+
+    #[test]
+    fn a_question_for_the_status_ends_with_the_daemon() {
+        let link = DaemonLink::default();
+        assert!(!link.ask_status(), "nobody is there");
+        link.set_daemon(Some(DaemonId([2; 16])));
+        assert!(link.ask_status() && link.awaits_status());
+        let part = |part| StatusPart { part, parts: 2, text: vec![b'a'] };
+        assert!(!link.add_status(&part(0)));
+        link.lost();
+        assert!(!link.add_status(&part(1)) && !link.awaits_status());
+        assert!(matches!(link.take_status(), StatusAnswer::Lost));
+        assert_eq!(link.daemon(), None);
+    }
+
+    #[test]
+    fn refusals_are_kept_up_to_a_bound() {
+        let link = DaemonLink::default();
+        assert!(link.keep_refusal("first".to_owned()));
+        (0..REFUSALS).for_each(|_| assert!(!link.keep_refusal("further".to_owned())));
+        assert_eq!(link.take_refusals().len(), REFUSALS);
+        assert!(link.keep_refusal("first again".to_owned()));
+    }
+}

@@ -144,3 +144,20 @@ impl ListeningState {
         self.callbacks + self.tasks == 0
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_soonest_look_counts_and_is_over_once_it_was_due() {
+        let (listening, now) = (Listening::default(), Instant::now());
+        let second = Duration::from_secs(1);
+        assert_eq!(listening.take_due(now), (false, None));
+        assert!(listening.look_again(now + 2 * second));
+        assert!(listening.look_again(now + second));
+        assert!(!listening.look_again(now + 2 * second), "it is looked sooner");
+        assert_eq!(listening.take_due(now), (false, Some(now + second)));
+        assert_eq!(listening.take_due(now + second), (true, None));
+    }
+}
