@@ -45,6 +45,11 @@
 #define AXON_TYPE_HASH_SIZE 64
 
 /**
+ * The time at which the call is made, as a sample's source timestamp.
+ */
+#define AXON_TIME_NOW INT64_MIN
+
+/**
  * Of a subscription: a publisher became alive or ceased to be.
  */
 #define AXON_EVENT_LIVELINESS_CHANGED 0
@@ -138,11 +143,6 @@
  * Error: an operation of the library failed.
  */
 #define AXON_LOG_ERROR 40
-
-/**
- * The time at which the call is made, as a sample's source timestamp.
- */
-#define AXON_TIME_NOW INT64_MIN
 
 /**
  * Left to AXON, in any policy: RELIABLE, VOLATILE, KEEP_LAST, AUTOMATIC.
@@ -501,14 +501,24 @@ typedef struct axon_publisher_t {
 } axon_publisher_t;
 
 /**
- * One event of a publisher or a subscription.
+ * Memory that a publisher lent, to be published or abandoned.
  */
-typedef struct axon_event_t {
+typedef struct axon_loan_t {
     /**
      * 0 where it is none.
      */
     uint64_t id;
-} axon_event_t;
+} axon_loan_t;
+
+/**
+ * Answers the requests of a service.
+ */
+typedef struct axon_server_t {
+    /**
+     * 0 where it is none.
+     */
+    uint64_t id;
+} axon_server_t;
 
 /**
  * Receives the samples of a topic.
@@ -519,6 +529,16 @@ typedef struct axon_subscription_t {
      */
     uint64_t id;
 } axon_subscription_t;
+
+/**
+ * One event of a publisher or a subscription.
+ */
+typedef struct axon_event_t {
+    /**
+     * 0 where it is none.
+     */
+    uint64_t id;
+} axon_event_t;
 
 /**
  * What is known of an event. Changes are since the status was last taken.
@@ -636,16 +656,6 @@ typedef struct axon_endpoint_t {
 typedef void (*axon_endpoint_visitor_t)(void *user, const struct axon_endpoint_t *endpoint);
 
 /**
- * Memory that a publisher lent, to be published or abandoned.
- */
-typedef struct axon_loan_t {
-    /**
-     * 0 where it is none.
-     */
-    uint64_t id;
-} axon_loan_t;
-
-/**
  * Told of a line: how severe it is (AXON_LOG_*), which part of the library says it, and what. Both
  * strings stand during the call. A line is one line: characters that could steer a terminal are escaped,
  * as in the daemon's log. It is called on a thread of the library's own, which begins with the
@@ -664,16 +674,6 @@ typedef struct axon_guard_t {
      */
     uint64_t id;
 } axon_guard_t;
-
-/**
- * Answers the requests of a service.
- */
-typedef struct axon_server_t {
-    /**
-     * 0 where it is none.
-     */
-    uint64_t id;
-} axon_server_t;
 
 /**
  * How a session is opened. `axon_session_options_init` fills it in; what is to be otherwise is
@@ -943,116 +943,6 @@ axon_ret_t axon_session_client_set_callback(struct axon_client_t client,
                                             const void *user);
 
 /**
- * What went wrong in the last call of this thread that failed: what, of which topic and node, why,
- * and what to do. Empty where none has. The text stands until the next call that fails in this
- * thread; it is null in a thread that is ending.
- */
-const char *axon_session_last_error(void);
-
-/**
- * One event of a publisher: AXON_RET_INVALID_ARGUMENT where `kind` is not one of its. It may be used
- * after the publisher has ended, and then does not happen again.
- *
- * # Safety
- * `event` points to room for a handle.
- */
-axon_ret_t axon_session_publisher_event(struct axon_publisher_t publisher,
-                                        uint32_t kind,
-                                        struct axon_event_t *event);
-
-/**
- * One event of a subscription, as `axon_session_publisher_event`.
- *
- * # Safety
- * As there.
- */
-axon_ret_t axon_session_subscription_event(struct axon_subscription_t subscription,
-                                           uint32_t kind,
-                                           struct axon_event_t *event);
-
-/**
- * Gives an event's handle up. Its callback has returned, and is not called any more, when this returns;
- * those of other handles of the same event are.
- */
-axon_ret_t axon_session_event_destroy(struct axon_event_t event);
-
-/**
- * The status. Its changes are counted anew from here, and the event is not ready any more until it
- * happens again.
- *
- * # Safety
- * `status` points to room for one.
- */
-axon_ret_t axon_session_event_take(struct axon_event_t event, struct axon_event_status_t *status);
-
-/**
- * Has `callback` told of the event from now on, in place of the one that this handle had before, which
- * has returned and is not called any more when this returns, unless this is called from within it.
- * Null: nobody is told. What happened since the status was last taken, and nobody was told of by this
- * handle, it is told at once, in this call.
- *
- * # Safety
- * `callback` may be called with `user` from any thread until it is replaced or the event is
- * destroyed.
- */
-axon_ret_t axon_session_event_set_callback(struct axon_event_t event,
-                                           axon_callback_t callback,
-                                           const void *user);
-
-/**
- * Calls `visitor` with every node of the graph, in order of namespace and name: as often as nodes of
- * one name are there. What it is given stands until it returns; no lock is held meanwhile.
- *
- * # Safety
- * `visitor` may be called with `user`.
- */
-axon_ret_t axon_session_graph_nodes(struct axon_session_t session,
-                                    axon_node_visitor_t visitor,
-                                    void *user);
-
-/**
- * Calls `visitor` with the names that endpoints of the given kinds (the sum of AXON_KIND_*) have, in
- * order, each with its types: of all endpoints, or, where `node` is not null, of those of the node of
- * this name and namespace.
- *
- * AXON_RET_NO_NODE: there is none.
- *
- * # Safety
- * `node` and `namespace_` are strings, or `node` is null; `visitor` may be called with `user`.
- */
-axon_ret_t axon_session_graph_names(struct axon_session_t session,
-                                    uint32_t kinds,
-                                    const char *node,
-                                    const char *namespace_,
-                                    axon_name_visitor_t visitor,
-                                    void *user);
-
-/**
- * Calls `visitor` with every endpoint of a kind (AXON_KIND_*) under a topic's or service's name, or,
- * where `topic` is null, of that kind.
- *
- * # Safety
- * `topic` is null or a string; `visitor` may be called with `user`.
- */
-axon_ret_t axon_session_graph_endpoints(struct axon_session_t session,
-                                        uint32_t kind,
-                                        const char *topic,
-                                        axon_endpoint_visitor_t visitor,
-                                        void *user);
-
-/**
- * How many endpoints of a kind (AXON_KIND_*) are under a topic's or service's name. One that is
- * counted is one that gets data.
- *
- * # Safety
- * `topic` is a string; `count` points to room for a number.
- */
-axon_ret_t axon_session_graph_count(struct axon_session_t session,
-                                    uint32_t kind,
-                                    const char *topic,
-                                    size_t *count);
-
-/**
  * Lends `len` bytes to be written and then published: in shared memory where they are more than
  * 4 KiB, or more than 512 bytes if the publisher was created to expect so many, so that nothing is
  * copied. They are at `data` and hold zeros or bytes of earlier samples.
@@ -1088,58 +978,6 @@ axon_ret_t axon_session_loan_publish(struct axon_loan_t loan,
  * Gives a loan back without publishing it.
  */
 axon_ret_t axon_session_loan_abandon(struct axon_loan_t loan);
-
-/**
- * Has `callback` told of what the library says in this process, in place of the one before, which has
- * returned and is not called any more when this returns; it blocks until then. To set the one that is
- * set already with the same `user` changes nothing, and does not block. Null: nobody is told, as at
- * first. A daemon has a log of its own. A forked child says it again for what it says itself.
- *
- * AXON_RET_ERROR: it is called from within a callback, or a part of the program in Rust has what the
- * library says already (a global `tracing` subscriber).
- *
- * # Safety
- * `callback` may be called with `user` from any thread until it is replaced.
- */
-axon_ret_t axon_session_log_set_callback(axon_log_t callback,
-                                         const void *user);
-
-/**
- * How severe a line must be at least to be told: AXON_LOG_WARN at first. A severity between those that
- * have a name is as good as any.
- */
-axon_ret_t axon_session_log_set_severity(uint32_t severity);
-
-/**
- * A node, which is in the graph until it is destroyed; its endpoints do not end with it. Two nodes
- * may have the same name. It keeps its session open.
- *
- * AXON_RET_INVALID_ARGUMENT: the name is empty, or a name is longer than 512 bytes.
- *
- * # Safety
- * The three names are strings; `node` points to room for a handle.
- */
-axon_ret_t axon_session_node_create(struct axon_session_t session,
-                                    const char *name,
-                                    const char *namespace_,
-                                    const char *enclave,
-                                    struct axon_node_t *node);
-
-/**
- * Takes a node out of the graph. It may block for milliseconds, as `axon_session_close` says.
- */
-axon_ret_t axon_session_node_destroy(struct axon_node_t node);
-
-/**
- * The guard condition that is triggered after every change of the graph, once what one asks of the
- * graph shows it, and when a service or a client of the session finds or loses its other end. It
- * is a handle of its own, to be destroyed like one that was created, and lasts as long as the
- * session.
- *
- * # Safety
- * `guard` points to room for a handle.
- */
-axon_ret_t axon_session_node_graph_guard(struct axon_node_t node, struct axon_guard_t *guard);
 
 /**
  * A publisher of a node. When it returns, the publisher is matched with those subscriptions that the
@@ -1241,27 +1079,6 @@ axon_ret_t axon_session_publisher_wait_acknowledged(struct axon_publisher_t publ
 axon_ret_t axon_session_publisher_assert_liveliness(struct axon_publisher_t publisher);
 
 /**
- * Whether a publisher with the one profile serves a subscription with the other: AXON_QOS_* at
- * `verdict`. Why not, or on what it hangs, is put into `reason` in words, cut to `reason_size`
- * bytes with the 0 at its end; null and 0 where that is not wanted.
- *
- * # Safety
- * `offered` and `requested` point to a profile each, `verdict` to room for a number, and `reason` to
- * room for `reason_size` bytes.
- */
-axon_ret_t axon_session_qos_check(const struct axon_qos_t *offered,
-                                  const struct axon_qos_t *requested,
-                                  uint32_t *verdict,
-                                  char *reason,
-                                  size_t reason_size);
-
-/**
- * The name of a policy as ROS 2 spells it, for instance `RELIABILITY`; null where there is none of
- * that number. It stands for ever.
- */
-const char *axon_session_policy_name(uint32_t policy);
-
-/**
  * A server of a node: `topic` in the options is the service's name. Of requests that were not taken
  * a KEEP_LAST server keeps the newest of each client, as many as its depth, and a KEEP_ALL one all.
  * What is kept is never dropped to make room. When it returns, the server is matched with those
@@ -1351,80 +1168,6 @@ axon_ret_t axon_session_server_respond(struct axon_server_t server,
 axon_ret_t axon_session_server_set_callback(struct axon_server_t server,
                                             axon_callback_t callback,
                                             const void *user);
-
-/**
- * Fills options in with what is usual. `abi` is the program's AXON_SESSION_ABI: AXON_RET_ABI where
- * the library has another, and nothing is written then.
- *
- * # Safety
- * `options` points to room for them, as the program's header declares them.
- */
-axon_ret_t axon_session_options_init(struct axon_session_options_t *options, uint32_t abi);
-
-/**
- * Checks the settings as `axon_session_open` does, and opens nothing.
- *
- * AXON_RET_CONFIG: one is wrong; the text names the variable, what was read, and what is accepted.
- *
- * # Safety
- * As for `axon_session_open`.
- */
-axon_ret_t axon_session_options_check(const struct axon_session_options_t *options);
-
-/**
- * How other hosts prove who they are to a session with these options: AXON_AUTHENTICATION_*, as the
- * environment and `axon.toml` say it. Opens nothing.
- *
- * AXON_RET_CONFIG: a setting is wrong, as for `axon_session_options_check`.
- *
- * # Safety
- * As for `axon_session_open`; `authentication` points to room for a number.
- */
-axon_ret_t axon_session_options_authentication(const struct axon_session_options_t *options,
-                                               uint32_t *authentication);
-
-/**
- * Opens a session, and starts a daemon where none runs and `AXON_DAEMON` lets it. A process may have
- * any number of them.
- *
- * Blocks until the daemon has answered: milliseconds, or up to 20 s where one is started.
- *
- * AXON_RET_CONFIG: a setting is wrong, or the daemon that runs has other security settings; the text
- * names the variable. Or the permissions cannot be read, are not valid now, or allow nothing in the
- * session's domain; the text names the file. AXON_RET_ERROR: there is no daemon and none can be
- * started, or it does not answer. AXON_RET_BAD_ALLOC: shared memory is short.
- *
- * # Safety
- * `options` points to options that `axon_session_options_init` filled in, whose pointers are null or
- * point to what they say; `session` points to room for a handle.
- */
-axon_ret_t axon_session_open(const struct axon_session_options_t *options,
-                             struct axon_session_t *session);
-
-/**
- * Gives a session's handle up. The session ends when the last of its nodes, endpoints and events is
- * destroyed and the last call returns that uses one, which then blocks for milliseconds while its
- * thread ends.
- */
-axon_ret_t axon_session_close(struct axon_session_t session);
-
-/**
- * The domain that the session is in.
- *
- * # Safety
- * `domain` points to room for a number.
- */
-axon_ret_t axon_session_domain(struct axon_session_t session, uint32_t *domain);
-
-/**
- * Whether the session reaches its daemon: 1, or 0 while there is none, as after it died, until
- * another has taken over. Where `AXON_DAEMON` is `off` there is none to reach: 1. What is attached
- * flows on either way.
- *
- * # Safety
- * `connected` points to room for a number.
- */
-axon_ret_t axon_session_is_connected(struct axon_session_t session, uint8_t *connected);
 
 /**
  * A subscription of a node. When it returns, the subscription is matched with those publishers that
@@ -1543,6 +1286,263 @@ axon_ret_t axon_session_subscription_lost(struct axon_subscription_t subscriptio
 axon_ret_t axon_session_subscription_set_callback(struct axon_subscription_t subscription,
                                                   axon_callback_t callback,
                                                   const void *user);
+
+/**
+ * What went wrong in the last call of this thread that failed: what, of which topic and node, why,
+ * and what to do. Empty where none has. The text stands until the next call that fails in this
+ * thread; it is null in a thread that is ending.
+ */
+const char *axon_session_last_error(void);
+
+/**
+ * One event of a publisher: AXON_RET_INVALID_ARGUMENT where `kind` is not one of its. It may be used
+ * after the publisher has ended, and then does not happen again.
+ *
+ * # Safety
+ * `event` points to room for a handle.
+ */
+axon_ret_t axon_session_publisher_event(struct axon_publisher_t publisher,
+                                        uint32_t kind,
+                                        struct axon_event_t *event);
+
+/**
+ * One event of a subscription, as `axon_session_publisher_event`.
+ *
+ * # Safety
+ * As there.
+ */
+axon_ret_t axon_session_subscription_event(struct axon_subscription_t subscription,
+                                           uint32_t kind,
+                                           struct axon_event_t *event);
+
+/**
+ * Gives an event's handle up. Its callback has returned, and is not called any more, when this returns;
+ * those of other handles of the same event are.
+ */
+axon_ret_t axon_session_event_destroy(struct axon_event_t event);
+
+/**
+ * The status. Its changes are counted anew from here, and the event is not ready any more until it
+ * happens again.
+ *
+ * # Safety
+ * `status` points to room for one.
+ */
+axon_ret_t axon_session_event_take(struct axon_event_t event, struct axon_event_status_t *status);
+
+/**
+ * Has `callback` told of the event from now on, in place of the one that this handle had before, which
+ * has returned and is not called any more when this returns, unless this is called from within it.
+ * Null: nobody is told. What happened since the status was last taken, and nobody was told of by this
+ * handle, it is told at once, in this call.
+ *
+ * # Safety
+ * `callback` may be called with `user` from any thread until it is replaced or the event is
+ * destroyed.
+ */
+axon_ret_t axon_session_event_set_callback(struct axon_event_t event,
+                                           axon_callback_t callback,
+                                           const void *user);
+
+/**
+ * Calls `visitor` with every node of the graph, in order of namespace and name: as often as nodes of
+ * one name are there. What it is given stands until it returns; no lock is held meanwhile.
+ *
+ * # Safety
+ * `visitor` may be called with `user`.
+ */
+axon_ret_t axon_session_graph_nodes(struct axon_session_t session,
+                                    axon_node_visitor_t visitor,
+                                    void *user);
+
+/**
+ * Calls `visitor` with the names that endpoints of the given kinds (the sum of AXON_KIND_*) have, in
+ * order, each with its types: of all endpoints, or, where `node` is not null, of those of the node of
+ * this name and namespace.
+ *
+ * AXON_RET_NO_NODE: there is none.
+ *
+ * # Safety
+ * `node` and `namespace_` are strings, or `node` is null; `visitor` may be called with `user`.
+ */
+axon_ret_t axon_session_graph_names(struct axon_session_t session,
+                                    uint32_t kinds,
+                                    const char *node,
+                                    const char *namespace_,
+                                    axon_name_visitor_t visitor,
+                                    void *user);
+
+/**
+ * Calls `visitor` with every endpoint of a kind (AXON_KIND_*) under a topic's or service's name, or,
+ * where `topic` is null, of that kind.
+ *
+ * # Safety
+ * `topic` is null or a string; `visitor` may be called with `user`.
+ */
+axon_ret_t axon_session_graph_endpoints(struct axon_session_t session,
+                                        uint32_t kind,
+                                        const char *topic,
+                                        axon_endpoint_visitor_t visitor,
+                                        void *user);
+
+/**
+ * How many endpoints of a kind (AXON_KIND_*) are under a topic's or service's name. One that is
+ * counted is one that gets data.
+ *
+ * # Safety
+ * `topic` is a string; `count` points to room for a number.
+ */
+axon_ret_t axon_session_graph_count(struct axon_session_t session,
+                                    uint32_t kind,
+                                    const char *topic,
+                                    size_t *count);
+
+/**
+ * Has `callback` told of what the library says in this process, in place of the one before, which has
+ * returned and is not called any more when this returns; it blocks until then. To set the one that is
+ * set already with the same `user` changes nothing, and does not block. Null: nobody is told, as at
+ * first. A daemon has a log of its own. A forked child says it again for what it says itself.
+ *
+ * AXON_RET_ERROR: it is called from within a callback, or a part of the program in Rust has what the
+ * library says already (a global `tracing` subscriber).
+ *
+ * # Safety
+ * `callback` may be called with `user` from any thread until it is replaced.
+ */
+axon_ret_t axon_session_log_set_callback(axon_log_t callback,
+                                         const void *user);
+
+/**
+ * How severe a line must be at least to be told: AXON_LOG_WARN at first. A severity between those that
+ * have a name is as good as any.
+ */
+axon_ret_t axon_session_log_set_severity(uint32_t severity);
+
+/**
+ * A node, which is in the graph until it is destroyed; its endpoints do not end with it. Two nodes
+ * may have the same name. It keeps its session open.
+ *
+ * AXON_RET_INVALID_ARGUMENT: the name is empty, or a name is longer than 512 bytes.
+ *
+ * # Safety
+ * The three names are strings; `node` points to room for a handle.
+ */
+axon_ret_t axon_session_node_create(struct axon_session_t session,
+                                    const char *name,
+                                    const char *namespace_,
+                                    const char *enclave,
+                                    struct axon_node_t *node);
+
+/**
+ * Takes a node out of the graph. It may block for milliseconds, as `axon_session_close` says.
+ */
+axon_ret_t axon_session_node_destroy(struct axon_node_t node);
+
+/**
+ * The guard condition that is triggered after every change of the graph, once what one asks of the
+ * graph shows it, and when a service or a client of the session finds or loses its other end. It
+ * is a handle of its own, to be destroyed like one that was created, and lasts as long as the
+ * session.
+ *
+ * # Safety
+ * `guard` points to room for a handle.
+ */
+axon_ret_t axon_session_node_graph_guard(struct axon_node_t node, struct axon_guard_t *guard);
+
+/**
+ * Whether a publisher with the one profile serves a subscription with the other: AXON_QOS_* at
+ * `verdict`. Why not, or on what it hangs, is put into `reason` in words, cut to `reason_size`
+ * bytes with the 0 at its end; null and 0 where that is not wanted.
+ *
+ * # Safety
+ * `offered` and `requested` point to a profile each, `verdict` to room for a number, and `reason` to
+ * room for `reason_size` bytes.
+ */
+axon_ret_t axon_session_qos_check(const struct axon_qos_t *offered,
+                                  const struct axon_qos_t *requested,
+                                  uint32_t *verdict,
+                                  char *reason,
+                                  size_t reason_size);
+
+/**
+ * The name of a policy as ROS 2 spells it, for instance `RELIABILITY`; null where there is none of
+ * that number. It stands for ever.
+ */
+const char *axon_session_policy_name(uint32_t policy);
+
+/**
+ * Fills options in with what is usual. `abi` is the program's AXON_SESSION_ABI: AXON_RET_ABI where
+ * the library has another, and nothing is written then.
+ *
+ * # Safety
+ * `options` points to room for them, as the program's header declares them.
+ */
+axon_ret_t axon_session_options_init(struct axon_session_options_t *options, uint32_t abi);
+
+/**
+ * Checks the settings as `axon_session_open` does, and opens nothing.
+ *
+ * AXON_RET_CONFIG: one is wrong; the text names the variable, what was read, and what is accepted.
+ *
+ * # Safety
+ * As for `axon_session_open`.
+ */
+axon_ret_t axon_session_options_check(const struct axon_session_options_t *options);
+
+/**
+ * How other hosts prove who they are to a session with these options: AXON_AUTHENTICATION_*, as the
+ * environment and `axon.toml` say it. Opens nothing.
+ *
+ * AXON_RET_CONFIG: a setting is wrong, as for `axon_session_options_check`.
+ *
+ * # Safety
+ * As for `axon_session_open`; `authentication` points to room for a number.
+ */
+axon_ret_t axon_session_options_authentication(const struct axon_session_options_t *options,
+                                               uint32_t *authentication);
+
+/**
+ * Opens a session, and starts a daemon where none runs and `AXON_DAEMON` lets it. A process may have
+ * any number of them.
+ *
+ * Blocks until the daemon has answered: milliseconds, or up to 20 s where one is started.
+ *
+ * AXON_RET_CONFIG: a setting is wrong, or the daemon that runs has other security settings; the text
+ * names the variable. Or the permissions cannot be read, are not valid now, or allow nothing in the
+ * session's domain; the text names the file. AXON_RET_ERROR: there is no daemon and none can be
+ * started, or it does not answer. AXON_RET_BAD_ALLOC: shared memory is short.
+ *
+ * # Safety
+ * `options` points to options that `axon_session_options_init` filled in, whose pointers are null or
+ * point to what they say; `session` points to room for a handle.
+ */
+axon_ret_t axon_session_open(const struct axon_session_options_t *options,
+                             struct axon_session_t *session);
+
+/**
+ * Gives a session's handle up. The session ends when the last of its nodes, endpoints and events is
+ * destroyed and the last call returns that uses one, which then blocks for milliseconds while its
+ * thread ends.
+ */
+axon_ret_t axon_session_close(struct axon_session_t session);
+
+/**
+ * The domain that the session is in.
+ *
+ * # Safety
+ * `domain` points to room for a number.
+ */
+axon_ret_t axon_session_domain(struct axon_session_t session, uint32_t *domain);
+
+/**
+ * Whether the session reaches its daemon: 1, or 0 while there is none, as after it died, until
+ * another has taken over. Where `AXON_DAEMON` is `off` there is none to reach: 1. What is attached
+ * flows on either way.
+ *
+ * # Safety
+ * `connected` points to room for a number.
+ */
+axon_ret_t axon_session_is_connected(struct axon_session_t session, uint8_t *connected);
 
 /**
  * A guard condition of a session. It does not keep the session open: it may be triggered and destroyed

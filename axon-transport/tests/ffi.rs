@@ -18,12 +18,22 @@ use c_program::{SYSTEM, WARNINGS, library, path, run};
 use skip::skip;
 
 fn files(directory: &str, extension: &str) -> Vec<PathBuf> {
-    let entries = fs::read_dir(path(directory)).unwrap();
-    let of = |path: &PathBuf| path.extension() == Some(OsStr::new(extension));
-    let mut files: Vec<PathBuf> = entries.map(|entry| entry.unwrap().path()).filter(of).collect();
+    let mut files = Vec::new();
+    add_files(&path(directory), OsStr::new(extension), &mut files);
     files.sort();
     assert!(!files.is_empty());
     files
+}
+
+fn add_files(directory: &Path, extension: &OsStr, files: &mut Vec<PathBuf>) {
+    for entry in fs::read_dir(directory).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            add_files(&path, extension, files);
+        } else if path.extension() == Some(extension) {
+            files.push(path);
+        }
+    }
 }
 
 /// Whether a program runs; what needs it is skipped where it does not.

@@ -6,7 +6,7 @@ use super::{
     callback::{axon_callback_t, told},
     error::{CallFailure, axon_ret_t},
     guarded,
-    handle::{axon_event_t, axon_publisher_t, axon_subscription_t, give, named, revoke},
+    handles::{axon_event_t, axon_publisher_t, axon_subscription_t, give, named, revoke},
     memory::{present, store},
     qos::policy,
 };

@@ -6,10 +6,10 @@ use std::{
 };
 
 use super::{
-    endpoint::axon_gid_t,
+    endpoints::axon_gid_t,
     error::{AXON_RET_NO_NODE, CallFailure, axon_ret_t},
     guarded,
-    handle::{axon_session_t, named},
+    handles::{axon_session_t, named},
     memory::{store, text},
     qos::axon_qos_t,
 };

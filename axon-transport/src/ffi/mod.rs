@@ -20,23 +20,16 @@
 #![allow(unsafe_code, non_camel_case_types)]
 
 mod callback;
-mod client;
-mod endpoint;
+mod endpoints;
 mod error;
 mod event;
 mod graph;
-mod handle;
-mod loan;
+mod handles;
 mod log;
 mod memory;
-mod named_loan;
 mod node;
-mod publisher;
 mod qos;
-mod server;
 mod session;
-mod subscription;
-mod table;
 #[cfg(test)]
 mod tests;
 mod wait;
@@ -44,20 +37,15 @@ mod wait;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 pub use callback::*;
-pub use client::*;
-pub use endpoint::*;
+pub use endpoints::*;
 pub use error::*;
 pub use event::*;
 pub use graph::*;
-pub use handle::*;
-pub use loan::*;
+pub use handles::*;
 pub use log::*;
 pub use node::*;
-pub use publisher::*;
 pub use qos::*;
-pub use server::*;
 pub use session::*;
-pub use subscription::*;
 pub use wait::*;
 
 /// The version of this interface. It rises whenever a program that was compiled against the former

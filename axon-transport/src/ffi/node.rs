@@ -5,7 +5,7 @@ use std::os::raw::c_char;
 use super::{
     error::axon_ret_t,
     guarded,
-    handle::{axon_guard_t, axon_node_t, axon_session_t, give, named, revoke},
+    handles::{axon_guard_t, axon_node_t, axon_session_t, give, named, revoke},
     memory::{present, text},
 };
 

@@ -6,7 +6,7 @@ use super::{
     AXON_SESSION_ABI,
     error::{AXON_RET_ABI, AXON_RET_CONFIG, CallFailure, axon_ret_t},
     guarded,
-    handle::{axon_session_t, give, named, revoke},
+    handles::{axon_session_t, give, named, revoke},
     memory::{elements, present, store, text, value},
 };
 use crate::{

@@ -12,7 +12,7 @@ use std::{
 };
 
 use super::{
-    handle::{Handle, give},
+    handles::{Handle, give},
     *,
 };
 use crate::{

@@ -5,7 +5,7 @@ use std::{sync::Arc, time::Duration};
 use super::{
     error::{AXON_RET_OK, AXON_RET_TIMEOUT, CallFailure, axon_ret_t},
     guarded,
-    handle::{
+    handles::{
         Handle, axon_client_t, axon_event_t, axon_guard_t, axon_server_t, axon_session_t,
         axon_subscription_t, give, named, revoke, visit,
     },

@@ -48,7 +48,7 @@ pub enum RecvError {
 
 impl RecvError {
     /// Why the control thread cannot listen.
-    pub(super) fn of_listening(error: &ShmError) -> Self {
+    pub(in crate::session) fn of_listening(error: &ShmError) -> Self {
         match error {
             ShmError::AlreadyLed(session) => Self::AlreadyLed(*session),
             // The only other reason to refuse an external leader.

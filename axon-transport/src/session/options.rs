@@ -22,16 +22,16 @@ use crate::{qos::Qos, session_key::SessionKey, wire::session::SessionRole};
 /// ```
 #[derive(Clone, Debug)]
 pub struct SessionOptions {
-    pub(super) name: String,
-    pub(super) role: SessionRole,
-    pub(super) daemon_command: Option<DaemonCommand>,
-    pub(super) callers: usize,
+    pub(in crate::session) name: String,
+    pub(in crate::session) role: SessionRole,
+    pub(in crate::session) daemon_command: Option<DaemonCommand>,
+    pub(in crate::session) callers: usize,
     /// It keeps what the daemon refuses of no endpoint in particular, for the process that it relays.
-    pub(super) keeps_refusals: bool,
+    pub(in crate::session) keeps_refusals: bool,
     /// What its id is made of.
-    pub(super) key: Option<Arc<SessionKey>>,
+    pub(in crate::session) key: Option<Arc<SessionKey>>,
     #[cfg(feature = "sros2")]
-    pub(super) permissions: Option<Arc<EnclavePermissions>>,
+    pub(in crate::session) permissions: Option<Arc<EnclavePermissions>>,
 }
 
 impl SessionOptions {

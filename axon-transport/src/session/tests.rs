@@ -37,7 +37,7 @@ use super::{
 use crate::{
     config::{Config, OsFiles},
     graph::EndpointKind,
-    ids::Gid,
+    ids::{DaemonId, Gid, SessionId},
     qos::{Durability, Qos},
     wire::session::{
         Attach, Granted, Graph, Message, PROTOCOL, Pair, Refused, Segment, SegmentOpened, Unmatch,

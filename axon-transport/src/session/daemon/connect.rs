@@ -16,9 +16,9 @@ use crate::{
     config::{Config, DaemonPolicy, DiscoveryRange, security_settings},
     ids::SessionId,
     session::{
-        SessionOptions,
         daemon::spawn::{SpawnOutcome, spawn},
         error::SessionError,
+        options::SessionOptions,
     },
     wire::session::{Hello, Message, PROTOCOL, SessionRole, Welcome},
 };

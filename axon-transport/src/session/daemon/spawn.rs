@@ -22,7 +22,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use crate::{
     config::{Config, DiscoveryRange, elevated::check_owner},
-    session::{DaemonCommand, SessionError},
+    session::{error::SessionError, options::DaemonCommand},
 };
 
 /// The flag of the first process.

@@ -1,70 +1,31 @@
-//! Requests the daemon's status, over the session's connection or over a separate one.
+//! Questions to a daemon over a connection of their own: its status, and what its tools ask.
 
 use std::{
     os::fd::OwnedFd,
-    sync::PoisonError,
     time::{Duration, Instant},
 };
 
-use axon_shm::ShmError;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::{
     address::Address,
     connect::Caller,
     socket::{self, SocketError},
-    status_text::{StatusAnswer, StatusText},
+    status_text::StatusText,
 };
 use crate::{
     access::Verb,
     config::{Config, DaemonPlace, DaemonPolicy},
     ids::{DaemonId, SessionId},
-    session::{Session, SessionOptions, error::SessionError, state::Outgoing},
+    session::{error::SessionError, options::SessionOptions},
     status::{PeerDecisions, ReloadReport},
     wire::session::{AccessCheck, CheckedUse, Message, SessionRole},
 };
 
 /// How long a daemon may take to answer.
-const ANSWER: Duration = Duration::from_secs(5);
+pub(in crate::session) const ANSWER: Duration = Duration::from_secs(5);
 /// How long a peer may take to answer: a lost packet is sent again by then.
 const PEER_ANSWER: Duration = Duration::from_secs(3);
-
-impl Session {
-    /// The daemon's status: the JSON of [`Status`](crate::status::Status).
-    ///
-    /// # Errors
-    /// When there is no daemon or it does not answer in time.
-    pub fn status_json(&self) -> Result<String, SessionError> {
-        let shared = self.shared();
-        if self.is_forked() {
-            return Err(ShmError::Forked.into());
-        }
-        let _asking = shared.asking.lock().unwrap_or_else(PoisonError::into_inner);
-        if shared.config.daemon == DaemonPolicy::Off {
-            return Err(SessionError::Off);
-        }
-        if self.handle.relay.is_some() {
-            return daemon_status(&shared.config);
-        }
-        {
-            let mut state = shared.state();
-            if state.daemon.is_none() {
-                return Err(SessionError::Disconnected);
-            }
-            state.status = StatusAnswer::Parts(Default::default());
-        }
-        shared.tell(Outgoing::Message(Box::new(Message::StatusRequest)));
-        shared.wait_changed(ANSWER, || !matches!(shared.state().status, StatusAnswer::Parts(_)));
-        let answer = std::mem::take(&mut shared.state().status);
-        match answer {
-            StatusAnswer::Whole(bytes) => status_text(bytes),
-            StatusAnswer::Lost => Err(SessionError::Disconnected),
-            StatusAnswer::None | StatusAnswer::Parts(_) => {
-                Err(SessionError::Silent { address: Address::of(&shared.config).to_string() })
-            }
-        }
-    }
-}
 
 /// The status of the daemon of this user and domain. Starts none, and is answered whatever the
 /// security settings.
@@ -178,7 +139,8 @@ pub fn daemon_check_access_at(
     serde_json::from_str(&text).map_err(|e| SessionError::Protocol(format!("access check: {e}")))
 }
 
-fn status_text(bytes: Vec<u8>) -> Result<String, SessionError> {
+/// A status as text.
+pub(in crate::session) fn status_text(bytes: Vec<u8>) -> Result<String, SessionError> {
     String::from_utf8(bytes).map_err(|e| SessionError::Protocol(format!("status: {e}")))
 }
 

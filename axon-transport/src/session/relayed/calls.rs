@@ -12,7 +12,7 @@ use super::{
 use crate::{
     ids::Gid,
     session::{
-        RemoteWriter,
+        endpoints::RemoteWriter,
         merge::{Merge, Taken},
     },
 };

@@ -13,14 +13,14 @@
 use std::time::Duration;
 
 pub mod calls;
-pub mod change_signal;
 pub mod flow;
-pub(crate) mod near;
+pub(super) mod near;
 pub mod pipe;
 mod response_log;
 mod unanswered;
 
-pub use flow::Pool;
+pub use self::flow::Pool;
+pub use super::core::ChangeSignal;
 
 /// Relayed sessions of one daemon: each costs it two threads and memory of its own.
 pub const MAX_SESSIONS: usize = 32;

@@ -17,7 +17,6 @@ use rustix::{
 };
 
 use super::{
-    change_signal::ChangeSignal,
     flow::{
         Channel, Content, InboundSample, Incoming, OutboundSample, Outgoing, Payload, Violation,
     },
@@ -28,8 +27,10 @@ use crate::{
     log_limit::LogLimit,
     registry::RelayCounters,
     session::{
-        RemoteWriter, Written, clock,
+        clock,
+        core::ChangeSignal,
         daemon::socket::{self, Received, SocketError},
+        endpoints::{RemoteWriter, Written},
     },
     wire::session::{Credit, Message},
 };

@@ -186,7 +186,7 @@ fn a_grant_is_lost(session_ends: bool) {
     if let Some(ending) = ending {
         ending.join().unwrap();
     } else if let Some(session) = &session {
-        let gone = || !session.shared().state().publishers.contains_key(&endpoint.gid);
+        let gone = || !session.shared().state().endpoints.publishers.contains_key(&endpoint.gid);
         until("it is gone", gone);
     }
     drop(session);
@@ -214,5 +214,5 @@ fn a_publisher_that_is_dropped_goes_at_once_where_its_reader_has_taken_up_its_gr
     drop(daemon);
     until("it is lost", || session.daemon().is_none());
     drop(publisher);
-    assert!(!session.shared().state().publishers.contains_key(&gid));
+    assert!(!session.shared().state().endpoints.publishers.contains_key(&gid));
 }

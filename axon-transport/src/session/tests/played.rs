@@ -8,7 +8,7 @@ use axon_shm::{
 use super::*;
 use crate::{
     graph::{Endpoint, EndpointKind},
-    session::arrivals,
+    session::control::arrivals,
     wire::session::{GivenUp, GraphItem},
 };
 
@@ -421,7 +421,7 @@ fn an_endpoint_that_is_refused_is_not_in_the_graph() {
     refuse(Gid::new(SessionId::random(), 1));
     has_heard(&daemon, &asking);
     assert!(!shows(&session, gone) && shows(&session, reader.gid()));
-    assert!(session.shared().state().refused.is_empty());
+    assert!(session.shared().state().graph.refused.is_empty());
 }
 
 #[test]

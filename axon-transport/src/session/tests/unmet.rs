@@ -40,10 +40,10 @@ fn each_daemon_is_told_what_a_reader_lost_that_did_not_come_in_time() {
     let (publisher, reader, _asked) = granted_in_vain(&session, &daemon, Qos::keep_all());
     let writer = publisher.gid();
     drop(publisher);
-    assert!(session.shared().state().publishers.contains_key(&writer), "it stays");
+    assert!(session.shared().state().endpoints.publishers.contains_key(&writer), "it stays");
     // Its time is over.
     session.shared().part_leaving(true);
-    session.shared().wake();
+    session.core().wake();
     let unmet = Message::Unmet(Unmet { reader, writer, samples: 5 });
     assert_eq!(told(&daemon, writer), unmet);
     assert!(matches!(told(&daemon, writer), Message::EndpointGone(_)));
@@ -130,7 +130,7 @@ fn each_daemon_is_told_what_was_granted_to_a_reader_that_has_not_come() {
     assert_eq!((granted.reader, granted.writer, granted.first), (reader, writer, 0));
     drop(publisher);
     session.shared().part_leaving(true);
-    session.shared().wake();
+    session.core().wake();
     let next = daemon.hear(|message| match &message {
         Message::Grant(_) | Message::Unmet(_) => Some(message),
         _ => None,

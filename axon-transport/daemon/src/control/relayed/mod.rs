@@ -29,9 +29,8 @@ use axon_transport::{
             RemoteWriter,
             daemon::socket::{self, SocketError},
             relayed::{
-                LINGER, MAX_CALLERS, MAX_ENDPOINTS, Pool,
+                ChangeSignal, LINGER, MAX_CALLERS, MAX_ENDPOINTS, Pool,
                 calls::{self, Calls},
-                change_signal::ChangeSignal,
                 flow::{Channel, Incoming},
                 pipe::{End, LossReport, Pipe},
             },
@@ -107,7 +106,7 @@ impl DaemonRelay {
             }
         };
         let change_signal = ChangeSignal::new().map_err(|e| End::Other(e.to_string()))?;
-        change_signal.of(&session);
+        session.set_listener(change_signal.listener());
         let leader = session.segment().external_leader().map_err(|e| End::Other(e.to_string()))?;
         let daemon = session.daemon().unwrap_or_default();
         let pid = std::process::id();

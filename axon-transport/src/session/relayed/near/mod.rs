@@ -8,28 +8,19 @@ mod stand_ins;
 use std::{
     cell::OnceCell,
     collections::{BTreeMap, BTreeSet, HashMap},
-    sync::{
-        Arc,
-        atomic::{AtomicBool, Ordering},
-    },
-    thread::JoinHandle,
+    sync::{Arc, atomic::AtomicBool},
     time::{Duration, Instant},
 };
 
-use axon_shm::{
-    ExternalLeader,
-    internal::{BlockedSignals, descriptors::PassedFd},
-};
+use axon_shm::{ExternalLeader, internal::descriptors::PassedFd};
 
 use self::{
     relays::Relay,
     stand_ins::{Kept, KeptCalls, StandIn},
 };
 use super::{
-    Pool,
     calls::{self, Calls},
-    change_signal::ChangeSignal,
-    flow::{Channel, Incoming},
+    flow::{Channel, Incoming, Pool},
     pipe::{End, LossReport, Pipe},
     unanswered::Unanswered,
 };
@@ -39,22 +30,19 @@ use crate::{
     ids::{DaemonId, Gid},
     registry::RelayCounters,
     session::{
-        Session, SessionError, SessionShared, clock,
+        clock,
+        control::local::LocalRegistry,
+        core::ChangeSignal,
         daemon::{connect::Connected, socket::SocketError},
-        local::LocalRegistry,
+        error::SessionError,
+        handle::Session,
+        relay_thread::RelayThread,
+        state::SessionShared,
     },
     wire::session::{
         Announce, Asserted, EndpointRole, GivenUp, Gone, Graph, Leaving, Message, Refused,
     },
 };
-
-/// Carries a session's samples to its daemon and back, until it is dropped.
-#[derive(Debug)]
-pub(crate) struct SessionRelay {
-    finish: Arc<AtomicBool>,
-    change_signal: Arc<ChangeSignal>,
-    thread: Option<JoinHandle<()>>,
-}
 
 /// What outlives a connection.
 struct Common {
@@ -70,48 +58,34 @@ struct Common {
     reason: String,
 }
 
-impl SessionRelay {
-    pub(crate) fn start(
-        shared: Arc<SessionShared>,
-        local_registry: Arc<LocalRegistry>,
-        outside: Session,
-        connected: Connected,
-        reason: String,
-    ) -> Result<Self, SessionError> {
-        let system = |what| move |source: std::io::Error| SessionError::System { what, source };
-        let change_signal = ChangeSignal::new().map_err(system("creating an eventfd"))?;
-        change_signal.of(&outside);
-        let finish = Arc::new(AtomicBool::new(false));
-        let leader = outside.segment().external_leader()?;
-        let common = Common {
-            shared,
-            local_registry,
-            outside,
-            leader,
-            change_signal: Arc::clone(&change_signal),
-            finish: Arc::clone(&finish),
-            finish_by: OnceCell::new(),
-            reason,
-        };
-        let blocked = BlockedSignals::all();
-        let thread = std::thread::Builder::new()
-            .name("axon-relay".into())
-            .spawn(move || common.run(connected))
-            .map_err(system("starting the relay's thread"))?;
-        drop(blocked);
-        Ok(Self { finish, change_signal, thread: Some(thread) })
-    }
-}
-
-impl Drop for SessionRelay {
-    fn drop(&mut self) {
-        // Pairs with the loads of the relay's thread.
-        self.finish.store(true, Ordering::Release);
-        self.change_signal.wake();
-        if let Some(thread) = self.thread.take() {
-            let _ = thread.join();
-        }
-    }
+/// Starts to carry the samples of `shared`.
+///
+/// # Errors
+/// The process has no descriptors left, or no thread can be started.
+pub(in crate::session) fn start(
+    shared: Arc<SessionShared>,
+    local_registry: Arc<LocalRegistry>,
+    outside: Session,
+    connected: Connected,
+    reason: String,
+) -> Result<RelayThread, SessionError> {
+    let system = |what| move |source: std::io::Error| SessionError::System { what, source };
+    let change_signal = ChangeSignal::new().map_err(system("creating an eventfd"))?;
+    outside.set_listener(change_signal.listener());
+    let finish = Arc::new(AtomicBool::new(false));
+    let leader = outside.segment().external_leader()?;
+    let common = Common {
+        shared,
+        local_registry,
+        outside,
+        leader,
+        change_signal: Arc::clone(&change_signal),
+        finish: Arc::clone(&finish),
+        finish_by: OnceCell::new(),
+        reason,
+    };
+    RelayThread::spawn(finish, change_signal, move || common.run(connected))
+        .map_err(system("starting the relay's thread"))
 }
 
 impl Common {
@@ -186,7 +160,7 @@ impl<'a> RelayConnection<'a> {
         unanswered.keep_clients(|client| graph.endpoints.contains_key(client));
         // This end trusts its daemon with memory: there is one, and it takes what it is given credit
         // for.
-        let incoming = Incoming::new(common.shared.config.max_message, Pool::new(u64::MAX));
+        let incoming = Incoming::new(common.shared.core.config.max_message, Pool::new(u64::MAX));
         let socket = PassedFd::connection(connected.socket).trusted();
         let mut pipe = Pipe::new(socket, incoming, Arc::new(RelayCounters::default()));
         pipe.response_log = Some(response_log);
@@ -336,7 +310,7 @@ impl<'a> RelayConnection<'a> {
         for item in graph.added {
             let daemon = item.daemon.unwrap_or(self.daemon);
             // This process knows better what its own endpoints are.
-            if !item.endpoint.gid.is_of(&self.common.shared.id) {
+            if !item.endpoint.gid.is_of(&self.common.shared.core.id) {
                 changes.entry(daemon).or_default().0.push(item.endpoint.clone());
                 self.world.insert(item.endpoint.gid, (daemon, item.endpoint));
             }
@@ -370,7 +344,7 @@ impl<'a> RelayConnection<'a> {
     fn tell_endpoints(&mut self) -> Result<(), End> {
         let common = self.common;
         let graph = common.outside.graph();
-        let session = &common.shared.id;
+        let session = &common.shared.core.id;
         let gone: Vec<(Gid, EndpointKind)> = self
             .own
             .values()

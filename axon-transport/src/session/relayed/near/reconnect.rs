@@ -10,8 +10,8 @@ use super::{Common, stand_ins::Kept};
 use crate::{
     config::{Config, DaemonPolicy},
     session::{
-        SessionError,
         daemon::connect::{Caller, Connected},
+        error::SessionError,
         relayed::LINGER,
     },
 };
@@ -48,14 +48,14 @@ impl Common {
                 pause = (pause * 2).min(if self.finishes() { MIN_PAUSE } else { MAX_PAUSE });
             }
             // A session that ends starts no daemon.
-            let config = &self.shared.config;
+            let config = &self.shared.core.config;
             let last = self
                 .finishes()
                 .then(|| Config { daemon: DaemonPolicy::Require, ..Config::clone(config) });
             let caller = Caller {
                 config: last.as_ref().unwrap_or(config),
-                options: &self.shared.options,
-                id: self.shared.id,
+                options: &self.shared.core.options,
+                id: self.shared.core.id,
                 segment: None,
                 relay: Some(&self.reason),
                 cancel: Some(&|| if last.is_some() { self.is_over() } else { self.finishes() }),

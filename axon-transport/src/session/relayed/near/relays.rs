@@ -15,7 +15,8 @@ use crate::{
     ids::Gid,
     qos::{Durability, History, Liveliness, Qos, Reliability},
     session::{
-        EndpointSpec, Subscription,
+        endpoints::Subscription,
+        options::EndpointSpec,
         relayed::{
             MAX_MATCHED,
             flow::{Channel, OutboundSample, Payload},

@@ -10,7 +10,7 @@ use crate::{
     graph::{Endpoint, EndpointKind, Pairing, pairing, reads},
     ids::{DaemonId, Gid},
     session::{
-        RemoteWriter,
+        endpoints::RemoteWriter,
         relayed::{
             MAX_CALLERS, calls::Calls, flow::Channel, pipe::End, response_log::ResponseLog,
             unanswered::Unanswered,

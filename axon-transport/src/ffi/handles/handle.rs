@@ -1,0 +1,247 @@
+//! The kinds of handles, and the object that each kind names.
+
+use std::sync::Arc;
+
+use axon_shm::{
+    Sample,
+    internal::{ForkToken, Made, PerProcess},
+};
+
+use super::{
+    named_loan::NamedLoan,
+    table::{HandleTable, Process, Unknown},
+};
+use crate::{
+    ffi::{
+        error::{
+            AXON_RET_BAD_ALLOC, AXON_RET_FORKED, AXON_RET_INVALID_HANDLE, CallFailure, axon_ret_t,
+        },
+        memory::store,
+    },
+    session::{Client, Event, GuardCondition, Node, Publisher, Server, Session, Subscription},
+};
+
+/// A session: a process's membership of a domain. Destroyed by `axon_session_close`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct axon_session_t {
+    /// 0 where it is none.
+    pub id: u64,
+}
+
+/// A node: a name in the graph to which endpoints belong.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct axon_node_t {
+    /// 0 where it is none.
+    pub id: u64,
+}
+
+/// Sends the samples of a topic.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct axon_publisher_t {
+    /// 0 where it is none.
+    pub id: u64,
+}
+
+/// Receives the samples of a topic.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct axon_subscription_t {
+    /// 0 where it is none.
+    pub id: u64,
+}
+
+/// Answers the requests of a service.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct axon_server_t {
+    /// 0 where it is none.
+    pub id: u64,
+}
+
+/// Sends requests to a service.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct axon_client_t {
+    /// 0 where it is none.
+    pub id: u64,
+}
+
+/// A guard condition: stands from when it is triggered until a wait has seen it.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct axon_guard_t {
+    /// 0 where it is none.
+    pub id: u64,
+}
+
+/// One event of a publisher or a subscription.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct axon_event_t {
+    /// 0 where it is none.
+    pub id: u64,
+}
+
+/// A sample that was taken in place, to be given back by `axon_session_sample_release`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct axon_sample_t {
+    /// 0 where it is none.
+    pub id: u64,
+}
+
+/// Memory that a publisher lent, to be published or abandoned.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct axon_loan_t {
+    /// 0 where it is none.
+    pub id: u64,
+}
+
+/// A type of handle, and what it names.
+pub(in crate::ffi) trait Handle: Copy {
+    type Object;
+    const WHAT: &'static str;
+
+    fn id(self) -> u64;
+    fn of(id: u64) -> Self;
+    fn table(tables: &Tables) -> &HandleTable<Self::Object>;
+}
+
+macro_rules! handles {
+    ($($number:literal $table:ident: $handle:ident => $object:ty, $what:literal;)+) => {
+        /// What the handles of a process name.
+        pub(in crate::ffi) struct Tables {
+            process: Process,
+            $($table: HandleTable<$object>,)+
+        }
+
+        impl Tables {
+            fn new(token: ForkToken) -> Self {
+                let process = Process::new(token.value());
+                Self { process, $($table: HandleTable::new($number, process),)+ }
+            }
+        }
+
+        /// What a handle of this kind names.
+        fn what(kind: u8) -> &'static str {
+            match kind {
+                $($number => $what,)+
+                _ => "nothing",
+            }
+        }
+
+        $(impl Handle for $handle {
+            type Object = $object;
+            const WHAT: &'static str = $what;
+
+            fn id(self) -> u64 {
+                self.id
+            }
+
+            fn of(id: u64) -> Self {
+                Self { id }
+            }
+
+            fn table(tables: &Tables) -> &HandleTable<$object> {
+                &tables.$table
+            }
+        })+
+    };
+}
+
+handles! {
+    1 sessions: axon_session_t => Session, "session";
+    2 nodes: axon_node_t => Node, "node";
+    3 publishers: axon_publisher_t => Publisher, "publisher";
+    4 subscriptions: axon_subscription_t => Subscription, "subscription";
+    5 servers: axon_server_t => Server, "server";
+    6 clients: axon_client_t => Client, "client";
+    7 guards: axon_guard_t => GuardCondition, "guard condition";
+    8 events: axon_event_t => Event, "event";
+    9 samples: axon_sample_t => Sample, "sample";
+    10 loans: axon_loan_t => NamedLoan, "loan";
+}
+
+static TABLES: PerProcess<Tables> = PerProcess::new();
+
+/// This process's tables. A forked child begins with new ones.
+fn current() -> Result<&'static Made<Tables>, CallFailure> {
+    let none = |_: &'static Tables, _: &'static Tables| {};
+    TABLES.get(Tables::new, none).map_err(|error| CallFailure::new(AXON_RET_BAD_ALLOC, error))
+}
+
+/// What a handle names.
+pub(in crate::ffi) fn named<H: Handle>(handle: H) -> Result<Arc<H::Object>, CallFailure> {
+    let tables = current()?;
+    let found = H::table(tables.value()).get(handle.id());
+    #[cfg(test)]
+    crate::ffi::tests::found();
+    found.map_err(|why| unknown(tables, handle, why))
+}
+
+/// A handle for something new, stored at `out`.
+///
+/// # Safety
+/// As [`store`].
+pub(in crate::ffi) unsafe fn give<H: Handle>(
+    object: H::Object,
+    out: *mut H,
+) -> Result<(), CallFailure> {
+    let id = H::table(current()?.value()).insert(object).ok_or_else(|| {
+        let what = H::WHAT;
+        CallFailure::new(AXON_RET_BAD_ALLOC, format_args!("no {what} more: there are a million"))
+    })?;
+    // SAFETY: the caller's word.
+    unsafe { store(out, H::of(id), "the place of the handle") }
+}
+
+/// Gives a handle up: what it named ends when no call uses it any more.
+pub(in crate::ffi) fn revoke<H: Handle>(handle: H) -> Result<Arc<H::Object>, CallFailure> {
+    let tables = current()?;
+    H::table(tables.value()).remove(handle.id()).map_err(|why| unknown(tables, handle, why))
+}
+
+/// Does something with what a handle names, as a signal handler may: see [`HandleTable::visit`].
+pub(in crate::ffi) fn visit<H: Handle>(
+    handle: H,
+    visit: impl FnOnce(&H::Object),
+) -> Result<(), axon_ret_t> {
+    let Some(tables) = TABLES.latest() else { return Err(AXON_RET_INVALID_HANDLE) };
+    if tables.is_forked() {
+        return Err(AXON_RET_FORKED);
+    }
+    H::table(tables.value()).visit(handle.id(), visit).map_err(|why| code(tables, why))
+}
+
+fn code(tables: &Made<Tables>, why: Unknown) -> axon_ret_t {
+    match why {
+        Unknown::Foreign(process) if tables.ancestors().any(|a| a.process == process) => {
+            AXON_RET_FORKED
+        }
+        _ => AXON_RET_INVALID_HANDLE,
+    }
+}
+
+fn unknown<H: Handle>(tables: &Made<Tables>, handle: H, why: Unknown) -> CallFailure {
+    let (id, what) = (handle.id(), H::WHAT);
+    let code = code(tables, why);
+    let text = match why {
+        Unknown::Null => format!("the handle of the {what} is 0"),
+        Unknown::OtherKind(kind) => {
+            let other = self::what(kind);
+            format!("the handle {id:#x} names a {other} where a {what} is expected")
+        }
+        Unknown::Foreign(_) if code == AXON_RET_FORKED => format!(
+            "the {what} belongs to the process of which this one is a fork: \
+             open a session here"
+        ),
+        Unknown::Foreign(_) | Unknown::Gone => {
+            format!("the handle {id:#x} names no {what}: it was destroyed")
+        }
+    };
+    CallFailure::new(code, text)
+}

@@ -1,0 +1,8 @@
+//! Handles, and the tables of what they name.
+
+mod handle;
+mod named_loan;
+mod table;
+
+pub use self::handle::*;
+pub(in crate::ffi) use self::named_loan::NamedLoan;

@@ -1,0 +1,146 @@
+//! Remote endpoints that the graph does not show yet. An endpoint appears once its pairs with the session's own
+//! endpoints are attached, so that a counted endpoint can be reached.
+//!
+//! Plain data. An endpoint is delayed for [`PATIENCE`] at most: a stopped process must not hide endpoints from other
+//! processes.
+
+use std::{
+    collections::{BTreeSet, HashMap},
+    time::{Duration, Instant},
+};
+
+use crate::{graph::GraphEntry, ids::Gid, wire::session::Pair};
+
+/// How long an endpoint is held back at most.
+pub(in crate::session) const PATIENCE: Duration = Duration::from_secs(1);
+
+#[derive(Default)]
+pub(super) struct Arrivals {
+    arriving: HashMap<Gid, Arriving>,
+    /// Until when those were to be held back that were arriving when everything began to be told
+    /// anew.
+    before: HashMap<Gid, Instant>,
+}
+
+struct Arriving {
+    entry: GraphEntry,
+    missing: BTreeSet<Pair>,
+    until: Instant,
+}
+
+impl Arrivals {
+    /// Holds `entry` back until the pairs in `missing` stand.
+    pub(super) fn hold(&mut self, entry: GraphEntry, missing: BTreeSet<Pair>, now: Instant) {
+        let gid = entry.endpoint.gid;
+        let until = self.before.remove(&gid).unwrap_or(now + PATIENCE);
+        self.arriving.insert(gid, Arriving { entry, missing, until });
+    }
+
+    /// Those that are held back.
+    pub(super) fn entries(&self) -> impl Iterator<Item = &GraphEntry> {
+        self.arriving.values().map(|arriving| &arriving.entry)
+    }
+
+    /// A pair stands. The endpoint that waited for it and for no other.
+    pub(super) fn pair_up(&mut self, pair: &Pair) -> Option<GraphEntry> {
+        [pair.reader, pair.writer].iter().find_map(|gid| {
+            let arriving = self.arriving.get_mut(gid)?;
+            arriving.missing.remove(pair);
+            let whole = arriving.missing.is_empty();
+            whole.then(|| self.arriving.remove(gid).map(|arriving| arriving.entry)).flatten()
+        })
+    }
+
+    /// An endpoint is gone before it arrived.
+    pub(super) fn remove(&mut self, gid: &Gid) -> Option<GraphEntry> {
+        self.arriving.remove(gid).map(|arriving| arriving.entry)
+    }
+
+    /// An endpoint of the session's own is gone. Those that waited for nothing else.
+    pub(super) fn own_gone(&mut self, own: &Gid) -> Vec<GraphEntry> {
+        self.take_where(|arriving| {
+            arriving.missing.retain(|pair| pair.reader != *own && pair.writer != *own);
+            arriving.missing.is_empty()
+        })
+    }
+
+    /// Those that have been held back for long enough.
+    pub(super) fn overdue(&mut self, now: Instant) -> Vec<GraphEntry> {
+        if self.due().is_none_or(|due| due > now) {
+            return Vec::new();
+        }
+        self.take_where(|arriving| arriving.until <= now)
+    }
+
+    /// When the next one has been.
+    pub(super) fn due(&self) -> Option<Instant> {
+        self.arriving.values().map(|arriving| arriving.until).min()
+    }
+
+    /// Everything is told anew: an endpoint that is not told again is gone.
+    pub(super) fn restart(&mut self) {
+        let arriving = std::mem::take(&mut self.arriving);
+        self.before = arriving.into_iter().map(|(gid, arriving)| (gid, arriving.until)).collect();
+    }
+
+    fn take_where(&mut self, mut which: impl FnMut(&mut Arriving) -> bool) -> Vec<GraphEntry> {
+        let taken = self.arriving.extract_if(|_, arriving| which(arriving));
+        taken.map(|(_, arriving)| arriving.entry).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::graph::{Endpoint, EndpointKind};
+
+    const fn gid(number: u8) -> Gid {
+        Gid([number; 16])
+    }
+
+    fn entry(number: u8) -> GraphEntry {
+        let endpoint = Endpoint::example(gid(number), EndpointKind::Publisher);
+        GraphEntry { endpoint: Arc::new(endpoint), daemon: None, reach: None }
+    }
+
+    fn pair(reader: u8, writer: u8) -> Pair {
+        Pair { reader: gid(reader), writer: gid(writer) }
+    }
+
+    fn shown(entries: impl IntoIterator<Item = GraphEntry>) -> Vec<Gid> {
+        entries.into_iter().map(|entry| entry.endpoint.gid).collect()
+    }
+
+    #[test]
+    fn an_endpoint_appears_with_the_last_of_its_pairs() {
+        let (mut arrivals, now) = (Arrivals::default(), Instant::now());
+        arrivals.hold(entry(9), [pair(1, 9), pair(9, 2), pair(3, 9)].into(), now);
+        assert!(arrivals.pair_up(&pair(1, 9)).is_none());
+        assert!(arrivals.pair_up(&pair(1, 9)).is_none(), "once more");
+        assert!(arrivals.pair_up(&pair(1, 8)).is_none(), "another's");
+        assert!(arrivals.own_gone(&gid(2)).is_empty());
+        assert_eq!(shown(arrivals.pair_up(&pair(3, 9))), [gid(9)]);
+        assert!(arrivals.due().is_none());
+        arrivals.hold(entry(9), [pair(1, 9)].into(), now);
+        assert_eq!(shown(arrivals.own_gone(&gid(1))), [gid(9)]);
+    }
+
+    #[test]
+    fn none_is_held_back_for_ever() {
+        let (mut arrivals, now) = (Arrivals::default(), Instant::now());
+        arrivals.hold(entry(8), [pair(1, 8)].into(), now);
+        arrivals.hold(entry(9), [pair(1, 9)].into(), now + PATIENCE / 2);
+        assert_eq!(arrivals.due(), Some(now + PATIENCE));
+        assert!(arrivals.overdue(now).is_empty());
+        assert_eq!(shown(arrivals.overdue(now + PATIENCE)), [gid(8)]);
+        // Being told of it again and again makes it no longer.
+        arrivals.restart();
+        assert!(arrivals.due().is_none());
+        arrivals.hold(entry(9), [pair(1, 9)].into(), now + PATIENCE);
+        assert_eq!(arrivals.due(), Some(now + PATIENCE / 2 + PATIENCE));
+        assert_eq!(shown(arrivals.remove(&gid(9))), [gid(9)]);
+        assert!(arrivals.pair_up(&pair(1, 9)).is_none());
+    }
+}

@@ -1,0 +1,485 @@
+//! Handles the daemon's messages on the control thread.
+
+use std::{collections::HashSet, sync::Arc};
+
+use axon_shm::{
+    ShmError,
+    internal::{Grant, Location, Peer, ReaderInfo, Terms, descriptors::PassedFd},
+};
+
+use super::{Control, Link, pair_log, peers::PeerError, stands_for};
+use crate::{
+    graph::EndpointKind,
+    ids::{Gid, SessionId},
+    session::sides::{Accept, Asking, Numbers, PublisherInner, SubscriptionInner},
+    wire::session::{
+        Attach, Fence, GivenUp, Granted, Leaving, MAX_DESCRIPTORS, Message, Pair, Refused, Segment,
+        SegmentName, SegmentOpened, StatusPart, Unmatch, Unmet,
+    },
+};
+
+impl Control {
+    pub(super) fn handle(&mut self, message: Message, descriptors: Vec<PassedFd>) {
+        match message {
+            Message::Graph(graph) => self.graph(graph),
+            Message::Match(pair) => self.matched(pair),
+            Message::Attach(attach) => self.attach(attach, descriptors),
+            Message::Grant(grant) => self.grant(grant, descriptors),
+            Message::Detach(pair) => {
+                self.pairs.remove(&pair);
+                self.peers.release(&pair);
+                self.detach_reader(&pair);
+            }
+            Message::Unmatch(unmatch) => self.unmatch(&unmatch),
+            Message::Leaving(leaving) => self.leave(leaving),
+            Message::Unmet(unmet) => self.unmet(unmet),
+            Message::GivenUp(given_up) => self.give_up(given_up),
+            Message::Fence(fence) => self.fence(fence),
+            Message::Segment(opened) => self.segment(&opened, &descriptors),
+            Message::SegmentGone(gone) => {
+                self.peers.gone(&gone.session, gone.number);
+            }
+            Message::Status(part) => self.status(&part),
+            Message::Refused(Refused { endpoint, text: reason, .. }) => {
+                // The process that is relayed logs it itself.
+                if !self.shared.core.options.keeps_refusals {
+                    tracing::error!(reason, "the daemon refuses something of the session");
+                }
+                match endpoint {
+                    Some(gid) => self.shared.refuse(gid, reason),
+                    None => self.shared.keep_refusal(reason),
+                }
+            }
+            // What a daemon never says is not worth more than not being heard.
+            _ => {}
+        }
+    }
+
+    fn status(&self, part: &StatusPart) {
+        if self.shared.core.link.add_status(part) {
+            // Those who wait for the whole.
+            self.shared.notify(None);
+        }
+    }
+
+    /// Endpoints ended, perhaps while there was no daemon to say who was attached to them.
+    pub(super) fn endpoints_over(&mut self, gids: &[Gid]) {
+        if gids.is_empty() {
+            return;
+        }
+        // Thousands may end at a time, and be attached to one each.
+        let gids: HashSet<Gid> = gids.iter().copied().collect();
+        self.pairs.remove_endpoints(&gids);
+        let (publishers, subscriptions) = self.endpoints();
+        for publisher in publishers {
+            let attached = publisher.granted();
+            let ended = attached.iter().filter(|gid| gids.contains(gid));
+            let detached = ended.filter(|gid| publisher.detach(**gid));
+            let writer = publisher.endpoint.gid;
+            let detached = detached.inspect(|gid| {
+                pair_log::over(&Pair { reader: **gid, writer }, "the reader ended");
+            });
+            if detached.count() > 0 {
+                self.writer_changed(&publisher);
+            }
+        }
+        for subscription in subscriptions {
+            let mut matched_readers = subscription.lock();
+            let reader = subscription.endpoint.gid;
+            let writers = matched_readers.all_writers().into_iter();
+            let ended = writers.filter(|gid| gids.contains(gid));
+            let ended = ended.filter(|gid| matched_readers.end(gid));
+            let ended = ended.inspect(|gid| {
+                pair_log::over(&Pair { reader, writer: *gid }, "the writer ended");
+            });
+            let news = ended.count();
+            drop(matched_readers);
+            if news > 0 {
+                self.reader_changed(&subscription);
+            }
+        }
+    }
+
+    /// A writer has ended, or has not after all, and more comes of it.
+    fn leave(&mut self, Leaving { gid, leaving }: Leaving) {
+        let (_, subscriptions) = self.endpoints();
+        for subscription in subscriptions {
+            if subscription.lock().leave(&gid, leaving) {
+                self.reader_changed(&subscription);
+            }
+        }
+    }
+
+    /// A publisher ended before this session was told what it granted to one of its readers.
+    fn unmet(&self, Unmet { reader, writer, samples }: Unmet) {
+        let subscription = self.shared.state().endpoints.subscriptions.get(&reader).cloned();
+        let Some(subscription) = subscription else { return };
+        if subscription.lock().count_unmet(&writer, samples) {
+            pair_log::unmet(&Pair { reader, writer }, samples);
+            let topic = &subscription.endpoint.topic;
+            tracing::warn!(
+                topic, %writer, samples,
+                "samples are lost: their publisher ended before this process was told of it"
+            );
+            // Those who wait for losses.
+            self.shared.core.segment.notify();
+        }
+    }
+
+    /// A relay of a publisher here gave samples up.
+    fn give_up(&self, GivenUp { reader, writer, samples }: GivenUp) {
+        let publisher = self.shared.state().endpoints.publishers.get(&writer).cloned();
+        if let Some(publisher) = publisher {
+            publisher.rings.give_up(reader, samples);
+            // Those who wait for acknowledgements.
+            self.shared.core.segment.notify();
+        }
+    }
+
+    /// All that was said of a publisher here until it asked was sent to those who read it.
+    fn fence(&self, Fence { writer, number }: Fence) {
+        let publisher = self.shared.state().endpoints.publishers.get(&writer).cloned();
+        if let Some(publisher) = publisher {
+            publisher.was_sent(number);
+            // Those who wait for acknowledgements.
+            self.shared.core.segment.notify();
+        }
+    }
+
+    /// What the daemon told of and did not say again is over: it was unmatched while the session was
+    /// too slow to be told.
+    pub(super) fn drop_pairs(&mut self, over: &HashSet<Pair>) {
+        let (publishers, subscriptions) = self.endpoints();
+        for publisher in publishers {
+            let (writer, attached) = (publisher.endpoint.gid, publisher.granted());
+            for reader in attached {
+                let pair = Pair { reader, writer };
+                if over.contains(&pair) && !self.is_own_pair(&pair) && publisher.detach(reader) {
+                    pair_log::over(&pair, "the daemon did not repeat it to the writer");
+                    self.writer_changed(&publisher);
+                }
+            }
+        }
+        for subscription in subscriptions {
+            let reader = subscription.endpoint.gid;
+            let mut matched_readers = subscription.lock();
+            let gone = matched_readers
+                .writers()
+                .into_iter()
+                .map(|writer| Pair { reader, writer })
+                .filter(|pair| over.contains(pair) && !self.is_own_pair(pair))
+                .map(|pair| pair.writer);
+            let gone =
+                gone.collect::<Vec<_>>().into_iter().filter(|writer| matched_readers.end(writer));
+            let gone = gone.inspect(|writer| {
+                let pair = Pair { reader, writer: *writer };
+                pair_log::over(&pair, "the daemon did not repeat it to the reader");
+            });
+            let news = gone.count();
+            drop(matched_readers);
+            if news > 0 {
+                self.reader_changed(&subscription);
+            }
+        }
+    }
+
+    /// Whether both are the session's own, which part as soon as one of them ends.
+    fn is_own_pair(&self, pair: &Pair) -> bool {
+        pair.reader.is_of(&self.shared.core.id) && pair.writer.is_of(&self.shared.core.id)
+    }
+
+    /// Lets go of memory of others that nobody here reads any more, of which the daemon did not say
+    /// so as it does not know of it: it was given up while there was no daemon, or while this
+    /// session was too slow to be told. After everything has been `told` anew the daemon hears of
+    /// what is read, so that it will say when that is given up.
+    pub(super) fn drop_unread(&mut self, told: bool) {
+        let shared = self.shared.clone();
+        let read = |writer: &Gid| {
+            let subscriptions: Vec<_> =
+                shared.state().endpoints.subscriptions.values().cloned().collect();
+            subscriptions.iter().any(|subscription| subscription.lock().reads(writer))
+        };
+        let unnamed = self.peers.drop_unread(read);
+        for (session, number) in unnamed.into_iter().filter(|_| told) {
+            self.say(Message::Need(SegmentName { session, number }));
+        }
+    }
+
+    fn matched(&mut self, pair: Pair) {
+        self.pairs.tell(pair);
+        self.ask(&pair);
+    }
+
+    /// Asks a writer to serve a reader of ours, or repeats it.
+    fn ask(&mut self, pair: &Pair) {
+        let Some(subscription) =
+            self.shared.state().endpoints.subscriptions.get(&pair.reader).cloned()
+        else {
+            return;
+        };
+        if subscription.ignores_local && pair.writer.is_of(&self.shared.core.id) {
+            return;
+        }
+        let segment = self.shared.core.segment.clone();
+        let asking = subscription.lock().lane_for(pair.writer, || segment.allocate_lane());
+        self.ask_with(&subscription, pair.writer, asking);
+    }
+
+    fn ask_with(
+        &mut self,
+        subscription: &SubscriptionInner,
+        writer: Gid,
+        asking: Result<Asking, ShmError>,
+    ) {
+        match asking {
+            Ok(asking) => {
+                let message = self.attach_message(subscription, writer, asking);
+                self.say(message);
+            }
+            Err(error) => {
+                let topic = &subscription.endpoint.topic;
+                tracing::error!(topic, %error, "a publisher cannot be received from");
+                // For its status: the caller that waits for samples is on another host, where this is a gateway.
+                let pair = Pair { reader: subscription.endpoint.gid, writer };
+                self.tell_failure(&pair, error.to_string());
+            }
+        }
+    }
+
+    pub(super) fn attach_message(
+        &self,
+        subscription: &SubscriptionInner,
+        writer: Gid,
+        Asking { lane, after }: Asking,
+    ) -> Message {
+        Message::Attach(Attach {
+            reader: subscription.endpoint.gid,
+            writer,
+            lane,
+            qos: subscription.qos,
+            session: self.shared.core.id,
+            stands_for: stands_for(subscription),
+            segments: Vec::new(),
+            // The numbers of the others say nothing of what came before.
+            after: after.filter(|_| subscription.rising),
+            carries: subscription.carries.then_some(true),
+        })
+    }
+
+    fn attach(&mut self, attach: Attach, descriptors: Vec<PassedFd>) {
+        let pair = Pair { reader: attach.reader, writer: attach.writer };
+        self.pairs.tell(pair);
+        // Counted whether or not it comes to anything, as the daemon does.
+        let peer = self.hold(attach.session, pair, descriptors, &attach.segments);
+        let shared = self.shared.clone();
+        let own = attach.session == shared.core.id;
+        // Neither of two of our own shall end between the look at it and the grant.
+        let own_pairs = own.then(|| shared.lock_own_pairs());
+        let Some(publisher) = self.shared.state().endpoints.publishers.get(&attach.writer).cloned()
+        else {
+            return;
+        };
+        if own && !self.has_lane(&pair, attach.lane) {
+            return;
+        }
+        // Before it is served: what is published for it from then on waits for its grant to be sent.
+        self.shared.core.memory.hands_over();
+        let grant = peer.map_err(|e| e.to_string()).and_then(|peer| {
+            let Attach { reader: gid, lane, qos, stands_for, after, carries, .. } = attach;
+            let reader = ReaderInfo { gid, lane, qos, peer, stands_for };
+            let terms = Terms { after, carries: carries == Some(true) };
+            publisher.attach(reader, terms).map_err(|e| e.to_string())
+        });
+        drop(own_pairs);
+        match grant {
+            Ok((Grant { generation, first }, after, ring)) => {
+                let Pair { reader, writer } = pair;
+                pair_log::granted(&pair, generation, first);
+                let session = self.shared.core.id;
+                let segments = Vec::new();
+                let after = Some(after);
+                let relayed = publisher.relayed.then_some(true);
+                let grant = Granted {
+                    reader,
+                    writer,
+                    generation,
+                    first,
+                    session,
+                    ring,
+                    segments,
+                    after,
+                    relayed,
+                };
+                self.say(Message::Grant(grant));
+                self.writer_changed(&publisher);
+            }
+            Err(error) => {
+                let topic = &publisher.endpoint.topic;
+                tracing::error!(topic, reader = %pair.reader, error, "a reader is not served");
+                self.tell_failure(&pair, error);
+            }
+        }
+    }
+
+    /// Tells the daemon, which shows it, why a pair that it matched does not come about.
+    fn tell_failure(&mut self, pair: &Pair, reason: String) {
+        let Pair { reader, writer } = *pair;
+        self.say(Message::Unmatch(Unmatch { reader, writer, reason }));
+    }
+
+    fn grant(&mut self, granted: Granted, descriptors: Vec<PassedFd>) {
+        let Granted { reader, writer, generation, first, session, ring, segments, .. } = granted;
+        let Granted { after, relayed, .. } = granted;
+        let pair = Pair { reader, writer };
+        self.pairs.tell(pair);
+        // In a packet that is full not all of them were named.
+        let all = descriptors.len() < MAX_DESCRIPTORS;
+        let peer = self.hold(session, pair, descriptors, &segments);
+        if all {
+            self.peers.drop_unnamed(&session, writer);
+        }
+        let shared = self.shared.clone();
+        let own = session == shared.core.id;
+        let own_pairs = own.then(|| shared.lock_own_pairs());
+        let Some(subscription) = self.shared.state().endpoints.subscriptions.get(&reader).cloned()
+        else {
+            return;
+        };
+        if own && !self.has_ring(&writer, ring) {
+            return;
+        }
+        let grant = Grant { generation, first };
+        let mut matched_readers = subscription.lock();
+        let lane = match matched_readers.accept(writer, grant) {
+            Accept::Stands => return,
+            Accept::AskAgain => {
+                pair_log::forgotten(&pair);
+                // Under the same lock: the lane of before is in use still, so this is another one,
+                // and what we ask is no repetition, which the daemon would not pass on.
+                let segment = &self.shared.core.segment;
+                let asking = matched_readers.lane_for(writer, || segment.allocate_lane());
+                drop(matched_readers);
+                return self.ask_with(&subscription, writer, asking);
+            }
+            Accept::Map(lane) => lane,
+        };
+        drop(matched_readers);
+        let mapped = peer.map_err(|e| e.to_string()).and_then(|peer| {
+            let most = shared.core.config.max_message;
+            subscription.map(writer, peer, ring, lane, grant, most).map_err(|e| e.to_string())
+        });
+        match mapped {
+            Ok(mapped) => {
+                pair_log::accepted(&pair, generation, first);
+                let stands_in = !writer.is_of(&session) || relayed == Some(true);
+                let linked = matches!(self.link, Link::Socket(_));
+                let numbers = match subscription.endpoint.kind {
+                    EndpointKind::Subscription if stands_in && linked => Numbers::All,
+                    // In a relayed process what was lost on the way is said aloud.
+                    EndpointKind::Subscription if stands_in => Numbers::Between,
+                    _ if subscription.keeps_all() => Numbers::Since,
+                    _ => Numbers::None,
+                };
+                subscription.lock().add(mapped, after, numbers);
+                drop(own_pairs);
+                self.reader_changed(&subscription);
+                // It may have history to take.
+                self.shared.core.segment.notify();
+            }
+            Err(error) => {
+                drop(own_pairs);
+                let topic = &subscription.endpoint.topic;
+                tracing::error!(topic, %writer, error, "a publisher cannot be received from");
+                self.tell_failure(&pair, error);
+            }
+        }
+    }
+
+    fn hold(
+        &mut self,
+        session: SessionId,
+        pair: Pair,
+        descriptors: Vec<PassedFd>,
+        segments: &[Segment],
+    ) -> Result<Peer, PeerError> {
+        let held = self.peers.hold(session, pair, descriptors, segments);
+        if matches!(held, Err(PeerError::Missing)) {
+            // The daemon takes us to hold what we do not: have it start over.
+            self.outbox.push_back((Message::Resync, Vec::new()));
+        }
+        if !segments.is_empty() {
+            // Those who wait for what is in them.
+            self.shared.core.segment.notify();
+        }
+        held
+    }
+
+    /// Whether a subscription of this session has that lane for the writer. The daemon's message says where
+    /// lanes and rings are. Without this check it could name the bytes of one of this session's samples.
+    fn has_lane(&self, pair: &Pair, lane: Location) -> bool {
+        let subscription = self.shared.state().endpoints.subscriptions.get(&pair.reader).cloned();
+        // It may have ended, with its lanes, since it asked.
+        let Some(subscription) = subscription else { return false };
+        let has = subscription.lock().lanes().contains(&(pair.writer, lane));
+        if !has {
+            tracing::error!(
+                reader = %pair.reader,
+                "ignored an attachment: it names a lane that this session does not have"
+            );
+        }
+        has
+    }
+
+    /// Whether a publisher of ours has that ring.
+    fn has_ring(&self, writer: &Gid, ring: Location) -> bool {
+        let publisher = self.shared.state().endpoints.publishers.get(writer).cloned();
+        let Some(publisher) = publisher else { return false };
+        let has = publisher.rings.has(ring);
+        if !has {
+            tracing::error!(%writer, "ignored a grant: it names a ring that this session does not have");
+        }
+        has
+    }
+
+    fn segment(&mut self, opened: &SegmentOpened, descriptors: &[PassedFd]) {
+        if let [descriptor] = descriptors {
+            self.peers.opened(&opened.session, opened.segment, descriptor);
+            // Those who wait for what is in it.
+            self.shared.core.segment.notify();
+        }
+    }
+
+    fn unmatch(&mut self, unmatch: &Unmatch) {
+        let Unmatch { reader, writer, reason } = unmatch;
+        let pair = Pair { reader: *reader, writer: *writer };
+        self.pairs.remove(&pair);
+        self.peers.release(&pair);
+        self.detach_reader(&pair);
+        let subscription = self.shared.state().endpoints.subscriptions.get(reader).cloned();
+        if let Some(subscription) = subscription {
+            if subscription.lock().end(writer) {
+                pair_log::over(&pair, reason);
+                self.reader_changed(&subscription);
+            }
+            let topic = &subscription.endpoint.topic;
+            tracing::debug!(topic, %writer, reason, "a publisher is not received from");
+        }
+    }
+
+    fn detach_reader(&mut self, pair: &Pair) {
+        let publisher = self.shared.state().endpoints.publishers.get(&pair.writer).cloned();
+        if let Some(publisher) = publisher.filter(|p| p.detach(pair.reader)) {
+            pair_log::over(pair, "the daemon said so to the writer");
+            self.writer_changed(&publisher);
+        }
+        if self.shared.core.segment.tidy_some() {
+            self.look_after_memory();
+        }
+    }
+
+    pub(super) fn endpoints(&self) -> (Vec<Arc<PublisherInner>>, Vec<Arc<SubscriptionInner>>) {
+        let state = self.shared.state();
+        let publishers = state.endpoints.publishers.values().cloned().collect();
+        (publishers, state.endpoints.subscriptions.values().cloned().collect())
+    }
+}

@@ -1,0 +1,81 @@
+//! The connection to a daemon, and the search for a new daemon.
+
+use std::{sync::mpsc::TryRecvError, time::Instant};
+
+use axon_shm::internal::descriptors::PassedFd;
+
+use super::{
+    Control, Link,
+    search::Search,
+    told::{ToldPairs, ToldSegments},
+};
+use crate::{
+    session::{
+        core::{Outgoing, SegmentChange, SessionEvent},
+        daemon::connect::Connected,
+    },
+    wire::session::Message,
+};
+
+impl Control {
+    pub(super) fn connected(&mut self, connected: Connected) {
+        self.outbox.clear();
+        self.building = None;
+        self.pairs = ToldPairs::default();
+        self.segments = ToldSegments::default();
+        self.pause.handle_connected(Instant::now());
+        self.retry = None;
+        let daemon = connected.welcome.daemon;
+        {
+            let mut state = self.shared.state();
+            state.forget_refusals();
+            let gids = state.endpoints.gids();
+            let mut outgoing: Vec<_> = gids.into_iter().map(Outgoing::Announce).collect();
+            // Behind the announcements, and the memory that they name.
+            let pledged =
+                state.endpoints.publishers.values().flat_map(|p| p.pledged(self.shared.core.id));
+            outgoing.extend(pledged.map(|granted| Outgoing::message(Message::Grant(granted))));
+            // Before their ends.
+            let unmet = state.unmet.iter().map(|unmet| Outgoing::message(Message::Unmet(unmet)));
+            outgoing.extend(unmet);
+            outgoing.extend(state.graph.tombstones.iter().map(|gid| Outgoing::gone(*gid)));
+            self.shared.core.link.connected(daemon, outgoing);
+        }
+        self.link = Link::Socket(PassedFd::connection(connected.socket).trusted());
+        self.shared.core.memory.begins_anew();
+        for info in self.shared.core.segment.segments() {
+            self.tell_segment(SegmentChange::Opened(info.number));
+        }
+        tracing::debug!(%daemon, "a daemon took the session");
+        self.shared.notify(Some(&SessionEvent::DaemonFound(daemon)));
+    }
+
+    pub(super) fn lost(&mut self, why: &dyn std::fmt::Display) {
+        tracing::warn!(%why, "the connection to the daemon is lost");
+        self.outbox.clear();
+        self.shared.core.link.lost();
+        let pause = self.pause.handle_lost(Instant::now());
+        let search =
+            self.reconnects.then(|| Search::begin(self.shared.core.clone(), pause)).flatten();
+        self.link = search.map_or(Link::Ended, Link::Reconnecting);
+        self.shared.notify(Some(&SessionEvent::DaemonLost));
+    }
+
+    pub(super) fn try_reconnected(&mut self) {
+        let Link::Reconnecting(search) = &self.link else { return };
+        match search.try_found() {
+            Ok(connected) => self.connected(connected),
+            Err(TryRecvError::Empty) => {}
+            Err(TryRecvError::Disconnected) => self.link = Link::Ended,
+        }
+    }
+
+    /// Whether there is a daemon, or may be one.
+    pub(super) fn is_served(&self) -> bool {
+        matches!(self.link, Link::Socket(_) | Link::Reconnecting(_))
+    }
+
+    pub(super) fn is_linked(&self) -> bool {
+        matches!(self.link, Link::Socket(_) | Link::Local(_))
+    }
+}

@@ -1,0 +1,513 @@
+//! The control thread: sends the messages that the handles queue, handles the daemon's messages, watches peers for
+//! their death, and finds another daemon when the connection to the old one is lost.
+
+pub(in crate::session) mod arrivals;
+mod graph;
+mod handle;
+mod link;
+pub(in crate::session) mod local;
+mod memory;
+mod pair_log;
+mod pause;
+mod peers;
+mod search;
+mod time;
+mod told;
+
+use std::{
+    collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
+    os::fd::{AsFd, BorrowedFd},
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use axon_shm::{ExternalLeader, ShmError, internal::descriptors::PassedFd};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
+use self::{
+    arrivals::Arrivals,
+    local::{Local, LocalRegistry},
+    pause::ReconnectPause,
+    peers::Peers,
+    search::Search,
+    told::{ToldPairs, ToldSegments},
+};
+use crate::{
+    graph::GraphView,
+    ids::Gid,
+    session::{
+        core::Outgoing,
+        daemon::{
+            connect::Connected,
+            socket::{self, SocketError},
+        },
+        error::SessionError,
+        sides::{Asking, EventSource, PublisherInner, SubscriptionInner},
+        state::SessionShared,
+    },
+    wire::session::{Announce, EndpointRole, Gone, Message},
+};
+
+/// Packets handled before queued ones are sent: neither direction starves the other.
+const BATCH: usize = 64;
+/// Until a process that had no descriptors left tries again.
+const RETRY: Duration = Duration::from_secs(2);
+/// How long a session that ends waits for a daemon whose socket is full.
+const FAREWELL: Duration = Duration::from_secs(1);
+/// How long a session that ends stays for readers that have not taken up what its publishers granted.
+const STAY: Duration = Duration::from_secs(if cfg!(test) { 60 } else { 1 });
+/// A relay stands for at most this many remote subscriptions by name; one packet holds no more.
+const MAX_STANDS_FOR: usize = 1024;
+
+pub(in crate::session) struct Control {
+    shared: Arc<SessionShared>,
+    link: Link,
+    reconnects: bool,
+    peers: Peers,
+    outbox: VecDeque<(Message, Vec<PassedFd>)>,
+    buffer: Vec<u8>,
+    /// A whole graph of which parts are still to come.
+    building: Option<GraphView>,
+    /// The pairs that the daemon of this connection told of.
+    pairs: ToldPairs,
+    /// When to look after the memory of large samples, while there is any.
+    reclaim_idle: Option<Instant>,
+    /// The segments of our memory that this connection was told of.
+    segments: ToldSegments,
+    /// Publishers that have no memory ready for their next large sample.
+    low: BTreeSet<Gid>,
+    pause: ReconnectPause,
+    /// This process had no descriptors left: when it asks to be told everything anew.
+    retry: Option<Instant>,
+    arrivals: Arrivals,
+    /// The endpoints of the graph by their topics: of the whole one of which parts are to come, or of the one that is
+    /// shown.
+    topics: HashMap<String, BTreeSet<Gid>>,
+    /// Endpoints of whose pairs some came or went since [`tell_matched`](Self::tell_matched).
+    rematching: Rematching,
+    /// The graph is another one than was last told.
+    graph_changed: bool,
+    /// Endpoints of whom somebody watches the time, unless they are to be looked for anew.
+    timed: Option<Vec<EventSource>>,
+    /// When to look at them, by the monotonic clock.
+    alarm: Option<u64>,
+}
+
+/// By GID.
+#[derive(Default)]
+struct Rematching {
+    writers: BTreeMap<Gid, Arc<PublisherInner>>,
+    readers: BTreeMap<Gid, Arc<SubscriptionInner>>,
+}
+
+/// The peer that a session speaks with first.
+pub(in crate::session) enum Start {
+    /// A daemon; another one when it is gone.
+    Daemon(Connected),
+    /// The process at the other end of a socket, and nobody after it.
+    Socket(Connected),
+    /// The registry of its own process, where it meets another session.
+    LocalRegistry(Arc<LocalRegistry>),
+    /// Nobody.
+    Alone,
+}
+
+enum Link {
+    Socket(PassedFd),
+    Local(Local),
+    Reconnecting(Search),
+    Ended,
+}
+
+impl Control {
+    pub(in crate::session) fn new(
+        shared: Arc<SessionShared>,
+        start: Start,
+    ) -> Result<Self, SessionError> {
+        let reconnects = matches!(start, Start::Daemon(_));
+        shared.core.segment.is_watched();
+        let peers = Peers::new(shared.core.segment.clone(), shared.core.memory.clone())
+            .map_err(ShmError::system("watching processes"))?;
+        let mut control = Self {
+            shared,
+            link: Link::Ended,
+            reconnects,
+            peers,
+            outbox: VecDeque::new(),
+            buffer: Vec::new(),
+            building: None,
+            pairs: ToldPairs::default(),
+            reclaim_idle: None,
+            segments: ToldSegments::default(),
+            low: BTreeSet::new(),
+            pause: ReconnectPause::new(Instant::now()),
+            retry: None,
+            arrivals: Arrivals::default(),
+            topics: HashMap::new(),
+            rematching: Rematching::default(),
+            graph_changed: false,
+            timed: None,
+            alarm: None,
+        };
+        match start {
+            Start::Daemon(connected) | Start::Socket(connected) => control.connected(connected),
+            Start::LocalRegistry(local_registry) => {
+                control.link = Link::Local(Local::join(local_registry, &control.shared.core)?);
+            }
+            Start::Alone => control.link = Link::Local(Local::alone(&control.shared.core)),
+        }
+        Ok(control)
+    }
+
+    pub(in crate::session) fn run(mut self) {
+        let _ = self.shared.control.set(std::thread::current().id());
+        let mut farewell = None::<Instant>;
+        loop {
+            let others_stay = self.shared.part_leaving(false);
+            if self.shared.core.stops() {
+                let until = *farewell.get_or_insert_with(|| Instant::now() + STAY);
+                if !others_stay || !self.is_served() || until <= Instant::now() {
+                    break;
+                }
+            }
+            self.try_reconnected();
+            self.try_again();
+            self.tell_rematched();
+            // Before the others hear of it: an endpoint that is granted something is counted here.
+            self.tell_matched();
+            self.collect();
+            self.send();
+            self.prepare();
+            self.look_at_time();
+            self.tell_graph();
+            self.sleep();
+            self.receive();
+            self.remove_dead();
+            self.reclaim_idle();
+        }
+        self.shared.part_leaving(true);
+        // What was queued last, such as ENDPOINT_GONE, is said by the end of the connection. Only
+        // of memory, in which readers may find the last samples, nobody else could tell, nor of what
+        // readers lost.
+        let deadline = Instant::now() + FAREWELL;
+        loop {
+            self.shared.core.segment.tidy();
+            self.tell_segments();
+            self.tell_unmet();
+            self.send_rest(deadline);
+            let heard = !self.leaves_news() || self.was_heard(deadline);
+            if heard || !self.find_next_daemon(deadline) {
+                return;
+            }
+        }
+    }
+
+    /// Whether readers have yet to be sent memory, or told what they lost.
+    fn leaves_news(&self) -> bool {
+        self.shared.core.segment.has_unread() || !self.shared.state().unmet.is_empty()
+    }
+
+    /// Queues what the daemon has yet to hear of readers that never took up their grant.
+    fn tell_unmet(&mut self) {
+        if !self.is_linked() {
+            return;
+        }
+        let unmet = self.shared.core.link.take_messages(|m| matches!(m, Message::Unmet(_)));
+        self.outbox.extend(unmet.into_iter().map(|message| (message, Vec::new())));
+    }
+
+    /// Ends the connection. Whether there is nobody who could hear more: false where the daemon was killed and may not
+    /// have read all.
+    fn was_heard(&mut self, deadline: Instant) -> bool {
+        match &self.link {
+            Link::Socket(socket) if socket::finish(socket, deadline) => true,
+            Link::Socket(_) => {
+                self.lost(&SocketError::Closed);
+                false
+            }
+            Link::Reconnecting(_) => false,
+            Link::Local(_) | Link::Ended => true,
+        }
+    }
+
+    /// Waits for the next daemon, to tell it of the memory that readers have yet to be sent, and of what they lost.
+    /// Whether there is one.
+    fn find_next_daemon(&mut self, deadline: Instant) -> bool {
+        while matches!(self.link, Link::Reconnecting(_)) && self.leaves_news() {
+            let left = deadline.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return false;
+            }
+            let nap = Timespec::try_from(left.min(Duration::from_millis(20))).ok();
+            let _ = poll(&mut [PollFd::new(&self.shared.core.waker, PollFlags::IN)], nap.as_ref());
+            self.shared.core.waker.take();
+            self.try_reconnected();
+        }
+        if self.is_linked() {
+            self.collect();
+        }
+        self.is_linked()
+    }
+
+    /// Sends what is queued, and waits for a daemon whose socket is full.
+    fn send_rest(&mut self, deadline: Instant) {
+        let mut writable = false;
+        loop {
+            let queued = self.outbox.len();
+            self.send();
+            let left = deadline.saturating_duration_since(Instant::now());
+            let Link::Socket(socket) = &self.link else { return };
+            if self.outbox.is_empty() || left.is_zero() {
+                return;
+            }
+            let nap = left.min(Duration::from_millis(20));
+            // A socket that is short of descriptors in flight is writable, and does not say when that passes.
+            if writable && self.outbox.len() == queued {
+                std::thread::sleep(nap);
+            }
+            let nap = Timespec::try_from(nap).ok();
+            writable =
+                poll(&mut [PollFd::new(socket, PollFlags::OUT)], nap.as_ref()).is_ok_and(|n| n > 0);
+        }
+    }
+
+    /// Queues a message for the daemon, behind what it must know of memory that the message may
+    /// speak of.
+    fn say(&mut self, message: Message) {
+        self.tell_segments();
+        self.outbox.push_back((message, Vec::new()));
+    }
+
+    fn try_again(&mut self) {
+        if self.retry.is_some_and(|retry| retry <= Instant::now()) {
+            self.retry = None;
+            self.outbox.push_back((Message::Resync, Vec::new()));
+        }
+    }
+
+    /// Takes what the handles queued.
+    fn collect(&mut self) {
+        let shared = self.shared.clone();
+        if self.is_linked() {
+            self.tell_segments();
+        }
+        let (mut gone, mut fences) = (Vec::new(), BTreeMap::new());
+        // Under this lock endpoints and what is to be told of them change together.
+        let state = shared.state();
+        let queued = shared.core.link.take();
+        if matches!(self.link, Link::Reconnecting(_) | Link::Ended) {
+            // All of it is said to the next daemon from what stands then.
+            return;
+        }
+        for outgoing in queued {
+            match outgoing {
+                Outgoing::Message(message) => {
+                    if let Message::EndpointGone(Gone { gid }) = *message {
+                        self.timed = None;
+                        gone.push(gid);
+                    }
+                    self.say(*message);
+                }
+                Outgoing::Fence(fence) => {
+                    self.tell_segments();
+                    if self.segments.are_complete() {
+                        self.outbox.push_back((Message::Fence(fence), Vec::new()));
+                    } else {
+                        fences.insert(fence.writer, Outgoing::Fence(fence));
+                    }
+                }
+                Outgoing::Announce(gid) => {
+                    if let Some(publisher) = state.endpoints.publishers.get(&gid) {
+                        self.note_timed(&EventSource::Publisher(publisher.clone()));
+                        let announce = Announce {
+                            endpoint: publisher.endpoint.clone(),
+                            role: publisher.role,
+                            stands_for: Vec::new(),
+                            ring: publisher.rings.shared().map(|writer| writer.location()),
+                            only: None,
+                        };
+                        self.say(Message::Endpoint(announce));
+                    } else if let Some(subscription) = state.endpoints.subscriptions.get(&gid) {
+                        self.note_timed(&EventSource::Subscription(subscription.clone()));
+                        let announce = Announce {
+                            endpoint: subscription.endpoint.clone(),
+                            role: subscription.role,
+                            stands_for: stands_for(subscription).unwrap_or_default(),
+                            ring: None,
+                            only: subscription.only,
+                        };
+                        self.outbox.push_back((Message::Endpoint(announce), Vec::new()));
+                        if subscription.role == EndpointRole::Relay {
+                            let lanes = subscription.lock().lanes();
+                            for (writer, lane) in lanes {
+                                let asking = Asking { lane, after: None };
+                                let attach = self.attach_message(subscription, writer, asking);
+                                self.say(attach);
+                            }
+                        }
+                    } else if let Some((node, _)) = state.endpoints.nodes.get(&gid) {
+                        let announce = Announce {
+                            endpoint: node.clone(),
+                            role: EndpointRole::Application,
+                            stands_for: Vec::new(),
+                            ring: None,
+                            only: None,
+                        };
+                        self.outbox.push_back((Message::Endpoint(announce), Vec::new()));
+                    }
+                }
+            }
+        }
+        // For want of descriptors there is memory that the daemon was not told of.
+        shared.core.link.put_back(fences.into_values());
+        drop(state);
+        gone.iter().for_each(|gid| self.own_gone(gid));
+    }
+
+    fn send(&mut self) {
+        while let Some((message, descriptors)) = self.outbox.pop_front() {
+            match &mut self.link {
+                Link::Local(local) => {
+                    for (message, descriptors) in local.exchange(Some((message, descriptors))) {
+                        self.handle(message, descriptors);
+                    }
+                    self.tell_matched();
+                }
+                Link::Socket(socket) => {
+                    let packet = match message.encode() {
+                        Ok(packet) => packet,
+                        Err(error) => {
+                            tracing::error!(%error, "a control message was dropped");
+                            continue;
+                        }
+                    };
+                    let fds: Vec<BorrowedFd<'_>> = descriptors.iter().map(AsFd::as_fd).collect();
+                    match socket::send(&*socket, &packet, &fds) {
+                        Ok(()) => {}
+                        Err(SocketError::NotReady) => {
+                            self.outbox.push_front((message, descriptors));
+                            return;
+                        }
+                        Err(error) => {
+                            // What the daemon said last is worth hearing: REFUSED, or memory in which
+                            // samples are found. It adds nothing, so that there is an end to it.
+                            while matches!(error, SocketError::Closed)
+                                && matches!(self.link, Link::Socket(_))
+                            {
+                                self.receive();
+                                self.tell_matched();
+                            }
+                            if matches!(self.link, Link::Socket(_)) {
+                                self.lost(&error);
+                            }
+                            return;
+                        }
+                    }
+                }
+                Link::Reconnecting(_) | Link::Ended => return,
+            }
+        }
+    }
+
+    fn sleep(&mut self) {
+        let deaths = PollFd::from_borrowed_fd(self.peers.deaths(), PollFlags::IN);
+        let mut fds = vec![PollFd::new(&self.shared.core.waker, PollFlags::IN), deaths];
+        if let Link::Socket(socket) = &self.link {
+            let waits = if self.outbox.is_empty() { PollFlags::empty() } else { PollFlags::OUT };
+            fds.push(PollFd::new(socket, PollFlags::IN | waits));
+        }
+        let (listening, until) = self.shared.core.listening.leader();
+        if let Some(listening) = &listening {
+            fds.push(PollFd::new(listening, PollFlags::IN));
+            self.tell_arrived(listening);
+        }
+        // A socket without room becomes writable, but one that is short of descriptors in flight
+        // does not say when that passes.
+        let blocked = self.is_linked() && !(self.outbox.is_empty() && self.segments.are_complete());
+        let looks = blocked || !self.shared.state().endpoints.leaving.is_empty();
+        let nap = looks.then_some(Duration::from_millis(20));
+        let reclaim_idle = self.reclaim_idle.filter(|_| self.is_linked());
+        let again = self.look_again();
+        let due = reclaim_idle
+            .into_iter()
+            .chain(self.retry)
+            .chain(self.arrivals.due())
+            .chain(again)
+            .chain(until)
+            .min();
+        let due = due.map(|due| due.saturating_duration_since(Instant::now()));
+        let timeout = nap.into_iter().chain(due).chain(self.until_alarm()).min();
+        let timeout = timeout.and_then(|timeout| Timespec::try_from(timeout).ok());
+        let _ = poll(&mut fds, timeout.as_ref());
+        self.shared.core.waker.take();
+    }
+
+    /// Tells callbacks and tasks of samples that came. What comes later rings, unless all tasks were woken
+    /// and there is no callback: a task arms a ticket of its own before it sleeps again.
+    fn tell_arrived(&self, listening: &ExternalLeader) {
+        listening.clear();
+        let (_, subscriptions) = self.endpoints();
+        // All are woken: it must not end with the first whose tasks wait.
+        let wake_tasks =
+            || subscriptions.iter().filter(|of| of.wake_tasks(&self.shared.core)).count() > 0;
+        if self.shared.core.listening.has_callbacks() || wake_tasks() {
+            listening.arm(false);
+            subscriptions.iter().for_each(|subscription| subscription.tell_arrived());
+            wake_tasks();
+        }
+    }
+
+    fn receive(&mut self) {
+        if let Link::Local(local) = &mut self.link {
+            for (message, descriptors) in local.exchange(None) {
+                self.handle(message, descriptors);
+            }
+        }
+        for _ in 0..BATCH {
+            let Link::Socket(socket) = &self.link else { return };
+            match socket::receive(socket, &mut self.buffer) {
+                Ok(received) => self.handle(received.message, received.descriptors),
+                Err(SocketError::NotReady) => return,
+                Err(error @ SocketError::NoDescriptors) => {
+                    // Others would have to match anew what a new connection has it announce.
+                    tracing::error!(
+                        %error,
+                        "lost a daemon message: out of file descriptors; requesting it again in {RETRY:?}"
+                    );
+                    self.retry.get_or_insert_with(|| Instant::now() + RETRY);
+                }
+                Err(error) => return self.lost(&error),
+            }
+        }
+        self.shared.core.wake();
+    }
+
+    /// Looks for peers that died.
+    fn remove_dead(&mut self) {
+        if !self.peers.note_deaths() {
+            return;
+        }
+        let (publishers, subscriptions) = self.endpoints();
+        for publisher in publishers {
+            if publisher.drop_dead() {
+                self.writer_changed(&publisher);
+                // A server keeps the responses of a client that a daemon carried; one that does not come back has none.
+                self.look_after_memory();
+            }
+        }
+        for subscription in subscriptions {
+            if subscription.lock().end_dead() {
+                self.reader_changed(&subscription);
+            }
+        }
+    }
+}
+
+/// The remote subscriptions that a relay reads for.
+fn stands_for(subscription: &SubscriptionInner) -> Option<Vec<Gid>> {
+    (subscription.role == EndpointRole::Relay).then(|| {
+        let mut gids = subscription.stands_for();
+        gids.truncate(MAX_STANDS_FOR);
+        gids
+    })
+}

@@ -1,0 +1,212 @@
+//! A client of a service, as its application holds it.
+
+use std::{fmt, sync::Arc, time::Duration};
+
+use axon_shm::{Meta, PublishError, Sample, internal::Writer};
+
+use super::service::{attached, await_both, both, set_callback, take_from_one};
+use crate::{
+    graph::Endpoint,
+    ids::Gid,
+    session::{
+        clock,
+        error::{RecvError, SessionError},
+        handle::Session,
+        sides::{MessageInfo, OnNew, PublisherInner, SubscriptionInner},
+    },
+};
+
+/// Sends requests. Thread-safe.
+///
+/// ```
+/// use std::time::Duration;
+///
+/// use axon_transport::{
+///     EndpointSpec, Session, SessionOptions,
+///     config::{Config, DaemonPolicy},
+///     qos::Qos,
+/// };
+///
+/// let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// let spec = || EndpointSpec::new("/add", "AddTwoInts", Qos::default());
+/// let server = session.create_server(spec())?;
+/// let client = session.create_client(spec())?;
+/// assert!(client.wait_available(Duration::from_secs(10)));
+///
+/// let number = client.send_request(b"1 + 2")?;
+/// let mut bytes = Vec::new();
+/// let request = server.recv_request(&mut bytes, None)?;
+/// server.send_response(request.publisher, request.sequence, b"3")?;
+/// let response = client.recv_response(&mut bytes, None)?;
+/// assert_eq!((response.sequence, &bytes[..]), (number, &b"3"[..]));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+pub struct Client {
+    requests: Arc<PublisherInner>,
+    pub(in crate::session) ring: Arc<Writer>,
+    pub(in crate::session) responses: Arc<SubscriptionInner>,
+    pub(in crate::session) session: Session,
+}
+
+impl Client {
+    pub(in crate::session) fn new(
+        requests: Arc<PublisherInner>,
+        responses: Arc<SubscriptionInner>,
+        ring: Arc<Writer>,
+        session: Session,
+    ) -> Self {
+        Self { requests, ring, responses, session }
+    }
+
+    /// Its GID.
+    pub fn gid(&self) -> Gid {
+        self.requests.endpoint.gid
+    }
+
+    /// Itself, as others see it.
+    pub fn endpoint(&self) -> &Endpoint {
+        &self.requests.endpoint
+    }
+
+    /// Sends a request to every server that is there, and returns its number. Where there is none,
+    /// nobody will answer: see [`is_available`](Self::is_available).
+    ///
+    /// # Errors
+    /// [`PublishError::Blocked`] after 100 ms when a server does not take its requests and there is
+    /// no room for more; the others say what does not fit.
+    pub fn send_request(&self, payload: &[u8]) -> Result<u64, PublishError> {
+        self.ring.publish_next(clock::wall(), payload)
+    }
+
+    /// For who speaks for it: a request under the number that it has there, without waiting for room.
+    pub(crate) fn try_forward(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
+        self.ring.try_publish(meta, payload).map(drop)
+    }
+
+    /// For a relay: the next response of one server.
+    pub(crate) fn take_response_from(&self, server: &Gid) -> Option<Sample> {
+        take_from_one(&self.responses, &self.session, server)
+    }
+
+    /// For a relay: the response of this number, and all that it took of this server before, are where they are to go.
+    pub(crate) fn finish_through(&self, server: &Gid, number: u64) {
+        if !self.session.is_forked() {
+            self.responses.lock().finish_through(server, number);
+        }
+    }
+
+    /// For a relay: responses that it took and that are not where they are to go are to be taken once more.
+    pub(crate) fn take_back(&self) {
+        if !self.session.is_forked() {
+            self.responses.lock().take_back(false);
+        }
+    }
+
+    /// For a relay: how many responses of all servers it has not taken.
+    pub(crate) fn unread(&self) -> u64 {
+        if self.session.is_forked() {
+            return 0;
+        }
+        self.responses.lock().slots().undone().into_values().fold(0, u64::saturating_add)
+    }
+
+    /// For a relay: how many responses of all servers found no room, if those that it has not taken are why the next ones
+    /// may not.
+    pub(crate) fn refused(&self) -> Option<u64> {
+        if self.session.is_forked() {
+            return None;
+        }
+        let responses = self.responses.lock();
+        let servers = responses.slots().undone().into_keys();
+        let refused = servers.filter_map(|server| responses.slots().refused_of(&server));
+        refused.reduce(u64::saturating_add)
+    }
+
+    /// Whether there is a response of this server to be taken.
+    pub(crate) fn has_response_from(&self, server: &Gid) -> bool {
+        !self.session.is_forked() && self.responses.lock().slots().has_from(server)
+    }
+
+    pub(in crate::session) fn await_servers(&self) {
+        await_both(&self.requests, &self.responses, &self.session);
+    }
+
+    /// The next response, into `out`, which it replaces. `None` when there is none. What is known of
+    /// it names the server, and the number of the request that it answers.
+    pub fn take_response(&self, out: &mut Vec<u8>) -> Option<MessageInfo> {
+        self.responses.take_bytes(self.session.core(), out)
+    }
+
+    /// As [`take_response`](Self::take_response), in place, as
+    /// [`Subscription::take_sample`](crate::Subscription::take_sample).
+    pub fn take_response_sample(&self) -> Option<(MessageInfo, Sample)> {
+        self.responses.take_sample(self.session.core())
+    }
+
+    /// As [`take_response`](Self::take_response), after waiting for at most `timeout`.
+    ///
+    /// # Errors
+    /// [`RecvError::TimedOut`], and [`RecvError::Forked`] in a forked child.
+    pub fn recv_response(
+        &self,
+        out: &mut Vec<u8>,
+        timeout: Option<Duration>,
+    ) -> Result<MessageInfo, RecvError> {
+        self.responses.recv(self.session.core(), timeout, || self.take_response(out))
+    }
+
+    /// Whether there is a server that a request sent now reaches, and whose response reaches this
+    /// client.
+    pub fn is_available(&self) -> bool {
+        !self.servers().is_empty()
+    }
+
+    /// Waits until a server [is available](Self::is_available); whether one is.
+    pub fn wait_available(&self, timeout: Duration) -> bool {
+        self.session.wait_changed(timeout, || self.is_available())
+    }
+
+    /// The servers that it reaches and that reach it.
+    pub fn servers(&self) -> Vec<Gid> {
+        both(&self.requests, &self.responses, &self.session)
+    }
+
+    /// For a relay: as [`servers`](Self::servers), with those of whom there is more to come.
+    pub(crate) fn attached(&self) -> Vec<Gid> {
+        attached(&self.requests, &self.responses, &self.session)
+    }
+
+    /// Whether there is a response to be taken.
+    pub fn has_response(&self) -> bool {
+        !self.session.is_forked() && self.responses.has_data()
+    }
+
+    /// As [`Subscription::set_on_new_sample`](crate::Subscription::set_on_new_sample), of responses.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn set_on_new_response(&self, callback: Option<OnNew>) -> Result<(), SessionError> {
+        set_callback(&self.responses, callback, &self.session)
+    }
+
+    /// As [`Subscription::tell_no_more`](crate::Subscription::tell_no_more).
+    pub(crate) fn tell_no_more(&self) {
+        if !self.session.is_forked() {
+            self.responses.tell_no_more(self.session.core());
+        }
+    }
+}
+
+impl fmt::Debug for Client {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Client").field(self.endpoint()).finish()
+    }
+}
+
+impl Drop for Client {
+    fn drop(&mut self) {
+        self.tell_no_more();
+        self.session.forget_endpoint(&self.gid());
+    }
+}

@@ -1,0 +1,27 @@
+//! Endpoints, as the application and those who speak for other processes hold them. Each handle keeps its session open.
+
+mod call;
+mod client;
+mod event;
+mod loan;
+mod messages;
+mod publisher;
+mod remote_writer;
+mod server;
+mod service;
+mod subscription;
+mod trusted;
+
+pub(crate) use self::loan::OwnedLoan;
+pub use self::{
+    call::CallError,
+    client::Client,
+    event::Event,
+    loan::Loan,
+    messages::Messages,
+    publisher::Publisher,
+    remote_writer::{RemoteWriter, Written},
+    server::Server,
+    subscription::Subscription,
+    trusted::TrustedSubscription,
+};

@@ -1,0 +1,214 @@
+//! A server of a service, as its application holds it.
+
+use std::{fmt, sync::Arc, time::Duration};
+
+use axon_shm::{Meta, PublishError, Sample};
+
+use super::service::{attached, await_both, both, set_callback, take_from_one};
+use crate::{
+    graph::Endpoint,
+    ids::Gid,
+    session::{
+        clock,
+        error::{RecvError, SessionError},
+        handle::Session,
+        sides::{MessageInfo, OnNew, PublisherInner, RingsByClient, SubscriptionInner},
+    },
+};
+
+/// How long a response waits for a client whose request came before it could be answered.
+const PATIENCE: Duration = Duration::from_millis(100);
+
+/// Answers requests. Thread-safe.
+///
+/// ```
+/// # use std::time::Duration;
+/// # use axon_transport::{
+/// #     EndpointSpec, Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// #     qos::Qos,
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// # let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default());
+/// let server = session.create_server(spec())?;
+/// let client = session.create_client(spec())?;
+/// assert!(client.wait_available(Duration::from_secs(10)));
+/// client.send_request(b"how fast?")?;
+///
+/// let mut payload = Vec::new();
+/// let request = server.recv_request(&mut payload, Some(Duration::from_secs(10)))?;
+/// server.send_response(request.publisher, request.sequence, b"1.5 m/s")?;
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+pub struct Server {
+    responses: Arc<PublisherInner>,
+    rings: Arc<RingsByClient>,
+    pub(in crate::session) requests: Arc<SubscriptionInner>,
+    pub(in crate::session) session: Session,
+}
+
+impl Server {
+    pub(in crate::session) fn new(
+        responses: Arc<PublisherInner>,
+        requests: Arc<SubscriptionInner>,
+        rings: Arc<RingsByClient>,
+        session: Session,
+    ) -> Self {
+        Self { responses, rings, requests, session }
+    }
+
+    /// Its GID.
+    pub fn gid(&self) -> Gid {
+        self.responses.endpoint.gid
+    }
+
+    /// Itself, as others see it.
+    pub fn endpoint(&self) -> &Endpoint {
+        &self.responses.endpoint
+    }
+
+    /// The next request, into `out`, which it replaces. `None` when there is none. What is known of
+    /// it names the client, and the number that the response must carry.
+    pub fn take_request(&self, out: &mut Vec<u8>) -> Option<MessageInfo> {
+        self.requests.take_bytes(self.session.core(), out)
+    }
+
+    /// As [`take_request`](Self::take_request), in place, as
+    /// [`Subscription::take_sample`](crate::Subscription::take_sample).
+    pub fn take_request_sample(&self) -> Option<(MessageInfo, Sample)> {
+        self.requests.take_sample(self.session.core())
+    }
+
+    /// As [`take_request`](Self::take_request), after waiting for at most `timeout`.
+    ///
+    /// # Errors
+    /// [`RecvError::TimedOut`], and [`RecvError::Forked`] in a forked child.
+    pub fn recv_request(
+        &self,
+        out: &mut Vec<u8>,
+        timeout: Option<Duration>,
+    ) -> Result<MessageInfo, RecvError> {
+        self.requests.recv(self.session.core(), timeout, || self.take_request(out))
+    }
+
+    /// Answers request `sequence` of `client`. A client that is gone is no error.
+    ///
+    /// # Errors
+    /// [`PublishError::Blocked`] after 100 ms when the client does not take its responses and there
+    /// is no room for more; the others say what does not fit.
+    pub fn send_response(
+        &self,
+        client: Gid,
+        sequence: u64,
+        payload: &[u8],
+    ) -> Result<(), PublishError> {
+        if self.session.is_forked() {
+            return Err(PublishError::Forked);
+        }
+        let ring = || self.rings.ring(&client);
+        // Its request may have come before it could be answered.
+        let settled = || ring().is_some() || !self.requests.lock().writers().contains(&client);
+        if !settled() {
+            self.session.wait_changed(PATIENCE, settled);
+        }
+        let Some(ring) = ring() else { return Ok(()) };
+        let meta = Meta::at_nanos(sequence, clock::wall());
+        ring.publish(meta, payload).map(drop)
+    }
+
+    /// For who speaks for it: gives `client` a response without waiting for room. `false` when there is no
+    /// such client any more.
+    pub(crate) fn try_respond(
+        &self,
+        client: &Gid,
+        meta: Meta,
+        payload: &[u8],
+    ) -> Result<bool, PublishError> {
+        let Some(ring) = self.rings.ring(client) else { return Ok(false) };
+        ring.try_publish(meta, payload).map(|_| true)
+    }
+
+    /// For a relay: how many responses to this client are in its ring and are not where they are to go.
+    pub(crate) fn undelivered(&self, client: &Gid) -> u64 {
+        self.rings.ring(client).map_or(0, |ring| ring.under_way())
+    }
+
+    /// For a relay: the next request of one client.
+    pub(crate) fn take_request_from(&self, client: &Gid) -> Option<Sample> {
+        take_from_one(&self.requests, &self.session, client)
+    }
+
+    /// For a relay: requests of this client up to this number are where they are to go.
+    pub(crate) fn finish_requests(&self, client: &Gid, number: u64) {
+        if !self.session.is_forked() {
+            self.requests.lock().finish_of(client, number);
+        }
+    }
+
+    /// For a relay: how many requests of this client it has not taken.
+    pub(crate) fn unread_of(&self, client: &Gid) -> u64 {
+        if self.session.is_forked() { 0 } else { self.requests.lock().slots().undone_of(client) }
+    }
+
+    /// For a relay: how many requests of this client found no room, if one that it has not taken is why the next one may
+    /// not.
+    pub(crate) fn refused_of(&self, client: &Gid) -> Option<u64> {
+        if self.session.is_forked() {
+            return None;
+        }
+        self.requests.lock().slots().refused_of(client)
+    }
+
+    /// Whether there is a request of this client to be taken.
+    pub(crate) fn has_request_from(&self, client: &Gid) -> bool {
+        !self.session.is_forked() && self.requests.lock().slots().has_from(client)
+    }
+
+    pub(in crate::session) fn await_clients(&self) {
+        await_both(&self.responses, &self.requests, &self.session);
+    }
+
+    /// The clients that reach it and that it reaches.
+    pub fn clients(&self) -> Vec<Gid> {
+        both(&self.responses, &self.requests, &self.session)
+    }
+
+    /// For a relay: as [`clients`](Self::clients), with those of whom there is more to come.
+    pub(crate) fn attached(&self) -> Vec<Gid> {
+        attached(&self.responses, &self.requests, &self.session)
+    }
+
+    /// Whether there is a request to be taken.
+    pub fn has_request(&self) -> bool {
+        !self.session.is_forked() && self.requests.has_data()
+    }
+
+    /// As [`Subscription::set_on_new_sample`](crate::Subscription::set_on_new_sample), of requests.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn set_on_new_request(&self, callback: Option<OnNew>) -> Result<(), SessionError> {
+        set_callback(&self.requests, callback, &self.session)
+    }
+
+    /// As [`Subscription::tell_no_more`](crate::Subscription::tell_no_more).
+    pub(crate) fn tell_no_more(&self) {
+        if !self.session.is_forked() {
+            self.requests.tell_no_more(self.session.core());
+        }
+    }
+}
+
+impl fmt::Debug for Server {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Server").field(self.endpoint()).finish()
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        self.tell_no_more();
+        self.session.forget_endpoint(&self.gid());
+    }
+}

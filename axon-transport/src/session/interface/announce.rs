@@ -1,0 +1,196 @@
+//! Adds endpoints to a session and announces them to the daemon.
+
+use std::sync::Arc;
+
+use axon_shm::{
+    ShmError,
+    internal::{Allowance, RingOptions, Writer},
+};
+
+use crate::{
+    graph::{Endpoint, EndpointKind},
+    ids::Gid,
+    qos::Qos,
+    session::{
+        core::Outgoing,
+        endpoints::{Client, Publisher, Server, Subscription},
+        error::SessionError,
+        handle::Session,
+        options::EndpointSpec,
+        sides::{PublisherInner, Rings, RingsByClient, SubscriptionInner},
+    },
+    wire::session::EndpointRole,
+};
+
+impl Session {
+    pub(in crate::session) fn endpoint(
+        &self,
+        spec: EndpointSpec,
+        kind: EndpointKind,
+    ) -> Result<Endpoint, SessionError> {
+        let endpoint = self.describe(spec, kind)?;
+        if !endpoint.is_sane() {
+            return Err(SessionError::Endpoint { topic: endpoint.topic });
+        }
+        #[cfg(feature = "sros2")]
+        self.shared().permit(&endpoint)?;
+        Ok(endpoint)
+    }
+
+    /// An endpoint with a GID of its own.
+    pub(in crate::session) fn describe(
+        &self,
+        spec: EndpointSpec,
+        kind: EndpointKind,
+    ) -> Result<Endpoint, SessionError> {
+        if self.is_forked() {
+            return Err(ShmError::Forked.into());
+        }
+        let number = self.shared().state().endpoints.next_number();
+        let EndpointSpec { topic, type_name, type_hash, qos, node, namespace, .. } = spec;
+        Ok(Endpoint {
+            gid: Gid::new(self.shared().core.id, number),
+            kind,
+            topic,
+            type_name,
+            type_hash,
+            qos,
+            node,
+            namespace,
+            enclave: String::new(),
+        })
+    }
+
+    pub(in crate::session) fn add_publisher(
+        &self,
+        endpoint: Endpoint,
+        expected_len: u64,
+    ) -> Result<Publisher, SessionError> {
+        let role = EndpointRole::Application;
+        self.add_writer(endpoint, expected_len, None, |e, rings| {
+            PublisherInner::new(e, role, rings)
+        })
+    }
+
+    /// A publisher that is alive when it is said to be. It takes the memory for its samples of `allowance`, if there is one.
+    pub(in crate::session) fn add_asserted(
+        &self,
+        endpoint: Endpoint,
+        role: EndpointRole,
+        allowance: Option<&Arc<Allowance>>,
+    ) -> Result<Publisher, SessionError> {
+        self.add_writer(endpoint, 0, allowance, |e, rings| {
+            PublisherInner::new(e, role, rings).asserted()
+        })
+    }
+
+    fn add_writer(
+        &self,
+        endpoint: Endpoint,
+        expected: u64,
+        allowance: Option<&Arc<Allowance>>,
+        inner: impl FnOnce(Endpoint, Rings) -> PublisherInner,
+    ) -> Result<Publisher, SessionError> {
+        let options = RingOptions { expected, ..self.ring(&endpoint, endpoint.qos) };
+        let writer = Arc::new(Writer::create(self.shared().core.segment.clone(), options)?);
+        allowance.into_iter().for_each(|allowance| writer.share(allowance));
+        let inner = Arc::new(inner(endpoint, Rings::Shared(writer.clone())));
+        self.announce(Some(&inner), None);
+        Ok(Publisher { inner, writer, session: self.clone() })
+    }
+
+    pub(in crate::session) fn add_reader(&self, inner: SubscriptionInner) -> Subscription {
+        let inner = Arc::new(inner);
+        self.announce(None, Some(&inner));
+        Subscription { inner, session: self.clone() }
+    }
+
+    /// A client, of whose responses those stand that `reads` asks for. One that `carries` them to another process says
+    /// which of them are there.
+    pub(in crate::session) fn add_client(
+        &self,
+        endpoint: Endpoint,
+        role: EndpointRole,
+        reads: Qos,
+        carries: bool,
+        allowance: Option<&Arc<Allowance>>,
+    ) -> Result<Client, SessionError> {
+        let options = self.ring(&endpoint, Qos::keep_all());
+        let segment = self.shared().core.segment.clone();
+        let writer = Arc::new(Writer::create_for_calls(segment, options)?);
+        allowance.into_iter().for_each(|allowance| writer.share(allowance));
+        let rings = Rings::Shared(writer.clone());
+        let (requests, responses) = self.add_both(endpoint, role, reads, rings, carries);
+        responses.calls.set_ring(writer.clone());
+        Ok(Client::new(requests, responses, writer, self.clone()))
+    }
+
+    /// A server, of whose requests those stand that `reads` asks for. One that `carries` them to another process says
+    /// which of them are there.
+    pub(in crate::session) fn add_server(
+        &self,
+        endpoint: Endpoint,
+        role: EndpointRole,
+        reads: Qos,
+        carries: bool,
+        allowance: Option<&Arc<Allowance>>,
+    ) -> Server {
+        let options = self.ring(&endpoint, Qos::keep_all());
+        let shared = self.shared();
+        let (segment, room) = (shared.core.segment.clone(), shared.room.clone());
+        let by_client = RingsByClient::new(segment, options, room, allowance.cloned());
+        let by_client = Arc::new(by_client);
+        let rings = Rings::Each(by_client.clone());
+        let (responses, requests) = self.add_both(endpoint, role, reads, rings, carries);
+        Server::new(responses, requests, by_client, self.clone())
+    }
+
+    /// The two sides of an endpoint that writes and reads.
+    fn add_both(
+        &self,
+        endpoint: Endpoint,
+        role: EndpointRole,
+        reads: Qos,
+        rings: Rings,
+        carries: bool,
+    ) -> (Arc<PublisherInner>, Arc<SubscriptionInner>) {
+        let writes = Arc::new(PublisherInner::new(endpoint.clone(), role, rings));
+        let mut reads = SubscriptionInner::of_service(endpoint, role, reads);
+        reads.carries = carries;
+        let reads = Arc::new(reads);
+        self.announce(Some(&writes), Some(&reads));
+        (writes, reads)
+    }
+
+    fn ring(&self, endpoint: &Endpoint, qos: Qos) -> RingOptions {
+        let config = &self.shared().core.config;
+        let (budget, max_message) = (config.ring_bytes, config.max_message);
+        RingOptions { gid: endpoint.gid, qos, budget, max_message, expected: 0 }
+    }
+
+    /// Keeps an endpoint's sides for the control thread, and has it told of.
+    fn announce(
+        &self,
+        writes: Option<&Arc<PublisherInner>>,
+        reads: Option<&Arc<SubscriptionInner>>,
+    ) {
+        let shared = self.shared();
+        let mut state = shared.state();
+        let (mut endpoint, mut role) = (None, EndpointRole::Application);
+        if let Some(inner) = writes {
+            state.endpoints.publishers.insert(inner.endpoint.gid, inner.clone());
+            (endpoint, role) = (Some(&inner.endpoint), inner.role);
+        }
+        if let Some(inner) = reads {
+            state.endpoints.subscriptions.insert(inner.endpoint.gid, inner.clone());
+            (endpoint, role) = (Some(&inner.endpoint), inner.role);
+        }
+        let Some(endpoint) = endpoint else { return };
+        if role == EndpointRole::Application {
+            state.endpoints.index(endpoint);
+        }
+        shared.core.link.queue(Outgoing::Announce(endpoint.gid));
+        drop(state);
+        shared.core.wake();
+    }
+}

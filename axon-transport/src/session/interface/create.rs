@@ -1,0 +1,141 @@
+//! Creates publishers, subscriptions, clients, servers, nodes and guard conditions of a session.
+
+use super::Node;
+use crate::{
+    graph::{Endpoint, EndpointKind},
+    ids::Gid,
+    qos::Qos,
+    session::{
+        core::GuardCondition,
+        endpoints::{Client, Publisher, Server, Subscription},
+        error::SessionError,
+        handle::Session,
+        options::EndpointSpec,
+        sides::SubscriptionInner,
+    },
+    wire::session::EndpointRole,
+};
+
+impl Session {
+    /// A publisher. It is matched with those readers that the graph shows, unless they take more
+    /// than some milliseconds; others are matched later: see [`Publisher::wait_matched`].
+    ///
+    /// # Errors
+    /// When the specification is out of bounds or there is no memory.
+    pub fn create_publisher(&self, spec: EndpointSpec) -> Result<Publisher, SessionError> {
+        let expected_len = spec.expected_len;
+        let endpoint = self.endpoint(spec, EndpointKind::Publisher)?;
+        let publisher = self.add_publisher(endpoint, expected_len)?;
+        let inner = &publisher.inner;
+        self.shared().meet(&inner.endpoint);
+        self.shared().await_pairs(&inner.endpoint, |other| inner.events.is_matched(other));
+        Ok(publisher)
+    }
+
+    /// A subscription. It is matched with those publishers that the graph shows, unless they take
+    /// more than some milliseconds; others are matched later: see [`Subscription::wait_matched`].
+    ///
+    /// # Errors
+    /// When the specification is out of bounds.
+    pub fn create_subscription(&self, spec: EndpointSpec) -> Result<Subscription, SessionError> {
+        let ignores_local = spec.ignore_local;
+        let endpoint = self.endpoint(spec, EndpointKind::Subscription)?;
+        let mut inner = SubscriptionInner::new(endpoint, EndpointRole::Application, Vec::new());
+        inner.ignores_local = ignores_local;
+        let subscription = self.add_reader(inner);
+        let inner = &subscription.inner;
+        self.shared().meet(&inner.endpoint);
+        self.shared().await_pairs(&inner.endpoint, |other| inner.events.is_matched(other));
+        Ok(subscription)
+    }
+
+    /// A server of a service. Its clients are matched as a publisher's readers are. Of requests that
+    /// nobody took a KEEP_LAST server keeps the newest of each client, as many as its depth.
+    ///
+    /// # Errors
+    /// When the specification is out of bounds.
+    pub fn create_server(&self, spec: EndpointSpec) -> Result<Server, SessionError> {
+        let endpoint = self.endpoint(spec, EndpointKind::Server)?;
+        let reads = unread(&endpoint.qos);
+        let server = self.add_server(endpoint, EndpointRole::Application, reads, false, None);
+        self.shared().meet(server.endpoint());
+        server.await_clients();
+        Ok(server)
+    }
+
+    /// A client of a service. Its servers are matched as a publisher's readers are; see
+    /// [`Client::wait_available`]. Of responses that nobody took a KEEP_LAST client keeps the newest of
+    /// each server, as many as its depth.
+    ///
+    /// # Errors
+    /// When the specification is out of bounds or there is no memory.
+    pub fn create_client(&self, spec: EndpointSpec) -> Result<Client, SessionError> {
+        let endpoint = self.endpoint(spec, EndpointKind::Client)?;
+        let reads = unread(&endpoint.qos);
+        let client = self.add_client(endpoint, EndpointRole::Application, reads, false, None)?;
+        self.shared().meet(client.endpoint());
+        client.await_servers();
+        Ok(client)
+    }
+
+    /// Creates a node, which is in the graph until it is dropped.
+    ///
+    /// # Errors
+    /// When the name is empty, or a name is out of bounds.
+    pub fn create_node(
+        &self,
+        name: &str,
+        namespace: &str,
+        enclave: &str,
+    ) -> Result<Node, SessionError> {
+        // Fields that nodes do not use keep their defaults.
+        let spec = EndpointSpec {
+            node: name.to_owned(),
+            namespace: namespace.to_owned(),
+            ..EndpointSpec::new("", "", Qos::default())
+        };
+        let described =
+            Endpoint { enclave: enclave.to_owned(), ..self.describe(spec, EndpointKind::Node)? };
+        if !described.is_sane() {
+            return Err(SessionError::Node { name: described.node });
+        }
+        Ok(self.adopt_node(described))
+    }
+
+    /// A condition that the program triggers itself, for wait sets of the session.
+    pub fn create_guard_condition(&self) -> GuardCondition {
+        GuardCondition::new(self.core())
+    }
+
+    /// As [`create_relay`](Self::create_relay), of one publisher alone. Where the publisher `waits` for
+    /// it, what it takes is acknowledged when it [says so](Subscription::acknowledge_of), whether or not
+    /// it stands for a remote subscription.
+    pub(crate) fn create_relay_of(
+        &self,
+        publisher: Gid,
+        spec: EndpointSpec,
+        stands_for: Vec<Gid>,
+        waits: bool,
+    ) -> Result<Subscription, SessionError> {
+        self.add_relay(spec, Some(publisher), stands_for, waits)
+    }
+
+    pub(super) fn add_relay(
+        &self,
+        spec: EndpointSpec,
+        only: Option<Gid>,
+        stands_for: Vec<Gid>,
+        carries: bool,
+    ) -> Result<Subscription, SessionError> {
+        let endpoint = self.endpoint(spec, EndpointKind::Subscription)?;
+        let mut inner = SubscriptionInner::new(endpoint, EndpointRole::Relay, stands_for);
+        inner.only = only;
+        inner.carries = carries;
+        Ok(self.add_reader(inner))
+    }
+}
+
+/// What a client or server of this profile asks of those that it reads: nothing is lost but for its depth.
+fn unread(qos: &Qos) -> Qos {
+    Qos::keep_all().with_history(qos.history).with_depth(qos.depth)
+}

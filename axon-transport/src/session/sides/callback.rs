@@ -1,0 +1,350 @@
+//! A callback of the application that is called with the number of new events.
+
+use std::{
+    convert::Infallible,
+    fmt,
+    sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
+    thread::{self, ThreadId},
+};
+
+/// Told how often something happened since it was told last; at least once. It may be called on the
+/// session's control thread, but never by two threads at once, and must neither block nor panic.
+///
+/// ```
+/// # use std::time::Duration;
+/// use std::sync::{Arc, atomic::{AtomicU64, Ordering}};
+/// use axon_transport::OnNew;
+/// # use axon_transport::{
+/// #     EndpointSpec, Session, SessionOptions,
+/// #     config::{Config, DaemonPolicy},
+/// #     qos::Qos,
+/// # };
+/// # let config = Config::builder().daemon(DaemonPolicy::Off).build()?;
+/// # let session = Session::open(&config, SessionOptions::new("robot"))?;
+/// # let spec = || EndpointSpec::new("/speed", "example/Speed", Qos::default());
+/// let publisher = session.create_publisher(spec())?;
+/// let subscription = session.create_subscription(spec())?;
+/// assert!(publisher.wait_matched(1, Duration::from_secs(10)));
+/// let new = Arc::new(AtomicU64::new(0));
+/// let counter = new.clone();
+/// let callback: OnNew = Arc::new(move |count| {
+///     counter.fetch_add(count, Ordering::Relaxed);
+/// });
+/// publisher.publish(b"1.5 m/s")?;
+/// subscription.set_on_new_sample(Some(callback))?;
+/// assert_eq!(new.load(Ordering::Relaxed), 1);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+pub type OnNew = Arc<dyn Fn(u64) + Send + Sync>;
+
+/// What is to be told, and to whom.
+#[derive(Default)]
+pub(in crate::session) struct Callback {
+    state: Mutex<CallbackState>,
+    idle: Condvar,
+}
+
+#[derive(Default)]
+struct CallbackState {
+    function: Option<OnNew>,
+    untold: u64,
+    /// The thread that is in a function. Another thread that has something to tell meanwhile leaves it to
+    /// that thread: two in the same function that both wait for the other to return would wait for ever.
+    running: Option<ThreadId>,
+    /// There is to be no function any more.
+    ended: bool,
+}
+
+impl Callback {
+    /// It happened `count` times more.
+    pub(in crate::session) fn add(&self, count: u64) {
+        if count > 0 {
+            self.lock().untold += count;
+            self.tell();
+        }
+    }
+
+    /// It happened `count` times that nobody was told of.
+    pub(in crate::session) fn recount(&self, count: u64) {
+        self.lock().untold = count;
+    }
+
+    /// Whether there is anybody to tell.
+    pub(in crate::session) fn is_set(&self) -> bool {
+        self.lock().function.is_some()
+    }
+
+    /// Has `function` told from now on, and at once of what nobody was told, unless it [ended](Self::end).
+    /// The one before is not called any more once this returns, but by the calling thread that is in
+    /// it, which tells `function` when it has left it.
+    pub(in crate::session) fn set(&self, function: Option<OnNew>) {
+        let Ok(()) = self.replace(function, Ok::<_, Infallible>);
+    }
+
+    /// As [`set`](Self::set), where `recount` says of how often it happened untold what that is now. It
+    /// runs under the lock, at the moment from which `function` is told of the rest. Nobody is told
+    /// any more where it fails.
+    pub(in crate::session) fn replace<E>(
+        &self,
+        function: Option<OnNew>,
+        recount: impl FnOnce(u64) -> Result<u64, E>,
+    ) -> Result<(), E> {
+        let mut state = self.vacate();
+        if state.ended {
+            return Ok(());
+        }
+        state.untold = recount(state.untold)?;
+        state.function = function;
+        drop(state);
+        self.tell();
+        Ok(())
+    }
+
+    /// Nobody is told any more, whatever is set from now on. What was set is not called any more once
+    /// this returns, but by the calling thread that is in it.
+    pub(in crate::session) fn end(&self) {
+        self.lock().ended = true;
+        drop(self.vacate());
+    }
+
+    /// Has nobody told, and waits for the call that is under way on another thread.
+    fn vacate(&self) -> MutexGuard<'_, CallbackState> {
+        let me = thread::current().id();
+        let mut state = self.lock();
+        loop {
+            if let Some(before) = state.function.take() {
+                drop(state);
+                // What it captured may be anything.
+                drop(before);
+                state = self.lock();
+            } else if state.running.is_some_and(|running| running != me) {
+                state = self.idle.wait(state).unwrap_or_else(PoisonError::into_inner);
+            } else {
+                return state;
+            }
+        }
+    }
+
+    fn tell(&self) {
+        loop {
+            let mut state = self.lock();
+            if state.running.is_some() || state.untold == 0 {
+                return;
+            }
+            let Some(function) = state.function.clone() else { return };
+            let count = std::mem::take(&mut state.untold);
+            state.running = Some(thread::current().id());
+            drop(state);
+            let running = Running(self);
+            function(count);
+            drop((function, running));
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, CallbackState> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// A call that is under way, until it is dropped.
+struct Running<'a>(&'a Callback);
+
+impl Drop for Running<'_> {
+    fn drop(&mut self) {
+        self.0.lock().running = None;
+        self.0.idle.notify_all();
+    }
+}
+
+impl fmt::Debug for Callback {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Callback").finish_non_exhaustive()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::{
+        atomic::{AtomicBool, AtomicU64, Ordering},
+        mpsc,
+    };
+
+    use super::*;
+
+    fn counter() -> (OnNew, Arc<AtomicU64>) {
+        let told = Arc::new(AtomicU64::new(0));
+        let count = told.clone();
+        let add = move |new| {
+            assert!(new > 0);
+            count.fetch_add(new, Ordering::SeqCst);
+        };
+        (Arc::new(add), told)
+    }
+
+    #[test]
+    fn a_new_callback_receives_earlier_events_once() {
+        let callback = Callback::default();
+        callback.recount(2);
+        callback.add(1);
+        let (first, told_first) = counter();
+        callback.set(Some(first));
+        assert_eq!(told_first.load(Ordering::SeqCst), 3);
+        callback.add(4);
+        assert_eq!(told_first.load(Ordering::SeqCst), 7);
+        let (second, told_second) = counter();
+        callback.set(Some(second));
+        callback.add(0);
+        assert_eq!(told_second.load(Ordering::SeqCst), 0);
+        callback.set(None);
+        callback.add(5);
+        callback.recount(0);
+        callback.add(1);
+        let (third, told_third) = counter();
+        callback.set(Some(third));
+        assert_eq!(told_third.load(Ordering::SeqCst), 1);
+    }
+
+    #[test]
+    fn a_callback_may_replace_itself() {
+        let callback = Arc::new(Callback::default());
+        let own = Arc::downgrade(&callback);
+        callback.set(Some(Arc::new(move |_| own.upgrade().unwrap().set(None))));
+        callback.add(1);
+        assert!(!callback.is_set());
+    }
+
+    #[test]
+    fn a_callback_that_replaces_itself_tells_the_next_one_of_the_rest() {
+        let callback = Arc::new(Callback::default());
+        let (next, told) = counter();
+        let (own, count) = (Arc::downgrade(&callback), told.clone());
+        callback.set(Some(Arc::new(move |_| {
+            let own = own.upgrade().unwrap();
+            own.set(Some(next.clone()));
+            own.add(2);
+            assert_eq!(count.load(Ordering::SeqCst), 0, "this one has not returned");
+        })));
+        callback.add(1);
+        assert_eq!(told.load(Ordering::SeqCst), 2);
+    }
+
+    /// A function that says that it was entered, and returns when it is told to.
+    fn gate() -> (OnNew, mpsc::Receiver<u64>, mpsc::Sender<()>, Arc<AtomicBool>) {
+        let (entered, entries) = mpsc::channel();
+        let (go, goes) = mpsc::channel();
+        let (inside, goes) = (Arc::new(AtomicBool::new(false)), Mutex::new(goes));
+        let within = inside.clone();
+        let function = move |new| {
+            assert!(!inside.swap(true, Ordering::SeqCst), "in two threads at once");
+            entered.send(new).unwrap();
+            goes.lock().unwrap().recv().unwrap();
+            inside.store(false, Ordering::SeqCst);
+        };
+        (Arc::new(function), entries, go, within)
+    }
+
+    #[test]
+    fn events_during_a_callback_are_reported_after_it_by_the_same_thread() {
+        let callback = Callback::default();
+        let (function, entries, go, _) = gate();
+        callback.set(Some(function));
+        thread::scope(|scope| {
+            scope.spawn(|| callback.add(1));
+            assert_eq!(entries.recv(), Ok(1));
+            callback.add(2);
+            callback.add(3);
+            go.send(()).unwrap();
+            assert_eq!(entries.recv(), Ok(5));
+            go.send(()).unwrap();
+        });
+    }
+
+    #[test]
+    fn the_one_before_runs_no_more_once_it_is_replaced_and_the_next_is_told_what_is_counted_then() {
+        let callback = Callback::default();
+        let (function, entries, go, inside) = gate();
+        let (next, told) = counter();
+        callback.set(Some(function));
+        thread::scope(|scope| {
+            scope.spawn(|| callback.add(1));
+            assert_eq!(entries.recv(), Ok(1));
+            let (vacant, counted) = (&callback, &inside);
+            let replacing = scope.spawn(move || {
+                let Ok(()) = vacant.replace(Some(next), |untold| {
+                    assert!(!counted.load(Ordering::SeqCst), "it was waited for");
+                    Ok::<_, Infallible>(untold.min(2))
+                });
+            });
+            // Nobody is told from the moment at which it begins to wait.
+            while callback.is_set() {
+                thread::yield_now();
+            }
+            callback.add(3);
+            assert_eq!(told.load(Ordering::SeqCst), 0);
+            go.send(()).unwrap();
+            replacing.join().unwrap();
+        });
+        assert_eq!(told.load(Ordering::SeqCst), 2);
+    }
+
+    #[test]
+    fn once_it_has_ended_nobody_is_told_whatever_is_set() {
+        let callback = Callback::default();
+        let (function, entries, go, inside) = gate();
+        let (late, told) = counter();
+        callback.set(Some(function));
+        thread::scope(|scope| {
+            scope.spawn(|| callback.add(1));
+            assert_eq!(entries.recv(), Ok(1));
+            let ending = scope.spawn(|| {
+                callback.end();
+                assert!(!inside.load(Ordering::SeqCst), "it was waited for");
+            });
+            while callback.is_set() {
+                thread::yield_now();
+            }
+            callback.add(3);
+            // It waits, too.
+            let setting = scope.spawn(|| callback.set(Some(late.clone())));
+            go.send(()).unwrap();
+            ending.join().unwrap();
+            setting.join().unwrap();
+        });
+        callback.set(Some(late.clone()));
+        callback.add(1);
+        assert_eq!(told.load(Ordering::SeqCst), 0);
+        assert_eq!(Arc::strong_count(&late), 1, "it was not kept");
+    }
+
+    #[test]
+    fn it_may_end_within_itself_and_nobody_is_told_where_counting_fails() {
+        let callback = Arc::new(Callback::default());
+        let own = Arc::downgrade(&callback);
+        callback.set(Some(Arc::new(move |_| own.upgrade().unwrap().end())));
+        callback.add(1);
+        callback.add(1);
+        assert!(!callback.is_set());
+
+        let callback = Callback::default();
+        let (function, told) = counter();
+        assert_eq!(callback.replace(Some(function), |_| Err("no")), Err("no"));
+        callback.add(1);
+        assert_eq!(told.load(Ordering::SeqCst), 0);
+    }
+
+    #[test]
+    fn none_of_many_is_lost_or_told_twice() {
+        let callback = Callback::default();
+        let (first, told) = counter();
+        thread::scope(|scope| {
+            for _ in 0..4 {
+                scope.spawn(|| (0..10_000).for_each(|_| callback.add(1)));
+            }
+            for round in 0..1000 {
+                callback.set((round % 2 == 0).then(|| first.clone()));
+            }
+        });
+        callback.set(Some(first.clone()));
+        assert_eq!(told.load(Ordering::SeqCst), 40_000);
+    }
+}

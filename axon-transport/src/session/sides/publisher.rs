@@ -1,0 +1,235 @@
+//! The writing side of a publisher, client or server.
+
+use std::{
+    collections::BTreeSet,
+    sync::{Mutex, MutexGuard, PoisonError},
+};
+
+use axon_shm::{
+    PublishError, ShmError,
+    internal::{Grant, Location, ReaderInfo, Terms, holds, nanoseconds},
+};
+
+use super::{
+    events::{Changes, EndpointEvents},
+    rings::Rings,
+};
+use crate::{
+    graph::{Endpoint, EndpointKind},
+    ids::{Gid, SessionId},
+    qos::{Liveliness, Qos},
+    session::{
+        clock,
+        core::{Outgoing, SessionCore},
+    },
+    wire::session::{EndpointRole, Fence, Granted},
+};
+
+/// The writing side of a publisher, client or server, which the session's control thread shares with
+/// the handle.
+pub(in crate::session) struct PublisherInner {
+    pub(in crate::session) endpoint: Endpoint,
+    pub(in crate::session) role: EndpointRole,
+    pub(in crate::session) rings: Rings,
+    pub(in crate::session) events: EndpointEvents,
+    /// A publication says that the publisher is alive, and nothing else but the program does.
+    pub(in crate::session) asserts: bool,
+    /// Its samples come from a process of this host that shares no memory.
+    pub(in crate::session) relayed: bool,
+    /// Readers that were granted; a relay as itself.
+    attached: Mutex<BTreeSet<Gid>>,
+    sending: Mutex<Sending>,
+}
+
+/// How far readers were sent what they need to find a publisher's samples, by the session's count of
+/// [handovers](crate::session::core::MemoryChanges::handovers).
+#[derive(Default)]
+struct Sending {
+    /// What the daemon was asked, and has not answered.
+    asked: Option<PendingFence>,
+    /// What it said was sent.
+    sent: Option<u64>,
+    /// The number of the last sample that can be found by that.
+    number: u64,
+}
+
+/// A question to the daemon.
+#[derive(Clone, Copy)]
+struct PendingFence {
+    /// Which connection to a daemon it was said on: another one does not answer it.
+    connection: u64,
+    handovers: u64,
+    /// The last sample that had been handed over as it was asked.
+    number: u64,
+}
+
+impl PublisherInner {
+    pub(in crate::session) fn new(endpoint: Endpoint, role: EndpointRole, rings: Rings) -> Self {
+        let Qos { liveliness, lease, .. } = endpoint.qos;
+        let asserts = liveliness == Liveliness::ManualByTopic && lease.is_some();
+        let events = EndpointEvents::of_publisher(&endpoint.qos, clock::monotonic());
+        let (relayed, attached, sending) = (false, Mutex::default(), Mutex::default());
+        Self { endpoint, role, rings, events, asserts, relayed, attached, sending }
+    }
+
+    /// Liveliness is asserted explicitly: the publisher runs in another process.
+    pub(in crate::session) fn asserted(mut self) -> Self {
+        self.asserts = self.endpoint.qos.lease.is_some();
+        self.relayed = self.role == EndpointRole::Application;
+        self
+    }
+
+    /// Serves a reader on its terms: what it is granted, the number in front of that, and in which ring.
+    pub(in crate::session) fn attach(
+        &self,
+        reader: ReaderInfo,
+        terms: Terms,
+    ) -> Result<(Grant, u64, Location), ShmError> {
+        let gid = reader.gid;
+        let granted = self.rings.attach(reader, terms)?;
+        self.attached().insert(gid);
+        Ok(granted)
+    }
+
+    /// Whether it has samples for a reader that has not taken up its grant and must not lose one: a daemon that was
+    /// killed may not have passed the grant on.
+    pub(in crate::session) fn expects_readers(&self) -> bool {
+        let Rings::Shared(writer) = &self.rings else { return false };
+        self.endpoint.kind == EndpointKind::Publisher
+            && self.role == EndpointRole::Application
+            && holds(&self.endpoint.qos)
+            && writer.expects_readers()
+    }
+
+    /// The readers of other sessions that have not taken up their grant, and how many samples there are for each.
+    pub(in crate::session) fn unmet(&self) -> Vec<(Gid, u64)> {
+        let Rings::Shared(writer) = &self.rings else { return Vec::new() };
+        let counted =
+            self.endpoint.kind == EndpointKind::Publisher && self.role == EndpointRole::Application;
+        if counted { writer.unmet() } else { Vec::new() }
+    }
+
+    /// What it granted to readers of other sessions that have not taken it up, said once more.
+    pub(in crate::session) fn pledged(&self, session: SessionId) -> Vec<Granted> {
+        let counted = self.endpoint.kind == EndpointKind::Publisher
+            && self.role == EndpointRole::Application
+            && !self.relayed;
+        let Some(writer) = self.rings.shared().filter(|_| counted) else { return Vec::new() };
+        let ring = writer.location();
+        let granted = |(reader, Grant { generation, first }, after)| Granted {
+            reader,
+            writer: self.endpoint.gid,
+            generation,
+            first,
+            session,
+            ring,
+            segments: Vec::new(),
+            after: Some(after),
+            relayed: None,
+        };
+        writer.pledged().into_iter().map(granted).collect()
+    }
+
+    /// Whether it was attached.
+    pub(in crate::session) fn detach(&self, reader: Gid) -> bool {
+        self.attached().remove(&reader);
+        self.rings.detach(reader)
+    }
+
+    /// Whether any reader's process was dead.
+    pub(in crate::session) fn drop_dead(&self) -> bool {
+        let dead = self.rings.drop_dead();
+        let mut attached = self.attached();
+        dead.iter().for_each(|gid| {
+            attached.remove(gid);
+        });
+        !dead.is_empty()
+    }
+
+    /// The number up to which its samples are with those who carry them to other processes and hosts, and
+    /// can be read by all others whatever becomes of this process: these were sent the memory that they
+    /// are in. The session's memory wakes the thread that waits for that.
+    pub(in crate::session) fn delivered_up_to(&self, core: &SessionCore) -> u64 {
+        let Rings::Shared(writer) = &self.rings else { return 0 };
+        let (began, number) = (core.memory.connections(), writer.delivered_up_to());
+        // In this order: it counts what the readers of those samples have to be sent.
+        let handovers = core.memory.handovers();
+        let mut sending = self.sending();
+        if sending.sent == Some(handovers) {
+            sending.number = sending.number.max(number);
+        } else if sending.asked.is_none_or(|asked| asked.connection != began) {
+            // One at a time: where there is always something more to be sent, each is answered.
+            sending.asked = Some(PendingFence { connection: began, handovers, number });
+            let fence = Fence { writer: self.endpoint.gid, number: handovers };
+            core.tell(Outgoing::Fence(fence));
+        }
+        number.min(sending.number)
+    }
+
+    /// The daemon says that readers were sent what they needed as this count was reached.
+    pub(in crate::session) fn was_sent(&self, handovers: u64) {
+        let mut sending = self.sending();
+        if let Some(asked) = sending.asked.take_if(|asked| asked.handovers == handovers) {
+            sending.sent = Some(handovers);
+            sending.number = sending.number.max(asked.number);
+        }
+    }
+
+    fn sending(&self) -> MutexGuard<'_, Sending> {
+        self.sending.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The readers that were granted.
+    pub(in crate::session) fn granted(&self) -> Vec<Gid> {
+        self.attached().iter().copied().collect()
+    }
+
+    fn attached(&self) -> MutexGuard<'_, BTreeSet<Gid>> {
+        self.attached.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// What became of its matches since it was asked last.
+    pub(in crate::session) fn rematch(&self) -> Changes {
+        self.events.readers(|| self.rings.readers())
+    }
+
+    /// Counts the deadlines that passed, and asserts or watches the lease. When to look again, and
+    /// whether something happened.
+    pub(in crate::session) fn look_at_time(&self, now: u64) -> (Option<u64>, bool) {
+        let qos = &self.endpoint.qos;
+        let Rings::Shared(writer) = &self.rings else { return (None, false) };
+        let times = writer.times();
+        let (due, news) = self.events.offered(qos, &times, now);
+        let Some(lease) = qos.lease.filter(|_| !self.asserts) else {
+            return (due, news);
+        };
+        let third = nanoseconds(lease / 3).max(1_000_000);
+        let mut next = times.asserted.map_or(now, |asserted| asserted.saturating_add(third));
+        if next <= now {
+            writer.assert(now);
+            next = now.saturating_add(third);
+        }
+        (Some(due.map_or(next, |due| due.min(next))), news)
+    }
+
+    /// Notes what was published, where somebody watches the time.
+    pub(in crate::session) fn published<T>(
+        &self,
+        result: Result<T, PublishError>,
+    ) -> Result<T, PublishError> {
+        let deadline = self.endpoint.qos.deadline.is_some();
+        if result.is_ok()
+            && (deadline || self.asserts)
+            && let Rings::Shared(writer) = &self.rings
+        {
+            let now = clock::monotonic();
+            if deadline {
+                writer.note_sample(now);
+            }
+            if self.asserts {
+                writer.assert(now);
+            }
+        }
+        result
+    }
+}

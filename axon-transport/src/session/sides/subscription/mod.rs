@@ -1,0 +1,450 @@
+//! The reading side of a subscription, client or server: a reader of all matched publishers of a topic, merged into
+//! one stream.
+
+mod counts;
+mod matched_reader;
+mod matched_readers;
+mod message_info;
+mod remembered;
+mod slots;
+mod taking;
+#[cfg(test)]
+mod tests;
+
+use std::{
+    ops::Range,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::{Duration, Instant},
+};
+
+use axon_shm::{
+    Meta, Sample, ShmError, TakeError,
+    internal::{Grant, Lane, Location, Peer, Reader, ReaderOptions, WakeCheck, holds},
+};
+
+pub(in crate::session) use self::{
+    matched_reader::Numbers,
+    matched_readers::{Accept, Asking},
+};
+use self::{
+    matched_readers::MatchedReaders,
+    taking::{Take, TakeRules},
+};
+pub use self::{
+    message_info::{Lifetime, MessageInfo},
+    taking::TakeLimit,
+};
+use super::{
+    callback::{Callback, OnNew},
+    calls::Calls,
+    events::{Changes, EndpointEvents},
+    wakers::Wakers,
+};
+use crate::{
+    graph::{Endpoint, EndpointKind},
+    ids::Gid,
+    qos::{History, Qos},
+    session::{
+        clock,
+        core::{Outgoing, SessionCore},
+        error::RecvError,
+    },
+    wire::session::{EndpointRole, Message, Pair},
+};
+
+/// The reading side of a subscription, client or server, which the session's control thread shares
+/// with the handle.
+pub(in crate::session) struct SubscriptionInner {
+    pub(in crate::session) endpoint: Endpoint,
+    /// What its readers request.
+    pub(in crate::session) qos: Qos,
+    /// How many samples stand of all its writers together. Of each alone it is what `qos` says: a
+    /// client's requests do not take the room of another's.
+    shared_depth: Option<u32>,
+    /// Whether it is never matched with publishers of its own session.
+    pub(in crate::session) ignores_local: bool,
+    /// The only publisher that a relay reads, where it is not all.
+    pub(in crate::session) only: Option<Gid>,
+    /// Whether it carries samples to another process, which says what it has.
+    pub(in crate::session) carries: bool,
+    /// Whether a writer's numbers rise: the responses of a server come in whatever order it likes.
+    pub(in crate::session) rising: bool,
+    pub(in crate::session) role: EndpointRole,
+    pub(in crate::session) events: EndpointEvents,
+    stands_for: Mutex<Vec<Gid>>,
+    matched_readers: Mutex<MatchedReaders>,
+    arrived: Callback,
+    /// Whether the control thread listens for its callback.
+    listens: Mutex<bool>,
+    /// The tasks that wait for a message.
+    pub(in crate::session) wakers: Wakers,
+    /// Of a client: the requests whose responses tasks wait for.
+    pub(in crate::session) calls: Calls,
+}
+
+impl SubscriptionInner {
+    pub(in crate::session) fn new(
+        endpoint: Endpoint,
+        role: EndpointRole,
+        stands_for: Vec<Gid>,
+    ) -> Self {
+        let qos = endpoint.qos;
+        let shared_depth = (qos.history == History::KeepLast).then_some(qos.depth);
+        Self { shared_depth, stands_for: stands_for.into(), ..Self::reading(endpoint, role, qos) }
+    }
+
+    /// The reading side of a client or server.
+    pub(in crate::session) fn of_service(endpoint: Endpoint, role: EndpointRole, qos: Qos) -> Self {
+        let rising = endpoint.kind != EndpointKind::Client;
+        let matched_readers = MatchedReaders::of_service().into();
+        Self { rising, matched_readers, ..Self::reading(endpoint, role, qos) }
+    }
+
+    fn reading(endpoint: Endpoint, role: EndpointRole, qos: Qos) -> Self {
+        let events = EndpointEvents::of_subscription(&endpoint.qos);
+        let keeps_all = endpoint.kind == EndpointKind::Subscription && holds(&qos);
+        let matched_readers = MatchedReaders::new(keeps_all);
+        Self {
+            endpoint,
+            qos,
+            shared_depth: None,
+            ignores_local: false,
+            only: None,
+            carries: false,
+            rising: true,
+            role,
+            events,
+            stands_for: Mutex::default(),
+            matched_readers: matched_readers.into(),
+            arrived: Callback::default(),
+            listens: Mutex::new(false),
+            wakers: Wakers::default(),
+            calls: Calls::default(),
+        }
+    }
+
+    /// Whether it wants every sample of its publishers.
+    pub(in crate::session) fn keeps_all(&self) -> bool {
+        self.endpoint.kind == EndpointKind::Subscription && holds(&self.qos)
+    }
+
+    /// What a take has to know.
+    fn take_rules(&self) -> TakeRules<'_> {
+        TakeRules {
+            topic: &self.endpoint.topic,
+            shared_depth: self.shared_depth,
+            rising: self.rising,
+            loses_skipped: self.role == EndpointRole::Relay,
+        }
+    }
+
+    /// The oldest sample that may be taken, in place.
+    pub(in crate::session) fn take_sample(
+        &self,
+        core: &SessionCore,
+    ) -> Option<(MessageInfo, Sample)> {
+        let copy = core.config.shm_copy;
+        self.take(core, |reader| {
+            let sample = if copy { reader.take_copy() } else { reader.take_sample() };
+            Ok(sample?.map(|sample| (sample.meta(), sample)))
+        })
+    }
+
+    /// The oldest sample that may be taken, as `take` takes it from its ring.
+    pub(in crate::session) fn take<T>(
+        &self,
+        core: &SessionCore,
+        take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
+    ) -> Option<(MessageInfo, T)> {
+        self.take_with(core, |begun| begun.next(take))
+    }
+
+    /// The oldest sample that may be taken, as bytes, into `out`, which it replaces.
+    pub(in crate::session) fn take_bytes(
+        &self,
+        core: &SessionCore,
+        out: &mut Vec<u8>,
+    ) -> Option<MessageInfo> {
+        let take = |reader: &mut Reader| Ok(reader.take(out)?.map(|taken| (taken.meta, ())));
+        self.take(core, take).map(|(info, ())| info)
+    }
+
+    /// The next sample of one writer, as bytes.
+    pub(in crate::session) fn take_of(
+        &self,
+        core: &SessionCore,
+        writer: &Gid,
+    ) -> Option<(MessageInfo, Vec<u8>)> {
+        let mut out = Vec::new();
+        let take = |reader: &mut Reader| Ok(reader.take(&mut out)?.map(|taken| (taken.meta, ())));
+        let (info, ()) = self.take_with(core, |begun| begun.next_of(writer, take))?;
+        Some((info, out))
+    }
+
+    /// Samples of one writer, into `out`, which it replaces. `each` is told where a sample's payload is. Returns how many.
+    pub(in crate::session) fn take_many_of(
+        &self,
+        core: &SessionCore,
+        writer: &Gid,
+        most: TakeLimit,
+        out: &mut Vec<u8>,
+        each: impl FnMut(MessageInfo, Range<usize>),
+    ) -> usize {
+        out.clear();
+        let taken = self.take_with(core, |begun| {
+            Some(begun.many_of(writer, most, out, each)).filter(|taken| *taken > 0)
+        });
+        taken.unwrap_or(0)
+    }
+
+    /// The next sample of one writer, for a relay, and how many of that writer's were lost by then. The process has not forked.
+    pub(in crate::session) fn sample_of(&self, writer: &Gid) -> Option<(Sample, u64)> {
+        Take::begin(&mut self.lock(), self.take_rules()).sample_of(writer)
+    }
+
+    /// What `take` takes; `None` when there is nothing.
+    fn take_with<T>(
+        &self,
+        core: &SessionCore,
+        take: impl FnOnce(Take<'_>) -> Option<T>,
+    ) -> Option<T> {
+        // A thread of the parent may have held the lock when this process was forked.
+        if core.is_forked() {
+            tracing::error!("an endpoint of the parent process is used after fork");
+            return None;
+        }
+        let mut matched_readers = self.lock();
+        let taken = take(Take::begin(&mut matched_readers, self.take_rules()));
+        let gone = std::mem::take(&mut matched_readers.discarded);
+        let lost = matched_readers.new_losses();
+        let again = if taken.is_none() { matched_readers.slots.look_again() } else { None };
+        drop(matched_readers);
+        if let Some(again) = again {
+            core.look_again(again);
+        }
+        self.events.lost(lost);
+        for writer in gone {
+            let detach = Message::Detach(Pair { reader: self.endpoint.gid, writer });
+            core.tell(Outgoing::message(detach));
+        }
+        taken
+    }
+
+    /// What `take` finds, after waiting for at most `timeout`.
+    pub(in crate::session) fn recv<T>(
+        self: &Arc<Self>,
+        core: &SessionCore,
+        timeout: Option<Duration>,
+        mut take: impl FnMut() -> Option<T>,
+    ) -> Result<T, RecvError> {
+        let mut begun = None;
+        loop {
+            // Nothing comes to a forked child, however long it waits.
+            if core.is_forked() {
+                return Err(RecvError::Forked);
+            }
+            if let Some(taken) = take() {
+                return Ok(taken);
+            }
+            // What is there already is taken without a look at the clock.
+            let now = Instant::now();
+            let waited = now.duration_since(*begun.get_or_insert(now));
+            let left = timeout.map(|timeout| timeout.saturating_sub(waited));
+            let look = || -> Arc<dyn WakeCheck> { self.clone() };
+            let over = left.is_some_and(|left| left.is_zero());
+            if over || !core.segment.wait_for(|| self.has_data(), &look, left) {
+                return Err(RecvError::TimedOut);
+            }
+        }
+    }
+
+    /// For the control thread: wakes the tasks for which something came. Whether some still wait, so that
+    /// whatever comes next must ring.
+    pub(in crate::session) fn wake_tasks(&self, core: &SessionCore) -> bool {
+        let calls = self.collect_responses(core);
+        let receivers = self.wakers.wake_if(|| self.has_data());
+        calls || receivers
+    }
+
+    /// Gives each call the response that came to it; see [`Calls::collect`].
+    pub(in crate::session) fn collect_responses(&self, core: &SessionCore) -> bool {
+        let take = || self.take_sample(core).map(|(info, sample)| (info.sequence, sample));
+        self.calls.collect(core, take, |servers| {
+            let matched_readers = self.lock();
+            servers.retain(|server| !matched_readers.reads(server));
+        })
+    }
+
+    /// The publishers it receives from.
+    pub(in crate::session) fn matched(&self) -> Vec<Gid> {
+        let matched_readers = self.lock();
+        let matched = matched_readers.slots.iter().filter(|slot| slot.counts());
+        matched.map(|slot| slot.reader.writer()).collect()
+    }
+
+    /// Samples taken.
+    pub(in crate::session) fn received(&self) -> u64 {
+        self.lock().counts.received
+    }
+
+    /// Samples that were older than their publisher's lifespan when they would have been taken.
+    pub(in crate::session) fn expired(&self) -> u64 {
+        self.lock().counts.expired
+    }
+
+    /// Samples that were lost.
+    pub(in crate::session) fn lost(&self) -> u64 {
+        self.lock().losses()
+    }
+
+    pub(in crate::session) fn has_data(&self) -> bool {
+        self.lock().slots.has_data()
+    }
+
+    pub(in crate::session) fn set_on_new_sample(
+        &self,
+        callback: Option<OnNew>,
+        core: &SessionCore,
+    ) -> Result<(), ShmError> {
+        let listens = callback.is_some();
+        self.arrived.replace(callback, |untold| {
+            self.listen(listens, core)?;
+            let mut matched_readers = self.lock();
+            // Of those that nobody was told of some may have been taken, or lost.
+            let untold = untold + matched_readers.new_arrivals();
+            Ok(untold.min(self.within_depth(matched_readers.slots.unread())))
+        })
+    }
+
+    /// At most as many samples as all writers together may have to be taken, if they share a depth.
+    fn within_depth(&self, unread: u64) -> u64 {
+        self.shared_depth.map_or(unread, |depth| unread.min(depth.into()))
+    }
+
+    /// Nobody hears of samples any more, whatever is set from now on.
+    pub(in crate::session) fn tell_no_more(&self, core: &SessionCore) {
+        self.arrived.end();
+        // Only listening may fail, not ceasing to.
+        let _ = self.listen(false, core);
+    }
+
+    /// Has the control thread listen for its callback, or not any more.
+    fn listen(&self, whether: bool, core: &SessionCore) -> Result<(), ShmError> {
+        let mut listens = lock(&self.listens);
+        match (*listens, whether) {
+            (false, true) => core.listen()?,
+            (true, false) => core.listen_no_more(),
+            _ => {}
+        }
+        *listens = whether;
+        Ok(())
+    }
+
+    /// Tells of samples that came, where somebody wants to hear of them.
+    pub(in crate::session) fn tell_arrived(&self) {
+        if self.arrived.is_set() {
+            let new = self.lock().new_arrivals();
+            self.arrived.add(new);
+        }
+    }
+
+    /// What reads the ring that a writer granted.
+    pub(in crate::session) fn map(
+        &self,
+        writer: Gid,
+        peer: Peer,
+        ring: Location,
+        lane: Lane,
+        grant: Grant,
+        max_message: u64,
+    ) -> Result<Reader, ShmError> {
+        let (reader, qos) = (self.endpoint.gid, self.qos);
+        let options = ReaderOptions { reader, writer, peer, ring, lane, grant, qos, max_message };
+        let mut mapped = Reader::map(options)?;
+        if self.role == EndpointRole::Relay {
+            mapped.tell_progress();
+        }
+        if self.role == EndpointRole::Relay || self.carries {
+            mapped.finish_later();
+        }
+        if matches!(self.endpoint.kind, EndpointKind::Server | EndpointKind::Client) {
+            mapped.tell_room();
+        }
+        // Where its session is a gateway's, which reads too many rings to look at all of them.
+        if self.role != EndpointRole::Application {
+            mapped.follow(self.endpoint.gid);
+        }
+        Ok(mapped)
+    }
+
+    /// What became of its matches since it was asked last.
+    pub(in crate::session) fn rematch(&self) -> Changes {
+        let leases = || {
+            let matched_readers = self.lock();
+            let active = matched_readers.slots.iter().filter(|slot| slot.counts());
+            active.map(|slot| (slot.reader.writer(), slot.lease)).collect()
+        };
+        self.events.writers(leases, clock::monotonic())
+    }
+
+    /// Counts the deadlines that passed and looks who is alive. When to look again, and whether
+    /// something happened.
+    pub(in crate::session) fn look_at_time(&self, now: u64) -> (Option<u64>, bool) {
+        let times: Vec<_> = {
+            let matched_readers = self.lock();
+            let active = matched_readers.slots.iter().filter(|slot| slot.counts());
+            let times = active.map(|slot| {
+                let mut times = slot.reader.times();
+                times.sampled = times.sampled.filter(|sampled| *sampled >= slot.since);
+                (slot.reader.writer(), times)
+            });
+            times.collect()
+        };
+        self.events.requested(&self.qos, &times, now)
+    }
+
+    /// The same for who must not wait for a thread that takes.
+    pub(in crate::session) fn may_have_losses(&self) -> bool {
+        let Ok(mut matched_readers) = self.matched_readers.try_lock() else { return true };
+        matched_readers.slots.iter_mut().for_each(|slot| drop(slot.reader.peek()));
+        matched_readers.counts.has_new_losses(matched_readers.slots.lost())
+    }
+
+    /// Counts what would be found lost by taking now.
+    pub(in crate::session) fn look_for_losses(&self) {
+        let mut matched_readers = self.lock();
+        for slot in matched_readers.slots.iter_mut() {
+            // What is wrong with its memory, the next take says.
+            let _ = slot.reader.peek();
+        }
+        let lost = matched_readers.new_losses();
+        drop(matched_readers);
+        self.events.lost(lost);
+    }
+
+    pub(in crate::session) fn lock(&self) -> MutexGuard<'_, MatchedReaders> {
+        lock(&self.matched_readers)
+    }
+
+    pub(in crate::session) fn set_stands_for(&self, gids: Vec<Gid>) {
+        *lock(&self.stands_for) = gids;
+    }
+
+    pub(in crate::session) fn stands_for(&self) -> Vec<Gid> {
+        lock(&self.stands_for).clone()
+    }
+}
+
+impl WakeCheck for SubscriptionInner {
+    fn ready(&self) -> bool {
+        match self.matched_readers.try_lock() {
+            Ok(matched_readers) => matched_readers.slots.has_data(),
+            // The thread that holds the lock may be about to add something.
+            Err(_) => true,
+        }
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

@@ -1,0 +1,72 @@
+//! The endpoints and nodes that a session has.
+
+use std::{
+    collections::{BTreeMap, BTreeSet, HashMap},
+    sync::Arc,
+    time::Instant,
+};
+
+use crate::{
+    graph::Endpoint,
+    ids::Gid,
+    session::{
+        core::GuardCondition,
+        sides::{PublisherInner, SubscriptionInner},
+    },
+    wire::session::EndpointRole,
+};
+
+/// The endpoints and nodes of a session, those that it has for other processes among them.
+#[derive(Default)]
+pub(in crate::session) struct OwnEndpoints {
+    last_number: u32,
+    /// With what tells of changes of the graph.
+    pub(in crate::session) nodes: HashMap<Gid, (Endpoint, GuardCondition)>,
+    pub(in crate::session) publishers: HashMap<Gid, Arc<PublisherInner>>,
+    pub(in crate::session) subscriptions: HashMap<Gid, Arc<SubscriptionInner>>,
+    /// Publishers that the application has dropped, and until when they stay at most.
+    pub(in crate::session) leaving: BTreeMap<Gid, Instant>,
+    /// Applications' endpoints of both kinds by topic or service.
+    pub(in crate::session) topics: HashMap<String, BTreeSet<Gid>>,
+}
+
+impl OwnEndpoints {
+    /// The number of a new one.
+    pub(in crate::session) fn next_number(&mut self) -> u32 {
+        self.last_number += 1;
+        self.last_number
+    }
+
+    /// The nodes and endpoints of the session's application.
+    pub(in crate::session) fn own(&self) -> impl Iterator<Item = &Endpoint> {
+        let application = |role| role == EndpointRole::Application;
+        let nodes = self.nodes.values().map(|(node, _)| node);
+        let publishers = self
+            .publishers
+            .values()
+            .filter(move |p| application(p.role) && !self.leaving.contains_key(&p.endpoint.gid));
+        let subscriptions = self.subscriptions.values().filter(move |s| application(s.role));
+        nodes
+            .chain(publishers.map(|publisher| &publisher.endpoint))
+            .chain(subscriptions.map(|subscription| &subscription.endpoint))
+    }
+
+    /// The GIDs of all of them.
+    pub(in crate::session) fn gids(&self) -> BTreeSet<Gid> {
+        let endpoints = self.publishers.keys().chain(self.subscriptions.keys());
+        self.nodes.keys().chain(endpoints).copied().collect()
+    }
+
+    pub(in crate::session) fn index(&mut self, endpoint: &Endpoint) {
+        self.topics.entry(endpoint.topic.clone()).or_default().insert(endpoint.gid);
+    }
+
+    pub(in crate::session) fn unindex(&mut self, endpoint: &Endpoint) {
+        if let Some(gids) = self.topics.get_mut(&endpoint.topic) {
+            gids.remove(&endpoint.gid);
+            if gids.is_empty() {
+                self.topics.remove(&endpoint.topic);
+            }
+        }
+    }
+}

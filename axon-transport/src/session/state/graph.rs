@@ -1,0 +1,56 @@
+//! The graph that a session shows.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    mem,
+    sync::Arc,
+};
+
+use crate::{
+    graph::{Endpoint, GraphEntry, GraphView},
+    ids::Gid,
+};
+
+/// The graph as the daemon described it, with the session's own endpoints as they are.
+#[derive(Default)]
+pub(in crate::session) struct ShownGraph {
+    pub(in crate::session) view: Arc<GraphView>,
+    /// Own endpoints that the daemon refused, and why. No other session learns of them.
+    pub(in crate::session) refused: BTreeMap<Gid, String>,
+    /// Ended endpoints, until a daemon has announced their end.
+    pub(in crate::session) tombstones: BTreeSet<Gid>,
+    /// Whether it changed since the control thread last reported it.
+    changed: bool,
+}
+
+impl ShownGraph {
+    /// Shows what the session has made, whatever the daemon does meanwhile: the caller that
+    /// made it finds it in the graph, unless the daemon has refused it.
+    pub(in crate::session) fn show(&mut self, own: &Endpoint) {
+        if self.refused.contains_key(&own.gid) {
+            return;
+        }
+        let entry = || GraphEntry { endpoint: Arc::new(own.clone()), daemon: None, reach: None };
+        Arc::make_mut(&mut self.view).endpoints.entry(own.gid).or_insert_with(entry);
+        self.changed = true;
+    }
+
+    pub(in crate::session) fn hide(&mut self, gid: &Gid) {
+        if self.view.endpoints.contains_key(gid) {
+            Arc::make_mut(&mut self.view).endpoints.remove(gid);
+            self.changed = true;
+        }
+    }
+
+    /// An own endpoint is gone: nobody here counts it any more, whatever the daemon has heard.
+    pub(in crate::session) fn remove_dead(&mut self, gid: &Gid) {
+        self.tombstones.insert(*gid);
+        self.refused.remove(gid);
+        self.hide(gid);
+    }
+
+    /// Whether it changed since this was asked last.
+    pub(in crate::session) fn take_changed(&mut self) -> bool {
+        mem::take(&mut self.changed)
+    }
+}

@@ -1,0 +1,60 @@
+//! Readers that never took up what a publisher granted them before it ended. They are told how many samples they lost,
+//! by way of the daemon.
+//!
+//! A daemon that is killed takes the grant with it that it did not pass on, and a reader whose process is stopped comes
+//! to the next daemon late. So the session remembers what it told, and tells each daemon anew.
+
+use std::collections::VecDeque;
+
+use crate::wire::session::Unmet;
+
+/// Pairs that a session remembers.
+const REMEMBERED: usize = 1024;
+
+/// The pairs of a session's publishers that ended with readers that had not taken up their grant.
+#[derive(Debug, Default)]
+pub(in crate::session) struct UnmetPairs {
+    pairs: VecDeque<Unmet>,
+    full: bool,
+}
+
+impl UnmetPairs {
+    pub(in crate::session) fn is_empty(&self) -> bool {
+        self.pairs.is_empty()
+    }
+
+    /// What each daemon is told.
+    pub(in crate::session) fn iter(&self) -> impl Iterator<Item = Unmet> {
+        self.pairs.iter().copied()
+    }
+
+    pub(in crate::session) fn remember(&mut self, unmet: Unmet) {
+        if self.pairs.len() == REMEMBERED {
+            self.pairs.pop_front();
+            if !std::mem::replace(&mut self.full, true) {
+                tracing::warn!(
+                    "more than {REMEMBERED} readers were never told of a publisher of this session \
+                     that ended: the oldest of them do not count what they lost if the daemon is \
+                     killed before it has told them"
+                );
+            }
+        }
+        self.pairs.push_back(unmet);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ids::{Gid, SessionId};
+
+    #[test]
+    fn the_oldest_pair_is_forgotten_beyond_the_bound() {
+        let mut pairs = UnmetPairs::default();
+        let [reader, writer] = [1, 2].map(|session| Gid::new(SessionId([session; 16]), 1));
+        for samples in 0..=REMEMBERED as u64 {
+            pairs.remember(Unmet { reader, writer, samples });
+        }
+        assert_eq!((pairs.iter().count(), pairs.pairs[0].samples), (REMEMBERED, 1));
+    }
+}
