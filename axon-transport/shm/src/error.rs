@@ -45,7 +45,7 @@ pub enum ShmError {
     #[error(
         "shared memory: {needed} bytes needed, {available} left of the {most} that the rings of one peer may take"
     )]
-    Allowance {
+    MemoryBudget {
         /// Bytes that were needed.
         needed: u64,
         /// Bytes that the ring could have had.
@@ -180,7 +180,7 @@ pub enum PublishError {
     #[error(
         "{needed} bytes more needed for the sample, {available} left of the {most} that the rings of one peer may take"
     )]
-    Allowance {
+    MemoryBudget {
         /// Bytes that were needed.
         needed: u64,
         /// Bytes that the ring could have had.

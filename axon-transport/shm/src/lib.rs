@@ -51,7 +51,7 @@ pub use writer::loan::Loan;
 pub mod internal {
     pub use crate::{
         alloc::{
-            allowance::Allowance,
+            budget::MemoryBudget,
             segments::{SegmentEvent, SegmentInfo},
         },
         direct::connect::reencode_packet,
@@ -79,7 +79,7 @@ pub mod internal {
         },
         session::{
             lane::Lane,
-            peer::{Peer, PeerDescriptors, PeerSession},
+            peer::{PeerDescriptors, PeerSession, RingPeer},
             reader_info::{ReaderInfo, Terms},
             segment::SessionSegment,
             segment_message::{Segment, SegmentName, SegmentOpened},
@@ -96,8 +96,8 @@ pub mod internal {
     /// Descriptors that go from process to process.
     pub mod descriptors {
         pub use crate::os::descriptors::{
-            FEW, Packet, PassedFd, carries_descriptors, close_queue_is_full, is_clogged, is_scarce,
-            is_tight, limit, look, open, receive, receive_few, share,
+            FEW, PassedFd, SocketPacket, carries_descriptors, close_queue_is_full, is_clogged,
+            is_scarce, is_tight, limit, look, open, receive, receive_few, share,
         };
     }
 }

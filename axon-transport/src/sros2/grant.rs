@@ -147,7 +147,7 @@ impl Rule {
 }
 
 /// Whether criteria are about the partition without a name, in which an endpoint of ROS 2 is. Where they name none,
-/// an allowance is about that one and a denial about all.
+/// a budget is about that one and a denial about all.
 fn has_own_partition(partitions: Option<&[String]>, line: u32) -> Result<bool, String> {
     let Some(partitions) = partitions else { return Ok(true) };
     if partitions.is_empty() {

@@ -4,7 +4,7 @@
 use std::{collections::HashMap, rc::Rc, sync::Arc, time::Duration};
 
 use axon_envelope::inner::RequestId;
-use axon_shm::{Meta, ids::Gid, internal::Allowance};
+use axon_shm::{Meta, ids::Gid, internal::MemoryBudget};
 use axon_transport::{
     EndpointSpec, MessageInfo,
     graph::Endpoint,
@@ -31,7 +31,7 @@ pub(crate) trait Rings {
     fn open_writer(
         &self,
         remote: &Endpoint,
-        held: &Arc<Allowance>,
+        held: &Arc<MemoryBudget>,
     ) -> Result<Rc<dyn RingWriter>, String>;
 
     /// Adds to `found` the readers that may have samples to take, each with the publisher: those whose rings got samples

@@ -9,7 +9,7 @@ use std::{
     time::Duration,
 };
 
-use axon_shm::{ExternalLeader, Meta, PublishError, ShmError, ids::Gid, internal::Allowance};
+use axon_shm::{ExternalLeader, Meta, PublishError, ShmError, ids::Gid, internal::MemoryBudget};
 use axon_transport::{
     EndpointSpec, MessageInfo, Session, Subscription,
     graph::Endpoint,
@@ -78,7 +78,7 @@ impl Rings for ShmRings {
     fn open_writer(
         &self,
         remote: &Endpoint,
-        held: &Arc<Allowance>,
+        held: &Arc<MemoryBudget>,
     ) -> Result<Rc<dyn RingWriter>, String> {
         let writer = RemoteWriter::stand_in(&self.session, remote.clone(), held);
         Ok(Rc::new(StandInWriter(writer.map_err(|error| error.to_string())?)))
@@ -213,7 +213,7 @@ impl RingWriter for StandInWriter {
             PublishError::Blocked { .. } => RingError::Full,
             // One that fits in no state of the other rings is lost like any that is too long. Whether one fits in the end that
             // is a little shorter is for them to say, so the engine does not wait for ever.
-            error @ PublishError::Allowance { needed, most, .. } if needed <= most / 2 => {
+            error @ PublishError::MemoryBudget { needed, most, .. } if needed <= most / 2 => {
                 RingError::Short(error.to_string())
             }
             error => RingError::Lost(error.to_string()),

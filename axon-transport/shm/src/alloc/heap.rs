@@ -36,12 +36,12 @@ pub(crate) struct Block {
 
 /// A block, and the map that it is in. Not given back when dropped.
 #[derive(Clone)]
-pub(crate) struct Object {
+pub(crate) struct HeapObject {
     pub(crate) block: Block,
     pub(crate) map: Arc<Map>,
 }
 
-impl Object {
+impl HeapObject {
     #[inline]
     pub(crate) fn words(&self) -> &[AtomicU64] {
         let start = self.block.at.offset as usize / 8;
@@ -59,9 +59,9 @@ pub(crate) enum Need {
 }
 
 /// The segments that hold objects, and what of them is free.
-pub(crate) struct Heap(Mutex<Vec<Part>>);
+pub(crate) struct Heap(Mutex<Vec<HeapPart>>);
 
-struct Part {
+struct HeapPart {
     segment: Arc<OwnSegment>,
     area: Area,
     /// Where objects end that are no lanes.
@@ -71,7 +71,7 @@ struct Part {
     since: Instant,
 }
 
-impl Part {
+impl HeapPart {
     fn new(segment: Arc<OwnSegment>) -> Self {
         let bytes = segment.memory.bytes();
         let (start, limit) =
@@ -85,18 +85,18 @@ impl Part {
     }
 
     /// As [`allocate`](Self::allocate); what is in its way is noted, if it is the first.
-    fn give(&mut self, len: u64, short: &mut Option<ShmError>) -> Option<Object> {
+    fn give(&mut self, len: u64, short: &mut Option<ShmError>) -> Option<HeapObject> {
         self.allocate(len).unwrap_or_else(|error| {
             short.get_or_insert(error);
             None
         })
     }
 
-    fn allocate(&mut self, len: u64) -> Result<Option<Object>, ShmError> {
+    fn allocate(&mut self, len: u64) -> Result<Option<HeapObject>, ShmError> {
         self.allocate_below(self.limit, len)
     }
 
-    fn allocate_below(&mut self, limit: u64, len: u64) -> Result<Option<Object>, ShmError> {
+    fn allocate_below(&mut self, limit: u64, len: u64) -> Result<Option<HeapObject>, ShmError> {
         let Some(offset) = self.area.allocate_below(limit, len) else { return Ok(None) };
         let end = offset + len;
         if end > self.committed {
@@ -108,14 +108,14 @@ impl Part {
             self.committed = upto;
         }
         let at = Location { segment: self.segment.number(), offset };
-        Ok(Some(Object { block: Block { at, len }, map: Arc::clone(self.segment.map()) }))
+        Ok(Some(HeapObject { block: Block { at, len }, map: Arc::clone(self.segment.map()) }))
     }
 }
 
 impl Heap {
     /// A heap in a session's first segment.
     pub(crate) fn new(first: Arc<OwnSegment>) -> Self {
-        Self(Mutex::new(vec![Part::new(first)]))
+        Self(Mutex::new(vec![HeapPart::new(first)]))
     }
 
     /// `len` bytes, best in a segment that is `mapped` by those that will read there. `None` when
@@ -129,10 +129,10 @@ impl Heap {
         len: u64,
         need: Need,
         mapped: impl Fn(u32) -> bool,
-    ) -> Result<Option<Object>, ShmError> {
+    ) -> Result<Option<HeapObject>, ShmError> {
         let len = Area::rounded(len);
         let mut parts = self.parts();
-        let usable = |part: &Part| {
+        let usable = |part: &HeapPart| {
             let number = part.segment.number();
             number == 0 || mapped(number) || part.since.elapsed() >= PATIENCE
         };
@@ -183,17 +183,17 @@ impl Heap {
         }
     }
 
-    fn another(segments: &Segments, len: u64) -> Result<Part, ShmError> {
+    fn another(segments: &Segments, len: u64) -> Result<HeapPart, ShmError> {
         if len > HEAP_BYTES_MAX - HEAP_AT {
             return Err(ShmError::NoMemory { needed: len, available: HEAP_BYTES_MAX });
         }
         let bytes = (HEAP_AT + len).next_multiple_of(HEAP_BYTES);
-        Ok(Part::new(segments.open(SegmentKind::Heap, bytes)?))
+        Ok(HeapPart::new(segments.open(SegmentKind::Heap, bytes)?))
     }
 
     /// Memory for a lane, always in the first segment. A reader's first request arrives there, before other
     /// segments are mapped.
-    pub(crate) fn allocate_lane(&self) -> Result<Object, ShmError> {
+    pub(crate) fn allocate_lane(&self) -> Result<HeapObject, ShmError> {
         let object = self.parts()[0].allocate_below(layout::SESSION_BYTES, layout::LANE)?;
         // As for `allocate`: another object may have been there.
         about_to_write::<AtomicU64>();
@@ -208,7 +208,7 @@ impl Heap {
         }
     }
 
-    fn parts(&self) -> MutexGuard<'_, Vec<Part>> {
+    fn parts(&self) -> MutexGuard<'_, Vec<HeapPart>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -57,7 +57,7 @@ impl PinLimit {
 
 /// What there is to be shared out.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Pool {
+pub(crate) struct PinPool {
     /// Bytes that all readers of other sessions may keep together. What this leaves of the publisher's
     /// segments is more than half of them.
     bytes: u64,
@@ -65,7 +65,7 @@ pub(crate) struct Pool {
     largest: u64,
 }
 
-impl Pool {
+impl PinPool {
     /// Of a publisher with this budget.
     pub(crate) fn new(budget: u64, max_message: u64) -> Self {
         let segment = samples_bytes(budget, max_message, RECORDS as u64) - SLOTS_AT;
@@ -123,7 +123,7 @@ mod tests {
     }
 
     /// What `readers` get one after the other, each of a process of its own or all of one.
-    fn shares(pool: Pool, readers: usize, one_process: bool) -> Vec<u64> {
+    fn shares(pool: PinPool, readers: usize, one_process: bool) -> Vec<u64> {
         let mut taken = 0;
         let mut shares = Vec::new();
         for _ in 0..readers {
@@ -138,7 +138,7 @@ mod tests {
     #[test]
     fn two_readers_keep_any_sample_and_many_keep_shorter_ones() {
         // As publishers usually are.
-        let shares = shares(Pool::new(64 * MIB, 256 * MIB), 1000, false);
+        let shares = shares(PinPool::new(64 * MIB, 256 * MIB), 1000, false);
         assert_eq!(shares[..2], [256 * MIB; 2]);
         assert!(shares[2..16].iter().all(|longest| *longest >= 8 * MIB), "{shares:?}");
         assert!(shares[16..64].iter().all(|longest| *longest >= MIB / 2), "{shares:?}");
@@ -148,7 +148,7 @@ mod tests {
     #[test]
     fn one_process_leaves_something_to_the_next() {
         for (budget, max_message) in [(64 * MIB, 256 * MIB), (0, 25 * MIB), (1 << 32, 1 << 31)] {
-            let pool = Pool::new(budget, max_message);
+            let pool = PinPool::new(budget, max_message);
             let of_one = shares(pool, 5000, true);
             assert!(of_one[1] >= max_message && of_one[4999] == 0);
             let taken = of_one.iter().map(|longest| 6 * longest.min(&pool.largest)).sum();

@@ -3,7 +3,7 @@
 
 use std::ops::Range;
 
-use crate::{alloc::slots::Slots, ring::layout::Location};
+use crate::{alloc::slots::SegmentSlots, ring::layout::Location};
 
 /// Retired samples by segment. One store at a time takes new samples. A store that was left is
 /// [vacated](Self::vacated) once its last sample has been released.
@@ -20,7 +20,7 @@ pub(crate) struct RetireList {
 #[derive(Clone, Debug)]
 struct Store {
     number: u32,
-    slots: Slots,
+    slots: SegmentSlots,
     left: bool,
 }
 
@@ -36,7 +36,7 @@ impl RetireList {
     /// Makes the segment of this number take new samples, in `range`.
     pub(crate) fn open(&mut self, number: u32, range: Range<u64>) {
         self.leave();
-        self.stores.push(Store { number, slots: Slots::new(range, 16), left: false });
+        self.stores.push(Store { number, slots: SegmentSlots::new(range, 16), left: false });
     }
 
     /// Makes all segments refuse new samples until another one is opened.
@@ -45,7 +45,7 @@ impl RetireList {
     }
 
     /// The slots of the segment at a loan's location.
-    pub(crate) fn slots(&mut self, at: Location) -> &mut Slots {
+    pub(crate) fn slots(&mut self, at: Location) -> &mut SegmentSlots {
         slots(&mut self.stores, at)
     }
 
@@ -65,7 +65,7 @@ impl RetireList {
         self.take_by(|slots| slots.take(len))
     }
 
-    fn take_by(&mut self, take: impl FnOnce(&mut Slots) -> Option<u64>) -> Option<Location> {
+    fn take_by(&mut self, take: impl FnOnce(&mut SegmentSlots) -> Option<u64>) -> Option<Location> {
         let store = self.stores.last_mut().filter(|store| !store.left)?;
         let offset = take(&mut store.slots)?;
         Some(Location { segment: store.number, offset })
@@ -172,7 +172,7 @@ impl RetireList {
     }
 }
 
-fn slots(stores: &mut [Store], at: Location) -> &mut Slots {
+fn slots(stores: &mut [Store], at: Location) -> &mut SegmentSlots {
     let store = stores.iter_mut().find(|store| store.number == at.segment);
     // A segment is only forgotten once it holds nothing.
     &mut store.expect("the segment of what is in use").slots

@@ -10,7 +10,7 @@ use std::{
 use crate::{
     error::ShmError,
     ids::{Gid, SessionId},
-    memory::segment::{Map, Segment},
+    memory::segment::{Map, OwnMapping},
     ring::layout::{self, SegmentKind},
 };
 
@@ -40,7 +40,7 @@ type Listener = Box<dyn Fn(SegmentEvent<'_>) + Send + Sync>;
 /// One of them.
 pub(crate) struct OwnSegment {
     pub(crate) info: SegmentInfo,
-    pub(crate) memory: Segment,
+    pub(crate) memory: OwnMapping,
 }
 
 impl OwnSegment {
@@ -98,7 +98,7 @@ impl Segments {
             SegmentKind::Heap => "axon-heap",
             SegmentKind::Samples(_) => "axon-samples",
         };
-        let memory = Segment::create(name, bytes)?;
+        let memory = OwnMapping::create(name, bytes)?;
         memory.commit(0, layout::ALIGN)?;
         let mut table = self.table.write().unwrap_or_else(PoisonError::into_inner);
         let number = table.next;

@@ -5,7 +5,7 @@
 //! that is in no list, then a slot of one of the next larger classes. Only if all of that fails does it empty the
 //! lists, join adjacent ranges, and take the lowest range that is large enough, so that memory grows last.
 //!
-//! Slots that fit in a core's own cache are also [used in rotation](Slots::take_turn). If the publisher wrote to the
+//! Slots that fit in a core's own cache are also [used in rotation](SegmentSlots::take_turn). If the publisher wrote to the
 //! slot that was read last, each cache line would first have to move from the reader's core.
 
 use std::ops::Range;
@@ -24,7 +24,7 @@ const TURNING: u64 = 512 << 10;
 
 /// The slots of one segment.
 #[derive(Clone, Debug)]
-pub(crate) struct Slots {
+pub(crate) struct SegmentSlots {
     /// Free slots by class, the one that came back last on top.
     free: Vec<Vec<u64>>,
     /// What is in no slot.
@@ -41,7 +41,7 @@ pub(crate) struct Slots {
     used: u64,
 }
 
-impl Slots {
+impl SegmentSlots {
     /// Slots in `range`, none of which is backed by memory. Up to `pieces` are expected at a time.
     pub(crate) fn new(range: Range<u64>, pieces: usize) -> Self {
         Self {
@@ -170,12 +170,12 @@ mod tests {
 
     const MIB: u64 = 1 << 20;
 
-    fn slots(bytes: u64) -> Slots {
-        Slots::new(0..bytes, 16)
+    fn slots(bytes: u64) -> SegmentSlots {
+        SegmentSlots::new(0..bytes, 16)
     }
 
     /// As a publisher does: what is taken is backed.
-    fn take(slots: &mut Slots, len: u64) -> Option<u64> {
+    fn take(slots: &mut SegmentSlots, len: u64) -> Option<u64> {
         let at = slots.take(len)?;
         slots.back(slots.end(at, len));
         Some(at)

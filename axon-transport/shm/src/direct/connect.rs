@@ -67,7 +67,7 @@ pub enum ConnectError {
     Incompatible(Incompatible),
     /// The publisher refused, and said why.
     #[error("the publisher refused: {0}")]
-    Refused(String),
+    ConnectRefusal(String),
     /// The other end sent something else than it should.
     #[error(
         "the other end sent {0}: is there a publisher at one end and a subscriber at the other?"
@@ -110,7 +110,7 @@ pub(crate) struct AttachRequest {
 
 /// What a publisher answers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
-pub(crate) struct Granted {
+pub(crate) struct PublisherAnswer {
     /// Who asked: an answer to a question that was given up is not one to the next.
     #[n(0)]
     pub(crate) reader: Gid,
@@ -134,7 +134,7 @@ pub(crate) enum SegmentUpdate {
 }
 
 #[derive(Debug, Encode, Decode)]
-struct Refused {
+struct ConnectRefusal {
     #[n(0)]
     reader: Gid,
     #[n(1)]
@@ -146,9 +146,9 @@ enum Packet {
     #[n(0)]
     AttachRequest(#[n(0)] AttachRequest),
     #[n(1)]
-    Granted(#[n(0)] Granted),
+    PublisherAnswer(#[n(0)] PublisherAnswer),
     #[n(2)]
-    Refused(#[n(0)] Refused),
+    ConnectRefusal(#[n(0)] ConnectRefusal),
     #[n(3)]
     Opened(#[n(0)] SegmentOpened),
     #[n(4)]
@@ -190,14 +190,14 @@ fn no_descriptors() -> ConnectError {
 }
 
 /// One end of the socket, for as long as the two need to come together.
-pub(crate) struct Channel<'a> {
+pub(crate) struct ConnectChannel<'a> {
     socket: BorrowedFd<'a>,
     deadline: Option<Instant>,
     /// Whether it has received something.
     heard: Cell<bool>,
 }
 
-impl<'a> Channel<'a> {
+impl<'a> ConnectChannel<'a> {
     pub(crate) fn new(socket: BorrowedFd<'a>, timeout: Option<Duration>) -> Self {
         let deadline = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
         Self { socket, deadline, heard: Cell::new(false) }
@@ -239,30 +239,30 @@ impl<'a> Channel<'a> {
 
     pub(crate) fn grant(
         &self,
-        granted: &Granted,
+        granted: &PublisherAnswer,
         own: &PeerDescriptors,
     ) -> Result<(), ConnectError> {
         let fds = [own.segment.as_fd(), own.doorbell.as_fd(), own.pidfd.as_fd()];
-        self.send(&Packet::Granted(*granted), &fds)
+        self.send(&Packet::PublisherAnswer(*granted), &fds)
     }
 
     /// The answer to what `reader` asked.
     pub(crate) fn await_granted(
         &self,
         reader: Gid,
-    ) -> Result<(Granted, PeerDescriptors), ConnectError> {
+    ) -> Result<(PublisherAnswer, PeerDescriptors), ConnectError> {
         loop {
             match self.receive()? {
-                (Packet::Granted(granted), fds) if granted.reader == reader => {
+                (Packet::PublisherAnswer(granted), fds) if granted.reader == reader => {
                     let [segment, doorbell, pidfd] = fds
                         .try_into()
                         .map_err(|_| ConnectError::Protocol("another number of descriptors"))?;
                     return Ok((granted, PeerDescriptors { segment, doorbell, pidfd }));
                 }
-                (Packet::Refused(refused), _) if refused.reader == reader => {
-                    return Err(ConnectError::Refused(refused.reason));
+                (Packet::ConnectRefusal(refused), _) if refused.reader == reader => {
+                    return Err(ConnectError::ConnectRefusal(refused.reason));
                 }
-                (Packet::Granted(_) | Packet::Refused(_), _) => {}
+                (Packet::PublisherAnswer(_) | Packet::ConnectRefusal(_), _) => {}
                 (Packet::Opened(_) | Packet::Gone(_), _) => {}
                 (Packet::AttachRequest(_), _) => {
                     return Err(ConnectError::Protocol("a question where an answer was due"));
@@ -297,7 +297,12 @@ impl<'a> Channel<'a> {
                     }
                 }
                 (Packet::Gone(gone), _) => return Ok(SegmentUpdate::Gone(gone)),
-                (Packet::AttachRequest(_) | Packet::Granted(_) | Packet::Refused(_), _) => {}
+                (
+                    Packet::AttachRequest(_)
+                    | Packet::PublisherAnswer(_)
+                    | Packet::ConnectRefusal(_),
+                    _,
+                ) => {}
             }
         }
     }
@@ -307,7 +312,7 @@ impl<'a> Channel<'a> {
         let mut reason = why.to_string();
         let end = (0..=MAX_REASON.min(reason.len())).rev().find(|&i| reason.is_char_boundary(i));
         reason.truncate(end.unwrap_or(0));
-        let _ = self.send(&Packet::Refused(Refused { reader, reason }), &[]);
+        let _ = self.send(&Packet::ConnectRefusal(ConnectRefusal { reader, reason }), &[]);
     }
 
     fn send(&self, packet: &Packet, fds: &[BorrowedFd<'_>]) -> Result<(), ConnectError> {
@@ -336,7 +341,7 @@ impl<'a> Channel<'a> {
 
     fn receive_by(
         &self,
-        receive: impl Fn(BorrowedFd<'a>, &mut [u8]) -> Result<descriptors::Packet, Errno>,
+        receive: impl Fn(BorrowedFd<'a>, &mut [u8]) -> Result<descriptors::SocketPacket, Errno>,
     ) -> Result<(Packet, Vec<PassedFd>), ConnectError> {
         if self.heard.replace(true) && self.left().is_some_and(|left| left.is_zero()) {
             return Err(ConnectError::Timeout);

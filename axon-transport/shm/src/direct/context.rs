@@ -13,7 +13,7 @@ use std::{
 
 use crate::{
     direct::{
-        connect::{Granted, SegmentUpdate},
+        connect::{PublisherAnswer, SegmentUpdate},
         segment_channels::SegmentChannels,
     },
     error::ShmError,
@@ -22,7 +22,7 @@ use crate::{
     ring::layout::Location,
     session::{
         leader::ExternalLeader,
-        peer::{Peer, PeerDescriptors, PeerSession},
+        peer::{PeerDescriptors, PeerSession, RingPeer},
         segment::SessionSegment,
         segment_message::{SegmentName, SegmentOpened},
     },
@@ -57,27 +57,27 @@ struct ContextInner {
     /// What other contexts handed over and could not be mapped then.
     unmapped: Mutex<Vec<Unmapped>>,
     /// What subscribers of this context ask for, and what its own publishers answered.
-    own: Mutex<HashMap<Gid, Own>>,
+    own: Mutex<HashMap<Gid, OwnQuestion>>,
 }
 
 type Unmapped = (Weak<PeerSession>, SegmentOpened, PassedFd);
 
 /// A question of this context's.
-struct Own {
+struct OwnQuestion {
     lane: Location,
-    granted: Option<Granted>,
+    granted: Option<PublisherAnswer>,
 }
 
 /// That a subscriber asks, until it has its answer.
-pub(crate) struct Asking<'a> {
+pub(crate) struct SubscriberQuestion<'a> {
     context: &'a Context,
     reader: Gid,
 }
 
-impl Asking<'_> {
+impl SubscriberQuestion<'_> {
     /// The end that answered `granted` as this very context. Our id, memory and pidfd prove
     /// nothing, as every peer has them: a publisher of ours must have granted just that.
-    pub(crate) fn answered(&self, granted: &Granted) -> Result<Peer, ShmError> {
+    pub(crate) fn answered(&self, granted: &PublisherAnswer) -> Result<RingPeer, ShmError> {
         match self.context.own()?.get(&self.reader) {
             Some(own) if own.granted.as_ref() == Some(granted) => Ok(self.context.local()),
             _ => Err(ShmError::Refused { what: "no publisher of this context has granted that" }),
@@ -85,7 +85,7 @@ impl Asking<'_> {
     }
 }
 
-impl Drop for Asking<'_> {
+impl Drop for SubscriberQuestion<'_> {
     fn drop(&mut self) {
         if let Ok(mut own) = self.context.own() {
             own.remove(&self.reader);
@@ -207,13 +207,17 @@ impl Context {
     }
 
     /// A subscriber of this context is about to ask with `lane`.
-    pub(crate) fn asking(&self, reader: Gid, lane: Location) -> Result<Asking<'_>, ShmError> {
-        self.own()?.insert(reader, Own { lane, granted: None });
-        Ok(Asking { context: self, reader })
+    pub(crate) fn asking(
+        &self,
+        reader: Gid,
+        lane: Location,
+    ) -> Result<SubscriberQuestion<'_>, ShmError> {
+        self.own()?.insert(reader, OwnQuestion { lane, granted: None });
+        Ok(SubscriberQuestion { context: self, reader })
     }
 
     /// This very context, if it has asked so.
-    pub(crate) fn asked_itself(&self, reader: Gid, lane: Location) -> Result<Peer, ShmError> {
+    pub(crate) fn asked_itself(&self, reader: Gid, lane: Location) -> Result<RingPeer, ShmError> {
         match self.own()?.get(&reader) {
             Some(own) if own.lane == lane => Ok(self.local()),
             _ => Err(ShmError::Refused { what: "no subscriber of this context asks for that" }),
@@ -221,18 +225,18 @@ impl Context {
     }
 
     /// A publisher of this context answers a subscriber of it.
-    pub(crate) fn granted_itself(&self, granted: &Granted) -> Result<(), ShmError> {
+    pub(crate) fn granted_itself(&self, granted: &PublisherAnswer) -> Result<(), ShmError> {
         if let Some(own) = self.own()?.get_mut(&granted.reader) {
             own.granted = Some(*granted);
         }
         Ok(())
     }
 
-    fn local(&self) -> Peer {
-        Peer::Local(Arc::clone(self.session()))
+    fn local(&self) -> RingPeer {
+        RingPeer::Local(Arc::clone(self.session()))
     }
 
-    fn own(&self) -> Result<MutexGuard<'_, HashMap<Gid, Own>>, ShmError> {
+    fn own(&self) -> Result<MutexGuard<'_, HashMap<Gid, OwnQuestion>>, ShmError> {
         // A thread of the parent may have held the lock when this process was forked.
         if self.session().is_forked() {
             return Err(ShmError::Forked);
@@ -245,7 +249,7 @@ impl Context {
         &self,
         id: SessionId,
         descriptors: PeerDescriptors,
-    ) -> Result<Peer, ShmError> {
+    ) -> Result<RingPeer, ShmError> {
         // A thread of the parent may have held the lock below when this process was forked.
         if self.session().is_forked() {
             return Err(ShmError::Forked);
@@ -272,12 +276,12 @@ impl Context {
             if known.memory != memory || !session.is_of(process) {
                 return refuse("another process has this context's id");
             }
-            return Ok(Peer::Remote(session));
+            return Ok(RingPeer::Remote(session));
         }
         let others: Vec<_> = peers.values().filter_map(|other| other.session.upgrade()).collect();
         let session = PeerSession::map_among(id, descriptors, &others)?;
         peers.insert(id, MappedContext { session: Arc::downgrade(&session), memory });
-        Ok(Peer::Remote(session))
+        Ok(RingPeer::Remote(session))
     }
 }
 

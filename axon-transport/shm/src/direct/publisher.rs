@@ -8,7 +8,7 @@ use std::{
 
 use crate::{
     direct::{
-        connect::{AttachRequest, Channel, ConnectError, Granted},
+        connect::{AttachRequest, ConnectChannel, ConnectError, PublisherAnswer},
         context::Context,
     },
     error::{PublishError, ShmError},
@@ -17,7 +17,7 @@ use crate::{
     qos::{Qos, compatible},
     ring::types::{Grant, Meta, RingOptions},
     session::{
-        peer::{Peer, PeerDescriptors},
+        peer::{PeerDescriptors, RingPeer},
         reader_info::ReaderInfo,
     },
     writer::{Writer, loan::Loan},
@@ -130,7 +130,7 @@ impl Publisher {
     /// It did not ask in time, asked for what this publisher does not offer, or handed over what
     /// cannot be used; it is told.
     pub fn serve(&self, socket: impl AsFd, timeout: Option<Duration>) -> Result<Gid, ConnectError> {
-        let channel = Channel::new(socket.as_fd(), timeout);
+        let channel = ConnectChannel::new(socket.as_fd(), timeout);
         let (asked, descriptors, line) = channel.await_asked()?;
         let gid = asked.reader;
         let admitted = self.admit(asked, descriptors).and_then(|(granted, peer)| {
@@ -151,7 +151,7 @@ impl Publisher {
         &self,
         asked: AttachRequest,
         descriptors: PeerDescriptors,
-    ) -> Result<(Granted, Peer), ConnectError> {
+    ) -> Result<(PublisherAnswer, RingPeer), ConnectError> {
         let AttachRequest { session, reader: gid, lane, qos } = asked;
         compatible(&self.qos, &qos).map_err(ConnectError::Incompatible)?;
         let peer = if session == self.context.id() {
@@ -163,8 +163,8 @@ impl Publisher {
         let Grant { generation, first } = self.writer.attach(info)?;
         let (session, writer) = (self.context.id(), self.gid());
         let ring = self.writer.location();
-        let granted = Granted { reader: gid, session, writer, generation, first, ring };
-        if let Peer::Local(_) = peer {
+        let granted = PublisherAnswer { reader: gid, session, writer, generation, first, ring };
+        if let RingPeer::Local(_) = peer {
             self.context.granted_itself(&granted)?;
         }
         Ok((granted, peer))
@@ -173,17 +173,17 @@ impl Publisher {
     /// Answers, and hands over the memory that is in use and, from then on, what comes into use.
     fn answer(
         &self,
-        channel: &Channel<'_>,
-        granted: &Granted,
-        peer: Peer,
+        channel: &ConnectChannel<'_>,
+        granted: &PublisherAnswer,
+        peer: RingPeer,
         line: PassedFd,
     ) -> Result<(), ConnectError> {
         let session = self.context.session();
         channel.grant(granted, &session.descriptors()?)?;
         match peer {
             // It finds all of it here, and would take none of it from the line.
-            Peer::Local(_) => Ok(()),
-            Peer::Remote(_) => self.context.lines().add(session, peer, granted, line),
+            RingPeer::Local(_) => Ok(()),
+            RingPeer::Remote(_) => self.context.lines().add(session, peer, granted, line),
         }
     }
 

@@ -14,11 +14,11 @@ use rustix::net::sockopt;
 
 use crate::{
     alloc::segments::{SegmentEvent, SegmentInfo},
-    direct::connect::{Channel, ConnectError, Granted},
+    direct::connect::{ConnectChannel, ConnectError, PublisherAnswer},
     ids::{Gid, SessionId},
     os::descriptors::PassedFd,
     ring::layout::SegmentKind,
-    session::{peer::Peer, segment::SessionSegment},
+    session::{peer::RingPeer, segment::SessionSegment},
     wake::Purpose,
 };
 
@@ -47,7 +47,7 @@ struct ChannelsState {
 struct SegmentChannel {
     reader: Gid,
     writer: Gid,
-    peer: Peer,
+    peer: RingPeer,
     socket: PassedFd,
     /// The segments that its context was given, and that this line has to tell when they are gone.
     told: Vec<SegmentInfo>,
@@ -107,8 +107,8 @@ impl SegmentChannel {
     }
 
     /// The channel, whose sends do not block.
-    fn channel(&self) -> Channel<'_> {
-        Channel::new(self.socket.as_fd(), Some(Duration::ZERO))
+    fn channel(&self) -> ConnectChannel<'_> {
+        ConnectChannel::new(self.socket.as_fd(), Some(Duration::ZERO))
     }
 }
 
@@ -157,11 +157,11 @@ impl SegmentChannels {
     pub(crate) fn add(
         &self,
         session: &SessionSegment,
-        peer: Peer,
-        granted: &Granted,
+        peer: RingPeer,
+        granted: &PublisherAnswer,
         socket: PassedFd,
     ) -> Result<(), ConnectError> {
-        let Granted { reader, writer, ring, .. } = *granted;
+        let PublisherAnswer { reader, writer, ring, .. } = *granted;
         // One that cannot be set holds more, which is its own harm.
         let _ = sockopt::set_socket_send_buffer_size(&socket, ROOM);
         let mut line =

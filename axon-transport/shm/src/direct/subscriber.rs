@@ -11,7 +11,7 @@ use rustix::net::{Shutdown, shutdown};
 
 use crate::{
     direct::{
-        connect::{AttachRequest, Channel, ConnectError, line},
+        connect::{AttachRequest, ConnectChannel, ConnectError, line},
         context::Context,
     },
     error::TakeError,
@@ -20,7 +20,7 @@ use crate::{
     qos::Qos,
     reader::{Reader, ReaderOptions, sample::Sample},
     ring::types::{Grant, Meta},
-    session::peer::{Peer, PeerSession},
+    session::peer::{PeerSession, RingPeer},
 };
 
 /// No sleep is longer: what a publisher stored last and did not live to ring for is found then.
@@ -137,7 +137,7 @@ impl Subscriber {
     ) -> Result<Self, ConnectError> {
         let SubscriberOptions { qos, max_len: max_message } = options;
         let start = Instant::now();
-        let channel = Channel::new(socket.as_fd(), timeout);
+        let channel = ConnectChannel::new(socket.as_fd(), timeout);
         let lane = context.session().allocate_lane()?;
         let gid = context.next_gid();
         let asked =
@@ -154,10 +154,10 @@ impl Subscriber {
         };
         let ring = granted.ring;
         let (mut kept, mut hold) = (None, None);
-        if let Peer::Remote(peer) = &peer {
+        if let RingPeer::Remote(peer) = &peer {
             hold = Some(Hold::new(context, peer, granted.writer));
             let left = timeout.map(|timeout| timeout.saturating_sub(start.elapsed()));
-            let channel = Channel::new(ours.as_fd(), left);
+            let channel = ConnectChannel::new(ours.as_fd(), left);
             // A ring that is not in the first segment: its own follows.
             while !peer.has_segment(ring.segment) {
                 context.hear(peer, channel.take_news()?);
@@ -236,7 +236,7 @@ impl Subscriber {
         }
         let line = line.lock().unwrap_or_else(PoisonError::into_inner);
         for _ in 0..NEWS {
-            match Channel::new(line.as_fd(), Some(Duration::ZERO)).take_news() {
+            match ConnectChannel::new(line.as_fd(), Some(Duration::ZERO)).take_news() {
                 Ok(news) => self.context.hear(publisher, news),
                 // What finds no room here is there the next time, too.
                 Err(_) => break,

@@ -64,27 +64,33 @@ fn available_in(proc: &Path, cgroup: &Path, enough: u64) -> Option<u64> {
         .min()
 }
 
-struct Files {
+struct MemoryFiles {
     limit: &'static str,
     usage: &'static str,
     reclaimable: &'static str,
 }
 
-const V2: Files =
-    Files { limit: "memory.max", usage: "memory.current", reclaimable: "inactive_file " };
-const V1: Files = Files {
+const V2: MemoryFiles =
+    MemoryFiles { limit: "memory.max", usage: "memory.current", reclaimable: "inactive_file " };
+const V1: MemoryFiles = MemoryFiles {
     limit: "memory.limit_in_bytes",
     usage: "memory.usage_in_bytes",
     reclaimable: "total_inactive_file ",
 };
 
 /// The memory left to a group and its ancestors, by the tightest of their limits.
-fn lowest(root: &Path, group: &str, files: &Files, enough: u64, text: &mut String) -> Option<u64> {
+fn lowest(
+    root: &Path,
+    group: &str,
+    files: &MemoryFiles,
+    enough: u64,
+    text: &mut String,
+) -> Option<u64> {
     let groups = Path::new(group).ancestors();
     groups.filter_map(|group| room(&root.join(group), files, enough, text)).min()
 }
 
-fn room(directory: &Path, files: &Files, enough: u64, text: &mut String) -> Option<u64> {
+fn room(directory: &Path, files: &MemoryFiles, enough: u64, text: &mut String) -> Option<u64> {
     let mut number = |name| read(&directory.join(name), text)?.trim_ascii().parse::<u64>().ok();
     // A group without a limit says "max", which is no number.
     let limit = number(files.limit)?;

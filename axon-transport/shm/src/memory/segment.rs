@@ -40,13 +40,13 @@ fn seals() -> SealFlags {
 /// The step that a limit on the length of files forbids.
 pub(super) const SIZING: &str = "sizing a memfd, whose length `ulimit -f` must allow";
 
-/// Memory that this process alone writes, sparse until [`Segment::commit`].
-pub(crate) struct Segment {
+/// Memory that this process alone writes, sparse until [`OwnMapping::commit`].
+pub(crate) struct OwnMapping {
     fd: OwnedFd,
     map: Arc<Map>,
 }
 
-impl Segment {
+impl OwnMapping {
     /// A new sealed memfd of `len` bytes, a multiple of [`ALIGN`].
     pub(crate) fn create(name: &str, len: u64) -> Result<Self, ShmError> {
         debug_assert!(len.is_multiple_of(ALIGN));
@@ -155,7 +155,7 @@ const TMPFS_MAGIC: i64 = 0x0102_1994;
 // SAFETY: what `base` points to is plain memory, and unmapping it works from any thread. The other fields
 // may go anywhere by themselves.
 unsafe impl Send for Map {}
-// SAFETY: as above: all access is atomic, but for bytes whose address a `Segment` gives away, and the
+// SAFETY: as above: all access is atomic, but for bytes whose address an `OwnMapping` gives away, and the
 // caller that asks for it answers for that (what is lent is one loan's alone).
 unsafe impl Sync for Map {}
 

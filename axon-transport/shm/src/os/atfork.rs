@@ -25,23 +25,23 @@ use crate::error::ShmError;
 
 /// A writable map, in a list that the child walks without a lock: entries are reused and never
 /// freed.
-struct Entry {
+struct WritableMap {
     /// 0 while nobody uses the entry, [`TAKEN`] while it is filled in.
     base: AtomicUsize,
     bytes: AtomicUsize,
-    next: *const Entry,
+    next: *const WritableMap,
 }
 
 // SAFETY: all of it is atomic but for `next`, which stays as it is once others can see the entry.
-unsafe impl Sync for Entry {}
+unsafe impl Sync for WritableMap {}
 
 /// No map begins there.
 const TAKEN: usize = 1;
 
-static ENTRIES: AtomicPtr<Entry> = AtomicPtr::new(ptr::null_mut());
+static ENTRIES: AtomicPtr<WritableMap> = AtomicPtr::new(ptr::null_mut());
 
 /// Keeps a map's place in children, until it is dropped.
-pub(crate) struct KeptAddress(&'static Entry);
+pub(crate) struct KeptAddress(&'static WritableMap);
 
 impl KeptAddress {
     /// Of the map at `base`, which children do not get.
@@ -71,9 +71,9 @@ impl Drop for KeptAddress {
     }
 }
 
-fn free_entry() -> &'static Entry {
+fn free_entry() -> &'static WritableMap {
     // Pairs with the release exchange below: the entry and those after it are whole.
-    let mut at: *const Entry = ENTRIES.load(Ordering::Acquire);
+    let mut at: *const WritableMap = ENTRIES.load(Ordering::Acquire);
     // SAFETY: entries are never freed, and reached only once they are whole.
     while let Some(entry) = unsafe { at.as_ref() } {
         let taken = entry.base.compare_exchange(0, TAKEN, Ordering::Acquire, Ordering::Relaxed);
@@ -83,7 +83,7 @@ fn free_entry() -> &'static Entry {
         at = entry.next;
     }
     let mut next = ENTRIES.load(Ordering::Acquire);
-    let entry = Box::leak(Box::new(Entry {
+    let entry = Box::leak(Box::new(WritableMap {
         base: AtomicUsize::new(TAKEN),
         bytes: AtomicUsize::new(0),
         next,
@@ -101,7 +101,7 @@ fn free_entry() -> &'static Entry {
 /// Runs in the child before `fork` returns there, in its only thread: no lock, no allocation.
 extern "C" fn in_child() {
     // Pairs with the release exchange in `free_entry`.
-    let mut at: *const Entry = ENTRIES.load(Ordering::Acquire);
+    let mut at: *const WritableMap = ENTRIES.load(Ordering::Acquire);
     // SAFETY: entries are never freed, and reached only once they are whole.
     while let Some(entry) = unsafe { at.as_ref() } {
         // Pairs with the release store in `KeptAddress::keep`.

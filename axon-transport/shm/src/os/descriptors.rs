@@ -39,12 +39,12 @@ const RESERVE: u64 = 400;
 pub struct PassedFd {
     /// `None` only while it is dropped.
     fd: Option<OwnedFd>,
-    origin: Origin,
+    origin: FdOrigin,
 }
 
 /// Where it is from, which decides how it is closed.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Origin {
+enum FdOrigin {
     Own,
     /// Another process sent it.
     Passed,
@@ -55,22 +55,22 @@ enum Origin {
 impl PassedFd {
     /// One that another process sent, and that can be anything.
     pub fn received(fd: OwnedFd) -> Self {
-        Self::new(fd, Origin::Passed)
+        Self::new(fd, FdOrigin::Passed)
     }
 
     /// A connection, with whatever stands in its queue. Its other end is told at once when it is
     /// dropped.
     pub fn connection(fd: OwnedFd) -> Self {
-        Self::new(fd, Origin::Connection(FdClass::Stranger))
+        Self::new(fd, FdOrigin::Connection(FdClass::Stranger))
     }
 
     /// The connection of somebody who may have a session.
     pub fn trusted(mut self) -> Self {
-        self.origin = Origin::Connection(FdClass::Session);
+        self.origin = FdOrigin::Connection(FdClass::Session);
         self
     }
 
-    fn new(fd: OwnedFd, origin: Origin) -> Self {
+    fn new(fd: OwnedFd, origin: FdOrigin) -> Self {
         // It guards nothing: `is_short` may be off by those that come and go at the moment.
         OPEN.fetch_add(1, Ordering::Relaxed);
         Self { fd: Some(fd), origin }
@@ -83,7 +83,7 @@ impl PassedFd {
     pub fn try_clone(&self) -> io::Result<Self> {
         let origin = match self.origin {
             // It is not over with a copy of its descriptor.
-            Origin::Connection(_) => Origin::Passed,
+            FdOrigin::Connection(_) => FdOrigin::Passed,
             origin => origin,
         };
         Ok(Self::new(self.as_fd().try_clone_to_owned()?, origin))
@@ -113,13 +113,13 @@ impl PassedFd {
     /// else's could answer late.
     fn lane(&self) -> Option<FdClass> {
         match self.origin {
-            Origin::Own => None,
-            Origin::Connection(lane) => Some(lane),
-            Origin::Passed if self.is_memfd() => {
+            FdOrigin::Own => None,
+            FdOrigin::Connection(lane) => Some(lane),
+            FdOrigin::Passed if self.is_memfd() => {
                 let small = fstat(self).is_ok_and(|found| found.st_blocks < SMALL);
                 (!small).then_some(FdClass::Memory)
             }
-            Origin::Passed => (!self.is_pidfd()).then_some(FdClass::Session),
+            FdOrigin::Passed => (!self.is_pidfd()).then_some(FdClass::Session),
         }
     }
 }
@@ -127,7 +127,7 @@ impl PassedFd {
 impl From<OwnedFd> for PassedFd {
     /// One of our own.
     fn from(fd: OwnedFd) -> Self {
-        Self::new(fd, Origin::Own)
+        Self::new(fd, FdOrigin::Own)
     }
 }
 
@@ -151,7 +151,7 @@ impl fmt::Debug for PassedFd {
 
 impl Drop for PassedFd {
     fn drop(&mut self) {
-        if matches!(self.origin, Origin::Connection(_)) {
+        if matches!(self.origin, FdOrigin::Connection(_)) {
             // It leaves the queue alone, so it does not block, and the other end need not wait for
             // the closing to know.
             let _ = shutdown(&*self, Shutdown::Both);
@@ -222,7 +222,7 @@ pub fn share() -> usize {
 }
 
 /// A packet of a socket.
-pub struct Packet {
+pub struct SocketPacket {
     /// How long it is, as far as it was received.
     pub bytes: usize,
     /// It was longer than the buffer.
@@ -234,7 +234,7 @@ pub struct Packet {
 }
 
 /// Receives one packet without waiting, with all descriptors that can come with it.
-pub fn receive(socket: impl AsFd, buffer: &mut [u8]) -> Result<Packet, Errno> {
+pub fn receive(socket: impl AsFd, buffer: &mut [u8]) -> Result<SocketPacket, Errno> {
     let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(SCM_MAX_FD))];
     receive_with(&socket, buffer, RecvFlags::empty(), &mut space)
 }
@@ -244,7 +244,7 @@ fn receive_with(
     buffer: &mut [u8],
     how: RecvFlags,
     space: &mut [MaybeUninit<u8>],
-) -> Result<Packet, Errno> {
+) -> Result<SocketPacket, Errno> {
     let mut control = RecvAncillaryBuffer::new(space);
     let flags = RecvFlags::DONTWAIT | RecvFlags::CMSG_CLOEXEC | how;
     let got = loop {
@@ -259,7 +259,7 @@ fn receive_with(
             descriptors.extend(received.map(PassedFd::received));
         }
     }
-    Ok(Packet {
+    Ok(SocketPacket {
         bytes: got.bytes,
         truncated: got.flags.contains(ReturnFlags::TRUNC),
         // There is room for whatever can come.
@@ -269,7 +269,7 @@ fn receive_with(
 }
 
 /// As [`receive`], but a packet for whose descriptors there is no room stays where it is.
-pub(crate) fn receive_whole(socket: impl AsFd, buffer: &mut [u8]) -> Result<Packet, Errno> {
+pub(crate) fn receive_whole(socket: impl AsFd, buffer: &mut [u8]) -> Result<SocketPacket, Errno> {
     let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(SCM_MAX_FD))];
     // To look gives descriptors of the same things.
     let packet = receive_with(&socket, buffer, RecvFlags::PEEK, &mut space)?;
@@ -283,7 +283,7 @@ pub(crate) fn receive_whole(socket: impl AsFd, buffer: &mut [u8]) -> Result<Pack
 /// As [`receive`], for a packet of at most [`FEW`] descriptors: closes none of them for the last time, and needs no room
 /// for more. A packet with more descriptors is reported as truncated and stays in the socket. A packet for whose descriptors
 /// the process has no room is reported as lost and stays, too.
-pub fn receive_few(socket: impl AsFd, buffer: &mut [u8]) -> Result<Packet, Errno> {
+pub fn receive_few(socket: impl AsFd, buffer: &mut [u8]) -> Result<SocketPacket, Errno> {
     let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(FEW))];
     let packet = receive_with(&socket, buffer, RecvFlags::PEEK, &mut space)?;
     // By its alignment the space may have room for one more.
@@ -292,7 +292,7 @@ pub fn receive_few(socket: impl AsFd, buffer: &mut [u8]) -> Result<Packet, Errno
         take_seen(&socket);
     }
     let truncated = packet.truncated || more || packet.lost && packet.descriptors.len() == FEW;
-    Ok(Packet { truncated, lost: packet.lost || more, ..packet })
+    Ok(SocketPacket { truncated, lost: packet.lost || more, ..packet })
 }
 
 /// Takes a packet that was looked at: what goes with it is not closed for the last time here.

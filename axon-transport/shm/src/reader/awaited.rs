@@ -11,7 +11,7 @@ const MISSING_DEAD: Duration = Duration::from_secs(10);
 
 /// The segment that a reader waits for, if it waits for one, and for how long it waits.
 #[derive(Default)]
-pub(super) struct Awaited {
+pub(super) struct AwaitedSegment {
     missing: Option<Missing>,
     /// Whether memory of the publisher's process, which has ended, was waited for in vain.
     waited: bool,
@@ -38,7 +38,7 @@ pub(super) enum Wait {
     InVain,
 }
 
-impl Awaited {
+impl AwaitedSegment {
     /// The segment that is needed to go on and has not come.
     #[inline]
     pub(super) fn segment(&self) -> Option<u32> {
@@ -98,7 +98,7 @@ mod tests {
     use super::*;
 
     /// What the reader does about a segment, by the second from when it found the segment missing.
-    fn waits(awaited: &mut Awaited, segment: u32, seconds: u64, is_dead: bool) -> Vec<Wait> {
+    fn waits(awaited: &mut AwaitedSegment, segment: u32, seconds: u64, is_dead: bool) -> Vec<Wait> {
         let start = Instant::now();
         let at = |second| start + Duration::from_secs(second);
         (0..=seconds)
@@ -108,7 +108,7 @@ mod tests {
 
     #[test]
     fn a_reader_asks_once_a_second_as_long_as_the_publisher_lives() {
-        let (mut awaited, start) = (Awaited::default(), Instant::now());
+        let (mut awaited, start) = (AwaitedSegment::default(), Instant::now());
         let at = |tenth: u64| start + Duration::from_millis(100 * tenth);
         let asked = (0..1000)
             .filter(|tenth| awaited.handle_missing(1, at(*tenth), || false) == Wait::Ask)
@@ -121,7 +121,7 @@ mod tests {
 
     #[test]
     fn a_reader_waits_once_for_all_memory_of_a_dead_process() {
-        let mut awaited = Awaited::default();
+        let mut awaited = AwaitedSegment::default();
         let first = waits(&mut awaited, 1, 10, true);
         assert_eq!((&first[..10], first[10]), (&[Wait::Ask; 10][..], Wait::InVain));
         assert_eq!(waits(&mut awaited, 2, 1, true), [Wait::Ask, Wait::InVain]);
@@ -129,7 +129,7 @@ mod tests {
 
     #[test]
     fn a_reader_that_was_told_of_the_end_asks_anew_and_twice_for_each_segment() {
-        let mut awaited = Awaited::default();
+        let mut awaited = AwaitedSegment::default();
         assert_eq!(waits(&mut awaited, 1, 5, false), [Wait::Ask; 6]);
         awaited.end();
         assert_eq!(awaited.segment(), None);

@@ -6,14 +6,14 @@ use std::{
     time::Instant,
 };
 
-use super::{ATTEMPTS, Attachment, KNOWN, Obstacle, Reader, awaited::Wait};
+use super::{ATTEMPTS, Attachment, KNOWN, ReadObstacle, Reader, awaited::Wait};
 use crate::{
     error::TakeError,
     memory::{copy, segment::Map},
     reader::sample::Extract,
     ring::{
         layout::{self, Array, COPIED, COPIED_ALWAYS},
-        protocol::{self, PayloadPlace, PositionState, Record, RecordRead, View},
+        protocol::{self, PayloadLocation, PositionState, Record, RecordRead, View},
     },
     session::peer::Found,
 };
@@ -54,16 +54,16 @@ impl Reader {
                 }
                 Ok(found)
             }
-            Err(Obstacle::Missing(segment)) if self.lacks(segment) => {
+            Err(ReadObstacle::Missing(segment)) if self.lacks(segment) => {
                 // None of what is there will ever be found.
                 self.give_all_up().map_err(|what| self.corrupt(what)).map(|()| None)
             }
-            Err(Obstacle::Missing(_)) => Ok(None),
-            Err(Obstacle::Corrupt(what)) => Err(self.corrupt(what)),
+            Err(ReadObstacle::Missing(_)) => Ok(None),
+            Err(ReadObstacle::Corrupt(what)) => Err(self.corrupt(what)),
         }
     }
 
-    fn find_sane(&mut self) -> Result<Option<Record>, Obstacle> {
+    fn find_sane(&mut self) -> Result<Option<Record>, ReadObstacle> {
         for _ in 0..ATTEMPTS {
             let word = protocol::array(self.attachment.ring());
             if self.descriptors.as_ref().is_none_or(|known| known.word != word) {
@@ -88,7 +88,7 @@ impl Reader {
                         match view.look(cursor) {
                             RecordRead::Sample(record) => return Ok(Some(record)),
                             RecordRead::Lapped => {}
-                            RecordRead::Corrupt(what) => return Err(Obstacle::Corrupt(what)),
+                            RecordRead::Corrupt(what) => return Err(ReadObstacle::Corrupt(what)),
                         }
                     }
                     self.count(head)?;
@@ -98,7 +98,7 @@ impl Reader {
                     self.count(0)?;
                     if wrong && self.cursor == cursor {
                         let what = "a descriptor that stands carries another position";
-                        return Err(Obstacle::Corrupt(what));
+                        return Err(ReadObstacle::Corrupt(what));
                     }
                 }
             }
@@ -108,12 +108,13 @@ impl Reader {
 
     /// Counts what is skipped and what is lost, by what the head, which is at least `least`, and
     /// the tail say.
-    fn count(&mut self, least: u64) -> Result<(), Obstacle> {
-        let (tail, head) = protocol::bounds(self.attachment.ring()).map_err(Obstacle::Corrupt)?;
+    fn count(&mut self, least: u64) -> Result<(), ReadObstacle> {
+        let (tail, head) =
+            protocol::bounds(self.attachment.ring()).map_err(ReadObstacle::Corrupt)?;
         let head = head.max(least);
         // A sample may be taken by its stamp before the head says so.
         if head + 1 < self.cursor {
-            return Err(Obstacle::Corrupt("its head went back"));
+            return Err(ReadObstacle::Corrupt("its head went back"));
         }
         self.seen = head;
         let unread = head.saturating_sub(self.cursor);
@@ -145,13 +146,13 @@ impl Reader {
     }
 
     /// Where the descriptors are that the ring's word speaks of.
-    pub(super) fn resolve(&self, word: u64) -> Result<Descriptors, Obstacle> {
-        let wrong = Obstacle::Corrupt("its descriptors are nowhere");
+    pub(super) fn resolve(&self, word: u64) -> Result<Descriptors, ReadObstacle> {
+        let wrong = ReadObstacle::Corrupt("its descriptors are nowhere");
         let Some(Array { at, descriptors }) = Array::from_word(word) else { return Err(wrong) };
         let map = match self.reads.peer.find(at.segment) {
             Found::Map(map) => map,
             Found::Refused => return Err(wrong),
-            Found::Absent => return Err(Obstacle::Missing(at.segment)),
+            Found::Absent => return Err(ReadObstacle::Missing(at.segment)),
         };
         match at.words(descriptors * layout::DESCRIPTOR, map.words().len()) {
             Some(words) => Ok(Descriptors { word, map, words }),
@@ -174,28 +175,28 @@ impl Reader {
                     self.awaited.clear();
                     return Ok(Some((record, bytes)));
                 }
-                Err(Obstacle::Missing(segment)) => {
+                Err(ReadObstacle::Missing(segment)) => {
                     if !self.lacks(segment) {
                         return Ok(None);
                     }
                     self.lose();
                 }
-                Err(Obstacle::Corrupt(what)) => return Err(self.corrupt(what)),
+                Err(ReadObstacle::Corrupt(what)) => return Err(self.corrupt(what)),
             }
         }
         Ok(None)
     }
 
     /// Where the bytes of a record that stood are.
-    fn locate(&mut self, record: &Record) -> Result<Bytes, Obstacle> {
+    fn locate(&mut self, record: &Record) -> Result<Bytes, ReadObstacle> {
         let (at, slot) = match record.place {
-            PayloadPlace::Inline => return Ok(Bytes::Inline),
-            PayloadPlace::Block(at) => (at, false),
-            PayloadPlace::Slot(at) => (at, true),
+            PayloadLocation::Inline => return Ok(Bytes::Inline),
+            PayloadLocation::Block(at) => (at, false),
+            PayloadLocation::Slot(at) => (at, true),
         };
         let len = u64::from(record.len);
         if slot && len <= COPIED_ALWAYS || !slot && len > COPIED {
-            return Err(Obstacle::Corrupt("a sample is in the wrong kind of place"));
+            return Err(ReadObstacle::Corrupt("a sample is in the wrong kind of place"));
         }
         let known = self.maps.iter().find(|(number, _)| *number == at.segment);
         let map = match known.and_then(|(_, map)| map.upgrade()) {
@@ -211,12 +212,12 @@ impl Reader {
                     map
                 }
                 Found::Refused => {
-                    return Err(Obstacle::Corrupt("a sample is in memory that was refused"));
+                    return Err(ReadObstacle::Corrupt("a sample is in memory that was refused"));
                 }
-                Found::Absent => return Err(Obstacle::Missing(at.segment)),
+                Found::Absent => return Err(ReadObstacle::Missing(at.segment)),
             },
         };
-        let outside = Obstacle::Corrupt("a sample lies outside its segment");
+        let outside = ReadObstacle::Corrupt("a sample lies outside its segment");
         let limit = map.words().len();
         if slot {
             let words = at.words_of(len, limit).ok_or(outside)?;

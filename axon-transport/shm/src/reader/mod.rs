@@ -13,9 +13,9 @@ use std::{
 };
 
 use self::{
-    awaited::Awaited,
+    awaited::AwaitedSegment,
     find::{Bytes, Descriptors},
-    under_way::UnderWay,
+    under_way::UnconfirmedSamples,
 };
 use crate::{
     alloc::pin_limit::PinLimit,
@@ -35,7 +35,7 @@ use crate::{
         activity::WatchKey,
         attachment::{Attachment, Pinning},
         lane::Lane,
-        peer::{Found, Peer},
+        peer::{Found, RingPeer},
     },
     sync::Ordering,
     wake::{Purpose, settle},
@@ -53,7 +53,7 @@ pub struct ReaderOptions {
     /// The publisher.
     pub writer: Gid,
     /// The publisher's session.
-    pub peer: Peer,
+    pub peer: RingPeer,
     /// Where the ring is in that session's memory.
     pub ring: Location,
     /// The lane by which the reader attached.
@@ -77,11 +77,11 @@ pub struct Reader {
     descriptors: Option<Descriptors>,
     /// Maps of the segments that samples were in.
     maps: Vec<(u32, Weak<Map>)>,
-    awaited: Awaited,
+    awaited: AwaitedSegment,
     cursor: u64,
     /// Samples that the caller releases explicitly. Boxed: few readers have any, and the fields that each take reads
     /// stay together.
-    under_way: Option<Box<UnderWay>>,
+    under_way: Option<Box<UnconfirmedSamples>>,
     /// The head at the last look.
     seen: u64,
     received: u64,
@@ -93,7 +93,7 @@ pub struct Reader {
 }
 
 /// What is in the way of a reader.
-enum Obstacle {
+enum ReadObstacle {
     Missing(u32),
     Corrupt(&'static str),
 }
@@ -101,7 +101,7 @@ enum Obstacle {
 /// What does not change.
 struct Reads {
     writer: Gid,
-    peer: Peer,
+    peer: RingPeer,
     grant: Grant,
     depth: u64,
     max_message: u64,
@@ -149,7 +149,7 @@ impl Reader {
             attachment,
             descriptors: None,
             maps: Vec::new(),
-            awaited: Awaited::default(),
+            awaited: AwaitedSegment::default(),
             cursor: grant.first,
             under_way: None,
             seen: 0,
@@ -337,7 +337,7 @@ impl Reader {
     }
 
     /// The publisher's session.
-    pub(super) fn peer(&self) -> &Peer {
+    pub(super) fn peer(&self) -> &RingPeer {
         &self.reads.peer
     }
 

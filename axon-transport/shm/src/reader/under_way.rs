@@ -18,9 +18,9 @@ const LOOKS: u64 = 1 << 13;
 /// Numbers and positions of samples that were taken and are not done with, and how many samples were given
 /// up so far.
 #[derive(Default)]
-pub(super) struct UnderWay(VecDeque<(u64, u64)>, u64);
+pub(super) struct UnconfirmedSamples(VecDeque<(u64, u64)>, u64);
 
-impl UnderWay {
+impl UnconfirmedSamples {
     pub(super) fn add(&mut self, sequence: u64, position: u64) {
         self.0.push_back((sequence, position));
     }

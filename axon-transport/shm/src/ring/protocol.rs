@@ -36,7 +36,7 @@ pub(crate) const MAX_POSITION: u64 = 1 << 62;
 
 /// Where a sample's bytes are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum PayloadPlace {
+pub(crate) enum PayloadLocation {
     /// In the descriptor.
     Inline,
     /// In memory that is written over as soon as the sample is given up.
@@ -45,7 +45,7 @@ pub(crate) enum PayloadPlace {
     Slot(Location),
 }
 
-impl PayloadPlace {
+impl PayloadLocation {
     fn word(self) -> (u32, u64) {
         match self {
             Self::Inline => (0, 0),
@@ -63,7 +63,7 @@ pub(crate) struct Record {
     /// 0 where the ring's lifespan is infinite.
     pub(crate) published: u64,
     pub(crate) len: u32,
-    pub(crate) place: PayloadPlace,
+    pub(crate) place: PayloadLocation,
 }
 
 fn descriptor<W>(array: &[W], position: u64) -> &[W] {
@@ -117,8 +117,8 @@ pub(crate) fn publish<W: Word>(
         slot[PUBLISHED].store(record.published, Ordering::Relaxed);
     }
     match record.place {
-        PayloadPlace::Inline => copy_in(&slot[DATA..PUBLISHED], inline),
-        PayloadPlace::Block(_) | PayloadPlace::Slot(_) => {
+        PayloadLocation::Inline => copy_in(&slot[DATA..PUBLISHED], inline),
+        PayloadLocation::Block(_) | PayloadLocation::Slot(_) => {
             slot[DATA].store(offset, Ordering::Relaxed)
         }
     }
@@ -236,9 +236,9 @@ impl<'a, W: Word> View<'a, W> {
             0 if len as usize > INLINE_WORDS * 8 => {
                 return RecordRead::Corrupt("a sample in a descriptor is longer than that");
             }
-            0 => PayloadPlace::Inline,
-            1 => PayloadPlace::Block(at),
-            2 => PayloadPlace::Slot(at),
+            0 => PayloadLocation::Inline,
+            1 => PayloadLocation::Block(at),
+            2 => PayloadLocation::Slot(at),
             _ => return RecordRead::Corrupt("a sample is in no known kind of place"),
         };
         RecordRead::Sample(Record { sequence, timestamp, published, len, place })

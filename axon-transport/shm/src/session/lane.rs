@@ -9,7 +9,7 @@
 use std::sync::{Arc, atomic::AtomicU64};
 
 use crate::{
-    alloc::{heap::Object, pin_limit::PinLimit},
+    alloc::{heap::HeapObject, pin_limit::PinLimit},
     ids::Gid,
     memory::segment::Map,
     ring::{
@@ -198,14 +198,14 @@ impl LaneView {
 /// Freed when dropped.
 pub struct Lane {
     session: Arc<SessionSegment>,
-    object: Object,
+    object: HeapObject,
     /// Which time it is that the session uses one.
     number: u64,
 }
 
 impl Lane {
     /// The lane in `object`, for the `number`th time that the session gives one out.
-    pub(crate) fn new(session: Arc<SessionSegment>, object: Object, number: u64) -> Self {
+    pub(crate) fn new(session: Arc<SessionSegment>, object: HeapObject, number: u64) -> Self {
         let lane = Self { session, object, number };
         ask(lane.words(), number);
         lane

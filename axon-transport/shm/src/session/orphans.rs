@@ -5,7 +5,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use crate::{
     alloc::{
-        allowance::Holding,
+        budget::Holding,
         heap::{Block, Heap},
         segments::Segments,
     },

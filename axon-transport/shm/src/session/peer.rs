@@ -101,7 +101,7 @@ pub struct PeerSession {
     quota: Arc<Quota>,
     /// Its first segment.
     first: Arc<Map>,
-    further: Mutex<Further>,
+    further: Mutex<FurtherSegments>,
     wanting: OnceLock<Box<dyn Fn() + Send + Sync>>,
     bell: Bell,
     pidfd: PassedFd,
@@ -113,7 +113,7 @@ pub struct PeerSession {
 
 /// What is known of the segments besides the first.
 #[derive(Default)]
-struct Further {
+struct FurtherSegments {
     /// By their numbers.
     maps: BTreeMap<u32, AnnouncedSegment>,
     /// The highest number of those that came.
@@ -309,7 +309,7 @@ impl PeerSession {
         reader.set_mapped(further.highest);
     }
 
-    fn further(&self) -> MutexGuard<'_, Further> {
+    fn further(&self) -> MutexGuard<'_, FurtherSegments> {
         self.further.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -385,14 +385,14 @@ impl PeerSession {
 
 /// The session at the other end of a ring.
 #[derive(Clone)]
-pub enum Peer {
+pub enum RingPeer {
     /// The very same session.
     Local(Arc<SessionSegment>),
     /// Another one, in this process or another.
     Remote(Arc<PeerSession>),
 }
 
-impl Peer {
+impl RingPeer {
     /// The session's id.
     #[inline]
     pub fn id(&self) -> SessionId {

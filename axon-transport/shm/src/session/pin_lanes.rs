@@ -5,7 +5,7 @@
 use std::sync::{Arc, atomic::AtomicU64};
 
 use crate::{
-    alloc::pin_limit::{PinLimit, Pool},
+    alloc::pin_limit::{PinLimit, PinPool},
     error::ShmError,
     ids::{Gid, SessionId},
     ring::{
@@ -14,7 +14,7 @@ use crate::{
     },
     session::{
         lane::{LaneId, LaneState, LaneView},
-        peer::{Peer, PeerSession},
+        peer::{PeerSession, RingPeer},
     },
     sync::Word,
 };
@@ -101,11 +101,11 @@ impl PinLane {
 pub(crate) struct PinLanes {
     all: Vec<PinLane>,
     /// What they may keep.
-    pool: Pool,
+    pool: PinPool,
 }
 
 impl PinLanes {
-    pub(crate) fn new(pool: Pool) -> Self {
+    pub(crate) fn new(pool: PinPool) -> Self {
         Self { all: Vec::new(), pool }
     }
 
@@ -118,7 +118,7 @@ impl PinLanes {
     pub(crate) fn admit(
         &mut self,
         reader: Gid,
-        peer: &Peer,
+        peer: &RingPeer,
         at: Location,
         lane: &LaneView,
     ) -> Result<LaneId, ShmError> {

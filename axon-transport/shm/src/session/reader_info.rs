@@ -1,6 +1,6 @@
 //! The data that a reader sends to a publisher when it attaches.
 
-use crate::{ids::Gid, qos::Qos, ring::layout::Location, session::peer::Peer};
+use crate::{ids::Gid, qos::Qos, ring::layout::Location, session::peer::RingPeer};
 
 /// A reader that wants to attach.
 #[derive(Clone)]
@@ -12,7 +12,7 @@ pub struct ReaderInfo {
     /// What it requests.
     pub qos: Qos,
     /// Its session.
-    pub peer: Peer,
+    pub peer: RingPeer,
     /// The subscriptions elsewhere that it stands for when it is a relay; `None` when it reads for itself.
     pub stands_for: Option<Vec<Gid>>,
 }

@@ -14,7 +14,7 @@ use rustix::process::{PidfdFlags, getpid, pidfd_open};
 
 use crate::{
     alloc::{
-        heap::{Block, Heap, Need, Object},
+        heap::{Block, Heap, HeapObject, Need},
         segments::{OwnSegment, SegmentEvent, SegmentInfo, Segments},
     },
     error::ShmError,
@@ -57,7 +57,7 @@ pub struct SessionSegment {
 struct Lanes {
     /// Those that nobody uses. Their memory never becomes something else: who looks at a lane that
     /// has passed on must see that it has.
-    free: Vec<Object>,
+    free: Vec<HeapObject>,
     /// How many there are.
     made: u32,
     /// How often one has been given out.
@@ -346,7 +346,7 @@ impl SessionSegment {
         self.first.memory.is_forked()
     }
 
-    pub(crate) fn free_lane(&self, lane: Object) {
+    pub(crate) fn free_lane(&self, lane: HeapObject) {
         self.lanes.lock().unwrap_or_else(PoisonError::into_inner).free.push(lane);
     }
 
@@ -356,7 +356,7 @@ impl SessionSegment {
         len: u64,
         need: Need,
         mapped: impl Fn(u32) -> bool,
-    ) -> Result<Option<Object>, ShmError> {
+    ) -> Result<Option<HeapObject>, ShmError> {
         self.heap.allocate(&self.segments, len, need, mapped)
     }
 

@@ -123,7 +123,7 @@ fn incompatible_qos_is_reported_at_both_ends() {
     let publisher = publisher(&context, offered);
     let (served, subscriber) = together(&publisher, &context, requested);
     assert!(matches!(served, Err(ConnectError::Incompatible(_))));
-    let Err(ConnectError::Refused(reason)) = subscriber else { panic!("{subscriber:?}") };
+    let Err(ConnectError::ConnectRefusal(reason)) = subscriber else { panic!("{subscriber:?}") };
     assert!(reason.contains("RELIABILITY"), "{reason}");
     assert!(publisher.subscribers().is_empty());
 }
@@ -163,7 +163,7 @@ fn misbehaving_peers_are_refused_at_connect() {
     for reader in [Gid::new(a, 1), Gid::new(b, 1)] {
         let lane = Location { segment: 0, offset: 4096 };
         let asked = connect::AttachRequest { session: a, reader, lane, qos: Qos::default() };
-        let channel = connect::Channel::new(theirs.as_fd(), soon);
+        let channel = connect::ConnectChannel::new(theirs.as_fd(), soon);
         let (_, line) = connect::line().unwrap();
         channel.ask(&asked, &context.session().descriptors().unwrap(), line).unwrap();
         assert!(publisher.serve(&ours, soon).is_err());

@@ -1,11 +1,11 @@
 //! Limits on the resources that one process can take from another.
 
 use super::*;
-use crate::{memory::segment::Segment, session::pin_lanes::OF_PROCESS};
+use crate::{memory::segment::OwnMapping, session::pin_lanes::OF_PROCESS};
 
 /// A segment as a session would announce it: of address space, and of next to no memory.
-fn sparse(of: &SessionSegment, number: u32, bytes: u64) -> Segment {
-    let segment = Segment::create("test", bytes).unwrap();
+fn sparse(of: &SessionSegment, number: u32, bytes: u64) -> OwnMapping {
+    let segment = OwnMapping::create("test", bytes).unwrap();
     layout::write_segment(segment.words(), of.id(), number, SegmentKind::Heap);
     segment
 }

@@ -14,7 +14,7 @@ use rustix::{
 };
 
 use super::*;
-use crate::memory::segment::Segment;
+use crate::memory::segment::OwnMapping;
 
 const RING: u64 = layout::HEAP_AT;
 const ARRAY: u64 = RING + 512;
@@ -25,7 +25,7 @@ const ALL: u64 = 63 << 24;
 
 /// A session whose every word a test may scribble on, with a ring in it.
 struct Scribble {
-    segment: Segment,
+    segment: OwnMapping,
     id: SessionId,
     gid: Gid,
     reader: Arc<SessionSegment>,
@@ -37,7 +37,7 @@ impl Scribble {
     fn new() -> Self {
         let id = SessionId::random();
         let gid = Gid::new(id, 1);
-        let segment = Segment::create("test", layout::SESSION_BYTES).unwrap();
+        let segment = OwnMapping::create("test", layout::SESSION_BYTES).unwrap();
         layout::write_segment(segment.words(), id, 0, SegmentKind::Session);
         let at = Location { segment: 0, offset: ARRAY };
         let array = layout::Array { at, descriptors: SLOTS };
@@ -84,7 +84,7 @@ impl Scribble {
         let options = ReaderOptions {
             reader: Gid::new(self.reader.id(), 2),
             writer: self.gid,
-            peer: Peer::Remote(self.peer()?),
+            peer: RingPeer::Remote(self.peer()?),
             ring,
             lane: self.reader.allocate_lane().unwrap(),
             grant: Grant { generation: self.generation, first },
@@ -151,7 +151,7 @@ fn a_segment_must_be_a_sealed_memfd_of_a_sane_size() {
         let info = SegmentInfo { number: 1, kind: SegmentKind::Heap };
         assert!(peer.add_segment(info, &fd).is_err());
         assert!(peer.has_segment(1));
-        assert!(Peer::Remote(peer).lane(Location { segment: 1, offset: 4096 }).is_err());
+        assert!(RingPeer::Remote(peer).lane(Location { segment: 1, offset: 4096 }).is_err());
     }
 }
 

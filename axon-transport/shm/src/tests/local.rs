@@ -448,7 +448,7 @@ fn one_who_carries_samples_on_from_later_has_none_of_those_before_to_hand_over()
         gid,
         lane: lane.location(),
         qos: keep_last(10),
-        peer: Peer::Local(a.clone()),
+        peer: RingPeer::Local(a.clone()),
         stands_for: Some(vec![gid]),
     };
     assert_eq!(writer.attach(info).unwrap().first, 3);

@@ -6,7 +6,7 @@ use rustix::process::{Pid, PidfdFlags, pidfd_open};
 
 use super::*;
 
-mod allowance;
+mod budget;
 
 /// A reader in another session that is told of segments only by [`hand`].
 fn attach_untold(
@@ -28,7 +28,7 @@ fn attach_untold_with(
     qos: Qos,
 ) -> (Reader, Arc<PeerSession>) {
     let from = PeerSession::map(publisher.id(), descriptors).unwrap();
-    let reader = attach_to(writer, publisher, reader, Peer::Remote(from.clone()), qos);
+    let reader = attach_to(writer, publisher, reader, RingPeer::Remote(from.clone()), qos);
     (reader, from)
 }
 

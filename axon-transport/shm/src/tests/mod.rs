@@ -36,7 +36,7 @@ use crate::{
     },
     session::{
         lane::Lane,
-        peer::{Peer, PeerDescriptors, PeerSession},
+        peer::{PeerDescriptors, PeerSession, RingPeer},
         reader_info::ReaderInfo,
         segment::SessionSegment,
     },
@@ -97,8 +97,8 @@ fn writer(session: &Arc<SessionSegment>, qos: Qos, budget: u64) -> Writer {
 static VIEWS: Mutex<Vec<Weak<PeerSession>>> = Mutex::new(Vec::new());
 
 /// How `of` looks to `from`.
-fn peer(from: &SessionSegment, of: &Arc<SessionSegment>) -> Peer {
-    if from.id() == of.id() { Peer::Local(of.clone()) } else { Peer::Remote(view(of)) }
+fn peer(from: &SessionSegment, of: &Arc<SessionSegment>) -> RingPeer {
+    if from.id() == of.id() { RingPeer::Local(of.clone()) } else { RingPeer::Remote(view(of)) }
 }
 
 /// How a session looks to another that is told of its segments, as a daemon would.
@@ -141,7 +141,7 @@ fn attach_to(
     writer: &Writer,
     publisher: &Arc<SessionSegment>,
     reader: &Arc<SessionSegment>,
-    from: Peer,
+    from: RingPeer,
     qos: Qos,
 ) -> Reader {
     let lane = reader.allocate_lane().unwrap();

@@ -281,7 +281,7 @@ fn nothing_is_given_up_for_a_sample_that_there_is_no_memory_for() {
 fn a_sample_that_went_before_its_memory_came_holds_nobody_up() {
     let (a, b) = (silent_session(), session());
     let writer = writer(&a, keep_last(10), 0);
-    let from = Peer::Remote(PeerSession::map(a.id(), a.descriptors().unwrap()).unwrap());
+    let from = RingPeer::Remote(PeerSession::map(a.id(), a.descriptors().unwrap()).unwrap());
     let mut reader = attach_to(&writer, &a, &b, from, keep_last(10));
     publish(&writer, 0, IMAGE);
     assert!(reader.take_sample().unwrap().is_none(), "its memory has not come");

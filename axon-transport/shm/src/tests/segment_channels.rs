@@ -15,7 +15,7 @@ use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use super::*;
 use crate::{
     alloc::heap::Need,
-    direct::connect::{AttachRequest, Channel, Granted, SegmentUpdate},
+    direct::connect::{AttachRequest, ConnectChannel, PublisherAnswer, SegmentUpdate},
     os::descriptors::PassedFd,
     tests::api::{SOON, pair, publisher, together},
 };
@@ -24,8 +24,8 @@ fn contexts() -> (Context, Context) {
     (Context::new().unwrap(), Context::new().unwrap())
 }
 
-fn at_once(socket: &impl AsFd) -> Channel<'_> {
-    Channel::new(socket.as_fd(), Some(Duration::ZERO))
+fn at_once(socket: &impl AsFd) -> ConnectChannel<'_> {
+    ConnectChannel::new(socket.as_fd(), Some(Duration::ZERO))
 }
 
 /// A subscriber of a publisher that tells it nothing, and the line over which the test may.
@@ -38,15 +38,16 @@ fn untold(
     let options = SubscriberOptions::new(keep_last(5));
     thread::scope(|scope| {
         let subscriber = scope.spawn(|| Subscriber::connect(context, theirs, options, SOON));
-        let channel = Channel::new(ours.as_fd(), SOON);
+        let channel = ConnectChannel::new(ours.as_fd(), SOON);
         let (asked, descriptors, line) = channel.await_asked().unwrap();
         let AttachRequest { session: id, reader, lane, qos } = asked;
-        let peer = Peer::Remote(PeerSession::map(id, descriptors).unwrap());
+        let peer = RingPeer::Remote(PeerSession::map(id, descriptors).unwrap());
         let info = ReaderInfo { gid: reader, lane, qos, peer, stands_for: None };
         let Grant { generation, first } = writer.attach(info).unwrap();
         let (session_id, ring) = (session.id(), writer.location());
         let writer = writer.gid();
-        let granted = Granted { reader, session: session_id, writer, generation, first, ring };
+        let granted =
+            PublisherAnswer { reader, session: session_id, writer, generation, first, ring };
         let mut own = session.descriptors().unwrap();
         if let Some(process) = process {
             own.pidfd = process.into();
@@ -107,7 +108,7 @@ fn withdrawn_segments_do_not_fill_an_unread_channel() {
     let asked =
         AttachRequest { session: there.id(), reader, lane: lane.location(), qos: keep_last(1) };
     let descriptors = there.session().descriptors().unwrap();
-    Channel::new(theirs.as_fd(), SOON).ask(&asked, &descriptors, far).unwrap();
+    ConnectChannel::new(theirs.as_fd(), SOON).ask(&asked, &descriptors, far).unwrap();
     publisher.serve(ours, SOON).unwrap();
     for _ in 0..500 {
         let segment = here.session().open_samples(publisher.gid(), 2 * layout::ALIGN).unwrap();
@@ -274,7 +275,7 @@ fn a_forged_session_id_does_not_replace_its_owner() {
     let publisher = publisher(&here, keep_last(1));
     let (served, connected) = together(&publisher, &there, keep_last(1));
     assert!(matches!(served, Err(ConnectError::Memory(ShmError::Refused { .. }))), "{served:?}");
-    assert!(matches!(connected, Err(ConnectError::Refused(_))), "{connected:?}");
+    assert!(matches!(connected, Err(ConnectError::ConnectRefusal(_))), "{connected:?}");
     drop(first);
     assert!(together(&publisher, &there, keep_last(1)).1.is_ok());
 }
@@ -287,12 +288,12 @@ fn an_answer_in_our_name_needs_our_own_grant() {
     let options = SubscriberOptions::new(keep_last(5));
     let refused = thread::scope(|scope| {
         let subscriber = scope.spawn(|| Subscriber::connect(&here, theirs, options, SOON));
-        let channel = Channel::new(ours.as_fd(), SOON);
+        let channel = ConnectChannel::new(ours.as_fd(), SOON);
         let (asked, descriptors, _line) = channel.await_asked().unwrap();
         let (reader, session) = (asked.reader, here.id());
         let (generation, first) = (1, 0);
         let (writer, ring) = (ring.gid(), ring.location());
-        let granted = Granted { reader, session, writer, generation, first, ring };
+        let granted = PublisherAnswer { reader, session, writer, generation, first, ring };
         channel.grant(&granted, &descriptors).unwrap();
         subscriber.join().unwrap().map(drop)
     });
@@ -309,7 +310,7 @@ fn a_reader_with_our_session_id_is_served_only_if_we_ask() {
     let (session, reader) = (here.id(), Gid::new(here.id(), 77));
     let asked = AttachRequest { session, reader, lane: lane.location(), qos: keep_last(1) };
     let descriptors = here.session().descriptors().unwrap();
-    Channel::new(theirs.as_fd(), SOON).ask(&asked, &descriptors, far).unwrap();
+    ConnectChannel::new(theirs.as_fd(), SOON).ask(&asked, &descriptors, far).unwrap();
     let served = publisher.serve(ours, SOON);
     assert!(matches!(served, Err(ConnectError::Memory(ShmError::Refused { .. }))), "{served:?}");
     assert!(publisher.subscribers().is_empty());

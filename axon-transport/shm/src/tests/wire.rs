@@ -106,7 +106,7 @@ impl Wire {
     pub(super) fn serve(&self, session: &SessionSegment, writer: &Writer, qos: Qos) {
         self.send_session(session, writer.location(), writer.gid());
         let (peer, lane, gid) = self.receive_session();
-        let info = ReaderInfo { gid, lane, qos, peer: Peer::Remote(peer), stands_for: None };
+        let info = ReaderInfo { gid, lane, qos, peer: RingPeer::Remote(peer), stands_for: None };
         let grant = writer.attach(info).unwrap();
         self.send_numbers(&[grant.generation, grant.first]);
     }
@@ -121,7 +121,7 @@ impl Wire {
         let options = ReaderOptions {
             reader,
             writer,
-            peer: Peer::Remote(peer),
+            peer: RingPeer::Remote(peer),
             ring,
             lane,
             grant: Grant { generation: grant[0], first: grant[1] },

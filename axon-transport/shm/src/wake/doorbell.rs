@@ -10,7 +10,7 @@ use rustix::{event::Timespec, io::Errno};
 
 use super::{
     Bell, arm, disarm,
-    receiver::{BellReceiver, CLOSED, Drained, Heard},
+    receiver::{BellReceiver, CLOSED, Drained, HeardBells},
     spin::Spin,
 };
 
@@ -241,7 +241,7 @@ impl Doorbell {
     }
 
     /// Wakes those of the waiters that what was heard may concern.
-    fn spread(&self, mut waiters: MutexGuard<'_, Waiters>, words: Words<'_>, heard: Heard) {
+    fn spread(&self, mut waiters: MutexGuard<'_, Waiters>, words: Words<'_>, heard: HeardBells) {
         if heard.closed && !waiters.closed {
             waiters.give_up(&self.receiver, "closed the session's doorbell");
         }

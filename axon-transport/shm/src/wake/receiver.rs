@@ -51,7 +51,7 @@ pub(super) struct BellReceiver {
 
 /// What came.
 #[derive(Clone, Copy, Default)]
-pub(super) struct Heard {
+pub(super) struct HeardBells {
     /// A ring of the bell, or a wake-up from this process.
     pub(super) rung: bool,
     /// A ring of the bell, which stands in its queue.
@@ -100,7 +100,7 @@ impl BellReceiver {
     }
 
     /// Sleeps until something comes, for at most `left`. Events of `others` end it too.
-    pub(super) fn listen(&self, others: &[BorrowedFd<'_>], left: Option<Duration>) -> Heard {
+    pub(super) fn listen(&self, others: &[BorrowedFd<'_>], left: Option<Duration>) -> HeardBells {
         let whole = whole_millis(left);
         let timespec = |time| Timespec::try_from(time).ok();
         if others.is_empty() && whole != Some(Duration::ZERO) {
@@ -119,8 +119,8 @@ impl BellReceiver {
     }
 
     /// What came, if it comes within `timeout`.
-    pub(super) fn take(&self, timeout: Option<&Timespec>) -> Heard {
-        let mut heard = Heard::default();
+    pub(super) fn take(&self, timeout: Option<&Timespec>) -> HeardBells {
+        let mut heard = HeardBells::default();
         let mut events = [MaybeUninit::<epoll::Event>::uninit(); 4];
         let Ok((events, _)) = epoll::wait(&self.set, &mut events, timeout) else { return heard };
         for event in events {

@@ -19,12 +19,12 @@ pub(super) struct Attached {
     pub(super) dead: bool,
     /// Of a relay: the furthest position that it was seen to be done with.
     done: u64,
-    given_up: GivenUp,
+    given_up: LaneGivenUp,
 }
 
 /// The samples that a reader gave up, by its lane and by what its session said: both say the same, one of them later.
 #[derive(Debug, Default)]
-struct GivenUp {
+struct LaneGivenUp {
     /// How many were counted.
     counted: u64,
     /// How many its session said so far that it gave up, and how many its lane says.
@@ -32,7 +32,7 @@ struct GivenUp {
     shown: u64,
 }
 
-impl GivenUp {
+impl LaneGivenUp {
     /// Its lane says that it gave up so many in all.
     fn show(&mut self, samples: u64) {
         self.shown = self.shown.max(samples);
@@ -61,7 +61,7 @@ impl Attached {
         grant: Grant,
         carries: bool,
     ) -> Self {
-        let (dead, done, given_up) = (false, grant.first, GivenUp::default());
+        let (dead, done, given_up) = (false, grant.first, LaneGivenUp::default());
         Self { info, lane, tenancy, grant, carries, dead, done, given_up }
     }
 
@@ -160,7 +160,7 @@ mod tests {
 
     #[test]
     fn samples_that_lane_and_session_both_name_are_counted_once() {
-        let mut given_up = GivenUp::default();
+        let mut given_up = LaneGivenUp::default();
         given_up.show(3);
         assert_eq!((given_up.count_new(100), given_up.count_new(100)), (3, 0));
         given_up.tell(2, 100);
@@ -176,10 +176,10 @@ mod tests {
 
     #[test]
     fn no_more_samples_are_given_up_than_were_published() {
-        let mut given_up = GivenUp::default();
+        let mut given_up = LaneGivenUp::default();
         given_up.show(u64::MAX);
         assert_eq!((given_up.count_new(5), given_up.count_new(8)), (5, 3));
-        let mut given_up = GivenUp::default();
+        let mut given_up = LaneGivenUp::default();
         given_up.tell(u64::MAX, 5);
         given_up.tell(u64::MAX, 5);
         assert_eq!(

@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::{LOOKS, Numbering, Payload, WriterState};
+use super::{LOOKS, Numbering, RingPayload, WriterState};
 use crate::{
     alloc::area::Area,
     error::PublishError,
@@ -14,7 +14,7 @@ use crate::{
     qos::Durability,
     ring::{
         layout::{COPIED, INLINE, Location},
-        protocol::{self, PayloadPlace, Record},
+        protocol::{self, PayloadLocation, Record},
         types::{Meta, Published},
     },
     session::peer::PeerSession,
@@ -23,8 +23,8 @@ use crate::{
         Writer,
         header::Dropped,
         history::Extent,
-        loan::{Lender, Loan, LoanPlace},
-        room::Refusal,
+        loan::{Lender, Loan, LoanLocation},
+        room::PublishObstacle,
     },
 };
 
@@ -66,9 +66,9 @@ impl Writer {
         let bytes = self.check(payload.len())?;
         let mut deadline = PublishDeadline::new(deadline);
         if payload.len() as u64 <= COPIED {
-            return self.commit(numbering, Payload::Bytes(payload), deadline, bells);
+            return self.commit(numbering, RingPayload::Bytes(payload), deadline, bells);
         }
-        let lent: Result<LoanPlace, Meta> = self.retry_until(&mut deadline, |state| {
+        let lent: Result<LoanLocation, Meta> = self.retry_until(&mut deadline, |state| {
             state.numbers.judge(numbering)?;
             if self.is_unread(state) {
                 return Ok(Err(self.pass(state, numbering)));
@@ -90,7 +90,7 @@ impl Writer {
     pub(crate) fn commit(
         &self,
         numbering: Numbering,
-        payload: Payload<'_>,
+        payload: RingPayload<'_>,
         mut deadline: PublishDeadline,
         bells: Bells,
     ) -> Result<(u64, Published), PublishError> {
@@ -105,17 +105,17 @@ impl Writer {
             }
             self.make_place(state)?;
             let (extent, place) = match payload {
-                Payload::Bytes(bytes) if bytes.len() <= INLINE => {
-                    (Extent::Inline, PayloadPlace::Inline)
+                RingPayload::Bytes(bytes) if bytes.len() <= INLINE => {
+                    (Extent::Inline, PayloadLocation::Inline)
                 }
-                Payload::Bytes(bytes) => {
+                RingPayload::Bytes(bytes) => {
                     let block = self.copy_in(state, bytes)?;
-                    (Extent::Block(block), PayloadPlace::Block(block.at))
+                    (Extent::Block(block), PayloadLocation::Block(block.at))
                 }
-                Payload::Written { at, lead, len: sample, lent } => {
+                RingPayload::Written { at, lead, len: sample, lent } => {
                     let len = Area::rounded(lent as u64);
                     let first = Location { offset: at.offset + lead as u64, ..at };
-                    (Extent::Slot { at, len, sample: sample as u64 }, PayloadPlace::Slot(first))
+                    (Extent::Slot { at, len, sample: sample as u64 }, PayloadLocation::Slot(first))
                 }
             };
             let meta = state.numbers.number(numbering);
@@ -169,12 +169,12 @@ impl Writer {
         state: &mut WriterState,
         meta: Meta,
         extent: Extent,
-        place: PayloadPlace,
-        payload: Payload<'_>,
+        place: PayloadLocation,
+        payload: RingPayload<'_>,
     ) -> u64 {
         let (len, inline) = match payload {
-            Payload::Bytes(bytes) => (bytes.len(), bytes),
-            Payload::Written { len, .. } => (len, &[][..]),
+            RingPayload::Bytes(bytes) => (bytes.len(), bytes),
+            RingPayload::Written { len, .. } => (len, &[][..]),
         };
         self.header.show_published(state.numbers.count());
         let position = state.history.push(extent);
@@ -204,7 +204,7 @@ impl Writer {
     pub(super) fn retry_until<T>(
         &self,
         deadline: &mut PublishDeadline,
-        attempt: impl FnMut(&mut WriterState) -> Result<T, Refusal>,
+        attempt: impl FnMut(&mut WriterState) -> Result<T, PublishObstacle>,
     ) -> Result<T, PublishError> {
         let tried = self.try_for(deadline, attempt);
         if let Err(error) = &tried {
@@ -224,19 +224,19 @@ impl Writer {
     fn try_for<T>(
         &self,
         deadline: &mut PublishDeadline,
-        mut attempt: impl FnMut(&mut WriterState) -> Result<T, Refusal>,
+        mut attempt: impl FnMut(&mut WriterState) -> Result<T, PublishObstacle>,
     ) -> Result<T, PublishError> {
         for look in 0u32.. {
             let (short, laggards) = {
                 let mut state = self.lock();
                 let short = match attempt(&mut state) {
                     Ok(done) => return Ok(done),
-                    Err(Refusal::Error(error)) => return Err(error),
-                    Err(Refusal::Pinned(kept)) => {
+                    Err(PublishObstacle::Error(error)) => return Err(error),
+                    Err(PublishObstacle::Pinned(kept)) => {
                         drop(state);
                         return Err(kept.into_error());
                     }
-                    Err(Refusal::OldestInUse { short }) => short,
+                    Err(PublishObstacle::OldestInUse { short }) => short,
                 };
                 let WriterState { history, reader_set, .. } = &mut *state;
                 let laggards = reader_set.laggards(history.tail(), history.head());

@@ -6,7 +6,7 @@
 use std::{sync::atomic::AtomicU64, time::Duration};
 
 use crate::{
-    alloc::heap::{Block, Object},
+    alloc::heap::{Block, HeapObject},
     error::PublishError,
     ring::{
         layout::ring::{
@@ -19,7 +19,7 @@ use crate::{
 
 /// A ring's header.
 #[derive(Clone)]
-pub(crate) struct RingHeader(Object);
+pub(crate) struct RingHeader(HeapObject);
 
 /// Why a sample was dropped, as `axon status` counts it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -46,7 +46,7 @@ impl Dropped {
 }
 
 impl RingHeader {
-    pub(super) fn new(ring: Object) -> Self {
+    pub(super) fn new(ring: HeapObject) -> Self {
         Self(ring)
     }
 
@@ -57,7 +57,7 @@ impl RingHeader {
     }
 
     /// The header's memory, for what needs an object and uses none.
-    pub(super) fn object(&self) -> Object {
+    pub(super) fn object(&self) -> HeapObject {
         self.0.clone()
     }
 

@@ -11,7 +11,7 @@ use crate::{
 /// Samples that readers copy out are in blocks, which are written over as soon as a sample is given
 /// up, for the readers find out. Samples that readers pin are in slots.
 #[derive(Debug)]
-pub(crate) struct History {
+pub(crate) struct SampleHistory {
     head: u64,
     tail: u64,
     /// By descriptor.
@@ -47,7 +47,7 @@ pub(crate) enum Extent {
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct OldestInUse;
 
-impl History {
+impl SampleHistory {
     /// A history of samples in `descriptors` descriptors.
     pub(crate) fn new(descriptors: u64, budget: u64) -> Self {
         Self {
@@ -276,8 +276,8 @@ mod tests {
 
     const SEGMENT: u32 = 3;
 
-    fn history(descriptors: u64, slots: u64, budget: u64) -> History {
-        let mut history = History::new(descriptors, budget);
+    fn history(descriptors: u64, slots: u64, budget: u64) -> SampleHistory {
+        let mut history = SampleHistory::new(descriptors, budget);
         history.pinned().open(SEGMENT, 0..slots);
         history
     }
@@ -303,7 +303,7 @@ mod tests {
 
     #[test]
     fn history_keeps_samples_in_use() {
-        let mut history = History::new(4, 0);
+        let mut history = SampleHistory::new(4, 0);
         for _ in 0..3 {
             history.make_place(|_| false).unwrap();
             history.push(Extent::Inline);
@@ -334,7 +334,7 @@ mod tests {
     #[test]
     fn descriptors_that_count_share_the_budget_with_blocks() {
         const BUDGET: u64 = 100 * 128;
-        let mut history = History::new(256, BUDGET);
+        let mut history = SampleHistory::new(256, BUDGET);
         history.count_descriptors();
         let mut inline = 0..1000;
         while inline.next().is_some() {

@@ -19,7 +19,7 @@ use crate::{
         layout::{ALIGNED, Location},
         types::{Meta, Published},
     },
-    writer::{Bells, Numbering, PATIENCE, Payload, PublishDeadline, Writer},
+    writer::{Bells, Numbering, PATIENCE, PublishDeadline, RingPayload, Writer},
 };
 
 /// Memory to be filled and published: shared memory where such a sample is read in place. Dropping
@@ -80,18 +80,18 @@ impl Deref for Lender<'_> {
 enum LoanMemory {
     /// Of words that are aligned to 16.
     Own(Vec<u128>),
-    Shared(LoanPlace),
+    Shared(LoanLocation),
     Published,
 }
 
 /// Shared memory that was lent.
-pub(crate) struct LoanPlace {
+pub(crate) struct LoanLocation {
     pub(crate) segment: Arc<OwnSegment>,
     /// Where it is in the segment, in bytes.
     pub(crate) at: u64,
 }
 
-impl LoanPlace {
+impl LoanLocation {
     fn location(&self) -> Location {
         Location { segment: self.segment.number(), offset: self.at }
     }
@@ -104,7 +104,7 @@ impl<'a> Loan<'a> {
     }
 
     /// `len` bytes there behind the first `lead`, all of which have been lent.
-    pub(crate) fn placed(writer: Lender<'a>, lead: usize, len: usize, place: LoanPlace) -> Self {
+    pub(crate) fn placed(writer: Lender<'a>, lead: usize, len: usize, place: LoanLocation) -> Self {
         Self { writer, lead, len, written: 0, memory: LoanMemory::Shared(place) }
     }
 
@@ -178,13 +178,13 @@ impl<'a> Loan<'a> {
         let payload = match &self.memory {
             LoanMemory::Shared(place) if len as u64 > self.writer.longest_copied() => {
                 let (lead, lent) = (self.lead, self.lead + self.len);
-                Payload::Written { at: place.location(), lead, len, lent }
+                RingPayload::Written { at: place.location(), lead, len, lent }
             }
             // What has become short is copied from where it was written.
-            LoanMemory::Own(_) | LoanMemory::Shared(_) => Payload::Bytes(&self[..len]),
+            LoanMemory::Own(_) | LoanMemory::Shared(_) => RingPayload::Bytes(&self[..len]),
             LoanMemory::Published => unreachable!("publishing takes the loan"),
         };
-        let taken = matches!(payload, Payload::Written { .. });
+        let taken = matches!(payload, RingPayload::Written { .. });
         let (sequence, published) = self.writer.commit(numbering, payload, deadline, Bells::Now)?;
         // What nobody reads has not become a sample, and its memory is given back.
         if taken && published.position.is_some() {
@@ -195,7 +195,7 @@ impl<'a> Loan<'a> {
 
     /// The address of the memory that is lent.
     #[inline]
-    fn lent(&self, place: &LoanPlace) -> NonNull<u8> {
+    fn lent(&self, place: &LoanLocation) -> NonNull<u8> {
         assert!(!self.writer.is_forked(), "a loan of shared memory, used after fork");
         place.segment.memory.address(place.at + self.lead as u64, self.len)
     }

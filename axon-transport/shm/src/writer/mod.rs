@@ -24,10 +24,10 @@ pub(super) use self::{
 
 use crate::{
     alloc::{
-        allowance::{Allowance, Holding},
         area::Area,
-        heap::{Need, Object},
-        pin_limit::Pool,
+        budget::{Holding, MemoryBudget},
+        heap::{HeapObject, Need},
+        pin_limit::PinPool,
     },
     error::{PublishError, ShmError},
     ids::Gid,
@@ -47,7 +47,7 @@ use crate::{
     },
     writer::{
         header::RingHeader,
-        history::History,
+        history::SampleHistory,
         loan::{Lender, Loan},
         reader_set::ReaderSet,
     },
@@ -133,7 +133,7 @@ fn most_descriptors(budget: u64) -> u64 {
 
 /// A sample's bytes on their way into a ring.
 #[derive(Clone, Copy)]
-pub(super) enum Payload<'a> {
+pub(super) enum RingPayload<'a> {
     /// At most [`COPIED`] bytes, copied in under the lock.
     Bytes(&'a [u8]),
     /// Written to memory that was lent: where, how far behind its start, the sample's length, and how
@@ -166,7 +166,7 @@ impl Writer {
         // Readers are told of the segments with the ring.
         let allocate = |len| {
             let object = session.allocate(len, Need::Now, |_| true)?;
-            Ok::<Object, ShmError>(object.expect("there is always one that will do"))
+            Ok::<HeapObject, ShmError>(object.expect("there is always one that will do"))
         };
         let ring = allocate(layout::RING)?;
         let descriptors = layout::FIRST_DESCRIPTORS;
@@ -182,11 +182,11 @@ impl Writer {
         let number = session.number_ring();
         layout::write_ring(ring.words(), options.gid, number, &at);
         offer(ring.words(), &options.qos);
-        let mut history = History::new(descriptors, budget);
+        let mut history = SampleHistory::new(descriptors, budget);
         if keeps_all(&qos) {
             history.count_descriptors();
         }
-        let reader_set = ReaderSet::new(qos, limit - 1, Pool::new(budget, max_message));
+        let reader_set = ReaderSet::new(qos, limit - 1, PinPool::new(budget, max_message));
         let state = WriterState::new(reader_set, history, array);
         let (header, state) = (RingHeader::new(ring), PiMutex::new(state)?);
         let writer = Self { options, session, header, number, limit, state };
@@ -209,12 +209,12 @@ impl Writer {
         Ok(writer)
     }
 
-    /// Has the ring share a bound on memory with others: from then on it takes what it needs for samples of `allowance`,
+    /// Has the ring share a bound on memory with others: from then on it takes what it needs for samples of `budget`,
     /// beside its first descriptors. Where that has no more, the ring does with what it has, like one whose host has no
     /// memory; but its newest sample replaces even the last one that stands.
-    pub fn share(&self, allowance: &Arc<Allowance>) {
+    pub fn share(&self, budget: &Arc<MemoryBudget>) {
         if !self.is_forked() {
-            self.lock().holding = Holding::of(Arc::clone(allowance));
+            self.lock().holding = Holding::of(Arc::clone(budget));
         }
     }
 
@@ -497,8 +497,8 @@ impl Drop for Writer {
         }
         let WriterState { mut history, array, reader_set, holding, .. } = {
             let mut state = self.lock();
-            let nobody = ReaderSet::new(self.options.qos, 0, Pool::default());
-            let empty = WriterState::new(nobody, History::new(1, 0), self.header.object());
+            let nobody = ReaderSet::new(self.options.qos, 0, PinPool::default());
+            let empty = WriterState::new(nobody, SampleHistory::new(1, 0), self.header.object());
             std::mem::replace(&mut *state, empty)
         };
         // Readers drain what stands. After them nobody looks at any of it.

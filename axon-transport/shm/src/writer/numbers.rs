@@ -19,14 +19,14 @@ pub(crate) enum Numbering {
 
 /// The last sample's number, and how many there were.
 #[derive(Debug, Default)]
-pub(crate) struct Numbers {
+pub(crate) struct WriterNumbers {
     /// The last sample's sequence number.
     last: u64,
     /// Samples published, read or not.
     published: u64,
 }
 
-impl Numbers {
+impl WriterNumbers {
     /// The last sample's sequence number.
     pub(super) fn last(&self) -> u64 {
         self.last
@@ -71,7 +71,7 @@ mod tests {
 
     #[test]
     fn samples_are_numbered_from_one_or_as_given() {
-        let mut numbers = Numbers::default();
+        let mut numbers = WriterNumbers::default();
         assert_eq!(numbers.number(Numbering::Next(5)).sequence, 1);
         let meta = numbers.number(given(40));
         assert_eq!((meta.sequence, meta.source_timestamp, meta.published), (40, 7, 8));
@@ -86,7 +86,7 @@ mod tests {
 
     #[test]
     fn a_number_that_no_publisher_can_have_reached_is_refused() {
-        let mut numbers = Numbers::default();
+        let mut numbers = WriterNumbers::default();
         assert!(numbers.judge(given(MAX_FIRST)).is_ok());
         assert!(numbers.judge(given(MAX_FIRST + 1)).is_err());
         numbers.number(given(10));

@@ -3,7 +3,7 @@
 use std::{collections::HashSet, sync::Arc, time::Duration};
 
 use crate::{
-    alloc::pin_limit::Pool,
+    alloc::pin_limit::PinPool,
     error::ShmError,
     ids::Gid,
     qos::{Durability, History, Qos},
@@ -13,7 +13,7 @@ use crate::{
     },
     session::{
         lane::LaneView,
-        peer::{Peer, PeerSession},
+        peer::{PeerSession, RingPeer},
         pin_lanes::{PinLanes, Pinned, PinningReader},
         reader_info::ReaderInfo,
     },
@@ -37,7 +37,7 @@ pub(crate) struct ReaderSet {
     /// Their lanes, and those of readers that were here and may hold samples still.
     pin_lanes: PinLanes,
     /// Their sessions, each once, shared with publishes that ring after they have unlocked.
-    peers: Arc<[Peer]>,
+    peers: Arc<[RingPeer]>,
     window: u64,
     /// Whether samples are noted in the session's journal, for readers that may follow it: relays, and where each
     /// reader waits for calls, all in other sessions.
@@ -57,7 +57,7 @@ pub(crate) struct Floors {
 }
 
 impl ReaderSet {
-    pub(crate) fn new(offered: Qos, capacity: u64, pool: Pool) -> Self {
+    pub(crate) fn new(offered: Qos, capacity: u64, pool: PinPool) -> Self {
         let mut reader_set = Self {
             offered,
             heeds_depths: false,
@@ -99,7 +99,7 @@ impl ReaderSet {
         keeps_all(&self.offered)
     }
 
-    pub(crate) fn peers(&self) -> Arc<[Peer]> {
+    pub(crate) fn peers(&self) -> Arc<[RingPeer]> {
         Arc::clone(&self.peers)
     }
 
@@ -116,7 +116,7 @@ impl ReaderSet {
 
     /// The sessions, if anybody there waits for a sample, after [`settle`](crate::wake::settle).
     #[inline]
-    pub(crate) fn waiting(&self) -> Option<Arc<[Peer]>> {
+    pub(crate) fn waiting(&self) -> Option<Arc<[RingPeer]>> {
         self.peers.iter().any(|peer| peer.waits(Purpose::Samples)).then(|| self.peers())
     }
 

@@ -6,7 +6,7 @@ use std::sync::{Arc, atomic::AtomicU64};
 use crate::{
     alloc::{
         area::Area,
-        heap::{Block, Need, Object},
+        heap::{Block, HeapObject, Need},
     },
     error::{PinHolder, PublishError, ShmError},
     memory::segment::Map,
@@ -19,7 +19,7 @@ use crate::{
 };
 
 /// Why an attempt to publish did not succeed.
-pub(crate) enum Refusal {
+pub(crate) enum PublishObstacle {
     /// A KEEP_ALL reader holds the oldest sample.
     OldestInUse {
         /// Why there is no room for more than it holds, where that is for want of memory.
@@ -54,13 +54,13 @@ impl PinnedMemory {
     }
 }
 
-impl From<PublishError> for Refusal {
+impl From<PublishError> for PublishObstacle {
     fn from(error: PublishError) -> Self {
         Self::Error(error)
     }
 }
 
-impl From<OldestInUse> for Refusal {
+impl From<OldestInUse> for PublishObstacle {
     fn from(OldestInUse: OldestInUse) -> Self {
         Self::OldestInUse { short: None }
     }
@@ -71,7 +71,7 @@ impl From<OldestInUse> for Refusal {
 pub(crate) struct Maps(Vec<(u32, Arc<Map>)>);
 
 impl Maps {
-    fn add(&mut self, object: &Object) {
+    fn add(&mut self, object: &HeapObject) {
         let number = object.block.at.segment;
         if self.0.iter().all(|(known, _)| *known != number) {
             self.0.push((number, Arc::clone(&object.map)));
@@ -95,8 +95,8 @@ pub(crate) fn no_memory(error: ShmError) -> PublishError {
         ShmError::NoMemory { needed, available } => {
             PublishError::NoMemory { needed, available, keeper: None }
         }
-        ShmError::Allowance { needed, available, most } => {
-            PublishError::Allowance { needed, available, most }
+        ShmError::MemoryBudget { needed, available, most } => {
+            PublishError::MemoryBudget { needed, available, most }
         }
         other => PublishError::Segment { reason: other.to_string() },
     }
@@ -105,12 +105,12 @@ pub(crate) fn no_memory(error: ShmError) -> PublishError {
 /// How many samples stay in a ring that has to do with the memory that it has. One, so that those who come later find it;
 /// but a ring that may have no more memory shows its newest sample rather than an old one.
 pub(crate) fn least_kept(short: &PublishError) -> u64 {
-    u64::from(!matches!(short, PublishError::Allowance { .. }))
+    u64::from(!matches!(short, PublishError::MemoryBudget { .. }))
 }
 
 impl Writer {
     /// Makes sure that the next position has a descriptor.
-    pub(crate) fn make_place(&self, state: &mut WriterState) -> Result<(), Refusal> {
+    pub(crate) fn make_place(&self, state: &mut WriterState) -> Result<(), PublishObstacle> {
         if state.history.is_full() {
             let floors = state.reader_set.floors(state.history.head());
             // What has been taken in is kept a little longer than the window asks for, so that the
@@ -137,7 +137,7 @@ impl Writer {
             // What all have taken goes without a loss.
             let is_lost = history.is_full() && short.is_some() && history.tail() >= consumed;
             let made = history.make_place(|position| position < floors.held);
-            made.map_err(|OldestInUse| Refusal::OldestInUse { short })?;
+            made.map_err(|OldestInUse| PublishObstacle::OldestInUse { short })?;
             if is_lost {
                 self.header.count(Dropped::NoMemory);
             }
@@ -195,7 +195,7 @@ impl Writer {
         &self,
         state: &mut WriterState,
         payload: &[u8],
-    ) -> Result<Block, Refusal> {
+    ) -> Result<Block, PublishObstacle> {
         debug_assert!(payload.len() as u64 <= COPIED);
         let bytes = Area::rounded(payload.len() as u64);
         // Nobody asks without need how far readers are: they say so in cache lines of their own.
@@ -212,7 +212,11 @@ impl Writer {
     }
 
     /// A block for a sample, for which the oldest samples go if they have to.
-    fn block_with_room(&self, state: &mut WriterState, bytes: u64) -> Result<Block, Refusal> {
+    fn block_with_room(
+        &self,
+        state: &mut WriterState,
+        bytes: u64,
+    ) -> Result<Block, PublishObstacle> {
         let floors = state.reader_set.floors(state.history.head());
         let may_go = |position| position < floors.held;
         state.history.make_room(bytes, may_go)?;
@@ -230,7 +234,7 @@ impl Writer {
                         Ok(true) if was_kept => self.header.count(Dropped::NoMemory),
                         Ok(true) => {}
                         Err(OldestInUse) => {
-                            return Err(Refusal::OldestInUse { short: Some(error) });
+                            return Err(PublishObstacle::OldestInUse { short: Some(error) });
                         }
                     }
                     self.give_blocks_back(state);

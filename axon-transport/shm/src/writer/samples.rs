@@ -8,7 +8,7 @@ use std::{
 
 use crate::{
     alloc::{
-        allowance::Holding,
+        budget::Holding,
         pin_limit::samples_bytes,
         retention::Retention,
         segments::{OwnSegment, SegmentEvent},
@@ -25,8 +25,8 @@ use crate::{
         LOOKS, Writer, WriterState,
         header::Dropped,
         history::OldestInUse,
-        loan::LoanPlace,
-        room::{PinnedMemory, Refusal, least_kept, no_memory},
+        loan::LoanLocation,
+        room::{PinnedMemory, PublishObstacle, least_kept, no_memory},
     },
 };
 
@@ -165,7 +165,11 @@ impl Writer {
     }
 
     /// Takes `bytes`, more than [`COPIED_ALWAYS`], that no reader reads.
-    pub(crate) fn lend(&self, state: &mut WriterState, bytes: u64) -> Result<LoanPlace, Refusal> {
+    pub(crate) fn lend(
+        &self,
+        state: &mut WriterState,
+        bytes: u64,
+    ) -> Result<LoanLocation, PublishObstacle> {
         debug_assert!(bytes > COPIED_ALWAYS);
         self.open_samples(state).map_err(no_memory)?;
         if let Some(place) = self.next_turn(state, bytes) {
@@ -234,7 +238,7 @@ impl Writer {
                         continue;
                     }
                     // Room that the reader makes will do, whether or not there is memory.
-                    Err(OldestInUse) => return Err(Refusal::OldestInUse { short }),
+                    Err(OldestInUse) => return Err(PublishObstacle::OldestInUse { short }),
                     Ok(false) => {}
                 }
             }
@@ -248,7 +252,7 @@ impl Writer {
                 None if look < LOOKS => {}
                 holder => {
                     let holder = holder.unwrap_or(PinningReader { reader: self.gid(), peer: None });
-                    return Err(Refusal::Pinned(PinnedMemory {
+                    return Err(PublishObstacle::Pinned(PinnedMemory {
                         holder,
                         samples: kept.len(),
                         short,
@@ -261,7 +265,7 @@ impl Writer {
 
     /// A slot at hand, as long as slots take turns: to find out what readers have taken costs lines
     /// that they have just written to, and need not be done for each sample.
-    fn next_turn(&self, state: &mut WriterState, bytes: u64) -> Option<LoanPlace> {
+    fn next_turn(&self, state: &mut WriterState, bytes: u64) -> Option<LoanLocation> {
         let WriterState { history, samples: Some(samples), .. } = state else { return None };
         let Some(turns) = samples.turns.checked_sub(1) else {
             samples.turns = TURNS - 1;
@@ -280,7 +284,7 @@ impl Writer {
         state: &mut WriterState,
         bytes: u64,
         grow: bool,
-    ) -> Result<Option<LoanPlace>, PublishError> {
+    ) -> Result<Option<LoanLocation>, PublishError> {
         match state.history.lend(bytes) {
             Some(at) => self.settled(state, at, bytes, grow),
             None => Ok(None),
@@ -294,7 +298,7 @@ impl Writer {
         at: Location,
         bytes: u64,
         grow: bool,
-    ) -> Result<Option<LoanPlace>, PublishError> {
+    ) -> Result<Option<LoanLocation>, PublishError> {
         let WriterState { history, samples: Some(samples), holding, .. } = state else {
             return Ok(None);
         };
@@ -327,7 +331,7 @@ impl Writer {
         }
         // Readers that copy without a pin find out by this that it is written over.
         protocol::about_to_write::<AtomicU64>();
-        Ok(Some(LoanPlace { segment, at: at.offset }))
+        Ok(Some(LoanLocation { segment, at: at.offset }))
     }
 
     /// Frees what was given up and is not read by anybody.

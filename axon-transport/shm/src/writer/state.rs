@@ -1,20 +1,21 @@
 //! What a publisher's lock protects.
 
 use super::{
-    history::History, numbers::Numbers, reader_set::ReaderSet, room::Maps, samples::Samples,
+    history::SampleHistory, numbers::WriterNumbers, reader_set::ReaderSet, room::Maps,
+    samples::Samples,
 };
 use crate::{
-    alloc::{allowance::Holding, heap::Object},
+    alloc::{budget::Holding, heap::HeapObject},
     ring::protocol,
     session::pin_lanes::Pinned,
 };
 
 /// The samples that stand, their readers and their memory.
 pub(crate) struct WriterState {
-    pub(crate) history: History,
+    pub(crate) history: SampleHistory,
     pub(crate) reader_set: ReaderSet,
     /// The descriptors.
-    pub(super) array: Object,
+    pub(super) array: HeapObject,
     /// The segments that blocks are in.
     pub(super) maps: Maps,
     /// Where the next samples go that readers pin, once there has been one.
@@ -25,13 +26,13 @@ pub(crate) struct WriterState {
     pub(super) shown_tail: u64,
     /// What was found pinned, kept for its memory.
     pub(super) pinned: Pinned,
-    pub(super) numbers: Numbers,
+    pub(super) numbers: WriterNumbers,
     /// Of the samples that relays gave up: those of which a wait said so.
     pub(super) known_given_up: u64,
 }
 
 impl WriterState {
-    pub(super) fn new(reader_set: ReaderSet, history: History, array: Object) -> Self {
+    pub(super) fn new(reader_set: ReaderSet, history: SampleHistory, array: HeapObject) -> Self {
         Self {
             history,
             reader_set,
@@ -41,7 +42,7 @@ impl WriterState {
             holding: Holding::default(),
             shown_tail: 0,
             pinned: Pinned::default(),
-            numbers: Numbers::default(),
+            numbers: WriterNumbers::default(),
             known_given_up: 0,
         }
     }

@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use axon_shm::{Meta, PublishError, Sample, internal::Allowance};
+use axon_shm::{Meta, PublishError, Sample, internal::MemoryBudget};
 
 use super::{client::Client, publisher::Publisher, server::Server};
 use crate::{
@@ -35,7 +35,7 @@ pub enum Written {
 }
 
 impl RemoteWriter {
-    /// A stand-in for `remote`, under its GID, which takes the memory for what it holds of `allowance`. For gateways
+    /// A stand-in for `remote`, under its GID, which takes the memory for what it holds of `budget`. For gateways
     /// alone; a daemon refuses it from anybody else.
     ///
     /// # Errors
@@ -43,9 +43,9 @@ impl RemoteWriter {
     pub fn stand_in(
         session: &Session,
         remote: Endpoint,
-        allowance: &Arc<Allowance>,
+        budget: &Arc<MemoryBudget>,
     ) -> Result<Self, SessionError> {
-        Self::new(session, remote, EndpointRole::StandIn, false, Some(allowance))
+        Self::new(session, remote, EndpointRole::StandIn, false, Some(budget))
     }
 
     /// As [`stand_in`](Self::stand_in). A client says which of the responses that it takes are
@@ -72,20 +72,20 @@ impl RemoteWriter {
         of: Endpoint,
         role: EndpointRole,
         carries: bool,
-        allowance: Option<&Arc<Allowance>>,
+        budget: Option<&Arc<MemoryBudget>>,
     ) -> Result<Self, SessionError> {
         // What it takes is another's, whose depth counts there.
         let all = Qos::keep_all();
         Ok(match of.kind {
             EndpointKind::Client => {
-                Self::Client(session.add_client(of, role, all, carries, allowance)?)
+                Self::Client(session.add_client(of, role, all, carries, budget)?)
             }
             EndpointKind::Server => {
                 // Requests to a stand-in are kept by the relay until they have a response (`relayed::unanswered`).
                 let carries = carries && role == EndpointRole::Application;
-                Self::Server(session.add_server(of, role, all, carries, allowance))
+                Self::Server(session.add_server(of, role, all, carries, budget))
             }
-            _ => Self::Publisher(session.add_asserted(of, role, allowance)?),
+            _ => Self::Publisher(session.add_asserted(of, role, budget)?),
         })
     }
 

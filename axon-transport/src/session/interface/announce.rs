@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use axon_shm::{
     ShmError,
-    internal::{Allowance, RingOptions, Writer},
+    internal::{MemoryBudget, RingOptions, Writer},
 };
 
 use crate::{
@@ -72,14 +72,14 @@ impl Session {
         })
     }
 
-    /// A publisher that is alive when it is said to be. It takes the memory for its samples of `allowance`, if there is one.
+    /// A publisher that is alive when it is said to be. It takes the memory for its samples of `budget`, if there is one.
     pub(in crate::session) fn add_asserted(
         &self,
         endpoint: Endpoint,
         role: EndpointRole,
-        allowance: Option<&Arc<Allowance>>,
+        budget: Option<&Arc<MemoryBudget>>,
     ) -> Result<Publisher, SessionError> {
-        self.add_writer(endpoint, 0, allowance, |e, rings| {
+        self.add_writer(endpoint, 0, budget, |e, rings| {
             PublisherInner::new(e, role, rings).asserted()
         })
     }
@@ -88,12 +88,12 @@ impl Session {
         &self,
         endpoint: Endpoint,
         expected: u64,
-        allowance: Option<&Arc<Allowance>>,
+        budget: Option<&Arc<MemoryBudget>>,
         inner: impl FnOnce(Endpoint, Rings) -> PublisherInner,
     ) -> Result<Publisher, SessionError> {
         let options = RingOptions { expected, ..self.ring(&endpoint, endpoint.qos) };
         let writer = Arc::new(Writer::create(self.shared().core.segment.clone(), options)?);
-        allowance.into_iter().for_each(|allowance| writer.share(allowance));
+        budget.into_iter().for_each(|budget| writer.share(budget));
         let inner = Arc::new(inner(endpoint, Rings::Shared(writer.clone())));
         self.announce(Some(&inner), None);
         Ok(Publisher { inner, writer, session: self.clone() })
@@ -113,12 +113,12 @@ impl Session {
         role: EndpointRole,
         reads: Qos,
         carries: bool,
-        allowance: Option<&Arc<Allowance>>,
+        budget: Option<&Arc<MemoryBudget>>,
     ) -> Result<Client, SessionError> {
         let options = self.ring(&endpoint, Qos::keep_all());
         let segment = self.shared().core.segment.clone();
         let writer = Arc::new(Writer::create_for_calls(segment, options)?);
-        allowance.into_iter().for_each(|allowance| writer.share(allowance));
+        budget.into_iter().for_each(|budget| writer.share(budget));
         let rings = Rings::Shared(writer.clone());
         let (requests, responses) = self.add_both(endpoint, role, reads, rings, carries);
         responses.calls.set_ring(writer.clone());
@@ -133,12 +133,12 @@ impl Session {
         role: EndpointRole,
         reads: Qos,
         carries: bool,
-        allowance: Option<&Arc<Allowance>>,
+        budget: Option<&Arc<MemoryBudget>>,
     ) -> Server {
         let options = self.ring(&endpoint, Qos::keep_all());
         let shared = self.shared();
         let (segment, room) = (shared.core.segment.clone(), shared.room.clone());
-        let by_client = RingsByClient::new(segment, options, room, allowance.cloned());
+        let by_client = RingsByClient::new(segment, options, room, budget.cloned());
         let by_client = Arc::new(by_client);
         let rings = Rings::Each(by_client.clone());
         let (responses, requests) = self.add_both(endpoint, role, reads, rings, carries);

@@ -12,7 +12,7 @@ use std::{
 use axon_shm::{
     ShmError,
     internal::{
-        Allowance, Grant, Location, ReaderInfo, RingOptions, SessionSegment, Terms, Writer,
+        Grant, Location, MemoryBudget, ReaderInfo, RingOptions, SessionSegment, Terms, Writer,
     },
 };
 
@@ -32,7 +32,7 @@ pub(in crate::session) struct RingsByClient {
     options: RingOptions,
     room: Arc<ClientLimit>,
     /// The memory that they share with rings of other endpoints.
-    allowance: Option<Arc<Allowance>>,
+    budget: Option<Arc<MemoryBudget>>,
     rings: Mutex<BTreeMap<Gid, (Arc<Writer>, ClientSlot)>>,
 }
 
@@ -173,9 +173,9 @@ impl RingsByClient {
         session: Arc<SessionSegment>,
         options: RingOptions,
         room: Arc<ClientLimit>,
-        allowance: Option<Arc<Allowance>>,
+        budget: Option<Arc<MemoryBudget>>,
     ) -> Self {
-        Self { session, options, room, allowance, rings: Mutex::default() }
+        Self { session, options, room, budget, rings: Mutex::default() }
     }
 
     /// The ring of a client; `None` when it is not, or no more, served.
@@ -207,8 +207,8 @@ impl RingsByClient {
         }
         let place = self.room.take()?;
         let ring = Arc::new(Writer::create_for_calls(self.session.clone(), self.options)?);
-        if let Some(allowance) = &self.allowance {
-            ring.share(allowance);
+        if let Some(budget) = &self.budget {
+            ring.share(budget);
         }
         self.lock().insert(client, (ring.clone(), place));
         Ok(ring)

@@ -17,7 +17,7 @@ use std::{
     time::Duration,
 };
 
-use axon_shm::internal::Allowance;
+use axon_shm::internal::MemoryBudget;
 
 use self::pace::ChangeTurns;
 use super::{limits::IdentityLimits, peer::routes::RouteKey};
@@ -293,7 +293,7 @@ pub(crate) struct Account {
     /// Memory for its messages that have not come whole, in bytes.
     pub(crate) messages: MessageMemory,
     /// Memory for the samples, requests and responses that its stand-ins hold, in bytes.
-    pub(crate) held: Arc<Allowance>,
+    pub(crate) held: Arc<MemoryBudget>,
     /// Bytes of refused routes that are remembered.
     pub(crate) refusals: Rc<Meter>,
     /// Sessions that it proved to be its own.
@@ -312,7 +312,7 @@ impl Account {
         budget: &str,
         graph: usize,
         [relays, lanes, stand_ins]: [&Rc<Meter>; 3],
-        held: Arc<Allowance>,
+        held: Arc<MemoryBudget>,
         limits: Rc<IdentityLimits>,
     ) -> Self {
         Self {
@@ -422,19 +422,19 @@ pub(crate) struct Accounts {
     lanes: Rc<Meter>,
     stand_ins: Rc<Meter>,
     /// What all stand-ins hold, and what one identity's may.
-    held: (Arc<Allowance>, u64),
+    held: (Arc<MemoryBudget>, u64),
     open: HashMap<String, Weak<Account>>,
     /// What passed of late, also of identities without a link: a new link gives them no more.
     limits: HashMap<String, Rc<IdentityLimits>>,
     /// What the stand-ins of a budget hold. Readers may be at it when its last link is over.
-    held_by: HashMap<String, SharedWeak<Allowance>>,
+    held_by: HashMap<String, SharedWeak<MemoryBudget>>,
 }
 
 impl Accounts {
     /// Accounts whose graphs may take so many bytes, and whose stand-ins may hold so many.
     pub(crate) fn new(graph: usize, held: u64) -> Self {
         let [relays, lanes, stand_ins] = [(); 3].map(|()| Meter::new(OF_ALL));
-        let held = (Allowance::new(held.saturating_mul(HELD_BY_ALL)), held);
+        let held = (MemoryBudget::new(held.saturating_mul(HELD_BY_ALL)), held);
         let (open, limits, held_by) = Default::default();
         Self { graph, relays, lanes, stand_ins, held, open, limits, held_by }
     }
@@ -469,12 +469,12 @@ impl Accounts {
         account
     }
 
-    fn held_by(&mut self, budget: &str) -> Arc<Allowance> {
+    fn held_by(&mut self, budget: &str) -> Arc<MemoryBudget> {
         if let Some(held) = self.held_by.get(budget).and_then(SharedWeak::upgrade) {
             return held;
         }
         self.held_by.retain(|_, held| held.strong_count() > 0);
-        let held = Allowance::within(&self.held.0, self.held.1);
+        let held = MemoryBudget::within(&self.held.0, self.held.1);
         self.held_by.insert(budget.to_owned(), Arc::downgrade(&held));
         held
     }

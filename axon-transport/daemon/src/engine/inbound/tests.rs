@@ -8,7 +8,7 @@ use std::{
 };
 
 use axon_envelope::{Kind, Route, TopicHash, inner};
-use axon_shm::{Meta, ids::Gid, internal::Allowance, qos::Qos};
+use axon_shm::{Meta, ids::Gid, internal::MemoryBudget, qos::Qos};
 use axon_transport::{
     EndpointSpec, MessageInfo,
     graph::{Endpoint, EndpointKind},
@@ -104,7 +104,7 @@ impl Rings for One {
     fn open_writer(
         &self,
         _remote: &Endpoint,
-        _held: &Arc<Allowance>,
+        _held: &Arc<MemoryBudget>,
     ) -> Result<Rc<dyn RingWriter>, String> {
         Ok(Rc::clone(&self.0) as Rc<dyn RingWriter>)
     }

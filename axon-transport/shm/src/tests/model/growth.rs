@@ -9,8 +9,8 @@ use crate::{
     ring::{
         layout::{DESCRIPTOR_WORDS, LANE_WORDS, RING_WORDS},
         protocol::{
-            PayloadPlace, PositionState, RecordRead, View, about_to_write, array, copy_descriptors,
-            publish, replace, retire,
+            PayloadLocation, PositionState, RecordRead, View, about_to_write, array,
+            copy_descriptors, publish, replace, retire,
         },
     },
     session::lane,
@@ -37,7 +37,7 @@ impl Growing {
 
     fn show(&self, which: usize, position: u64) {
         about_to_write::<AtomicU64>();
-        let record = record(position, PayloadPlace::Inline);
+        let record = record(position, PayloadLocation::Inline);
         publish(&self.header, &self.arrays[which], position, &record, &[]);
     }
 
@@ -70,7 +70,7 @@ fn samples_survive_the_growth_of_their_ring() {
             assert_eq!(view.state(position), PositionState::Here);
             match view.look(position) {
                 RecordRead::Sample(found) => {
-                    assert_eq!(found, record(position, PayloadPlace::Inline))
+                    assert_eq!(found, record(position, PayloadLocation::Inline))
                 }
                 // It moved meanwhile.
                 RecordRead::Lapped => {}
@@ -101,7 +101,7 @@ fn an_old_array_that_became_something_else_is_noticed() {
         let view = ring.view();
         if view.state(0) == PositionState::Here {
             match view.look(0) {
-                RecordRead::Sample(found) => assert_eq!(found, record(0, PayloadPlace::Inline)),
+                RecordRead::Sample(found) => assert_eq!(found, record(0, PayloadLocation::Inline)),
                 RecordRead::Lapped => {}
                 RecordRead::Corrupt(what) => panic!("{what}"),
             }

@@ -20,7 +20,7 @@ use crate::{
     alloc::pin_limit::PinLimit,
     ring::{
         layout::{DESCRIPTOR_WORDS, LANE_WORDS, RING_WORDS, ring::TAIL},
-        protocol::{PayloadPlace, Record, View, about_to_write, publish},
+        protocol::{PayloadLocation, Record, View, about_to_write, publish},
         types::Grant,
     },
     session::lane::{self, LaneId},
@@ -83,16 +83,16 @@ impl Ring {
 
     /// Publishes a sample whose payload is elsewhere.
     fn show(&self, position: u64) {
-        self.publish(position, PayloadPlace::Inline);
+        self.publish(position, PayloadLocation::Inline);
     }
 
-    fn publish(&self, position: u64, place: PayloadPlace) {
+    fn publish(&self, position: u64, place: PayloadLocation) {
         about_to_write::<AtomicU64>();
         publish(&self.header, &self.array, position, &record(position, place), &[]);
     }
 }
 
-fn record(position: u64, place: PayloadPlace) -> Record {
+fn record(position: u64, place: PayloadLocation) -> Record {
     Record { sequence: 10 + position, timestamp: 0, published: 0, len: 0, place }
 }
 

@@ -9,7 +9,7 @@ use crate::{
     ring::{
         layout::Location,
         protocol::{
-            PayloadPlace, PositionState, RecordRead, about_to_write, bounds, copy_in, retire,
+            PayloadLocation, PositionState, RecordRead, about_to_write, bounds, copy_in, retire,
         },
     },
     session::lane,
@@ -19,8 +19,8 @@ use crate::{
 
 const DESCRIPTORS: u64 = 2;
 
-fn place(position: u64) -> PayloadPlace {
-    PayloadPlace::Block(Location { segment: 0, offset: position % 2 * 16 })
+fn place(position: u64) -> PayloadLocation {
+    PayloadLocation::Block(Location { segment: 0, offset: position % 2 * 16 })
 }
 
 /// Two words for every other sample.

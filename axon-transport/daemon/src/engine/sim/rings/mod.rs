@@ -13,7 +13,7 @@ use std::{
 use axon_shm::{
     Meta,
     ids::{Gid, SessionId},
-    internal::Allowance,
+    internal::MemoryBudget,
     qos::{Durability, History, Qos, Reliability},
 };
 use axon_transport::{
@@ -508,7 +508,7 @@ impl Rings for SimRings {
     fn open_writer(
         &self,
         remote: &Endpoint,
-        _held: &Arc<Allowance>,
+        _held: &Arc<MemoryBudget>,
     ) -> Result<Rc<dyn RingWriter>, String> {
         if self.state.borrow().fails {
             return Err("no memory".into());

@@ -4,17 +4,17 @@ use std::os::fd::AsFd;
 
 use super::*;
 use crate::{
-    alloc::{allowance::Allowance, retention::IDLE},
+    alloc::{budget::MemoryBudget, retention::IDLE},
     ring::inspect::committed,
 };
 
 const IMAGE: usize = 300_000;
 const MOST: u64 = 8 << 20;
-/// What a ring has that counts for no allowance: its first descriptors and header, of several rings.
+/// What a ring has that counts for no budget: its first descriptors and header, of several rings.
 const BESIDE: u64 = 1 << 20;
 
 /// A ring of 4 MiB whose number is that of its publisher.
-fn ring(session: &Arc<SessionSegment>, number: u32, qos: Qos, of: &Arc<Allowance>) -> Writer {
+fn ring(session: &Arc<SessionSegment>, number: u32, qos: Qos, of: &Arc<MemoryBudget>) -> Writer {
     let gid = Gid::new(session.id(), number);
     let options = RingOptions { gid, qos, budget: 4 << 20, max_message: MAX, expected: 0 };
     let writer = Writer::create(session.clone(), options).unwrap();
@@ -40,7 +40,7 @@ fn fill(writers: &[Writer], len: usize, count: u64) -> u64 {
         for writer in writers {
             match try_publish(writer, sequence, len) {
                 Ok(()) => {}
-                Err(PublishError::Allowance { most: MOST, .. }) => refused += 1,
+                Err(PublishError::MemoryBudget { most: MOST, .. }) => refused += 1,
                 Err(other) => panic!("{other}"),
             }
         }
@@ -52,15 +52,15 @@ fn fill(writers: &[Writer], len: usize, count: u64) -> u64 {
 fn history_of_many_rings_is_bounded_together_and_given_back() {
     for (len, count) in [(IMAGE, 20), (2_000, 2_500), (60, 5_000)] {
         let (a, b) = (session(), session());
-        let allowance = Allowance::new(MOST);
+        let budget = MemoryBudget::new(MOST);
         let before = backed(&a);
         let all = transient(Qos::keep_all());
-        let mut writers: Vec<_> = (0..10).map(|n| ring(&a, n, all, &allowance)).collect();
+        let mut writers: Vec<_> = (0..10).map(|n| ring(&a, n, all, &budget)).collect();
         fill(&writers, len, count);
         let held = backed(&a) - before;
         assert!(held <= MOST + BESIDE, "{held} of samples of {len}");
-        assert!(allowance.held() > MOST / 2, "most of it is of use: {}", allowance.held());
-        assert!(allowance.refused() > 0);
+        assert!(budget.held() > MOST / 2, "most of it is of use: {}", budget.held());
+        assert!(budget.refused() > 0);
         // The newest sample is there for those that come later.
         let mut reader = attach(&writers[0], &a, &b, all);
         let mut last = None;
@@ -70,25 +70,25 @@ fn history_of_many_rings_is_bounded_together_and_given_back() {
         assert_eq!(last, Some(count - 1), "{len}");
         // A publisher that ends keeps its part for as long as readers may be at it.
         drop(writers.remove(0));
-        let with_reader = allowance.held();
+        let with_reader = budget.held();
         drop(reader);
         a.tidy();
-        assert!(allowance.held() < with_reader, "{len}");
+        assert!(budget.held() < with_reader, "{len}");
         drop(writers);
         a.tidy();
-        assert_eq!(allowance.held(), 0);
+        assert_eq!(budget.held(), 0);
     }
 }
 
 #[test]
 fn a_ring_that_may_have_no_more_memory_shows_its_newest_sample() {
     let (a, b) = (session(), session());
-    let allowance = Allowance::new(MOST);
-    let writers = [1, 2].map(|n| ring(&a, n, transient(keep_last(1)), &allowance));
+    let budget = MemoryBudget::new(MOST);
+    let writers = [1, 2].map(|n| ring(&a, n, transient(keep_last(1)), &budget));
     publish(&writers[0], 0, IMAGE);
     // Others take all but what the sample took.
     let others: Vec<_> =
-        (3..12).map(|n| ring(&a, n, transient(Qos::keep_all()), &allowance)).collect();
+        (3..12).map(|n| ring(&a, n, transient(Qos::keep_all()), &budget)).collect();
     fill(&others, IMAGE, 20);
     for sequence in 1..10 {
         publish(&writers[0], sequence, IMAGE);
@@ -100,11 +100,11 @@ fn a_ring_that_may_have_no_more_memory_shows_its_newest_sample() {
 #[test]
 fn a_ring_that_its_readers_hold_is_held_back_and_goes_on_when_they_take() {
     let (a, b) = (session(), session());
-    let allowance = Allowance::new(MOST);
-    let writer = ring(&a, 1, Qos::keep_all(), &allowance);
+    let budget = MemoryBudget::new(MOST);
+    let writer = ring(&a, 1, Qos::keep_all(), &budget);
     let mut reader = attach(&writer, &a, &b, Qos::keep_all());
     let others: Vec<_> =
-        (2..12).map(|n| ring(&a, n, transient(Qos::keep_all()), &allowance)).collect();
+        (2..12).map(|n| ring(&a, n, transient(Qos::keep_all()), &budget)).collect();
     let mut sequence = 0;
     while sequence < 4 {
         publish(&writer, sequence, IMAGE);
@@ -129,8 +129,8 @@ fn a_ring_that_its_readers_hold_is_held_back_and_goes_on_when_they_take() {
 #[test]
 fn memory_that_is_not_in_use_goes_to_those_that_were_refused_some() {
     let (a, b) = (session(), session());
-    let allowance = Allowance::new(MOST);
-    let idle = ring(&a, 1, Qos::default(), &allowance);
+    let budget = MemoryBudget::new(MOST);
+    let idle = ring(&a, 1, Qos::default(), &budget);
     let mut reader = attach(&idle, &a, &b, Qos::default());
     for sequence in 0..10 {
         publish(&idle, sequence, IMAGE);
@@ -138,14 +138,14 @@ fn memory_that_is_not_in_use_goes_to_those_that_were_refused_some() {
     while take(&mut reader).is_some() {}
     let now = Instant::now();
     idle.reclaim_idle(now);
-    let kept = allowance.held();
+    let kept = budget.held();
     assert!(kept > 0, "it may need it again");
     let others: Vec<_> =
-        (2..12).map(|n| ring(&a, n, transient(Qos::keep_all()), &allowance)).collect();
+        (2..12).map(|n| ring(&a, n, transient(Qos::keep_all()), &budget)).collect();
     fill(&others, IMAGE, 20);
-    let full = allowance.held();
+    let full = budget.held();
     assert!(now + IDLE > Instant::now());
     idle.reclaim_idle(now);
-    assert!(allowance.held() < full, "{} of {full}", allowance.held());
+    assert!(budget.held() < full, "{} of {full}", budget.held());
     assert_eq!(fill(&others[..1], IMAGE, 0), 0);
 }

@@ -11,7 +11,7 @@ use crate::error::ShmError;
 /// Memory that several rings may take together, in bytes. Each of them takes at most half of what the others leave, so
 /// none takes the last.
 #[derive(Debug)]
-pub struct Allowance {
+pub struct MemoryBudget {
     most: u64,
     held: AtomicU64,
     /// How often there was not as much as a ring asked for.
@@ -20,7 +20,7 @@ pub struct Allowance {
     pool: Option<Arc<Self>>,
 }
 
-impl Allowance {
+impl MemoryBudget {
     /// Allows up to `most` bytes.
     pub fn new(most: u64) -> Arc<Self> {
         Self::with(most, None)
@@ -68,26 +68,26 @@ impl Allowance {
     }
 }
 
-/// What one ring takes of an allowance. Given back when it is dropped.
+/// What one ring takes of a budget. Given back when it is dropped.
 #[derive(Debug, Default)]
 pub(crate) struct Holding {
-    of: Option<Arc<Allowance>>,
+    of: Option<Arc<MemoryBudget>>,
     bytes: u64,
     /// Refusals that were known when it was last asked.
     refused: u64,
 }
 
 impl Holding {
-    /// Of an allowance.
-    pub(crate) fn of(allowance: Arc<Allowance>) -> Self {
-        let refused = allowance.refused();
-        Self { of: Some(allowance), bytes: 0, refused }
+    /// Of a budget.
+    pub(crate) fn of(budget: Arc<MemoryBudget>) -> Self {
+        let refused = budget.refused();
+        Self { of: Some(budget), bytes: 0, refused }
     }
 
     /// Takes `bytes` more.
     ///
     /// # Errors
-    /// The allowance has not so much left.
+    /// The budget has not so much left.
     pub(crate) fn take(&mut self, bytes: u64) -> Result<(), ShmError> {
         let Some(of) = &self.of else { return Ok(()) };
         let pool_held = of.held();
@@ -102,7 +102,7 @@ impl Holding {
             }
             Err(available) => {
                 of.refused.fetch_add(1, Ordering::Relaxed);
-                Err(ShmError::Allowance { needed: bytes, available, most: of.most })
+                Err(ShmError::MemoryBudget { needed: bytes, available, most: of.most })
             }
         }
     }
@@ -138,22 +138,22 @@ mod tests {
 
     #[test]
     fn a_ring_takes_at_most_half_of_what_others_leave_and_gives_all_of_it_back() {
-        let allowance = Allowance::new(100);
-        let [mut one, mut two] = [(); 2].map(|()| Holding::of(Arc::clone(&allowance)));
+        let budget = MemoryBudget::new(100);
+        let [mut one, mut two] = [(); 2].map(|()| Holding::of(Arc::clone(&budget)));
         assert!(one.take(51).is_err() && one.take(30).is_ok() && one.take(20).is_ok());
         assert!(one.take(1).is_err(), "it has half of all");
         assert!(two.take(26).is_err() && two.take(25).is_ok());
-        assert_eq!((allowance.held(), allowance.refused()), (75, 3));
+        assert_eq!((budget.held(), budget.refused()), (75, 3));
         one.give_back(40);
         assert!(two.take(21).is_err() && two.take(20).is_ok());
         drop((one, two));
-        assert_eq!(allowance.held(), 0);
+        assert_eq!(budget.held(), 0);
     }
 
     #[test]
     fn what_a_pool_does_not_have_is_not_taken() {
-        let pool = Allowance::new(100);
-        let [one, two] = [80, 80].map(|most| Allowance::within(&pool, most));
+        let pool = MemoryBudget::new(100);
+        let [one, two] = [80, 80].map(|most| MemoryBudget::within(&pool, most));
         let mut of_one = [(); 2].map(|()| Holding::of(Arc::clone(&one)));
         assert!(of_one[0].take(40).is_ok() && of_one[1].take(10).is_ok());
         assert!(of_one[1].take(1).is_err(), "the identity has half of the pool");
@@ -166,8 +166,8 @@ mod tests {
 
     #[test]
     fn a_ring_hears_once_that_another_one_was_refused() {
-        let allowance = Allowance::new(100);
-        let [mut one, mut two] = [(); 2].map(|()| Holding::of(Arc::clone(&allowance)));
+        let budget = MemoryBudget::new(100);
+        let [mut one, mut two] = [(); 2].map(|()| Holding::of(Arc::clone(&budget)));
         assert!(!one.is_short());
         two.take(60).unwrap_err();
         assert!(one.is_short() && !one.is_short());
