@@ -9,10 +9,10 @@ const BETWEEN: Duration = Duration::from_secs(1);
 
 /// Counts what would be said of each.
 #[derive(Debug, Default)]
-pub struct LogLimit(Mutex<Said>);
+pub struct LogLimit(Mutex<LogCount>);
 
 #[derive(Debug, Default)]
-struct Said {
+struct LogCount {
     last: Option<Duration>,
     since: u64,
 }

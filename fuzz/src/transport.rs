@@ -17,7 +17,7 @@ use axon_transport::{
     graph::{Endpoint, EndpointKind},
     ids::{DaemonId, Gid, SessionId},
     internal::{
-        session::relayed::flow::{Channel, Incoming, Pool, WINDOW},
+        session::relayed::flow::{FlowChannel, IncomingFlow, ArrivalPool, WINDOW},
         wire::session::{self as session, CodecError, MAX_PACKET},
     },
     qos::Qos,
@@ -70,10 +70,10 @@ pub fn link_frame(data: &[u8]) -> bool {
 
 /// What decodes encodes to a packet that decodes to the same.
 pub fn session_message(data: &[u8]) -> bool {
-    let Ok(message) = session::Message::decode(data) else { return false };
+    let Ok(message) = session::SessionMessage::decode(data) else { return false };
     match message.encode() {
         Ok(packet) => {
-            let again = session::Message::decode(&packet).expect("what was encoded decodes");
+            let again = session::SessionMessage::decode(&packet).expect("what was encoded decodes");
             assert_eq!(again, message);
         }
         // An array of indefinite length can be a byte shorter than its definite spelling.
@@ -91,17 +91,17 @@ pub fn connect_packet(data: &[u8]) -> bool {
 }
 
 /// A publisher's, and those of a server's responses to two clients.
-fn relay_channels() -> [Channel; 3] {
+fn relay_channels() -> [FlowChannel; 3] {
     let [writer, one, other] = [1, 2, 3].map(|number| Gid([number; 16]));
-    [Channel::of(writer), Channel::between(writer, one), Channel::between(writer, other)]
+    [FlowChannel::of(writer), FlowChannel::between(writer, one), FlowChannel::between(writer, other)]
 }
 
 /// Packets of a relayed session, each behind its length: whatever their pieces say, no more is kept
 /// than the session was given credit for, and all of it is given back.
 pub fn relay_pieces(data: &[u8]) -> bool {
     const MAX: u64 = 100_000;
-    let pool = Pool::new(MAX);
-    let mut incoming = Incoming::new(MAX, pool.clone());
+    let pool = ArrivalPool::new(MAX);
+    let mut incoming = IncomingFlow::new(MAX, pool.clone());
     let channels = relay_channels();
     for channel in channels {
         assert!(incoming.open(channel, 0).is_some_and(|credit| credit.bytes == WINDOW));
@@ -112,7 +112,7 @@ pub fn relay_pieces(data: &[u8]) -> bool {
         let length = usize::from(u16::from_be_bytes(*length)).min(rest.len());
         let (packet, rest) = rest.split_at(length);
         packets = rest;
-        let Ok(session::Message::SampleFragment(piece)) = session::Message::decode(packet) else {
+        let Ok(session::SessionMessage::SampleFragment(piece)) = session::SessionMessage::decode(packet) else {
             return false;
         };
         match incoming.piece(piece) {
@@ -277,7 +277,7 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
 /// One sample in one piece, one on each of three channels at a time in several, and one longer than a
 /// channel's window.
 pub fn relay_pieces_seeds() -> Vec<Vec<u8>> {
-    use session::{Message, SampleFragment, SampleHeader};
+    use session::{SessionMessage, SampleFragment, SampleHeader};
     let piece = |channel: usize, length: Option<u32>, bytes: usize| {
         let head = length.map(|length| SampleHeader {
             length,
@@ -286,9 +286,9 @@ pub fn relay_pieces_seeds() -> Vec<Vec<u8>> {
             lost: 3,
             published: 4,
         });
-        let Channel { writer: publisher, client } = relay_channels()[channel];
+        let FlowChannel { writer: publisher, client } = relay_channels()[channel];
         let piece = SampleFragment { publisher, head, bytes: vec![0; bytes], client };
-        let packet = Message::SampleFragment(piece).encode().unwrap();
+        let packet = SessionMessage::SampleFragment(piece).encode().unwrap();
         let length = u16::try_from(packet.len()).unwrap().to_be_bytes();
         [&length[..], &packet].concat()
     };
@@ -320,8 +320,8 @@ pub fn connect_packet_seeds() -> Vec<Vec<u8>> {
 /// Every message of the session socket.
 pub fn session_message_seeds() -> Vec<Vec<u8>> {
     use session::{
-        Announce, Asserted, Attach, Credit, EndpointRole, Gone, Granted, Graph, GraphItem, Hello,
-        Matched, Message, PROTOCOL, Pair, Refused, SampleFragment, SampleHeader, Segment,
+        Announce, Asserted, Attach, Credit, EndpointRole, Gone, Granted, SessionGraph, GraphItem, SessionHello,
+        RelayMatched, SessionMessage, PROTOCOL, Pair, SessionRefused, SampleFragment, SampleHeader, Segment,
         SegmentName, SegmentOpened, SessionRole, StatusPart, Unmatch, Unmet, Welcome,
     };
     let (reader, writer) = (Gid([1; 16]), Gid([2; 16]));
@@ -330,7 +330,7 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
     let session = SessionId([3; 16]);
     let daemon = DaemonId([4; 16]);
     let messages = [
-        Message::Hello(Hello {
+        SessionMessage::SessionHello(SessionHello {
             protocol: PROTOCOL,
             session,
             role: SessionRole::Application,
@@ -341,23 +341,23 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
             range: Some(0),
             static_peers: None,
         }),
-        Message::Welcome(Welcome { protocol: PROTOCOL, daemon, pid: 12, ranges: Some(true) }),
-        Message::Refused(Refused {
+        SessionMessage::Welcome(Welcome { protocol: PROTOCOL, daemon, pid: 12, ranges: Some(true) }),
+        SessionMessage::SessionRefused(SessionRefused {
             variable: "AXON_QUIC_CIPHER".into(),
             ours: "chacha20-poly1305".into(),
             theirs: "aes-256-gcm".into(),
             text: "they differ".into(),
             endpoint: Some(writer),
         }),
-        Message::Endpoint(Announce {
+        SessionMessage::Endpoint(Announce {
             endpoint: endpoint(),
             role: EndpointRole::Relay,
             stands_for: vec![reader, writer],
             ring: Some(place),
             only: Some(writer),
         }),
-        Message::EndpointGone(Gone { gid: reader }),
-        Message::Graph(Graph {
+        SessionMessage::EndpointGone(Gone { gid: reader }),
+        SessionMessage::SessionGraph(SessionGraph {
             version: 3,
             whole: true,
             added: vec![GraphItem { endpoint: endpoint(), daemon: Some(daemon), reach: None }],
@@ -365,8 +365,8 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
             more: false,
             ended: Some(vec![writer]),
         }),
-        Message::Match(Pair { reader, writer }),
-        Message::Attach(Attach {
+        SessionMessage::Match(Pair { reader, writer }),
+        SessionMessage::Attach(Attach {
             reader,
             writer,
             lane: place,
@@ -377,7 +377,7 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
             after: Some(2),
             carries: Some(true),
         }),
-        Message::Grant(Granted {
+        SessionMessage::Grant(Granted {
             reader,
             writer,
             generation: 5,
@@ -388,21 +388,21 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
             after: Some(2),
             relayed: Some(true),
         }),
-        Message::Detach(Pair { reader, writer }),
-        Message::Unmatch(Unmatch { reader, writer, reason: "gone".into() }),
-        Message::StatusRequest,
-        Message::AccessCheck(session::AccessCheck {
+        SessionMessage::Detach(Pair { reader, writer }),
+        SessionMessage::Unmatch(Unmatch { reader, writer, reason: "gone".into() }),
+        SessionMessage::StatusRequest,
+        SessionMessage::AccessCheck(session::AccessCheck {
             daemon: DaemonId([9; 16]),
             uses: vec![session::CheckedUse { verb: 0, name: "/scan".into() }],
         }),
-        Message::Status(StatusPart { part: 0, parts: 1, text: b"{}".to_vec() }),
-        Message::Resync,
-        Message::Segment(SegmentOpened { session, segment }),
-        Message::SegmentGone(SegmentName { session, number: 3 }),
-        Message::Need(SegmentName { session, number: 3 }),
-        Message::Unmet(Unmet { reader, writer, samples: 12 }),
-        Message::Matched(Matched { gid: reader, others: vec![writer] }),
-        Message::SampleFragment(SampleFragment {
+        SessionMessage::Status(StatusPart { part: 0, parts: 1, text: b"{}".to_vec() }),
+        SessionMessage::Resync,
+        SessionMessage::Segment(SegmentOpened { session, segment }),
+        SessionMessage::SegmentGone(SegmentName { session, number: 3 }),
+        SessionMessage::Need(SegmentName { session, number: 3 }),
+        SessionMessage::Unmet(Unmet { reader, writer, samples: 12 }),
+        SessionMessage::RelayMatched(RelayMatched { gid: reader, others: vec![writer] }),
+        SessionMessage::SampleFragment(SampleFragment {
             publisher: writer,
             head: Some(SampleHeader {
                 length: 3,
@@ -414,15 +414,15 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
             bytes: vec![1, 2],
             client: None,
         }),
-        Message::Credit(Credit {
+        SessionMessage::Credit(Credit {
             publisher: writer,
             bytes: 128,
             opens: Some(3),
             client: Some(reader),
             done: Some(7),
         }),
-        Message::Asserted(Asserted { publishers: vec![writer] }),
-        Message::Unknown(200),
+        SessionMessage::Asserted(Asserted { publishers: vec![writer] }),
+        SessionMessage::Unknown(200),
     ];
     messages.iter().map(|message| message.encode().unwrap()).collect()
 }

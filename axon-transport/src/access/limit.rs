@@ -91,12 +91,12 @@ impl fmt::Display for EgressLimit {
 #[derive(Debug)]
 pub(super) struct LimitRule {
     pub(super) peers: Vec<PartyPattern>,
-    pub(super) limits: Limits,
+    pub(super) limits: LimitKind,
 }
 
 /// What a `[[limit]]` limits.
 #[derive(Debug)]
-pub(super) enum Limits {
+pub(super) enum LimitKind {
     /// What the party does, with which topics and services.
     Uses(Vec<(Verb, TopicPattern)>, PlacedLimit),
     /// All that is sent to it.
@@ -159,7 +159,7 @@ impl LimitRule {
 
     /// The limit, if it is on this use.
     pub(super) fn of(&self, verb: Verb, name: &str) -> Option<&PlacedLimit> {
-        let Limits::Uses(uses, limit) = &self.limits else { return None };
+        let LimitKind::Uses(uses, limit) = &self.limits else { return None };
         let fits = uses.iter().any(|(used, pattern)| *used == verb && pattern.fits(name));
         fits.then_some(limit)
     }
@@ -167,16 +167,16 @@ impl LimitRule {
     /// The limit, if it is on all that is sent.
     pub(super) fn egress(&self) -> Option<&EgressLimit> {
         match &self.limits {
-            Limits::Egress(limit) => Some(limit),
-            Limits::Uses(..) => None,
+            LimitKind::Egress(limit) => Some(limit),
+            LimitKind::Uses(..) => None,
         }
     }
 
     /// How decisions name the file.
     pub(super) fn file(&self) -> &str {
         match &self.limits {
-            Limits::Uses(_, limit) => &limit.file,
-            Limits::Egress(limit) => &limit.file,
+            LimitKind::Uses(_, limit) => &limit.file,
+            LimitKind::Egress(limit) => &limit.file,
         }
     }
 }

@@ -44,7 +44,7 @@ impl AccessRules {
     /// # Errors
     /// The first thing that is wrong.
     pub fn parse(text: &str, file: &str) -> Result<Self, AccessError> {
-        Reader::new(text, file).read(true)
+        RuleFileReader::new(text, file).read(true)
     }
 
     /// The rules of an `axon.toml`, whose other keys are not looked at.
@@ -52,7 +52,7 @@ impl AccessRules {
     /// # Errors
     /// The first thing that is wrong with a rule.
     pub fn parse_among_settings(text: &str, file: &str) -> Result<Self, AccessError> {
-        Reader::new(text, file).read(false)
+        RuleFileReader::new(text, file).read(false)
     }
 
     /// Whether a key at the top of an `axon.toml` is of rules.
@@ -64,7 +64,7 @@ impl AccessRules {
 type Value<'i> = Spanned<DeValue<'i>>;
 
 /// A file that is being read.
-struct Reader<'t> {
+struct RuleFileReader<'t> {
     text: &'t str,
     file: Arc<str>,
     patterns: usize,
@@ -72,7 +72,7 @@ struct Reader<'t> {
     limited: usize,
 }
 
-impl<'t> Reader<'t> {
+impl<'t> RuleFileReader<'t> {
     fn new(text: &'t str, file: &str) -> Self {
         Self { text, file: file.into(), patterns: 0, limited: 0 }
     }

@@ -8,11 +8,11 @@ use super::{pattern::TopicPattern, starred_segments::StarredSegments};
 #[derive(Debug)]
 pub(super) struct PatternSet {
     /// The first is the root.
-    nodes: Vec<Node>,
+    nodes: Vec<PatternNode>,
 }
 
 #[derive(Debug, Default)]
-struct Node {
+struct PatternNode {
     /// The next segment, where it is plain text.
     literal: HashMap<Box<str>, usize>,
     /// The next segment, where it has a `*`.
@@ -27,7 +27,7 @@ struct Node {
 
 impl Default for PatternSet {
     fn default() -> Self {
-        Self { nodes: vec![Node::default()] }
+        Self { nodes: vec![PatternNode::default()] }
     }
 }
 
@@ -47,7 +47,7 @@ impl PatternSet {
 
     /// Whether one pattern fits each name of ROS 2: `**` or `/**`.
     pub(super) fn fits_all(&self) -> bool {
-        let any = |node: &Node| node.any.is_some_and(|any| self.nodes[any].line.is_some());
+        let any = |node: &PatternNode| node.any.is_some_and(|any| self.nodes[any].line.is_some());
         let [root, ..] = &self.nodes[..] else { return false };
         any(root) || root.literal.get("").is_some_and(|slash| any(&self.nodes[*slash]))
     }
@@ -64,7 +64,7 @@ impl PatternSet {
             return known;
         }
         let next = self.nodes.len();
-        self.nodes.push(Node { stays: segment == "**", ..Node::default() });
+        self.nodes.push(PatternNode { stays: segment == "**", ..PatternNode::default() });
         let node = &mut self.nodes[at];
         match segment {
             "**" => node.any = Some(next),
@@ -83,7 +83,7 @@ impl PatternSet {
         self.enter(&mut at, 0);
         for segment in name.split('/') {
             for node in at.drain(..) {
-                let Node { literal, starred, stays, .. } = &self.nodes[node];
+                let PatternNode { literal, starred, stays, .. } = &self.nodes[node];
                 if *stays {
                     self.enter(&mut next, node);
                 }

@@ -19,12 +19,12 @@ pub(super) struct Compiled {
     pub(super) file: Arc<str>,
     pub(super) allow: VerbPatterns,
     pub(super) deny: VerbPatterns,
-    pub(super) otherwise: Otherwise,
+    pub(super) otherwise: DefaultDecision,
 }
 
 /// What counts where no pattern fits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Otherwise {
+pub(super) enum DefaultDecision {
     /// No `[[allow]]` names the party.
     Allow,
     /// One does.
@@ -75,7 +75,8 @@ impl Permissions {
     /// Whether there is anything that the party may publish, subscribe to, serve or call.
     pub(crate) fn allow_any_use(&self) -> bool {
         let Some(rules) = &self.rules else { return true };
-        let open = rules.otherwise == Otherwise::Allow && !rules.deny.of(Verb::See).fits_all();
+        let open =
+            rules.otherwise == DefaultDecision::Allow && !rules.deny.of(Verb::See).fits_all();
         Verb::ALL.into_iter().filter(|verb| *verb != Verb::See).any(|verb| {
             (open || !rules.allow.of(verb).is_empty()) && !rules.deny.of(verb).fits_all()
         })
@@ -92,15 +93,15 @@ impl Permissions {
         if let Some(line) = rules.allow.of(verb).first_fit(name) {
             return Decision(Reason::Allowed { file: file(), line });
         }
-        if rules.otherwise == Otherwise::Allow
+        if rules.otherwise == DefaultDecision::Allow
             && let Some(line) = rules.deny.of(Verb::See).first_fit(name)
         {
             return Decision(Reason::Denied { file: file(), line });
         }
         Decision(match rules.otherwise {
-            Otherwise::Allow => Reason::Open { file: file() },
-            Otherwise::NotAllowed => Reason::NotAllowed { file: file() },
-            Otherwise::DenyByDefault => Reason::Default { file: file() },
+            DefaultDecision::Allow => Reason::Open { file: file() },
+            DefaultDecision::NotAllowed => Reason::NotAllowed { file: file() },
+            DefaultDecision::DenyByDefault => Reason::Default { file: file() },
         })
     }
 }

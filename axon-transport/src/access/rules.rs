@@ -6,7 +6,7 @@ use super::{
     Decision, Party, Permissions, TopicPattern,
     limit::{InterfaceLimit, LimitRule},
     party::{HostPattern, PartyPattern},
-    permissions::{Compiled, Otherwise, VerbPatterns},
+    permissions::{Compiled, DefaultDecision, VerbPatterns},
 };
 
 /// What a party does with a topic, a service or a node.
@@ -133,9 +133,9 @@ impl AccessRules {
             insert(&mut deny, rule);
         }
         let otherwise = match (is_named, rules.denies_by_default) {
-            (true, _) => Otherwise::NotAllowed,
-            (false, true) => Otherwise::DenyByDefault,
-            (false, false) => Otherwise::Allow,
+            (true, _) => DefaultDecision::NotAllowed,
+            (false, true) => DefaultDecision::DenyByDefault,
+            (false, false) => DefaultDecision::Allow,
         };
         let compiled = Compiled { file: Arc::clone(&rules.file), allow, deny, otherwise };
         Permissions::new(Some(compiled), limits)

@@ -9,7 +9,7 @@ use super::{
     Config, ConfigError, Files, OsFiles, environment, file_beside,
     names::{RUNTIME_DIR, TRUSTED_UIDS},
     resolve,
-    sources::Sources,
+    sources::SettingSources,
     values::Values,
 };
 
@@ -46,7 +46,7 @@ impl DaemonPlace {
         files: &impl Files,
     ) -> Result<Self, ConfigError> {
         let only = &[RUNTIME_DIR, TRUSTED_UIDS];
-        let sources = Sources::collect_only(only, env, default_file, files)?;
+        let sources = SettingSources::collect_only(only, env, default_file, files)?;
         let values = Values { sources: &sources, files };
         let (runtime_dir, socket_in_runtime_dir) = resolve::runtime_dir(&values)?;
         Ok(Self {

@@ -13,8 +13,8 @@ use super::{
     daemon_env::DaemonEnv,
     files::Files,
     names, rules_file,
-    sources::{Given, Sources},
-    values::{self, Use, Values},
+    sources::{Given, SettingSources},
+    values::{self, FileUse, Values},
 };
 
 const MIB: u64 = 1 << 20;
@@ -30,7 +30,7 @@ pub(super) fn resolve(
     files: &impl Files,
     daemon_env: DaemonEnv,
 ) -> Result<Config, ConfigError> {
-    let mut sources = Sources::collect(env, given, default_file, files)?;
+    let mut sources = SettingSources::collect(env, given, default_file, files)?;
     let modes = [SecurityMode::Classic, SecurityMode::Qkd].map(|mode| (mode.name(), mode));
     let mode = Values { sources: &sources, files }.choice("AXON_SECURITY_MODE", &modes)?;
     let mode = match mode {
@@ -80,7 +80,7 @@ pub(super) fn resolve(
         range,
         static_peers,
         daemon: values.choice("AXON_DAEMON", &policies)?.unwrap_or(DaemonPolicy::Spawn),
-        daemon_path: values.file("AXON_DAEMON_PATH", Use::Program)?,
+        daemon_path: values.file("AXON_DAEMON_PATH", FileUse::Program)?,
         runtime_dir,
         socket_in_runtime_dir,
         bind_addrs,
@@ -172,18 +172,18 @@ fn classic(values: &Values<'_, impl Files>) -> Result<ClassicConfig, ConfigError
     }
     Ok(ClassicConfig {
         auth,
-        key: values.file(KEY, Use::Secret)?,
-        trust: values.file(TRUST, Use::Public)?,
-        ca: values.file(CA, Use::Public)?,
-        cert: values.file(CERT, Use::Public)?,
-        crl: values.file(CRL, Use::Public)?,
+        key: values.file(KEY, FileUse::Secret)?,
+        trust: values.file(TRUST, FileUse::Public)?,
+        ca: values.file(CA, FileUse::Public)?,
+        cert: values.file(CERT, FileUse::Public)?,
+        crl: values.file(CRL, FileUse::Public)?,
     })
 }
 
 fn qkd(values: &Values<'_, impl Files>) -> Result<QkdConfig, ConfigError> {
     let key_modes = [("messages10", KeyMode::Messages10), ("session", KeyMode::Session)];
     let kexes = [QkdKex::PskKe, QkdKex::PskDheKe].map(|kex| (kex.name(), kex));
-    let file = |name: &str, usage: Use| {
+    let file = |name: &str, usage: FileUse| {
         let path = values.file(name, usage)?;
         required(path, name, "the path of a file; AXON_SECURITY_MODE=qkd needs it")
     };
@@ -218,11 +218,11 @@ fn qkd(values: &Values<'_, impl Files>) -> Result<QkdConfig, ConfigError> {
             "AXON_KME_URL",
             "https://host:port of this host's KME",
         )?,
-        kme_ca: file("AXON_KME_CA", Use::Public)?,
+        kme_ca: file("AXON_KME_CA", FileUse::Public)?,
         kme_id,
         sae_id,
-        sae_cert: file("AXON_SAE_CERT", Use::Public)?,
-        sae_key: file("AXON_SAE_KEY", Use::Secret)?,
+        sae_cert: file("AXON_SAE_CERT", FileUse::Public)?,
+        sae_key: file("AXON_SAE_KEY", FileUse::Secret)?,
         kme_quirks,
         kme_connect_timeout,
         kme_answer_timeout,
@@ -247,7 +247,7 @@ fn kme_timeouts(values: &Values<'_, impl Files>) -> Result<(Duration, Duration),
     Ok((Duration::from_secs(connect), Duration::from_secs(answer)))
 }
 
-pub(super) fn domain(sources: &Sources) -> Result<u32, ConfigError> {
+pub(super) fn domain(sources: &SettingSources) -> Result<u32, ConfigError> {
     const NAME: &str = "ROS_DOMAIN_ID";
     match sources.foreign.get(NAME).map(String::as_str) {
         None | Some("") => Ok(0),
@@ -259,7 +259,7 @@ pub(super) fn domain(sources: &Sources) -> Result<u32, ConfigError> {
 }
 
 /// ROS 2's discovery variables, by the rules of rcl: `ROS_LOCALHOST_ONLY=1` wins over the others.
-fn range(sources: &Sources) -> Result<(DiscoveryRange, Vec<String>), ConfigError> {
+fn range(sources: &SettingSources) -> Result<(DiscoveryRange, Vec<String>), ConfigError> {
     const RANGE: &str = "ROS_AUTOMATIC_DISCOVERY_RANGE";
     const PEERS: &str = "ROS_STATIC_PEERS";
     let variable = |name| sources.foreign.get(name).map_or("", String::as_str);

@@ -11,7 +11,7 @@ use super::{
     files::{FileKind, Files, OsFiles},
     names,
     sources::is_setting_key,
-    values::{Use, Values},
+    values::{FileUse, Values},
 };
 use crate::access::{AccessError, AccessRules, HostPattern};
 
@@ -42,7 +42,7 @@ pub(super) fn of_settings(
     let inline = &values.sources.access;
     let named = match values.sources.settings.get(NAME) {
         Some(setting) if setting.text == NO_FILE => Some(NO_FILE.into()),
-        _ => values.file(NAME, Use::Public)?,
+        _ => values.file(NAME, FileUse::Public)?,
     };
     let (rules, file) = match named {
         Some(_) if inline.file().is_some() => {

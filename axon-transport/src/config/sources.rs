@@ -18,11 +18,11 @@ use crate::access::{AccessRules, parse::position};
 #[derive(Clone, Debug)]
 pub(super) struct Setting {
     pub(super) text: String,
-    pub(super) origin: Origin,
+    pub(super) origin: SettingOrigin,
 }
 
 #[derive(Clone, Debug)]
-pub(super) enum Origin {
+pub(super) enum SettingOrigin {
     Environment,
     /// A method of [`ConfigBuilder`](super::ConfigBuilder).
     Builder,
@@ -31,7 +31,7 @@ pub(super) enum Origin {
 
 /// All settings given, and the few variables of others that count.
 #[derive(Debug, Default)]
-pub(super) struct Sources {
+pub(super) struct SettingSources {
     pub(super) settings: BTreeMap<&'static str, Setting>,
     /// `ROS_*` and `XDG_RUNTIME_DIR`, from the environment alone.
     pub(super) foreign: BTreeMap<&'static str, String>,
@@ -63,7 +63,7 @@ pub(super) const FOREIGN: &[&str] = &[
     "XDG_RUNTIME_DIR",
 ];
 
-impl Sources {
+impl SettingSources {
     /// Reads the environment, then the file it names (or `default_file`), and lets the environment
     /// win. What a builder was `given` counts in place of the environment's. `default_file` may be
     /// absent; one that `AXON_CONFIG` names may not.
@@ -131,7 +131,7 @@ impl Sources {
                 setting => setting?,
             };
             let text = utf8(setting, &value)?;
-            self.settings.insert(setting, Setting { text, origin: Origin::Environment });
+            self.settings.insert(setting, Setting { text, origin: SettingOrigin::Environment });
         }
         Ok(())
     }
@@ -164,7 +164,7 @@ impl Sources {
             if FOREIGN.contains(&name) {
                 self.foreign.insert(name, text.clone());
             } else {
-                let setting = Setting { text: text.clone(), origin: Origin::Builder };
+                let setting = Setting { text: text.clone(), origin: SettingOrigin::Builder };
                 self.settings.insert(name, setting);
             }
         }
@@ -281,7 +281,7 @@ fn setting_of_file(
     let place = format!("{key} in {}", file.display());
     let name = setting_of_key(key).map_err(|e| e.at(&*place))?;
     let text = text_of(name, value).map_err(|e| e.at(&*place))?;
-    Ok((name, Setting { text, origin: Origin::File(Rc::clone(file)) }))
+    Ok((name, Setting { text, origin: SettingOrigin::File(Rc::clone(file)) }))
 }
 
 /// Whether a key at the top of a file is one of settings.

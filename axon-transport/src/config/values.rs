@@ -11,7 +11,7 @@ use super::{
     ConfigError, PeerAddress, QkdConfig, QkdPeers,
     files::{FileKind, Files},
     names,
-    sources::{self, Origin, Setting, Sources},
+    sources::{self, Setting, SettingOrigin, SettingSources},
 };
 
 /// Most entries of any list.
@@ -24,7 +24,7 @@ const LONGEST_ENCODED_SAE_ID: usize = 128 - 12 - 1 - 36;
 
 /// How a file is used, which decides what is asked of it.
 #[derive(Clone, Copy, PartialEq, Eq)]
-pub(super) enum Use {
+pub(super) enum FileUse {
     /// Certificates, pins: read by the daemon and digested by sessions.
     Public,
     /// A private key: looked at from outside only.
@@ -35,7 +35,7 @@ pub(super) enum Use {
 
 /// The settings with the file system they name files in.
 pub(super) struct Values<'a, F> {
-    pub(super) sources: &'a Sources,
+    pub(super) sources: &'a SettingSources,
     pub(super) files: &'a F,
 }
 
@@ -212,7 +212,7 @@ impl<F: Files> Values<'_, F> {
     }
 
     /// A file that exists, is as private or as public as its use asks, and can be used.
-    pub(super) fn file(&self, name: &str, usage: Use) -> Result<Option<PathBuf>, ConfigError> {
+    pub(super) fn file(&self, name: &str, usage: FileUse) -> Result<Option<PathBuf>, ConfigError> {
         let Some(setting) = self.text(name, "the path of a file")? else { return Ok(None) };
         let path = self.path(name, setting)?;
         let facts = self.files.facts(&path).map_err(|error| {
@@ -222,7 +222,7 @@ impl<F: Files> Values<'_, F> {
             return Err(refuse(name, setting, "the path of a regular file"));
         }
         match usage {
-            Use::Secret if facts.mode & 0o077 != 0 => Err(refuse(
+            FileUse::Secret if facts.mode & 0o077 != 0 => Err(refuse(
                 name,
                 setting,
                 format!(
@@ -231,19 +231,19 @@ impl<F: Files> Values<'_, F> {
                     facts.mode & 0o777
                 ),
             )),
-            Use::Public if facts.mode & 0o002 != 0 => {
+            FileUse::Public if facts.mode & 0o002 != 0 => {
                 Err(refuse(name, setting, "a file that not everybody may write; chmod o-w"))
             }
-            Use::Program if facts.mode & 0o111 == 0 => {
+            FileUse::Program if facts.mode & 0o111 == 0 => {
                 Err(refuse(name, setting, "a program that may be executed; chmod +x"))
             }
-            Use::Public => match self.files.readable(&path) {
+            FileUse::Public => match self.files.readable(&path) {
                 Ok(()) => Ok(Some(path)),
                 Err(error) => {
                     Err(refuse(name, setting, format!("a file that can be read ({error})")))
                 }
             },
-            Use::Secret | Use::Program => Ok(Some(path)),
+            FileUse::Secret | FileUse::Program => Ok(Some(path)),
         }
     }
 
@@ -258,8 +258,8 @@ impl<F: Files> Values<'_, F> {
 
     fn path(&self, name: &str, setting: &Setting) -> Result<PathBuf, ConfigError> {
         let file = match &setting.origin {
-            Origin::Environment | Origin::Builder => None,
-            Origin::File(path) => Some(path.as_path()),
+            SettingOrigin::Environment | SettingOrigin::Builder => None,
+            SettingOrigin::File(path) => Some(path.as_path()),
         };
         sources::absolute(name, &setting.text, file, self.files)
     }
@@ -281,9 +281,9 @@ fn refuse(name: &str, setting: &Setting, accepted: impl Into<String>) -> ConfigE
 
 fn at(error: ConfigError, name: &str, setting: &Setting) -> ConfigError {
     match &setting.origin {
-        Origin::Environment => error,
-        Origin::Builder => error.at(method(name)),
-        Origin::File(path) => error.at(in_file(name, path)),
+        SettingOrigin::Environment => error,
+        SettingOrigin::Builder => error.at(method(name)),
+        SettingOrigin::File(path) => error.at(in_file(name, path)),
     }
 }
 

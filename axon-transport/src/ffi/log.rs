@@ -105,7 +105,7 @@ pub unsafe extern "C" fn axon_session_log_set_callback(
         if log.waiting.is_teller() {
             return Err(CallFailure::new(AXON_RET_ERROR, "called from within a log callback"));
         }
-        if callback.is_some() && !Listener::stands() {
+        if callback.is_some() && !LogListener::stands() {
             let text = "another part of the program has a global subscriber of tracing";
             return Err(CallFailure::new(AXON_RET_ERROR, text));
         }
@@ -138,7 +138,7 @@ fn is_wanted(severity: u32) -> bool {
 }
 
 /// Something that was said.
-struct Line {
+struct LogLine {
     severity: u32,
     part: &'static str,
     text: String,
@@ -173,7 +173,7 @@ impl Log {
     }
 
     /// Calls the program, if it still wants to hear of this. No lock is held meanwhile.
-    fn tell(&self, line: &Line) {
+    fn tell(&self, line: &LogLine) {
         let mut slot = self.slot();
         let Some(told) = slot.told.filter(|_| is_wanted(line.severity)) else { return };
         slot.called = Some(slot.version);
@@ -194,9 +194,9 @@ impl Log {
 }
 
 /// Hears all of the process.
-struct Listener;
+struct LogListener;
 
-impl Listener {
+impl LogListener {
     /// Whether it is this one that hears.
     fn stands() -> bool {
         let _ = set_global_default(Self);
@@ -204,7 +204,7 @@ impl Listener {
     }
 }
 
-impl Subscriber for Listener {
+impl Subscriber for LogListener {
     // What is wanted may change at any time.
     fn register_callsite(&self, _: &'static Metadata<'static>) -> Interest {
         Interest::sometimes()
@@ -219,7 +219,7 @@ impl Subscriber for Listener {
         let metadata = event.metadata();
         let mut text = Text::default();
         event.record(&mut text);
-        let line = Line {
+        let line = LogLine {
             severity: severity(metadata.level()),
             part: metadata.target(),
             text: text.message + &text.values,

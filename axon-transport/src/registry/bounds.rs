@@ -7,8 +7,8 @@ use crate::{
     graph::EndpointKind,
     qos::Qos,
     wire::session::{
-        Announce, Attach, EndpointRole, Gone, Granted, Leaving, Message, Segment, SegmentName,
-        SegmentOpened, StatusPart, Unmatch,
+        Announce, Attach, EndpointRole, Gone, Granted, Segment, SegmentName, SegmentOpened,
+        SessionMessage, StatusPart, Unmatch, WriterLeaving,
     },
 };
 
@@ -28,9 +28,9 @@ fn registry(roles: &[SessionRole]) -> Registry<Label> {
     registry
 }
 
-fn drain(registry: &mut Registry<Label>, number: u8) -> Vec<Message> {
+fn drain(registry: &mut Registry<Label>, number: u8) -> Vec<SessionMessage> {
     std::iter::from_fn(|| registry.poll_output(&id(number)))
-        .map(|output| Message::decode(&output.packet).unwrap())
+        .map(|output| SessionMessage::decode(&output.packet).unwrap())
         .collect()
 }
 
@@ -48,16 +48,19 @@ fn announce_as(
     let place = Location { segment: 0, offset: 4096 };
     let ring = (endpoint.kind == EndpointKind::Publisher).then_some(place);
     let announce = Announce { endpoint, role, stands_for: vec![], ring, only: None };
-    let message = Message::Endpoint(announce);
+    let message = SessionMessage::Endpoint(announce);
     registry.handle_message(&id(session), message, vec![]).unwrap();
 }
 
-fn graphs(messages: &[Message]) -> usize {
-    messages.iter().filter(|m| matches!(m, Message::Graph(_))).count()
+fn graphs(messages: &[SessionMessage]) -> usize {
+    messages.iter().filter(|m| matches!(m, SessionMessage::SessionGraph(_))).count()
 }
 
-fn whole_graphs(messages: &[Message]) -> usize {
-    messages.iter().filter(|m| matches!(m, Message::Graph(graph) if graph.whole)).count()
+fn whole_graphs(messages: &[SessionMessage]) -> usize {
+    messages
+        .iter()
+        .filter(|m| matches!(m, SessionMessage::SessionGraph(graph) if graph.whole))
+        .count()
 }
 
 #[test]
@@ -77,7 +80,11 @@ fn the_pairs_that_a_session_makes_are_bounded_and_others_make_theirs() {
     }
     assert_eq!(registry.pairs.len(), MAX_PAIRS, "one too many");
     let refused = drain(&mut registry, 1);
-    assert!(refused.iter().any(|m| matches!(m, Message::Refused(r) if r.text.contains("pairs"))));
+    assert!(
+        refused
+            .iter()
+            .any(|m| matches!(m, SessionMessage::SessionRefused(r) if r.text.contains("pairs")))
+    );
     let shown = registry.take_refused();
     assert!(matches!(&shown[..], [(of, why)] if *of == id(1) && why.contains("pairs")), "once");
 
@@ -89,7 +96,7 @@ fn the_pairs_that_a_session_makes_are_bounded_and_others_make_theirs() {
     let [first, second] = [64, 65].map(|number| Gid::new(id(1), number));
     let why = "its session has 1024 pairs of publishers and subscriptions, and would have 32 more: the most are 1024";
     assert_eq!(refused(&registry), [(first, why.to_owned()), (second, why.to_owned())]);
-    let gone = |gid| Message::EndpointGone(Gone { gid });
+    let gone = |gid| SessionMessage::EndpointGone(Gone { gid });
     registry.handle_message(&id(1), gone(first), vec![]).unwrap();
     assert_eq!(refused(&registry).len(), 1);
     registry.handle_message(&id(1), gone(Gid::new(id(1), 63)), vec![]).unwrap();
@@ -131,7 +138,7 @@ fn the_gateway_brings_the_publishers_of_other_hosts_to_every_reader() {
     assert_eq!(registry.take_refused().len(), 1);
     let last = stand_in(u32::try_from(MAX_ALL_PAIRS).unwrap() / readers);
     assert!(registry.endpoints.get(&last).is_none(), "it was refused");
-    let gone = |gid| Message::EndpointGone(Gone { gid });
+    let gone = |gid| SessionMessage::EndpointGone(Gone { gid });
     assert_eq!(registry.handle_message(&id(1), gone(last), vec![]), Ok(()));
     let other = registry.handle_message(&id(2), gone(last), vec![]);
     assert_eq!(other, Err(Violation::NotItsOwn(last)), "nobody else speaks for other hosts");
@@ -148,9 +155,11 @@ fn the_gateway_is_told_of_this_host_alone() {
     announce(&mut registry, 2, 1, EndpointKind::Publisher);
     registry.flush();
     assert_eq!(graphs(&drain(&mut registry, 1)), 1);
-    registry.handle_message(&id(1), Message::Resync, vec![]).unwrap();
+    registry.handle_message(&id(1), SessionMessage::Resync, vec![]).unwrap();
     let told = drain(&mut registry, 1);
-    let items = told.iter().filter_map(|m| if let Message::Graph(g) = m { Some(g) } else { None });
+    let items = told
+        .iter()
+        .filter_map(|m| if let SessionMessage::SessionGraph(g) = m { Some(g) } else { None });
     let gids: Vec<_> = items.flat_map(|g| &g.added).map(|item| item.endpoint.gid).collect();
     assert_eq!(gids, [Gid::new(id(2), 1)]);
     registry.remote_gone(&DaemonId([1; 16]));
@@ -166,7 +175,7 @@ fn sessions_that_are_told_everything_share_its_packets() {
     registry.remote_graph(DaemonId([1; 16]), true, many, vec![]);
     registry.flush();
     let mut first = [1, 2].map(|number| {
-        registry.handle_message(&id(number), Message::Resync, vec![]).unwrap();
+        registry.handle_message(&id(number), SessionMessage::Resync, vec![]).unwrap();
         while registry.session(&id(number)).is_some_and(|s| s.queued() > 0) {
             registry.poll_output(&id(number));
         }
@@ -175,7 +184,7 @@ fn sessions_that_are_told_everything_share_its_packets() {
     assert!(Arc::ptr_eq(&first[0], &first[1]));
     // Of another version are others.
     announce(&mut registry, 1, 1, EndpointKind::Subscription);
-    registry.handle_message(&id(2), Message::Resync, vec![]).unwrap();
+    registry.handle_message(&id(2), SessionMessage::Resync, vec![]).unwrap();
     while registry.session(&id(2)).is_some_and(|s| s.queued() > 0) {
         registry.poll_output(&id(2));
     }
@@ -187,17 +196,17 @@ fn sessions_that_are_told_everything_share_its_packets() {
 fn everything_is_told_anew_once_however_often_it_is_asked_for() {
     let mut registry = registry(&[SessionRole::Application]);
     for _ in 0..100 {
-        registry.handle_message(&id(1), Message::Resync, vec![]).unwrap();
+        registry.handle_message(&id(1), SessionMessage::Resync, vec![]).unwrap();
     }
     assert_eq!(whole_graphs(&drain(&mut registry, 1)), 1);
-    registry.handle_message(&id(1), Message::Resync, vec![]).unwrap();
+    registry.handle_message(&id(1), SessionMessage::Resync, vec![]).unwrap();
     assert_eq!(whole_graphs(&drain(&mut registry, 1)), 1);
 }
 
 #[test]
 fn a_sessions_queue_is_bounded_in_bytes() {
     let mut registry = registry(&[SessionRole::Application]);
-    let part = Message::Status(StatusPart { part: 0, parts: 1, text: vec![0; 24 << 10] });
+    let part = SessionMessage::Status(StatusPart { part: 0, parts: 1, text: vec![0; 24 << 10] });
     for _ in 0..1000 {
         registry.push(&id(1), &part, vec![]);
         let entry = registry.session(&id(1)).unwrap();
@@ -208,10 +217,10 @@ fn a_sessions_queue_is_bounded_in_bytes() {
 }
 
 /// What a session puts together of the parts that it is sent.
-fn put_together(messages: &[Message]) -> Vec<u8> {
+fn put_together(messages: &[SessionMessage]) -> Vec<u8> {
     let mut text = Vec::new();
     for (number, message) in (0..).zip(messages) {
-        let Message::Status(part) = message else { panic!("{message:?}") };
+        let SessionMessage::Status(part) = message else { panic!("{message:?}") };
         assert_eq!(part.part, number);
         text.extend_from_slice(&part.text);
         assert_eq!(number + 1 == part.parts, text.len() == 6_000_000, "the last is the last");
@@ -236,7 +245,7 @@ fn a_status_larger_than_the_queue_is_told_whole() {
         while let Some(output) = registry.poll_output(&id(1)) {
             registry.return_output(&id(1), output);
             let output = registry.poll_output(&id(1)).unwrap();
-            all.push(Message::decode(&output.packet).unwrap());
+            all.push(SessionMessage::decode(&output.packet).unwrap());
         }
         assert!(put_together(&all) == status);
         assert!(!registry.repeat_status(&id(1)), "it has been told");
@@ -254,7 +263,7 @@ fn a_tool_that_asks_again_is_told_the_same_status_from_its_beginning() {
     assert_eq!(put_together(&drain(&mut registry, 1)).len(), 6_000_000);
     registry.tell_status(&id(1), Vec::new().into());
     let one = drain(&mut registry, 1);
-    assert!(matches!(&one[..], [Message::Status(part)] if part.parts == 1));
+    assert!(matches!(&one[..], [SessionMessage::Status(part)] if part.parts == 1));
 }
 
 #[test]
@@ -265,7 +274,7 @@ fn a_pair_that_cannot_share_memory_is_shown_with_the_reason() {
     let (writer, reader) = (Gid::new(id(1), 1), Gid::new(id(2), 1));
     let fail = |registry: &mut Registry<Label>, session| {
         let reason = "not \u{1b}[1mmapped".to_owned() + &"!".repeat(10_000);
-        let unmatch = Message::Unmatch(Unmatch { reader, writer, reason });
+        let unmatch = SessionMessage::Unmatch(Unmatch { reader, writer, reason });
         registry.handle_message(&id(session), unmatch, vec![])
     };
     assert_eq!(fail(&mut registry, 3), Err(Violation::NotItsOwn(reader)));
@@ -286,7 +295,9 @@ fn a_pair_that_cannot_share_memory_is_shown_with_the_reason() {
     assert!((registry.pairs.len() == 0));
     assert_eq!(registry.take_refused()[0].0, id(2));
     let over = drain(&mut registry, 1);
-    assert!(over.iter().any(|m| matches!(m, Message::Detach(pair) if pair.reader == reader)));
+    assert!(
+        over.iter().any(|m| matches!(m, SessionMessage::Detach(pair) if pair.reader == reader))
+    );
     // And says nothing of what is no pair.
     fail(&mut registry, 2).unwrap();
     assert!(registry.take_refused().is_empty());
@@ -302,7 +313,7 @@ fn attached(registry: &mut Registry<Label>) -> Gid {
     let (after, carries) = (None, None);
     let attach =
         Attach { reader, writer, lane, qos, session, stands_for, segments, after, carries };
-    registry.handle_message(&id(2), Message::Attach(attach), vec![]).unwrap();
+    registry.handle_message(&id(2), SessionMessage::Attach(attach), vec![]).unwrap();
     let relayed = None;
     let (generation, first, segments, session) = (1, 0, vec![], id(1));
     let granted = Granted {
@@ -316,7 +327,7 @@ fn attached(registry: &mut Registry<Label>) -> Gid {
         after,
         relayed,
     };
-    registry.handle_message(&id(1), Message::Grant(granted), vec![]).unwrap();
+    registry.handle_message(&id(1), SessionMessage::Grant(granted), vec![]).unwrap();
     drain(registry, 2);
     writer
 }
@@ -328,11 +339,11 @@ fn memory_that_is_given_up_does_not_wait_for_who_is_stopped() {
     let mut turn = |number| {
         let (session, publisher) = (id(1), Some(writer));
         let segment = Segment { number, publisher };
-        let opened = Message::Segment(SegmentOpened { session, segment });
+        let opened = SessionMessage::Segment(SegmentOpened { session, segment });
         registry.handle_message(&session, opened, vec!["map"]).unwrap();
         // The first is taken before it is given up.
         let taken = (number == 1).then(|| drain(&mut registry, 2).len());
-        let gone = Message::SegmentGone(SegmentName { session, number });
+        let gone = SessionMessage::SegmentGone(SegmentName { session, number });
         registry.handle_message(&session, gone, vec![]).unwrap();
         taken
     };
@@ -340,7 +351,7 @@ fn memory_that_is_given_up_does_not_wait_for_who_is_stopped() {
     (2..1000).for_each(|number| assert_eq!(turn(number), None));
     let waiting = drain(&mut registry, 2);
     assert!(
-        matches!(&waiting[..], [Message::SegmentGone(gone)] if gone.number == 1),
+        matches!(&waiting[..], [SessionMessage::SegmentGone(gone)] if gone.number == 1),
         "{} packets wait",
         waiting.len()
     );
@@ -352,15 +363,18 @@ fn a_session_that_asked_again_for_memory_hears_that_it_is_given_up() {
     let publisher = Some(attached(&mut registry));
     let (session, number) = (id(1), 1);
     let segment = Segment { number, publisher };
-    let opened = Message::Segment(SegmentOpened { session, segment });
+    let opened = SessionMessage::Segment(SegmentOpened { session, segment });
     registry.handle_message(&session, opened, vec!["map"]).unwrap();
     assert_eq!(drain(&mut registry, 2).len(), 1);
     // It has it, and it is on its way once more.
     let name = SegmentName { session, number };
-    registry.handle_message(&id(2), Message::Need(name), vec![]).unwrap();
-    registry.handle_message(&session, Message::SegmentGone(name), vec![]).unwrap();
+    registry.handle_message(&id(2), SessionMessage::Need(name), vec![]).unwrap();
+    registry.handle_message(&session, SessionMessage::SegmentGone(name), vec![]).unwrap();
     let waiting = drain(&mut registry, 2);
-    assert!(matches!(&waiting[..], [Message::SegmentGone(gone)] if *gone == name), "{waiting:?}");
+    assert!(
+        matches!(&waiting[..], [SessionMessage::SegmentGone(gone)] if *gone == name),
+        "{waiting:?}"
+    );
 }
 
 #[test]
@@ -369,13 +383,17 @@ fn the_segments_of_a_session_are_bounded_and_it_is_told() {
     let session = id(1);
     for number in 1..=MAX_SEGMENTS as u32 + 1 {
         let segment = Segment { number, publisher: None };
-        let opened = Message::Segment(SegmentOpened { session, segment });
+        let opened = SessionMessage::Segment(SegmentOpened { session, segment });
         registry.handle_message(&session, opened, vec!["map"]).unwrap();
     }
     assert_eq!(registry.session(&session).unwrap().segments.len(), MAX_SEGMENTS);
     let refused = drain(&mut registry, 1);
-    assert!(refused.iter().any(|m| matches!(m, Message::Refused(r) if r.text.contains("memory"))));
-    let gone = Message::SegmentGone(SegmentName { session, number: 1 });
+    assert!(
+        refused
+            .iter()
+            .any(|m| matches!(m, SessionMessage::SessionRefused(r) if r.text.contains("memory")))
+    );
+    let gone = SessionMessage::SegmentGone(SegmentName { session, number: 1 });
     registry.handle_message(&session, gone, vec![]).unwrap();
     assert_eq!(registry.session(&session).unwrap().segments.len(), MAX_SEGMENTS - 1);
 }
@@ -398,7 +416,7 @@ fn a_leaving_writer_is_hidden_and_read_to_its_end() {
         after: None,
         carries: None,
     };
-    registry.handle_message(&id(2), Message::Attach(attach), vec![]).unwrap();
+    registry.handle_message(&id(2), SessionMessage::Attach(attach), vec![]).unwrap();
     let grant = Granted {
         reader,
         writer,
@@ -410,13 +428,13 @@ fn a_leaving_writer_is_hidden_and_read_to_its_end() {
         after: None,
         relayed: None,
     };
-    registry.handle_message(&id(1), Message::Grant(grant), vec![]).unwrap();
+    registry.handle_message(&id(1), SessionMessage::Grant(grant), vec![]).unwrap();
     registry.flush();
     (1..=3).for_each(|session| drop(drain(&mut registry, session)));
     let before = registry.digest();
 
     let leave = |registry: &mut Registry<Label>, session, leaving| {
-        let leaving = Message::Leaving(Leaving { gid: writer, leaving });
+        let leaving = SessionMessage::WriterLeaving(WriterLeaving { gid: writer, leaving });
         registry.handle_message(&id(session), leaving, vec![])
     };
     assert_eq!(leave(&mut registry, 2, true), Err(Violation::NotItsOwn(writer)));
@@ -424,34 +442,35 @@ fn a_leaving_writer_is_hidden_and_read_to_its_end() {
         leave(&mut registry, 1, true).unwrap();
     }
     registry.flush();
-    let is_leaving =
-        |m: &&Message| matches!(m, Message::Leaving(l) if l.gid == writer && l.leaving);
-    let removed = |m: &Message| matches!(m, Message::Graph(graph) if graph.removed == [writer]);
+    let is_leaving = |m: &&SessionMessage| matches!(m, SessionMessage::WriterLeaving(l) if l.gid == writer && l.leaving);
+    let removed = |m: &SessionMessage| matches!(m, SessionMessage::SessionGraph(graph) if graph.removed == [writer]);
     let told = drain(&mut registry, 2);
     assert_eq!(told.iter().filter(is_leaving).count(), 1);
-    assert!(!told.iter().any(|m| matches!(m, Message::Unmatch(_))));
+    assert!(!told.iter().any(|m| matches!(m, SessionMessage::Unmatch(_))));
     assert!(told.iter().any(removed) && drain(&mut registry, 3).iter().any(removed));
     assert_ne!(registry.digest(), before);
 
     // Nobody new gets it, and who is told everything anew hears so again, after the grant.
     announce(&mut registry, 3, 1, EndpointKind::Subscription);
-    assert!(!drain(&mut registry, 3).iter().any(|m| matches!(m, Message::Match(_))));
+    assert!(!drain(&mut registry, 3).iter().any(|m| matches!(m, SessionMessage::Match(_))));
     drain(&mut registry, 2);
-    registry.handle_message(&id(2), Message::Resync, vec![]).unwrap();
+    registry.handle_message(&id(2), SessionMessage::Resync, vec![]).unwrap();
     let told = drain(&mut registry, 2);
-    let granted = told.iter().position(|m| matches!(m, Message::Grant(_))).unwrap();
+    let granted = told.iter().position(|m| matches!(m, SessionMessage::Grant(_))).unwrap();
     assert!(told[granted..].iter().any(|m| is_leaving(&m)));
-    let shows = |m: &Message| matches!(m, Message::Graph(graph) if graph.added.iter().any(|i| i.endpoint.gid == writer));
+    let shows = |m: &SessionMessage| matches!(m, SessionMessage::SessionGraph(graph) if graph.added.iter().any(|i| i.endpoint.gid == writer));
     assert!(!told.iter().any(shows));
 
     // It has come back.
     leave(&mut registry, 1, false).unwrap();
     registry.flush();
     let told = drain(&mut registry, 3);
-    assert!(told.iter().any(shows) && told.iter().any(|m| matches!(m, Message::Match(_))));
+    assert!(told.iter().any(shows) && told.iter().any(|m| matches!(m, SessionMessage::Match(_))));
     assert_eq!(registry.pairs.len(), 2);
     leave(&mut registry, 1, true).unwrap();
-    registry.handle_message(&id(1), Message::EndpointGone(Gone { gid: writer }), vec![]).unwrap();
+    registry
+        .handle_message(&id(1), SessionMessage::EndpointGone(Gone { gid: writer }), vec![])
+        .unwrap();
     assert!((registry.pairs.len() == 0));
     assert_eq!(registry.pairs.made_by(&id(1)), 0);
 }

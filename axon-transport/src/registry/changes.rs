@@ -9,14 +9,14 @@ use super::{limits::MAX_TOMBSTONES, range::GraphFilter, sessions::encode};
 use crate::{
     graph::Endpoint,
     ids::{DaemonId, Gid},
-    wire::session::{Graph, GraphItem, Message},
+    wire::session::{GraphItem, SessionGraph, SessionMessage},
 };
 
 /// Bytes of endpoints in one packet; leaves room for the rest of the message and one endpoint more.
 const PART: usize = 24 * 1024;
 
 /// An endpoint that is new in the graph, and its daemon where that is another host's.
-pub(super) type Item = (Arc<Endpoint>, Option<DaemonId>);
+pub(super) type NewEndpoint = (Arc<Endpoint>, Option<DaemonId>);
 
 /// What changed in the graph since sessions were told last, and its version.
 ///
@@ -33,7 +33,7 @@ pub(super) struct GraphChanges {
 /// A change of the graph.
 #[derive(Debug, Default)]
 pub(super) struct GraphChange {
-    pub(super) added: BTreeMap<Gid, Item>,
+    pub(super) added: BTreeMap<Gid, NewEndpoint>,
     /// Whether each was this host's own.
     removed: BTreeMap<Gid, bool>,
     /// Endpoints of this host that ended. Sessions detach from them.
@@ -150,7 +150,7 @@ pub(super) fn packets(
 ) -> Vec<Arc<[u8]>> {
     let mut packets = Vec::new();
     each_part(version, whole, added, removed, ended, open, |part| {
-        packets.extend(encode(&Message::Graph(part)));
+        packets.extend(encode(&SessionMessage::SessionGraph(part)));
     });
     packets
 }
@@ -163,7 +163,7 @@ pub fn parts(
     removed: &[Gid],
     ended: &BTreeSet<Gid>,
     open: bool,
-) -> Vec<Graph> {
+) -> Vec<SessionGraph> {
     let mut parts = Vec::new();
     each_part(version, whole, added, removed, ended, open, |part| parts.push(part));
     parts
@@ -176,10 +176,16 @@ fn each_part(
     removed: &[Gid],
     ended: &BTreeSet<Gid>,
     open: bool,
-    mut each: impl FnMut(Graph),
+    mut each: impl FnMut(SessionGraph),
 ) {
-    let empty =
-        |whole| Graph { version, whole, added: vec![], removed: vec![], more: true, ended: None };
+    let empty = |whole| SessionGraph {
+        version,
+        whole,
+        added: vec![],
+        removed: vec![],
+        more: true,
+        ended: None,
+    };
     let mut part = empty(whole);
     let mut size = 0;
     // Removals go first: a GID that was removed and is back must end up present.

@@ -72,7 +72,7 @@ mod tests {
         qos::Qos,
         registry::{MAX_QUEUE, Registry, Violation},
         wire::session::{
-            Announce, EndpointRole, Gone, Message, Segment, SegmentOpened, SessionRole,
+            Announce, EndpointRole, Gone, Segment, SegmentOpened, SessionMessage, SessionRole,
         },
     };
 
@@ -103,35 +103,37 @@ mod tests {
             let ring = (session == WRITER).then_some(Location { segment: 0, offset: 4096 });
             let (role, stands_for) = (EndpointRole::Application, Vec::new());
             let announce = Announce { endpoint, role, stands_for, ring, only: None };
-            registry.handle_message(&id(session), Message::Endpoint(announce), vec![]).unwrap();
+            registry
+                .handle_message(&id(session), SessionMessage::Endpoint(announce), vec![])
+                .unwrap();
         }
         [WRITER, KEEPS, KEEPS_LAST].iter().for_each(|session| drop(take(&mut registry, *session)));
         registry
     }
 
-    fn take(registry: &mut Registry<&'static str>, session: u8) -> Vec<Message> {
+    fn take(registry: &mut Registry<&'static str>, session: u8) -> Vec<SessionMessage> {
         let taken = std::iter::from_fn(|| registry.poll_output(&id(session)));
-        let taken = taken.map(|output| Message::decode(&output.packet).unwrap()).collect();
+        let taken = taken.map(|output| SessionMessage::decode(&output.packet).unwrap()).collect();
         registry.answer_fences();
         taken
     }
 
     fn ask(registry: &mut Registry<&'static str>, number: u64) {
         let fence = Fence { writer: gid(WRITER), number };
-        registry.handle_message(&id(WRITER), Message::Fence(fence), vec![]).unwrap();
+        registry.handle_message(&id(WRITER), SessionMessage::Fence(fence), vec![]).unwrap();
     }
 
     /// What was answered.
     fn answers(registry: &mut Registry<&'static str>) -> Vec<u64> {
         let answers = take(registry, WRITER).into_iter().filter_map(|message| match message {
-            Message::Fence(fence) => Some(fence.number),
+            SessionMessage::Fence(fence) => Some(fence.number),
             _ => None,
         });
         answers.collect()
     }
 
     fn say(registry: &mut Registry<&'static str>, to: u8) {
-        registry.push(&id(to), &Message::Resync, Vec::new());
+        registry.push(&id(to), &SessionMessage::Resync, Vec::new());
     }
 
     #[test]
@@ -163,7 +165,7 @@ mod tests {
         say(&mut registry, KEEPS);
         ask(&mut registry, 1);
         let segment = Segment { number: 1, publisher: None };
-        let opened = Message::Segment(SegmentOpened { session: id(WRITER), segment });
+        let opened = SessionMessage::Segment(SegmentOpened { session: id(WRITER), segment });
         registry.push(&id(KEEPS), &opened, vec!["map"]);
         let entry = registry.sessions.get_mut(&id(KEEPS)).unwrap();
         assert!(entry.outbox.take_back(&id(WRITER), 1));
@@ -201,7 +203,7 @@ mod tests {
         let mut registry = self::registry();
         say(&mut registry, KEEPS);
         ask(&mut registry, 1);
-        let gone = Message::EndpointGone(Gone { gid: gid(WRITER) });
+        let gone = SessionMessage::EndpointGone(Gone { gid: gid(WRITER) });
         registry.handle_message(&id(WRITER), gone, vec![]).unwrap();
         assert!(!registry.has_fences());
         ask(&mut registry, 2);
@@ -211,7 +213,7 @@ mod tests {
     #[test]
     fn nobody_asks_about_the_publisher_of_another() {
         let mut registry = registry();
-        let fence = Message::Fence(Fence { writer: gid(WRITER), number: 1 });
+        let fence = SessionMessage::Fence(Fence { writer: gid(WRITER), number: 1 });
         let refused = registry.handle_message(&id(KEEPS), fence, vec![]);
         assert_eq!(refused, Err(Violation::NotItsOwn(gid(WRITER))));
     }

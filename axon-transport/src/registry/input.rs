@@ -14,8 +14,8 @@ use crate::{
     ids::{Gid, SessionId},
     text,
     wire::session::{
-        Announce, Attach, EndpointRole, Fence, GivenUp, Granted, Leaving, Message, Pair, Refused,
-        SessionRole, Unmatch, Unmet,
+        Announce, Attach, EndpointRole, Fence, Granted, Pair, RelayGivenUp, SessionMessage,
+        SessionRefused, SessionRole, Unmatch, Unmet, WriterLeaving,
     },
 };
 
@@ -134,40 +134,40 @@ impl<F: Clone> Registry<F> {
     pub fn handle_message(
         &mut self,
         id: &SessionId,
-        message: Message,
+        message: SessionMessage,
         descriptors: Vec<F>,
     ) -> Result<(), Violation> {
         let tool = self.sessions.get(id).is_none_or(|s| s.role == SessionRole::Tool);
-        let carries = matches!(message, Message::Segment(_) | Message::Unknown(_));
+        let carries = matches!(message, SessionMessage::Segment(_) | SessionMessage::Unknown(_));
         if !descriptors.is_empty() && !carries {
             return Err(Violation::Descriptors(descriptors.len()));
         }
         match message {
-            Message::Unknown(_) => Ok(()),
+            SessionMessage::Unknown(_) => Ok(()),
             _ if tool => Err(Violation::Unexpected),
-            Message::Endpoint(announce) => self.announce(id, announce),
-            Message::Segment(opened) => {
+            SessionMessage::Endpoint(announce) => self.announce(id, announce),
+            SessionMessage::Segment(opened) => {
                 let owns = |id: &SessionId, gid: &Gid| self.endpoints.session_of(gid) == Some(*id);
                 self.sessions.open_segment(id, opened.segment, descriptors, owns)
             }
-            Message::SegmentGone(gone) => {
+            SessionMessage::SegmentGone(gone) => {
                 self.sessions.close_segment(id, gone.number);
                 Ok(())
             }
-            Message::Need(need) => {
+            SessionMessage::Need(need) => {
                 self.sessions.need_segment(id, &need.session, need.number);
                 Ok(())
             }
-            Message::EndpointGone(gone) => self.gone(id, gone.gid),
-            Message::Leaving(leaving) => self.leave(id, leaving),
-            Message::Attach(attach) => self.attach(id, attach),
-            Message::Grant(grant) => self.grant(id, grant),
-            Message::Detach(pair) => self.detach(id, pair),
-            Message::GivenUp(given_up) => self.give_up(id, given_up),
-            Message::Fence(fence) => self.fence(id, fence),
-            Message::Unmet(unmet) => self.unmet(id, unmet),
-            Message::Unmatch(unmatch) => self.fail(id, unmatch),
-            Message::Resync => {
+            SessionMessage::EndpointGone(gone) => self.gone(id, gone.gid),
+            SessionMessage::WriterLeaving(leaving) => self.leave(id, leaving),
+            SessionMessage::Attach(attach) => self.attach(id, attach),
+            SessionMessage::Grant(grant) => self.grant(id, grant),
+            SessionMessage::Detach(pair) => self.detach(id, pair),
+            SessionMessage::RelayGivenUp(given_up) => self.give_up(id, given_up),
+            SessionMessage::Fence(fence) => self.fence(id, fence),
+            SessionMessage::Unmet(unmet) => self.unmet(id, unmet),
+            SessionMessage::Unmatch(unmatch) => self.fail(id, unmatch),
+            SessionMessage::Resync => {
                 // Everything costs much more to tell than to ask for.
                 self.sessions.request_resync(id);
                 Ok(())
@@ -220,7 +220,7 @@ impl<F: Clone> Registry<F> {
             self.pairs.refusal(id, new, entry.role == SessionRole::Gateway)
         };
         if let Some(why) = refusal {
-            let refused = Refused::of(&endpoint, &why);
+            let refused = SessionRefused::of(&endpoint, &why);
             self.sessions.note_refused(id, &refused.text);
             if let Some(entry) = self.sessions.get_mut(id)
                 && entry.refused_endpoints.len() < MAX_REFUSED
@@ -228,7 +228,7 @@ impl<F: Clone> Registry<F> {
             {
                 entry.refused_endpoints.insert(gid, (endpoint, why));
             }
-            self.push(id, &Message::Refused(refused), Vec::new());
+            self.push(id, &SessionMessage::SessionRefused(refused), Vec::new());
             return Ok(());
         }
         if let Some(entry) = self.sessions.get_mut(id) {
@@ -280,8 +280,8 @@ impl<F: Clone> Registry<F> {
 
     /// An endpoint has ended, or has not after all, and there is more to come of it: its pairs stand,
     /// but nobody counts it, and nobody new is matched with it.
-    fn leave(&mut self, id: &SessionId, leave: Leaving) -> Result<(), Violation> {
-        let Leaving { gid, leaving } = leave;
+    fn leave(&mut self, id: &SessionId, leave: WriterLeaving) -> Result<(), Violation> {
+        let WriterLeaving { gid, leaving } = leave;
         // It may have been refused.
         let Some(local) = self.endpoints.get(&gid) else { return Ok(()) };
         if local.session != *id || !writes(local.endpoint.kind) {
@@ -302,7 +302,7 @@ impl<F: Clone> Registry<F> {
         let readers = self.endpoints.get(&gid).into_iter().flat_map(|w| self.readers_of(w));
         let readers: BTreeSet<SessionId> = readers.map(|reader| reader.session).collect();
         for reader in readers {
-            self.push(&reader, &Message::Leaving(leave), Vec::new());
+            self.push(&reader, &SessionMessage::WriterLeaving(leave), Vec::new());
         }
         if !leaving {
             self.match_endpoint(&gid);
@@ -362,7 +362,7 @@ impl<F: Clone> Registry<F> {
         let mut descriptors = self.sessions.introduce(&to, &of, pair);
         // The publisher looks at nothing but the lane.
         attach.segments = self.sessions.hand_over(&to, &of, [lane], &mut descriptors);
-        self.push(&to, &Message::Attach(attach), descriptors);
+        self.push(&to, &SessionMessage::Attach(attach), descriptors);
     }
 
     fn grant(&mut self, id: &SessionId, grant: Granted) -> Result<(), Violation> {
@@ -395,10 +395,11 @@ impl<F: Clone> Registry<F> {
         let numbers = self.sessions.segments_for(&of, &pair.writer);
         let numbers = [grant.ring.segment].into_iter().chain(numbers);
         grant.segments = self.sessions.hand_over(&to, &of, numbers, &mut descriptors);
-        self.push(&to, &Message::Grant(grant), descriptors);
+        self.push(&to, &SessionMessage::Grant(grant), descriptors);
         self.sessions.hand_over_rest(&to, &of, &pair.writer);
         if leaving {
-            let leaving = Message::Leaving(Leaving { gid: pair.writer, leaving });
+            let leaving =
+                SessionMessage::WriterLeaving(WriterLeaving { gid: pair.writer, leaving });
             self.push(&to, &leaving, Vec::new());
         }
         true
@@ -438,24 +439,24 @@ impl<F: Clone> Registry<F> {
             && to != *id
         {
             self.sessions.part(&pair, &to, id);
-            self.push(&to, &Message::Detach(pair), Vec::new());
+            self.push(&to, &SessionMessage::Detach(pair), Vec::new());
         }
         let Pair { reader, writer } = pair;
         let reason = "detached".to_owned();
-        self.push(id, &Message::Unmatch(Unmatch { reader, writer, reason }), Vec::new());
+        self.push(id, &SessionMessage::Unmatch(Unmatch { reader, writer, reason }), Vec::new());
         Ok(())
     }
 
     /// A relay gave up samples of a publisher, whose session is told.
-    fn give_up(&mut self, id: &SessionId, given_up: GivenUp) -> Result<(), Violation> {
-        let GivenUp { reader, writer, .. } = given_up;
+    fn give_up(&mut self, id: &SessionId, given_up: RelayGivenUp) -> Result<(), Violation> {
+        let RelayGivenUp { reader, writer, .. } = given_up;
         let relay = self.endpoints.get(&reader).filter(|e| e.role == EndpointRole::Relay);
         if relay.is_some_and(|relay| relay.session != *id) {
             return Err(Violation::NotItsOwn(reader));
         }
         let read = relay.is_some() && self.pairs.contains(&Pair { reader, writer });
         if let (Some(to), true) = (self.endpoints.session_of(&writer), read) {
-            self.push(&to, &Message::GivenUp(given_up), Vec::new());
+            self.push(&to, &SessionMessage::RelayGivenUp(given_up), Vec::new());
         }
         Ok(())
     }

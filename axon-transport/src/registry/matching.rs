@@ -10,7 +10,7 @@ use super::{
 use crate::{
     graph::{Endpoint, OutOfRange, Pairing, RemoteEndpoint, pairing},
     ids::{Gid, SessionId},
-    wire::session::{EndpointRole, Message, Pair, Refused, Unmatch},
+    wire::session::{EndpointRole, Pair, SessionMessage, SessionRefused, Unmatch},
 };
 
 impl<F: Clone> Registry<F> {
@@ -39,7 +39,7 @@ impl<F: Clone> Registry<F> {
                 Pairing::Match => {
                     let by = if pair.writer == *gid { to_writer } else { to_reader };
                     self.pairs.insert(pair, by);
-                    self.push(&to_reader, &Message::Match(pair), Vec::new());
+                    self.push(&to_reader, &SessionMessage::Match(pair), Vec::new());
                 }
                 Pairing::IncompatibleQos(policy) => {
                     self.unmatch(&pair, to_writer, to_reader, &format!("incompatible {policy}"));
@@ -86,9 +86,13 @@ impl<F: Clone> Registry<F> {
     /// Has the status and the log say that an endpoint is denied, and tells its session. REFUSED does not name the endpoint:
     /// for a session that would be for good, and other rules may allow the endpoint.
     pub(super) fn note_denied(&mut self, id: &SessionId, endpoint: &Endpoint, why: &str) {
-        let refused = Refused::of(endpoint, why);
+        let refused = SessionRefused::of(endpoint, why);
         self.sessions.note_refused(id, &refused.text);
-        self.push(id, &Message::Refused(Refused::because(refused.text)), Vec::new());
+        self.push(
+            id,
+            &SessionMessage::SessionRefused(SessionRefused::because(refused.text)),
+            Vec::new(),
+        );
     }
 
     /// Forgets an endpoint, which its session's entry no longer lists.
@@ -177,7 +181,8 @@ impl<F: Clone> Registry<F> {
 
     fn unmatch(&mut self, pair: &Pair, to_writer: SessionId, to_reader: SessionId, reason: &str) {
         let Pair { reader, writer } = *pair;
-        let message = Message::Unmatch(Unmatch { reader, writer, reason: reason.to_owned() });
+        let message =
+            SessionMessage::Unmatch(Unmatch { reader, writer, reason: reason.to_owned() });
         self.push(&to_reader, &message, Vec::new());
         if to_writer != to_reader {
             self.push(&to_writer, &message, Vec::new());

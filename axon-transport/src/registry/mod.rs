@@ -32,7 +32,7 @@ pub use self::{
     },
     range::OutOfRangePair,
     relayed::RelayCounters,
-    sessions::{Output, OwnMemory, SessionEntry, SessionSegment},
+    sessions::{OwnMemory, RegisteredSegment, SessionEntry, SessionPacket},
 };
 use self::{
     changes::{GraphChanges, WholeGraphs},
@@ -40,7 +40,7 @@ use self::{
     fence::Fences,
     pairs::Pairs,
     range::Ranges,
-    remote::{Heard, RemoteEndpoints},
+    remote::{RemoteChange, RemoteEndpoints},
     sessions::Sessions,
 };
 use crate::{
@@ -215,11 +215,11 @@ impl<F: Clone> Registry<F> {
                 continue;
             }
             let Some(heard) = self.remote.insert(daemon, &remote) else { continue };
-            if heard == Heard::Range {
+            if heard == RemoteChange::Range {
                 // Sessions that saw it may not see it any more.
                 self.changes.remove(gid, false);
             }
-            if heard != Heard::Known {
+            if heard != RemoteChange::Known {
                 changed.push(remote.clone());
             }
             self.changes.add(remote.endpoint, Some(daemon));

@@ -5,11 +5,11 @@ use std::{collections::BTreeSet, sync::Arc};
 use super::{
     Registry,
     changes::packets,
-    sessions::{Due, Output},
+    sessions::{DueMessage, SessionPacket},
 };
 use crate::{
     ids::SessionId,
-    wire::session::{Graph, Message},
+    wire::session::{SessionGraph, SessionMessage},
 };
 
 /// Pairs of which a session is told at a time, and the rest of those of one endpoint.
@@ -22,10 +22,10 @@ impl<F: Clone> Registry<F> {
     /// to its readers, and what readers asked of its writers, closed by a GRAPH without `more`. What
     /// it does not hear again is over. It is told a part at a time, when it has taken what waits for it:
     /// so the parts and what changes in between come in the order in which they were so.
-    pub fn poll_output(&mut self, id: &SessionId) -> Option<Output<F>> {
+    pub fn poll_output(&mut self, id: &SessionId) -> Option<SessionPacket<F>> {
         match self.sessions.get(id)?.outbox.due() {
-            Some(Due::Pairs) => self.tell_pairs(id),
-            Some(Due::Everything) => self.tell_everything(id),
+            Some(DueMessage::Pairs) => self.tell_pairs(id),
+            Some(DueMessage::Everything) => self.tell_everything(id),
             None => {}
         }
         self.sessions.pop(id)
@@ -44,7 +44,7 @@ impl<F: Clone> Registry<F> {
     }
 
     /// Puts a packet back that could not be sent.
-    pub fn return_output(&mut self, id: &SessionId, output: Output<F>) {
+    pub fn return_output(&mut self, id: &SessionId, output: SessionPacket<F>) {
         self.sessions.put_back(id, output);
     }
 
@@ -54,7 +54,7 @@ impl<F: Clone> Registry<F> {
     }
 
     /// Queues a message for one session.
-    pub fn push(&mut self, to: &SessionId, message: &Message, descriptors: Vec<F>) {
+    pub fn push(&mut self, to: &SessionId, message: &SessionMessage, descriptors: Vec<F>) {
         self.sessions.push(to, message, descriptors);
     }
 
@@ -62,7 +62,7 @@ impl<F: Clone> Registry<F> {
     /// when sessions ended.
     pub fn answer_fences(&mut self) {
         for (by, fence) in self.fences.take_answered(&self.sessions) {
-            self.push(&by, &Message::Fence(fence), Vec::new());
+            self.push(&by, &SessionMessage::Fence(fence), Vec::new());
         }
     }
 
@@ -160,7 +160,7 @@ impl<F: Clone> Registry<F> {
             for pair in pairs {
                 // A reader that is not served yet asks again; one that is learns how.
                 if pair.reader == gid && !self.forward_grant(&pair) {
-                    self.push(id, &Message::Match(pair), Vec::new());
+                    self.push(id, &SessionMessage::Match(pair), Vec::new());
                 }
                 if pair.writer == gid {
                     self.forward_attach(&pair);
@@ -172,8 +172,8 @@ impl<F: Clone> Registry<F> {
 
     fn tell_end(&mut self, id: &SessionId) {
         let (added, removed, version) = (Vec::new(), Vec::new(), self.changes.version());
-        let end = Graph { version, whole: false, added, removed, more: false, ended: None };
-        self.push(id, &Message::Graph(end), Vec::new());
+        let end = SessionGraph { version, whole: false, added, removed, more: false, ended: None };
+        self.push(id, &SessionMessage::SessionGraph(end), Vec::new());
         self.limit_queue(id);
     }
 

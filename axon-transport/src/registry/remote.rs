@@ -13,7 +13,7 @@ pub(super) struct RemoteEndpoints(BTreeMap<DaemonId, BTreeMap<Gid, RemoteEndpoin
 
 /// What is new of an endpoint that another host has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Heard {
+pub(super) enum RemoteChange {
     /// It came.
     New,
     /// How far it is discovered changed.
@@ -38,7 +38,11 @@ impl RemoteEndpoints {
 
     /// A host has an endpoint. It is refused, as `None`, if it is out of bounds, if the host has as many as it may, or
     /// if another host has it.
-    pub(super) fn insert(&mut self, daemon: DaemonId, remote: &RemoteEndpoint) -> Option<Heard> {
+    pub(super) fn insert(
+        &mut self,
+        daemon: DaemonId,
+        remote: &RemoteEndpoint,
+    ) -> Option<RemoteChange> {
         let Endpoint { gid, .. } = *remote.endpoint;
         let elsewhere =
             self.0.iter().any(|(other, all)| *other != daemon && all.contains_key(&gid));
@@ -47,9 +51,9 @@ impl RemoteEndpoints {
             return None;
         }
         Some(match all.insert(gid, remote.clone()) {
-            None => Heard::New,
-            Some(before) if before.toward != remote.toward => Heard::Range,
-            Some(_) => Heard::Known,
+            None => RemoteChange::New,
+            Some(before) if before.toward != remote.toward => RemoteChange::Range,
+            Some(_) => RemoteChange::Known,
         })
     }
 
@@ -87,13 +91,13 @@ mod tests {
     #[test]
     fn a_gid_is_of_the_host_that_told_of_it_first() {
         let mut all = RemoteEndpoints::default();
-        assert_eq!(all.insert(HOST, &remote(1)), Some(Heard::New));
+        assert_eq!(all.insert(HOST, &remote(1)), Some(RemoteChange::New));
         assert_eq!(all.insert(OTHER, &remote(1)), None);
-        assert_eq!(all.insert(HOST, &remote(1)), Some(Heard::Known));
+        assert_eq!(all.insert(HOST, &remote(1)), Some(RemoteChange::Known));
         let gid = remote(1).endpoint.gid;
         assert_eq!(all.find(&gid).unwrap().0, &HOST);
         assert!(all.remove(&OTHER, &gid).is_none() && all.remove(&HOST, &gid).is_some());
-        assert_eq!(all.insert(OTHER, &remote(1)), Some(Heard::New));
+        assert_eq!(all.insert(OTHER, &remote(1)), Some(RemoteChange::New));
         assert!(all.disown(&gid) && !all.disown(&gid));
         assert!(all.find(&gid).is_none());
     }
@@ -103,10 +107,10 @@ mod tests {
         let mut all = RemoteEndpoints::default();
         let most = u32::try_from(LIMITS.endpoints).unwrap();
         for number in 0..most {
-            assert_eq!(all.insert(HOST, &remote(number)), Some(Heard::New));
+            assert_eq!(all.insert(HOST, &remote(number)), Some(RemoteChange::New));
         }
         assert_eq!(all.insert(HOST, &remote(most)), None);
-        assert_eq!(all.insert(OTHER, &remote(most)), Some(Heard::New));
+        assert_eq!(all.insert(OTHER, &remote(most)), Some(RemoteChange::New));
         let gone: Vec<Gid> = all.remove_host(&HOST).collect();
         assert_eq!(gone.len(), LIMITS.endpoints);
         assert_eq!(all.iter().count(), 1);

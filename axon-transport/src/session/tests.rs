@@ -19,7 +19,7 @@ use std::{
 use axon_shm::{
     Meta,
     internal::{
-        Grant, Location, Peer, PeerDescriptors, PeerSession, Purpose, ReaderInfo, RingOptions,
+        Grant, Location, PeerDescriptors, PeerSession, Purpose, ReaderInfo, RingOptions, RingPeer,
         SegmentInfo, SegmentKind, SessionSegment, Terms, Writer,
     },
 };
@@ -31,7 +31,7 @@ use rustix::{
 };
 
 use super::{
-    daemon::socket::{self, Received, SocketError},
+    daemon::socket::{self, ReceivedMessage, SocketError},
     *,
 };
 use crate::{
@@ -40,8 +40,8 @@ use crate::{
     ids::{DaemonId, Gid, SessionId},
     qos::{Durability, Qos},
     wire::session::{
-        Attach, Granted, Graph, Message, PROTOCOL, Pair, Refused, Segment, SegmentOpened, Unmatch,
-        Welcome,
+        Attach, Granted, PROTOCOL, Pair, Segment, SegmentOpened, SessionGraph, SessionMessage,
+        SessionRefused, Unmatch, Welcome,
     },
 };
 
@@ -63,7 +63,9 @@ fn session() -> (Session, Daemon) {
     let (socket, theirs) = socketpair(AddressFamily::UNIX, kind, flags, None).unwrap();
     let config = Config::resolve([], None, &OsFiles).unwrap();
     let opening = thread::spawn(move || Session::over(theirs, &config, SessionOptions::new("t")));
-    let Received { message: Message::Hello(hello), descriptors } = hear(&socket) else {
+    let ReceivedMessage { message: SessionMessage::SessionHello(hello), descriptors } =
+        hear(&socket)
+    else {
         panic!("something else before HELLO")
     };
     let [segment, doorbell, pidfd] = <[_; 3]>::try_from(descriptors).expect("three");
@@ -72,12 +74,12 @@ fn session() -> (Session, Daemon) {
     let pid = std::process::id();
     let welcome =
         Welcome { protocol: PROTOCOL, daemon: DaemonId([7; 16]), pid, ranges: Some(true) };
-    daemon.say(Message::Welcome(welcome), &[]);
+    daemon.say(SessionMessage::Welcome(welcome), &[]);
     daemon.tell_all(Vec::new());
     (opening.join().unwrap().unwrap(), daemon)
 }
 
-fn hear(socket: &OwnedFd) -> Received {
+fn hear(socket: &OwnedFd) -> ReceivedMessage {
     let mut buffer = Vec::new();
     loop {
         match socket::receive(socket, &mut buffer) {
@@ -93,7 +95,7 @@ fn hear(socket: &OwnedFd) -> Received {
 
 impl Daemon {
     /// The next message of those that `pick` wants.
-    fn hear<T>(&self, mut pick: impl FnMut(Message) -> Option<T>) -> T {
+    fn hear<T>(&self, mut pick: impl FnMut(SessionMessage) -> Option<T>) -> T {
         loop {
             if let Some(picked) = pick(hear(&self.socket).message) {
                 return picked;
@@ -103,23 +105,23 @@ impl Daemon {
 
     fn hear_attach(&self) -> Attach {
         self.hear(|message| match message {
-            Message::Attach(attach) => Some(attach),
+            SessionMessage::Attach(attach) => Some(attach),
             _ => None,
         })
     }
 
-    fn say(&self, message: Message, descriptors: &[BorrowedFd<'_>]) {
+    fn say(&self, message: SessionMessage, descriptors: &[BorrowedFd<'_>]) {
         socket::send(&self.socket, &message.encode().unwrap(), descriptors).unwrap();
     }
 
     fn graph(&self, whole: bool, more: bool) {
         let (added, removed) = (Vec::new(), Vec::new());
-        let graph = Graph { version: 1, whole, added, removed, more, ended: None };
-        self.say(Message::Graph(graph), &[]);
+        let graph = SessionGraph { version: 1, whole, added, removed, more, ended: None };
+        self.say(SessionMessage::SessionGraph(graph), &[]);
     }
 
     /// Tells everything from the beginning.
-    fn tell_all(&self, what: Vec<(Message, Vec<OwnedFd>)>) {
+    fn tell_all(&self, what: Vec<(SessionMessage, Vec<OwnedFd>)>) {
         self.graph(true, true);
         for (message, descriptors) in what {
             self.say(message, &descriptors.iter().map(AsFd::as_fd).collect::<Vec<_>>());
@@ -132,14 +134,14 @@ impl Daemon {
 struct Far {
     session: Arc<SessionSegment>,
     writer: Writer,
-    view: Peer,
+    view: RingPeer,
 }
 
 impl Far {
     fn new(daemon: &Daemon) -> Self {
         let session = SessionSegment::create(SessionId::random()).unwrap();
         let view = PeerSession::map(daemon.id, daemon.handed.try_clone().unwrap()).unwrap();
-        Self::with(1, session, Peer::Remote(view))
+        Self::with(1, session, RingPeer::Remote(view))
     }
 
     /// Another publisher of the same session, so that the two sessions have to do with each other
@@ -148,7 +150,7 @@ impl Far {
         Self::with(2, self.session.clone(), self.view.clone())
     }
 
-    fn with(number: u32, session: Arc<SessionSegment>, view: Peer) -> Self {
+    fn with(number: u32, session: Arc<SessionSegment>, view: RingPeer) -> Self {
         let (gid, qos) = (Gid::new(session.id(), number), Qos::keep_all());
         let options = RingOptions { gid, qos, budget: 16 << 20, max_message: 1 << 20, expected: 0 };
         let writer = Writer::create(session.clone(), options).unwrap();
@@ -187,17 +189,17 @@ impl Far {
     fn hand(&self, number: u32, daemon: &Daemon) {
         let (segment, descriptor) = self.segment(number);
         let opened = SegmentOpened { session: self.session.id(), segment };
-        daemon.say(Message::Segment(opened), &[descriptor.as_fd()]);
+        daemon.say(SessionMessage::Segment(opened), &[descriptor.as_fd()]);
     }
 
     /// A subscription to it, and its grant.
     fn matched(&self, session: &Session, daemon: &Daemon) -> (Subscription, Granted) {
         let subscription = subscription(session);
-        daemon.say(Message::Match(self.pair(&subscription)), &[]);
+        daemon.say(SessionMessage::Match(self.pair(&subscription)), &[]);
         let granted = self.grant(&daemon.hear_attach());
         let introduction = self.introduction();
         let introduction: Vec<_> = introduction.iter().map(AsFd::as_fd).collect();
-        daemon.say(Message::Grant(granted.clone()), &introduction);
+        daemon.say(SessionMessage::Grant(granted.clone()), &introduction);
         assert!(subscription.wait_matched(1, EVER));
         (subscription, granted)
     }
@@ -256,14 +258,14 @@ fn memory_that_comes_with_a_repeated_grant_wakes_who_waits_for_it() {
     let start = Instant::now();
     let received = thread::scope(|scope| {
         let reader = scope.spawn(|| subscription.recv(&mut Vec::new(), Some(EVER)));
-        daemon.hear(|message| matches!(message, Message::Need(_)).then_some(()));
+        daemon.hear(|message| matches!(message, SessionMessage::Need(_)).then_some(()));
         // It has found that its memory is missing, and sleeps.
         let armed = session.segment().armed_word(Purpose::Samples);
         until("it sleeps", || armed.load(std::sync::atomic::Ordering::Relaxed) != 0);
         thread::sleep(Duration::from_millis(20));
         let (segment, descriptor) = far.segment(1);
         let granted = Granted { segments: vec![segment], ..granted };
-        daemon.say(Message::Grant(granted), &[descriptor.as_fd()]);
+        daemon.say(SessionMessage::Grant(granted), &[descriptor.as_fd()]);
         reader.join().unwrap()
     });
     assert_eq!(received.map(|info| info.sequence), Ok(1));
@@ -275,13 +277,13 @@ fn a_segment_that_is_refused_does_not_spoil_the_grant_it_came_with() {
     let (session, daemon) = session();
     let far = Far::new(&daemon);
     let subscription = subscription(&session);
-    daemon.say(Message::Match(far.pair(&subscription)), &[]);
+    daemon.say(SessionMessage::Match(far.pair(&subscription)), &[]);
     let granted = far.grant(&daemon.hear_attach());
     let segments = vec![Segment { number: 77, publisher: None }];
     let mut descriptors = far.introduction();
     descriptors.push(fs::File::open("/dev/null").unwrap().into());
     let descriptors: Vec<_> = descriptors.iter().map(AsFd::as_fd).collect();
-    daemon.say(Message::Grant(Granted { segments, ..granted }), &descriptors);
+    daemon.say(SessionMessage::Grant(Granted { segments, ..granted }), &descriptors);
     assert!(subscription.wait_matched(1, EVER));
     far.publish(1, b"x");
     assert_eq!(take(&subscription), Some(1));
@@ -295,11 +297,11 @@ fn memory_is_told_of_before_what_lies_in_it() {
     let _publishers: Vec<_> = (0..300).map(|_| session.create_publisher(spec()).unwrap()).collect();
     let mut told = Vec::new();
     let ring = daemon.hear(|message| match message {
-        Message::Segment(opened) => {
+        SessionMessage::Segment(opened) => {
             told.push(opened.segment.number);
             None
         }
-        Message::Endpoint(announce) => announce.ring.filter(|ring| ring.segment != 0),
+        SessionMessage::Endpoint(announce) => announce.ring.filter(|ring| ring.segment != 0),
         _ => None,
     });
     assert_eq!((ring.segment, told), (1, vec![1]));
@@ -316,11 +318,11 @@ fn a_writer_that_grants_anew_and_anew_takes_no_more_than_two_lanes() {
         // What it leaves unread each time keeps the lane.
         far.publish(round + 1, b"x");
         let generation = granted.generation ^ 1 | 2;
-        daemon.say(Message::Grant(Granted { generation, ..granted }), &[]);
+        daemon.say(SessionMessage::Grant(Granted { generation, ..granted }), &[]);
         let attach = daemon.hear_attach();
         lanes.push(attach.lane);
         granted = far.grant(&attach);
-        daemon.say(Message::Grant(granted.clone()), &[]);
+        daemon.say(SessionMessage::Grant(granted.clone()), &[]);
     }
     far.publish(rounds + 1, b"x");
     lanes.sort();
@@ -350,9 +352,9 @@ fn memory_that_was_given_up_while_the_session_was_behind_is_let_go() {
         assert_eq!(maps_of(inode), 2, "the publisher's, and the reader's");
         far.give_memory_up();
         assert_eq!(maps_of(inode), 1);
-        let mut all = vec![(Message::Grant(again.clone()), far.introduction())];
+        let mut all = vec![(SessionMessage::Grant(again.clone()), far.introduction())];
         if repeated {
-            all.push((Message::Grant(granted.clone()), Vec::new()));
+            all.push((SessionMessage::Grant(granted.clone()), Vec::new()));
         }
         daemon.tell_all(all);
         until("nobody keeps it", || maps_of(inode) == 0);
@@ -370,9 +372,9 @@ fn a_reader_requests_the_memory_of_an_ended_writer() {
     far.publish(1, &[1; LARGE]);
     let number = far.session.segments()[0].number;
     far.hand(number, &daemon);
-    daemon.tell_all(vec![(Message::Grant(granted), far.introduction())]);
+    daemon.tell_all(vec![(SessionMessage::Grant(granted), far.introduction())]);
     let needed = daemon.hear(|message| match message {
-        Message::Need(need) => Some((need.session, need.number)),
+        SessionMessage::Need(need) => Some((need.session, need.number)),
         _ => None,
     });
     assert_eq!(needed, (far.session.id(), number), "so that it is told when that is gone");
@@ -393,7 +395,7 @@ fn memory_that_a_writer_did_not_leave_is_given_up_with_what_is_in_it() {
     }
     let Pair { reader, writer } = far.pair(&subscription);
     let unmatch = Unmatch { reader, writer, reason: "gone".into() };
-    daemon.say(Message::Unmatch(unmatch), &[]);
+    daemon.say(SessionMessage::Unmatch(unmatch), &[]);
     until("it is over", || subscription.matched().is_empty());
     assert_eq!(take(&subscription), Some(1), "what is there");
     until("the others are lost", || take(&subscription).is_none() && subscription.lost() == 19);
@@ -420,7 +422,7 @@ fn a_daemon_cannot_have_a_session_read_its_own_samples_as_rings_and_lanes() {
     forged[264] = 4;
     publisher.publish(&forged).unwrap();
     let ring = daemon.hear(|message| match message {
-        Message::Endpoint(announce) if announce.endpoint.gid == writer => announce.ring,
+        SessionMessage::Endpoint(announce) if announce.endpoint.gid == writer => announce.ring,
         _ => None,
     });
     let mut memory = vec![0; 512 << 10];
@@ -429,7 +431,7 @@ fn a_daemon_cannot_have_a_session_read_its_own_samples_as_rings_and_lanes() {
     let at = (4096..memory.len()).step_by(128).find(is).expect("the sample");
     let sample = Location { segment: 0, offset: at as u64 };
 
-    daemon.say(Message::Match(Pair { reader, writer }), &[]);
+    daemon.say(SessionMessage::Match(Pair { reader, writer }), &[]);
     let asked = daemon.hear_attach();
     // As a publisher would to the first that asks.
     let (generation, segments) = (5 << 24 | 1, Vec::new());
@@ -437,23 +439,24 @@ fn a_daemon_cannot_have_a_session_read_its_own_samples_as_rings_and_lanes() {
     let relayed = None;
     let granted =
         Granted { reader, writer, generation, first, session, ring, segments, after, relayed };
-    daemon.say(Message::Grant(granted), &[]);
-    daemon.say(Message::Attach(Attach { lane: sample, ..asked.clone() }), &[]);
-    daemon.say(Message::Attach(asked), &[]);
+    daemon.say(SessionMessage::Grant(granted), &[]);
+    daemon.say(SessionMessage::Attach(Attach { lane: sample, ..asked.clone() }), &[]);
+    daemon.say(SessionMessage::Attach(asked), &[]);
     // What was said before is done with when this is answered.
-    daemon.say(Message::Match(Pair { reader, writer: Gid::new(SessionId::random(), 1) }), &[]);
+    daemon
+        .say(SessionMessage::Match(Pair { reader, writer: Gid::new(SessionId::random(), 1) }), &[]);
     let mut grants = Vec::new();
     daemon.hear(|message| match message {
-        Message::Grant(granted) => {
+        SessionMessage::Grant(granted) => {
             grants.push(granted);
             None
         }
-        other => matches!(other, Message::Attach(_)).then_some(()),
+        other => matches!(other, SessionMessage::Attach(_)).then_some(()),
     });
     assert!(subscription.matched().is_empty(), "a sample is no ring");
     assert_eq!(grants.len(), 1, "a sample is no lane");
     // What is as it must be goes through.
-    daemon.say(Message::Grant(grants.remove(0)), &[]);
+    daemon.say(SessionMessage::Grant(grants.remove(0)), &[]);
     assert!(subscription.wait_matched(1, EVER));
     publisher.publish(b"x").unwrap();
     assert!(subscription.take(&mut Vec::new()).is_some());
@@ -492,14 +495,14 @@ fn memory_that_could_not_be_handed_over_for_want_of_descriptors_is_later() {
     all.pop();
     publisher.publish(&[1; LARGE]).unwrap();
     let (reader, writer) = (subscription.gid(), Gid::new(SessionId::random(), 1));
-    daemon.say(Message::Match(Pair { reader, writer }), &[]);
+    daemon.say(SessionMessage::Match(Pair { reader, writer }), &[]);
     daemon.hear(|message| match message {
-        Message::Segment(_) => panic!("there was no descriptor for it"),
-        other => matches!(other, Message::Attach(_)).then_some(()),
+        SessionMessage::Segment(_) => panic!("there was no descriptor for it"),
+        other => matches!(other, SessionMessage::Attach(_)).then_some(()),
     });
     drop(all);
     let told = daemon.hear(|message| match message {
-        Message::Segment(opened) => Some(opened.segment.publisher),
+        SessionMessage::Segment(opened) => Some(opened.segment.publisher),
         _ => None,
     });
     assert_eq!(told, Some(publisher.gid()));

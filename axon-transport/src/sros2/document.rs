@@ -3,7 +3,7 @@
 use roxmltree::Node;
 
 use super::{
-    names::Does,
+    names::TopicUse,
     signed,
     xml::{self, Lines, child, elements, text},
 };
@@ -27,7 +27,7 @@ pub struct Grant {
     /// Whether it allows what no rule fits, and the line that says so.
     pub default: Option<(bool, u32)>,
     /// Elements that are known to nobody here.
-    pub unknown: Vec<Unknown>,
+    pub unknown: Vec<UnknownElement>,
 }
 
 /// When a grant counts, as it is written.
@@ -55,7 +55,7 @@ pub struct Rule {
     /// The lines of what it says of relays.
     pub relays: Vec<u32>,
     /// Elements that are known to nobody here.
-    pub unknown: Vec<Unknown>,
+    pub unknown: Vec<UnknownElement>,
 }
 
 /// Domains that a rule is for.
@@ -71,11 +71,11 @@ pub struct Domains {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Criteria {
     /// What is done.
-    pub does: Does,
+    pub does: TopicUse,
     /// The line of its start.
     pub line: u32,
     /// Expressions for topics of DDS.
-    pub topics: Vec<Says>,
+    pub topics: Vec<ExpressionEntry>,
     /// Expressions for partitions, where it has an element for some.
     pub partitions: Option<Vec<String>>,
     /// Whether it has an element for data tags.
@@ -84,7 +84,7 @@ pub struct Criteria {
 
 /// One expression.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Says {
+pub struct ExpressionEntry {
     /// The expression.
     pub text: String,
     /// Its line.
@@ -93,14 +93,14 @@ pub struct Says {
 
 /// An element that is known to nobody here.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Unknown {
+pub struct UnknownElement {
     /// Its name.
     pub name: String,
     /// Its line.
     pub line: u32,
 }
 
-impl Unknown {
+impl UnknownElement {
     fn of(node: Node<'_, '_>, lines: &Lines) -> Self {
         Self { name: node.tag_name().name().to_owned(), line: lines.of(node) }
     }
@@ -165,7 +165,7 @@ fn grant(node: Node<'_, '_>, lines: &Lines) -> Result<Grant, String> {
                 let default = allows(&text(element), line)?;
                 once(&mut read.default, (default, line), element, line)?;
             }
-            _ => read.unknown.push(Unknown::of(element, lines)),
+            _ => read.unknown.push(UnknownElement::of(element, lines)),
         }
     }
     Ok(read)
@@ -210,8 +210,8 @@ fn rule(node: Node<'_, '_>, allows: bool, lines: &Lines) -> Rule {
     };
     for element in elements(node) {
         let does = match element.tag_name().name() {
-            "publish" => Does::Publish,
-            "subscribe" => Does::Subscribe,
+            "publish" => TopicUse::Publish,
+            "subscribe" => TopicUse::Subscribe,
             "domains" => {
                 read.domains.push(domains(element, lines, &mut read.unknown));
                 continue;
@@ -221,7 +221,7 @@ fn rule(node: Node<'_, '_>, allows: bool, lines: &Lines) -> Rule {
                 continue;
             }
             _ => {
-                read.unknown.push(Unknown::of(element, lines));
+                read.unknown.push(UnknownElement::of(element, lines));
                 continue;
             }
         };
@@ -230,7 +230,12 @@ fn rule(node: Node<'_, '_>, allows: bool, lines: &Lines) -> Rule {
     read
 }
 
-fn criteria(node: Node<'_, '_>, does: Does, lines: &Lines, unknown: &mut Vec<Unknown>) -> Criteria {
+fn criteria(
+    node: Node<'_, '_>,
+    does: TopicUse,
+    lines: &Lines,
+    unknown: &mut Vec<UnknownElement>,
+) -> Criteria {
     let mut read = Criteria {
         does,
         line: lines.of(node),
@@ -246,27 +251,32 @@ fn criteria(node: Node<'_, '_>, does: Does, lines: &Lines, unknown: &mut Vec<Unk
                 read.partitions.get_or_insert_default().extend(all.into_iter().map(|one| one.text));
             }
             "data_tags" => read.has_data_tags = true,
-            _ => unknown.push(Unknown::of(part, lines)),
+            _ => unknown.push(UnknownElement::of(part, lines)),
         }
     }
     read
 }
 
 /// The texts of the elements of a name.
-fn list(node: Node<'_, '_>, name: &str, lines: &Lines, unknown: &mut Vec<Unknown>) -> Vec<Says> {
+fn list(
+    node: Node<'_, '_>,
+    name: &str,
+    lines: &Lines,
+    unknown: &mut Vec<UnknownElement>,
+) -> Vec<ExpressionEntry> {
     let mut all = Vec::new();
     for element in elements(node) {
         if element.has_tag_name(name) {
-            all.push(Says { text: text(element), line: lines.of(element) });
-            unknown.extend(elements(element).map(|inner| Unknown::of(inner, lines)));
+            all.push(ExpressionEntry { text: text(element), line: lines.of(element) });
+            unknown.extend(elements(element).map(|inner| UnknownElement::of(inner, lines)));
         } else {
-            unknown.push(Unknown::of(element, lines));
+            unknown.push(UnknownElement::of(element, lines));
         }
     }
     all
 }
 
-fn domains(node: Node<'_, '_>, lines: &Lines, unknown: &mut Vec<Unknown>) -> Domains {
+fn domains(node: Node<'_, '_>, lines: &Lines, unknown: &mut Vec<UnknownElement>) -> Domains {
     let mut ranges = Vec::new();
     for element in elements(node) {
         match element.tag_name().name() {
@@ -275,7 +285,7 @@ fn domains(node: Node<'_, '_>, lines: &Lines, unknown: &mut Vec<Unknown>) -> Dom
                 let bound = |name| child(element, name).map(text);
                 ranges.push((bound("min"), bound("max")));
             }
-            _ => unknown.push(Unknown::of(element, lines)),
+            _ => unknown.push(UnknownElement::of(element, lines)),
         }
     }
     Domains { ranges, line: lines.of(node) }

@@ -8,10 +8,10 @@ use std::{
 use super::{
     Denial, PermissionsError, date,
     document::{self, MOST_EXPRESSIONS, common_name},
-    error::{Denied, Reason},
+    error::{DenialReason, Denied},
     file,
-    grant::{Decision, Grant},
-    names::{Does, uses},
+    grant::{CompiledGrant, GrantDecision},
+    names::{TopicUse, uses},
 };
 use crate::graph::EndpointKind;
 
@@ -44,7 +44,7 @@ pub struct EnclavePermissions {
     enclave: String,
     path: PathBuf,
     /// Those for the enclave, in their order. There is one at least.
-    grants: Vec<Grant>,
+    grants: Vec<CompiledGrant>,
 }
 
 impl EnclavePermissions {
@@ -78,7 +78,7 @@ impl EnclavePermissions {
             if common_name(subject) == Some(enclave) {
                 let criteria = grant.rules.iter().flat_map(|rule| &rule.criteria);
                 expressions += criteria.map(|criteria| criteria.topics.len()).sum::<usize>();
-                grants.push(Grant::new(grant).map_err(malformed)?);
+                grants.push(CompiledGrant::new(grant).map_err(malformed)?);
             } else if known.len() < 20 {
                 known.push(subject.to_owned());
             }
@@ -147,11 +147,11 @@ impl EnclavePermissions {
             let topic = part.dds_name(name);
             let reason = match grant {
                 Ok(grant) => match grant.decide(domain, does, &topic) {
-                    Decision::Allowed => continue,
-                    Decision::DeniedByRule(line) => Reason::Rule(line),
-                    Decision::DeniedByDefault(line) => Reason::Default(line),
+                    GrantDecision::Allowed => continue,
+                    GrantDecision::DeniedByRule(line) => DenialReason::Rule(line),
+                    GrantDecision::DeniedByDefault(line) => DenialReason::Default(line),
                 },
-                Err(document::Validity { not_before, not_after, line }) => Reason::NotValid {
+                Err(document::Validity { not_before, not_after, line }) => DenialReason::NotValid {
                     not_before: not_before.clone(),
                     not_after: not_after.clone(),
                     line: *line,
@@ -162,13 +162,13 @@ impl EnclavePermissions {
         Ok(())
     }
 
-    fn denial(&self, does: Does, topic: String, reason: Reason) -> Denial {
+    fn denial(&self, does: TopicUse, topic: String, reason: DenialReason) -> Denial {
         let (enclave, path) = (self.enclave.clone(), self.path.clone());
         Denial(Box::new(Denied { enclave, path, does, topic, reason }))
     }
 
     /// The first grant that is valid, or when the last one is.
-    fn grant(&self, now: SystemTime) -> Result<&Grant, &document::Validity> {
+    fn grant(&self, now: SystemTime) -> Result<&CompiledGrant, &document::Validity> {
         let now = date::of_clock(now);
         let last = &self.grants[self.grants.len() - 1];
         self.grants.iter().find(|grant| grant.is_valid(now)).ok_or(&last.validity)

@@ -2,7 +2,7 @@
 
 use std::{fmt, io, path::PathBuf};
 
-use super::names::Does;
+use super::names::TopicUse;
 use crate::text::plain;
 
 /// Shown of a name from a file.
@@ -95,14 +95,14 @@ pub struct Denial(pub(super) Box<Denied>);
 pub(super) struct Denied {
     pub(super) enclave: String,
     pub(super) path: PathBuf,
-    pub(super) does: Does,
+    pub(super) does: TopicUse,
     pub(super) topic: String,
-    pub(super) reason: Reason,
+    pub(super) reason: DenialReason,
 }
 
 /// What denies it.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum Reason {
+pub(super) enum DenialReason {
     /// The line of an expression of a `deny_rule`.
     Rule(u32),
     /// No rule fits, and this line says that the default is to deny.
@@ -115,7 +115,9 @@ impl Denial {
     /// The line of the file that decides.
     pub fn line(&self) -> u32 {
         match self.0.reason {
-            Reason::Rule(line) | Reason::Default(line) | Reason::NotValid { line, .. } => line,
+            DenialReason::Rule(line)
+            | DenialReason::Default(line)
+            | DenialReason::NotValid { line, .. } => line,
         }
     }
 }
@@ -127,11 +129,11 @@ impl fmt::Display for Denial {
         let path = path.display();
         write!(f, "enclave {enclave} may not {} {topic}: ", does.verb())?;
         match reason {
-            Reason::Rule(_) => write!(f, "denied by line {line} of {path}"),
-            Reason::Default(_) => {
+            DenialReason::Rule(_) => write!(f, "denied by line {line} of {path}"),
+            DenialReason::Default(_) => {
                 write!(f, "no rule allows it, and line {line} of {path} denies the rest")
             }
-            Reason::NotValid { not_before, not_after, .. } => write!(
+            DenialReason::NotValid { not_before, not_after, .. } => write!(
                 f,
                 "its permissions are valid from {not_before} to {not_after} UTC, by line {line} of {path}"
             ),

@@ -8,7 +8,7 @@ const LONGEST: usize = 4096;
 pub struct Expression(String);
 
 /// One step of an expression.
-enum Step<'a> {
+enum ExpressionStep<'a> {
     /// `*`.
     Many,
     /// `?`.
@@ -33,7 +33,7 @@ impl Expression {
         let mut rest = text;
         while !rest.is_empty() {
             let (step, behind) = step(rest).ok_or("ends in a backslash")?;
-            if let Step::Set { inner, .. } = step {
+            if let ExpressionStep::Set { inner, .. } = step {
                 let mut members = inner;
                 while let Some((_, behind)) = member(members)? {
                     members = behind;
@@ -52,7 +52,7 @@ impl Expression {
         loop {
             let character = name.chars().next();
             match (step(pattern), character) {
-                (Some((Step::Many, behind)), _) => {
+                (Some((ExpressionStep::Many, behind)), _) => {
                     retry = Some((behind, name));
                     pattern = behind;
                     continue;
@@ -80,7 +80,7 @@ impl Expression {
     }
 }
 
-impl Step<'_> {
+impl ExpressionStep<'_> {
     /// Whether it fits one character.
     fn fits(&self, c: char) -> bool {
         match *self {
@@ -103,23 +103,26 @@ impl Step<'_> {
 }
 
 /// The first step of a pattern, and the rest. `None` at its end, and where a backslash escapes nothing.
-fn step(pattern: &str) -> Option<(Step<'_>, &str)> {
+fn step(pattern: &str) -> Option<(ExpressionStep<'_>, &str)> {
     let mut characters = pattern.chars();
     let step = match characters.next()? {
-        '*' => Step::Many,
-        '?' => Step::One,
-        '\\' => Step::Character(characters.next()?),
+        '*' => ExpressionStep::Many,
+        '?' => ExpressionStep::One,
+        '\\' => ExpressionStep::Character(characters.next()?),
         '[' => {
             let (inner, behind) = match set(characters.as_str()) {
                 Some(found) => found,
                 // Nothing closes it.
-                None => return Some((Step::Character('['), characters.as_str())),
+                None => return Some((ExpressionStep::Character('['), characters.as_str())),
             };
             let positive = inner.strip_prefix(['!', '^']);
             let inverted = positive.is_some();
-            return Some((Step::Set { inner: positive.unwrap_or(inner), inverted }, behind));
+            return Some((
+                ExpressionStep::Set { inner: positive.unwrap_or(inner), inverted },
+                behind,
+            ));
         }
-        other => Step::Character(other),
+        other => ExpressionStep::Character(other),
     };
     Some((step, characters.as_str()))
 }

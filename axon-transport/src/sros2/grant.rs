@@ -2,25 +2,25 @@
 
 use super::{
     date,
-    document::{self, Unknown},
+    document::{self, UnknownElement},
     expression::Expression,
-    names::Does,
+    names::TopicUse,
 };
 
 /// A grant that can be judged by.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct Grant {
+pub(super) struct CompiledGrant {
     pub(super) line: u32,
     pub(super) validity: document::Validity,
     not_before: i64,
     not_after: i64,
-    rules: Vec<Rule>,
+    rules: Vec<CompiledRule>,
     allows_by_default: bool,
     default_line: u32,
 }
 
 #[derive(Clone, Debug, PartialEq, Eq)]
-struct Rule {
+struct CompiledRule {
     allows: bool,
     /// The first and the last of each range.
     domains: Vec<(u32, u32)>,
@@ -30,13 +30,13 @@ struct Rule {
 
 /// What a grant decides, and the line that does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Decision {
+pub(super) enum GrantDecision {
     Allowed,
     DeniedByRule(u32),
     DeniedByDefault(u32),
 }
 
-impl Grant {
+impl CompiledGrant {
     /// # Errors
     /// A part of it is missing or not understood. What is not understood might be a denial.
     pub(super) fn new(read: document::Grant) -> Result<Self, String> {
@@ -55,7 +55,7 @@ impl Grant {
             not_before: seconds(&validity.not_before, "not_before")?,
             not_after: seconds(&validity.not_after, "not_after")?,
             validity,
-            rules: read.rules.into_iter().map(Rule::new).collect::<Result<_, _>>()?,
+            rules: read.rules.into_iter().map(CompiledRule::new).collect::<Result<_, _>>()?,
             allows_by_default: default,
             default_line,
         })
@@ -87,26 +87,30 @@ impl Grant {
     }
 
     /// The first rule for the domain that fits decides, else the default.
-    pub(super) fn decide(&self, domain: u32, does: Does, topic: &str) -> Decision {
+    pub(super) fn decide(&self, domain: u32, does: TopicUse, topic: &str) -> GrantDecision {
         let rules = self.rules.iter().filter(|rule| rule.is_for(domain));
         for rule in rules {
             let expressions = match does {
-                Does::Publish => &rule.publish,
-                Does::Subscribe => &rule.subscribe,
+                TopicUse::Publish => &rule.publish,
+                TopicUse::Subscribe => &rule.subscribe,
             };
             if let Some((_, line)) = expressions.iter().find(|(one, _)| one.fits(topic)) {
-                return if rule.allows { Decision::Allowed } else { Decision::DeniedByRule(*line) };
+                return if rule.allows {
+                    GrantDecision::Allowed
+                } else {
+                    GrantDecision::DeniedByRule(*line)
+                };
             }
         }
         if self.allows_by_default {
-            Decision::Allowed
+            GrantDecision::Allowed
         } else {
-            Decision::DeniedByDefault(self.default_line)
+            GrantDecision::DeniedByDefault(self.default_line)
         }
     }
 }
 
-impl Rule {
+impl CompiledRule {
     fn new(read: document::Rule) -> Result<Self, String> {
         known(&read.unknown)?;
         let mut rule = Self {
@@ -134,8 +138,8 @@ impl Rule {
                 continue;
             }
             match criteria.does {
-                Does::Publish => rule.publish.append(&mut expressions),
-                Does::Subscribe => rule.subscribe.append(&mut expressions),
+                TopicUse::Publish => rule.publish.append(&mut expressions),
+                TopicUse::Subscribe => rule.subscribe.append(&mut expressions),
             }
         }
         Ok(rule)
@@ -190,9 +194,11 @@ fn domains(all: &[document::Domains], line: u32) -> Result<Vec<(u32, u32)>, Stri
 
 /// # Errors
 /// There is an element that nobody here knows.
-fn known(unknown: &[Unknown]) -> Result<(), String> {
+fn known(unknown: &[UnknownElement]) -> Result<(), String> {
     match unknown.first() {
         None => Ok(()),
-        Some(Unknown { name, line }) => Err(format!("line {line}: element <{name}> is not known")),
+        Some(UnknownElement { name, line }) => {
+            Err(format!("line {line}: element <{name}> is not known"))
+        }
     }
 }

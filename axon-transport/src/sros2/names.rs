@@ -4,14 +4,14 @@ use crate::graph::EndpointKind;
 
 /// What a participant of DDS does with a topic of DDS.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Does {
+pub enum TopicUse {
     /// It writes.
     Publish,
     /// It reads.
     Subscribe,
 }
 
-impl Does {
+impl TopicUse {
     /// As a verb before a topic.
     pub const fn verb(self) -> &'static str {
         match self {
@@ -23,7 +23,7 @@ impl Does {
 
 /// What a topic of DDS carries.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Part {
+pub enum TopicPart {
     /// The samples of a topic.
     Topic,
     /// The requests of a service.
@@ -32,7 +32,7 @@ pub enum Part {
     Reply,
 }
 
-impl Part {
+impl TopicPart {
     /// All of them.
     pub const ALL: [Self; 3] = [Self::Topic, Self::Request, Self::Reply];
 
@@ -54,12 +54,16 @@ impl Part {
 }
 
 /// What the participant of an endpoint does: each of these with that topic of DDS.
-pub const fn uses(kind: EndpointKind) -> &'static [(Does, Part)] {
+pub const fn uses(kind: EndpointKind) -> &'static [(TopicUse, TopicPart)] {
     match kind {
-        EndpointKind::Publisher => &[(Does::Publish, Part::Topic)],
-        EndpointKind::Subscription => &[(Does::Subscribe, Part::Topic)],
-        EndpointKind::Client => &[(Does::Publish, Part::Request), (Does::Subscribe, Part::Reply)],
-        EndpointKind::Server => &[(Does::Subscribe, Part::Request), (Does::Publish, Part::Reply)],
+        EndpointKind::Publisher => &[(TopicUse::Publish, TopicPart::Topic)],
+        EndpointKind::Subscription => &[(TopicUse::Subscribe, TopicPart::Topic)],
+        EndpointKind::Client => {
+            &[(TopicUse::Publish, TopicPart::Request), (TopicUse::Subscribe, TopicPart::Reply)]
+        }
+        EndpointKind::Server => {
+            &[(TopicUse::Subscribe, TopicPart::Request), (TopicUse::Publish, TopicPart::Reply)]
+        }
         EndpointKind::Node => &[],
     }
 }

@@ -7,7 +7,7 @@ use std::{
 
 use proptest::prelude::*;
 
-use super::{EnclavePermissions, PermissionsError, names::Does};
+use super::{EnclavePermissions, PermissionsError, names::TopicUse};
 use crate::graph::EndpointKind;
 
 /// 2026-06-01.
@@ -338,7 +338,7 @@ fn a_file_that_everybody_may_write_or_that_is_none_is_refused() {
 struct Drawn {
     allows: bool,
     domains: (u32, u32),
-    does: Does,
+    does: TopicUse,
     topics: Vec<String>,
     /// `None` for no element.
     partition: Option<String>,
@@ -347,7 +347,7 @@ struct Drawn {
 impl Drawn {
     fn xml(&self) -> String {
         let kind = if self.allows { "allow_rule" } else { "deny_rule" };
-        let does = if self.does == Does::Publish { "publish" } else { "subscribe" };
+        let does = if self.does == TopicUse::Publish { "publish" } else { "subscribe" };
         let topics: String =
             self.topics.iter().map(|one| format!("<topic>{one}</topic>")).collect();
         let partition = self.partition.as_ref().map_or(String::new(), |name| {
@@ -376,7 +376,7 @@ fn fnmatch(pattern: &[u8], name: &[u8]) -> bool {
 
 fn drawn() -> impl Strategy<Value = Drawn> {
     let topics = prop::collection::vec("(r[tqr])?[/ab*?]{0,4}(Request|Reply)?", 1..4);
-    let does = prop_oneof![Just(Does::Publish), Just(Does::Subscribe)];
+    let does = prop_oneof![Just(TopicUse::Publish), Just(TopicUse::Subscribe)];
     (any::<bool>(), (0u32..4, 0u32..4), does, topics, prop::option::of("[a*]{0,2}")).prop_map(
         |(allows, domains, does, topics, partition)| Drawn {
             allows,
@@ -398,7 +398,7 @@ proptest! {
     ) {
         let text: String = rules.iter().map(Drawn::xml).collect();
         let permissions = parse(&grant(&text, if default { "ALLOW" } else { "DENY" })).unwrap();
-        let allowed = |does: Does, topic: String| {
+        let allowed = |does: TopicUse, topic: String| {
             let fits = |rule: &&Drawn| {
                 (rule.domains.0..=rule.domains.1).contains(&domain)
                     && rule.does == does
@@ -417,10 +417,10 @@ proptest! {
                 allowed(requests, ros("rq", "Request")) && allowed(replies, ros("rr", "Reply"))
             };
             for (kind, expected) in [
-                (EndpointKind::Publisher, topic(Does::Publish)),
-                (EndpointKind::Subscription, topic(Does::Subscribe)),
-                (EndpointKind::Client, halves(Does::Publish, Does::Subscribe)),
-                (EndpointKind::Server, halves(Does::Subscribe, Does::Publish)),
+                (EndpointKind::Publisher, topic(TopicUse::Publish)),
+                (EndpointKind::Subscription, topic(TopicUse::Subscribe)),
+                (EndpointKind::Client, halves(TopicUse::Publish, TopicUse::Subscribe)),
+                (EndpointKind::Server, halves(TopicUse::Subscribe, TopicUse::Publish)),
             ] {
                 let checked = permissions.check(kind, &name, domain, now());
                 prop_assert_eq!(checked.is_ok(), expected, "{:?} {}: {:?}", kind, name, checked);

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use axon_transport::{
     access::TopicPattern,
-    internal::sros2::names::{Does, Part},
+    internal::sros2::names::{TopicPart, TopicUse},
 };
 
 use super::{
@@ -71,7 +71,7 @@ impl Patterns {
 }
 
 /// All patterns of allowing, or of denying.
-type Sets = BTreeMap<(Does, Part), Patterns>;
+type Sets = BTreeMap<(TopicUse, TopicPart), Patterns>;
 
 /// The rules that say the same. What they cannot say is in `notes`.
 pub(super) fn convert(grant: &Grant, notes: &mut Notes) -> Rules {
@@ -90,7 +90,7 @@ pub(super) fn convert(grant: &Grant, notes: &mut Notes) -> Rules {
                 continue;
             }
         };
-        if says.allows && says.does == Does::Subscribe && parts.len() > 1 {
+        if says.allows && says.does == TopicUse::Subscribe && parts.len() > 1 {
             see.insert("**".into());
         }
         for (part, pattern) in
@@ -131,12 +131,12 @@ pub(super) fn convert(grant: &Grant, notes: &mut Notes) -> Rules {
 /// A rule for the graph, which AXON has no topic for.
 fn graph(says: &Says, see: &mut Names, notes: &mut Notes) {
     match (says.allows, says.does) {
-        (true, Does::Subscribe) => {
+        (true, TopicUse::Subscribe) => {
             see.insert("**".into());
             let what = "ros_discovery_info: written as see = \"**\", for all nodes of the graph";
             notes.add(Effect::None, says.line, what);
         }
-        (true, Does::Publish) => {
+        (true, TopicUse::Publish) => {
             let what =
                 "ros_discovery_info: a peer tells of its endpoints as far as it may use them";
             notes.add(Effect::None, says.line, what);
@@ -151,14 +151,14 @@ fn graph(says: &Says, see: &mut Names, notes: &mut Notes) {
 fn uses(sets: &mut Sets, allows: bool, notes: &mut Notes) -> Uses {
     let mut take = |does, part| sets.remove(&(does, part)).unwrap_or_default();
     let (requests, replies) =
-        (take(Does::Publish, Part::Request), take(Does::Subscribe, Part::Reply));
+        (take(TopicUse::Publish, TopicPart::Request), take(TopicUse::Subscribe, TopicPart::Reply));
     let call = pair("a call", &requests, &replies, allows, notes);
     let (requests, replies) =
-        (take(Does::Subscribe, Part::Request), take(Does::Publish, Part::Reply));
+        (take(TopicUse::Subscribe, TopicPart::Request), take(TopicUse::Publish, TopicPart::Reply));
     let serve = pair("a server", &requests, &replies, allows, notes);
     Uses {
-        publish: take(Does::Publish, Part::Topic).names(),
-        subscribe: take(Does::Subscribe, Part::Topic).names(),
+        publish: take(TopicUse::Publish, TopicPart::Topic).names(),
+        subscribe: take(TopicUse::Subscribe, TopicPart::Topic).names(),
         serve,
         call,
         ..Uses::default()

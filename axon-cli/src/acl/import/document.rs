@@ -1,6 +1,6 @@
 //! What a document says, in the order in which it says it.
 
-use axon_transport::internal::sros2::{document::MOST_EXPRESSIONS, names::Does};
+use axon_transport::internal::sros2::{document::MOST_EXPRESSIONS, names::TopicUse};
 
 use super::notes::{Effect, Notes};
 
@@ -8,7 +8,7 @@ use super::notes::{Effect, Notes};
 #[derive(Debug)]
 pub(super) struct Says {
     pub(super) allows: bool,
-    pub(super) does: Does,
+    pub(super) does: TopicUse,
     /// For topics of DDS.
     pub(super) expression: String,
     pub(super) line: u32,

@@ -1,6 +1,6 @@
 //! Topics of DDS as ROS 2 and SROS2 write them, and the patterns of AXON that fit the same names.
 
-use axon_transport::{access::TopicPattern, internal::sros2::names::Part};
+use axon_transport::{access::TopicPattern, internal::sros2::names::TopicPart};
 
 /// As many patterns as one expression may become.
 const MOST: usize = 16;
@@ -9,15 +9,15 @@ const MOST: usize = 16;
 ///
 /// # Errors
 /// No pattern says the same; the error says why.
-pub(super) fn parts(expression: &str) -> Result<Vec<(Part, Vec<String>)>, &'static str> {
+pub(super) fn parts(expression: &str) -> Result<Vec<(TopicPart, Vec<String>)>, &'static str> {
     if !expression.is_empty() && expression.bytes().all(|byte| byte == b'*') {
-        return Ok(Part::ALL.map(|part| (part, vec!["/**".to_owned()])).into());
+        return Ok(TopicPart::ALL.map(|part| (part, vec!["/**".to_owned()])).into());
     }
-    let is_of = |part: &Part| {
+    let is_of = |part: &TopicPart| {
         let name = expression.strip_prefix(part.mangling().0);
         name.is_some_and(|name| name.starts_with('/'))
     };
-    let Some(part) = Part::ALL.into_iter().find(is_of) else {
+    let Some(part) = TopicPart::ALL.into_iter().find(is_of) else {
         return Err("not a topic of ROS 2: AXON carries those that begin with rt/, rq/ or rr/");
     };
     let suffix = part.mangling().1;
@@ -87,16 +87,16 @@ mod tests {
     #[test]
     fn names_of_topics_and_services_are_unmangled() {
         for (expression, part, name) in [
-            ("rt/chatter", Part::Topic, "/chatter"),
-            ("rt/*", Part::Topic, "/**"),
-            ("rt/camera/*", Part::Topic, "/camera/*/**"),
-            ("rt/camera*", Part::Topic, "/camera*/**"),
-            ("rt/*/cmd_vel", Part::Topic, "/*/**/cmd_vel"),
-            ("rq/add_two_intsRequest", Part::Request, "/add_two_ints"),
-            ("rr/a/bReply", Part::Reply, "/a/b"),
-            ("rq/*Request", Part::Request, "/**"),
-            ("rr/*", Part::Reply, "/**"),
-            ("rq/arm*", Part::Request, "/arm*/**"),
+            ("rt/chatter", TopicPart::Topic, "/chatter"),
+            ("rt/*", TopicPart::Topic, "/**"),
+            ("rt/camera/*", TopicPart::Topic, "/camera/*/**"),
+            ("rt/camera*", TopicPart::Topic, "/camera*/**"),
+            ("rt/*/cmd_vel", TopicPart::Topic, "/*/**/cmd_vel"),
+            ("rq/add_two_intsRequest", TopicPart::Request, "/add_two_ints"),
+            ("rr/a/bReply", TopicPart::Reply, "/a/b"),
+            ("rq/*Request", TopicPart::Request, "/**"),
+            ("rr/*", TopicPart::Reply, "/**"),
+            ("rq/arm*", TopicPart::Request, "/arm*/**"),
         ] {
             let expected = vec![(part, vec![name.to_owned()])];
             assert_eq!(parts(expression), Ok(expected), "{expression}");

@@ -1,6 +1,6 @@
 //! Permissions of DDS Security, as `permissions.xml` of an enclave has them, and what of them no rule can say.
 
-use axon_transport::internal::sros2::document::{self, Domains, Rule, Unknown};
+use axon_transport::internal::sros2::document::{self, Domains, Rule, UnknownElement};
 
 use super::{
     document::{Grant, Says, choose, unknown},
@@ -92,8 +92,8 @@ fn rule(rule: Rule, read: &mut Grant, notes: &mut Notes) -> Result<(), String> {
     Ok(())
 }
 
-fn all_unknown(all: &[Unknown], effect: Effect, notes: &mut Notes) {
-    for Unknown { name, line } in all {
+fn all_unknown(all: &[UnknownElement], effect: Effect, notes: &mut Notes) {
+    for UnknownElement { name, line } in all {
         unknown(name, *line, effect, notes);
     }
 }

@@ -4,7 +4,7 @@ use axon_transport::internal::{
     access::{ACTION_SERVICES, ACTION_TOPICS},
     sros2::{
         document::allows,
-        names::{Does, Part},
+        names::{TopicPart, TopicUse},
         xml::{Lines, elements, text},
     },
 };
@@ -68,13 +68,15 @@ fn profile(
             continue;
         }
         for attribute in group.attributes() {
-            let expand: fn(&str) -> Vec<(Does, String)> = match (kind, attribute.name()) {
-                ("topics", "publish") => |name| vec![topic(Does::Publish, name)],
-                ("topics", "subscribe") => |name| vec![topic(Does::Subscribe, name)],
-                ("services", "request") => |name| service(Does::Publish, name).into(),
-                ("services", "reply") => |name| service(Does::Subscribe, name).into(),
-                ("actions", "call") => |name| action(Does::Publish, Does::Subscribe, name),
-                ("actions", "execute") => |name| action(Does::Subscribe, Does::Publish, name),
+            let expand: fn(&str) -> Vec<(TopicUse, String)> = match (kind, attribute.name()) {
+                ("topics", "publish") => |name| vec![topic(TopicUse::Publish, name)],
+                ("topics", "subscribe") => |name| vec![topic(TopicUse::Subscribe, name)],
+                ("services", "request") => |name| service(TopicUse::Publish, name).into(),
+                ("services", "reply") => |name| service(TopicUse::Subscribe, name).into(),
+                ("actions", "call") => |name| action(TopicUse::Publish, TopicUse::Subscribe, name),
+                ("actions", "execute") => {
+                    |name| action(TopicUse::Subscribe, TopicUse::Publish, name)
+                }
                 // It says where an included file was.
                 (_, "base") => continue,
                 (_, other) => return Err(format!("line {line}: {kind} has no {other}")),
@@ -110,17 +112,18 @@ fn unknown_element(node: Node<'_, '_>, lines: &Lines, effect: Effect, notes: &mu
     unknown(node.tag_name().name(), lines.of(node), effect, notes);
 }
 
-fn topic(does: Does, name: &str) -> (Does, String) {
-    (does, Part::Topic.dds_name(name))
+fn topic(does: TopicUse, name: &str) -> (TopicUse, String) {
+    (does, TopicPart::Topic.dds_name(name))
 }
 
 /// A client publishes requests, and a server subscribes to them.
-fn service(requests: Does, name: &str) -> [(Does, String); 2] {
-    let replies = if requests == Does::Publish { Does::Subscribe } else { Does::Publish };
-    [(requests, Part::Request.dds_name(name)), (replies, Part::Reply.dds_name(name))]
+fn service(requests: TopicUse, name: &str) -> [(TopicUse, String); 2] {
+    let replies =
+        if requests == TopicUse::Publish { TopicUse::Subscribe } else { TopicUse::Publish };
+    [(requests, TopicPart::Request.dds_name(name)), (replies, TopicPart::Reply.dds_name(name))]
 }
 
-fn action(requests: Does, topics: Does, name: &str) -> Vec<(Does, String)> {
+fn action(requests: TopicUse, topics: TopicUse, name: &str) -> Vec<(TopicUse, String)> {
     let services = ACTION_SERVICES.map(|part| service(requests, &format!("{name}/{part}")));
     let topics = ACTION_TOPICS.map(|part| topic(topics, &format!("{name}/{part}")));
     services.into_iter().flatten().chain(topics).collect()

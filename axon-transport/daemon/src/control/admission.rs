@@ -8,7 +8,7 @@ use axon_transport::{
     config::{Config, security_settings},
     internal::{
         session::daemon::connect::SHM,
-        wire::session::{Hello, PROTOCOL, Refused, SessionRole},
+        wire::session::{PROTOCOL, SessionHello, SessionRefused, SessionRole},
     },
 };
 
@@ -48,7 +48,7 @@ impl Admission {
     }
 
     /// As [`trusts`](Self::trusts), for a session that is about to be admitted.
-    pub(super) fn still_trusts(&self, uid: u32) -> Result<(), Box<Refused>> {
+    pub(super) fn still_trusts(&self, uid: u32) -> Result<(), Box<SessionRefused>> {
         let text = || format!("user {uid} is not trusted (AXON_TRUSTED_UIDS of the daemon)");
         if self.trusts(uid) { Ok(()) } else { Err(plain(text())) }
     }
@@ -61,11 +61,11 @@ impl Admission {
     /// Checks a HELLO, and hands out its descriptors. `inside` is the daemon's own gateway.
     pub(super) fn check(
         &mut self,
-        hello: &Hello,
+        hello: &SessionHello,
         descriptors: Vec<PassedFd>,
         peer: PeerProcess,
         inside: bool,
-    ) -> Result<Option<[PassedFd; 3]>, Box<Refused>> {
+    ) -> Result<Option<[PassedFd; 3]>, Box<SessionRefused>> {
         if hello.protocol != PROTOCOL {
             let text =
                 format!("this daemon speaks session protocol {PROTOCOL}, not {}", hello.protocol);
@@ -143,7 +143,7 @@ impl Admission {
         }
     }
 
-    fn compare(&self, theirs: &[(String, String)]) -> Result<(), Box<Refused>> {
+    fn compare(&self, theirs: &[(String, String)]) -> Result<(), Box<SessionRefused>> {
         let find = |all: &[(String, String)], name: &str| {
             all.iter().find(|(n, _)| n == name).map_or("unset".to_owned(), |(_, v)| v.clone())
         };
@@ -166,20 +166,20 @@ fn differs(
     variable: &str,
     session: &dyn std::fmt::Display,
     daemon: &dyn std::fmt::Display,
-) -> Box<Refused> {
+) -> Box<SessionRefused> {
     let (variable, ours, theirs) = (variable.to_owned(), session.to_string(), daemon.to_string());
     let text = format!("{variable} is {ours} in the session and {theirs} in the daemon");
-    Box::new(Refused { variable, ours, theirs, text, endpoint: None })
+    Box::new(SessionRefused { variable, ours, theirs, text, endpoint: None })
 }
 
 /// No memory can be shared with it: it may come back to be relayed.
-pub(super) fn unshared(text: String) -> Box<Refused> {
+pub(super) fn unshared(text: String) -> Box<SessionRefused> {
     let [ours, theirs] = ["on", "off"].map(str::to_owned);
-    Box::new(Refused { variable: SHM.into(), ours, theirs, text, endpoint: None })
+    Box::new(SessionRefused { variable: SHM.into(), ours, theirs, text, endpoint: None })
 }
 
-fn plain(text: String) -> Box<Refused> {
-    Box::new(Refused::because(text))
+fn plain(text: String) -> Box<SessionRefused> {
+    Box::new(SessionRefused::because(text))
 }
 
 #[cfg(test)]
@@ -199,8 +199,8 @@ mod tests {
         Admission { uid: 1000, config: Arc::new(config), settings: settings.into() }
     }
 
-    fn hello() -> Hello {
-        Hello {
+    fn hello() -> SessionHello {
+        SessionHello {
             protocol: PROTOCOL,
             session: SessionId::random(),
             role: SessionRole::Application,
@@ -213,7 +213,7 @@ mod tests {
         }
     }
 
-    fn refusal(hello: &Hello) -> Refused {
+    fn refusal(hello: &SessionHello) -> SessionRefused {
         let peer = PeerProcess { uid: 1000, pid: std::process::id() };
         *admission().check(hello, Vec::new(), peer, false).unwrap_err()
     }
@@ -245,7 +245,7 @@ mod tests {
         let refused = daemon.check(&hello(), Vec::new(), peer, false).unwrap_err();
         assert!(refused.text.contains("0 descriptors"), "a session without rules is let in");
 
-        assert_eq!(refusal(&Hello { domain: 4, ..hello() }).variable, "ROS_DOMAIN_ID");
+        assert_eq!(refusal(&SessionHello { domain: 4, ..hello() }).variable, "ROS_DOMAIN_ID");
     }
 
     #[test]
@@ -263,7 +263,7 @@ mod tests {
             Admission::new(Arc::new(config.clone()), security_settings(&config).unwrap());
         let mut why = |settings| {
             let peer = PeerProcess { uid: 1000, pid: std::process::id() };
-            let hello = Hello { domain: 0, settings, ..hello() };
+            let hello = SessionHello { domain: 0, settings, ..hello() };
             admission.check(&hello, Vec::new(), peer, false).unwrap_err().text
         };
         let of_its_own = "0 descriptors";
@@ -292,16 +292,18 @@ mod tests {
         let rules = "default = \"allow\"";
         assert!(check(rules, 1001).contains("access rules are in force"));
         assert!(check(rules, 1000).contains("0 descriptors"), "the own user shares memory");
-        let relayed = Hello { relay: Some("why".into()), ..hello() };
+        let relayed = SessionHello { relay: Some("why".into()), ..hello() };
         let peer = PeerProcess { uid: 1001, pid: std::process::id() };
         assert!(admission().check(&relayed, Vec::new(), peer, false).unwrap().is_none());
     }
 
     #[test]
     fn nobody_else_is_the_gateway_and_strangers_are_not_heard() {
-        let gateway = Hello { role: SessionRole::Gateway, ..hello() };
+        let gateway = SessionHello { role: SessionRole::Gateway, ..hello() };
         assert!(refusal(&gateway).text.contains("gateway"));
-        assert!(refusal(&Hello { protocol: PROTOCOL + 1, ..hello() }).text.contains("protocol"));
+        assert!(
+            refusal(&SessionHello { protocol: PROTOCOL + 1, ..hello() }).text.contains("protocol")
+        );
         assert!(refusal(&hello()).text.contains("0 descriptors"));
         assert!(admission().trusts(1000) && admission().trusts(1001) && !admission().trusts(0));
     }

@@ -14,8 +14,8 @@ use axon_shm::{
 };
 use axon_transport::internal::{
     registry::{MAX_QUEUE, SessionEntry},
-    session::daemon::socket::{self, Received, SocketError},
-    wire::session::Message,
+    session::daemon::socket::{self, ReceivedMessage, SocketError},
+    wire::session::SessionMessage,
 };
 use tokio::{io::unix::AsyncFd, sync::Notify};
 
@@ -188,7 +188,7 @@ pub(super) fn receive(
     spare: &SpareDescriptors,
     socket: &PassedFd,
     buffer: &mut Vec<u8>,
-) -> Result<Received, SocketError> {
+) -> Result<ReceivedMessage, SocketError> {
     let (clogged, tight) = (descriptors::is_clogged(), descriptors::is_tight());
     if !(clogged || tight) || !descriptors::carries_descriptors(socket) {
         return socket::receive(socket, buffer);
@@ -223,23 +223,27 @@ fn receive_some(
     let queued = |c: &ControlPlane| c.registry.session(id).map_or(0, SessionEntry::queued);
     while begin.elapsed() < PART && queued(control) < unread {
         match receive(&control.spare, socket.get_ref(), buffer) {
-            Ok(Received { message: Message::StatusRequest, .. }) => send_status(control, id),
-            Ok(Received { message: Message::Reload, .. }) => control.ask_reload(id),
-            Ok(Received { message: Message::AccessCheck(check), .. }) => {
+            Ok(ReceivedMessage { message: SessionMessage::StatusRequest, .. }) => {
+                send_status(control, id)
+            }
+            Ok(ReceivedMessage { message: SessionMessage::Reload, .. }) => control.ask_reload(id),
+            Ok(ReceivedMessage { message: SessionMessage::AccessCheck(check), .. }) => {
                 control.ask_decisions(id, check);
             }
             // The one thing that is handed over after HELLO, and the only one that the daemon reads:
             // reading anything else may block.
-            Ok(Received { descriptors, .. }) if !descriptors.iter().all(PassedFd::is_memfd) => {
+            Ok(ReceivedMessage { descriptors, .. })
+                if !descriptors.iter().all(PassedFd::is_memfd) =>
+            {
                 tracing::warn!(session = %id, "a session that sent no memfd was disconnected");
                 outcome = Err("it sent a descriptor that is no memfd".into());
                 break;
             }
-            Ok(Received { message, descriptors }) => {
+            Ok(ReceivedMessage { message, descriptors }) => {
                 control.traffic.packets_in += 1;
                 // Without a segment it goes on; without its connection it would have to come back, with all
                 // that it has.
-                if matches!(message, Message::Segment(_))
+                if matches!(message, SessionMessage::Segment(_))
                     && let Some(why) = no_room_for_segment(control, id)
                 {
                     control.registry.refuse_segment(id, &why);
@@ -285,7 +289,7 @@ async fn ended(death: Option<&AsyncFd<Arc<PassedFd>>>) {
 /// Says something to somebody new, whose socket has room; whether it was said.
 pub(super) fn say(
     socket: &AsyncFd<PassedFd>,
-    message: Message,
+    message: SessionMessage,
     descriptors: &[BorrowedFd<'_>],
 ) -> bool {
     let packet = message.encode();

@@ -6,8 +6,8 @@ use std::sync::Arc;
 use axon_shm::internal::descriptors::{self, PassedFd};
 use axon_transport::internal::{
     OWNER, SessionKey,
-    session::daemon::socket::{self, Received, SocketError},
-    wire::session::{Hello, Message, Refused},
+    session::daemon::socket::{self, ReceivedMessage, SocketError},
+    wire::session::{SessionHello, SessionMessage, SessionRefused},
 };
 use tokio::io::unix::AsyncFd;
 use zeroize::Zeroize;
@@ -23,7 +23,7 @@ const UNKNOWN: u32 = 8;
 
 /// What a connection begins with.
 pub(super) struct FirstMessage {
-    pub(super) hello: Hello,
+    pub(super) hello: SessionHello,
     pub(super) descriptors: Vec<PassedFd>,
     /// What came before: the key that the session's id is made of.
     pub(super) key: Option<Arc<SessionKey>>,
@@ -33,11 +33,11 @@ pub(super) struct FirstMessage {
 
 impl FirstMessage {
     /// Whether the key that came, if one did, is that of the id.
-    pub(super) fn is_its_own(&self) -> Result<(), Box<Refused>> {
+    pub(super) fn is_its_own(&self) -> Result<(), Box<SessionRefused>> {
         match &self.key {
             Some(key) if key.id() != self.hello.session => {
                 let text = "the session's id is not made of the key that it handed over";
-                Err(Box::new(Refused::because(text.into())))
+                Err(Box::new(SessionRefused::because(text.into())))
             }
             _ => Ok(()),
         }
@@ -58,15 +58,17 @@ pub(super) async fn first(
         let mut ready = socket.readable().await.ok()?;
         let fd = socket.get_ref();
         if descriptors::is_tight() && descriptors::carries_descriptors(fd) && !has_room() {
-            let Ok(Message::Hello(hello)) = socket::look(fd, &mut buffer) else { return None };
+            let Ok(SessionMessage::SessionHello(hello)) = socket::look(fd, &mut buffer) else {
+                return None;
+            };
             let descriptors = Vec::new();
             return Some(FirstMessage { hello, descriptors, key, is_crowded: true });
         }
         match receive(spare, fd, &mut buffer) {
-            Ok(Received { message: Message::Hello(hello), descriptors }) => {
+            Ok(ReceivedMessage { message: SessionMessage::SessionHello(hello), descriptors }) => {
                 return Some(FirstMessage { hello, descriptors, key, is_crowded: false });
             }
-            Ok(Received { message: Message::Unknown(OWNER), descriptors })
+            Ok(ReceivedMessage { message: SessionMessage::Unknown(OWNER), descriptors })
                 if key.is_none() && descriptors.is_empty() =>
             {
                 // One that is no key ends the connection: it comes once at most.
@@ -75,7 +77,7 @@ pub(super) async fn first(
                 key = Some(Arc::new(its_key?));
             }
             // A later version may say something first; a flood would keep everybody else waiting.
-            Ok(Received { message: Message::Unknown(_), descriptors })
+            Ok(ReceivedMessage { message: SessionMessage::Unknown(_), descriptors })
                 if unknown < UNKNOWN && descriptors.is_empty() =>
             {
                 unknown += 1;
@@ -86,7 +88,7 @@ pub(super) async fn first(
                 if !descriptors::is_clogged() && spare.can_keep_caller() =>
             {
                 let text = "its descriptors do not arrive".to_owned();
-                say(socket, Message::Refused(*unshared(text)), &[]);
+                say(socket, SessionMessage::SessionRefused(*unshared(text)), &[]);
                 return None;
             }
             Ok(_) | Err(_) => return None,

@@ -24,7 +24,9 @@ use axon_transport::{
         log_limit::LogLimit,
         registry::{MAX_OF_PROCESS, RelayCounters, SessionEntry},
         text,
-        wire::session::{Hello, Message, PROTOCOL, Refused, SessionRole, Welcome},
+        wire::session::{
+            PROTOCOL, SessionHello, SessionMessage, SessionRefused, SessionRole, Welcome,
+        },
     },
 };
 use rustix::{
@@ -213,12 +215,12 @@ fn refuse(
     socket: &AsyncFd<PassedFd>,
     name: &str,
     peer: PeerProcess,
-    refused: Refused,
+    refused: SessionRefused,
 ) {
     let what = if refused.variable.is_empty() { "session" } else { &refused.variable }.to_owned();
     let who = format!("session {name} (pid {})", peer.pid);
     control.refused(RefusalKind::Local, who, what, refused.text.clone());
-    say(socket, Message::Refused(refused), &[]);
+    say(socket, SessionMessage::SessionRefused(refused), &[]);
 }
 
 /// Refuses a session for want of descriptors.
@@ -230,7 +232,7 @@ fn refuse_for_room(
     why: String,
 ) {
     control.refused_for_room(format!("session {name} (pid {})", peer.pid), why.clone());
-    say(socket, Message::Refused(Refused::because(why)), &[]);
+    say(socket, SessionMessage::SessionRefused(SessionRefused::because(why)), &[]);
 }
 
 /// Why there are no descriptors for a session, if so. What a tool needs is its connection.
@@ -283,14 +285,13 @@ fn relay(
             if state.registry.relayed()
                 >= axon_transport::internal::session::relayed::MAX_SESSIONS =>
         {
-            Err(Refused::because(format!(
+            Err(SessionRefused::because(format!(
                 "{} sessions are relayed already; one that shares memory is served",
                 axon_transport::internal::session::relayed::MAX_SESSIONS
             )))
         }
-        Ok(_) => {
-            pair().map_err(|error| Refused::because(format!("no socket to relay it by: {error}")))
-        }
+        Ok(_) => pair()
+            .map_err(|error| SessionRefused::because(format!("no socket to relay it by: {error}"))),
     };
     let (ours, theirs) = match checked {
         Ok(pair) => pair,
@@ -317,7 +318,7 @@ fn relay(
 }
 
 /// How far a session is discovered, as it says.
-fn scope_of(hello: &Hello) -> Scope {
+fn scope_of(hello: &SessionHello) -> Scope {
     Scope::of(hello.range, hello.static_peers.clone().unwrap_or_default())
 }
 
@@ -379,13 +380,13 @@ fn admit(
     // Endpoints are named after their session's id: a session with another's id could end them.
     if let Some(pid) = taken_by(control, &hello.session, pid) {
         let text = format!("process {pid} has a session with this one's id or one like it");
-        refuse(control, socket, &hello.name, peer, Refused::because(text));
+        refuse(control, socket, &hello.name, peer, SessionRefused::because(text));
         return None;
     }
     let same = |(_, entry): &(&SessionId, &SessionEntry<_>)| entry.pid == pid;
     if !gateway && control.registry.sessions().filter(same).count() >= MAX_OF_PROCESS {
         let text = format!("its process has {MAX_OF_PROCESS} sessions already");
-        refuse(control, socket, &hello.name, peer, Refused::because(text));
+        refuse(control, socket, &hello.name, peer, SessionRefused::because(text));
         return None;
     }
     let handed = handed.map(|fds| fds.map(Arc::new));
@@ -394,12 +395,12 @@ fn admit(
         None => None,
     };
     let scope = (!gateway).then(|| scope_of(&hello));
-    let Hello { session, role, name, .. } = hello;
+    let SessionHello { session, role, name, .. } = hello;
     tracing::debug!(%session, name, pid, "a session");
     if let Err(violation) =
         control.registry.handle_connect(session, role, name.clone(), pid, handed, scope)
     {
-        refuse(control, socket, &name, peer, Refused::because(violation.to_string()));
+        refuse(control, socket, &name, peer, SessionRefused::because(violation.to_string()));
         return None;
     }
     // What another user may do, the access rules say.
@@ -418,7 +419,7 @@ fn admit(
     let pid = std::process::id();
     let welcome = Welcome { protocol: PROTOCOL, daemon: control.id, pid, ranges: Some(true) };
     let probe: Vec<BorrowedFd<'_>> = control.probe.iter().map(AsFd::as_fd).collect();
-    if !say(socket, Message::Welcome(welcome), &probe) {
+    if !say(socket, SessionMessage::Welcome(welcome), &probe) {
         control.registry.handle_disconnect(&session);
         control.keys_of_sessions.remove(&session);
         control.settle();

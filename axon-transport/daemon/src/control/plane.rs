@@ -23,7 +23,7 @@ use axon_transport::{
     internal::{
         log_limit::LogLimit,
         registry::Registry,
-        session::{daemon::address::Address, relayed::Pool},
+        session::{daemon::address::Address, relayed::ArrivalPool},
     },
     status::{LinkStatus, RefusalStatus, TrafficStatus},
 };
@@ -77,7 +77,7 @@ pub(super) struct ControlPlane {
     /// The sessions' own keys, with which the gateway proves that they are this daemon's.
     pub(super) keys_of_sessions: Arc<SessionKeys>,
     /// For the samples that arrive over relays.
-    pub(super) pool: Arc<Pool>,
+    pub(super) pool: Arc<ArrivalPool>,
     /// Memory that sessions try whether they can map it.
     pub(super) probe: Option<OwnedFd>,
     /// Packets that were exchanged with sessions.
@@ -140,7 +140,7 @@ impl ControlPlane {
             port: None,
             gateway: "off".into(),
             keys_of_sessions: Arc::default(),
-            pool: Pool::new(config.reliable_queue),
+            pool: ArrivalPool::new(config.reliable_queue),
             probe: probe()
                 .inspect_err(
                     |error| tracing::error!(%error, "could not create the shared-memory probe"),

@@ -6,8 +6,8 @@ use super::*;
 use crate::reluctant::{hiding, send_away};
 
 /// What a tool says first.
-fn tool_hello() -> Message {
-    Message::Hello(Hello {
+fn tool_hello() -> SessionMessage {
+    SessionMessage::SessionHello(SessionHello {
         protocol: PROTOCOL,
         session: SessionId::random(),
         role: SessionRole::Tool,
@@ -28,7 +28,7 @@ fn garbage_on_the_socket_hurts_nobody() {
     let publisher = session.create_publisher(spec("/t")).unwrap();
     let address = Address::of(&host.config());
     let hello = |name: &str, settings| {
-        Message::Hello(Hello {
+        SessionMessage::SessionHello(SessionHello {
             protocol: PROTOCOL,
             session: SessionId::random(),
             role: SessionRole::Application,
@@ -46,7 +46,7 @@ fn garbage_on_the_socket_hurts_nobody() {
         vec![1],
         vec![0xff; 32 * 1024],
         vec![0xff; 40 * 1024],
-        Message::Resync.encode().unwrap(),
+        SessionMessage::Resync.encode().unwrap(),
         hello("without settings", vec![]),
         hello(&"n".repeat(20_000), vec![]),
         vec![],
@@ -67,7 +67,7 @@ fn garbage_on_the_socket_hurts_nobody() {
     // A tool that speaks out of turn.
     let tool = address.connect().unwrap();
     socket::send(&tool, &tool_hello().encode().unwrap(), &[]).unwrap();
-    socket::send(&tool, &Message::Resync.encode().unwrap(), &[]).unwrap();
+    socket::send(&tool, &SessionMessage::Resync.encode().unwrap(), &[]).unwrap();
     until("the tool is put out", || {
         matches!(socket::receive(&tool, &mut Vec::new()), Err(socket::SocketError::Closed))
     });
@@ -90,7 +90,7 @@ fn the_daemon_is_handed_nothing_that_a_read_could_wait_for() {
     for (name, descriptor) in [("memory", &memory), ("pipe", &pipe)] {
         let segment = SessionSegment::create(SessionId::random()).unwrap();
         let session = segment.id();
-        let hello = Message::Hello(Hello {
+        let hello = SessionMessage::SessionHello(SessionHello {
             protocol: PROTOCOL,
             session,
             role: SessionRole::Application,
@@ -106,7 +106,7 @@ fn the_daemon_is_handed_nothing_that_a_read_could_wait_for() {
         let handed = [&handed.segment, &handed.doorbell, &handed.pidfd].map(AsFd::as_fd);
         socket::send(&socket, &hello.encode().unwrap(), &handed).unwrap();
         let opened = SegmentOpened { session, segment: Segment { number: 1, publisher: None } };
-        let packet = Message::Segment(opened).encode().unwrap();
+        let packet = SessionMessage::Segment(opened).encode().unwrap();
         socket::send(&socket, &packet, &[descriptor.as_fd()]).unwrap();
         let over = || loop {
             match socket::receive(&socket, &mut Vec::new()) {

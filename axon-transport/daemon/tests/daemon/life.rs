@@ -283,7 +283,7 @@ fn another_version_is_refused_by_both_sides() {
     let host = Host::new();
     let daemon = host.daemon();
     let hello = |protocol| {
-        Message::Hello(Hello {
+        SessionMessage::SessionHello(SessionHello {
             protocol,
             session: SessionId([9; 16]),
             role: SessionRole::Tool,
@@ -303,7 +303,7 @@ fn another_version_is_refused_by_both_sides() {
         answer.is_some()
     });
     match answer.unwrap().message {
-        Message::Refused(refused) => {
+        SessionMessage::SessionRefused(refused) => {
             assert!(refused.text.contains("protocol"), "{}", refused.text);
         }
         other => panic!("instead of a refusal: {other:?}"),
@@ -321,10 +321,11 @@ fn another_version_is_refused_by_both_sides() {
         let accepted = accepted.unwrap();
         until("HELLO", || {
             let received = socket::receive(&accepted, &mut Vec::new());
-            received.is_ok_and(|received| matches!(received.message, Message::Hello(_)))
+            received
+                .is_ok_and(|received| matches!(received.message, SessionMessage::SessionHello(_)))
         });
         let daemon = DaemonId([7; 16]);
-        let welcome = Message::Welcome(Welcome {
+        let welcome = SessionMessage::Welcome(Welcome {
             protocol: PROTOCOL + 1,
             daemon,
             pid: std::process::id(),

@@ -42,7 +42,7 @@ fn cause_log_lines(host: &Host) {
         let session = host.session("short").unwrap();
         session.create_publisher(spec("/t")).unwrap();
         let stranger = Address::of(&host.config()).connect().unwrap();
-        let _ = socket::send(&stranger, &Message::Resync.encode().unwrap(), &[]);
+        let _ = socket::send(&stranger, &SessionMessage::Resync.encode().unwrap(), &[]);
     }
 }
 
@@ -199,7 +199,7 @@ fn a_flood_of_one_kind_leaves_few_lines_and_a_count() {
     let daemon = foreground(&host, program(&host), File::create(&log).unwrap());
     let address = Address::of(&host.config());
     const FLOOD: usize = 500;
-    let hello = Message::Hello(Hello {
+    let hello = SessionMessage::SessionHello(SessionHello {
         protocol: PROTOCOL + 1,
         session: SessionId::random(),
         role: SessionRole::Application,

@@ -35,7 +35,9 @@ use axon_transport::{
     ids::SessionId,
     internal::{
         session::daemon::{address::Address, socket},
-        wire::session::{Hello, Message, PROTOCOL, Segment, SegmentOpened, SessionRole},
+        wire::session::{
+            PROTOCOL, Segment, SegmentOpened, SessionHello, SessionMessage, SessionRole,
+        },
     },
     qos::Qos,
     status::Status,

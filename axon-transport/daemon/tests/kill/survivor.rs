@@ -10,7 +10,7 @@ use std::{
 use axon_shm::{
     ExternalLeader, Sample,
     internal::{
-        Peer, PeerSession, Reader, ReaderInfo, ReaderOptions, SegmentInfo, SegmentKind,
+        PeerSession, Reader, ReaderInfo, ReaderOptions, RingPeer, SegmentInfo, SegmentKind,
         SessionSegment, Writer,
     },
 };
@@ -329,7 +329,7 @@ fn another_pair(session: &Arc<SessionSegment>) {
 /// A reader in the survivor's own session.
 fn attach(session: &Arc<SessionSegment>, writer: &Writer, qos: Qos) -> Reader {
     let lane = session.allocate_lane().expect("a lane");
-    let (reader, peer) = (Gid::new(session.id(), 2), Peer::Local(session.clone()));
+    let (reader, peer) = (Gid::new(session.id(), 2), RingPeer::Local(session.clone()));
     let info = ReaderInfo {
         gid: reader,
         lane: lane.location(),

@@ -9,8 +9,9 @@ use std::{
 };
 
 use axon_shm::internal::{
-    Grant, Lane, Location, Peer, PeerDescriptors, PeerSession, Reader, ReaderInfo, ReaderOptions,
-    SegmentEvent, SegmentInfo, SegmentKind, SessionSegment, Writer, descriptors::PassedFd,
+    Grant, Lane, Location, PeerDescriptors, PeerSession, Reader, ReaderInfo, ReaderOptions,
+    RingPeer, SegmentEvent, SegmentInfo, SegmentKind, SessionSegment, Writer,
+    descriptors::PassedFd,
 };
 use axon_transport::{
     ids::{Gid, SessionId},
@@ -100,7 +101,7 @@ impl Wire {
     /// What the publisher attaches; with it the reader's segments, to be looked at from outside.
     pub(crate) fn take_request(&self, qos: Qos) -> (ReaderInfo, Vec<OwnedFd>) {
         let (peer, gid, lane, seen) = self.meet();
-        let (peer, stands_for) = (Peer::Remote(peer), None);
+        let (peer, stands_for) = (RingPeer::Remote(peer), None);
         (ReaderInfo { gid, lane, qos, peer, stands_for }, seen)
     }
 
@@ -287,7 +288,7 @@ pub(crate) fn options(
     qos: Qos,
 ) -> ReaderOptions {
     let reader = Gid::new(session.id(), 1);
-    let (peer, max_message) = (Peer::Remote(peer), LARGEST);
+    let (peer, max_message) = (RingPeer::Remote(peer), LARGEST);
     ReaderOptions { reader, writer, peer, ring, lane, grant, qos, max_message }
 }
 

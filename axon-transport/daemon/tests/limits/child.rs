@@ -8,7 +8,7 @@ use axon_transport::{
     config::Config,
     internal::{
         session::daemon::socket,
-        wire::session::{Hello, Message, PROTOCOL, SessionRole},
+        wire::session::{PROTOCOL, SessionHello, SessionMessage, SessionRole},
     },
     qos::{Durability, Qos},
 };
@@ -187,7 +187,7 @@ pub(crate) fn play(part: &str) {
             )
             .unwrap();
             rustix::net::connect(&socket, &name).unwrap();
-            let hello = Message::Hello(Hello {
+            let hello = SessionMessage::SessionHello(SessionHello {
                 protocol: PROTOCOL,
                 session: axon_transport::ids::SessionId::random(),
                 role: SessionRole::Tool,

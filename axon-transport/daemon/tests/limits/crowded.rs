@@ -5,7 +5,7 @@ use axon_transport::{
     ids::SessionId,
     internal::{
         session::daemon::address::Address,
-        wire::session::{Hello, Message, PROTOCOL, SessionRole},
+        wire::session::{PROTOCOL, SessionHello, SessionMessage, SessionRole},
     },
 };
 use rustix::process::{Pid, Resource, Rlimit, Signal, WaitId, WaitIdOptions, prlimit, waitid};
@@ -151,7 +151,7 @@ fn descriptors_of_callers_that_are_refused_are_not_received() {
     let daemon = host.daemon();
     limit(&daemon, 256);
     let (mut served, _) = crowd(&host, 64);
-    let hello = Message::Hello(Hello {
+    let hello = SessionMessage::SessionHello(SessionHello {
         protocol: PROTOCOL,
         session: SessionId([9; 16]),
         role: SessionRole::Application,

@@ -10,12 +10,12 @@ use rustix::{
 use super::*;
 
 /// What a session under the id of nines says first.
-pub(super) fn hello(host: &Host) -> Hello {
+pub(super) fn hello(host: &Host) -> SessionHello {
     hello_of(&host.config())
 }
 
-fn hello_of(config: &Config) -> Hello {
-    Hello {
+fn hello_of(config: &Config) -> SessionHello {
+    SessionHello {
         protocol: PROTOCOL,
         session: SessionId([9; 16]),
         role: SessionRole::Application,
@@ -28,7 +28,7 @@ fn hello_of(config: &Config) -> Hello {
     }
 }
 
-pub(crate) fn say_to(socket: &OwnedFd, message: &Message) {
+pub(crate) fn say_to(socket: &OwnedFd, message: &SessionMessage) {
     let packet = message.encode().unwrap();
     while let Err(SocketError::NotReady) = socket::send(socket, &packet, &[]) {
         thread::sleep(Duration::from_millis(1));
@@ -36,7 +36,10 @@ pub(crate) fn say_to(socket: &OwnedFd, message: &Message) {
 }
 
 /// The next message that `want` wants; `None` at the end of the connection.
-pub(crate) fn hear(socket: &OwnedFd, want: impl Fn(&Message) -> bool) -> Option<Message> {
+pub(crate) fn hear(
+    socket: &OwnedFd,
+    want: impl Fn(&SessionMessage) -> bool,
+) -> Option<SessionMessage> {
     let deadline = Instant::now() + PATIENCE;
     loop {
         match socket::receive(socket, &mut Vec::new()) {
@@ -51,30 +54,30 @@ pub(crate) fn hear(socket: &OwnedFd, want: impl Fn(&Message) -> bool) -> Option<
     }
 }
 
-fn refused(host: &Host, hello: Hello) -> Refused {
+fn refused(host: &Host, hello: SessionHello) -> SessionRefused {
     let socket = Address::of(&host.config()).connect().unwrap();
-    say_to(&socket, &Message::Hello(hello));
+    say_to(&socket, &SessionMessage::SessionHello(hello));
     match hear(&socket, |_| true) {
-        Some(Message::Refused(refused)) => refused,
+        Some(SessionMessage::SessionRefused(refused)) => refused,
         other => panic!("instead of a refusal: {other:?}"),
     }
 }
 
 /// A relayed session that does as the test does.
-pub(super) fn by_hand(host: &Host, hello: Hello) -> OwnedFd {
+pub(super) fn by_hand(host: &Host, hello: SessionHello) -> OwnedFd {
     let socket = Address::of(&host.config()).connect().unwrap();
-    say_to(&socket, &Message::Hello(hello));
-    assert!(matches!(hear(&socket, |_| true), Some(Message::Welcome(_))));
+    say_to(&socket, &SessionMessage::SessionHello(hello));
+    assert!(matches!(hear(&socket, |_| true), Some(SessionMessage::Welcome(_))));
     socket
 }
 
-fn announce(gid: Gid, kind: EndpointKind, role: EndpointRole) -> Message {
+fn announce(gid: Gid, kind: EndpointKind, role: EndpointRole) -> SessionMessage {
     let endpoint = Endpoint::new(gid, kind, "/t", "test/Bytes").with_qos(Qos::keep_all());
     let (stands_for, ring, only) = (Vec::new(), None, None);
-    Message::Endpoint(Announce { endpoint, role, stands_for, ring, only })
+    SessionMessage::Endpoint(Announce { endpoint, role, stands_for, ring, only })
 }
 
-fn piece(publisher: Gid, length: Option<u32>, bytes: usize) -> Message {
+fn piece(publisher: Gid, length: Option<u32>, bytes: usize) -> SessionMessage {
     let head = length.map(|length| SampleHeader {
         length,
         sequence: 1,
@@ -82,35 +85,42 @@ fn piece(publisher: Gid, length: Option<u32>, bytes: usize) -> Message {
         lost: 0,
         published: 0,
     });
-    Message::SampleFragment(SampleFragment { publisher, head, bytes: vec![0; bytes], client: None })
+    SessionMessage::SampleFragment(SampleFragment {
+        publisher,
+        head,
+        bytes: vec![0; bytes],
+        client: None,
+    })
 }
 
 #[test]
 fn who_is_not_to_be_relayed_is_refused() {
     let host = host();
     let _daemon = host.daemon();
-    let of = |role| Hello { role, ..hello(&host) };
+    let of = |role| SessionHello { role, ..hello(&host) };
     assert!(refused(&host, of(SessionRole::Tool)).text.contains("application"));
     assert!(refused(&host, of(SessionRole::Gateway)).text.contains("gateway"));
     let mut other = hello(&host);
     other.settings[0].1 = "other".into();
     assert_eq!(refused(&host, other).variable, hello(&host).settings[0].0);
-    let empty = Hello { relay: None, ..hello(&host) };
+    let empty = SessionHello { relay: None, ..hello(&host) };
     assert_eq!(refused(&host, empty).variable, "AXON_SHM", "it may come back to be relayed");
 
     // An id that another process has, or one like it, and one session too many.
     let witness = session(&host, "witness", false);
-    let theirs = Hello { session: witness.id(), ..hello(&host) };
+    let theirs = SessionHello { session: witness.id(), ..hello(&host) };
     let alike = {
         let mut id = witness.id();
         id.0[15] ^= 1;
         id
     };
-    assert!(refused(&host, Hello { session: alike, ..theirs }).text.contains("id"));
+    assert!(refused(&host, SessionHello { session: alike, ..theirs }).text.contains("id"));
     let many: Vec<OwnedFd> = (1..32)
-        .map(|number| by_hand(&host, Hello { session: SessionId([number; 16]), ..hello(&host) }))
+        .map(|number| {
+            by_hand(&host, SessionHello { session: SessionId([number; 16]), ..hello(&host) })
+        })
         .collect();
-    let more = Hello { session: SessionId([77; 16]), ..hello(&host) };
+    let more = SessionHello { session: SessionId([77; 16]), ..hello(&host) };
     assert!(refused(&host, more).text.contains("32 sessions"));
     drop(many);
     until("they are gone", || relays(&host.status().unwrap()).len() == 1);
@@ -127,7 +137,7 @@ pub(crate) fn stop(daemon: &Kept) {
 fn call() -> OwnedFd {
     let config = Config::from_env().unwrap();
     let socket = Address::of(&config).connect().unwrap();
-    say_to(&socket, &Message::Hello(hello_of(&config)));
+    say_to(&socket, &SessionMessage::SessionHello(hello_of(&config)));
     socket
 }
 
@@ -142,7 +152,7 @@ pub(crate) fn call_and_leave() -> u32 {
 /// In a child: calls, and leaves the connection to a process that talks until the other end hangs up.
 pub(crate) fn call_and_have_it_talk() -> u32 {
     let socket = call();
-    assert!(matches!(hear(&socket, |_| true), Some(Message::Welcome(_))));
+    assert!(matches!(hear(&socket, |_| true), Some(SessionMessage::Welcome(_))));
     rustix::io::ioctl_fionbio(&socket, false).unwrap();
     let holder = Command::new("yes").stdin(Stdio::null()).stdout(socket).spawn();
     holder.expect("yes is there").id()
@@ -156,9 +166,10 @@ pub(super) fn own() -> Gid {
 /// Has it publish as many as may be under way together; the bytes that it may send.
 pub(super) fn announce_and_await_credit(socket: &OwnedFd) -> u64 {
     say_to(socket, &announce(own(), EndpointKind::Publisher, EndpointRole::Application));
-    let credit = |m: &Message| matches!(m, Message::Credit(c) if c.publisher == own());
+    let credit =
+        |m: &SessionMessage| matches!(m, SessionMessage::Credit(c) if c.publisher == own());
     match hear(socket, credit) {
-        Some(Message::Credit(credit)) => credit.bytes,
+        Some(SessionMessage::Credit(credit)) => credit.bytes,
         other => panic!("instead of credit: {other:?}"),
     }
 }
@@ -172,7 +183,7 @@ fn say_all(socket: &OwnedFd) {
         let bytes = pattern(sequence, 10);
         say_to(
             socket,
-            &Message::SampleFragment(SampleFragment {
+            &SessionMessage::SampleFragment(SampleFragment {
                 publisher: own(),
                 head,
                 bytes,
@@ -185,7 +196,7 @@ fn say_all(socket: &OwnedFd) {
 /// In a child: publishes when it is told to.
 pub(crate) fn publish_when_told() {
     let socket = call();
-    assert!(matches!(hear(&socket, |_| true), Some(Message::Welcome(_))));
+    assert!(matches!(hear(&socket, |_| true), Some(SessionMessage::Welcome(_))));
     announce_and_await_credit(&socket);
     say("credited");
     std::io::stdin().read_line(&mut String::new()).unwrap();
@@ -223,17 +234,23 @@ fn a_sample_that_cannot_be_written_is_given_up() {
         Some(SampleHeader { length: 0, sequence, source_timestamp: 0, lost: 0, published: 0 });
     say_to(
         &socket,
-        &Message::SampleFragment(SampleFragment {
+        &SessionMessage::SampleFragment(SampleFragment {
             publisher: own(),
             head,
             bytes: vec![],
             client: None,
         }),
     );
-    let told = hear(&socket, |m| matches!(m, Message::GivenUp(_) | Message::Credit(_)));
-    let given_up = GivenUp { reader: own(), writer: own(), samples: 1 };
-    assert_eq!(told, Some(Message::GivenUp(given_up)), "before it counts as acknowledged");
-    let done = |m: &Message| matches!(m, Message::Credit(c) if c.done == Some(sequence));
+    let told =
+        hear(&socket, |m| matches!(m, SessionMessage::RelayGivenUp(_) | SessionMessage::Credit(_)));
+    let given_up = RelayGivenUp { reader: own(), writer: own(), samples: 1 };
+    assert_eq!(
+        told,
+        Some(SessionMessage::RelayGivenUp(given_up)),
+        "before it counts as acknowledged"
+    );
+    let done =
+        |m: &SessionMessage| matches!(m, SessionMessage::Credit(c) if c.done == Some(sequence));
     assert!(hear(&socket, done).is_some());
 }
 
@@ -302,12 +319,13 @@ fn hostile_frames_end_their_own_relay_and_nothing_else() {
     let credited = || {
         let socket = by_hand(&host, hello(&host));
         say_to(&socket, &announce(own, kind, application));
-        let credit = |m: &Message| matches!(m, Message::Credit(c) if c.publisher == own);
+        let credit =
+            |m: &SessionMessage| matches!(m, SessionMessage::Credit(c) if c.publisher == own);
         assert!(hear(&socket, credit).is_some());
         socket
     };
     for message in [
-        Message::Resync,
+        SessionMessage::Resync,
         announce(publisher.gid(), kind, application),
         announce(own, kind, stand_in),
         announce(Gid([7; 16]), EndpointKind::Subscription, application),
@@ -335,13 +353,13 @@ fn hostile_frames_end_their_own_relay_and_nothing_else() {
         let socket = by_hand(&host, hello(&host));
         let _ = socket::send(&socket, packet, &[]);
         // What it does not know it passes over.
-        let _ = socket::send(&socket, &Message::Resync.encode().unwrap(), &[]);
+        let _ = socket::send(&socket, &SessionMessage::Resync.encode().unwrap(), &[]);
         assert!(hear(&socket, |_| false).is_none());
     }
     let socket = by_hand(&host, hello(&host));
     let null = std::fs::File::open("/dev/null").unwrap();
     let descriptor = [null.as_fd()];
-    socket::send(&socket, &Message::Resync.encode().unwrap(), &descriptor).unwrap();
+    socket::send(&socket, &SessionMessage::Resync.encode().unwrap(), &descriptor).unwrap();
     assert!(hear(&socket, |_| false).is_none(), "descriptors");
 
     // Samples of another's publisher go nowhere.
@@ -361,7 +379,7 @@ fn hostile_frames_end_their_own_relay_and_nothing_else() {
 fn server_for(host: &Host, own: Gid, others: Vec<Gid>) -> OwnedFd {
     let socket = by_hand(host, hello(host));
     say_to(&socket, &announce(own, EndpointKind::Server, EndpointRole::Application));
-    say_to(&socket, &Message::Matched(Matched { gid: own, others }));
+    say_to(&socket, &SessionMessage::RelayMatched(RelayMatched { gid: own, others }));
     socket
 }
 
@@ -379,25 +397,36 @@ fn a_server_that_answers_what_nobody_asked_it_reaches_nobody() {
         let head =
             Some(SampleHeader { length, sequence: 1, source_timestamp: 0, lost: 0, published: 0 });
         let bytes = vec![7; bytes];
-        Message::SampleFragment(SampleFragment { publisher: of, head, bytes, client: Some(client) })
+        SessionMessage::SampleFragment(SampleFragment {
+            publisher: of,
+            head,
+            bytes,
+            client: Some(client),
+        })
     };
 
     // Not its own, or no server.
     for gid in [server.gid(), client.gid(), Gid([7; 16])] {
         let socket = by_hand(&host, hello(&host));
-        say_to(&socket, &Message::Matched(Matched { gid, others: vec![client.gid()] }));
+        say_to(
+            &socket,
+            &SessionMessage::RelayMatched(RelayMatched { gid, others: vec![client.gid()] }),
+        );
         assert!(hear(&socket, |_| false).is_none(), "{gid}");
     }
     let socket = by_hand(&host, hello(&host));
     say_to(&socket, &announce(own, EndpointKind::Client, EndpointRole::Application));
-    say_to(&socket, &Message::Matched(Matched { gid: own, others: vec![server.gid()] }));
+    say_to(
+        &socket,
+        &SessionMessage::RelayMatched(RelayMatched { gid: own, others: vec![server.gid()] }),
+    );
     assert!(hear(&socket, |_| false).is_none(), "a client answers nobody");
     // More than it may.
     let many = (0..1025).map(|number| Gid::new(SessionId([8; 16]), number)).collect();
     assert!(hear(&server_for(&host, own, many), |_| false).is_none());
     // More than there is credit for.
     let socket = server_for(&host, own, vec![client.gid()]);
-    let credit = |m: &Message| matches!(m, Message::Credit(c) if c.publisher == own && c.client == Some(client.gid()));
+    let credit = |m: &SessionMessage| matches!(m, SessionMessage::Credit(c) if c.publisher == own && c.client == Some(client.gid()));
     assert!(hear(&socket, credit).is_some());
     say_to(&socket, &answer(own, client.gid(), 10, 11));
     assert!(hear(&socket, |_| false).is_none());
@@ -408,7 +437,8 @@ fn a_server_that_answers_what_nobody_asked_it_reaches_nobody() {
     let socket = server_for(&host, own, vec![stranger]);
     say_to(&socket, &answer(server.gid(), client.gid(), 4, 4));
     say_to(&socket, &answer(own, client.gid(), 4, 4));
-    let opened = |m: &Message| matches!(m, Message::Credit(c) if c.client == Some(stranger));
+    let opened =
+        |m: &SessionMessage| matches!(m, SessionMessage::Credit(c) if c.client == Some(stranger));
     assert!(hear(&socket, opened).is_some());
     for _ in 0..600 {
         say_to(&socket, &answer(own, stranger, 0, 0));
@@ -416,13 +446,13 @@ fn a_server_that_answers_what_nobody_asked_it_reaches_nobody() {
     }
     // Its word does not keep a publisher alive that is not its own.
     let publishers = vec![server.gid(), own, stranger];
-    say_to(&socket, &Message::Asserted(Asserted { publishers }));
+    say_to(&socket, &SessionMessage::Asserted(Asserted { publishers }));
     assert!(client.recv_response(&mut Vec::new(), Some(Duration::from_millis(20))).is_err());
     let number = client.send_request(b"x").unwrap();
     services::answer(&server);
     let info = client.recv_response(&mut Vec::new(), Some(PATIENCE)).unwrap();
     assert_eq!((info.publisher, info.sequence), (server.gid(), number));
-    say_to(&socket, &Message::Resync);
+    say_to(&socket, &SessionMessage::Resync);
     assert!(hear(&socket, |_| false).is_none(), "it was there until now");
 }
 
@@ -437,8 +467,9 @@ fn a_reader_that_gives_no_credit_back_does_not_make_the_daemon_keep_ended_writer
     let mut others = Vec::new();
     let mut told = |socket: &OwnedFd, wanted: &dyn Fn(&[Gid]) -> bool| {
         while !wanted(&others) {
-            let heard = hear(socket, |m| matches!(m, Message::Matched(m) if m.gid == own));
-            let Some(Message::Matched(matched)) = heard else { panic!("it hangs up") };
+            let heard =
+                hear(socket, |m| matches!(m, SessionMessage::RelayMatched(m) if m.gid == own));
+            let Some(SessionMessage::RelayMatched(matched)) = heard else { panic!("it hangs up") };
             others = matched.others;
         }
     };
@@ -449,9 +480,9 @@ fn a_reader_that_gives_no_credit_back_does_not_make_the_daemon_keep_ended_writer
         first.get_or_insert(gid);
         told(&socket, &|others| others.contains(&gid));
         let credit = open_for(gid, u64::MAX);
-        say_to(&socket, &Message::Credit(credit));
+        say_to(&socket, &SessionMessage::Credit(credit));
         publish(&publisher, b"x");
-        let piece = |m: &Message| matches!(m, Message::SampleFragment(p) if p.publisher == gid);
+        let piece = |m: &SessionMessage| matches!(m, SessionMessage::SampleFragment(p) if p.publisher == gid);
         assert!(hear(&socket, piece).is_some());
     }
     let first = first.unwrap();

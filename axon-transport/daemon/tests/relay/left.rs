@@ -36,23 +36,23 @@ fn send_until_held_back(host: &Host, socket: &OwnedFd, mut credit: u64) -> u64 {
 }
 
 /// The sample of this number, or the part of it that has so many bytes.
-fn fragment(sequence: u64, bytes: usize) -> Message {
+fn fragment(sequence: u64, bytes: usize) -> SessionMessage {
     after_loss(sequence, bytes, 0)
 }
 
 /// The same, of a publisher that lost so many samples before it.
-fn after_loss(sequence: u64, bytes: usize, lost: u64) -> Message {
+fn after_loss(sequence: u64, bytes: usize, lost: u64) -> SessionMessage {
     let (length, source_timestamp, published) = (LENGTH as u32, 0, 0);
     let head = Some(SampleHeader { length, sequence, source_timestamp, lost, published });
     let bytes = pattern(sequence, bytes);
-    Message::SampleFragment(SampleFragment { publisher: own(), head, bytes, client: None })
+    SessionMessage::SampleFragment(SampleFragment { publisher: own(), head, bytes, client: None })
 }
 
 /// The credit that has come.
 fn credits(socket: &OwnedFd) -> u64 {
     let mut bytes = 0;
     while let Ok(received) = socket::receive(socket, &mut Vec::new()) {
-        if let Message::Credit(credit) = received.message {
+        if let SessionMessage::Credit(credit) = received.message {
             bytes += credit.bytes;
         }
     }

@@ -35,8 +35,9 @@ use axon_transport::{
             socket::{self, SocketError},
         },
         wire::session::{
-            Announce, Asserted, Credit, EndpointRole, GivenUp, Hello, Matched, Message, PROTOCOL,
-            Refused, SampleFragment, SampleHeader, SessionRole,
+            Announce, Asserted, Credit, EndpointRole, PROTOCOL, RelayGivenUp, RelayMatched,
+            SampleFragment, SampleHeader, SessionHello, SessionMessage, SessionRefused,
+            SessionRole,
         },
     },
     qos::{Durability, History, Qos, Reliability},

@@ -2,7 +2,7 @@
 
 use axon_transport::{
     ids::DaemonId,
-    internal::wire::session::{Gone, Graph, GraphItem, Welcome},
+    internal::wire::session::{Gone, GraphItem, SessionGraph, Welcome},
 };
 
 use super::{hostile::hear, *};
@@ -19,11 +19,18 @@ fn played(host: &Host) -> (Session, OwnedFd) {
             socket.is_some()
         });
         let socket = socket.unwrap();
-        assert!(hear(&socket, |message| matches!(message, Message::Hello(_))).is_some());
+        assert!(
+            hear(&socket, |message| matches!(message, SessionMessage::SessionHello(_))).is_some()
+        );
         let (daemon, pid) = (DaemonId([1; 16]), std::process::id());
         say_to(
             &socket,
-            &Message::Welcome(Welcome { protocol: PROTOCOL, daemon, pid, ranges: Some(true) }),
+            &SessionMessage::Welcome(Welcome {
+                protocol: PROTOCOL,
+                daemon,
+                pid,
+                ranges: Some(true),
+            }),
         );
         (session.join().unwrap(), socket)
     });
@@ -46,26 +53,26 @@ fn show_as(socket: &OwnedFd, gid: Gid, own: &Endpoint, kind: EndpointKind) -> Gi
     };
     let added = vec![GraphItem { endpoint, daemon: None, reach: None }];
     let (removed, ended) = (Vec::new(), None);
-    let graph = Graph { version: 1, whole: false, added, removed, more: false, ended };
-    say_to(socket, &Message::Graph(graph));
+    let graph = SessionGraph { version: 1, whole: false, added, removed, more: false, ended };
+    say_to(socket, &SessionMessage::SessionGraph(graph));
     gid
 }
 
 fn announced(socket: &OwnedFd, gid: Gid) {
-    let heard = hear(socket, |m| matches!(m, Message::Endpoint(a) if a.endpoint.gid == gid));
+    let heard = hear(socket, |m| matches!(m, SessionMessage::Endpoint(a) if a.endpoint.gid == gid));
     assert!(heard.is_some());
 }
 
 fn opened(socket: &OwnedFd, writer: Gid, reader: Option<Gid>) {
     let heard = hear(
         socket,
-        |m| matches!(m, Message::Credit(c) if c.publisher == writer && c.client == reader && c.opens.is_some()),
+        |m| matches!(m, SessionMessage::Credit(c) if c.publisher == writer && c.client == reader && c.opens.is_some()),
     );
     assert!(heard.is_some());
 }
 
 fn matched(socket: &OwnedFd, gid: Gid, others: &[Gid]) {
-    say_to(socket, &Message::Matched(Matched { gid, others: others.to_vec() }));
+    say_to(socket, &SessionMessage::RelayMatched(RelayMatched { gid, others: others.to_vec() }));
 }
 
 #[test]
@@ -117,9 +124,9 @@ fn whom_the_daemon_names_for_another_publisher_is_not_counted() {
         until("it counts the one outside", || other.matched() == [outside]);
         let number = other.publish(b"x").unwrap();
         let credit = open_for(other.gid(), 9);
-        say_to(&socket, &Message::Credit(credit));
-        let piece = hear(&socket, |m| matches!(m, Message::SampleFragment(_)));
-        let Some(Message::SampleFragment(piece)) = piece else { panic!("it hangs up") };
+        say_to(&socket, &SessionMessage::Credit(credit));
+        let piece = hear(&socket, |m| matches!(m, SessionMessage::SampleFragment(_)));
+        let Some(SessionMessage::SampleFragment(piece)) = piece else { panic!("it hangs up") };
         let SampleHeader { sequence, lost, .. } = piece.head.unwrap();
         assert_eq!((piece.publisher, sequence, lost), (other.gid(), number, 0));
     }
@@ -137,15 +144,15 @@ fn a_sample_is_acknowledged_once_the_daemon_has_it() {
         matched(&socket, publisher.gid(), &[outside]);
         until("it counts the one outside", || publisher.matched() == [outside]);
         assert!(publisher.wait_acknowledged(soon), "nothing was published");
-        say_to(&socket, &Message::Credit(open_for(publisher.gid(), 99)));
+        say_to(&socket, &SessionMessage::Credit(open_for(publisher.gid(), 99)));
         for sequence in 1..=2 {
             assert_eq!(publisher.publish(b"x").unwrap(), sequence);
-            assert!(hear(&socket, |m| matches!(m, Message::SampleFragment(_))).is_some());
+            assert!(hear(&socket, |m| matches!(m, SessionMessage::SampleFragment(_))).is_some());
         }
         for sequence in 1..=2 {
             assert!(!publisher.wait_acknowledged(soon), "{sequence} is on its way");
             let back = Credit { bytes: 129, opens: None, ..open_for(publisher.gid(), 0) };
-            say_to(&socket, &Message::Credit(Credit { done: Some(sequence), ..back }));
+            say_to(&socket, &SessionMessage::Credit(Credit { done: Some(sequence), ..back }));
         }
         assert!(publisher.wait_acknowledged(PATIENCE));
     }
@@ -162,14 +169,17 @@ fn samples_that_the_daemon_gave_up_are_not_acknowledged() {
         let outside = show(&socket, publisher.endpoint(), EndpointKind::Subscription);
         matched(&socket, gid, &[outside]);
         until("it counts the one outside", || publisher.matched() == [outside]);
-        say_to(&socket, &Message::Credit(open_for(gid, 99)));
+        say_to(&socket, &SessionMessage::Credit(open_for(gid, 99)));
         for _ in 0..3 {
             publisher.publish(b"x").unwrap();
-            assert!(hear(&socket, |m| matches!(m, Message::SampleFragment(_))).is_some());
+            assert!(hear(&socket, |m| matches!(m, SessionMessage::SampleFragment(_))).is_some());
         }
-        say_to(&socket, &Message::GivenUp(GivenUp { reader: gid, writer: gid, samples: 2 }));
+        say_to(
+            &socket,
+            &SessionMessage::RelayGivenUp(RelayGivenUp { reader: gid, writer: gid, samples: 2 }),
+        );
         let back = Credit { bytes: 3 * 129, opens: None, ..open_for(gid, 0) };
-        say_to(&socket, &Message::Credit(Credit { done: Some(3), ..back }));
+        say_to(&socket, &SessionMessage::Credit(Credit { done: Some(3), ..back }));
         assert!(!publisher.wait_acknowledged(PATIENCE), "two are lost");
         assert_eq!(publisher.given_up(), 2);
         // The loss is told before the credit, which says that all of them are done with.
@@ -230,11 +240,11 @@ fn a_request_is_sent_once_however_many_servers_it_is_for() {
     opened(&socket, one, Some(own.gid()));
     assert!(own.wait_available(PATIENCE));
     let credit = open_for(own.gid(), 1);
-    say_to(&socket, &Message::Credit(credit));
+    say_to(&socket, &SessionMessage::Credit(credit));
     for number in 1..=3 {
         assert_eq!(own.send_request(b"x").unwrap(), number);
-        let piece = hear(&socket, |m| matches!(m, Message::SampleFragment(_)));
-        let Some(Message::SampleFragment(piece)) = piece else { panic!("no request") };
+        let piece = hear(&socket, |m| matches!(m, SessionMessage::SampleFragment(_)));
+        let Some(SessionMessage::SampleFragment(piece)) = piece else { panic!("no request") };
         assert_eq!((piece.publisher, piece.client), (own.gid(), None));
         assert_eq!(piece.head.unwrap().sequence, number);
     }
@@ -243,7 +253,12 @@ fn a_request_is_sent_once_however_many_servers_it_is_for() {
     let answer = |server, client, sequence| {
         let head =
             Some(SampleHeader { length: 1, sequence, source_timestamp: 0, lost: 0, published: 0 });
-        Message::SampleFragment(SampleFragment { publisher: server, head, bytes: vec![0], client })
+        SessionMessage::SampleFragment(SampleFragment {
+            publisher: server,
+            head,
+            bytes: vec![0],
+            client,
+        })
     };
     say_to(&socket, &answer(other, Some(own.gid()), 1));
     say_to(&socket, &answer(one, Some(other), 1));
@@ -269,10 +284,10 @@ fn what_waits_for_one_server_goes_before_what_another_has_too() {
     until("it counts both", || own.servers().len() == 2);
     assert_eq!(own.send_request(b"x").unwrap(), 5);
     let credit = open_for(own.gid(), 1);
-    say_to(&socket, &Message::Credit(credit));
+    say_to(&socket, &SessionMessage::Credit(credit));
     for number in 1..=5 {
-        let piece = hear(&socket, |m| matches!(m, Message::SampleFragment(_)));
-        let Some(Message::SampleFragment(piece)) = piece else { panic!("no request") };
+        let piece = hear(&socket, |m| matches!(m, SessionMessage::SampleFragment(_)));
+        let Some(SessionMessage::SampleFragment(piece)) = piece else { panic!("no request") };
         assert_eq!(piece.head.unwrap().sequence, number);
     }
 }
@@ -303,7 +318,7 @@ fn a_channel_goes_on_when_one_of_its_readers_ends_and_another_is_matched() {
         let bytes = bytes.to_vec();
         say_to(
             &socket,
-            &Message::SampleFragment(SampleFragment {
+            &SessionMessage::SampleFragment(SampleFragment {
                 publisher: outside,
                 head,
                 bytes,
@@ -313,14 +328,15 @@ fn a_channel_goes_on_when_one_of_its_readers_ends_and_another_is_matched() {
     };
     piece(head, front);
     drop(one);
-    let ended = |m: &Message| *m == Message::EndpointGone(Gone { gid: gone });
+    let ended = |m: &SessionMessage| *m == SessionMessage::EndpointGone(Gone { gid: gone });
     assert!(hear(&socket, ended).is_some());
     // Said before the daemon has heard that: for the daemon the channel has had a reader all along.
     matched(&socket, other.gid(), &[outside]);
     until("it is received from", || other.matched() == [outside]);
     piece(None, rest);
     assert_eq!(take_until(&other, 1), [1]);
-    let back = |m: &Message| matches!(m, Message::Credit(c) if c.publisher == outside);
-    let Some(Message::Credit(credit)) = hear(&socket, back) else { panic!("it hangs up") };
+    let back =
+        |m: &SessionMessage| matches!(m, SessionMessage::Credit(c) if c.publisher == outside);
+    let Some(SessionMessage::Credit(credit)) = hear(&socket, back) else { panic!("it hangs up") };
     assert_eq!((credit.bytes, credit.opens), (1128, None), "it does not begin anew");
 }

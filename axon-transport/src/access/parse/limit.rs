@@ -4,10 +4,10 @@ use std::{collections::BTreeSet, num::NonZeroU32, ops::Range, sync::Arc};
 
 use toml::de::{DeTable, DeValue};
 
-use super::{AccessError, Reader, Value};
+use super::{AccessError, RuleFileReader, Value};
 use crate::access::{
     TopicPattern, Verb,
-    limit::{EgressLimit, InterfaceLimit, LimitRule, Limits, Over, PlacedLimit, RateLimit},
+    limit::{EgressLimit, InterfaceLimit, LimitKind, LimitRule, Over, PlacedLimit, RateLimit},
     party::PartyPattern,
 };
 
@@ -84,7 +84,7 @@ impl Entries {
 }
 
 /// One of them.
-enum Entry {
+enum LimitEntry {
     Peer(LimitRule),
     Interface(InterfaceLimit),
 }
@@ -103,19 +103,23 @@ struct Parts {
     egress: Option<f64>,
 }
 
-impl Reader<'_> {
+impl RuleFileReader<'_> {
     pub(super) fn limits(&mut self, value: &Value<'_>) -> Result<Entries, AccessError> {
         let mut entries = Entries::default();
         for (table, span) in self.tables(value, "[[limit]]")? {
             match self.limit(table, span)? {
-                Entry::Peer(rule) => entries.peers.push(rule),
-                Entry::Interface(limit) => entries.interfaces.push(limit),
+                LimitEntry::Peer(rule) => entries.peers.push(rule),
+                LimitEntry::Interface(limit) => entries.interfaces.push(limit),
             }
         }
         Ok(entries)
     }
 
-    fn limit(&mut self, table: &DeTable<'_>, span: Range<usize>) -> Result<Entry, AccessError> {
+    fn limit(
+        &mut self,
+        table: &DeTable<'_>,
+        span: Range<usize>,
+    ) -> Result<LimitEntry, AccessError> {
         let mut parts = Parts::default();
         for (key, value) in table {
             let (key_span, key) = (key.span(), &**key.get_ref());
@@ -230,7 +234,7 @@ impl Reader<'_> {
 
     /// # Errors
     /// What is missing, or does not go together.
-    fn whole(&self, parts: Parts, line: u32) -> Result<Entry, &'static str> {
+    fn whole(&self, parts: Parts, line: u32) -> Result<LimitEntry, &'static str> {
         let Parts { peers, interfaces, mut uses, rate, bytes, burst, over, together, egress } =
             parts;
         let is_of_interfaces = !interfaces.is_empty();
@@ -251,8 +255,8 @@ impl Reader<'_> {
             }
             let limit = EgressLimit { bytes: egress, file: Arc::clone(&self.file), line };
             return Ok(match is_of_interfaces {
-                true => Entry::Interface(InterfaceLimit { interfaces, limit }),
-                false => Entry::Peer(LimitRule { peers, limits: Limits::Egress(limit) }),
+                true => LimitEntry::Interface(InterfaceLimit { interfaces, limit }),
+                false => LimitEntry::Peer(LimitRule { peers, limits: LimitKind::Egress(limit) }),
             });
         }
         if rate.is_none() && bytes.is_none() {
@@ -280,7 +284,7 @@ impl Reader<'_> {
         let names: BTreeSet<_> = uses.iter().map(|(_, pattern)| pattern.to_string()).collect();
         let names = names.into_iter().collect::<Vec<_>>().join(", ").into();
         let limit = PlacedLimit { limit, names, file: Arc::clone(&self.file), line };
-        Ok(Entry::Peer(LimitRule { peers, limits: Limits::Uses(uses, limit) }))
+        Ok(LimitEntry::Peer(LimitRule { peers, limits: LimitKind::Uses(uses, limit) }))
     }
 }
 

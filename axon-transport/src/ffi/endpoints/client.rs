@@ -4,7 +4,7 @@ use std::ffi::c_void;
 
 use super::{
     endpoint::{axon_endpoint_options_t, axon_gid_t, describe, end, matched, set_callback, spec},
-    subscription::{CopyTarget, SamplePlace, axon_message_info_t, axon_room_t},
+    subscription::{CopyTarget, SampleInPlace, axon_message_info_t, axon_room_t},
 };
 use crate::ffi::{
     callback::axon_callback_t,
@@ -157,7 +157,7 @@ pub unsafe extern "C" fn axon_session_client_take_sample(
 ) -> axon_ret_t {
     guarded(|| {
         let client = named(client)?;
-        let to = SamplePlace { sample, data, len, info };
+        let to = SampleInPlace { sample, data, len, info };
         // SAFETY: the caller's word.
         unsafe { to.put(|| client.take_response_sample(), client.endpoint()) }
     })

@@ -92,7 +92,7 @@ pub(super) unsafe fn spec(
 }
 
 /// What a handle of any endpoint names.
-pub(super) trait Object {
+pub(super) trait EndpointObject {
     fn endpoint(&self) -> &Endpoint;
 
     /// How many others it is matched with.
@@ -100,14 +100,14 @@ pub(super) trait Object {
 }
 
 /// An endpoint of which something is taken.
-pub(super) trait Taking: Object {
+pub(super) trait Taking: EndpointObject {
     fn set_on_new(&self, callback: Option<OnNew>) -> Result<(), SessionError>;
     fn tell_no_more(&self);
 }
 
 macro_rules! objects {
     ($($object:ident: $matched:ident $(, $set:ident)?;)+) => {$(
-        impl Object for $object {
+        impl EndpointObject for $object {
             fn endpoint(&self) -> &Endpoint {
                 self.endpoint()
             }
@@ -140,7 +140,7 @@ objects! {
 ///
 /// # Safety
 /// `gid` and `qos` are null or point to room for one.
-pub(super) unsafe fn describe<H: Handle<Object: Object>>(
+pub(super) unsafe fn describe<H: Handle<Object: EndpointObject>>(
     handle: H,
     gid: *mut axon_gid_t,
     qos: *mut axon_qos_t,
@@ -159,7 +159,7 @@ pub(super) unsafe fn describe<H: Handle<Object: Object>>(
 ///
 /// # Safety
 /// `count` points to room for a number.
-pub(super) unsafe fn matched<H: Handle<Object: Object>>(
+pub(super) unsafe fn matched<H: Handle<Object: EndpointObject>>(
     handle: H,
     count: *mut usize,
 ) -> Result<(), CallFailure> {

@@ -4,7 +4,7 @@ use std::ffi::c_void;
 
 use super::{
     endpoint::{axon_endpoint_options_t, axon_gid_t, describe, end, matched, set_callback, spec},
-    subscription::{CopyTarget, SamplePlace, axon_message_info_t, axon_room_t},
+    subscription::{CopyTarget, SampleInPlace, axon_message_info_t, axon_room_t},
 };
 use crate::{
     ffi::{
@@ -114,7 +114,7 @@ pub unsafe extern "C" fn axon_session_server_take_sample(
 ) -> axon_ret_t {
     guarded(|| {
         let server = named(server)?;
-        let to = SamplePlace { sample, data, len, info };
+        let to = SampleInPlace { sample, data, len, info };
         // SAFETY: the caller's word.
         unsafe { to.put(|| server.take_request_sample(), server.endpoint()) }
     })

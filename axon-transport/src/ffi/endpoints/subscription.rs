@@ -179,7 +179,7 @@ pub unsafe extern "C" fn axon_session_subscription_take_sample(
 ) -> axon_ret_t {
     guarded(|| {
         let subscription = named(subscription)?;
-        let to = SamplePlace { sample, data, len, info };
+        let to = SampleInPlace { sample, data, len, info };
         // SAFETY: the caller's word.
         unsafe { to.put(|| subscription.take_sample(), subscription.endpoint()) }
     })
@@ -297,14 +297,14 @@ impl CopyTarget {
 }
 
 /// Where one goes that is taken in place.
-pub(super) struct SamplePlace {
+pub(super) struct SampleInPlace {
     pub(super) sample: *mut axon_sample_t,
     pub(super) data: *mut *const u8,
     pub(super) len: *mut usize,
     pub(super) info: *mut axon_message_info_t,
 }
 
-impl SamplePlace {
+impl SampleInPlace {
     /// # Safety
     /// The places are as [`axon_session_subscription_take_sample`] says.
     pub(super) unsafe fn put(

@@ -14,7 +14,7 @@ use std::{
 
 use axon_shm::internal::BlockedSignals;
 
-use super::{AXON_LOG_WARN, Line};
+use super::{AXON_LOG_WARN, LogLine};
 
 /// So many lines wait at most.
 const ROOM: usize = 256;
@@ -28,7 +28,7 @@ pub(super) struct Waiting {
 
 #[derive(Default)]
 struct QueueState {
-    lines: VecDeque<Line>,
+    lines: VecDeque<LogLine>,
     /// How many more there would have been.
     lost: u64,
     /// Whether the thread runs.
@@ -48,7 +48,7 @@ impl Waiting {
     }
 
     /// Has `tell` called with it soon.
-    pub(super) fn say(&'static self, line: Line, tell: impl Fn(Line) + Send + 'static) {
+    pub(super) fn say(&'static self, line: LogLine, tell: impl Fn(LogLine) + Send + 'static) {
         let mut state = self.lock();
         if !state.runs {
             let blocked = BlockedSignals::all();
@@ -67,7 +67,7 @@ impl Waiting {
         self.more.notify_one();
     }
 
-    fn tell_all(&self, tell: impl Fn(Line) + Send + 'static) {
+    fn tell_all(&self, tell: impl Fn(LogLine) + Send + 'static) {
         TELLS.set(self);
         let mut state = self.lock();
         loop {
@@ -80,7 +80,7 @@ impl Waiting {
                 (None, _) => {
                     let lost = mem::take(&mut state.lost);
                     let text = format!("{lost} more lines than could wait were said");
-                    Line { severity: AXON_LOG_WARN, part: module_path!(), text }
+                    LogLine { severity: AXON_LOG_WARN, part: module_path!(), text }
                 }
             };
             drop(state);

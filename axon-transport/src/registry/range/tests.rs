@@ -9,7 +9,7 @@ use crate::{
     graph::{Endpoint, EndpointKind, EndpointRange, RemoteEndpoint},
     qos::Qos,
     registry::Registry,
-    wire::session::{Announce, Attach, Granted, Message},
+    wire::session::{Announce, Attach, Granted, SessionMessage},
 };
 
 use DiscoveryRange::{Localhost, Off, Subnet};
@@ -52,14 +52,16 @@ impl World {
         self.drain(number);
     }
 
-    fn drain(&mut self, number: u8) -> Vec<Message> {
+    fn drain(&mut self, number: u8) -> Vec<SessionMessage> {
         std::iter::from_fn(|| self.registry.poll_output(&id(number)))
-            .map(|output| Message::decode(&output.packet).unwrap())
+            .map(|output| SessionMessage::decode(&output.packet).unwrap())
             .collect()
     }
 
     fn announce(&mut self, session: u8, announce: Announce) {
-        self.registry.handle_message(&id(session), Message::Endpoint(announce), vec![]).unwrap();
+        self.registry
+            .handle_message(&id(session), SessionMessage::Endpoint(announce), vec![])
+            .unwrap();
     }
 
     fn own(&mut self, session: u8, number: u32, kind: EndpointKind) -> Gid {
@@ -106,7 +108,7 @@ impl World {
     fn graph(&mut self, session: u8, known: &mut BTreeSet<Gid>) {
         self.registry.flush();
         for message in self.drain(session) {
-            let Message::Graph(graph) = message else { continue };
+            let SessionMessage::SessionGraph(graph) = message else { continue };
             if graph.whole {
                 known.clear();
             }
@@ -117,7 +119,7 @@ impl World {
 
     fn sees(&mut self, session: u8) -> BTreeSet<Gid> {
         let mut known = BTreeSet::new();
-        self.registry.handle_message(&id(session), Message::Resync, vec![]).unwrap();
+        self.registry.handle_message(&id(session), SessionMessage::Resync, vec![]).unwrap();
         self.graph(session, &mut known);
         known
     }
@@ -246,7 +248,7 @@ fn pairs_and_graph_follow_a_link_that_comes_and_goes() {
         world.registry.flush();
         let told = world.drain(GATEWAY);
         let reach = told.iter().rev().find_map(|message| match message {
-            Message::Graph(graph) => {
+            SessionMessage::SessionGraph(graph) => {
                 graph.added.iter().find(|item| item.endpoint.gid == writer)?.reach.clone()
             }
             _ => None,
@@ -255,9 +257,10 @@ fn pairs_and_graph_follow_a_link_that_comes_and_goes() {
         world.unlink();
         assert!(world.pairs().is_empty(), "another address is another host");
         let told = world.drain(1);
-        let parted = |m: &Message| matches!(m, Message::Unmatch(u) if u.writer == writer);
+        let parted =
+            |m: &SessionMessage| matches!(m, SessionMessage::Unmatch(u) if u.writer == writer);
         assert!(told.iter().any(parted), "{told:?}");
-        world.registry.handle_message(&id(1), Message::Resync, vec![]).unwrap();
+        world.registry.handle_message(&id(1), SessionMessage::Resync, vec![]).unwrap();
         world.graph(1, &mut seen[0]);
         assert!(!seen[0].contains(&subscription));
         assert!(seen[0].contains(&unlisted));
@@ -301,10 +304,10 @@ fn a_publisher_counts_those_of_a_relay_that_it_meets() {
         after: None,
         carries: None,
     };
-    world.registry.handle_message(&id(GATEWAY), Message::Attach(attach), vec![]).unwrap();
-    let stands_for = |told: &[Message]| {
+    world.registry.handle_message(&id(GATEWAY), SessionMessage::Attach(attach), vec![]).unwrap();
+    let stands_for = |told: &[SessionMessage]| {
         told.iter().rev().find_map(|message| match message {
-            Message::Attach(attach) => attach.stands_for.clone(),
+            SessionMessage::Attach(attach) => attach.stands_for.clone(),
             _ => None,
         })
     };
@@ -320,7 +323,7 @@ fn a_publisher_counts_those_of_a_relay_that_it_meets() {
         after: None,
         relayed: None,
     };
-    world.registry.handle_message(&id(1), Message::Grant(granted), vec![]).unwrap();
+    world.registry.handle_message(&id(1), SessionMessage::Grant(granted), vec![]).unwrap();
     // The other host's session lists this host from now on.
     world.remote(OTHER, not_met, Subscription, RangeToHost { lists: true, ..SUBNET });
     assert_eq!(stands_for(&world.drain(1)), Some(vec![met, not_met]));

@@ -10,7 +10,7 @@ use crate::{
 
 /// A segment of a session's memory.
 #[derive(Clone, Debug)]
-pub struct SessionSegment<F> {
+pub struct RegisteredSegment<F> {
     /// What it is.
     pub segment: Segment,
     /// Its descriptor.
@@ -20,7 +20,7 @@ pub struct SessionSegment<F> {
 /// The segments of a session's memory besides the first, by number.
 #[derive(Debug)]
 pub struct OwnMemory<F> {
-    segments: BTreeMap<u32, SessionSegment<F>>,
+    segments: BTreeMap<u32, RegisteredSegment<F>>,
     /// The session was told that no more segments are taken, and has given none up since.
     short: bool,
 }
@@ -42,7 +42,7 @@ impl<F> Default for OwnMemory<F> {
 
 impl<F> OwnMemory<F> {
     /// The segments.
-    pub fn iter(&self) -> impl Iterator<Item = &SessionSegment<F>> {
+    pub fn iter(&self) -> impl Iterator<Item = &RegisteredSegment<F>> {
         self.segments.values()
     }
 
@@ -57,7 +57,7 @@ impl<F> OwnMemory<F> {
     }
 
     /// The segment of a number.
-    pub fn get(&self, number: u32) -> Option<&SessionSegment<F>> {
+    pub fn get(&self, number: u32) -> Option<&RegisteredSegment<F>> {
         self.segments.get(&number)
     }
 
@@ -69,7 +69,7 @@ impl<F> OwnMemory<F> {
         if self.segments.len() >= MAX_SEGMENTS {
             return Err(NotTaken::Full);
         }
-        self.segments.insert(number, SessionSegment { segment, descriptor });
+        self.segments.insert(number, RegisteredSegment { segment, descriptor });
         Ok(())
     }
 
@@ -87,7 +87,7 @@ impl<F> OwnMemory<F> {
 
     /// The segments in which a reader of `writer` looks.
     pub(super) fn numbers_for(&self, writer: &Gid) -> Vec<u32> {
-        let concerns = |s: &&SessionSegment<F>| s.segment.publisher.is_none_or(|p| p == *writer);
+        let concerns = |s: &&RegisteredSegment<F>| s.segment.publisher.is_none_or(|p| p == *writer);
         self.iter().filter(concerns).map(|s| s.segment.number).collect()
     }
 }

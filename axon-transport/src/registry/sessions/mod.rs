@@ -15,14 +15,14 @@ use std::{
     sync::Arc,
 };
 
-pub(super) use self::outbox::Due;
+pub(super) use self::outbox::DueMessage;
 pub use self::{
     entry::SessionEntry,
-    memory::{OwnMemory, SessionSegment},
-    outbox::Output,
+    memory::{OwnMemory, RegisteredSegment},
+    outbox::SessionPacket,
 };
 use self::{
-    left::{Left, packets_of_grant},
+    left::{LeftBehind, packets_of_grant},
     memory::NotTaken,
     outbox::Pushed,
 };
@@ -30,8 +30,8 @@ use super::limits::{MAX_SEGMENTS, MAX_SESSIONS, Violation};
 use crate::{
     ids::{DaemonId, Gid, SessionId},
     wire::session::{
-        Granted, MAX_DESCRIPTORS, Message, Pair, Refused, Segment, SegmentName, SegmentOpened,
-        SessionRole, Unmet,
+        Granted, MAX_DESCRIPTORS, Pair, Segment, SegmentName, SegmentOpened, SessionMessage,
+        SessionRefused, SessionRole, Unmet,
     },
 };
 
@@ -44,7 +44,7 @@ pub(super) struct Sessions<F> {
     /// The first endpoint of each session that was refused, and why.
     refused: Vec<(SessionId, String)>,
     /// What they left to readers that are not here.
-    left: Left<F>,
+    left: LeftBehind<F>,
 }
 
 impl<F> Default for Sessions<F> {
@@ -53,7 +53,7 @@ impl<F> Default for Sessions<F> {
             entries: BTreeMap::new(),
             ready: BTreeSet::new(),
             refused: Vec::new(),
-            left: Left::default(),
+            left: LeftBehind::default(),
         }
     }
 }
@@ -170,12 +170,12 @@ impl<F> Sessions<F> {
     }
 
     /// Queues a message for one session.
-    pub(super) fn push(&mut self, to: &SessionId, message: &Message, descriptors: Vec<F>) {
+    pub(super) fn push(&mut self, to: &SessionId, message: &SessionMessage, descriptors: Vec<F>) {
         // It is told everything anew.
         if self.entries.get(to).is_none_or(|entry| entry.outbox.is_behind()) {
             return;
         }
-        if let Some(output) = Output::of(message, descriptors) {
+        if let Some(output) = SessionPacket::of(message, descriptors) {
             self.push_output(to, output);
         }
     }
@@ -194,11 +194,12 @@ impl<F> Sessions<F> {
     pub(super) fn tell_unmet(&mut self, by: &SessionId, unmet: Unmet) {
         self.forget_pledge(&Pair { reader: unmet.reader, writer: unmet.writer });
         let process = self.process_of(by);
-        let output = Output::kept(&Message::Unmet(unmet), Vec::new(), unmet.reader, process);
+        let output =
+            SessionPacket::kept(&SessionMessage::Unmet(unmet), Vec::new(), unmet.reader, process);
         output.into_iter().for_each(|output| self.push_kept(output));
     }
 
-    fn push_kept(&mut self, output: Output<F>) {
+    fn push_kept(&mut self, output: SessionPacket<F>) {
         let Some(reader) = output.kept_for else { return };
         let to = self.session_of(&reader);
         // With some of them memory is handed over. An id proves nothing: a tool, or another user, may claim a reader's.
@@ -244,11 +245,11 @@ impl<F> Sessions<F> {
     /// Queues a packet for several sessions, which share its memory.
     pub(super) fn push_encoded(&mut self, to: &[SessionId], packet: &Arc<[u8]>) {
         for id in to {
-            self.push_output(id, Output::plain(Arc::clone(packet)));
+            self.push_output(id, SessionPacket::plain(Arc::clone(packet)));
         }
     }
 
-    fn push_output(&mut self, to: &SessionId, output: Output<F>) {
+    fn push_output(&mut self, to: &SessionId, output: SessionPacket<F>) {
         let Some(entry) = self.entries.get_mut(to) else { return };
         match entry.outbox.push(output) {
             Pushed::Queued => {
@@ -260,11 +261,11 @@ impl<F> Sessions<F> {
     }
 
     /// The next packet that waits for a session.
-    pub(super) fn pop(&mut self, id: &SessionId) -> Option<Output<F>> {
+    pub(super) fn pop(&mut self, id: &SessionId) -> Option<SessionPacket<F>> {
         self.entries.get_mut(id)?.outbox.pop()
     }
 
-    pub(super) fn put_back(&mut self, id: &SessionId, output: Output<F>) {
+    pub(super) fn put_back(&mut self, id: &SessionId, output: SessionPacket<F>) {
         if let Some(entry) = self.entries.get_mut(id) {
             entry.outbox.put_back(output);
         }
@@ -328,7 +329,7 @@ impl<F: Clone> Sessions<F> {
              fewer publishers of samples over 4 KiB in one process"
         );
         self.note_refused(id, &text);
-        self.push(id, &Message::Refused(Refused::because(text)), Vec::new());
+        self.push(id, &SessionMessage::SessionRefused(SessionRefused::because(text)), Vec::new());
     }
 
     /// A session ends. Hands what it pledged to the readers. Called before its pairs end.
@@ -381,7 +382,7 @@ impl<F: Clone> Sessions<F> {
                 told.push(*reader);
             }
         }
-        let gone = Message::SegmentGone(SegmentName { session: *id, number });
+        let gone = SessionMessage::SegmentGone(SegmentName { session: *id, number });
         if let Some(packet) = encode(&gone) {
             self.push_encoded(&told, &packet);
         }
@@ -405,13 +406,13 @@ impl<F: Clone> Sessions<F> {
             return;
         }
         let there = self.entries.get(of).and_then(|entry| entry.segments.get(number));
-        let Some(SessionSegment { segment, descriptor }) =
+        let Some(RegisteredSegment { segment, descriptor }) =
             there.or_else(|| self.left.segment(of, number)).cloned()
         else {
             return;
         };
         let opened = SegmentOpened { session: *of, segment };
-        self.push(id, &Message::Segment(opened), vec![descriptor]);
+        self.push(id, &SessionMessage::Segment(opened), vec![descriptor]);
     }
 
     /// The segments of session `of` in which a reader of `writer` looks.
@@ -432,7 +433,7 @@ impl<F: Clone> Sessions<F> {
             if descriptors.len() == MAX_DESCRIPTORS {
                 break;
             }
-            if let Some(SessionSegment { segment, descriptor }) = self.lacking(to, of, number) {
+            if let Some(RegisteredSegment { segment, descriptor }) = self.lacking(to, of, number) {
                 handed.push(segment);
                 descriptors.push(descriptor);
             }
@@ -448,9 +449,9 @@ impl<F: Clone> Sessions<F> {
     }
 
     fn hand(&mut self, to: &SessionId, of: &SessionId, number: u32) {
-        if let Some(SessionSegment { segment, descriptor }) = self.lacking(to, of, number) {
+        if let Some(RegisteredSegment { segment, descriptor }) = self.lacking(to, of, number) {
             let opened = SegmentOpened { session: *of, segment };
-            self.push(to, &Message::Segment(opened), vec![descriptor]);
+            self.push(to, &SessionMessage::Segment(opened), vec![descriptor]);
         }
     }
 
@@ -460,7 +461,7 @@ impl<F: Clone> Sessions<F> {
         to: &SessionId,
         of: &SessionId,
         number: u32,
-    ) -> Option<SessionSegment<F>> {
+    ) -> Option<RegisteredSegment<F>> {
         let segment = self.entries.get(of)?.segments.get(number)?.clone();
         self.entries.get_mut(to)?.held.hand(of, number).then_some(segment)
     }
@@ -488,7 +489,7 @@ impl<F: Clone> Sessions<F> {
 }
 
 /// The packet of a message.
-pub(super) fn encode(message: &Message) -> Option<Arc<[u8]>> {
+pub(super) fn encode(message: &SessionMessage) -> Option<Arc<[u8]>> {
     match message.encode() {
         Ok(packet) => Some(packet.into()),
         Err(error) => {

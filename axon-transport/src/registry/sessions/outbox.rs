@@ -6,7 +6,7 @@ use super::{encode, shares::makes_room};
 use crate::{
     ids::{Gid, SessionId},
     registry::limits::{MAX_QUEUE, MAX_QUEUE_BYTES, STATUS_SLICE},
-    wire::session::{Message, StatusPart},
+    wire::session::{SessionMessage, StatusPart},
 };
 
 /// Packets that stay for their readers that may wait for one session.
@@ -14,7 +14,7 @@ const MAX_WAITING_KEPT: usize = 1024;
 
 /// A packet for a session.
 #[derive(Clone, Debug)]
-pub struct Output<F> {
+pub struct SessionPacket<F> {
     /// Its bytes.
     pub packet: Arc<[u8]>,
     /// What goes with it.
@@ -29,11 +29,11 @@ pub struct Output<F> {
     number: u64,
 }
 
-impl<F> Output<F> {
+impl<F> SessionPacket<F> {
     /// A message that does not fit is left out: everything that is stored is small enough to be passed on.
-    pub(super) fn of(message: &Message, descriptors: Vec<F>) -> Option<Self> {
+    pub(super) fn of(message: &SessionMessage, descriptors: Vec<F>) -> Option<Self> {
         let segment = match message {
-            Message::Segment(opened) => Some((opened.session, opened.segment.number)),
+            SessionMessage::Segment(opened) => Some((opened.session, opened.segment.number)),
             _ => None,
         };
         Some(Self {
@@ -48,7 +48,7 @@ impl<F> Output<F> {
 
     /// A packet of a publisher of `process` that stays for its reader whatever becomes of the session's queue.
     pub(super) fn kept(
-        message: &Message,
+        message: &SessionMessage,
         descriptors: Vec<F>,
         reader: Gid,
         process: u32,
@@ -71,7 +71,7 @@ impl<F> Output<F> {
 
 /// What a session with an empty queue is told next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(in crate::registry) enum Due {
+pub(in crate::registry) enum DueMessage {
     /// Everything, from the beginning.
     Everything,
     /// More of the pairs of its endpoints.
@@ -95,7 +95,7 @@ pub(super) enum Pushed {
 /// again. While it is told everything the bounds grow with what it has to hear.
 #[derive(Debug)]
 pub(in crate::registry) struct Outbox<F> {
-    queue: VecDeque<Output<F>>,
+    queue: VecDeque<SessionPacket<F>>,
     /// How many of them stay whatever becomes of the rest. They have a bound of their own.
     kept: usize,
     /// The number of the last packet that was queued.
@@ -153,7 +153,7 @@ impl<F> Outbox<F> {
     }
 
     /// Queues a packet. After [`Pushed::Full`] the session has to [`fall_behind`](Self::fall_behind).
-    pub(super) fn push(&mut self, output: Output<F>) -> Pushed {
+    pub(super) fn push(&mut self, output: SessionPacket<F>) -> Pushed {
         if self.behind {
             return Pushed::Behind;
         }
@@ -162,20 +162,20 @@ impl<F> Outbox<F> {
         }
         self.bytes += output.packet.len();
         self.last_queued += 1;
-        self.queue.push_back(Output { number: self.last_queued, ..output });
+        self.queue.push_back(SessionPacket { number: self.last_queued, ..output });
         Pushed::Queued
     }
 
     /// Queues what the session would not hear of otherwise: it stays if the session falls behind. Beyond the bound the
     /// process that said most of it loses the oldest.
-    pub(super) fn push_kept(&mut self, output: Output<F>) {
+    pub(super) fn push_kept(&mut self, output: SessionPacket<F>) {
         if self.kept == MAX_WAITING_KEPT {
             self.make_room(output.process);
         }
         self.kept += 1;
         self.bytes += output.packet.len();
         self.last_queued += 1;
-        self.queue.push_back(Output { number: self.last_queued, ..output });
+        self.queue.push_back(SessionPacket { number: self.last_queued, ..output });
     }
 
     fn make_room(&mut self, newcomer: u32) {
@@ -194,35 +194,35 @@ impl<F> Outbox<F> {
     }
 
     /// Takes back what stays for its readers.
-    pub(super) fn take_kept(&mut self) -> Vec<Output<F>> {
-        let is_kept = |output: &Output<F>| output.kept_for.is_some();
+    pub(super) fn take_kept(&mut self) -> Vec<SessionPacket<F>> {
+        let is_kept = |output: &SessionPacket<F>| output.kept_for.is_some();
         let (taken, rest): (VecDeque<_>, _) =
             std::mem::take(&mut self.queue).into_iter().partition(is_kept);
         self.queue = rest;
-        let taken = Vec::<Output<F>>::from(taken);
+        let taken = Vec::<SessionPacket<F>>::from(taken);
         self.kept -= taken.len();
         self.bytes -= taken.iter().map(|output| output.packet.len()).sum::<usize>();
         taken
     }
 
     /// Takes what stays for its readers, of a session that is gone.
-    pub(super) fn into_kept(self) -> impl Iterator<Item = Output<F>> {
+    pub(super) fn into_kept(self) -> impl Iterator<Item = SessionPacket<F>> {
         self.queue.into_iter().filter(|output| output.kept_for.is_some())
     }
 
     /// What has to be queued before the next [`pop`](Self::pop).
-    pub(in crate::registry) fn due(&self) -> Option<Due> {
+    pub(in crate::registry) fn due(&self) -> Option<DueMessage> {
         if !self.queue.is_empty() {
             None
         } else if self.telling.is_some() {
-            Some(Due::Pairs)
+            Some(DueMessage::Pairs)
         } else {
-            (self.behind || self.resync).then_some(Due::Everything)
+            (self.behind || self.resync).then_some(DueMessage::Everything)
         }
     }
 
     /// The next packet, or the next part of a status.
-    pub(super) fn pop(&mut self) -> Option<Output<F>> {
+    pub(super) fn pop(&mut self) -> Option<SessionPacket<F>> {
         let output = self.queue.pop_front();
         self.bytes -= output.as_ref().map_or(0, |output| output.packet.len());
         self.kept -= usize::from(output.as_ref().is_some_and(|output| output.kept_for.is_some()));
@@ -234,8 +234,8 @@ impl<F> Outbox<F> {
     }
 
     /// Puts a packet back that could not be sent.
-    pub(super) fn put_back(&mut self, output: Output<F>) {
-        if Message::is_status(&output.packet) {
+    pub(super) fn put_back(&mut self, output: SessionPacket<F>) {
+        if SessionMessage::is_status(&output.packet) {
             if let Some((_, next)) = &mut self.status {
                 *next = next.saturating_sub(1);
             }
@@ -314,7 +314,7 @@ impl<F> Outbox<F> {
     }
 
     /// The next part of a status. A status without text has one part, too.
-    fn next_part(&mut self) -> Option<Output<F>> {
+    fn next_part(&mut self) -> Option<SessionPacket<F>> {
         let (text, next) = self.status.as_mut()?;
         let parts = u32::try_from(text.len().div_ceil(STATUS_SLICE).max(1)).ok()?;
         if *next == parts {
@@ -323,9 +323,9 @@ impl<F> Outbox<F> {
         }
         let from = *next as usize * STATUS_SLICE;
         let slice = &text[from..text.len().min(from + STATUS_SLICE)];
-        let part = Message::Status(StatusPart { part: *next, parts, text: slice.to_vec() });
+        let part = SessionMessage::Status(StatusPart { part: *next, parts, text: slice.to_vec() });
         *next += 1;
-        Output::of(&part, Vec::new())
+        SessionPacket::of(&part, Vec::new())
     }
 
     /// The number of the packet up to which all has to be sent before a FENCE of now is answered; `None` while the
@@ -367,14 +367,14 @@ mod tests {
 
     const OTHER: SessionId = SessionId([2; 16]);
 
-    fn packet(bytes: usize) -> Output<&'static str> {
-        Output::plain(vec![0xa0; bytes].into())
+    fn packet(bytes: usize) -> SessionPacket<&'static str> {
+        SessionPacket::plain(vec![0xa0; bytes].into())
     }
 
-    fn segment(number: u32) -> Output<&'static str> {
+    fn segment(number: u32) -> SessionPacket<&'static str> {
         let segment = Segment { number, publisher: None };
-        let opened = Message::Segment(SegmentOpened { session: OTHER, segment });
-        Output::of(&opened, vec!["map"]).unwrap()
+        let opened = SessionMessage::Segment(SegmentOpened { session: OTHER, segment });
+        SessionPacket::of(&opened, vec!["map"]).unwrap()
     }
 
     #[test]
@@ -387,7 +387,7 @@ mod tests {
         outbox.fall_behind();
         assert_eq!(outbox.check(), 0);
         assert!(outbox.is_behind());
-        assert_eq!(outbox.due(), Some(Due::Everything));
+        assert_eq!(outbox.due(), Some(DueMessage::Everything));
         assert_eq!(outbox.push(packet(1)), Pushed::Behind);
 
         let mut tool = Outbox::<()>::new(false);
@@ -425,7 +425,7 @@ mod tests {
         while outbox.due().is_none() {
             outbox.pop().unwrap();
         }
-        assert_eq!(outbox.due(), Some(Due::Pairs));
+        assert_eq!(outbox.due(), Some(DueMessage::Pairs));
         assert_eq!(outbox.next_endpoint(), Some(endpoint));
         assert!(outbox.is_being_told());
         assert_eq!(outbox.next_endpoint(), None);

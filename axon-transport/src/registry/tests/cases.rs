@@ -21,18 +21,21 @@ fn forged_session_messages_are_violations() {
     let stolen = registry.handle_message(&own, announce(foreign.clone()), vec![]);
     assert_eq!(stolen, Err(Violation::NotItsOwn(foreign.gid)));
     registry.handle_message(&other, announce(foreign.clone()), vec![]).unwrap();
-    let gone =
-        registry.handle_message(&own, Message::EndpointGone(Gone { gid: foreign.gid }), vec![]);
+    let gone = registry.handle_message(
+        &own,
+        SessionMessage::EndpointGone(Gone { gid: foreign.gid }),
+        vec![],
+    );
     assert_eq!(gone, Err(Violation::NotItsOwn(foreign.gid)));
 
     let writer = endpoint(Gid::new(own, 1), EndpointKind::Publisher, 0, Qos::default());
     let role = EndpointRole::Application;
     let endpoint = writer.clone();
     let placeless = Announce { endpoint, role, stands_for: vec![], ring: None, only: None };
-    let placeless = registry.handle_message(&own, Message::Endpoint(placeless), vec![]);
+    let placeless = registry.handle_message(&own, SessionMessage::Endpoint(placeless), vec![]);
     assert_eq!(placeless, Err(Violation::Unexpected));
     let segment = Segment { number: 3, publisher: None };
-    let opened = Message::Segment(SegmentOpened { session: own, segment });
+    let opened = SessionMessage::Segment(SegmentOpened { session: own, segment });
     for fds in [vec![], vec![(own, "map"); 2]] {
         let opened = registry.handle_message(&own, opened.clone(), fds);
         assert!(matches!(opened, Err(Violation::Descriptors(_))));
@@ -44,19 +47,19 @@ fn forged_session_messages_are_violations() {
         let taken = registry.handle_message(&own, announce_as(writer.clone(), role), vec![]);
         assert_eq!(taken, Err(Violation::NotItsOwn(writer.gid)), "{role:?}");
     }
-    let littered = registry.handle_message(&own, Message::Resync, vec![(own, "ring")]);
+    let littered = registry.handle_message(&own, SessionMessage::Resync, vec![(own, "ring")]);
     assert_eq!(littered, Err(Violation::Descriptors(1)));
     assert_eq!(
-        registry.handle_message(&own, Message::StatusRequest, vec![]),
+        registry.handle_message(&own, SessionMessage::StatusRequest, vec![]),
         Err(Violation::Unexpected)
     );
     let pair = Pair { reader: foreign.gid, writer: writer.gid };
     assert_eq!(
-        registry.handle_message(&own, Message::Match(pair), vec![]),
+        registry.handle_message(&own, SessionMessage::Match(pair), vec![]),
         Err(Violation::Unexpected)
     );
     assert_eq!(
-        registry.handle_message(&own, Message::Detach(pair), vec![]),
+        registry.handle_message(&own, SessionMessage::Detach(pair), vec![]),
         Err(Violation::NotItsOwn(foreign.gid))
     );
 }
@@ -70,7 +73,10 @@ fn an_endpoint_out_of_bounds_is_refused_and_the_session_goes_on() {
     huge.topic = "x".repeat(1000);
     world.registry.handle_message(&own, announce(huge), vec![]).unwrap();
     let answer = world.registry.poll_output(&own).unwrap();
-    assert!(matches!(Message::decode(&answer.packet).unwrap(), Message::Refused(_)));
+    assert!(matches!(
+        SessionMessage::decode(&answer.packet).unwrap(),
+        SessionMessage::SessionRefused(_)
+    ));
     assert_eq!(world.registry.endpoints().count(), 0);
 }
 
@@ -112,8 +118,8 @@ fn a_sample_never_goes_back_to_where_it_came_from() {
         .registry
         .whole_graph(&own)
         .iter()
-        .flat_map(|packet| match Message::decode(packet).unwrap() {
-            Message::Graph(graph) => graph.added,
+        .flat_map(|packet| match SessionMessage::decode(packet).unwrap() {
+            SessionMessage::SessionGraph(graph) => graph.added,
             other => panic!("{other:?}"),
         })
         .map(|item| item.endpoint.gid)
@@ -172,12 +178,16 @@ fn a_tombstone_reaches_those_who_come_later() {
     let mut world = connected(1);
     let own = first(&world);
     let gid = Gid::new(own, 7);
-    world.registry.handle_message(&own, Message::EndpointGone(Gone { gid }), vec![]).unwrap();
+    world
+        .registry
+        .handle_message(&own, SessionMessage::EndpointGone(Gone { gid }), vec![])
+        .unwrap();
     world.take(Step::Connect(1));
     let late = world.clients[&1].id;
     let mut removed = Vec::new();
     while let Some(output) = world.registry.poll_output(&late) {
-        if let Message::Graph(graph) = Message::decode(&output.packet).unwrap() {
+        if let SessionMessage::SessionGraph(graph) = SessionMessage::decode(&output.packet).unwrap()
+        {
             removed.extend(graph.ended.unwrap_or_default());
         }
     }
@@ -192,7 +202,7 @@ fn a_detached_pair_is_over_at_both_ends() {
     world.settle();
     let pair = *world.clients[&1].attached.first().unwrap();
     let reader = world.clients.get_mut(&1).unwrap();
-    reader.outgoing.push((Message::Detach(pair), vec![]));
+    reader.outgoing.push((SessionMessage::Detach(pair), vec![]));
     world.settle();
     for client in world.clients.values() {
         assert!(client.attached.is_empty() && client.held.is_empty());
@@ -241,7 +251,8 @@ fn a_remote_endpoint_that_comes_and_goes_ends_nothing_here() {
     world.registry.flush();
     let mut seen = false;
     while let Some(output) = world.registry.poll_output(&own) {
-        if let Message::Graph(graph) = Message::decode(&output.packet).unwrap() {
+        if let SessionMessage::SessionGraph(graph) = SessionMessage::decode(&output.packet).unwrap()
+        {
             assert_eq!(graph.ended.unwrap_or_default(), vec![]);
             seen |= graph.added.iter().any(|item| item.endpoint.gid == gid);
         }

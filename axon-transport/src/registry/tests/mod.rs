@@ -16,7 +16,7 @@ use crate::{
     graph::EndpointKind,
     qos::{Qos, Reliability, compatible},
     wire::session::{
-        Announce, Gone, Granted, Message, Pair, Segment, SegmentName, SegmentOpened, Unmatch,
+        Announce, Gone, Granted, Pair, Segment, SegmentName, SegmentOpened, SessionMessage, Unmatch,
     },
 };
 
@@ -37,14 +37,14 @@ fn endpoint(gid: Gid, kind: EndpointKind, topic: u8, qos: Qos) -> Endpoint {
 
 const PLACE: Location = Location { segment: 0, offset: 4096 };
 
-fn announce(endpoint: Endpoint) -> Message {
+fn announce(endpoint: Endpoint) -> SessionMessage {
     announce_as(endpoint, EndpointRole::Application)
 }
 
-fn announce_as(endpoint: Endpoint, role: EndpointRole) -> Message {
+fn announce_as(endpoint: Endpoint, role: EndpointRole) -> SessionMessage {
     let has = matches!(endpoint.kind, EndpointKind::Publisher | EndpointKind::Client);
     let ring = has.then_some(PLACE);
-    Message::Endpoint(Announce { endpoint, role, stands_for: vec![], ring, only: None })
+    SessionMessage::Endpoint(Announce { endpoint, role, stands_for: vec![], ring, only: None })
 }
 
 /// A session that does what the client does, without rings.
@@ -66,11 +66,17 @@ struct Client {
     building: Option<BTreeMap<Gid, Option<DaemonId>>>,
     repeated: Option<HashSet<Pair>>,
     told: bool,
-    outgoing: Vec<(Message, Vec<Label>)>,
+    outgoing: Vec<(SessionMessage, Vec<Label>)>,
 }
 
 impl Client {
-    fn hold(&mut self, of: SessionId, pair: Pair, output: &Output<Label>, segments: &[Segment]) {
+    fn hold(
+        &mut self,
+        of: SessionId,
+        pair: Pair,
+        output: &SessionPacket<Label>,
+        segments: &[Segment],
+    ) {
         let came = &output.descriptors;
         let (came, maps) = came.split_at(came.len() - segments.len());
         for (segment, label) in segments.iter().zip(maps) {
@@ -108,10 +114,10 @@ impl Client {
         });
     }
 
-    fn handle(&mut self, output: &Output<Label>) {
+    fn handle(&mut self, output: &SessionPacket<Label>) {
         let fds = &output.descriptors;
-        match Message::decode(&output.packet).unwrap() {
-            Message::Graph(graph) => {
+        match SessionMessage::decode(&output.packet).unwrap() {
+            SessionMessage::SessionGraph(graph) => {
                 if graph.whole {
                     self.building = Some(BTreeMap::new());
                     self.held.clear();
@@ -134,7 +140,7 @@ impl Client {
                     }
                 }
             }
-            Message::Match(pair) => {
+            SessionMessage::Match(pair) => {
                 if let Some(repeated) = &mut self.repeated {
                     repeated.insert(pair);
                 }
@@ -150,10 +156,10 @@ impl Client {
                         after: None,
                         carries: None,
                     };
-                    self.outgoing.push((Message::Attach(attach), vec![]));
+                    self.outgoing.push((SessionMessage::Attach(attach), vec![]));
                 }
             }
-            Message::Attach(attach) => {
+            SessionMessage::Attach(attach) => {
                 let pair = Pair { reader: attach.reader, writer: attach.writer };
                 if let Some(repeated) = &mut self.repeated {
                     repeated.insert(pair);
@@ -174,10 +180,10 @@ impl Client {
                         after: None,
                         relayed: None,
                     };
-                    self.outgoing.push((Message::Grant(grant), vec![]));
+                    self.outgoing.push((SessionMessage::Grant(grant), vec![]));
                 }
             }
-            Message::Grant(grant) => {
+            SessionMessage::Grant(grant) => {
                 let pair = Pair { reader: grant.reader, writer: grant.writer };
                 if let Some(repeated) = &mut self.repeated {
                     repeated.insert(pair);
@@ -187,18 +193,18 @@ impl Client {
                     self.attached.insert(pair);
                 }
             }
-            Message::Unmatch(Unmatch { reader, writer, .. }) => {
+            SessionMessage::Unmatch(Unmatch { reader, writer, .. }) => {
                 self.release(&Pair { reader, writer });
                 self.attached.remove(&Pair { reader, writer });
             }
-            Message::Detach(pair) => {
+            SessionMessage::Detach(pair) => {
                 self.release(&pair);
                 self.attached.remove(&pair);
             }
-            Message::Segment(SegmentOpened { session, segment }) => {
+            SessionMessage::Segment(SegmentOpened { session, segment }) => {
                 self.map(session, &segment, &fds[0]);
             }
-            Message::SegmentGone(SegmentName { session, number }) => {
+            SessionMessage::SegmentGone(SegmentName { session, number }) => {
                 for held in [&mut self.mapped, &mut self.named] {
                     if let Some(numbers) = held.get_mut(&session) {
                         numbers.remove(&number);
@@ -360,14 +366,14 @@ impl World {
                     *client.endpoints.keys().nth(which.index(client.endpoints.len())).unwrap();
                 client.endpoints.remove(&gid);
                 client.attached.retain(|p| p.reader != gid && p.writer != gid);
-                client.outgoing.push((Message::EndpointGone(Gone { gid }), vec![]));
+                client.outgoing.push((SessionMessage::EndpointGone(Gone { gid }), vec![]));
             }
             Step::Up(session) => drop(self.up(session)),
             Step::Down(session, count) => drop(self.down(session, count.into())),
             Step::Flush => self.registry.flush(),
             Step::Resync(session) => {
                 if let Some(client) = self.clients.get_mut(&session) {
-                    client.outgoing.push((Message::Resync, vec![]));
+                    client.outgoing.push((SessionMessage::Resync, vec![]));
                 }
             }
             Step::Remote { daemon, reset, add, remove } => {
@@ -387,7 +393,7 @@ impl World {
                 let segment = Segment { number: client.number, publisher: which.and_then(own) };
                 client.segments.insert(segment.number, segment);
                 let opened = SegmentOpened { session: client.id, segment };
-                client.outgoing.push((Message::Segment(opened), vec![(client.id, "map")]));
+                client.outgoing.push((SessionMessage::Segment(opened), vec![(client.id, "map")]));
             }
             Step::Close { session, which } => {
                 let Some(client) = self.clients.get_mut(&session) else { return };
@@ -398,13 +404,13 @@ impl World {
                 let number = *client.segments.keys().nth(at).unwrap();
                 client.segments.remove(&number);
                 let gone = SegmentName { session: client.id, number };
-                client.outgoing.push((Message::SegmentGone(gone), vec![]));
+                client.outgoing.push((SessionMessage::SegmentGone(gone), vec![]));
             }
             Step::Need { session, of, number } => {
                 let Some(of) = self.clients.get(&of).map(|client| client.id) else { return };
                 let Some(client) = self.clients.get_mut(&session) else { return };
                 let need = SegmentName { session: of, number };
-                client.outgoing.push((Message::Need(need), vec![]));
+                client.outgoing.push((SessionMessage::Need(need), vec![]));
             }
             Step::RemoteGone(daemon) => self.registry.remote_gone(&DaemonId([daemon; 16])),
         }

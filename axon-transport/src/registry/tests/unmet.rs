@@ -11,7 +11,7 @@ use crate::{
         limits::{MAX_LEFT, MAX_PLEDGES, MAX_UNMET},
     },
     wire::session::{
-        Announce, Attach, EndpointRole, Gone, Granted, Message, Segment, SegmentOpened,
+        Announce, Attach, EndpointRole, Gone, Granted, Segment, SegmentOpened, SessionMessage,
         SessionRole, Unmet,
     },
 };
@@ -41,7 +41,7 @@ fn registry(sessions: &[u8]) -> Registry<&'static str> {
     registry
 }
 
-fn say(registry: &mut Registry<&'static str>, message: Message) {
+fn say(registry: &mut Registry<&'static str>, message: SessionMessage) {
     registry.handle_message(&id(WRITER), message, vec![]).unwrap();
 }
 
@@ -51,18 +51,18 @@ fn announce(registry: &mut Registry<&'static str>) {
     let (role, stands_for) = (EndpointRole::Application, Vec::new());
     let ring = Some(Location { segment: 0, offset: 4096 });
     let announce = Announce { endpoint, role, stands_for, ring, only: None };
-    say(registry, Message::Endpoint(announce));
+    say(registry, SessionMessage::Endpoint(announce));
 }
 
-fn taken(registry: &mut Registry<&'static str>, session: u8) -> Vec<Message> {
+fn taken(registry: &mut Registry<&'static str>, session: u8) -> Vec<SessionMessage> {
     let taken = std::iter::from_fn(|| registry.poll_output(&id(session)));
-    taken.map(|output| Message::decode(&output.packet).unwrap()).collect()
+    taken.map(|output| SessionMessage::decode(&output.packet).unwrap()).collect()
 }
 
 /// What the reader's session is told of unmet pairs.
 fn told(registry: &mut Registry<&'static str>) -> Vec<u64> {
     let samples = taken(registry, READER).into_iter().filter_map(|message| match message {
-        Message::Unmet(unmet) => Some(unmet.samples),
+        SessionMessage::Unmet(unmet) => Some(unmet.samples),
         _ => None,
     });
     samples.collect()
@@ -71,12 +71,12 @@ fn told(registry: &mut Registry<&'static str>) -> Vec<u64> {
 #[test]
 fn a_reader_hears_of_it_once_whether_its_session_is_here_or_comes_later() {
     let mut registry = registry(&[WRITER, READER]);
-    say(&mut registry, Message::Unmet(unmet(3)));
+    say(&mut registry, SessionMessage::Unmet(unmet(3)));
     assert_eq!(told(&mut registry), [3]);
 
     registry.handle_disconnect(&id(READER));
-    say(&mut registry, Message::Unmet(unmet(5)));
-    say(&mut registry, Message::Unmet(unmet(5)));
+    say(&mut registry, SessionMessage::Unmet(unmet(5)));
+    say(&mut registry, SessionMessage::Unmet(unmet(5)));
     registry.handle_disconnect(&id(WRITER));
     connect(&mut registry, READER);
     assert_eq!(told(&mut registry), [5], "its session has ended");
@@ -89,29 +89,29 @@ fn a_reader_hears_of_it_before_it_hears_that_the_publisher_ended() {
     let writer = unmet(3).writer;
     registry.keep_left_memory(1);
     announce(&mut registry);
-    say(&mut registry, Message::Unmet(unmet(3)));
-    say(&mut registry, Message::EndpointGone(Gone { gid: writer }));
+    say(&mut registry, SessionMessage::Unmet(unmet(3)));
+    say(&mut registry, SessionMessage::EndpointGone(Gone { gid: writer }));
     registry.flush();
     connect(&mut registry, READER);
     let told = taken(&mut registry, READER);
-    let ends = |m: &Message| matches!(m, Message::Graph(g) if g.ended.as_ref().is_some_and(|e| e.contains(&writer)));
-    let at = |is: &dyn Fn(&Message) -> bool| told.iter().position(is).expect("it was told");
-    assert!(at(&|m| *m == Message::Unmet(unmet(3))) < at(&ends));
+    let ends = |m: &SessionMessage| matches!(m, SessionMessage::SessionGraph(g) if g.ended.as_ref().is_some_and(|e| e.contains(&writer)));
+    let at = |is: &dyn Fn(&SessionMessage) -> bool| told.iter().position(is).expect("it was told");
+    assert!(at(&|m| *m == SessionMessage::Unmet(unmet(3))) < at(&ends));
 }
 
 #[test]
 fn a_session_that_is_told_everything_anew_hears_of_it_all_the_same() {
     let mut registry = registry(&[WRITER, READER]);
-    say(&mut registry, Message::Unmet(unmet(3)));
+    say(&mut registry, SessionMessage::Unmet(unmet(3)));
     for _ in 0..=MAX_QUEUE {
-        registry.push(&id(READER), &Message::Resync, Vec::new());
+        registry.push(&id(READER), &SessionMessage::Resync, Vec::new());
     }
     // Its queue was dropped.
     let other = Gid::new(id(WRITER), 2);
-    say(&mut registry, Message::Unmet(Unmet { writer: other, ..unmet(4) }));
+    say(&mut registry, SessionMessage::Unmet(Unmet { writer: other, ..unmet(4) }));
     assert_eq!(told(&mut registry), [3, 4]);
 
-    say(&mut registry, Message::Unmet(unmet(5)));
+    say(&mut registry, SessionMessage::Unmet(unmet(5)));
     registry.handle_disconnect(&id(READER));
     connect(&mut registry, READER);
     assert_eq!(told(&mut registry), [5], "its connection broke");
@@ -122,7 +122,7 @@ fn the_oldest_pair_is_forgotten_beyond_the_bound() {
     let mut registry = registry(&[WRITER]);
     for number in 0..=MAX_UNMET as u32 {
         let writer = Gid::new(id(WRITER), 1 + number);
-        say(&mut registry, Message::Unmet(Unmet { writer, ..unmet(number.into()) }));
+        say(&mut registry, SessionMessage::Unmet(Unmet { writer, ..unmet(number.into()) }));
     }
     connect(&mut registry, READER);
     assert_eq!(told(&mut registry), [1, 2, 3, 4]);
@@ -131,7 +131,7 @@ fn the_oldest_pair_is_forgotten_beyond_the_bound() {
 #[test]
 fn nobody_speaks_for_the_publishers_of_another_session() {
     let mut registry = registry(&[WRITER, READER]);
-    let refused = registry.handle_message(&id(READER), Message::Unmet(unmet(3)), vec![]);
+    let refused = registry.handle_message(&id(READER), SessionMessage::Unmet(unmet(3)), vec![]);
     assert_eq!(refused, Err(Violation::NotItsOwn(unmet(3).writer)));
 }
 
@@ -146,9 +146,9 @@ fn handed(registry: &mut Registry<&'static str>) -> Vec<(Granted, Vec<&'static s
     let packets: Vec<_> = std::iter::from_fn(|| registry.poll_output(&id(READER))).collect();
     let mut handed = Vec::new();
     for output in packets {
-        match Message::decode(&output.packet).unwrap() {
-            Message::Grant(granted) => handed.push((granted, output.descriptors)),
-            Message::Unmatch(end) => {
+        match SessionMessage::decode(&output.packet).unwrap() {
+            SessionMessage::Grant(granted) => handed.push((granted, output.descriptors)),
+            SessionMessage::Unmatch(end) => {
                 let over =
                     |(of, _): &(Granted, _)| (of.reader, of.writer) == (end.reader, end.writer);
                 assert!(handed.iter().any(over), "it is over before it was granted");
@@ -163,10 +163,10 @@ fn handed(registry: &mut Registry<&'static str>) -> Vec<(Granted, Vec<&'static s
 fn pledged(sessions: &[u8]) -> Registry<&'static str> {
     let mut registry = registry(sessions);
     let segment = Segment { number: 1, publisher: None };
-    let opened = Message::Segment(SegmentOpened { session: id(WRITER), segment });
+    let opened = SessionMessage::Segment(SegmentOpened { session: id(WRITER), segment });
     registry.handle_message(&id(WRITER), opened, vec!["heap"]).unwrap();
     announce(&mut registry);
-    say(&mut registry, Message::Grant(grant(unmet(0).reader, unmet(0).writer)));
+    say(&mut registry, SessionMessage::Grant(grant(unmet(0).reader, unmet(0).writer)));
     registry
 }
 
@@ -193,14 +193,14 @@ fn a_reader_is_handed_the_ring_of_a_publisher_whose_process_was_killed_before_it
 #[test]
 fn a_publisher_that_ended_by_itself_has_said_what_its_readers_lost() {
     let mut registry = pledged(&[WRITER]);
-    say(&mut registry, Message::Unmet(unmet(3)));
+    say(&mut registry, SessionMessage::Unmet(unmet(3)));
     registry.handle_disconnect(&id(WRITER));
     connect(&mut registry, READER);
     assert_eq!(told(&mut registry), [3]);
 
     let mut registry = pledged(&[WRITER]);
     // Its reader has taken up the grant meanwhile.
-    say(&mut registry, Message::EndpointGone(Gone { gid: unmet(0).writer }));
+    say(&mut registry, SessionMessage::EndpointGone(Gone { gid: unmet(0).writer }));
     registry.handle_disconnect(&id(WRITER));
     connect(&mut registry, READER);
     assert_eq!(handed(&mut registry), []);
@@ -214,16 +214,16 @@ fn a_grant_that_a_session_did_not_take_in_time_comes_though_the_publisher_is_kil
     let endpoint = Endpoint::example(reader, EndpointKind::Subscription);
     let (role, stands_for) = (EndpointRole::Application, Vec::new());
     let announce = Announce { endpoint, role, stands_for, ring: None, only: None };
-    registry.handle_message(&id(READER), Message::Endpoint(announce), vec![]).unwrap();
+    registry.handle_message(&id(READER), SessionMessage::Endpoint(announce), vec![]).unwrap();
     let (lane, session) = (Location { segment: 0, offset: 64 }, id(READER));
     let (stands_for, segments, after, carries) = (None, Vec::new(), None, None);
     let qos = Qos::default();
     let attach =
         Attach { reader, writer, lane, qos, session, stands_for, segments, after, carries };
-    registry.handle_message(&id(READER), Message::Attach(attach), vec![]).unwrap();
-    say(&mut registry, Message::Grant(grant(reader, writer)));
+    registry.handle_message(&id(READER), SessionMessage::Attach(attach), vec![]).unwrap();
+    say(&mut registry, SessionMessage::Grant(grant(reader, writer)));
     for _ in 0..=MAX_QUEUE {
-        registry.push(&id(READER), &Message::Resync, Vec::new());
+        registry.push(&id(READER), &SessionMessage::Resync, Vec::new());
     }
     registry.handle_disconnect(&id(WRITER));
     assert_eq!(handed(&mut registry).len(), 1);
@@ -234,13 +234,15 @@ fn the_oldest_of_the_rings_that_wait_for_their_readers_is_given_up_beyond_the_bo
     let mut registry = registry(&[WRITER]);
     let reader = unmet(0).reader;
     let writers: Vec<Gid> = (0..=MAX_LEFT as u32).map(|n| Gid::new(id(WRITER), 1 + n)).collect();
-    writers.iter().for_each(|writer| say(&mut registry, Message::Grant(grant(reader, *writer))));
+    writers
+        .iter()
+        .for_each(|writer| say(&mut registry, SessionMessage::Grant(grant(reader, *writer))));
     registry.handle_disconnect(&id(WRITER));
     connect(&mut registry, READER);
     let packets: Vec<_> = std::iter::from_fn(|| registry.poll_output(&id(READER))).collect();
-    let packets = packets.iter().map(|output| Message::decode(&output.packet).unwrap());
+    let packets = packets.iter().map(|output| SessionMessage::decode(&output.packet).unwrap());
     let granted = packets.filter_map(|message| match message {
-        Message::Grant(granted) => Some(granted.writer),
+        SessionMessage::Grant(granted) => Some(granted.writer),
         _ => None,
     });
     assert_eq!(granted.collect::<Vec<_>>(), writers[1..]);
@@ -283,7 +285,11 @@ fn memory_is_handed_to_no_tool_and_no_other_user_that_claims_the_id_of_a_reader(
 }
 
 /// Another process says or grants this, many times over.
-fn others_say(registry: &mut Registry<&'static str>, times: usize, what: impl Fn(u32) -> Message) {
+fn others_say(
+    registry: &mut Registry<&'static str>,
+    times: usize,
+    what: impl Fn(u32) -> SessionMessage,
+) {
     for number in 1..=times as u32 {
         registry.handle_message(&id(OTHER), what(number), vec![]).unwrap();
     }
@@ -294,13 +300,13 @@ const OTHER: u8 = 7;
 #[test]
 fn process_that_fills_what_is_kept_displaces_nothing_of_another_one() {
     let mut registry = registry(&[WRITER, OTHER]);
-    say(&mut registry, Message::Unmet(unmet(3)));
+    say(&mut registry, SessionMessage::Unmet(unmet(3)));
     let of = |number| Unmet {
         reader: Gid::new(id(8), number),
         writer: Gid::new(id(OTHER), number),
         samples: 1,
     };
-    others_say(&mut registry, 3 * MAX_UNMET, |number| Message::Unmet(of(number)));
+    others_say(&mut registry, 3 * MAX_UNMET, |number| SessionMessage::Unmet(of(number)));
     connect(&mut registry, READER);
     assert_eq!(told(&mut registry), [3]);
 }
@@ -309,7 +315,7 @@ fn process_that_fills_what_is_kept_displaces_nothing_of_another_one() {
 fn rings_of_a_process_that_leaves_many_displace_no_ring_of_another_one() {
     let mut registry = pledged(&[WRITER, OTHER]);
     let of = |number| grant(Gid::new(id(8), number), Gid::new(id(OTHER), number));
-    others_say(&mut registry, 3 * MAX_LEFT, |number| Message::Grant(of(number)));
+    others_say(&mut registry, 3 * MAX_LEFT, |number| SessionMessage::Grant(of(number)));
     registry.handle_disconnect(&id(WRITER));
     registry.handle_disconnect(&id(OTHER));
     connect(&mut registry, READER);
@@ -320,7 +326,7 @@ fn rings_of_a_process_that_leaves_many_displace_no_ring_of_another_one() {
 fn grants_of_a_process_that_repeats_many_displace_no_grant_of_another_one() {
     let mut registry = pledged(&[WRITER, OTHER]);
     let of = |number| grant(Gid::new(id(8), number), Gid::new(id(OTHER), number));
-    others_say(&mut registry, 3 * MAX_PLEDGES, |number| Message::Grant(of(number)));
+    others_say(&mut registry, 3 * MAX_PLEDGES, |number| SessionMessage::Grant(of(number)));
     registry.handle_disconnect(&id(WRITER));
     connect(&mut registry, READER);
     assert_eq!(handed(&mut registry).len(), 1);
@@ -330,9 +336,9 @@ fn grants_of_a_process_that_repeats_many_displace_no_grant_of_another_one() {
 fn reader_that_is_stopped_hears_of_a_pair_though_another_process_told_it_of_very_many() {
     let mut registry = registry(&[WRITER, OTHER, READER]);
     let of = |number| Unmet { writer: Gid::new(id(OTHER), number), ..unmet(1) };
-    others_say(&mut registry, 2000, |number| Message::Unmet(of(number)));
-    say(&mut registry, Message::Unmet(unmet(3)));
-    others_say(&mut registry, 2000, |number| Message::Unmet(of(2000 + number)));
+    others_say(&mut registry, 2000, |number| SessionMessage::Unmet(of(number)));
+    say(&mut registry, SessionMessage::Unmet(unmet(3)));
+    others_say(&mut registry, 2000, |number| SessionMessage::Unmet(of(2000 + number)));
     assert!(told(&mut registry).contains(&3));
 }
 
@@ -343,7 +349,7 @@ fn session_that_comes_back_on_another_connection_hands_no_ring_to_its_readers() 
     assert_eq!(handed(&mut registry), [], "its process lives");
     // It says anew what it granted.
     announce(&mut registry);
-    say(&mut registry, Message::Grant(grant(unmet(0).reader, unmet(0).writer)));
+    say(&mut registry, SessionMessage::Grant(grant(unmet(0).reader, unmet(0).writer)));
     registry.handle_disconnect(&id(WRITER));
     assert_eq!(handed(&mut registry).len(), 1);
 }

@@ -9,7 +9,7 @@ use crate::{
     graph::{Endpoint, EndpointKind, RemoteEndpoint},
     ids::{DaemonId, Gid, SessionId},
     registry::Registry,
-    wire::session::{Announce, EndpointRole, Message, Pair, SessionRole},
+    wire::session::{Announce, EndpointRole, Pair, SessionMessage, SessionRole},
 };
 
 use EndpointKind::{Node, Publisher, Subscription};
@@ -50,9 +50,9 @@ impl World {
         self.0.handle_connect(id(number), role, String::new(), 1, handed, None).unwrap();
     }
 
-    fn drain(&mut self, number: u8) -> Vec<Message> {
+    fn drain(&mut self, number: u8) -> Vec<SessionMessage> {
         std::iter::from_fn(|| self.0.poll_output(&id(number)))
-            .map(|output| Message::decode(&output.packet).unwrap())
+            .map(|output| SessionMessage::decode(&output.packet).unwrap())
             .collect()
     }
 
@@ -68,7 +68,7 @@ impl World {
         let ring = (kind == Publisher).then_some(Location { segment: 0, offset: 4096 });
         let (role, stands_for, only) = (EndpointRole::Application, Vec::new(), None);
         let announce = Announce { endpoint, role, stands_for, ring, only };
-        self.0.handle_message(&id(session), Message::Endpoint(announce), vec![]).unwrap();
+        self.0.handle_message(&id(session), SessionMessage::Endpoint(announce), vec![]).unwrap();
         gid
     }
 
@@ -82,7 +82,7 @@ impl World {
         self.0.sessions.request_resync(&id(session));
         let mut seen = BTreeSet::new();
         for message in self.drain(session) {
-            let Message::Graph(graph) = message else { continue };
+            let SessionMessage::SessionGraph(graph) = message else { continue };
             if graph.whole {
                 seen.clear();
             }
@@ -133,8 +133,9 @@ fn the_refusals_name_a_denied_endpoint_and_its_rule_and_its_session_keeps_it() {
     world.drain(3);
     world.own(3, Publisher, "/in");
     let told = world.drain(3);
-    let refused: Vec<_> = told.iter().filter(|m| matches!(m, Message::Refused(_))).collect();
-    let [Message::Refused(refused)] = refused[..] else { panic!("{told:?}") };
+    let refused: Vec<_> =
+        told.iter().filter(|m| matches!(m, SessionMessage::SessionRefused(_))).collect();
+    let [SessionMessage::SessionRefused(refused)] = refused[..] else { panic!("{told:?}") };
     assert_eq!(refused.endpoint, None, "an endpoint would be refused for good");
     assert!(refused.text.contains("denied by line 7 of access.toml"), "{}", refused.text);
     let said = world.0.take_refused();
@@ -142,7 +143,7 @@ fn the_refusals_name_a_denied_endpoint_and_its_rule_and_its_session_keeps_it() {
     // The same rules once more say nothing new; other ones do.
     world.set(&format!("{RULES}\n[[deny]]\npeer = \"local\"\npublish = \"/in\""));
     assert!(world.0.take_refused().is_empty());
-    assert!(!world.drain(3).iter().any(|m| matches!(m, Message::Refused(_))));
+    assert!(!world.drain(3).iter().any(|m| matches!(m, SessionMessage::SessionRefused(_))));
     world.set("default = \"allow\"");
     world.set("default = \"deny\"");
     assert!(world.0.take_refused()[0].1.contains("default = "));
@@ -161,7 +162,8 @@ fn rules_that_change_end_pairs_and_make_pairs_at_once() {
     world.set("default = \"deny\"");
     assert!(world.pairs().is_empty());
     let told = world.drain(2);
-    let unmatched = |m: &Message| matches!(m, Message::Unmatch(u) if u.writer == publisher);
+    let unmatched =
+        |m: &SessionMessage| matches!(m, SessionMessage::Unmatch(u) if u.writer == publisher);
     assert!(told.iter().any(unmatched), "{told:?}");
     assert!(!world.seen(2).contains(&publisher) && !world.seen(3).contains(&subscription));
     world.set("[[allow]]\npeer = \"local\"\npublish = \"**\"\nsee = \"/ns/*\"");

@@ -10,12 +10,12 @@ use crate::{
         core::SessionEvent,
         sides::{Changes, EventSource, PublisherInner, SubscriptionInner},
     },
-    wire::session::{Graph, Pair},
+    wire::session::{Pair, SessionGraph},
 };
 
 impl Control {
     /// The daemon tells of a change, or a part of the whole.
-    pub(super) fn graph(&mut self, graph: Graph) {
+    pub(super) fn graph(&mut self, graph: SessionGraph) {
         if graph.whole {
             self.building = Some(GraphView::default());
             self.topics.clear();

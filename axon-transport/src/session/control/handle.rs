@@ -4,43 +4,43 @@ use std::{collections::HashSet, sync::Arc};
 
 use axon_shm::{
     ShmError,
-    internal::{Grant, Location, Peer, ReaderInfo, Terms, descriptors::PassedFd},
+    internal::{Grant, Location, ReaderInfo, RingPeer, Terms, descriptors::PassedFd},
 };
 
 use super::{Control, Link, pair_log, peers::PeerError, stands_for};
 use crate::{
     graph::EndpointKind,
     ids::{Gid, SessionId},
-    session::sides::{Accept, Asking, Numbers, PublisherInner, SubscriptionInner},
+    session::sides::{Accept, NumberKind, PublisherInner, ServeRequest, SubscriptionInner},
     wire::session::{
-        Attach, Fence, GivenUp, Granted, Leaving, MAX_DESCRIPTORS, Message, Pair, Refused, Segment,
-        SegmentName, SegmentOpened, StatusPart, Unmatch, Unmet,
+        Attach, Fence, Granted, MAX_DESCRIPTORS, Pair, RelayGivenUp, Segment, SegmentName,
+        SegmentOpened, SessionMessage, SessionRefused, StatusPart, Unmatch, Unmet, WriterLeaving,
     },
 };
 
 impl Control {
-    pub(super) fn handle(&mut self, message: Message, descriptors: Vec<PassedFd>) {
+    pub(super) fn handle(&mut self, message: SessionMessage, descriptors: Vec<PassedFd>) {
         match message {
-            Message::Graph(graph) => self.graph(graph),
-            Message::Match(pair) => self.matched(pair),
-            Message::Attach(attach) => self.attach(attach, descriptors),
-            Message::Grant(grant) => self.grant(grant, descriptors),
-            Message::Detach(pair) => {
+            SessionMessage::SessionGraph(graph) => self.graph(graph),
+            SessionMessage::Match(pair) => self.matched(pair),
+            SessionMessage::Attach(attach) => self.attach(attach, descriptors),
+            SessionMessage::Grant(grant) => self.grant(grant, descriptors),
+            SessionMessage::Detach(pair) => {
                 self.pairs.remove(&pair);
                 self.peers.release(&pair);
                 self.detach_reader(&pair);
             }
-            Message::Unmatch(unmatch) => self.unmatch(&unmatch),
-            Message::Leaving(leaving) => self.leave(leaving),
-            Message::Unmet(unmet) => self.unmet(unmet),
-            Message::GivenUp(given_up) => self.give_up(given_up),
-            Message::Fence(fence) => self.fence(fence),
-            Message::Segment(opened) => self.segment(&opened, &descriptors),
-            Message::SegmentGone(gone) => {
+            SessionMessage::Unmatch(unmatch) => self.unmatch(&unmatch),
+            SessionMessage::WriterLeaving(leaving) => self.leave(leaving),
+            SessionMessage::Unmet(unmet) => self.unmet(unmet),
+            SessionMessage::RelayGivenUp(given_up) => self.give_up(given_up),
+            SessionMessage::Fence(fence) => self.fence(fence),
+            SessionMessage::Segment(opened) => self.segment(&opened, &descriptors),
+            SessionMessage::SegmentGone(gone) => {
                 self.peers.gone(&gone.session, gone.number);
             }
-            Message::Status(part) => self.status(&part),
-            Message::Refused(Refused { endpoint, text: reason, .. }) => {
+            SessionMessage::Status(part) => self.status(&part),
+            SessionMessage::SessionRefused(SessionRefused { endpoint, text: reason, .. }) => {
                 // The process that is relayed logs it itself.
                 if !self.shared.core.options.keeps_refusals {
                     tracing::error!(reason, "the daemon refuses something of the session");
@@ -101,7 +101,7 @@ impl Control {
     }
 
     /// A writer has ended, or has not after all, and more comes of it.
-    fn leave(&mut self, Leaving { gid, leaving }: Leaving) {
+    fn leave(&mut self, WriterLeaving { gid, leaving }: WriterLeaving) {
         let (_, subscriptions) = self.endpoints();
         for subscription in subscriptions {
             if subscription.lock().leave(&gid, leaving) {
@@ -127,7 +127,7 @@ impl Control {
     }
 
     /// A relay of a publisher here gave samples up.
-    fn give_up(&self, GivenUp { reader, writer, samples }: GivenUp) {
+    fn give_up(&self, RelayGivenUp { reader, writer, samples }: RelayGivenUp) {
         let publisher = self.shared.state().endpoints.publishers.get(&writer).cloned();
         if let Some(publisher) = publisher {
             publisher.rings.give_up(reader, samples);
@@ -201,7 +201,7 @@ impl Control {
         };
         let unnamed = self.peers.drop_unread(read);
         for (session, number) in unnamed.into_iter().filter(|_| told) {
-            self.say(Message::Need(SegmentName { session, number }));
+            self.say(SessionMessage::Need(SegmentName { session, number }));
         }
     }
 
@@ -229,7 +229,7 @@ impl Control {
         &mut self,
         subscription: &SubscriptionInner,
         writer: Gid,
-        asking: Result<Asking, ShmError>,
+        asking: Result<ServeRequest, ShmError>,
     ) {
         match asking {
             Ok(asking) => {
@@ -250,9 +250,9 @@ impl Control {
         &self,
         subscription: &SubscriptionInner,
         writer: Gid,
-        Asking { lane, after }: Asking,
-    ) -> Message {
-        Message::Attach(Attach {
+        ServeRequest { lane, after }: ServeRequest,
+    ) -> SessionMessage {
+        SessionMessage::Attach(Attach {
             reader: subscription.endpoint.gid,
             writer,
             lane,
@@ -310,7 +310,7 @@ impl Control {
                     after,
                     relayed,
                 };
-                self.say(Message::Grant(grant));
+                self.say(SessionMessage::Grant(grant));
                 self.writer_changed(&publisher);
             }
             Err(error) => {
@@ -324,7 +324,7 @@ impl Control {
     /// Tells the daemon, which shows it, why a pair that it matched does not come about.
     fn tell_failure(&mut self, pair: &Pair, reason: String) {
         let Pair { reader, writer } = *pair;
-        self.say(Message::Unmatch(Unmatch { reader, writer, reason }));
+        self.say(SessionMessage::Unmatch(Unmatch { reader, writer, reason }));
     }
 
     fn grant(&mut self, granted: Granted, descriptors: Vec<PassedFd>) {
@@ -374,11 +374,11 @@ impl Control {
                 let stands_in = !writer.is_of(&session) || relayed == Some(true);
                 let linked = matches!(self.link, Link::Socket(_));
                 let numbers = match subscription.endpoint.kind {
-                    EndpointKind::Subscription if stands_in && linked => Numbers::All,
+                    EndpointKind::Subscription if stands_in && linked => NumberKind::All,
                     // In a relayed process what was lost on the way is said aloud.
-                    EndpointKind::Subscription if stands_in => Numbers::Between,
-                    _ if subscription.keeps_all() => Numbers::Since,
-                    _ => Numbers::None,
+                    EndpointKind::Subscription if stands_in => NumberKind::Between,
+                    _ if subscription.keeps_all() => NumberKind::Since,
+                    _ => NumberKind::None,
                 };
                 subscription.lock().add(mapped, after, numbers);
                 drop(own_pairs);
@@ -401,11 +401,11 @@ impl Control {
         pair: Pair,
         descriptors: Vec<PassedFd>,
         segments: &[Segment],
-    ) -> Result<Peer, PeerError> {
+    ) -> Result<RingPeer, PeerError> {
         let held = self.peers.hold(session, pair, descriptors, segments);
         if matches!(held, Err(PeerError::Missing)) {
             // The daemon takes us to hold what we do not: have it start over.
-            self.outbox.push_back((Message::Resync, Vec::new()));
+            self.outbox.push_back((SessionMessage::Resync, Vec::new()));
         }
         if !segments.is_empty() {
             // Those who wait for what is in them.

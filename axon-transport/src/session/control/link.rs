@@ -14,7 +14,7 @@ use crate::{
         core::{Outgoing, SegmentChange, SessionEvent},
         daemon::connect::Connected,
     },
-    wire::session::Message,
+    wire::session::SessionMessage,
 };
 
 impl Control {
@@ -34,9 +34,11 @@ impl Control {
             // Behind the announcements, and the memory that they name.
             let pledged =
                 state.endpoints.publishers.values().flat_map(|p| p.pledged(self.shared.core.id));
-            outgoing.extend(pledged.map(|granted| Outgoing::message(Message::Grant(granted))));
+            outgoing
+                .extend(pledged.map(|granted| Outgoing::message(SessionMessage::Grant(granted))));
             // Before their ends.
-            let unmet = state.unmet.iter().map(|unmet| Outgoing::message(Message::Unmet(unmet)));
+            let unmet =
+                state.unmet.iter().map(|unmet| Outgoing::message(SessionMessage::Unmet(unmet)));
             outgoing.extend(unmet);
             outgoing.extend(state.graph.tombstones.iter().map(|gid| Outgoing::gone(*gid)));
             self.shared.core.link.connected(daemon, outgoing);

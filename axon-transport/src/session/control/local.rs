@@ -14,7 +14,7 @@ use crate::{
     ids::{DaemonId, Gid, SessionId},
     registry::Registry,
     session::core::{ControlWaker, SessionCore},
-    wire::session::Message,
+    wire::session::SessionMessage,
 };
 
 /// Brings the sessions of one process together.
@@ -103,8 +103,8 @@ impl Local {
     /// What a daemon would answer to nothing, or to a message.
     pub(in crate::session) fn exchange(
         &mut self,
-        message: Option<(Message, Vec<PassedFd>)>,
-    ) -> Vec<(Message, Vec<PassedFd>)> {
+        message: Option<(SessionMessage, Vec<PassedFd>)>,
+    ) -> Vec<(SessionMessage, Vec<PassedFd>)> {
         let mut inside = self.local_registry.lock();
         if let Some((message, descriptors)) = message {
             let descriptors = descriptors.into_iter().map(Arc::new).collect();
@@ -117,7 +117,7 @@ impl Local {
         while let Some(output) = inside.registry.poll_output(&self.id) {
             let descriptors: std::io::Result<Vec<PassedFd>> =
                 output.descriptors.iter().map(|d| d.try_clone()).collect();
-            match (Message::decode(&output.packet), descriptors) {
+            match (SessionMessage::decode(&output.packet), descriptors) {
                 (Ok(message), Ok(descriptors)) => answers.push((message, descriptors)),
                 (message, descriptors) => {
                     tracing::error!(

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use super::Control;
 use crate::{
     session::core::SegmentChange,
-    wire::session::{Message, SegmentName, SegmentOpened},
+    wire::session::{SegmentName, SegmentOpened, SessionMessage},
 };
 
 /// How often the memory of large samples is looked after.
@@ -31,7 +31,8 @@ impl Control {
                 Ok(Some((info, descriptor))) => {
                     self.segments.tell(number);
                     let opened = SegmentOpened { session, segment: info.into() };
-                    self.outbox.push_back((Message::Segment(opened), vec![descriptor.into()]));
+                    self.outbox
+                        .push_back((SessionMessage::Segment(opened), vec![descriptor.into()]));
                 }
                 // It is gone again.
                 Ok(None) => self.segments.remove(number),
@@ -47,7 +48,7 @@ impl Control {
             SegmentChange::Gone(number) => {
                 self.segments.remove(number);
                 let gone = SegmentName { session, number };
-                self.outbox.push_back((Message::SegmentGone(gone), Vec::new()));
+                self.outbox.push_back((SessionMessage::SegmentGone(gone), Vec::new()));
             }
             SegmentChange::Low(gid) => {
                 self.low.insert(gid);
@@ -55,7 +56,7 @@ impl Control {
             SegmentChange::Wanted(session) => {
                 for number in self.peers.take_wanted(&session) {
                     let need = SegmentName { session, number };
-                    self.outbox.push_back((Message::Need(need), Vec::new()));
+                    self.outbox.push_back((SessionMessage::Need(need), Vec::new()));
                 }
             }
         }

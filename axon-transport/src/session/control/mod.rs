@@ -42,10 +42,10 @@ use crate::{
             socket::{self, SocketError},
         },
         error::SessionError,
-        sides::{Asking, EventSource, PublisherInner, SubscriptionInner},
+        sides::{EventSource, PublisherInner, ServeRequest, SubscriptionInner},
         state::SessionShared,
     },
-    wire::session::{Announce, EndpointRole, Gone, Message},
+    wire::session::{Announce, EndpointRole, Gone, SessionMessage},
 };
 
 /// Packets handled before queued ones are sent: neither direction starves the other.
@@ -64,7 +64,7 @@ pub(in crate::session) struct Control {
     link: Link,
     reconnects: bool,
     peers: Peers,
-    outbox: VecDeque<(Message, Vec<PassedFd>)>,
+    outbox: VecDeque<(SessionMessage, Vec<PassedFd>)>,
     buffer: Vec<u8>,
     /// A whole graph of which parts are still to come.
     building: Option<GraphView>,
@@ -212,7 +212,7 @@ impl Control {
         if !self.is_linked() {
             return;
         }
-        let unmet = self.shared.core.link.take_messages(|m| matches!(m, Message::Unmet(_)));
+        let unmet = self.shared.core.link.take_messages(|m| matches!(m, SessionMessage::Unmet(_)));
         self.outbox.extend(unmet.into_iter().map(|message| (message, Vec::new())));
     }
 
@@ -273,7 +273,7 @@ impl Control {
 
     /// Queues a message for the daemon, behind what it must know of memory that the message may
     /// speak of.
-    fn say(&mut self, message: Message) {
+    fn say(&mut self, message: SessionMessage) {
         self.tell_segments();
         self.outbox.push_back((message, Vec::new()));
     }
@@ -281,7 +281,7 @@ impl Control {
     fn try_again(&mut self) {
         if self.retry.is_some_and(|retry| retry <= Instant::now()) {
             self.retry = None;
-            self.outbox.push_back((Message::Resync, Vec::new()));
+            self.outbox.push_back((SessionMessage::Resync, Vec::new()));
         }
     }
 
@@ -302,7 +302,7 @@ impl Control {
         for outgoing in queued {
             match outgoing {
                 Outgoing::Message(message) => {
-                    if let Message::EndpointGone(Gone { gid }) = *message {
+                    if let SessionMessage::EndpointGone(Gone { gid }) = *message {
                         self.timed = None;
                         gone.push(gid);
                     }
@@ -311,7 +311,7 @@ impl Control {
                 Outgoing::Fence(fence) => {
                     self.tell_segments();
                     if self.segments.are_complete() {
-                        self.outbox.push_back((Message::Fence(fence), Vec::new()));
+                        self.outbox.push_back((SessionMessage::Fence(fence), Vec::new()));
                     } else {
                         fences.insert(fence.writer, Outgoing::Fence(fence));
                     }
@@ -326,7 +326,7 @@ impl Control {
                             ring: publisher.rings.shared().map(|writer| writer.location()),
                             only: None,
                         };
-                        self.say(Message::Endpoint(announce));
+                        self.say(SessionMessage::Endpoint(announce));
                     } else if let Some(subscription) = state.endpoints.subscriptions.get(&gid) {
                         self.note_timed(&EventSource::Subscription(subscription.clone()));
                         let announce = Announce {
@@ -336,11 +336,11 @@ impl Control {
                             ring: None,
                             only: subscription.only,
                         };
-                        self.outbox.push_back((Message::Endpoint(announce), Vec::new()));
+                        self.outbox.push_back((SessionMessage::Endpoint(announce), Vec::new()));
                         if subscription.role == EndpointRole::Relay {
                             let lanes = subscription.lock().lanes();
                             for (writer, lane) in lanes {
-                                let asking = Asking { lane, after: None };
+                                let asking = ServeRequest { lane, after: None };
                                 let attach = self.attach_message(subscription, writer, asking);
                                 self.say(attach);
                             }
@@ -353,7 +353,7 @@ impl Control {
                             ring: None,
                             only: None,
                         };
-                        self.outbox.push_back((Message::Endpoint(announce), Vec::new()));
+                        self.outbox.push_back((SessionMessage::Endpoint(announce), Vec::new()));
                     }
                 }
             }

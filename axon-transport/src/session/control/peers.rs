@@ -14,7 +14,7 @@ use std::{
 use axon_shm::{
     ShmError,
     internal::{
-        Peer, PeerDescriptors, PeerSession, SegmentInfo, SegmentKind, SessionSegment,
+        PeerDescriptors, PeerSession, RingPeer, SegmentInfo, SegmentKind, SessionSegment,
         descriptors::PassedFd,
     },
 };
@@ -162,9 +162,9 @@ impl Peers {
         pair: Pair,
         mut descriptors: Vec<PassedFd>,
         segments: &[Segment],
-    ) -> Result<Peer, PeerError> {
+    ) -> Result<RingPeer, PeerError> {
         if id == self.own.id() {
-            return Ok(Peer::Local(self.own.clone()));
+            return Ok(RingPeer::Local(self.own.clone()));
         }
         let introduced = descriptors.len().saturating_sub(segments.len());
         let maps = descriptors.split_off(introduced);
@@ -184,7 +184,7 @@ impl Peers {
         for (segment, descriptor) in segments.iter().zip(&maps) {
             entry.add(*segment, descriptor);
         }
-        Ok(Peer::Remote(entry.session.clone()))
+        Ok(RingPeer::Remote(entry.session.clone()))
     }
 
     /// The segments of a session that readers miss.

@@ -10,7 +10,7 @@ use std::{
 use crate::{
     ids::{DaemonId, Gid},
     session::daemon::status_text::StatusAnswer,
-    wire::session::{Fence, Gone, Message, StatusPart},
+    wire::session::{Fence, Gone, SessionMessage, StatusPart},
 };
 
 /// Refusals that are kept for a process that is relayed, until it takes them. It is not told of those beyond.
@@ -22,19 +22,19 @@ pub(in crate::session) enum Outgoing {
     /// This endpoint of ours, as it is when the message is sent.
     Announce(Gid),
     /// A message without descriptors.
-    Message(Box<Message>),
+    Message(Box<SessionMessage>),
     /// A question behind all that readers have to be sent.
     Fence(Fence),
 }
 
 impl Outgoing {
-    pub(in crate::session) fn message(message: Message) -> Self {
+    pub(in crate::session) fn message(message: SessionMessage) -> Self {
         Self::Message(Box::new(message))
     }
 
     /// An endpoint of ours is gone.
     pub(in crate::session) fn gone(gid: Gid) -> Self {
-        Self::message(Message::EndpointGone(Gone { gid }))
+        Self::message(SessionMessage::EndpointGone(Gone { gid }))
     }
 }
 
@@ -94,8 +94,8 @@ impl DaemonLink {
     /// Takes the queued messages for which `which` holds, and leaves the rest.
     pub(in crate::session) fn take_messages(
         &self,
-        which: impl Fn(&Message) -> bool,
-    ) -> Vec<Message> {
+        which: impl Fn(&SessionMessage) -> bool,
+    ) -> Vec<SessionMessage> {
         let mut taken = Vec::new();
         let mut state = self.lock();
         for outgoing in mem::take(&mut state.outgoing) {
@@ -201,11 +201,11 @@ mod tests {
     #[test]
     fn only_the_messages_that_are_asked_for_are_taken() {
         let link = DaemonLink::default();
-        let unmet = || Message::Unmet(Unmet { reader: gid(1), writer: gid(2), samples: 3 });
+        let unmet = || SessionMessage::Unmet(Unmet { reader: gid(1), writer: gid(2), samples: 3 });
         link.queue(Outgoing::gone(gid(1)));
         link.queue(Outgoing::message(unmet()));
         link.queue(fence(4));
-        let taken = link.take_messages(|message| matches!(message, Message::Unmet(_)));
+        let taken = link.take_messages(|message| matches!(message, SessionMessage::Unmet(_)));
         assert_eq!(taken, [unmet()]);
         assert_eq!(told(link.take()), told([Outgoing::gone(gid(1)), fence(4)]));
     }

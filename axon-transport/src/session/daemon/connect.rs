@@ -20,7 +20,7 @@ use crate::{
         error::SessionError,
         options::SessionOptions,
     },
-    wire::session::{Hello, Message, PROTOCOL, SessionRole, Welcome},
+    wire::session::{PROTOCOL, SessionHello, SessionMessage, SessionRole, Welcome},
 };
 
 /// How long a daemon may take to come up and answer.
@@ -165,7 +165,7 @@ impl<'a> Caller<'a> {
         } else {
             security_settings(self.config).map_err(SessionError::from)?
         };
-        let hello = Message::Hello(Hello {
+        let hello = SessionMessage::SessionHello(SessionHello {
             protocol: PROTOCOL,
             session: self.id,
             role: self.options.role,
@@ -220,29 +220,31 @@ impl<'a> Caller<'a> {
                 }
             };
             return match received.message {
-                Message::Welcome(welcome) if welcome.protocol == PROTOCOL => {
+                SessionMessage::Welcome(welcome) if welcome.protocol == PROTOCOL => {
                     self.check_range(&welcome, address, pid)?;
                     Ok(Connected { socket, welcome, descriptors: received.descriptors })
                 }
-                Message::Welcome(welcome) => Err(Attempt::Final(SessionError::Refused {
+                SessionMessage::Welcome(welcome) => Err(Attempt::Final(SessionError::Refused {
                     address: address.to_owned(),
                     text: format!("it speaks protocol {}, this {PROTOCOL}", welcome.protocol),
                 })),
-                Message::Refused(refused) if refused.variable.is_empty() => {
+                SessionMessage::SessionRefused(refused) if refused.variable.is_empty() => {
                     let address = address.to_owned();
                     Err(Attempt::Final(SessionError::Refused { address, text: refused.text }))
                 }
-                Message::Refused(refused) if refused.variable == SHM => {
+                SessionMessage::SessionRefused(refused) if refused.variable == SHM => {
                     Err(Attempt::Final(SessionError::NotShared(refused.text)))
                 }
-                Message::Refused(refused) => Err(Attempt::Final(SessionError::Mismatch {
-                    variable: refused.variable,
-                    ours: refused.ours,
-                    theirs: refused.theirs,
-                    address: address.to_owned(),
-                    pid,
-                })),
-                Message::Unknown(_) => continue,
+                SessionMessage::SessionRefused(refused) => {
+                    Err(Attempt::Final(SessionError::Mismatch {
+                        variable: refused.variable,
+                        ours: refused.ours,
+                        theirs: refused.theirs,
+                        address: address.to_owned(),
+                        pid,
+                    }))
+                }
+                SessionMessage::Unknown(_) => continue,
                 other => {
                     let text = format!("{other:?} before WELCOME");
                     Err(Attempt::Final(SessionError::Protocol(text)))
@@ -309,7 +311,7 @@ fn look_into(descriptors: &[PassedFd]) -> Result<(), SessionError> {
 /// What a daemon said that has closed the connection before it was spoken to.
 fn refusal(socket: &OwnedFd, address: &str) -> Option<Attempt> {
     match socket::receive(socket, &mut Vec::new()).ok()?.message {
-        Message::Refused(refused) if refused.variable.is_empty() => {
+        SessionMessage::SessionRefused(refused) if refused.variable.is_empty() => {
             let address = address.to_owned();
             Some(Attempt::Final(SessionError::Refused { address, text: refused.text }))
         }

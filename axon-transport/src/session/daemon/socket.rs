@@ -7,20 +7,20 @@ use std::{
     time::Instant,
 };
 
-use axon_shm::internal::descriptors::{self, Packet, PassedFd};
+use axon_shm::internal::descriptors::{self, PassedFd, SocketPacket};
 use rustix::{
     event::{PollFd, PollFlags, Timespec, poll},
     io::Errno,
     net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, Shutdown, sendmsg, shutdown},
 };
 
-use crate::wire::session::{CodecError, MAX_DESCRIPTORS, MAX_PACKET, Message};
+use crate::wire::session::{CodecError, MAX_DESCRIPTORS, MAX_PACKET, SessionMessage};
 
 /// A message that arrived, and what came with it.
 #[derive(Debug)]
-pub struct Received {
+pub struct ReceivedMessage {
     /// The message.
-    pub message: Message,
+    pub message: SessionMessage,
     /// Its descriptors, close-on-exec.
     pub descriptors: Vec<PassedFd>,
 }
@@ -95,7 +95,7 @@ pub fn send(
 /// # Errors
 /// [`SocketError::NotReady`] when there is none. Every other error is final for the connection, but
 /// for [`SocketError::NoDescriptors`]: the packet is gone, and the next ones may come whole.
-pub fn receive(socket: impl AsFd, buffer: &mut Vec<u8>) -> Result<Received, SocketError> {
+pub fn receive(socket: impl AsFd, buffer: &mut Vec<u8>) -> Result<ReceivedMessage, SocketError> {
     buffer.resize(MAX_PACKET + 1, 0);
     let packet = match descriptors::receive(&socket, buffer) {
         // Said once, before what the other end has sent: it closed without having read all of ours.
@@ -110,7 +110,10 @@ pub fn receive(socket: impl AsFd, buffer: &mut Vec<u8>) -> Result<Received, Sock
 ///
 /// # Errors
 /// As [`receive`]. A packet for whose descriptors there is no room stays where it is.
-pub fn receive_few(socket: impl AsFd, buffer: &mut Vec<u8>) -> Result<Received, SocketError> {
+pub fn receive_few(
+    socket: impl AsFd,
+    buffer: &mut Vec<u8>,
+) -> Result<ReceivedMessage, SocketError> {
     const { assert!(MAX_DESCRIPTORS <= descriptors::FEW) };
     buffer.resize(MAX_PACKET + 1, 0);
     let packet = match descriptors::receive_few(&socket, buffer) {
@@ -124,17 +127,17 @@ pub fn receive_few(socket: impl AsFd, buffer: &mut Vec<u8>) -> Result<Received, 
 ///
 /// # Errors
 /// As [`receive`].
-pub fn look(socket: impl AsFd, buffer: &mut Vec<u8>) -> Result<Message, SocketError> {
+pub fn look(socket: impl AsFd, buffer: &mut Vec<u8>) -> Result<SessionMessage, SocketError> {
     buffer.resize(MAX_PACKET + 1, 0);
     let bytes = descriptors::look(&socket, buffer)?;
     if bytes > MAX_PACKET {
         return Err(SocketError::Truncated);
     }
-    Ok(Message::decode(&buffer[..bytes])?)
+    Ok(SessionMessage::decode(&buffer[..bytes])?)
 }
 
-fn received(packet: Packet, buffer: &[u8]) -> Result<Received, SocketError> {
-    let Packet { bytes, truncated, lost, descriptors } = packet;
+fn received(packet: SocketPacket, buffer: &[u8]) -> Result<ReceivedMessage, SocketError> {
+    let SocketPacket { bytes, truncated, lost, descriptors } = packet;
     if truncated || descriptors.len() > MAX_DESCRIPTORS {
         return Err(SocketError::Truncated);
     }
@@ -144,7 +147,7 @@ fn received(packet: Packet, buffer: &[u8]) -> Result<Received, SocketError> {
     if bytes == 0 {
         return Err(SocketError::Closed);
     }
-    Ok(Received { message: Message::decode(&buffer[..bytes])?, descriptors })
+    Ok(ReceivedMessage { message: SessionMessage::decode(&buffer[..bytes])?, descriptors })
 }
 
 /// Says that nothing more comes, and waits until the other end closes. Whether it had read everything by then; also true
@@ -156,7 +159,7 @@ pub fn finish(socket: impl AsFd, deadline: Instant) -> bool {
     let mut buffer = vec![0; MAX_PACKET + 1];
     loop {
         match descriptors::receive(&socket, &mut buffer) {
-            Ok(Packet { bytes: 0, .. }) => return true,
+            Ok(SocketPacket { bytes: 0, .. }) => return true,
             Ok(_) | Err(Errno::INTR | Errno::AGAIN) => {}
             Err(_) => return false,
         }
@@ -212,9 +215,9 @@ mod tests {
         assert!(matches!(receive(&b, &mut Vec::new()), Err(SocketError::NotReady)));
         let fds = [null(), null()];
         let fds: Vec<BorrowedFd<'_>> = fds.iter().map(AsFd::as_fd).collect();
-        send(&a, &Message::Resync.encode().unwrap(), &fds).unwrap();
+        send(&a, &SessionMessage::Resync.encode().unwrap(), &fds).unwrap();
         let got = receive(&b, &mut Vec::new()).unwrap();
-        assert_eq!(got.message, Message::Resync);
+        assert_eq!(got.message, SessionMessage::Resync);
         assert_eq!(got.descriptors.len(), 2);
         drop(a);
         assert!(matches!(receive(&b, &mut Vec::new()), Err(SocketError::Closed)));
@@ -223,18 +226,18 @@ mod tests {
     #[test]
     fn messages_of_a_closed_peer_are_received_despite_its_unread_ones() {
         let (a, b) = pair();
-        let message = Message::Resync.encode().unwrap();
+        let message = SessionMessage::Resync.encode().unwrap();
         [&b, &a, &a].iter().for_each(|from| send(from, &message, &[]).unwrap());
         drop(a);
         for _ in 0..2 {
-            assert_eq!(receive(&b, &mut Vec::new()).unwrap().message, Message::Resync);
+            assert_eq!(receive(&b, &mut Vec::new()).unwrap().message, SessionMessage::Resync);
         }
         assert!(matches!(receive(&b, &mut Vec::new()), Err(SocketError::Closed)));
     }
 
     #[test]
     fn one_that_finishes_knows_whether_the_other_end_has_read_everything() {
-        let message = Message::Resync.encode().unwrap();
+        let message = SessionMessage::Resync.encode().unwrap();
         let ever = || Instant::now() + std::time::Duration::from_secs(60);
         let (a, b) = pair();
         send(&a, &message, &[]).unwrap();

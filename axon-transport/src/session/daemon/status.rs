@@ -19,7 +19,7 @@ use crate::{
     ids::{DaemonId, SessionId},
     session::{error::SessionError, options::SessionOptions},
     status::{PeerDecisions, ReloadReport},
-    wire::session::{AccessCheck, CheckedUse, Message, SessionRole},
+    wire::session::{AccessCheck, CheckedUse, SessionMessage, SessionRole},
 };
 
 /// How long a daemon may take to answer.
@@ -68,7 +68,7 @@ pub fn daemon_status_at(place: &DaemonPlace) -> Result<String, SessionError> {
     let options = SessionOptions::new("status").role(SessionRole::Tool);
     let connected = Caller::new(&config, &options, SessionId::random()).connect()?;
     let address = Address::of(&config).to_string();
-    status_text(ask(&connected.socket, &Message::StatusRequest, &address, ANSWER)?)
+    status_text(ask(&connected.socket, &SessionMessage::StatusRequest, &address, ANSWER)?)
 }
 
 /// Has the daemon of this user and domain read again those of its settings that may change while it runs: access rules,
@@ -93,7 +93,7 @@ pub fn daemon_reload_at(place: &DaemonPlace) -> Result<ReloadReport, SessionErro
     let options = SessionOptions::new("reload").role(SessionRole::Tool);
     let connected = Caller::new(&config, &options, SessionId::random()).connect()?;
     let address = Address::of(&config).to_string();
-    let text = status_text(ask(&connected.socket, &Message::Reload, &address, ANSWER)?)?;
+    let text = status_text(ask(&connected.socket, &SessionMessage::Reload, &address, ANSWER)?)?;
     serde_json::from_str(&text).map_err(|e| SessionError::Protocol(format!("reload: {e}")))
 }
 
@@ -134,7 +134,7 @@ pub fn daemon_check_access_at(
     let connected = Caller::new(&config, &options, SessionId::random()).connect()?;
     let address = Address::of(&config).to_string();
     let uses = uses.iter().map(|(verb, name)| CheckedUse { verb: *verb as u8, name: name.clone() });
-    let question = Message::AccessCheck(AccessCheck { daemon, uses: uses.collect() });
+    let question = SessionMessage::AccessCheck(AccessCheck { daemon, uses: uses.collect() });
     let text = status_text(ask(&connected.socket, &question, &address, PEER_ANSWER)?)?;
     serde_json::from_str(&text).map_err(|e| SessionError::Protocol(format!("access check: {e}")))
 }
@@ -147,7 +147,7 @@ pub(in crate::session) fn status_text(bytes: Vec<u8>) -> Result<String, SessionE
 /// The text that answers a question.
 fn ask(
     socket: &OwnedFd,
-    question: &Message,
+    question: &SessionMessage,
     address: &str,
     patience: Duration,
 ) -> Result<Vec<u8>, SessionError> {
@@ -159,7 +159,7 @@ fn ask(
     loop {
         match socket::receive(socket, &mut buffer) {
             Ok(received) => {
-                if let Message::Status(part) = received.message
+                if let SessionMessage::Status(part) = received.message
                     && let Some(whole) = text.add(&part)
                 {
                     return Ok(whole);

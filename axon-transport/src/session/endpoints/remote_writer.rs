@@ -11,7 +11,7 @@ use crate::{
     ids::Gid,
     qos::Qos,
     session::{core::Outgoing, error::SessionError, handle::Session},
-    wire::session::{EndpointRole, Leaving, Message},
+    wire::session::{EndpointRole, SessionMessage, WriterLeaving},
 };
 
 /// What stands for it here. Of a service it reads, too: a client's is given the responses that go to
@@ -116,8 +116,8 @@ impl RemoteWriter {
             Self::Client(client) => &client.session,
             Self::Server(server) => &server.session,
         };
-        let leaving = Leaving { gid: self.endpoint().gid, leaving };
-        session.core().tell(Outgoing::message(Message::Leaving(leaving)));
+        let leaving = WriterLeaving { gid: self.endpoint().gid, leaving };
+        session.core().tell(Outgoing::message(SessionMessage::WriterLeaving(leaving)));
     }
 
     /// Writes a sample, a request, or a response to `client`, without waiting for room.

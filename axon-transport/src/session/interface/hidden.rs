@@ -27,7 +27,7 @@ use crate::{
         options::{EndpointSpec, SessionOptions},
         sides::{Lifetime, MessageInfo, SubscriptionInner, TakeLimit},
     },
-    wire::session::{EndpointRole, GivenUp, Message, SessionRole},
+    wire::session::{EndpointRole, RelayGivenUp, SessionMessage, SessionRole},
 };
 
 #[doc(hidden)]
@@ -260,8 +260,8 @@ impl Subscription {
         // The publisher sees it before it sees that they are acknowledged. Its process is told besides: it
         // may be of an older version, and the publisher may wait for acknowledgements.
         self.inner.lock().give_up_of(&writer, samples);
-        let given_up = GivenUp { reader: self.gid(), writer, samples };
-        self.session.core().tell(Outgoing::message(Message::GivenUp(given_up)));
+        let given_up = RelayGivenUp { reader: self.gid(), writer, samples };
+        self.session.core().tell(Outgoing::message(SessionMessage::RelayGivenUp(given_up)));
     }
 
     /// For a relay: the next sample of one publisher, as bytes.

@@ -17,7 +17,7 @@ use crate::{
         error::SessionError,
         handle::Session,
     },
-    wire::session::Message,
+    wire::session::SessionMessage,
 };
 
 impl Session {
@@ -40,7 +40,7 @@ impl Session {
         if !core.link.ask_status() {
             return Err(SessionError::Disconnected);
         }
-        core.tell(Outgoing::message(Message::StatusRequest));
+        core.tell(Outgoing::message(SessionMessage::StatusRequest));
         shared.wait_changed(ANSWER, || !core.link.awaits_status());
         match core.link.take_status() {
             StatusAnswer::Whole(bytes) => status_text(bytes),

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use axon_shm::Sample;
 
 use super::{
-    flow::{Channel, Content, OutboundSample, Payload},
+    flow::{FlowChannel, OutboundSample, SampleContent, SamplePayload},
     unanswered::Unanswered,
 };
 use crate::{
@@ -19,14 +19,14 @@ use crate::{
 
 /// The channels to the other end that a relay's clients and servers call for, and how far they have got.
 #[derive(Default)]
-pub struct Calls {
+pub struct CallChannels {
     /// The requests of each client that is on this side, by way of the servers here.
     requests: BTreeMap<Gid, Merge<Sample>>,
     /// The number up to which the other end has them, where it says so.
     done: BTreeMap<Gid, u64>,
 }
 
-impl Calls {
+impl CallChannels {
     /// From now on these are the pairs of client and server by way of whose servers requests are taken.
     pub fn set(&mut self, pairs: impl Iterator<Item = (Gid, Gid)>) {
         let mut servers: BTreeMap<Gid, Vec<Gid>> = BTreeMap::new();
@@ -45,7 +45,7 @@ impl Calls {
         &mut self,
         client: &Gid,
         find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,
-    ) -> Option<OutboundSample<Payload>> {
+    ) -> Option<OutboundSample<SamplePayload>> {
         let requests = self.requests.get_mut(client)?;
         // Each server reads all requests, from the same memory: none is ahead of the others.
         let next = requests.next(|server| find(server)?.take_from(client).map(taken), |_| false);
@@ -59,7 +59,7 @@ impl Calls {
         client: &Gid,
         unanswered: &mut Unanswered,
         find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,
-    ) -> Option<OutboundSample<Payload>> {
+    ) -> Option<OutboundSample<SamplePayload>> {
         if let Some(again) = unanswered.next_due(client) {
             return Some(again);
         }
@@ -118,9 +118,9 @@ fn finish<'a>(
 
 /// The next response on `channel`; `client` finds the one that it is for.
 pub fn response<'a>(
-    channel: &Channel,
+    channel: &FlowChannel,
     find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,
-) -> Option<OutboundSample<Payload>> {
+) -> Option<OutboundSample<SamplePayload>> {
     let client = find(&channel.client?)?;
     client.take_from(&channel.writer).map(taken).map(OutboundSample::from)
 }

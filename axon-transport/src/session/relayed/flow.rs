@@ -1,10 +1,10 @@
 //! Splits samples into pieces and controls their flow: plain data in, data out.
 //!
-//! There is a [`Channel`] for each publisher whose samples cross, for each client's requests, and for the
+//! There is a [`FlowChannel`] for each publisher whose samples cross, for each client's requests, and for the
 //! responses of each server to each client. The receiver of a channel grants the sender a number of bytes in
 //! flight. It gives the credit back when the samples have reached their destination. Samples of a channel that
 //! nobody reads stay in their source ring, where the publisher's QoS applies; such a channel delays others only
-//! through long samples ([`Incoming::grants`]). Pieces of all channels take turns, so that an image does not delay
+//! through long samples ([`IncomingFlow::grants`]). Pieces of all channels take turns, so that an image does not delay
 //! a small sample.
 
 mod incoming;
@@ -17,8 +17,8 @@ use std::sync::Arc;
 use axon_shm::{Meta, Sample};
 
 pub use self::{
-    incoming::{InboundSample, Incoming, Pool, Violation},
-    outgoing::Outgoing,
+    incoming::{ArrivalPool, FlowViolation, InboundSample, IncomingFlow},
+    outgoing::OutgoingFlow,
 };
 use crate::{ids::Gid, session::merge::Taken, wire::session::Credit};
 
@@ -31,14 +31,14 @@ pub const PIECE: usize = 31 << 10;
 
 /// Samples that follow each other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct Channel {
+pub struct FlowChannel {
     /// Who wrote them.
     pub writer: Gid,
     /// The one whose responses they are, where a server did.
     pub client: Option<Gid>,
 }
 
-impl Channel {
+impl FlowChannel {
     /// That of a publisher's samples, or a client's requests.
     pub fn of(writer: Gid) -> Self {
         Self { writer, client: None }
@@ -60,7 +60,7 @@ impl Channel {
 }
 
 /// A sample's bytes.
-pub trait Content {
+pub trait SampleContent {
     /// How many there are.
     fn len(&self) -> usize;
     /// Whether there are none.
@@ -71,7 +71,7 @@ pub trait Content {
     fn read_at(&self, at: usize, out: &mut [u8]) -> usize;
 }
 
-impl Content for Vec<u8> {
+impl SampleContent for Vec<u8> {
     fn len(&self) -> usize {
         self.len()
     }
@@ -83,14 +83,14 @@ impl Content for Vec<u8> {
 
 /// The bytes of a sample that goes.
 #[derive(Debug)]
-pub enum Payload {
+pub enum SamplePayload {
     /// They stay in the ring.
     Ring(Sample),
     /// They are kept, to be sent again.
     Kept(Arc<[u8]>),
 }
 
-impl Content for Payload {
+impl SampleContent for SamplePayload {
     fn len(&self) -> usize {
         match self {
             Self::Ring(sample) => sample.len(),
@@ -123,8 +123,8 @@ pub struct OutboundSample<S> {
     pub content: S,
 }
 
-impl From<Taken<Sample>> for OutboundSample<Payload> {
+impl From<Taken<Sample>> for OutboundSample<SamplePayload> {
     fn from(Taken { lost, content, .. }: Taken<Sample>) -> Self {
-        Self { meta: content.meta(), lost, content: Payload::Ring(content) }
+        Self { meta: content.meta(), lost, content: SamplePayload::Ring(content) }
     }
 }

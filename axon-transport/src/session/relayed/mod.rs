@@ -19,7 +19,7 @@ pub mod pipe;
 mod response_log;
 mod unanswered;
 
-pub use self::flow::Pool;
+pub use self::flow::ArrivalPool;
 pub use super::core::ChangeSignal;
 
 /// Relayed sessions of one daemon: each costs it two threads and memory of its own.

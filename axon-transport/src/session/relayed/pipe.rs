@@ -18,7 +18,8 @@ use rustix::{
 
 use super::{
     flow::{
-        Channel, Content, InboundSample, Incoming, OutboundSample, Outgoing, Payload, Violation,
+        FlowChannel, FlowViolation, InboundSample, IncomingFlow, OutboundSample, OutgoingFlow,
+        SampleContent, SamplePayload,
     },
     response_log::ResponseLog,
 };
@@ -29,10 +30,10 @@ use crate::{
     session::{
         clock,
         core::ChangeSignal,
-        daemon::socket::{self, Received, SocketError},
+        daemon::socket::{self, ReceivedMessage, SocketError},
         endpoints::{RemoteWriter, Written},
     },
-    wire::session::{Credit, Message},
+    wire::session::{Credit, SessionMessage},
 };
 
 /// Bytes of control messages that may wait for an end that does not read.
@@ -51,7 +52,7 @@ pub enum End {
     Socket(#[from] SocketError),
     /// The other end broke the protocol of pieces and credit.
     #[error("the other end sent {0}")]
-    Violation(#[from] Violation),
+    Violation(#[from] FlowViolation),
     /// The other end sent descriptors, which no message of a relay has.
     #[error("the other end sent descriptors")]
     Descriptors,
@@ -116,18 +117,18 @@ pub struct Pipe {
     waiting: VecDeque<Vec<u8>>,
     waiting_bytes: usize,
     /// Samples on their way to the other end.
-    pub outgoing: Outgoing<Payload>,
-    pub(crate) incoming: Incoming,
+    pub outgoing: OutgoingFlow<SamplePayload>,
+    pub(crate) incoming: IncomingFlow,
     /// Samples that came and are not published yet.
-    arrived: BTreeMap<Channel, VecDeque<InboundSample>>,
+    arrived: BTreeMap<FlowChannel, VecDeque<InboundSample>>,
     /// Channels of which a sample was written, or is to be, each with the highest number that came.
-    begun: BTreeMap<Channel, u64>,
+    begun: BTreeMap<FlowChannel, u64>,
     /// Whether one of them waits for a reader.
     blocked: bool,
     /// Channels whose samples are written and not all handed over.
-    written: BTreeMap<Channel, Unacknowledged>,
+    written: BTreeMap<FlowChannel, Unacknowledged>,
     /// The same of responses: the number of each, in the order in which they came.
-    undelivered: BTreeMap<Channel, VecDeque<u64>>,
+    undelivered: BTreeMap<FlowChannel, VecDeque<u64>>,
     /// Responses that were written, of which a copy may come through the next daemon.
     pub(crate) response_log: Option<ResponseLog>,
     /// MATCHED that this end has said, and those that it has heard: by these both ends tell a channel
@@ -144,13 +145,13 @@ pub struct Pipe {
 
 impl Pipe {
     /// An end that has said and heard nothing.
-    pub fn new(socket: PassedFd, incoming: Incoming, tally: Arc<RelayCounters>) -> Self {
+    pub fn new(socket: PassedFd, incoming: IncomingFlow, tally: Arc<RelayCounters>) -> Self {
         Self {
             socket,
             buffer: Vec::new(),
             waiting: VecDeque::new(),
             waiting_bytes: 0,
-            outgoing: Outgoing::default(),
+            outgoing: OutgoingFlow::default(),
             incoming,
             arrived: BTreeMap::new(),
             begun: BTreeMap::new(),
@@ -168,14 +169,14 @@ impl Pipe {
     }
 
     /// Queues a control message.
-    pub fn say(&mut self, message: &Message) -> Result<(), End> {
+    pub fn say(&mut self, message: &SessionMessage) -> Result<(), End> {
         if self.gone {
             return Ok(());
         }
         let packet = message.encode().map_err(|e| End::Other(e.to_string()))?;
         self.waiting_bytes += packet.len();
         self.waiting.push_back(packet);
-        self.said += u64::from(matches!(message, Message::Matched(_)));
+        self.said += u64::from(matches!(message, SessionMessage::RelayMatched(_)));
         if self.waiting_bytes > MAX_WAITING { Err(End::Deaf) } else { Ok(()) }
     }
 
@@ -185,20 +186,20 @@ impl Pipe {
     }
 
     /// Opens a channel for samples that go, once the MATCHED is said by which the other end knows.
-    pub fn open_out(&mut self, channel: Channel) {
+    pub fn open_out(&mut self, channel: FlowChannel) {
         self.outgoing.open(channel, self.said);
     }
 
     /// Opens a channel for samples that come.
-    pub fn open_in(&mut self, channel: Channel) -> Result<(), End> {
+    pub fn open_in(&mut self, channel: FlowChannel) -> Result<(), End> {
         match self.incoming.open(channel, self.heard) {
-            Some(credit) => self.say(&Message::Credit(credit)),
+            Some(credit) => self.say(&SessionMessage::Credit(credit)),
             None => Ok(()),
         }
     }
 
     /// Closes those that `keep` does not want.
-    pub fn retain(&mut self, keep: impl Fn(&Channel) -> bool) {
+    pub fn retain(&mut self, keep: impl Fn(&FlowChannel) -> bool) {
         self.incoming.retain(&keep);
         self.arrived.retain(|channel, _| keep(channel));
         self.written.retain(|channel, _| keep(channel));
@@ -243,11 +244,11 @@ impl Pipe {
     }
 
     /// Takes packets; the messages among them that are not of samples, and whether there may be more.
-    pub fn receive(&mut self) -> Result<(Vec<Message>, bool), End> {
+    pub fn receive(&mut self) -> Result<(Vec<SessionMessage>, bool), End> {
         let mut messages = Vec::new();
         for _ in 0..BATCH {
             let message = match socket::receive(&self.socket, &mut self.buffer) {
-                Ok(Received { message, descriptors }) if descriptors.is_empty() => message,
+                Ok(ReceivedMessage { message, descriptors }) if descriptors.is_empty() => message,
                 Ok(_) => return Err(End::Descriptors),
                 Err(SocketError::NotReady) => return Ok((messages, false)),
                 Err(SocketError::Closed) => {
@@ -258,13 +259,13 @@ impl Pipe {
                 Err(error) => return Err(error.into()),
             };
             match message {
-                Message::SampleFragment(piece) => {
+                SessionMessage::SampleFragment(piece) => {
                     if let Some(sample) = self.incoming.piece(piece)? {
                         self.arrived.entry(sample.channel).or_default().push_back(sample);
                     }
                 }
                 other => {
-                    self.heard += u64::from(matches!(other, Message::Matched(_)));
+                    self.heard += u64::from(matches!(other, SessionMessage::RelayMatched(_)));
                     messages.push(other);
                 }
             }
@@ -282,7 +283,7 @@ impl Pipe {
         self.blocked = false;
         let mut credits = Vec::new();
         for (channel, samples) in &mut self.arrived {
-            let Channel { writer: gid, client } = channel;
+            let FlowChannel { writer: gid, client } = channel;
             while let Some(sample) = samples.front_mut() {
                 let Some(remote_writer) = find(gid) else { break };
                 let number = sample.meta.sequence;
@@ -367,23 +368,23 @@ impl Pipe {
 
     /// Tells the other end what it is given back, and which of its samples are where they are to go.
     pub fn give_back(&mut self, credits: Vec<Credit>) -> Result<(), End> {
-        credits.into_iter().try_for_each(|credit| self.say(&Message::Credit(credit)))
+        credits.into_iter().try_for_each(|credit| self.say(&SessionMessage::Credit(credit)))
     }
 
     /// Sends what there is, as far as the socket has room: what `take` has of each channel that may
     /// send. Whether anything was sent.
     pub fn send(
         &mut self,
-        mut take: impl FnMut(&Channel) -> Option<OutboundSample<Payload>>,
+        mut take: impl FnMut(&FlowChannel) -> Option<OutboundSample<SamplePayload>>,
     ) -> Result<bool, End> {
         if self.gone {
             return Ok(false);
         }
         for credit in self.incoming.grants() {
-            self.say(&Message::Credit(credit))?;
+            self.say(&SessionMessage::Credit(credit))?;
         }
         let tally = Arc::clone(&self.tally);
-        let mut take = |channel: &Channel| {
+        let mut take = |channel: &FlowChannel| {
             take(channel).inspect(|sample| tally.departed(sample.content.len()))
         };
         self.outgoing.fill(&mut take);
@@ -395,7 +396,7 @@ impl Pipe {
                     self.outgoing.next_piece()
                 });
                 let Some(piece) = piece else { break };
-                self.say(&Message::SampleFragment(piece))?;
+                self.say(&SessionMessage::SampleFragment(piece))?;
             }
             let Some(packet) = self.waiting.front() else { break };
             match socket::send(&self.socket, packet, &[]) {

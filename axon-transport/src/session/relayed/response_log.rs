@@ -4,14 +4,14 @@ use std::collections::{BTreeSet, VecDeque};
 
 use axon_shm::Meta;
 
-use super::flow::Channel;
+use super::flow::FlowChannel;
 
 /// Responses that are remembered. A server that was not told of more than these before its daemon ended sends one of
 /// them once more.
 const MAX_RESPONSES: usize = 4096;
 
 /// A response: a server that answers a request twice does so at two times.
-type Response = (Channel, u64, i64);
+type Response = (FlowChannel, u64, i64);
 
 /// The last responses that came.
 #[derive(Debug, Default)]
@@ -21,18 +21,18 @@ pub(crate) struct ResponseLog {
     order: VecDeque<Response>,
 }
 
-fn response(channel: &Channel, meta: &Meta) -> Response {
+fn response(channel: &FlowChannel, meta: &Meta) -> Response {
     (*channel, meta.sequence, meta.source_timestamp)
 }
 
 impl ResponseLog {
     /// Whether it came before.
-    pub(super) fn has(&self, channel: &Channel, meta: &Meta) -> bool {
+    pub(super) fn has(&self, channel: &FlowChannel, meta: &Meta) -> bool {
         channel.client.is_some() && self.known.contains(&response(channel, meta))
     }
 
     /// It came.
-    pub(super) fn add(&mut self, channel: &Channel, meta: &Meta) {
+    pub(super) fn add(&mut self, channel: &FlowChannel, meta: &Meta) {
         let response = response(channel, meta);
         if channel.client.is_none() || !self.known.insert(response) {
             return;
@@ -55,21 +55,21 @@ mod tests {
     fn response_that_came_is_known_and_another_one_to_the_same_request_is_not() {
         let mut log = ResponseLog::default();
         let [server, client, other] = [1, 2, 3].map(|byte| Gid([byte; 16]));
-        let channel = Channel::between(server, client);
+        let channel = FlowChannel::between(server, client);
         let of = Meta::at_nanos;
         log.add(&channel, &of(7, 100));
         assert!(log.has(&channel, &of(7, 100)));
         assert!(!log.has(&channel, &of(7, 101)) && !log.has(&channel, &of(8, 100)));
-        assert!(!log.has(&Channel::between(server, other), &of(7, 100)));
+        assert!(!log.has(&FlowChannel::between(server, other), &of(7, 100)));
         // A topic's samples have numbers of their own.
-        log.add(&Channel::of(server), &of(9, 100));
-        assert!(!log.has(&Channel::of(server), &of(9, 100)));
+        log.add(&FlowChannel::of(server), &of(9, 100));
+        assert!(!log.has(&FlowChannel::of(server), &of(9, 100)));
     }
 
     #[test]
     fn no_more_than_the_last_ones_are_remembered() {
         let mut log = ResponseLog::default();
-        let channel = Channel::between(Gid([1; 16]), Gid([2; 16]));
+        let channel = FlowChannel::between(Gid([1; 16]), Gid([2; 16]));
         for number in 0..=MAX_RESPONSES as u64 {
             log.add(&channel, &Meta::at_nanos(number, 5));
             log.add(&channel, &Meta::at_nanos(number, 5));

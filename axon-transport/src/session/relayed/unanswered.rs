@@ -9,7 +9,7 @@ use std::{
 
 use axon_shm::Meta;
 
-use super::flow::{OutboundSample, Payload};
+use super::flow::{OutboundSample, SamplePayload};
 use crate::ids::Gid;
 
 /// Requests that are kept.
@@ -78,10 +78,10 @@ impl Unanswered {
     }
 
     /// The next request of `client` that is to be sent again.
-    pub(crate) fn next_due(&mut self, client: &Gid) -> Option<OutboundSample<Payload>> {
+    pub(crate) fn next_due(&mut self, client: &Gid) -> Option<OutboundSample<SamplePayload>> {
         let request = self.of(client).find(|request| request.due)?;
         request.due = false;
-        let content = Payload::Kept(Arc::clone(&request.payload));
+        let content = SamplePayload::Kept(Arc::clone(&request.payload));
         Some(OutboundSample { meta: request.meta, lost: 0, content })
     }
 

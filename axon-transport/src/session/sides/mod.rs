@@ -17,7 +17,7 @@ pub(in crate::session) use self::{
     publisher::PublisherInner,
     rings::{ClientLimit, Rings, RingsByClient},
     source::EventSource,
-    subscription::{Accept, Asking, Numbers, SubscriptionInner},
+    subscription::{Accept, NumberKind, ServeRequest, SubscriptionInner},
 };
 pub use self::{
     callback::OnNew,

@@ -30,7 +30,7 @@ use crate::{
     config::Config,
     graph::Endpoint,
     ids::{DaemonId, Gid},
-    wire::session::{Message, Unmet},
+    wire::session::{SessionMessage, Unmet},
 };
 
 /// A session: its [core](SessionCore), and the endpoints and the graph that the core knows nothing of.
@@ -92,7 +92,7 @@ impl SessionState {
         for (reader, samples) in publisher.unmet() {
             let unmet = Unmet { reader, writer, samples };
             self.unmet.remember(unmet);
-            link.queue(Outgoing::message(Message::Unmet(unmet)));
+            link.queue(Outgoing::message(SessionMessage::Unmet(unmet)));
         }
     }
 }

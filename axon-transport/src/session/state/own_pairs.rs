@@ -13,7 +13,7 @@ use std::{
 
 use axon_shm::{
     ShmError,
-    internal::{Peer, ReaderInfo, Terms},
+    internal::{ReaderInfo, RingPeer, Terms},
 };
 
 use super::SessionShared;
@@ -22,7 +22,7 @@ use crate::{
     ids::Gid,
     session::{
         core::Outgoing,
-        sides::{Accept, EventSource, Numbers, PublisherInner, SubscriptionInner},
+        sides::{Accept, EventSource, NumberKind, PublisherInner, SubscriptionInner},
     },
     wire::session::EndpointRole,
 };
@@ -82,7 +82,7 @@ impl SessionShared {
 
     fn join(&self, writer: &PublisherInner, reader: &SubscriptionInner) -> Result<(), ShmError> {
         let (from, gid, peer) =
-            (writer.endpoint.gid, reader.endpoint.gid, Peer::Local(self.core.segment.clone()));
+            (writer.endpoint.gid, reader.endpoint.gid, RingPeer::Local(self.core.segment.clone()));
         // All of it under one lock: between two parts, the control thread would ask by another lane.
         let mut matched_readers = reader.lock();
         let lane = matched_readers.lane_for(from, || self.core.segment.allocate_lane())?.lane;
@@ -91,7 +91,7 @@ impl SessionShared {
         if let Accept::Map(lane) = matched_readers.accept(from, grant) {
             let max_message = self.core.config.max_message;
             let mapped = reader.map(from, peer, ring, lane, grant, max_message)?;
-            matched_readers.add(mapped, Some(after), Numbers::None);
+            matched_readers.add(mapped, Some(after), NumberKind::None);
         }
         Ok(())
     }

@@ -36,10 +36,10 @@ impl Stage {
         let socket = accept_with(&self.listener, flags).unwrap();
         let (hello, descriptors) = loop {
             match hear(&socket) {
-                Received { message: Message::Hello(hello), descriptors } => {
+                ReceivedMessage { message: SessionMessage::SessionHello(hello), descriptors } => {
                     break (hello, descriptors);
                 }
-                Received { message: Message::Unknown(OWNER), .. } => {}
+                ReceivedMessage { message: SessionMessage::Unknown(OWNER), .. } => {}
                 other => panic!("before HELLO: {:?}", other.message),
             }
         };
@@ -52,7 +52,7 @@ impl Stage {
             pid: std::process::id(),
             ranges: Some(true),
         };
-        daemon.say(Message::Welcome(welcome), &[probe().unwrap().as_fd()]);
+        daemon.say(SessionMessage::Welcome(welcome), &[probe().unwrap().as_fd()]);
         daemon.tell_all(Vec::new());
         daemon
     }
@@ -68,9 +68,9 @@ impl Stage {
 /// Waits until the session has done what it was told: it asks for a pair that it is told of last.
 pub(super) fn done(daemon: &Daemon, asking: &Subscription) {
     let writer = Gid::new(SessionId::random(), 1);
-    daemon.say(Message::Match(Pair { reader: asking.gid(), writer }), &[]);
+    daemon.say(SessionMessage::Match(Pair { reader: asking.gid(), writer }), &[]);
     daemon.hear(|message| {
-        matches!(message, Message::Attach(attach) if attach.writer == writer).then_some(())
+        matches!(message, SessionMessage::Attach(attach) if attach.writer == writer).then_some(())
     });
 }
 
@@ -104,7 +104,7 @@ fn a_pair_stands_though_a_new_daemon_that_tells_all_again_does_not_know_of_it_ye
 
     // What it told of itself, and does not repeat, is over.
     let Pair { reader, writer } = far.pair(&subscription);
-    daemon.say(Message::Match(Pair { reader, writer }), &[]);
+    daemon.say(SessionMessage::Match(Pair { reader, writer }), &[]);
     daemon.hear_attach();
     daemon.tell_all(Vec::new());
     done(&daemon, &subscription);
@@ -119,17 +119,17 @@ fn a_reader_that_is_attached_anew_goes_on_where_it_was_and_counts_what_is_missin
     let pair = far.pair(&subscription);
     let lose = || {
         let Pair { reader, writer } = pair;
-        daemon.say(Message::Unmatch(Unmatch { reader, writer, reason: "lost".into() }), &[]);
+        daemon.say(SessionMessage::Unmatch(Unmatch { reader, writer, reason: "lost".into() }), &[]);
         until("it is over", || subscription.matched().is_empty());
     };
     let attach_after = |number| {
-        daemon.say(Message::Match(pair), &[]);
+        daemon.say(SessionMessage::Match(pair), &[]);
         let attach = daemon.hear_attach();
         assert_eq!(attach.after, Some(number));
         let granted = far.grant(&attach);
         let introduction = far.introduction();
         let introduction: Vec<_> = introduction.iter().map(AsFd::as_fd).collect();
-        daemon.say(Message::Grant(granted), &introduction);
+        daemon.say(SessionMessage::Grant(granted), &introduction);
         assert!(subscription.wait_matched(1, EVER));
     };
     far.publish(1, b"x");
@@ -175,7 +175,7 @@ fn a_grant_is_lost(session_ends: bool) {
     };
     let daemon = stage.daemon(2);
     daemon.hear(|message| {
-        matches!(message, Message::Endpoint(announce) if announce.endpoint.gid == endpoint.gid)
+        matches!(message, SessionMessage::Endpoint(announce) if announce.endpoint.gid == endpoint.gid)
             .then_some(())
     });
     let again = taker.ask(&endpoint, lane.location(), None, &daemon);

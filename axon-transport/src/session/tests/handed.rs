@@ -9,11 +9,11 @@ use crate::wire::session::Fence;
 fn hear_fence(daemon: &Daemon) -> (Fence, bool) {
     let mut told = false;
     let fence = daemon.hear(|message| match message {
-        Message::Segment(_) => {
+        SessionMessage::Segment(_) => {
             told = true;
             None
         }
-        Message::Fence(fence) => Some(fence),
+        SessionMessage::Fence(fence) => Some(fence),
         _ => None,
     });
     (fence, told)
@@ -30,19 +30,19 @@ fn a_sample_is_handed_over_when_its_reader_was_sent_the_memory_that_it_is_in() {
     assert_eq!(publisher.delivered_up_to(), 0, "its grant may not have been sent");
     let (granted, _) = hear_fence(&daemon);
     assert_eq!(granted.writer, publisher.gid());
-    daemon.say(Message::Fence(granted), &[]);
+    daemon.say(SessionMessage::Fence(granted), &[]);
     until("it was", || publisher.delivered_up_to() == 1);
 
     publisher.publish(&[1; LARGE]).unwrap();
     assert_eq!(publisher.delivered_up_to(), 1);
     let (opened, told) = hear_fence(&daemon);
     assert!(told && opened.number > granted.number);
-    daemon.say(Message::Fence(granted), &[]);
+    daemon.say(SessionMessage::Fence(granted), &[]);
     // An answer wakes those who wait for room, and they ask once more.
     publisher.publish(b"small").unwrap();
     thread::sleep(Duration::from_millis(20));
     assert_eq!(publisher.delivered_up_to(), 1, "that was an answer to something else");
-    daemon.say(Message::Fence(opened), &[]);
+    daemon.say(SessionMessage::Fence(opened), &[]);
     until("both were", || publisher.delivered_up_to() == 3);
     // Its memory is known by now.
     publisher.publish(&[2; LARGE / 2]).unwrap();
@@ -61,11 +61,11 @@ fn a_question_counts_for_what_it_was_asked_though_more_is_to_be_sent_since() {
     let _second = Taker::new().attach(&publisher, None, &daemon);
     publisher.publish(b"x").unwrap();
     assert_eq!(publisher.delivered_up_to(), 0, "the grant of the second may not have been sent");
-    daemon.say(Message::Fence(asked), &[]);
+    daemon.say(SessionMessage::Fence(asked), &[]);
     until("the first sample was", || publisher.delivered_up_to() == 1);
     let (again, _) = hear_fence(&daemon);
     assert!(again.number > asked.number);
-    daemon.say(Message::Fence(again), &[]);
+    daemon.say(SessionMessage::Fence(again), &[]);
     until("the second was", || publisher.delivered_up_to() == 2);
     // A daemon that tells everything anew may have dropped its answer.
     publisher.publish(&[1; LARGE]).unwrap();
@@ -75,7 +75,7 @@ fn a_question_counts_for_what_it_was_asked_though_more_is_to_be_sent_since() {
     until("it is asked once more", || {
         let _ = publisher.delivered_up_to();
         let heard = socket::receive(&daemon.socket, &mut Vec::new());
-        heard.is_ok_and(|heard| matches!(heard.message, Message::Fence(_)))
+        heard.is_ok_and(|heard| matches!(heard.message, SessionMessage::Fence(_)))
     });
 }
 
@@ -105,17 +105,17 @@ impl Drop for Process {
 fn stands_in(id: SessionId, daemon: &Daemon, process: &Process) -> (Far, Vec<OwnedFd>) {
     let session = SessionSegment::create(id).unwrap();
     let view = PeerSession::map(daemon.id, daemon.handed.try_clone().unwrap()).unwrap();
-    let far = Far::with(1, session, Peer::Remote(view));
+    let far = Far::with(1, session, RingPeer::Remote(view));
     let mut introduction = far.introduction();
     introduction[2] = process.descriptor();
     (far, introduction)
 }
 
 fn grant(far: &Far, introduction: &[OwnedFd], subscription: &Subscription, daemon: &Daemon) {
-    daemon.say(Message::Match(far.pair(subscription)), &[]);
+    daemon.say(SessionMessage::Match(far.pair(subscription)), &[]);
     let granted = Granted { relayed: Some(true), ..far.grant(&daemon.hear_attach()) };
     let introduction: Vec<_> = introduction.iter().map(AsFd::as_fd).collect();
-    daemon.say(Message::Grant(granted), &introduction);
+    daemon.say(SessionMessage::Grant(granted), &introduction);
 }
 
 #[test]

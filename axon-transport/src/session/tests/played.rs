@@ -9,7 +9,7 @@ use super::*;
 use crate::{
     graph::{Endpoint, EndpointKind},
     session::control::arrivals,
-    wire::session::{GivenUp, GraphItem},
+    wire::session::{GraphItem, RelayGivenUp},
 };
 
 /// What is read, and the session that it is of as the reader has it.
@@ -23,10 +23,11 @@ impl Taking {
     pub(super) fn take(&mut self, daemon: &Daemon) -> u64 {
         let mut taken = None;
         until("a sample", || {
-            while let Ok(Received { message, descriptors }) =
+            while let Ok(ReceivedMessage { message, descriptors }) =
                 socket::receive(&daemon.socket, &mut Vec::new())
             {
-                if let (Message::Segment(opened), [descriptor]) = (message, &descriptors[..]) {
+                if let (SessionMessage::Segment(opened), [descriptor]) = (message, &descriptors[..])
+                {
                     self.view.add_segment(opened.segment.into(), descriptor).unwrap();
                 }
             }
@@ -83,9 +84,9 @@ impl Taker {
         };
         let PeerDescriptors { segment, doorbell, pidfd } = self.session.descriptors().unwrap();
         let descriptors = [segment.as_fd(), doorbell.as_fd(), pidfd.as_fd()];
-        daemon.say(Message::Attach(attach), &descriptors);
+        daemon.say(SessionMessage::Attach(attach), &descriptors);
         daemon.hear(|message| match message {
-            Message::Grant(granted) => Some(granted),
+            SessionMessage::Grant(granted) => Some(granted),
             _ => None,
         })
     }
@@ -103,7 +104,7 @@ impl Taker {
         let mut reader = Reader::map(ReaderOptions {
             reader: self.gid,
             writer: of.gid,
-            peer: Peer::Remote(view.clone()),
+            peer: RingPeer::Remote(view.clone()),
             ring,
             lane,
             grant: Grant { generation, first },
@@ -172,30 +173,36 @@ impl Relayed {
 
     /// The daemon says that the relay gave up so many samples.
     fn gives_up(&self, samples: u64) {
-        let given_up = GivenUp { reader: self.relay, writer: self.publisher.gid(), samples };
-        self.daemon.say(Message::GivenUp(given_up), &[]);
+        let given_up = RelayGivenUp { reader: self.relay, writer: self.publisher.gid(), samples };
+        self.daemon.say(SessionMessage::RelayGivenUp(given_up), &[]);
     }
 
     /// The daemon says that the relay ended.
     fn ends(&self) {
         let pair = Pair { reader: self.relay, writer: self.publisher.gid() };
-        self.daemon.say(Message::Detach(pair), &[]);
+        self.daemon.say(SessionMessage::Detach(pair), &[]);
     }
 }
 
 fn appears(daemon: &Daemon, endpoint: Endpoint) {
     let added = vec![GraphItem { endpoint, daemon: None, reach: None }];
-    let graph =
-        Graph { version: 2, whole: false, added, removed: Vec::new(), more: false, ended: None };
-    daemon.say(Message::Graph(graph), &[]);
+    let graph = SessionGraph {
+        version: 2,
+        whole: false,
+        added,
+        removed: Vec::new(),
+        more: false,
+        ended: None,
+    };
+    daemon.say(SessionMessage::SessionGraph(graph), &[]);
 }
 
 /// Waits until the session has heard all that was said so far: it asks about a pair when it has.
 fn has_heard(daemon: &Daemon, asking: &Subscription) {
     let writer = Gid::new(SessionId::random(), 1);
-    daemon.say(Message::Match(Pair { reader: asking.gid(), writer }), &[]);
+    daemon.say(SessionMessage::Match(Pair { reader: asking.gid(), writer }), &[]);
     daemon.hear(|message| {
-        matches!(message, Message::Attach(attach) if attach.writer == writer).then_some(())
+        matches!(message, SessionMessage::Attach(attach) if attach.writer == writer).then_some(())
     });
 }
 
@@ -258,16 +265,16 @@ fn a_publisher_is_counted_once_it_is_received_from() {
         has_heard(&daemon, &asking);
         let mut held = !shows(&session, gid);
         for reader in [&asking, &subscription] {
-            daemon.say(Message::Match(far.pair(reader)), &[]);
+            daemon.say(SessionMessage::Match(far.pair(reader)), &[]);
             let attach = daemon.hear(|message| match message {
-                Message::Attach(attach) if attach.writer == gid => Some(attach),
+                SessionMessage::Attach(attach) if attach.writer == gid => Some(attach),
                 _ => None,
             });
             held &= !shows(&session, gid);
             let introduction = far.introduction();
             let introduction: Vec<_> = introduction.iter().map(AsFd::as_fd).collect();
             let introduction = if reader.gid() == asking.gid() { &introduction[..] } else { &[] };
-            daemon.say(Message::Grant(far.grant(&attach)), introduction);
+            daemon.say(SessionMessage::Grant(far.grant(&attach)), introduction);
         }
         assert!(session.wait_graph(EVER, |graph| graph.endpoints.contains_key(&gid)));
         far.publish(1, b"x");
@@ -401,8 +408,9 @@ fn an_endpoint_that_is_refused_is_not_in_the_graph() {
         session.create_subscription(EndpointSpec::new("/p", "test/Bytes", Qos::default())).unwrap();
     assert!(shows(&session, refused.gid()), "until it is refused");
     let refuse = |gid| {
-        let refusal = Refused { endpoint: Some(gid), ..Refused::because("too many".into()) };
-        daemon.say(Message::Refused(refusal), &[]);
+        let refusal =
+            SessionRefused { endpoint: Some(gid), ..SessionRefused::because("too many".into()) };
+        daemon.say(SessionMessage::SessionRefused(refusal), &[]);
     };
     refuse(refused.gid());
     let changed = [Waitable::GuardCondition(node.graph_changed())];
@@ -432,13 +440,14 @@ fn one_that_is_refused_while_it_is_made_is_never_shown_again() {
         let (created, gid) = thread::scope(|scope| {
             let creating = scope.spawn(|| publisher(&session, Qos::default()));
             let gid = daemon.hear(|message| match message {
-                Message::Endpoint(announce) if announce.endpoint.topic == "/p" => {
+                SessionMessage::Endpoint(announce) if announce.endpoint.topic == "/p" => {
                     Some(announce.endpoint.gid)
                 }
                 _ => None,
             });
-            let refusal = Refused { endpoint: Some(gid), ..Refused::because("no".into()) };
-            daemon.say(Message::Refused(refusal), &[]);
+            let refusal =
+                SessionRefused { endpoint: Some(gid), ..SessionRefused::because("no".into()) };
+            daemon.say(SessionMessage::SessionRefused(refusal), &[]);
             (creating.join().unwrap(), gid)
         });
         has_heard(&daemon, &asking);

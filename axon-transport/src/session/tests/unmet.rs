@@ -6,10 +6,10 @@ use super::{followed::Stage, played::Taker, *};
 use crate::wire::session::Unmet;
 
 /// What the daemon is told next of unmet pairs, or of the end of `writer`.
-fn told(daemon: &Daemon, writer: Gid) -> Message {
+fn told(daemon: &Daemon, writer: Gid) -> SessionMessage {
     daemon.hear(|message| match &message {
-        Message::Unmet(_) => Some(message),
-        Message::EndpointGone(gone) if gone.gid == writer => Some(message),
+        SessionMessage::Unmet(_) => Some(message),
+        SessionMessage::EndpointGone(gone) if gone.gid == writer => Some(message),
         _ => None,
     })
 }
@@ -44,9 +44,9 @@ fn each_daemon_is_told_what_a_reader_lost_that_did_not_come_in_time() {
     // Its time is over.
     session.shared().part_leaving(true);
     session.core().wake();
-    let unmet = Message::Unmet(Unmet { reader, writer, samples: 5 });
+    let unmet = SessionMessage::Unmet(Unmet { reader, writer, samples: 5 });
     assert_eq!(told(&daemon, writer), unmet);
-    assert!(matches!(told(&daemon, writer), Message::EndpointGone(_)));
+    assert!(matches!(told(&daemon, writer), SessionMessage::EndpointGone(_)));
     drop(daemon);
     let daemon = stage.daemon(2);
     assert_eq!(told(&daemon, writer), unmet, "the first one may not have passed it on");
@@ -66,7 +66,7 @@ fn a_session_that_ends_waits_for_a_daemon_to_tell_what_a_reader_lost() {
     let ending = thread::spawn(move || drop(session));
     let daemon = stage.daemon(2);
     let unmet = Unmet { reader, writer, samples: 2 };
-    assert_eq!(told(&daemon, writer), Message::Unmet(unmet), "of five, as many as it keeps");
+    assert_eq!(told(&daemon, writer), SessionMessage::Unmet(unmet), "of five, as many as it keeps");
     drop(daemon);
     ending.join().unwrap();
 }
@@ -80,7 +80,7 @@ fn a_publisher_whose_reader_has_taken_up_its_grant_tells_nothing() {
     let _taking = Taker::new().attach(&publisher, None, &daemon);
     publisher.publish(b"x").unwrap();
     drop(publisher);
-    assert!(matches!(told(&daemon, writer), Message::EndpointGone(_)));
+    assert!(matches!(told(&daemon, writer), SessionMessage::EndpointGone(_)));
 }
 
 #[test]
@@ -89,25 +89,25 @@ fn a_reader_counts_what_it_lost_once_and_only_where_its_grant_never_came() {
     let far = Far::new(&daemon);
     let (met, _) = far.matched(&session, &daemon);
     let unmet = subscription(&session);
-    daemon.say(Message::Match(far.pair(&unmet)), &[]);
+    daemon.say(SessionMessage::Match(far.pair(&unmet)), &[]);
     let attach = daemon.hear_attach();
     let late = far.grant(&attach);
     let say = |subscription: &Subscription, samples| {
         let Pair { reader, writer } = far.pair(subscription);
-        daemon.say(Message::Unmet(Unmet { reader, writer, samples }), &[]);
+        daemon.say(SessionMessage::Unmet(Unmet { reader, writer, samples }), &[]);
     };
     say(&met, 7);
     say(&unmet, 7);
     until("it is counted", || unmet.lost() == 7);
     say(&unmet, 7);
-    daemon.say(Message::Grant(late), &[]);
+    daemon.say(SessionMessage::Grant(late), &[]);
     far.publish(1, b"x");
     until("the other takes", || take(&met) == Some(1));
     followed::done(&daemon, &met);
     assert_eq!((unmet.lost(), met.lost()), (7, 0));
     assert!(unmet.matched().is_empty(), "it has ended");
 
-    daemon.say(Message::Match(far.pair(&unmet)), &[]);
+    daemon.say(SessionMessage::Match(far.pair(&unmet)), &[]);
     daemon.hear_attach();
     say(&unmet, u64::MAX);
     followed::done(&daemon, &met);
@@ -124,7 +124,7 @@ fn each_daemon_is_told_what_was_granted_to_a_reader_that_has_not_come() {
     drop(daemon);
     let daemon = stage.daemon(2);
     let granted = daemon.hear(|message| match message {
-        Message::Grant(granted) => Some(granted),
+        SessionMessage::Grant(granted) => Some(granted),
         _ => None,
     });
     assert_eq!((granted.reader, granted.writer, granted.first), (reader, writer, 0));
@@ -132,10 +132,10 @@ fn each_daemon_is_told_what_was_granted_to_a_reader_that_has_not_come() {
     session.shared().part_leaving(true);
     session.core().wake();
     let next = daemon.hear(|message| match &message {
-        Message::Grant(_) | Message::Unmet(_) => Some(message),
+        SessionMessage::Grant(_) | SessionMessage::Unmet(_) => Some(message),
         _ => None,
     });
-    assert_eq!(next, Message::Unmet(Unmet { reader, writer, samples: 5 }), "one grant");
+    assert_eq!(next, SessionMessage::Unmet(Unmet { reader, writer, samples: 5 }), "one grant");
 }
 
 #[test]
@@ -143,15 +143,15 @@ fn a_reader_takes_what_a_publisher_left_that_is_gone_as_it_is_granted() {
     let (session, daemon) = session();
     let far = Far::new(&daemon);
     let subscription = subscription(&session);
-    daemon.say(Message::Match(far.pair(&subscription)), &[]);
+    daemon.say(SessionMessage::Match(far.pair(&subscription)), &[]);
     let granted = far.grant(&daemon.hear_attach());
     far.publish(1, b"x");
     far.publish(2, b"x");
     let introduction = far.introduction();
     let introduction: Vec<_> = introduction.iter().map(AsFd::as_fd).collect();
-    daemon.say(Message::Grant(granted), &introduction);
+    daemon.say(SessionMessage::Grant(granted), &introduction);
     let Pair { reader, writer } = far.pair(&subscription);
-    daemon.say(Message::Unmatch(Unmatch { reader, writer, reason: "gone".into() }), &[]);
+    daemon.say(SessionMessage::Unmatch(Unmatch { reader, writer, reason: "gone".into() }), &[]);
     until("the first came", || take(&subscription) == Some(1));
     assert_eq!((take(&subscription), subscription.lost()), (Some(2), 0));
     until("it is gone", || subscription.matched().is_empty());

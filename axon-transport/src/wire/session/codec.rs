@@ -2,7 +2,7 @@
 
 use minicbor::{Decode, Encode};
 
-use super::{MAX_PACKET, Message};
+use super::{MAX_PACKET, SessionMessage};
 
 /// Why bytes are not a message, or a message has no bytes.
 #[derive(Debug, thiserror::Error)]
@@ -32,19 +32,19 @@ pub enum CodecError {
 #[cbor(map)]
 struct Empty {}
 
-impl Message {
+impl SessionMessage {
     /// The packet's bytes.
     ///
     /// # Errors
     /// [`CodecError::TooLarge`] when they do not fit into one packet.
     pub fn encode(&self) -> Result<Vec<u8>, CodecError> {
         let (kind, body) = match self {
-            Self::Hello(m) => (1, minicbor::to_vec(m)),
+            Self::SessionHello(m) => (1, minicbor::to_vec(m)),
             Self::Welcome(m) => (2, minicbor::to_vec(m)),
-            Self::Refused(m) => (3, minicbor::to_vec(m)),
+            Self::SessionRefused(m) => (3, minicbor::to_vec(m)),
             Self::Endpoint(m) => (4, minicbor::to_vec(m)),
             Self::EndpointGone(m) => (5, minicbor::to_vec(m)),
-            Self::Graph(m) => (6, minicbor::to_vec(m)),
+            Self::SessionGraph(m) => (6, minicbor::to_vec(m)),
             Self::Match(m) => (7, minicbor::to_vec(m)),
             Self::Attach(m) => (8, minicbor::to_vec(m)),
             Self::Grant(m) => (9, minicbor::to_vec(m)),
@@ -56,11 +56,11 @@ impl Message {
             Self::Segment(m) => (15, minicbor::to_vec(m)),
             Self::SegmentGone(m) => (16, minicbor::to_vec(m)),
             Self::Need(m) => (17, minicbor::to_vec(m)),
-            Self::Leaving(m) => (18, minicbor::to_vec(m)),
-            Self::GivenUp(m) => (19, minicbor::to_vec(m)),
+            Self::WriterLeaving(m) => (18, minicbor::to_vec(m)),
+            Self::RelayGivenUp(m) => (19, minicbor::to_vec(m)),
             Self::Fence(m) => (20, minicbor::to_vec(m)),
             Self::Unmet(m) => (21, minicbor::to_vec(m)),
-            Self::Matched(m) => (24, minicbor::to_vec(m)),
+            Self::RelayMatched(m) => (24, minicbor::to_vec(m)),
             Self::SampleFragment(m) => (25, minicbor::to_vec(m)),
             Self::Credit(m) => (26, minicbor::to_vec(m)),
             Self::Asserted(m) => (27, minicbor::to_vec(m)),
@@ -94,12 +94,12 @@ impl Message {
         }
         let (&kind, body) = packet.split_first().ok_or(CodecError::Empty)?;
         Ok(match kind {
-            1 => Self::Hello(map(kind, body)?),
+            1 => Self::SessionHello(map(kind, body)?),
             2 => Self::Welcome(map(kind, body)?),
-            3 => Self::Refused(map(kind, body)?),
+            3 => Self::SessionRefused(map(kind, body)?),
             4 => Self::Endpoint(map(kind, body)?),
             5 => Self::EndpointGone(map(kind, body)?),
-            6 => Self::Graph(map(kind, body)?),
+            6 => Self::SessionGraph(map(kind, body)?),
             7 => Self::Match(map(kind, body)?),
             8 => Self::Attach(map(kind, body)?),
             9 => Self::Grant(map(kind, body)?),
@@ -111,11 +111,11 @@ impl Message {
             15 => Self::Segment(map(kind, body)?),
             16 => Self::SegmentGone(map(kind, body)?),
             17 => Self::Need(map(kind, body)?),
-            18 => Self::Leaving(map(kind, body)?),
-            19 => Self::GivenUp(map(kind, body)?),
+            18 => Self::WriterLeaving(map(kind, body)?),
+            19 => Self::RelayGivenUp(map(kind, body)?),
             20 => Self::Fence(map(kind, body)?),
             21 => Self::Unmet(map(kind, body)?),
-            24 => Self::Matched(map(kind, body)?),
+            24 => Self::RelayMatched(map(kind, body)?),
             25 => Self::SampleFragment(map(kind, body)?),
             26 => Self::Credit(map(kind, body)?),
             27 => Self::Asserted(map(kind, body)?),

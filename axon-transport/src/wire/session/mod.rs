@@ -1,7 +1,7 @@
 //! The control messages between sessions and their daemon (`docs/formats.md`, section 8).
 //!
 //! A packet is a type byte and one CBOR map. Unknown keys are skipped. A packet of unknown type decodes to
-//! [`Message::Unknown`]. Any other invalid packet is an error.
+//! [`SessionMessage::Unknown`]. Any other invalid packet is an error.
 
 mod codec;
 #[cfg(test)]
@@ -61,7 +61,7 @@ pub enum EndpointRole {
 /// The first message of a session.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
-pub struct Hello {
+pub struct SessionHello {
     /// The protocol that the session speaks.
     #[n(0)]
     pub protocol: u32,
@@ -113,7 +113,7 @@ pub struct Welcome {
 /// The daemon does not take the session, or one of its endpoints.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
-pub struct Refused {
+pub struct SessionRefused {
     /// The variable that differs; empty when none does.
     #[n(0)]
     pub variable: String,
@@ -131,7 +131,7 @@ pub struct Refused {
     pub endpoint: Option<Gid>,
 }
 
-impl Refused {
+impl SessionRefused {
     /// For a reason that no variable is to blame for.
     pub fn because(text: String) -> Self {
         let [variable, ours, theirs] = [const { String::new() }; 3];
@@ -193,7 +193,7 @@ pub struct GraphItem {
 /// A change of the graph, or a part of the whole of it.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
-pub struct Graph {
+pub struct SessionGraph {
     /// The version after this change.
     #[n(0)]
     pub version: u64,
@@ -329,7 +329,7 @@ pub struct StatusPart {
 /// clients of a server for which there is what stands for them in its process.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
-pub struct Matched {
+pub struct RelayMatched {
     /// The endpoint.
     #[n(0)]
     pub gid: Gid,
@@ -412,7 +412,7 @@ pub struct Asserted {
 /// a ring: it is in no graph and nobody counts it, and those who read it get the rest.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
-pub struct Leaving {
+pub struct WriterLeaving {
     /// What.
     #[n(0)]
     pub gid: Gid,
@@ -424,7 +424,7 @@ pub struct Leaving {
 /// A relay does not get samples where they are to go: their publisher learns of it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
-pub struct GivenUp {
+pub struct RelayGivenUp {
     /// The relay; the publisher itself where its session is relayed.
     #[n(0)]
     pub reader: Gid,
@@ -496,13 +496,13 @@ pub struct CheckedUse {
 /// A message of the session socket.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[allow(missing_docs)]
-pub enum Message {
-    Hello(Hello),
+pub enum SessionMessage {
+    SessionHello(SessionHello),
     Welcome(Welcome),
-    Refused(Refused),
+    SessionRefused(SessionRefused),
     Endpoint(Announce),
     EndpointGone(Gone),
-    Graph(Graph),
+    SessionGraph(SessionGraph),
     Match(Pair),
     Attach(Attach),
     Grant(Granted),
@@ -517,11 +517,11 @@ pub enum Message {
     Segment(SegmentOpened),
     SegmentGone(SegmentName),
     Need(SegmentName),
-    Leaving(Leaving),
-    GivenUp(GivenUp),
+    WriterLeaving(WriterLeaving),
+    RelayGivenUp(RelayGivenUp),
     Fence(Fence),
     Unmet(Unmet),
-    Matched(Matched),
+    RelayMatched(RelayMatched),
     SampleFragment(SampleFragment),
     Credit(Credit),
     Asserted(Asserted),

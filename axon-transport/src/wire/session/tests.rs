@@ -19,11 +19,11 @@ fn endpoint() -> Endpoint {
     }
 }
 
-fn messages() -> Vec<Message> {
+fn messages() -> Vec<SessionMessage> {
     let (reader, writer) = (Gid([1; 16]), Gid([2; 16]));
     let session = SessionId([3; 16]);
     vec![
-        Message::Hello(Hello {
+        SessionMessage::SessionHello(SessionHello {
             protocol: PROTOCOL,
             session,
             role: SessionRole::Application,
@@ -34,28 +34,28 @@ fn messages() -> Vec<Message> {
             range: Some(0),
             static_peers: None,
         }),
-        Message::Welcome(Welcome {
+        SessionMessage::Welcome(Welcome {
             protocol: 1,
             daemon: DaemonId([4; 16]),
             pid: 12,
             ranges: Some(true),
         }),
-        Message::Refused(Refused {
+        SessionMessage::SessionRefused(SessionRefused {
             variable: "AXON_QUIC_CIPHER".into(),
             ours: "a".into(),
             theirs: "b".into(),
             text: String::new(),
             endpoint: Some(writer),
         }),
-        Message::Endpoint(Announce {
+        SessionMessage::Endpoint(Announce {
             endpoint: endpoint(),
             role: EndpointRole::Relay,
             stands_for: vec![reader, writer],
             ring: Some(Location { segment: 0, offset: 4096 }),
             only: Some(writer),
         }),
-        Message::EndpointGone(Gone { gid: reader }),
-        Message::Graph(Graph {
+        SessionMessage::EndpointGone(Gone { gid: reader }),
+        SessionMessage::SessionGraph(SessionGraph {
             version: 3,
             whole: true,
             added: vec![GraphItem {
@@ -67,8 +67,8 @@ fn messages() -> Vec<Message> {
             more: false,
             ended: Some(vec![Gid([8; 16])]),
         }),
-        Message::Match(Pair { reader, writer }),
-        Message::Attach(Attach {
+        SessionMessage::Match(Pair { reader, writer }),
+        SessionMessage::Attach(Attach {
             reader,
             writer,
             lane: Location { segment: 3, offset: 1 << 33 },
@@ -79,7 +79,7 @@ fn messages() -> Vec<Message> {
             after: Some(8),
             carries: Some(true),
         }),
-        Message::Grant(Granted {
+        SessionMessage::Grant(Granted {
             reader,
             writer,
             generation: 5,
@@ -90,27 +90,27 @@ fn messages() -> Vec<Message> {
             after: Some(11),
             relayed: Some(true),
         }),
-        Message::Detach(Pair { reader, writer }),
-        Message::Unmatch(Unmatch { reader, writer, reason: "gone".into() }),
-        Message::StatusRequest,
-        Message::Reload,
-        Message::AccessCheck(AccessCheck {
+        SessionMessage::Detach(Pair { reader, writer }),
+        SessionMessage::Unmatch(Unmatch { reader, writer, reason: "gone".into() }),
+        SessionMessage::StatusRequest,
+        SessionMessage::Reload,
+        SessionMessage::AccessCheck(AccessCheck {
             daemon: DaemonId([9; 16]),
             uses: vec![CheckedUse { verb: 0, name: "/scan".into() }],
         }),
-        Message::Status(StatusPart { part: 0, parts: 1, text: b"{}".to_vec() }),
-        Message::Resync,
-        Message::Segment(SegmentOpened {
+        SessionMessage::Status(StatusPart { part: 0, parts: 1, text: b"{}".to_vec() }),
+        SessionMessage::Resync,
+        SessionMessage::Segment(SegmentOpened {
             session,
             segment: Segment { number: 9, publisher: Some(writer) },
         }),
-        Message::SegmentGone(SegmentName { session, number: 9 }),
-        Message::Need(SegmentName { session, number: 9 }),
-        Message::Leaving(Leaving { gid: writer, leaving: true }),
-        Message::Fence(Fence { writer, number: 12 }),
-        Message::Unmet(Unmet { reader, writer, samples: 13 }),
-        Message::Matched(Matched { gid: reader, others: vec![writer] }),
-        Message::SampleFragment(SampleFragment {
+        SessionMessage::SegmentGone(SegmentName { session, number: 9 }),
+        SessionMessage::Need(SegmentName { session, number: 9 }),
+        SessionMessage::WriterLeaving(WriterLeaving { gid: writer, leaving: true }),
+        SessionMessage::Fence(Fence { writer, number: 12 }),
+        SessionMessage::Unmet(Unmet { reader, writer, samples: 13 }),
+        SessionMessage::RelayMatched(RelayMatched { gid: reader, others: vec![writer] }),
+        SessionMessage::SampleFragment(SampleFragment {
             publisher: writer,
             head: Some(SampleHeader {
                 length: 3,
@@ -122,48 +122,48 @@ fn messages() -> Vec<Message> {
             bytes: vec![1, 2],
             client: None,
         }),
-        Message::SampleFragment(SampleFragment {
+        SessionMessage::SampleFragment(SampleFragment {
             publisher: writer,
             head: None,
             bytes: vec![3],
             client: Some(reader),
         }),
-        Message::Credit(Credit {
+        SessionMessage::Credit(Credit {
             publisher: writer,
             bytes: 128,
             opens: Some(3),
             client: None,
             done: Some(8),
         }),
-        Message::Asserted(Asserted { publishers: vec![writer] }),
+        SessionMessage::Asserted(Asserted { publishers: vec![writer] }),
     ]
 }
 
 #[test]
 fn hostile_packets_are_errors() {
-    assert!(matches!(Message::decode(&[]), Err(CodecError::Empty)));
+    assert!(matches!(SessionMessage::decode(&[]), Err(CodecError::Empty)));
     assert!(matches!(
-        Message::decode(&vec![0; MAX_PACKET + 1]),
+        SessionMessage::decode(&vec![0; MAX_PACKET + 1]),
         Err(CodecError::TooLarge(n)) if n == MAX_PACKET + 1
     ));
-    assert!(matches!(Message::decode(&[7]), Err(CodecError::Malformed { kind: 7, .. })));
+    assert!(matches!(SessionMessage::decode(&[7]), Err(CodecError::Malformed { kind: 7, .. })));
     // A map without a needed key.
-    assert!(matches!(Message::decode(&[5, 0xa0]), Err(CodecError::Malformed { .. })));
+    assert!(matches!(SessionMessage::decode(&[5, 0xa0]), Err(CodecError::Malformed { .. })));
     // An array that claims 2^32 elements allocates nothing.
-    assert!(Message::decode(&[6, 0xa1, 3, 0x9a, 0xff, 0xff, 0xff, 0xff]).is_err());
+    assert!(SessionMessage::decode(&[6, 0xa1, 3, 0x9a, 0xff, 0xff, 0xff, 0xff]).is_err());
     for message in messages() {
         let mut packet = message.encode().unwrap();
         packet.push(0);
-        assert!(Message::decode(&packet).is_err(), "{message:?} with a byte after it");
+        assert!(SessionMessage::decode(&packet).is_err(), "{message:?} with a byte after it");
         for cut in 1..packet.len() - 1 {
-            assert!(Message::decode(&packet[..cut]).is_err(), "{message:?} cut at {cut}");
+            assert!(SessionMessage::decode(&packet[..cut]).is_err(), "{message:?} cut at {cut}");
         }
     }
 }
 
 #[test]
 fn unknown_types_and_keys_are_skipped() {
-    assert_eq!(Message::decode(&[200, 1, 2, 3]).unwrap(), Message::Unknown(200));
+    assert_eq!(SessionMessage::decode(&[200, 1, 2, 3]).unwrap(), SessionMessage::Unknown(200));
     // { 0: pid, 1: .., 99: [1, {2: 3}] } for WELCOME with one key more.
     let mut packet = vec![2];
     let mut e = minicbor::Encoder::new(&mut packet);
@@ -174,14 +174,14 @@ fn unknown_types_and_keys_are_skipped() {
     e.u8(1).unwrap().bytes(&[4; 16]).unwrap();
     e.u8(2).unwrap().u8(12).unwrap();
     let welcome = Welcome { protocol: 1, daemon: DaemonId([4; 16]), pid: 12, ranges: None };
-    assert_eq!(Message::decode(&packet).unwrap(), Message::Welcome(welcome));
+    assert_eq!(SessionMessage::decode(&packet).unwrap(), SessionMessage::Welcome(welcome));
 }
 
 #[test]
 fn messages_survive_the_wire() {
     for message in messages() {
         let packet = message.encode().unwrap();
-        assert_eq!(Message::decode(&packet).unwrap(), message);
+        assert_eq!(SessionMessage::decode(&packet).unwrap(), message);
     }
 }
 
@@ -189,14 +189,14 @@ fn messages_survive_the_wire() {
 fn a_message_larger_than_a_packet_is_refused_by_its_sender() {
     let removed = vec![Gid([1; 16]); 3000];
     let graph =
-        Graph { version: 1, whole: false, added: vec![], removed, more: false, ended: None };
-    assert!(matches!(Message::Graph(graph).encode(), Err(CodecError::TooLarge(_))));
+        SessionGraph { version: 1, whole: false, added: vec![], removed, more: false, ended: None };
+    assert!(matches!(SessionMessage::SessionGraph(graph).encode(), Err(CodecError::TooLarge(_))));
 }
 
 proptest! {
     #[test]
     fn no_packet_panics(packet in proptest::collection::vec(any::<u8>(), 0..512)) {
-        let _ = Message::decode(&packet);
+        let _ = SessionMessage::decode(&packet);
     }
 
     #[test]
@@ -206,6 +206,6 @@ proptest! {
         let mut packet = messages()[which].encode().unwrap();
         let at = at.index(packet.len());
         packet[at] = byte;
-        let _ = Message::decode(&packet);
+        let _ = SessionMessage::decode(&packet);
     }
 }

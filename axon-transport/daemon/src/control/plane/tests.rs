@@ -7,7 +7,7 @@ use axon_shm::{
 use axon_transport::{
     access::AccessRules,
     graph::{Endpoint, EndpointKind},
-    internal::wire::session::{AccessCheck, Announce, EndpointRole, Message, SessionRole},
+    internal::wire::session::{AccessCheck, Announce, EndpointRole, SessionMessage, SessionRole},
 };
 use serde_json::Value;
 
@@ -36,7 +36,11 @@ fn link(control: &mut ControlPlane) {
 /// How often the session is told that a route does not cross.
 fn told(control: &mut ControlPlane) -> usize {
     let packets = std::iter::from_fn(|| control.registry.poll_output(&SESSION));
-    packets.filter(|out| matches!(Message::decode(&out.packet), Ok(Message::Refused(_)))).count()
+    packets
+        .filter(|out| {
+            matches!(SessionMessage::decode(&out.packet), Ok(SessionMessage::SessionRefused(_)))
+        })
+        .count()
 }
 
 #[test]
@@ -47,7 +51,7 @@ fn a_gateway_that_ended_leaves_no_refused_route_and_sessions_are_told_by_the_nex
     let endpoint = Endpoint::new(Gid::new(SESSION, 1), EndpointKind::Subscription, "/t", "T");
     let role = EndpointRole::Application;
     let announce = Announce { endpoint, role, stands_for: vec![], ring: None, only: None };
-    control.registry.handle_message(&SESSION, Message::Endpoint(announce), vec![]).unwrap();
+    control.registry.handle_message(&SESSION, SessionMessage::Endpoint(announce), vec![]).unwrap();
     told(&mut control);
     link(&mut control);
     assert_eq!(told(&mut control), 1);
@@ -75,7 +79,10 @@ fn with_users(rules: &str) -> ControlPlane {
         let endpoint = Endpoint::new(Gid::new(session, 1), EndpointKind::Subscription, "/t", "T");
         let role = EndpointRole::Application;
         let announce = Announce { endpoint, role, stands_for: vec![], ring: None, only: None };
-        control.registry.handle_message(&session, Message::Endpoint(announce), vec![]).unwrap();
+        control
+            .registry
+            .handle_message(&session, SessionMessage::Endpoint(announce), vec![])
+            .unwrap();
     }
     control.registry.set_user(&SESSION, 7);
     link(&mut control);
@@ -95,7 +102,7 @@ fn connect(control: &mut ControlPlane, session: SessionId, shares_memory: bool) 
 fn report(control: &mut ControlPlane, session: SessionId) -> Value {
     let mut text = Vec::new();
     while let Some(output) = control.registry.poll_output(&session) {
-        if let Ok(Message::Status(part)) = Message::decode(&output.packet) {
+        if let Ok(SessionMessage::Status(part)) = SessionMessage::decode(&output.packet) {
             text.extend(part.text);
         }
     }

@@ -21,11 +21,11 @@ use axon_transport::{
             merge::{Merge, Taken},
             relayed::{
                 MAX_MATCHED,
-                flow::{Channel, OutboundSample, Payload},
+                flow::{FlowChannel, OutboundSample, SamplePayload},
                 pipe::End,
             },
         },
-        wire::session::{GraphItem, Matched, Message},
+        wire::session::{GraphItem, RelayMatched, SessionMessage},
     },
 };
 
@@ -76,7 +76,7 @@ impl RelayedSession {
             return Ok(());
         }
         let all = parts(now.version, false, added.into_iter(), &removed, &BTreeSet::new(), false);
-        all.into_iter().try_for_each(|part| self.pipe.say(&Message::Graph(part)))
+        all.into_iter().try_for_each(|part| self.pipe.say(&SessionMessage::SessionGraph(part)))
     }
 
     /// Tells with whom the session's endpoints are matched, and decides by which of them what others
@@ -135,7 +135,7 @@ impl RelayedSession {
         }
         self.subscriptions.get(gid).is_some_and(|subscription| subscription.has_from(other))
             || self.sources.get(other).is_some_and(|source| source.samples.holds(gid))
-            || !self.pipe.outgoing.is_idle(&Channel::of(*other))
+            || !self.pipe.outgoing.is_idle(&FlowChannel::of(*other))
     }
 
     /// Gives up what `other`, which is gone, has left for an endpoint of a session that does not take it.
@@ -167,7 +167,7 @@ impl RelayedSession {
     /// order in which the session hears it.
     fn tell(&mut self, gid: Gid, others: BTreeSet<Gid>) -> Result<(), End> {
         let shown = others.iter().copied().collect();
-        self.pipe.say(&Message::Matched(Matched { gid, others: shown }))?;
+        self.pipe.say(&SessionMessage::RelayMatched(RelayMatched { gid, others: shown }))?;
         let before = self.told.insert(gid, others);
         if before.is_some_and(|before| !before.is_subset(&self.told[&gid])) {
             self.close_unwanted();
@@ -179,24 +179,24 @@ impl RelayedSession {
     }
 
     /// On which channels the session gets what `others` write for an endpoint of its.
-    fn channels(&self, gid: &Gid, others: &BTreeSet<Gid>) -> Vec<Channel> {
+    fn channels(&self, gid: &Gid, others: &BTreeSet<Gid>) -> Vec<FlowChannel> {
         match self.writers.get(gid) {
             Some(RemoteWriter::Publisher(_)) => Vec::new(),
             Some(remote_writer) => {
                 others.iter().map(|other| channel(remote_writer, *other)).collect()
             }
-            None => others.iter().map(|writer| Channel::of(*writer)).collect(),
+            None => others.iter().map(|writer| FlowChannel::of(*writer)).collect(),
         }
     }
 
     /// The channels to the session, as it has been told with whom its endpoints are matched.
-    fn wanted(&self) -> BTreeSet<Channel> {
+    fn wanted(&self) -> BTreeSet<FlowChannel> {
         self.told.iter().flat_map(|(gid, others)| self.channels(gid, others)).collect()
     }
 
     pub(super) fn close_unwanted(&mut self) {
         let wanted = self.wanted();
-        self.sources.retain(|writer, _| wanted.contains(&Channel::of(*writer)));
+        self.sources.retain(|writer, _| wanted.contains(&FlowChannel::of(*writer)));
         self.pipe.outgoing.retain(|channel| wanted.contains(channel));
     }
 
@@ -247,7 +247,7 @@ pub(super) fn take(
     source: &mut RelayedSource,
     subscriptions: &BTreeMap<Gid, Subscription>,
     writer: &Gid,
-) -> Option<OutboundSample<Payload>> {
+) -> Option<OutboundSample<SamplePayload>> {
     let waits = |reader: &Gid| {
         subscriptions.get(reader).is_some_and(|s| s.may_lose_nothing() && s.is_held_up(writer))
     };
@@ -265,9 +265,9 @@ fn taken(
 }
 
 /// On which channel the session gets what `other` writes for one of its clients or servers.
-fn channel(of: &RemoteWriter, other: Gid) -> Channel {
+fn channel(of: &RemoteWriter, other: Gid) -> FlowChannel {
     match of {
-        RemoteWriter::Client(client) => Channel::between(other, client.gid()),
-        RemoteWriter::Server(_) | RemoteWriter::Publisher(_) => Channel::of(other),
+        RemoteWriter::Client(client) => FlowChannel::between(other, client.gid()),
+        RemoteWriter::Server(_) | RemoteWriter::Publisher(_) => FlowChannel::of(other),
     }
 }

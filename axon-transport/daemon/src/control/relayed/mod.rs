@@ -29,15 +29,15 @@ use axon_transport::{
             RemoteWriter,
             daemon::socket::{self, SocketError},
             relayed::{
-                ChangeSignal, LINGER, MAX_CALLERS, MAX_ENDPOINTS, Pool,
-                calls::{self, Calls},
-                flow::{Channel, Incoming},
+                ArrivalPool, ChangeSignal, LINGER, MAX_CALLERS, MAX_ENDPOINTS,
+                calls::{self, CallChannels},
+                flow::{FlowChannel, IncomingFlow},
                 pipe::{End, LossReport, Pipe},
             },
         },
         wire::session::{
-            Announce, Asserted, EndpointRole, GivenUp, Leaving, Matched, Message, PROTOCOL,
-            Refused, Welcome,
+            Announce, Asserted, EndpointRole, PROTOCOL, RelayGivenUp, RelayMatched, SessionMessage,
+            SessionRefused, Welcome, WriterLeaving,
         },
     },
 };
@@ -60,7 +60,7 @@ pub(crate) struct DaemonRelay {
     pub(crate) name: String,
     pub(crate) id: SessionId,
     pub(crate) tally: Arc<RelayCounters>,
-    pub(crate) pool: Arc<Pool>,
+    pub(crate) pool: Arc<ArrivalPool>,
     pub(crate) losses: Arc<Losses>,
 }
 
@@ -83,7 +83,7 @@ impl DaemonRelay {
 
     fn open(self) -> Result<RelayedSession, End> {
         let Self { socket, inside, config, name, id, tally, pool, losses } = self;
-        let say = |message: Message| {
+        let say = |message: SessionMessage| {
             let packet = message.encode().map_err(|e| End::Other(e.to_string()))?;
             // The connection is new: its buffer has room.
             Ok::<(), End>(socket::send(&socket, &packet, &[])?)
@@ -101,7 +101,7 @@ impl DaemonRelay {
         let session = match Session::over_as(id, inside, &config, options) {
             Ok(session) => session,
             Err(error) => {
-                say(Message::Refused(Refused::because(error.to_string())))?;
+                say(SessionMessage::SessionRefused(SessionRefused::because(error.to_string())))?;
                 return Err(failed(&error));
             }
         };
@@ -111,8 +111,8 @@ impl DaemonRelay {
         let daemon = session.daemon().unwrap_or_default();
         let pid = std::process::id();
         let welcome = Welcome { protocol: PROTOCOL, daemon, pid, ranges: Some(true) };
-        say(Message::Welcome(welcome))?;
-        let incoming = Incoming::new(config.max_message, pool);
+        say(SessionMessage::Welcome(welcome))?;
+        let incoming = IncomingFlow::new(config.max_message, pool);
         Ok(RelayedSession {
             id,
             pipe: Pipe::new(socket, incoming, Arc::clone(&tally)),
@@ -123,7 +123,7 @@ impl DaemonRelay {
             nodes: BTreeMap::new(),
             told: BTreeMap::new(),
             sources: BTreeMap::new(),
-            calls: Calls::default(),
+            calls: CallChannels::default(),
             callers: BTreeMap::new(),
             alive: Alive::default(),
             unreached: BTreeMap::new(),
@@ -176,7 +176,7 @@ struct RelayedSession {
     /// The publishers whose samples the session gets.
     sources: BTreeMap<Gid, RelayedSource>,
     /// What is asked of its servers.
-    calls: Calls,
+    calls: CallChannels,
     /// The clients that its process has for each of its servers: whose responses may come.
     callers: BTreeMap<Gid, BTreeSet<Gid>>,
     alive: Alive,
@@ -214,7 +214,7 @@ impl RelayedSession {
                 return Err(End::Other("the control plane dropped it".into()));
             }
             let (messages, more) = self.pipe.receive()?;
-            let changed = messages.iter().any(|m| !matches!(m, Message::Credit(_)));
+            let changed = messages.iter().any(|m| !matches!(m, SessionMessage::Credit(_)));
             messages.into_iter().try_for_each(|message| self.handle(message))?;
             if signalled {
                 self.tell_refused()?;
@@ -225,7 +225,7 @@ impl RelayedSession {
             }
             let leased = self.subscriptions.values().flat_map(Subscription::assertions);
             for publishers in self.alive.news(self.begun.elapsed(), leased) {
-                self.pipe.say(&Message::Asserted(Asserted { publishers }))?;
+                self.pipe.say(&SessionMessage::Asserted(Asserted { publishers }))?;
             }
             self.write()?;
             if self.pipe.is_over() {
@@ -283,7 +283,11 @@ impl RelayedSession {
             let samples = self.unreached.entry(writer).or_default().news(given_up);
             if samples > 0 {
                 // Ahead of the credit by which they count as acknowledged.
-                self.pipe.say(&Message::GivenUp(GivenUp { reader: writer, writer, samples }))?;
+                self.pipe.say(&SessionMessage::RelayGivenUp(RelayGivenUp {
+                    reader: writer,
+                    writer,
+                    samples,
+                }))?;
             }
         }
         self.pipe.give_back(credits)
@@ -346,27 +350,27 @@ impl RelayedSession {
         }
     }
 
-    fn handle(&mut self, message: Message) -> Result<(), End> {
+    fn handle(&mut self, message: SessionMessage) -> Result<(), End> {
         match message {
-            Message::Endpoint(announce) => self.announce(announce),
-            Message::EndpointGone(gone) => {
+            SessionMessage::Endpoint(announce) => self.announce(announce),
+            SessionMessage::EndpointGone(gone) => {
                 self.forget(&gone.gid);
-                self.pipe.say(&Message::EndpointGone(gone))
+                self.pipe.say(&SessionMessage::EndpointGone(gone))
             }
-            Message::Leaving(Leaving { gid, leaving }) => {
+            SessionMessage::WriterLeaving(WriterLeaving { gid, leaving }) => {
                 // It may have been refused.
                 if let Some(remote_writer) = self.writers.get(&gid) {
                     remote_writer.leave(leaving);
                 }
                 Ok(())
             }
-            Message::Matched(matched) => self.callers(matched),
-            Message::Asserted(asserted) => {
+            SessionMessage::RelayMatched(matched) => self.callers(matched),
+            SessionMessage::Asserted(asserted) => {
                 let own = asserted.publishers.iter().filter_map(|gid| self.writers.get(gid));
                 own.for_each(RemoteWriter::assert_alive);
                 Ok(())
             }
-            Message::Credit(credit) => {
+            SessionMessage::Credit(credit) => {
                 self.pipe.outgoing.credit(&credit);
                 if let (Some(client), Some(number)) = (&credit.client, credit.done)
                     && let Some(client) = self.writers.get(client)
@@ -382,7 +386,7 @@ impl RelayedSession {
                 }
                 Ok(())
             }
-            Message::Unknown(_) => Ok(()),
+            SessionMessage::Unknown(_) => Ok(()),
             _ => Err(End::Other("it sent a message that no relayed session sends".into())),
         }
     }
@@ -436,7 +440,7 @@ impl RelayedSession {
                     self.writers.insert(gid, remote_writer);
                     // A server's responses are a channel for each of its clients.
                     if kind != EndpointKind::Server {
-                        self.pipe.open_in(Channel::of(gid))?;
+                        self.pipe.open_in(FlowChannel::of(gid))?;
                     }
                 }
                 Err(error) => self.refuse(&endpoint, &error.to_string())?,
@@ -461,8 +465,8 @@ impl RelayedSession {
     }
 
     /// The process holds stand-ins for these clients of a server. Their responses pass through it.
-    fn callers(&mut self, matched: Matched) -> Result<(), End> {
-        let Matched { gid, others } = matched;
+    fn callers(&mut self, matched: RelayMatched) -> Result<(), End> {
+        let RelayMatched { gid, others } = matched;
         let others: BTreeSet<Gid> = others.into_iter().collect();
         match self.writers.get(&gid) {
             Some(RemoteWriter::Server(_)) => {}
@@ -478,7 +482,7 @@ impl RelayedSession {
         let wanted = |client: Option<Gid>| client.is_some_and(|client| others.contains(&client));
         self.pipe.retain(|channel| channel.writer != gid || wanted(channel.client));
         for client in &others {
-            self.pipe.open_in(Channel::between(gid, *client))?;
+            self.pipe.open_in(FlowChannel::between(gid, *client))?;
         }
         self.callers.insert(gid, others);
         Ok(())
@@ -488,16 +492,16 @@ impl RelayedSession {
     fn tell_refused(&mut self) -> Result<(), End> {
         for (gid, text) in self.session.refused() {
             self.forget(&gid);
-            let refused = Refused { endpoint: Some(gid), ..Refused::because(text) };
-            self.pipe.say(&Message::Refused(refused))?;
+            let refused = SessionRefused { endpoint: Some(gid), ..SessionRefused::because(text) };
+            self.pipe.say(&SessionMessage::SessionRefused(refused))?;
         }
         for text in self.session.take_refusals() {
-            self.pipe.say(&Message::Refused(Refused::because(text)))?;
+            self.pipe.say(&SessionMessage::SessionRefused(SessionRefused::because(text)))?;
         }
         Ok(())
     }
 
     fn refuse(&mut self, endpoint: &Endpoint, why: &str) -> Result<(), End> {
-        self.pipe.say(&Message::Refused(Refused::of(endpoint, why)))
+        self.pipe.say(&SessionMessage::SessionRefused(SessionRefused::of(endpoint, why)))
     }
 }

@@ -19,13 +19,13 @@ fn pair() -> [OwnedFd; 2] {
     socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None).unwrap().into()
 }
 
-fn say(socket: &OwnedFd, message: &Message) {
+fn say(socket: &OwnedFd, message: &SessionMessage) {
     socket::send(socket, &message.encode().unwrap(), &[]).unwrap();
 }
 
 /// The next message of those that `pick` wants.
 #[track_caller]
-fn hear<T>(socket: &OwnedFd, mut pick: impl FnMut(Message) -> Option<T>) -> T {
+fn hear<T>(socket: &OwnedFd, mut pick: impl FnMut(SessionMessage) -> Option<T>) -> T {
     loop {
         match socket::receive(socket, &mut Vec::new()) {
             Ok(received) => {
@@ -53,16 +53,16 @@ fn a_relayed_process_receives_the_control_planes_refusal() {
         name: "t".into(),
         id,
         tally: Arc::default(),
-        pool: Pool::new(0),
+        pool: ArrivalPool::new(0),
         losses: Arc::default(),
     };
     relay.start().unwrap();
-    hear(&control, |message| matches!(message, Message::Hello(_)).then_some(()));
+    hear(&control, |message| matches!(message, SessionMessage::SessionHello(_)).then_some(()));
     let pid = std::process::id();
     let welcome =
         Welcome { protocol: PROTOCOL, daemon: DaemonId([7; 16]), pid, ranges: Some(true) };
-    say(&control, &Message::Welcome(welcome));
-    hear(&process, |message| matches!(message, Message::Welcome(_)).then_some(()));
+    say(&control, &SessionMessage::Welcome(welcome));
+    hear(&process, |message| matches!(message, SessionMessage::Welcome(_)).then_some(()));
     let all = [
         EndpointKind::Publisher,
         EndpointKind::Subscription,
@@ -76,22 +76,28 @@ fn a_relayed_process_receives_the_control_planes_refusal() {
             .with_node("n", String::new());
         let (gid, role) = (endpoint.gid, EndpointRole::Application);
         let (stands_for, ring, only) = (Vec::new(), None, None);
-        say(&process, &Message::Endpoint(Announce { endpoint, role, stands_for, ring, only }));
+        say(
+            &process,
+            &SessionMessage::Endpoint(Announce { endpoint, role, stands_for, ring, only }),
+        );
         let announced = hear(&control, |message| match message {
-            Message::Endpoint(announce) => Some(announce.endpoint),
+            SessionMessage::Endpoint(announce) => Some(announce.endpoint),
             _ => None,
         });
         assert_eq!(announced.gid, gid);
-        say(&control, &Message::Refused(Refused::of(&announced, "there are enough")));
+        say(
+            &control,
+            &SessionMessage::SessionRefused(SessionRefused::of(&announced, "there are enough")),
+        );
         let refused = hear(&process, |message| match message {
-            Message::Refused(refused) => Some(refused),
+            SessionMessage::SessionRefused(refused) => Some(refused),
             _ => None,
         });
         assert_eq!(refused.endpoint, Some(gid), "{kind:?}");
         assert!(refused.text.contains("there are enough"), "{}", refused.text);
         // It is given up here, too.
         hear(&control, |message| {
-            matches!(message, Message::EndpointGone(gone) if gone.gid == gid).then_some(())
+            matches!(message, SessionMessage::EndpointGone(gone) if gone.gid == gid).then_some(())
         });
     }
 }

@@ -12,7 +12,7 @@ use axon_shm::{
 };
 use axon_transport::internal::{
     registry::{LocalEndpoint, Registry},
-    wire::session::{EndpointRole, Message, Refused},
+    wire::session::{EndpointRole, SessionMessage, SessionRefused},
 };
 
 use crate::bridge::RefusedRoute;
@@ -65,7 +65,11 @@ impl NotifiedEndpoints {
     ) {
         let news = self.news(registry, peer, host, routes);
         for (session, text) in news {
-            registry.push(&session, &Message::Refused(Refused::because(text)), Vec::new());
+            registry.push(
+                &session,
+                &SessionMessage::SessionRefused(SessionRefused::because(text)),
+                Vec::new(),
+            );
         }
     }
 
@@ -122,19 +126,20 @@ mod tests {
         let endpoint = Endpoint::new(gid, EndpointKind::Subscription, topic, "T");
         let role = EndpointRole::Application;
         let announce = Announce { endpoint, role, stands_for: vec![], ring: None, only: None };
-        registry.handle_message(&SESSION, Message::Endpoint(announce), vec![]).unwrap();
+        registry.handle_message(&SESSION, SessionMessage::Endpoint(announce), vec![]).unwrap();
     }
 
     /// What the session is told.
     fn heard(registry: &mut Sessions) -> Vec<String> {
         let packets = std::iter::from_fn(|| registry.poll_output(&SESSION));
-        let texts = packets.filter_map(|output| match Message::decode(&output.packet).unwrap() {
-            Message::Refused(refused) => {
-                assert_eq!(refused.endpoint, None, "it stays in the graph");
-                Some(refused.text)
-            }
-            _ => None,
-        });
+        let texts =
+            packets.filter_map(|output| match SessionMessage::decode(&output.packet).unwrap() {
+                SessionMessage::SessionRefused(refused) => {
+                    assert_eq!(refused.endpoint, None, "it stays in the graph");
+                    Some(refused.text)
+                }
+                _ => None,
+            });
         texts.collect()
     }
 

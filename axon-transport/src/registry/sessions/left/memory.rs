@@ -6,7 +6,7 @@
 
 use std::collections::VecDeque;
 
-use super::super::memory::{OwnMemory, SessionSegment};
+use super::super::memory::{OwnMemory, RegisteredSegment};
 use crate::ids::SessionId;
 
 /// The segments of sessions that ended.
@@ -51,7 +51,7 @@ impl<F> LeftMemory<F> {
         self.sessions.retain(|(left, _)| left != id);
     }
 
-    pub(super) fn segment(&self, of: &SessionId, number: u32) -> Option<&SessionSegment<F>> {
+    pub(super) fn segment(&self, of: &SessionId, number: u32) -> Option<&RegisteredSegment<F>> {
         let (_, segments) = self.sessions.iter().find(|(id, _)| id == of)?;
         segments.get(number)
     }
@@ -67,7 +67,8 @@ mod tests {
         ids::Gid,
         registry::Registry,
         wire::session::{
-            Announce, EndpointRole, Message, Segment, SegmentName, SegmentOpened, SessionRole,
+            Announce, EndpointRole, Segment, SegmentName, SegmentOpened, SessionMessage,
+            SessionRole,
         },
     };
 
@@ -97,11 +98,13 @@ mod tests {
     fn open(registry: &mut Registry<&'static str>, session: u8, number: u32) {
         let opened =
             SegmentOpened { session: id(session), segment: Segment { number, publisher: None } };
-        registry.handle_message(&id(session), Message::Segment(opened), vec!["map"]).unwrap();
+        registry
+            .handle_message(&id(session), SessionMessage::Segment(opened), vec!["map"])
+            .unwrap();
     }
 
     fn need(registry: &mut Registry<&'static str>, number: u32) {
-        let need = Message::Need(SegmentName { session: id(WRITER), number });
+        let need = SessionMessage::Need(SegmentName { session: id(WRITER), number });
         registry.handle_message(&id(READER), need, vec![]).unwrap();
     }
 
@@ -109,8 +112,8 @@ mod tests {
     fn taken(registry: &mut Registry<&'static str>) -> Vec<u32> {
         let packets = std::iter::from_fn(|| registry.poll_output(&id(READER)));
         let segments =
-            packets.filter_map(|output| match Message::decode(&output.packet).unwrap() {
-                Message::Segment(opened) => {
+            packets.filter_map(|output| match SessionMessage::decode(&output.packet).unwrap() {
+                SessionMessage::Segment(opened) => {
                     assert_eq!(output.descriptors, ["map"]);
                     Some(opened.segment.number)
                 }
@@ -176,16 +179,17 @@ mod tests {
         let endpoint = Endpoint::example(gid, EndpointKind::Publisher);
         let (role, ring) = (EndpointRole::Application, Some(Location { segment: 0, offset: 4096 }));
         let announce = Announce { endpoint, role, stands_for: Vec::new(), ring, only: None };
-        registry.handle_message(&id(WRITER), Message::Endpoint(announce), vec![]).unwrap();
+        registry.handle_message(&id(WRITER), SessionMessage::Endpoint(announce), vec![]).unwrap();
         registry.flush();
         registry.handle_disconnect(&id(WRITER));
         registry.flush();
         connect(&mut registry, 3);
         let packets = std::iter::from_fn(|| registry.poll_output(&id(3)));
-        let ended = packets.filter_map(|output| match Message::decode(&output.packet).unwrap() {
-            Message::Graph(graph) => graph.ended,
-            _ => None,
-        });
+        let ended =
+            packets.filter_map(|output| match SessionMessage::decode(&output.packet).unwrap() {
+                SessionMessage::SessionGraph(graph) => graph.ended,
+                _ => None,
+            });
         assert_eq!(ended.flatten().collect::<Vec<_>>(), [gid]);
     }
 }

@@ -5,38 +5,38 @@ mod memory;
 mod news;
 mod pledges;
 
-use self::{memory::LeftMemory, news::LeftNews, pledges::Pledges};
+use self::{memory::LeftMemory, news::UndeliveredPackets, pledges::EarlierGrants};
 use super::{
     entry::SessionEntry,
-    memory::{OwnMemory, SessionSegment},
-    outbox::Output,
+    memory::{OwnMemory, RegisteredSegment},
+    outbox::SessionPacket,
 };
 use crate::{
     ids::{Gid, SessionId},
-    wire::session::{Granted, MAX_DESCRIPTORS, Message, Pair, Unmatch},
+    wire::session::{Granted, MAX_DESCRIPTORS, Pair, SessionMessage, Unmatch},
 };
 
 /// What sessions left to readers.
 #[derive(Debug)]
-pub(super) struct Left<F> {
+pub(super) struct LeftBehind<F> {
     /// Memory of those that ended.
     memory: LeftMemory<F>,
     /// What is for readers whose sessions are not here.
-    news: LeftNews<F>,
-    pledges: Pledges,
+    news: UndeliveredPackets<F>,
+    pledges: EarlierGrants,
 }
 
-impl<F> Default for Left<F> {
+impl<F> Default for LeftBehind<F> {
     fn default() -> Self {
         Self {
             memory: LeftMemory::default(),
-            news: LeftNews::default(),
-            pledges: Pledges::default(),
+            news: UndeliveredPackets::default(),
+            pledges: EarlierGrants::default(),
         }
     }
 }
 
-impl<F> Left<F> {
+impl<F> LeftBehind<F> {
     /// From now on keeps segments of sessions that end, `most` at a time.
     pub(super) fn keep_memory(&mut self, most: usize) {
         self.memory = LeftMemory::new(most);
@@ -48,7 +48,7 @@ impl<F> Left<F> {
     }
 
     /// A segment of a session that ended.
-    pub(super) fn segment(&self, of: &SessionId, number: u32) -> Option<&SessionSegment<F>> {
+    pub(super) fn segment(&self, of: &SessionId, number: u32) -> Option<&RegisteredSegment<F>> {
         self.memory.segment(of, number)
     }
 
@@ -63,7 +63,7 @@ impl<F> Left<F> {
         &mut self,
         id: SessionId,
         segments: OwnMemory<F>,
-        kept: impl Iterator<Item = Output<F>>,
+        kept: impl Iterator<Item = SessionPacket<F>>,
     ) {
         self.memory.keep(id, segments);
         // It may come back.
@@ -71,17 +71,17 @@ impl<F> Left<F> {
     }
 
     /// Keeps a packet for its reader.
-    pub(super) fn keep(&mut self, output: Output<F>) {
+    pub(super) fn keep(&mut self, output: SessionPacket<F>) {
         self.news.keep(output, None);
     }
 
     /// Keeps a packet for its reader, until the process of session `id` has ended.
-    pub(super) fn hold_back(&mut self, output: Output<F>, id: SessionId) {
+    pub(super) fn hold_back(&mut self, output: SessionPacket<F>, id: SessionId) {
         self.news.keep(output, Some(id));
     }
 
     /// Takes what was kept for a session's readers.
-    pub(super) fn take_for(&mut self, id: &SessionId) -> Vec<Output<F>> {
+    pub(super) fn take_for(&mut self, id: &SessionId) -> Vec<SessionPacket<F>> {
         self.news.take(id)
     }
 
@@ -91,7 +91,7 @@ impl<F> Left<F> {
     }
 
     /// Takes what awaited the end of a session's process.
-    pub(super) fn take_awaiting(&mut self, id: &SessionId) -> Vec<Output<F>> {
+    pub(super) fn take_awaiting(&mut self, id: &SessionId) -> Vec<SessionPacket<F>> {
         self.news.take_awaiting(id)
     }
 
@@ -121,7 +121,7 @@ impl<F> Left<F> {
 pub(super) fn packets_of_grant<F: Clone>(
     entry: &SessionEntry<F>,
     granted: Granted,
-) -> Vec<Output<F>> {
+) -> Vec<SessionPacket<F>> {
     // What another user may give to readers here, the access rules say, and these may have changed.
     let Some(descriptors) = entry.descriptors.clone().filter(|_| entry.user.is_none()) else {
         return Vec::new();
@@ -135,9 +135,9 @@ pub(super) fn packets_of_grant<F: Clone>(
         own.map(|of| (of.segment, of.descriptor.clone())).unzip();
     descriptors.extend(maps);
     let Granted { reader, writer, .. } = granted;
-    let grant = Message::Grant(Granted { segments, ..granted });
+    let grant = SessionMessage::Grant(Granted { segments, ..granted });
     let end = Unmatch { reader, writer, reason: "its session ended".to_owned() };
-    let grant = Output::kept(&grant, descriptors, reader, entry.pid);
-    let end = Output::kept(&Message::Unmatch(end), Vec::new(), reader, entry.pid);
+    let grant = SessionPacket::kept(&grant, descriptors, reader, entry.pid);
+    let end = SessionPacket::kept(&SessionMessage::Unmatch(end), Vec::new(), reader, entry.pid);
     grant.into_iter().chain(end).collect()
 }

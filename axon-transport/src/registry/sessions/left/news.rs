@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use super::super::{outbox::Output, shares::makes_room};
+use super::super::{outbox::SessionPacket, shares::makes_room};
 use crate::{
     ids::SessionId,
     registry::limits::{MAX_LEFT, MAX_UNMET},
@@ -11,36 +11,36 @@ use crate::{
 /// Packets for readers that are not here, and that never learned of the grant of a publisher that ended. Their processes
 /// may be stopped, and may have ended. Packets that hand a ring over wait until the publisher's process has ended, too.
 #[derive(Debug)]
-pub(super) struct LeftNews<F> {
-    kept: VecDeque<Kept<F>>,
+pub(super) struct UndeliveredPackets<F> {
+    kept: VecDeque<KeptPacket<F>>,
     full: bool,
 }
 
 #[derive(Debug)]
-struct Kept<F> {
-    output: Output<F>,
+struct KeptPacket<F> {
+    output: SessionPacket<F>,
     /// The session whose process has to end first.
     awaits: Option<SessionId>,
 }
 
-impl<F> Kept<F> {
+impl<F> KeptPacket<F> {
     fn holds(&self) -> bool {
         !self.output.descriptors.is_empty()
     }
 }
 
-impl<F> Default for LeftNews<F> {
+impl<F> Default for UndeliveredPackets<F> {
     fn default() -> Self {
         Self { kept: VecDeque::new(), full: false }
     }
 }
 
-impl<F> LeftNews<F> {
+impl<F> UndeliveredPackets<F> {
     /// Keeps a packet for its reader, which does not get it before the process of session `awaits` has ended. A session
     /// may say the same again.
-    pub(super) fn keep(&mut self, output: Output<F>, awaits: Option<SessionId>) {
+    pub(super) fn keep(&mut self, output: SessionPacket<F>, awaits: Option<SessionId>) {
         self.kept.retain(|kept| kept.output.packet != output.packet);
-        let new = Kept { output, awaits };
+        let new = KeptPacket { output, awaits };
         let full = self.kept.len() == MAX_UNMET;
         let rings = new.holds() && self.kept.iter().filter(|of| of.holds()).count() == MAX_LEFT;
         if full || rings {
@@ -50,7 +50,7 @@ impl<F> LeftNews<F> {
     }
 
     /// Drops the oldest of those, of the process that has most of them.
-    fn make_room(&mut self, newcomer: u32, of: impl Fn(&Kept<F>) -> bool) {
+    fn make_room(&mut self, newcomer: u32, of: impl Fn(&KeptPacket<F>) -> bool) {
         let those: Vec<usize> =
             (0..self.kept.len()).filter(|index| of(&self.kept[*index])).collect();
         let processes = those.iter().map(|index| self.kept[*index].output.process);
@@ -66,14 +66,14 @@ impl<F> LeftNews<F> {
     }
 
     /// Takes those for a session's readers.
-    pub(super) fn take(&mut self, session: &SessionId) -> Vec<Output<F>> {
-        self.take_where(|Kept { output, awaits }| {
+    pub(super) fn take(&mut self, session: &SessionId) -> Vec<SessionPacket<F>> {
+        self.take_where(|KeptPacket { output, awaits }| {
             awaits.is_none() && output.kept_for.is_some_and(|gid| gid.is_of(session))
         })
     }
 
     /// Takes those that await the end of this session's process.
-    pub(super) fn take_awaiting(&mut self, session: &SessionId) -> Vec<Output<F>> {
+    pub(super) fn take_awaiting(&mut self, session: &SessionId) -> Vec<SessionPacket<F>> {
         self.take_where(|kept| kept.awaits.as_ref() == Some(session))
     }
 
@@ -82,7 +82,7 @@ impl<F> LeftNews<F> {
         self.kept.iter().any(|kept| kept.awaits.as_ref() == Some(session))
     }
 
-    fn take_where(&mut self, which: impl Fn(&Kept<F>) -> bool) -> Vec<Output<F>> {
+    fn take_where(&mut self, which: impl Fn(&KeptPacket<F>) -> bool) -> Vec<SessionPacket<F>> {
         let (taken, rest): (Vec<_>, _) = self.kept.drain(..).partition(which);
         self.kept = rest.into();
         taken.into_iter().map(|kept| kept.output).collect()

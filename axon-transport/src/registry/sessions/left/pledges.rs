@@ -8,21 +8,21 @@ use crate::{ids::SessionId, registry::limits::MAX_PLEDGES, wire::session::Grante
 /// What publishers granted, by way of an earlier daemon, to readers that had not taken it up when the publishers came here.
 /// A publisher whose process is killed tells nobody what these readers lost: they are handed the grant, and the ring.
 #[derive(Debug, Default)]
-pub(super) struct Pledges(VecDeque<Pledge>);
+pub(super) struct EarlierGrants(VecDeque<EarlierGrant>);
 
 #[derive(Debug)]
-struct Pledge {
+struct EarlierGrant {
     granted: Granted,
     /// The publisher's process.
     process: u32,
 }
 
-impl Pledges {
+impl EarlierGrants {
     pub(super) fn note(&mut self, granted: Granted, process: u32) {
         self.forget(|known| (known.reader, known.writer) == (granted.reader, granted.writer));
         if self.0.len() == MAX_PLEDGES
             && let Some(index) = makes_room(self.0.iter().map(|pledge| pledge.process), process)
-            && let Some(Pledge { granted: Granted { reader, writer, .. }, .. }) =
+            && let Some(EarlierGrant { granted: Granted { reader, writer, .. }, .. }) =
                 self.0.remove(index)
         {
             tracing::warn!(
@@ -31,7 +31,7 @@ impl Pledges {
                  does not count what it lost if its publisher is killed"
             );
         }
-        self.0.push_back(Pledge { granted, process });
+        self.0.push_back(EarlierGrant { granted, process });
     }
 
     pub(super) fn forget(&mut self, which: impl Fn(&Granted) -> bool) {

@@ -10,7 +10,7 @@ use std::{
 
 use axon_shm::Meta;
 
-use super::{Channel, OVERHEAD, WINDOW};
+use super::{FlowChannel, OVERHEAD, WINDOW};
 use crate::wire::session::{Credit, SampleFragment, SampleHeader};
 
 /// Bytes beyond the windows of its channels that one session's arriving samples may take, but for one
@@ -24,7 +24,7 @@ pub(super) const LONG: u64 = SESSION / 8;
 #[derive(Debug, PartialEq, Eq)]
 pub struct InboundSample {
     /// On which channel.
-    pub channel: Channel,
+    pub channel: FlowChannel,
     /// Its number and time.
     pub meta: Meta,
     /// Samples of its publisher that were lost since the one before.
@@ -42,7 +42,7 @@ impl InboundSample {
 /// What no sender does. The connection is closed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
-pub enum Violation {
+pub enum FlowViolation {
     /// A sample longer than any may be.
     #[error("a sample of {0} bytes, which is more than AXON_MAX_MESSAGE_MB allows")]
     TooLarge(u32),
@@ -56,12 +56,12 @@ pub enum Violation {
 
 /// The memory that the arriving samples of all of a daemon's relayed sessions share.
 #[derive(Debug)]
-pub struct Pool {
+pub struct ArrivalPool {
     held: AtomicU64,
     limit: u64,
 }
 
-impl Pool {
+impl ArrivalPool {
     /// A pool of `limit` bytes.
     pub fn new(limit: u64) -> Arc<Self> {
         Arc::new(Self { held: AtomicU64::new(0), limit })
@@ -88,16 +88,16 @@ impl Pool {
 
 /// The receiving end.
 #[derive(Debug)]
-pub struct Incoming {
-    channels: HashMap<Channel, Receiving>,
+pub struct IncomingFlow {
+    channels: HashMap<FlowChannel, Receiving>,
     max_message: u64,
     /// Channels whose sample is longer than their window, until there is room.
-    waiting: VecDeque<Channel>,
+    waiting: VecDeque<FlowChannel>,
     /// Bytes that were granted beyond the windows to samples that are not long.
     reserved: u64,
     /// The channel of the one that is, and what it was granted.
-    long: Option<(Channel, u64)>,
-    pool: Arc<Pool>,
+    long: Option<(FlowChannel, u64)>,
+    pool: Arc<ArrivalPool>,
     is_short: bool,
 }
 
@@ -116,17 +116,17 @@ struct Partial {
     payload: Vec<u8>,
 }
 
-impl Incoming {
+impl IncomingFlow {
     /// An end that takes samples of at most `max_message` bytes, and memory beyond its windows out of
     /// `pool`.
-    pub fn new(max_message: u64, pool: Arc<Pool>) -> Self {
+    pub fn new(max_message: u64, pool: Arc<ArrivalPool>) -> Self {
         let (channels, waiting) = (HashMap::new(), VecDeque::new());
         Self { channels, max_message, waiting, reserved: 0, long: None, pool, is_short: false }
     }
 
     /// Opens a channel, unless it is open: what its sender, of which so many MATCHED were heard, is to
     /// be told.
-    pub fn open(&mut self, channel: Channel, heard: u64) -> Option<Credit> {
+    pub fn open(&mut self, channel: FlowChannel, heard: u64) -> Option<Credit> {
         if self.channels.contains_key(&channel) {
             return None;
         }
@@ -135,7 +135,7 @@ impl Incoming {
     }
 
     /// Closes those channels that `keep` does not want, and forgets what came on them.
-    pub fn retain(&mut self, keep: impl Fn(&Channel) -> bool) {
+    pub fn retain(&mut self, keep: impl Fn(&FlowChannel) -> bool) {
         let closed = self.channels.extract_if(|name, _| !keep(name));
         for (name, channel) in closed.collect::<Vec<_>>() {
             self.release(name, channel.granted);
@@ -145,7 +145,7 @@ impl Incoming {
     }
 
     /// The channels of which a sample has come in part.
-    pub fn partial(&self) -> impl Iterator<Item = &Channel> {
+    pub fn partial(&self) -> impl Iterator<Item = &FlowChannel> {
         let partial = self.channels.iter().filter(|(_, channel)| channel.partial.is_some());
         partial.map(|(name, _)| name)
     }
@@ -153,28 +153,28 @@ impl Incoming {
     /// Takes a piece; the sample, if it was the last.
     ///
     /// # Errors
-    /// [`Violation`].
-    pub fn piece(&mut self, piece: SampleFragment) -> Result<Option<InboundSample>, Violation> {
+    /// [`FlowViolation`].
+    pub fn piece(&mut self, piece: SampleFragment) -> Result<Option<InboundSample>, FlowViolation> {
         let SampleFragment { publisher, head, bytes, client } = piece;
-        let name = Channel { writer: publisher, client };
+        let name = FlowChannel { writer: publisher, client };
         // Of a channel that was closed meanwhile.
         let Some(channel) = self.channels.get_mut(&name) else { return Ok(None) };
         let opens = head.is_some();
         let partial = match (head, channel.partial.take()) {
             (Some(head), None) if u64::from(head.length) > self.max_message => {
-                return Err(Violation::TooLarge(head.length));
+                return Err(FlowViolation::TooLarge(head.length));
             }
             (Some(head), None) => Partial { head, payload: Vec::new() },
             (None, Some(partial)) if !bytes.is_empty() => partial,
-            _ => return Err(Violation::OutOfPlace),
+            _ => return Err(FlowViolation::OutOfPlace),
         };
         let length = partial.head.length as usize;
         if bytes.len() > length - partial.payload.len() {
-            return Err(Violation::OutOfPlace);
+            return Err(FlowViolation::OutOfPlace);
         }
         channel.held += bytes.len() as u64 + if opens { OVERHEAD } else { 0 };
         if channel.held > WINDOW + channel.granted {
-            return Err(Violation::Overrun);
+            return Err(FlowViolation::Overrun);
         }
         let Partial { head, mut payload } = partial;
         // Grows with what really arrives.
@@ -211,7 +211,7 @@ impl Incoming {
         granted
     }
 
-    fn reserve(&mut self, name: Channel, bytes: u64) -> bool {
+    fn reserve(&mut self, name: FlowChannel, bytes: u64) -> bool {
         let is_long = bytes > LONG;
         let fits = if is_long { self.long.is_none() } else { self.reserved + bytes <= SESSION };
         if !fits {
@@ -247,7 +247,7 @@ impl Incoming {
         Some(Credit { done: Some(sample.meta.sequence), ..name.credit(cost - more, None) })
     }
 
-    fn release(&mut self, of: Channel, bytes: u64) {
+    fn release(&mut self, of: FlowChannel, bytes: u64) {
         let mut rest = bytes;
         if let Some((name, long)) = &mut self.long
             && *name == of
@@ -263,7 +263,7 @@ impl Incoming {
     }
 }
 
-impl Drop for Incoming {
+impl Drop for IncomingFlow {
     fn drop(&mut self) {
         self.pool.give(self.reserved + self.long.map_or(0, |(_, bytes)| bytes));
     }

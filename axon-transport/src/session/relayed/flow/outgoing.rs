@@ -4,19 +4,19 @@ use std::collections::{BTreeMap, VecDeque};
 
 use axon_shm::Meta;
 
-use super::{Channel, Content, OVERHEAD, OutboundSample, PIECE};
+use super::{FlowChannel, OVERHEAD, OutboundSample, PIECE, SampleContent};
 use crate::wire::session::{Credit, SampleFragment, SampleHeader};
 
 /// The sending end.
 #[derive(Debug)]
-pub struct Outgoing<S> {
-    channels: BTreeMap<Channel, Sending<S>>,
+pub struct OutgoingFlow<S> {
+    channels: BTreeMap<FlowChannel, SendingSample<S>>,
     /// Channels that may send a piece, in their order.
-    turns: VecDeque<Channel>,
+    turns: VecDeque<FlowChannel>,
 }
 
 #[derive(Debug)]
-struct Sending<S> {
+struct SendingSample<S> {
     /// MATCHED that this end had said when it opened its end.
     since: u64,
     /// Bytes that may still be sent; `None` until the receiver opened its end.
@@ -28,30 +28,31 @@ struct Sending<S> {
     in_turn: bool,
 }
 
-impl<S> Default for Outgoing<S> {
+impl<S> Default for OutgoingFlow<S> {
     fn default() -> Self {
         Self { channels: BTreeMap::new(), turns: VecDeque::new() }
     }
 }
 
-impl<S: Content> Outgoing<S> {
+impl<S: SampleContent> OutgoingFlow<S> {
     /// Opens a channel, which waits for a receiver that has heard as many MATCHED as were said when it
     /// was to be opened: one that has not means a channel of the same name that was closed since.
-    pub fn open(&mut self, channel: Channel, since: u64) {
-        let closed = Sending { since, credit: None, window: 0, current: None, in_turn: false };
+    pub fn open(&mut self, channel: FlowChannel, since: u64) {
+        let closed =
+            SendingSample { since, credit: None, window: 0, current: None, in_turn: false };
         self.channels.entry(channel).or_insert(closed);
     }
 
     /// Closes those channels that `keep` does not want; the rest of a sample that is under way is not
     /// sent.
-    pub fn retain(&mut self, keep: impl Fn(&Channel) -> bool) {
+    pub fn retain(&mut self, keep: impl Fn(&FlowChannel) -> bool) {
         self.channels.retain(|channel, _| keep(channel));
         let channels = &self.channels;
         self.turns.retain(|channel| channels.contains_key(channel));
     }
 
     /// Closes a channel.
-    pub fn close(&mut self, channel: &Channel) {
+    pub fn close(&mut self, channel: &FlowChannel) {
         self.channels.remove(channel);
         self.turns.retain(|other| other != channel);
     }
@@ -59,7 +60,7 @@ impl<S: Content> Outgoing<S> {
     /// What the receiver of a channel says.
     pub fn credit(&mut self, credit: &Credit) {
         let Credit { publisher, bytes, opens, client, .. } = *credit;
-        let name = Channel { writer: publisher, client };
+        let name = FlowChannel { writer: publisher, client };
         let Some(channel) = self.channels.get_mut(&name) else { return };
         match (&mut channel.credit, opens) {
             (none @ None, Some(heard)) if heard >= channel.since => {
@@ -74,7 +75,7 @@ impl<S: Content> Outgoing<S> {
     }
 
     /// Whether all that was sent on a channel has gone to where it belongs.
-    pub fn is_idle(&self, channel: &Channel) -> bool {
+    pub fn is_idle(&self, channel: &FlowChannel) -> bool {
         self.channels.get(channel).is_none_or(|channel| {
             channel.current.is_none()
                 && channel.credit.is_none_or(|credit| credit == channel.window)
@@ -83,7 +84,10 @@ impl<S: Content> Outgoing<S> {
 
     /// Asks for the next sample of each channel that has none under way and may send one. Whether
     /// there was any.
-    pub fn fill(&mut self, mut take: impl FnMut(&Channel) -> Option<OutboundSample<S>>) -> bool {
+    pub fn fill(
+        &mut self,
+        mut take: impl FnMut(&FlowChannel) -> Option<OutboundSample<S>>,
+    ) -> bool {
         let mut found = Vec::new();
         for (name, channel) in &mut self.channels {
             if channel.current.is_none() && channel.credit >= Some(OVERHEAD) {
@@ -137,12 +141,12 @@ impl<S: Content> Outgoing<S> {
             } else {
                 self.enqueue(name);
             }
-            let Channel { writer: publisher, client } = name;
+            let FlowChannel { writer: publisher, client } = name;
             return Some(SampleFragment { publisher, head, bytes, client });
         }
     }
 
-    fn enqueue(&mut self, name: Channel) {
+    fn enqueue(&mut self, name: FlowChannel) {
         if let Some(channel) = self.channels.get_mut(&name)
             && channel.current.is_some()
             && !std::mem::replace(&mut channel.in_turn, true)

@@ -13,17 +13,17 @@ use crate::wire::session::{SampleFragment, SampleHeader};
 const MAX: u64 = 1 << 20;
 
 /// Those of requests and of responses beside those of publishers.
-fn channel(number: u8) -> Channel {
+fn channel(number: u8) -> FlowChannel {
     let writer = Gid([number / 2; 16]);
     if number.is_multiple_of(2) {
-        Channel::of(writer)
+        FlowChannel::of(writer)
     } else {
-        Channel::between(writer, Gid([9; 16]))
+        FlowChannel::between(writer, Gid([9; 16]))
     }
 }
 
-fn incoming() -> Incoming {
-    Incoming::new(MAX, Pool::new(MAX))
+fn incoming() -> IncomingFlow {
+    IncomingFlow::new(MAX, ArrivalPool::new(MAX))
 }
 
 fn departing(sequence: u64, len: usize) -> OutboundSample<Vec<u8>> {
@@ -56,26 +56,33 @@ fn invalid_fragments_are_refused() {
         }
         incoming.piece(last.clone()).unwrap_err()
     };
-    assert_eq!(refused(&[piece(1, head(MAX as u32 + 1), 0)]), Violation::TooLarge(MAX as u32 + 1));
-    assert_eq!(refused(&[piece(1, None, 10)]), Violation::OutOfPlace);
-    assert_eq!(refused(&[piece(1, head(10), 11)]), Violation::OutOfPlace);
-    assert_eq!(refused(&[piece(1, head(10), 5), piece(1, None, 6)]), Violation::OutOfPlace);
-    assert_eq!(refused(&[piece(1, head(10), 5), piece(1, head(10), 5)]), Violation::OutOfPlace);
-    assert_eq!(refused(&[piece(1, head(10), 5), piece(1, None, 0)]), Violation::OutOfPlace);
+    assert_eq!(
+        refused(&[piece(1, head(MAX as u32 + 1), 0)]),
+        FlowViolation::TooLarge(MAX as u32 + 1)
+    );
+    assert_eq!(refused(&[piece(1, None, 10)]), FlowViolation::OutOfPlace);
+    assert_eq!(refused(&[piece(1, head(10), 11)]), FlowViolation::OutOfPlace);
+    assert_eq!(refused(&[piece(1, head(10), 5), piece(1, None, 6)]), FlowViolation::OutOfPlace);
+    assert_eq!(refused(&[piece(1, head(10), 5), piece(1, head(10), 5)]), FlowViolation::OutOfPlace);
+    assert_eq!(refused(&[piece(1, head(10), 5), piece(1, None, 0)]), FlowViolation::OutOfPlace);
     let long = WINDOW as usize;
-    assert_eq!(refused(&[piece(1, head(MAX as u32), long)]), Violation::Overrun);
+    assert_eq!(refused(&[piece(1, head(MAX as u32), long)]), FlowViolation::Overrun);
     let mut samples = open();
     for _ in 0..WINDOW / OVERHEAD {
         assert!(samples.piece(piece(1, head(0), 0)).unwrap().is_some());
     }
-    assert_eq!(samples.piece(piece(1, head(0), 0)), Err(Violation::Overrun), "empty ones count");
+    assert_eq!(
+        samples.piece(piece(1, head(0), 0)),
+        Err(FlowViolation::Overrun),
+        "empty ones count"
+    );
     assert_eq!(open().piece(piece(2, None, 10)), Ok(None), "of a channel that was closed");
 }
 
 #[test]
 fn a_long_sample_waits_for_room_and_gives_it_back() {
-    let pool = Pool::new(100_000);
-    let mut ends = [(); 2].map(|()| Incoming::new(MAX, Arc::clone(&pool)));
+    let pool = ArrivalPool::new(100_000);
+    let mut ends = [(); 2].map(|()| IncomingFlow::new(MAX, Arc::clone(&pool)));
     for incoming in &mut ends {
         incoming.open(channel(1), 0);
         assert_eq!(incoming.piece(piece(1, head(100_000), 0)), Ok(None));
@@ -103,15 +110,16 @@ fn a_long_sample_waits_for_room_and_gives_it_back() {
 
 #[test]
 fn a_long_sample_that_is_not_read_holds_up_none_but_long_ones() {
-    let mut incoming = Incoming::new(1 << 30, Pool::new(u64::MAX));
+    let mut incoming = IncomingFlow::new(1 << 30, ArrivalPool::new(u64::MAX));
     let lengths = [63 << 20, 200 << 20, LONG as u32, LONG as u32, 40 << 20, 100_000];
     for (number, length) in (0..).zip(lengths) {
         incoming.open(channel(number), 0);
         assert_eq!(incoming.piece(piece(number, head(length), 0)), Ok(None));
     }
-    let granted = |incoming: &mut Incoming| {
+    let granted = |incoming: &mut IncomingFlow| {
         let names = incoming.grants().into_iter();
-        let names = names.map(|credit| Channel { writer: credit.publisher, client: credit.client });
+        let names =
+            names.map(|credit| FlowChannel { writer: credit.publisher, client: credit.client });
         names.collect::<Vec<_>>()
     };
     assert_eq!(granted(&mut incoming), [0, 2, 3, 5].map(channel));
@@ -131,7 +139,7 @@ fn a_long_sample_that_is_not_read_holds_up_none_but_long_ones() {
 
 #[test]
 fn one_sample_may_be_longer_than_the_pool() {
-    let mut incoming = Incoming::new(MAX, Pool::new(1));
+    let mut incoming = IncomingFlow::new(MAX, ArrivalPool::new(1));
     incoming.open(channel(1), 0);
     assert_eq!(incoming.piece(piece(1, head(MAX as u32), 0)), Ok(None));
     assert_eq!(incoming.grants().len(), 1);
@@ -139,11 +147,11 @@ fn one_sample_may_be_longer_than_the_pool() {
 
 #[test]
 fn an_image_does_not_hold_a_small_sample_up() {
-    let next = |outgoing: &mut Outgoing<Vec<u8>>| {
+    let next = |outgoing: &mut OutgoingFlow<Vec<u8>>| {
         let piece = outgoing.next_piece().unwrap();
-        Channel { writer: piece.publisher, client: piece.client }
+        FlowChannel { writer: piece.publisher, client: piece.client }
     };
-    let mut outgoing = Outgoing::default();
+    let mut outgoing = OutgoingFlow::default();
     for number in [1, 2] {
         outgoing.open(channel(number), 0);
         outgoing.credit(&channel(number).credit(MAX, Some(0)));
@@ -158,7 +166,7 @@ fn an_image_does_not_hold_a_small_sample_up() {
 
 #[test]
 fn a_channel_without_its_receiver_sends_nothing() {
-    let mut outgoing = Outgoing::default();
+    let mut outgoing = OutgoingFlow::default();
     outgoing.open(channel(1), 0);
     outgoing.credit(&channel(1).credit(1000, None));
     assert!(!outgoing.fill(|_| Some(departing(1, 1))), "of a channel before it");
@@ -177,7 +185,7 @@ fn a_channel_without_its_receiver_sends_nothing() {
 
 #[test]
 fn credit_for_a_closed_channel_opens_no_later_one() {
-    let mut outgoing = Outgoing::default();
+    let mut outgoing = OutgoingFlow::default();
     outgoing.open(channel(1), 1);
     outgoing.close(&channel(1));
     outgoing.open(channel(1), 3);
@@ -198,11 +206,11 @@ proptest! {
         stuck in 0u8..4,
         order in any::<u64>(),
     ) {
-        let pool = Pool::new(300_000);
-        let mut incoming = Incoming::new(MAX, Arc::clone(&pool));
-        let mut outgoing = Outgoing::default();
-        let mut queues: HashMap<Channel, VecDeque<OutboundSample<Vec<u8>>>> = HashMap::new();
-        let mut expected: HashMap<Channel, VecDeque<Vec<u8>>> = HashMap::new();
+        let pool = ArrivalPool::new(300_000);
+        let mut incoming = IncomingFlow::new(MAX, Arc::clone(&pool));
+        let mut outgoing = OutgoingFlow::default();
+        let mut queues: HashMap<FlowChannel, VecDeque<OutboundSample<Vec<u8>>>> = HashMap::new();
+        let mut expected: HashMap<FlowChannel, VecDeque<Vec<u8>>> = HashMap::new();
         for number in 0..4 {
             outgoing.open(channel(number), 0);
             outgoing.credit(&incoming.open(channel(number), 0).unwrap());
@@ -259,8 +267,8 @@ proptest! {
         pieces in prop::collection::vec(
             (0u8..3, prop::option::of(0u32..100_000), 0usize..40_000, any::<bool>()), 0..60),
     ) {
-        let pool = Pool::new(50_000);
-        let mut incoming = Incoming::new(90_000, Arc::clone(&pool));
+        let pool = ArrivalPool::new(50_000);
+        let mut incoming = IncomingFlow::new(90_000, Arc::clone(&pool));
         incoming.open(channel(0), 0);
         incoming.open(channel(1), 0);
         let mut kept = 0;

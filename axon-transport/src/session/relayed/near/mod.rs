@@ -15,12 +15,12 @@ use std::{
 use axon_shm::{ExternalLeader, internal::descriptors::PassedFd};
 
 use self::{
-    relays::Relay,
-    stand_ins::{Kept, KeptCalls, StandIn},
+    relays::NearRelay,
+    stand_ins::{Kept, KeptCalls, NearStandIn},
 };
 use super::{
-    calls::{self, Calls},
-    flow::{Channel, Incoming, Pool},
+    calls::{self, CallChannels},
+    flow::{ArrivalPool, FlowChannel, IncomingFlow},
     pipe::{End, LossReport, Pipe},
     unanswered::Unanswered,
 };
@@ -40,7 +40,8 @@ use crate::{
         state::SessionShared,
     },
     wire::session::{
-        Announce, Asserted, EndpointRole, GivenUp, Gone, Graph, Leaving, Message, Refused,
+        Announce, Asserted, EndpointRole, Gone, RelayGivenUp, SessionGraph, SessionMessage,
+        SessionRefused, WriterLeaving,
     },
 };
 
@@ -110,7 +111,7 @@ impl Common {
             self.shared.set_daemon(None);
             next = self.reconnect(since.elapsed() < Duration::from_secs(1), &mut kept);
         }
-        kept.relays.values().for_each(Relay::give_up);
+        kept.relays.values().for_each(NearRelay::give_up);
     }
 }
 
@@ -133,10 +134,10 @@ struct RelayConnection<'a> {
     /// With whom the daemon says they are matched.
     matched: HashMap<Gid, BTreeSet<Gid>>,
     /// One for each of its publishers of which something crosses.
-    relays: BTreeMap<Gid, Relay>,
-    stand_ins: BTreeMap<Gid, StandIn>,
+    relays: BTreeMap<Gid, NearRelay>,
+    stand_ins: BTreeMap<Gid, NearStandIn>,
     /// What the session's clients ask.
-    calls: Calls,
+    calls: CallChannels,
     /// Their requests that have no response.
     unanswered: Unanswered,
     /// Since when the daemon knows of each of its clients.
@@ -160,7 +161,8 @@ impl<'a> RelayConnection<'a> {
         unanswered.keep_clients(|client| graph.endpoints.contains_key(client));
         // This end trusts its daemon with memory: there is one, and it takes what it is given credit
         // for.
-        let incoming = Incoming::new(common.shared.core.config.max_message, Pool::new(u64::MAX));
+        let incoming =
+            IncomingFlow::new(common.shared.core.config.max_message, ArrivalPool::new(u64::MAX));
         let socket = PassedFd::connection(connected.socket).trusted();
         let mut pipe = Pipe::new(socket, incoming, Arc::new(RelayCounters::default()));
         pipe.response_log = Some(response_log);
@@ -195,22 +197,22 @@ impl<'a> RelayConnection<'a> {
             common.leader.arm(waiting);
             let signalled = common.change_signal.take() | !std::mem::replace(&mut begun, true);
             let (messages, more) = self.pipe.receive()?;
-            let changed = messages.iter().any(|m| !matches!(m, Message::Credit(_)));
+            let changed = messages.iter().any(|m| !matches!(m, SessionMessage::Credit(_)));
             messages.into_iter().for_each(|message| self.handle(message));
             let waits = self.held_back
                 || !self.ending.is_empty()
                 || !self.settling.is_empty()
-                || self.stand_ins.values().any(StandIn::is_kept)
-                || self.relays.values().any(Relay::is_carried_over);
+                || self.stand_ins.values().any(NearStandIn::is_kept)
+                || self.relays.values().any(NearRelay::is_carried_over);
             if signalled || changed || waits {
                 self.update()?;
             }
-            let leased = self.relays.values().flat_map(Relay::assertions);
+            let leased = self.relays.values().flat_map(NearRelay::assertions);
             for publishers in self.alive.news(Duration::from_nanos(clock::monotonic()), leased) {
-                self.pipe.say(&Message::Asserted(Asserted { publishers }))?;
+                self.pipe.say(&SessionMessage::Asserted(Asserted { publishers }))?;
             }
             let stand_ins = &self.stand_ins;
-            let find = |gid: &Gid| stand_ins.get(gid).map(StandIn::remote_writer);
+            let find = |gid: &Gid| stand_ins.get(gid).map(NearStandIn::remote_writer);
             let credits = self.pipe.write(find, |gid, loss| {
                 let first = matches!(loss, LossReport::Before { first: true, .. });
                 common.shared.lost(gid, loss.samples(), first);
@@ -228,7 +230,7 @@ impl<'a> RelayConnection<'a> {
             let (calls, settling) = (&mut self.calls, &self.settling);
             let unanswered = &mut self.unanswered;
             let sent = self.pipe.send(|channel| {
-                let Channel { writer, client } = channel;
+                let FlowChannel { writer, client } = channel;
                 match own.get(writer)? {
                     _ if client.is_some() => calls::response(channel, find),
                     _ if settling.contains_key(writer) => None,
@@ -254,19 +256,19 @@ impl<'a> RelayConnection<'a> {
                 .into_iter()
                 .chain(self.settled_in())
                 .chain(self.kept_for())
-                .chain(self.relays.values().filter_map(Relay::waits_for))
+                .chain(self.relays.values().filter_map(NearRelay::waits_for))
                 .chain(end)
                 .min();
             self.pipe.sleep(&common.leader, &common.change_signal, None, left);
         }
     }
 
-    fn handle(&mut self, message: Message) {
+    fn handle(&mut self, message: SessionMessage) {
         match message {
-            Message::Graph(graph) => self.graph(graph),
-            Message::Matched(matched) => self.rematch(matched),
-            Message::EndpointGone(gone) => self.part(&gone.gid),
-            Message::Credit(credit) => {
+            SessionMessage::SessionGraph(graph) => self.graph(graph),
+            SessionMessage::RelayMatched(matched) => self.rematch(matched),
+            SessionMessage::EndpointGone(gone) => self.part(&gone.gid),
+            SessionMessage::Credit(credit) => {
                 self.pipe.outgoing.credit(&credit);
                 if let (Some(client), Some(number)) = (&credit.client, credit.done)
                     && let Some(client) = self.stand_ins.get(client)
@@ -280,16 +282,16 @@ impl<'a> RelayConnection<'a> {
                 }
             }
             // It comes before the credit that confirms them.
-            Message::GivenUp(GivenUp { writer, samples, .. }) => {
+            SessionMessage::RelayGivenUp(RelayGivenUp { writer, samples, .. }) => {
                 if let Some(relay) = self.relays.get(&writer) {
                     relay.lose(samples);
                 }
             }
-            Message::Asserted(asserted) => {
+            SessionMessage::Asserted(asserted) => {
                 let named = asserted.publishers.iter().filter_map(|gid| self.stand_ins.get(gid));
                 named.for_each(|stand_in| stand_in.remote_writer().assert_alive());
             }
-            Message::Refused(Refused { endpoint, text: reason, .. }) => {
+            SessionMessage::SessionRefused(SessionRefused { endpoint, text: reason, .. }) => {
                 tracing::error!(reason, "the daemon refuses an endpoint");
                 if let Some(gid) = endpoint {
                     self.refuse(gid, reason);
@@ -300,7 +302,7 @@ impl<'a> RelayConnection<'a> {
         }
     }
 
-    fn graph(&mut self, graph: Graph) {
+    fn graph(&mut self, graph: SessionGraph) {
         let mut changes: BTreeMap<DaemonId, (Vec<Endpoint>, Vec<Gid>)> = BTreeMap::new();
         for gid in graph.removed {
             if let Some((daemon, _)) = self.world.remove(&gid) {
@@ -379,7 +381,7 @@ impl<'a> RelayConnection<'a> {
     }
 
     fn announce(&mut self, endpoint: &Arc<Endpoint>) -> Result<(), End> {
-        self.pipe.say(&Message::Endpoint(Announce {
+        self.pipe.say(&SessionMessage::Endpoint(Announce {
             endpoint: Endpoint::clone(endpoint),
             role: EndpointRole::Application,
             stands_for: Vec::new(),
@@ -389,7 +391,7 @@ impl<'a> RelayConnection<'a> {
         self.own.insert(endpoint.gid, Arc::clone(endpoint));
         // A server's responses are a channel for each of its clients.
         if matches!(endpoint.kind, EndpointKind::Publisher | EndpointKind::Client) {
-            self.pipe.open_out(Channel::of(endpoint.gid));
+            self.pipe.open_out(FlowChannel::of(endpoint.gid));
         }
         Ok(())
     }
@@ -399,7 +401,7 @@ impl<'a> RelayConnection<'a> {
     fn announce_ended(&mut self) -> Result<(), End> {
         let kept = self.relays.values_mut().filter(|relay| relay.is_carried_over());
         let untold = kept.filter(|relay| !self.own.contains_key(&relay.publisher().gid));
-        let untold: Vec<_> = untold.map(Relay::resume).collect();
+        let untold: Vec<_> = untold.map(NearRelay::resume).collect();
         for endpoint in untold {
             self.announce(&endpoint)?;
             self.ending.insert(endpoint.gid, false);
@@ -414,7 +416,7 @@ impl<'a> RelayConnection<'a> {
         } else {
             self.matched.remove(&gid);
         }
-        self.pipe.say(&Message::EndpointGone(Gone { gid }))
+        self.pipe.say(&SessionMessage::EndpointGone(Gone { gid }))
     }
 
     /// The daemon does not take an endpoint: it knows nothing of it.
@@ -461,7 +463,8 @@ impl<'a> RelayConnection<'a> {
             } else if self.is_revived(&gid) {
                 // The readers of one that leaves are told of it only where they knew it before.
             } else if self.ending.insert(gid, true) == Some(false) {
-                self.pipe.say(&Message::Leaving(Leaving { gid, leaving: true }))?;
+                self.pipe
+                    .say(&SessionMessage::WriterLeaving(WriterLeaving { gid, leaving: true }))?;
             }
         }
         Ok(())

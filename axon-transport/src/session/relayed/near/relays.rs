@@ -19,12 +19,12 @@ use crate::{
         options::EndpointSpec,
         relayed::{
             MAX_MATCHED,
-            flow::{Channel, OutboundSample, Payload},
+            flow::{FlowChannel, OutboundSample, SamplePayload},
         },
     },
 };
 
-pub(super) struct Relay {
+pub(super) struct NearRelay {
     subscription: Subscription,
     /// Its publisher, which may have ended.
     publisher: Arc<Endpoint>,
@@ -46,7 +46,7 @@ struct Awaits {
 /// How long samples that a daemon did not confirm are kept for their readers, once that daemon is gone.
 pub(super) const ABSENCE: Duration = Duration::from_secs(10);
 
-impl Relay {
+impl NearRelay {
     /// When its publisher was last alive, if that has a lease.
     pub(super) fn assertions(&self) -> Vec<(Gid, u64)> {
         self.subscription.assertions()
@@ -106,7 +106,7 @@ impl Relay {
     }
 
     /// The next sample of its publisher.
-    pub(super) fn take(&mut self) -> Option<OutboundSample<Payload>> {
+    pub(super) fn take(&mut self) -> Option<OutboundSample<SamplePayload>> {
         if self.is_carried_over() {
             return None;
         }
@@ -114,7 +114,7 @@ impl Relay {
         let before = std::mem::replace(&mut self.lost, now);
         // Where the publisher has granted anew, it counts from 0.
         let lost = now.checked_sub(before).unwrap_or(now);
-        Some(OutboundSample { meta: content.meta(), lost, content: Payload::Ring(content) })
+        Some(OutboundSample { meta: content.meta(), lost, content: SamplePayload::Ring(content) })
     }
 
     /// Takes back what was not confirmed, to be sent through the next daemon; whether it is kept for
@@ -136,7 +136,7 @@ impl Relay {
 }
 
 /// Lets go of the relays that waited for too long while there is no daemon.
-pub(super) fn drop_overdue(kept: &mut BTreeMap<Gid, Relay>) {
+pub(super) fn drop_overdue(kept: &mut BTreeMap<Gid, NearRelay>) {
     kept.retain(|_, relay| {
         let waits = relay.waits();
         if !waits {
@@ -148,7 +148,7 @@ pub(super) fn drop_overdue(kept: &mut BTreeMap<Gid, Relay>) {
 
 impl RelayConnection<'_> {
     /// The relays that outlive the connection.
-    pub(super) fn keep_relays(&mut self) -> BTreeMap<Gid, Relay> {
+    pub(super) fn keep_relays(&mut self) -> BTreeMap<Gid, NearRelay> {
         let mut relays = std::mem::take(&mut self.relays);
         relays.retain(|_, relay| relay.outlive_connection());
         relays
@@ -165,7 +165,7 @@ impl RelayConnection<'_> {
             let known = self.relays.get(&gid);
             let rest =
                 self.ending.contains_key(&gid) && known.is_some_and(|r| !r.is_carried_over());
-            if history || rest || known.is_some_and(Relay::waits) || !readers.is_empty() {
+            if history || rest || known.is_some_and(NearRelay::waits) || !readers.is_empty() {
                 wanted.insert(gid, readers);
             }
         }
@@ -195,7 +195,7 @@ impl RelayConnection<'_> {
             let outside = &self.common.outside;
             match outside.create_relay_of(publisher, spec, gids, holds(qos)) {
                 Ok(subscription) => {
-                    let relay = Relay {
+                    let relay = NearRelay {
                         subscription,
                         publisher: endpoint,
                         stands_for,
@@ -214,7 +214,7 @@ impl RelayConnection<'_> {
     pub(super) fn is_published(&self, publisher: &Gid) -> bool {
         let relay = self.relays.get(publisher);
         relay.is_none_or(|relay| relay.unconfirmed() == 0)
-            && self.pipe.outgoing.is_idle(&Channel::of(*publisher))
+            && self.pipe.outgoing.is_idle(&FlowChannel::of(*publisher))
     }
 
     /// Whether the daemon was told of a publisher after it had ended.

@@ -5,18 +5,18 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::{RelayConnection, relays::Relay};
+use super::{RelayConnection, relays::NearRelay};
 use crate::{
     graph::{Endpoint, EndpointKind, Pairing, pairing, reads},
     ids::{DaemonId, Gid},
     session::{
         endpoints::RemoteWriter,
         relayed::{
-            MAX_CALLERS, calls::Calls, flow::Channel, pipe::End, response_log::ResponseLog,
-            unanswered::Unanswered,
+            MAX_CALLERS, calls::CallChannels, flow::FlowChannel, pipe::End,
+            response_log::ResponseLog, unanswered::Unanswered,
         },
     },
-    wire::session::{Matched, Message},
+    wire::session::{RelayMatched, SessionMessage},
 };
 
 /// How long a client's requests wait for servers that it counts and that the daemon does not say yet
@@ -24,7 +24,7 @@ use crate::{
 const SETTLING: Duration = Duration::from_secs(1);
 
 /// What stands for one of them.
-pub(super) struct StandIn {
+pub(super) struct NearStandIn {
     remote_writer: RemoteWriter,
     since: Instant,
     /// Whom it stands for is gone, and has left something.
@@ -33,7 +33,7 @@ pub(super) struct StandIn {
     kept_until: Option<Instant>,
 }
 
-impl StandIn {
+impl NearStandIn {
     pub(super) fn remote_writer(&self) -> &RemoteWriter {
         &self.remote_writer
     }
@@ -63,7 +63,7 @@ impl StandIn {
 /// What a connection leaves to the next one.
 #[derive(Default)]
 pub(super) struct Kept {
-    pub(super) relays: BTreeMap<Gid, Relay>,
+    pub(super) relays: BTreeMap<Gid, NearRelay>,
     pub(super) calls: KeptCalls,
 }
 
@@ -71,8 +71,8 @@ pub(super) struct Kept {
 pub(super) struct KeptCalls {
     /// The daemon's process that carried them.
     pub(super) daemon: Option<DaemonId>,
-    pub(super) stand_ins: BTreeMap<Gid, StandIn>,
-    pub(super) calls: Calls,
+    pub(super) stand_ins: BTreeMap<Gid, NearStandIn>,
+    pub(super) calls: CallChannels,
     pub(super) unanswered: Unanswered,
     pub(super) response_log: ResponseLog,
 }
@@ -87,8 +87,8 @@ impl Default for KeptCalls {
 impl RelayConnection<'_> {
     /// The daemon says with whom an endpoint of the session is matched. What it was matched with before
     /// is let go of at once: another message may have it come back, and its channels begin anew then.
-    pub(super) fn rematch(&mut self, matched: Matched) {
-        let Matched { gid, others } = matched;
+    pub(super) fn rematch(&mut self, matched: RelayMatched) {
+        let RelayMatched { gid, others } = matched;
         // A writer may have ended meanwhile.
         if !self.own.contains_key(&gid) && !self.parting.contains(&gid) {
             return;
@@ -136,7 +136,7 @@ impl RelayConnection<'_> {
             }
             stays
         });
-        self.pipe.retain(|Channel { writer, client }| {
+        self.pipe.retain(|FlowChannel { writer, client }| {
             wanted.get(writer).is_some_and(|readers| client.is_none_or(|c| readers.contains(&c)))
         });
         wanted
@@ -154,7 +154,7 @@ impl RelayConnection<'_> {
                     Ok(remote_writer) => {
                         self.stand_ins.insert(
                             writer,
-                            StandIn {
+                            NearStandIn {
                                 remote_writer,
                                 since: Instant::now(),
                                 leaving: false,
@@ -173,7 +173,7 @@ impl RelayConnection<'_> {
             let partners = remote_writer.partners();
             if let RemoteWriter::Server(_) = remote_writer {
                 for client in readers.iter().filter(|client| partners.contains(client)) {
-                    self.pipe.open_in(Channel::between(writer, *client))?;
+                    self.pipe.open_in(FlowChannel::between(writer, *client))?;
                 }
                 continue;
             }
@@ -183,7 +183,7 @@ impl RelayConnection<'_> {
             let mut readers =
                 own.filter(|e| pairing(remote_writer.endpoint(), e) == Pairing::Match);
             if readers.all(|reader| partners.contains(&reader.gid)) {
-                self.pipe.open_in(Channel::of(writer))?;
+                self.pipe.open_in(FlowChannel::of(writer))?;
             }
         }
         Ok(())
@@ -204,7 +204,7 @@ impl RelayConnection<'_> {
     pub(super) fn is_served(&self, reader: &Endpoint) -> bool {
         // A client may be told of: its requests wait until it is served (`settling`).
         !matches!(reader.kind, EndpointKind::Subscription | EndpointKind::Server)
-            || self.stand_ins.values().map(StandIn::remote_writer).all(|remote_writer| {
+            || self.stand_ins.values().map(NearStandIn::remote_writer).all(|remote_writer| {
                 pairing(remote_writer.endpoint(), reader) != Pairing::Match
                     || remote_writer.partners().contains(&reader.gid)
             })
@@ -265,12 +265,12 @@ impl RelayConnection<'_> {
         changes.sort_by_key(|(more, ..)| *more);
         for (_, server, now) in changes {
             let others = now.iter().copied().collect();
-            self.pipe.say(&Message::Matched(Matched { gid: server, others }))?;
-            self.pipe.outgoing.retain(|Channel { writer, client }| {
+            self.pipe.say(&SessionMessage::RelayMatched(RelayMatched { gid: server, others }))?;
+            self.pipe.outgoing.retain(|FlowChannel { writer, client }| {
                 *writer != server || client.is_some_and(|client| now.contains(&client))
             });
             for client in &now {
-                self.pipe.open_out(Channel::between(server, *client));
+                self.pipe.open_out(FlowChannel::between(server, *client));
             }
             self.callers.insert(server, now);
         }
@@ -286,7 +286,7 @@ impl RelayConnection<'_> {
     /// Whether all requests of a client of the session are with the daemon.
     pub(super) fn is_asked(&self, client: &Gid) -> bool {
         !self.unanswered.is_due(client)
-            && self.pipe.outgoing.is_idle(&Channel::of(*client))
+            && self.pipe.outgoing.is_idle(&FlowChannel::of(*client))
             && self.stand_ins.iter().all(|(server, stand_in)| {
                 !stand_in.remote_writer().has_from(client) && !self.calls.holds(client, server)
             })
@@ -298,7 +298,7 @@ impl RelayConnection<'_> {
         let mut there = clients.filter_map(|client| Some((client, self.stand_ins.get(client)?)));
         there.all(|(client, stand_in)| {
             !stand_in.remote_writer().has_from(server)
-                && self.pipe.outgoing.is_idle(&Channel::between(*server, *client))
+                && self.pipe.outgoing.is_idle(&FlowChannel::between(*server, *client))
         })
     }
 }

@@ -8,7 +8,7 @@ use crate::session::clock;
 
 /// What a writer's numbers tell of losses that the ring's positions do not.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(in crate::session) enum Numbers {
+pub(in crate::session) enum NumberKind {
     None,
     /// It stands in for one elsewhere: what was lost on the way to its ring.
     All,
@@ -21,7 +21,7 @@ pub(in crate::session) enum Numbers {
 
 /// What the take that is under way found at a reader.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) enum Turn {
+pub(super) enum TakeTurn {
     /// Nothing yet: the reader may have a sample.
     #[default]
     Open,
@@ -44,7 +44,7 @@ pub(in crate::session) struct MatchedReader {
     pub(super) over: bool,
     /// It is gone, too, but what it left is still to come.
     pub(super) leaving: bool,
-    pub(super) turn: Turn,
+    pub(super) turn: TakeTurn,
     /// The last sequence number taken of its writer, by way of whatever reader; of one that was attached
     /// before and has taken nothing, the one in front of its first.
     pub(super) last: Option<u64>,
@@ -52,7 +52,7 @@ pub(in crate::session) struct MatchedReader {
     after: Option<u64>,
     /// The gaps in its numbers, where they tell of losses.
     gaps: Option<Gaps>,
-    numbers: Numbers,
+    numbers: NumberKind,
     /// A number of its writer was known when it was granted.
     pub(super) resumed: bool,
     /// What was missing while they were looked at.
@@ -93,13 +93,13 @@ impl MatchedReader {
         after: Option<u64>,
         last: Option<u64>,
         resumed: bool,
-        numbers: Numbers,
+        numbers: NumberKind,
     ) -> Self {
         let times = reader.times();
         let told = match numbers {
-            Numbers::None => false,
-            Numbers::All => true,
-            Numbers::Since | Numbers::Between => resumed,
+            NumberKind::None => false,
+            NumberKind::All => true,
+            NumberKind::Since | NumberKind::Between => resumed,
         };
         Self {
             since: clock::monotonic(),
@@ -107,7 +107,7 @@ impl MatchedReader {
             lease: times.lease,
             over: false,
             leaving: false,
-            turn: Turn::Open,
+            turn: TakeTurn::Open,
             last,
             // One that speaks for another has no number before it has a sample.
             after: after.filter(|number| *number > 0),
@@ -132,7 +132,7 @@ impl MatchedReader {
             gaps.before = Some((last, self.reader.grant().first));
         }
         gaps.pass(sequence, position);
-        if self.numbers == Numbers::Between {
+        if self.numbers == NumberKind::Between {
             self.missed = gaps.lost;
             self.gaps = None;
         }
@@ -153,7 +153,7 @@ impl MatchedReader {
     pub(super) fn sends_again(&self, earlier: &Self) -> bool {
         self.reader.writer() == earlier.reader.writer()
             && self.resumed
-            && self.numbers != Numbers::None
+            && self.numbers != NumberKind::None
             && !self.reader.is_of_ring(&earlier.reader)
     }
 }

@@ -6,7 +6,7 @@ use axon_shm::internal::{Grant, Lane, Location, MAX_GAP, Reader};
 
 use super::{
     counts::Counts,
-    matched_reader::{MatchedReader, Numbers},
+    matched_reader::{MatchedReader, NumberKind},
     remembered::Remembered,
     slots::Slots,
 };
@@ -32,7 +32,7 @@ pub(in crate::session) struct MatchedReaders {
 }
 
 /// How a writer is asked to serve.
-pub(in crate::session) struct Asking {
+pub(in crate::session) struct ServeRequest {
     pub(in crate::session) lane: Location,
     /// The last number that the reader has of it, where it was attached before.
     pub(in crate::session) after: Option<u64>,
@@ -83,19 +83,19 @@ impl MatchedReaders {
         &mut self,
         writer: Gid,
         allocate: impl FnOnce() -> Result<Lane, E>,
-    ) -> Result<Asking, E> {
+    ) -> Result<ServeRequest, E> {
         if let Some(slot) = self.slots.attached(&writer) {
-            return Ok(Asking { lane: slot.reader.lane(), after: None });
+            return Ok(ServeRequest { lane: slot.reader.lane(), after: None });
         }
         if let Some((lane, after)) = self.pending.get(&writer) {
-            return Ok(Asking { lane: lane.location(), after: *after });
+            return Ok(ServeRequest { lane: lane.location(), after: *after });
         }
         let earlier = self.slots.of(&writer).next();
         let after = earlier.map_or_else(|| self.last.get(&writer), MatchedReader::reached);
         let lane = allocate()?;
         let location = lane.location();
         self.pending.insert(writer, (lane, after));
-        Ok(Asking { lane: location, after })
+        Ok(ServeRequest { lane: location, after })
     }
 
     /// The lanes of all that are attached, or asked to be: what is repeated when `stands_for`
@@ -125,7 +125,12 @@ impl MatchedReaders {
     }
 
     /// A writer granted what comes `after` a number.
-    pub(in crate::session) fn add(&mut self, reader: Reader, after: Option<u64>, numbers: Numbers) {
+    pub(in crate::session) fn add(
+        &mut self,
+        reader: Reader,
+        after: Option<u64>,
+        numbers: NumberKind,
+    ) {
         let writer = reader.writer();
         let earlier = self.slots.of(&writer).next().map(MatchedReader::reached);
         let last = earlier.unwrap_or_else(|| self.last.remove(&writer));

@@ -19,12 +19,12 @@ use std::{
 
 use axon_shm::{
     Meta, Sample, ShmError, TakeError,
-    internal::{Grant, Lane, Location, Peer, Reader, ReaderOptions, WakeCheck, holds},
+    internal::{Grant, Lane, Location, Reader, ReaderOptions, RingPeer, WakeCheck, holds},
 };
 
 pub(in crate::session) use self::{
-    matched_reader::Numbers,
-    matched_readers::{Accept, Asking},
+    matched_reader::NumberKind,
+    matched_readers::{Accept, ServeRequest},
 };
 use self::{
     matched_readers::MatchedReaders,
@@ -49,7 +49,7 @@ use crate::{
         core::{Outgoing, SessionCore},
         error::RecvError,
     },
-    wire::session::{EndpointRole, Message, Pair},
+    wire::session::{EndpointRole, Pair, SessionMessage},
 };
 
 /// The reading side of a subscription, client or server, which the session's control thread shares
@@ -224,7 +224,7 @@ impl SubscriptionInner {
         }
         self.events.lost(lost);
         for writer in gone {
-            let detach = Message::Detach(Pair { reader: self.endpoint.gid, writer });
+            let detach = SessionMessage::Detach(Pair { reader: self.endpoint.gid, writer });
             core.tell(Outgoing::message(detach));
         }
         taken
@@ -352,7 +352,7 @@ impl SubscriptionInner {
     pub(in crate::session) fn map(
         &self,
         writer: Gid,
-        peer: Peer,
+        peer: RingPeer,
         ring: Location,
         lane: Lane,
         grant: Grant,

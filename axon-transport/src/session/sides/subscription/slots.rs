@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::matched_reader::{MatchedReader, Turn};
+use super::matched_reader::{MatchedReader, TakeTurn};
 use crate::ids::Gid;
 
 /// How long nobody is woken for a sample that there was no memory to take.
@@ -96,12 +96,12 @@ impl Slots {
 
     /// A take begins: each reader may have something.
     pub(super) fn begin_take(&mut self) {
-        self.slots.iter_mut().for_each(|slot| slot.turn = Turn::Open);
+        self.slots.iter_mut().for_each(|slot| slot.turn = TakeTurn::Open);
     }
 
     /// There was no memory for the next sample of a reader. Returns whether that is news.
     pub(super) fn note_short(&mut self, index: usize) -> bool {
-        self.slots[index].turn = Turn::Short;
+        self.slots[index].turn = TakeTurn::Short;
         let news = self.short_until().is_none();
         self.short = Some(Instant::now());
         news
@@ -128,12 +128,12 @@ impl Slots {
         let next = self.slots.iter().position(|slot| {
             slot.reader.writer() == *writer
                 && match slot.turn {
-                    Turn::Open => slot.reader.has_data(),
-                    Turn::Overtaken => false,
-                    Turn::Short => true,
+                    TakeTurn::Open => slot.reader.has_data(),
+                    TakeTurn::Overtaken => false,
+                    TakeTurn::Short => true,
                 }
         });
-        next.filter(|index| self.slots[*index].turn != Turn::Short)
+        next.filter(|index| self.slots[*index].turn != TakeTurn::Short)
     }
 
     /// The reader whose next sample is the oldest, of those that are not faster than we are. What a
@@ -146,14 +146,14 @@ impl Slots {
             let earlier = self.slots[..index].iter().position(|slot| {
                 slot.reader.writer() == writer
                     && match slot.turn {
-                        Turn::Open => slot.over && slot.reader.has_data(),
-                        Turn::Overtaken => false,
-                        Turn::Short => true,
+                        TakeTurn::Open => slot.over && slot.reader.has_data(),
+                        TakeTurn::Overtaken => false,
+                        TakeTurn::Short => true,
                     }
             });
             match earlier {
-                Some(earlier) if self.slots[earlier].turn == Turn::Short => {
-                    self.slots[index].turn = Turn::Overtaken;
+                Some(earlier) if self.slots[earlier].turn == TakeTurn::Short => {
+                    self.slots[index].turn = TakeTurn::Overtaken;
                 }
                 earlier => return Some(earlier.unwrap_or(index)),
             }
@@ -163,10 +163,11 @@ impl Slots {
     fn oldest_by_time(&mut self) -> Option<usize> {
         if let [slot] = self.slots.as_slice() {
             // Taking finds out whether it has anything, which most often it has.
-            return (slot.turn == Turn::Open).then_some(0);
+            return (slot.turn == TakeTurn::Open).then_some(0);
         }
         let mut oldest = None;
-        let open = self.slots.iter_mut().enumerate().filter(|(_, slot)| slot.turn == Turn::Open);
+        let open =
+            self.slots.iter_mut().enumerate().filter(|(_, slot)| slot.turn == TakeTurn::Open);
         for (index, slot) in open {
             // A writer whose memory is corrupt is chosen, so that taking finds out.
             let stamp = match slot.reader.peek() {
@@ -303,7 +304,7 @@ mod tests {
     use super::*;
     use crate::{
         ids::SessionId,
-        session::sides::subscription::{matched_reader::Numbers, tests::reading},
+        session::sides::subscription::{matched_reader::NumberKind, tests::reading},
     };
 
     /// Readers of the rings of these writers in turn, each with samples of these times.
@@ -316,7 +317,7 @@ mod tests {
             for (sequence, stamp) in (1..).zip(*stamps) {
                 writer.publish(Meta::at_nanos(sequence, *stamp), b"sample").unwrap();
             }
-            slots.push(MatchedReader::new(reader, None, None, false, Numbers::None));
+            slots.push(MatchedReader::new(reader, None, None, false, NumberKind::None));
             writer
         });
         let writers = writers.collect();
@@ -329,7 +330,7 @@ mod tests {
         assert_eq!(slots.oldest(), Some(2));
         slots[0].over = true;
         assert_eq!(slots.oldest(), Some(0), "the writer granted anew");
-        slots[0].turn = Turn::Overtaken;
+        slots[0].turn = TakeTurn::Overtaken;
         assert_eq!(slots.oldest(), Some(2));
         assert!(slots.note_short(0) && !slots.note_short(0));
         assert_eq!(slots.oldest(), Some(1), "what the first reader has comes before the third's");

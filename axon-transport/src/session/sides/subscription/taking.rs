@@ -5,7 +5,7 @@ use std::{ops::Range, time::SystemTime};
 use axon_shm::{Meta, Sample, TakeError, internal::Reader};
 
 use super::{
-    matched_reader::Turn,
+    matched_reader::TakeTurn,
     matched_readers::MatchedReaders,
     message_info::{Lifetime, MessageInfo},
 };
@@ -159,7 +159,7 @@ impl<'a> Take<'a> {
             Ok(Some(taken)) => taken,
             // Overwritten again and again while we read: the others have their turn first.
             Ok(None) => {
-                slot.turn = Turn::Overtaken;
+                slot.turn = TakeTurn::Overtaken;
                 return None;
             }
             Err(error @ TakeError::TooLarge { .. }) => {

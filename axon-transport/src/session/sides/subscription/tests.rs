@@ -4,11 +4,11 @@ use std::sync::Arc;
 
 use axon_shm::{
     Meta, PublishError, TakeError,
-    internal::{Peer, Reader, ReaderInfo, ReaderOptions, RingOptions, SessionSegment, Writer},
+    internal::{Reader, ReaderInfo, ReaderOptions, RingOptions, RingPeer, SessionSegment, Writer},
 };
 
 use super::{
-    SubscriptionInner, matched_reader::Numbers, matched_readers::MatchedReaders, taking::Take,
+    SubscriptionInner, matched_reader::NumberKind, matched_readers::MatchedReaders, taking::Take,
 };
 use crate::{
     graph::{Endpoint, EndpointKind},
@@ -19,7 +19,7 @@ use crate::{
 
 /// A subscription's reader of a publisher of the same session, which is made for it.
 pub(super) fn reading(session: &Arc<SessionSegment>, writer: Gid, reader: Gid) -> (Writer, Reader) {
-    let (qos, peer) = (Qos::default(), Peer::Local(session.clone()));
+    let (qos, peer) = (Qos::default(), RingPeer::Local(session.clone()));
     let options = RingOptions { gid: writer, qos, budget: 0, max_message: 10, expected: 0 };
     let publisher = Writer::create(session.clone(), options).unwrap();
     let lane = session.allocate_lane().unwrap();
@@ -66,7 +66,7 @@ impl Served {
     fn daemon(&mut self, numbers: impl IntoIterator<Item = u64>) {
         let (ring, reader) = reading(&self.session, self.client, self.server);
         self.requests.end(&self.client);
-        self.requests.add(reader, None, Numbers::None);
+        self.requests.add(reader, None, NumberKind::None);
         let stamp = -(self.rings.len() as i64);
         for number in numbers {
             ring.publish(Meta::at_nanos(number, stamp), b"request").unwrap();
@@ -155,7 +155,7 @@ fn nobody_is_woken_at_once_for_a_sample_that_there_is_no_memory_for() {
     let [writer, gid] = [1, 2].map(|number| Gid::new(session.id(), number));
     let (publisher, reader) = reading(&session, writer, gid);
     let mut matched_readers = MatchedReaders::default();
-    matched_readers.add(reader, None, Numbers::None);
+    matched_readers.add(reader, None, NumberKind::None);
     publisher.publish_next(0, b"sample").unwrap();
     assert!(matched_readers.slots().has_data());
     let inner = subscription(gid);
@@ -181,7 +181,7 @@ fn unannounced_samples_of_an_ended_writer_are_read() {
     let publishers = writers.map(|writer| {
         let (publisher, mut reader) = reading(&session, writer, gid);
         reader.follow(gid);
-        matched_readers.add(reader, None, Numbers::None);
+        matched_readers.add(reader, None, NumberKind::None);
         publisher
     });
     let active = || {
@@ -209,7 +209,7 @@ fn numbers_from_other_hosts_leave_losses_that_can_be_counted() {
     let mut publishers = Vec::new();
     for writer in writers {
         let (publisher, reader) = reading(&session, writer, gid);
-        matched_readers.add(reader, None, Numbers::All);
+        matched_readers.add(reader, None, NumberKind::All);
         let say = |sequence| publisher.publish(Meta::at_nanos(sequence, 0), b"sample");
         say(1).unwrap();
         // So many cannot have been lost.
