@@ -212,12 +212,12 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
     };
     let mask = |bits| IndexMask::from_bits(bits).unwrap();
     let messages = [
-        LinkMessage::LinkHello(hello),
+        LinkMessage::Hello(hello),
         LinkMessage::Elected(link::Elected { link: [9; 16], election: 3 }),
-        LinkMessage::GraphUpdate(graph(1)),
-        LinkMessage::GraphUpdate(graph(64)),
+        LinkMessage::Graph(graph(1)),
+        LinkMessage::Graph(graph(64)),
         LinkMessage::GraphResync(link::GraphResync { version: 2 }),
-        LinkMessage::LivelinessAsserted(link::LivelinessAsserted { publishers: vec![gid] }),
+        LinkMessage::Asserted(link::LivelinessAsserted { publishers: vec![gid] }),
         LinkMessage::Owners(link::Owners {
             proofs: vec![axon_daemon::internal::owner::Proof { key: [1; 32], signature: [2; 64] }],
         }),
@@ -231,7 +231,7 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
             acknowledges: Some(true),
             short_headers: None,
         }),
-        LinkMessage::ReceivedUpTo(link::ReceivedUpTo {
+        LinkMessage::Received(link::ReceivedUpTo {
             flows: vec![link::ReceivedOf { route: 1, publisher: gid, sequence: 43, dropped: 1 }],
         }),
         LinkMessage::RouteRefused(link::RouteRefused {
@@ -250,7 +250,7 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
         LinkMessage::Keepalive,
         LinkMessage::LinkClosed(link::LinkClosed { link: [3; 16] }),
         LinkMessage::Intake(link::Intake { unread: 33 << 20, messages: 64 << 20 }),
-        LinkMessage::DeniedUses(link::DeniedUses {
+        LinkMessage::Denied(link::DeniedUses {
             denied: vec![link::DeniedUse {
                 verb: 0,
                 name: "/cmd_vel".into(),
@@ -258,7 +258,7 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
             }],
             lifted: vec![link::DeniedUse { verb: 3, name: "/dock".into(), reason: String::new() }],
         }),
-        LinkMessage::LinkAccessCheck(link::LinkAccessCheck {
+        LinkMessage::AccessCheck(link::LinkAccessCheck {
             number: 5,
             uses: vec![session::CheckedUse { verb: 4, name: "/scan".into() }],
         }),
@@ -330,7 +330,7 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
     let session = SessionId([3; 16]);
     let daemon = DaemonId([4; 16]);
     let messages = [
-        SessionMessage::SessionHello(SessionHello {
+        SessionMessage::Hello(SessionHello {
             protocol: PROTOCOL,
             session,
             role: SessionRole::Application,
@@ -342,7 +342,7 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
             static_peers: None,
         }),
         SessionMessage::Welcome(Welcome { protocol: PROTOCOL, daemon, pid: 12, ranges: Some(true) }),
-        SessionMessage::SessionRefused(SessionRefused {
+        SessionMessage::Refused(SessionRefused {
             variable: "AXON_QUIC_CIPHER".into(),
             ours: "chacha20-poly1305".into(),
             theirs: "aes-256-gcm".into(),
@@ -357,7 +357,7 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
             only: Some(writer),
         }),
         SessionMessage::EndpointGone(Gone { gid: reader }),
-        SessionMessage::SessionGraph(SessionGraph {
+        SessionMessage::Graph(SessionGraph {
             version: 3,
             whole: true,
             added: vec![GraphItem { endpoint: endpoint(), daemon: Some(daemon), reach: None }],
@@ -401,7 +401,7 @@ pub fn session_message_seeds() -> Vec<Vec<u8>> {
         SessionMessage::SegmentGone(SegmentName { session, number: 3 }),
         SessionMessage::Need(SegmentName { session, number: 3 }),
         SessionMessage::Unmet(Unmet { reader, writer, samples: 12 }),
-        SessionMessage::RelayMatched(RelayMatched { gid: reader, others: vec![writer] }),
+        SessionMessage::Matched(RelayMatched { gid: reader, others: vec![writer] }),
         SessionMessage::SampleFragment(SampleFragment {
             publisher: writer,
             head: Some(SampleHeader {

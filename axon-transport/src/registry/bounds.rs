@@ -53,14 +53,11 @@ fn announce_as(
 }
 
 fn graphs(messages: &[SessionMessage]) -> usize {
-    messages.iter().filter(|m| matches!(m, SessionMessage::SessionGraph(_))).count()
+    messages.iter().filter(|m| matches!(m, SessionMessage::Graph(_))).count()
 }
 
 fn whole_graphs(messages: &[SessionMessage]) -> usize {
-    messages
-        .iter()
-        .filter(|m| matches!(m, SessionMessage::SessionGraph(graph) if graph.whole))
-        .count()
+    messages.iter().filter(|m| matches!(m, SessionMessage::Graph(graph) if graph.whole)).count()
 }
 
 #[test]
@@ -81,9 +78,7 @@ fn the_pairs_that_a_session_makes_are_bounded_and_others_make_theirs() {
     assert_eq!(registry.pairs.len(), MAX_PAIRS, "one too many");
     let refused = drain(&mut registry, 1);
     assert!(
-        refused
-            .iter()
-            .any(|m| matches!(m, SessionMessage::SessionRefused(r) if r.text.contains("pairs")))
+        refused.iter().any(|m| matches!(m, SessionMessage::Refused(r) if r.text.contains("pairs")))
     );
     let shown = registry.take_refused();
     assert!(matches!(&shown[..], [(of, why)] if *of == id(1) && why.contains("pairs")), "once");
@@ -157,9 +152,8 @@ fn the_gateway_is_told_of_this_host_alone() {
     assert_eq!(graphs(&drain(&mut registry, 1)), 1);
     registry.handle_message(&id(1), SessionMessage::Resync, vec![]).unwrap();
     let told = drain(&mut registry, 1);
-    let items = told
-        .iter()
-        .filter_map(|m| if let SessionMessage::SessionGraph(g) = m { Some(g) } else { None });
+    let items =
+        told.iter().filter_map(|m| if let SessionMessage::Graph(g) = m { Some(g) } else { None });
     let gids: Vec<_> = items.flat_map(|g| &g.added).map(|item| item.endpoint.gid).collect();
     assert_eq!(gids, [Gid::new(id(2), 1)]);
     registry.remote_gone(&DaemonId([1; 16]));
@@ -391,7 +385,7 @@ fn the_segments_of_a_session_are_bounded_and_it_is_told() {
     assert!(
         refused
             .iter()
-            .any(|m| matches!(m, SessionMessage::SessionRefused(r) if r.text.contains("memory")))
+            .any(|m| matches!(m, SessionMessage::Refused(r) if r.text.contains("memory")))
     );
     let gone = SessionMessage::SegmentGone(SegmentName { session, number: 1 });
     registry.handle_message(&session, gone, vec![]).unwrap();
@@ -434,7 +428,7 @@ fn a_leaving_writer_is_hidden_and_read_to_its_end() {
     let before = registry.digest();
 
     let leave = |registry: &mut Registry<Label>, session, leaving| {
-        let leaving = SessionMessage::WriterLeaving(WriterLeaving { gid: writer, leaving });
+        let leaving = SessionMessage::Leaving(WriterLeaving { gid: writer, leaving });
         registry.handle_message(&id(session), leaving, vec![])
     };
     assert_eq!(leave(&mut registry, 2, true), Err(Violation::NotItsOwn(writer)));
@@ -442,8 +436,9 @@ fn a_leaving_writer_is_hidden_and_read_to_its_end() {
         leave(&mut registry, 1, true).unwrap();
     }
     registry.flush();
-    let is_leaving = |m: &&SessionMessage| matches!(m, SessionMessage::WriterLeaving(l) if l.gid == writer && l.leaving);
-    let removed = |m: &SessionMessage| matches!(m, SessionMessage::SessionGraph(graph) if graph.removed == [writer]);
+    let is_leaving = |m: &&SessionMessage| matches!(m, SessionMessage::Leaving(l) if l.gid == writer && l.leaving);
+    let removed =
+        |m: &SessionMessage| matches!(m, SessionMessage::Graph(graph) if graph.removed == [writer]);
     let told = drain(&mut registry, 2);
     assert_eq!(told.iter().filter(is_leaving).count(), 1);
     assert!(!told.iter().any(|m| matches!(m, SessionMessage::Unmatch(_))));
@@ -458,7 +453,7 @@ fn a_leaving_writer_is_hidden_and_read_to_its_end() {
     let told = drain(&mut registry, 2);
     let granted = told.iter().position(|m| matches!(m, SessionMessage::Grant(_))).unwrap();
     assert!(told[granted..].iter().any(|m| is_leaving(&m)));
-    let shows = |m: &SessionMessage| matches!(m, SessionMessage::SessionGraph(graph) if graph.added.iter().any(|i| i.endpoint.gid == writer));
+    let shows = |m: &SessionMessage| matches!(m, SessionMessage::Graph(graph) if graph.added.iter().any(|i| i.endpoint.gid == writer));
     assert!(!told.iter().any(shows));
 
     // It has come back.

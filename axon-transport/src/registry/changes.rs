@@ -150,7 +150,7 @@ pub(super) fn packets(
 ) -> Vec<Arc<[u8]>> {
     let mut packets = Vec::new();
     each_part(version, whole, added, removed, ended, open, |part| {
-        packets.extend(encode(&SessionMessage::SessionGraph(part)));
+        packets.extend(encode(&SessionMessage::Graph(part)));
     });
     packets
 }

@@ -159,11 +159,11 @@ impl<F: Clone> Registry<F> {
                 Ok(())
             }
             SessionMessage::EndpointGone(gone) => self.gone(id, gone.gid),
-            SessionMessage::WriterLeaving(leaving) => self.leave(id, leaving),
+            SessionMessage::Leaving(leaving) => self.leave(id, leaving),
             SessionMessage::Attach(attach) => self.attach(id, attach),
             SessionMessage::Grant(grant) => self.grant(id, grant),
             SessionMessage::Detach(pair) => self.detach(id, pair),
-            SessionMessage::RelayGivenUp(given_up) => self.give_up(id, given_up),
+            SessionMessage::GivenUp(given_up) => self.give_up(id, given_up),
             SessionMessage::Fence(fence) => self.fence(id, fence),
             SessionMessage::Unmet(unmet) => self.unmet(id, unmet),
             SessionMessage::Unmatch(unmatch) => self.fail(id, unmatch),
@@ -228,7 +228,7 @@ impl<F: Clone> Registry<F> {
             {
                 entry.refused_endpoints.insert(gid, (endpoint, why));
             }
-            self.push(id, &SessionMessage::SessionRefused(refused), Vec::new());
+            self.push(id, &SessionMessage::Refused(refused), Vec::new());
             return Ok(());
         }
         if let Some(entry) = self.sessions.get_mut(id) {
@@ -302,7 +302,7 @@ impl<F: Clone> Registry<F> {
         let readers = self.endpoints.get(&gid).into_iter().flat_map(|w| self.readers_of(w));
         let readers: BTreeSet<SessionId> = readers.map(|reader| reader.session).collect();
         for reader in readers {
-            self.push(&reader, &SessionMessage::WriterLeaving(leave), Vec::new());
+            self.push(&reader, &SessionMessage::Leaving(leave), Vec::new());
         }
         if !leaving {
             self.match_endpoint(&gid);
@@ -398,8 +398,7 @@ impl<F: Clone> Registry<F> {
         self.push(&to, &SessionMessage::Grant(grant), descriptors);
         self.sessions.hand_over_rest(&to, &of, &pair.writer);
         if leaving {
-            let leaving =
-                SessionMessage::WriterLeaving(WriterLeaving { gid: pair.writer, leaving });
+            let leaving = SessionMessage::Leaving(WriterLeaving { gid: pair.writer, leaving });
             self.push(&to, &leaving, Vec::new());
         }
         true
@@ -456,7 +455,7 @@ impl<F: Clone> Registry<F> {
         }
         let read = relay.is_some() && self.pairs.contains(&Pair { reader, writer });
         if let (Some(to), true) = (self.endpoints.session_of(&writer), read) {
-            self.push(&to, &SessionMessage::RelayGivenUp(given_up), Vec::new());
+            self.push(&to, &SessionMessage::GivenUp(given_up), Vec::new());
         }
         Ok(())
     }

@@ -88,11 +88,7 @@ impl<F: Clone> Registry<F> {
     pub(super) fn note_denied(&mut self, id: &SessionId, endpoint: &Endpoint, why: &str) {
         let refused = SessionRefused::of(endpoint, why);
         self.sessions.note_refused(id, &refused.text);
-        self.push(
-            id,
-            &SessionMessage::SessionRefused(SessionRefused::because(refused.text)),
-            Vec::new(),
-        );
+        self.push(id, &SessionMessage::Refused(SessionRefused::because(refused.text)), Vec::new());
     }
 
     /// Forgets an endpoint, which its session's entry no longer lists.

@@ -173,7 +173,7 @@ impl<F: Clone> Registry<F> {
     fn tell_end(&mut self, id: &SessionId) {
         let (added, removed, version) = (Vec::new(), Vec::new(), self.changes.version());
         let end = SessionGraph { version, whole: false, added, removed, more: false, ended: None };
-        self.push(id, &SessionMessage::SessionGraph(end), Vec::new());
+        self.push(id, &SessionMessage::Graph(end), Vec::new());
         self.limit_queue(id);
     }
 

@@ -63,8 +63,7 @@ fn session() -> (Session, Daemon) {
     let (socket, theirs) = socketpair(AddressFamily::UNIX, kind, flags, None).unwrap();
     let config = Config::resolve([], None, &OsFiles).unwrap();
     let opening = thread::spawn(move || Session::over(theirs, &config, SessionOptions::new("t")));
-    let ReceivedMessage { message: SessionMessage::SessionHello(hello), descriptors } =
-        hear(&socket)
+    let ReceivedMessage { message: SessionMessage::Hello(hello), descriptors } = hear(&socket)
     else {
         panic!("something else before HELLO")
     };
@@ -117,7 +116,7 @@ impl Daemon {
     fn graph(&self, whole: bool, more: bool) {
         let (added, removed) = (Vec::new(), Vec::new());
         let graph = SessionGraph { version: 1, whole, added, removed, more, ended: None };
-        self.say(SessionMessage::SessionGraph(graph), &[]);
+        self.say(SessionMessage::Graph(graph), &[]);
     }
 
     /// Tells everything from the beginning.

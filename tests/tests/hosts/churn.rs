@@ -70,7 +70,7 @@ impl Churn {
         let added = (self.made + 1..=self.made + AT_A_TIME).map(endpoint).collect();
         let (version, before) = (self.version + 1, self.version);
         let graph = GraphUpdate { version, before, added, removed, ..GraphUpdate::default() };
-        camera.stranger.say(&mut self.link, &LinkMessage::GraphUpdate(graph));
+        camera.stranger.say(&mut self.link, &LinkMessage::Graph(graph));
         (self.version, self.made) = (version, self.made + AT_A_TIME);
     }
 }

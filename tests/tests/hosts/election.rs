@@ -60,7 +60,7 @@ impl Elector {
     /// Until the host says its graph on it, as it does first on a link.
     fn linked(&self, met: &mut Met) {
         let whole =
-            |m: &LinkMessage| matches!(m, LinkMessage::GraphUpdate(GraphUpdate { before: 0, .. }));
+            |m: &LinkMessage| matches!(m, LinkMessage::Graph(GraphUpdate { before: 0, .. }));
         self.stranger.hear(met, whole).expect("the host's graph");
     }
 
@@ -79,7 +79,7 @@ impl Elector {
         let subscription = Endpoint::new(SUBSCRIPTION, EndpointKind::Subscription, TOPIC, TYPE)
             .with_node("one", "/");
         let graph = GraphUpdate { version: 1, added: vec![subscription], ..GraphUpdate::default() };
-        self.stranger.say(met, &LinkMessage::GraphUpdate(graph));
+        self.stranger.say(met, &LinkMessage::Graph(graph));
     }
 
     /// Says a whole graph of 600 publishers in two parts; the last is of the topic.
@@ -99,7 +99,7 @@ impl Elector {
             let (added, removed) = (part.map(publisher).collect(), Vec::new());
             let graph =
                 GraphUpdate { version, before, added, removed, more, ..GraphUpdate::default() };
-            self.stranger.say(met, &LinkMessage::GraphUpdate(graph));
+            self.stranger.say(met, &LinkMessage::Graph(graph));
         }
     }
 
@@ -233,7 +233,7 @@ fn a_whole_graph_in_parts_ends_no_route_in_between() {
     let ended = std::cell::Cell::new(false);
     let next = |m: &LinkMessage| {
         ended.set(ended.get() || matches!(m, LinkMessage::Unsubscribe(_)));
-        matches!(m, LinkMessage::GraphUpdate(GraphUpdate { before: 0, .. }))
+        matches!(m, LinkMessage::Graph(GraphUpdate { before: 0, .. }))
     };
     elector.stranger.hear(&mut link, next).expect("the host's graph");
     assert!(!ended.get() && !subscription.matched().is_empty());

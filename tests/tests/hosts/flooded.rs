@@ -84,7 +84,7 @@ fn a_flood_of_strangers_hides_no_refused_session_and_no_claim_of_a_pinned_peer()
     let gid = Gid::new(SessionId([7; 16]), 1);
     let claim = Endpoint::new(gid, EndpointKind::Publisher, "/claimed", "test/Text");
     let graph = GraphUpdate { version: 1, added: vec![claim], ..GraphUpdate::default() };
-    camera.stranger.say(&mut link, &LinkMessage::GraphUpdate(graph));
+    camera.stranger.say(&mut link, &LinkMessage::Graph(graph));
     camera.a.wait_refusal("the claim", |text| text.contains("did not prove"));
     flood(60);
     let strangers = |text: &str| text.contains("trust");

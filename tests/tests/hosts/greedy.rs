@@ -93,7 +93,7 @@ impl Camera {
             let (version, before) = (u64::from(to), u64::from(from));
             let more = to < count;
             let graph = GraphUpdate { version, before, added, more, ..GraphUpdate::default() };
-            self.stranger.say(met, &LinkMessage::GraphUpdate(graph));
+            self.stranger.say(met, &LinkMessage::Graph(graph));
         }
     }
 
@@ -234,7 +234,7 @@ fn a_graph_has_a_bound_for_all_daemon_ids_of_a_peer_and_the_rest_of_the_link_goe
     let [first, second] = &mut links;
     let change = |before: u64, added, removed| {
         let version = before + 1;
-        LinkMessage::GraphUpdate(GraphUpdate {
+        LinkMessage::Graph(GraphUpdate {
             version,
             before,
             added,
@@ -300,7 +300,7 @@ fn a_flood_of_changes_holds_up_nobody_and_ends_in_the_newest_state() {
                 let before = version - 1;
                 let added = vec![short(session, 1, &topic(version))];
                 let graph = GraphUpdate { version, before, added, ..GraphUpdate::default() };
-                camera.stranger.say(link, &LinkMessage::GraphUpdate(graph));
+                camera.stranger.say(link, &LinkMessage::Graph(graph));
                 said.store(version, Relaxed);
                 // More than the daemon takes, and no more than its socket does: QUIC closes a connection for many lost
                 // packets of a stream that nobody reads.
@@ -313,7 +313,7 @@ fn a_flood_of_changes_holds_up_nobody_and_ends_in_the_newest_state() {
             version += 1;
             let (before, added) = (version - 1, vec![short(session, 1, &topic(version))]);
             let graph = GraphUpdate { version, before, added, ..GraphUpdate::default() };
-            camera.stranger.say(link, &LinkMessage::GraphUpdate(graph));
+            camera.stranger.say(link, &LinkMessage::Graph(graph));
             version
         });
         let end = OnDrop(|| enough.store(true, Relaxed));

@@ -46,7 +46,7 @@ fn all_published(camera: &Camera, met: &mut Met, topic: &str, all: &[Gid]) -> u3
     };
     let added = all.iter().map(publisher).collect();
     let graph = GraphUpdate { version: 1, added, ..GraphUpdate::default() };
-    camera.stranger.say(met, &LinkMessage::GraphUpdate(graph));
+    camera.stranger.say(met, &LinkMessage::Graph(graph));
     let asked = |m: &LinkMessage| matches!(m, LinkMessage::Subscribe(s) if s.topic == topic);
     match camera.stranger.hear(met, asked) {
         Ok(LinkMessage::Subscribe(subscribe)) => subscribe.route,

@@ -69,7 +69,7 @@ fn a_pinned_peer_that_announces_gids_first_does_not_keep_their_owner_out() {
     let mut link = camera.link(0xff);
     let added = (0..64).map(|number| claim(first.gid(), number)).collect();
     let graph = GraphUpdate { version: 1, added, ..GraphUpdate::default() };
-    camera.stranger.say(&mut link, &LinkMessage::GraphUpdate(graph));
+    camera.stranger.say(&mut link, &LinkMessage::Graph(graph));
     camera.a.wait_refusal("the claim, by name", |text| {
         ["camera", TOPIC, "did not prove", "session"].iter().all(|part| text.contains(part))
     });
@@ -102,11 +102,11 @@ fn a_pinned_peer_that_announces_gids_later_takes_nothing_away() {
     let added = vec![claimed];
     for version in 1..100 {
         let graph = GraphUpdate { version, added: added.clone(), ..GraphUpdate::default() };
-        camera.stranger.say(&mut link, &LinkMessage::GraphUpdate(graph));
+        camera.stranger.say(&mut link, &LinkMessage::Graph(graph));
         let removed = vec![publisher.gid()];
         let (before, version) = (version, version + 1);
         let graph = GraphUpdate { version, before, removed, ..GraphUpdate::default() };
-        camera.stranger.say(&mut link, &LinkMessage::GraphUpdate(graph));
+        camera.stranger.say(&mut link, &LinkMessage::Graph(graph));
     }
     camera.a.wait_refusal("the claim, by name", |text| {
         text.contains("camera") && text.contains("did not prove")
@@ -123,7 +123,7 @@ fn a_proof_of_another_connection_or_daemon_is_worth_nothing_and_one_of_its_own_c
     let gid = Gid::new(key.id(), 0);
     let announce = |link: &mut _, version: u64| {
         let graph = GraphUpdate { version, added: vec![claim(gid, 0)], ..GraphUpdate::default() };
-        camera.stranger.say(link, &LinkMessage::GraphUpdate(graph));
+        camera.stranger.say(link, &LinkMessage::Graph(graph));
     };
     let left_out = |text: &str| text.contains("did not prove") && text.contains(&gid.to_string());
     let mut link = camera.link(0xff);
@@ -178,7 +178,7 @@ fn where_nothing_is_proved_the_first_address_has_a_gid_until_it_leaves() {
     let added: Vec<_> = (used + 1..used + 64).map(|number| claim(first.gid(), number)).collect();
     let last = added.last().unwrap().gid;
     let graph = GraphUpdate { version: 1, added, ..GraphUpdate::default() };
-    stranger.say(&mut link, &LinkMessage::GraphUpdate(graph));
+    stranger.say(&mut link, &LinkMessage::Graph(graph));
     until("the squatter is first", || node_of(&reader, last).is_some());
 
     let publisher = owner.create_publisher(spec(TOPIC)).unwrap();

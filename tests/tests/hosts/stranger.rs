@@ -119,8 +119,8 @@ impl Stranger {
                 Err(error) => Err(error.to_string()),
             }
         })?;
-        self.say(&mut met, &LinkMessage::LinkHello(hello(domain, claim)));
-        self.hear(&mut met, |message| matches!(message, LinkMessage::LinkHello(_)))?;
+        self.say(&mut met, &LinkMessage::Hello(hello(domain, claim)));
+        self.hear(&mut met, |message| matches!(message, LinkMessage::Hello(_)))?;
         Ok(met)
     }
 

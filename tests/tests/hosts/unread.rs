@@ -42,7 +42,7 @@ pub(super) fn subscribe(stranger: &Stranger, met: &mut Met, topic: &str) {
         .with_qos(Qos::keep_all())
         .with_node("idle", "/");
     let graph = GraphUpdate { version: 1, added: vec![subscription], ..GraphUpdate::default() };
-    stranger.say(met, &LinkMessage::GraphUpdate(graph));
+    stranger.say(met, &LinkMessage::Graph(graph));
     let subscribe = Subscribe {
         route: 1,
         topic: topic.into(),
@@ -133,7 +133,7 @@ fn claims_to_have_dropped(host: &Host, session: &Session) {
     until("it is served", || publisher.matched().len() == 1);
     let mut say = |sequence, dropped| {
         let flow = ReceivedOf { route: 1, publisher: publisher.gid(), sequence, dropped };
-        stranger.say(&mut met, &LinkMessage::ReceivedUpTo(ReceivedUpTo { flows: vec![flow] }));
+        stranger.say(&mut met, &LinkMessage::Received(ReceivedUpTo { flows: vec![flow] }));
     };
     for given_up in 1..=2 {
         let sequence = publisher.publish(b"sample").unwrap();
@@ -245,7 +245,7 @@ fn at_service(host: &Host, kind: EndpointKind, idler: Idler) -> (Stranger, Met) 
         .with_qos(Qos::keep_all())
         .with_node("idle", "/");
     let graph = GraphUpdate { version: 1, added: vec![end], ..GraphUpdate::default() };
-    stranger.say(&mut met, &LinkMessage::GraphUpdate(graph));
+    stranger.say(&mut met, &LinkMessage::Graph(graph));
     if idler != Idler::Silent {
         ask(&stranger, &mut met, kind);
     }

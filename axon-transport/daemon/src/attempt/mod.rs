@@ -185,7 +185,7 @@ impl AcceptedLink {
         let messages = [
             LinkMessage::Elected(Elected { link: rand::random(), election: 1 }),
             LinkMessage::Owners(Owners { proofs: vec![proof] }),
-            LinkMessage::GraphUpdate(graph),
+            LinkMessage::Graph(graph),
         ];
         messages.iter().try_for_each(|message| self.control.send(message)).map_err(internal)
     }

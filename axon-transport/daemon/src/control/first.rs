@@ -58,14 +58,14 @@ pub(super) async fn first(
         let mut ready = socket.readable().await.ok()?;
         let fd = socket.get_ref();
         if descriptors::is_tight() && descriptors::carries_descriptors(fd) && !has_room() {
-            let Ok(SessionMessage::SessionHello(hello)) = socket::look(fd, &mut buffer) else {
+            let Ok(SessionMessage::Hello(hello)) = socket::look(fd, &mut buffer) else {
                 return None;
             };
             let descriptors = Vec::new();
             return Some(FirstMessage { hello, descriptors, key, is_crowded: true });
         }
         match receive(spare, fd, &mut buffer) {
-            Ok(ReceivedMessage { message: SessionMessage::SessionHello(hello), descriptors }) => {
+            Ok(ReceivedMessage { message: SessionMessage::Hello(hello), descriptors }) => {
                 return Some(FirstMessage { hello, descriptors, key, is_crowded: false });
             }
             Ok(ReceivedMessage { message: SessionMessage::Unknown(OWNER), descriptors })
@@ -88,7 +88,7 @@ pub(super) async fn first(
                 if !descriptors::is_clogged() && spare.can_keep_caller() =>
             {
                 let text = "its descriptors do not arrive".to_owned();
-                say(socket, SessionMessage::SessionRefused(*unshared(text)), &[]);
+                say(socket, SessionMessage::Refused(*unshared(text)), &[]);
                 return None;
             }
             Ok(_) | Err(_) => return None,

@@ -220,7 +220,7 @@ fn refuse(
     let what = if refused.variable.is_empty() { "session" } else { &refused.variable }.to_owned();
     let who = format!("session {name} (pid {})", peer.pid);
     control.refused(RefusalKind::Local, who, what, refused.text.clone());
-    say(socket, SessionMessage::SessionRefused(refused), &[]);
+    say(socket, SessionMessage::Refused(refused), &[]);
 }
 
 /// Refuses a session for want of descriptors.
@@ -232,7 +232,7 @@ fn refuse_for_room(
     why: String,
 ) {
     control.refused_for_room(format!("session {name} (pid {})", peer.pid), why.clone());
-    say(socket, SessionMessage::SessionRefused(SessionRefused::because(why)), &[]);
+    say(socket, SessionMessage::Refused(SessionRefused::because(why)), &[]);
 }
 
 /// Why there are no descriptors for a session, if so. What a tool needs is its connection.

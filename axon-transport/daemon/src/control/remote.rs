@@ -208,7 +208,7 @@ impl DaemonGateway {
             DiscoveryAction::SendFromQuicPort { to, bytes } => {
                 self.order(ToGateway::SendDatagram { to, bytes });
             }
-            DiscoveryAction::PeerMismatch(mismatch) => {
+            DiscoveryAction::Mismatch(mismatch) => {
                 let peer = format!("{} at {}", mismatch.peer, mismatch.address);
                 let what = mismatch.setting.to_owned();
                 let reason =

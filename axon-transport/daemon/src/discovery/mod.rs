@@ -85,7 +85,7 @@ pub(crate) enum DiscoveryAction {
         bytes: Vec<u8>,
     },
     /// This peer is not dialled, and why. Said once a peer; after 32 of them one a second.
-    PeerMismatch(PeerMismatch),
+    Mismatch(PeerMismatch),
     /// The addresses that the names of static peers have.
     Named(BTreeMap<String, Vec<IpAddr>>),
     /// Nothing was heard of this peer for long, or it said goodbye.

@@ -143,7 +143,7 @@ async fn listed_daemons_find_each_other_without_multicast_and_say_why_they_do_no
     let (mut a, mut b) = (Daemon::start(a).await, Daemon::start(b).await);
     let (of_a, of_b) = (a.next().await.unwrap(), b.next().await.unwrap());
     for (action, peer, theirs) in [(of_a, &b, "aes-256-gcm"), (of_b, &a, "chacha20-poly1305")] {
-        let DiscoveryAction::PeerMismatch(mismatch) = action else { panic!("{action:?}") };
+        let DiscoveryAction::Mismatch(mismatch) = action else { panic!("{action:?}") };
         assert_eq!((mismatch.peer, mismatch.setting), (peer.id, "AXON_QUIC_CIPHER"));
         assert_eq!((mismatch.address, &*mismatch.theirs), (peer.address, theirs));
     }

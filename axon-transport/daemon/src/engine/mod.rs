@@ -359,7 +359,7 @@ impl Engine {
             return;
         };
         match message {
-            LinkMessage::GraphUpdate(graph) => match peer.take_graph(graph) {
+            LinkMessage::Graph(graph) => match peer.take_graph(graph) {
                 GraphTaken::Changed { .. } => peer.stirred = true,
                 GraphTaken::Part => {}
                 GraphTaken::Gap => {
@@ -396,7 +396,7 @@ impl Engine {
         let mut messages = Vec::new();
         for peer in self.peers.values_mut() {
             while let Some(receipt) = peer.inbound.poll_receipt(now) {
-                peer.say(LinkMessage::ReceivedUpTo(receipt));
+                peer.say(LinkMessage::Received(receipt));
             }
             while let Some(message) = peer.poll_message() {
                 messages.push((peer.link, message));

@@ -81,10 +81,10 @@ impl Order {
     /// [`OutOfOrder`]; the connection is then closed.
     pub fn accept(&mut self, message: &LinkMessage) -> Result<(), OutOfOrder> {
         let allowed = match (message, self.step) {
-            (LinkMessage::LinkHello(_), OrderStep::Hello) => {
+            (LinkMessage::Hello(_), OrderStep::Hello) => {
                 !std::mem::replace(&mut self.hello_seen, true)
             }
-            (LinkMessage::LinkHello(_), _) => false,
+            (LinkMessage::Hello(_), _) => false,
             // The server announces the key that proves the client's name.
             (LinkMessage::Keys(KeyMessage::Announce(_)), OrderStep::Proof) => {
                 self.side == Side::Client
@@ -118,23 +118,23 @@ impl LinkMessage {
     /// The message's name in `docs/formats.md`.
     pub fn name(&self) -> &'static str {
         match self {
-            Self::LinkHello(_) => "HELLO",
+            Self::Hello(_) => "HELLO",
             Self::Elected(_) => "ELECTED",
-            Self::GraphUpdate(_) => "GRAPH",
+            Self::Graph(_) => "GRAPH",
             Self::GraphResync(_) => "GRAPH_RESYNC",
             Self::Subscribe(_) => "SUBSCRIBE",
             Self::Unsubscribe(_) => "UNSUBSCRIBE",
             Self::RouteReady(_) => "ROUTE_READY",
             Self::Keepalive => "KEEPALIVE",
-            Self::LivelinessAsserted(_) => "ASSERTED",
-            Self::ReceivedUpTo(_) => "RECEIVED",
+            Self::Asserted(_) => "ASSERTED",
+            Self::Received(_) => "RECEIVED",
             Self::RouteRefused(_) => "ROUTE_REFUSED",
             Self::RouteUnasked(_) => "ROUTE_UNASKED",
             Self::Owners(_) => "OWNERS",
             Self::LinkClosed(_) => "LINK_CLOSED",
             Self::Intake(_) => "INTAKE",
-            Self::DeniedUses(_) => "DENIED",
-            Self::LinkAccessCheck(_) => "ACCESS_CHECK",
+            Self::Denied(_) => "DENIED",
+            Self::AccessCheck(_) => "ACCESS_CHECK",
             Self::AccessDecisions(_) => "ACCESS_DECISIONS",
             Self::Keys(m) => m.name(),
         }

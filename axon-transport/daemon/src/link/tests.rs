@@ -53,10 +53,10 @@ fn nothing_precedes_hello_proof_and_election() {
             assert_eq!(order.accept(m).is_ok(), allowed, "{} before the proof", m.name());
         }
         order.proven();
-        assert!(order.accept(&LinkMessage::GraphUpdate(GraphUpdate::default())).is_err());
+        assert!(order.accept(&LinkMessage::Graph(GraphUpdate::default())).is_err());
         order.accept(&elected()).unwrap();
         order.elected();
-        order.accept(&LinkMessage::GraphUpdate(GraphUpdate::default())).unwrap();
+        order.accept(&LinkMessage::Graph(GraphUpdate::default())).unwrap();
         assert!(order.accept(&elected()).is_err(), "a second ELECTED");
     }
 }

@@ -45,7 +45,7 @@ pub(super) enum ReactorInput {
     /// The KME answered.
     Key(KmeAnswer),
     /// Another thread did something.
-    TaskResult(TaskResult),
+    Done(TaskResult),
 }
 
 /// Channels and the doorbell.
@@ -98,7 +98,7 @@ impl Inputs {
             inputs.push(ReactorInput::Key(event));
         }
         while let Ok(done) = self.done.try_recv() {
-            inputs.push(ReactorInput::TaskResult(done));
+            inputs.push(ReactorInput::Done(done));
         }
         inputs
     }
@@ -123,7 +123,7 @@ impl Inputs {
             }
         }
         if let Poll::Ready(Some(done)) = self.done.poll_recv(cx) {
-            self.taken.push(ReactorInput::TaskResult(done));
+            self.taken.push(ReactorInput::Done(done));
         }
         if self.rang || !self.taken.is_empty() { Poll::Ready(()) } else { Poll::Pending }
     }

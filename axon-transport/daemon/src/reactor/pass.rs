@@ -215,7 +215,7 @@ impl Reactor {
             match input {
                 ReactorInput::Order(order) => self.handle_order(order, now),
                 ReactorInput::Key(event) => self.engine.handle_key_event(event, now),
-                ReactorInput::TaskResult(done) => self.handle_done(done, now),
+                ReactorInput::Done(done) => self.handle_done(done, now),
             }
         }
         if self.engine.follow_local_at() <= now && self.notices.take_graph() {

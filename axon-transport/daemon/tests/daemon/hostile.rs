@@ -7,7 +7,7 @@ use crate::reluctant::{hiding, send_away};
 
 /// What a tool says first.
 fn tool_hello() -> SessionMessage {
-    SessionMessage::SessionHello(SessionHello {
+    SessionMessage::Hello(SessionHello {
         protocol: PROTOCOL,
         session: SessionId::random(),
         role: SessionRole::Tool,
@@ -28,7 +28,7 @@ fn garbage_on_the_socket_hurts_nobody() {
     let publisher = session.create_publisher(spec("/t")).unwrap();
     let address = Address::of(&host.config());
     let hello = |name: &str, settings| {
-        SessionMessage::SessionHello(SessionHello {
+        SessionMessage::Hello(SessionHello {
             protocol: PROTOCOL,
             session: SessionId::random(),
             role: SessionRole::Application,
@@ -90,7 +90,7 @@ fn the_daemon_is_handed_nothing_that_a_read_could_wait_for() {
     for (name, descriptor) in [("memory", &memory), ("pipe", &pipe)] {
         let segment = SessionSegment::create(SessionId::random()).unwrap();
         let session = segment.id();
-        let hello = SessionMessage::SessionHello(SessionHello {
+        let hello = SessionMessage::Hello(SessionHello {
             protocol: PROTOCOL,
             session,
             role: SessionRole::Application,

@@ -283,7 +283,7 @@ fn another_version_is_refused_by_both_sides() {
     let host = Host::new();
     let daemon = host.daemon();
     let hello = |protocol| {
-        SessionMessage::SessionHello(SessionHello {
+        SessionMessage::Hello(SessionHello {
             protocol,
             session: SessionId([9; 16]),
             role: SessionRole::Tool,
@@ -303,7 +303,7 @@ fn another_version_is_refused_by_both_sides() {
         answer.is_some()
     });
     match answer.unwrap().message {
-        SessionMessage::SessionRefused(refused) => {
+        SessionMessage::Refused(refused) => {
             assert!(refused.text.contains("protocol"), "{}", refused.text);
         }
         other => panic!("instead of a refusal: {other:?}"),
@@ -321,8 +321,7 @@ fn another_version_is_refused_by_both_sides() {
         let accepted = accepted.unwrap();
         until("HELLO", || {
             let received = socket::receive(&accepted, &mut Vec::new());
-            received
-                .is_ok_and(|received| matches!(received.message, SessionMessage::SessionHello(_)))
+            received.is_ok_and(|received| matches!(received.message, SessionMessage::Hello(_)))
         });
         let daemon = DaemonId([7; 16]);
         let welcome = SessionMessage::Welcome(Welcome {

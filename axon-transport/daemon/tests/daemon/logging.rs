@@ -199,7 +199,7 @@ fn a_flood_of_one_kind_leaves_few_lines_and_a_count() {
     let daemon = foreground(&host, program(&host), File::create(&log).unwrap());
     let address = Address::of(&host.config());
     const FLOOD: usize = 500;
-    let hello = SessionMessage::SessionHello(SessionHello {
+    let hello = SessionMessage::Hello(SessionHello {
         protocol: PROTOCOL + 1,
         session: SessionId::random(),
         role: SessionRole::Application,

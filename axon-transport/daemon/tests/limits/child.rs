@@ -187,7 +187,7 @@ pub(crate) fn play(part: &str) {
             )
             .unwrap();
             rustix::net::connect(&socket, &name).unwrap();
-            let hello = SessionMessage::SessionHello(SessionHello {
+            let hello = SessionMessage::Hello(SessionHello {
                 protocol: PROTOCOL,
                 session: axon_transport::ids::SessionId::random(),
                 role: SessionRole::Tool,

@@ -151,7 +151,7 @@ fn descriptors_of_callers_that_are_refused_are_not_received() {
     let daemon = host.daemon();
     limit(&daemon, 256);
     let (mut served, _) = crowd(&host, 64);
-    let hello = SessionMessage::SessionHello(SessionHello {
+    let hello = SessionMessage::Hello(SessionHello {
         protocol: PROTOCOL,
         session: SessionId([9; 16]),
         role: SessionRole::Application,

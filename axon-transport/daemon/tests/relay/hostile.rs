@@ -56,9 +56,9 @@ pub(crate) fn hear(
 
 fn refused(host: &Host, hello: SessionHello) -> SessionRefused {
     let socket = Address::of(&host.config()).connect().unwrap();
-    say_to(&socket, &SessionMessage::SessionHello(hello));
+    say_to(&socket, &SessionMessage::Hello(hello));
     match hear(&socket, |_| true) {
-        Some(SessionMessage::SessionRefused(refused)) => refused,
+        Some(SessionMessage::Refused(refused)) => refused,
         other => panic!("instead of a refusal: {other:?}"),
     }
 }
@@ -66,7 +66,7 @@ fn refused(host: &Host, hello: SessionHello) -> SessionRefused {
 /// A relayed session that does as the test does.
 pub(super) fn by_hand(host: &Host, hello: SessionHello) -> OwnedFd {
     let socket = Address::of(&host.config()).connect().unwrap();
-    say_to(&socket, &SessionMessage::SessionHello(hello));
+    say_to(&socket, &SessionMessage::Hello(hello));
     assert!(matches!(hear(&socket, |_| true), Some(SessionMessage::Welcome(_))));
     socket
 }
@@ -137,7 +137,7 @@ pub(crate) fn stop(daemon: &Kept) {
 fn call() -> OwnedFd {
     let config = Config::from_env().unwrap();
     let socket = Address::of(&config).connect().unwrap();
-    say_to(&socket, &SessionMessage::SessionHello(hello_of(&config)));
+    say_to(&socket, &SessionMessage::Hello(hello_of(&config)));
     socket
 }
 
@@ -242,13 +242,9 @@ fn a_sample_that_cannot_be_written_is_given_up() {
         }),
     );
     let told =
-        hear(&socket, |m| matches!(m, SessionMessage::RelayGivenUp(_) | SessionMessage::Credit(_)));
+        hear(&socket, |m| matches!(m, SessionMessage::GivenUp(_) | SessionMessage::Credit(_)));
     let given_up = RelayGivenUp { reader: own(), writer: own(), samples: 1 };
-    assert_eq!(
-        told,
-        Some(SessionMessage::RelayGivenUp(given_up)),
-        "before it counts as acknowledged"
-    );
+    assert_eq!(told, Some(SessionMessage::GivenUp(given_up)), "before it counts as acknowledged");
     let done =
         |m: &SessionMessage| matches!(m, SessionMessage::Credit(c) if c.done == Some(sequence));
     assert!(hear(&socket, done).is_some());
@@ -379,7 +375,7 @@ fn hostile_frames_end_their_own_relay_and_nothing_else() {
 fn server_for(host: &Host, own: Gid, others: Vec<Gid>) -> OwnedFd {
     let socket = by_hand(host, hello(host));
     say_to(&socket, &announce(own, EndpointKind::Server, EndpointRole::Application));
-    say_to(&socket, &SessionMessage::RelayMatched(RelayMatched { gid: own, others }));
+    say_to(&socket, &SessionMessage::Matched(RelayMatched { gid: own, others }));
     socket
 }
 
@@ -408,17 +404,14 @@ fn a_server_that_answers_what_nobody_asked_it_reaches_nobody() {
     // Not its own, or no server.
     for gid in [server.gid(), client.gid(), Gid([7; 16])] {
         let socket = by_hand(&host, hello(&host));
-        say_to(
-            &socket,
-            &SessionMessage::RelayMatched(RelayMatched { gid, others: vec![client.gid()] }),
-        );
+        say_to(&socket, &SessionMessage::Matched(RelayMatched { gid, others: vec![client.gid()] }));
         assert!(hear(&socket, |_| false).is_none(), "{gid}");
     }
     let socket = by_hand(&host, hello(&host));
     say_to(&socket, &announce(own, EndpointKind::Client, EndpointRole::Application));
     say_to(
         &socket,
-        &SessionMessage::RelayMatched(RelayMatched { gid: own, others: vec![server.gid()] }),
+        &SessionMessage::Matched(RelayMatched { gid: own, others: vec![server.gid()] }),
     );
     assert!(hear(&socket, |_| false).is_none(), "a client answers nobody");
     // More than it may.
@@ -467,9 +460,8 @@ fn a_reader_that_gives_no_credit_back_does_not_make_the_daemon_keep_ended_writer
     let mut others = Vec::new();
     let mut told = |socket: &OwnedFd, wanted: &dyn Fn(&[Gid]) -> bool| {
         while !wanted(&others) {
-            let heard =
-                hear(socket, |m| matches!(m, SessionMessage::RelayMatched(m) if m.gid == own));
-            let Some(SessionMessage::RelayMatched(matched)) = heard else { panic!("it hangs up") };
+            let heard = hear(socket, |m| matches!(m, SessionMessage::Matched(m) if m.gid == own));
+            let Some(SessionMessage::Matched(matched)) = heard else { panic!("it hangs up") };
             others = matched.others;
         }
     };

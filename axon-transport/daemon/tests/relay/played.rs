@@ -19,9 +19,7 @@ fn played(host: &Host) -> (Session, OwnedFd) {
             socket.is_some()
         });
         let socket = socket.unwrap();
-        assert!(
-            hear(&socket, |message| matches!(message, SessionMessage::SessionHello(_))).is_some()
-        );
+        assert!(hear(&socket, |message| matches!(message, SessionMessage::Hello(_))).is_some());
         let (daemon, pid) = (DaemonId([1; 16]), std::process::id());
         say_to(
             &socket,
@@ -54,7 +52,7 @@ fn show_as(socket: &OwnedFd, gid: Gid, own: &Endpoint, kind: EndpointKind) -> Gi
     let added = vec![GraphItem { endpoint, daemon: None, reach: None }];
     let (removed, ended) = (Vec::new(), None);
     let graph = SessionGraph { version: 1, whole: false, added, removed, more: false, ended };
-    say_to(socket, &SessionMessage::SessionGraph(graph));
+    say_to(socket, &SessionMessage::Graph(graph));
     gid
 }
 
@@ -72,7 +70,7 @@ fn opened(socket: &OwnedFd, writer: Gid, reader: Option<Gid>) {
 }
 
 fn matched(socket: &OwnedFd, gid: Gid, others: &[Gid]) {
-    say_to(socket, &SessionMessage::RelayMatched(RelayMatched { gid, others: others.to_vec() }));
+    say_to(socket, &SessionMessage::Matched(RelayMatched { gid, others: others.to_vec() }));
 }
 
 #[test]
@@ -176,7 +174,7 @@ fn samples_that_the_daemon_gave_up_are_not_acknowledged() {
         }
         say_to(
             &socket,
-            &SessionMessage::RelayGivenUp(RelayGivenUp { reader: gid, writer: gid, samples: 2 }),
+            &SessionMessage::GivenUp(RelayGivenUp { reader: gid, writer: gid, samples: 2 }),
         );
         let back = Credit { bytes: 3 * 129, opens: None, ..open_for(gid, 0) };
         say_to(&socket, &SessionMessage::Credit(Credit { done: Some(3), ..back }));

@@ -67,7 +67,7 @@ pub enum ConnectError {
     Incompatible(Incompatible),
     /// The publisher refused, and said why.
     #[error("the publisher refused: {0}")]
-    ConnectRefusal(String),
+    Refused(String),
     /// The other end sent something else than it should.
     #[error(
         "the other end sent {0}: is there a publisher at one end and a subscriber at the other?"
@@ -146,9 +146,9 @@ enum Packet {
     #[n(0)]
     AttachRequest(#[n(0)] AttachRequest),
     #[n(1)]
-    PublisherAnswer(#[n(0)] PublisherAnswer),
+    Granted(#[n(0)] PublisherAnswer),
     #[n(2)]
-    ConnectRefusal(#[n(0)] ConnectRefusal),
+    Refused(#[n(0)] ConnectRefusal),
     #[n(3)]
     Opened(#[n(0)] SegmentOpened),
     #[n(4)]
@@ -243,7 +243,7 @@ impl<'a> ConnectChannel<'a> {
         own: &PeerDescriptors,
     ) -> Result<(), ConnectError> {
         let fds = [own.segment.as_fd(), own.doorbell.as_fd(), own.pidfd.as_fd()];
-        self.send(&Packet::PublisherAnswer(*granted), &fds)
+        self.send(&Packet::Granted(*granted), &fds)
     }
 
     /// The answer to what `reader` asked.
@@ -253,16 +253,16 @@ impl<'a> ConnectChannel<'a> {
     ) -> Result<(PublisherAnswer, PeerDescriptors), ConnectError> {
         loop {
             match self.receive()? {
-                (Packet::PublisherAnswer(granted), fds) if granted.reader == reader => {
+                (Packet::Granted(granted), fds) if granted.reader == reader => {
                     let [segment, doorbell, pidfd] = fds
                         .try_into()
                         .map_err(|_| ConnectError::Protocol("another number of descriptors"))?;
                     return Ok((granted, PeerDescriptors { segment, doorbell, pidfd }));
                 }
-                (Packet::ConnectRefusal(refused), _) if refused.reader == reader => {
-                    return Err(ConnectError::ConnectRefusal(refused.reason));
+                (Packet::Refused(refused), _) if refused.reader == reader => {
+                    return Err(ConnectError::Refused(refused.reason));
                 }
-                (Packet::PublisherAnswer(_) | Packet::ConnectRefusal(_), _) => {}
+                (Packet::Granted(_) | Packet::Refused(_), _) => {}
                 (Packet::Opened(_) | Packet::Gone(_), _) => {}
                 (Packet::AttachRequest(_), _) => {
                     return Err(ConnectError::Protocol("a question where an answer was due"));
@@ -297,12 +297,7 @@ impl<'a> ConnectChannel<'a> {
                     }
                 }
                 (Packet::Gone(gone), _) => return Ok(SegmentUpdate::Gone(gone)),
-                (
-                    Packet::AttachRequest(_)
-                    | Packet::PublisherAnswer(_)
-                    | Packet::ConnectRefusal(_),
-                    _,
-                ) => {}
+                (Packet::AttachRequest(_) | Packet::Granted(_) | Packet::Refused(_), _) => {}
             }
         }
     }
@@ -312,7 +307,7 @@ impl<'a> ConnectChannel<'a> {
         let mut reason = why.to_string();
         let end = (0..=MAX_REASON.min(reason.len())).rev().find(|&i| reason.is_char_boundary(i));
         reason.truncate(end.unwrap_or(0));
-        let _ = self.send(&Packet::ConnectRefusal(ConnectRefusal { reader, reason }), &[]);
+        let _ = self.send(&Packet::Refused(ConnectRefusal { reader, reason }), &[]);
     }
 
     fn send(&self, packet: &Packet, fds: &[BorrowedFd<'_>]) -> Result<(), ConnectError> {

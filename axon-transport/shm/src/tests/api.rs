@@ -123,7 +123,7 @@ fn incompatible_qos_is_reported_at_both_ends() {
     let publisher = publisher(&context, offered);
     let (served, subscriber) = together(&publisher, &context, requested);
     assert!(matches!(served, Err(ConnectError::Incompatible(_))));
-    let Err(ConnectError::ConnectRefusal(reason)) = subscriber else { panic!("{subscriber:?}") };
+    let Err(ConnectError::Refused(reason)) = subscriber else { panic!("{subscriber:?}") };
     assert!(reason.contains("RELIABILITY"), "{reason}");
     assert!(publisher.subscribers().is_empty());
 }

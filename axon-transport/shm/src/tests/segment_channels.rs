@@ -275,7 +275,7 @@ fn a_forged_session_id_does_not_replace_its_owner() {
     let publisher = publisher(&here, keep_last(1));
     let (served, connected) = together(&publisher, &there, keep_last(1));
     assert!(matches!(served, Err(ConnectError::Memory(ShmError::Refused { .. }))), "{served:?}");
-    assert!(matches!(connected, Err(ConnectError::ConnectRefusal(_))), "{connected:?}");
+    assert!(matches!(connected, Err(ConnectError::Refused(_))), "{connected:?}");
     drop(first);
     assert!(together(&publisher, &there, keep_last(1)).1.is_ok());
 }

@@ -108,7 +108,7 @@ impl World {
     fn graph(&mut self, session: u8, known: &mut BTreeSet<Gid>) {
         self.registry.flush();
         for message in self.drain(session) {
-            let SessionMessage::SessionGraph(graph) = message else { continue };
+            let SessionMessage::Graph(graph) = message else { continue };
             if graph.whole {
                 known.clear();
             }
@@ -248,7 +248,7 @@ fn pairs_and_graph_follow_a_link_that_comes_and_goes() {
         world.registry.flush();
         let told = world.drain(GATEWAY);
         let reach = told.iter().rev().find_map(|message| match message {
-            SessionMessage::SessionGraph(graph) => {
+            SessionMessage::Graph(graph) => {
                 graph.added.iter().find(|item| item.endpoint.gid == writer)?.reach.clone()
             }
             _ => None,

@@ -329,7 +329,7 @@ impl<F: Clone> Sessions<F> {
              fewer publishers of samples over 4 KiB in one process"
         );
         self.note_refused(id, &text);
-        self.push(id, &SessionMessage::SessionRefused(SessionRefused::because(text)), Vec::new());
+        self.push(id, &SessionMessage::Refused(SessionRefused::because(text)), Vec::new());
     }
 
     /// A session ends. Hands what it pledged to the readers. Called before its pairs end.

@@ -73,10 +73,7 @@ fn an_endpoint_out_of_bounds_is_refused_and_the_session_goes_on() {
     huge.topic = "x".repeat(1000);
     world.registry.handle_message(&own, announce(huge), vec![]).unwrap();
     let answer = world.registry.poll_output(&own).unwrap();
-    assert!(matches!(
-        SessionMessage::decode(&answer.packet).unwrap(),
-        SessionMessage::SessionRefused(_)
-    ));
+    assert!(matches!(SessionMessage::decode(&answer.packet).unwrap(), SessionMessage::Refused(_)));
     assert_eq!(world.registry.endpoints().count(), 0);
 }
 
@@ -119,7 +116,7 @@ fn a_sample_never_goes_back_to_where_it_came_from() {
         .whole_graph(&own)
         .iter()
         .flat_map(|packet| match SessionMessage::decode(packet).unwrap() {
-            SessionMessage::SessionGraph(graph) => graph.added,
+            SessionMessage::Graph(graph) => graph.added,
             other => panic!("{other:?}"),
         })
         .map(|item| item.endpoint.gid)
@@ -186,8 +183,7 @@ fn a_tombstone_reaches_those_who_come_later() {
     let late = world.clients[&1].id;
     let mut removed = Vec::new();
     while let Some(output) = world.registry.poll_output(&late) {
-        if let SessionMessage::SessionGraph(graph) = SessionMessage::decode(&output.packet).unwrap()
-        {
+        if let SessionMessage::Graph(graph) = SessionMessage::decode(&output.packet).unwrap() {
             removed.extend(graph.ended.unwrap_or_default());
         }
     }
@@ -251,8 +247,7 @@ fn a_remote_endpoint_that_comes_and_goes_ends_nothing_here() {
     world.registry.flush();
     let mut seen = false;
     while let Some(output) = world.registry.poll_output(&own) {
-        if let SessionMessage::SessionGraph(graph) = SessionMessage::decode(&output.packet).unwrap()
-        {
+        if let SessionMessage::Graph(graph) = SessionMessage::decode(&output.packet).unwrap() {
             assert_eq!(graph.ended.unwrap_or_default(), vec![]);
             seen |= graph.added.iter().any(|item| item.endpoint.gid == gid);
         }

@@ -117,7 +117,7 @@ impl Client {
     fn handle(&mut self, output: &SessionPacket<Label>) {
         let fds = &output.descriptors;
         match SessionMessage::decode(&output.packet).unwrap() {
-            SessionMessage::SessionGraph(graph) => {
+            SessionMessage::Graph(graph) => {
                 if graph.whole {
                     self.building = Some(BTreeMap::new());
                     self.held.clear();

@@ -94,7 +94,7 @@ fn a_reader_hears_of_it_before_it_hears_that_the_publisher_ended() {
     registry.flush();
     connect(&mut registry, READER);
     let told = taken(&mut registry, READER);
-    let ends = |m: &SessionMessage| matches!(m, SessionMessage::SessionGraph(g) if g.ended.as_ref().is_some_and(|e| e.contains(&writer)));
+    let ends = |m: &SessionMessage| matches!(m, SessionMessage::Graph(g) if g.ended.as_ref().is_some_and(|e| e.contains(&writer)));
     let at = |is: &dyn Fn(&SessionMessage) -> bool| told.iter().position(is).expect("it was told");
     assert!(at(&|m| *m == SessionMessage::Unmet(unmet(3))) < at(&ends));
 }

@@ -82,7 +82,7 @@ impl World {
         self.0.sessions.request_resync(&id(session));
         let mut seen = BTreeSet::new();
         for message in self.drain(session) {
-            let SessionMessage::SessionGraph(graph) = message else { continue };
+            let SessionMessage::Graph(graph) = message else { continue };
             if graph.whole {
                 seen.clear();
             }
@@ -133,9 +133,8 @@ fn the_refusals_name_a_denied_endpoint_and_its_rule_and_its_session_keeps_it() {
     world.drain(3);
     world.own(3, Publisher, "/in");
     let told = world.drain(3);
-    let refused: Vec<_> =
-        told.iter().filter(|m| matches!(m, SessionMessage::SessionRefused(_))).collect();
-    let [SessionMessage::SessionRefused(refused)] = refused[..] else { panic!("{told:?}") };
+    let refused: Vec<_> = told.iter().filter(|m| matches!(m, SessionMessage::Refused(_))).collect();
+    let [SessionMessage::Refused(refused)] = refused[..] else { panic!("{told:?}") };
     assert_eq!(refused.endpoint, None, "an endpoint would be refused for good");
     assert!(refused.text.contains("denied by line 7 of access.toml"), "{}", refused.text);
     let said = world.0.take_refused();
@@ -143,7 +142,7 @@ fn the_refusals_name_a_denied_endpoint_and_its_rule_and_its_session_keeps_it() {
     // The same rules once more say nothing new; other ones do.
     world.set(&format!("{RULES}\n[[deny]]\npeer = \"local\"\npublish = \"/in\""));
     assert!(world.0.take_refused().is_empty());
-    assert!(!world.drain(3).iter().any(|m| matches!(m, SessionMessage::SessionRefused(_))));
+    assert!(!world.drain(3).iter().any(|m| matches!(m, SessionMessage::Refused(_))));
     world.set("default = \"allow\"");
     world.set("default = \"deny\"");
     assert!(world.0.take_refused()[0].1.contains("default = "));

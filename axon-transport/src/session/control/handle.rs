@@ -21,7 +21,7 @@ use crate::{
 impl Control {
     pub(super) fn handle(&mut self, message: SessionMessage, descriptors: Vec<PassedFd>) {
         match message {
-            SessionMessage::SessionGraph(graph) => self.graph(graph),
+            SessionMessage::Graph(graph) => self.graph(graph),
             SessionMessage::Match(pair) => self.matched(pair),
             SessionMessage::Attach(attach) => self.attach(attach, descriptors),
             SessionMessage::Grant(grant) => self.grant(grant, descriptors),
@@ -31,16 +31,16 @@ impl Control {
                 self.detach_reader(&pair);
             }
             SessionMessage::Unmatch(unmatch) => self.unmatch(&unmatch),
-            SessionMessage::WriterLeaving(leaving) => self.leave(leaving),
+            SessionMessage::Leaving(leaving) => self.leave(leaving),
             SessionMessage::Unmet(unmet) => self.unmet(unmet),
-            SessionMessage::RelayGivenUp(given_up) => self.give_up(given_up),
+            SessionMessage::GivenUp(given_up) => self.give_up(given_up),
             SessionMessage::Fence(fence) => self.fence(fence),
             SessionMessage::Segment(opened) => self.segment(&opened, &descriptors),
             SessionMessage::SegmentGone(gone) => {
                 self.peers.gone(&gone.session, gone.number);
             }
             SessionMessage::Status(part) => self.status(&part),
-            SessionMessage::SessionRefused(SessionRefused { endpoint, text: reason, .. }) => {
+            SessionMessage::Refused(SessionRefused { endpoint, text: reason, .. }) => {
                 // The process that is relayed logs it itself.
                 if !self.shared.core.options.keeps_refusals {
                     tracing::error!(reason, "the daemon refuses something of the session");

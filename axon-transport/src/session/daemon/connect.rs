@@ -165,7 +165,7 @@ impl<'a> Caller<'a> {
         } else {
             security_settings(self.config).map_err(SessionError::from)?
         };
-        let hello = SessionMessage::SessionHello(SessionHello {
+        let hello = SessionMessage::Hello(SessionHello {
             protocol: PROTOCOL,
             session: self.id,
             role: self.options.role,
@@ -228,22 +228,20 @@ impl<'a> Caller<'a> {
                     address: address.to_owned(),
                     text: format!("it speaks protocol {}, this {PROTOCOL}", welcome.protocol),
                 })),
-                SessionMessage::SessionRefused(refused) if refused.variable.is_empty() => {
+                SessionMessage::Refused(refused) if refused.variable.is_empty() => {
                     let address = address.to_owned();
                     Err(Attempt::Final(SessionError::Refused { address, text: refused.text }))
                 }
-                SessionMessage::SessionRefused(refused) if refused.variable == SHM => {
+                SessionMessage::Refused(refused) if refused.variable == SHM => {
                     Err(Attempt::Final(SessionError::NotShared(refused.text)))
                 }
-                SessionMessage::SessionRefused(refused) => {
-                    Err(Attempt::Final(SessionError::Mismatch {
-                        variable: refused.variable,
-                        ours: refused.ours,
-                        theirs: refused.theirs,
-                        address: address.to_owned(),
-                        pid,
-                    }))
-                }
+                SessionMessage::Refused(refused) => Err(Attempt::Final(SessionError::Mismatch {
+                    variable: refused.variable,
+                    ours: refused.ours,
+                    theirs: refused.theirs,
+                    address: address.to_owned(),
+                    pid,
+                })),
                 SessionMessage::Unknown(_) => continue,
                 other => {
                     let text = format!("{other:?} before WELCOME");
@@ -311,7 +309,7 @@ fn look_into(descriptors: &[PassedFd]) -> Result<(), SessionError> {
 /// What a daemon said that has closed the connection before it was spoken to.
 fn refusal(socket: &OwnedFd, address: &str) -> Option<Attempt> {
     match socket::receive(socket, &mut Vec::new()).ok()?.message {
-        SessionMessage::SessionRefused(refused) if refused.variable.is_empty() => {
+        SessionMessage::Refused(refused) if refused.variable.is_empty() => {
             let address = address.to_owned();
             Some(Attempt::Final(SessionError::Refused { address, text: refused.text }))
         }

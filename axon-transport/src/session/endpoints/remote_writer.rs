@@ -117,7 +117,7 @@ impl RemoteWriter {
             Self::Server(server) => &server.session,
         };
         let leaving = WriterLeaving { gid: self.endpoint().gid, leaving };
-        session.core().tell(Outgoing::message(SessionMessage::WriterLeaving(leaving)));
+        session.core().tell(Outgoing::message(SessionMessage::Leaving(leaving)));
     }
 
     /// Writes a sample, a request, or a response to `client`, without waiting for room.

@@ -261,7 +261,7 @@ impl Subscription {
         // may be of an older version, and the publisher may wait for acknowledgements.
         self.inner.lock().give_up_of(&writer, samples);
         let given_up = RelayGivenUp { reader: self.gid(), writer, samples };
-        self.session.core().tell(Outgoing::message(SessionMessage::RelayGivenUp(given_up)));
+        self.session.core().tell(Outgoing::message(SessionMessage::GivenUp(given_up)));
     }
 
     /// For a relay: the next sample of one publisher, as bytes.

@@ -176,7 +176,7 @@ impl Pipe {
         let packet = message.encode().map_err(|e| End::Other(e.to_string()))?;
         self.waiting_bytes += packet.len();
         self.waiting.push_back(packet);
-        self.said += u64::from(matches!(message, SessionMessage::RelayMatched(_)));
+        self.said += u64::from(matches!(message, SessionMessage::Matched(_)));
         if self.waiting_bytes > MAX_WAITING { Err(End::Deaf) } else { Ok(()) }
     }
 
@@ -265,7 +265,7 @@ impl Pipe {
                     }
                 }
                 other => {
-                    self.heard += u64::from(matches!(other, SessionMessage::RelayMatched(_)));
+                    self.heard += u64::from(matches!(other, SessionMessage::Matched(_)));
                     messages.push(other);
                 }
             }

@@ -36,7 +36,7 @@ impl Stage {
         let socket = accept_with(&self.listener, flags).unwrap();
         let (hello, descriptors) = loop {
             match hear(&socket) {
-                ReceivedMessage { message: SessionMessage::SessionHello(hello), descriptors } => {
+                ReceivedMessage { message: SessionMessage::Hello(hello), descriptors } => {
                     break (hello, descriptors);
                 }
                 ReceivedMessage { message: SessionMessage::Unknown(OWNER), .. } => {}

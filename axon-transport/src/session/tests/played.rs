@@ -174,7 +174,7 @@ impl Relayed {
     /// The daemon says that the relay gave up so many samples.
     fn gives_up(&self, samples: u64) {
         let given_up = RelayGivenUp { reader: self.relay, writer: self.publisher.gid(), samples };
-        self.daemon.say(SessionMessage::RelayGivenUp(given_up), &[]);
+        self.daemon.say(SessionMessage::GivenUp(given_up), &[]);
     }
 
     /// The daemon says that the relay ended.
@@ -194,7 +194,7 @@ fn appears(daemon: &Daemon, endpoint: Endpoint) {
         more: false,
         ended: None,
     };
-    daemon.say(SessionMessage::SessionGraph(graph), &[]);
+    daemon.say(SessionMessage::Graph(graph), &[]);
 }
 
 /// Waits until the session has heard all that was said so far: it asks about a pair when it has.
@@ -410,7 +410,7 @@ fn an_endpoint_that_is_refused_is_not_in_the_graph() {
     let refuse = |gid| {
         let refusal =
             SessionRefused { endpoint: Some(gid), ..SessionRefused::because("too many".into()) };
-        daemon.say(SessionMessage::SessionRefused(refusal), &[]);
+        daemon.say(SessionMessage::Refused(refusal), &[]);
     };
     refuse(refused.gid());
     let changed = [Waitable::GuardCondition(node.graph_changed())];
@@ -447,7 +447,7 @@ fn one_that_is_refused_while_it_is_made_is_never_shown_again() {
             });
             let refusal =
                 SessionRefused { endpoint: Some(gid), ..SessionRefused::because("no".into()) };
-            daemon.say(SessionMessage::SessionRefused(refusal), &[]);
+            daemon.say(SessionMessage::Refused(refusal), &[]);
             (creating.join().unwrap(), gid)
         });
         has_heard(&daemon, &asking);

@@ -23,7 +23,7 @@ fn messages() -> Vec<SessionMessage> {
     let (reader, writer) = (Gid([1; 16]), Gid([2; 16]));
     let session = SessionId([3; 16]);
     vec![
-        SessionMessage::SessionHello(SessionHello {
+        SessionMessage::Hello(SessionHello {
             protocol: PROTOCOL,
             session,
             role: SessionRole::Application,
@@ -40,7 +40,7 @@ fn messages() -> Vec<SessionMessage> {
             pid: 12,
             ranges: Some(true),
         }),
-        SessionMessage::SessionRefused(SessionRefused {
+        SessionMessage::Refused(SessionRefused {
             variable: "AXON_QUIC_CIPHER".into(),
             ours: "a".into(),
             theirs: "b".into(),
@@ -55,7 +55,7 @@ fn messages() -> Vec<SessionMessage> {
             only: Some(writer),
         }),
         SessionMessage::EndpointGone(Gone { gid: reader }),
-        SessionMessage::SessionGraph(SessionGraph {
+        SessionMessage::Graph(SessionGraph {
             version: 3,
             whole: true,
             added: vec![GraphItem {
@@ -106,10 +106,10 @@ fn messages() -> Vec<SessionMessage> {
         }),
         SessionMessage::SegmentGone(SegmentName { session, number: 9 }),
         SessionMessage::Need(SegmentName { session, number: 9 }),
-        SessionMessage::WriterLeaving(WriterLeaving { gid: writer, leaving: true }),
+        SessionMessage::Leaving(WriterLeaving { gid: writer, leaving: true }),
         SessionMessage::Fence(Fence { writer, number: 12 }),
         SessionMessage::Unmet(Unmet { reader, writer, samples: 13 }),
-        SessionMessage::RelayMatched(RelayMatched { gid: reader, others: vec![writer] }),
+        SessionMessage::Matched(RelayMatched { gid: reader, others: vec![writer] }),
         SessionMessage::SampleFragment(SampleFragment {
             publisher: writer,
             head: Some(SampleHeader {
@@ -190,7 +190,7 @@ fn a_message_larger_than_a_packet_is_refused_by_its_sender() {
     let removed = vec![Gid([1; 16]); 3000];
     let graph =
         SessionGraph { version: 1, whole: false, added: vec![], removed, more: false, ended: None };
-    assert!(matches!(SessionMessage::SessionGraph(graph).encode(), Err(CodecError::TooLarge(_))));
+    assert!(matches!(SessionMessage::Graph(graph).encode(), Err(CodecError::TooLarge(_))));
 }
 
 proptest! {

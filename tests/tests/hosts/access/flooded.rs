@@ -45,7 +45,7 @@ fn flood(camera: &Camera, over: &AtomicBool, said: &AtomicU64) {
         }
         let (before, next) = (version, version + 1);
         let graph = GraphUpdate { version: next, before, added, removed, ..GraphUpdate::default() };
-        camera.stranger.say(&mut link, &LinkMessage::GraphUpdate(graph));
+        camera.stranger.say(&mut link, &LinkMessage::Graph(graph));
         version = next;
         said.store(version, Relaxed);
     }

@@ -33,10 +33,8 @@ fn asked(
         endpoint(1, EndpointKind::Publisher, "/cmd_vel"),
         endpoint(2, EndpointKind::Publisher, "/status"),
     ];
-    stranger.say(
-        met,
-        &LinkMessage::GraphUpdate(GraphUpdate { version: 1, added, ..GraphUpdate::default() }),
-    );
+    stranger
+        .say(met, &LinkMessage::Graph(GraphUpdate { version: 1, added, ..GraphUpdate::default() }));
     let mut asked = Vec::new();
     while !awaited.iter().all(|topic| asked.iter().any(|asked| asked == topic)) {
         let subscribe = |message: &LinkMessage| matches!(message, LinkMessage::Subscribe(_));

@@ -102,8 +102,7 @@ fn a_name_that_looks_like_one_that_rules_permit_is_another_name() {
     let mut link = camera.link(0xff);
     camera.stranger.prove(&mut link, DaemonId([0xff; 16]), &[&key]);
     let added = endpoints(&key, all.iter().copied(), EndpointKind::Publisher, 1);
-    let announced =
-        LinkMessage::GraphUpdate(GraphUpdate { version: 1, added, ..GraphUpdate::default() });
+    let announced = LinkMessage::Graph(GraphUpdate { version: 1, added, ..GraphUpdate::default() });
     camera.stranger.say(&mut link, &announced);
     // It asks for all topics, and last for one that it may have.
     for (route, topic) in (100..).zip(&all) {
@@ -121,9 +120,7 @@ fn a_name_that_looks_like_one_that_rules_permit_is_another_name() {
                 assert_eq!(no.reason, "denied: no [[allow]] in access.toml permits this");
                 refused.insert(all[no.route as usize - 100].to_owned());
             }
-            LinkMessage::GraphUpdate(graph) => {
-                shown.extend(graph.added.into_iter().map(|e| e.topic))
-            }
+            LinkMessage::Graph(graph) => shown.extend(graph.added.into_iter().map(|e| e.topic)),
             _ => {}
         }
     }
@@ -155,11 +152,8 @@ fn names_that_are_too_long_end_the_link_that_they_come_over_and_no_other() {
                     node.node = name.to_owned();
                 }
             }
-            let announced = LinkMessage::GraphUpdate(GraphUpdate {
-                version: 1,
-                added,
-                ..GraphUpdate::default()
-            });
+            let announced =
+                LinkMessage::Graph(GraphUpdate { version: 1, added, ..GraphUpdate::default() });
             camera.stranger.say(&mut link, &announced);
             let why = camera.stranger.hear(&mut link, |_| false).expect_err("it is closed");
             assert!(!why.is_empty());

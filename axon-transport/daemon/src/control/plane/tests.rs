@@ -37,9 +37,7 @@ fn link(control: &mut ControlPlane) {
 fn told(control: &mut ControlPlane) -> usize {
     let packets = std::iter::from_fn(|| control.registry.poll_output(&SESSION));
     packets
-        .filter(|out| {
-            matches!(SessionMessage::decode(&out.packet), Ok(SessionMessage::SessionRefused(_)))
-        })
+        .filter(|out| matches!(SessionMessage::decode(&out.packet), Ok(SessionMessage::Refused(_))))
         .count()
 }
 

@@ -76,7 +76,7 @@ impl RelayedSession {
             return Ok(());
         }
         let all = parts(now.version, false, added.into_iter(), &removed, &BTreeSet::new(), false);
-        all.into_iter().try_for_each(|part| self.pipe.say(&SessionMessage::SessionGraph(part)))
+        all.into_iter().try_for_each(|part| self.pipe.say(&SessionMessage::Graph(part)))
     }
 
     /// Tells with whom the session's endpoints are matched, and decides by which of them what others
@@ -167,7 +167,7 @@ impl RelayedSession {
     /// order in which the session hears it.
     fn tell(&mut self, gid: Gid, others: BTreeSet<Gid>) -> Result<(), End> {
         let shown = others.iter().copied().collect();
-        self.pipe.say(&SessionMessage::RelayMatched(RelayMatched { gid, others: shown }))?;
+        self.pipe.say(&SessionMessage::Matched(RelayMatched { gid, others: shown }))?;
         let before = self.told.insert(gid, others);
         if before.is_some_and(|before| !before.is_subset(&self.told[&gid])) {
             self.close_unwanted();

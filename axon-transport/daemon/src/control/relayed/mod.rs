@@ -101,7 +101,7 @@ impl DaemonRelay {
         let session = match Session::over_as(id, inside, &config, options) {
             Ok(session) => session,
             Err(error) => {
-                say(SessionMessage::SessionRefused(SessionRefused::because(error.to_string())))?;
+                say(SessionMessage::Refused(SessionRefused::because(error.to_string())))?;
                 return Err(failed(&error));
             }
         };
@@ -283,7 +283,7 @@ impl RelayedSession {
             let samples = self.unreached.entry(writer).or_default().news(given_up);
             if samples > 0 {
                 // Ahead of the credit by which they count as acknowledged.
-                self.pipe.say(&SessionMessage::RelayGivenUp(RelayGivenUp {
+                self.pipe.say(&SessionMessage::GivenUp(RelayGivenUp {
                     reader: writer,
                     writer,
                     samples,
@@ -357,14 +357,14 @@ impl RelayedSession {
                 self.forget(&gone.gid);
                 self.pipe.say(&SessionMessage::EndpointGone(gone))
             }
-            SessionMessage::WriterLeaving(WriterLeaving { gid, leaving }) => {
+            SessionMessage::Leaving(WriterLeaving { gid, leaving }) => {
                 // It may have been refused.
                 if let Some(remote_writer) = self.writers.get(&gid) {
                     remote_writer.leave(leaving);
                 }
                 Ok(())
             }
-            SessionMessage::RelayMatched(matched) => self.callers(matched),
+            SessionMessage::Matched(matched) => self.callers(matched),
             SessionMessage::Asserted(asserted) => {
                 let own = asserted.publishers.iter().filter_map(|gid| self.writers.get(gid));
                 own.for_each(RemoteWriter::assert_alive);
@@ -493,15 +493,15 @@ impl RelayedSession {
         for (gid, text) in self.session.refused() {
             self.forget(&gid);
             let refused = SessionRefused { endpoint: Some(gid), ..SessionRefused::because(text) };
-            self.pipe.say(&SessionMessage::SessionRefused(refused))?;
+            self.pipe.say(&SessionMessage::Refused(refused))?;
         }
         for text in self.session.take_refusals() {
-            self.pipe.say(&SessionMessage::SessionRefused(SessionRefused::because(text)))?;
+            self.pipe.say(&SessionMessage::Refused(SessionRefused::because(text)))?;
         }
         Ok(())
     }
 
     fn refuse(&mut self, endpoint: &Endpoint, why: &str) -> Result<(), End> {
-        self.pipe.say(&SessionMessage::SessionRefused(SessionRefused::of(endpoint, why)))
+        self.pipe.say(&SessionMessage::Refused(SessionRefused::of(endpoint, why)))
     }
 }

@@ -57,7 +57,7 @@ fn a_relayed_process_receives_the_control_planes_refusal() {
         losses: Arc::default(),
     };
     relay.start().unwrap();
-    hear(&control, |message| matches!(message, SessionMessage::SessionHello(_)).then_some(()));
+    hear(&control, |message| matches!(message, SessionMessage::Hello(_)).then_some(()));
     let pid = std::process::id();
     let welcome =
         Welcome { protocol: PROTOCOL, daemon: DaemonId([7; 16]), pid, ranges: Some(true) };
@@ -85,12 +85,9 @@ fn a_relayed_process_receives_the_control_planes_refusal() {
             _ => None,
         });
         assert_eq!(announced.gid, gid);
-        say(
-            &control,
-            &SessionMessage::SessionRefused(SessionRefused::of(&announced, "there are enough")),
-        );
+        say(&control, &SessionMessage::Refused(SessionRefused::of(&announced, "there are enough")));
         let refused = hear(&process, |message| match message {
-            SessionMessage::SessionRefused(refused) => Some(refused),
+            SessionMessage::Refused(refused) => Some(refused),
             _ => None,
         });
         assert_eq!(refused.endpoint, Some(gid), "{kind:?}");

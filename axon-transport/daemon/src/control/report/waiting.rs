@@ -67,7 +67,7 @@ impl NotifiedEndpoints {
         for (session, text) in news {
             registry.push(
                 &session,
-                &SessionMessage::SessionRefused(SessionRefused::because(text)),
+                &SessionMessage::Refused(SessionRefused::because(text)),
                 Vec::new(),
             );
         }
@@ -134,7 +134,7 @@ mod tests {
         let packets = std::iter::from_fn(|| registry.poll_output(&SESSION));
         let texts =
             packets.filter_map(|output| match SessionMessage::decode(&output.packet).unwrap() {
-                SessionMessage::SessionRefused(refused) => {
+                SessionMessage::Refused(refused) => {
                     assert_eq!(refused.endpoint, None, "it stays in the graph");
                     Some(refused.text)
                 }

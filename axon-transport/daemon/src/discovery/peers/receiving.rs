@@ -173,7 +173,7 @@ impl PeerDiscovery {
         record.reported = true;
         let Difference { setting, ours, theirs } = what;
         let mismatch = PeerMismatch { peer: daemon, address: from, setting, ours, theirs };
-        self.act(DiscoveryAction::PeerMismatch(mismatch));
+        self.act(DiscoveryAction::Mismatch(mismatch));
     }
 
     fn in_range(&self, from: SocketAddr, arrival: Arrival, theirs: bool, listed: bool) -> bool {

@@ -368,7 +368,7 @@ pub(crate) fn cost_of_frame(frame: &[u8]) -> u32 {
 /// What a message costs: about as many changes as it says.
 pub(crate) fn cost(message: &LinkMessage) -> u32 {
     costs(match message {
-        LinkMessage::GraphUpdate(graph) => {
+        LinkMessage::Graph(graph) => {
             let toward = [&graph.localhost, &graph.listing, &graph.denied].into_iter().flatten();
             let toward = toward.map(Vec::len).sum::<usize>() / LOOKED_UP;
             graph.added.len() + graph.removed.len() + toward
@@ -379,19 +379,19 @@ pub(crate) fn cost(message: &LinkMessage) -> u32 {
         LinkMessage::Unsubscribe(_)
         | LinkMessage::RouteRefused(_)
         | LinkMessage::RouteUnasked(_) => 7,
-        LinkMessage::DeniedUses(uses) => 7 * (uses.denied.len() + uses.lifted.len()),
-        LinkMessage::LinkAccessCheck(check) => 7 + 7 * check.uses.len(),
+        LinkMessage::Denied(uses) => 7 * (uses.denied.len() + uses.lifted.len()),
+        LinkMessage::AccessCheck(check) => 7 + 7 * check.uses.len(),
         LinkMessage::AccessDecisions(decisions) => decisions.decisions.len(),
-        LinkMessage::LivelinessAsserted(asserted) => asserted.publishers.len() / 8,
+        LinkMessage::Asserted(asserted) => asserted.publishers.len() / 8,
         LinkMessage::Owners(owners) => 7 * owners.proofs.len(),
-        LinkMessage::ReceivedUpTo(received) => received.flows.len() / LOOKED_UP,
+        LinkMessage::Received(received) => received.flows.len() / LOOKED_UP,
         LinkMessage::RouteReady(ready) => ready.publishers.len() / LOOKED_UP,
         // Keys are bounded where they are kept.
         LinkMessage::Keys(KeyMessage::Announce(key_ids)) => key_ids.len() / 8,
         LinkMessage::Keys(
             KeyMessage::Ready { .. } | KeyMessage::Failed { .. } | KeyMessage::Retire { .. },
         ) => 0,
-        LinkMessage::LinkHello(_)
+        LinkMessage::Hello(_)
         | LinkMessage::Elected(_)
         | LinkMessage::GraphResync(_)
         | LinkMessage::Keepalive

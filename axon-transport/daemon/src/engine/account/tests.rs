@@ -110,7 +110,7 @@ fn each_that_shares_leaves_as_much_and_takes_up_what_others_leave() {
 #[test]
 fn a_message_costs_what_it_says_and_a_frame_what_it_is_unpacked() {
     let flow = ReceivedOf { route: 1, publisher: Gid::default(), sequence: 1, dropped: 0 };
-    let received = |count| LinkMessage::ReceivedUpTo(ReceivedUpTo { flows: vec![flow; count] });
+    let received = |count| LinkMessage::Received(ReceivedUpTo { flows: vec![flow; count] });
     let publishers = vec![Gid::default(); 65_536];
     let ready = LinkMessage::RouteReady(RouteReady { route: 1, publishers });
     assert_eq!((cost(&received(65_536)), cost(&ready)), (2049, 2049));

@@ -92,7 +92,7 @@ pub(super) enum Piece {
     /// Not all have arrived.
     Later,
     /// The stream ended before.
-    StreamEnd,
+    End,
 }
 
 /// What a stream waits for.
@@ -197,7 +197,7 @@ impl IncomingStream {
                     self.chunk = chunk;
                 }
                 Ok(None) => return Piece::Later,
-                Err(StreamEnd) => return Piece::StreamEnd,
+                Err(StreamEnd) => return Piece::End,
             }
         }
     }

@@ -98,7 +98,7 @@ impl Inbound {
                 let header = match stream.take(HEADER, key.1, quic, read) {
                     Piece::Whole(header) => header,
                     Piece::Later => return Ok(wait(stream, StreamStep::Header)),
-                    Piece::StreamEnd => return Ok(Next::Over),
+                    Piece::End => return Ok(Next::Over),
                 };
                 let header = StreamHeader::parse(&header).map_err(malformed)?;
                 stream.header = Some((header, None));
@@ -117,7 +117,7 @@ impl Inbound {
                 let prefix = match stream.take(4, key.1, quic, read) {
                     Piece::Whole(prefix) => prefix,
                     Piece::Later => return Ok(wait(stream, StreamStep::Length)),
-                    Piece::StreamEnd => return Ok(Next::Over),
+                    Piece::End => return Ok(Next::Over),
                 };
                 let mut bytes = [0; 4];
                 bytes.copy_from_slice(&prefix);
@@ -156,7 +156,7 @@ impl Inbound {
                 let body = match stream.take(length, key.1, quic, read) {
                     Piece::Whole(body) => body,
                     Piece::Later => return Ok(wait(stream, StreamStep::Body(length))),
-                    Piece::StreamEnd => {
+                    Piece::End => {
                         self.release(stream);
                         return Ok(Next::Over);
                     }

@@ -231,7 +231,7 @@ fn answers_reach_the_machine_that_asked() {
     }
     assert_eq!(origins, [(RequestOrigin::Acceptor, false), (RequestOrigin::Dialler, true)]);
     assert!(resolver.resolve(&bytes).is_some());
-    assert!(matches!(ring.dial(s(0), "sae-c"), DialDecision::DialKey(_)));
+    assert!(matches!(ring.dial(s(0), "sae-c"), DialDecision::Attempt(_)));
 
     let request = KmeRequest::Enc { slave: "sae-a".into(), number: 1, purpose: KeyPurpose::Proof };
     for origin in [RequestOrigin::Proof(5), RequestOrigin::Responder(5)] {

@@ -268,7 +268,7 @@ impl Dialling {
                 self.state = DialPhase::WaitForKey(until.map_or(again, |until| until.min(again)));
                 None
             }
-            DialDecision::DialKey(attempt) => {
+            DialDecision::Attempt(attempt) => {
                 self.state = DialPhase::Try(DialRound::new(Some(Arc::new(attempt))));
                 None
             }

@@ -353,7 +353,7 @@ impl Opening {
     /// The client says HELLO, and both sides wait for the peer's.
     fn greet(&mut self, now: Duration, psk_sae: Option<String>) {
         if self.side == Side::Client {
-            self.messages.push_back(LinkMessage::LinkHello(self.ours.clone()));
+            self.messages.push_back(LinkMessage::Hello(self.ours.clone()));
         }
         self.step = OpeningStep::Hello(psk_sae);
         self.until = Some(now + HELLO_TIMEOUT);
@@ -369,7 +369,7 @@ impl Opening {
         let out_of_order = |text: String| LinkFailure::Ours(CloseCode::OutOfOrder, text);
         self.order.accept(message).map_err(|e| out_of_order(e.to_string()))?;
         match (&mut self.step, message, keyring) {
-            (OpeningStep::Hello(psk_sae), LinkMessage::LinkHello(theirs), keyring) => {
+            (OpeningStep::Hello(psk_sae), LinkMessage::Hello(theirs), keyring) => {
                 check(&self.ours, theirs, psk_sae.as_deref())
                     .map_err(|m| LinkFailure::Ours(m.code, m.to_string()))?;
                 if let Some(chain) = &self.chain {
@@ -394,7 +394,7 @@ impl Opening {
         keyring: Option<&mut Keyring>,
     ) -> Result<(), LinkFailure> {
         if self.side == Side::Server {
-            self.messages.push_back(LinkMessage::LinkHello(self.ours.clone()));
+            self.messages.push_back(LinkMessage::Hello(self.ours.clone()));
         }
         self.greeted = true;
         self.order.hello_checked(theirs.daemon < self.ours.daemon);

@@ -383,7 +383,7 @@ impl Links {
             // A predecessor's are old.
             _ if self.current(daemon) != Some(number) => {}
             message => {
-                if let LinkMessage::GraphUpdate(_) = &message {
+                if let LinkMessage::Graph(_) = &message {
                     self.succeeded(daemon);
                 }
                 self.outbox.event(LinkEvent::Message(number, daemon, message, room));

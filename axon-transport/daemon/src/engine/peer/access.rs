@@ -230,7 +230,7 @@ impl PeerAccess {
             self.asked.pop_first();
         }
         self.asked.insert(number, uses.len());
-        LinkMessage::LinkAccessCheck(LinkAccessCheck { number, uses })
+        LinkMessage::AccessCheck(LinkAccessCheck { number, uses })
     }
 
     /// The peer's answer, if this host asked. Each question has one.
@@ -276,7 +276,7 @@ fn message((verb, name): &AccessUse, reason: &str) -> DeniedUse {
 
 fn parts(denied: Vec<DeniedUse>, lifted: Vec<DeniedUse>) -> Vec<LinkMessage> {
     let part = |denied: &[DeniedUse], lifted: &[DeniedUse]| {
-        LinkMessage::DeniedUses(DeniedUses { denied: denied.to_vec(), lifted: lifted.to_vec() })
+        LinkMessage::Denied(DeniedUses { denied: denied.to_vec(), lifted: lifted.to_vec() })
     };
     let lifted = lifted.chunks(MAX_DENIED).map(|lifted| part(&[], lifted));
     lifted.chain(denied.chunks(MAX_DENIED).map(|denied| part(denied, &[]))).collect()
@@ -296,9 +296,7 @@ mod tests {
 
     fn said(messages: &[LinkMessage]) -> (usize, usize) {
         messages.iter().fold((0, 0), |(denied, lifted), message| match message {
-            LinkMessage::DeniedUses(uses) => {
-                (denied + uses.denied.len(), lifted + uses.lifted.len())
-            }
+            LinkMessage::Denied(uses) => (denied + uses.denied.len(), lifted + uses.lifted.len()),
             other => panic!("{other:?}"),
         })
     }

@@ -252,15 +252,15 @@ impl Peer {
                 self.unserve(unsubscribe.route);
                 self.stirred |= of_service && self.services_changed();
             }
-            LinkMessage::LivelinessAsserted(asserted) => self.handle_asserted(&asserted),
+            LinkMessage::Asserted(asserted) => self.handle_asserted(&asserted),
             LinkMessage::Intake(intake) => self.outbound.set_intake(&intake),
-            LinkMessage::ReceivedUpTo(received) => self.outbound.handle_received(&received.flows),
+            LinkMessage::Received(received) => self.outbound.handle_received(&received.flows),
             LinkMessage::RouteRefused(refused) => self.handle_route_refused(refused, now),
-            LinkMessage::DeniedUses(denied) => {
+            LinkMessage::Denied(denied) => {
                 let allowed = self.access.handle_denied(self.daemon, denied, now);
                 self.ask_for_allowed(&allowed);
             }
-            LinkMessage::LinkAccessCheck(check) => {
+            LinkMessage::AccessCheck(check) => {
                 let answer = self.access.answer(&check);
                 self.say(answer);
             }
@@ -448,7 +448,7 @@ impl Peer {
             Source::StandIn(_) => Vec::new(),
         });
         for publishers in self.alive.news(now, asserted) {
-            self.say(LinkMessage::LivelinessAsserted(LivelinessAsserted { publishers }));
+            self.say(LinkMessage::Asserted(LivelinessAsserted { publishers }));
         }
     }
 

@@ -83,7 +83,7 @@ impl ShownGraph {
             let last = parts.len() - 1;
             for (index, part) in parts.into_iter().enumerate() {
                 self.version += 1;
-                messages.push(LinkMessage::GraphUpdate(GraphUpdate {
+                messages.push(LinkMessage::Graph(GraphUpdate {
                     version: self.version,
                     before,
                     removed: removed.take().unwrap_or_default(),
@@ -131,9 +131,7 @@ mod tests {
     /// Version, version before, and how many endpoints come and go, with whether more follows.
     fn said(messages: Vec<LinkMessage>) -> Vec<(u64, u64, usize, usize, bool)> {
         let of = |message| match message {
-            LinkMessage::GraphUpdate(g) => {
-                (g.version, g.before, g.added.len(), g.removed.len(), g.more)
-            }
+            LinkMessage::Graph(g) => (g.version, g.before, g.added.len(), g.removed.len(), g.more),
             other => panic!("{other:?}"),
         };
         messages.into_iter().map(of).collect()

@@ -129,7 +129,7 @@ impl Raw {
     /// Says HELLO on a link.
     pub(super) fn say_hello(&mut self, link: usize) {
         let hello = self.hello();
-        self.links[link].say(&LinkMessage::LinkHello(hello));
+        self.links[link].say(&LinkMessage::Hello(hello));
     }
 
     /// Closes a link.
@@ -324,7 +324,7 @@ impl RawLink {
 
     /// Whether the other side's HELLO came.
     pub(super) fn is_greeted(&self) -> bool {
-        self.messages.iter().any(|message| matches!(message, LinkMessage::LinkHello(_)))
+        self.messages.iter().any(|message| matches!(message, LinkMessage::Hello(_)))
     }
 
     /// Whether the other side elected it.

@@ -40,7 +40,7 @@ const IN_FLIGHT: usize = 8;
 #[derive(Debug)]
 pub enum DialDecision {
     /// Dial it with this key.
-    DialKey(DialKey),
+    Attempt(DialKey),
     /// Ask again later.
     Wait {
         /// When; `None`: when the KME has answered.
@@ -160,7 +160,7 @@ impl BootstrapDialler {
             }
             DialState::UnspentKey(held) => {
                 let psk = Arc::clone(&held.psk);
-                return DialDecision::DialKey(DialKey { key_id: held.key_id.clone(), psk });
+                return DialDecision::Attempt(DialKey { key_id: held.key_id.clone(), psk });
             }
             DialState::Wanted | DialState::Asked => {}
         }

@@ -389,11 +389,11 @@ const MAX_REASON: usize = 1024;
 #[non_exhaustive]
 pub enum LinkMessage {
     /// Who I am.
-    LinkHello(LinkHello),
+    Hello(LinkHello),
     /// This connection stays.
     Elected(Elected),
     /// Graph changes.
-    GraphUpdate(GraphUpdate),
+    Graph(GraphUpdate),
     /// Send the whole graph.
     GraphResync(GraphResync),
     /// Send a topic.
@@ -405,9 +405,9 @@ pub enum LinkMessage {
     /// Still here.
     Keepalive,
     /// These publishers, too.
-    LivelinessAsserted(LivelinessAsserted),
+    Asserted(LivelinessAsserted),
     /// So far samples came.
-    ReceivedUpTo(ReceivedUpTo),
+    Received(ReceivedUpTo),
     /// This route is not served.
     RouteRefused(RouteRefused),
     /// This route is not asked for.
@@ -419,9 +419,9 @@ pub enum LinkMessage {
     /// This is how much I take in.
     Intake(Intake),
     /// These are things that you may not do here.
-    DeniedUses(DeniedUses),
+    Denied(DeniedUses),
     /// May I do this at your host?
-    LinkAccessCheck(LinkAccessCheck),
+    AccessCheck(LinkAccessCheck),
     /// These rules decide.
     AccessDecisions(AccessDecisions),
     /// About keys.
@@ -432,23 +432,23 @@ impl LinkMessage {
     /// Type byte and CBOR map.
     pub(super) fn encode(&self) -> (u8, Vec<u8>) {
         match self {
-            Self::LinkHello(m) => (1, to_map(m)),
+            Self::Hello(m) => (1, to_map(m)),
             Self::Elected(m) => (2, to_map(m)),
-            Self::GraphUpdate(m) => (3, to_map(m)),
+            Self::Graph(m) => (3, to_map(m)),
             Self::GraphResync(m) => (4, to_map(m)),
             Self::Subscribe(m) => (5, to_map(m)),
             Self::Unsubscribe(m) => (6, to_map(m)),
             Self::RouteReady(m) => (7, to_map(m)),
             Self::Keepalive => (8, to_map(&NoContent {})),
-            Self::LivelinessAsserted(m) => (9, to_map(m)),
-            Self::ReceivedUpTo(m) => (10, to_map(m)),
+            Self::Asserted(m) => (9, to_map(m)),
+            Self::Received(m) => (10, to_map(m)),
             Self::RouteRefused(m) => (11, to_map(m)),
             Self::Owners(m) => (12, to_map(m)),
             Self::LinkClosed(m) => (13, to_map(m)),
             Self::RouteUnasked(m) => (14, to_map(m)),
             Self::Intake(m) => (15, to_map(m)),
-            Self::DeniedUses(m) => (20, to_map(m)),
-            Self::LinkAccessCheck(m) => (21, to_map(m)),
+            Self::Denied(m) => (20, to_map(m)),
+            Self::AccessCheck(m) => (21, to_map(m)),
             Self::AccessDecisions(m) => (22, to_map(m)),
             Self::Keys(m) => {
                 let mut map = Vec::new();
@@ -466,16 +466,16 @@ impl LinkMessage {
     /// The message of type `kind`, `None` for an unknown type.
     pub(super) fn decode(kind: u8, map: &[u8]) -> Result<Option<Self>, FrameError> {
         let message = match kind {
-            1 => Self::LinkHello(from_map(kind, map)?),
+            1 => Self::Hello(from_map(kind, map)?),
             2 => Self::Elected(from_map(kind, map)?),
-            3 => Self::GraphUpdate(from_map(kind, map)?),
+            3 => Self::Graph(from_map(kind, map)?),
             4 => Self::GraphResync(from_map(kind, map)?),
             5 => Self::Subscribe(from_map(kind, map)?),
             6 => Self::Unsubscribe(from_map(kind, map)?),
             7 => Self::RouteReady(from_map(kind, map)?),
             8 => from_map::<NoContent>(kind, map).map(|_| Self::Keepalive)?,
-            9 => Self::LivelinessAsserted(from_map(kind, map)?),
-            10 => Self::ReceivedUpTo(from_map(kind, map)?),
+            9 => Self::Asserted(from_map(kind, map)?),
+            10 => Self::Received(from_map(kind, map)?),
             11 => Self::RouteRefused(from_map(kind, map)?),
             12 => Self::Owners(from_map(kind, map)?),
             13 => Self::LinkClosed(from_map(kind, map)?),
@@ -485,8 +485,8 @@ impl LinkMessage {
                 KeyMessage::decode(kind, map)
                     .map_err(|e| FrameError::Malformed { kind, reason: e.to_string() })?,
             ),
-            20 => Self::DeniedUses(from_map(kind, map)?),
-            21 => Self::LinkAccessCheck(from_map(kind, map)?),
+            20 => Self::Denied(from_map(kind, map)?),
+            21 => Self::AccessCheck(from_map(kind, map)?),
             22 => Self::AccessDecisions(from_map(kind, map)?),
             _ => return Ok(None),
         };
@@ -500,11 +500,11 @@ impl LinkMessage {
     fn bounds(&self) -> Result<(), &'static str> {
         let ok = |condition: bool, reason| if condition { Ok(()) } else { Err(reason) };
         match self {
-            Self::LinkHello(m) => ok(
+            Self::Hello(m) => ok(
                 m.host.len() <= MAX_HOST && m.sae.as_ref().is_none_or(|s| s.len() <= MAX_SAE),
                 "a name is too long",
             ),
-            Self::GraphUpdate(m) => ok(
+            Self::Graph(m) => ok(
                 m.added.len() <= LIMITS.endpoints
                     && m.removed.len() <= LIMITS.endpoints
                     && [&m.localhost, &m.listing, &m.denied]
@@ -513,11 +513,11 @@ impl LinkMessage {
                     && m.added.iter().all(Endpoint::is_sane),
                 "an endpoint is out of bounds",
             ),
-            Self::LivelinessAsserted(LivelinessAsserted { publishers })
+            Self::Asserted(LivelinessAsserted { publishers })
             | Self::RouteReady(RouteReady { publishers, .. }) => {
                 ok(publishers.len() <= LIMITS.endpoints, "more publishers than there can be")
             }
-            Self::ReceivedUpTo(m) => {
+            Self::Received(m) => {
                 ok(m.flows.len() <= LIMITS.endpoints, "more publishers than there can be")
             }
             Self::RouteRefused(m) => ok(m.reason.len() <= MAX_REASON, "a reason is too long"),
@@ -528,7 +528,7 @@ impl LinkMessage {
                     && m.reason.as_ref().is_none_or(|reason| reason.len() <= MAX_REASON),
                 "a route is out of bounds",
             ),
-            Self::DeniedUses(DeniedUses { denied, lifted }) => ok(
+            Self::Denied(DeniedUses { denied, lifted }) => ok(
                 denied.len() <= MAX_DENIED
                     && lifted.len() <= MAX_DENIED
                     && denied.iter().chain(lifted).all(|denied| {
@@ -538,7 +538,7 @@ impl LinkMessage {
                     }),
                 "a denied use is out of bounds",
             ),
-            Self::LinkAccessCheck(m) => ok(
+            Self::AccessCheck(m) => ok(
                 m.uses.len() <= MOST_CHECKED
                     && m.uses.iter().all(|used| used.verb <= 4 && used.name.len() <= LIMITS.name),
                 "a use that is asked about is out of bounds",

@@ -47,14 +47,14 @@ pub(crate) fn elected() -> LinkMessage {
 pub(crate) fn messages() -> Vec<LinkMessage> {
     let qos = Qos::keep_all().with_lifespan(std::time::Duration::from_nanos(7));
     vec![
-        LinkMessage::LinkHello(LinkHello {
+        LinkMessage::Hello(LinkHello {
             replaces: Some([3; 16]),
             expects: Some(DaemonId([4; 16])),
             proof: Some(DaemonProof { key: [5; 32], signature: [6; 64] }),
             ..hello()
         }),
         elected(),
-        LinkMessage::GraphUpdate(GraphUpdate {
+        LinkMessage::Graph(GraphUpdate {
             version: 2,
             before: 1,
             added: vec![],
@@ -75,7 +75,7 @@ pub(crate) fn messages() -> Vec<LinkMessage> {
             acknowledges: Some(true),
             short_headers: Some(true),
         }),
-        LinkMessage::ReceivedUpTo(ReceivedUpTo {
+        LinkMessage::Received(ReceivedUpTo {
             flows: vec![ReceivedOf { route: 1, publisher: Gid([7; 16]), sequence: 43, dropped: 1 }],
         }),
         LinkMessage::RouteRefused(RouteRefused {
@@ -92,17 +92,15 @@ pub(crate) fn messages() -> Vec<LinkMessage> {
         LinkMessage::Unsubscribe(Unsubscribe { route: 1 }),
         LinkMessage::RouteReady(RouteReady { route: 1, publishers: vec![Gid([7; 16])] }),
         LinkMessage::Keepalive,
-        LinkMessage::LivelinessAsserted(LivelinessAsserted {
-            publishers: vec![Gid([7; 16]), Gid([8; 16])],
-        }),
+        LinkMessage::Asserted(LivelinessAsserted { publishers: vec![Gid([7; 16]), Gid([8; 16])] }),
         LinkMessage::Owners(Owners { proofs: vec![Proof { key: [1; 32], signature: [2; 64] }; 2] }),
         LinkMessage::LinkClosed(LinkClosed { link: [3; 16] }),
         LinkMessage::Intake(Intake { unread: 33 << 20, messages: 64 << 20 }),
-        LinkMessage::DeniedUses(DeniedUses {
+        LinkMessage::Denied(DeniedUses {
             denied: vec![DeniedUse { verb: 0, name: "/cmd_vel".into(), reason: "line 4".into() }],
             lifted: vec![DeniedUse { verb: 3, name: "/dock".into(), reason: String::new() }],
         }),
-        LinkMessage::LinkAccessCheck(LinkAccessCheck {
+        LinkMessage::AccessCheck(LinkAccessCheck {
             number: 5,
             uses: vec![CheckedUse { verb: 4, name: "/scan".into() }],
         }),

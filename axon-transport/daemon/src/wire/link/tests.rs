@@ -26,8 +26,7 @@ fn every_message_survives_its_frame() {
 #[test]
 fn a_large_graph_is_compressed_and_comes_back() {
     let removed = (0..4096u32).map(|n| Gid::new(axon_shm::ids::SessionId([1; 16]), n)).collect();
-    let message =
-        LinkMessage::GraphUpdate(GraphUpdate { version: 1, removed, ..GraphUpdate::default() });
+    let message = LinkMessage::Graph(GraphUpdate { version: 1, removed, ..GraphUpdate::default() });
     let frame = message.to_frame().unwrap();
     assert!(frame.len() < 4096 * 16 / 2, "{} bytes", frame.len());
     assert_eq!(frame[4] & 0x80, 0x80);
@@ -60,8 +59,7 @@ fn an_unknown_type_is_skipped_without_decompression() {
 fn a_list_of_more_publishers_than_there_can_be_is_refused() {
     let gids = |count| vec![Gid::default(); count];
     let ready = |count| LinkMessage::RouteReady(RouteReady { route: 1, publishers: gids(count) });
-    let asserted =
-        |count| LinkMessage::LivelinessAsserted(LivelinessAsserted { publishers: gids(count) });
+    let asserted = |count| LinkMessage::Asserted(LivelinessAsserted { publishers: gids(count) });
     let taken = |message: LinkMessage| decode(body(&message.to_frame().unwrap())).is_ok();
     assert!(taken(ready(65_536)) && taken(asserted(65_536)));
     assert!(!taken(ready(65_537)) && !taken(asserted(65_537)));

@@ -187,7 +187,7 @@ mod tests {
         let packets = std::iter::from_fn(|| registry.poll_output(&id(3)));
         let ended =
             packets.filter_map(|output| match SessionMessage::decode(&output.packet).unwrap() {
-                SessionMessage::SessionGraph(graph) => graph.ended,
+                SessionMessage::Graph(graph) => graph.ended,
                 _ => None,
             });
         assert_eq!(ended.flatten().collect::<Vec<_>>(), [gid]);

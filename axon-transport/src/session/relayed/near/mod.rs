@@ -265,8 +265,8 @@ impl<'a> RelayConnection<'a> {
 
     fn handle(&mut self, message: SessionMessage) {
         match message {
-            SessionMessage::SessionGraph(graph) => self.graph(graph),
-            SessionMessage::RelayMatched(matched) => self.rematch(matched),
+            SessionMessage::Graph(graph) => self.graph(graph),
+            SessionMessage::Matched(matched) => self.rematch(matched),
             SessionMessage::EndpointGone(gone) => self.part(&gone.gid),
             SessionMessage::Credit(credit) => {
                 self.pipe.outgoing.credit(&credit);
@@ -282,7 +282,7 @@ impl<'a> RelayConnection<'a> {
                 }
             }
             // It comes before the credit that confirms them.
-            SessionMessage::RelayGivenUp(RelayGivenUp { writer, samples, .. }) => {
+            SessionMessage::GivenUp(RelayGivenUp { writer, samples, .. }) => {
                 if let Some(relay) = self.relays.get(&writer) {
                     relay.lose(samples);
                 }
@@ -291,7 +291,7 @@ impl<'a> RelayConnection<'a> {
                 let named = asserted.publishers.iter().filter_map(|gid| self.stand_ins.get(gid));
                 named.for_each(|stand_in| stand_in.remote_writer().assert_alive());
             }
-            SessionMessage::SessionRefused(SessionRefused { endpoint, text: reason, .. }) => {
+            SessionMessage::Refused(SessionRefused { endpoint, text: reason, .. }) => {
                 tracing::error!(reason, "the daemon refuses an endpoint");
                 if let Some(gid) = endpoint {
                     self.refuse(gid, reason);
@@ -463,8 +463,7 @@ impl<'a> RelayConnection<'a> {
             } else if self.is_revived(&gid) {
                 // The readers of one that leaves are told of it only where they knew it before.
             } else if self.ending.insert(gid, true) == Some(false) {
-                self.pipe
-                    .say(&SessionMessage::WriterLeaving(WriterLeaving { gid, leaving: true }))?;
+                self.pipe.say(&SessionMessage::Leaving(WriterLeaving { gid, leaving: true }))?;
             }
         }
         Ok(())

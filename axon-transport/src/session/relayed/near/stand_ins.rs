@@ -265,7 +265,7 @@ impl RelayConnection<'_> {
         changes.sort_by_key(|(more, ..)| *more);
         for (_, server, now) in changes {
             let others = now.iter().copied().collect();
-            self.pipe.say(&SessionMessage::RelayMatched(RelayMatched { gid: server, others }))?;
+            self.pipe.say(&SessionMessage::Matched(RelayMatched { gid: server, others }))?;
             self.pipe.outgoing.retain(|FlowChannel { writer, client }| {
                 *writer != server || client.is_some_and(|client| now.contains(&client))
             });

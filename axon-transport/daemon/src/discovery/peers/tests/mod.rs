@@ -118,7 +118,7 @@ pub(super) fn fail(peers: &mut PeerDiscovery, now: Duration, daemon: DaemonId) {
 
 fn mismatches(peers: &mut PeerDiscovery) -> Vec<PeerMismatch> {
     let told = actions(peers).into_iter().filter_map(|action| match action {
-        DiscoveryAction::PeerMismatch(mismatch) => Some(mismatch),
+        DiscoveryAction::Mismatch(mismatch) => Some(mismatch),
         DiscoveryAction::Dial { daemon, .. } => panic!("dialled {daemon}"),
         _ => None,
     });
@@ -142,9 +142,8 @@ fn a_peer_of_other_terms_is_told_apart_once_and_never_dialled() {
         peers.handle_timeout(secs(3.5 + f64::from(n)));
     }
     let all = actions(&mut peers);
-    let told: Vec<_> =
-        all.iter().filter(|a| matches!(a, DiscoveryAction::PeerMismatch(_))).collect();
-    let DiscoveryAction::PeerMismatch(mismatch) = told[0] else { unreachable!() };
+    let told: Vec<_> = all.iter().filter(|a| matches!(a, DiscoveryAction::Mismatch(_))).collect();
+    let DiscoveryAction::Mismatch(mismatch) = told[0] else { unreachable!() };
     assert_eq!(told.len(), 1);
     assert_eq!((mismatch.peer, mismatch.setting), (LOWER, "AXON_SECURITY_MODE"));
     assert_eq!((&*mismatch.ours, &*mismatch.theirs), ("classic", "qkd"));

@@ -164,7 +164,7 @@ impl Subnet {
                     let wait = Duration::from_millis(self.random.random_range(5..200));
                     self.later(wait, What::DialEnds { from: host, to, standing });
                 }
-                PeersOutput::Action(DiscoveryAction::PeerMismatch(mismatch)) => {
+                PeersOutput::Action(DiscoveryAction::Mismatch(mismatch)) => {
                     self.hosts[host].mismatches.push((mismatch.peer, mismatch.setting));
                 }
                 PeersOutput::Action(DiscoveryAction::Named(names)) => {

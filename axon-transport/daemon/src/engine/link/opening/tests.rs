@@ -157,7 +157,7 @@ impl End {
     /// An end that has the peer's HELLO, in qkd.
     fn greeted(now: Duration, side: Side, key_mode: KeyMode) -> Self {
         let mut end = Self::awaiting_hello(now, side, Some(key_mode));
-        end.hears(now, &LinkMessage::LinkHello(theirs(side, Some(key_mode))));
+        end.hears(now, &LinkMessage::Hello(theirs(side, Some(key_mode))));
         end
     }
 
@@ -167,7 +167,7 @@ impl End {
         end.ask(now, kmes);
         assert!(end.outcome(now).is_none());
         let messages: Vec<_> = std::iter::from_fn(|| end.opening.poll_message()).collect();
-        let [LinkMessage::LinkHello(_), LinkMessage::Keys(KeyMessage::Announce(key_ids))] =
+        let [LinkMessage::Hello(_), LinkMessage::Keys(KeyMessage::Announce(key_ids))] =
             &messages[..]
         else {
             panic!("{messages:?}");

@@ -63,7 +63,7 @@ pub(super) fn dial(world: &mut World, host: usize) -> usize {
 pub(super) fn greet(world: &mut World, of: usize, replaces: Option<[u8; 16]>) {
     world.with_raw(0, |raw, _| {
         let hello = LinkHello { replaces, ..raw.hello() };
-        raw.links[of].say(&LinkMessage::LinkHello(hello));
+        raw.links[of].say(&LinkMessage::Hello(hello));
     });
     world.until(secs(5), |world| link(world, of).is_greeted());
 }
@@ -101,11 +101,7 @@ pub(super) fn publishes(topic: &str, gid: Gid, qos: Qos) -> LinkMessage {
     let endpoint = Endpoint::new(gid, EndpointKind::Publisher, topic, "T")
         .with_qos(qos)
         .with_node("node", "/");
-    LinkMessage::GraphUpdate(GraphUpdate {
-        version: 1,
-        added: vec![endpoint],
-        ..GraphUpdate::default()
-    })
+    LinkMessage::Graph(GraphUpdate { version: 1, added: vec![endpoint], ..GraphUpdate::default() })
 }
 
 /// Waits until a host asked for a topic or service. Returns the number of its route.
@@ -292,7 +288,7 @@ fn a_peer_of_another_protocol_version_is_refused_in_words_and_harms_nothing() {
         let refused = dial(&mut world, 0);
         world.with_raw(0, |raw, _| {
             let hello = LinkHello { protocol_min, protocol_max, ..raw.hello() };
-            raw.links[refused].say(&LinkMessage::LinkHello(hello));
+            raw.links[refused].say(&LinkMessage::Hello(hello));
         });
         world.publish(pair, 10);
         world.until(secs(5), |world| link(world, refused).closed.is_some());
@@ -308,7 +304,7 @@ fn a_peer_of_another_protocol_version_is_refused_in_words_and_harms_nothing() {
     let accepted = dial(&mut world, 0);
     world.with_raw(0, |raw, _| {
         let hello = LinkHello { protocol_max: 2, ..raw.hello() };
-        raw.links[accepted].say(&LinkMessage::LinkHello(hello));
+        raw.links[accepted].say(&LinkMessage::Hello(hello));
     });
     world.until(secs(5), |world| link(world, accepted).is_elected());
     world.run_for(secs(1));
@@ -362,13 +358,13 @@ fn a_publisher_that_is_announced_again_does_not_begin_with_any_number() {
     world.run_for(secs(1));
     let gone =
         GraphUpdate { version: 2, before: 1, removed: vec![of_raw(1)], ..GraphUpdate::default() };
-    say(&mut world, on, &LinkMessage::GraphUpdate(gone));
+    say(&mut world, on, &LinkMessage::Graph(gone));
     world.run_for(secs(1));
     link_messages(&mut world, on).clear();
-    let LinkMessage::GraphUpdate(graph) = publishes("/t", of_raw(1), Qos::keep_all()) else {
+    let LinkMessage::Graph(graph) = publishes("/t", of_raw(1), Qos::keep_all()) else {
         return;
     };
-    say(&mut world, on, &LinkMessage::GraphUpdate(GraphUpdate { version: 3, before: 2, ..graph }));
+    say(&mut world, on, &LinkMessage::Graph(GraphUpdate { version: 3, before: 2, ..graph }));
     let route = asked(&mut world, on, "/t");
     let bytes = samples(route, "/t", of_raw(1), [1 << 31, 3]);
     world.with_raw(0, |raw, _| raw.links[on].open(bytes));

@@ -39,7 +39,7 @@ pub(super) fn linked_as(world: &mut World, peer: usize, id: u8) -> usize {
     world.until(secs(5), |world| world.raws[peer].links[number].connected);
     world.with_raw(peer, |raw, _| {
         let hello = LinkHello { daemon: DaemonId([id; 16]), ..raw.hello() };
-        raw.links[number].say(&LinkMessage::LinkHello(hello));
+        raw.links[number].say(&LinkMessage::Hello(hello));
     });
     world.until(secs(5), |world| world.raws[peer].links[number].is_elected());
     number
@@ -61,8 +61,7 @@ fn endpoint(kind: EndpointKind, gid: Gid, topic: &str) -> Endpoint {
 fn publishes(world: &mut World, link: usize, id: u8, topic: &str, count: u32) {
     let publisher = |n| endpoint(EndpointKind::Publisher, gid(id, n), topic);
     let added = (0..count).map(publisher).collect();
-    let graph =
-        LinkMessage::GraphUpdate(GraphUpdate { version: 1, added, ..GraphUpdate::default() });
+    let graph = LinkMessage::Graph(GraphUpdate { version: 1, added, ..GraphUpdate::default() });
     world.with_raw(0, |raw, _| raw.links[link].say(&graph));
 }
 
@@ -249,14 +248,14 @@ fn restarts(world: &mut World, peer: usize, id: u8, topics: u32) {
     let subscription = endpoint(EndpointKind::Subscription, gid(id, 0), "/moved");
     let graph = GraphUpdate { version: 1, added: vec![subscription], ..GraphUpdate::default() };
     let number = linked_as(world, peer, id);
-    world.with_raw(peer, |raw, _| raw.links[number].say(&LinkMessage::GraphUpdate(graph.clone())));
+    world.with_raw(peer, |raw, _| raw.links[number].say(&LinkMessage::Graph(graph.clone())));
     for route in 0..topics {
         let message = subscribe(route, &format!("/topic_{route}"), gid(id, 1 + route));
         world.with_raw(peer, |raw, _| raw.links[number].say(&message));
     }
     world.run_for(secs(3));
     let next = linked_as(world, peer, id + 1);
-    world.with_raw(peer, |raw, _| raw.links[next].say(&LinkMessage::GraphUpdate(graph)));
+    world.with_raw(peer, |raw, _| raw.links[next].say(&LinkMessage::Graph(graph)));
     world.run_for(secs(1));
 }
 
@@ -372,7 +371,7 @@ fn the_lanes_of_a_relay_that_is_kept_stay_charged_where_the_next_daemon_finds_no
         world.with_raw(0, |raw, _| raw.links[link].say(message));
     };
     let moved = endpoint(EndpointKind::Subscription, gid(0xf0, 0), "/moved");
-    let graph = LinkMessage::GraphUpdate(GraphUpdate {
+    let graph = LinkMessage::Graph(GraphUpdate {
         version: 1,
         added: vec![moved],
         ..GraphUpdate::default()

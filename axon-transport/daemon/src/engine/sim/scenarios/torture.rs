@@ -82,7 +82,7 @@ impl Torture {
         let (gid, number, route) = (self.gid(), self.number(), self.number() as u32);
         let hello = self.world.raws[0].hello();
         match &mut message {
-            LinkMessage::LinkHello(m) => {
+            LinkMessage::Hello(m) => {
                 *m = hello;
                 match self.rng.random_range(0..6) {
                     0 => m.domain = route,
@@ -94,7 +94,7 @@ impl Torture {
                 }
             }
             LinkMessage::Elected(m) => *m = Elected { link: gid.0, election: number },
-            LinkMessage::GraphUpdate(m) => {
+            LinkMessage::Graph(m) => {
                 (m.version, m.before) = (self.number(), if number == 1 { 0 } else { number });
                 m.more = self.rng.random_bool(0.2);
                 m.removed = vec![gid];
@@ -120,15 +120,15 @@ impl Torture {
             LinkMessage::Unsubscribe(m) => m.route = route,
             LinkMessage::RouteRefused(m) => m.route = route,
             LinkMessage::RouteUnasked(m) => (m.topic, m.type_name) = ("/t".into(), "T".into()),
-            LinkMessage::DeniedUses(m) => {
+            LinkMessage::Denied(m) => {
                 m.denied.iter_mut().for_each(|denied| denied.name = "/t".into())
             }
-            LinkMessage::LinkAccessCheck(m) => m.number = number,
+            LinkMessage::AccessCheck(m) => m.number = number,
             LinkMessage::AccessDecisions(m) => m.number = number,
             LinkMessage::RouteReady(m) => (m.route, m.publishers) = (route, vec![gid]),
-            LinkMessage::LivelinessAsserted(m) => m.publishers = vec![gid],
+            LinkMessage::Asserted(m) => m.publishers = vec![gid],
             LinkMessage::GraphResync(m) => m.version = number,
-            LinkMessage::ReceivedUpTo(m) => {
+            LinkMessage::Received(m) => {
                 for flow in &mut m.flows {
                     (flow.route, flow.publisher) = (route, gid);
                     (flow.sequence, flow.dropped) = (number, number);
@@ -276,7 +276,7 @@ fn honest(raw: &mut Raw, on: usize, greeted: bool) {
     let hello = LinkHello { replaces: Some([1; 16]), ..raw.hello() };
     match raw.daemon {
         LOWEST => raw.links[on].say(&LinkMessage::Elected(Elected { link: [1; 16], election: 1 })),
-        _ => raw.links[on].say(&LinkMessage::LinkHello(hello)),
+        _ => raw.links[on].say(&LinkMessage::Hello(hello)),
     }
 }
 

@@ -19,7 +19,7 @@ fn give(dialler: &mut BootstrapDialler, now: Duration, name: &str) {
 
 fn attempt(dialler: &mut BootstrapDialler, now: Duration) -> Option<KeyId> {
     match dialler.dial(now, "sae-b") {
-        DialDecision::DialKey(attempt) => Some(attempt.key_id),
+        DialDecision::Attempt(attempt) => Some(attempt.key_id),
         _ => None,
     }
 }
@@ -184,7 +184,7 @@ fn answers_nobody_waits_for_are_dropped() {
 #[test]
 fn an_expired_refused_mismatched_or_spent_psk_is_erased_in_attempts_under_way() {
     let psk = |dialler: &mut BootstrapDialler| match dialler.dial(s(0), "sae-b") {
-        DialDecision::DialKey(attempt) => attempt.psk,
+        DialDecision::Attempt(attempt) => attempt.psk,
         other => panic!("{other:?}"),
     };
     type End = fn(&mut BootstrapDialler);

@@ -41,7 +41,7 @@ fn hello_that_differs_is_refused_and_a_server_does_not_answer_it() {
                 while end.opening.poll_message().is_some() {}
                 let mut theirs = theirs(side, key_mode);
                 change(&mut theirs);
-                end.hears(NOW, &LinkMessage::LinkHello(theirs));
+                end.hears(NOW, &LinkMessage::Hello(theirs));
                 end.refuses(NOW, name);
                 assert!(end.opening.poll_message().is_none(), "{name}");
             }
@@ -52,7 +52,7 @@ fn hello_that_differs_is_refused_and_a_server_does_not_answer_it() {
 #[test]
 fn own_daemon_is_refused() {
     let mut end = End::awaiting_hello(NOW, Side::Server, None);
-    end.hears(NOW, &LinkMessage::LinkHello(ours(Side::Server, &Config::default())));
+    end.hears(NOW, &LinkMessage::Hello(ours(Side::Server, &Config::default())));
     end.refuses(NOW, "SELF");
 }
 
@@ -156,7 +156,7 @@ fn qkd_without_keys_opens_nothing() {
             let mut end = End::awaiting_hello(NOW, side, Some(key_mode));
             end.ring = None;
             let theirs = LinkHello { sae: None, ..theirs(side, Some(key_mode)) };
-            end.hears(NOW, &LinkMessage::LinkHello(theirs));
+            end.hears(NOW, &LinkMessage::Hello(theirs));
             assert!(end.outcome(NOW).unwrap().is_err());
         }
     }
@@ -166,12 +166,12 @@ fn qkd_without_keys_opens_nothing() {
 fn message_that_is_read_too_early_ends_the_opening() {
     let key_mode = Some(KeyMode::Session);
     let mut end = End::new(NOW, Side::Server, key_mode);
-    end.hears(NOW, &LinkMessage::LinkHello(theirs(Side::Server, key_mode)));
+    end.hears(NOW, &LinkMessage::Hello(theirs(Side::Server, key_mode)));
     end.refuses(NOW, "INTERNAL");
 
     // After the opening succeeded, and before its owner knows.
     let mut end = End::awaiting_hello(NOW, Side::Server, None);
-    end.hears(NOW, &LinkMessage::LinkHello(theirs(Side::Server, None)));
+    end.hears(NOW, &LinkMessage::Hello(theirs(Side::Server, None)));
     end.hears(NOW, &elected());
     end.refuses(NOW, "INTERNAL");
 }
@@ -251,7 +251,7 @@ fn certificate_must_name_the_host_in_ca() {
             let facts = Handshake { chain, ..facts(side, None) };
             let mut end = End::with(NOW, facts, &settings, None);
             let theirs = LinkHello { host: "Robot-1.LAN".into(), ..ours(side.peer(), &settings) };
-            end.hears(NOW, &LinkMessage::LinkHello(theirs));
+            end.hears(NOW, &LinkMessage::Hello(theirs));
             if good {
                 assert!(end.outcome(NOW).unwrap().is_ok());
             } else {

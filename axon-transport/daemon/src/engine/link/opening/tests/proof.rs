@@ -53,7 +53,7 @@ fn counts(key_mode: KeyMode, fail: impl Fn(&mut End, &mut Kmes)) -> bool {
         facts.negotiated = Some(psk(&format!("bootstrap-{number}")));
         let mut end = End::with(NOW, facts, &settings, Some(ring));
         end.opening.handle_recorded(NOW, true, end.ring.as_mut());
-        end.hears(NOW, &LinkMessage::LinkHello(theirs(Side::Server, Some(key_mode))));
+        end.hears(NOW, &LinkMessage::Hello(theirs(Side::Server, Some(key_mode))));
         fail(&mut end, &mut kmes);
         let End { opening, ring: after, .. } = end;
         drop(opening);
@@ -271,7 +271,7 @@ fn connection_without_exporters_is_refused() {
             let facts = Handshake { exporters: None, ..facts(side, Some(key_mode)) };
             let mut end = End::with(NOW, facts, &settings, Keyring::new(&settings));
             end.opening.handle_recorded(NOW, true, end.ring.as_mut());
-            end.hears(NOW, &LinkMessage::LinkHello(theirs(side, Some(key_mode))));
+            end.hears(NOW, &LinkMessage::Hello(theirs(side, Some(key_mode))));
             assert_eq!(end.refuses(NOW, "INTERNAL"), "no TLS exporter");
         }
     }

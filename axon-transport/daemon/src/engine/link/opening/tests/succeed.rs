@@ -18,7 +18,7 @@ const PROOF: [(Side, &str); 4] = [
 fn awaits_election(client: &mut OpenedConnection, server: &mut OpenedConnection) {
     assert_eq!((client.hello.daemon, server.hello.daemon), (SERVER, CLIENT));
     assert!(client.order.accept(&elected()).is_err(), "the client has the lower id");
-    let graph = LinkMessage::GraphUpdate(GraphUpdate::default());
+    let graph = LinkMessage::Graph(GraphUpdate::default());
     assert!(server.order.accept(&graph).is_err());
     server.order.accept(&elected()).unwrap();
     server.order.elected();
@@ -112,7 +112,7 @@ fn limits_of_frames_grow_with_the_trust() {
 
     let mut end = End::awaiting_hello(s(1), Side::Server, None);
     assert_eq!(end.opening.limits(), limits(least, least));
-    end.hears(s(1), &LinkMessage::LinkHello(theirs(Side::Server, None)));
+    end.hears(s(1), &LinkMessage::Hello(theirs(Side::Server, None)));
     assert_eq!(end.opening.limits(), most);
 
     let end = End::announced(s(1), KeyMode::Session, &mut Kmes::default());

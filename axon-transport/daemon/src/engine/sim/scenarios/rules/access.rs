@@ -275,14 +275,14 @@ fn a_peer_that_ignores_rules_receives_and_delivers_nothing() {
     });
     assert_eq!(refused.unwrap(), "denied by line 4 of access.toml");
     let told = heard.iter().find_map(|message| match message {
-        LinkMessage::DeniedUses(denied) => Some(denied.denied.clone()),
+        LinkMessage::Denied(denied) => Some(denied.denied.clone()),
         _ => None,
     });
     let told = told.unwrap();
     assert_eq!((told.len(), told[0].verb, &*told[0].name), (1, 0, "/in"));
     for message in heard {
         match message {
-            LinkMessage::GraphUpdate(graph) => {
+            LinkMessage::Graph(graph) => {
                 let topics: Vec<_> = graph.added.iter().map(|e| e.topic.as_str()).collect();
                 assert!(!topics.contains(&"/out") && !topics.contains(&"/in"), "{topics:?}");
             }
@@ -404,7 +404,7 @@ fn answers_that_nobody_asked_for_and_questions_out_of_bounds_change_nothing() {
     // A flood of questions is answered at the rate of control messages, and the link stands.
     for number in 0..FLOOD {
         let uses = vec![used.clone(); MOST_CHECKED];
-        say(&mut world, on, &LinkMessage::LinkAccessCheck(LinkAccessCheck { number, uses }));
+        say(&mut world, on, &LinkMessage::AccessCheck(LinkAccessCheck { number, uses }));
     }
     world.run_for(secs(1));
     let answers = |world: &World| {
@@ -415,7 +415,7 @@ fn answers_that_nobody_asked_for_and_questions_out_of_bounds_change_nothing() {
     assert!((1..FLOOD as usize).contains(&first), "{first} at once");
     world.until(secs(120), |world| answers(world) == FLOOD as usize);
     let uses = vec![used; MOST_CHECKED + 1];
-    say(&mut world, on, &LinkMessage::LinkAccessCheck(LinkAccessCheck { number: 0, uses }));
+    say(&mut world, on, &LinkMessage::AccessCheck(LinkAccessCheck { number: 0, uses }));
     world.run_for(secs(1));
     assert!(world.hosts[0].refusals.iter().any(|(_, why)| why.contains("out of bounds")));
 }

@@ -81,7 +81,7 @@ fn calls_and_answers_that_rules_deny_reach_nobody_whatever_the_peer_sends() {
     say(
         &mut world,
         on,
-        &LinkMessage::GraphUpdate(GraphUpdate { version: 1, added, ..GraphUpdate::default() }),
+        &LinkMessage::Graph(GraphUpdate { version: 1, added, ..GraphUpdate::default() }),
     );
     // It also asks for what it may not have: requests of the client, and responses of the server. A host takes the
     // responses of servers that take its requests.
@@ -202,7 +202,7 @@ fn requests_that_a_limit_holds_reach_nobody_once_rules_deny_them() {
             .with_qos(Qos::keep_all())
             .with_node("node", "/");
         let graph = GraphUpdate { version: 1, added: vec![client], ..GraphUpdate::default() };
-        say(&mut world, on, &LinkMessage::GraphUpdate(graph));
+        say(&mut world, on, &LinkMessage::Graph(graph));
         let route = asked(&mut world, on, "/set");
         let requests = messages(Kind::Request, route, "/set", (of_raw(1), of_raw(1)), 1..=4);
         open(&mut world, on, requests);
@@ -230,14 +230,13 @@ fn rules_that_change_between_handshake_and_election_or_within_a_succession_count
     world.run_for(millis(1));
     say(&mut world, first, &elect(1));
     let publish = |world: &mut World, on: usize, version: u64| {
-        let LinkMessage::GraphUpdate(mut graph) = publishes("/t", of_raw(1), Qos::keep_all())
-        else {
+        let LinkMessage::Graph(mut graph) = publishes("/t", of_raw(1), Qos::keep_all()) else {
             return;
         };
         let other = publishes("/other", of_raw(2), Qos::keep_all());
-        let LinkMessage::GraphUpdate(other) = other else { return };
+        let LinkMessage::Graph(other) = other else { return };
         graph.added.extend(other.added);
-        say(world, on, &LinkMessage::GraphUpdate(GraphUpdate { version, ..graph }));
+        say(world, on, &LinkMessage::Graph(GraphUpdate { version, ..graph }));
     };
     publish(&mut world, first, 1);
     asked(&mut world, first, "/other");
@@ -302,8 +301,7 @@ fn daemons_of_one_identity_have_its_rules_and_share_its_bucket() {
         let on = linked_as(&mut world, 0, id);
         let publisher = gid(id, 1);
         let graph = |topic, number| {
-            let LinkMessage::GraphUpdate(graph) =
-                publishes(topic, gid(id, number), Qos::keep_all())
+            let LinkMessage::Graph(graph) = publishes(topic, gid(id, number), Qos::keep_all())
             else {
                 unreachable!()
             };
@@ -313,7 +311,7 @@ fn daemons_of_one_identity_have_its_rules_and_share_its_bucket() {
         say(
             &mut world,
             on,
-            &LinkMessage::GraphUpdate(GraphUpdate { version: 1, added, ..GraphUpdate::default() }),
+            &LinkMessage::Graph(GraphUpdate { version: 1, added, ..GraphUpdate::default() }),
         );
         let route = asked(&mut world, on, "/t");
         open(&mut world, on, samples(route, "/t", publisher, 1..=50));
@@ -353,15 +351,15 @@ fn a_denied_peer_neither_speaks_for_an_endpoint_of_a_permitted_one_nor_keeps_it_
         let on = dial(&mut world, 0);
         greet(&mut world, on, None);
         say(&mut world, on, &elect(1));
-        let LinkMessage::GraphUpdate(mut graph) = publishes("/cmd_vel", publisher, Qos::keep_all())
+        let LinkMessage::Graph(mut graph) = publishes("/cmd_vel", publisher, Qos::keep_all())
         else {
             unreachable!()
         };
-        let LinkMessage::GraphUpdate(other) = publishes("/open", of_raw(2), Qos::keep_all()) else {
+        let LinkMessage::Graph(other) = publishes("/open", of_raw(2), Qos::keep_all()) else {
             unreachable!()
         };
         graph.added.extend(other.added);
-        say(&mut world, on, &LinkMessage::GraphUpdate(graph));
+        say(&mut world, on, &LinkMessage::Graph(graph));
         let route = asked(&mut world, on, "/open");
         let pretend = |world: &mut World, numbers: std::ops::RangeInclusive<u64>| {
             for route in [route, route + 1, route + 2] {

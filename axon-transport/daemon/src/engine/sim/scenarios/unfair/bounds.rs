@@ -33,7 +33,7 @@ fn greets(world: &mut World, id: u8, replaces: Option<[u8; 16]>) -> usize {
     world.until(secs(5), |world| world.raws[0].links[number].connected);
     world.with_raw(0, |raw, _| {
         let hello = LinkHello { daemon: DaemonId([id; 16]), replaces, ..raw.hello() };
-        raw.links[number].say(&LinkMessage::LinkHello(hello));
+        raw.links[number].say(&LinkMessage::Hello(hello));
     });
     number
 }
@@ -188,7 +188,7 @@ fn a_whole_graph_is_sent_once_a_second_however_often_it_is_asked_for() {
     world.run_for(secs(5));
     let whole = |world: &World| {
         let graphs = world.raws[0].links[number].messages.iter();
-        graphs.filter(|m| matches!(m, LinkMessage::GraphUpdate(graph) if graph.before == 0)).count()
+        graphs.filter(|m| matches!(m, LinkMessage::Graph(graph) if graph.before == 0)).count()
     };
     let before = whole(&world);
     for _ in 0..100 {

@@ -58,7 +58,7 @@ fn a_stream_of_another_host_goes_on_while_a_peer_announces_12_000_long_endpoints
             more: to < MANY,
             ..GraphUpdate::default()
         };
-        world.with_raw(0, |raw, _| raw.links[number].say(&LinkMessage::GraphUpdate(graph)));
+        world.with_raw(0, |raw, _| raw.links[number].say(&LinkMessage::Graph(graph)));
     }
     let heard = |world: &World| world.hosts[0].heard_endpoints();
     let (before, start) = (world.hosts[0].handled(), world.now);

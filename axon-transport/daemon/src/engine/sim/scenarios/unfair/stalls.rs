@@ -71,7 +71,7 @@ impl Held {
             let mut daemon = DaemonId([0xff; 16]);
             daemon.0[15] = id;
             let hello = LinkHello { daemon, replaces, ..raw.hello() };
-            raw.links[link].say(&LinkMessage::LinkHello(hello));
+            raw.links[link].say(&LinkMessage::Hello(hello));
         });
         world.until(secs(5), |world| world.raws[0].links[link].is_elected());
         let endpoint = Endpoint::new(SUBSCRIPTION, EndpointKind::Subscription, "/t", "T")
@@ -88,7 +88,7 @@ impl Held {
             acknowledges: Some(true),
             short_headers: None,
         };
-        let mut says = [LinkMessage::GraphUpdate(graph), LinkMessage::Subscribe(subscribe)];
+        let mut says = [LinkMessage::Graph(graph), LinkMessage::Subscribe(subscribe)];
         if replaces.is_some() {
             // A route that is asked for before the graph goes on.
             says.reverse();
