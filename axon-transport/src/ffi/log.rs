@@ -23,7 +23,7 @@ use tracing::{
     subscriber::{Interest, set_global_default},
 };
 
-use self::queue::Waiting;
+use self::queue::WaitingLines;
 use super::{
     callback::User,
     error::{AXON_RET_BAD_ALLOC, AXON_RET_ERROR, CallFailure, axon_ret_t},
@@ -59,7 +59,7 @@ pub type axon_log_t = Option<
 /// said before it was forked its parent tells.
 #[derive(Default)]
 struct Log {
-    waiting: Waiting,
+    waiting: WaitingLines,
     slot: Mutex<CallbackSlot>,
     /// A call has returned.
     returned: Condvar,

@@ -12,7 +12,7 @@ use std::{
 };
 
 use super::{
-    handles::{Handle, give},
+    handles::{FfiHandle, give},
     *,
 };
 use crate::{
@@ -72,7 +72,7 @@ fn ok(returned: axon_ret_t) {
     assert_eq!(returned, AXON_RET_OK);
 }
 
-fn handle<H: Handle>(object: H::Object) -> H {
+fn handle<H: FfiHandle>(object: H::Object) -> H {
     let mut handle = H::of(0);
     // SAFETY: a place for one.
     unsafe { give(object, &raw mut handle) }.unwrap();

@@ -6,7 +6,7 @@ use super::{
     error::{AXON_RET_OK, AXON_RET_TIMEOUT, CallFailure, axon_ret_t},
     guarded,
     handles::{
-        Handle, axon_client_t, axon_event_t, axon_guard_t, axon_server_t, axon_session_t,
+        FfiHandle, axon_client_t, axon_event_t, axon_guard_t, axon_server_t, axon_session_t,
         axon_subscription_t, give, named, revoke, visit,
     },
     memory::{elements_mut, present, value},
@@ -168,7 +168,7 @@ impl<'a> Arrays<'a> {
     }
 }
 
-fn keep<H: Handle>(
+fn keep<H: FfiHandle>(
     handles: &mut [H],
     number: &mut usize,
     ready: &mut std::iter::Peekable<impl Iterator<Item = usize>>,
@@ -182,7 +182,7 @@ fn keep<H: Handle>(
 }
 
 /// What the handles name that are not 0.
-fn all<H: Handle>(handles: &[H]) -> Result<Vec<Arc<H::Object>>, CallFailure> {
+fn all<H: FfiHandle>(handles: &[H]) -> Result<Vec<Arc<H::Object>>, CallFailure> {
     handles.iter().filter(|handle| handle.id() != 0).map(|handle| named(*handle)).collect()
 }
 

@@ -13,7 +13,7 @@ const BATCH: usize = 64;
 
 /// A message that was taken.
 #[derive(Debug)]
-pub struct Taken<T> {
+pub struct MergedSample<T> {
     /// Its number.
     pub number: u64,
     /// Of the writer's messages, those that the reader has lost by then. Of what is given on, those that
@@ -39,7 +39,7 @@ pub struct Merge<T> {
 #[derive(Debug)]
 struct MergeSource<T> {
     /// Taken, and newer than what was given on.
-    next: Option<Taken<T>>,
+    next: Option<MergedSample<T>>,
     /// Messages that its reader has lost, as far as is known.
     lost: u64,
     /// Those among them that come after what was given on.
@@ -125,9 +125,9 @@ impl<T> Merge<T> {
     /// it cannot give yet, for want of memory, and may not lose: what others have meanwhile may be newer.
     pub fn next(
         &mut self,
-        take: impl Fn(&Gid) -> Option<Taken<T>>,
+        take: impl Fn(&Gid) -> Option<MergedSample<T>>,
         waits: impl Fn(&Gid) -> bool,
-    ) -> Option<Taken<T>> {
+    ) -> Option<MergedSample<T>> {
         self.look(&take);
         if self.ways.len() > 1 && self.holds_any() {
             // Where there was nothing there may be by now what was written before that one.
@@ -149,7 +149,7 @@ impl<T> Merge<T> {
     }
 
     /// Drops what one reader has and another had; whether it [is behind](Self::is_behind).
-    pub fn pass_over(&mut self, take: impl Fn(&Gid) -> Option<Taken<T>>) -> bool {
+    pub fn pass_over(&mut self, take: impl Fn(&Gid) -> Option<MergedSample<T>>) -> bool {
         if self.ways.len() > 1 || self.behind {
             self.look(&take);
         }
@@ -157,9 +157,9 @@ impl<T> Merge<T> {
     }
 
     /// Has the next message of each reader at hand, if it has one that was not given on.
-    fn look(&mut self, take: &impl Fn(&Gid) -> Option<Taken<T>>) {
+    fn look(&mut self, take: &impl Fn(&Gid) -> Option<MergedSample<T>>) {
         let given = self.given;
-        let is_new = |next: &Taken<T>| Some(next.number) > given;
+        let is_new = |next: &MergedSample<T>| Some(next.number) > given;
         self.behind = false;
         for (reader, way) in &mut self.ways {
             let mut left = BATCH;
@@ -211,9 +211,9 @@ mod tests {
             self.0.borrow_mut().entry(reader).or_default().extend(samples);
         }
 
-        fn take(&self, reader: &Gid) -> Option<Taken<()>> {
+        fn take(&self, reader: &Gid) -> Option<MergedSample<()>> {
             let (number, lost) = self.0.borrow_mut().get_mut(reader)?.pop_front()?;
-            Some(Taken { number, lost, content: () })
+            Some(MergedSample { number, lost, content: () })
         }
     }
 

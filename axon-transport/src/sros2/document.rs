@@ -13,7 +13,7 @@ pub const MOST_EXPRESSIONS: usize = 8192;
 
 /// What one subject may do.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Grant {
+pub struct SubjectGrant {
     /// Its attribute `name`.
     pub name: Option<String>,
     /// The line of its start.
@@ -23,7 +23,7 @@ pub struct Grant {
     /// When it counts.
     pub validity: Option<Validity>,
     /// Its rules.
-    pub rules: Vec<Rule>,
+    pub rules: Vec<SubjectRule>,
     /// Whether it allows what no rule fits, and the line that says so.
     pub default: Option<(bool, u32)>,
     /// Elements that are known to nobody here.
@@ -43,7 +43,7 @@ pub struct Validity {
 
 /// An `allow_rule` or `deny_rule`.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Rule {
+pub struct SubjectRule {
     /// Whether it allows.
     pub allows: bool,
     /// The line of its start.
@@ -110,7 +110,7 @@ impl UnknownElement {
 ///
 /// # Errors
 /// It has no such document, or a value that is none of those that there are; the error says which, and where.
-pub fn parse(file: &str) -> Result<Vec<Grant>, String> {
+pub fn parse(file: &str) -> Result<Vec<SubjectGrant>, String> {
     let signed::Cleartext { text, lines_before } = signed::cleartext(file)?;
     let document = xml::parse(text)?;
     let root = document.root_element();
@@ -124,14 +124,14 @@ pub fn parse(file: &str) -> Result<Vec<Grant>, String> {
 ///
 /// # Errors
 /// As [`parse`].
-pub fn grants(root: Node<'_, '_>, lines: &Lines) -> Result<Vec<Grant>, String> {
+pub fn grants(root: Node<'_, '_>, lines: &Lines) -> Result<Vec<SubjectGrant>, String> {
     let permissions = elements(root).filter(|node| node.has_tag_name("permissions"));
     let grants = permissions.flat_map(elements).filter(|node| node.has_tag_name("grant"));
     grants.map(|node| grant(node, lines)).collect()
 }
 
-fn grant(node: Node<'_, '_>, lines: &Lines) -> Result<Grant, String> {
-    let mut read = Grant {
+fn grant(node: Node<'_, '_>, lines: &Lines) -> Result<SubjectGrant, String> {
+    let mut read = SubjectGrant {
         name: node.attribute("name").map(str::to_owned),
         line: lines.of(node),
         subject: None,
@@ -199,8 +199,8 @@ pub fn allows(value: &str, line: u32) -> Result<bool, String> {
     }
 }
 
-fn rule(node: Node<'_, '_>, allows: bool, lines: &Lines) -> Rule {
-    let mut read = Rule {
+fn rule(node: Node<'_, '_>, allows: bool, lines: &Lines) -> SubjectRule {
+    let mut read = SubjectRule {
         allows,
         line: lines.of(node),
         domains: Vec::new(),

@@ -39,7 +39,7 @@ pub(super) enum GrantDecision {
 impl CompiledGrant {
     /// # Errors
     /// A part of it is missing or not understood. What is not understood might be a denial.
-    pub(super) fn new(read: document::Grant) -> Result<Self, String> {
+    pub(super) fn new(read: document::SubjectGrant) -> Result<Self, String> {
         let of_grant = |what: &str| format!("line {}: the grant has no <{what}>", read.line);
         known(&read.unknown)?;
         let validity = read.validity.ok_or_else(|| of_grant("validity"))?;
@@ -111,7 +111,7 @@ impl CompiledGrant {
 }
 
 impl CompiledRule {
-    fn new(read: document::Rule) -> Result<Self, String> {
+    fn new(read: document::SubjectRule) -> Result<Self, String> {
         known(&read.unknown)?;
         let mut rule = Self {
             allows: read.allows,

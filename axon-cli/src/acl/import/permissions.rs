@@ -1,6 +1,6 @@
 //! Permissions of DDS Security, as `permissions.xml` of an enclave has them, and what of them no rule can say.
 
-use axon_transport::internal::sros2::document::{self, Domains, Rule, UnknownElement};
+use axon_transport::internal::sros2::document::{self, Domains, SubjectRule, UnknownElement};
 
 use super::{
     document::{Grant, Says, choose, unknown},
@@ -12,7 +12,7 @@ use super::{
 /// # Errors
 /// There is none, or more than one.
 pub(super) fn choose_and_note(
-    grants: Vec<document::Grant>,
+    grants: Vec<document::SubjectGrant>,
     enclave: Option<&str>,
     notes: &mut Notes,
 ) -> Result<Grant, String> {
@@ -47,13 +47,13 @@ pub(super) fn choose_and_note(
 }
 
 /// What a grant can be called: its name, its subject, and the common name in it.
-fn names(grant: &document::Grant) -> Vec<String> {
+fn names(grant: &document::SubjectGrant) -> Vec<String> {
     let subject = grant.subject.clone().map(|(subject, _)| subject).unwrap_or_default();
     let common = document::common_name(&subject).map(str::to_owned);
     grant.name.clone().into_iter().chain(common).chain([subject]).collect()
 }
 
-fn rule(rule: Rule, read: &mut Grant, notes: &mut Notes) -> Result<(), String> {
+fn rule(rule: SubjectRule, read: &mut Grant, notes: &mut Notes) -> Result<(), String> {
     let allows = rule.allows;
     // What is left out of an allow_rule allows less, and of a deny_rule more. What is taken in whole does the reverse.
     let (left_out, in_whole) =

@@ -6,7 +6,7 @@ use crate::{
     ffi::{
         callback::{axon_callback_t, told},
         error::CallFailure,
-        handles::{Handle, named, revoke},
+        handles::{FfiHandle, named, revoke},
         memory::{elements, present_if_wanted, store, store_if_wanted, text, value},
         qos::{axon_qos_t, store_qos},
     },
@@ -140,7 +140,7 @@ objects! {
 ///
 /// # Safety
 /// `gid` and `qos` are null or point to room for one.
-pub(super) unsafe fn describe<H: Handle<Object: EndpointObject>>(
+pub(super) unsafe fn describe<H: FfiHandle<Object: EndpointObject>>(
     handle: H,
     gid: *mut axon_gid_t,
     qos: *mut axon_qos_t,
@@ -159,7 +159,7 @@ pub(super) unsafe fn describe<H: Handle<Object: EndpointObject>>(
 ///
 /// # Safety
 /// `count` points to room for a number.
-pub(super) unsafe fn matched<H: Handle<Object: EndpointObject>>(
+pub(super) unsafe fn matched<H: FfiHandle<Object: EndpointObject>>(
     handle: H,
     count: *mut usize,
 ) -> Result<(), CallFailure> {
@@ -169,7 +169,7 @@ pub(super) unsafe fn matched<H: Handle<Object: EndpointObject>>(
 }
 
 /// Has `callback` told of what comes to an endpoint.
-pub(super) fn set_callback<H: Handle<Object: Taking>>(
+pub(super) fn set_callback<H: FfiHandle<Object: Taking>>(
     handle: H,
     callback: axon_callback_t,
     user: *const c_void,
@@ -182,7 +182,7 @@ pub(super) fn set_callback<H: Handle<Object: Taking>>(
 }
 
 /// Ends an endpoint that has a callback.
-pub(super) fn end<H: Handle<Object: Taking>>(handle: H) -> Result<(), CallFailure> {
+pub(super) fn end<H: FfiHandle<Object: Taking>>(handle: H) -> Result<(), CallFailure> {
     // Another call may keep it for a while.
     revoke(handle)?.tell_no_more();
     Ok(())

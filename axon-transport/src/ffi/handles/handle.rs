@@ -102,7 +102,7 @@ pub struct axon_loan_t {
 }
 
 /// A type of handle, and what it names.
-pub(in crate::ffi) trait Handle: Copy {
+pub(in crate::ffi) trait FfiHandle: Copy {
     type Object;
     const WHAT: &'static str;
 
@@ -134,7 +134,7 @@ macro_rules! handles {
             }
         }
 
-        $(impl Handle for $handle {
+        $(impl FfiHandle for $handle {
             type Object = $object;
             const WHAT: &'static str = $what;
 
@@ -175,7 +175,7 @@ fn current() -> Result<&'static Made<Tables>, CallFailure> {
 }
 
 /// What a handle names.
-pub(in crate::ffi) fn named<H: Handle>(handle: H) -> Result<Arc<H::Object>, CallFailure> {
+pub(in crate::ffi) fn named<H: FfiHandle>(handle: H) -> Result<Arc<H::Object>, CallFailure> {
     let tables = current()?;
     let found = H::table(tables.value()).get(handle.id());
     #[cfg(test)]
@@ -187,7 +187,7 @@ pub(in crate::ffi) fn named<H: Handle>(handle: H) -> Result<Arc<H::Object>, Call
 ///
 /// # Safety
 /// As [`store`].
-pub(in crate::ffi) unsafe fn give<H: Handle>(
+pub(in crate::ffi) unsafe fn give<H: FfiHandle>(
     object: H::Object,
     out: *mut H,
 ) -> Result<(), CallFailure> {
@@ -200,13 +200,13 @@ pub(in crate::ffi) unsafe fn give<H: Handle>(
 }
 
 /// Gives a handle up: what it named ends when no call uses it any more.
-pub(in crate::ffi) fn revoke<H: Handle>(handle: H) -> Result<Arc<H::Object>, CallFailure> {
+pub(in crate::ffi) fn revoke<H: FfiHandle>(handle: H) -> Result<Arc<H::Object>, CallFailure> {
     let tables = current()?;
     H::table(tables.value()).remove(handle.id()).map_err(|why| unknown(tables, handle, why))
 }
 
 /// Does something with what a handle names, as a signal handler may: see [`HandleTable::visit`].
-pub(in crate::ffi) fn visit<H: Handle>(
+pub(in crate::ffi) fn visit<H: FfiHandle>(
     handle: H,
     visit: impl FnOnce(&H::Object),
 ) -> Result<(), axon_ret_t> {
@@ -226,7 +226,7 @@ fn code(tables: &Made<Tables>, why: Unknown) -> axon_ret_t {
     }
 }
 
-fn unknown<H: Handle>(tables: &Made<Tables>, handle: H, why: Unknown) -> CallFailure {
+fn unknown<H: FfiHandle>(tables: &Made<Tables>, handle: H, why: Unknown) -> CallFailure {
     let (id, what) = (handle.id(), H::WHAT);
     let code = code(tables, why);
     let text = match why {

@@ -21,7 +21,7 @@ const ROOM: usize = 256;
 
 /// What a process has said and its thread has not told yet.
 #[derive(Default)]
-pub(super) struct Waiting {
+pub(super) struct WaitingLines {
     state: Mutex<QueueState>,
     more: Condvar,
 }
@@ -37,10 +37,10 @@ struct QueueState {
 
 thread_local! {
     /// Whose lines this thread tells.
-    static TELLS: Cell<*const Waiting> = const { Cell::new(ptr::null()) };
+    static TELLS: Cell<*const WaitingLines> = const { Cell::new(ptr::null()) };
 }
 
-impl Waiting {
+impl WaitingLines {
     /// Whether this is the thread that calls the program. In a child that a callback forked it is not:
     /// the lines there are others.
     pub(super) fn is_teller(&self) -> bool {

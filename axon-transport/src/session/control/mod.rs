@@ -101,7 +101,7 @@ struct Rematching {
 }
 
 /// The peer that a session speaks with first.
-pub(in crate::session) enum Start {
+pub(in crate::session) enum FirstPeer {
     /// A daemon; another one when it is gone.
     Daemon(Connected),
     /// The process at the other end of a socket, and nobody after it.
@@ -122,9 +122,9 @@ enum Link {
 impl Control {
     pub(in crate::session) fn new(
         shared: Arc<SessionShared>,
-        start: Start,
+        start: FirstPeer,
     ) -> Result<Self, SessionError> {
-        let reconnects = matches!(start, Start::Daemon(_));
+        let reconnects = matches!(start, FirstPeer::Daemon(_));
         shared.core.segment.is_watched();
         let peers = Peers::new(shared.core.segment.clone(), shared.core.memory.clone())
             .map_err(ShmError::system("watching processes"))?;
@@ -150,11 +150,13 @@ impl Control {
             alarm: None,
         };
         match start {
-            Start::Daemon(connected) | Start::Socket(connected) => control.connected(connected),
-            Start::LocalRegistry(local_registry) => {
+            FirstPeer::Daemon(connected) | FirstPeer::Socket(connected) => {
+                control.connected(connected)
+            }
+            FirstPeer::LocalRegistry(local_registry) => {
                 control.link = Link::Local(Local::join(local_registry, &control.shared.core)?);
             }
-            Start::Alone => control.link = Link::Local(Local::alone(&control.shared.core)),
+            FirstPeer::Alone => control.link = Link::Local(Local::alone(&control.shared.core)),
         }
         Ok(control)
     }

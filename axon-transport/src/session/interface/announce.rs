@@ -17,7 +17,7 @@ use crate::{
         error::SessionError,
         handle::Session,
         options::EndpointSpec,
-        sides::{PublisherInner, Rings, RingsByClient, SubscriptionInner},
+        sides::{PublisherInner, RingsByClient, SubscriptionInner, WriterRings},
     },
     wire::session::EndpointRole,
 };
@@ -89,12 +89,12 @@ impl Session {
         endpoint: Endpoint,
         expected: u64,
         budget: Option<&Arc<MemoryBudget>>,
-        inner: impl FnOnce(Endpoint, Rings) -> PublisherInner,
+        inner: impl FnOnce(Endpoint, WriterRings) -> PublisherInner,
     ) -> Result<Publisher, SessionError> {
         let options = RingOptions { expected, ..self.ring(&endpoint, endpoint.qos) };
         let writer = Arc::new(Writer::create(self.shared().core.segment.clone(), options)?);
         budget.into_iter().for_each(|budget| writer.share(budget));
-        let inner = Arc::new(inner(endpoint, Rings::Shared(writer.clone())));
+        let inner = Arc::new(inner(endpoint, WriterRings::Shared(writer.clone())));
         self.announce(Some(&inner), None);
         Ok(Publisher { inner, writer, session: self.clone() })
     }
@@ -119,7 +119,7 @@ impl Session {
         let segment = self.shared().core.segment.clone();
         let writer = Arc::new(Writer::create_for_calls(segment, options)?);
         budget.into_iter().for_each(|budget| writer.share(budget));
-        let rings = Rings::Shared(writer.clone());
+        let rings = WriterRings::Shared(writer.clone());
         let (requests, responses) = self.add_both(endpoint, role, reads, rings, carries);
         responses.calls.set_ring(writer.clone());
         Ok(Client::new(requests, responses, writer, self.clone()))
@@ -140,7 +140,7 @@ impl Session {
         let (segment, room) = (shared.core.segment.clone(), shared.room.clone());
         let by_client = RingsByClient::new(segment, options, room, budget.cloned());
         let by_client = Arc::new(by_client);
-        let rings = Rings::Each(by_client.clone());
+        let rings = WriterRings::Each(by_client.clone());
         let (responses, requests) = self.add_both(endpoint, role, reads, rings, carries);
         Server::new(responses, requests, by_client, self.clone())
     }
@@ -151,7 +151,7 @@ impl Session {
         endpoint: Endpoint,
         role: EndpointRole,
         reads: Qos,
-        rings: Rings,
+        rings: WriterRings,
         carries: bool,
     ) -> (Arc<PublisherInner>, Arc<SubscriptionInner>) {
         let writes = Arc::new(PublisherInner::new(endpoint.clone(), role, rings));

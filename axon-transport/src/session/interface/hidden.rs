@@ -18,7 +18,7 @@ use crate::{
     ids::{Gid, SessionId},
     qos::Durability,
     session::{
-        control::Start,
+        control::FirstPeer,
         core::Outgoing,
         daemon::connect::Caller,
         endpoints::{Publisher, Server, Subscription},
@@ -73,7 +73,7 @@ impl Session {
         let segment = SessionSegment::create(id)?;
         let caller = Caller { segment: Some(&segment), ..Caller::new(config, &options, id) };
         let connected = caller.greet_over(socket)?;
-        Ok(Self::of(Self::start(config, options, segment, Start::Socket(connected))?))
+        Ok(Self::of(Self::start(config, options, segment, FirstPeer::Socket(connected))?))
     }
 
     /// A subscription as another process of the session describes it, under its GID there. Where it

@@ -8,7 +8,7 @@ use crate::{
     config::{Config, DaemonPolicy},
     ids::SessionId,
     session::{
-        control::{Control, Start, local::LocalRegistry},
+        control::{Control, FirstPeer, local::LocalRegistry},
         daemon::connect::Caller,
         error::SessionError,
         handle::{Handle, Session},
@@ -36,14 +36,14 @@ impl Session {
         let id = options.key.as_ref().map_or_else(SessionId::random, |key| key.id());
         if config.daemon == DaemonPolicy::Off {
             let segment = SessionSegment::create(id)?;
-            return Ok(Self::of(Self::start(config, options, segment, Start::Alone)?));
+            return Ok(Self::of(Self::start(config, options, segment, FirstPeer::Alone)?));
         }
         let reason = if config.shm {
             let segment = SessionSegment::create(id)?;
             let caller = Caller { segment: Some(&segment), ..Caller::new(config, &options, id) };
             match caller.connect() {
                 Ok(daemon) => {
-                    let start = Start::Daemon(daemon);
+                    let start = FirstPeer::Daemon(daemon);
                     return Ok(Self::of(Self::start(config, options, segment, start)?));
                 }
                 Err(SessionError::NotShared(reason)) => reason,
@@ -68,11 +68,11 @@ impl Session {
         let connected = caller.connect()?;
         let local_registry = Arc::<LocalRegistry>::default();
         let segment = SessionSegment::create(id)?;
-        let start = Start::LocalRegistry(Arc::clone(&local_registry));
+        let start = FirstPeer::LocalRegistry(Arc::clone(&local_registry));
         let mut handle = Self::start(config, options, segment, start)?;
         let outside = SessionOptions::new("relay").role(SessionRole::Gateway);
         let segment = SessionSegment::create(SessionId::random())?;
-        let start = Start::LocalRegistry(Arc::clone(&local_registry));
+        let start = FirstPeer::LocalRegistry(Arc::clone(&local_registry));
         let outside = Self::of(Self::start(config, outside, segment, start)?);
         handle.relay = Some(near::start(
             Arc::clone(&handle.shared),
@@ -88,7 +88,7 @@ impl Session {
         config: &Config,
         options: SessionOptions,
         segment: Arc<SessionSegment>,
-        start: Start,
+        start: FirstPeer,
     ) -> Result<Handle, SessionError> {
         let system = |what| move |source: std::io::Error| SessionError::System { what, source };
         let shared = SessionShared::new(config.clone(), options, segment)

@@ -13,7 +13,7 @@ use crate::{
     ids::Gid,
     session::{
         endpoints::RemoteWriter,
-        merge::{Merge, Taken},
+        merge::{Merge, MergedSample},
     },
 };
 
@@ -125,6 +125,6 @@ pub fn response<'a>(
     client.take_from(&channel.writer).map(taken).map(OutboundSample::from)
 }
 
-fn taken(content: Sample) -> Taken<Sample> {
-    Taken { number: content.meta().sequence, lost: 0, content }
+fn taken(content: Sample) -> MergedSample<Sample> {
+    MergedSample { number: content.meta().sequence, lost: 0, content }
 }

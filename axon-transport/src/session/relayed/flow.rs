@@ -20,7 +20,7 @@ pub use self::{
     incoming::{ArrivalPool, FlowViolation, InboundSample, IncomingFlow},
     outgoing::OutgoingFlow,
 };
-use crate::{ids::Gid, session::merge::Taken, wire::session::Credit};
+use crate::{ids::Gid, session::merge::MergedSample, wire::session::Credit};
 
 /// Bytes that a channel may have under way without asking.
 pub const WINDOW: u64 = 32 << 10;
@@ -123,8 +123,8 @@ pub struct OutboundSample<S> {
     pub content: S,
 }
 
-impl From<Taken<Sample>> for OutboundSample<SamplePayload> {
-    fn from(Taken { lost, content, .. }: Taken<Sample>) -> Self {
+impl From<MergedSample<Sample>> for OutboundSample<SamplePayload> {
+    fn from(MergedSample { lost, content, .. }: MergedSample<Sample>) -> Self {
         Self { meta: content.meta(), lost, content: SamplePayload::Ring(content) }
     }
 }

@@ -15,7 +15,7 @@ pub(in crate::session) use self::{
     calls::ServerGone,
     events::Changes,
     publisher::PublisherInner,
-    rings::{ClientLimit, Rings, RingsByClient},
+    rings::{ClientLimit, RingsByClient, WriterRings},
     source::EventSource,
     subscription::{Accept, NumberKind, ServeRequest, SubscriptionInner},
 };

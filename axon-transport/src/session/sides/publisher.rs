@@ -12,7 +12,7 @@ use axon_shm::{
 
 use super::{
     events::{Changes, EndpointEvents},
-    rings::Rings,
+    rings::WriterRings,
 };
 use crate::{
     graph::{Endpoint, EndpointKind},
@@ -30,7 +30,7 @@ use crate::{
 pub(in crate::session) struct PublisherInner {
     pub(in crate::session) endpoint: Endpoint,
     pub(in crate::session) role: EndpointRole,
-    pub(in crate::session) rings: Rings,
+    pub(in crate::session) rings: WriterRings,
     pub(in crate::session) events: EndpointEvents,
     /// A publication says that the publisher is alive, and nothing else but the program does.
     pub(in crate::session) asserts: bool,
@@ -64,7 +64,11 @@ struct PendingFence {
 }
 
 impl PublisherInner {
-    pub(in crate::session) fn new(endpoint: Endpoint, role: EndpointRole, rings: Rings) -> Self {
+    pub(in crate::session) fn new(
+        endpoint: Endpoint,
+        role: EndpointRole,
+        rings: WriterRings,
+    ) -> Self {
         let Qos { liveliness, lease, .. } = endpoint.qos;
         let asserts = liveliness == Liveliness::ManualByTopic && lease.is_some();
         let events = EndpointEvents::of_publisher(&endpoint.qos, clock::monotonic());
@@ -94,7 +98,7 @@ impl PublisherInner {
     /// Whether it has samples for a reader that has not taken up its grant and must not lose one: a daemon that was
     /// killed may not have passed the grant on.
     pub(in crate::session) fn expects_readers(&self) -> bool {
-        let Rings::Shared(writer) = &self.rings else { return false };
+        let WriterRings::Shared(writer) = &self.rings else { return false };
         self.endpoint.kind == EndpointKind::Publisher
             && self.role == EndpointRole::Application
             && holds(&self.endpoint.qos)
@@ -103,7 +107,7 @@ impl PublisherInner {
 
     /// The readers of other sessions that have not taken up their grant, and how many samples there are for each.
     pub(in crate::session) fn unmet(&self) -> Vec<(Gid, u64)> {
-        let Rings::Shared(writer) = &self.rings else { return Vec::new() };
+        let WriterRings::Shared(writer) = &self.rings else { return Vec::new() };
         let counted =
             self.endpoint.kind == EndpointKind::Publisher && self.role == EndpointRole::Application;
         if counted { writer.unmet() } else { Vec::new() }
@@ -150,7 +154,7 @@ impl PublisherInner {
     /// can be read by all others whatever becomes of this process: these were sent the memory that they
     /// are in. The session's memory wakes the thread that waits for that.
     pub(in crate::session) fn delivered_up_to(&self, core: &SessionCore) -> u64 {
-        let Rings::Shared(writer) = &self.rings else { return 0 };
+        let WriterRings::Shared(writer) = &self.rings else { return 0 };
         let (began, number) = (core.memory.connections(), writer.delivered_up_to());
         // In this order: it counts what the readers of those samples have to be sent.
         let handovers = core.memory.handovers();
@@ -197,7 +201,7 @@ impl PublisherInner {
     /// whether something happened.
     pub(in crate::session) fn look_at_time(&self, now: u64) -> (Option<u64>, bool) {
         let qos = &self.endpoint.qos;
-        let Rings::Shared(writer) = &self.rings else { return (None, false) };
+        let WriterRings::Shared(writer) = &self.rings else { return (None, false) };
         let times = writer.times();
         let (due, news) = self.events.offered(qos, &times, now);
         let Some(lease) = qos.lease.filter(|_| !self.asserts) else {
@@ -220,7 +224,7 @@ impl PublisherInner {
         let deadline = self.endpoint.qos.deadline.is_some();
         if result.is_ok()
             && (deadline || self.asserts)
-            && let Rings::Shared(writer) = &self.rings
+            && let WriterRings::Shared(writer) = &self.rings
         {
             let now = clock::monotonic();
             if deadline {

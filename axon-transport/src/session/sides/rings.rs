@@ -18,7 +18,7 @@ use axon_shm::{
 
 use crate::ids::Gid;
 
-pub(in crate::session) enum Rings {
+pub(in crate::session) enum WriterRings {
     /// A publisher's samples, or a client's requests.
     Shared(Arc<Writer>),
     /// A server's responses, which are nobody's but the client's who asked.
@@ -67,7 +67,7 @@ impl Drop for ClientSlot {
     }
 }
 
-impl Rings {
+impl WriterRings {
     pub(in crate::session) fn shared(&self) -> Option<&Arc<Writer>> {
         match self {
             Self::Shared(writer) => Some(writer),

@@ -18,7 +18,7 @@ use axon_transport::{
         registry::parts,
         session::{
             RemoteWriter,
-            merge::{Merge, Taken},
+            merge::{Merge, MergedSample},
             relayed::{
                 MAX_MATCHED,
                 flow::{FlowChannel, OutboundSample, SamplePayload},
@@ -259,9 +259,9 @@ fn taken(
     subscriptions: &BTreeMap<Gid, Subscription>,
     reader: &Gid,
     writer: &Gid,
-) -> Option<Taken<Sample>> {
+) -> Option<MergedSample<Sample>> {
     let (content, lost) = subscriptions.get(reader)?.take_from(writer)?;
-    Some(Taken { number: content.meta().sequence, lost, content })
+    Some(MergedSample { number: content.meta().sequence, lost, content })
 }
 
 /// On which channel the session gets what `other` writes for one of its clients or servers.

@@ -125,7 +125,7 @@ pub(crate) enum CompressionReply {
 
 /// An order without an answer.
 #[derive(Debug)]
-struct Pending {
+struct PendingOrder {
     name: Option<SampleName>,
     length: usize,
     askers: Vec<Asker>,
@@ -135,7 +135,7 @@ struct Pending {
 struct OrderState {
     number: u64,
     orders: VecDeque<CompressionOrder>,
-    pending: HashMap<u64, Pending>,
+    pending: HashMap<u64, PendingOrder>,
     /// The orders of samples that other peers may ask for, too.
     named: HashMap<SampleName, u64>,
     pending_bytes: usize,
@@ -235,7 +235,7 @@ impl Compression {
         state.number += 1;
         let number = state.number;
         state.pending_bytes += length;
-        state.pending.insert(number, Pending { name, length, askers: vec![by] });
+        state.pending.insert(number, PendingOrder { name, length, askers: vec![by] });
         if let Some(name) = name {
             state.named.insert(name, number);
         }
@@ -252,7 +252,8 @@ impl Compression {
     pub(crate) fn handle_answer(&self, answer: &CompressionAnswer, now: Duration) -> Vec<Asker> {
         let mut state = self.0.borrow_mut();
         state.used = now;
-        let Some(Pending { name, length, askers }) = state.pending.remove(&answer.number) else {
+        let Some(PendingOrder { name, length, askers }) = state.pending.remove(&answer.number)
+        else {
             return Vec::new();
         };
         state.pending_bytes -= length;

@@ -49,7 +49,7 @@ enum DialPhase {
     /// A handshake with the address before `next` is under way until this time.
     Connecting(DialRound, Duration),
     /// That handshake ended.
-    Ended(DialRound, Outcome),
+    Ended(DialRound, HandshakeOutcome),
     /// The connection is given up: the dial ends with the next poll.
     Ending(Refusal),
     /// The dial ended.
@@ -71,7 +71,7 @@ impl DialRound {
 }
 
 /// How a handshake ended.
-enum Outcome {
+enum HandshakeOutcome {
     Connected,
     Failed(ConnectionError),
     /// No packet was sent.
@@ -129,12 +129,12 @@ impl Dialling {
 
     /// The handshake is complete.
     pub(crate) fn handle_connected(&mut self) {
-        self.end(Outcome::Connected);
+        self.end(HandshakeOutcome::Connected);
     }
 
     /// The connection ended before its handshake was complete.
     pub(crate) fn handle_failed(&mut self, error: &ConnectionError) {
-        self.end(Outcome::Failed(error.clone()));
+        self.end(HandshakeOutcome::Failed(error.clone()));
     }
 
     /// No handshake could be started with the address: no local address reaches it, or QUIC refused with
@@ -142,7 +142,7 @@ impl Dialling {
     pub(crate) fn handle_unreachable(&mut self, error: Option<&ConnectError>) {
         let DialPhase::Connecting(round, _) = &self.state else { return };
         let address = self.target.addresses[round.next - 1];
-        self.end(Outcome::Unreachable(match error {
+        self.end(HandshakeOutcome::Unreachable(match error {
             None => {
                 format!("{address} cannot be reached from the addresses in AXON_BIND_ADDRS")
             }
@@ -152,7 +152,7 @@ impl Dialling {
 
     /// The settings, or the key, make no TLS client.
     pub(crate) fn handle_unusable(&mut self, error: impl fmt::Display) {
-        self.end(Outcome::Unusable(error.to_string()));
+        self.end(HandshakeOutcome::Unusable(error.to_string()));
     }
 
     /// The dialler took an answer of the KME: a dial that waits for a key asks for it again.
@@ -233,7 +233,7 @@ impl Dialling {
         }
     }
 
-    fn end(&mut self, outcome: Outcome) {
+    fn end(&mut self, outcome: HandshakeOutcome) {
         match std::mem::replace(&mut self.state, DialPhase::Over) {
             DialPhase::Connecting(round, _) => self.state = DialPhase::Ended(round, outcome),
             // An event of a connection that the dial gave up.
@@ -280,25 +280,27 @@ impl Dialling {
         &mut self,
         now: Duration,
         mut round: DialRound,
-        outcome: Outcome,
+        outcome: HandshakeOutcome,
         keyring: Option<&mut Keyring>,
     ) -> Option<DialAction> {
         match outcome {
-            Outcome::Connected => Some(self.connected(now, &round, keyring)),
-            Outcome::Unusable(error) => {
+            HandshakeOutcome::Connected => Some(self.connected(now, &round, keyring)),
+            HandshakeOutcome::Unusable(error) => {
                 Some(DialAction::Failed(Refusal::here(CloseCode::Internal, error)))
             }
-            Outcome::Unreachable(reason) => {
+            HandshakeOutcome::Unreachable(reason) => {
                 round.last = reason;
                 self.state = DialPhase::Try(round);
                 None
             }
-            Outcome::Failed(ConnectionError::TimedOut) => {
+            HandshakeOutcome::Failed(ConnectionError::TimedOut) => {
                 self.silent(round);
                 None
             }
             // The peer that answers at one address answers at all of them.
-            Outcome::Failed(error) => self.refused(now, &round, Refusal::of(&error), keyring),
+            HandshakeOutcome::Failed(error) => {
+                self.refused(now, &round, Refusal::of(&error), keyring)
+            }
         }
     }
 

@@ -46,7 +46,7 @@ pub(crate) use self::{
     lanes::WritersHere,
     serving::{MAX_ROUTES, StalledRoute},
 };
-use super::peer_graph::shown::{ShownEndpoint, ShownGraph};
+use super::peer_graph::shown::{ShownEndpoint, ToldGraph};
 use super::{
     inbound::Inbound,
     outbound::{Outbound, Source, StallCause},
@@ -99,7 +99,7 @@ pub(crate) struct Peer {
     /// Endpoints of it were ignored, since another peer had them.
     pub(super) displaced: bool,
     /// The graph that it was sent.
-    told: ShownGraph,
+    told: ToldGraph,
     /// It has been silent for so long that the control plane takes it for gone.
     pub(super) silent: bool,
     /// Its graph changed, and what follows was not done.
@@ -174,7 +174,7 @@ impl Peer {
             remote: PeerGraph::new(account, prover.is_needed(), permissions),
             prover,
             displaced: false,
-            told: ShownGraph::default(),
+            told: ToldGraph::default(),
             silent: false,
             stirred: false,
             refusal_said: false,

@@ -11,7 +11,7 @@ use axon_transport::{
     access::Over,
     internal::session::{
         TakeLimit,
-        merge::{Merge, Taken},
+        merge::{Merge, MergedSample},
     },
 };
 
@@ -457,7 +457,7 @@ impl FlowRings {
         let of_reader = |reader: &Gid| sources.iter().find(|source| source.gid() == *reader);
         let take = |reader: &Gid| {
             let content = of_reader(reader)?.take_of(of, now)?;
-            Some(Taken { number: content.info.sequence, lost: 0, content })
+            Some(MergedSample { number: content.info.sequence, lost: 0, content })
         };
         let waits = |reader: &Gid| of_reader(reader).is_some_and(|source| source.is_held_up(of));
         let next = merge.next(take, waits);
