@@ -361,7 +361,9 @@ impl Control {
             }
         }
         // For want of descriptors there is memory that the daemon was not told of.
-        shared.core.link.put_back(fences.into_values());
+        if !fences.is_empty() {
+            shared.core.link.put_back(fences.into_values());
+        }
         drop(state);
         gone.iter().for_each(|gid| self.own_gone(gid));
     }
