@@ -94,7 +94,7 @@ impl RetireList {
         Some(at)
     }
 
-    /// As [`lend`](Self::lend), while slots [take turns](Slots::take_turn).
+    /// As [`lend`](Self::lend), while slots [take turns](SegmentSlots::take_turn).
     pub(crate) fn lend_turn(&mut self, len: u64) -> Option<Location> {
         let at = self.take_by(|slots| slots.take_turn(len))?;
         self.loans += 1;

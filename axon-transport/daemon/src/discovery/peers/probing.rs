@@ -21,7 +21,7 @@ use crate::{
 /// Most probes whose answer is awaited.
 const MOST_ASKED: usize = 1024;
 /// Most of them to one host: beacons may be forged, and it hears so many within [`ANSWER_WITHIN`].
-/// Those to the [expected ports](Peers::expects) of a known host come on top.
+/// Those to the [expected ports](PeerDiscovery::expects) of a known host come on top.
 const MOST_ASKED_OF_A_HOST: usize = 32;
 /// An address is probed at most this often, whatever daemons are said to be there.
 const ASKED_AGAIN: Duration = Duration::from_millis(250);

@@ -42,7 +42,7 @@ const MESSAGE_CALLS: usize = 16;
 /// Who asked, and so who gets the answer. The numbers are the caller's own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum RequestOrigin {
-    /// The [`Dialler`](super::Dialler).
+    /// The [`BootstrapDialler`](super::BootstrapDialler).
     Dialler,
     /// The [`Acceptor`](super::Acceptor).
     Acceptor,
@@ -50,9 +50,9 @@ pub enum RequestOrigin {
     Proof(u64),
     /// A [`ProofResponder`](super::ProofResponder).
     Responder(u64),
-    /// A [`Sender`](super::Sender).
+    /// A [`KeySender`](super::KeySender).
     Sender(u64),
-    /// A [`Receiver`](super::Receiver).
+    /// A [`KeyReceiver`](super::KeyReceiver).
     Receiver(u64),
 }
 

@@ -220,7 +220,7 @@ impl ClientProof {
     }
 
     /// The key that proved it: in `messages10` the first sending key, for
-    /// [`Sender::adopt`](crate::keys::Sender::adopt); in `session` it is spent by being dropped.
+    /// [`KeySender::adopt`](crate::keys::KeySender::adopt); in `session` it is spent by being dropped.
     pub fn into_key(self) -> Option<(KeyId, KmeKey)> {
         match self.step {
             ProofStep::Proven(key_id, key) => Some((key_id, key)),

@@ -1,5 +1,5 @@
 //! Client side in `session`: answers the server's request for the proof. In `messages10` the
-//! [`Receiver`](crate::keys::Receiver) answers.
+//! [`KeyReceiver`](crate::keys::KeyReceiver) answers.
 
 use std::{sync::Arc, time::Duration};
 
