@@ -33,7 +33,7 @@ impl Alive {
 
     /// If it is time: those that have been alive since this was last asked, as many together as go into
     /// a message. `asserted` has when each was; a publisher may be in it several times.
-    pub fn news(
+    pub fn due_assertions(
         &mut self,
         now: Duration,
         asserted: impl Iterator<Item = (Gid, u64)>,
@@ -47,10 +47,10 @@ impl Alive {
             let last = alive.entry(gid).or_default();
             *last = at.max(*last);
         }
-        let news = alive.iter().filter(|(gid, at)| self.told.get(gid) != Some(at));
-        let news: Vec<Gid> = news.map(|(gid, _)| *gid).collect();
+        let asserted = alive.iter().filter(|(gid, at)| self.told.get(gid) != Some(at));
+        let asserted: Vec<Gid> = asserted.map(|(gid, _)| *gid).collect();
         self.told = alive;
-        news.chunks(PART).map(<[_]>::to_vec).collect()
+        asserted.chunks(PART).map(<[_]>::to_vec).collect()
     }
 }
 
@@ -68,19 +68,22 @@ mod tests {
     fn alive_reports_within_the_shortest_lease() {
         let (mut alive, start) = (Alive::default(), Duration::from_secs(1000));
         assert_eq!(alive.left(start), None);
-        assert!(alive.news(start, [(gid(1), 1)].into_iter()).is_empty(), "nobody has a lease");
+        assert!(
+            alive.due_assertions(start, [(gid(1), 1)].into_iter()).is_empty(),
+            "nobody has a lease"
+        );
         alive.watch([2 * LEASE, LEASE].into_iter());
         assert_eq!(alive.left(start), Some(Duration::ZERO));
         let both = [(gid(1), 1), (gid(2), 1), (gid(1), 3)];
-        assert_eq!(alive.news(start, both.into_iter()), [[gid(1), gid(2)]]);
+        assert_eq!(alive.due_assertions(start, both.into_iter()), [[gid(1), gid(2)]]);
         let quarter = LEASE / 4;
         assert_eq!(alive.left(start), Some(quarter));
         let early = start + quarter / 2;
-        assert!(alive.news(early, [(gid(2), 2)].into_iter()).is_empty(), "not yet");
+        assert!(alive.due_assertions(early, [(gid(2), 2)].into_iter()).is_empty(), "not yet");
         // What stands is no news, in whatever order it comes; who was not heard of meanwhile is.
         let next = start + quarter;
         let now = [(gid(1), 3), (gid(1), 1), (gid(2), 2), (gid(3), 1)];
-        assert_eq!(alive.news(next, now.into_iter()), [[gid(2), gid(3)]]);
+        assert_eq!(alive.due_assertions(next, now.into_iter()), [[gid(2), gid(3)]]);
         alive.watch([Duration::from_nanos(1)].into_iter());
         assert_eq!(alive.left(next), Some(SHORTEST));
         alive.watch(std::iter::empty());
@@ -96,7 +99,7 @@ mod tests {
             gid[..8].copy_from_slice(&number.to_be_bytes());
             (Gid(gid), 1)
         });
-        let parts = alive.news(Duration::from_secs(1000), many);
+        let parts = alive.due_assertions(Duration::from_secs(1000), many);
         assert!(parts.iter().map(Vec::len).eq([1024, 1024, 452]));
     }
 }

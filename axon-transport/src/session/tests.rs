@@ -3,7 +3,7 @@
 
 mod followed;
 mod handed;
-mod played;
+mod simulated_daemon;
 mod unmet;
 
 use std::{

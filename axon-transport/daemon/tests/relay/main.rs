@@ -6,9 +6,9 @@ mod hostile;
 mod killed;
 mod left;
 mod life;
-mod played;
 mod refused;
 mod services;
+mod simulated_daemon;
 #[allow(dead_code, reason = "for the tests of daemons too")]
 #[path = "../support/mod.rs"]
 mod support;

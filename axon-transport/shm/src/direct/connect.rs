@@ -288,7 +288,7 @@ impl<'a> ConnectChannel<'a> {
 
     /// The next segment that is handed over or given up. One for whose descriptor there is no room
     /// stays where it is. For one thread at a time.
-    pub(crate) fn take_news(&self) -> Result<SegmentUpdate, ConnectError> {
+    pub(crate) fn take_update(&self) -> Result<SegmentUpdate, ConnectError> {
         loop {
             match self.receive_by(descriptors::receive_whole)? {
                 (Packet::Opened(opened), mut fds) => {

@@ -160,7 +160,7 @@ impl Subscriber {
             let channel = ConnectChannel::new(ours.as_fd(), left);
             // A ring that is not in the first segment: its own follows.
             while !peer.has_segment(ring.segment) {
-                context.hear(peer, channel.take_news()?);
+                context.hear(peer, channel.take_update()?);
             }
             // The process at the other end decides what is queued in it, and so how long closing it takes.
             kept = Some(Mutex::new(PassedFd::received(ours)));
@@ -236,7 +236,7 @@ impl Subscriber {
         }
         let line = line.lock().unwrap_or_else(PoisonError::into_inner);
         for _ in 0..NEWS {
-            match ConnectChannel::new(line.as_fd(), Some(Duration::ZERO)).take_news() {
+            match ConnectChannel::new(line.as_fd(), Some(Duration::ZERO)).take_update() {
                 Ok(news) => self.context.hear(publisher, news),
                 // What finds no room here is there the next time, too.
                 Err(_) => break,

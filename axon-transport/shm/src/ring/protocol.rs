@@ -31,7 +31,7 @@ const DATA: usize = 4;
 const PUBLISHED: usize = DESCRIPTOR_WORDS - 1;
 const INLINE_WORDS: usize = PUBLISHED - DATA;
 
-/// No ring gets this far; a head beyond it was scribbled.
+/// No ring gets this far; a head beyond it was corrupted.
 pub(crate) const MAX_POSITION: u64 = 1 << 62;
 
 /// Where a sample's bytes are.

@@ -23,8 +23,8 @@ const BLOCK: u64 = 32 << 10;
 /// Of a generation: samples of any length may be pinned.
 const ALL: u64 = 63 << 24;
 
-/// A session whose every word a test may scribble on, with a ring in it.
-struct Scribble {
+/// A session whose every word a test may corrupt, with a ring in it.
+struct HostileSession {
     segment: OwnMapping,
     id: SessionId,
     gid: Gid,
@@ -33,7 +33,7 @@ struct Scribble {
     generation: u64,
 }
 
-impl Scribble {
+impl HostileSession {
     fn new() -> Self {
         let id = SessionId::random();
         let gid = Gid::new(id, 1);
@@ -173,9 +173,9 @@ fn memory_that_is_handed_over_cannot_be_changed_by_its_receiver() {
 #[test]
 fn rings_that_make_no_sense_are_refused() {
     for (byte, value) in [(0, 0), (0, u64::from_ne_bytes(*b"AXONRNG1")), (16, 7)] {
-        let scribble = Scribble::new();
-        scribble.set(RING + byte, value);
-        refusal(scribble.map(0));
+        let hostile = HostileSession::new();
+        hostile.set(RING + byte, value);
+        refusal(hostile.map(0));
     }
     for (segment, offset) in [
         (0, 0),
@@ -185,10 +185,10 @@ fn rings_that_make_no_sense_are_refused() {
         (0, u64::MAX),
         (1, RING),
     ] {
-        refusal(Scribble::new().map_at(Location { segment, offset }, 0, Qos::default()));
+        refusal(HostileSession::new().map_at(Location { segment, offset }, 0, Qos::default()));
     }
-    refusal(Scribble::new().map(u64::MAX));
-    assert!(Scribble::new().map(0).is_ok());
+    refusal(HostileSession::new().map(u64::MAX));
+    assert!(HostileSession::new().map(0).is_ok());
 }
 
 #[test]
@@ -196,13 +196,13 @@ fn grants_that_make_no_sense_are_refused() {
     // With 0 no reader would have the lane, and with the others a reader that still asks.
     // Nor is one for an earlier or later reader with the same lane for this one.
     for generation in [0, 1 << 63, 1 << 63 | 1, u64::MAX, 2, 7 << 24, 7 << 24 | 2] {
-        let mut scribble = Scribble::new();
-        scribble.generation = generation;
-        refusal(scribble.map(0));
+        let mut hostile = HostileSession::new();
+        hostile.generation = generation;
+        refusal(hostile.map(0));
     }
-    let mut scribble = Scribble::new();
-    scribble.generation = 1 << 62 | 1;
-    assert!(scribble.map(0).is_ok());
+    let mut hostile = HostileSession::new();
+    hostile.generation = 1 << 62 | 1;
+    assert!(hostile.map(0).is_ok());
 }
 
 #[test]
@@ -219,9 +219,9 @@ fn segments_of_others_versions_and_machines_are_refused_by_name() {
         (40, layout::SESSION_BYTES - layout::ALIGN, "not as large"),
     ];
     for (byte, value, reason) in cases {
-        let scribble = Scribble::new();
-        scribble.set(byte, value);
-        match scribble.peer() {
+        let hostile = HostileSession::new();
+        hostile.set(byte, value);
+        match hostile.peer() {
             Err(ShmError::Refused { what }) => assert!(what.contains(reason), "{what}"),
             other => panic!("{reason}: {:?}", other.map(|peer| peer.id())),
         }
@@ -274,16 +274,16 @@ fn a_descriptor_that_is_no_pidfd_names_no_process() {
 fn control_words_that_make_no_sense_are_reported_and_stay_so() {
     let huge = u64::MAX;
     for (tail, head) in [(0, huge), (5, 4), (huge, 0), (huge, huge), (0, 1 << 63)] {
-        let scribble = Scribble::new();
-        let mut reader = scribble.map(0).unwrap();
+        let hostile = HostileSession::new();
+        let mut reader = hostile.map(0).unwrap();
         // One that is late looks at them.
-        scribble.descriptor(SLOTS, 1, 0, 0);
-        scribble.set_tail(tail);
-        scribble.set_head(head);
+        hostile.descriptor(SLOTS, 1, 0, 0);
+        hostile.set_tail(tail);
+        hostile.set_head(head);
         let mut out = Vec::new();
         assert!(matches!(reader.take(&mut out), Err(TakeError::Corrupt { .. })));
-        scribble.set_tail(0);
-        scribble.set_head(0);
+        hostile.set_tail(0);
+        hostile.set_head(0);
         assert!(matches!(reader.peek(), Err(TakeError::Corrupt { .. })));
         assert!(!reader.has_data());
     }
@@ -291,10 +291,10 @@ fn control_words_that_make_no_sense_are_reported_and_stay_so() {
 
 #[test]
 fn a_head_that_goes_back_is_reported() {
-    let scribble = Scribble::new();
-    let mut reader = scribble.map(7).unwrap();
-    scribble.descriptor(7 + SLOTS, 1, 0, 0);
-    scribble.set_head(3);
+    let hostile = HostileSession::new();
+    let mut reader = hostile.map(7).unwrap();
+    hostile.descriptor(7 + SLOTS, 1, 0, 0);
+    hostile.set_head(3);
     assert!(matches!(reader.take(&mut Vec::new()), Err(TakeError::Corrupt { .. })));
 }
 
@@ -306,9 +306,9 @@ fn descriptors_in_places_that_make_no_sense_are_reported() {
         words.push((offset / 128) << 6 | 4);
     }
     for word in words {
-        let scribble = Scribble::new();
-        let mut reader = scribble.map(0).unwrap();
-        scribble.set_array(word);
+        let hostile = HostileSession::new();
+        let mut reader = hostile.map(0).unwrap();
+        hostile.set_array(word);
         assert!(reader.has_data(), "so that somebody looks");
         let taken = reader.take(&mut Vec::new());
         let missing = word >> 40 != 0 && (1..=18).contains(&(word & 63));
@@ -320,11 +320,11 @@ fn descriptors_in_places_that_make_no_sense_are_reported() {
         }
     }
     // Of its own accord it is as good elsewhere.
-    let scribble = Scribble::new();
-    let mut reader = scribble.map(0).unwrap();
-    scribble.descriptor(0, 1, 0, 0);
+    let hostile = HostileSession::new();
+    let mut reader = hostile.map(0).unwrap();
+    hostile.descriptor(0, 1, 0, 0);
     for word in [ARRAY >> 7 << 6 | 3, ARRAY >> 7 << 6 | 1] {
-        scribble.set_array(word);
+        hostile.set_array(word);
         assert_eq!(
             reader.peek().unwrap(),
             Some(Meta { sequence: 5, source_timestamp: 6, published: 0 })
@@ -358,31 +358,31 @@ fn samples_in_places_that_make_no_sense_are_reported() {
         (1, 0xff, BLOCK),
     ];
     for (len, place, data) in cases {
-        let scribble = Scribble::new();
-        let mut reader = scribble.map(0).unwrap();
+        let hostile = HostileSession::new();
+        let mut reader = hostile.map(0).unwrap();
         reader.expect(u64::MAX);
-        scribble.descriptor(0, len, place, data);
+        hostile.descriptor(0, len, place, data);
         let taken = reader.take(&mut Vec::new());
         assert!(matches!(taken, Err(TakeError::Corrupt { .. })), "{len} {place} {data}");
         assert!(matches!(reader.take_sample(), Err(TakeError::Corrupt { .. })));
     }
     // The same descriptor with what a publisher writes.
-    let scribble = Scribble::new();
-    let mut reader = scribble.map(0).unwrap();
-    scribble.descriptor(0, 200, 1, end - 256);
+    let hostile = HostileSession::new();
+    let mut reader = hostile.map(0).unwrap();
+    hostile.descriptor(0, 200, 1, end - 256);
     let mut out = Vec::new();
     assert_eq!(reader.take(&mut out).unwrap().unwrap().meta.sequence, 5);
     assert_eq!(out, [0; 200]);
-    scribble.descriptor(1, 5000, 2, end - 5000);
+    hostile.descriptor(1, 5000, 2, end - 5000);
     assert_eq!(reader.take(&mut out).unwrap().unwrap().meta.sequence, 5);
     assert_eq!(out, [0; 5000]);
 }
 
 #[test]
 fn a_segment_that_never_comes_holds_no_reader_for_ever() {
-    let scribble = Scribble::new();
-    let mut reader = scribble.map_as(0, keep_last(2)).unwrap();
-    scribble.descriptor(0, 1, 1 | 77 << 8, BLOCK);
+    let hostile = HostileSession::new();
+    let mut reader = hostile.map_as(0, keep_last(2)).unwrap();
+    hostile.descriptor(0, 1, 1 | 77 << 8, BLOCK);
     assert!(reader.has_data());
     assert_eq!(reader.take(&mut Vec::new()), Ok(None));
     assert_eq!(
@@ -391,7 +391,7 @@ fn a_segment_that_never_comes_holds_no_reader_for_ever() {
     );
     // The samples that are more recent and fill the depth are there.
     for position in 1..3 {
-        scribble.descriptor(position, 1, 0, 0);
+        hostile.descriptor(position, 1, 0, 0);
     }
     assert!(reader.has_data());
     assert_eq!(reader.take(&mut Vec::new()).unwrap().unwrap().position, 1);
@@ -400,11 +400,11 @@ fn a_segment_that_never_comes_holds_no_reader_for_ever() {
 
 #[test]
 fn descriptors_that_never_come_are_given_up_once_the_writer_is_gone() {
-    let scribble = Scribble::new();
-    let mut reader = scribble.map_as(0, keep_last(2)).unwrap();
-    scribble.descriptor(0, 1, 0, 0);
-    scribble.set(RING + 8 * layout::ring::HEAD as u64, 1);
-    scribble.set_array(77 << 40 | ARRAY >> 7 << 6 | 4);
+    let hostile = HostileSession::new();
+    let mut reader = hostile.map_as(0, keep_last(2)).unwrap();
+    hostile.descriptor(0, 1, 0, 0);
+    hostile.set(RING + 8 * layout::ring::HEAD as u64, 1);
+    hostile.set_array(77 << 40 | ARRAY >> 7 << 6 | 4);
     assert_eq!(reader.take(&mut Vec::new()), Ok(None));
     assert_eq!((reader.missing(), reader.is_drained()), (Some(77), false));
     reader.end();
@@ -459,13 +459,13 @@ fn lanes_that_make_no_sense_hold_nobody_for_ever() {
 
 proptest! {
     #[test]
-    fn any_scribbling_ends_in_an_answer(
+    fn any_corruption_ends_in_an_answer(
         writes in proptest::collection::vec((0usize..1024, any::<u64>(), any::<u8>()), 1..40),
         first in 0u64..20,
         depth in 1u32..40,
     ) {
-        let scribble = Scribble::new();
-        let Ok(mut reader) = scribble.map_as(first, keep_last(depth)) else {
+        let hostile = HostileSession::new();
+        let Ok(mut reader) = hostile.map_as(first, keep_last(depth)) else {
             return Err(TestCaseError::fail("an honest header was refused"));
         };
         let mut out = Vec::new();
@@ -473,14 +473,14 @@ proptest! {
             // Small values make plausible heads, tails and lengths.
             let value = value >> (shift % 64);
             match word % 4 {
-                0 => scribble.set_head(value),
-                1 => scribble.set_tail(value),
+                0 => hostile.set_head(value),
+                1 => hostile.set_tail(value),
                 2 => {
                     let place = (value >> 8) as u32 & 0x1ff;
                     let offset = (value % layout::SESSION_BYTES) & !127;
-                    scribble.descriptor(value % 64, value as u32 % 9000, place, offset);
+                    hostile.descriptor(value % 64, value as u32 % 9000, place, offset);
                 }
-                _ => scribble.words()[RING as usize / 8 + word].store(value, Relaxed),
+                _ => hostile.words()[RING as usize / 8 + word].store(value, Relaxed),
             }
             let _ = reader.peek();
             if let Ok(Some(taken)) = reader.take(&mut out) {

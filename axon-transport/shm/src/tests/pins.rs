@@ -441,7 +441,7 @@ fn a_loan_is_a_slice_of_the_ring() {
 }
 
 #[test]
-fn scribbled_pins_keep_six_samples_at_most() {
+fn corrupted_pins_keep_six_samples_at_most() {
     let (a, b) = (session(), session());
     let writer = writer(&a, keep_last(1), 0);
     let reader = attach(&writer, &a, &b, keep_last(1));

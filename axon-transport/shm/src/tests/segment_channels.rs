@@ -117,7 +117,7 @@ fn withdrawn_segments_do_not_fill_an_unread_channel() {
     let mut kept = BTreeSet::new();
     let mut drain = || {
         let mut packets = 0;
-        while let Ok(news) = at_once(&line).take_news() {
+        while let Ok(news) = at_once(&line).take_update() {
             packets += 1;
             match news {
                 SegmentUpdate::Opened(opened, _) => assert!(kept.insert(opened.segment.number)),

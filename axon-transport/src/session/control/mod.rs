@@ -197,7 +197,7 @@ impl Control {
             self.tell_segments();
             self.tell_unmet();
             self.send_rest(deadline);
-            let heard = !self.leaves_news() || self.was_heard(deadline);
+            let heard = !self.leaves_notices() || self.was_heard(deadline);
             if heard || !self.find_next_daemon(deadline) {
                 return;
             }
@@ -205,7 +205,7 @@ impl Control {
     }
 
     /// Whether readers have yet to be sent memory, or told what they lost.
-    fn leaves_news(&self) -> bool {
+    fn leaves_notices(&self) -> bool {
         self.shared.core.segment.has_unread() || !self.shared.state().unmet.is_empty()
     }
 
@@ -235,7 +235,7 @@ impl Control {
     /// Waits for the next daemon, to tell it of the memory that readers have yet to be sent, and of what they lost.
     /// Whether there is one.
     fn find_next_daemon(&mut self, deadline: Instant) -> bool {
-        while matches!(self.link, Link::Reconnecting(_)) && self.leaves_news() {
+        while matches!(self.link, Link::Reconnecting(_)) && self.leaves_notices() {
             let left = deadline.saturating_duration_since(Instant::now());
             if left.is_zero() {
                 return false;

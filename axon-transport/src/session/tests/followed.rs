@@ -6,7 +6,7 @@ use rustix::net::accept_with;
 use super::*;
 use crate::{
     config::{Config, OsFiles},
-    session::{daemon::address::Address, tests::played::Taker},
+    session::{daemon::address::Address, tests::simulated_daemon::Taker},
     session_key::OWNER,
 };
 

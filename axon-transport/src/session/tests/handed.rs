@@ -2,7 +2,7 @@
 
 use rustix::process::{Pid, PidfdFlags, pidfd_open};
 
-use super::{played::Taker, *};
+use super::{simulated_daemon::Taker, *};
 use crate::wire::session::Fence;
 
 /// What the session asks the daemon next, and whether it told of memory before that.

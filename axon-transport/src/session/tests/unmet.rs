@@ -2,7 +2,7 @@
 
 use axon_shm::internal::Lane;
 
-use super::{followed::Stage, played::Taker, *};
+use super::{followed::Stage, simulated_daemon::Taker, *};
 use crate::wire::session::Unmet;
 
 /// What the daemon is told next of unmet pairs, or of the end of `writer`.

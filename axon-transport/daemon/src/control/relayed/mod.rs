@@ -154,7 +154,7 @@ struct Unreached {
 
 impl Unreached {
     /// How many are to be told of, if readers gave up so many in all.
-    fn news(&mut self, given_up: u64) -> u64 {
+    fn given_up_since(&mut self, given_up: u64) -> u64 {
         let all = given_up.saturating_add(self.unwritten);
         all.saturating_sub(std::mem::replace(&mut self.told, all))
     }
@@ -224,7 +224,7 @@ impl RelayedSession {
                 self.match_up()?;
             }
             let leased = self.subscriptions.values().flat_map(Subscription::assertions);
-            for publishers in self.alive.news(self.begun.elapsed(), leased) {
+            for publishers in self.alive.due_assertions(self.begun.elapsed(), leased) {
                 self.pipe.say(&SessionMessage::Asserted(Asserted { publishers }))?;
             }
             self.write()?;
@@ -280,7 +280,7 @@ impl RelayedSession {
             let Some(given_up) = self.writers.get(&writer).and_then(RemoteWriter::given_up) else {
                 continue;
             };
-            let samples = self.unreached.entry(writer).or_default().news(given_up);
+            let samples = self.unreached.entry(writer).or_default().given_up_since(given_up);
             if samples > 0 {
                 // Ahead of the credit by which they count as acknowledged.
                 self.pipe.say(&SessionMessage::GivenUp(RelayGivenUp {

@@ -63,8 +63,8 @@ impl NotifiedEndpoints {
         host: &str,
         routes: &[RefusedRoute],
     ) {
-        let news = self.news(registry, peer, host, routes);
-        for (session, text) in news {
+        let untold = self.take_untold(registry, peer, host, routes);
+        for (session, text) in untold {
             registry.push(
                 &session,
                 &SessionMessage::Refused(SessionRefused::because(text)),
@@ -73,14 +73,14 @@ impl NotifiedEndpoints {
         }
     }
 
-    fn news(
+    fn take_untold(
         &mut self,
         registry: &Sessions,
         peer: &str,
         host: &str,
         routes: &[RefusedRoute],
     ) -> Vec<(SessionId, String)> {
-        let mut news = Vec::new();
+        let mut untold = Vec::new();
         // Other users are shown neither hosts nor rules.
         let is_own = |local: &LocalEndpoint| {
             registry.session(&local.session).is_some_and(|session| session.user.is_none())
@@ -97,9 +97,9 @@ impl NotifiedEndpoints {
                 "endpoint {gid} of topic {:?}: nothing crosses to or from host {host:?}: {}",
                 route.topic, route.reason
             );
-            news.push((local.session, text));
+            untold.push((local.session, text));
         }
-        news
+        untold
     }
 }
 

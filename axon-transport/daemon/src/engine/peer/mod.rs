@@ -447,7 +447,7 @@ impl Peer {
             Source::Relay(_, reader) => reader.assertions(),
             Source::StandIn(_) => Vec::new(),
         });
-        for publishers in self.alive.news(now, asserted) {
+        for publishers in self.alive.due_assertions(now, asserted) {
             self.say(LinkMessage::Asserted(LivelinessAsserted { publishers }));
         }
     }

@@ -117,7 +117,7 @@ fn readers_are_looked_at_in_time_whatever_the_journal_says() {
 }
 
 #[test]
-fn a_journal_that_its_session_scribbles_over_costs_a_look_at_its_rings_alone() {
+fn a_journal_that_its_session_corrupts_costs_a_look_at_its_rings_alone() {
     let (of, other, from) = (session(), session(), session());
     from.follow();
     let all = topics(&of, &from, 1..101, true);

@@ -208,7 +208,9 @@ impl<'a> RelayConnection<'a> {
                 self.update()?;
             }
             let leased = self.relays.values().flat_map(NearRelay::assertions);
-            for publishers in self.alive.news(Duration::from_nanos(clock::monotonic()), leased) {
+            for publishers in
+                self.alive.due_assertions(Duration::from_nanos(clock::monotonic()), leased)
+            {
                 self.pipe.say(&SessionMessage::Asserted(Asserted { publishers }))?;
             }
             let stand_ins = &self.stand_ins;

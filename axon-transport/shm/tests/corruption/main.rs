@@ -8,12 +8,12 @@
 //! neighbour runs under valgrind where that is installed, so that not even a read outside its memory
 //! goes unseen.
 //!
-//! Ten seconds by default; `cargo test --release -p axon-shm --test scribble -- --minutes 10`
+//! Ten seconds by default; `cargo test --release -p axon-shm --test corruption -- --minutes 10`
 //! for longer, `--seed N` for the same choices again. With the address sanitizer, on nightly:
 //!
 //! ```sh
 //! RUSTFLAGS=-Zsanitizer=address cargo +nightly test --target x86_64-unknown-linux-gnu \
-//!     -p axon-shm --test scribble -- --minutes 2
+//!     -p axon-shm --test corruption -- --minutes 2
 //! ```
 //!
 //! Whether anything checks the neighbour is tried first: a process reads beyond its memory, and must
@@ -40,10 +40,10 @@ use std::{
 
 use axon_shm::{Context, Publisher, PublisherOptions, Subscriber, SubscriberOptions, qos::Qos};
 
-/// The environment variables that make a process one of them: what it plays, and where they meet.
-const ROLE: &str = "SCRIBBLE_ROLE";
-const PLACE: &str = "SCRIBBLE_PLACE";
-const SEED: &str = "SCRIBBLE_SEED";
+/// The environment variables that make a process one of them: its role, and where they meet.
+const ROLE: &str = "CORRUPTION_ROLE";
+const PLACE: &str = "CORRUPTION_PLACE";
+const SEED: &str = "CORRUPTION_SEED";
 /// A hostile process that lives for so long stands still.
 const LIFE: Duration = Duration::from_secs(3);
 /// A neighbour that says nothing for so long is hanging.
@@ -64,7 +64,7 @@ fn main() -> ExitCode {
         return ExitCode::SUCCESS;
     }
     if arguments.iter().any(|a| a == "--list") {
-        println!("scribble: test");
+        println!("corruption: test");
         return ExitCode::SUCCESS;
     }
     let value = |name: &str| {
@@ -153,12 +153,12 @@ fn works_under(checker: &[&str], place: &Path) -> bool {
 }
 
 /// Lets one hostile process come after another. How many there were.
-fn scribble(place: &Path, seed: u64, over: &AtomicBool) -> u64 {
+fn corrupt(place: &Path, seed: u64, over: &AtomicBool) -> u64 {
     let mut lives = 0;
     while !over.load(Ordering::Relaxed) {
         let mut hostile = play("hostile", place, seed + lives, &[]);
         lives += 1;
-        // One that scribbles over what it uses itself may well crash, or stand still.
+        // One that overwrites what it uses itself may well crash, or stand still.
         let start = Instant::now();
         while hostile.0.try_wait().expect("a child").is_none() && start.elapsed() < LIFE {
             thread::sleep(Duration::from_millis(5));
@@ -187,7 +187,7 @@ fn conduct(time: Duration, seed: u64, plain: bool) {
     let (over, mut last) = (AtomicBool::new(false), String::new());
     let reported = |line: &str| numbers(line).last().copied().unwrap_or(0);
     let lives = thread::scope(|scope| {
-        let hostile = scope.spawn(|| scribble(place.path(), seed, &over));
+        let hostile = scope.spawn(|| corrupt(place.path(), seed, &over));
         // It says once a second how it is. At its end the honest one's samples must still come. On
         // a busy machine it may take longer until the two have met at all.
         let enough = || start.elapsed() >= time;
@@ -215,7 +215,7 @@ fn conduct(time: Duration, seed: u64, plain: bool) {
         (_, false) => "unchecked",
     };
     let seconds = start.elapsed().as_secs_f64();
-    println!("scribble: seed {seed}, {seconds:.0} s, {lives} hostile processes, {how}: {last}");
+    println!("corruption: seed {seed}, {seconds:.0} s, {lives} hostile processes, {how}: {last}");
     let numbers = numbers(&last);
     let [honest, .., reported] = numbers[..] else { panic!("{last}") };
     assert!(honest > 0, "the honest one was not heard");

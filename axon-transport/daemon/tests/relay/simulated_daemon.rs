@@ -7,8 +7,8 @@ use axon_transport::{
 
 use super::{hostile::hear, *};
 
-/// A relayed session, and the connection to its daemon, which is played.
-fn played(host: &Host) -> (Session, OwnedFd) {
+/// A relayed session, and the connection to its daemon, which is simulated.
+fn simulated(host: &Host) -> (Session, OwnedFd) {
     let (listeners, lock) = Address::of(&host.config()).bind().unwrap().into_parts();
     let session = thread::scope(|scope| {
         let session = scope.spawn(|| session(host, "session", false));
@@ -76,7 +76,7 @@ fn matched(socket: &OwnedFd, gid: Gid, others: &[Gid]) {
 #[test]
 fn who_is_gone_and_back_at_once_is_received_from_anew() {
     let host = host();
-    let (session, socket) = played(&host);
+    let (session, socket) = simulated(&host);
     let subscription = session.create_subscription(spec("/t", Qos::default())).unwrap();
     announced(&socket, subscription.gid());
     let outside = show(&socket, subscription.endpoint(), EndpointKind::Publisher);
@@ -104,7 +104,7 @@ fn settle(session: &Session, socket: &OwnedFd) {
 #[test]
 fn whom_the_daemon_names_for_another_publisher_is_not_counted() {
     let host = host();
-    let (session, socket) = played(&host);
+    let (session, socket) = simulated(&host);
     let publisher = |qos| {
         let own = session.create_publisher(spec("/t", qos)).unwrap();
         announced(&socket, own.gid());
@@ -134,7 +134,7 @@ fn whom_the_daemon_names_for_another_publisher_is_not_counted() {
 fn a_sample_is_acknowledged_once_the_daemon_has_it() {
     let soon = Duration::from_millis(20);
     let host = host();
-    let (session, socket) = played(&host);
+    let (session, socket) = simulated(&host);
     for qos in [Qos::default(), Qos::keep_all(), best_effort(10), latched(10)] {
         let publisher = session.create_publisher(spec("/t", qos)).unwrap();
         announced(&socket, publisher.gid());
@@ -159,7 +159,7 @@ fn a_sample_is_acknowledged_once_the_daemon_has_it() {
 #[test]
 fn samples_that_the_daemon_gave_up_are_not_acknowledged() {
     let host = host();
-    let (session, socket) = played(&host);
+    let (session, socket) = simulated(&host);
     for qos in [Qos::default(), Qos::keep_all(), best_effort(10), latched(10)] {
         let publisher = session.create_publisher(spec("/t", qos)).unwrap();
         let gid = publisher.gid();
@@ -189,7 +189,7 @@ fn samples_that_the_daemon_gave_up_are_not_acknowledged() {
 #[test]
 fn a_session_ends_though_nobody_takes_what_it_left() {
     let host = host();
-    let (session, socket) = played(&host);
+    let (session, socket) = simulated(&host);
     let publisher = session.create_publisher(spec("/t", Qos::keep_all())).unwrap();
     announced(&socket, publisher.gid());
     let outside = show(&socket, publisher.endpoint(), EndpointKind::Subscription);
@@ -205,7 +205,7 @@ fn a_session_ends_though_nobody_takes_what_it_left() {
 #[test]
 fn the_ends_of_a_service_that_are_gone_and_back_at_once_begin_anew() {
     let host = host();
-    let (session, socket) = played(&host);
+    let (session, socket) = simulated(&host);
     let own = session.create_server(services::service()).unwrap();
     announced(&socket, own.gid());
     let outside = show(&socket, own.endpoint(), EndpointKind::Client);
@@ -230,7 +230,7 @@ fn the_ends_of_a_service_that_are_gone_and_back_at_once_begin_anew() {
 #[test]
 fn a_request_is_sent_once_however_many_servers_it_is_for() {
     let host = host();
-    let (session, socket) = played(&host);
+    let (session, socket) = simulated(&host);
     let own = session.create_client(services::service()).unwrap();
     announced(&socket, own.gid());
     let one = show(&socket, own.endpoint(), EndpointKind::Server);
@@ -269,7 +269,7 @@ fn a_request_is_sent_once_however_many_servers_it_is_for() {
 #[test]
 fn what_waits_for_one_server_goes_before_what_another_has_too() {
     let host = host();
-    let (session, socket) = played(&host);
+    let (session, socket) = simulated(&host);
     let own = session.create_client(services::service()).unwrap();
     announced(&socket, own.gid());
     let [early, late] = [7, 3].map(|number| Gid::new(SessionId([9; 16]), number));
@@ -293,7 +293,7 @@ fn what_waits_for_one_server_goes_before_what_another_has_too() {
 #[test]
 fn a_channel_goes_on_when_one_of_its_readers_ends_and_another_is_matched() {
     let host = host();
-    let (session, socket) = played(&host);
+    let (session, socket) = simulated(&host);
     let [one, other] = [(); 2].map(|()| {
         let own = session.create_subscription(spec("/t", Qos::keep_all())).unwrap();
         announced(&socket, own.gid());

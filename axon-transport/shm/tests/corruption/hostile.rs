@@ -20,7 +20,7 @@ use crate::meeting::meet;
 /// How long two try to come together, and stay so.
 const ROUND: Duration = Duration::from_millis(250);
 
-/// One life: shares memory, scribbles over it, and ends without a word.
+/// One life: shares memory, overwrites it, and ends without a word.
 pub(crate) fn run(place: &Path, seed: u64) {
     let random = AtomicU64::new(seed);
     let context = Context::new().expect("memory");
@@ -33,12 +33,12 @@ pub(crate) fn run(place: &Path, seed: u64) {
         thread::sleep(Duration::from_millis(next(&random) % 100));
         let start = Instant::now();
         while start.elapsed() < ROUND {
-            scribble(&random);
+            corrupt(&random);
         }
         // So that an attached process has something to notice, whatever chance did.
         deface();
         thread::sleep(Duration::from_millis(20));
-        // The others may wait for ever for what they have scribbled over.
+        // The others may wait for ever for what they have overwritten.
         std::process::exit(0);
     });
 }
@@ -114,13 +114,13 @@ fn deface() {
 
 fn word(at: usize) -> &'static AtomicU64 {
     // SAFETY: `at` is aligned, and inside a writable map of this process, which stands while its
-    // context and publisher do: for as long as anybody scribbles. It may be written by others of its
+    // context and publisher do: for as long as another process corrupts it. It may be written by others of its
     // threads, atomically. That what it breaks is its own is the point of this process.
     unsafe { &*std::ptr::with_exposed_provenance::<AtomicU64>(at) }
 }
 
 /// Writes here and there for some milliseconds.
-fn scribble(random: &AtomicU64) {
+fn corrupt(random: &AtomicU64) {
     let extents = shared();
     if extents.is_empty() {
         return;
