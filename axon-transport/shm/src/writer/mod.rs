@@ -73,7 +73,7 @@ const DESCRIPTORS_KEEP_ALL: u64 = 1 << 13;
 /// use axon_shm::{
 ///     Meta,
 ///     ids::{Gid, SessionId},
-///     internal::{Peer, Reader, ReaderInfo, ReaderOptions, RingOptions, SessionSegment, Writer},
+///     internal::{RingPeer, Reader, ReaderInfo, ReaderOptions, RingOptions, SessionSegment, Writer},
 ///     qos::Qos,
 /// };
 ///
@@ -90,7 +90,7 @@ const DESCRIPTORS_KEEP_ALL: u64 = 1 << 13;
 /// let writer = Writer::create(session.clone(), options)?;
 ///
 /// let lane = session.allocate_lane()?;
-/// let peer = Peer::Local(session.clone());
+/// let peer = RingPeer::Local(session.clone());
 /// let grant = writer.attach(ReaderInfo {
 ///     gid: reader_gid,
 ///     lane: lane.location(),
