@@ -385,7 +385,7 @@ pub struct LinkConfig {
     pub graph: usize,
     /// Memory for the samples and calls of one peer that are kept here for readers and servers, in bytes.
     pub held: u64,
-    /// What the daemon does between two inputs.
+    /// How long the reactor looks for input before it sleeps.
     pub poll: LinkPoll,
     /// Where QUIC's events are written, in the format qlog.
     pub qlog: Option<PathBuf>,

@@ -137,7 +137,7 @@ fn is_wanted(severity: u32) -> bool {
     severity >= LEAST.load(Ordering::Relaxed)
 }
 
-/// Something that was said.
+/// One log line.
 struct LogLine {
     severity: u32,
     part: &'static str,

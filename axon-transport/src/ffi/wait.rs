@@ -191,7 +191,7 @@ fn limit(nanoseconds: i64) -> Option<Duration> {
     u64::try_from(nanoseconds).ok().map(Duration::from_nanos)
 }
 
-/// A timeout where there must be one: for ever is some hundred years.
+/// Converts a timeout. A negative one, which means for ever, becomes some hundred years.
 pub(super) fn duration(nanoseconds: i64) -> Duration {
     limit(nanoseconds).unwrap_or(Duration::from_nanos(i64::MAX as u64))
 }

@@ -178,8 +178,7 @@ impl Endpoints {
         members.map(|all| all.pairs_of(&endpoint.gid, endpoint.kind)).unwrap_or_default()
     }
 
-    /// A number that stands for the endpoints of applications here: another one, most likely, when
-    /// they change.
+    /// A hash of the applications' endpoints. It differs, most likely, when they change.
     pub(super) fn digest(&self) -> u64 {
         self.shown().fold(0, |digest, local| {
             // GIDs are mostly random; FNV-1a spreads the rest.

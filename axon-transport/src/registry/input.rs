@@ -278,8 +278,8 @@ impl<F: Clone> Registry<F> {
         }
     }
 
-    /// An endpoint has ended, or has not after all, and there is more to come of it: its pairs stand,
-    /// but nobody counts it, and nobody new is matched with it.
+    /// Handles LEAVING. An endpoint that leaves keeps its pairs until its samples have arrived. It does not count as matched,
+    /// and is matched with no further endpoint. LEAVING can also take that back.
     fn leave(&mut self, id: &SessionId, leave: WriterLeaving) -> Result<(), Violation> {
         let WriterLeaving { gid, leaving } = leave;
         // It may have been refused.

@@ -143,7 +143,11 @@ pub(super) async fn serve(
 ) {
     let Ok(peer) = peer_process(&socket) else { return };
     if !control.borrow().admission.trusts(peer.uid) {
-        tracing::warn!(uid = peer.uid, pid = peer.pid, "a stranger's connection was closed");
+        tracing::warn!(
+            uid = peer.uid,
+            pid = peer.pid,
+            "closed the connection of a user who is not in AXON_TRUSTED_UIDS"
+        );
         return;
     }
     let Ok(socket) = watch(socket.trusted()) else { return };

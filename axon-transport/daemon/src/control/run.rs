@@ -262,7 +262,7 @@ fn start(config: Config, _options: &DaemonOptions) -> Result<Started, DaemonErro
 /// Keys live in this process: no core file, no debugger of the same user. And a robot has many
 /// sessions with four descriptors each.
 fn harden() {
-    let refused = |what, error: rustix::io::Errno| tracing::warn!(what, %error, "not hardened");
+    let refused = |what, error: rustix::io::Errno| tracing::warn!(what, %error, "could not harden the process");
     if let Err(error) = set_dumpable_behavior(DumpableBehavior::NotDumpable) {
         refused("PR_SET_DUMPABLE", error);
     }
@@ -328,8 +328,8 @@ async fn serve(
             tracing::info!("{signal}: flushing samples queued for other hosts before exit");
             tokio::select! {
                 () = remote.finish(&control) => {}
-                _ = terminate.recv() => tracing::info!("SIGTERM once more"),
-                _ = interrupt.recv() => tracing::info!("SIGINT once more"),
+                _ = terminate.recv() => tracing::info!("second SIGTERM: the daemon ends now"),
+                _ = interrupt.recv() => tracing::info!("second SIGINT: the daemon ends now"),
             }
         }
         None => tracing::info!("no session needs the daemon any more"),

@@ -63,14 +63,14 @@ impl Counters {
         self.compressed.set(compressed);
     }
 
-    /// `count` samples were dropped for `cause`.
+    /// Counts samples of the link that were dropped for `cause`.
     pub(crate) fn dropped(&self, cause: &'static str, count: u64) {
         if count > 0 {
             *self.dropped.borrow_mut().entry(cause).or_default() += count;
         }
     }
 
-    /// As [`dropped`](Self::dropped), of a topic, for [`take_lost`](Self::take_lost).
+    /// Counts as [`dropped`](Self::dropped) does, and for the topic as well, which [`take_lost`](Self::take_lost) reports.
     pub(crate) fn lost(&self, topic: &Arc<str>, cause: &'static str, count: u64) {
         if count == 0 {
             return;

@@ -111,7 +111,7 @@ pub(crate) enum NoStandIn {
     Failed(String),
 }
 
-/// A stand-in that there is, or was.
+/// A stand-in, or what is left of one that was dropped.
 #[derive(Debug)]
 struct Known {
     stand_in: Weak<StandIn>,

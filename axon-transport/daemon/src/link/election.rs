@@ -18,7 +18,7 @@ pub struct Candidate {
 /// A successor always does: it was dialled on purpose. Otherwise the lower id's own dial stays,
 /// and of two dials by the same side the newer one, since a daemon dials again only when it gave
 /// the first one up.
-pub fn keep(ours: DaemonId, peer: DaemonId, current: Candidate, new: Candidate) -> bool {
+pub fn new_wins(ours: DaemonId, peer: DaemonId, current: Candidate, new: Candidate) -> bool {
     let dialled_by_lower = |c: Candidate| (c.side == Side::Client) == (ours < peer);
     new.successor
         || current.side == new.side
@@ -39,23 +39,23 @@ mod tests {
     #[test]
     fn both_ends_keep_the_dial_of_the_lower_id() {
         // At the lower id its own dial is the client's end, at the higher one the server's.
-        assert!(keep(LOW, HIGH, plain(Side::Server), plain(Side::Client)));
-        assert!(!keep(LOW, HIGH, plain(Side::Client), plain(Side::Server)));
-        assert!(keep(HIGH, LOW, plain(Side::Client), plain(Side::Server)));
-        assert!(!keep(HIGH, LOW, plain(Side::Server), plain(Side::Client)));
+        assert!(new_wins(LOW, HIGH, plain(Side::Server), plain(Side::Client)));
+        assert!(!new_wins(LOW, HIGH, plain(Side::Client), plain(Side::Server)));
+        assert!(new_wins(HIGH, LOW, plain(Side::Client), plain(Side::Server)));
+        assert!(!new_wins(HIGH, LOW, plain(Side::Server), plain(Side::Client)));
     }
 
     #[test]
     fn a_successor_replaces_a_link_whichever_side_dialled() {
         for side in [Side::Client, Side::Server] {
             let new = Candidate { side, successor: true };
-            assert!(keep(LOW, HIGH, plain(Side::Client), new));
-            assert!(keep(HIGH, LOW, plain(Side::Server), new));
+            assert!(new_wins(LOW, HIGH, plain(Side::Client), new));
+            assert!(new_wins(HIGH, LOW, plain(Side::Server), new));
         }
     }
 
     #[test]
     fn the_newer_of_two_dials_by_one_side_stays() {
-        assert!(keep(LOW, HIGH, plain(Side::Server), plain(Side::Server)));
+        assert!(new_wins(LOW, HIGH, plain(Side::Server), plain(Side::Server)));
     }
 }

@@ -15,7 +15,7 @@ pub use crate::wire::link::{
     Owners, ReceivedOf, ReceivedUpTo, RouteReady, RouteRefused, RouteSubscriber, RouteUnasked,
     Subscribe, Unsubscribe, UseDecision, read_length, unpacked_length,
 };
-pub use election::{Candidate, keep};
+pub use election::{Candidate, new_wins};
 pub use hello::{PROTOCOL, TermMismatch, check};
 pub use order::{Order, OutOfOrder, Side};
 

@@ -15,7 +15,7 @@ const MODEST: u64 = 1 << 20;
 pub(crate) struct Retention {
     /// Whether there was a large sample since the last look.
     used: bool,
-    /// When there was one last, as far as the looks tell.
+    /// The last look that found one.
     last: Instant,
     /// The most bytes in use since `since`.
     peak: u64,

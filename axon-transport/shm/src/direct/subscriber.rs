@@ -25,7 +25,7 @@ use crate::{
 
 /// No sleep is longer: what a publisher stored last and did not live to ring for is found then.
 const LONGEST_SLEEP: Duration = Duration::from_secs(1);
-/// More than can stand in a line, unless its other end fills it all the time.
+/// Updates that one look reads at most. A socket holds fewer, unless the other end fills it all the time.
 const NEWS: u32 = 64;
 
 /// What a [`Subscriber`] asks for.

@@ -21,8 +21,8 @@ const OF_PROCESS: Amount = Amount { maps: 1 << 10, bytes: 4 << 40 };
 /// address space of 47 bits.
 const OF_ALL: Amount = Amount { maps: 16 << 10, bytes: 32 << 40 };
 
-/// The same in an address space of `space` bytes, of which all get half at most, and one process a
-/// quarter of that: 39 bits, as on some small machines, are 512 GiB.
+/// The bounds for all processes and for one, in an address space of `space` bytes. All get half of it at most, and one
+/// process a quarter of that. Some small machines have 39 bits, which are 512 GiB.
 fn bounds(space: u64) -> (Amount, Amount) {
     let all = OF_ALL.bytes.min(space / 2);
     let process = OF_PROCESS.bytes.min(all / 4);

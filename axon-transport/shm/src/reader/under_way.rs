@@ -81,8 +81,8 @@ impl Reader {
         described.saturating_add(lengths.sum::<u64>().saturating_mul(every))
     }
 
-    /// How many publishes found no room since KEEP_ALL readers were not done with the oldest sample that stands, if this
-    /// reader is not. Another process wrote the number: any value is possible.
+    /// How many publishes found no room because KEEP_ALL readers were not done with the oldest sample. `None` where this
+    /// reader is done with it. Another process wrote the number, so any value is possible.
     pub fn refused(&self) -> Option<u64> {
         if self.attachment.lane.is_forked() {
             return None;

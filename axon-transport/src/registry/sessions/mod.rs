@@ -433,7 +433,9 @@ impl<F: Clone> Sessions<F> {
             if descriptors.len() == MAX_DESCRIPTORS {
                 break;
             }
-            if let Some(RegisteredSegment { segment, descriptor }) = self.lacking(to, of, number) {
+            if let Some(RegisteredSegment { segment, descriptor }) =
+                self.take_if_missing(to, of, number)
+            {
                 handed.push(segment);
                 descriptors.push(descriptor);
             }
@@ -441,7 +443,7 @@ impl<F: Clone> Sessions<F> {
         handed
     }
 
-    /// Hands over those that did not go into the packet.
+    /// Hands over the segments that the packet had no room for.
     pub(super) fn hand_over_rest(&mut self, to: &SessionId, of: &SessionId, writer: &Gid) {
         for number in self.segments_for(of, writer) {
             self.hand(to, of, number);
@@ -449,14 +451,16 @@ impl<F: Clone> Sessions<F> {
     }
 
     fn hand(&mut self, to: &SessionId, of: &SessionId, number: u32) {
-        if let Some(RegisteredSegment { segment, descriptor }) = self.lacking(to, of, number) {
+        if let Some(RegisteredSegment { segment, descriptor }) =
+            self.take_if_missing(to, of, number)
+        {
             let opened = SegmentOpened { session: *of, segment };
             self.push(to, &SessionMessage::Segment(opened), vec![descriptor]);
         }
     }
 
-    /// A segment of `of` that `to` was not handed, and now is.
-    fn lacking(
+    /// Marks a segment of `of` as handed to `to`, and returns it. `None`: `to` has it.
+    fn take_if_missing(
         &mut self,
         to: &SessionId,
         of: &SessionId,

@@ -16,7 +16,7 @@ use crate::session::{
     error::SessionError,
 };
 
-/// A search that is under way. It ends with this.
+/// A search that is under way. Dropping this ends it.
 pub(super) struct Search {
     found: Receiver<Connected>,
     over: Arc<AtomicBool>,

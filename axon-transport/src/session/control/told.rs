@@ -84,7 +84,7 @@ impl ToldSegments {
         self.untold.insert(number)
     }
 
-    /// One is given up.
+    /// Forgets a segment that this session gave up.
     pub(super) fn remove(&mut self, number: u32) {
         self.told.remove(&number);
         self.untold.remove(&number);

@@ -39,7 +39,7 @@ pub const SHM: &str = "AXON_SHM";
 pub(crate) struct Connected {
     pub(crate) socket: OwnedFd,
     pub(crate) welcome: Welcome,
-    /// What came with it.
+    /// The descriptors that came with WELCOME.
     descriptors: Vec<PassedFd>,
 }
 

@@ -107,9 +107,9 @@ impl Session {
         GuardCondition::new(self.core())
     }
 
-    /// As [`create_relay`](Self::create_relay), of one publisher alone. Where the publisher `waits` for
-    /// it, what it takes is acknowledged when it [says so](Subscription::acknowledge_of), whether or not
-    /// it stands for a remote subscription.
+    /// Creates a relay as [`create_relay`](Self::create_relay) does, for one publisher. A publisher that `waits` keeps a
+    /// sample until the relay [acknowledges](Subscription::acknowledge_of) it. That holds even where the relay stands for
+    /// no remote subscription.
     pub(crate) fn create_relay_of(
         &self,
         publisher: Gid,

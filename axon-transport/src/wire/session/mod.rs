@@ -345,7 +345,7 @@ pub struct SampleFragment {
     /// Its publisher, client or server.
     #[n(0)]
     pub publisher: Gid,
-    /// In the first part.
+    /// Present in the first fragment alone.
     #[n(1)]
     pub head: Option<SampleHeader>,
     /// The bytes that follow those of the part before.

@@ -117,7 +117,9 @@ fn source(refusal: &RefusalStatus) -> Option<IpAddr> {
 /// Logs a refusal. Each kind has its own line: the log's rate limit is by line of code.
 pub(super) fn warn(kind: RefusalKind, peer: &str, what: &str, reason: &str) {
     match kind {
-        RefusalKind::Beacon => tracing::warn!(peer, what, reason, "refused by its beacon"),
+        RefusalKind::Beacon => {
+            tracing::warn!(peer, what, reason, "ignored a peer whose beacon does not match")
+        }
         RefusalKind::Unproven => {
             tracing::warn!(peer, what, reason, "link refused: the peer has not proved who it is");
         }

@@ -93,7 +93,7 @@ impl DaemonRelay {
             Err(Errno::SRCH) => return Err(End::Gone),
             // It is served as long as somebody holds the connection.
             Err(error) => {
-                tracing::debug!(session = %id, %error, "the end of its process will not be seen");
+                tracing::debug!(session = %id, %error, "no pidfd of the session's process: its end shows when the socket closes");
                 None
             }
         };

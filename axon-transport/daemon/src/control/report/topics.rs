@@ -250,7 +250,7 @@ fn summed_up(mut topic: TopicStatus) -> TopicStatus {
     topic
 }
 
-/// Whatever another process says that it counted.
+/// Adds a count of another process, which may be any number.
 fn add(sum: &mut u64, count: u64) {
     *sum = sum.saturating_add(count);
 }

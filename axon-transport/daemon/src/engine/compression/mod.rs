@@ -59,7 +59,7 @@ pub(crate) struct CompressionAnswer {
     pub(crate) number: u64,
     /// One zstd frame, or nothing where that would save too little.
     pub(crate) compressed: Option<Bytes>,
-    /// What the thread took for it.
+    /// How long the compression took.
     pub(crate) took: Duration,
 }
 

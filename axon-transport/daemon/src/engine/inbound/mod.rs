@@ -125,7 +125,7 @@ pub(crate) struct Inbound {
     full_retry: Option<Duration>,
     /// The link whose peer was found to have more long messages in flight than it may.
     exceeded: Option<u64>,
-    /// What the memory for messages had given back when it was looked at last.
+    /// Bytes that the memory for messages had released at the last look.
     released: usize,
     receipts: Receipts,
     /// The stand-in whose subscriptions were not woken for what was written.

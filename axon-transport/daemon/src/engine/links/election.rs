@@ -27,7 +27,7 @@ use crate::{
         quic::transport::{LINK_WINDOW, STREAMS_OPEN, window_credit},
         refusal::Refusal,
     },
-    link::{Candidate, CloseCode, Elected, Intake, LinkHello, LinkMessage, Side, keep},
+    link::{Candidate, CloseCode, Elected, Intake, LinkHello, LinkMessage, Side, new_wins},
 };
 
 /// The peer elects one of its connections within this time.
@@ -106,7 +106,7 @@ impl Links {
         let successor = replaced || current.is_some_and(|peer| peer.silence.is_gone());
         let candidate = Candidate { side, successor };
         let we_elect = ours < daemon;
-        if we_elect && current.is_some_and(|c| !keep(ours, daemon, c.candidate, candidate)) {
+        if we_elect && current.is_some_and(|c| !new_wins(ours, daemon, c.candidate, candidate)) {
             self.table.remove(number);
             // The dial did not fail: the peer is linked.
             self.dials.opened(number);
@@ -225,7 +225,7 @@ impl Links {
         }
         self.widen(number);
         if superseded {
-            tracing::debug!(peer = %daemon, "superseded before its election was heard of");
+            tracing::debug!(peer = %daemon, "a newer link was elected before this one's ELECTED arrived");
             if let Some(peer) = self.table.peer_mut(number) {
                 // Nothing is sent over it: its keys are not needed.
                 peer.sealing = None;

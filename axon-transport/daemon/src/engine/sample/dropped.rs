@@ -20,7 +20,7 @@ struct Run {
 pub(crate) enum EarlierFate {
     /// It was dropped, as far as is known.
     Dropped,
-    /// It was dealt with, and is not told as dropped.
+    /// It was handled, and is not reported as dropped.
     Passed,
     /// It did not come, or was delivered.
     Unknown,

@@ -137,7 +137,7 @@ struct Cached {
 }
 
 impl Drop for Cached {
-    /// A handshake that looked it up keeps the PSK.
+    /// Erases the PSK explicitly: a handshake that looked it up shares it.
     fn drop(&mut self) {
         self.psk.erase();
     }

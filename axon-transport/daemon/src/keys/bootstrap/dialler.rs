@@ -122,7 +122,7 @@ struct UnspentKey {
 }
 
 impl Drop for UnspentKey {
-    /// Attempts and connections keep their configuration, and with it the PSK.
+    /// Erases the PSK explicitly: attempts and connections share it with their configuration.
     fn drop(&mut self) {
         self.psk.erase();
     }

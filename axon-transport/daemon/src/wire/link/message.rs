@@ -416,13 +416,13 @@ pub enum LinkMessage {
     Owners(Owners),
     /// A silent link that this one succeeds is closed.
     LinkClosed(LinkClosed),
-    /// This is how much I take in.
+    /// How much the sender takes in at a time.
     Intake(Intake),
-    /// These are things that you may not do here.
+    /// Uses that the sender's access rules deny to the receiver.
     Denied(DeniedUses),
-    /// May I do this at your host?
+    /// Asks whether the receiver's access rules allow uses.
     AccessCheck(LinkAccessCheck),
-    /// These rules decide.
+    /// Answers ACCESS_CHECK.
     AccessDecisions(AccessDecisions),
     /// About keys.
     Keys(KeyMessage),

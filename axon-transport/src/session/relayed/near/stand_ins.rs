@@ -256,7 +256,10 @@ impl RelayConnection<'_> {
             }
             if now.len() < there.len() {
                 let topic = &server.topic;
-                tracing::error!(topic, "it has more clients than a relayed session may answer");
+                tracing::error!(
+                    topic,
+                    "a service has more clients than a relayed session may answer: the others get no response"
+                );
             }
             let more = now.len().cast_signed() - before.map_or(0, BTreeSet::len).cast_signed();
             changes.push((more, server.gid, now));

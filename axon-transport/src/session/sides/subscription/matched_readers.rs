@@ -54,7 +54,7 @@ impl MatchedReaders {
         Self { keeps_all, ..Self::default() }
     }
 
-    /// Those of a client or server.
+    /// The readers of a client or server.
     pub(super) fn of_service() -> Self {
         Self { of_service: true, ..Self::default() }
     }

@@ -169,7 +169,7 @@ impl<'a> Take<'a> {
             // It stands, and may be taken when there is memory again.
             Err(error @ TakeError::NoMemory { .. }) => {
                 if readers.slots.note_short(index) {
-                    tracing::error!(topic, %error, "a sample is not taken yet");
+                    tracing::error!(topic, %error, "cannot take a sample yet");
                 }
                 return None;
             }
@@ -228,7 +228,7 @@ impl<'a> Take<'a> {
                 taken
             }
             Err(error @ (TakeError::TooLarge { .. } | TakeError::NoMemory { .. })) => {
-                tracing::error!(topic, %error, "a sample is not taken");
+                tracing::error!(topic, %error, "cannot take a sample");
                 None
             }
             Err(error) => {

@@ -159,7 +159,7 @@ impl FlowTable {
         })
     }
 
-    /// The flows of a route that have KEEP_ALL relays keep samples, by publisher, and how far QUIC took these.
+    /// The flows of a route whose samples KEEP_ALL relays keep, by publisher, with how far QUIC took the samples.
     pub(super) fn kept_flows(&self, number: u32) -> Vec<(Gid, BusyFlow, SentProgress)> {
         let Some(served) = self.routes.get(number) else { return Vec::new() };
         let flows = served.flows.iter().filter_map(|(of, id)| {
