@@ -93,7 +93,7 @@ impl<F: Clone> Registry<F> {
 
     fn disconnect_in_parts(&mut self, id: &SessionId, lives: bool) -> bool {
         self.sessions.fall_behind(id);
-        self.sessions.hand_over_pledges(id, lives);
+        self.sessions.hand_over_earlier_grants(id, lives);
         let mut pairs = 0;
         while let Some(entry) = self.sessions.get_mut(id) {
             let before = self.pairs.len();
@@ -253,7 +253,7 @@ impl<F: Clone> Registry<F> {
 
     fn gone(&mut self, id: &SessionId, gid: Gid) -> Result<(), Violation> {
         if gid.is_of(id) {
-            self.sessions.forget_pledges(&gid);
+            self.sessions.forget_earlier_grants(&gid);
         }
         if let Some(entry) = self.sessions.get_mut(id) {
             entry.refused_endpoints.remove(&gid);
@@ -373,9 +373,9 @@ impl<F: Clone> Registry<F> {
         let grant = Granted { session: *id, segments: Vec::new(), ..grant };
         if self.pairs.attach_of(&pair).is_none() && grant.writer.is_of(id) {
             // The reader has not come back from an earlier daemon.
-            self.sessions.pledge(id, grant);
+            self.sessions.add_earlier_grant(id, grant);
         } else if self.pairs.grant(grant) {
-            self.sessions.forget_pledge(&pair);
+            self.sessions.forget_earlier_grant(&pair);
             self.forward_grant(&pair);
         }
         Ok(())

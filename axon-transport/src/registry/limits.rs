@@ -27,7 +27,7 @@ pub(super) const MAX_TOMBSTONES: usize = 4096;
 /// here.
 pub(super) const MAX_UNMET: usize = if cfg!(test) { 4 } else { 4096 };
 /// Remembered grants of an earlier daemon's time to readers that are not here.
-pub(super) const MAX_PLEDGES: usize = 256;
+pub(super) const MAX_EARLIER_GRANTS: usize = 256;
 /// Grants of publishers that were killed, with their rings, kept for readers whose sessions are not here.
 pub(super) const MAX_LEFT: usize = if cfg!(test) { 2 } else { 16 };
 

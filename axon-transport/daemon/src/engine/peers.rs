@@ -121,14 +121,14 @@ impl LinkedPeers {
         act: impl FnOnce(&mut Peer, &PeerContext<'_>) -> T,
     ) -> Option<T> {
         let Self { all, config, rings, stand_ins, stalls, kept, local, writers, .. } = self;
-        let with = surroundings(config, &**rings, stand_ins, (stalls, kept), (local, writers));
+        let with = peer_context(config, &**rings, stand_ins, (stalls, kept), (local, writers));
         all.get_mut(&daemon).map(|peer| act(peer, &with))
     }
 
     /// Has each peer act with what all peers use.
     pub(super) fn with_each(&mut self, mut each: impl FnMut(&mut Peer, &PeerContext<'_>)) {
         let Self { all, config, rings, stand_ins, stalls, kept, local, writers, .. } = self;
-        let with = surroundings(config, &**rings, stand_ins, (stalls, kept), (local, writers));
+        let with = peer_context(config, &**rings, stand_ins, (stalls, kept), (local, writers));
         all.values_mut().for_each(|peer| each(peer, &with));
     }
 
@@ -214,7 +214,7 @@ impl LinkedPeers {
     }
 }
 
-fn surroundings<'a>(
+fn peer_context<'a>(
     config: &'a Config,
     rings: &'a dyn Rings,
     stand_ins: &'a StandIns,

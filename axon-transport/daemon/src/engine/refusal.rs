@@ -141,7 +141,7 @@ fn meaning(alert: u8) -> Option<&'static str> {
         42 | 43 | 46 | 48 => "the key or certificate is not trusted by the side that refuses",
         44 => "the certificate was revoked",
         45 => "the certificate has expired, or a clock is wrong",
-        49 => "somebody looked at this host's key, as `axon trust scan` does, and left",
+        49 => "a client read this host's key, as `axon trust scan` does, and closed the connection",
         116 => "the dialler showed no key or certificate",
         51 => "the PSK binder does not fit: the two sides hold different keys",
         109 => "no PSK was offered to a daemon in qkd: AXON_SECURITY_MODE differs",

@@ -1,47 +1,29 @@
-//! The clock that all key state machines share.
+//! The time of the keys that a TLS handshake asks for.
 
 use std::{
     sync::{
         Arc,
         atomic::{AtomicU64, Ordering},
     },
-    time::{Duration, Instant},
+    time::Duration,
 };
 
-/// Monotonic time since it was made. Clones show the same time.
-#[derive(Clone, Debug)]
-pub struct Clock(ClockSource);
-
-#[derive(Clone, Debug)]
-enum ClockSource {
-    Monotonic(Instant),
+/// The engine's time, for the acceptor's keys: TLS looks them up in the middle of a handshake and passes no time. The
+/// engine sets it before it handles a datagram. Clones share it.
+#[derive(Clone, Debug, Default)]
+pub struct Clock(
     /// Nanoseconds.
-    Manual(Arc<AtomicU64>),
-}
+    Arc<AtomicU64>,
+);
 
 impl Clock {
-    /// The system's monotonic clock, zero now.
-    pub fn start() -> Self {
-        Self(ClockSource::Monotonic(Instant::now()))
-    }
-
-    /// A clock for tests, zero until [`advance`](Self::advance)d.
-    pub fn manual() -> Self {
-        Self(ClockSource::Manual(Arc::default()))
-    }
-
-    /// Time since the start.
+    /// The time.
     pub fn now(&self) -> Duration {
-        match &self.0 {
-            ClockSource::Monotonic(start) => start.elapsed(),
-            ClockSource::Manual(nanos) => Duration::from_nanos(nanos.load(Ordering::Relaxed)),
-        }
+        Duration::from_nanos(self.0.load(Ordering::Relaxed))
     }
 
-    /// Moves a [`manual`](Self::manual) clock; the system's goes by itself.
+    /// Moves the time on. Relaxed: the time orders no other memory.
     pub fn advance(&self, by: Duration) {
-        if let ClockSource::Manual(nanos) = &self.0 {
-            nanos.fetch_add(by.as_nanos().try_into().unwrap_or(u64::MAX), Ordering::Relaxed);
-        }
+        self.0.fetch_add(by.as_nanos().try_into().unwrap_or(u64::MAX), Ordering::Relaxed);
     }
 }

@@ -3,7 +3,7 @@
 //! [`bootstrap`] gives a link its first key (the TLS external PSK), [`verifier`] proves the client's name over it,
 //! and [`supply`] provides `messages10` with envelope keys. They are state machines (`docs/architecture.md`):
 //! `poll_request` returns the next request to the KME, and `handle_answer` takes the [`Answer`]. Only [`kme`] talks
-//! to the KME. Every `now` is the time of the daemon's one [`Clock`].
+//! to the KME. Every `now` is the engine's time. [`bootstrap::Acceptor`] reads it from a [`Clock`].
 
 #![forbid(unsafe_code)]
 

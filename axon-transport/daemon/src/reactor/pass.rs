@@ -24,7 +24,7 @@ use super::{
     finishing::Finishing,
     inputs::{Inputs, ReactorInput, TaskResult},
     key_reports::KeyReports,
-    looks::{PollDecision, PollRule},
+    poll_rule::{PollDecision, PollRule},
     rings::ShmRings,
     session::{Notices, local_graph},
     sockets::{ReceivedDatagram, Sockets},

@@ -165,7 +165,7 @@ impl Packet {
         match minicbor::decode(bytes) {
             Ok((VERSION, packet)) => Ok(packet),
             Ok(_) => Err(ConnectError::Protocol("a packet of another version")),
-            Err(_) => Err(ConnectError::Protocol("what is no packet")),
+            Err(_) => Err(ConnectError::Protocol("bytes that are no packet")),
         }
     }
 }

@@ -71,13 +71,13 @@ impl Writer {
     }
 
     /// What was granted to readers of other sessions that have not taken it up, and the number in front of it.
-    pub fn pledged(&self) -> Vec<(Gid, Grant, u64)> {
+    pub fn untaken_grants(&self) -> Vec<(Gid, Grant, u64)> {
         if self.is_forked() {
             return Vec::new();
         }
         let state = self.lock();
-        let pledged = state.reader_set.pledged().into_iter();
-        pledged.map(|(gid, grant)| (gid, grant, state.number_before(grant.first))).collect()
+        let untaken_grants = state.reader_set.untaken_grants().into_iter();
+        untaken_grants.map(|(gid, grant)| (gid, grant, state.number_before(grant.first))).collect()
     }
 
     /// Samples with which those who carry them elsewhere are not done.

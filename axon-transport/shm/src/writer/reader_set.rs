@@ -411,7 +411,7 @@ impl ReaderSet {
     }
 
     /// What was granted to readers of other sessions that have not taken it up, and carry samples nowhere.
-    pub(crate) fn pledged(&self) -> Vec<(Gid, Grant)> {
+    pub(crate) fn untaken_grants(&self) -> Vec<(Gid, Grant)> {
         let readers = self.asking(u64::MAX).filter(|reader| !reader.is_carrier());
         readers.map(|reader| (reader.info.gid, reader.grant)).collect()
     }

@@ -192,7 +192,7 @@ impl<F> Sessions<F> {
 
     /// Tells a reader's session of a pair that was never made. If it is not here, it is told when it comes.
     pub(super) fn tell_unmet(&mut self, by: &SessionId, unmet: Unmet) {
-        self.forget_pledge(&Pair { reader: unmet.reader, writer: unmet.writer });
+        self.forget_earlier_grant(&Pair { reader: unmet.reader, writer: unmet.writer });
         let process = self.process_of(by);
         let output =
             SessionPacket::kept(&SessionMessage::Unmet(unmet), Vec::new(), unmet.reader, process);
@@ -223,9 +223,9 @@ impl<F> Sessions<F> {
     }
 
     /// A publisher granted this by way of an earlier daemon.
-    pub(super) fn pledge(&mut self, by: &SessionId, granted: Granted) {
+    pub(super) fn add_earlier_grant(&mut self, by: &SessionId, granted: Granted) {
         let process = self.process_of(by);
-        self.left.pledge(granted, process);
+        self.left.add_earlier_grant(granted, process);
     }
 
     fn process_of(&self, id: &SessionId) -> u32 {
@@ -233,13 +233,13 @@ impl<F> Sessions<F> {
     }
 
     /// A reader is granted something else, or was told that it gets nothing.
-    pub(super) fn forget_pledge(&mut self, pair: &Pair) {
-        self.left.forget_pledge(pair);
+    pub(super) fn forget_earlier_grant(&mut self, pair: &Pair) {
+        self.left.forget_earlier_grant(pair);
     }
 
     /// A publisher has ended, and said what its readers lost.
-    pub(super) fn forget_pledges(&mut self, writer: &Gid) {
-        self.left.forget_pledges(writer);
+    pub(super) fn forget_earlier_grants(&mut self, writer: &Gid) {
+        self.left.forget_earlier_grants(writer);
     }
 
     /// Queues a packet for several sessions, which share its memory.
@@ -332,10 +332,10 @@ impl<F: Clone> Sessions<F> {
         self.push(id, &SessionMessage::Refused(SessionRefused::because(text)), Vec::new());
     }
 
-    /// A session ends. Hands what it pledged to the readers. Called before its pairs end.
-    pub(super) fn hand_over_pledges(&mut self, id: &SessionId, lives: bool) {
-        let pledged = self.left.take_pledges(id);
-        pledged.into_iter().for_each(|granted| self.hand_over_grant(id, granted, lives));
+    /// A session ends. Hands its earlier grants to the readers. Called before its pairs end.
+    pub(super) fn hand_over_earlier_grants(&mut self, id: &SessionId, lives: bool) {
+        let grants = self.left.take_earlier_grants(id);
+        grants.into_iter().for_each(|granted| self.hand_over_grant(id, granted, lives));
     }
 
     /// Hands what a session that ends granted to a reader, and its ring. If its process still `lives`, this waits for the

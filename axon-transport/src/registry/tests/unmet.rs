@@ -8,7 +8,7 @@ use crate::{
     qos::Qos,
     registry::{
         MAX_QUEUE, Registry, Violation,
-        limits::{MAX_LEFT, MAX_PLEDGES, MAX_UNMET},
+        limits::{MAX_EARLIER_GRANTS, MAX_LEFT, MAX_UNMET},
     },
     wire::session::{
         Announce, Attach, EndpointRole, Gone, Granted, Segment, SegmentOpened, SessionMessage,
@@ -160,7 +160,7 @@ fn handed(registry: &mut Registry<&'static str>) -> Vec<(Granted, Vec<&'static s
 }
 
 /// The publisher has come from an earlier daemon, which did not pass its grant on.
-fn pledged(sessions: &[u8]) -> Registry<&'static str> {
+fn with_earlier_grants(sessions: &[u8]) -> Registry<&'static str> {
     let mut registry = registry(sessions);
     let segment = Segment { number: 1, publisher: None };
     let opened = SessionMessage::Segment(SegmentOpened { session: id(WRITER), segment });
@@ -176,7 +176,7 @@ fn a_reader_is_handed_the_ring_of_a_publisher_whose_process_was_killed_before_it
     let expected = Granted { segments, ..grant(unmet(0).reader, unmet(0).writer) };
     let descriptors = vec!["segment", "doorbell", "pidfd", "heap"];
     for comes_before in [false, true] {
-        let mut registry = pledged(&[WRITER]);
+        let mut registry = with_earlier_grants(&[WRITER]);
         if comes_before {
             connect(&mut registry, READER);
             assert_eq!(handed(&mut registry), []);
@@ -192,13 +192,13 @@ fn a_reader_is_handed_the_ring_of_a_publisher_whose_process_was_killed_before_it
 
 #[test]
 fn a_publisher_that_ended_by_itself_has_said_what_its_readers_lost() {
-    let mut registry = pledged(&[WRITER]);
+    let mut registry = with_earlier_grants(&[WRITER]);
     say(&mut registry, SessionMessage::Unmet(unmet(3)));
     registry.handle_disconnect(&id(WRITER));
     connect(&mut registry, READER);
     assert_eq!(told(&mut registry), [3]);
 
-    let mut registry = pledged(&[WRITER]);
+    let mut registry = with_earlier_grants(&[WRITER]);
     // Its reader has taken up the grant meanwhile.
     say(&mut registry, SessionMessage::EndpointGone(Gone { gid: unmet(0).writer }));
     registry.handle_disconnect(&id(WRITER));
@@ -261,7 +261,7 @@ fn memory_is_handed_to_no_tool_and_no_other_user_that_claims_the_id_of_a_reader(
     };
     for claim in [tool, user] {
         for claimed_before in [false, true] {
-            let mut registry = pledged(&[WRITER]);
+            let mut registry = with_earlier_grants(&[WRITER]);
             if claimed_before {
                 claim(&mut registry);
             }
@@ -277,7 +277,7 @@ fn memory_is_handed_to_no_tool_and_no_other_user_that_claims_the_id_of_a_reader(
         }
     }
     // Nor is memory of another user handed on.
-    let mut registry = pledged(&[WRITER]);
+    let mut registry = with_earlier_grants(&[WRITER]);
     registry.set_user(&id(WRITER), 1001);
     registry.handle_disconnect(&id(WRITER));
     connect(&mut registry, READER);
@@ -313,7 +313,7 @@ fn process_that_fills_what_is_kept_displaces_nothing_of_another_one() {
 
 #[test]
 fn rings_of_a_process_that_leaves_many_displace_no_ring_of_another_one() {
-    let mut registry = pledged(&[WRITER, OTHER]);
+    let mut registry = with_earlier_grants(&[WRITER, OTHER]);
     let of = |number| grant(Gid::new(id(8), number), Gid::new(id(OTHER), number));
     others_say(&mut registry, 3 * MAX_LEFT, |number| SessionMessage::Grant(of(number)));
     registry.handle_disconnect(&id(WRITER));
@@ -324,9 +324,9 @@ fn rings_of_a_process_that_leaves_many_displace_no_ring_of_another_one() {
 
 #[test]
 fn grants_of_a_process_that_repeats_many_displace_no_grant_of_another_one() {
-    let mut registry = pledged(&[WRITER, OTHER]);
+    let mut registry = with_earlier_grants(&[WRITER, OTHER]);
     let of = |number| grant(Gid::new(id(8), number), Gid::new(id(OTHER), number));
-    others_say(&mut registry, 3 * MAX_PLEDGES, |number| SessionMessage::Grant(of(number)));
+    others_say(&mut registry, 3 * MAX_EARLIER_GRANTS, |number| SessionMessage::Grant(of(number)));
     registry.handle_disconnect(&id(WRITER));
     connect(&mut registry, READER);
     assert_eq!(handed(&mut registry).len(), 1);
@@ -344,7 +344,7 @@ fn reader_that_is_stopped_hears_of_a_pair_though_another_process_told_it_of_very
 
 #[test]
 fn session_that_comes_back_on_another_connection_hands_no_ring_to_its_readers() {
-    let mut registry = pledged(&[WRITER, READER]);
+    let mut registry = with_earlier_grants(&[WRITER, READER]);
     connect(&mut registry, WRITER);
     assert_eq!(handed(&mut registry), [], "its process lives");
     // It says anew what it granted.
@@ -361,7 +361,7 @@ fn hang_up(registry: &mut Registry<&'static str>, session: u8) {
 #[test]
 fn ring_of_a_session_that_hung_up_is_handed_over_once_its_process_has_ended() {
     for comes_before in [false, true] {
-        let mut registry = pledged(&[WRITER]);
+        let mut registry = with_earlier_grants(&[WRITER]);
         if comes_before {
             connect(&mut registry, READER);
         }
@@ -379,7 +379,7 @@ fn ring_of_a_session_that_hung_up_is_handed_over_once_its_process_has_ended() {
 
 #[test]
 fn ring_of_a_session_that_hung_up_and_came_back_is_handed_to_nobody() {
-    let mut registry = pledged(&[WRITER, READER]);
+    let mut registry = with_earlier_grants(&[WRITER, READER]);
     hang_up(&mut registry, WRITER);
     connect(&mut registry, WRITER);
     assert!(!registry.awaits_process(&id(WRITER)));

@@ -7,7 +7,7 @@ use axon_shm::{
     internal::{Grant, Location, ReaderInfo, RingPeer, Terms, descriptors::PassedFd},
 };
 
-use super::{Control, Link, pair_log, peers::PeerError, stands_for};
+use super::{Control, DaemonConnection, pair_log, peers::PeerError, stands_for};
 use crate::{
     graph::EndpointKind,
     ids::{Gid, SessionId},
@@ -372,7 +372,7 @@ impl Control {
             Ok(mapped) => {
                 pair_log::accepted(&pair, generation, first);
                 let stands_in = !writer.is_of(&session) || relayed == Some(true);
-                let linked = matches!(self.link, Link::Socket(_));
+                let linked = matches!(self.link, DaemonConnection::Socket(_));
                 let numbers = match subscription.endpoint.kind {
                     EndpointKind::Subscription if stands_in && linked => NumberKind::All,
                     // In a relayed process what was lost on the way is said aloud.

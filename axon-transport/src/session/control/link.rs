@@ -5,9 +5,9 @@ use std::{sync::mpsc::TryRecvError, time::Instant};
 use axon_shm::internal::descriptors::PassedFd;
 
 use super::{
-    Control, Link,
+    Control, DaemonConnection,
+    announced::{AnnouncedPairs, AnnouncedSegments},
     search::Search,
-    told::{ToldPairs, ToldSegments},
 };
 use crate::{
     session::{
@@ -21,8 +21,8 @@ impl Control {
     pub(super) fn connected(&mut self, connected: Connected) {
         self.outbox.clear();
         self.building = None;
-        self.pairs = ToldPairs::default();
-        self.segments = ToldSegments::default();
+        self.pairs = AnnouncedPairs::default();
+        self.segments = AnnouncedSegments::default();
         self.pause.handle_connected(Instant::now());
         self.retry = None;
         let daemon = connected.welcome.daemon;
@@ -32,10 +32,14 @@ impl Control {
             let gids = state.endpoints.gids();
             let mut outgoing: Vec<_> = gids.into_iter().map(Outgoing::Announce).collect();
             // Behind the announcements, and the memory that they name.
-            let pledged =
-                state.endpoints.publishers.values().flat_map(|p| p.pledged(self.shared.core.id));
-            outgoing
-                .extend(pledged.map(|granted| Outgoing::message(SessionMessage::Grant(granted))));
+            let untaken_grants = state
+                .endpoints
+                .publishers
+                .values()
+                .flat_map(|p| p.untaken_grants(self.shared.core.id));
+            outgoing.extend(
+                untaken_grants.map(|granted| Outgoing::message(SessionMessage::Grant(granted))),
+            );
             // Before their ends.
             let unmet =
                 state.unmet.iter().map(|unmet| Outgoing::message(SessionMessage::Unmet(unmet)));
@@ -43,7 +47,7 @@ impl Control {
             outgoing.extend(state.graph.tombstones.iter().map(|gid| Outgoing::gone(*gid)));
             self.shared.core.link.connected(daemon, outgoing);
         }
-        self.link = Link::Socket(PassedFd::connection(connected.socket).trusted());
+        self.link = DaemonConnection::Socket(PassedFd::connection(connected.socket).trusted());
         self.shared.core.memory.begins_anew();
         for info in self.shared.core.segment.segments() {
             self.tell_segment(SegmentChange::Opened(info.number));
@@ -59,25 +63,25 @@ impl Control {
         let pause = self.pause.handle_lost(Instant::now());
         let search =
             self.reconnects.then(|| Search::begin(self.shared.core.clone(), pause)).flatten();
-        self.link = search.map_or(Link::Ended, Link::Reconnecting);
+        self.link = search.map_or(DaemonConnection::Ended, DaemonConnection::Reconnecting);
         self.shared.notify(Some(&SessionEvent::DaemonLost));
     }
 
     pub(super) fn try_reconnected(&mut self) {
-        let Link::Reconnecting(search) = &self.link else { return };
+        let DaemonConnection::Reconnecting(search) = &self.link else { return };
         match search.try_found() {
             Ok(connected) => self.connected(connected),
             Err(TryRecvError::Empty) => {}
-            Err(TryRecvError::Disconnected) => self.link = Link::Ended,
+            Err(TryRecvError::Disconnected) => self.link = DaemonConnection::Ended,
         }
     }
 
     /// Whether there is a daemon, or may be one.
     pub(super) fn is_served(&self) -> bool {
-        matches!(self.link, Link::Socket(_) | Link::Reconnecting(_))
+        matches!(self.link, DaemonConnection::Socket(_) | DaemonConnection::Reconnecting(_))
     }
 
     pub(super) fn is_linked(&self) -> bool {
-        matches!(self.link, Link::Socket(_) | Link::Local(_))
+        matches!(self.link, DaemonConnection::Socket(_) | DaemonConnection::Local(_))
     }
 }

@@ -1,6 +1,7 @@
 //! The control thread: sends the messages that the handles queue, handles the daemon's messages, watches peers for
 //! their death, and finds another daemon when the connection to the old one is lost.
 
+mod announced;
 pub(in crate::session) mod arrivals;
 mod graph;
 mod handle;
@@ -12,7 +13,6 @@ mod pause;
 mod peers;
 mod search;
 mod time;
-mod told;
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
@@ -25,12 +25,12 @@ use axon_shm::{ExternalLeader, ShmError, internal::descriptors::PassedFd};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use self::{
+    announced::{AnnouncedPairs, AnnouncedSegments},
     arrivals::Arrivals,
     local::{Local, LocalRegistry},
     pause::ReconnectPause,
     peers::Peers,
     search::Search,
-    told::{ToldPairs, ToldSegments},
 };
 use crate::{
     graph::GraphView,
@@ -61,7 +61,7 @@ const MAX_STANDS_FOR: usize = 1024;
 
 pub(in crate::session) struct Control {
     shared: Arc<SessionShared>,
-    link: Link,
+    link: DaemonConnection,
     reconnects: bool,
     peers: Peers,
     outbox: VecDeque<(SessionMessage, Vec<PassedFd>)>,
@@ -69,11 +69,11 @@ pub(in crate::session) struct Control {
     /// A whole graph of which parts are still to come.
     building: Option<GraphView>,
     /// The pairs that the daemon of this connection told of.
-    pairs: ToldPairs,
+    pairs: AnnouncedPairs,
     /// When to look after the memory of large samples, while there is any.
     reclaim_idle: Option<Instant>,
     /// The segments of our memory that this connection was told of.
-    segments: ToldSegments,
+    segments: AnnouncedSegments,
     /// Publishers that have no memory ready for their next large sample.
     low: BTreeSet<Gid>,
     pause: ReconnectPause,
@@ -112,7 +112,7 @@ pub(in crate::session) enum FirstPeer {
     Alone,
 }
 
-enum Link {
+enum DaemonConnection {
     Socket(PassedFd),
     Local(Local),
     Reconnecting(Search),
@@ -130,15 +130,15 @@ impl Control {
             .map_err(ShmError::system("watching processes"))?;
         let mut control = Self {
             shared,
-            link: Link::Ended,
+            link: DaemonConnection::Ended,
             reconnects,
             peers,
             outbox: VecDeque::new(),
             buffer: Vec::new(),
             building: None,
-            pairs: ToldPairs::default(),
+            pairs: AnnouncedPairs::default(),
             reclaim_idle: None,
-            segments: ToldSegments::default(),
+            segments: AnnouncedSegments::default(),
             low: BTreeSet::new(),
             pause: ReconnectPause::new(Instant::now()),
             retry: None,
@@ -154,9 +154,12 @@ impl Control {
                 control.connected(connected)
             }
             FirstPeer::LocalRegistry(local_registry) => {
-                control.link = Link::Local(Local::join(local_registry, &control.shared.core)?);
+                control.link =
+                    DaemonConnection::Local(Local::join(local_registry, &control.shared.core)?);
             }
-            FirstPeer::Alone => control.link = Link::Local(Local::alone(&control.shared.core)),
+            FirstPeer::Alone => {
+                control.link = DaemonConnection::Local(Local::alone(&control.shared.core))
+            }
         }
         Ok(control)
     }
@@ -222,20 +225,20 @@ impl Control {
     /// have read all.
     fn was_heard(&mut self, deadline: Instant) -> bool {
         match &self.link {
-            Link::Socket(socket) if socket::finish(socket, deadline) => true,
-            Link::Socket(_) => {
+            DaemonConnection::Socket(socket) if socket::finish(socket, deadline) => true,
+            DaemonConnection::Socket(_) => {
                 self.lost(&SocketError::Closed);
                 false
             }
-            Link::Reconnecting(_) => false,
-            Link::Local(_) | Link::Ended => true,
+            DaemonConnection::Reconnecting(_) => false,
+            DaemonConnection::Local(_) | DaemonConnection::Ended => true,
         }
     }
 
     /// Waits for the next daemon, to tell it of the memory that readers have yet to be sent, and of what they lost.
     /// Whether there is one.
     fn find_next_daemon(&mut self, deadline: Instant) -> bool {
-        while matches!(self.link, Link::Reconnecting(_)) && self.leaves_notices() {
+        while matches!(self.link, DaemonConnection::Reconnecting(_)) && self.leaves_notices() {
             let left = deadline.saturating_duration_since(Instant::now());
             if left.is_zero() {
                 return false;
@@ -258,7 +261,7 @@ impl Control {
             let queued = self.outbox.len();
             self.send();
             let left = deadline.saturating_duration_since(Instant::now());
-            let Link::Socket(socket) = &self.link else { return };
+            let DaemonConnection::Socket(socket) = &self.link else { return };
             if self.outbox.is_empty() || left.is_zero() {
                 return;
             }
@@ -297,7 +300,7 @@ impl Control {
         // Under this lock endpoints and what is to be told of them change together.
         let state = shared.state();
         let queued = shared.core.link.take();
-        if matches!(self.link, Link::Reconnecting(_) | Link::Ended) {
+        if matches!(self.link, DaemonConnection::Reconnecting(_) | DaemonConnection::Ended) {
             // All of it is said to the next daemon from what stands then.
             return;
         }
@@ -371,13 +374,13 @@ impl Control {
     fn send(&mut self) {
         while let Some((message, descriptors)) = self.outbox.pop_front() {
             match &mut self.link {
-                Link::Local(local) => {
+                DaemonConnection::Local(local) => {
                     for (message, descriptors) in local.exchange(Some((message, descriptors))) {
                         self.handle(message, descriptors);
                     }
                     self.tell_matched();
                 }
-                Link::Socket(socket) => {
+                DaemonConnection::Socket(socket) => {
                     let packet = match message.encode() {
                         Ok(packet) => packet,
                         Err(error) => {
@@ -396,19 +399,19 @@ impl Control {
                             // What the daemon said last is worth hearing: REFUSED, or memory in which
                             // samples are found. It adds nothing, so that there is an end to it.
                             while matches!(error, SocketError::Closed)
-                                && matches!(self.link, Link::Socket(_))
+                                && matches!(self.link, DaemonConnection::Socket(_))
                             {
                                 self.receive();
                                 self.tell_matched();
                             }
-                            if matches!(self.link, Link::Socket(_)) {
+                            if matches!(self.link, DaemonConnection::Socket(_)) {
                                 self.lost(&error);
                             }
                             return;
                         }
                     }
                 }
-                Link::Reconnecting(_) | Link::Ended => return,
+                DaemonConnection::Reconnecting(_) | DaemonConnection::Ended => return,
             }
         }
     }
@@ -416,7 +419,7 @@ impl Control {
     fn sleep(&mut self) {
         let deaths = PollFd::from_borrowed_fd(self.peers.deaths(), PollFlags::IN);
         let mut fds = vec![PollFd::new(&self.shared.core.waker, PollFlags::IN), deaths];
-        if let Link::Socket(socket) = &self.link {
+        if let DaemonConnection::Socket(socket) = &self.link {
             let waits = if self.outbox.is_empty() { PollFlags::empty() } else { PollFlags::OUT };
             fds.push(PollFd::new(socket, PollFlags::IN | waits));
         }
@@ -462,13 +465,13 @@ impl Control {
     }
 
     fn receive(&mut self) {
-        if let Link::Local(local) = &mut self.link {
+        if let DaemonConnection::Local(local) = &mut self.link {
             for (message, descriptors) in local.exchange(None) {
                 self.handle(message, descriptors);
             }
         }
         for _ in 0..BATCH {
-            let Link::Socket(socket) = &self.link else { return };
+            let DaemonConnection::Socket(socket) = &self.link else { return };
             match socket::receive(socket, &mut self.buffer) {
                 Ok(received) => self.handle(received.message, received.descriptors),
                 Err(SocketError::NotReady) => return,

@@ -114,7 +114,7 @@ impl PublisherInner {
     }
 
     /// What it granted to readers of other sessions that have not taken it up, said once more.
-    pub(in crate::session) fn pledged(&self, session: SessionId) -> Vec<Granted> {
+    pub(in crate::session) fn untaken_grants(&self, session: SessionId) -> Vec<Granted> {
         let counted = self.endpoint.kind == EndpointKind::Publisher
             && self.role == EndpointRole::Application
             && !self.relayed;
@@ -131,7 +131,7 @@ impl PublisherInner {
             after: Some(after),
             relayed: None,
         };
-        writer.pledged().into_iter().map(granted).collect()
+        writer.untaken_grants().into_iter().map(granted).collect()
     }
 
     /// Whether it was attached.

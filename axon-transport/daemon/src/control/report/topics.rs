@@ -39,7 +39,7 @@ const LOOKED_AT: usize = 1 << 16;
 const KEPT_APART: usize = 64;
 
 type Sessions = Registry<Arc<PassedFd>>;
-type Session = SessionEntry<Arc<PassedFd>>;
+type ShmSession = SessionEntry<Arc<PassedFd>>;
 
 /// All topics with an endpoint somewhere.
 pub(super) fn topics(
@@ -156,7 +156,7 @@ fn entry<'a>(
     })
 }
 
-fn writer(session: &Session, local: &LocalEndpoint, counts: &RingCounts) -> WriterStatus {
+fn writer(session: &ShmSession, local: &LocalEndpoint, counts: &RingCounts) -> WriterStatus {
     let gid = local.endpoint.gid;
     let own = session.segments.iter().filter(|s| s.segment.publisher == Some(gid));
     let own = own.map(|segment| inspect::committed(segment.descriptor.as_fd()));
@@ -176,10 +176,10 @@ fn writer(session: &Session, local: &LocalEndpoint, counts: &RingCounts) -> Writ
 }
 
 fn reader(
-    session: &Session,
+    session: &ShmSession,
     local: &LocalEndpoint,
     attach: &Attach,
-    ring: Option<&(&Session, RingCounts)>,
+    ring: Option<&(&ShmSession, RingCounts)>,
 ) -> ReaderStatus {
     let lane = memory(session, attach.lane).and_then(|m| LaneCounts::read(m, attach.lane));
     let lane = lane.unwrap_or_default();
@@ -212,7 +212,7 @@ fn unread(counts: &RingCounts, lane: &LaneCounts) -> u64 {
 
 /// When the oldest sample was published that the reader has not taken. Where that does not stand
 /// any more, the one before it, which the reader has taken: hardly older on a topic so busy.
-fn oldest_unread(writer: &Session, counts: &RingCounts, lane: &LaneCounts) -> Option<i64> {
+fn oldest_unread(writer: &ShmSession, counts: &RingCounts, lane: &LaneCounts) -> Option<i64> {
     let (tail, _) = counts.standing;
     if let (true, Some(taken)) = (lane.cursor < tail, lane.taken) {
         return Some(taken);
@@ -261,13 +261,13 @@ fn depth(qos: &Qos) -> Option<u32> {
 }
 
 /// What a publisher counts, and its session.
-fn ring<'a>(registry: &'a Sessions, local: &LocalEndpoint) -> Option<(&'a Session, RingCounts)> {
+fn ring<'a>(registry: &'a Sessions, local: &LocalEndpoint) -> Option<(&'a ShmSession, RingCounts)> {
     let (session, at) = (registry.session(&local.session)?, local.ring?);
     Some((session, RingCounts::read(memory(session, at)?, at)?))
 }
 
 /// The segment that an object of a session is in.
-fn memory(session: &Session, at: Location) -> Option<BorrowedFd<'_>> {
+fn memory(session: &ShmSession, at: Location) -> Option<BorrowedFd<'_>> {
     match (at.segment, &session.descriptors) {
         (0, Some([first, ..])) => Some(first.as_fd()),
         (number, _) => session.segments.get(number).map(|segment| segment.descriptor.as_fd()),

@@ -20,11 +20,11 @@ use crate::bridge::RefusedRoute;
 /// Endpoints that are told of one peer's routes, while it is linked.
 const MOST: usize = 4096;
 
-type Sessions = Registry<Arc<PassedFd>>;
+type DaemonRegistry = Registry<Arc<PassedFd>>;
 
 /// Each endpoint that waits for one of these routes.
 pub(super) fn waiting<'a, 'r>(
-    registry: &'a Sessions,
+    registry: &'a DaemonRegistry,
     routes: &'r [RefusedRoute],
 ) -> Vec<(&'a LocalEndpoint, &'r RefusedRoute)> {
     if routes.is_empty() {
@@ -58,7 +58,7 @@ impl NotifiedEndpoints {
     /// Tells the sessions of endpoints that wait for these routes to or from `peer`, which is the host `host`.
     pub(in crate::control) fn tell(
         &mut self,
-        registry: &mut Sessions,
+        registry: &mut DaemonRegistry,
         peer: &str,
         host: &str,
         routes: &[RefusedRoute],
@@ -75,7 +75,7 @@ impl NotifiedEndpoints {
 
     fn take_untold(
         &mut self,
-        registry: &Sessions,
+        registry: &DaemonRegistry,
         peer: &str,
         host: &str,
         routes: &[RefusedRoute],
@@ -114,14 +114,14 @@ mod tests {
 
     const SESSION: SessionId = SessionId([1; 16]);
 
-    fn registry() -> Sessions {
+    fn registry() -> DaemonRegistry {
         let mut registry = Registry::default();
         let (role, name) = (SessionRole::Application, String::new());
         registry.handle_connect(SESSION, role, name, 1, None, None).unwrap();
         registry
     }
 
-    fn announce(registry: &mut Sessions, number: u32, topic: &str) {
+    fn announce(registry: &mut DaemonRegistry, number: u32, topic: &str) {
         let gid = Gid::new(SESSION, number);
         let endpoint = Endpoint::new(gid, EndpointKind::Subscription, topic, "T");
         let role = EndpointRole::Application;
@@ -130,7 +130,7 @@ mod tests {
     }
 
     /// What the session is told.
-    fn heard(registry: &mut Sessions) -> Vec<String> {
+    fn heard(registry: &mut DaemonRegistry) -> Vec<String> {
         let packets = std::iter::from_fn(|| registry.poll_output(&SESSION));
         let texts =
             packets.filter_map(|output| match SessionMessage::decode(&output.packet).unwrap() {

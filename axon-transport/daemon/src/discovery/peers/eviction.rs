@@ -30,7 +30,7 @@ pub(super) struct EvictionCandidates {
 
 /// The records of one host.
 #[derive(Default)]
-struct OfHost {
+struct HostRecords {
     records: usize,
     /// Those that may be dropped, the oldest last.
     candidates: Vec<(Reverse<Duration>, DaemonId)>,
@@ -52,11 +52,11 @@ impl PeerDiscovery {
         if self.records.len() < MOST_HEARD {
             return;
         }
-        // In a flood they are as full as when victims were chosen.
+        // In a flood they are as full as when records were chosen for eviction.
         let known = self.knows(from);
         if !known
-            && self.records.len() >= self.victims.records
-            && let Some(victim) = self.chosen_victim()
+            && self.records.len() >= self.eviction.records
+            && let Some(victim) = self.chosen_for_eviction()
         {
             return self.forget(victim);
         }
@@ -69,15 +69,15 @@ impl PeerDiscovery {
             return;
         }
         let heard_goes = crowded || heard > LEAST_HEARD;
-        if let Some(victim) = self.next_victim(heard_goes) {
+        if let Some(victim) = self.next_to_evict(heard_goes) {
             self.forget(victim);
         }
     }
 
     /// The record that goes next.
-    fn next_victim(&mut self, heard_goes: bool) -> Option<DaemonId> {
-        self.choose_victims(heard_goes);
-        if let Some(victim) = self.chosen_victim() {
+    fn next_to_evict(&mut self, heard_goes: bool) -> Option<DaemonId> {
+        self.choose_to_evict(heard_goes);
+        if let Some(victim) = self.chosen_for_eviction() {
             return Some(victim);
         }
         // One whose peer was heard from goes last, whatever was forged under its address.
@@ -87,14 +87,14 @@ impl PeerDiscovery {
         answered.min_by_key(|(_, record)| record.last_seen).map(|(id, _)| *id)
     }
 
-    /// The next of the victims that were chosen, unless something was heard of it since.
-    fn chosen_victim(&mut self) -> Option<DaemonId> {
-        while let Some((victim, seen)) = self.victims.chosen.pop() {
+    /// The next record that was chosen for eviction, unless something was heard of its daemon since.
+    fn chosen_for_eviction(&mut self) -> Option<DaemonId> {
+        while let Some((victim, seen)) = self.eviction.chosen.pop() {
             let still = |record: &DaemonRecord| {
                 record.last_seen == seen
                     && record.may_be_forgotten()
                     && !record.has_answered()
-                    && is_heard(record) == self.victims.heard
+                    && is_heard(record) == self.eviction.heard
             };
             if self.records.get(&victim).is_some_and(still) {
                 return Some(victim);
@@ -103,8 +103,8 @@ impl PeerDiscovery {
         None
     }
 
-    fn choose_victims(&mut self, heard_goes: bool) {
-        let mut hosts: BTreeMap<Option<IpAddr>, OfHost> = BTreeMap::new();
+    fn choose_to_evict(&mut self, heard_goes: bool) {
+        let mut hosts: BTreeMap<Option<IpAddr>, HostRecords> = BTreeMap::new();
         for (id, record) in &self.records {
             let host = hosts.entry(record.host()).or_default();
             host.records += 1;
@@ -116,7 +116,7 @@ impl PeerDiscovery {
         hosts.values_mut().for_each(|host| host.candidates.sort_unstable());
         let mut chosen = Vec::with_capacity(CHOSEN);
         while chosen.len() < CHOSEN {
-            let most = |host: &&mut OfHost| (host.records, host.candidates.last().copied());
+            let most = |host: &&mut HostRecords| (host.records, host.candidates.last().copied());
             let hosts = hosts.values_mut().filter(|host| !host.candidates.is_empty());
             let Some(host) = hosts.max_by_key(most) else { break };
             host.records -= 1;
@@ -124,7 +124,7 @@ impl PeerDiscovery {
             chosen.extend(oldest.map(|(seen, id)| (id, seen.0)));
         }
         chosen.reverse();
-        self.victims =
+        self.eviction =
             EvictionCandidates { chosen, heard: heard_goes, records: self.records.len() };
     }
 

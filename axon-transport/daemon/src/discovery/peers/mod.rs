@@ -68,7 +68,7 @@ pub(crate) struct PeerDiscovery {
     local: LocalDaemon,
     here: LocalAddresses,
     records: BTreeMap<DaemonId, DaemonRecord>,
-    victims: EvictionCandidates,
+    eviction: EvictionCandidates,
     /// Addresses of listed peers, with a port where one was given.
     listed: Vec<(IpAddr, Option<u16>)>,
     port: Option<u16>,
@@ -104,7 +104,7 @@ impl PeerDiscovery {
             local,
             here,
             records: BTreeMap::new(),
-            victims: EvictionCandidates::default(),
+            eviction: EvictionCandidates::default(),
             listed: Vec::new(),
             port: None,
             graph: 0,
@@ -276,7 +276,7 @@ impl PeerDiscovery {
     pub(crate) fn handle_link_down(&mut self, now: Duration, daemon: DaemonId) {
         let Some(record) = self.records.get_mut(&daemon) else { return };
         (record.linked, record.cut) = (false, false);
-        record.doubt = None;
+        record.unproven = None;
         record.done();
         let left = record.left(now);
         // One that dialled us and whose beacons never came cannot be dialled.

@@ -163,7 +163,7 @@ impl PeerDiscovery {
         if record.compatible || record.linked {
             if !std::mem::replace(&mut record.contradicted, true) {
                 let Difference { setting, theirs, .. } = what;
-                info!(peer = %daemon, %from, setting, theirs, "beacon contradicts what is known");
+                info!(peer = %daemon, %from, setting, theirs, "a beacon contradicts the known settings of its daemon");
             }
             return;
         }

@@ -81,7 +81,7 @@ pub(super) struct DaemonRecord {
     /// The path of its link does not work: it may have other addresses.
     pub(super) cut: bool,
     /// The peer of the link did not prove that the id is its own: another one may have the id.
-    pub(super) doubt: Option<UnprovenAddresses>,
+    pub(super) unproven: Option<UnprovenAddresses>,
     /// One for each standing: a dial to an address where nobody is holds up no better one.
     pub(super) dials: [DialTime; AddressConfidence::COUNT],
 }
@@ -174,29 +174,30 @@ impl DaemonRecord {
             false => true,
             true => {
                 let moved = self.cut && source.answered && !source.proven;
-                standing != AddressConfidence::Heard && (moved || self.doubts(source.address))
+                standing != AddressConfidence::Heard
+                    && (moved || self.unproven_addresses(source.address))
             }
         })
     }
 
     /// Whether, besides the linked host, another one that has the id may be at this address, or the linked one itself.
     pub(super) fn may_be_at(&self, source: &DialAddress) -> bool {
-        (self.cut && !source.proven) || self.doubts(source.address)
+        (self.cut && !source.proven) || self.unproven_addresses(source.address)
     }
 
     /// Whether another host than the linked one may have the id, at this address.
-    pub(super) fn doubts(&self, address: SocketAddr) -> bool {
-        self.doubt.as_ref().is_some_and(|doubt| !doubt.0.contains(&address))
+    pub(super) fn unproven_addresses(&self, address: SocketAddr) -> bool {
+        self.unproven.as_ref().is_some_and(|unproven| !unproven.0.contains(&address))
     }
 
     /// A link stands with a peer at this address. `proven`: the id is its own.
     pub(super) fn found(&mut self, address: SocketAddr, proven: bool) {
-        let mut doubt = self.doubt.take().unwrap_or_default();
+        let mut unproven = self.unproven.take().unwrap_or_default();
         if !proven {
-            doubt.0.retain(|other| *other != address);
-            doubt.0.insert(0, address);
-            doubt.0.truncate(MOST_FOUND);
-            self.doubt = Some(doubt);
+            unproven.0.retain(|other| *other != address);
+            unproven.0.insert(0, address);
+            unproven.0.truncate(MOST_FOUND);
+            self.unproven = Some(unproven);
         }
     }
 
@@ -281,7 +282,7 @@ impl DaemonRecord {
             (source.answered, source.asked) = (false, false);
         }
         self.order();
-        // A pause of doubt is for links that stand.
+        // The pause before other addresses are tried is for links that stand.
         self.dials.iter_mut().for_each(|dial| dial.due = None);
     }
 

@@ -4,7 +4,7 @@
 //! network share what they may take, as a host may have any of them. A [`Charge`] holds what counts for a [`Meter`], and
 //! gives it back when it is dropped.
 
-pub(in crate::engine) mod pace;
+pub(in crate::engine) mod change_turns;
 #[cfg(test)]
 mod tests;
 
@@ -19,7 +19,7 @@ use std::{
 
 use axon_shm::internal::MemoryBudget;
 
-use self::pace::ChangeTurns;
+use self::change_turns::ChangeTurns;
 use super::{limits::IdentityLimits, peer::routes::RouteKey};
 use crate::{
     keys::KeyMessage,

@@ -7,9 +7,9 @@ use axon_shm::Meta;
 use axon_transport::internal::session::Written;
 
 use super::{
-    FULL_RETRY, Inbound, Key, RouteIn,
+    FULL_RETRY, Inbound, RouteIn, StreamKey,
     incoming::{IncomingStream, OpenedMessage, StreamHeader, StreamStep},
-    reading::{Next, wait},
+    reading::{StepOutcome, wait},
 };
 use crate::engine::{rings::RingError, sample::dropped::EarlierFate, stand_in::StandIn};
 
@@ -22,13 +22,13 @@ impl Inbound {
     /// Writes a message to its ring.
     pub(super) fn deliver(
         &mut self,
-        key: Key,
+        key: StreamKey,
         stream: &mut IncomingStream,
         message: OpenedMessage,
         until: Duration,
         now: Duration,
-    ) -> Next {
-        let Some((header, Some(route))) = stream.header else { return Next::Over };
+    ) -> StepOutcome {
+        let Some((header, Some(route))) = stream.header else { return StepOutcome::Over };
         let found = self.routes.get(&header.route);
         let Some(stand_in) = found.and_then(|route| route.writers.get(&message.writer)) else {
             if found.is_some() && now < until {
@@ -42,7 +42,7 @@ impl Inbound {
                 self.receipts.dropped((header.route, header.of), message.number, now);
             }
             self.release(stream);
-            return Next::Go;
+            return StepOutcome::Go;
         };
         self.waiting.remove(&(until, key));
         let of_topic = route.kind == Kind::Topic;
@@ -57,18 +57,18 @@ impl Inbound {
         if acknowledged && before == EarlierFate::Dropped {
             self.receipts.dropped_again(flow, sequence, now);
             self.release(stream);
-            return Next::Go;
+            return StepOutcome::Go;
         }
         if acknowledged && (before == EarlierFate::Passed || last >= Some(sequence)) {
             self.receipts.came(flow, sequence, length, now);
             self.release(stream);
-            return Next::Go;
+            return StepOutcome::Go;
         }
         if !header.reliable && last >= Some(sequence) {
             // A newer one overtook it: readers drop it.
             self.counters.lost(&self.topic(header.route), "late", 1);
             self.release(stream);
-            return Next::Over;
+            return StepOutcome::Over;
         }
         let stand_in = Rc::clone(stand_in);
         let limit = found.map(|route| &route.limit).filter(|limit| !limit.is_none()).cloned();
@@ -106,7 +106,7 @@ impl Inbound {
             self.receipts.came(flow, sequence, length, now);
         }
         self.release(stream);
-        if header.reliable { Next::Go } else { Next::Over }
+        if header.reliable { StepOutcome::Go } else { StepOutcome::Over }
     }
 
     /// Goes on after a message that was dropped and counted. The peer is told where it waits to hear of it.
@@ -116,13 +116,13 @@ impl Inbound {
         acknowledged: bool,
         sequence: u64,
         now: Duration,
-    ) -> Next {
-        let Some((header, _)) = stream.header else { return Next::Over };
+    ) -> StepOutcome {
+        let Some((header, _)) = stream.header else { return StepOutcome::Over };
         if acknowledged {
             self.receipts.dropped((header.route, header.of), sequence, now);
         }
         self.release(stream);
-        if header.reliable { Next::Go } else { Next::Over }
+        if header.reliable { StepOutcome::Go } else { StepOutcome::Over }
     }
 
     /// Writes a sample to its ring. Whether it is there; `None`: the ring is full. `short_since` says since when it has been
@@ -183,11 +183,11 @@ impl Inbound {
     /// The message's ring is full.
     pub(super) fn wait_for_room(
         &mut self,
-        key: Key,
+        key: StreamKey,
         stream: &mut IncomingStream,
         message: OpenedMessage,
         now: Duration,
-    ) -> Next {
+    ) -> StepOutcome {
         self.full.insert(key);
         self.full_retry.get_or_insert(now + FULL_RETRY);
         wait(stream, StreamStep::Ring(message))

@@ -9,42 +9,42 @@ use axon_envelope::Kind;
 use axon_transport::access::Over;
 
 use super::{
-    Inbound, Key,
+    Inbound, StreamKey,
     incoming::{IncomingStream, OpenedMessage, StreamStep},
-    reading::{Next, wait},
+    reading::{StepOutcome, wait},
 };
 use crate::engine::limits::RouteLimit;
 
 /// Streams that are not read on until their limit opens.
 #[derive(Debug, Default)]
 pub(super) struct Limited {
-    due: BTreeSet<(Duration, Key)>,
-    of: HashMap<Key, Duration>,
+    due: BTreeSet<(Duration, StreamKey)>,
+    of: HashMap<StreamKey, Duration>,
 }
 
 impl Limited {
-    pub(super) fn hold(&mut self, stream: Key, until: Duration) {
+    pub(super) fn hold(&mut self, stream: StreamKey, until: Duration) {
         self.forget(&stream);
         self.due.insert((until, stream));
         self.of.insert(stream, until);
     }
 
     /// A stream is gone.
-    pub(super) fn forget(&mut self, stream: &Key) {
+    pub(super) fn forget(&mut self, stream: &StreamKey) {
         if let Some(until) = self.of.remove(stream) {
             self.due.remove(&(until, *stream));
         }
     }
 
     /// A stream that is read on now.
-    pub(super) fn take_due(&mut self, now: Duration) -> Option<Key> {
+    pub(super) fn take_due(&mut self, now: Duration) -> Option<StreamKey> {
         let (_, stream) = self.due.first().copied().filter(|(due, _)| *due <= now)?;
         self.forget(&stream);
         Some(stream)
     }
 
     /// All streams, which are held no more.
-    fn take_all(&mut self) -> Vec<Key> {
+    fn take_all(&mut self) -> Vec<StreamKey> {
         self.due.clear();
         std::mem::take(&mut self.of).into_keys().collect()
     }
@@ -69,13 +69,15 @@ impl Inbound {
     /// publisher would not be told of it. So a topic is held only where its publisher waits for its readers anyway.
     pub(super) fn pass_limit(
         &mut self,
-        key: Key,
+        key: StreamKey,
         stream: &mut IncomingStream,
         limit: &RouteLimit,
         message: OpenedMessage,
         now: Duration,
-    ) -> Result<OpenedMessage, Option<Next>> {
-        let Some((header, Some(route))) = stream.header else { return Err(Some(Next::Over)) };
+    ) -> Result<OpenedMessage, Option<StepOutcome>> {
+        let Some((header, Some(route))) = stream.header else {
+            return Err(Some(StepOutcome::Over));
+        };
         let keeps_all = self.routes.get(&header.route).is_some_and(|route| route.keeps_all);
         let may_wait = route.kind == Kind::Request || header.reliable && keeps_all;
         // Streams that wait for one limit are read on in turn.

@@ -61,7 +61,7 @@ const ENDED: &str = "the link ended before they were read";
 const NO_ROUTE: VarInt = VarInt::from_u32(CloseCode::OutOfOrder as u32);
 
 /// A data stream: its connection, and its number there.
-type Key = (u64, StreamId);
+type StreamKey = (u64, StreamId);
 
 /// The peer broke a rule: the code that ends its link, and why.
 pub(crate) type LinkViolation = (CloseCode, String);
@@ -107,14 +107,14 @@ impl RouteIn {
 /// The samples from one peer.
 pub(crate) struct Inbound {
     routes: HashMap<u32, RouteIn>,
-    streams: HashMap<Key, IncomingStream>,
+    streams: HashMap<StreamKey, IncomingStream>,
     /// The streams of each flow, in the order in which they came.
-    turns: HashMap<(u32, Gid), VecDeque<Key>>,
-    ready: VecDeque<Key>,
+    turns: HashMap<(u32, Gid), VecDeque<StreamKey>>,
+    ready: VecDeque<StreamKey>,
     /// Streams that wait until a time at the latest.
-    waiting: BTreeSet<(Duration, Key)>,
+    waiting: BTreeSet<(Duration, StreamKey)>,
     /// Streams that wait for room in a ring.
-    full: HashSet<Key>,
+    full: HashSet<StreamKey>,
     /// Streams that wait for memory.
     without_room: StreamQueue,
     limited: Limited,
@@ -189,7 +189,7 @@ impl Inbound {
         self.make_ready((link, stream));
     }
 
-    fn make_ready(&mut self, key: Key) {
+    fn make_ready(&mut self, key: StreamKey) {
         if let Some(stream) = self.streams.get_mut(&key)
             && !std::mem::replace(&mut stream.is_ready, true)
         {
@@ -293,7 +293,7 @@ impl Inbound {
         }
     }
 
-    fn forget(&mut self, key: Key) {
+    fn forget(&mut self, key: StreamKey) {
         let Some(mut stream) = self.streams.remove(&key) else { return };
         self.release(&mut stream);
         self.end_turn(key, &stream);

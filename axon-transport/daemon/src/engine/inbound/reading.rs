@@ -7,7 +7,7 @@ use axon_shm::{Meta, ids::Gid};
 use bytes::Bytes;
 
 use super::{
-    ARRIVAL, ENDED, Inbound, Key, LONG, LinkViolation, NO_ROUTE, TURN,
+    ARRIVAL, ENDED, Inbound, LONG, LinkViolation, NO_ROUTE, StreamKey, TURN,
     incoming::{HEADER, IncomingStream, OpenedMessage, Piece, StreamHeader, StreamStep},
 };
 use crate::{
@@ -31,7 +31,7 @@ impl Inbound {
     /// The peer broke a rule.
     pub(crate) fn read(
         &mut self,
-        key: Key,
+        key: StreamKey,
         quic: &mut quinn_proto::Connection,
         open: &mut Open<'_>,
         now: Duration,
@@ -45,7 +45,7 @@ impl Inbound {
 
     fn read_turn(
         &mut self,
-        key: Key,
+        key: StreamKey,
         quic: &mut quinn_proto::Connection,
         open: &mut Open<'_>,
         now: Duration,
@@ -63,14 +63,14 @@ impl Inbound {
                 }
             };
             match next {
-                Next::Go if read < TURN => {}
-                Next::Go => {
+                StepOutcome::Go if read < TURN => {}
+                StepOutcome::Go => {
                     stream.is_ready = true;
                     self.ready.push_back(key);
                     break;
                 }
-                Next::Wait => break,
-                Next::Over => {
+                StepOutcome::Wait => break,
+                StepOutcome::Over => {
                     self.end_turn(key, &stream);
                     if stream.is_over(key.1, quic) {
                         return Ok(read);
@@ -86,19 +86,19 @@ impl Inbound {
 
     fn step(
         &mut self,
-        key: Key,
+        key: StreamKey,
         stream: &mut IncomingStream,
         quic: &mut quinn_proto::Connection,
         open: &mut Open<'_>,
         read: &mut usize,
         now: Duration,
-    ) -> Result<Next, LinkViolation> {
+    ) -> Result<StepOutcome, LinkViolation> {
         match std::mem::replace(&mut stream.step, StreamStep::Length) {
             StreamStep::Header => {
                 let header = match stream.take(HEADER, key.1, quic, read) {
                     Piece::Whole(header) => header,
                     Piece::Later => return Ok(wait(stream, StreamStep::Header)),
-                    Piece::End => return Ok(Next::Over),
+                    Piece::End => return Ok(StepOutcome::Over),
                 };
                 let header = StreamHeader::parse(&header).map_err(malformed)?;
                 stream.header = Some((header, None));
@@ -107,7 +107,7 @@ impl Inbound {
                 turns.push_back(key);
                 self.waiting.insert((now + ARRIVAL, key));
                 stream.step = StreamStep::Turn(now + ARRIVAL);
-                Ok(Next::Go)
+                Ok(StepOutcome::Go)
             }
             StreamStep::Turn(until) => Ok(self.begin(key, stream, quic, until, now)),
             StreamStep::Length => {
@@ -117,7 +117,7 @@ impl Inbound {
                 let prefix = match stream.take(4, key.1, quic, read) {
                     Piece::Whole(prefix) => prefix,
                     Piece::Later => return Ok(wait(stream, StreamStep::Length)),
-                    Piece::End => return Ok(Next::Over),
+                    Piece::End => return Ok(StepOutcome::Over),
                 };
                 let mut bytes = [0; 4];
                 bytes.copy_from_slice(&prefix);
@@ -128,7 +128,7 @@ impl Inbound {
                     return Err((CloseCode::TooLarge, text));
                 }
                 stream.step = StreamStep::Room(length as usize);
-                Ok(Next::Go)
+                Ok(StepOutcome::Go)
             }
             StreamStep::Room(length) => {
                 if length > LONG {
@@ -141,7 +141,7 @@ impl Inbound {
                     stream.room = Some(room);
                 }
                 stream.step = StreamStep::Body(length);
-                Ok(Next::Go)
+                Ok(StepOutcome::Go)
             }
             StreamStep::Body(length) => {
                 // One that has come whole is held by nobody.
@@ -158,13 +158,13 @@ impl Inbound {
                     Piece::Later => return Ok(wait(stream, StreamStep::Body(length))),
                     Piece::End => {
                         self.release(stream);
-                        return Ok(Next::Over);
+                        return Ok(StepOutcome::Over);
                     }
                 };
                 self.open(stream, body, open, now)
             }
             StreamStep::Unpack(header, sent) => self.unpack(key, stream, header, sent, read, now),
-            StreamStep::Over => Ok(Next::Over),
+            StreamStep::Over => Ok(StepOutcome::Over),
             StreamStep::Writer(message, until) => {
                 Ok(self.deliver(key, stream, message, until, now))
             }
@@ -175,13 +175,13 @@ impl Inbound {
     /// Begins to read a stream once its route is there and it is its turn.
     fn begin(
         &mut self,
-        key: Key,
+        key: StreamKey,
         stream: &mut IncomingStream,
         quic: &mut quinn_proto::Connection,
         until: Duration,
         now: Duration,
-    ) -> Next {
-        let Some((header, _)) = stream.header else { return Next::Over };
+    ) -> StepOutcome {
+        let Some((header, _)) = stream.header else { return StepOutcome::Over };
         let route = self.routes.get(&header.route);
         let found = route.filter(|route| route.has_flow(&header.of));
         let Some(found) = found else {
@@ -193,7 +193,7 @@ impl Inbound {
             self.waiting.remove(&(until, key));
             self.counters.lost(&self.topic(header.route), "no_route", 1);
             let _ = quic.recv_stream(key.1).stop(NO_ROUTE);
-            return Next::Over;
+            return StepOutcome::Over;
         };
         stream.header = Some((header, Some(found.route)));
         self.waiting.remove(&(until, key));
@@ -203,7 +203,7 @@ impl Inbound {
             return wait(stream, StreamStep::Turn(Duration::MAX));
         }
         stream.step = StreamStep::Length;
-        Next::Go
+        StepOutcome::Go
     }
 
     /// Opens a message that has arrived.
@@ -213,8 +213,8 @@ impl Inbound {
         body: Bytes,
         open: &mut Open<'_>,
         now: Duration,
-    ) -> Result<Next, LinkViolation> {
-        let Some((header, Some(route))) = stream.header else { return Ok(Next::Over) };
+    ) -> Result<StepOutcome, LinkViolation> {
+        let Some((header, Some(route))) = stream.header else { return Ok(StepOutcome::Over) };
         if let Some(short) = &mut stream.headers {
             permit_short(route, open)?;
             let (told, payload) = short.read(&body).map_err(malformed)?;
@@ -222,35 +222,35 @@ impl Inbound {
             let (writer, number, payload) = (header.of, meta.sequence, body.slice_ref(payload));
             let message = OpenedMessage { writer, number, meta, payload };
             stream.step = StreamStep::Writer(message, now + ARRIVAL);
-            return Ok(Next::Go);
+            return Ok(StepOutcome::Go);
         }
         let Some((opened, payload)) = open_body(open, body, route, now).map_err(refused)? else {
             self.lost("no_link", header, ENDED, now);
             self.release(stream);
-            return Ok(Next::Go);
+            return Ok(StepOutcome::Go);
         };
         let numbered = header.acknowledged && route.kind == Kind::Response;
         writer_of(route.kind, header.of, numbered, &opened).map_err(malformed)?;
         if opened.compressed {
             stream.step = StreamStep::Unpack(opened, payload);
-            return Ok(Next::Go);
+            return Ok(StepOutcome::Go);
         }
         let message = self.message(header, route, &opened, payload, now);
         stream.step = StreamStep::Writer(message, now + ARRIVAL);
-        Ok(Next::Go)
+        Ok(StepOutcome::Go)
     }
 
     /// Decompresses a message once there is memory for it: a few bytes may become a long one, which then waits for its
     /// ring.
     fn unpack(
         &mut self,
-        key: Key,
+        key: StreamKey,
         stream: &mut IncomingStream,
         header: inner::Header,
         sent: Bytes,
         read: &mut usize,
         now: Duration,
-    ) -> Result<Next, LinkViolation> {
+    ) -> Result<StepOutcome, LinkViolation> {
         let length = unpacked_length(&header, self.max_message).map_err(refused)?;
         let has = stream.room.as_ref().map_or(0, Charge::amount);
         let is_long = length > LONG;
@@ -269,10 +269,10 @@ impl Inbound {
         }
         let payload = unpack(&sent, length).map_err(refused)?.into();
         *read += length;
-        let Some((of_stream, Some(route))) = stream.header else { return Ok(Next::Over) };
+        let Some((of_stream, Some(route))) = stream.header else { return Ok(StepOutcome::Over) };
         let message = self.message(of_stream, route, &header, payload, now);
         stream.step = StreamStep::Writer(message, now + ARRIVAL);
-        Ok(Next::Go)
+        Ok(StepOutcome::Go)
     }
 
     /// A message of a stream. Its writer was judged before.
@@ -314,7 +314,7 @@ impl Inbound {
         }
     }
 
-    pub(super) fn end_turn(&mut self, key: Key, stream: &IncomingStream) {
+    pub(super) fn end_turn(&mut self, key: StreamKey, stream: &IncomingStream) {
         let Some((header, _)) = stream.header else { return };
         let flow = (header.route, header.of);
         let Some(turns) = self.turns.get_mut(&flow) else { return };
@@ -330,7 +330,7 @@ impl Inbound {
 
 /// What a step says.
 #[derive(Debug)]
-pub(super) enum Next {
+pub(super) enum StepOutcome {
     /// Take the next one.
     Go,
     /// Nothing more can be done now.
@@ -339,9 +339,9 @@ pub(super) enum Next {
     Over,
 }
 
-pub(super) fn wait(stream: &mut IncomingStream, step: StreamStep) -> Next {
+pub(super) fn wait(stream: &mut IncomingStream, step: StreamStep) -> StepOutcome {
     stream.step = step;
-    Next::Wait
+    StepOutcome::Wait
 }
 
 /// Whether a stream of this route may have short headers.

@@ -6,9 +6,9 @@ use axon_envelope::{Kind, Route};
 use bytes::{Buf, Bytes};
 
 use super::{
-    ENDED, Inbound, Key, LONG, LinkViolation, RouteIn,
+    ENDED, Inbound, LONG, LinkViolation, RouteIn, StreamKey,
     incoming::{IncomingStream, OpenedMessage, StreamHeader, StreamStep},
-    reading::{Next, malformed, permit_short, refused, told},
+    reading::{StepOutcome, malformed, permit_short, refused, told},
 };
 use crate::engine::{
     sample::{
@@ -48,11 +48,11 @@ impl Inbound {
     /// The peer broke a rule.
     pub(super) fn run(
         &mut self,
-        key: Key,
+        key: StreamKey,
         stream: &mut IncomingStream,
         open: &mut Open<'_>,
         now: Duration,
-    ) -> Result<Option<Next>, LinkViolation> {
+    ) -> Result<Option<StepOutcome>, LinkViolation> {
         let Some((header, Some(route))) = stream.header else { return Ok(None) };
         if !header.reliable || route.kind != Kind::Topic || !stream.gathered.is_empty() {
             return Ok(None);
@@ -81,7 +81,7 @@ impl Inbound {
             }
             Some(step) => {
                 stream.step = step;
-                Ok(Some(Next::Go))
+                Ok(Some(StepOutcome::Go))
             }
         }
     }

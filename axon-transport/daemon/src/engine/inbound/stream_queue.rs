@@ -2,32 +2,32 @@
 
 use std::collections::{HashSet, VecDeque};
 
-use super::Key;
+use super::StreamKey;
 
 /// A line of streams.
 #[derive(Debug, Default)]
 pub(super) struct StreamQueue {
-    order: VecDeque<Key>,
-    all: HashSet<Key>,
+    order: VecDeque<StreamKey>,
+    all: HashSet<StreamKey>,
 }
 
 impl StreamQueue {
     /// Adds a stream behind the others, unless it is in line.
-    pub(super) fn add(&mut self, key: Key) {
+    pub(super) fn add(&mut self, key: StreamKey) {
         if self.all.insert(key) {
             self.order.push_back(key);
         }
     }
 
     /// Removes a stream.
-    pub(super) fn remove(&mut self, key: &Key) {
+    pub(super) fn remove(&mut self, key: &StreamKey) {
         if self.all.remove(key) {
             self.order.retain(|other| other != key);
         }
     }
 
     /// Removes all, in order.
-    pub(super) fn take(&mut self) -> VecDeque<Key> {
+    pub(super) fn take(&mut self) -> VecDeque<StreamKey> {
         self.all.clear();
         std::mem::take(&mut self.order)
     }
@@ -38,7 +38,7 @@ impl StreamQueue {
     }
 
     /// The streams in line.
-    pub(super) fn iter(&self) -> impl Iterator<Item = &Key> {
+    pub(super) fn iter(&self) -> impl Iterator<Item = &StreamKey> {
         self.order.iter()
     }
 

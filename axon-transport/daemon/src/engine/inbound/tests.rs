@@ -20,7 +20,7 @@ use quinn_proto::{Dir, Side, StreamId};
 use super::{
     Inbound, RouteIn,
     incoming::{IncomingStream, OpenedMessage, StreamHeader, StreamStep},
-    reading::Next,
+    reading::StepOutcome,
 };
 use crate::{
     engine::{
@@ -185,7 +185,7 @@ impl Way {
     }
 
     /// QUIC gave this, and the stream is read. The code with which a violation ends the link.
-    fn read(&mut self, bytes: Vec<u8>) -> Result<Option<Next>, CloseCode> {
+    fn read(&mut self, bytes: Vec<u8>) -> Result<Option<StepOutcome>, CloseCode> {
         self.stream.chunk = bytes.into();
         let key = (1, StreamId::new(Side::Client, Dir::Uni, 0));
         let run = self.inbound.run(key, &mut self.stream, &mut Open::Link, NOW);
@@ -231,7 +231,7 @@ fn a_full_ring_keeps_the_sample_that_has_no_room() {
     for short in [true, false] {
         let mut way = Way::new(Kind::Topic, short, 3);
         let piece = way.messages(1..=5);
-        assert!(matches!(way.read(piece), Ok(Some(Next::Wait))));
+        assert!(matches!(way.read(piece), Ok(Some(StepOutcome::Wait))));
         assert_eq!(way.numbers(), [1, 2, 3]);
         let StreamStep::Ring(message) = &way.stream.step else { panic!("{:?}", way.stream.step) };
         assert_eq!((message.meta.sequence, message.writer), (4, PUBLISHER));
@@ -301,7 +301,7 @@ fn a_call_of_a_client_that_is_gone_is_acknowledged_as_dropped() {
     let message = OpenedMessage { writer: Gid([9; 16]), number: 4, meta, payload: Bytes::new() };
     let key = (1, StreamId::new(Side::Client, Dir::Uni, 0));
     let next = way.inbound.deliver(key, &mut way.stream, message, NOW, NOW);
-    assert!(matches!(next, Next::Go));
+    assert!(matches!(next, StepOutcome::Go));
     let of = ReceivedOf { route: ROUTE, publisher: PUBLISHER, sequence: 4, dropped: 1 };
     assert_eq!(way.acknowledged(), Some(of));
 }

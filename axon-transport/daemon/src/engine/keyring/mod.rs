@@ -92,7 +92,7 @@ impl Keyring {
     /// The keyring of a daemon in `qkd`, `None` in `classic`.
     pub(crate) fn new(config: &Config) -> Option<Self> {
         let Security::Qkd(qkd) = &config.security else { return None };
-        let (clock, cipher) = (Clock::manual(), tls_cipher(config.cipher));
+        let (clock, cipher) = (Clock::default(), tls_cipher(config.cipher));
         let allowed = qkd.peers.clone();
         Some(Self {
             acceptor: Acceptor::new(&qkd.sae_id, allowed.clone(), cipher, clock.clone()),

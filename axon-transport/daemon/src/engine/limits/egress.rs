@@ -9,7 +9,7 @@ use std::{
 
 use axon_transport::{access::EgressLimit, status::LimitStatus};
 
-use super::{interfaces::InterfaceLimits, leaky_bucket::Level};
+use super::{interfaces::InterfaceLimits, rate_bucket::BucketLevel};
 
 /// What may leave at once, in seconds of the limit, and at least in bytes: a few packets.
 const AT_ONCE: (f64, f64) = (0.005, 6000.0);
@@ -24,7 +24,7 @@ pub(crate) struct EgressCap {
     limit: EgressLimit,
     /// `None`: it is on those to an identity.
     interface: Option<String>,
-    level: RefCell<Level>,
+    level: RefCell<BucketLevel>,
     packets: Cell<u64>,
 }
 
@@ -41,7 +41,7 @@ impl EgressCap {
 
     fn new(limit: &EgressLimit, interface: Option<String>) -> Self {
         let most = (limit.bytes * AT_ONCE.0).max(AT_ONCE.1);
-        let level = RefCell::new(Level::full(limit.bytes, most));
+        let level = RefCell::new(BucketLevel::full(limit.bytes, most));
         Self { limit: limit.clone(), interface, level, packets: Cell::default() }
     }
 

@@ -4,7 +4,7 @@
 mod egress;
 mod flow_queue;
 mod interfaces;
-mod leaky_bucket;
+mod rate_bucket;
 
 use std::{
     cell::{Cell, RefCell},
@@ -22,7 +22,7 @@ use axon_transport::{
 };
 
 pub(crate) use self::{egress::Egress, interfaces::InterfaceLimits};
-use self::{egress::EgressCap, flow_queue::FlowQueue, leaky_bucket::LeakyBucket};
+use self::{egress::EgressCap, flow_queue::FlowQueue, rate_bucket::RateBucket};
 
 /// Limits that status lists.
 const LISTED: usize = 64;
@@ -73,7 +73,7 @@ pub(crate) struct Limit {
     place: RefCell<String>,
     /// The cause under which what it drops is counted.
     cause: &'static str,
-    bucket: RefCell<LeakyBucket>,
+    bucket: RefCell<RateBucket>,
     /// The flows that wait for it.
     line: RefCell<FlowQueue>,
     passed: Cell<u64>,
@@ -146,7 +146,7 @@ impl IdentityLimits {
         // Those that are not in force any more.
         limits.retain(|limit| Rc::strong_count(limit) > 1);
         let limit = Rc::new(Limit {
-            bucket: RefCell::new(LeakyBucket::new(rate)),
+            bucket: RefCell::new(RateBucket::new(rate)),
             line: RefCell::default(),
             rate: rate.clone(),
             scope,

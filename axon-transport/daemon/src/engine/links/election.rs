@@ -93,7 +93,7 @@ impl Links {
             None
         };
         if let Some(text) = too_many {
-            if self.admission.is_news(address.ip(), now) {
+            if self.admission.is_new(address.ip(), now) {
                 return self.turn_away(number, &hello, text.into(), now);
             }
             self.table.remove(number);
@@ -184,7 +184,7 @@ impl Links {
         tracing::info!(%newcomer, "{text}");
         let address = links.iter().find(|(_, other)| *other == number).map(|(ip, _)| *ip);
         if let Some(address) = address
-            && self.admission.is_news(address, now)
+            && self.admission.is_new(address, now)
         {
             let peer = self.peer_text(number);
             let kind = self.authenticated(address);

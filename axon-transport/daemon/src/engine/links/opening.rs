@@ -49,7 +49,7 @@ impl Links {
         let source = incoming.remote_address();
         let Some(place) = self.admission.enter(source.ip()) else {
             self.connections.endpoints().refuse(endpoint, incoming);
-            if self.admission.is_news(source.ip(), now) {
+            if self.admission.is_new(source.ip(), now) {
                 let text = "hosts at this address have as many handshakes under way as they may";
                 let refusal = Refusal::here(CloseCode::NotAllowed, text);
                 let kind = self.unauthenticated(source.ip());

@@ -40,7 +40,7 @@ use self::{
     budget::Budget,
     ending::{Endings, FinishedPublisher, GivenUpSamples},
     flow::{Flow, FlowPause},
-    pings::Nudges,
+    pings::Pings,
     served::{FlowRoute, ServedFlows},
     source::FlowProgress,
     stall::{BusyFlow, FlowStalls, PeerActivity},
@@ -82,7 +82,7 @@ pub(crate) struct Outbound {
     turns: FlowTurns,
     endings: Endings,
     stalls: FlowStalls,
-    nudges: Nudges,
+    pings: Pings,
     budget: Rc<Budget>,
     counters: Rc<Counters>,
     responses: ResponseNumbers,
@@ -105,7 +105,7 @@ impl Outbound {
             turns: FlowTurns::new(Rc::clone(&budget)),
             endings: Endings::new(budget.of_daemon()),
             stalls: FlowStalls::new(stalled_after, now),
-            nudges: Nudges::default(),
+            pings: Pings::default(),
             budget,
             counters,
             responses,
@@ -131,10 +131,10 @@ impl Outbound {
         };
         self.table.routes.add(number, shared);
         self.update_sources(number, sources, seen, now);
-        for (of, UnfinishedFlow { progress, furthest }) in unfinished {
+        for (of, UnfinishedFlow { progress, sent_progress }) in unfinished {
             let Some(id) = self.table.find(number, &of) else { continue };
             let Some(flow) = self.table.flows.get_mut(id) else { continue };
-            flow.go_on(furthest);
+            flow.go_on(sent_progress);
             self.stalls.inherit(id, flow.progress(), progress, now);
         }
     }
@@ -238,8 +238,8 @@ impl Outbound {
     /// What is known of the flows of a route that hold somebody up.
     fn leave(&mut self, number: u32, now: Duration) -> UnfinishedFlows {
         let flows = self.table.kept_flows(number).into_iter();
-        let known = flows.map(|(of, flow, furthest)| {
-            (of, UnfinishedFlow { progress: self.stalls.leave(&flow, now), furthest })
+        let known = flows.map(|(of, flow, sent_progress)| {
+            (of, UnfinishedFlow { progress: self.stalls.leave(&flow, now), sent_progress })
         });
         known.collect()
     }
@@ -265,7 +265,7 @@ impl Outbound {
     fn forget(&mut self, gone: impl IntoIterator<Item = FlowId>) {
         for id in gone {
             self.turns.forget(id);
-            self.nudges.forget(id);
+            self.pings.forget(id);
             self.stalls.forget(id);
         }
     }
@@ -296,7 +296,7 @@ impl Outbound {
             served.done(flow.info.of, done);
             let taken = carrier.taken - before;
             if carrier.loses && taken > 0 {
-                self.nudges.handle_sent(turn.flow, carrier.quic.rtt(), now);
+                self.pings.handle_sent(turn.flow, carrier.quic.rtt(), now);
             }
             self.turns.handle_sent(turn, taken);
             if flow.is_held() {
@@ -426,7 +426,7 @@ impl Outbound {
             self.table.flows.poll_timeout(),
             self.endings.poll_timeout(),
             (!self.table.flows.are_quiet()).then(|| self.stalls.poll_timeout()),
-            self.nudges.poll_timeout(),
+            self.pings.poll_timeout(),
             self.turns.poll_timeout(),
         ];
         parts.into_iter().flatten().min()
@@ -459,7 +459,7 @@ impl Outbound {
         let rtt = carrier.as_deref().map_or(NO_CARRIER, |carrier| carrier.quic.rtt());
         let lacks_keys = carrier.as_deref().is_some_and(|carrier| carrier.seal.lacks_keys_of_kme());
         let is_on_the_way = |id| self.table.flows.get(id).is_some_and(Flow::is_on_the_way);
-        if self.nudges.handle_timeout(rtt, now, is_on_the_way)
+        if self.pings.handle_timeout(rtt, now, is_on_the_way)
             && let Some(carrier) = carrier
         {
             carrier.quic.ping();

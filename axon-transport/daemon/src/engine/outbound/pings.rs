@@ -16,7 +16,7 @@ const MOST: u8 = 100;
 
 /// The samples on the way that PINGs follow.
 #[derive(Debug, Default)]
-pub(super) struct Nudges {
+pub(super) struct Pings {
     /// Flows with samples on the way, and the PINGs since the last one.
     flows: HashMap<FlowId, u8>,
     due: Option<Duration>,
@@ -24,7 +24,7 @@ pub(super) struct Nudges {
     sent: bool,
 }
 
-impl Nudges {
+impl Pings {
     /// A flow sent samples over a link that loses packets.
     pub(super) fn handle_sent(&mut self, flow: FlowId, rtt: Duration, now: Duration) {
         self.flows.insert(flow, 0);
@@ -69,41 +69,41 @@ mod tests {
     const RTT: Duration = Duration::from_millis(4);
 
     /// The number of PINGs until nothing is due.
-    fn pings(nudges: &mut Nudges, on_the_way: impl Fn(Duration) -> bool) -> u32 {
-        let mut pings = 0;
-        while let Some(now) = nudges.poll_timeout() {
-            pings += u32::from(nudges.handle_timeout(RTT, now, |_| on_the_way(now)));
+    fn count(pings: &mut Pings, on_the_way: impl Fn(Duration) -> bool) -> u32 {
+        let mut sent = 0;
+        while let Some(now) = pings.poll_timeout() {
+            sent += u32::from(pings.handle_timeout(RTT, now, |_| on_the_way(now)));
         }
-        pings
+        sent
     }
 
     #[test]
     fn pings_follow_samples_until_they_have_arrived() {
-        let mut nudges = Nudges::default();
-        assert_eq!(nudges.poll_timeout(), None);
-        nudges.handle_sent(7, RTT, Duration::ZERO);
-        assert_eq!(nudges.poll_timeout(), Some(LEAST));
+        let mut pings = Pings::default();
+        assert_eq!(pings.poll_timeout(), None);
+        pings.handle_sent(7, RTT, Duration::ZERO);
+        assert_eq!(pings.poll_timeout(), Some(LEAST));
         // At 3 ms the sample itself had just been sent; then there are PINGs at 6, 9 and 12 ms.
-        assert_eq!(pings(&mut nudges, |now| now < Duration::from_millis(15)), 3);
-        nudges.handle_sent(7, RTT, Duration::ZERO);
-        nudges.forget(7);
-        assert_eq!(pings(&mut nudges, |_| true), 0);
+        assert_eq!(count(&mut pings, |now| now < Duration::from_millis(15)), 3);
+        pings.handle_sent(7, RTT, Duration::ZERO);
+        pings.forget(7);
+        assert_eq!(count(&mut pings, |_| true), 0);
     }
 
     #[test]
     fn pings_end_where_nothing_says_that_a_sample_arrived() {
-        let mut nudges = Nudges::default();
-        nudges.handle_sent(7, RTT, Duration::ZERO);
-        assert_eq!(pings(&mut nudges, |_| true), u32::from(MOST) - 1);
+        let mut pings = Pings::default();
+        pings.handle_sent(7, RTT, Duration::ZERO);
+        assert_eq!(count(&mut pings, |_| true), u32::from(MOST) - 1);
     }
 
     #[test]
     fn samples_that_follow_each_other_need_no_pings() {
-        let mut nudges = Nudges::default();
+        let mut pings = Pings::default();
         for time in 0..100 {
             let now = Duration::from_millis(time);
-            nudges.handle_sent(7, RTT, now);
-            assert!(!nudges.handle_timeout(RTT, now, |_| true), "{time}");
+            pings.handle_sent(7, RTT, now);
+            assert!(!pings.handle_timeout(RTT, now, |_| true), "{time}");
         }
     }
 }

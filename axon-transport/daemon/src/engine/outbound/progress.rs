@@ -27,12 +27,12 @@ mod tests {
 
     #[test]
     fn bytes_that_were_taken_before_do_not_count_again() {
-        let mut furthest = SentProgress::default();
+        let mut sent_progress = SentProgress::default();
         let taken = [(1, 10), (1, 30), (2, 5), (1, 40), (2, 5), (2, 3), (2, 7), (9, 0), (9, 1)];
-        let new = taken.map(|(sequence, bytes)| furthest.advance(sequence, bytes));
+        let new = taken.map(|(sequence, bytes)| sent_progress.advance(sequence, bytes));
         assert_eq!(new, [10, 20, 5, 0, 0, 0, 2, 0, 1]);
         // A flow that follows goes on from there.
-        let mut next = SentProgress::default().max(furthest);
+        let mut next = SentProgress::default().max(sent_progress);
         assert_eq!([(1, 50), (9, 4)].map(|(s, b)| next.advance(s, b)), [0, 3]);
     }
 }

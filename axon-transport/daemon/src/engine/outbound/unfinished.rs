@@ -13,7 +13,7 @@ pub(crate) struct UnfinishedFlow {
     /// What the peer did, and did not do.
     pub(super) progress: Progress,
     /// How far QUIC took its samples.
-    pub(super) furthest: SentProgress,
+    pub(super) sent_progress: SentProgress,
 }
 
 /// Those of one route, by publisher.
@@ -24,7 +24,7 @@ impl UnfinishedFlow {
     pub(crate) fn and(self, other: Self) -> Self {
         Self {
             progress: self.progress.and(other.progress, (0, 0)),
-            furthest: self.furthest.max(other.furthest),
+            sent_progress: self.sent_progress.max(other.sent_progress),
         }
     }
 

@@ -21,7 +21,7 @@ use axon_transport::{
 
 use super::{
     refused::shown,
-    rights::{EndpointRights, JudgedEndpoints},
+    rights::{EndpointRights, RightsByEndpoint},
 };
 use crate::{
     bridge::RefusedRoute,
@@ -69,7 +69,7 @@ pub(super) struct PeerAccess {
     permissions: Permissions,
     /// The rules changed since the denied uses were judged.
     changed: bool,
-    judged: JudgedEndpoints,
+    rights: RightsByEndpoint,
     /// Uses by endpoints of the peer that are denied here, with what remembers them. The peer was told.
     here: BTreeMap<AccessUse, (String, Charge)>,
     /// Uses by endpoints of this host that the peer's host denies, with what remembers them.
@@ -87,8 +87,8 @@ impl PeerAccess {
         let (here, there) = (BTreeMap::new(), BTreeMap::new());
         let (room, places) = (Rc::clone(&account.refusals), Rc::clone(&account.denied));
         let asked = BTreeMap::new();
-        let (judged, logged) = (JudgedEndpoints::default(), LogLimit::default());
-        Self { permissions, changed: false, judged, here, there, room, places, asked, logged }
+        let (rights, logged) = (RightsByEndpoint::default(), LogLimit::default());
+        Self { permissions, changed: false, rights, here, there, room, places, asked, logged }
     }
 
     pub(super) fn permissions(&self) -> &Permissions {
@@ -99,17 +99,17 @@ impl PeerAccess {
     pub(super) fn set_permissions(&mut self, permissions: Permissions) {
         self.permissions = permissions;
         self.changed = true;
-        self.judged.clear();
+        self.rights.clear();
     }
 
     /// What the peer may see and use of an endpoint of this host.
     pub(super) fn judge(&mut self, endpoint: &Arc<Endpoint>) -> EndpointRights {
-        self.judged.judge(&self.permissions, endpoint)
+        self.rights.judge(&self.permissions, endpoint)
     }
 
     /// Forgets endpoints of this host that are gone.
-    pub(super) fn retain_judged(&mut self, stands: impl Fn(&Gid) -> bool) {
-        self.judged.retain(stands);
+    pub(super) fn retain_rights(&mut self, stands: impl Fn(&Gid) -> bool) {
+        self.rights.retain(stands);
     }
 
     /// Why the peer may not do this, if it may not.
@@ -147,12 +147,12 @@ impl PeerAccess {
             self.here.keys().filter(gone).cloned().collect()
         };
         let anew = std::mem::take(&mut self.changed).then_some(known).into_iter().flatten();
-        let judged: Vec<AccessUse> =
+        let rights: Vec<AccessUse> =
             anew.chain(new).map(|(verb, name)| (verb, name.to_owned())).collect();
         // What goes makes room for what comes.
         lifted.iter().for_each(|used| drop(self.here.remove(used)));
         let mut denied = Vec::new();
-        for used in judged {
+        for used in rights {
             let mut place = None;
             if !self.here.contains_key(&used) {
                 // Uses for which there is no place are not judged: a peer with many of them would have the rules asked at each

@@ -46,7 +46,7 @@ pub(crate) use self::{
     lanes::WritersHere,
     serving::{MAX_ROUTES, StalledRoute},
 };
-use super::peer_graph::shown::{ShownEndpoint, ToldGraph};
+use super::peer_graph::shown::{ShownEndpoint, ShownToPeer};
 use super::{
     inbound::Inbound,
     outbound::{Outbound, Source, StallCause},
@@ -99,7 +99,7 @@ pub(crate) struct Peer {
     /// Endpoints of it were ignored, since another peer had them.
     pub(super) displaced: bool,
     /// The graph that it was sent.
-    told: ToldGraph,
+    shown_graph: ShownToPeer,
     /// It has been silent for so long that the control plane takes it for gone.
     pub(super) silent: bool,
     /// Its graph changed, and what follows was not done.
@@ -174,7 +174,7 @@ impl Peer {
             remote: PeerGraph::new(account, prover.is_needed(), permissions),
             prover,
             displaced: false,
-            told: ToldGraph::default(),
+            shown_graph: ShownToPeer::default(),
             silent: false,
             stirred: false,
             refusal_said: false,
@@ -349,7 +349,7 @@ impl Peer {
 
     /// Publishers that ended stay in the graph that the peer sees until their samples have arrived.
     fn keep_ending(&mut self, local: &LocalEndpoints, now: Duration) {
-        let ended = self.told.iter().filter(|(gid, shown)| {
+        let ended = self.shown_graph.iter().filter(|(gid, shown)| {
             shown.remote.endpoint.kind == EndpointKind::Publisher
                 && !local.contains_key(gid)
                 && !self.ending.contains_key(gid)
@@ -400,13 +400,16 @@ impl Peer {
             ShownEndpoint { remote, denied }
         };
         let now: BTreeMap<_, _> = visible.into_iter().map(|(gid, e)| (gid, told(e))).collect();
-        self.access.retain_judged(|gid| local.contains_key(gid) || self.ending.contains_key(gid));
-        self.told.tell(now, whole).into_iter().for_each(|message| self.messages.say(message));
+        self.access.retain_rights(|gid| local.contains_key(gid) || self.ending.contains_key(gid));
+        self.shown_graph
+            .tell(now, whole)
+            .into_iter()
+            .for_each(|message| self.messages.say(message));
     }
 
     /// The peer asks for the whole graph.
     fn resync(&mut self, local: &LocalEndpoints, now: Duration) {
-        if self.told.handle_resync(now) {
+        if self.shown_graph.handle_resync(now) {
             self.prover.forget();
             self.send_graph(local, true);
         }
@@ -466,7 +469,7 @@ impl Peer {
     pub(super) fn poll_timeout(&self, now: Duration) -> Option<Duration> {
         let alive = self.alive_due(now);
         let (attaching, announcing) = (self.look_at_attaching, self.served.poll_timeout());
-        let (resync, asks) = (self.told.poll_timeout(), self.refused.poll_timeout());
+        let (resync, asks) = (self.shown_graph.poll_timeout(), self.refused.poll_timeout());
         let unanswered = self.unanswered.poll_timeout();
         [attaching, announcing, alive, resync, asks, unanswered].into_iter().flatten().min()
     }
@@ -478,7 +481,7 @@ impl Peer {
         self.tell_alive(now);
         self.ask_again(now);
         self.look_at_unanswered(with, now);
-        if self.told.owes_resync() {
+        if self.shown_graph.owes_resync() {
             self.resync(with.local, now);
         }
     }

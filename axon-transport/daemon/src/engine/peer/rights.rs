@@ -22,9 +22,9 @@ pub(super) struct EndpointRights {
 
 /// The endpoints of this host that rules about the peer were asked about.
 #[derive(Default)]
-pub(super) struct JudgedEndpoints(HashMap<Gid, (Arc<Endpoint>, EndpointRights)>);
+pub(super) struct RightsByEndpoint(HashMap<Gid, (Arc<Endpoint>, EndpointRights)>);
 
-impl JudgedEndpoints {
+impl RightsByEndpoint {
     /// What the rules say. They are asked about an endpoint that is new, or is not what it was.
     pub(super) fn judge(
         &mut self,
@@ -79,7 +79,7 @@ mod tests {
     #[test]
     fn an_endpoint_is_judged_once_until_it_or_the_rules_change_or_it_is_gone() {
         let closed = rules("[[deny]]\npeer = \"*\"\nsubscribe = \"/closed\"");
-        let mut judged = JudgedEndpoints::default();
+        let mut judged = RightsByEndpoint::default();
         let mut judge = |rules: &Permissions, topic| {
             let before = looks_at_rules();
             let judgement = judged.judge(rules, &publisher(topic));
@@ -100,7 +100,7 @@ mod tests {
 
     #[test]
     fn nothing_is_remembered_where_there_are_no_rules() {
-        let mut judged = JudgedEndpoints::default();
+        let mut judged = RightsByEndpoint::default();
         let none = AccessRules::default().permissions(Party::Name("base"));
         let judgement = judged.judge(&none, &publisher("/t"));
         assert!(judgement.shown && judgement.usable && judged.0.is_empty());

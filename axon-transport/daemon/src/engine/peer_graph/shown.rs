@@ -23,7 +23,7 @@ pub(in crate::engine) struct ShownEndpoint {
 
 /// The graph of this host as far as a peer was told of it.
 #[derive(Default)]
-pub(in crate::engine) struct ToldGraph {
+pub(in crate::engine) struct ShownToPeer {
     endpoints: BTreeMap<Gid, ShownEndpoint>,
     version: u64,
     /// When the peer had the whole graph last because it asked for that.
@@ -32,7 +32,7 @@ pub(in crate::engine) struct ToldGraph {
     resync_due: bool,
 }
 
-impl ToldGraph {
+impl ShownToPeer {
     /// The endpoints that the peer knows.
     pub(in crate::engine) fn iter(&self) -> impl Iterator<Item = (&Gid, &ShownEndpoint)> {
         self.endpoints.iter()
@@ -139,7 +139,7 @@ mod tests {
 
     #[test]
     fn a_peer_is_told_what_changed_and_of_nothing_twice() {
-        let mut told = ToldGraph::default();
+        let mut told = ShownToPeer::default();
         assert_eq!(said(told.tell(endpoints(1..4), false)), [(1, 0, 3, 0, false)]);
         assert!(told.tell(endpoints(1..4), false).is_empty());
         assert_eq!(said(told.tell(endpoints([2, 3, 4, 5]), false)), [(2, 1, 2, 1, false)]);
@@ -149,7 +149,7 @@ mod tests {
 
     #[test]
     fn a_whole_graph_begins_at_version_0_and_is_sent_if_it_is_empty() {
-        let mut told = ToldGraph::default();
+        let mut told = ShownToPeer::default();
         told.tell(endpoints(1..4), false);
         assert_eq!(said(told.tell(endpoints(2..4), true)), [(2, 0, 2, 0, false)]);
         assert_eq!(said(told.tell(endpoints([]), true)), [(3, 0, 0, 0, false)]);
@@ -159,7 +159,7 @@ mod tests {
 
     #[test]
     fn a_peer_that_asks_again_and_again_gets_the_whole_graph_once_a_second() {
-        let mut told = ToldGraph::default();
+        let mut told = ShownToPeer::default();
         let at = Duration::from_millis;
         assert!(told.handle_resync(at(100)) && !told.owes_resync());
         assert!(!told.handle_resync(at(200)) && !told.handle_resync(at(1099)));

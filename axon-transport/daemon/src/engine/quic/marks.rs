@@ -11,17 +11,20 @@ use quinn_proto::{
 };
 
 /// A congestion controller that counts reports of marks, and otherwise does as the one that it wraps.
-struct Counting {
+struct EcnCountingController {
     inner: Box<dyn Controller>,
     marks: u64,
 }
 
-/// Makes [`Counting`] controllers around those of another factory.
-pub(in crate::engine) struct CountingFactory<F>(pub(super) Arc<F>);
+/// Makes [`EcnCountingController`] controllers around those of another factory.
+pub(in crate::engine) struct EcnCountingFactory<F>(pub(super) Arc<F>);
 
-impl<F: ControllerFactory> ControllerFactory for CountingFactory<F> {
+impl<F: ControllerFactory> ControllerFactory for EcnCountingFactory<F> {
     fn build(self: Arc<Self>, now: Instant, current_mtu: u16) -> Box<dyn Controller> {
-        Box::new(Counting { inner: Arc::clone(&self.0).build(now, current_mtu), marks: 0 })
+        Box::new(EcnCountingController {
+            inner: Arc::clone(&self.0).build(now, current_mtu),
+            marks: 0,
+        })
     }
 }
 
@@ -29,16 +32,17 @@ impl<F: ControllerFactory> ControllerFactory for CountingFactory<F> {
 pub(in crate::engine) fn marks_reported(quic: &quinn_proto::Connection) -> u64 {
     // A copy is the only way to it. It is made for status, once a second.
     let controller = quic.congestion_state().clone_box().into_any();
-    controller.downcast_ref::<Counting>().map_or(0, |counting| counting.marks)
+    controller.downcast_ref::<EcnCountingController>().map_or(0, |counting| counting.marks)
 }
 
 /// A copy of the controller that is wrapped.
 pub(in crate::engine) fn wrapped(quic: &quinn_proto::Connection) -> Option<Box<dyn Any>> {
-    let counting = quic.congestion_state().clone_box().into_any().downcast::<Counting>().ok()?;
+    let counting =
+        quic.congestion_state().clone_box().into_any().downcast::<EcnCountingController>().ok()?;
     Some(counting.inner.into_any())
 }
 
-impl Controller for Counting {
+impl Controller for EcnCountingController {
     fn on_sent(&mut self, now: Instant, bytes: u64, last_packet_number: u64) {
         self.inner.on_sent(now, bytes, last_packet_number);
     }
@@ -112,7 +116,7 @@ mod tests {
     #[test]
     fn marks_are_counted_and_losses_are_not_and_both_reach_the_wrapped_controller() {
         let now = Instant::now();
-        let factory = Arc::new(CountingFactory(Arc::new(CubicConfig::default())));
+        let factory = Arc::new(EcnCountingFactory(Arc::new(CubicConfig::default())));
         let mut controller = factory.build(now, 1200);
         let at = |seconds| now + Duration::from_secs(seconds);
         let initial = controller.window();
@@ -121,6 +125,9 @@ mod tests {
         controller.on_congestion_event(at(2), at(2), false, 1200);
         assert!(initial > marked && marked > controller.window());
         let copy = controller.clone_box().into_any();
-        assert_eq!(copy.downcast_ref::<Counting>().map(|counting| counting.marks), Some(1));
+        assert_eq!(
+            copy.downcast_ref::<EcnCountingController>().map(|counting| counting.marks),
+            Some(1)
+        );
     }
 }

@@ -11,7 +11,7 @@ use quinn_proto::{
     crypto::{CryptoError, HmacKey},
 };
 
-use super::marks::CountingFactory;
+use super::marks::EcnCountingFactory;
 use crate::engine::congestion::DelayConfig;
 
 /// A link whose peer is silent ends after this. Until then its flows and routes stand, and a successor takes them over.
@@ -161,7 +161,7 @@ fn control<F>(transport: &mut TransportConfig, factory: F)
 where
     F: ControllerFactory + Send + Sync + 'static,
 {
-    transport.congestion_controller_factory(Arc::new(CountingFactory(Arc::new(factory))));
+    transport.congestion_controller_factory(Arc::new(EcnCountingFactory(Arc::new(factory))));
 }
 
 #[cfg(test)]

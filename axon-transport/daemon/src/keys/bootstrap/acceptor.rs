@@ -15,7 +15,6 @@ use axon_tls::{
 };
 use axon_transport::config::QkdPeers;
 use secrecy::ExposeSecret;
-use tokio::sync::Notify;
 
 use super::{
     Completion,
@@ -111,7 +110,6 @@ struct AcceptorInner {
     cipher: Cipher,
     clock: Clock,
     state: Mutex<AcceptorState>,
-    queued: Notify,
 }
 
 struct AcceptorState {
@@ -172,7 +170,6 @@ impl Acceptor {
                 known_sources: SeenSet::new(KNOWN),
                 known_saes: SeenSet::new(KNOWN),
             }),
-            queued: Notify::new(),
         }))
     }
 
@@ -228,16 +225,6 @@ impl Acceptor {
             key_ids: vec![pending.key_id.clone()],
             purpose: KeyPurpose::Accept,
         })
-    }
-
-    /// The next call to the KME, when there is one. Cancel safe; for one caller at a time.
-    pub async fn next_request(&self) -> KmeRequest {
-        loop {
-            if let Some(request) = self.poll_request() {
-                return request;
-            }
-            self.0.queued.notified().await;
-        }
     }
 
     /// The KME's answer to one of our requests.
@@ -355,7 +342,6 @@ impl Acceptor {
         let identity = parsed;
         state.pending.push(Pending { identity, key_id, source, known, since: now, asked: false });
         drop(state);
-        inner.queued.notify_one();
         (failure.map_or(Lookup::Fetching, |(_, why)| Lookup::KmeFailed(why)), None)
     }
 

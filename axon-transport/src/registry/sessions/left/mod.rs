@@ -1,11 +1,11 @@
 //! What is kept for readers whose sessions are not here, or do not read yet: memory, grants and their rings, and the
 //! numbers of samples that they lost.
 
+mod earlier_grants;
 mod memory;
-mod news;
-mod pledges;
+mod undelivered;
 
-use self::{memory::LeftMemory, news::UndeliveredPackets, pledges::EarlierGrants};
+use self::{earlier_grants::EarlierGrants, memory::LeftMemory, undelivered::UndeliveredPackets};
 use super::{
     entry::SessionEntry,
     memory::{OwnMemory, RegisteredSegment},
@@ -22,16 +22,16 @@ pub(super) struct LeftBehind<F> {
     /// Memory of those that ended.
     memory: LeftMemory<F>,
     /// What is for readers whose sessions are not here.
-    news: UndeliveredPackets<F>,
-    pledges: EarlierGrants,
+    undelivered: UndeliveredPackets<F>,
+    earlier_grants: EarlierGrants,
 }
 
 impl<F> Default for LeftBehind<F> {
     fn default() -> Self {
         Self {
             memory: LeftMemory::default(),
-            news: UndeliveredPackets::default(),
-            pledges: EarlierGrants::default(),
+            undelivered: UndeliveredPackets::default(),
+            earlier_grants: EarlierGrants::default(),
         }
     }
 }
@@ -55,7 +55,7 @@ impl<F> LeftBehind<F> {
     /// A session came, or came back. It says anew what it granted: its process lives.
     pub(super) fn session_came(&mut self, id: &SessionId) {
         self.memory.forget(id);
-        self.news.take_awaiting(id);
+        self.undelivered.take_awaiting(id);
     }
 
     /// A session ended, which had this memory, and for whose readers these packets were kept.
@@ -72,47 +72,47 @@ impl<F> LeftBehind<F> {
 
     /// Keeps a packet for its reader.
     pub(super) fn keep(&mut self, output: SessionPacket<F>) {
-        self.news.keep(output, None);
+        self.undelivered.keep(output, None);
     }
 
     /// Keeps a packet for its reader, until the process of session `id` has ended.
     pub(super) fn hold_back(&mut self, output: SessionPacket<F>, id: SessionId) {
-        self.news.keep(output, Some(id));
+        self.undelivered.keep(output, Some(id));
     }
 
     /// Takes what was kept for a session's readers.
     pub(super) fn take_for(&mut self, id: &SessionId) -> Vec<SessionPacket<F>> {
-        self.news.take(id)
+        self.undelivered.take(id)
     }
 
     /// Whether something awaits the end of a session's process.
     pub(super) fn awaits_process(&self, id: &SessionId) -> bool {
-        self.news.awaits(id)
+        self.undelivered.awaits(id)
     }
 
     /// Takes what awaited the end of a session's process.
     pub(super) fn take_awaiting(&mut self, id: &SessionId) -> Vec<SessionPacket<F>> {
-        self.news.take_awaiting(id)
+        self.undelivered.take_awaiting(id)
     }
 
     /// A publisher of a process granted this by way of an earlier daemon.
-    pub(super) fn pledge(&mut self, granted: Granted, process: u32) {
-        self.pledges.note(granted, process);
+    pub(super) fn add_earlier_grant(&mut self, granted: Granted, process: u32) {
+        self.earlier_grants.note(granted, process);
     }
 
     /// A reader is granted something else, or was told that it gets nothing.
-    pub(super) fn forget_pledge(&mut self, pair: &Pair) {
-        self.pledges.forget(|of| (of.reader, of.writer) == (pair.reader, pair.writer));
+    pub(super) fn forget_earlier_grant(&mut self, pair: &Pair) {
+        self.earlier_grants.forget(|of| (of.reader, of.writer) == (pair.reader, pair.writer));
     }
 
     /// A publisher has ended, and said what its readers lost.
-    pub(super) fn forget_pledges(&mut self, writer: &Gid) {
-        self.pledges.forget(|granted| granted.writer == *writer);
+    pub(super) fn forget_earlier_grants(&mut self, writer: &Gid) {
+        self.earlier_grants.forget(|granted| granted.writer == *writer);
     }
 
-    /// Takes what a session's publishers pledged.
-    pub(super) fn take_pledges(&mut self, id: &SessionId) -> Vec<Granted> {
-        self.pledges.take(id)
+    /// Takes the grants of a session's publishers by way of an earlier daemon.
+    pub(super) fn take_earlier_grants(&mut self, id: &SessionId) -> Vec<Granted> {
+        self.earlier_grants.take(id)
     }
 }
 

@@ -16,7 +16,7 @@ use axon_shm::{ExternalLeader, internal::descriptors::PassedFd};
 
 use self::{
     relays::NearRelay,
-    stand_ins::{Kept, KeptCalls, NearStandIn},
+    stand_ins::{KeptCalls, LeftByConnection, NearStandIn},
 };
 use super::{
     calls::{self, CallChannels},
@@ -92,7 +92,7 @@ pub(in crate::session) fn start(
 impl Common {
     fn run(self, connected: Connected) {
         let mut next = Some(connected);
-        let mut kept = Kept::default();
+        let mut kept = LeftByConnection::default();
         while let Some(connected) = next {
             let since = Instant::now();
             let daemon = connected.welcome.daemon;
@@ -100,7 +100,7 @@ impl Common {
             self.shared.set_daemon(Some(daemon));
             let why = served.serve();
             served.forget_world();
-            kept = Kept { relays: served.keep_relays(), calls: served.keep_calls() };
+            kept = LeftByConnection { relays: served.keep_relays(), calls: served.keep_calls() };
             drop(served);
             if self.finishes() && (why.is_ok() || kept.relays.is_empty()) {
                 break;
@@ -152,8 +152,8 @@ struct RelayConnection<'a> {
 }
 
 impl<'a> RelayConnection<'a> {
-    fn new(common: &'a Common, connected: Connected, kept: Kept) -> Self {
-        let Kept { relays, calls } = kept;
+    fn new(common: &'a Common, connected: Connected, kept: LeftByConnection) -> Self {
+        let LeftByConnection { relays, calls } = kept;
         let KeptCalls { stand_ins, calls, mut unanswered, response_log, .. } =
             calls.for_daemon(connected.welcome.daemon);
         // A client may have ended while there was no daemon.

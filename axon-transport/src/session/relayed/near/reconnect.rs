@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::{Common, stand_ins::Kept};
+use super::{Common, stand_ins::LeftByConnection};
 use crate::{
     config::{Config, DaemonPolicy},
     session::{
@@ -38,7 +38,7 @@ impl Common {
 
     /// Another daemon; `None` when the session ends. `brief` says that the last one was as good as
     /// none.
-    pub(super) fn reconnect(&self, brief: bool, kept: &mut Kept) -> Option<Connected> {
+    pub(super) fn reconnect(&self, brief: bool, kept: &mut LeftByConnection) -> Option<Connected> {
         let mut pause = MIN_PAUSE;
         let mut wait = brief;
         while !self.is_over() {

@@ -12,7 +12,7 @@ use std::{
 use super::{
     RelayConnection,
     relays::{ABSENCE, drop_overdue},
-    stand_ins::{Kept, KeptCalls, NearStandIn},
+    stand_ins::{KeptCalls, LeftByConnection, NearStandIn},
 };
 use crate::{
     graph::EndpointKind,
@@ -20,7 +20,7 @@ use crate::{
     session::relayed::unanswered::Unanswered,
 };
 
-impl Kept {
+impl LeftByConnection {
     /// Lets go of what waited for too long while there is no daemon.
     pub(super) fn drop_overdue(&mut self) {
         drop_overdue(&mut self.relays);

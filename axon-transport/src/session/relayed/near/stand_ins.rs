@@ -62,7 +62,7 @@ impl NearStandIn {
 
 /// What a connection leaves to the next one.
 #[derive(Default)]
-pub(super) struct Kept {
+pub(super) struct LeftByConnection {
     pub(super) relays: BTreeMap<Gid, NearRelay>,
     pub(super) calls: KeptCalls,
 }

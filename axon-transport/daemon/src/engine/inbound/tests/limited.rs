@@ -26,7 +26,7 @@ fn way(over: &str, room: usize) -> Way {
 
 impl Way {
     /// A sample comes.
-    fn come(&mut self, number: u64, now: Duration) -> Next {
+    fn come(&mut self, number: u64, now: Duration) -> StepOutcome {
         let payload = Bytes::copy_from_slice(&number.to_be_bytes());
         let meta = Meta::at_nanos(number, 1000);
         let message = OpenedMessage { writer: PUBLISHER, number, meta, payload };
@@ -37,7 +37,7 @@ impl Way {
     fn come_100(&mut self) {
         for ms in 0..1000 {
             if ms % 10 == 0 {
-                assert!(matches!(self.come(ms / 10 + 1, at(ms)), Next::Go));
+                assert!(matches!(self.come(ms / 10 + 1, at(ms)), StepOutcome::Go));
             }
             self.inbound.handle_timeout(at(ms));
         }
@@ -89,9 +89,9 @@ fn the_stream_of_a_keep_all_topic_is_read_on_when_its_sample_may_pass() {
     let mut way = way("hold", 1000);
     way.inbound.routes().get_mut(&ROUTE).unwrap().keeps_all = true;
     for number in 1..=2 {
-        assert!(matches!(way.come(number, NOW), Next::Go));
+        assert!(matches!(way.come(number, NOW), StepOutcome::Go));
     }
-    assert!(matches!(way.come(3, NOW), Next::Wait));
+    assert!(matches!(way.come(3, NOW), StepOutcome::Wait));
     assert!(matches!(way.stream.step, StreamStep::Ring(_)));
     way.inbound.streams.insert(key(), std::mem::take(&mut way.stream));
     way.inbound.handle_timeout(at(99));
@@ -109,7 +109,7 @@ fn a_best_effort_sample_of_a_keep_all_topic_is_never_held() {
     way.inbound.routes().get_mut(&ROUTE).unwrap().keeps_all = true;
     way.stream.header.as_mut().unwrap().0.reliable = false;
     for number in 1..=3 {
-        assert!(matches!(way.come(number, NOW), Next::Over));
+        assert!(matches!(way.come(number, NOW), StepOutcome::Over));
     }
     assert_eq!((way.numbers(), way.limited()), (vec![1, 2], vec![("limit", 1)]));
 }

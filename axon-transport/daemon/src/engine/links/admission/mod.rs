@@ -45,8 +45,8 @@ impl AddressAdmission {
     }
 
     /// Whether a refusal at this address is to be said, which it then was.
-    pub(super) fn is_news(&mut self, address: IpAddr, now: Duration) -> bool {
-        self.said.is_news(address, now)
+    pub(super) fn is_new(&mut self, address: IpAddr, now: Duration) -> bool {
+        self.said.is_new(address, now)
     }
 
     /// The link that gives way to one of a newcomer. `links` are those there are.

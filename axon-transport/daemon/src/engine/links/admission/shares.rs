@@ -109,7 +109,7 @@ pub(crate) struct LoggedRefusals(VecDeque<(IpAddr, Duration)>);
 
 impl LoggedRefusals {
     /// Whether it is to be said, which it then was.
-    pub(crate) fn is_news(&mut self, address: IpAddr, now: Duration) -> bool {
+    pub(crate) fn is_new(&mut self, address: IpAddr, now: Duration) -> bool {
         self.0.retain(|(_, at)| now.saturating_sub(*at) < SAID_AGAIN);
         let at = place(address);
         if self.0.iter().any(|(said, _)| *said == at) || self.0.len() >= MOST_SAID {
@@ -171,9 +171,9 @@ mod tests {
     #[test]
     fn a_refusal_is_said_once_for_each_address() {
         let (mut said, now) = (LoggedRefusals::default(), NOW);
-        assert!(said.is_news(at(1), now) && said.is_news(at(2), now));
-        assert!(!said.is_news(at(1), now));
-        assert!(said.is_news(at(1), now + SAID_AGAIN));
-        assert!((0..=255).filter(|host| said.is_news(at(*host), now)).count() <= MOST_SAID);
+        assert!(said.is_new(at(1), now) && said.is_new(at(2), now));
+        assert!(!said.is_new(at(1), now));
+        assert!(said.is_new(at(1), now + SAID_AGAIN));
+        assert!((0..=255).filter(|host| said.is_new(at(*host), now)).count() <= MOST_SAID);
     }
 }

@@ -9,7 +9,7 @@ const MINUTE: u32 = 60;
 
 /// What a look is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(in crate::engine::links) struct LookKind {
+pub(in crate::engine::links) struct CheckKind {
     /// Whether certificates are checked, too: that costs signatures.
     pub(in crate::engine::links) at_certificates: bool,
 }
@@ -33,13 +33,13 @@ impl LookTimes {
     }
 
     /// The look that is due, if one is.
-    pub(in crate::engine::links) fn take_due(&mut self, now: Duration) -> Option<LookKind> {
+    pub(in crate::engine::links) fn take_due(&mut self, now: Duration) -> Option<CheckKind> {
         if now < self.next {
             return None;
         }
         self.next = now + EVERY;
         self.passed = self.passed.wrapping_add(1);
-        Some(LookKind { at_certificates: self.passed.is_multiple_of(MINUTE) })
+        Some(CheckKind { at_certificates: self.passed.is_multiple_of(MINUTE) })
     }
 }
 
@@ -64,7 +64,7 @@ mod tests {
     fn looks_that_were_missed_are_not_made_up_for() {
         let mut looks = LookTimes::new();
         let now = Duration::from_secs(100);
-        assert_eq!(looks.take_due(now), Some(LookKind { at_certificates: false }));
+        assert_eq!(looks.take_due(now), Some(CheckKind { at_certificates: false }));
         assert_eq!((looks.take_due(now), looks.poll_timeout()), (None, now + EVERY));
     }
 }

@@ -318,13 +318,13 @@ impl Flow {
     }
 
     /// How far QUIC took its samples.
-    pub(super) fn furthest(&self) -> SentProgress {
-        self.reliable.furthest()
+    pub(super) fn sent_progress(&self) -> SentProgress {
+        self.reliable.sent_progress()
     }
 
     /// Goes on with the samples of a flow that ended.
-    pub(super) fn go_on(&mut self, furthest: SentProgress) {
-        self.reliable.go_on(furthest);
+    pub(super) fn go_on(&mut self, sent_progress: SentProgress) {
+        self.reliable.go_on(sent_progress);
     }
 
     /// Whether it waits for other flows: none of its samples is in flight, and the peer takes in theirs first. Then it is

@@ -58,7 +58,7 @@ pub(super) struct ReliableStream {
     active_at: Duration,
     /// Bytes that QUIC took for the first time, and how far.
     new_bytes: u64,
-    furthest: SentProgress,
+    sent_progress: SentProgress,
 }
 
 impl ReliableStream {
@@ -73,7 +73,7 @@ impl ReliableStream {
             credit,
             active_at: Duration::ZERO,
             new_bytes: 0,
-            furthest: SentProgress::default(),
+            sent_progress: SentProgress::default(),
         }
     }
 
@@ -108,13 +108,13 @@ impl ReliableStream {
     }
 
     /// How far QUIC took the samples.
-    pub(super) fn furthest(&self) -> SentProgress {
-        self.furthest
+    pub(super) fn sent_progress(&self) -> SentProgress {
+        self.sent_progress
     }
 
     /// QUIC took them so far over a link before.
-    pub(super) fn go_on(&mut self, furthest: SentProgress) {
-        self.furthest = self.furthest.max(furthest);
+    pub(super) fn go_on(&mut self, sent_progress: SentProgress) {
+        self.sent_progress = self.sent_progress.max(sent_progress);
     }
 
     /// Writes the pending batch, or seals the next one. `None`: go on.
@@ -228,7 +228,7 @@ impl ReliableStream {
         let mut whole = 0;
         self.batch.handle_taken(bytes, |sealed, taken, is_whole| {
             if is_ordered {
-                self.new_bytes += self.furthest.advance(sealed.sequence, taken);
+                self.new_bytes += self.sent_progress.advance(sealed.sequence, taken);
             }
             if !is_whole {
                 return;

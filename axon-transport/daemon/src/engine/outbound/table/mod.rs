@@ -164,7 +164,7 @@ impl FlowTable {
         let Some(served) = self.routes.get(number) else { return Vec::new() };
         let flows = served.flows.iter().filter_map(|(of, id)| {
             let flow = self.flows.get(*id)?;
-            Some((*of, busy_flow(*id, flow, served), flow.furthest()))
+            Some((*of, busy_flow(*id, flow, served), flow.sent_progress()))
         });
         flows.filter(|(_, flow, _)| flow.keeps.is_some()).collect()
     }

@@ -1,7 +1,7 @@
 use super::*;
 
 pub(super) fn new(peers: QkdPeers) -> (Acceptor, Clock) {
-    let clock = Clock::manual();
+    let clock = Clock::default();
     (Acceptor::new("sae-b", peers, Cipher::default(), clock.clone()), clock)
 }
 
@@ -189,20 +189,6 @@ fn strangers_do_not_empty_the_bucket_of_an_address_that_authenticated() {
     let stranger = look_up(&acceptor, "10.0.0.2", &identity("sae-a", "k"));
     assert!(matches!(stranger, Lookup::Limited(_)));
     assert_eq!(look_up(&acceptor, "10.9.9.9", &identity("sae-a", "k")), Lookup::Fetching);
-}
-
-#[tokio::test]
-async fn a_waiting_caller_is_woken_by_a_look_up() {
-    let (acceptor, _) = new(listed(&["sae-a"]));
-    let other = acceptor.clone();
-    let waiting = tokio::spawn(async move { other.next_request().await });
-    tokio::task::yield_now().await;
-    let resolver = acceptor.resolver(ip("10.0.0.1"));
-    std::thread::spawn(move || Arc::clone(&resolver).resolve(&identity("sae-a", "k1")))
-        .join()
-        .map(|psk| assert!(psk.is_none()))
-        .unwrap();
-    assert!(matches!(waiting.await.unwrap(), KmeRequest::Dec { .. }));
 }
 
 /// Handshakes under way keep the PSK that they looked up: letting go of it erases nothing.

@@ -2,7 +2,7 @@ mod acceptor;
 mod dialler;
 mod flood;
 
-use std::{net::IpAddr, sync::Arc, time::Duration};
+use std::{net::IpAddr, time::Duration};
 
 use axon_envelope::{KeyId, KmeKey};
 use axon_tls::{

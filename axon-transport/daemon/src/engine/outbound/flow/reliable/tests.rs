@@ -169,7 +169,7 @@ fn what_is_sent_again_over_another_link_is_no_progress() {
     }
     // Nor is it where another flow goes on.
     let mut next = Way::new(true);
-    next.reliable.go_on(way.reliable.furthest());
+    next.reliable.go_on(way.reliable.sent_progress());
     next.offer(8, 128 << 10);
     next.write_and_read_all();
     assert_eq!(next.reliable.parts(), 0);

@@ -7,7 +7,7 @@ use crate::{ids::Gid, wire::session::Pair};
 /// The pairs that the daemon of this connection has told of. What it never told of stands by the word of an earlier
 /// one, and this one may know nothing of it yet: a stopped process has not come back.
 #[derive(Debug, Default)]
-pub(super) struct ToldPairs {
+pub(super) struct AnnouncedPairs {
     told: HashSet<Pair>,
     /// Those that it repeated since it began to tell everything anew.
     repeated: Option<HashSet<Pair>>,
@@ -15,7 +15,7 @@ pub(super) struct ToldPairs {
     whole: bool,
 }
 
-impl ToldPairs {
+impl AnnouncedPairs {
     /// The daemon begins to tell everything. One that tells everything to a session it knew repeats every pair that
     /// it told it of. A new daemon learns of the pairs from their two sides, one by one.
     pub(super) fn begin_whole(&mut self) {
@@ -53,12 +53,12 @@ impl ToldPairs {
 /// The segments of the session's memory that this connection's daemon was told of, and those that it could not be told
 /// of, for want of descriptors. None is both.
 #[derive(Debug, Default)]
-pub(super) struct ToldSegments {
+pub(super) struct AnnouncedSegments {
     told: BTreeSet<u32>,
     untold: BTreeSet<u32>,
 }
 
-impl ToldSegments {
+impl AnnouncedSegments {
     pub(super) fn is_told(&self, number: u32) -> bool {
         self.told.contains(&number)
     }
@@ -103,7 +103,7 @@ mod tests {
 
     #[test]
     fn pairs_that_the_daemon_does_not_repeat_are_over() {
-        let mut pairs = ToldPairs::default();
+        let mut pairs = AnnouncedPairs::default();
         pairs.begin_whole();
         (1..4).for_each(|number| pairs.tell(pair(number)));
         assert_eq!(pairs.end_whole(), None, "the first time there is nothing to repeat");
@@ -118,7 +118,7 @@ mod tests {
 
     #[test]
     fn a_pair_that_ended_meanwhile_is_not_over_once_more() {
-        let mut pairs = ToldPairs::default();
+        let mut pairs = AnnouncedPairs::default();
         pairs.begin_whole();
         (1..4).for_each(|number| pairs.tell(pair(number)));
         pairs.end_whole();
@@ -130,7 +130,7 @@ mod tests {
 
     #[test]
     fn a_whole_that_begins_anew_forgets_what_was_repeated() {
-        let mut pairs = ToldPairs::default();
+        let mut pairs = AnnouncedPairs::default();
         pairs.begin_whole();
         pairs.tell(pair(1));
         pairs.end_whole();
@@ -142,7 +142,7 @@ mod tests {
 
     #[test]
     fn a_segment_that_could_not_be_told_of_is_told_later_or_given_up() {
-        let mut segments = ToldSegments::default();
+        let mut segments = AnnouncedSegments::default();
         assert!(segments.fail(1) && !segments.fail(1) && segments.fail(2));
         assert_eq!(segments.untold(), [1, 2]);
         segments.tell(1);

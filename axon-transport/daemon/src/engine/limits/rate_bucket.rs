@@ -1,4 +1,4 @@
-//! A leaky bucket for samples and their bytes.
+//! A rate bucket for samples and their bytes.
 
 use std::time::Duration;
 
@@ -12,7 +12,7 @@ const SHORTEST: Duration = Duration::from_micros(100);
 
 /// What may pass, as it grows back with time.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Level {
+pub(super) struct BucketLevel {
     a_second: f64,
     most: f64,
     /// Below zero where more passed than there was.
@@ -20,7 +20,7 @@ pub(super) struct Level {
     at: Duration,
 }
 
-impl Level {
+impl BucketLevel {
     pub(super) fn full(a_second: f64, most: f64) -> Self {
         Self { a_second, most, left: most, at: Duration::ZERO }
     }
@@ -46,21 +46,21 @@ impl Level {
 
 /// A bucket. A sample passes while there is room for one of any length: a long one is made up for before the next.
 #[derive(Debug)]
-pub(super) struct LeakyBucket {
-    samples: Option<Level>,
-    bytes: Option<Level>,
+pub(super) struct RateBucket {
+    samples: Option<BucketLevel>,
+    bytes: Option<BucketLevel>,
     /// The length of the last sample that passed.
     last: f64,
 }
 
-impl LeakyBucket {
+impl RateBucket {
     /// A full one.
     pub(super) fn new(limit: &RateLimit) -> Self {
         let burst = f64::from(limit.burst.get());
         Self {
-            samples: limit.rate.map(|rate| Level::full(rate, burst)),
+            samples: limit.rate.map(|rate| BucketLevel::full(rate, burst)),
             // A hundredth of a second's, so that a timer that is late costs nothing.
-            bytes: limit.bytes.map(|bytes| Level::full(bytes, (bytes / 100.0).max(1.0))),
+            bytes: limit.bytes.map(|bytes| BucketLevel::full(bytes, (bytes / 100.0).max(1.0))),
             last: 1.0,
         }
     }
@@ -120,7 +120,7 @@ mod tests {
         limit
     }
 
-    impl LeakyBucket {
+    impl RateBucket {
         fn wait(&self, now: Duration) -> Duration {
             self.open_at().saturating_sub(now)
         }
@@ -132,7 +132,7 @@ mod tests {
 
     #[test]
     fn a_burst_passes_at_once_and_then_one_for_each_interval() {
-        let mut bucket = LeakyBucket::new(&limit(Some(10.0), None, 3));
+        let mut bucket = RateBucket::new(&limit(Some(10.0), None, 3));
         assert_eq!(bucket.passes(ms(5)), 3);
         (0..3).for_each(|_| bucket.pass(1000, ms(5)));
         assert_eq!(bucket.passes(ms(5)), 0);
@@ -146,7 +146,7 @@ mod tests {
 
     #[test]
     fn a_sample_longer_than_a_second_of_bytes_passes_and_is_made_up_for() {
-        let mut bucket = LeakyBucket::new(&limit(None, Some(1e6), 1));
+        let mut bucket = RateBucket::new(&limit(None, Some(1e6), 1));
         bucket.pass(3_000_000, ms(0));
         assert_eq!(bucket.passes(ms(2900)), 0);
         assert_eq!(bucket.passes(ms(3000)), 1);
@@ -161,7 +161,7 @@ mod tests {
             burst in 1_u32..20,
             lengths in proptest::collection::vec(0_usize..100_000, 1..50),
         ) {
-            let mut bucket = LeakyBucket::new(&limit(Some(rate), bytes, burst));
+            let mut bucket = RateBucket::new(&limit(Some(rate), bytes, burst));
             let (mut now, mut samples, mut sum) = (Duration::ZERO, 0_u32, 0.0);
             for length in lengths.iter().cycle().take(400) {
                 let wait = bucket.wait(now);

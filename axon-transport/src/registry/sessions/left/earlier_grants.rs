@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 
 use super::super::shares::makes_room;
-use crate::{ids::SessionId, registry::limits::MAX_PLEDGES, wire::session::Granted};
+use crate::{ids::SessionId, registry::limits::MAX_EARLIER_GRANTS, wire::session::Granted};
 
 /// What publishers granted, by way of an earlier daemon, to readers that had not taken it up when the publishers came here.
 /// A publisher whose process is killed tells nobody what these readers lost: they are handed the grant, and the ring.
@@ -20,14 +20,15 @@ struct EarlierGrant {
 impl EarlierGrants {
     pub(super) fn note(&mut self, granted: Granted, process: u32) {
         self.forget(|known| (known.reader, known.writer) == (granted.reader, granted.writer));
-        if self.0.len() == MAX_PLEDGES
-            && let Some(index) = makes_room(self.0.iter().map(|pledge| pledge.process), process)
+        if self.0.len() == MAX_EARLIER_GRANTS
+            && let Some(index) =
+                makes_room(self.0.iter().map(|earlier_grant| earlier_grant.process), process)
             && let Some(EarlierGrant { granted: Granted { reader, writer, .. }, .. }) =
                 self.0.remove(index)
         {
             tracing::warn!(
                 %reader, %writer,
-                "more than {MAX_PLEDGES} readers have not come back from an earlier daemon: this one \
+                "more than {MAX_EARLIER_GRANTS} readers have not come back from an earlier daemon: this one \
                  does not count what it lost if its publisher is killed"
             );
         }
@@ -35,14 +36,14 @@ impl EarlierGrants {
     }
 
     pub(super) fn forget(&mut self, which: impl Fn(&Granted) -> bool) {
-        self.0.retain(|pledge| !which(&pledge.granted));
+        self.0.retain(|earlier_grant| !which(&earlier_grant.granted));
     }
 
     /// Takes those of a session's publishers.
     pub(super) fn take(&mut self, session: &SessionId) -> Vec<Granted> {
         let (taken, rest): (Vec<_>, _) =
-            self.0.drain(..).partition(|pledge| pledge.granted.writer.is_of(session));
+            self.0.drain(..).partition(|earlier_grant| earlier_grant.granted.writer.is_of(session));
         self.0 = rest.into();
-        taken.into_iter().map(|pledge| pledge.granted).collect()
+        taken.into_iter().map(|earlier_grant| earlier_grant.granted).collect()
     }
 }
