@@ -27,9 +27,19 @@ pub(super) fn latency(load: &Load) -> Option<f64> {
     }
 }
 
-/// What is said of a ratio beside its budget.
+/// A ratio as it is written, in thousandths.
+pub(super) fn rounded(ratio: f64) -> f64 {
+    (ratio * 1e3).round() / 1e3
+}
+
+/// Whether a ratio is within a budget, as far as its digits say: 1.05 that is written is within 1.05.
+pub(super) fn is_met(ratio: f64, budget: f64) -> bool {
+    rounded(ratio) <= rounded(budget)
+}
+
+/// The word for a ratio beside its budget.
 pub(super) fn verdict(ratio: f64, budget: f64) -> &'static str {
-    if ratio <= budget { "met" } else { "not met" }
+    if is_met(ratio, budget) { "met" } else { "not met" }
 }
 
 #[cfg(test)]
@@ -54,5 +64,8 @@ mod tests {
         assert_eq!(latency(&paced), Some(1.1));
         assert_eq!(of(64, Wake::Event, Motion::Copy), None);
         assert_eq!((verdict(1.3, 1.3), verdict(1.31, 1.3)), ("met", "not met"));
+        // What is written as 1.050 is within 1.05, and 1.051 is not.
+        assert!(is_met(1.0504, 1.05) && !is_met(1.0506, 1.05));
+        assert!(is_met(0.85, 0.8496) && !is_met(0.85, 0.8494));
     }
 }

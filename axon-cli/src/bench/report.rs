@@ -266,10 +266,13 @@ pub(super) fn json(results: &Results) -> String {
 }
 
 fn ratio_json(ratio: Ratio) -> Value {
-    let round = |value: f64| (value * 1e3).round() / 1e3;
-    json!({ "of_best_rounds": round(ratio.best), "median_of_rounds": round(ratio.median) })
+    let [best, median] = [ratio.best, ratio.median].map(budgets::rounded);
+    json!({ "of_best_rounds": best, "median_of_rounds": median })
 }
 
 fn budget_json(ratio: f64, budget: Option<f64>) -> Value {
-    budget.map_or(Value::Null, |budget| json!({ "at_most": budget, "met": ratio <= budget }))
+    budget.map_or(
+        Value::Null,
+        |budget| json!({ "at_most": budget, "met": budgets::is_met(ratio, budget) }),
+    )
 }

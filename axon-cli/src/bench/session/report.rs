@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use super::{BUDGET, Compared, KINDS, Results, SERVICE_BUDGET};
 use crate::{
     bench::{
-        budgets::verdict,
+        budgets::{is_met, rounded, verdict},
         harness::{Rounds, words},
     },
     text::{self, TextTable},
@@ -103,8 +103,7 @@ fn latency_table(rows: Vec<&Compared>) -> String {
 
 pub(super) fn json(results: &Results) -> String {
     let judged = |(ratio, budget): Judged| -> Value {
-        let ratio = (ratio * 1e3).round() / 1e3;
-        json!({ "ratio": ratio, "at_most": budget, "met": ratio <= budget })
+        json!({ "ratio": rounded(ratio), "at_most": budget, "met": is_met(ratio, budget) })
     };
     let streams = results.streams.iter().map(|row| {
         json!({
