@@ -297,7 +297,7 @@ impl Control {
         let state = shared.state();
         let queued = shared.core.link.take();
         if matches!(self.link, Link::Reconnecting(_) | Link::Ended) {
-            // All of it is said to the next daemon from what stands then.
+            // The next daemon is sent everything from the state of that time.
             return;
         }
         for outgoing in queued {
