@@ -124,7 +124,7 @@ pub struct Pipe {
     pub(crate) incoming: IncomingFlow,
     /// Samples that arrived and are not published yet.
     arrived: BTreeMap<FlowChannel, VecDeque<InboundSample>>,
-    /// Channels of which a sample was handled, each with the highest number that arrived.
+    /// Channels with a handled sample, each with the highest number that arrived.
     begun: BTreeMap<FlowChannel, u64>,
     /// Whether an arrived sample waits for a reader to make room.
     blocked: bool,
