@@ -34,93 +34,93 @@
 #include <stdint.h>
 
 /**
- * The version of this interface. It rises whenever a program that was compiled against the former
- * header would not work any more.
+ * The version of this interface. A new version means that a program compiled against an older header no
+ * longer works.
  */
 #define AXON_SESSION_ABI 3
 
 /**
- * The most bytes that the hash of a type may have.
+ * The largest size of a type's hash in bytes.
  */
 #define AXON_TYPE_HASH_SIZE 64
 
 /**
- * The time at which the call is made, as a sample's source timestamp.
+ * A source timestamp that means the time of the call.
  */
 #define AXON_TIME_NOW INT64_MIN
 
 /**
- * Of a subscription: a publisher became alive or ceased to be.
+ * Subscription event: a publisher became alive or stopped being alive.
  */
 #define AXON_EVENT_LIVELINESS_CHANGED 0
 
 /**
- * Of a subscription: no sample came for longer than its deadline.
+ * Subscription event: no sample arrived within the requested deadline.
  */
 #define AXON_EVENT_REQUESTED_DEADLINE_MISSED 1
 
 /**
- * Of a subscription: a publisher offers less than it requests.
+ * Subscription event: a publisher offers less than the subscription requests.
  */
 #define AXON_EVENT_REQUESTED_QOS_INCOMPATIBLE 2
 
 /**
- * Of a subscription: samples were lost before they could be taken.
+ * Subscription event: samples were lost before the subscription could take them.
  */
 #define AXON_EVENT_MESSAGE_LOST 3
 
 /**
- * Of a subscription: a publisher of the topic has another type.
+ * Subscription event: a publisher of the topic has another type.
  */
 #define AXON_EVENT_SUBSCRIPTION_INCOMPATIBLE_TYPE 4
 
 /**
- * Of a subscription: a publisher was matched or unmatched.
+ * Subscription event: a publisher was matched or unmatched.
  */
 #define AXON_EVENT_SUBSCRIPTION_MATCHED 5
 
 /**
- * Of a publisher: it did not assert its liveliness within its lease.
+ * Publisher event: the publisher did not assert its liveliness within its lease.
  */
 #define AXON_EVENT_LIVELINESS_LOST 6
 
 /**
- * Of a publisher: it did not publish within its deadline.
+ * Publisher event: the publisher did not publish within its deadline.
  */
 #define AXON_EVENT_OFFERED_DEADLINE_MISSED 7
 
 /**
- * Of a publisher: a subscription requests more than it offers.
+ * Publisher event: a subscription requests more than the publisher offers.
  */
 #define AXON_EVENT_OFFERED_QOS_INCOMPATIBLE 8
 
 /**
- * Of a publisher: a subscription of the topic has another type.
+ * Publisher event: a subscription of the topic has another type.
  */
 #define AXON_EVENT_PUBLISHER_INCOMPATIBLE_TYPE 9
 
 /**
- * Of a publisher: a subscription was matched or unmatched.
+ * Publisher event: a subscription was matched or unmatched.
  */
 #define AXON_EVENT_PUBLICATION_MATCHED 10
 
 /**
- * A kind of endpoint: publishers.
+ * Endpoint kind: publisher.
  */
 #define AXON_KIND_PUBLISHER 1
 
 /**
- * Subscriptions.
+ * Endpoint kind: subscription.
  */
 #define AXON_KIND_SUBSCRIPTION 2
 
 /**
- * Servers.
+ * Endpoint kind: server.
  */
 #define AXON_KIND_SERVER 4
 
 /**
- * Clients.
+ * Endpoint kind: client.
  */
 #define AXON_KIND_CLIENT 8
 
@@ -145,18 +145,18 @@
 #define AXON_LOG_ERROR 40
 
 /**
- * Left to AXON, in any policy: RELIABLE, VOLATILE, KEEP_LAST, AUTOMATIC.
+ * Any policy: AXON's default, which is RELIABLE, VOLATILE, KEEP_LAST and AUTOMATIC.
  */
 #define AXON_CHOICE_DEFAULT 0
 
 /**
- * In reliability, durability and liveliness: what matches most of the endpoints that the graph
- * holds when the endpoint is created, at the highest level that does.
+ * Reliability, durability and liveliness: the highest level that matches most endpoints in the graph. It is
+ * chosen when the endpoint is created.
  */
 #define AXON_CHOICE_BEST_AVAILABLE 255
 
 /**
- * Samples arrive, within the bounds of the history.
+ * Samples arrive within the bounds of the history.
  */
 #define AXON_RELIABILITY_RELIABLE 1
 
@@ -171,7 +171,7 @@
 #define AXON_DURABILITY_TRANSIENT_LOCAL 1
 
 /**
- * It receives samples from then on.
+ * A subscription that joins late receives only samples that are published afterwards.
  */
 #define AXON_DURABILITY_VOLATILE 2
 
@@ -181,7 +181,7 @@
 #define AXON_HISTORY_KEEP_LAST 1
 
 /**
- * All are kept, up to the memory budget; then the publisher waits.
+ * All samples are kept, up to the memory budget. Then the publisher waits.
  */
 #define AXON_HISTORY_KEEP_ALL 2
 
@@ -191,128 +191,128 @@
 #define AXON_LIVELINESS_AUTOMATIC 1
 
 /**
- * The publisher does, by publishing or asserting.
+ * The publisher asserts that it is alive, by publishing or by an explicit call.
  */
 #define AXON_LIVELINESS_MANUAL_BY_TOPIC 3
 
 /**
- * A time that is left to AXON, which takes it to be infinite.
+ * AXON's default: infinite.
  */
 #define AXON_DURATION_DEFAULT 0
 
 /**
- * As AXON_CHOICE_BEST_AVAILABLE, for a deadline or a lease.
+ * AXON_CHOICE_BEST_AVAILABLE for a deadline or a lease.
  */
 #define AXON_DURATION_BEST_AVAILABLE 18446744073709551614ull
 
 /**
- * No end.
+ * Infinite.
  */
 #define AXON_DURATION_INFINITE 18446744073709551615ull
 
 /**
- * The two profiles go together.
+ * The two profiles are compatible.
  */
 #define AXON_QOS_COMPATIBLE 0
 
 /**
- * That hangs on policies that are left open, as default or as best available.
+ * The result depends on policies that are still open: default or best available.
  */
 #define AXON_QOS_UNKNOWN 1
 
 /**
- * They do not.
+ * The two profiles are incompatible.
  */
 #define AXON_QOS_INCOMPATIBLE 2
 
 /**
- * No policy.
+ * No policy is incompatible.
  */
 #define AXON_POLICY_NONE 0
 
 /**
- * Which policy keeps two endpoints apart: reliability.
+ * The incompatible policy: reliability.
  */
 #define AXON_POLICY_RELIABILITY 1
 
 /**
- * Durability.
+ * The incompatible policy: durability.
  */
 #define AXON_POLICY_DURABILITY 2
 
 /**
- * Deadline.
+ * The incompatible policy: deadline.
  */
 #define AXON_POLICY_DEADLINE 3
 
 /**
- * Liveliness.
+ * The incompatible policy: liveliness.
  */
 #define AXON_POLICY_LIVELINESS 4
 
 /**
- * The liveliness lease.
+ * The incompatible policy: the liveliness lease.
  */
 #define AXON_POLICY_LIVELINESS_LEASE 5
 
 /**
- * The domain is what `ROS_DOMAIN_ID` says, else 0.
+ * The domain in `ROS_DOMAIN_ID`, or 0 if that is not set.
  */
 #define AXON_DOMAIN_ENVIRONMENT 4294967295
 
 /**
- * Discovery reaches as far as `ROS_AUTOMATIC_DISCOVERY_RANGE`, `ROS_STATIC_PEERS` and
- * `ROS_LOCALHOST_ONLY` say.
+ * The discovery range in `ROS_AUTOMATIC_DISCOVERY_RANGE`, `ROS_STATIC_PEERS` and `ROS_LOCALHOST_ONLY`.
  */
 #define AXON_DISCOVERY_ENVIRONMENT 0
 
 /**
- * Nowhere: the session reaches its own endpoints alone, static peers or not.
+ * No discovery: the session reaches only its own endpoints. Static peers are ignored.
  */
 #define AXON_DISCOVERY_OFF 1
 
 /**
- * This host, and other hosts of which either side lists the other as a static peer.
+ * This host. Another host is reached if either of the two lists the other as a static peer.
  */
 #define AXON_DISCOVERY_LOCALHOST 2
 
 /**
- * What multicast reaches, and static peers.
+ * The hosts that multicast reaches, and the static peers.
  */
 #define AXON_DISCOVERY_SUBNET 3
 
 /**
- * What multicast reaches; the list is passed over.
+ * The hosts that multicast reaches. The list of static peers is ignored.
  */
 #define AXON_DISCOVERY_SYSTEM_DEFAULT 4
 
 /**
- * `AXON_SECURITY_MODE` is `classic` and `AXON_CLASSIC_AUTH` is `none`: any host that answers is a peer.
+ * `AXON_SECURITY_MODE` is `classic` and `AXON_CLASSIC_AUTH` is `none`: any host that answers is accepted as
+ * a peer.
  */
 #define AXON_AUTHENTICATION_NONE 0
 
 /**
- * `classic` and `pinned`: a peer has a key of the trust file.
+ * `classic` and `pinned`: a peer proves a key of the trust file.
  */
 #define AXON_AUTHENTICATION_PINNED 1
 
 /**
- * `classic` and `ca`: a peer has a certificate of the CA.
+ * `classic` and `ca`: a peer proves a certificate of the CA.
  */
 #define AXON_AUTHENTICATION_CA 2
 
 /**
- * `qkd`: a peer has a key that the KMEs gave to both.
+ * `qkd`: a peer proves a key that the KMEs gave to both hosts.
  */
 #define AXON_AUTHENTICATION_QKD 3
 
 /**
- * As a timeout: for ever.
+ * A timeout value that means without end.
  */
 #define AXON_WAIT_FOREVER -1
 
 /**
- * What a call returns: `AXON_RET_OK`, or why it did not do what it was asked.
+ * The result of a call: `AXON_RET_OK`, or the reason for the failure.
  */
 typedef int32_t axon_ret_t;
 
@@ -321,15 +321,15 @@ typedef int32_t axon_ret_t;
  */
 typedef struct axon_node_t {
     /**
-     * 0 where it is none.
+     * 0 if the handle names no object.
      */
     uint64_t id;
 } axon_node_t;
 
 /**
- * What an endpoint offers or requests. All zeros is the default profile: RELIABLE, VOLATILE,
- * KEEP_LAST(10). What AXON says of an endpoint that there is holds no default and nothing best
- * available.
+ * The QoS profile that an endpoint offers or requests. All zeros is the default profile: RELIABLE, VOLATILE,
+ * KEEP_LAST(10). A profile that AXON returns for an existing endpoint contains neither defaults nor
+ * best-available values.
  */
 typedef struct axon_qos_t {
     /**
@@ -345,7 +345,7 @@ typedef struct axon_qos_t {
      */
     uint32_t history;
     /**
-     * Samples kept by KEEP_LAST; 0 is the default.
+     * The number of samples that KEEP_LAST keeps; 0 for the default.
      */
     uint32_t depth;
     /**
@@ -353,30 +353,30 @@ typedef struct axon_qos_t {
      */
     uint32_t liveliness;
     /**
-     * 0.
+     * Must be 0.
      */
     uint32_t reserved;
     /**
-     * Longest time between two samples, in nanoseconds, or AXON_DURATION_*.
+     * The longest time between two samples, in nanoseconds, or AXON_DURATION_*.
      */
     uint64_t deadline;
     /**
-     * Age at which a sample is not delivered any more, in nanoseconds, or AXON_DURATION_*.
+     * The age from which a sample is not delivered any more, in nanoseconds, or AXON_DURATION_*.
      */
     uint64_t lifespan;
     /**
-     * Time without an assertion after which a publisher counts as not alive, in nanoseconds, or
+     * The time without an assertion after which a publisher counts as not alive, in nanoseconds, or
      * AXON_DURATION_*.
      */
     uint64_t lease;
 } axon_qos_t;
 
 /**
- * What an endpoint is created with. All zeros but the two names is a usual one.
+ * The options of a new endpoint. All fields but the two names may be zero.
  */
 typedef struct axon_endpoint_options_t {
     /**
-     * The full name of the topic or service, of at most 512 bytes. AXON gives it no meaning.
+     * The full name of the topic or service, of at most 512 bytes. AXON does not interpret the name.
      */
     const char *topic;
     /**
@@ -384,148 +384,149 @@ typedef struct axon_endpoint_options_t {
      */
     const char *type_name;
     /**
-     * The type's hash, of at most AXON_TYPE_HASH_SIZE bytes. Where both ends know it, it must be the
-     * same.
+     * The type's hash, of at most AXON_TYPE_HASH_SIZE bytes. If both ends know the hash, the two must be
+     * equal.
      */
     const uint8_t *type_hash;
     /**
-     * 0: it is not known.
+     * The size of the hash in bytes; 0 if the hash is unknown.
      */
     size_t type_hash_size;
     /**
-     * What it offers or requests.
+     * The profile that the endpoint offers or requests.
      */
     struct axon_qos_t qos;
     /**
-     * A subscription: not 0 to receive nothing from publishers of its own session.
+     * Subscription only: a value other than 0 ignores publishers of the subscription's own session.
      */
     uint8_t ignore_local;
     /**
-     * 0.
+     * Must be 0.
      */
     uint8_t reserved[3];
     /**
-     * A publisher: the length of most samples in bytes; 0 where it is not known. Where it is more than
-     * 512, the publisher has memory of its own for samples from the start, which each reader maps, and
-     * loans of more than 512 bytes are in place there, like all samples of more than 4 KiB. Otherwise
-     * only the latter are, in memory that comes with the first of them.
+     * Publisher only: the length of most samples in bytes; 0 if unknown. With a length of more than 512, the
+     * publisher allocates memory for samples at creation, which each reader maps. Loans of more than 512
+     * bytes and all samples of more than 4 KiB are then in place there. Otherwise only samples of more than
+     * 4 KiB are in place, in memory that is allocated for the first of them.
      */
     uint32_t expected_len;
 } axon_endpoint_options_t;
 
 /**
- * Sends requests to a service.
+ * A client, which sends requests to a service.
  */
 typedef struct axon_client_t {
     /**
-     * 0 where it is none.
+     * 0 if the handle names no object.
      */
     uint64_t id;
 } axon_client_t;
 
 /**
- * Names an endpoint or a node: no other anywhere has the same.
+ * The globally unique ID of an endpoint or a node.
  */
 typedef struct axon_gid_t {
     /**
-     * In the order in which they are shown.
+     * The bytes in the order in which tools print them.
      */
     uint8_t bytes[16];
 } axon_gid_t;
 
 /**
- * Says where a message of `len` bytes is to be put: room for as many, or null where there is none.
- * It runs in the call that takes the message, and must not take one of the same endpoint itself.
+ * A function that returns memory for a message of `len` bytes, or null if there is none. The taking call
+ * runs the function. The function must not take a message of the same endpoint.
  */
 typedef uint8_t *(*axon_room_t)(void *user, size_t len);
 
 /**
- * What is known of a message besides its bytes. Times are nanoseconds since the Unix epoch.
+ * The metadata of a message. Times are nanoseconds since the Unix epoch.
  */
 typedef struct axon_message_info_t {
     /**
-     * Who sent it: a publisher, a client of a request, or a server of a response.
+     * The sender: a publisher, the client of a request, or the server of a response.
      */
     struct axon_gid_t sender;
     /**
-     * The publication's number, from 1; of a response, that of the request that it answers.
+     * The publication's number, which starts at 1. A response has the number of its request.
      */
     uint64_t publication_sequence;
     /**
-     * Its number among the messages that this endpoint has taken, from 1.
+     * The message's number among the messages that this endpoint has taken, which starts at 1.
      */
     uint64_t reception_sequence;
     /**
-     * When it was sent, by the sender's clock.
+     * The time of sending, by the sender's clock.
      */
     int64_t source_timestamp;
     /**
-     * When it was taken, by this host's clock.
+     * The time of taking, by this host's clock.
      */
     int64_t received_timestamp;
     /**
-     * 1 where the sender is an endpoint of the same session, else 0.
+     * 1 if the sender is an endpoint of the same session, else 0.
      */
     uint8_t own_session;
     /**
-     * 0.
+     * Must be 0.
      */
     uint8_t reserved[7];
 } axon_message_info_t;
 
 /**
- * A sample that was taken in place, to be given back by `axon_session_sample_release`.
+ * A sample that was taken in place. `axon_session_sample_release` gives it back.
  */
 typedef struct axon_sample_t {
     /**
-     * 0 where it is none.
+     * 0 if the handle names no object.
      */
     uint64_t id;
 } axon_sample_t;
 
 /**
- * Told how often something happened since it was told last; at least once. It may be called on the
- * session's thread, but never by two threads at once, must not block, and may call any function of this
- * interface that does not block, also to replace itself or to destroy what it was set for.
+ * A function that receives the number of new events: those since its last call, at least one. The session's
+ * thread may call the function. Two threads never call it at once. The function must not block. It may call
+ * any function of this interface that does not block: it may replace itself, or destroy the object that it
+ * was set for.
  */
 typedef void (*axon_callback_t)(const void *user, size_t count);
 
 /**
- * Sends the samples of a topic.
+ * A publisher, which sends the samples of a topic.
  */
 typedef struct axon_publisher_t {
     /**
-     * 0 where it is none.
+     * 0 if the handle names no object.
      */
     uint64_t id;
 } axon_publisher_t;
 
 /**
- * Memory that a publisher lent, to be published or abandoned.
+ * Memory that a publisher lent. The program publishes or abandons the loan.
  */
 typedef struct axon_loan_t {
     /**
-     * 0 where it is none.
+     * 0 if the handle names no object.
      */
     uint64_t id;
 } axon_loan_t;
 
 /**
- * Answers the requests of a service.
+ * A server, which answers the requests of a service.
  */
 typedef struct axon_server_t {
     /**
-     * 0 where it is none.
+     * 0 if the handle names no object.
      */
     uint64_t id;
 } axon_server_t;
 
 /**
- * Receives the samples of a topic.
+ * A subscription, which receives the samples of a topic.
  */
 typedef struct axon_subscription_t {
     /**
-     * 0 where it is none.
+     * 0 if the handle names no object.
      */
     uint64_t id;
 } axon_subscription_t;
@@ -535,13 +536,13 @@ typedef struct axon_subscription_t {
  */
 typedef struct axon_event_t {
     /**
-     * 0 where it is none.
+     * 0 if the handle names no object.
      */
     uint64_t id;
 } axon_event_t;
 
 /**
- * What is known of an event. Changes are since the status was last taken.
+ * The status of an event. Each change is counted since the status was last taken.
  */
 typedef struct axon_event_status_t {
     /**
@@ -549,47 +550,48 @@ typedef struct axon_event_status_t {
      */
     uint32_t kind;
     /**
-     * Of incompatible QoS: AXON_POLICY_*, one that kept the last endpoint apart.
+     * Incompatible QoS: AXON_POLICY_* of a policy that kept the last endpoint from matching.
      */
     uint32_t last_policy;
     /**
-     * How often it happened in all; of `matched`, endpoints matched ever.
+     * How often the event happened. For `matched`: the endpoints that were ever matched.
      */
     uint64_t total;
     /**
-     * How much of that is new.
+     * The change of `total`.
      */
     uint64_t total_change;
     /**
-     * Of `matched`, endpoints matched now; of liveliness changed, publishers that are alive now.
+     * For `matched`: the endpoints that are matched now. For liveliness changed: the publishers that are
+     * alive now.
      */
     uint64_t current;
     /**
-     * By how many that changed.
+     * The change of `current`.
      */
     int64_t current_change;
     /**
-     * Of liveliness changed, publishers that are matched and not alive now.
+     * For liveliness changed: the publishers that are matched and not alive now.
      */
     uint64_t not_alive;
     /**
-     * By how many that changed.
+     * The change of `not_alive`.
      */
     int64_t not_alive_change;
 } axon_event_status_t;
 
 /**
- * A session: a process's membership of a domain. Destroyed by `axon_session_close`.
+ * A session: a process's membership of a domain. `axon_session_close` destroys the handle.
  */
 typedef struct axon_session_t {
     /**
-     * 0 where it is none.
+     * 0 if the handle names no object.
      */
     uint64_t id;
 } axon_session_t;
 
 /**
- * Told of a node.
+ * A function that receives one node.
  */
 typedef void (*axon_node_visitor_t)(void *user,
                                     const char *name,
@@ -597,7 +599,7 @@ typedef void (*axon_node_visitor_t)(void *user,
                                     const char *enclave);
 
 /**
- * Told of a topic or service and the types that its endpoints have, of which there is at least one.
+ * A function that receives the name of one topic or service, and the types of its endpoints: at least one.
  */
 typedef void (*axon_name_visitor_t)(void *user,
                                     const char *name,
@@ -605,11 +607,11 @@ typedef void (*axon_name_visitor_t)(void *user,
                                     size_t type_count);
 
 /**
- * An endpoint of the graph. What it points to stands during the call that it is given to.
+ * An endpoint of the graph. Its pointers are valid during the call of the visitor.
  */
 typedef struct axon_endpoint_t {
     /**
-     * Its GID.
+     * The endpoint's GID.
      */
     struct axon_gid_t gid;
     /**
@@ -617,11 +619,11 @@ typedef struct axon_endpoint_t {
      */
     uint32_t kind;
     /**
-     * 1 where it is on another host, else 0.
+     * 1 if the endpoint is on another host, else 0.
      */
     uint32_t remote;
     /**
-     * The name of its topic or service.
+     * The name of the topic or service.
      */
     const char *topic;
     /**
@@ -633,55 +635,57 @@ typedef struct axon_endpoint_t {
      */
     const uint8_t *type_hash;
     /**
-     * 0 where it is not known.
+     * The length of the type's hash in bytes; 0 if the hash is unknown.
      */
     size_t type_hash_size;
     /**
-     * What it offers or requests.
+     * The profile that the endpoint offers or requests.
      */
     struct axon_qos_t qos;
     /**
-     * The node that it belongs to; empty where it belongs to none.
+     * The name of the endpoint's node; empty if the endpoint has no node.
      */
     const char *node;
     /**
-     * That node's namespace.
+     * The namespace of the node.
      */
     const char *namespace_;
 } axon_endpoint_t;
 
 /**
- * Told of an endpoint.
+ * A function that receives one endpoint.
  */
 typedef void (*axon_endpoint_visitor_t)(void *user, const struct axon_endpoint_t *endpoint);
 
 /**
- * Told of a line: how severe it is (AXON_LOG_*), which part of the library says it, and what. Both
- * strings stand during the call. A line is one line: characters that could steer a terminal are escaped,
- * as in the daemon's log. It is called on a thread of the library's own, which begins with the
- * first line, for one line after another. That thread has nothing else to do and holds nothing that the
- * program may wait for, so the callback may block and may call this interface. Meanwhile 256 lines wait;
- * of more only the number is told. What the callback makes the library say on its thread is not told.
+ * A function that receives one log line: its severity (AXON_LOG_*), the part of the library that logs it,
+ * and the text. Both strings are valid during the call. A text has no line breaks: characters that could
+ * control a terminal are escaped, as in the daemon's log.
+ *
+ * The library calls the function on a thread of its own, for one line after the other. The thread starts
+ * with the first line. It has no other work and holds no lock that the program may wait for. Therefore the
+ * function may block and may call this interface. Up to 256 lines are queued meanwhile. Of further lines
+ * only the number is reported. Lines that the library logs on this thread during the function are dropped.
  */
 typedef void (*axon_log_t)(const void *user, uint32_t severity, const char *part, const char *text);
 
 /**
- * A guard condition: stands from when it is triggered until a wait has seen it.
+ * A guard condition. It stays set from its trigger until a wait has reported it.
  */
 typedef struct axon_guard_t {
     /**
-     * 0 where it is none.
+     * 0 if the handle names no object.
      */
     uint64_t id;
 } axon_guard_t;
 
 /**
- * How a session is opened. `axon_session_options_init` fills it in; what is to be otherwise is
- * changed then. Everything that it does not say, the environment and `axon.toml` do.
+ * The options of a session. Fill them in with `axon_session_options_init`, then change individual fields.
+ * The environment and `axon.toml` give all other settings.
  */
 typedef struct axon_session_options_t {
     /**
-     * The interface that the program was compiled against.
+     * The interface version that the program was compiled against.
      */
     uint32_t abi;
     /**
@@ -689,11 +693,12 @@ typedef struct axon_session_options_t {
      */
     uint32_t domain;
     /**
-     * AXON_DISCOVERY_*: how far the session is discovered, whichever process started the daemon.
+     * AXON_DISCOVERY_*: the discovery range of the session. It does not depend on the process that started
+     * the daemon.
      */
     uint32_t discovery;
     /**
-     * 0.
+     * Must be 0.
      */
     uint32_t reserved;
     /**
@@ -701,136 +706,138 @@ typedef struct axon_session_options_t {
      */
     const char *const *static_peers;
     /**
-     * How many there are.
+     * The number of static peers.
      */
     size_t static_peer_count;
     /**
-     * Shown to people; null or empty: the program's name.
+     * The name of the session in tools; null or empty for the program's name.
      */
     const char *name;
     /**
-     * The daemon's program, where `AXON_DAEMON_PATH` names none. An `axon.toml` beside it is read. Null:
-     * `axon_daemon`, else `axon`, in the first of the following folders that has it: this program's own, the
-     * library's, those in `PATH`, and the one where cargo installs programs.
+     * The path of the daemon's program, used if `AXON_DAEMON_PATH` is not set. The daemon's folder may hold
+     * an `axon.toml`, which is read. Null selects `axon_daemon`, else `axon`, in the first of these folders
+     * that has one: the folder of this program, that of the library, those in `PATH`, and the folder where
+     * cargo installs programs.
      */
     const char *daemon_path;
     /**
-     * The file with the permissions of an SROS2 enclave, `permissions.p7s` or `permissions.xml`: the session creates no
-     * endpoint that they do not allow (AXON_RET_DENIED). Their signature is not verified. Null: no limit. A library
-     * that was built without the feature `sros2` takes null alone.
+     * The file with the permissions of an SROS2 enclave, `permissions.p7s` or `permissions.xml`. The session
+     * refuses to create an endpoint that the permissions do not allow (AXON_RET_DENIED). The signature of
+     * the file is not verified. Null means no limit. A library that was built without the feature `sros2`
+     * accepts only null.
      */
     const char *permissions_path;
     /**
-     * The enclave, as `/robot/arm`. Not null where `permissions_path` is not.
+     * The enclave, for instance `/robot/arm`. It must not be null if `permissions_path` is set.
      */
     const char *enclave;
 } axon_session_options_t;
 
 /**
- * What to wait for: arrays of handles, each of which may be empty, and then null. A handle that is
- * 0 is passed over.
+ * The handles that a wait includes, in one array for each kind. An empty array may be null. A wait skips
+ * handles that are 0.
  */
 typedef struct axon_wait_set_t {
     /**
-     * Ready while there is something to take.
+     * Ready while a sample can be taken.
      */
     struct axon_subscription_t *subscriptions;
     /**
-     * How many they are.
+     * The number of subscriptions.
      */
     size_t subscription_count;
     /**
-     * Ready once it was triggered. The wait that finds it so resets it.
+     * Ready once triggered. The wait that reports the condition resets it.
      */
     struct axon_guard_t *guards;
     /**
-     * How many they are.
+     * The number of guard conditions.
      */
     size_t guard_count;
     /**
-     * Ready while there is a request to take.
+     * Ready while a request can be taken.
      */
     struct axon_server_t *servers;
     /**
-     * How many they are.
+     * The number of servers.
      */
     size_t server_count;
     /**
-     * Ready while there is a response to take.
+     * Ready while a response can be taken.
      */
     struct axon_client_t *clients;
     /**
-     * How many they are.
+     * The number of clients.
      */
     size_t client_count;
     /**
-     * Ready while it happened and its status was not taken since.
+     * Ready if the event happened since its status was last taken.
      */
     struct axon_event_t *events;
     /**
-     * How many they are.
+     * The number of events.
      */
     size_t event_count;
 } axon_wait_set_t;
 
 /**
- * It worked.
+ * The call succeeded.
  */
 #define AXON_RET_OK 0
 
 /**
- * It did not, for a reason that only the text tells.
+ * The call failed for a reason without a code of its own. The text of the error states the reason.
  */
 #define AXON_RET_ERROR 1
 
 /**
- * The time was over first.
+ * The call timed out.
  */
 #define AXON_RET_TIMEOUT 2
 
 /**
- * An argument is null where it must not be, not UTF-8, or out of bounds.
+ * An argument is null although it must not be, not UTF-8, or out of bounds.
  */
 #define AXON_RET_INVALID_ARGUMENT 3
 
 /**
- * A handle names nothing: it is 0, was destroyed, or is of another kind.
+ * A handle names no object: the handle is 0, was destroyed, or is of another kind.
  */
 #define AXON_RET_INVALID_HANDLE 4
 
 /**
- * Memory, descriptors or handles are short.
+ * The process is out of memory, file descriptors or handles.
  */
 #define AXON_RET_BAD_ALLOC 5
 
 /**
- * A setting is wrong; the text names the variable.
+ * A setting is wrong. The text of the error names the variable.
  */
 #define AXON_RET_CONFIG 6
 
 /**
- * The handle belongs to a process of which this one is a fork. A child opens a session of its own.
+ * The handle belongs to the parent of this forked process. The child must open a session of its own.
  */
 #define AXON_RET_FORKED 7
 
 /**
- * The program was compiled against another version of this header than the library's.
+ * The program was compiled against another version of the header than the library's.
  */
 #define AXON_RET_ABI 8
 
 /**
- * There is no node of that name.
+ * The graph has no node of that name.
  */
 #define AXON_RET_NO_NODE 9
 
 /**
- * A defect of the library was caught. What the call should have done may be half done.
+ * The library caught a panic: a defect of AXON. The call may have done part of its work.
  */
 #define AXON_RET_PANIC 10
 
 /**
- * The permissions of the session's enclave do not allow the endpoint; the text names the topic, the
- * enclave, the file and its line.
+ * The permissions of the session's enclave do not allow the endpoint. The text of the error names the topic,
+ * the enclave, the file and the line in the file.
  */
 #define AXON_RET_DENIED 11
 
@@ -839,45 +846,43 @@ extern "C" {
 #endif // __cplusplus
 
 /**
- * The version of the interface that the library has. `axon_session_options_init` compares it with
- * the header's, so that no session is opened where they differ.
+ * Returns the interface version of the library. `axon_session_options_init` compares it with the version of
+ * the header and fails if the two differ, so that no session is opened.
  */
 uint32_t axon_session_abi(void);
 
 /**
- * A client of a node: `topic` in the options is the service's name. Of responses that were not taken
- * it keeps of each server what a server keeps of each client's requests. When it returns, the client
- * is matched with those servers that the graph shows, unless they take longer than 50 ms.
+ * Creates a client in a node. `topic` in the options is the service's name. A KEEP_LAST client keeps the
+ * newest untaken responses of each server, as many as its depth; a KEEP_ALL client keeps all. When the call
+ * returns, the client is matched with the servers in the graph, unless that takes longer than 50 ms.
  *
- * Returns as `axon_session_publisher_create`.
+ * Returns the same codes as `axon_session_publisher_create`.
  *
  * # Safety
- * `options` points to options whose pointers point to what they say; `client` points to room for a
- * handle.
+ * `options` points to options whose pointers point to valid data. `client` points to room for a handle.
  */
 axon_ret_t axon_session_client_create(struct axon_node_t node,
                                       const struct axon_endpoint_options_t *options,
                                       struct axon_client_t *client);
 
 /**
- * Ends a client. Its callback has returned, and is not called any more, when this returns.
+ * Destroys a client. When the call returns, the client's callback has returned and is not called again.
  */
 axon_ret_t axon_session_client_destroy(struct axon_client_t client);
 
 /**
- * What the client is: its GID, and the profile that it has for requests and for responses. Null
- * where one is not wanted.
+ * Stores the client's GID, and its profile for requests and responses. A null pointer skips its value.
  *
  * # Safety
- * `gid` and `qos` are null or point to room for one.
+ * `gid` and `qos` are null or point to room for their value.
  */
 axon_ret_t axon_session_client_describe(struct axon_client_t client,
                                         struct axon_gid_t *gid,
                                         struct axon_qos_t *qos);
 
 /**
- * How many servers a request that is sent now reaches, and whose responses reach the client: the
- * service is available where there is one.
+ * Counts the servers that receive a request sent now and whose responses reach the client. The service is
+ * available if there is at least one.
  *
  * # Safety
  * `count` points to room for a number.
@@ -885,18 +890,17 @@ axon_ret_t axon_session_client_describe(struct axon_client_t client,
 axon_ret_t axon_session_client_matched(struct axon_client_t client, size_t *count);
 
 /**
- * Blocks until the service is available, for at most `timeout` nanoseconds (negative: for ever):
- * AXON_RET_TIMEOUT where it is not.
+ * Blocks until the service is available, for at most `timeout` nanoseconds (negative: without end).
+ * AXON_RET_TIMEOUT: the service did not become available.
  */
 axon_ret_t axon_session_client_wait_available(struct axon_client_t client, int64_t timeout);
 
 /**
- * Sends a request of `len` bytes at `data`, which are copied, to every server that is there, and
- * stores its number, from 1, at `sequence`, which may be null. Where there is no server, nobody will
- * answer.
+ * Sends a request to every matched server. Copies the `len` bytes at `data`. Stores the request's number,
+ * which starts at 1, at `sequence`, which may be null. Without a server no response will arrive.
  *
- * May block for 100 ms where a server does not take its requests: AXON_RET_TIMEOUT when it made no
- * room. The rest is as for `axon_session_publisher_publish`.
+ * May block for 100 ms if a server does not take its requests. AXON_RET_TIMEOUT: the server made no room.
+ * All other results are those of `axon_session_publisher_publish`.
  *
  * # Safety
  * `data` points to `len` bytes, or is null and `len` 0; `sequence` is null or points to room for a
@@ -908,11 +912,11 @@ axon_ret_t axon_session_client_request(struct axon_client_t client,
                                        uint64_t *sequence);
 
 /**
- * Copies the next response to where `room` says, as `axon_session_subscription_take`. The
- * publication's number in `info` is that of the request.
+ * Copies the next response to the memory that `room` returns, as `axon_session_subscription_take` does. The
+ * publication's number in `info` is the number of the request.
  *
  * # Safety
- * As there.
+ * As for `axon_session_subscription_take`.
  */
 axon_ret_t axon_session_client_take(struct axon_client_t client,
                                     axon_room_t room,
@@ -921,10 +925,10 @@ axon_ret_t axon_session_client_take(struct axon_client_t client,
                                     uint8_t *taken);
 
 /**
- * Takes the next response in place, as `axon_session_subscription_take_sample`.
+ * Takes the next response in place, as `axon_session_subscription_take_sample` does.
  *
  * # Safety
- * As there.
+ * As for `axon_session_subscription_take_sample`.
  */
 axon_ret_t axon_session_client_take_sample(struct axon_client_t client,
                                            struct axon_sample_t *sample,
@@ -933,28 +937,32 @@ axon_ret_t axon_session_client_take_sample(struct axon_client_t client,
                                            struct axon_message_info_t *info);
 
 /**
- * Has `callback` told of new responses, as `axon_session_subscription_set_callback`.
+ * Sets the callback for new responses, as `axon_session_subscription_set_callback` does.
  *
  * # Safety
- * As there.
+ * As for `axon_session_subscription_set_callback`.
  */
 axon_ret_t axon_session_client_set_callback(struct axon_client_t client,
                                             axon_callback_t callback,
                                             const void *user);
 
 /**
- * Lends `len` bytes to be written and then published: in shared memory where they are more than
- * 4 KiB, or more than 512 bytes if the publisher was created to expect so many, so that nothing is
- * copied. They are at `data` and hold zeros or bytes of earlier samples.
- * Aligned to 16 is what is behind the first `header` of them, here and where they are taken in place:
- * 0 for all of them, 4 for a structure that follows a header of four bytes. Fewer than `len` may be published, so that what is serialized can be given its
- * upper bound. Blocks and fails as `axon_session_publisher_publish`.
+ * Lends `len` bytes of memory at `data`, which the program writes and then publishes. The memory is shared
+ * memory if `len` is more than 4 KiB, or more than 512 bytes for a publisher that expects samples of more
+ * than 512 bytes. Such a sample is published without a copy. The bytes hold zeros or data of earlier
+ * samples.
  *
- * One thread at a time may write. The bytes may be used until the loan is published or abandoned;
- * memory of a loan that is neither is lost to the publisher. A forked child may not use them.
+ * The byte after the first `header` bytes is aligned to 16, both here and where the sample is taken in
+ * place. Pass 0 to align the whole sample, or 4 for a structure that follows a header of four bytes. The
+ * program may publish fewer than `len` bytes, so `len` can be an upper bound of the serialized size. Blocks
+ * and fails as `axon_session_publisher_publish` does.
+ *
+ * One thread at a time may write. The bytes may be used until the loan is published or abandoned. The
+ * publisher loses the memory of a loan that is neither published nor abandoned. A forked child may not use
+ * the bytes.
  *
  * # Safety
- * `loan` and `data` point to room for a handle and a pointer.
+ * `loan` points to room for a handle, and `data` to room for a pointer.
  */
 axon_ret_t axon_session_publisher_loan(struct axon_publisher_t publisher,
                                        size_t header,
@@ -963,11 +971,11 @@ axon_ret_t axon_session_publisher_loan(struct axon_publisher_t publisher,
                                        uint8_t **data);
 
 /**
- * Publishes the first `len` bytes of a loan, as `axon_session_publisher_publish` does. The loan is
- * over, whatever this returns, but for AXON_RET_INVALID_ARGUMENT: `len` is more than was lent.
+ * Publishes the first `len` bytes of a loan, as `axon_session_publisher_publish` does. The loan ends with
+ * every result except AXON_RET_INVALID_ARGUMENT: `len` is more than was lent.
  *
  * # Safety
- * `sequence` is null or points to room for a number. Nobody uses the loan's bytes any more.
+ * `sequence` is null or points to room for a number. No code uses the loan's bytes from now on.
  */
 axon_ret_t axon_session_loan_publish(struct axon_loan_t loan,
                                      size_t len,
@@ -980,45 +988,45 @@ axon_ret_t axon_session_loan_publish(struct axon_loan_t loan,
 axon_ret_t axon_session_loan_abandon(struct axon_loan_t loan);
 
 /**
- * A publisher of a node. When it returns, the publisher is matched with those subscriptions that the
- * graph shows, unless they take longer than 50 ms.
+ * Creates a publisher in a node. When the call returns, the publisher is matched with the subscriptions in
+ * the graph, unless that takes longer than 50 ms.
  *
  * AXON_RET_INVALID_ARGUMENT: a name, the hash or a policy is out of bounds. AXON_RET_BAD_ALLOC: shared
- * memory is short. AXON_RET_DENIED: the session's permissions do not allow it.
+ * memory is short. AXON_RET_DENIED: the session's permissions do not allow the endpoint.
  *
  * # Safety
- * `options` points to options whose pointers point to what they say; `publisher` points to room for
- * a handle.
+ * `options` points to options whose pointers point to valid data. `publisher` points to room for a handle.
  */
 axon_ret_t axon_session_publisher_create(struct axon_node_t node,
                                          const struct axon_endpoint_options_t *options,
                                          struct axon_publisher_t *publisher);
 
 /**
- * Ends a publisher. Subscriptions still take what it left. What it lent can only be abandoned then.
+ * Destroys a publisher. Subscriptions can still take its remaining samples. Its loans can then only be
+ * abandoned.
  */
 axon_ret_t axon_session_publisher_destroy(struct axon_publisher_t publisher);
 
 /**
- * What the publisher is: its GID, and the profile that it has. Null where one is not wanted.
+ * Stores the publisher's GID and profile. A null pointer skips its value.
  *
  * # Safety
- * `gid` and `qos` are null or point to room for one.
+ * `gid` and `qos` are null or point to room for their value.
  */
 axon_ret_t axon_session_publisher_describe(struct axon_publisher_t publisher,
                                            struct axon_gid_t *gid,
                                            struct axon_qos_t *qos);
 
 /**
- * Publishes a sample of `len` bytes at `data`, which are copied. `source_timestamp` is in
- * nanoseconds since the Unix epoch, or AXON_TIME_NOW. Its sequence number, from 1, is stored at
- * `sequence`, which may be null.
+ * Publishes a sample. Copies the `len` bytes at `data`. `source_timestamp` is in nanoseconds since the Unix
+ * epoch, or AXON_TIME_NOW. Stores the sample's sequence number, which starts at 1, at `sequence`, which may
+ * be null.
  *
- * Where the publisher and a subscription are both RELIABLE and KEEP_ALL, it may block for 100 ms until
- * the subscription makes room: AXON_RET_TIMEOUT where its history stayed full, AXON_RET_BAD_ALLOC where
- * memory stayed short. Never else. AXON_RET_BAD_ALLOC: memory is short, or what loans and subscriptions
- * hold fills that of the publisher. AXON_RET_INVALID_ARGUMENT: the sample is longer than
- * `AXON_MAX_MESSAGE_MB` allows. A sample that was refused has no number: nobody counts it lost.
+ * The call may block for up to 100 ms if the publisher and a subscription are both RELIABLE and KEEP_ALL and
+ * the subscription has no room. It never blocks otherwise. AXON_RET_TIMEOUT: the subscription's history
+ * stayed full. AXON_RET_BAD_ALLOC: memory is short, or loans and subscriptions hold all memory of the
+ * publisher. AXON_RET_INVALID_ARGUMENT: the sample is longer than `AXON_MAX_MESSAGE_MB` allows. A refused
+ * sample gets no sequence number, so no subscription counts it as lost.
  *
  * # Safety
  * `data` points to `len` bytes, or is null and `len` 0; `sequence` is null or points to room for a
@@ -1031,9 +1039,9 @@ axon_ret_t axon_session_publisher_publish(struct axon_publisher_t publisher,
                                           uint64_t *sequence);
 
 /**
- * If a sample would be read by nobody, now or later, uses up the next sequence number and stores it
- * at `sequence`; stores 0 where somebody would. Publishing does the same where nobody reads, but
- * a caller that has to serialize first can save the work.
+ * Skips a sample that no subscription would read, now or later: uses up the next sequence number and stores
+ * it at `sequence`. Stores 0 if a subscription would read the sample. Publishing without readers has the
+ * same effect, but this call saves the caller the work of serializing first.
  *
  * # Safety
  * `sequence` points to room for a number.
@@ -1042,7 +1050,7 @@ axon_ret_t axon_session_publisher_skip_unread(struct axon_publisher_t publisher,
                                               uint64_t *sequence);
 
 /**
- * How many subscriptions receive from the publisher, on this host and on others.
+ * Counts the subscriptions on this and other hosts that receive from the publisher.
  *
  * # Safety
  * `count` points to room for a number.
@@ -1050,68 +1058,74 @@ axon_ret_t axon_session_publisher_skip_unread(struct axon_publisher_t publisher,
 axon_ret_t axon_session_publisher_matched(struct axon_publisher_t publisher, size_t *count);
 
 /**
- * Blocks until at least `count` subscriptions receive from the publisher, for at most `timeout`
- * nanoseconds (negative: for ever): AXON_RET_TIMEOUT where they do not.
+ * Blocks until at least `count` subscriptions receive from the publisher, for at most `timeout` nanoseconds
+ * (negative: without end). AXON_RET_TIMEOUT: fewer subscriptions do.
  */
 axon_ret_t axon_session_publisher_wait_matched(struct axon_publisher_t publisher,
                                                size_t count,
                                                int64_t timeout);
 
 /**
- * Blocks until every sample published so far is acknowledged, for at most `timeout` nanoseconds
- * (negative: for ever): AXON_RET_TIMEOUT where one is not. Between processes of this host that share
- * memory a sample is acknowledged at once. Where they share none (AXON_SHM), this host's daemon carries it:
- * a sample of a RELIABLE and KEEP_ALL publisher for a subscription like it is acknowledged when the other
- * process has it, any other when the daemon has it. For another host it depends on the QoS of publisher and
- * subscription. Both RELIABLE and KEEP_ALL: that host has the sample. Both RELIABLE, one of them KEEP_LAST:
- * that host has the newest samples, as many as the depth (the smaller one), or newer ones; older ones may be
- * missing. One of them BEST_EFFORT: the sample was sent or dropped. AXON_RET_TIMEOUT comes at once, and
- * once, when samples were given up since the last call: with a link, or with this host's daemon, for a host
- * that read nothing, or by a limit.
+ * Blocks until every sample published so far is acknowledged, for at most `timeout` nanoseconds (negative:
+ * without end). AXON_RET_TIMEOUT: a sample is not acknowledged.
+ *
+ * A sample is acknowledged at once between processes of this host that share memory. If they share none
+ * (AXON_SHM), this host's daemon carries the sample. If both the publisher and the subscription are RELIABLE
+ * and KEEP_ALL, it is acknowledged when the other process has it. Otherwise it is acknowledged when the
+ * daemon has it.
+ *
+ * The meaning for another host depends on the QoS of publisher and subscription:
+ *
+ * - Both RELIABLE and KEEP_ALL: that host has the sample.
+ * - Both RELIABLE, one of them KEEP_LAST: that host has the newest samples, as many as the smaller depth, or
+ *   newer ones. Older samples may be missing.
+ * - One of them BEST_EFFORT: the sample was sent or dropped.
+ *
+ * AXON_RET_TIMEOUT comes at once, and once, if samples were given up since the last call: because a link or
+ * this host's daemon failed, a host stopped reading, or a limit dropped them.
  */
 axon_ret_t axon_session_publisher_wait_acknowledged(struct axon_publisher_t publisher,
                                                     int64_t timeout);
 
 /**
- * Says that the publisher is alive. Where its liveliness is MANUAL_BY_TOPIC, so does every
- * publication; where it is AUTOMATIC, its session says so.
+ * Asserts that the publisher is alive. With MANUAL_BY_TOPIC liveliness, every publication asserts it, too.
+ * With AUTOMATIC liveliness, the session asserts it.
  */
 axon_ret_t axon_session_publisher_assert_liveliness(struct axon_publisher_t publisher);
 
 /**
- * A server of a node: `topic` in the options is the service's name. Of requests that were not taken
- * a KEEP_LAST server keeps the newest of each client, as many as its depth, and a KEEP_ALL one all.
- * What is kept is never dropped to make room. When it returns, the server is matched with those
- * clients that the graph shows, unless they take longer than 50 ms.
+ * Creates a server in a node. `topic` in the options is the service's name. A KEEP_LAST server keeps the
+ * newest untaken requests of each client, as many as its depth; a KEEP_ALL server keeps all. A kept request
+ * is never dropped to make room. When the call returns, the server is matched with the clients in the graph,
+ * unless that takes longer than 50 ms.
  *
- * Returns as `axon_session_publisher_create`.
+ * Returns the same codes as `axon_session_publisher_create`.
  *
  * # Safety
- * `options` points to options whose pointers point to what they say; `server` points to room for a
- * handle.
+ * `options` points to options whose pointers point to valid data. `server` points to room for a handle.
  */
 axon_ret_t axon_session_server_create(struct axon_node_t node,
                                       const struct axon_endpoint_options_t *options,
                                       struct axon_server_t *server);
 
 /**
- * Ends a server. Its callback has returned, and is not called any more, when this returns.
+ * Destroys a server. When the call returns, the server's callback has returned and is not called again.
  */
 axon_ret_t axon_session_server_destroy(struct axon_server_t server);
 
 /**
- * What the server is: its GID, and the profile that it has for requests and for responses. Null
- * where one is not wanted.
+ * Stores the server's GID, and its profile for requests and responses. A null pointer skips its value.
  *
  * # Safety
- * `gid` and `qos` are null or point to room for one.
+ * `gid` and `qos` are null or point to room for their value.
  */
 axon_ret_t axon_session_server_describe(struct axon_server_t server,
                                         struct axon_gid_t *gid,
                                         struct axon_qos_t *qos);
 
 /**
- * How many clients reach the server, and are reached by it.
+ * Counts the clients that are matched in both directions: their requests reach the server, and its responses
+ * reach them.
  *
  * # Safety
  * `count` points to room for a number.
@@ -1119,11 +1133,11 @@ axon_ret_t axon_session_server_describe(struct axon_server_t server,
 axon_ret_t axon_session_server_matched(struct axon_server_t server, size_t *count);
 
 /**
- * Copies the next request to where `room` says, as `axon_session_subscription_take`. The sender and
- * the publication's number in `info` are what the response must carry.
+ * Copies the next request to the memory that `room` returns, as `axon_session_subscription_take` does. The
+ * response must carry the sender and the publication's number in `info`.
  *
  * # Safety
- * As there.
+ * As for `axon_session_subscription_take`.
  */
 axon_ret_t axon_session_server_take(struct axon_server_t server,
                                     axon_room_t room,
@@ -1132,10 +1146,10 @@ axon_ret_t axon_session_server_take(struct axon_server_t server,
                                     uint8_t *taken);
 
 /**
- * Takes the next request in place, as `axon_session_subscription_take_sample`.
+ * Takes the next request in place, as `axon_session_subscription_take_sample` does.
  *
  * # Safety
- * As there.
+ * As for `axon_session_subscription_take_sample`.
  */
 axon_ret_t axon_session_server_take_sample(struct axon_server_t server,
                                            struct axon_sample_t *sample,
@@ -1144,11 +1158,11 @@ axon_ret_t axon_session_server_take_sample(struct axon_server_t server,
                                            struct axon_message_info_t *info);
 
 /**
- * Answers request `sequence` of `client` with `len` bytes at `data`, which are copied. Nobody else
- * receives it. A client that is gone is no error.
+ * Answers request `sequence` of `client`. Copies the `len` bytes at `data`. Only this client receives the
+ * response. A client that no longer exists is no error.
  *
- * May block for 100 ms where the client does not take its responses: AXON_RET_TIMEOUT when it made no
- * room. The rest is as for `axon_session_publisher_publish`.
+ * May block for 100 ms if the client does not take its responses. AXON_RET_TIMEOUT: the client made no room.
+ * All other results are those of `axon_session_publisher_publish`.
  *
  * # Safety
  * `client` points to a GID; `data` points to `len` bytes, or is null and `len` 0.
@@ -1160,47 +1174,47 @@ axon_ret_t axon_session_server_respond(struct axon_server_t server,
                                        size_t len);
 
 /**
- * Has `callback` told of new requests, as `axon_session_subscription_set_callback`.
+ * Sets the callback for new requests, as `axon_session_subscription_set_callback` does.
  *
  * # Safety
- * As there.
+ * As for `axon_session_subscription_set_callback`.
  */
 axon_ret_t axon_session_server_set_callback(struct axon_server_t server,
                                             axon_callback_t callback,
                                             const void *user);
 
 /**
- * A subscription of a node. When it returns, the subscription is matched with those publishers that
- * the graph shows, unless they take longer than 50 ms. There are no content filters.
+ * Creates a subscription in a node. When the call returns, the subscription is matched with the publishers
+ * in the graph, unless that takes longer than 50 ms. Content filters do not exist.
  *
- * Returns as `axon_session_publisher_create`.
+ * Returns the same codes as `axon_session_publisher_create`.
  *
  * # Safety
- * `options` points to options whose pointers point to what they say; `subscription` points to room
- * for a handle.
+ * `options` points to options whose pointers point to valid data. `subscription` points to room for a
+ * handle.
  */
 axon_ret_t axon_session_subscription_create(struct axon_node_t node,
                                             const struct axon_endpoint_options_t *options,
                                             struct axon_subscription_t *subscription);
 
 /**
- * Ends a subscription. Samples that were taken in place stay until they are released. Its callback
- * has returned, and is not called any more, when this returns.
+ * Destroys a subscription. Samples that were taken in place stay valid until they are released. When the
+ * call returns, the subscription's callback has returned and is not called again.
  */
 axon_ret_t axon_session_subscription_destroy(struct axon_subscription_t subscription);
 
 /**
- * What the subscription is: its GID, and the profile that it has. Null where one is not wanted.
+ * Stores the subscription's GID and profile. A null pointer skips its value.
  *
  * # Safety
- * `gid` and `qos` are null or point to room for one.
+ * `gid` and `qos` are null or point to room for their value.
  */
 axon_ret_t axon_session_subscription_describe(struct axon_subscription_t subscription,
                                               struct axon_gid_t *gid,
                                               struct axon_qos_t *qos);
 
 /**
- * How many publishers the subscription receives from, on this host and on others.
+ * Counts the publishers on this and other hosts that the subscription receives from.
  *
  * # Safety
  * `count` points to room for a number.
@@ -1209,24 +1223,25 @@ axon_ret_t axon_session_subscription_matched(struct axon_subscription_t subscrip
                                              size_t *count);
 
 /**
- * Blocks until the subscription receives from at least `count` publishers, for at most `timeout`
- * nanoseconds (negative: for ever): AXON_RET_TIMEOUT where it does not.
+ * Blocks until the subscription receives from at least `count` publishers, for at most `timeout` nanoseconds
+ * (negative: without end). AXON_RET_TIMEOUT: it receives from fewer.
  */
 axon_ret_t axon_session_subscription_wait_matched(struct axon_subscription_t subscription,
                                                   size_t count,
                                                   int64_t timeout);
 
 /**
- * Copies the oldest sample, by source timestamp among all publishers, to where `room` says, and
- * stores what is known of it at `info`, which may be null. `taken` is 0 where there was none, and
- * then `room` is not called. A publisher whose sample is in memory that this process has not been told
- * of yet, such as its first one of more than 4 KiB, holds up none of the others.
+ * Copies the oldest sample, by source timestamp among all publishers, to the memory that `room` returns.
+ * Stores its metadata at `info`, which may be null. Stores 1 at `taken`, or 0 if there was no sample; then
+ * `room` is not called. A publisher's sample may be in memory that this process has not received yet, for
+ * instance the first sample of more than 4 KiB. Such a sample does not delay the samples of other
+ * publishers.
  *
- * AXON_RET_BAD_ALLOC: `room` gave none; the sample is gone.
+ * AXON_RET_BAD_ALLOC: `room` returned no memory; the sample is lost.
  *
  * # Safety
- * `room` gives null, or room for as many bytes as it is asked for; `info` is null or points to room
- * for one; `taken` points to room for a number.
+ * `room` returns null, or memory for as many bytes as it is asked for. `info` is null or points to room for
+ * the metadata. `taken` points to room for a number.
  */
 axon_ret_t axon_session_subscription_take(struct axon_subscription_t subscription,
                                           axon_room_t room,
@@ -1235,20 +1250,23 @@ axon_ret_t axon_session_subscription_take(struct axon_subscription_t subscriptio
                                           uint8_t *taken);
 
 /**
- * Takes the oldest sample, by source timestamp among all publishers, in place: `len` bytes at `data`,
- * which stand until `axon_session_sample_release`. What was lent is aligned as it was, a copy as
- * the allocator does it (to 8 at least, but for one of 0 bytes, of which `data` is any address), and what a
- * publisher wrote that does not keep to the protocol anyhow. One of more than 4 KiB, and a loan of more
- * than 512 bytes whose publisher expects so many, is in the publisher's memory, of which a subscription
- * can keep five for each publisher; a sixth is copied.
- * Where there is none the handle is 0, and nothing else is stored.
+ * Takes the oldest sample, by source timestamp among all publishers, in place. The `len` bytes at `data` are
+ * valid until `axon_session_sample_release`. If there is no sample, the handle is 0 and nothing else is
+ * stored.
  *
- * Nobody may write to the bytes, and a forked child may not read them. Such a publisher, in another
- * process, could change them meanwhile: a parser reads each byte once, and checks what it read.
- * `AXON_SHM_COPY=1` has all of them copied.
+ * A sample of more than 4 KiB is in the publisher's memory. So is a loan of more than 512 bytes if its
+ * publisher expects samples of more than 512 bytes. A subscription can keep five such samples of each
+ * publisher; a sixth is copied. A lent sample has the alignment of its loan. A copy has the alignment of the
+ * allocator, at least 8; a copy of 0 bytes has any address. Samples of a publisher that violates the
+ * protocol may have any alignment.
+ *
+ * No code may write to the bytes, and a forked child may not read them. A publisher in another process that
+ * violates the protocol could change the bytes meanwhile. Therefore a parser should read each byte once and
+ * check the value that it read. `AXON_SHM_COPY=1` makes the library copy all samples.
  *
  * # Safety
- * `sample`, `data` and `len` point to room for one each; `info` is null or does.
+ * `sample`, `data` and `len` point to room for one value each. `info` is null or points to room for the
+ * metadata.
  */
 axon_ret_t axon_session_subscription_take_sample(struct axon_subscription_t subscription,
                                                  struct axon_sample_t *sample,
@@ -1257,14 +1275,14 @@ axon_ret_t axon_session_subscription_take_sample(struct axon_subscription_t subs
                                                  struct axon_message_info_t *info);
 
 /**
- * Gives a sample that was taken in place back: of a subscription, a server or a client. It may be
- * released after these have ended.
+ * Releases a sample that a subscription, a server or a client took in place. The release may come after the
+ * end of that endpoint.
  */
 axon_ret_t axon_session_sample_release(struct axon_sample_t sample);
 
 /**
- * Samples of the subscription that were lost: overwritten before they were taken, or lost on their
- * way from another host.
+ * Stores the number of samples that the subscription lost: samples that were overwritten before they were
+ * taken, or lost on the way from another host.
  *
  * # Safety
  * `lost` points to room for a number.
@@ -1272,15 +1290,15 @@ axon_ret_t axon_session_sample_release(struct axon_sample_t sample);
 axon_ret_t axon_session_subscription_lost(struct axon_subscription_t subscription, uint64_t *lost);
 
 /**
- * Has `callback` told of new samples from now on, in place of the one before, which has returned and
- * is not called any more when this returns, unless this is called from within it. Null: nobody is
- * told. What is there to be taken, and nobody was told of, it is told at once, in this call; the rest on
- * the session's thread.
+ * Sets the callback for new samples, which replaces the previous callback. When the call returns, the
+ * previous callback has returned and is not called again, unless the call comes from inside that callback.
+ * Null removes the callback. The call reports untaken samples at once that no callback was called for. The
+ * session's thread reports later samples.
  *
- * AXON_RET_ERROR: an event loop of the program's listens already.
+ * AXON_RET_ERROR: an event loop of the program already listens to the session.
  *
  * # Safety
- * `callback` may be called with `user` from any thread until it is replaced or the subscription is
+ * `callback` may be called with `user` from any thread until the callback is replaced or the subscription is
  * destroyed.
  */
 axon_ret_t axon_session_subscription_set_callback(struct axon_subscription_t subscription,
@@ -1288,15 +1306,15 @@ axon_ret_t axon_session_subscription_set_callback(struct axon_subscription_t sub
                                                   const void *user);
 
 /**
- * What went wrong in the last call of this thread that failed: what, of which topic and node, why,
- * and what to do. Empty where none has. The text stands until the next call that fails in this
- * thread; it is null in a thread that is ending.
+ * Returns the text of the last failed call in this thread: the failed operation, its topic and node, the
+ * cause, and the remedy. The text is empty if no call failed. It stays valid until the next failed call in
+ * this thread. A thread that is ending gets null.
  */
 const char *axon_session_last_error(void);
 
 /**
- * One event of a publisher: AXON_RET_INVALID_ARGUMENT where `kind` is not one of its. It may be used
- * after the publisher has ended, and then does not happen again.
+ * Creates a handle for one event of a publisher. AXON_RET_INVALID_ARGUMENT: a publisher has no event of this
+ * `kind`. The handle stays valid after the publisher ends. The event does not happen again then.
  *
  * # Safety
  * `event` points to room for a handle.
@@ -1306,38 +1324,40 @@ axon_ret_t axon_session_publisher_event(struct axon_publisher_t publisher,
                                         struct axon_event_t *event);
 
 /**
- * One event of a subscription, as `axon_session_publisher_event`.
+ * Creates a handle for one event of a subscription, as `axon_session_publisher_event` does.
  *
  * # Safety
- * As there.
+ * As for `axon_session_publisher_event`.
  */
 axon_ret_t axon_session_subscription_event(struct axon_subscription_t subscription,
                                            uint32_t kind,
                                            struct axon_event_t *event);
 
 /**
- * Gives an event's handle up. Its callback has returned, and is not called any more, when this returns;
- * those of other handles of the same event are.
+ * Destroys the handle of an event. When the call returns, the callback of this handle has returned and is
+ * not called again. The callbacks of other handles of the same event stay set.
  */
 axon_ret_t axon_session_event_destroy(struct axon_event_t event);
 
 /**
- * The status. Its changes are counted anew from here, and the event is not ready any more until it
+ * Takes the status of an event. The changes are counted from 0 again. The event is not ready until it
  * happens again.
  *
  * # Safety
- * `status` points to room for one.
+ * `status` points to room for one status.
  */
 axon_ret_t axon_session_event_take(struct axon_event_t event, struct axon_event_status_t *status);
 
 /**
- * Has `callback` told of the event from now on, in place of the one that this handle had before, which
- * has returned and is not called any more when this returns, unless this is called from within it.
- * Null: nobody is told. What happened since the status was last taken, and nobody was told of by this
- * handle, it is told at once, in this call.
+ * Sets the callback of this handle, which replaces the handle's previous callback. When the call returns,
+ * the previous callback has returned and is not called again, unless the call comes from inside that
+ * callback. Null removes the callback.
+ *
+ * The call reports the earlier occurrences at once: those since the status was last taken that this handle
+ * has not reported yet.
  *
  * # Safety
- * `callback` may be called with `user` from any thread until it is replaced or the event is
+ * `callback` may be called with `user` from any thread until the callback is replaced or the event is
  * destroyed.
  */
 axon_ret_t axon_session_event_set_callback(struct axon_event_t event,
@@ -1345,8 +1365,9 @@ axon_ret_t axon_session_event_set_callback(struct axon_event_t event,
                                            const void *user);
 
 /**
- * Calls `visitor` with every node of the graph, in order of namespace and name: as often as nodes of
- * one name are there. What it is given stands until it returns; no lock is held meanwhile.
+ * Calls `visitor` with every node of the graph, in order of namespace and name. Several nodes of the same
+ * name give one call each. The strings are valid until the visitor returns. The library holds no lock during
+ * the call of the visitor.
  *
  * # Safety
  * `visitor` may be called with `user`.
@@ -1356,11 +1377,11 @@ axon_ret_t axon_session_graph_nodes(struct axon_session_t session,
                                     void *user);
 
 /**
- * Calls `visitor` with the names that endpoints of the given kinds (the sum of AXON_KIND_*) have, in
- * order, each with its types: of all endpoints, or, where `node` is not null, of those of the node of
- * this name and namespace.
+ * Calls `visitor` with the topic and service names of the endpoints of the given kinds (the sum of
+ * AXON_KIND_*), in order, each with its types. Null for `node` selects all endpoints. Otherwise the
+ * endpoints of the node with this name and namespace are selected.
  *
- * AXON_RET_NO_NODE: there is none.
+ * AXON_RET_NO_NODE: the graph has no such node.
  *
  * # Safety
  * `node` and `namespace_` are strings, or `node` is null; `visitor` may be called with `user`.
@@ -1373,8 +1394,8 @@ axon_ret_t axon_session_graph_names(struct axon_session_t session,
                                     void *user);
 
 /**
- * Calls `visitor` with every endpoint of a kind (AXON_KIND_*) under a topic's or service's name, or,
- * where `topic` is null, of that kind.
+ * Calls `visitor` with every endpoint of a kind (AXON_KIND_*) that has this topic or service name. Null for
+ * `topic` selects all endpoints of the kind.
  *
  * # Safety
  * `topic` is null or a string; `visitor` may be called with `user`.
@@ -1386,8 +1407,8 @@ axon_ret_t axon_session_graph_endpoints(struct axon_session_t session,
                                         void *user);
 
 /**
- * How many endpoints of a kind (AXON_KIND_*) are under a topic's or service's name. One that is
- * counted is one that gets data.
+ * Counts the endpoints of a kind (AXON_KIND_*) that have this topic or service name. Data already flows to
+ * every counted endpoint with a compatible profile.
  *
  * # Safety
  * `topic` is a string; `count` points to room for a number.
@@ -1398,13 +1419,13 @@ axon_ret_t axon_session_graph_count(struct axon_session_t session,
                                     size_t *count);
 
 /**
- * Has `callback` told of what the library says in this process, in place of the one before, which has
- * returned and is not called any more when this returns; it blocks until then. To set the one that is
- * set already with the same `user` changes nothing, and does not block. Null: nobody is told, as at
- * first. A daemon has a log of its own. A forked child says it again for what it says itself.
+ * Sets the callback for the log lines of the library in this process, which replaces the previous one. The
+ * call blocks until the previous callback has returned; that one is not called again. Setting the current
+ * callback with the same `user` changes nothing and does not block. Null removes the callback; there is none
+ * at first. A daemon has a log of its own. A forked child must set a callback for its own log lines.
  *
- * AXON_RET_ERROR: it is called from within a callback, or a part of the program in Rust has what the
- * library says already (a global `tracing` subscriber).
+ * AXON_RET_ERROR: the call comes from inside a callback, or Rust code in the program already receives the
+ * log lines (a global `tracing` subscriber).
  *
  * # Safety
  * `callback` may be called with `user` from any thread until it is replaced.
@@ -1413,14 +1434,14 @@ axon_ret_t axon_session_log_set_callback(axon_log_t callback,
                                          const void *user);
 
 /**
- * How severe a line must be at least to be told: AXON_LOG_WARN at first. A severity between those that
- * have a name is as good as any.
+ * Sets the lowest severity that is reported, which is AXON_LOG_WARN at first. Values between the named
+ * severities are accepted.
  */
 axon_ret_t axon_session_log_set_severity(uint32_t severity);
 
 /**
- * A node, which is in the graph until it is destroyed; its endpoints do not end with it. Two nodes
- * may have the same name. It keeps its session open.
+ * Creates a node, which stays in the graph until it is destroyed. Its endpoints do not end with the node.
+ * Two nodes may have the same name. A node keeps its session open.
  *
  * AXON_RET_INVALID_ARGUMENT: the name is empty, or a name is longer than 512 bytes.
  *
@@ -1434,15 +1455,15 @@ axon_ret_t axon_session_node_create(struct axon_session_t session,
                                     struct axon_node_t *node);
 
 /**
- * Takes a node out of the graph. It may block for milliseconds, as `axon_session_close` says.
+ * Removes a node from the graph. The call may block for milliseconds, as `axon_session_close` may.
  */
 axon_ret_t axon_session_node_destroy(struct axon_node_t node);
 
 /**
- * The guard condition that is triggered after every change of the graph, once what one asks of the
- * graph shows it, and when a service or a client of the session finds or loses its other end. It
- * is a handle of its own, to be destroyed like one that was created, and lasts as long as the
- * session.
+ * Creates a handle for the guard condition of the graph. Every change of the graph triggers the condition,
+ * once graph queries return the new state. The condition is also triggered when a service or a client of the
+ * session finds or loses its other end. The program must destroy the handle, as one that it created. The
+ * condition lasts as long as the session.
  *
  * # Safety
  * `guard` points to room for a handle.
@@ -1450,13 +1471,14 @@ axon_ret_t axon_session_node_destroy(struct axon_node_t node);
 axon_ret_t axon_session_node_graph_guard(struct axon_node_t node, struct axon_guard_t *guard);
 
 /**
- * Whether a publisher with the one profile serves a subscription with the other: AXON_QOS_* at
- * `verdict`. Why not, or on what it hangs, is put into `reason` in words, cut to `reason_size`
- * bytes with the 0 at its end; null and 0 where that is not wanted.
+ * Checks whether a publisher that offers one profile matches a subscription that requests the other. The
+ * result, AXON_QOS_*, is stored at `verdict`. The reason for a result other than AXON_QOS_COMPATIBLE is
+ * stored at `reason` as text, cut to `reason_size` bytes with the 0 at its end. Null and 0 mean that no
+ * reason is wanted.
  *
  * # Safety
- * `offered` and `requested` point to a profile each, `verdict` to room for a number, and `reason` to
- * room for `reason_size` bytes.
+ * `offered` and `requested` point to one profile each. `verdict` points to room for a number, and `reason`
+ * to room for `reason_size` bytes.
  */
 axon_ret_t axon_session_qos_check(const struct axon_qos_t *offered,
                                   const struct axon_qos_t *requested,
@@ -1465,24 +1487,25 @@ axon_ret_t axon_session_qos_check(const struct axon_qos_t *offered,
                                   size_t reason_size);
 
 /**
- * The name of a policy as ROS 2 spells it, for instance `RELIABILITY`; null where there is none of
- * that number. It stands for ever.
+ * Returns the name of a policy as ROS 2 spells it, for instance `RELIABILITY`; null if no policy has that
+ * number. The string is static.
  */
 const char *axon_session_policy_name(uint32_t policy);
 
 /**
- * Fills options in with what is usual. `abi` is the program's AXON_SESSION_ABI: AXON_RET_ABI where
- * the library has another, and nothing is written then.
+ * Fills in options with the defaults. `abi` is the program's AXON_SESSION_ABI. AXON_RET_ABI: the library has
+ * another version; the call has written nothing.
  *
  * # Safety
- * `options` points to room for them, as the program's header declares them.
+ * `options` points to room for options as the program's header declares them.
  */
 axon_ret_t axon_session_options_init(struct axon_session_options_t *options, uint32_t abi);
 
 /**
- * Checks the settings as `axon_session_open` does, and opens nothing.
+ * Checks the settings as `axon_session_open` does, without opening a session.
  *
- * AXON_RET_CONFIG: one is wrong; the text names the variable, what was read, and what is accepted.
+ * AXON_RET_CONFIG: a setting is wrong. The text of the error names the variable, the value, and the accepted
+ * values.
  *
  * # Safety
  * As for `axon_session_open`.
@@ -1490,8 +1513,8 @@ axon_ret_t axon_session_options_init(struct axon_session_options_t *options, uin
 axon_ret_t axon_session_options_check(const struct axon_session_options_t *options);
 
 /**
- * How other hosts prove who they are to a session with these options: AXON_AUTHENTICATION_*, as the
- * environment and `axon.toml` say it. Opens nothing.
+ * Stores how a session with these options authenticates other hosts: AXON_AUTHENTICATION_*, according to the
+ * environment and `axon.toml`. Opens no session.
  *
  * AXON_RET_CONFIG: a setting is wrong, as for `axon_session_options_check`.
  *
@@ -1502,32 +1525,32 @@ axon_ret_t axon_session_options_authentication(const struct axon_session_options
                                                uint32_t *authentication);
 
 /**
- * Opens a session, and starts a daemon where none runs and `AXON_DAEMON` lets it. A process may have
- * any number of them.
+ * Opens a session. Starts a daemon if none runs and `AXON_DAEMON` permits it. A process may have any number
+ * of sessions.
  *
- * Blocks until the daemon has answered: milliseconds, or up to 20 s where one is started.
+ * Blocks until the daemon answers: for milliseconds, or up to 20 s if the call starts a daemon.
  *
- * AXON_RET_CONFIG: a setting is wrong, or the daemon that runs has other security settings; the text
- * names the variable. Or the permissions cannot be read, are not valid now, or allow nothing in the
- * session's domain; the text names the file. AXON_RET_ERROR: there is no daemon and none can be
- * started, or it does not answer. AXON_RET_BAD_ALLOC: shared memory is short.
+ * AXON_RET_CONFIG: a setting is wrong, or the running daemon has other security settings; the text names the
+ * variable. AXON_RET_CONFIG also means that the permissions cannot be read, are not valid now, or allow
+ * nothing in the session's domain; the text names the file. AXON_RET_ERROR: no daemon runs and none can be
+ * started, or the daemon does not answer. AXON_RET_BAD_ALLOC: shared memory is short.
  *
  * # Safety
- * `options` points to options that `axon_session_options_init` filled in, whose pointers are null or
- * point to what they say; `session` points to room for a handle.
+ * `options` points to options that `axon_session_options_init` filled in. Each of their pointers is null or
+ * points to valid data. `session` points to room for a handle.
  */
 axon_ret_t axon_session_open(const struct axon_session_options_t *options,
                              struct axon_session_t *session);
 
 /**
- * Gives a session's handle up. The session ends when the last of its nodes, endpoints and events is
- * destroyed and the last call returns that uses one, which then blocks for milliseconds while its
- * thread ends.
+ * Destroys the handle of a session. The session ends when its last node, endpoint and event is destroyed and
+ * the last call that uses one of them returns. That call blocks for milliseconds while the session's thread
+ * ends.
  */
 axon_ret_t axon_session_close(struct axon_session_t session);
 
 /**
- * The domain that the session is in.
+ * Stores the domain of the session.
  *
  * # Safety
  * `domain` points to room for a number.
@@ -1535,9 +1558,9 @@ axon_ret_t axon_session_close(struct axon_session_t session);
 axon_ret_t axon_session_domain(struct axon_session_t session, uint32_t *domain);
 
 /**
- * Whether the session reaches its daemon: 1, or 0 while there is none, as after it died, until
- * another has taken over. Where `AXON_DAEMON` is `off` there is none to reach: 1. What is attached
- * flows on either way.
+ * Stores 1 if the session is connected to a daemon, else 0. A session is not connected after its daemon has
+ * died, until another daemon takes over. If `AXON_DAEMON` is `off`, the result is always 1. Data flows
+ * between attached endpoints in both cases.
  *
  * # Safety
  * `connected` points to room for a number.
@@ -1545,8 +1568,8 @@ axon_ret_t axon_session_domain(struct axon_session_t session, uint32_t *domain);
 axon_ret_t axon_session_is_connected(struct axon_session_t session, uint8_t *connected);
 
 /**
- * A guard condition of a session. It does not keep the session open: it may be triggered and destroyed
- * when that has ended, but nobody can wait for it any more.
+ * Creates a guard condition for a session. It does not keep the session open. After the session has ended,
+ * the condition can still be triggered and destroyed, but no wait can include it.
  *
  * # Safety
  * `guard` points to room for a handle.
@@ -1555,34 +1578,34 @@ axon_ret_t axon_session_guard_create(struct axon_session_t session,
                                      struct axon_guard_t *guard);
 
 /**
- * Gives a guard condition's handle up. A wait that waits for it goes on without.
+ * Destroys the handle of a guard condition. A running wait continues without the condition.
  */
 axon_ret_t axon_session_guard_destroy(struct axon_guard_t guard);
 
 /**
- * Triggers a guard condition. Async-signal-safe: it takes no lock and no memory, and a signal handler
- * may call it at any time. It leaves errno and the text of the last error alone.
+ * Triggers a guard condition. The call is async-signal-safe: it takes no lock and allocates no memory. It
+ * changes neither errno nor the text of the last error.
  *
- * AXON_RET_INVALID_HANDLE: it names none, or is being destroyed.
+ * AXON_RET_INVALID_HANDLE: the handle names no guard condition, or the condition is being destroyed.
  */
 axon_ret_t axon_session_guard_trigger(struct axon_guard_t guard);
 
 /**
- * Blocks until at least one of what is in `set` is ready, for at most `timeout` nanoseconds: 0 not at
- * all, AXON_WAIT_FOREVER (any negative number) without end, also where the set is empty. Then sets
- * all handles in the arrays to 0 that are not ready.
+ * Blocks until at least one handle in `set` is ready, for at most `timeout` nanoseconds. A timeout of 0 does
+ * not block. AXON_WAIT_FOREVER, like any negative number, blocks without end, even if the set is empty. The
+ * call then sets all handles in the arrays to 0 that are not ready.
  *
- * AXON_RET_TIMEOUT: none was ready in time; all handles are 0. Every other failure leaves the arrays
- * as they were: AXON_RET_INVALID_HANDLE where one names nothing, AXON_RET_INVALID_ARGUMENT where one is
- * of another session that is closed. What is of another session of this process can be waited for
- * too, and takes a thread more on its way.
+ * AXON_RET_TIMEOUT: no handle was ready in time; all handles are 0. Every other failure leaves the arrays
+ * unchanged. AXON_RET_INVALID_HANDLE: a handle names no object. AXON_RET_INVALID_ARGUMENT: a handle belongs
+ * to another session that is closed. Handles of another open session of this process are permitted; their
+ * wake-up takes a detour through one more thread.
  *
- * Any number of threads may wait at once, each with arrays of its own. What is destroyed meanwhile is
- * out of the graph at once; the wait goes on.
+ * Any number of threads may wait at once, each with arrays of its own. An object that is destroyed during a
+ * wait leaves the graph at once. The wait continues.
  *
  * # Safety
- * `set` points to a set whose arrays hold as many handles as it says, which nobody else uses during
- * the call.
+ * `set` points to a set whose arrays hold as many handles as their counts say. No other code uses the arrays
+ * during the call.
  */
 axon_ret_t axon_session_wait(struct axon_session_t session,
                              const struct axon_wait_set_t *set,

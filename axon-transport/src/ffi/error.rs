@@ -15,33 +15,33 @@ use crate::{
     session::SessionError,
 };
 
-/// What a call returns: `AXON_RET_OK`, or why it did not do what it was asked.
+/// The result of a call: `AXON_RET_OK`, or the reason for the failure.
 pub type axon_ret_t = i32;
 
-/// It worked.
+/// The call succeeded.
 pub const AXON_RET_OK: axon_ret_t = 0;
-/// It did not, for a reason that only the text tells.
+/// The call failed for a reason without a code of its own. The text of the error states the reason.
 pub const AXON_RET_ERROR: axon_ret_t = 1;
-/// The time was over first.
+/// The call timed out.
 pub const AXON_RET_TIMEOUT: axon_ret_t = 2;
-/// An argument is null where it must not be, not UTF-8, or out of bounds.
+/// An argument is null although it must not be, not UTF-8, or out of bounds.
 pub const AXON_RET_INVALID_ARGUMENT: axon_ret_t = 3;
-/// A handle names nothing: it is 0, was destroyed, or is of another kind.
+/// A handle names no object: the handle is 0, was destroyed, or is of another kind.
 pub const AXON_RET_INVALID_HANDLE: axon_ret_t = 4;
-/// Memory, descriptors or handles are short.
+/// The process is out of memory, file descriptors or handles.
 pub const AXON_RET_BAD_ALLOC: axon_ret_t = 5;
-/// A setting is wrong; the text names the variable.
+/// A setting is wrong. The text of the error names the variable.
 pub const AXON_RET_CONFIG: axon_ret_t = 6;
-/// The handle belongs to a process of which this one is a fork. A child opens a session of its own.
+/// The handle belongs to the parent of this forked process. The child must open a session of its own.
 pub const AXON_RET_FORKED: axon_ret_t = 7;
-/// The program was compiled against another version of this header than the library's.
+/// The program was compiled against another version of the header than the library's.
 pub const AXON_RET_ABI: axon_ret_t = 8;
-/// There is no node of that name.
+/// The graph has no node of that name.
 pub const AXON_RET_NO_NODE: axon_ret_t = 9;
-/// A defect of the library was caught. What the call should have done may be half done.
+/// The library caught a panic: a defect of AXON. The call may have done part of its work.
 pub const AXON_RET_PANIC: axon_ret_t = 10;
-/// The permissions of the session's enclave do not allow the endpoint; the text names the topic, the
-/// enclave, the file and its line.
+/// The permissions of the session's enclave do not allow the endpoint. The text of the error names the topic,
+/// the enclave, the file and the line in the file.
 pub const AXON_RET_DENIED: axon_ret_t = 11;
 
 thread_local! {
@@ -64,26 +64,26 @@ impl CallFailure {
         Self::new(AXON_RET_INVALID_ARGUMENT, text)
     }
 
-    /// Says of what the failure is.
+    /// Prefixes the text with the name of the failed object.
     pub(super) fn of(self, whose: impl Display) -> Self {
         Self { text: format!("{whose}: {}", self.text), ..self }
     }
 
-    /// Says of which endpoint.
+    /// Prefixes the text with the kind, topic and node of the failed endpoint.
     pub(super) fn of_endpoint(self, endpoint: &Endpoint) -> Self {
         self.of(Named(endpoint))
     }
 
-    /// Keeps the text for this thread.
+    /// Stores the text as this thread's last error and returns the code.
     pub(super) fn note(self) -> axon_ret_t {
         let text = CString::new(self.text.replace('\0', " ")).unwrap_or_default();
-        // A thread that is ending has nowhere to keep it.
+        // A thread that is ending has no storage for the text any more.
         let _ = LAST.try_with(|last| last.replace(text));
         self.code
     }
 }
 
-/// An endpoint in an error.
+/// Formats an endpoint for an error text.
 struct Named<'a>(&'a Endpoint);
 
 impl Display for Named<'_> {
@@ -136,9 +136,9 @@ impl From<PublishError> for CallFailure {
     }
 }
 
-/// What went wrong in the last call of this thread that failed: what, of which topic and node, why,
-/// and what to do. Empty where none has. The text stands until the next call that fails in this
-/// thread; it is null in a thread that is ending.
+/// Returns the text of the last failed call in this thread: the failed operation, its topic and node, the
+/// cause, and the remedy. The text is empty if no call failed. It stays valid until the next failed call in
+/// this thread. A thread that is ending gets null.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_last_error() -> *const c_char {
     LAST.try_with(|last| last.borrow().as_ptr()).unwrap_or(ptr::null())

@@ -15,53 +15,54 @@ use crate::{
     session::Event,
 };
 
-/// Of a subscription: a publisher became alive or ceased to be.
+/// Subscription event: a publisher became alive or stopped being alive.
 pub const AXON_EVENT_LIVELINESS_CHANGED: u32 = 0;
-/// Of a subscription: no sample came for longer than its deadline.
+/// Subscription event: no sample arrived within the requested deadline.
 pub const AXON_EVENT_REQUESTED_DEADLINE_MISSED: u32 = 1;
-/// Of a subscription: a publisher offers less than it requests.
+/// Subscription event: a publisher offers less than the subscription requests.
 pub const AXON_EVENT_REQUESTED_QOS_INCOMPATIBLE: u32 = 2;
-/// Of a subscription: samples were lost before they could be taken.
+/// Subscription event: samples were lost before the subscription could take them.
 pub const AXON_EVENT_MESSAGE_LOST: u32 = 3;
-/// Of a subscription: a publisher of the topic has another type.
+/// Subscription event: a publisher of the topic has another type.
 pub const AXON_EVENT_SUBSCRIPTION_INCOMPATIBLE_TYPE: u32 = 4;
-/// Of a subscription: a publisher was matched or unmatched.
+/// Subscription event: a publisher was matched or unmatched.
 pub const AXON_EVENT_SUBSCRIPTION_MATCHED: u32 = 5;
-/// Of a publisher: it did not assert its liveliness within its lease.
+/// Publisher event: the publisher did not assert its liveliness within its lease.
 pub const AXON_EVENT_LIVELINESS_LOST: u32 = 6;
-/// Of a publisher: it did not publish within its deadline.
+/// Publisher event: the publisher did not publish within its deadline.
 pub const AXON_EVENT_OFFERED_DEADLINE_MISSED: u32 = 7;
-/// Of a publisher: a subscription requests more than it offers.
+/// Publisher event: a subscription requests more than the publisher offers.
 pub const AXON_EVENT_OFFERED_QOS_INCOMPATIBLE: u32 = 8;
-/// Of a publisher: a subscription of the topic has another type.
+/// Publisher event: a subscription of the topic has another type.
 pub const AXON_EVENT_PUBLISHER_INCOMPATIBLE_TYPE: u32 = 9;
-/// Of a publisher: a subscription was matched or unmatched.
+/// Publisher event: a subscription was matched or unmatched.
 pub const AXON_EVENT_PUBLICATION_MATCHED: u32 = 10;
 
-/// What is known of an event. Changes are since the status was last taken.
+/// The status of an event. Each change is counted since the status was last taken.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct axon_event_status_t {
     /// AXON_EVENT_*.
     pub kind: u32,
-    /// Of incompatible QoS: AXON_POLICY_*, one that kept the last endpoint apart.
+    /// Incompatible QoS: AXON_POLICY_* of a policy that kept the last endpoint from matching.
     pub last_policy: u32,
-    /// How often it happened in all; of `matched`, endpoints matched ever.
+    /// How often the event happened. For `matched`: the endpoints that were ever matched.
     pub total: u64,
-    /// How much of that is new.
+    /// The change of `total`.
     pub total_change: u64,
-    /// Of `matched`, endpoints matched now; of liveliness changed, publishers that are alive now.
+    /// For `matched`: the endpoints that are matched now. For liveliness changed: the publishers that are
+    /// alive now.
     pub current: u64,
-    /// By how many that changed.
+    /// The change of `current`.
     pub current_change: i64,
-    /// Of liveliness changed, publishers that are matched and not alive now.
+    /// For liveliness changed: the publishers that are matched and not alive now.
     pub not_alive: u64,
-    /// By how many that changed.
+    /// The change of `not_alive`.
     pub not_alive_change: i64,
 }
 
-/// One event of a publisher: AXON_RET_INVALID_ARGUMENT where `kind` is not one of its. It may be used
-/// after the publisher has ended, and then does not happen again.
+/// Creates a handle for one event of a publisher. AXON_RET_INVALID_ARGUMENT: a publisher has no event of this
+/// `kind`. The handle stays valid after the publisher ends. The event does not happen again then.
 ///
 /// # Safety
 /// `event` points to room for a handle.
@@ -75,15 +76,15 @@ pub unsafe extern "C" fn axon_session_publisher_event(
         present(event, "the place of the event")?;
         let publisher = named(publisher)?;
         let found = of_number(kind).and_then(|kind| publisher.event(kind));
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { give_event(found, kind, "publisher", event) }
     })
 }
 
-/// One event of a subscription, as `axon_session_publisher_event`.
+/// Creates a handle for one event of a subscription, as `axon_session_publisher_event` does.
 ///
 /// # Safety
-/// As there.
+/// As for `axon_session_publisher_event`.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_subscription_event(
     subscription: axon_subscription_t,
@@ -94,27 +95,27 @@ pub unsafe extern "C" fn axon_session_subscription_event(
         present(event, "the place of the event")?;
         let subscription = named(subscription)?;
         let found = of_number(kind).and_then(|kind| subscription.event(kind));
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { give_event(found, kind, "subscription", event) }
     })
 }
 
-/// Gives an event's handle up. Its callback has returned, and is not called any more, when this returns;
-/// those of other handles of the same event are.
+/// Destroys the handle of an event. When the call returns, the callback of this handle has returned and is
+/// not called again. The callbacks of other handles of the same event stay set.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_event_destroy(event: axon_event_t) -> axon_ret_t {
     guarded(|| {
-        // Another call may keep it for a while.
+        // A concurrent call may keep the object for a while.
         revoke(event)?.tell_no_more();
         Ok(())
     })
 }
 
-/// The status. Its changes are counted anew from here, and the event is not ready any more until it
+/// Takes the status of an event. The changes are counted from 0 again. The event is not ready until it
 /// happens again.
 ///
 /// # Safety
-/// `status` points to room for one.
+/// `status` points to room for one status.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_event_take(
     event: axon_event_t,
@@ -124,18 +125,20 @@ pub unsafe extern "C" fn axon_session_event_take(
         present(status, "the place of the status")?;
         let event = named(event)?;
         let found = flat(event.kind(), event.take());
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { store(status, found, "the place of the status") }
     })
 }
 
-/// Has `callback` told of the event from now on, in place of the one that this handle had before, which
-/// has returned and is not called any more when this returns, unless this is called from within it.
-/// Null: nobody is told. What happened since the status was last taken, and nobody was told of by this
-/// handle, it is told at once, in this call.
+/// Sets the callback of this handle, which replaces the handle's previous callback. When the call returns,
+/// the previous callback has returned and is not called again, unless the call comes from inside that
+/// callback. Null removes the callback.
+///
+/// The call reports the earlier occurrences at once: those since the status was last taken that this handle
+/// has not reported yet.
 ///
 /// # Safety
-/// `callback` may be called with `user` from any thread until it is replaced or the event is
+/// `callback` may be called with `user` from any thread until the callback is replaced or the event is
 /// destroyed.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_event_set_callback(
@@ -146,13 +149,13 @@ pub unsafe extern "C" fn axon_session_event_set_callback(
     guarded(|| {
         let object = named(event)?;
         object.set_callback(told(callback, user));
-        // One that was destroyed meanwhile has none.
+        // An object that was destroyed meanwhile has no callback.
         named(event).map(drop)
     })
 }
 
 /// # Safety
-/// As [`axon_session_publisher_event`].
+/// As for [`axon_session_publisher_event`].
 unsafe fn give_event(
     event: Option<Event>,
     kind: u32,
@@ -161,7 +164,7 @@ unsafe fn give_event(
 ) -> Result<(), CallFailure> {
     let none = || CallFailure::argument(format_args!("a {of} has no event {kind}"));
     let event = event.ok_or_else(none)?;
-    // SAFETY: the caller's word.
+    // SAFETY: guaranteed by the caller.
     unsafe { give(event, out) }
 }
 

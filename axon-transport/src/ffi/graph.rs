@@ -15,42 +15,42 @@ use super::{
 };
 use crate::graph::{EndpointKind, GraphEntry};
 
-/// A kind of endpoint: publishers.
+/// Endpoint kind: publisher.
 pub const AXON_KIND_PUBLISHER: u32 = 1;
-/// Subscriptions.
+/// Endpoint kind: subscription.
 pub const AXON_KIND_SUBSCRIPTION: u32 = 2;
-/// Servers.
+/// Endpoint kind: server.
 pub const AXON_KIND_SERVER: u32 = 4;
-/// Clients.
+/// Endpoint kind: client.
 pub const AXON_KIND_CLIENT: u32 = 8;
 
-/// An endpoint of the graph. What it points to stands during the call that it is given to.
+/// An endpoint of the graph. Its pointers are valid during the call of the visitor.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct axon_endpoint_t {
-    /// Its GID.
+    /// The endpoint's GID.
     pub gid: axon_gid_t,
     /// AXON_KIND_*.
     pub kind: u32,
-    /// 1 where it is on another host, else 0.
+    /// 1 if the endpoint is on another host, else 0.
     pub remote: u32,
-    /// The name of its topic or service.
+    /// The name of the topic or service.
     pub topic: *const c_char,
     /// The type's name.
     pub type_name: *const c_char,
     /// The type's hash.
     pub type_hash: *const u8,
-    /// 0 where it is not known.
+    /// The length of the type's hash in bytes; 0 if the hash is unknown.
     pub type_hash_size: usize,
-    /// What it offers or requests.
+    /// The profile that the endpoint offers or requests.
     pub qos: axon_qos_t,
-    /// The node that it belongs to; empty where it belongs to none.
+    /// The name of the endpoint's node; empty if the endpoint has no node.
     pub node: *const c_char,
-    /// That node's namespace.
+    /// The namespace of the node.
     pub namespace_: *const c_char,
 }
 
-/// Told of a node.
+/// A function that receives one node.
 pub type axon_node_visitor_t = Option<
     unsafe extern "C" fn(
         user: *mut c_void,
@@ -60,7 +60,7 @@ pub type axon_node_visitor_t = Option<
     ),
 >;
 
-/// Told of a topic or service and the types that its endpoints have, of which there is at least one.
+/// A function that receives the name of one topic or service, and the types of its endpoints: at least one.
 pub type axon_name_visitor_t = Option<
     unsafe extern "C" fn(
         user: *mut c_void,
@@ -70,12 +70,13 @@ pub type axon_name_visitor_t = Option<
     ),
 >;
 
-/// Told of an endpoint.
+/// A function that receives one endpoint.
 pub type axon_endpoint_visitor_t =
     Option<unsafe extern "C" fn(user: *mut c_void, endpoint: *const axon_endpoint_t)>;
 
-/// Calls `visitor` with every node of the graph, in order of namespace and name: as often as nodes of
-/// one name are there. What it is given stands until it returns; no lock is held meanwhile.
+/// Calls `visitor` with every node of the graph, in order of namespace and name. Several nodes of the same
+/// name give one call each. The strings are valid until the visitor returns. The library holds no lock during
+/// the call of the visitor.
 ///
 /// # Safety
 /// `visitor` may be called with `user`.
@@ -90,18 +91,18 @@ pub unsafe extern "C" fn axon_session_graph_nodes(
         for node in named(session)?.graph().nodes() {
             let (name, namespace) = (string(&node.name)?, string(&node.namespace)?);
             let enclave = string(&node.enclave)?;
-            // SAFETY: the caller's word; the strings stand until it returns.
+            // SAFETY: guaranteed by the caller; the strings stand until it returns.
             unsafe { visitor(user, name.as_ptr(), namespace.as_ptr(), enclave.as_ptr()) };
         }
         Ok(())
     })
 }
 
-/// Calls `visitor` with the names that endpoints of the given kinds (the sum of AXON_KIND_*) have, in
-/// order, each with its types: of all endpoints, or, where `node` is not null, of those of the node of
-/// this name and namespace.
+/// Calls `visitor` with the topic and service names of the endpoints of the given kinds (the sum of
+/// AXON_KIND_*), in order, each with its types. Null for `node` selects all endpoints. Otherwise the
+/// endpoints of the node with this name and namespace are selected.
 ///
-/// AXON_RET_NO_NODE: there is none.
+/// AXON_RET_NO_NODE: the graph has no such node.
 ///
 /// # Safety
 /// `node` and `namespace_` are strings, or `node` is null; `visitor` may be called with `user`.
@@ -121,9 +122,9 @@ pub unsafe extern "C" fn axon_session_graph_names(
         let names = if node.is_null() {
             graph.names_and_types(&kinds)
         } else {
-            // SAFETY: the caller's word.
+            // SAFETY: guaranteed by the caller.
             let node = unsafe { text(node, "the node's name") }?;
-            // SAFETY: the caller's word.
+            // SAFETY: guaranteed by the caller.
             let namespace = unsafe { text(namespace_, "the node's namespace") }?;
             graph.names_and_types_of(node, namespace, &kinds).ok_or_else(|| {
                 let text = format_args!("there is no node {node} in namespace {namespace}");
@@ -134,15 +135,15 @@ pub unsafe extern "C" fn axon_session_graph_names(
             let name = string(&name)?;
             let types = types.iter().map(|one| string(one)).collect::<Result<Vec<_>, _>>()?;
             let types: Vec<*const c_char> = types.iter().map(|one| one.as_ptr()).collect();
-            // SAFETY: the caller's word; the strings stand until it returns.
+            // SAFETY: guaranteed by the caller; the strings stand until it returns.
             unsafe { visitor(user, name.as_ptr(), types.as_ptr(), types.len()) };
         }
         Ok(())
     })
 }
 
-/// Calls `visitor` with every endpoint of a kind (AXON_KIND_*) under a topic's or service's name, or,
-/// where `topic` is null, of that kind.
+/// Calls `visitor` with every endpoint of a kind (AXON_KIND_*) that has this topic or service name. Null for
+/// `topic` selects all endpoints of the kind.
 ///
 /// # Safety
 /// `topic` is null or a string; `visitor` may be called with `user`.
@@ -161,7 +162,7 @@ pub unsafe extern "C" fn axon_session_graph_endpoints(
         let endpoints = if topic.is_null() {
             graph.endpoints_of_kind(known)
         } else {
-            // SAFETY: the caller's word.
+            // SAFETY: guaranteed by the caller.
             graph.endpoints_of(known, unsafe { text(topic, "the topic") }?)
         };
         for GraphEntry { endpoint, daemon, .. } in endpoints {
@@ -179,15 +180,15 @@ pub unsafe extern "C" fn axon_session_graph_endpoints(
                 node: node.as_ptr(),
                 namespace_: namespace.as_ptr(),
             };
-            // SAFETY: the caller's word; what it points to stands until it returns.
+            // SAFETY: guaranteed by the caller; what it points to stands until it returns.
             unsafe { visitor(user, &raw const shown) };
         }
         Ok(())
     })
 }
 
-/// How many endpoints of a kind (AXON_KIND_*) are under a topic's or service's name. One that is
-/// counted is one that gets data.
+/// Counts the endpoints of a kind (AXON_KIND_*) that have this topic or service name. Data already flows to
+/// every counted endpoint with a compatible profile.
 ///
 /// # Safety
 /// `topic` is a string; `count` points to room for a number.
@@ -200,10 +201,10 @@ pub unsafe extern "C" fn axon_session_graph_count(
 ) -> axon_ret_t {
     guarded(|| {
         let kind = of_number(kind)?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let topic = unsafe { text(topic, "the topic") }?;
         let found = named(session)?.graph().count(kind, topic);
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { store(count, found, "the place of the number") }
     })
 }
@@ -233,7 +234,7 @@ fn no_visitor() -> CallFailure {
     CallFailure::argument("the visitor is null")
 }
 
-/// Names of the graph hold no 0: every one of them was checked when it came.
+/// Converts a name of the graph, which holds no NUL: the session checks every name on arrival.
 fn string(text: &str) -> Result<CString, CallFailure> {
     CString::new(text).map_err(|_| CallFailure::argument("a name in the graph holds a NUL"))
 }

@@ -40,12 +40,14 @@ pub const AXON_LOG_WARN: u32 = 30;
 /// Error: an operation of the library failed.
 pub const AXON_LOG_ERROR: u32 = 40;
 
-/// Told of a line: how severe it is (AXON_LOG_*), which part of the library says it, and what. Both
-/// strings stand during the call. A line is one line: characters that could steer a terminal are escaped,
-/// as in the daemon's log. It is called on a thread of the library's own, which begins with the
-/// first line, for one line after another. That thread has nothing else to do and holds nothing that the
-/// program may wait for, so the callback may block and may call this interface. Meanwhile 256 lines wait;
-/// of more only the number is told. What the callback makes the library say on its thread is not told.
+/// A function that receives one log line: its severity (AXON_LOG_*), the part of the library that logs it,
+/// and the text. Both strings are valid during the call. A text has no line breaks: characters that could
+/// control a terminal are escaped, as in the daemon's log.
+///
+/// The library calls the function on a thread of its own, for one line after the other. The thread starts
+/// with the first line. It has no other work and holds no lock that the program may wait for. Therefore the
+/// function may block and may call this interface. Up to 256 lines are queued meanwhile. Of further lines
+/// only the number is reported. Lines that the library logs on this thread during the function are dropped.
 pub type axon_log_t = Option<
     unsafe extern "C" fn(
         user: *const c_void,
@@ -55,23 +57,23 @@ pub type axon_log_t = Option<
     ),
 >;
 
-/// The log of a process. A forked child has one of its own: nobody is told there at first, and what was
-/// said before it was forked its parent tells.
+/// The log of a process. A forked child has a log of its own, which starts without a callback. Lines that
+/// were logged before the fork are reported by the parent.
 #[derive(Default)]
 struct Log {
     waiting: WaitingLines,
     slot: Mutex<CallbackSlot>,
-    /// A call has returned.
+    /// Notified when a call of the callback returns.
     returned: Condvar,
 }
 
-/// The callback that is set, and the one that is being called.
+/// The current callback, and the version of the callback that is running.
 #[derive(Default)]
 struct CallbackSlot {
     told: Option<LogCallback>,
-    /// Rises with each that is set.
+    /// Increases with each callback that is set.
     version: u64,
-    /// The version that is being called.
+    /// The version of the callback that is running.
     called: Option<u64>,
 }
 
@@ -82,16 +84,16 @@ struct LogCallback {
 }
 
 static LOG: PerProcess<Log> = PerProcess::new();
-/// Guards nothing but itself: its loads and stores are relaxed.
+/// The lowest severity that is reported. Loads and stores are relaxed: the value guards no other memory.
 static LEAST: AtomicU32 = AtomicU32::new(AXON_LOG_WARN);
 
-/// Has `callback` told of what the library says in this process, in place of the one before, which has
-/// returned and is not called any more when this returns; it blocks until then. To set the one that is
-/// set already with the same `user` changes nothing, and does not block. Null: nobody is told, as at
-/// first. A daemon has a log of its own. A forked child says it again for what it says itself.
+/// Sets the callback for the log lines of the library in this process, which replaces the previous one. The
+/// call blocks until the previous callback has returned; that one is not called again. Setting the current
+/// callback with the same `user` changes nothing and does not block. Null removes the callback; there is none
+/// at first. A daemon has a log of its own. A forked child must set a callback for its own log lines.
 ///
-/// AXON_RET_ERROR: it is called from within a callback, or a part of the program in Rust has what the
-/// library says already (a global `tracing` subscriber).
+/// AXON_RET_ERROR: the call comes from inside a callback, or Rust code in the program already receives the
+/// log lines (a global `tracing` subscriber).
 ///
 /// # Safety
 /// `callback` may be called with `user` from any thread until it is replaced.
@@ -114,8 +116,8 @@ pub unsafe extern "C" fn axon_session_log_set_callback(
     })
 }
 
-/// How severe a line must be at least to be told: AXON_LOG_WARN at first. A severity between those that
-/// have a name is as good as any.
+/// Sets the lowest severity that is reported, which is AXON_LOG_WARN at first. Values between the named
+/// severities are accepted.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_log_set_severity(severity: u32) -> axon_ret_t {
     guarded(|| {
@@ -172,7 +174,7 @@ impl Log {
         }
     }
 
-    /// Calls the program, if it still wants to hear of this. No lock is held meanwhile.
+    /// Calls the callback with the line, if its severity is still wanted. Holds no lock during the call.
     fn tell(&self, line: &LogLine) {
         let mut slot = self.slot();
         let Some(told) = slot.told.filter(|_| is_wanted(line.severity)) else { return };
@@ -181,8 +183,8 @@ impl Log {
         // A NUL is escaped, too. A line may quote a peer, and the program shows it on a terminal.
         let text = |text: &str| CString::new(escaped(text)).unwrap_or_default();
         let (part, text) = (text(line.part), text(&line.text));
-        // SAFETY: the caller that set it says that it may be called so until it is replaced, and `set` does
-        // not return before this call has.
+        // SAFETY: the caller allows this call until the callback is replaced. `set` does not return before
+        // this call does.
         unsafe { (told.function)(told.user.0, line.severity, part.as_ptr(), text.as_ptr()) };
         self.slot().called = None;
         self.returned.notify_all();
@@ -193,11 +195,11 @@ impl Log {
     }
 }
 
-/// Hears all of the process.
+/// The `tracing` subscriber of the process.
 struct LogListener;
 
 impl LogListener {
-    /// Whether it is this one that hears.
+    /// Installs this subscriber if there is none. Returns whether it is the one in force.
     fn stands() -> bool {
         let _ = set_global_default(Self);
         tracing::dispatcher::get_default(tracing::Dispatch::is::<Self>)
@@ -205,7 +207,7 @@ impl LogListener {
 }
 
 impl Subscriber for LogListener {
-    // What is wanted may change at any time.
+    // The wanted severity may change at any time.
     fn register_callsite(&self, _: &'static Metadata<'static>) -> Interest {
         Interest::sometimes()
     }
@@ -224,12 +226,12 @@ impl Subscriber for LogListener {
             part: metadata.target(),
             text: text.message + &text.values,
         };
-        // Without memory to find it by there is no log.
+        // `Log::current` fails only if memory is short. Then the line is lost.
         let Ok(log) = Log::current() else { return };
         log.waiting.say(line, |line| log.tell(&line));
     }
 
-    // Spans are not shown: there is one of them, and it is not entered.
+    // Spans are not reported, so all spans share one ID.
     fn new_span(&self, _: &Attributes<'_>) -> Id {
         Id::from_u64(1)
     }
@@ -243,7 +245,7 @@ impl Subscriber for LogListener {
     fn exit(&self, _: &Id) {}
 }
 
-/// An event as text: what it says, and then its values.
+/// An event as text: the message, followed by the values.
 #[derive(Default)]
 struct Text {
     message: String,
@@ -252,7 +254,7 @@ struct Text {
 
 impl Visit for Text {
     fn record_debug(&mut self, field: &Field, value: &dyn Debug) {
-        // To write to a string does not fail.
+        // Writing to a string does not fail.
         let _ = match field.name() {
             "message" => write!(self.message, "{value:?}"),
             name => write!(self.values, " {name}={value:?}"),
@@ -270,14 +272,14 @@ mod tests {
     use super::*;
     use crate::ffi::error::AXON_RET_OK;
 
-    /// What a program's logger holds while it publishes what it logs.
+    /// A lock that the program's logger holds while it publishes its lines.
     static LOGGER: Mutex<()> = Mutex::new(());
 
     unsafe extern "C" fn hear(user: *const c_void, _: u32, _: *const c_char, text: *const c_char) {
-        // SAFETY: what the test set, which outlives its callback.
+        // SAFETY: the test set this pointer. Its target outlives the callback.
         let heard = unsafe { &*user.cast::<Mutex<mpsc::Sender<String>>>() };
         let _held = LOGGER.lock().unwrap();
-        // SAFETY: a string that stands during the call.
+        // SAFETY: a string that is valid during the call.
         let text = unsafe { CStr::from_ptr(text) }.to_string_lossy().into_owned();
         tracing::error!("said by a callback");
         let _ = heard.lock().unwrap().send(text);
@@ -288,7 +290,7 @@ mod tests {
         let (sender, heard) = mpsc::channel::<String>();
         let sender = Mutex::new(sender);
         let set = |callback: axon_log_t| {
-            // SAFETY: `sender` stands until the callback is taken back, below.
+            // SAFETY: `sender` lives until the callback is removed below.
             unsafe { axon_session_log_set_callback(callback, (&raw const sender).cast()) }
         };
         assert_eq!(set(Some(hear)), AXON_RET_OK);
@@ -298,7 +300,7 @@ mod tests {
         }
         drop(held);
         let mut said = 0;
-        // What other tests say meanwhile is heard as well.
+        // Lines of other tests arrive as well.
         loop {
             let text = heard.recv().unwrap();
             assert!(!text.contains("said by a callback"), "{text}");

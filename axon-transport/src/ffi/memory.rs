@@ -4,23 +4,23 @@ use std::{ffi::CStr, os::raw::c_char, slice};
 
 use super::error::CallFailure;
 
-/// The text at `text`.
+/// Returns the string at `text`.
 ///
 /// # Safety
-/// It is null, or points to a string that ends with a 0 byte and stands during the call.
+/// `text` is null, or points to a string that ends with a 0 byte and stays valid during the call.
 pub(super) unsafe fn text<'a>(text: *const c_char, what: &str) -> Result<&'a str, CallFailure> {
     if text.is_null() {
         return Err(CallFailure::argument(format_args!("{what} is null")));
     }
-    // SAFETY: not null, and the rest is the caller's word.
+    // SAFETY: not null. The caller guarantees the rest.
     let bytes = unsafe { CStr::from_ptr(text) };
     bytes.to_str().map_err(|_| CallFailure::argument(format_args!("{what} is not UTF-8")))
 }
 
-/// The elements at `data`.
+/// Returns the elements at `data`.
 ///
 /// # Safety
-/// It points to `count` initialized elements that nobody writes to during the call, or is null.
+/// `data` is null, or points to `count` initialized elements that no thread writes to during the call.
 pub(super) unsafe fn elements<'a, T: Copy>(
     data: *const T,
     count: usize,
@@ -30,14 +30,14 @@ pub(super) unsafe fn elements<'a, T: Copy>(
         return Ok(&[]);
     }
     check(data, count, what)?;
-    // SAFETY: not null, aligned, no longer than an object may be, and the rest is the caller's word.
+    // SAFETY: not null, aligned, and no longer than an object may be. The caller guarantees the rest.
     Ok(unsafe { slice::from_raw_parts(data, count) })
 }
 
-/// As [`elements`], to be written to.
+/// Returns the elements at `data` as a mutable slice; see [`elements`].
 ///
 /// # Safety
-/// As there, and nobody else uses them during the call.
+/// As for [`elements`]. In addition, no other code uses the elements during the call.
 pub(super) unsafe fn elements_mut<'a, T: Copy>(
     data: *mut T,
     count: usize,
@@ -47,7 +47,7 @@ pub(super) unsafe fn elements_mut<'a, T: Copy>(
         return Ok(&mut []);
     }
     check(data, count, what)?;
-    // SAFETY: as in `elements`, and the caller's word that nobody else uses them.
+    // SAFETY: as in `elements`. The caller guarantees that no other code uses the elements.
     Ok(unsafe { slice::from_raw_parts_mut(data, count) })
 }
 
@@ -59,46 +59,46 @@ fn check<T>(data: *const T, count: usize, what: &str) -> Result<(), CallFailure>
     present(data, what)
 }
 
-/// What is at `data`.
+/// Reads the value at `data`.
 ///
 /// # Safety
-/// It is null, or points to an initialized value that nobody writes to during the call.
+/// `data` is null, or points to an initialized value that no thread writes to during the call.
 pub(super) unsafe fn value<T: Copy>(data: *const T, what: &str) -> Result<T, CallFailure> {
     present(data, what)?;
-    // SAFETY: not null and aligned, and the rest is the caller's word.
+    // SAFETY: not null and aligned. The caller guarantees the rest.
     Ok(unsafe { data.read() })
 }
 
 /// Stores `value` at `out`.
 ///
 /// # Safety
-/// It is null, or points to room for a value that nobody else uses during the call. It need not be
+/// `out` is null, or points to room for a value that no other code uses during the call. The room need not be
 /// initialized.
 pub(super) unsafe fn store<T>(out: *mut T, value: T, what: &str) -> Result<(), CallFailure> {
     present(out, what)?;
-    // SAFETY: not null and aligned, and the rest is the caller's word.
+    // SAFETY: not null and aligned. The caller guarantees the rest.
     unsafe { out.write(value) };
     Ok(())
 }
 
-/// As [`store`], where null says that the value is not wanted.
+/// Stores `value` at `out` unless `out` is null.
 ///
 /// # Safety
-/// As there.
+/// As for [`store`].
 pub(super) unsafe fn store_if_wanted<T>(out: *mut T, value: T) -> Result<(), CallFailure> {
     if out.is_null() {
         return Ok(());
     }
-    // SAFETY: the caller's word.
+    // SAFETY: guaranteed by the caller.
     unsafe { store(out, value, "the place of a result") }
 }
 
-/// As [`present`], where null says that it is not wanted.
+/// Checks a pointer as [`present`] does, but accepts null.
 pub(super) fn present_if_wanted<T>(data: *const T) -> Result<(), CallFailure> {
     if data.is_null() { Ok(()) } else { present(data, "the place of a result") }
 }
 
-/// Checks that there can be something at `data`, before anything is done.
+/// Checks that `data` is neither null nor misaligned. Calls do this check before any work.
 pub(super) fn present<T>(data: *const T, what: &str) -> Result<(), CallFailure> {
     if data.is_null() || !data.is_aligned() {
         return Err(CallFailure::argument(format_args!("{what} is null or not aligned")));

@@ -48,18 +48,18 @@ pub use qos::*;
 pub use session::*;
 pub use wait::*;
 
-/// The version of this interface. It rises whenever a program that was compiled against the former
-/// header would not work any more.
+/// The version of this interface. A new version means that a program compiled against an older header no
+/// longer works.
 pub const AXON_SESSION_ABI: u32 = 3;
 
-/// The version of the interface that the library has. `axon_session_options_init` compares it with
-/// the header's, so that no session is opened where they differ.
+/// Returns the interface version of the library. `axon_session_options_init` compares it with the version of
+/// the header and fails if the two differ, so that no session is opened.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_abi() -> u32 {
     AXON_SESSION_ABI
 }
 
-/// Runs one call of the interface: nothing that panics in it reaches the caller.
+/// Runs one call of the interface and converts a panic in it to [`AXON_RET_PANIC`].
 fn guarded(call: impl FnOnce() -> Result<(), CallFailure>) -> axon_ret_t {
     match catch_unwind(AssertUnwindSafe(call)) {
         Ok(Ok(())) => AXON_RET_OK,

@@ -1,4 +1,4 @@
-//! Nodes.
+//! The C functions of nodes.
 
 use std::os::raw::c_char;
 
@@ -9,8 +9,8 @@ use super::{
     memory::{present, text},
 };
 
-/// A node, which is in the graph until it is destroyed; its endpoints do not end with it. Two nodes
-/// may have the same name. It keeps its session open.
+/// Creates a node, which stays in the graph until it is destroyed. Its endpoints do not end with the node.
+/// Two nodes may have the same name. A node keeps its session open.
 ///
 /// AXON_RET_INVALID_ARGUMENT: the name is empty, or a name is longer than 512 bytes.
 ///
@@ -27,28 +27,28 @@ pub unsafe extern "C" fn axon_session_node_create(
     guarded(|| {
         present(node, "the place of the node")?;
         let session = named(session)?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let name = unsafe { text(name, "the node's name") }?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let namespace = unsafe { text(namespace_, "the node's namespace") }?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let enclave = unsafe { text(enclave, "the node's enclave") }?;
         let created = session.create_node(name, namespace, enclave)?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { give(created, node) }
     })
 }
 
-/// Takes a node out of the graph. It may block for milliseconds, as `axon_session_close` says.
+/// Removes a node from the graph. The call may block for milliseconds, as `axon_session_close` may.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_node_destroy(node: axon_node_t) -> axon_ret_t {
     guarded(|| revoke(node).map(drop))
 }
 
-/// The guard condition that is triggered after every change of the graph, once what one asks of the
-/// graph shows it, and when a service or a client of the session finds or loses its other end. It
-/// is a handle of its own, to be destroyed like one that was created, and lasts as long as the
-/// session.
+/// Creates a handle for the guard condition of the graph. Every change of the graph triggers the condition,
+/// once graph queries return the new state. The condition is also triggered when a service or a client of the
+/// session finds or loses its other end. The program must destroy the handle, as one that it created. The
+/// condition lasts as long as the session.
 ///
 /// # Safety
 /// `guard` points to room for a handle.
@@ -60,7 +60,7 @@ pub unsafe extern "C" fn axon_session_node_graph_guard(
     guarded(|| {
         present(guard, "the place of the guard condition")?;
         let changed = named(node)?.graph_changed().clone();
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { give(changed, guard) }
     })
 }

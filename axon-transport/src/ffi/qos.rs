@@ -14,42 +14,42 @@ use crate::qos::{
     Reliability, check,
 };
 
-/// Left to AXON, in any policy: RELIABLE, VOLATILE, KEEP_LAST, AUTOMATIC.
+/// Any policy: AXON's default, which is RELIABLE, VOLATILE, KEEP_LAST and AUTOMATIC.
 pub const AXON_CHOICE_DEFAULT: u32 = 0;
-/// In reliability, durability and liveliness: what matches most of the endpoints that the graph
-/// holds when the endpoint is created, at the highest level that does.
+/// Reliability, durability and liveliness: the highest level that matches most endpoints in the graph. It is
+/// chosen when the endpoint is created.
 pub const AXON_CHOICE_BEST_AVAILABLE: u32 = 255;
 
-/// Samples arrive, within the bounds of the history.
+/// Samples arrive within the bounds of the history.
 pub const AXON_RELIABILITY_RELIABLE: u32 = 1;
 /// Samples may be lost.
 pub const AXON_RELIABILITY_BEST_EFFORT: u32 = 2;
 
 /// A subscription that joins late receives the publisher's history first.
 pub const AXON_DURABILITY_TRANSIENT_LOCAL: u32 = 1;
-/// It receives samples from then on.
+/// A subscription that joins late receives only samples that are published afterwards.
 pub const AXON_DURABILITY_VOLATILE: u32 = 2;
 
 /// The newest `depth` samples are kept.
 pub const AXON_HISTORY_KEEP_LAST: u32 = 1;
-/// All are kept, up to the memory budget; then the publisher waits.
+/// All samples are kept, up to the memory budget. Then the publisher waits.
 pub const AXON_HISTORY_KEEP_ALL: u32 = 2;
 
 /// The session asserts that a publisher is alive.
 pub const AXON_LIVELINESS_AUTOMATIC: u32 = 1;
-/// The publisher does, by publishing or asserting.
+/// The publisher asserts that it is alive, by publishing or by an explicit call.
 pub const AXON_LIVELINESS_MANUAL_BY_TOPIC: u32 = 3;
 
-/// A time that is left to AXON, which takes it to be infinite.
+/// AXON's default: infinite.
 pub const AXON_DURATION_DEFAULT: u64 = 0;
-/// As AXON_CHOICE_BEST_AVAILABLE, for a deadline or a lease.
+/// AXON_CHOICE_BEST_AVAILABLE for a deadline or a lease.
 pub const AXON_DURATION_BEST_AVAILABLE: u64 = 0xffff_ffff_ffff_fffe;
-/// No end.
+/// Infinite.
 pub const AXON_DURATION_INFINITE: u64 = 0xffff_ffff_ffff_ffff;
 
-/// What an endpoint offers or requests. All zeros is the default profile: RELIABLE, VOLATILE,
-/// KEEP_LAST(10). What AXON says of an endpoint that there is holds no default and nothing best
-/// available.
+/// The QoS profile that an endpoint offers or requests. All zeros is the default profile: RELIABLE, VOLATILE,
+/// KEEP_LAST(10). A profile that AXON returns for an existing endpoint contains neither defaults nor
+/// best-available values.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct axon_qos_t {
@@ -59,39 +59,39 @@ pub struct axon_qos_t {
     pub durability: u32,
     /// AXON_HISTORY_*, or AXON_CHOICE_DEFAULT.
     pub history: u32,
-    /// Samples kept by KEEP_LAST; 0 is the default.
+    /// The number of samples that KEEP_LAST keeps; 0 for the default.
     pub depth: u32,
     /// AXON_LIVELINESS_*, or AXON_CHOICE_*.
     pub liveliness: u32,
-    /// 0.
+    /// Must be 0.
     pub reserved: u32,
-    /// Longest time between two samples, in nanoseconds, or AXON_DURATION_*.
+    /// The longest time between two samples, in nanoseconds, or AXON_DURATION_*.
     pub deadline: u64,
-    /// Age at which a sample is not delivered any more, in nanoseconds, or AXON_DURATION_*.
+    /// The age from which a sample is not delivered any more, in nanoseconds, or AXON_DURATION_*.
     pub lifespan: u64,
-    /// Time without an assertion after which a publisher counts as not alive, in nanoseconds, or
+    /// The time without an assertion after which a publisher counts as not alive, in nanoseconds, or
     /// AXON_DURATION_*.
     pub lease: u64,
 }
 
-/// The two profiles go together.
+/// The two profiles are compatible.
 pub const AXON_QOS_COMPATIBLE: u32 = 0;
-/// That hangs on policies that are left open, as default or as best available.
+/// The result depends on policies that are still open: default or best available.
 pub const AXON_QOS_UNKNOWN: u32 = 1;
-/// They do not.
+/// The two profiles are incompatible.
 pub const AXON_QOS_INCOMPATIBLE: u32 = 2;
 
-/// No policy.
+/// No policy is incompatible.
 pub const AXON_POLICY_NONE: u32 = 0;
-/// Which policy keeps two endpoints apart: reliability.
+/// The incompatible policy: reliability.
 pub const AXON_POLICY_RELIABILITY: u32 = 1;
-/// Durability.
+/// The incompatible policy: durability.
 pub const AXON_POLICY_DURABILITY: u32 = 2;
-/// Deadline.
+/// The incompatible policy: deadline.
 pub const AXON_POLICY_DEADLINE: u32 = 3;
-/// Liveliness.
+/// The incompatible policy: liveliness.
 pub const AXON_POLICY_LIVELINESS: u32 = 4;
-/// The liveliness lease.
+/// The incompatible policy: the liveliness lease.
 pub const AXON_POLICY_LIVELINESS_LEASE: u32 = 5;
 
 impl axon_qos_t {
@@ -193,18 +193,19 @@ pub(super) fn policy(incompatible: Option<Incompatible>) -> u32 {
         Some(Incompatible::Deadline) => AXON_POLICY_DEADLINE,
         Some(Incompatible::Liveliness) => AXON_POLICY_LIVELINESS,
         Some(Incompatible::LivelinessLease) => AXON_POLICY_LIVELINESS_LEASE,
-        // The test below fails where there is a further one.
+        // The test below fails if another policy is added.
         Some(_) => AXON_POLICY_NONE,
     }
 }
 
-/// Whether a publisher with the one profile serves a subscription with the other: AXON_QOS_* at
-/// `verdict`. Why not, or on what it hangs, is put into `reason` in words, cut to `reason_size`
-/// bytes with the 0 at its end; null and 0 where that is not wanted.
+/// Checks whether a publisher that offers one profile matches a subscription that requests the other. The
+/// result, AXON_QOS_*, is stored at `verdict`. The reason for a result other than AXON_QOS_COMPATIBLE is
+/// stored at `reason` as text, cut to `reason_size` bytes with the 0 at its end. Null and 0 mean that no
+/// reason is wanted.
 ///
 /// # Safety
-/// `offered` and `requested` point to a profile each, `verdict` to room for a number, and `reason` to
-/// room for `reason_size` bytes.
+/// `offered` and `requested` point to one profile each. `verdict` points to room for a number, and `reason`
+/// to room for `reason_size` bytes.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_qos_check(
     offered: *const axon_qos_t,
@@ -215,11 +216,11 @@ pub unsafe extern "C" fn axon_session_qos_check(
 ) -> axon_ret_t {
     guarded(|| {
         present(verdict, "the place of the verdict")?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let offered = unsafe { value(offered, "the profile that is offered") }?.request()?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let requested = unsafe { value(requested, "the profile that is requested") }?.request()?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let room = unsafe { elements_mut(reason.cast(), reason_size, "the reason") }?;
         let (found, policies) = match check(&offered, &requested) {
             Compatibility::Compatible => (AXON_QOS_COMPATIBLE, Vec::new()),
@@ -234,13 +235,13 @@ pub unsafe extern "C" fn axon_session_qos_check(
             })
             .collect();
         write_text(room, &reasons.join("; "));
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { store(verdict, found, "the place of the verdict") }
     })
 }
 
-/// The name of a policy as ROS 2 spells it, for instance `RELIABILITY`; null where there is none of
-/// that number. It stands for ever.
+/// Returns the name of a policy as ROS 2 spells it, for instance `RELIABILITY`; null if no policy has that
+/// number. The string is static.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_policy_name(policy: u32) -> *const c_char {
     match policy {
@@ -253,16 +254,16 @@ pub extern "C" fn axon_session_policy_name(policy: u32) -> *const c_char {
     }
 }
 
-/// Stores an endpoint's profile where it is wanted.
+/// Stores an endpoint's profile at `out` unless `out` is null.
 ///
 /// # Safety
 /// `out` is null or points to room for a profile.
 pub(super) unsafe fn store_qos(out: *mut axon_qos_t, qos: &Qos) -> Result<(), CallFailure> {
-    // SAFETY: the caller's word.
+    // SAFETY: guaranteed by the caller.
     unsafe { store_if_wanted(out, axon_qos_t::from(qos)) }
 }
 
-/// As much of `text` as fits before the 0 at the end, without half characters.
+/// Writes `text` with a 0 at its end, cut to fit `room` between two characters.
 fn write_text(room: &mut [MaybeUninit<u8>], text: &str) {
     let Some(most) = room.len().checked_sub(1) else { return };
     let mut len = text.len().min(most);

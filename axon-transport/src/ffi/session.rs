@@ -1,4 +1,4 @@
-//! Sessions.
+//! The C functions of sessions and their options.
 
 use std::{ffi::OsString, os::raw::c_char, path::PathBuf};
 
@@ -14,66 +14,69 @@ use crate::{
     session::{DaemonCommand, Session, SessionOptions},
 };
 
-/// The domain is what `ROS_DOMAIN_ID` says, else 0.
+/// The domain in `ROS_DOMAIN_ID`, or 0 if that is not set.
 pub const AXON_DOMAIN_ENVIRONMENT: u32 = 0xffff_ffff;
 
-/// Discovery reaches as far as `ROS_AUTOMATIC_DISCOVERY_RANGE`, `ROS_STATIC_PEERS` and
-/// `ROS_LOCALHOST_ONLY` say.
+/// The discovery range in `ROS_AUTOMATIC_DISCOVERY_RANGE`, `ROS_STATIC_PEERS` and `ROS_LOCALHOST_ONLY`.
 pub const AXON_DISCOVERY_ENVIRONMENT: u32 = 0;
-/// Nowhere: the session reaches its own endpoints alone, static peers or not.
+/// No discovery: the session reaches only its own endpoints. Static peers are ignored.
 pub const AXON_DISCOVERY_OFF: u32 = 1;
-/// This host, and other hosts of which either side lists the other as a static peer.
+/// This host. Another host is reached if either of the two lists the other as a static peer.
 pub const AXON_DISCOVERY_LOCALHOST: u32 = 2;
-/// What multicast reaches, and static peers.
+/// The hosts that multicast reaches, and the static peers.
 pub const AXON_DISCOVERY_SUBNET: u32 = 3;
-/// What multicast reaches; the list is passed over.
+/// The hosts that multicast reaches. The list of static peers is ignored.
 pub const AXON_DISCOVERY_SYSTEM_DEFAULT: u32 = 4;
 
-/// `AXON_SECURITY_MODE` is `classic` and `AXON_CLASSIC_AUTH` is `none`: any host that answers is a peer.
+/// `AXON_SECURITY_MODE` is `classic` and `AXON_CLASSIC_AUTH` is `none`: any host that answers is accepted as
+/// a peer.
 pub const AXON_AUTHENTICATION_NONE: u32 = 0;
-/// `classic` and `pinned`: a peer has a key of the trust file.
+/// `classic` and `pinned`: a peer proves a key of the trust file.
 pub const AXON_AUTHENTICATION_PINNED: u32 = 1;
-/// `classic` and `ca`: a peer has a certificate of the CA.
+/// `classic` and `ca`: a peer proves a certificate of the CA.
 pub const AXON_AUTHENTICATION_CA: u32 = 2;
-/// `qkd`: a peer has a key that the KMEs gave to both.
+/// `qkd`: a peer proves a key that the KMEs gave to both hosts.
 pub const AXON_AUTHENTICATION_QKD: u32 = 3;
 
-/// How a session is opened. `axon_session_options_init` fills it in; what is to be otherwise is
-/// changed then. Everything that it does not say, the environment and `axon.toml` do.
+/// The options of a session. Fill them in with `axon_session_options_init`, then change individual fields.
+/// The environment and `axon.toml` give all other settings.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct axon_session_options_t {
-    /// The interface that the program was compiled against.
+    /// The interface version that the program was compiled against.
     pub abi: u32,
     /// 0 to 232, or AXON_DOMAIN_ENVIRONMENT.
     pub domain: u32,
-    /// AXON_DISCOVERY_*: how far the session is discovered, whichever process started the daemon.
+    /// AXON_DISCOVERY_*: the discovery range of the session. It does not depend on the process that started
+    /// the daemon.
     pub discovery: u32,
-    /// 0.
+    /// Must be 0.
     pub reserved: u32,
     /// Addresses or host names of other hosts, for any discovery but AXON_DISCOVERY_ENVIRONMENT.
     pub static_peers: *const *const c_char,
-    /// How many there are.
+    /// The number of static peers.
     pub static_peer_count: usize,
-    /// Shown to people; null or empty: the program's name.
+    /// The name of the session in tools; null or empty for the program's name.
     pub name: *const c_char,
-    /// The daemon's program, where `AXON_DAEMON_PATH` names none. An `axon.toml` beside it is read. Null:
-    /// `axon_daemon`, else `axon`, in the first of the following folders that has it: this program's own, the
-    /// library's, those in `PATH`, and the one where cargo installs programs.
+    /// The path of the daemon's program, used if `AXON_DAEMON_PATH` is not set. The daemon's folder may hold
+    /// an `axon.toml`, which is read. Null selects `axon_daemon`, else `axon`, in the first of these folders
+    /// that has one: the folder of this program, that of the library, those in `PATH`, and the folder where
+    /// cargo installs programs.
     pub daemon_path: *const c_char,
-    /// The file with the permissions of an SROS2 enclave, `permissions.p7s` or `permissions.xml`: the session creates no
-    /// endpoint that they do not allow (AXON_RET_DENIED). Their signature is not verified. Null: no limit. A library
-    /// that was built without the feature `sros2` takes null alone.
+    /// The file with the permissions of an SROS2 enclave, `permissions.p7s` or `permissions.xml`. The session
+    /// refuses to create an endpoint that the permissions do not allow (AXON_RET_DENIED). The signature of
+    /// the file is not verified. Null means no limit. A library that was built without the feature `sros2`
+    /// accepts only null.
     pub permissions_path: *const c_char,
-    /// The enclave, as `/robot/arm`. Not null where `permissions_path` is not.
+    /// The enclave, for instance `/robot/arm`. It must not be null if `permissions_path` is set.
     pub enclave: *const c_char,
 }
 
-/// Fills options in with what is usual. `abi` is the program's AXON_SESSION_ABI: AXON_RET_ABI where
-/// the library has another, and nothing is written then.
+/// Fills in options with the defaults. `abi` is the program's AXON_SESSION_ABI. AXON_RET_ABI: the library has
+/// another version; the call has written nothing.
 ///
 /// # Safety
-/// `options` points to room for them, as the program's header declares them.
+/// `options` points to room for options as the program's header declares them.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_options_init(
     options: *mut axon_session_options_t,
@@ -93,7 +96,7 @@ pub unsafe extern "C" fn axon_session_options_init(
             permissions_path: std::ptr::null(),
             enclave: std::ptr::null(),
         };
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { store(options, usual, "the place of the options") }
     })
 }
@@ -109,9 +112,10 @@ fn check_abi(abi: u32) -> Result<(), CallFailure> {
     Err(CallFailure::new(AXON_RET_ABI, text))
 }
 
-/// Checks the settings as `axon_session_open` does, and opens nothing.
+/// Checks the settings as `axon_session_open` does, without opening a session.
 ///
-/// AXON_RET_CONFIG: one is wrong; the text names the variable, what was read, and what is accepted.
+/// AXON_RET_CONFIG: a setting is wrong. The text of the error names the variable, the value, and the accepted
+/// values.
 ///
 /// # Safety
 /// As for `axon_session_open`.
@@ -120,13 +124,13 @@ pub unsafe extern "C" fn axon_session_options_check(
     options: *const axon_session_options_t,
 ) -> axon_ret_t {
     guarded(|| {
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { settings(options) }.map(drop)
     })
 }
 
-/// How other hosts prove who they are to a session with these options: AXON_AUTHENTICATION_*, as the
-/// environment and `axon.toml` say it. Opens nothing.
+/// Stores how a session with these options authenticates other hosts: AXON_AUTHENTICATION_*, according to the
+/// environment and `axon.toml`. Opens no session.
 ///
 /// AXON_RET_CONFIG: a setting is wrong, as for `axon_session_options_check`.
 ///
@@ -139,7 +143,7 @@ pub unsafe extern "C" fn axon_session_options_authentication(
 ) -> axon_ret_t {
     guarded(|| {
         present(authentication, "the place of the authentication")?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let (config, _) = unsafe { settings(options) }?;
         let of = match &config.security {
             Security::Classic(classic) => match classic.auth {
@@ -149,24 +153,24 @@ pub unsafe extern "C" fn axon_session_options_authentication(
             },
             Security::Qkd(_) => AXON_AUTHENTICATION_QKD,
         };
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { store(authentication, of, "the place of the authentication") }
     })
 }
 
-/// Opens a session, and starts a daemon where none runs and `AXON_DAEMON` lets it. A process may have
-/// any number of them.
+/// Opens a session. Starts a daemon if none runs and `AXON_DAEMON` permits it. A process may have any number
+/// of sessions.
 ///
-/// Blocks until the daemon has answered: milliseconds, or up to 20 s where one is started.
+/// Blocks until the daemon answers: for milliseconds, or up to 20 s if the call starts a daemon.
 ///
-/// AXON_RET_CONFIG: a setting is wrong, or the daemon that runs has other security settings; the text
-/// names the variable. Or the permissions cannot be read, are not valid now, or allow nothing in the
-/// session's domain; the text names the file. AXON_RET_ERROR: there is no daemon and none can be
-/// started, or it does not answer. AXON_RET_BAD_ALLOC: shared memory is short.
+/// AXON_RET_CONFIG: a setting is wrong, or the running daemon has other security settings; the text names the
+/// variable. AXON_RET_CONFIG also means that the permissions cannot be read, are not valid now, or allow
+/// nothing in the session's domain; the text names the file. AXON_RET_ERROR: no daemon runs and none can be
+/// started, or the daemon does not answer. AXON_RET_BAD_ALLOC: shared memory is short.
 ///
 /// # Safety
-/// `options` points to options that `axon_session_options_init` filled in, whose pointers are null or
-/// point to what they say; `session` points to room for a handle.
+/// `options` points to options that `axon_session_options_init` filled in. Each of their pointers is null or
+/// points to valid data. `session` points to room for a handle.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_open(
     options: *const axon_session_options_t,
@@ -174,10 +178,10 @@ pub unsafe extern "C" fn axon_session_open(
 ) -> axon_ret_t {
     guarded(|| {
         present(session, "the place of the session")?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let (config, options) = unsafe { settings(options) }?;
         let opened = Session::open(&config, options)?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { give(opened, session) }
     })
 }
@@ -187,9 +191,9 @@ pub unsafe extern "C" fn axon_session_open(
 unsafe fn settings(
     options: *const axon_session_options_t,
 ) -> Result<(Config, SessionOptions), CallFailure> {
-    // SAFETY: the caller's word. All versions of it begin with their number.
+    // SAFETY: guaranteed by the caller. All versions of the options begin with their version number.
     check_abi(unsafe { value(options.cast::<u32>(), "the pointer to the options") }?)?;
-    // SAFETY: the caller's word. The caller has this version.
+    // SAFETY: guaranteed by the caller, which has this version of the options.
     let options = unsafe { value(options, "the pointer to the options") }?;
     let mut overrides: Vec<(&'static str, Option<OsString>)> = Vec::new();
     if options.domain != AXON_DOMAIN_ENVIRONMENT {
@@ -205,11 +209,11 @@ unsafe fn settings(
     };
     if let Some(range) = range {
         let (peers, count) = (options.static_peers, options.static_peer_count);
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let peers = unsafe { elements(peers, count, "the list of static peers") }?;
         let mut texts = Vec::with_capacity(peers.len());
         for peer in peers {
-            // SAFETY: the caller's word.
+            // SAFETY: guaranteed by the caller.
             texts.push(unsafe { text(*peer, "a static peer") }?);
         }
         overrides.push(("ROS_LOCALHOST_ONLY", None));
@@ -219,7 +223,7 @@ unsafe fn settings(
     let daemon = if options.daemon_path.is_null() {
         None
     } else {
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         Some(PathBuf::from(unsafe { text(options.daemon_path, "the daemon's path") }?))
     };
     let config = Config::from_env_with(overrides, daemon.as_deref())
@@ -227,7 +231,7 @@ unsafe fn settings(
     let name = if options.name.is_null() {
         ""
     } else {
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { text(options.name, "the session's name") }?
     };
     let mut open = SessionOptions::new(if name.is_empty() { own_name() } else { name.to_owned() });
@@ -235,16 +239,16 @@ unsafe fn settings(
         open = open.daemon_command(DaemonCommand { program, arguments: Vec::new() });
     }
     if !options.permissions_path.is_null() {
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let path = unsafe { text(options.permissions_path, "the path of the permissions") }?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let enclave = unsafe { text(options.enclave, "the enclave") }?;
         open = limit(open, &config, path, enclave)?;
     }
     Ok((config, open))
 }
 
-/// Limits a session to what an enclave may do.
+/// Limits a session to the permissions of an enclave.
 #[cfg(feature = "sros2")]
 fn limit(
     options: SessionOptions,
@@ -258,7 +262,7 @@ fn limit(
     Ok(options.permissions(permissions))
 }
 
-/// Refuses the session: what cannot be judged is not let through.
+/// Refuses the session, because this build cannot check permissions.
 #[cfg(not(feature = "sros2"))]
 fn limit(
     _: SessionOptions,
@@ -276,15 +280,15 @@ fn own_name() -> String {
     path.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned())
 }
 
-/// Gives a session's handle up. The session ends when the last of its nodes, endpoints and events is
-/// destroyed and the last call returns that uses one, which then blocks for milliseconds while its
-/// thread ends.
+/// Destroys the handle of a session. The session ends when its last node, endpoint and event is destroyed and
+/// the last call that uses one of them returns. That call blocks for milliseconds while the session's thread
+/// ends.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_close(session: axon_session_t) -> axon_ret_t {
     guarded(|| revoke(session).map(drop))
 }
 
-/// The domain that the session is in.
+/// Stores the domain of the session.
 ///
 /// # Safety
 /// `domain` points to room for a number.
@@ -295,14 +299,14 @@ pub unsafe extern "C" fn axon_session_domain(
 ) -> axon_ret_t {
     guarded(|| {
         let of = named(session)?.domain();
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { store(domain, of, "the place of the domain") }
     })
 }
 
-/// Whether the session reaches its daemon: 1, or 0 while there is none, as after it died, until
-/// another has taken over. Where `AXON_DAEMON` is `off` there is none to reach: 1. What is attached
-/// flows on either way.
+/// Stores 1 if the session is connected to a daemon, else 0. A session is not connected after its daemon has
+/// died, until another daemon takes over. If `AXON_DAEMON` is `off`, the result is always 1. Data flows
+/// between attached endpoints in both cases.
 ///
 /// # Safety
 /// `connected` points to room for a number.
@@ -315,7 +319,7 @@ pub unsafe extern "C" fn axon_session_is_connected(
         let session = named(session)?;
         let off = session.daemon_policy() == DaemonPolicy::Off;
         let is = off || session.daemon().is_some();
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { store(connected, u8::from(is), "the place of the answer") }
     })
 }

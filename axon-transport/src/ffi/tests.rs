@@ -26,19 +26,19 @@ thread_local! {
     static MEANWHILE: Cell<Option<Box<dyn FnOnce()>>> = const { Cell::new(None) };
 }
 
-/// What a handle names was found, and nothing was done with it yet.
+/// Runs at the point where a call has found the object of its handle and not used it yet.
 pub(super) fn found() {
     if let Some(meanwhile) = MEANWHILE.take() {
         meanwhile();
     }
 }
 
-/// What other threads do once this one's next call has found what its handle names.
+/// Has another thread run `what` when this thread's next call has found the object of its handle.
 fn meanwhile(what: impl FnOnce() + Send + 'static) {
     MEANWHILE.set(Some(Box::new(|| thread::spawn(what).join().unwrap())));
 }
 
-/// What a program gives to a callback, and frees once the callback's object is destroyed.
+/// The data of a callback. The program frees it once the callback's object is destroyed.
 #[derive(Default)]
 struct User {
     told: AtomicU64,
@@ -53,13 +53,13 @@ impl User {
 }
 
 unsafe extern "C" fn hear(user: *const c_void, count: usize) {
-    // SAFETY: what the tests set, which outlives what it is set for.
+    // SAFETY: the tests set this pointer. Its target outlives the callback's object.
     let user = unsafe { &*user.cast::<User>() };
     user.told_when_freed.fetch_or(user.freed.load(Ordering::SeqCst), Ordering::SeqCst);
     user.told.fetch_add(count as u64, Ordering::SeqCst);
 }
 
-/// Endpoints of one session, each with something that a callback of it would be told at once.
+/// Endpoints of one session. Each has an occurrence that a new callback is called for at once.
 struct Place {
     publisher: axon_publisher_t,
     subscription: axon_subscription_t,
@@ -74,7 +74,7 @@ fn ok(returned: axon_ret_t) {
 
 fn handle<H: FfiHandle>(object: H::Object) -> H {
     let mut handle = H::of(0);
-    // SAFETY: a place for one.
+    // SAFETY: a place for one handle.
     unsafe { give(object, &raw mut handle) }.unwrap();
     handle
 }
@@ -95,7 +95,7 @@ impl Place {
         for _ in 0..2 {
             client.send_request(b"x").unwrap();
         }
-        // One is left.
+        // One of the two requests is left.
         let request = server.take_request(&mut Vec::new()).unwrap();
         server.send_response(request.publisher, request.sequence, b"x").unwrap();
         Self {
@@ -122,7 +122,7 @@ impl Place {
 
 type Set<H> = unsafe extern "C" fn(H, axon_callback_t, *const c_void) -> axon_ret_t;
 
-/// Sets a callback while the object is destroyed: between the look-up and what is done with it.
+/// Sets a callback while another thread destroys the object: between the look-up and the use of the object.
 fn set_while_destroyed<H: Copy + Send + 'static>(
     object: H,
     set: Set<H>,
@@ -134,14 +134,14 @@ fn set_while_destroyed<H: Copy + Send + 'static>(
         ok(destroy(object));
         freed.freed.store(true, Ordering::SeqCst);
     });
-    // SAFETY: the user stands until the end of this function, at which the object is long destroyed.
+    // SAFETY: the user lives until the end of this function. The object is destroyed before that.
     let returned = unsafe { set(object, Some(hear), user.pointer()) };
     assert_eq!(returned, AXON_RET_INVALID_HANDLE);
     assert!(!user.told_when_freed.load(Ordering::SeqCst), "told once it was destroyed");
     assert_eq!(user.told.load(Ordering::SeqCst), 0);
 }
 
-/// Sets one as usual, so that there is something to be told.
+/// Sets a callback without a race, to show that it is called at once.
 fn set_and_destroy<H: Copy>(object: H, set: Set<H>, destroy: extern "C" fn(H) -> axon_ret_t) {
     let user = Arc::new(User::default());
     // SAFETY: as above.
@@ -181,18 +181,18 @@ fn the_end_of_one_handle_of_an_event_leaves_the_callback_of_another() {
     let place = Place::new();
     let kind = AXON_EVENT_PUBLICATION_MATCHED;
     let mut other = axon_event_t { id: 0 };
-    // SAFETY: a place for one.
+    // SAFETY: a place for one handle.
     ok(unsafe { axon_session_publisher_event(place.publisher, kind, &raw mut other) });
     let users = [Arc::new(User::default()), Arc::new(User::default())];
     for (event, user) in [place.event, other].into_iter().zip(&users) {
-        // SAFETY: the users stand until the events are destroyed.
+        // SAFETY: the users live until the events are destroyed.
         ok(unsafe { axon_session_event_set_callback(event, Some(hear), user.pointer()) });
     }
     let told = || users.each_ref().map(|user| user.told.load(Ordering::SeqCst));
     assert_eq!(told(), [1, 1]);
     ok(axon_session_event_destroy(place.event));
     users[0].freed.store(true, Ordering::SeqCst);
-    // The session tells of it on this thread.
+    // The session reports the event on this thread.
     ok(axon_session_subscription_destroy(place.subscription));
     assert_eq!(told(), [1, 2]);
     assert!(!users[0].told_when_freed.load(Ordering::SeqCst));
@@ -204,7 +204,7 @@ fn the_end_of_one_handle_of_an_event_leaves_the_callback_of_another() {
 fn a_panic_becomes_a_code_and_a_text() {
     let panicked = guarded(|| panic!("somewhere inside"));
     assert_eq!(panicked, AXON_RET_PANIC);
-    // SAFETY: the text stands until the next call that fails in this thread.
+    // SAFETY: the text is valid until the next failed call in this thread.
     let text = unsafe { std::ffi::CStr::from_ptr(axon_session_last_error()) };
     assert!(text.to_str().unwrap().contains("defect of AXON"), "{text:?}");
     // The next call is not affected.

@@ -13,11 +13,11 @@ use super::{
 };
 use crate::session::Waitable;
 
-/// As a timeout: for ever.
+/// A timeout value that means without end.
 pub const AXON_WAIT_FOREVER: i64 = -1;
 
-/// A guard condition of a session. It does not keep the session open: it may be triggered and destroyed
-/// when that has ended, but nobody can wait for it any more.
+/// Creates a guard condition for a session. It does not keep the session open. After the session has ended,
+/// the condition can still be triggered and destroyed, but no wait can include it.
 ///
 /// # Safety
 /// `guard` points to room for a handle.
@@ -29,68 +29,68 @@ pub unsafe extern "C" fn axon_session_guard_create(
     guarded(|| {
         present(guard, "the place of the guard condition")?;
         let created = named(session)?.create_guard_condition();
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { give(created, guard) }
     })
 }
 
-/// Gives a guard condition's handle up. A wait that waits for it goes on without.
+/// Destroys the handle of a guard condition. A running wait continues without the condition.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_guard_destroy(guard: axon_guard_t) -> axon_ret_t {
     guarded(|| revoke(guard).map(drop))
 }
 
-/// Triggers a guard condition. Async-signal-safe: it takes no lock and no memory, and a signal handler
-/// may call it at any time. It leaves errno and the text of the last error alone.
+/// Triggers a guard condition. The call is async-signal-safe: it takes no lock and allocates no memory. It
+/// changes neither errno nor the text of the last error.
 ///
-/// AXON_RET_INVALID_HANDLE: it names none, or is being destroyed.
+/// AXON_RET_INVALID_HANDLE: the handle names no guard condition, or the condition is being destroyed.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_guard_trigger(guard: axon_guard_t) -> axon_ret_t {
     visit(guard, |guard| guard.trigger()).err().unwrap_or(AXON_RET_OK)
 }
 
-/// What to wait for: arrays of handles, each of which may be empty, and then null. A handle that is
-/// 0 is passed over.
+/// The handles that a wait includes, in one array for each kind. An empty array may be null. A wait skips
+/// handles that are 0.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct axon_wait_set_t {
-    /// Ready while there is something to take.
+    /// Ready while a sample can be taken.
     pub subscriptions: *mut axon_subscription_t,
-    /// How many they are.
+    /// The number of subscriptions.
     pub subscription_count: usize,
-    /// Ready once it was triggered. The wait that finds it so resets it.
+    /// Ready once triggered. The wait that reports the condition resets it.
     pub guards: *mut axon_guard_t,
-    /// How many they are.
+    /// The number of guard conditions.
     pub guard_count: usize,
-    /// Ready while there is a request to take.
+    /// Ready while a request can be taken.
     pub servers: *mut axon_server_t,
-    /// How many they are.
+    /// The number of servers.
     pub server_count: usize,
-    /// Ready while there is a response to take.
+    /// Ready while a response can be taken.
     pub clients: *mut axon_client_t,
-    /// How many they are.
+    /// The number of clients.
     pub client_count: usize,
-    /// Ready while it happened and its status was not taken since.
+    /// Ready if the event happened since its status was last taken.
     pub events: *mut axon_event_t,
-    /// How many they are.
+    /// The number of events.
     pub event_count: usize,
 }
 
-/// Blocks until at least one of what is in `set` is ready, for at most `timeout` nanoseconds: 0 not at
-/// all, AXON_WAIT_FOREVER (any negative number) without end, also where the set is empty. Then sets
-/// all handles in the arrays to 0 that are not ready.
+/// Blocks until at least one handle in `set` is ready, for at most `timeout` nanoseconds. A timeout of 0 does
+/// not block. AXON_WAIT_FOREVER, like any negative number, blocks without end, even if the set is empty. The
+/// call then sets all handles in the arrays to 0 that are not ready.
 ///
-/// AXON_RET_TIMEOUT: none was ready in time; all handles are 0. Every other failure leaves the arrays
-/// as they were: AXON_RET_INVALID_HANDLE where one names nothing, AXON_RET_INVALID_ARGUMENT where one is
-/// of another session that is closed. What is of another session of this process can be waited for
-/// too, and takes a thread more on its way.
+/// AXON_RET_TIMEOUT: no handle was ready in time; all handles are 0. Every other failure leaves the arrays
+/// unchanged. AXON_RET_INVALID_HANDLE: a handle names no object. AXON_RET_INVALID_ARGUMENT: a handle belongs
+/// to another session that is closed. Handles of another open session of this process are permitted; their
+/// wake-up takes a detour through one more thread.
 ///
-/// Any number of threads may wait at once, each with arrays of its own. What is destroyed meanwhile is
-/// out of the graph at once; the wait goes on.
+/// Any number of threads may wait at once, each with arrays of its own. An object that is destroyed during a
+/// wait leaves the graph at once. The wait continues.
 ///
 /// # Safety
-/// `set` points to a set whose arrays hold as many handles as it says, which nobody else uses during
-/// the call.
+/// `set` points to a set whose arrays hold as many handles as their counts say. No other code uses the arrays
+/// during the call.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_wait(
     session: axon_session_t,
@@ -99,9 +99,9 @@ pub unsafe extern "C" fn axon_session_wait(
 ) -> axon_ret_t {
     guarded(|| {
         let session = named(session)?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let set = unsafe { value(set, "the pointer to the set") }?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let mut arrays = unsafe { Arrays::new(&set) }?;
         let watch = {
             let subscriptions = all(arrays.subscriptions)?;
@@ -117,7 +117,7 @@ pub unsafe extern "C" fn axon_session_wait(
                 .chain(clients.iter().map(|one| Waitable::Client(one)))
                 .chain(events.iter().map(|one| Waitable::Event(one)))
                 .collect();
-            // It does not keep the objects that it waits for from ending.
+            // The watch does not keep its objects alive.
             session.watch(&waitables)?
         };
         let ready = session.wait_watch(&watch, limit(timeout))?;
@@ -139,9 +139,9 @@ struct Arrays<'a> {
 
 impl<'a> Arrays<'a> {
     /// # Safety
-    /// As [`axon_session_wait`].
+    /// As for [`axon_session_wait`].
     unsafe fn new(set: &axon_wait_set_t) -> Result<Self, CallFailure> {
-        // SAFETY: the caller's word, here and below: nobody else uses the arrays.
+        // SAFETY: guaranteed by the caller, here and below: no other code uses the arrays.
         let subscriptions = unsafe {
             elements_mut(set.subscriptions, set.subscription_count, "the subscriptions")
         }?;
@@ -156,8 +156,8 @@ impl<'a> Arrays<'a> {
         Ok(Self { subscriptions, guards, servers, clients, events })
     }
 
-    /// Sets those to 0 that are not ready. The ready ones are counted through all arrays, without
-    /// those that are 0.
+    /// Sets the handles to 0 that are not ready. `ready` counts through all arrays and skips handles that are
+    /// 0.
     fn keep(&mut self, ready: &[usize]) {
         let (mut number, mut ready) = (0, ready.iter().copied().peekable());
         keep(self.subscriptions, &mut number, &mut ready);
@@ -181,17 +181,17 @@ fn keep<H: FfiHandle>(
     }
 }
 
-/// What the handles name that are not 0.
+/// Returns the objects of the handles that are not 0.
 fn all<H: FfiHandle>(handles: &[H]) -> Result<Vec<Arc<H::Object>>, CallFailure> {
     handles.iter().filter(|handle| handle.id() != 0).map(|handle| named(*handle)).collect()
 }
 
-/// A timeout; `None` is for ever.
+/// Converts a timeout; `None` is without end.
 fn limit(nanoseconds: i64) -> Option<Duration> {
     u64::try_from(nanoseconds).ok().map(Duration::from_nanos)
 }
 
-/// Converts a timeout. A negative one, which means for ever, becomes some hundred years.
+/// Converts a timeout. A negative one, which means without end, becomes about 292 years.
 pub(super) fn duration(nanoseconds: i64) -> Duration {
     limit(nanoseconds).unwrap_or(Duration::from_nanos(i64::MAX as u64))
 }

@@ -1,8 +1,8 @@
-//! The control plane: matches the sessions of one user and domain on this host with each other, and with sessions on
-//! other hosts.
+//! The control plane: matches the sessions of one user and domain on this host with each other, and with
+//! sessions on other hosts.
 //!
-//! It runs on the thread that calls [`run`]. The gateway to other hosts has a separate thread and runtime; the two
-//! share only `bridge`. Samples between processes of this host pass neither.
+//! It runs on the thread that calls [`run`]. The gateway to other hosts has a thread and a runtime of its
+//! own. The two threads share only `bridge`. Samples between processes of this host pass through neither.
 
 mod admission;
 mod conversation;

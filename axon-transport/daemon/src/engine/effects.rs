@@ -1,4 +1,4 @@
-//! What the engine has its owner do, in order.
+//! Effects: the actions that the engine requests of its owner, in order.
 
 use std::{collections::VecDeque, sync::Arc};
 
@@ -16,10 +16,10 @@ use crate::{
     keys::{KmeRequest, RequestOrigin},
 };
 
-/// What the engine has its owner do.
+/// An action that the engine requests of its owner.
 #[derive(Debug)]
 pub(crate) enum Effect {
-    /// Tell the control plane.
+    /// Send a message to the control plane.
     Tell(ToControl),
     /// Ask the KME; the answer comes back by [`Engine::handle_key_event`](super::Engine::handle_key_event).
     Kme(RequestOrigin, KmeRequest),
@@ -34,7 +34,7 @@ pub(crate) enum Effect {
     /// List this host's network interfaces; the list comes back by
     /// [`Engine::handle_interfaces`](super::Engine::handle_interfaces).
     Interfaces,
-    /// Give freed memory back to the system, after a while.
+    /// Return freed memory to the system after a while.
     ReturnMemory,
     /// Compress a sample, on another thread; the answer comes back by
     /// [`Engine::handle_compressed`](super::Engine::handle_compressed).
@@ -45,7 +45,7 @@ pub(crate) enum Effect {
 #[derive(Default)]
 pub(super) struct Effects {
     waiting: VecDeque<Effect>,
-    /// What the control plane was told of [`tell_draining`](Self::tell_draining).
+    /// The state that [`tell_draining`](Self::tell_draining) last reported.
     draining: bool,
 }
 
@@ -55,19 +55,20 @@ impl Effects {
         self.waiting.push_back(effect);
     }
 
-    /// Tells the control plane.
+    /// Requests a message to the control plane.
     pub(super) fn tell(&mut self, what: ToControl) {
         self.push(Effect::Tell(what));
     }
 
-    /// Tells the control plane whether samples of publishers that ended are on their way, if that changed.
+    /// Reports to the control plane whether samples of ended publishers are still being sent, if that
+    /// changed.
     pub(super) fn tell_draining(&mut self, draining: bool) {
         if std::mem::replace(&mut self.draining, draining) != draining {
             self.tell(ToControl::Draining(draining));
         }
     }
 
-    /// Logs losses, and tells the control plane.
+    /// Logs losses and reports them to the control plane.
     pub(super) fn tell_lost(&mut self, peer: &str, losses: Vec<TopicLoss>) {
         counters::log(&losses, peer);
         for TopicLoss { topic, cause, samples } in losses {
@@ -75,8 +76,8 @@ impl Effects {
         }
     }
 
-    /// The last link of a peer is over. Logs the samples that the peer did not acknowledge, by topic, and tells the
-    /// control plane what was `counted` as lost.
+    /// Reports the end of a peer's last link. Logs the unacknowledged samples by topic, and reports the
+    /// losses in `counted` to the control plane.
     pub(super) fn tell_link_over(
         &mut self,
         daemon: DaemonId,
@@ -93,7 +94,7 @@ impl Effects {
         self.tell_lost(peer, counted);
     }
 
-    /// Logs, and tells the control plane, that relays were kept for peers that did not come back: samples by topic.
+    /// Logs and reports the samples, by topic, of relays that were kept for peers that did not return.
     pub(super) fn tell_relays_given_up(&mut self, given_up: Vec<(String, u64)>) {
         if given_up.is_empty() {
             return;
@@ -110,7 +111,7 @@ impl Effects {
         }
     }
 
-    /// Logs, and tells the control plane, that a peer does not read a route that it asked for.
+    /// Logs and reports that a peer does not read a route that it asked for.
     pub(super) fn tell_stalled(&mut self, kind: RefusalKind, peer: String, stalled: StalledRoute) {
         let StalledRoute { topic, reason, samples } = stalled;
         tracing::warn!(topic, samples, "samples are lost: a peer does not read the topic");
@@ -119,7 +120,7 @@ impl Effects {
         self.tell(ToControl::Lost { topic, cause: "stalled", samples });
     }
 
-    /// Passes on what the links report.
+    /// Passes on a report of the links.
     pub(super) fn tell_report(&mut self, report: LinkReport) {
         match report {
             LinkReport::Refused(kind, peer, refusal) => self.tell_refused(kind, peer, refusal),
@@ -134,7 +135,7 @@ impl Effects {
         }
     }
 
-    /// Tells the control plane, which logs it.
+    /// Reports a refusal to the control plane, which logs it.
     fn tell_refused(&mut self, kind: RefusalKind, peer: String, refusal: Refusal) {
         let by = match refusal.by {
             RefusedBy::Here => "refused here",
@@ -145,7 +146,7 @@ impl Effects {
         self.tell(ToControl::Refusal { kind, peer, what: refusal.name, reason });
     }
 
-    /// The next effect.
+    /// Returns the next effect.
     pub(super) fn poll(&mut self) -> Option<Effect> {
         self.waiting.pop_front()
     }
@@ -157,7 +158,7 @@ mod tests {
 
     use super::*;
 
-    /// What the control plane is told.
+    /// Returns the messages to the control plane.
     fn told(effects: &mut Effects) -> Vec<String> {
         let effects = std::iter::from_fn(|| effects.poll());
         let told = effects.map(|effect| match effect {

@@ -1,5 +1,5 @@
-//! The rings of this host, as the engine uses them: relay readers of local publishers, and stand-ins that write for
-//! remote ones. In the daemon they are shared memory; the simulator has models of them.
+//! The rings of this host as the engine uses them: relay readers of local publishers, and stand-ins that
+//! write for remote ones. The daemon's rings are in shared memory; the simulator has models of them.
 
 use std::{collections::HashMap, rc::Rc, sync::Arc, time::Duration};
 
@@ -14,31 +14,33 @@ use bytes::Bytes;
 
 /// Opens readers and writers.
 pub(crate) trait Rings {
-    /// Opens a relay: a subscription that reads for subscriptions of a peer, which it `stands_for`.
+    /// Opens a relay: a subscription that reads on behalf of a peer's subscriptions, `stands_for`.
     ///
     /// # Errors
-    /// Why there is none, for the log.
+    /// The reason for the failure, for the log.
     fn open_reader(
         &self,
         spec: EndpointSpec,
         stands_for: Vec<Gid>,
     ) -> Result<Rc<dyn RingReader>, String>;
 
-    /// Opens a stand-in for a remote publisher, client or server, under its GID. What it holds it takes of `held`.
+    /// Opens a stand-in for a remote publisher, client or server, under its GID. The stand-in's memory is
+    /// charged to `held`.
     ///
     /// # Errors
-    /// Why there is none, for the log.
+    /// The reason for the failure, for the log.
     fn open_writer(
         &self,
         remote: &Endpoint,
         held: &Arc<MemoryBudget>,
     ) -> Result<Rc<dyn RingWriter>, String>;
 
-    /// Adds to `found` the readers that may have samples to take, each with the publisher: those whose rings got samples
-    /// since the last call, and a few others. So the cost of a sample does not grow with the number of readers.
+    /// Adds to `found` the readers that may have samples to take, each with the publisher. These are the
+    /// readers whose rings got samples since the last call, and a few more. So the cost of a sample does not
+    /// grow with the number of readers.
     fn take_active(&self, found: &mut Vec<(Gid, Gid)>);
 
-    /// Says whether the engine waits for room in a ring: while it does, a reader that makes room wakes it.
+    /// Sets whether the engine waits for room in a ring. While it waits, a reader that makes room wakes it.
     fn set_waiting_for_room(&self, waiting: bool);
 }
 
@@ -46,125 +48,128 @@ pub(crate) trait Rings {
 pub(crate) trait RingReader {
     /// The relay's own GID.
     fn gid(&self) -> Gid;
-    /// The publishers that have samples to take.
+    /// Returns the publishers that have samples to take.
     fn with_data(&self) -> Vec<Gid>;
     /// Whether this publisher has samples to take.
     fn has_data_of(&self, publisher: &Gid) -> bool;
-    /// Whether it reads this publisher.
+    /// Returns whether the relay reads this publisher.
     fn reads(&self, publisher: &Gid) -> bool;
-    /// The publishers that it reads.
+    /// Returns the publishers that the relay reads.
     fn matched(&self) -> Vec<Gid>;
-    /// Takes the next samples of a publisher, as many as `most` says. Returns how many.
+    /// Takes the next samples of a publisher, up to `most`. Returns their number.
     fn take_many(
         &self,
         publisher: &Gid,
         most: TakeLimit,
         each: &mut dyn FnMut(MessageInfo, Bytes),
     ) -> usize;
-    /// After what time [`take_many`](Self::take_many) may have a sample, where it had none although some wait: it passes
-    /// over a number that do not count, such as expired ones, and then lets others have their turn; or there was no
-    /// memory for a sample.
+    /// Returns when to call [`take_many`](Self::take_many) again if it returned no sample although some wait.
+    /// It skips a number of samples that do not count, such as expired ones, and then lets others have their
+    /// turn. It also returns none if there was no memory for a sample.
     fn retry_of(&self, publisher: &Gid) -> Option<Duration>;
-    /// Whether samples of this publisher wait that cannot be taken yet, for want of memory: of the publisher's that has
-    /// not come, or of this process.
+    /// Returns whether waiting samples of this publisher cannot be taken yet, because memory is missing: the
+    /// publisher's memory has not arrived, or this process is short of it.
     fn is_held_up(&self, _publisher: &Gid) -> bool {
         false
     }
-    /// Passes over all samples of this publisher but the newest `depth`.
+    /// Skips all samples of this publisher but the newest `depth`.
     fn skip_of(&self, publisher: &Gid, depth: u64);
-    /// How many samples of this publisher newer ones replaced before they were taken, or were passed over.
+    /// Returns how many samples of this publisher were replaced by newer ones before they were taken, or
+    /// skipped.
     fn lost_of(&self, _publisher: &Gid) -> u64 {
         0
     }
-    /// The peer has the samples of this publisher up to this number, or will never have them.
+    /// Acknowledges the samples of this publisher up to this number: the peer has them or will never have
+    /// them.
     fn acknowledge_of(&self, publisher: &Gid, sequence: u64);
-    /// Has what was taken and not acknowledged taken once more.
+    /// Makes the taken samples that are not acknowledged available to be taken again.
     fn take_back(&self);
-    /// How many samples of each publisher are not acknowledged.
+    /// Returns the number of unacknowledged samples of each publisher.
     fn unacknowledged(&self) -> HashMap<Gid, u64>;
-    /// Bytes of its ring that the samples of this publisher take that are not acknowledged.
+    /// Returns the bytes that the unacknowledged samples of this publisher take in its ring.
     fn unacknowledged_bytes_of(&self, publisher: &Gid) -> u64;
-    /// How many publishes of this publisher found no room since readers had not taken, or acknowledged, its oldest
-    /// sample, if this reader is one of these now.
+    /// Returns how many publishes of this publisher found no room because readers had not taken, or
+    /// acknowledged, its oldest sample. Returns `None` unless this reader is one of them now.
     fn refused_of(&self, publisher: &Gid) -> Option<u64>;
-    /// So many samples of this publisher will never reach the peer.
+    /// Reports that so many samples of this publisher will never reach the peer.
     fn give_up(&self, publisher: Gid, samples: u64);
-    /// How often each publisher asserted its liveliness.
+    /// Returns how often each publisher asserted its liveliness.
     fn assertions(&self) -> Vec<(Gid, u64)>;
-    /// The peer's subscriptions that it reads for from now on.
+    /// Replaces the peer's subscriptions that the relay reads for.
     fn set_stands_for(&self, gids: Vec<Gid>);
 }
 
 /// Why a sample was not written to a ring.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum RingError {
-    /// A KEEP_ALL reader has no room: try again when a reader made some.
+    /// A KEEP_ALL reader has no room. Try again when a reader has made some.
     Full,
-    /// The stand-ins of the peer's identity hold as much as they may; the text says how much. Nothing says that others will
-    /// give any of it back.
+    /// The stand-ins of the peer's identity have used up their memory; the text states the amount. There is
+    /// no signal when others release some.
     Short(String),
-    /// The sample is lost; the text says why.
+    /// The sample is lost; the text gives the reason.
     Lost(String),
 }
 
-/// A stand-in for a remote publisher, client or server. That of a client or server also reads: the responses or the
-/// requests that go to it.
+/// A stand-in for a remote publisher, client or server. The stand-in of a client or server also reads the
+/// responses or requests for its endpoint.
 pub(crate) trait RingWriter {
     /// The remote endpoint.
     fn endpoint(&self) -> &Endpoint;
-    /// The local endpoints that it reaches.
+    /// Returns the local endpoints that the stand-in reaches.
     fn partners(&self) -> Vec<Gid>;
-    /// Writes a sample; `client` is the client that a response answers. A subscription that sleeps may sleep on until
-    /// [`announce`](Self::announce).
+    /// Writes a sample; `client` is the client that a response answers. A sleeping subscription may stay
+    /// asleep until [`announce`](Self::announce).
     ///
     /// # Errors
     /// The ring is full, or the sample is lost.
     fn try_write(&self, client: &Gid, meta: Meta, payload: &[u8]) -> Result<Written, RingError>;
-    /// Wakes the subscriptions that sleep, for all samples that were written.
+    /// Wakes the sleeping subscriptions once for all written samples.
     fn announce(&self);
-    /// The remote publisher asserted its liveliness.
+    /// Records that the remote publisher asserted its liveliness.
     fn assert_alive(&self);
-    /// The clients whose calls, or responses, wait to be taken.
+    /// Returns the clients whose calls, or responses, wait to be taken.
     fn with_calls(&self) -> Vec<Gid>;
-    /// Whether it reads the calls, or responses, of this client.
+    /// Returns whether the stand-in reads the calls, or responses, of this client.
     fn reads_calls_of(&self, client: &Gid) -> bool;
     /// Takes the next call, or response, of this client.
     fn take_call_of(&self, client: &Gid) -> Option<(MessageInfo, Vec<u8>)>;
-    /// How many calls, or responses, of this client wait to be taken.
+    /// Returns how many calls, or responses, of this client wait to be taken.
     fn calls_of(&self, _client: &Gid) -> u64 {
         0
     }
-    /// How many calls, or responses, of this client found no room, if those that wait here are why the next one may not.
+    /// Returns how many calls, or responses, of this client found no room, if the waiting ones may block the
+    /// next one.
     fn refused_of(&self, _client: &Gid) -> Option<u64> {
         None
     }
 }
 
-/// A sample on its way to a peer.
+/// A sample that is being sent to a peer.
 #[derive(Clone, Debug)]
 pub(crate) struct RingSample {
-    /// Its publisher, number and times.
+    /// The sample's publisher, number and times.
     pub(crate) info: MessageInfo,
-    /// The call that it is the request of, or answers.
+    /// The call, if the sample is its request or response.
     pub(crate) call: Option<RequestId>,
-    /// The bytes that are sent: the serialized message, or the frame that it was compressed to.
+    /// The bytes to send: the serialized message, or its compressed frame.
     pub(crate) payload: Bytes,
-    /// Whether it is compressed.
+    /// Whether the sample is compressed.
     form: Form,
-    /// When the engine took it from its ring.
+    /// When the engine took the sample from its ring.
     pub(crate) taken: Duration,
 }
 
 /// Whether a sample is compressed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Form {
-    /// Nobody asked.
+    /// Compression was not requested yet.
     Undecided,
-    /// The answer to the order with this number will tell.
+    /// The compression order with this number decides.
     Asked(u64),
-    /// It is sent as it is.
+    /// The sample is sent uncompressed.
     Plain,
-    /// Into one zstd frame, of so many bytes.
+    /// The sample is compressed into one zstd frame.
     Zstd {
         /// Bytes of the serialized message.
         from: usize,
@@ -172,23 +177,23 @@ enum Form {
 }
 
 impl RingSample {
-    /// A sample of a topic.
+    /// Creates a sample of a topic.
     pub(crate) fn new(info: MessageInfo, payload: Bytes, now: Duration) -> Self {
         Self { info, call: None, payload, form: Form::Undecided, taken: now }
     }
 
-    /// Time since it was published, as far as this host knows.
+    /// Returns the time since the sample was published, as far as this host knows.
     pub(crate) fn age(&self, now: Duration) -> Duration {
         let before = self.info.lifetime.map_or(Duration::ZERO, |lifetime| lifetime.age);
         before.saturating_add(now.saturating_sub(self.taken))
     }
 
-    /// What is left of its lifespan; `None` if that is infinite.
+    /// Returns the rest of the sample's lifespan; `None` if that is infinite.
     pub(crate) fn lifespan_left(&self, now: Duration) -> Option<Duration> {
         Some(self.info.lifetime?.lifespan.saturating_sub(self.age(now)))
     }
 
-    /// Bytes of the serialized message.
+    /// Returns the length of the serialized message in bytes.
     pub(crate) fn length(&self) -> usize {
         match self.form {
             Form::Zstd { from } => from,
@@ -196,12 +201,13 @@ impl RingSample {
         }
     }
 
-    /// The memory that a queue counts for it, in bytes, whether or not it is compressed: the peer needs as much for it.
+    /// Returns the memory in bytes that a queue counts for the sample. Compression does not reduce it,
+    /// because the peer needs the full amount.
     pub(crate) fn size(&self) -> usize {
         self.length() + size_of::<Self>()
     }
 
-    /// Whether nobody asked yet whether it becomes shorter.
+    /// Returns whether compression was not requested yet.
     pub(crate) fn is_undecided(&self) -> bool {
         self.form == Form::Undecided
     }
@@ -211,7 +217,7 @@ impl RingSample {
         matches!(self.form, Form::Asked(_))
     }
 
-    /// Whether the order with this number is about it.
+    /// Returns whether the compression order with this number is for this sample.
     pub(crate) fn is_asked_by(&self, order: u64) -> bool {
         self.form == Form::Asked(order)
     }
@@ -221,12 +227,12 @@ impl RingSample {
         matches!(self.form, Form::Zstd { .. })
     }
 
-    /// The order with this number will tell whether it becomes shorter.
+    /// Records the number of the compression order that decides.
     pub(crate) fn set_asked(&mut self, order: u64) {
         self.form = Form::Asked(order);
     }
 
-    /// It is sent as this frame, or as it is.
+    /// Sets the compressed frame; with `None` the sample is sent uncompressed.
     pub(crate) fn set_compressed(&mut self, frame: Option<Bytes>) {
         self.form = match frame {
             Some(frame) => Form::Zstd { from: std::mem::replace(&mut self.payload, frame).len() },

@@ -23,36 +23,38 @@ use super::{
 };
 use crate::engine::account::{Account, Charge};
 
-/// A stand-in. A link and its successor share it.
+/// A local writer for a remote endpoint. A link and its successor share the stand-in.
 pub(crate) struct StandIn {
     ring: Rc<dyn RingWriter>,
     gid: Gid,
-    /// Whether it writes samples or requests, whose numbers rise. A server answers calls in any order.
+    /// Whether sequence numbers rise, as those of samples and requests do. A server answers calls in any
+    /// order.
     rises: bool,
-    /// The number that was written last; 0 is none.
+    /// The last written sequence number; 0 if there is none.
     last: Cell<u64>,
-    /// The newest that were dropped here.
+    /// The newest samples that were dropped here.
     dropped: RefCell<DroppedRuns>,
-    /// What its publisher can have published.
+    /// The sequence numbers that the publisher can have reached.
     numbers: Rc<PublisherNumbers>,
     _place: Charge,
 }
 
 impl StandIn {
-    /// The remote endpoint's GID.
+    /// Returns the remote endpoint's GID.
     pub(crate) fn gid(&self) -> Gid {
         self.gid
     }
 
-    /// Its ring.
+    /// Returns the stand-in's ring.
     pub(crate) fn ring(&self) -> &dyn RingWriter {
         &*self.ring
     }
 
-    /// Writes a sample. A subscription that sleeps may sleep on until [`announce`](Self::announce).
+    /// Writes a sample. A sleeping subscription may stay asleep until [`announce`](Self::announce).
     ///
     /// # Errors
-    /// The ring is full, or the sample is lost: also one whose number its publisher cannot have reached.
+    /// The ring is full, or the sample is lost. A sample is also lost if its publisher cannot have reached
+    /// its number.
     pub(crate) fn try_write(
         &self,
         client: &Gid,
@@ -72,25 +74,26 @@ impl StandIn {
         Ok(written)
     }
 
-    /// Wakes the subscriptions that sleep, for all samples that were written.
+    /// Wakes the sleeping subscriptions once for all written samples.
     pub(crate) fn announce(&self) {
         self.ring.announce();
     }
 
-    /// The number of the newest sample of a publisher, or request of a client, that is in the ring.
+    /// Returns the number of the newest sample of a publisher, or request of a client, in the ring.
     pub(crate) fn last_sequence(&self) -> Option<u64> {
         Some(self.last.get()).filter(|last| self.rises && *last > 0)
     }
 
-    /// A sample was dropped here by a limit or for want of room. One whose number cannot be is not meant: the true one may
-    /// come.
+    /// Records that a sample was dropped here by a limit or for lack of room. Do not call this for an
+    /// impossible number: the sample that truly has the number may still arrive.
     pub(crate) fn drop_sample(&self, sequence: u64) {
         if self.rises {
             self.dropped.borrow_mut().add(sequence);
         }
     }
 
-    /// What became of a sample that may have been dropped here before: a publisher whose link broke sends it again.
+    /// Returns what became of a sample that may have been dropped here before. A publisher whose link broke
+    /// sends such a sample again.
     pub(crate) fn dropped(&self, sequence: u64) -> EarlierFate {
         self.dropped.borrow().find(sequence)
     }
@@ -105,18 +108,18 @@ impl fmt::Debug for StandIn {
 /// Why there is no stand-in for an endpoint.
 #[derive(Debug)]
 pub(crate) enum NoStandIn {
-    /// The identity that announced it has as many as it may.
+    /// The identity that announced the endpoint has as many stand-ins as it may.
     TooMany,
-    /// The text says why.
+    /// The stand-in could not be created for this reason.
     Failed(String),
 }
 
-/// A stand-in, or what is left of one that was dropped.
+/// A stand-in, or the numbers of one that is gone.
 #[derive(Debug)]
 struct Known {
     stand_in: Weak<StandIn>,
     numbers: Rc<PublisherNumbers>,
-    /// Whose it is.
+    /// The budget of the identity that announced the endpoint.
     identity: Rc<str>,
 }
 
@@ -124,18 +127,18 @@ struct Known {
 #[derive(Default)]
 pub(crate) struct StandIns {
     known: RefCell<HashMap<Gid, Known>>,
-    /// When so many are known, those that are gone are forgotten.
+    /// The number of known entries at which those of gone stand-ins are forgotten.
     clean_at: Cell<usize>,
 }
 
-/// As many are known before those that are gone are forgotten.
+/// The lowest number of known entries at which those of gone stand-ins are forgotten.
 const KNOWN: usize = 64;
-/// Publishers that are gone and whose numbers are remembered: one that comes again goes on from there. If there are more,
-/// each identity keeps as many of its newest as it would of equal shares.
+/// The most gone publishers whose numbers are remembered, so that a publisher that returns continues from its
+/// number. Beyond that, each identity keeps its newest entries up to an equal share.
 const REMEMBERED: usize = if cfg!(test) { 60 } else { 1 << 16 };
 
 impl StandIns {
-    /// The stand-in for `remote`: the one that exists, or a new one that `account` pays for.
+    /// Returns the stand-in for `remote`: the existing one, or a new one that is charged to `account`.
     ///
     /// # Errors
     /// [`NoStandIn`].
@@ -166,7 +169,7 @@ impl StandIns {
             numbers: Rc::clone(&numbers),
             _place: place,
         });
-        // Once for as many as there are: of thousands one comes at a time.
+        // Cleaning only when the number has doubled keeps the cost per entry constant.
         if known.len() >= self.clean_at.get() {
             forget(&mut known, now);
             self.clean_at.set(2 * known.len().max(KNOWN));
@@ -178,7 +181,7 @@ impl StandIns {
     }
 }
 
-/// Forgets those that are gone, but for the numbers that came not long ago.
+/// Forgets the entries of gone stand-ins, but keeps recent numbers.
 fn forget(known: &mut HashMap<Gid, Known>, now: Duration) {
     let is_there = |known: &Known| known.stand_in.strong_count() > 0;
     let recent = |known: &Known| known.numbers.last() > 0 && now < known.numbers.at() + FORGOTTEN;
@@ -195,7 +198,7 @@ fn forget(known: &mut HashMap<Gid, Known>, now: Duration) {
     }
 }
 
-/// The most that each may have so that all have `all` at most.
+/// Returns the largest share per identity with which all together have at most `all`.
 fn share(mut wanted: Vec<usize>, all: usize) -> usize {
     wanted.sort_unstable();
     let (mut left, mut others) = (all, wanted.len());

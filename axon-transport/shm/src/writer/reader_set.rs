@@ -27,32 +27,36 @@ use crate::{
 /// The readers of one ring.
 pub(crate) struct ReaderSet {
     offered: Qos,
-    /// Whether it waits for KEEP_LAST readers, too: for what is within their depth.
+    /// Whether the publisher also waits for KEEP_LAST readers, to keep the samples within their depths.
     heeds_depths: bool,
-    /// The most samples that can ever stand.
+    /// The most samples that the ring can hold.
     capacity: u64,
     readers: Vec<Attached>,
-    /// Those that carried samples to others and whose process ended.
+    /// Carriers (readers that deliver samples to another process or host) whose process has ended.
     absent: Absences,
-    /// Their lanes, and those of readers that were here and may hold samples still.
+    /// The lanes of all readers, and of detached readers that may still hold samples.
     pin_lanes: PinLanes,
-    /// Their sessions, each once, shared with publishes that ring after they have unlocked.
+    /// The sessions of the readers, each once. A publish shares the list and wakes the sessions after it has
+    /// unlocked.
     peers: Arc<[RingPeer]>,
     window: u64,
-    /// Whether samples are noted in the session's journal, for readers that may follow it: relays, and where each
-    /// reader waits for calls, all in other sessions.
+    /// Whether a reader may follow the session's journal, so that each publish must note its sample there.
+    /// Relays may; so may readers in other sessions if the depths are enforced, that is, readers of requests
+    /// and responses.
     followers: bool,
-    /// Samples that readers who stand for others gave up.
+    /// The samples that relays (readers that stand for remote ones) gave up.
     given_up: u64,
 }
 
-/// Positions from which on samples are wanted.
+/// The positions from which on samples are kept.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Floors {
-    /// Given up last: the windows of all readers, and what KEEP_ALL readers have not taken.
+    /// The floor of samples that are given up last: the windows of all readers, and the untaken samples of
+    /// KEEP_ALL readers.
     pub(crate) retained: u64,
-    /// Never given up: a RELIABLE, KEEP_ALL publisher's for its like in other sessions, and what is
-    /// within the depth of those that read requests or responses there.
+    /// The floor of samples that are never given up. A RELIABLE, KEEP_ALL publisher holds them for such
+    /// readers in other sessions. If depths are enforced, it also holds the samples within the depths of
+    /// readers there.
     pub(crate) held: u64,
 }
 
@@ -74,12 +78,13 @@ impl ReaderSet {
         reader_set
     }
 
-    /// Holds what is within its readers' depths, too.
+    /// Also holds the samples within the depths of the readers.
     pub(crate) fn enforce_depths(&mut self) {
         self.heeds_depths = true;
     }
 
-    /// The readers for which more than the window is kept, each with whether the publisher waits for it.
+    /// Returns the readers for which more than the window is kept, each with whether the publisher waits for
+    /// the reader.
     fn heeded(&self) -> impl Iterator<Item = (&Attached, bool)> {
         let all = self.heeds_depths;
         let heeded = move |reader: &&Attached| {
@@ -94,7 +99,7 @@ impl ReaderSet {
         self.readers.is_empty() && self.absent.is_empty()
     }
 
-    /// Whether all of the history is for those that come later, as far as its memory goes.
+    /// Returns whether the publisher keeps its whole history for later readers, as far as its memory permits.
     pub(crate) fn keeps_all(&self) -> bool {
         keeps_all(&self.offered)
     }
@@ -103,18 +108,18 @@ impl ReaderSet {
         Arc::clone(&self.peers)
     }
 
-    /// Whether there are readers that may follow the session's journal.
+    /// Returns whether a reader may follow the session's journal.
     #[inline]
     pub(crate) fn has_followers(&self) -> bool {
         self.followers
     }
 
-    /// Whether a reader may follow the journal. Others cost a publish nothing.
+    /// Returns whether a reader may follow the journal. A publish has no extra cost for other readers.
     fn may_follow(&self, reader: &ReaderInfo) -> bool {
         reader.stands_for.is_some() || (self.heeds_depths && reader.peer.remote().is_some())
     }
 
-    /// The sessions, if anybody there waits for a sample, after [`settle`](crate::wake::settle).
+    /// Returns the sessions if one of them waits for a sample. Call [`settle`](crate::wake::settle) first.
     #[inline]
     pub(crate) fn waiting(&self) -> Option<Arc<[RingPeer]>> {
         self.peers.iter().any(|peer| peer.waits(Purpose::Samples)).then(|| self.peers())
@@ -131,10 +136,10 @@ impl ReaderSet {
         gids
     }
 
-    /// Adds a reader, whose lane is `lane`, and which goes on at `resumed` if it has been here before.
+    /// Adds a reader with the given lane. `resumed` is the position at which a returning reader continues.
     ///
     /// # Errors
-    /// Its process has too many. It, or the one that it takes the place of, stays as it was.
+    /// The reader's process has too many lanes. The reader, or the one that it would replace, is unchanged.
     pub(crate) fn attach(
         &mut self,
         info: ReaderInfo,
@@ -144,8 +149,8 @@ impl ReaderSet {
         resumed: Option<u64>,
         carries: bool,
     ) -> Result<Grant, ShmError> {
-        // One whose process ended has nothing to do with this one, though they share GID and lane.
-        // A relay may follow one of a daemon that ended.
+        // A reader whose process has ended differs from the new one, even with the same GID and lane. A new
+        // relay may replace one of a daemon that ended.
         if info.is_relay() || self.readers.iter().any(|known| known.info.gid == info.gid) {
             self.mark_dead(head);
         }
@@ -156,7 +161,7 @@ impl ReaderSet {
                 && same.gid == info.gid
                 && same.lane == info.lane
                 && same.peer.id() == info.peer.id()
-                // One that has left since is given a new start.
+                // A reader that has left since gets a new start.
                 && known.cursor(head).is_some()
         });
         if let Some(index) = known {
@@ -186,47 +191,48 @@ impl ReaderSet {
         Ok(grant)
     }
 
-    /// Samples that are kept at least.
+    /// Returns the least number of samples that are kept.
     pub(crate) fn window(&self) -> u64 {
         self.window
     }
 
-    /// Whether all readers have got one of the publisher's segments of this number or a later one:
-    /// most likely that one, too.
+    /// Returns whether all readers have mapped the publisher's segment of this number or a later one. A
+    /// reader with a later one most likely has this one, too.
     pub(crate) fn has_mapped(&self, number: u32) -> bool {
         self.readers.iter().filter(|reader| !reader.dead).all(|reader| reader.has_mapped(number))
     }
 
-    /// The lanes of those that may be reading still.
+    /// Returns the lanes of the readers that may still read.
     pub(crate) fn into_pin_lanes(self) -> PinLanes {
         self.pin_lanes
     }
 
     pub(crate) fn detach(&mut self, reader: Gid, head: u64) -> bool {
         let before = self.readers.len();
-        // A process that ended said nothing of what it leaves.
+        // A carrier whose process has ended did not report its remaining samples: `mark_dead` accounts for
+        // them.
         if self.readers.iter().any(|known| known.info.gid == reader && known.is_carrier()) {
             self.mark_dead(head);
         }
-        // What it gave up last is counted.
+        // Counts the samples that the reader gave up last, before it is forgotten.
         self.given_up(head);
         self.readers.retain(|known| known.info.gid != reader);
         let gone = self.readers.len() != before;
-        // A session asks all of its publishers whenever an endpoint ends anywhere.
+        // Most calls find no reader: a session calls all of its publishers whenever any endpoint ends.
         if gone {
             self.changed();
         }
         gone
     }
 
-    /// Adds to `found` the positions that any reader pins, after
-    /// [`about_to_scan`](crate::ring::pins::about_to_scan).
+    /// Adds to `found` the positions that any reader pins. Call
+    /// [`about_to_scan`](crate::ring::pins::about_to_scan) first.
     pub(crate) fn scan(&mut self, found: &mut Pinned) {
         self.pin_lanes.scan(found);
     }
 
-    /// A reader that pins one of `positions`, and its session where that is not our own; `None` when
-    /// looking for it found that some of those that did are dead.
+    /// Returns a reader that pins one of `positions`, with its session if that is another one. Returns `None`
+    /// also if the search found that readers had left or died: look again then.
     pub(crate) fn holder(&mut self, positions: &[u64]) -> Option<PinningReader> {
         if self.pin_lanes.sweep(|_| true) { None } else { self.pin_lanes.holder(positions) }
     }
@@ -236,14 +242,14 @@ impl ReaderSet {
         self.pin_lanes.len()
     }
 
-    /// Forgets those that may keep samples no longer, as they have left or their process has ended.
+    /// Forgets the lanes that pin no samples any more, because the reader has left or its process has ended.
     pub(crate) fn sweep(&mut self) {
         self.pin_lanes.sweep(|_| true);
     }
 
-    /// Stops counting on readers whose process has ended; [`Self::drop_dead`] names them. What a relay
-    /// among them was not done with is given up; what one had that carried it to a process which may
-    /// live on is kept for a while.
+    /// Stops counting on readers whose process has ended; [`drop_dead`](Self::drop_dead) returns them. A dead
+    /// carrier may leave undelivered samples. They are kept for its successor for a while if the publisher
+    /// and the carrier are both RELIABLE and KEEP_ALL. Otherwise they are given up.
     pub(crate) fn mark_dead(&mut self, head: u64) {
         let late = self.absent.expire(head);
         self.given_up = self.given_up.saturating_add(late);
@@ -263,8 +269,8 @@ impl ReaderSet {
         }
     }
 
-    /// A reader that stands for others says that so many samples do not get there: of those that were
-    /// published since it came, and each of them once.
+    /// Counts samples that a relay reports as given up. Counts each sample once, and no more samples than
+    /// were published since the relay attached.
     pub(crate) fn give_up(&mut self, reader: Gid, samples: u64, head: u64) {
         let known = self.readers.iter_mut().find(|known| known.info.gid == reader);
         if let Some(known) = known.filter(|known| !known.dead) {
@@ -272,8 +278,8 @@ impl ReaderSet {
         }
     }
 
-    /// Samples that readers who stand for others gave up: those of them that were
-    /// [handed over](Self::delivered_up_to) are counted if that was asked before.
+    /// Returns the number of samples that relays gave up. That includes every given-up sample below the
+    /// position that an earlier call of [`delivered_up_to`](Self::delivered_up_to) returned.
     pub(crate) fn given_up(&mut self, head: u64) -> u64 {
         for reader in self.readers.iter_mut().filter(|r| !r.dead && r.info.stands_for.is_some()) {
             self.given_up = self.given_up.saturating_add(reader.newly_given_up(head));
@@ -286,10 +292,10 @@ impl ReaderSet {
         self.drop_those(|reader| reader.dead)
     }
 
-    /// Forgets those that have left, too, whether or not they keep samples.
+    /// Forgets dead readers and readers that have left, whether or not they keep samples.
     pub(crate) fn drop_gone(&mut self, head: u64) -> Vec<Gid> {
         self.mark_dead(head);
-        // A reader's cursor is at the end of all positions once it takes no more.
+        // A reader sets its cursor past all positions when it stops taking samples.
         self.drop_those(|reader| reader.dead || matches!(reader.position(), None | Some(u64::MAX)))
     }
 
@@ -309,7 +315,7 @@ impl ReaderSet {
         gids
     }
 
-    /// What of the ring is wanted now that `head` is the next position.
+    /// Returns the positions from which on samples are kept, now that `head` is the next position.
     #[inline]
     pub(crate) fn floors(&self, head: u64) -> Floors {
         let holds = holds(&self.offered);
@@ -329,8 +335,8 @@ impl ReaderSet {
         floors
     }
 
-    /// Below this position every reader has taken what it wanted, and a later reader gets nothing:
-    /// so no reader asks for it again.
+    /// Returns the position below which no reader asks for a sample again: every reader has taken what it
+    /// wants, and later readers get no history.
     pub(crate) fn consumed(&self, head: u64) -> u64 {
         if self.offered.durability == Durability::TransientLocal {
             return 0;
@@ -341,7 +347,7 @@ impl ReaderSet {
         cursors.chain(absent).min().unwrap_or(head)
     }
 
-    /// Below this every reader that carries samples elsewhere is done with what it wanted.
+    /// Returns the position below which every carrier has delivered its samples.
     pub(crate) fn delivered_up_to(&mut self, head: u64) -> u64 {
         let carriers = self.readers.iter_mut().filter(|r| !r.dead && r.is_carrier());
         let done = carriers.filter_map(|reader| reader.delivered(head));
@@ -353,17 +359,17 @@ impl ReaderSet {
         self.readers.iter().filter(|reader| !reader.dead && reader.is_carrier())
     }
 
-    /// Whether a reader that carries samples elsewhere has not taken the one at `tail`.
+    /// Returns whether a carrier has not taken the sample at `tail`.
     pub(crate) fn has_carrier_behind(&self, tail: u64) -> bool {
         self.carriers().filter_map(Attached::position).any(|position| position <= tail)
     }
 
-    /// Whether samples are kept for a reader whose process ended.
+    /// Returns whether samples are kept for a carrier whose process has ended.
     pub(crate) fn has_absent(&self) -> bool {
         !self.absent.is_empty()
     }
 
-    /// Whether samples are kept for this reader, which carries them to another process.
+    /// Returns why samples are kept for this carrier; `None` if none are.
     pub(crate) fn carried(&mut self, reader: &Gid, head: u64) -> Option<Carried> {
         self.mark_dead(head);
         if self.carriers().any(|known| known.info.gid == *reader) {
@@ -372,17 +378,18 @@ impl ReaderSet {
         self.absent.until(reader).map(Carried::Absent)
     }
 
-    /// How long it takes until one of the absent readers is given up.
+    /// Returns the time until the first absent carrier is given up.
     pub(crate) fn absent_for(&self) -> Option<Duration> {
         self.absent.left()
     }
 
-    /// The sessions of those that do.
+    /// Returns the other sessions that have a carrier.
     pub(crate) fn relays(&self) -> Vec<Arc<PeerSession>> {
         self.carriers().filter_map(|reader| reader.info.peer.remote().cloned()).collect()
     }
 
-    /// The reader that has most to take of those that hold `tail`, and the sessions of all these.
+    /// Returns the reader that is furthest behind among the readers that hold `tail`, and the sessions of all
+    /// of them.
     pub(crate) fn laggards(&self, tail: u64, head: u64) -> Option<(Gid, Vec<Arc<PeerSession>>)> {
         let mut worst = None;
         let mut peers = Vec::new();
@@ -397,32 +404,35 @@ impl ReaderSet {
         worst.into_iter().chain(absent).min().map(|(_, gid)| (gid, peers))
     }
 
-    /// Whether a KEEP_ALL reader of another session has not taken up its grant, though there are samples for it.
+    /// Returns whether a RELIABLE, KEEP_ALL reader of another session has samples to take and has not taken
+    /// up its grant.
     pub(crate) fn expects_readers(&self, head: u64) -> bool {
         self.asking(head).any(|reader| holds(&reader.info.qos))
     }
 
-    /// The readers of other sessions that have not taken up their grant, and how many samples there are for each: of a
-    /// KEEP_LAST one no more than its depth. What readers carry elsewhere is counted there.
+    /// Returns the readers of other sessions that have not taken up their grant, each with the number of
+    /// samples for it. A KEEP_LAST reader counts no more samples than its depth. Carriers are left out: their
+    /// samples are counted at their destination.
     pub(crate) fn unmet(&self, head: u64) -> Vec<(Gid, u64)> {
         let readers = self.asking(head).filter(|reader| !reader.is_carrier());
         let samples = |reader: &Attached| (head - reader.grant.first).min(depth(&reader.info.qos));
         readers.map(|reader| (reader.info.gid, samples(reader))).collect()
     }
 
-    /// What was granted to readers of other sessions that have not taken it up, and carry samples nowhere.
+    /// Returns the grants that readers of other sessions have not taken up. Carriers are left out.
     pub(crate) fn untaken_grants(&self) -> Vec<(Gid, Grant)> {
         let readers = self.asking(u64::MAX).filter(|reader| !reader.is_carrier());
         readers.map(|reader| (reader.info.gid, reader.grant)).collect()
     }
 
-    /// The readers of other sessions that live and have not taken up their grant, though there are samples for them.
+    /// Returns the readers of other, living sessions that have samples to take and have not taken up their
+    /// grant.
     fn asking(&self, head: u64) -> impl Iterator<Item = &Attached> {
         self.readers.iter().filter(move |reader| reader.is_asking(head))
     }
 
-    /// There is one reader more. A publisher of hundreds gets them one by one, so that what stands is
-    /// added to, and not found anew.
+    /// Adds one reader to the summaries. A publisher of hundreds of readers gets them one by one, so the
+    /// summaries are extended and not rebuilt.
     fn joined(&mut self, info: &ReaderInfo) {
         self.followers |= self.may_follow(info);
         self.window = self.window.max(wanted(&info.qos)).min(self.capacity);
@@ -432,7 +442,7 @@ impl ReaderSet {
         }
     }
 
-    /// There are others than before.
+    /// Rebuilds the summaries after readers have left.
     fn changed(&mut self) {
         self.window = if self.keeps_all() {
             self.capacity
@@ -445,7 +455,7 @@ impl ReaderSet {
         let mut met = HashSet::new();
         let peers = self.readers.iter().map(|reader| &reader.info.peer);
         self.peers = peers.filter(|peer| met.insert(peer.id())).cloned().collect();
-        // Nobody watches the processes of those that are not attached any more.
+        // Nothing watches the processes of detached readers any more.
         let attached: HashSet<u64> =
             self.readers.iter().map(|reader| reader.grant.generation).collect();
         self.pin_lanes.sweep(|lane| !attached.contains(&lane.tenancy.generation()));

@@ -16,15 +16,14 @@ use crate::ffi::{
     wait::duration,
 };
 
-/// A client of a node: `topic` in the options is the service's name. Of responses that were not taken
-/// it keeps of each server what a server keeps of each client's requests. When it returns, the client
-/// is matched with those servers that the graph shows, unless they take longer than 50 ms.
+/// Creates a client in a node. `topic` in the options is the service's name. A KEEP_LAST client keeps the
+/// newest untaken responses of each server, as many as its depth; a KEEP_ALL client keeps all. When the call
+/// returns, the client is matched with the servers in the graph, unless that takes longer than 50 ms.
 ///
-/// Returns as `axon_session_publisher_create`.
+/// Returns the same codes as `axon_session_publisher_create`.
 ///
 /// # Safety
-/// `options` points to options whose pointers point to what they say; `client` points to room for a
-/// handle.
+/// `options` points to options whose pointers point to valid data. `client` points to room for a handle.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_client_create(
     node: axon_node_t,
@@ -34,37 +33,36 @@ pub unsafe extern "C" fn axon_session_client_create(
     guarded(|| {
         present(client, "the place of the client")?;
         let node = named(node)?;
-        // SAFETY: the caller's word. Both ends of a service are created alike.
+        // SAFETY: guaranteed by the caller. Both ends of a service get the same profile.
         let (spec, _) = unsafe { spec(options) }?;
         let created = node.create_client(spec)?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { give(created, client) }
     })
 }
 
-/// Ends a client. Its callback has returned, and is not called any more, when this returns.
+/// Destroys a client. When the call returns, the client's callback has returned and is not called again.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_client_destroy(client: axon_client_t) -> axon_ret_t {
     guarded(|| end(client))
 }
 
-/// What the client is: its GID, and the profile that it has for requests and for responses. Null
-/// where one is not wanted.
+/// Stores the client's GID, and its profile for requests and responses. A null pointer skips its value.
 ///
 /// # Safety
-/// `gid` and `qos` are null or point to room for one.
+/// `gid` and `qos` are null or point to room for their value.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_client_describe(
     client: axon_client_t,
     gid: *mut axon_gid_t,
     qos: *mut axon_qos_t,
 ) -> axon_ret_t {
-    // SAFETY: the caller's word.
+    // SAFETY: guaranteed by the caller.
     guarded(|| unsafe { describe(client, gid, qos) })
 }
 
-/// How many servers a request that is sent now reaches, and whose responses reach the client: the
-/// service is available where there is one.
+/// Counts the servers that receive a request sent now and whose responses reach the client. The service is
+/// available if there is at least one.
 ///
 /// # Safety
 /// `count` points to room for a number.
@@ -73,12 +71,12 @@ pub unsafe extern "C" fn axon_session_client_matched(
     client: axon_client_t,
     count: *mut usize,
 ) -> axon_ret_t {
-    // SAFETY: the caller's word.
+    // SAFETY: guaranteed by the caller.
     guarded(|| unsafe { matched(client, count) })
 }
 
-/// Blocks until the service is available, for at most `timeout` nanoseconds (negative: for ever):
-/// AXON_RET_TIMEOUT where it is not.
+/// Blocks until the service is available, for at most `timeout` nanoseconds (negative: without end).
+/// AXON_RET_TIMEOUT: the service did not become available.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_client_wait_available(
     client: axon_client_t,
@@ -93,12 +91,11 @@ pub extern "C" fn axon_session_client_wait_available(
     })
 }
 
-/// Sends a request of `len` bytes at `data`, which are copied, to every server that is there, and
-/// stores its number, from 1, at `sequence`, which may be null. Where there is no server, nobody will
-/// answer.
+/// Sends a request to every matched server. Copies the `len` bytes at `data`. Stores the request's number,
+/// which starts at 1, at `sequence`, which may be null. Without a server no response will arrive.
 ///
-/// May block for 100 ms where a server does not take its requests: AXON_RET_TIMEOUT when it made no
-/// room. The rest is as for `axon_session_publisher_publish`.
+/// May block for 100 ms if a server does not take its requests. AXON_RET_TIMEOUT: the server made no room.
+/// All other results are those of `axon_session_publisher_publish`.
 ///
 /// # Safety
 /// `data` points to `len` bytes, or is null and `len` 0; `sequence` is null or points to room for a
@@ -113,20 +110,20 @@ pub unsafe extern "C" fn axon_session_client_request(
     guarded(|| {
         present_if_wanted(sequence)?;
         let client = named(client)?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let payload = unsafe { elements(data, len, "the request") }?;
         let sent = client.send_request(payload);
         let number = sent.map_err(|e| CallFailure::from(e).of_endpoint(client.endpoint()))?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { store_if_wanted(sequence, number) }
     })
 }
 
-/// Copies the next response to where `room` says, as `axon_session_subscription_take`. The
-/// publication's number in `info` is that of the request.
+/// Copies the next response to the memory that `room` returns, as `axon_session_subscription_take` does. The
+/// publication's number in `info` is the number of the request.
 ///
 /// # Safety
-/// As there.
+/// As for `axon_session_subscription_take`.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_client_take(
     client: axon_client_t,
@@ -137,16 +134,16 @@ pub unsafe extern "C" fn axon_session_client_take(
 ) -> axon_ret_t {
     guarded(|| {
         let client = named(client)?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let place = unsafe { CopyTarget::new(room, user, info, taken) }?;
         place.put(|| client.take_response_sample(), client.endpoint())
     })
 }
 
-/// Takes the next response in place, as `axon_session_subscription_take_sample`.
+/// Takes the next response in place, as `axon_session_subscription_take_sample` does.
 ///
 /// # Safety
-/// As there.
+/// As for `axon_session_subscription_take_sample`.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_client_take_sample(
     client: axon_client_t,
@@ -158,15 +155,15 @@ pub unsafe extern "C" fn axon_session_client_take_sample(
     guarded(|| {
         let client = named(client)?;
         let to = SampleInPlace { sample, data, len, info };
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { to.put(|| client.take_response_sample(), client.endpoint()) }
     })
 }
 
-/// Has `callback` told of new responses, as `axon_session_subscription_set_callback`.
+/// Sets the callback for new responses, as `axon_session_subscription_set_callback` does.
 ///
 /// # Safety
-/// As there.
+/// As for `axon_session_subscription_set_callback`.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_client_set_callback(
     client: axon_client_t,

@@ -16,14 +16,14 @@ use crate::{
     session::{Client, EndpointSpec, OnNew, Publisher, Server, SessionError, Subscription},
 };
 
-/// The most bytes that the hash of a type may have.
+/// The largest size of a type's hash in bytes.
 pub const AXON_TYPE_HASH_SIZE: usize = 64;
 
-/// Names an endpoint or a node: no other anywhere has the same.
+/// The globally unique ID of an endpoint or a node.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct axon_gid_t {
-    /// In the order in which they are shown.
+    /// The bytes in the order in which tools print them.
     pub bytes: [u8; 16],
 }
 
@@ -33,44 +33,44 @@ impl From<Gid> for axon_gid_t {
     }
 }
 
-/// What an endpoint is created with. All zeros but the two names is a usual one.
+/// The options of a new endpoint. All fields but the two names may be zero.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct axon_endpoint_options_t {
-    /// The full name of the topic or service, of at most 512 bytes. AXON gives it no meaning.
+    /// The full name of the topic or service, of at most 512 bytes. AXON does not interpret the name.
     pub topic: *const c_char,
     /// The type's name. Endpoints match on topic and type.
     pub type_name: *const c_char,
-    /// The type's hash, of at most AXON_TYPE_HASH_SIZE bytes. Where both ends know it, it must be the
-    /// same.
+    /// The type's hash, of at most AXON_TYPE_HASH_SIZE bytes. If both ends know the hash, the two must be
+    /// equal.
     pub type_hash: *const u8,
-    /// 0: it is not known.
+    /// The size of the hash in bytes; 0 if the hash is unknown.
     pub type_hash_size: usize,
-    /// What it offers or requests.
+    /// The profile that the endpoint offers or requests.
     pub qos: axon_qos_t,
-    /// A subscription: not 0 to receive nothing from publishers of its own session.
+    /// Subscription only: a value other than 0 ignores publishers of the subscription's own session.
     pub ignore_local: u8,
-    /// 0.
+    /// Must be 0.
     pub reserved: [u8; 3],
-    /// A publisher: the length of most samples in bytes; 0 where it is not known. Where it is more than
-    /// 512, the publisher has memory of its own for samples from the start, which each reader maps, and
-    /// loans of more than 512 bytes are in place there, like all samples of more than 4 KiB. Otherwise
-    /// only the latter are, in memory that comes with the first of them.
+    /// Publisher only: the length of most samples in bytes; 0 if unknown. With a length of more than 512, the
+    /// publisher allocates memory for samples at creation, which each reader maps. Loans of more than 512
+    /// bytes and all samples of more than 4 KiB are then in place there. Otherwise only samples of more than
+    /// 4 KiB are in place, in memory that is allocated for the first of them.
     pub expected_len: u32,
 }
 
-/// What is asked for, with the profile as it is asked for.
+/// Converts options to an endpoint specification, and returns the requested profile with it.
 ///
 /// # Safety
-/// `options` points to options whose pointers point to what they say.
+/// `options` points to options whose pointers point to valid data.
 pub(super) unsafe fn spec(
     options: *const axon_endpoint_options_t,
 ) -> Result<(EndpointSpec, QosRequest), CallFailure> {
-    // SAFETY: the caller's word.
+    // SAFETY: guaranteed by the caller.
     let options = unsafe { value(options, "the pointer to the options") }?;
-    // SAFETY: the caller's word.
+    // SAFETY: guaranteed by the caller.
     let topic = unsafe { text(options.topic, "the topic") }?;
-    // SAFETY: the caller's word.
+    // SAFETY: guaranteed by the caller.
     let type_name = unsafe { text(options.type_name, "the type's name") }?;
     let hash_size = options.type_hash_size;
     if hash_size > AXON_TYPE_HASH_SIZE {
@@ -79,7 +79,7 @@ pub(super) unsafe fn spec(
         );
         return Err(CallFailure::argument(text).of(topic));
     }
-    // SAFETY: the caller's word.
+    // SAFETY: guaranteed by the caller.
     let hash = unsafe { elements(options.type_hash, hash_size, "the type's hash") }?;
     let request = options.qos.request().map_err(|failure| failure.of(topic))?;
     let spec = EndpointSpec {
@@ -91,15 +91,15 @@ pub(super) unsafe fn spec(
     Ok((spec, request))
 }
 
-/// What a handle of any endpoint names.
+/// The object that the handle of any endpoint names.
 pub(super) trait EndpointObject {
     fn endpoint(&self) -> &Endpoint;
 
-    /// How many others it is matched with.
+    /// Returns the number of matched endpoints.
     fn count(&self) -> usize;
 }
 
-/// An endpoint of which something is taken.
+/// An endpoint that takes messages.
 pub(super) trait Taking: EndpointObject {
     fn set_on_new(&self, callback: Option<OnNew>) -> Result<(), SessionError>;
     fn tell_no_more(&self);
@@ -136,10 +136,10 @@ objects! {
     Client: servers, set_on_new_response;
 }
 
-/// Stores what an endpoint is.
+/// Stores the GID and the profile of an endpoint.
 ///
 /// # Safety
-/// `gid` and `qos` are null or point to room for one.
+/// `gid` and `qos` are null or point to room for their value.
 pub(super) unsafe fn describe<H: FfiHandle<Object: EndpointObject>>(
     handle: H,
     gid: *mut axon_gid_t,
@@ -149,13 +149,13 @@ pub(super) unsafe fn describe<H: FfiHandle<Object: EndpointObject>>(
     present_if_wanted(qos)?;
     let object = named(handle)?;
     let endpoint = object.endpoint();
-    // SAFETY: the caller's word.
+    // SAFETY: guaranteed by the caller.
     unsafe { store_if_wanted(gid, endpoint.gid.into()) }?;
-    // SAFETY: the caller's word.
+    // SAFETY: guaranteed by the caller.
     unsafe { store_qos(qos, &endpoint.qos) }
 }
 
-/// Stores how many others an endpoint is matched with.
+/// Stores the number of endpoints that an endpoint is matched with.
 ///
 /// # Safety
 /// `count` points to room for a number.
@@ -164,11 +164,11 @@ pub(super) unsafe fn matched<H: FfiHandle<Object: EndpointObject>>(
     count: *mut usize,
 ) -> Result<(), CallFailure> {
     let matched = named(handle)?.count();
-    // SAFETY: the caller's word.
+    // SAFETY: guaranteed by the caller.
     unsafe { store(count, matched, "the place of the number") }
 }
 
-/// Has `callback` told of what comes to an endpoint.
+/// Sets the callback for an endpoint's new messages.
 pub(super) fn set_callback<H: FfiHandle<Object: Taking>>(
     handle: H,
     callback: axon_callback_t,
@@ -177,13 +177,13 @@ pub(super) fn set_callback<H: FfiHandle<Object: Taking>>(
     let object = named(handle)?;
     let set = object.set_on_new(told(callback, user));
     set.map_err(|error| CallFailure::from(error).of_endpoint(object.endpoint()))?;
-    // One that was destroyed meanwhile has none.
+    // An object that was destroyed meanwhile has no callback.
     named(handle).map(drop)
 }
 
 /// Ends an endpoint that has a callback.
 pub(super) fn end<H: FfiHandle<Object: Taking>>(handle: H) -> Result<(), CallFailure> {
-    // Another call may keep it for a while.
+    // A concurrent call may keep the object for a while.
     revoke(handle)?.tell_no_more();
     Ok(())
 }

@@ -11,18 +11,22 @@ use crate::ffi::{
     memory::{present, present_if_wanted, store, store_if_wanted},
 };
 
-/// Lends `len` bytes to be written and then published: in shared memory where they are more than
-/// 4 KiB, or more than 512 bytes if the publisher was created to expect so many, so that nothing is
-/// copied. They are at `data` and hold zeros or bytes of earlier samples.
-/// Aligned to 16 is what is behind the first `header` of them, here and where they are taken in place:
-/// 0 for all of them, 4 for a structure that follows a header of four bytes. Fewer than `len` may be published, so that what is serialized can be given its
-/// upper bound. Blocks and fails as `axon_session_publisher_publish`.
+/// Lends `len` bytes of memory at `data`, which the program writes and then publishes. The memory is shared
+/// memory if `len` is more than 4 KiB, or more than 512 bytes for a publisher that expects samples of more
+/// than 512 bytes. Such a sample is published without a copy. The bytes hold zeros or data of earlier
+/// samples.
 ///
-/// One thread at a time may write. The bytes may be used until the loan is published or abandoned;
-/// memory of a loan that is neither is lost to the publisher. A forked child may not use them.
+/// The byte after the first `header` bytes is aligned to 16, both here and where the sample is taken in
+/// place. Pass 0 to align the whole sample, or 4 for a structure that follows a header of four bytes. The
+/// program may publish fewer than `len` bytes, so `len` can be an upper bound of the serialized size. Blocks
+/// and fails as `axon_session_publisher_publish` does.
+///
+/// One thread at a time may write. The bytes may be used until the loan is published or abandoned. The
+/// publisher loses the memory of a loan that is neither published nor abandoned. A forked child may not use
+/// the bytes.
 ///
 /// # Safety
-/// `loan` and `data` point to room for a handle and a pointer.
+/// `loan` points to room for a handle, and `data` to room for a pointer.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_publisher_loan(
     publisher: axon_publisher_t,
@@ -40,18 +44,18 @@ pub unsafe extern "C" fn axon_session_publisher_loan(
         let at = lent.as_mut_ptr();
         let publisher = std::sync::Arc::downgrade(&publisher);
         let object = NamedLoan { len, loan: Mutex::new(Some(lent)), publisher };
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { give(object, loan) }?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { store(data, at, "the place of the pointer") }
     })
 }
 
-/// Publishes the first `len` bytes of a loan, as `axon_session_publisher_publish` does. The loan is
-/// over, whatever this returns, but for AXON_RET_INVALID_ARGUMENT: `len` is more than was lent.
+/// Publishes the first `len` bytes of a loan, as `axon_session_publisher_publish` does. The loan ends with
+/// every result except AXON_RET_INVALID_ARGUMENT: `len` is more than was lent.
 ///
 /// # Safety
-/// `sequence` is null or points to room for a number. Nobody uses the loan's bytes any more.
+/// `sequence` is null or points to room for a number. No code uses the loan's bytes from now on.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_loan_publish(
     loan: axon_loan_t,
@@ -75,7 +79,7 @@ pub unsafe extern "C" fn axon_session_loan_publish(
         let published = memory.publish(len, time(source_timestamp));
         let number =
             published.map_err(|e| CallFailure::from(e).of_endpoint(publisher.endpoint()))?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { store_if_wanted(sequence, number) }
     })
 }

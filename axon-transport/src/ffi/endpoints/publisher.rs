@@ -1,4 +1,4 @@
-//! Publishers.
+//! The C functions of publishers.
 
 use super::endpoint::{axon_endpoint_options_t, axon_gid_t, describe, matched, spec};
 use crate::{
@@ -15,23 +15,22 @@ use crate::{
     session::from_unix_nanos,
 };
 
-/// The time at which the call is made, as a sample's source timestamp.
+/// A source timestamp that means the time of the call.
 pub const AXON_TIME_NOW: i64 = i64::MIN;
 
-/// A point in time of the caller's; `None` is now.
+/// Converts a source timestamp of the caller; `None` is now.
 pub(super) fn time(timestamp: i64) -> Option<i64> {
     (timestamp != AXON_TIME_NOW).then_some(timestamp)
 }
 
-/// A publisher of a node. When it returns, the publisher is matched with those subscriptions that the
-/// graph shows, unless they take longer than 50 ms.
+/// Creates a publisher in a node. When the call returns, the publisher is matched with the subscriptions in
+/// the graph, unless that takes longer than 50 ms.
 ///
 /// AXON_RET_INVALID_ARGUMENT: a name, the hash or a policy is out of bounds. AXON_RET_BAD_ALLOC: shared
-/// memory is short. AXON_RET_DENIED: the session's permissions do not allow it.
+/// memory is short. AXON_RET_DENIED: the session's permissions do not allow the endpoint.
 ///
 /// # Safety
-/// `options` points to options whose pointers point to what they say; `publisher` points to room for
-/// a handle.
+/// `options` points to options whose pointers point to valid data. `publisher` points to room for a handle.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_publisher_create(
     node: axon_node_t,
@@ -41,47 +40,48 @@ pub unsafe extern "C" fn axon_session_publisher_create(
     guarded(|| {
         present(publisher, "the place of the publisher")?;
         let node = named(node)?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let (mut spec, request) = unsafe { spec(options) }?;
         let graph = node.session().graph();
         let others = graph.endpoints_of(EndpointKind::Subscription, &spec.topic);
         let others: Vec<Qos> = others.iter().map(|entry| entry.endpoint.qos).collect();
         spec.qos = request.for_publisher(&others);
         let created = node.create_publisher(spec)?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { give(created, publisher) }
     })
 }
 
-/// Ends a publisher. Subscriptions still take what it left. What it lent can only be abandoned then.
+/// Destroys a publisher. Subscriptions can still take its remaining samples. Its loans can then only be
+/// abandoned.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_publisher_destroy(publisher: axon_publisher_t) -> axon_ret_t {
     guarded(|| revoke(publisher).map(drop))
 }
 
-/// What the publisher is: its GID, and the profile that it has. Null where one is not wanted.
+/// Stores the publisher's GID and profile. A null pointer skips its value.
 ///
 /// # Safety
-/// `gid` and `qos` are null or point to room for one.
+/// `gid` and `qos` are null or point to room for their value.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_publisher_describe(
     publisher: axon_publisher_t,
     gid: *mut axon_gid_t,
     qos: *mut axon_qos_t,
 ) -> axon_ret_t {
-    // SAFETY: the caller's word.
+    // SAFETY: guaranteed by the caller.
     guarded(|| unsafe { describe(publisher, gid, qos) })
 }
 
-/// Publishes a sample of `len` bytes at `data`, which are copied. `source_timestamp` is in
-/// nanoseconds since the Unix epoch, or AXON_TIME_NOW. Its sequence number, from 1, is stored at
-/// `sequence`, which may be null.
+/// Publishes a sample. Copies the `len` bytes at `data`. `source_timestamp` is in nanoseconds since the Unix
+/// epoch, or AXON_TIME_NOW. Stores the sample's sequence number, which starts at 1, at `sequence`, which may
+/// be null.
 ///
-/// Where the publisher and a subscription are both RELIABLE and KEEP_ALL, it may block for 100 ms until
-/// the subscription makes room: AXON_RET_TIMEOUT where its history stayed full, AXON_RET_BAD_ALLOC where
-/// memory stayed short. Never else. AXON_RET_BAD_ALLOC: memory is short, or what loans and subscriptions
-/// hold fills that of the publisher. AXON_RET_INVALID_ARGUMENT: the sample is longer than
-/// `AXON_MAX_MESSAGE_MB` allows. A sample that was refused has no number: nobody counts it lost.
+/// The call may block for up to 100 ms if the publisher and a subscription are both RELIABLE and KEEP_ALL and
+/// the subscription has no room. It never blocks otherwise. AXON_RET_TIMEOUT: the subscription's history
+/// stayed full. AXON_RET_BAD_ALLOC: memory is short, or loans and subscriptions hold all memory of the
+/// publisher. AXON_RET_INVALID_ARGUMENT: the sample is longer than `AXON_MAX_MESSAGE_MB` allows. A refused
+/// sample gets no sequence number, so no subscription counts it as lost.
 ///
 /// # Safety
 /// `data` points to `len` bytes, or is null and `len` 0; `sequence` is null or points to room for a
@@ -97,7 +97,7 @@ pub unsafe extern "C" fn axon_session_publisher_publish(
     guarded(|| {
         present_if_wanted(sequence)?;
         let publisher = named(publisher)?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let payload = unsafe { elements(data, len, "the sample") }?;
         let published = match time(source_timestamp) {
             Some(time) => publisher.publish_at(from_unix_nanos(time), payload),
@@ -105,14 +105,14 @@ pub unsafe extern "C" fn axon_session_publisher_publish(
         };
         let number =
             published.map_err(|e| CallFailure::from(e).of_endpoint(publisher.endpoint()))?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { store_if_wanted(sequence, number) }
     })
 }
 
-/// If a sample would be read by nobody, now or later, uses up the next sequence number and stores it
-/// at `sequence`; stores 0 where somebody would. Publishing does the same where nobody reads, but
-/// a caller that has to serialize first can save the work.
+/// Skips a sample that no subscription would read, now or later: uses up the next sequence number and stores
+/// it at `sequence`. Stores 0 if a subscription would read the sample. Publishing without readers has the
+/// same effect, but this call saves the caller the work of serializing first.
 ///
 /// # Safety
 /// `sequence` points to room for a number.
@@ -127,12 +127,12 @@ pub unsafe extern "C" fn axon_session_publisher_skip_unread(
         let skipped = publisher.skip_unread();
         let skipped =
             skipped.map_err(|e| CallFailure::from(e).of_endpoint(publisher.endpoint()))?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { store(sequence, skipped.unwrap_or(0), "the place of the number") }
     })
 }
 
-/// How many subscriptions receive from the publisher, on this host and on others.
+/// Counts the subscriptions on this and other hosts that receive from the publisher.
 ///
 /// # Safety
 /// `count` points to room for a number.
@@ -141,12 +141,12 @@ pub unsafe extern "C" fn axon_session_publisher_matched(
     publisher: axon_publisher_t,
     count: *mut usize,
 ) -> axon_ret_t {
-    // SAFETY: the caller's word.
+    // SAFETY: guaranteed by the caller.
     guarded(|| unsafe { matched(publisher, count) })
 }
 
-/// Blocks until at least `count` subscriptions receive from the publisher, for at most `timeout`
-/// nanoseconds (negative: for ever): AXON_RET_TIMEOUT where they do not.
+/// Blocks until at least `count` subscriptions receive from the publisher, for at most `timeout` nanoseconds
+/// (negative: without end). AXON_RET_TIMEOUT: fewer subscriptions do.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_publisher_wait_matched(
     publisher: axon_publisher_t,
@@ -163,16 +163,23 @@ pub extern "C" fn axon_session_publisher_wait_matched(
     })
 }
 
-/// Blocks until every sample published so far is acknowledged, for at most `timeout` nanoseconds
-/// (negative: for ever): AXON_RET_TIMEOUT where one is not. Between processes of this host that share
-/// memory a sample is acknowledged at once. Where they share none (AXON_SHM), this host's daemon carries it:
-/// a sample of a RELIABLE and KEEP_ALL publisher for a subscription like it is acknowledged when the other
-/// process has it, any other when the daemon has it. For another host it depends on the QoS of publisher and
-/// subscription. Both RELIABLE and KEEP_ALL: that host has the sample. Both RELIABLE, one of them KEEP_LAST:
-/// that host has the newest samples, as many as the depth (the smaller one), or newer ones; older ones may be
-/// missing. One of them BEST_EFFORT: the sample was sent or dropped. AXON_RET_TIMEOUT comes at once, and
-/// once, when samples were given up since the last call: with a link, or with this host's daemon, for a host
-/// that read nothing, or by a limit.
+/// Blocks until every sample published so far is acknowledged, for at most `timeout` nanoseconds (negative:
+/// without end). AXON_RET_TIMEOUT: a sample is not acknowledged.
+///
+/// A sample is acknowledged at once between processes of this host that share memory. If they share none
+/// (AXON_SHM), this host's daemon carries the sample. If both the publisher and the subscription are RELIABLE
+/// and KEEP_ALL, it is acknowledged when the other process has it. Otherwise it is acknowledged when the
+/// daemon has it.
+///
+/// The meaning for another host depends on the QoS of publisher and subscription:
+///
+/// - Both RELIABLE and KEEP_ALL: that host has the sample.
+/// - Both RELIABLE, one of them KEEP_LAST: that host has the newest samples, as many as the smaller depth, or
+///   newer ones. Older samples may be missing.
+/// - One of them BEST_EFFORT: the sample was sent or dropped.
+///
+/// AXON_RET_TIMEOUT comes at once, and once, if samples were given up since the last call: because a link or
+/// this host's daemon failed, a host stopped reading, or a limit dropped them.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_publisher_wait_acknowledged(
     publisher: axon_publisher_t,
@@ -187,8 +194,8 @@ pub extern "C" fn axon_session_publisher_wait_acknowledged(
     })
 }
 
-/// Says that the publisher is alive. Where its liveliness is MANUAL_BY_TOPIC, so does every
-/// publication; where it is AUTOMATIC, its session says so.
+/// Asserts that the publisher is alive. With MANUAL_BY_TOPIC liveliness, every publication asserts it, too.
+/// With AUTOMATIC liveliness, the session asserts it.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_publisher_assert_liveliness(
     publisher: axon_publisher_t,

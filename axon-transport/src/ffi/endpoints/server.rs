@@ -18,16 +18,15 @@ use crate::{
     ids::Gid,
 };
 
-/// A server of a node: `topic` in the options is the service's name. Of requests that were not taken
-/// a KEEP_LAST server keeps the newest of each client, as many as its depth, and a KEEP_ALL one all.
-/// What is kept is never dropped to make room. When it returns, the server is matched with those
-/// clients that the graph shows, unless they take longer than 50 ms.
+/// Creates a server in a node. `topic` in the options is the service's name. A KEEP_LAST server keeps the
+/// newest untaken requests of each client, as many as its depth; a KEEP_ALL server keeps all. A kept request
+/// is never dropped to make room. When the call returns, the server is matched with the clients in the graph,
+/// unless that takes longer than 50 ms.
 ///
-/// Returns as `axon_session_publisher_create`.
+/// Returns the same codes as `axon_session_publisher_create`.
 ///
 /// # Safety
-/// `options` points to options whose pointers point to what they say; `server` points to room for a
-/// handle.
+/// `options` points to options whose pointers point to valid data. `server` points to room for a handle.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_server_create(
     node: axon_node_t,
@@ -37,36 +36,36 @@ pub unsafe extern "C" fn axon_session_server_create(
     guarded(|| {
         present(server, "the place of the server")?;
         let node = named(node)?;
-        // SAFETY: the caller's word. Both ends of a service are created alike.
+        // SAFETY: guaranteed by the caller. Both ends of a service get the same profile.
         let (spec, _) = unsafe { spec(options) }?;
         let created = node.create_server(spec)?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { give(created, server) }
     })
 }
 
-/// Ends a server. Its callback has returned, and is not called any more, when this returns.
+/// Destroys a server. When the call returns, the server's callback has returned and is not called again.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_server_destroy(server: axon_server_t) -> axon_ret_t {
     guarded(|| end(server))
 }
 
-/// What the server is: its GID, and the profile that it has for requests and for responses. Null
-/// where one is not wanted.
+/// Stores the server's GID, and its profile for requests and responses. A null pointer skips its value.
 ///
 /// # Safety
-/// `gid` and `qos` are null or point to room for one.
+/// `gid` and `qos` are null or point to room for their value.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_server_describe(
     server: axon_server_t,
     gid: *mut axon_gid_t,
     qos: *mut axon_qos_t,
 ) -> axon_ret_t {
-    // SAFETY: the caller's word.
+    // SAFETY: guaranteed by the caller.
     guarded(|| unsafe { describe(server, gid, qos) })
 }
 
-/// How many clients reach the server, and are reached by it.
+/// Counts the clients that are matched in both directions: their requests reach the server, and its responses
+/// reach them.
 ///
 /// # Safety
 /// `count` points to room for a number.
@@ -75,15 +74,15 @@ pub unsafe extern "C" fn axon_session_server_matched(
     server: axon_server_t,
     count: *mut usize,
 ) -> axon_ret_t {
-    // SAFETY: the caller's word.
+    // SAFETY: guaranteed by the caller.
     guarded(|| unsafe { matched(server, count) })
 }
 
-/// Copies the next request to where `room` says, as `axon_session_subscription_take`. The sender and
-/// the publication's number in `info` are what the response must carry.
+/// Copies the next request to the memory that `room` returns, as `axon_session_subscription_take` does. The
+/// response must carry the sender and the publication's number in `info`.
 ///
 /// # Safety
-/// As there.
+/// As for `axon_session_subscription_take`.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_server_take(
     server: axon_server_t,
@@ -94,16 +93,16 @@ pub unsafe extern "C" fn axon_session_server_take(
 ) -> axon_ret_t {
     guarded(|| {
         let server = named(server)?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let place = unsafe { CopyTarget::new(room, user, info, taken) }?;
         place.put(|| server.take_request_sample(), server.endpoint())
     })
 }
 
-/// Takes the next request in place, as `axon_session_subscription_take_sample`.
+/// Takes the next request in place, as `axon_session_subscription_take_sample` does.
 ///
 /// # Safety
-/// As there.
+/// As for `axon_session_subscription_take_sample`.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_server_take_sample(
     server: axon_server_t,
@@ -115,16 +114,16 @@ pub unsafe extern "C" fn axon_session_server_take_sample(
     guarded(|| {
         let server = named(server)?;
         let to = SampleInPlace { sample, data, len, info };
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { to.put(|| server.take_request_sample(), server.endpoint()) }
     })
 }
 
-/// Answers request `sequence` of `client` with `len` bytes at `data`, which are copied. Nobody else
-/// receives it. A client that is gone is no error.
+/// Answers request `sequence` of `client`. Copies the `len` bytes at `data`. Only this client receives the
+/// response. A client that no longer exists is no error.
 ///
-/// May block for 100 ms where the client does not take its responses: AXON_RET_TIMEOUT when it made no
-/// room. The rest is as for `axon_session_publisher_publish`.
+/// May block for 100 ms if the client does not take its responses. AXON_RET_TIMEOUT: the client made no room.
+/// All other results are those of `axon_session_publisher_publish`.
 ///
 /// # Safety
 /// `client` points to a GID; `data` points to `len` bytes, or is null and `len` 0.
@@ -138,19 +137,19 @@ pub unsafe extern "C" fn axon_session_server_respond(
 ) -> axon_ret_t {
     guarded(|| {
         let server = named(server)?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let client = unsafe { value(client, "the client's GID") }?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let payload = unsafe { elements(data, len, "the response") }?;
         let sent = server.send_response(Gid(client.bytes), sequence, payload);
         sent.map_err(|e| CallFailure::from(e).of_endpoint(server.endpoint()))
     })
 }
 
-/// Has `callback` told of new requests, as `axon_session_subscription_set_callback`.
+/// Sets the callback for new requests, as `axon_session_subscription_set_callback` does.
 ///
 /// # Safety
-/// As there.
+/// As for `axon_session_subscription_set_callback`.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_server_set_callback(
     server: axon_server_t,

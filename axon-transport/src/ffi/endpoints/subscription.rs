@@ -1,4 +1,4 @@
-//! Subscriptions, and the samples that they take.
+//! The C functions of subscriptions and of the samples that they take.
 
 use std::{ffi::c_void, mem::MaybeUninit, slice};
 
@@ -22,38 +22,38 @@ use crate::{
     session::{MessageInfo, unix_nanos},
 };
 
-/// What is known of a message besides its bytes. Times are nanoseconds since the Unix epoch.
+/// The metadata of a message. Times are nanoseconds since the Unix epoch.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct axon_message_info_t {
-    /// Who sent it: a publisher, a client of a request, or a server of a response.
+    /// The sender: a publisher, the client of a request, or the server of a response.
     pub sender: axon_gid_t,
-    /// The publication's number, from 1; of a response, that of the request that it answers.
+    /// The publication's number, which starts at 1. A response has the number of its request.
     pub publication_sequence: u64,
-    /// Its number among the messages that this endpoint has taken, from 1.
+    /// The message's number among the messages that this endpoint has taken, which starts at 1.
     pub reception_sequence: u64,
-    /// When it was sent, by the sender's clock.
+    /// The time of sending, by the sender's clock.
     pub source_timestamp: i64,
-    /// When it was taken, by this host's clock.
+    /// The time of taking, by this host's clock.
     pub received_timestamp: i64,
-    /// 1 where the sender is an endpoint of the same session, else 0.
+    /// 1 if the sender is an endpoint of the same session, else 0.
     pub own_session: u8,
     /// 0.
     pub reserved: [u8; 7],
 }
 
-/// Says where a message of `len` bytes is to be put: room for as many, or null where there is none.
-/// It runs in the call that takes the message, and must not take one of the same endpoint itself.
+/// A function that returns memory for a message of `len` bytes, or null if there is none. The taking call
+/// runs the function. The function must not take a message of the same endpoint.
 pub type axon_room_t = Option<unsafe extern "C" fn(user: *mut c_void, len: usize) -> *mut u8>;
 
-/// A subscription of a node. When it returns, the subscription is matched with those publishers that
-/// the graph shows, unless they take longer than 50 ms. There are no content filters.
+/// Creates a subscription in a node. When the call returns, the subscription is matched with the publishers
+/// in the graph, unless that takes longer than 50 ms. Content filters do not exist.
 ///
-/// Returns as `axon_session_publisher_create`.
+/// Returns the same codes as `axon_session_publisher_create`.
 ///
 /// # Safety
-/// `options` points to options whose pointers point to what they say; `subscription` points to room
-/// for a handle.
+/// `options` points to options whose pointers point to valid data. `subscription` points to room for a
+/// handle.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_subscription_create(
     node: axon_node_t,
@@ -63,20 +63,20 @@ pub unsafe extern "C" fn axon_session_subscription_create(
     guarded(|| {
         present(subscription, "the place of the subscription")?;
         let node = named(node)?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let (mut spec, request) = unsafe { spec(options) }?;
         let graph = node.session().graph();
         let others = graph.endpoints_of(EndpointKind::Publisher, &spec.topic);
         let others: Vec<Qos> = others.iter().map(|entry| entry.endpoint.qos).collect();
         spec.qos = request.for_subscription(&others);
         let created = node.create_subscription(spec)?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { give(created, subscription) }
     })
 }
 
-/// Ends a subscription. Samples that were taken in place stay until they are released. Its callback
-/// has returned, and is not called any more, when this returns.
+/// Destroys a subscription. Samples that were taken in place stay valid until they are released. When the
+/// call returns, the subscription's callback has returned and is not called again.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_subscription_destroy(
     subscription: axon_subscription_t,
@@ -84,21 +84,21 @@ pub extern "C" fn axon_session_subscription_destroy(
     guarded(|| end(subscription))
 }
 
-/// What the subscription is: its GID, and the profile that it has. Null where one is not wanted.
+/// Stores the subscription's GID and profile. A null pointer skips its value.
 ///
 /// # Safety
-/// `gid` and `qos` are null or point to room for one.
+/// `gid` and `qos` are null or point to room for their value.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_subscription_describe(
     subscription: axon_subscription_t,
     gid: *mut axon_gid_t,
     qos: *mut axon_qos_t,
 ) -> axon_ret_t {
-    // SAFETY: the caller's word.
+    // SAFETY: guaranteed by the caller.
     guarded(|| unsafe { describe(subscription, gid, qos) })
 }
 
-/// How many publishers the subscription receives from, on this host and on others.
+/// Counts the publishers on this and other hosts that the subscription receives from.
 ///
 /// # Safety
 /// `count` points to room for a number.
@@ -107,12 +107,12 @@ pub unsafe extern "C" fn axon_session_subscription_matched(
     subscription: axon_subscription_t,
     count: *mut usize,
 ) -> axon_ret_t {
-    // SAFETY: the caller's word.
+    // SAFETY: guaranteed by the caller.
     guarded(|| unsafe { matched(subscription, count) })
 }
 
-/// Blocks until the subscription receives from at least `count` publishers, for at most `timeout`
-/// nanoseconds (negative: for ever): AXON_RET_TIMEOUT where it does not.
+/// Blocks until the subscription receives from at least `count` publishers, for at most `timeout` nanoseconds
+/// (negative: without end). AXON_RET_TIMEOUT: it receives from fewer.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_subscription_wait_matched(
     subscription: axon_subscription_t,
@@ -129,16 +129,17 @@ pub extern "C" fn axon_session_subscription_wait_matched(
     })
 }
 
-/// Copies the oldest sample, by source timestamp among all publishers, to where `room` says, and
-/// stores what is known of it at `info`, which may be null. `taken` is 0 where there was none, and
-/// then `room` is not called. A publisher whose sample is in memory that this process has not been told
-/// of yet, such as its first one of more than 4 KiB, holds up none of the others.
+/// Copies the oldest sample, by source timestamp among all publishers, to the memory that `room` returns.
+/// Stores its metadata at `info`, which may be null. Stores 1 at `taken`, or 0 if there was no sample; then
+/// `room` is not called. A publisher's sample may be in memory that this process has not received yet, for
+/// instance the first sample of more than 4 KiB. Such a sample does not delay the samples of other
+/// publishers.
 ///
-/// AXON_RET_BAD_ALLOC: `room` gave none; the sample is gone.
+/// AXON_RET_BAD_ALLOC: `room` returned no memory; the sample is lost.
 ///
 /// # Safety
-/// `room` gives null, or room for as many bytes as it is asked for; `info` is null or points to room
-/// for one; `taken` points to room for a number.
+/// `room` returns null, or memory for as many bytes as it is asked for. `info` is null or points to room for
+/// the metadata. `taken` points to room for a number.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_subscription_take(
     subscription: axon_subscription_t,
@@ -149,26 +150,29 @@ pub unsafe extern "C" fn axon_session_subscription_take(
 ) -> axon_ret_t {
     guarded(|| {
         let subscription = named(subscription)?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         let place = unsafe { CopyTarget::new(room, user, info, taken) }?;
         place.put(|| subscription.take_sample(), subscription.endpoint())
     })
 }
 
-/// Takes the oldest sample, by source timestamp among all publishers, in place: `len` bytes at `data`,
-/// which stand until `axon_session_sample_release`. What was lent is aligned as it was, a copy as
-/// the allocator does it (to 8 at least, but for one of 0 bytes, of which `data` is any address), and what a
-/// publisher wrote that does not keep to the protocol anyhow. One of more than 4 KiB, and a loan of more
-/// than 512 bytes whose publisher expects so many, is in the publisher's memory, of which a subscription
-/// can keep five for each publisher; a sixth is copied.
-/// Where there is none the handle is 0, and nothing else is stored.
+/// Takes the oldest sample, by source timestamp among all publishers, in place. The `len` bytes at `data` are
+/// valid until `axon_session_sample_release`. If there is no sample, the handle is 0 and nothing else is
+/// stored.
 ///
-/// Nobody may write to the bytes, and a forked child may not read them. Such a publisher, in another
-/// process, could change them meanwhile: a parser reads each byte once, and checks what it read.
-/// `AXON_SHM_COPY=1` has all of them copied.
+/// A sample of more than 4 KiB is in the publisher's memory. So is a loan of more than 512 bytes if its
+/// publisher expects samples of more than 512 bytes. A subscription can keep five such samples of each
+/// publisher; a sixth is copied. A lent sample has the alignment of its loan. A copy has the alignment of the
+/// allocator, at least 8; a copy of 0 bytes has any address. Samples of a publisher that violates the
+/// protocol may have any alignment.
+///
+/// No code may write to the bytes, and a forked child may not read them. A publisher in another process that
+/// violates the protocol could change the bytes meanwhile. Therefore a parser should read each byte once and
+/// check the value that it read. `AXON_SHM_COPY=1` makes the library copy all samples.
 ///
 /// # Safety
-/// `sample`, `data` and `len` point to room for one each; `info` is null or does.
+/// `sample`, `data` and `len` point to room for one value each. `info` is null or points to room for the
+/// metadata.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_subscription_take_sample(
     subscription: axon_subscription_t,
@@ -180,20 +184,20 @@ pub unsafe extern "C" fn axon_session_subscription_take_sample(
     guarded(|| {
         let subscription = named(subscription)?;
         let to = SampleInPlace { sample, data, len, info };
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { to.put(|| subscription.take_sample(), subscription.endpoint()) }
     })
 }
 
-/// Gives a sample that was taken in place back: of a subscription, a server or a client. It may be
-/// released after these have ended.
+/// Releases a sample that a subscription, a server or a client took in place. The release may come after the
+/// end of that endpoint.
 #[unsafe(no_mangle)]
 pub extern "C" fn axon_session_sample_release(sample: axon_sample_t) -> axon_ret_t {
     guarded(|| revoke(sample).map(drop))
 }
 
-/// Samples of the subscription that were lost: overwritten before they were taken, or lost on their
-/// way from another host.
+/// Stores the number of samples that the subscription lost: samples that were overwritten before they were
+/// taken, or lost on the way from another host.
 ///
 /// # Safety
 /// `lost` points to room for a number.
@@ -204,20 +208,20 @@ pub unsafe extern "C" fn axon_session_subscription_lost(
 ) -> axon_ret_t {
     guarded(|| {
         let count = named(subscription)?.lost();
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { store(lost, count, "the place of the number") }
     })
 }
 
-/// Has `callback` told of new samples from now on, in place of the one before, which has returned and
-/// is not called any more when this returns, unless this is called from within it. Null: nobody is
-/// told. What is there to be taken, and nobody was told of, it is told at once, in this call; the rest on
-/// the session's thread.
+/// Sets the callback for new samples, which replaces the previous callback. When the call returns, the
+/// previous callback has returned and is not called again, unless the call comes from inside that callback.
+/// Null removes the callback. The call reports untaken samples at once that no callback was called for. The
+/// session's thread reports later samples.
 ///
-/// AXON_RET_ERROR: an event loop of the program's listens already.
+/// AXON_RET_ERROR: an event loop of the program already listens to the session.
 ///
 /// # Safety
-/// `callback` may be called with `user` from any thread until it is replaced or the subscription is
+/// `callback` may be called with `user` from any thread until the callback is replaced or the subscription is
 /// destroyed.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn axon_session_subscription_set_callback(
@@ -242,7 +246,7 @@ impl axon_message_info_t {
     }
 }
 
-/// Where a message is to be copied.
+/// The destination of a message that is copied.
 pub(super) struct CopyTarget {
     room: unsafe extern "C" fn(user: *mut c_void, len: usize) -> *mut u8,
     user: *mut c_void,
@@ -252,7 +256,7 @@ pub(super) struct CopyTarget {
 
 impl CopyTarget {
     /// # Safety
-    /// As [`axon_session_subscription_take`] says, for as long as it stands.
+    /// As for [`axon_session_subscription_take`], for as long as the value lives.
     pub(super) unsafe fn new(
         room: axon_room_t,
         user: *mut c_void,
@@ -266,7 +270,7 @@ impl CopyTarget {
         Ok(Self { room, user, info, taken })
     }
 
-    /// Copies what was taken there.
+    /// Takes a message and copies it to the destination.
     pub(super) fn put(
         self,
         take: impl FnOnce() -> Option<(MessageInfo, Sample)>,
@@ -276,7 +280,7 @@ impl CopyTarget {
         let found = message.is_some();
         if let Some((info, sample)) = message {
             let len = sample.len();
-            // SAFETY: the caller of `new` says that it may be called so.
+            // SAFETY: the caller of `new` allows this call.
             let at = unsafe { (self.room)(self.user, len) };
             if at.is_null() && len > 0 {
                 let text = format_args!("no room for a message of {len} bytes, which is lost");
@@ -284,11 +288,11 @@ impl CopyTarget {
             }
             if len > 0 {
                 let at = at.cast::<MaybeUninit<u8>>();
-                // SAFETY: not null, and room for as many bytes, by the word of the caller of `new`. What
-                // is in it does not matter.
+                // SAFETY: not null, and room for that many bytes, as the caller of `new` guarantees. The old
+                // content does not matter.
                 sample.write_to(unsafe { slice::from_raw_parts_mut(at, len) });
             }
-            // SAFETY: as it was checked in `new`, and by its caller's word.
+            // SAFETY: checked in `new`, and guaranteed by its caller.
             unsafe { store_if_wanted(self.info, axon_message_info_t::new(&info, endpoint)) }?;
         }
         // SAFETY: as above.
@@ -296,7 +300,7 @@ impl CopyTarget {
     }
 }
 
-/// Where one goes that is taken in place.
+/// The destination of a sample that is taken in place.
 pub(super) struct SampleInPlace {
     pub(super) sample: *mut axon_sample_t,
     pub(super) data: *mut *const u8,
@@ -306,7 +310,7 @@ pub(super) struct SampleInPlace {
 
 impl SampleInPlace {
     /// # Safety
-    /// The places are as [`axon_session_subscription_take_sample`] says.
+    /// The pointers are as [`axon_session_subscription_take_sample`] requires.
     pub(super) unsafe fn put(
         self,
         take: impl FnOnce() -> Option<(MessageInfo, Sample)>,
@@ -317,18 +321,18 @@ impl SampleInPlace {
         present(self.len, "the place of the length")?;
         present_if_wanted(self.info)?;
         let Some((info, sample)) = take() else {
-            // SAFETY: the caller's word.
+            // SAFETY: guaranteed by the caller.
             return unsafe { store(self.sample, axon_sample_t { id: 0 }, "the place") };
         };
         let (at, len) = (sample.as_ptr(), sample.len());
         // The bytes stay where they are when the sample moves to its place in the table.
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { give(sample, self.sample) }?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { store(self.data, at, "the place of the pointer") }?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { store(self.len, len, "the place of the length") }?;
-        // SAFETY: the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { store_if_wanted(self.info, axon_message_info_t::new(&info, endpoint)) }
     }
 }

@@ -21,11 +21,11 @@ use crate::{
     session::{Client, Event, GuardCondition, Node, Publisher, Server, Session, Subscription},
 };
 
-/// A session: a process's membership of a domain. Destroyed by `axon_session_close`.
+/// A session: a process's membership of a domain. `axon_session_close` destroys the handle.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct axon_session_t {
-    /// 0 where it is none.
+    /// 0 if the handle names no object.
     pub id: u64,
 }
 
@@ -33,47 +33,47 @@ pub struct axon_session_t {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct axon_node_t {
-    /// 0 where it is none.
+    /// 0 if the handle names no object.
     pub id: u64,
 }
 
-/// Sends the samples of a topic.
+/// A publisher, which sends the samples of a topic.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct axon_publisher_t {
-    /// 0 where it is none.
+    /// 0 if the handle names no object.
     pub id: u64,
 }
 
-/// Receives the samples of a topic.
+/// A subscription, which receives the samples of a topic.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct axon_subscription_t {
-    /// 0 where it is none.
+    /// 0 if the handle names no object.
     pub id: u64,
 }
 
-/// Answers the requests of a service.
+/// A server, which answers the requests of a service.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct axon_server_t {
-    /// 0 where it is none.
+    /// 0 if the handle names no object.
     pub id: u64,
 }
 
-/// Sends requests to a service.
+/// A client, which sends requests to a service.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct axon_client_t {
-    /// 0 where it is none.
+    /// 0 if the handle names no object.
     pub id: u64,
 }
 
-/// A guard condition: stands from when it is triggered until a wait has seen it.
+/// A guard condition. It stays set from its trigger until a wait has reported it.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct axon_guard_t {
-    /// 0 where it is none.
+    /// 0 if the handle names no object.
     pub id: u64,
 }
 
@@ -81,27 +81,27 @@ pub struct axon_guard_t {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct axon_event_t {
-    /// 0 where it is none.
+    /// 0 if the handle names no object.
     pub id: u64,
 }
 
-/// A sample that was taken in place, to be given back by `axon_session_sample_release`.
+/// A sample that was taken in place. `axon_session_sample_release` gives it back.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct axon_sample_t {
-    /// 0 where it is none.
+    /// 0 if the handle names no object.
     pub id: u64,
 }
 
-/// Memory that a publisher lent, to be published or abandoned.
+/// Memory that a publisher lent. The program publishes or abandons the loan.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct axon_loan_t {
-    /// 0 where it is none.
+    /// 0 if the handle names no object.
     pub id: u64,
 }
 
-/// A type of handle, and what it names.
+/// A type of handle, and the type of object that it names.
 pub(in crate::ffi) trait FfiHandle: Copy {
     type Object;
     const WHAT: &'static str;
@@ -113,7 +113,7 @@ pub(in crate::ffi) trait FfiHandle: Copy {
 
 macro_rules! handles {
     ($($number:literal $table:ident: $handle:ident => $object:ty, $what:literal;)+) => {
-        /// What the handles of a process name.
+        /// The tables of all objects that the handles of a process name.
         pub(in crate::ffi) struct Tables {
             process: Process,
             $($table: HandleTable<$object>,)+
@@ -126,7 +126,7 @@ macro_rules! handles {
             }
         }
 
-        /// What a handle of this kind names.
+        /// Returns the name of a kind of object.
         fn what(kind: u8) -> &'static str {
             match kind {
                 $($number => $what,)+
@@ -168,13 +168,13 @@ handles! {
 
 static TABLES: PerProcess<Tables> = PerProcess::new();
 
-/// This process's tables. A forked child begins with new ones.
+/// Returns this process's tables. A forked child starts with new ones.
 fn current() -> Result<&'static Made<Tables>, CallFailure> {
     let none = |_: &'static Tables, _: &'static Tables| {};
     TABLES.get(Tables::new, none).map_err(|error| CallFailure::new(AXON_RET_BAD_ALLOC, error))
 }
 
-/// What a handle names.
+/// Returns the object that a handle names.
 pub(in crate::ffi) fn named<H: FfiHandle>(handle: H) -> Result<Arc<H::Object>, CallFailure> {
     let tables = current()?;
     let found = H::table(tables.value()).get(handle.id());
@@ -183,10 +183,10 @@ pub(in crate::ffi) fn named<H: FfiHandle>(handle: H) -> Result<Arc<H::Object>, C
     found.map_err(|why| unknown(tables, handle, why))
 }
 
-/// A handle for something new, stored at `out`.
+/// Creates a handle for a new object and stores it at `out`.
 ///
 /// # Safety
-/// As [`store`].
+/// As for [`store`].
 pub(in crate::ffi) unsafe fn give<H: FfiHandle>(
     object: H::Object,
     out: *mut H,
@@ -195,17 +195,18 @@ pub(in crate::ffi) unsafe fn give<H: FfiHandle>(
         let what = H::WHAT;
         CallFailure::new(AXON_RET_BAD_ALLOC, format_args!("no {what} more: there are a million"))
     })?;
-    // SAFETY: the caller's word.
+    // SAFETY: guaranteed by the caller.
     unsafe { store(out, H::of(id), "the place of the handle") }
 }
 
-/// Gives a handle up: what it named ends when no call uses it any more.
+/// Removes a handle from its table. Its object ends when no call uses it any more.
 pub(in crate::ffi) fn revoke<H: FfiHandle>(handle: H) -> Result<Arc<H::Object>, CallFailure> {
     let tables = current()?;
     H::table(tables.value()).remove(handle.id()).map_err(|why| unknown(tables, handle, why))
 }
 
-/// Does something with what a handle names, as a signal handler may: see [`HandleTable::visit`].
+/// Runs `visit` on the object that a handle names. A signal handler may call this: see
+/// [`HandleTable::visit`].
 pub(in crate::ffi) fn visit<H: FfiHandle>(
     handle: H,
     visit: impl FnOnce(&H::Object),

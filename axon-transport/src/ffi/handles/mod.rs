@@ -1,4 +1,4 @@
-//! Handles, and the tables of what they name.
+//! Handles, and the tables of the objects that they name.
 
 mod handle;
 mod named_loan;

@@ -7,19 +7,19 @@
 
 use std::sync::{Arc, Mutex, OnceLock, PoisonError, RwLock};
 
-/// Places in the first block; each block after it has twice as many. They come when they are
-/// needed and never go.
+/// Places in the first block; each further block has twice as many. A block is allocated when it is needed
+/// and never freed.
 const FIRST: usize = 64;
-/// Blocks at most: a million objects of one kind in one process.
+/// The most blocks: a million objects of one kind in one process.
 const BLOCKS: usize = 14;
 
-/// A handle's parts, from the least significant bit on: place, kind, process, generation.
+/// The bits of a handle's parts, from the least significant bit on: place, kind, process, generation.
 const PLACE: u32 = 20;
 const KIND: u32 = 4;
 const PROCESS: u32 = 12;
 const GENERATIONS: u32 = u32::MAX >> (PLACE + KIND + PROCESS - 32);
 
-/// The bits by which handles of different processes in a line of forks are told apart.
+/// The bits of a handle that distinguish a process from its ancestors and forked children.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(in crate::ffi) struct Process(u16);
 
@@ -29,21 +29,21 @@ impl Process {
     }
 }
 
-/// Why a handle names nothing.
+/// Why a handle names no object.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(in crate::ffi) enum Unknown {
-    /// It is 0.
+    /// The handle is 0.
     Null,
-    /// It is of this kind.
+    /// The handle is of this other kind.
     OtherKind(u8),
-    /// Another process made it, perhaps one of which this one is a fork.
+    /// The handle has the number of another process, perhaps of the parent of this one.
     Foreign(Process),
-    /// It was destroyed, or never was.
+    /// The handle was destroyed, or never existed.
     Gone,
 }
 
-/// Objects of one kind, by handle. A look-up takes no lock but the place's own, which only the
-/// object's creation and destruction hold for writing.
+/// The objects of one kind, by handle. A look-up takes only the lock of one place. Only the creation and the
+/// destruction of the object there hold that lock for writing.
 pub(in crate::ffi) struct HandleTable<T> {
     kind: u8,
     process: Process,
@@ -54,13 +54,13 @@ pub(in crate::ffi) struct HandleTable<T> {
 struct HandleSlot<T>(RwLock<Content<T>>);
 
 struct Content<T> {
-    /// Of the object that is here, or of the next one.
+    /// The generation of the object at this place, or of the next one if the place is free.
     generation: u32,
     object: Option<Arc<T>>,
 }
 
 struct Free {
-    /// Places that were given up, the newest last.
+    /// Free places that were used before, the newest last.
     places: Vec<usize>,
     /// The first place that was never used.
     fresh: usize,
@@ -77,7 +77,7 @@ impl<T> HandleTable<T> {
         }
     }
 
-    /// A handle for `object`, never 0. `None` when the table is full.
+    /// Inserts `object` and returns its handle, which is never 0. Returns `None` if the table is full.
     pub(in crate::ffi) fn insert(&self, object: T) -> Option<u64> {
         let index = {
             let mut free = self.free.lock().unwrap_or_else(PoisonError::into_inner);
@@ -102,7 +102,7 @@ impl<T> HandleTable<T> {
         Some(generation | process | u64::from(self.kind) << PLACE | index as u64)
     }
 
-    /// What `handle` names.
+    /// Returns the object that `handle` names.
     pub(in crate::ffi) fn get(&self, handle: u64) -> Result<Arc<T>, Unknown> {
         let (place, generation) = self.place(handle)?;
         let content = place.0.read().unwrap_or_else(PoisonError::into_inner);
@@ -112,8 +112,9 @@ impl<T> HandleTable<T> {
         }
     }
 
-    /// Does something with what `handle` names: for a signal handler, as it takes no memory, gives
-    /// none back and waits for nobody. What is being created or destroyed right now names nothing.
+    /// Runs `visit` on the object that `handle` names. A signal handler may call this: the call neither
+    /// allocates nor frees memory, and does not block. An object that is being created or destroyed at this
+    /// moment counts as [`Unknown::Gone`].
     pub(in crate::ffi) fn visit<R>(
         &self,
         handle: u64,
@@ -127,7 +128,7 @@ impl<T> HandleTable<T> {
         }
     }
 
-    /// Gives the handle up and returns what it named, which ends when nobody uses it any more.
+    /// Removes the handle and returns its object, which ends when no call uses it any more.
     pub(in crate::ffi) fn remove(&self, handle: u64) -> Result<Arc<T>, Unknown> {
         let (place, generation) = self.place(handle)?;
         let mut content = place.0.write().unwrap_or_else(PoisonError::into_inner);
@@ -135,7 +136,7 @@ impl<T> HandleTable<T> {
             return Err(Unknown::Gone);
         }
         let object = content.object.take().ok_or(Unknown::Gone)?;
-        // A place whose generations are used up is never used again.
+        // A place is never used again once its generations are used up.
         if content.generation < GENERATIONS {
             content.generation += 1;
             drop(content);
@@ -145,7 +146,7 @@ impl<T> HandleTable<T> {
         Ok(object)
     }
 
-    /// A handle's place and generation.
+    /// Returns the place and the generation of a handle.
     fn place(&self, handle: u64) -> Result<(&HandleSlot<T>, u32), Unknown> {
         if handle == 0 {
             return Err(Unknown::Null);
@@ -166,7 +167,7 @@ impl<T> HandleTable<T> {
     }
 }
 
-/// The block that a place is in, and where.
+/// Splits an index into the block and the position in that block.
 fn split(index: usize) -> (usize, usize) {
     let block = (index / FIRST + 1).ilog2() as usize;
     (block, index - FIRST * ((1 << block) - 1))
@@ -265,7 +266,7 @@ mod tests {
             for round in 0..3000 {
                 let handle = table.insert((thread, round)).unwrap();
                 assert_eq!(*table.get(handle).unwrap(), (thread, round));
-                // Two destroy it at once: one of them does.
+                // In some rounds two threads destroy the handle at once: one of them succeeds.
                 thread::scope(|scope| {
                     if round % 300 == 0 {
                         scope.spawn(|| remove(handle));

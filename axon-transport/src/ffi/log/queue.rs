@@ -16,10 +16,10 @@ use axon_shm::internal::BlockedSignals;
 
 use super::{AXON_LOG_WARN, LogLine};
 
-/// So many lines wait at most.
+/// The most lines that may be queued.
 const ROOM: usize = 256;
 
-/// What a process has said and its thread has not told yet.
+/// A queue of log lines for the thread that calls the callback.
 #[derive(Default)]
 pub(super) struct WaitingLines {
     state: Mutex<QueueState>,
@@ -29,25 +29,25 @@ pub(super) struct WaitingLines {
 #[derive(Default)]
 struct QueueState {
     lines: VecDeque<LogLine>,
-    /// How many more there would have been.
+    /// The number of lines that were dropped because the queue was full.
     lost: u64,
     /// Whether the thread runs.
     runs: bool,
 }
 
 thread_local! {
-    /// Whose lines this thread tells.
+    /// The queue that this thread serves.
     static TELLS: Cell<*const WaitingLines> = const { Cell::new(ptr::null()) };
 }
 
 impl WaitingLines {
-    /// Whether this is the thread that calls the program. In a child that a callback forked it is not:
-    /// the lines there are others.
+    /// Returns whether this thread is the one that calls the callback. In a child that a callback forked it
+    /// is not: the child has a queue of its own.
     pub(super) fn is_teller(&self) -> bool {
         ptr::eq(TELLS.get(), self)
     }
 
-    /// Has `tell` called with it soon.
+    /// Queues a line. The thread of the queue calls `tell` with it soon.
     pub(super) fn say(&'static self, line: LogLine, tell: impl Fn(LogLine) + Send + 'static) {
         let mut state = self.lock();
         if !state.runs {
@@ -55,7 +55,7 @@ impl WaitingLines {
             let run = move || self.tell_all(tell);
             let started = thread::Builder::new().name("axon-log".into()).spawn(run);
             drop(blocked);
-            // With the next line it is tried again.
+            // If the thread cannot be started, the next line tries again.
             state.runs = started.is_ok();
         }
         if state.lines.len() < ROOM {

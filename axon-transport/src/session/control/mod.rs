@@ -1,5 +1,5 @@
-//! The control thread: sends the messages that the handles queue, handles the daemon's messages, watches peers for
-//! their death, and finds another daemon when the connection to the old one is lost.
+//! The control thread of a session: sends the messages that the handles queue, handles the daemon's messages,
+//! watches the processes of peers, and connects to the next daemon when the connection is lost.
 
 mod announced;
 pub(in crate::session) mod arrivals;
@@ -48,15 +48,15 @@ use crate::{
     wire::session::{Announce, EndpointRole, Gone, SessionMessage},
 };
 
-/// Packets handled before queued ones are sent: neither direction starves the other.
+/// Packets that are received before queued ones are sent, so that neither direction starves the other.
 const BATCH: usize = 64;
-/// Until a process that had no descriptors left tries again.
+/// Time between attempts of a process that ran out of file descriptors.
 const RETRY: Duration = Duration::from_secs(2);
-/// How long a session that ends waits for a daemon whose socket is full.
+/// How long an ending session waits for a daemon whose socket is full.
 const FAREWELL: Duration = Duration::from_secs(1);
-/// How long a session that ends stays for readers that have not taken up what its publishers granted.
+/// How long an ending session stays for readers that have not taken up their grants from its publishers.
 const STAY: Duration = Duration::from_secs(if cfg!(test) { 60 } else { 1 });
-/// A relay stands for at most this many remote subscriptions by name; one packet holds no more.
+/// The most remote subscriptions that a relay announces by GID; one packet has no room for more.
 const MAX_STANDS_FOR: usize = 1024;
 
 pub(in crate::session) struct Control {
@@ -66,49 +66,48 @@ pub(in crate::session) struct Control {
     peers: Peers,
     outbox: VecDeque<(SessionMessage, Vec<PassedFd>)>,
     buffer: Vec<u8>,
-    /// A whole graph of which parts are still to come.
+    /// A full graph that is still incomplete.
     building: Option<GraphView>,
-    /// The pairs that the daemon of this connection told of.
+    /// The pairs that the daemon of this connection has reported.
     pairs: AnnouncedPairs,
-    /// When to look after the memory of large samples, while there is any.
+    /// When to check the memory of large samples; `None` if there is none.
     reclaim_idle: Option<Instant>,
-    /// The segments of our memory that this connection was told of.
+    /// The segments of this session's memory that were sent over this connection.
     segments: AnnouncedSegments,
-    /// Publishers that have no memory ready for their next large sample.
+    /// Publishers without prepared memory for their next large sample.
     low: BTreeSet<Gid>,
     pause: ReconnectPause,
-    /// This process had no descriptors left: when it asks to be told everything anew.
+    /// When to request everything anew, after the process ran out of file descriptors.
     retry: Option<Instant>,
     arrivals: Arrivals,
-    /// The endpoints of the graph by their topics: of the whole one of which parts are to come, or of the one that is
-    /// shown.
+    /// The endpoints of the graph by topic. While a full graph is incomplete, this map is about that graph.
     topics: HashMap<String, BTreeSet<Gid>>,
-    /// Endpoints of whose pairs some came or went since [`tell_matched`](Self::tell_matched).
+    /// Endpoints whose pairs changed since [`tell_matched`](Self::tell_matched).
     rematching: Rematching,
-    /// The graph is another one than was last told.
+    /// Whether the graph changed since it was last reported.
     graph_changed: bool,
-    /// Endpoints of whom somebody watches the time, unless they are to be looked for anew.
+    /// Endpoints with deadlines or leases; `None` if the list must be rebuilt.
     timed: Option<Vec<EventSource>>,
-    /// When to look at them, by the monotonic clock.
+    /// When to check these endpoints, by the monotonic clock.
     alarm: Option<u64>,
 }
 
-/// By GID.
+/// Endpoints whose pairs changed, by GID.
 #[derive(Default)]
 struct Rematching {
     writers: BTreeMap<Gid, Arc<PublisherInner>>,
     readers: BTreeMap<Gid, Arc<SubscriptionInner>>,
 }
 
-/// The peer that a session speaks with first.
+/// The first peer that a session communicates with.
 pub(in crate::session) enum FirstPeer {
-    /// A daemon; another one when it is gone.
+    /// A daemon. The session connects to another one if it is gone.
     Daemon(Connected),
-    /// The process at the other end of a socket, and nobody after it.
+    /// The process at the other end of a socket. The session has no other peer afterwards.
     Socket(Connected),
-    /// The registry of its own process, where it meets another session.
+    /// The registry of this process, where the session meets others of the process.
     LocalRegistry(Arc<LocalRegistry>),
-    /// Nobody.
+    /// No peer.
     Alone,
 }
 
@@ -178,7 +177,8 @@ impl Control {
             self.try_reconnected();
             self.try_again();
             self.tell_rematched();
-            // Before the others hear of it: an endpoint that is granted something is counted here.
+            // Match events come before the messages: an endpoint counts its matches before its peers learn of
+            // their grants.
             self.tell_matched();
             self.collect();
             self.send();
@@ -191,9 +191,9 @@ impl Control {
             self.reclaim_idle();
         }
         self.shared.part_leaving(true);
-        // What was queued last, such as ENDPOINT_GONE, is said by the end of the connection. Only
-        // of memory, in which readers may find the last samples, nobody else could tell, nor of what
-        // readers lost.
+        // The end of the connection replaces the messages that were queued last, such as ENDPOINT_GONE. It
+        // does not replace two others: the memory in which readers may find the last samples, and the samples
+        // that readers lost.
         let deadline = Instant::now() + FAREWELL;
         loop {
             self.shared.core.segment.tidy();
@@ -207,12 +207,12 @@ impl Control {
         }
     }
 
-    /// Whether readers have yet to be sent memory, or told what they lost.
+    /// Returns whether readers must still be sent memory or a report of lost samples.
     fn leaves_notices(&self) -> bool {
         self.shared.core.segment.has_unread() || !self.shared.state().unmet.is_empty()
     }
 
-    /// Queues what the daemon has yet to hear of readers that never took up their grant.
+    /// Queues the reports about readers that never took up their grant.
     fn tell_unmet(&mut self) {
         if !self.is_linked() {
             return;
@@ -221,8 +221,8 @@ impl Control {
         self.outbox.extend(unmet.into_iter().map(|message| (message, Vec::new())));
     }
 
-    /// Ends the connection. Whether there is nobody who could hear more: false where the daemon was killed and may not
-    /// have read all.
+    /// Ends the connection. Returns false if the daemon was killed and may not have read everything, so that
+    /// another daemon must be found.
     fn was_heard(&mut self, deadline: Instant) -> bool {
         match &self.link {
             DaemonConnection::Socket(socket) if socket::finish(socket, deadline) => true,
@@ -235,8 +235,8 @@ impl Control {
         }
     }
 
-    /// Waits for the next daemon, to tell it of the memory that readers have yet to be sent, and of what they lost.
-    /// Whether there is one.
+    /// Waits for the next daemon, to send it the memory and the loss reports that readers still need. Returns
+    /// whether one is connected.
     fn find_next_daemon(&mut self, deadline: Instant) -> bool {
         while matches!(self.link, DaemonConnection::Reconnecting(_)) && self.leaves_notices() {
             let left = deadline.saturating_duration_since(Instant::now());
@@ -254,7 +254,7 @@ impl Control {
         self.is_linked()
     }
 
-    /// Sends what is queued, and waits for a daemon whose socket is full.
+    /// Sends the queued messages, and waits while the daemon's socket is full.
     fn send_rest(&mut self, deadline: Instant) {
         let mut writable = false;
         loop {
@@ -266,7 +266,7 @@ impl Control {
                 return;
             }
             let nap = left.min(Duration::from_millis(20));
-            // A socket that is short of descriptors in flight is writable, and does not say when that passes.
+            // A socket with too many descriptors in flight is writable and does not signal when that ends.
             if writable && self.outbox.len() == queued {
                 std::thread::sleep(nap);
             }
@@ -276,8 +276,7 @@ impl Control {
         }
     }
 
-    /// Queues a message for the daemon, behind what it must know of memory that the message may
-    /// speak of.
+    /// Queues a message for the daemon. Segments that the message may refer to are queued first.
     fn say(&mut self, message: SessionMessage) {
         self.tell_segments();
         self.outbox.push_back((message, Vec::new()));
@@ -290,18 +289,18 @@ impl Control {
         }
     }
 
-    /// Takes what the handles queued.
+    /// Takes the messages that the handles queued.
     fn collect(&mut self) {
         let shared = self.shared.clone();
         if self.is_linked() {
             self.tell_segments();
         }
         let (mut gone, mut fences) = (Vec::new(), BTreeMap::new());
-        // Under this lock endpoints and what is to be told of them change together.
+        // Under this lock endpoints and their queued messages change together.
         let state = shared.state();
         let queued = shared.core.link.take();
         if matches!(self.link, DaemonConnection::Reconnecting(_) | DaemonConnection::Ended) {
-            // All of it is said to the next daemon from what stands then.
+            // The next daemon is sent everything from the state of that time.
             return;
         }
         for outgoing in queued {
@@ -363,7 +362,7 @@ impl Control {
                 }
             }
         }
-        // For want of descriptors there is memory that the daemon was not told of.
+        // The process is short of descriptors, so the daemon does not have all segments yet.
         if !fences.is_empty() {
             shared.core.link.put_back(fences.into_values());
         }
@@ -396,8 +395,8 @@ impl Control {
                             return;
                         }
                         Err(error) => {
-                            // What the daemon said last is worth hearing: REFUSED, or memory in which
-                            // samples are found. It adds nothing, so that there is an end to it.
+                            // The daemon's last messages matter: REFUSED, or memory that holds samples. A
+                            // closed socket receives no further ones, so the loop ends.
                             while matches!(error, SocketError::Closed)
                                 && matches!(self.link, DaemonConnection::Socket(_))
                             {
@@ -428,8 +427,8 @@ impl Control {
             fds.push(PollFd::new(listening, PollFlags::IN));
             self.tell_arrived(listening);
         }
-        // A socket without room becomes writable, but one that is short of descriptors in flight
-        // does not say when that passes.
+        // A full socket becomes writable later. A socket with too many descriptors in flight does not signal
+        // when that ends.
         let blocked = self.is_linked() && !(self.outbox.is_empty() && self.segments.are_complete());
         let looks = blocked || !self.shared.state().endpoints.leaving.is_empty();
         let nap = looks.then_some(Duration::from_millis(20));
@@ -449,12 +448,12 @@ impl Control {
         self.shared.core.waker.take();
     }
 
-    /// Tells callbacks and tasks of samples that came. What comes later rings, unless all tasks were woken
-    /// and there is no callback: a task arms a ticket of its own before it sleeps again.
+    /// Reports arrived samples to callbacks and tasks. Later samples ring, unless all tasks were woken and
+    /// there is no callback: a task arms a ticket of its own before it sleeps again.
     fn tell_arrived(&self, listening: &ExternalLeader) {
         listening.clear();
         let (_, subscriptions) = self.endpoints();
-        // All are woken: it must not end with the first whose tasks wait.
+        // `count` wakes the tasks of all subscriptions; `any` would stop at the first with waiting tasks.
         let wake_tasks =
             || subscriptions.iter().filter(|of| of.wake_tasks(&self.shared.core)).count() > 0;
         if self.shared.core.listening.has_callbacks() || wake_tasks() {
@@ -489,7 +488,7 @@ impl Control {
         self.shared.core.wake();
     }
 
-    /// Looks for peers that died.
+    /// Removes the endpoints of processes that have died.
     fn remove_dead(&mut self) {
         if !self.peers.note_deaths() {
             return;
@@ -498,7 +497,8 @@ impl Control {
         for publisher in publishers {
             if publisher.drop_dead() {
                 self.writer_changed(&publisher);
-                // A server keeps the responses of a client that a daemon carried; one that does not come back has none.
+                // A server keeps the responses of a client that a daemon carried. If the client does not
+                // return, the responses are freed.
                 self.look_after_memory();
             }
         }
@@ -510,7 +510,7 @@ impl Control {
     }
 }
 
-/// The remote subscriptions that a relay reads for.
+/// Returns the remote subscriptions that a relay reads for.
 fn stands_for(subscription: &SubscriptionInner) -> Option<Vec<Gid>> {
     (subscription.role == EndpointRole::Relay).then(|| {
         let mut gids = subscription.stands_for();

@@ -1,4 +1,4 @@
-//! The socket of a relay, as either end uses it: control messages first, then pieces of samples.
+//! The socket of a relay, which both ends use. Control messages go before pieces of samples.
 
 use std::{
     collections::{BTreeMap, VecDeque},
@@ -36,12 +36,12 @@ use crate::{
     wire::session::{Credit, SessionMessage},
 };
 
-/// Bytes of control messages that may wait for an end that does not read.
+/// Bytes of control messages that may be queued for an end that does not read.
 const MAX_WAITING: usize = 32 << 20;
-/// Packets sent, and received, before the other direction has its turn.
+/// Packets that are sent, or received, before the other direction has its turn.
 const BATCH: usize = 64;
 
-/// Between looks for what nobody tells of.
+/// Time between checks for changes that nothing signals.
 const NAP: Duration = Duration::from_millis(5);
 
 /// Why a relay ends.
@@ -67,32 +67,33 @@ pub enum End {
     Other(String),
 }
 
-/// Samples that are written, and of which it is not known whether they are where they are to go.
+/// Samples that are written and that may not have reached their destination.
 struct Unacknowledged {
-    /// The number up to which the other end was told that they are.
+    /// The number up to which delivery was reported to the other end.
     said: u64,
-    /// The last that was written.
+    /// The number of the last written sample.
     last: u64,
-    /// The number to say once that one is: of the last that came, written or not.
+    /// The number to report once the last sample is delivered: that of the last one that arrived, written or
+    /// not.
     then: u64,
 }
 
-/// Samples that were lost.
+/// A report of lost samples.
 #[derive(Clone, Copy, Debug)]
 pub enum LossReport {
-    /// These did not come; whether that was before the `first` of the channel.
+    /// Samples that did not arrive before the current one.
     Before {
-        /// How many.
+        /// The number of samples.
         samples: u64,
-        /// Whether none of the channel had come before.
+        /// Whether no sample of the channel arrived before.
         first: bool,
     },
-    /// One came and could not be written.
+    /// A sample that arrived and could not be written.
     Unwritten,
 }
 
 impl LossReport {
-    /// How many.
+    /// Returns the number of lost samples.
     pub fn samples(self) -> u64 {
         match self {
             Self::Before { samples, .. } => samples,
@@ -101,50 +102,53 @@ impl LossReport {
     }
 }
 
-/// Returns how many of the samples that the other end says were `lost` between the numbers `before` and `number` count.
-/// The other end may be another user's process, and the sums that they are added to never shrink.
+/// Returns how many samples count as lost if the other end reports `lost` ones between the numbers `before`
+/// and `number`. The report may come from another user's process, and the totals never shrink, so implausible
+/// reports are cut.
 fn judge_loss(lost: u64, before: Option<u64>, number: u64) -> u64 {
     let missing = number.saturating_sub(before.unwrap_or(0)).saturating_sub(1);
     let lost = lost.min(missing);
     if lost > MAX_GAP { 0 } else { lost }
 }
 
-/// One end of a relay's connection: sends samples within the other end's credit, publishes those that come.
+/// One end of a relay's connection: sends samples within the other end's credit, and publishes the samples
+/// that arrive.
 pub struct Pipe {
     socket: PassedFd,
     buffer: Vec<u8>,
-    /// Packets that go before any piece.
+    /// Packets that are sent before any piece of a sample.
     waiting: VecDeque<Vec<u8>>,
     waiting_bytes: usize,
-    /// Samples on their way to the other end.
+    /// The samples that are being sent.
     pub outgoing: OutgoingFlow<SamplePayload>,
     pub(crate) incoming: IncomingFlow,
-    /// Samples that came and are not published yet.
+    /// Samples that arrived and are not published yet.
     arrived: BTreeMap<FlowChannel, VecDeque<InboundSample>>,
-    /// Channels of which a sample was written, or is to be, each with the highest number that came.
+    /// Channels with a handled sample, each with the highest number that arrived.
     begun: BTreeMap<FlowChannel, u64>,
-    /// Whether one of them waits for a reader.
+    /// Whether an arrived sample waits for a reader to make room.
     blocked: bool,
-    /// Channels whose samples are written and not all handed over.
+    /// Channels whose samples are written and not all delivered.
     written: BTreeMap<FlowChannel, Unacknowledged>,
-    /// The same of responses: the number of each, in the order in which they came.
+    /// Channels whose responses are written and not all delivered: the number of each response, in order of
+    /// arrival.
     undelivered: BTreeMap<FlowChannel, VecDeque<u64>>,
-    /// Responses that were written, of which a copy may come through the next daemon.
+    /// Written responses. The next daemon may send copies of them.
     pub(crate) response_log: Option<ResponseLog>,
-    /// MATCHED that this end has said, and those that it has heard: by these both ends tell a channel
-    /// from an earlier one of the same name.
+    /// The MATCHED messages that this end has sent and received. With these counts both ends distinguish a
+    /// channel from an earlier one of the same name.
     said: u64,
     heard: u64,
-    /// The other end is gone, and nothing is said to it any more.
+    /// The other end is gone, and nothing is sent to it any more.
     gone: bool,
-    /// What it had said has been heard to its end.
+    /// Everything that the other end had sent has been received.
     over: bool,
     tally: Arc<RelayCounters>,
     losses: LogLimit,
 }
 
 impl Pipe {
-    /// An end that has said and heard nothing.
+    /// Creates an end that has sent and received nothing.
     pub fn new(socket: PassedFd, incoming: IncomingFlow, tally: Arc<RelayCounters>) -> Self {
         Self {
             socket,
@@ -180,17 +184,18 @@ impl Pipe {
         if self.waiting_bytes > MAX_WAITING { Err(End::Deaf) } else { Ok(()) }
     }
 
-    /// Whether there is something that the socket had no room for.
+    /// Returns whether packets wait for room in the socket.
     fn is_full(&self) -> bool {
         !self.waiting.is_empty()
     }
 
-    /// Opens a channel for samples that go, once the MATCHED is said by which the other end knows.
+    /// Opens a channel for outgoing samples. The MATCHED message that announces the channel must be sent
+    /// before.
     pub fn open_out(&mut self, channel: FlowChannel) {
         self.outgoing.open(channel, self.said);
     }
 
-    /// Opens a channel for samples that come.
+    /// Opens a channel for incoming samples.
     pub fn open_in(&mut self, channel: FlowChannel) -> Result<(), End> {
         match self.incoming.open(channel, self.heard) {
             Some(credit) => self.say(&SessionMessage::Credit(credit)),
@@ -198,7 +203,7 @@ impl Pipe {
         }
     }
 
-    /// Closes those that `keep` does not want.
+    /// Closes the channels that `keep` rejects.
     pub fn retain(&mut self, keep: impl Fn(&FlowChannel) -> bool) {
         self.incoming.retain(&keep);
         self.arrived.retain(|channel, _| keep(channel));
@@ -212,27 +217,27 @@ impl Pipe {
         self.blocked
     }
 
-    /// Whether readers that go on are worth being woken for.
+    /// Returns whether to wake this end when readers make progress.
     pub fn waits_for_readers(&self) -> bool {
         self.blocked || !self.written.is_empty() || !self.undelivered.is_empty()
     }
 
-    /// The other end is gone, or as good as that: what it has said is heard, and nothing is said to it
-    /// any more.
+    /// Ends the connection to an end that is gone or counts as gone. Messages that it has sent are still
+    /// received. Nothing is sent to it any more.
     pub fn hang_up(&mut self) {
-        // Another process that holds the peer's end can add nothing, so that reading comes to an end.
+        // Another process that holds the peer's end can then send no more, so reading comes to an end.
         let _ = shutdown(&self.socket, Shutdown::Both);
         self.gone = true;
         self.waiting.clear();
         self.waiting_bytes = 0;
     }
 
-    /// Whether the other end is gone and all that it had said is heard.
+    /// Returns whether the other end is gone and everything that it had sent is received.
     pub fn is_over(&self) -> bool {
         self.over
     }
 
-    /// Samples that came, whole or in part, and are not published, by their writer.
+    /// Counts, for each writer, the samples that arrived in whole or in part and are not published.
     pub fn unpublished(&self) -> BTreeMap<Gid, u64> {
         let whole = self.arrived.iter().map(|(channel, samples)| (channel, samples.len() as u64));
         let parts = self.incoming.partial().map(|channel| (channel, 1));
@@ -243,7 +248,8 @@ impl Pipe {
         samples
     }
 
-    /// Takes packets; the messages among them that are not of samples, and whether there may be more.
+    /// Receives packets. Returns the messages other than pieces of samples, and whether more may be
+    /// available.
     pub fn receive(&mut self) -> Result<(Vec<SessionMessage>, bool), End> {
         let mut messages = Vec::new();
         for _ in 0..BATCH {
@@ -273,8 +279,8 @@ impl Pipe {
         Ok((messages, true))
     }
 
-    /// Writes what came, as far as readers make room; `lost` hears of samples that were lost. Returns
-    /// what the other end is to be [given back](Self::give_back).
+    /// Writes arrived samples as far as readers have room. Calls `lost` for lost samples. Returns the credit
+    /// to [give back](Self::give_back) to the other end.
     pub fn write<'a>(
         &mut self,
         find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,
@@ -329,7 +335,7 @@ impl Pipe {
                 if let Some(sample) = samples.pop_front()
                     && let Some(mut credit) = self.incoming.done(&sample)
                 {
-                    // What is written is in this process's memory only, where others carry it on.
+                    // If other processes carry the sample on, it is only in this process's memory so far.
                     if let Some(over) = remote_writer.delivered_up_to().filter(|over| *over < last)
                     {
                         credit.done = Some(over);
@@ -366,13 +372,13 @@ impl Pipe {
         credits
     }
 
-    /// Tells the other end what it is given back, and which of its samples are where they are to go.
+    /// Sends the other end its credit back, together with the numbers of its delivered samples.
     pub fn give_back(&mut self, credits: Vec<Credit>) -> Result<(), End> {
         credits.into_iter().try_for_each(|credit| self.say(&SessionMessage::Credit(credit)))
     }
 
-    /// Sends what there is, as far as the socket has room: what `take` has of each channel that may
-    /// send. Whether anything was sent.
+    /// Sends samples as far as the socket has room. `take` returns the next sample of a channel that has
+    /// credit. Returns whether anything was sent.
     pub fn send(
         &mut self,
         mut take: impl FnMut(&FlowChannel) -> Option<OutboundSample<SamplePayload>>,
@@ -418,8 +424,8 @@ impl Pipe {
 }
 
 impl Pipe {
-    /// Sleeps until there is something to do, for at most `left`. The other end is gone once `end`, its
-    /// process, is readable.
+    /// Sleeps for at most `left`, until there is work. `end` is the other end's process, whose descriptor
+    /// becomes readable when the process ends; the other end then counts as gone.
     pub fn sleep(
         &mut self,
         leader: &ExternalLeader,
@@ -430,13 +436,13 @@ impl Pipe {
         let out = if self.is_full() { PollFlags::OUT } else { PollFlags::empty() };
         let mut fds =
             vec![PollFd::new(leader, PollFlags::IN), PollFd::new(change_signal, PollFlags::IN)];
-        // What has come to its end is readable for ever.
+        // A socket at its end of file stays readable for ever.
         if !self.over {
             fds.push(PollFd::new(&self.socket, PollFlags::IN | out));
         }
         let end = end.filter(|_| !self.gone);
         fds.extend(end.map(|end| PollFd::from_borrowed_fd(end, PollFlags::IN)));
-        // Nobody says when others have left room in the pool.
+        // Nothing signals when other connections free memory in the pool.
         let nap = self.incoming.is_short().then_some(NAP);
         let left = left.into_iter().chain(nap).min().and_then(|left| Timespec::try_from(left).ok());
         let _ = poll(&mut fds, left.as_ref());

@@ -27,67 +27,70 @@ use crate::{
     token_bucket::TokenBucket,
 };
 
-/// Relays that one identity may have here: those of 20,000 topics, and more. Each takes some 4 KiB, and a lane for each
-/// publisher here that it reads.
+/// The most relays of one identity on this host: enough for 20,000 topics and more. Each takes some 4 KiB,
+/// and a lane for each publisher here that it reads.
 pub(crate) const MAX_RELAYS: usize = 1 << 15;
-/// Stand-ins of one identity. Each costs a ring: with all that belongs to it some 6 KiB.
+/// The most stand-ins of one identity. Each costs a ring, which takes some 6 KiB altogether.
 pub(crate) const MAX_STAND_INS: usize = 1 << 15;
-/// Lanes of the relays and stand-ins of one identity.
+/// The most lanes of the relays and stand-ins of one identity.
 const MAX_LANES: usize = 1 << 16;
-/// Relays of all identities, and as many stand-ins, and lanes. The registry lets the engine's session have all three. An
-/// identity may take half of what the others leave, so that none takes the last.
+/// The most relays of all identities together; the same number bounds the stand-ins, and the lanes. The
+/// registry lets the engine's session have all three. One identity may take half of the rest, so that no
+/// identity takes the last.
 const OF_ALL: usize = 1 << 17;
-/// How much more an identity's routes may take than its graph: three copies of names and subscribers are held, and a
-/// route has more to it than an endpoint.
+/// Memory of an identity's routes as a multiple of its graph: three copies of names and subscribers are held,
+/// and a route has more data than an endpoint.
 const ROUTES_TO_GRAPH: usize = 4;
 /// Unread stream data of one identity, in bytes. Each of its links has
 /// [`LINK_WINDOW`](super::quic::transport::LINK_WINDOW) more.
 const UNREAD: usize = 64 << 20;
-/// Messages of one identity that are being read, in bytes: long ones, of which one may always be read, and short ones,
-/// which therefore never wait for those.
+/// Bytes of one identity's messages that are being read: long ones, of which one may always be read, and
+/// short ones. The two are separate, so short messages never wait for long ones.
 pub(crate) const MESSAGES: (usize, usize) = (64 << 20, 16 << 20);
-/// Control messages that wait for one identity to read them, in bytes.
+/// Control messages for one identity that it has not read yet, in bytes.
 const UNSENT: usize = 128 << 20;
-/// How many times what one identity may hold all may hold together.
+/// Memory that all identities may hold together, as a multiple of the memory of one.
 const HELD_BY_ALL: u64 = 2;
-/// Names and reasons of refused routes of one identity that are remembered for status, in bytes.
+/// Names and reasons of one identity's refused routes that are kept for status, in bytes.
 const REFUSALS: usize = 2 << 20;
-/// Sessions of one identity that are taken for proven.
+/// The most sessions of one identity that count as proven.
 pub(crate) const MAX_PROVEN: usize = 8192;
-/// Publishers, or clients, of one identity that one route shows here: a reader looks at all of its publishers.
+/// The most publishers, or clients, of one identity that one route shows here: a reader checks all of its
+/// publishers.
 const MAX_WRITERS_OF_ROUTE: usize = 1024;
-/// Identities of which it is remembered how much passed.
+/// The most identities whose recent traffic is remembered for the limits.
 const LIMITED: usize = 128;
-/// Control messages of one identity that are decompressed and not handled, in bytes: one of the largest length.
+/// Control messages of one identity that are decompressed and not handled, in bytes: room for one of the
+/// largest length.
 pub(crate) const DECODED: usize = DECODED_TO_UNPACKED * MAX_INFLATED;
-/// What a control message takes while it is decoded, to its length once it is decompressed: that length, and up to six
-/// times as much.
+/// Memory of a control message while it is decoded, as a multiple of its decompressed length: that length,
+/// and up to six times as much.
 const DECODED_TO_UNPACKED: usize = 7;
-/// Uses of one identity that are denied here and remembered.
+/// The most denied uses of one identity that are remembered.
 const DENIED: usize = 1024;
-/// What one identity may say a second, and at once, by [`cost`] and [`cost_of_frame`].
+/// The control messages that one identity may send in a second, and in a burst, as measured by [`cost`] and
+/// [`cost_of_frame`].
 const SAID: (u32, u32) = (16_384, 65_536);
-/// Bytes of a control message that cost as much as one change: what it takes to decompress and decode
-/// them.
+/// Bytes of a control message that cost as much to decompress and decode as one change.
 const BYTES: usize = 4096;
-/// GIDs that cost as much as one change, where each is looked up and nothing else.
+/// GIDs that cost as much as one change if each is only looked up.
 const LOOKED_UP: usize = 32;
 
-/// Something that may be held up to a bound.
+/// A resource that may be held up to a bound.
 #[derive(Debug)]
 pub(crate) struct Meter {
     most: usize,
-    /// What all identities share.
+    /// The meter that all identities share.
     pool: Option<Rc<Meter>>,
     held: Cell<usize>,
-    /// What was given back since the start.
+    /// The amount that was released since the start.
     released: Cell<usize>,
     /// The most that was held.
     #[cfg(test)]
     peak: Cell<usize>,
 }
 
-/// A part of what a [`Meter`] allows.
+/// A held part of a [`Meter`]'s bound. Dropping it releases the part.
 #[derive(Debug)]
 pub(crate) struct Charge {
     meter: Rc<Meter>,
@@ -95,7 +98,7 @@ pub(crate) struct Charge {
 }
 
 impl Meter {
-    /// Allows up to `most`.
+    /// Creates a meter that allows up to `most`.
     pub(crate) fn new(most: usize) -> Rc<Self> {
         Rc::new(Self::with(most, None))
     }
@@ -117,12 +120,12 @@ impl Meter {
         self.peak.get()
     }
 
-    /// Allows up to `most`, and half of what others leave in a pool.
+    /// Creates a meter that allows up to `most`, and at most half of the rest of a pool.
     pub(crate) fn within(pool: &Rc<Self>, most: usize) -> Rc<Self> {
         Rc::new(Self::with(most, Some(Rc::clone(pool))))
     }
 
-    /// What it allows besides what is held.
+    /// Returns the amount that may still be charged.
     pub(crate) fn left(&self) -> usize {
         let own = self.most.saturating_sub(self.held());
         let shared = self.pool.as_ref().map_or(usize::MAX, |pool| {
@@ -132,7 +135,7 @@ impl Meter {
         own.min(shared)
     }
 
-    /// A charge of nothing.
+    /// Creates a charge of 0.
     pub(crate) fn nothing(self: &Rc<Self>) -> Charge {
         Charge { meter: Rc::clone(self), amount: 0 }
     }
@@ -157,14 +160,14 @@ impl Meter {
         }
     }
 
-    /// Takes what was given back a moment ago, and what nobody took meanwhile.
+    /// Charges an amount again that was just released and that nothing else has taken meanwhile.
     fn take_again(&self, amount: usize) {
         for meter in iter::once(self).chain(self.pool.as_deref()) {
             meter.held.set(meter.held.get() + amount);
         }
     }
 
-    /// Raises a charge to half of what the others leave. Returns whether it grew.
+    /// Raises a charge to half of the amount that other charges leave. Returns whether it grew.
     pub(crate) fn share(self: &Rc<Self>, charge: &mut Charge) -> bool {
         let others = self.held().saturating_sub(charge.amount);
         let share = self.most.saturating_sub(others) / 2;
@@ -178,45 +181,46 @@ impl Meter {
         }
     }
 
-    /// What is held now.
+    /// Returns the amount that is held now.
     pub(crate) fn held(&self) -> usize {
         self.held.get()
     }
 
-    /// What was given back since the start. It changes when a charge that did not fit may fit now.
+    /// Returns the amount that was released since the start. When it changes, a charge that did not fit may
+    /// fit.
     pub(crate) fn released(&self) -> usize {
         self.released.get()
     }
 
-    /// What may be held.
+    /// Returns the bound.
     pub(crate) fn most(&self) -> usize {
         self.most
     }
 }
 
 impl Charge {
-    /// Takes `amount` of it, or all, as a charge of its own.
+    /// Splits off `amount`, or everything, as a charge of its own.
     pub(crate) fn split(&mut self, amount: usize) -> Self {
         let amount = amount.min(self.amount);
         self.amount -= amount;
         Self { meter: Rc::clone(&self.meter), amount }
     }
 
-    /// Another one of the same meter, if it fits.
+    /// Creates another charge of the same meter if it fits.
     pub(crate) fn more(&self, amount: usize) -> Option<Self> {
         self.meter.charge(amount)
     }
 
-    /// Adds another one of the same meter.
+    /// Adds another charge of the same meter.
     pub(crate) fn add(&mut self, mut other: Self) {
         debug_assert!(Rc::ptr_eq(&self.meter, &other.meter), "charges of two meters");
         self.amount += std::mem::take(&mut other.amount);
     }
 
-    /// Exchanges it for one of `amount` of a meter. What it holds makes room for that.
+    /// Exchanges the charge for one of `amount` of a meter. The old charge is released first, to make room.
     ///
     /// # Errors
-    /// There is not so much. Returns it as it was.
+    /// The amount does not fit. Returns the old charge.
     pub(crate) fn exchange(mut self, meter: &Rc<Meter>, amount: usize) -> Result<Self, Self> {
         self.meter.give_back(self.amount);
         let Some(other) = meter.charge(amount) else {
@@ -228,12 +232,12 @@ impl Charge {
         Ok(other)
     }
 
-    /// What it is of.
+    /// Returns the charge's meter.
     pub(crate) fn meter(&self) -> &Rc<Meter> {
         &self.meter
     }
 
-    /// What it holds.
+    /// Returns the charged amount.
     pub(crate) fn amount(&self) -> usize {
         self.amount
     }
@@ -246,63 +250,66 @@ impl Drop for Charge {
     }
 }
 
-/// Memory for messages that have not come whole, or wait for a reader, in bytes.
+/// Memory for messages that have not arrived completely or that wait for a reader, in bytes.
 #[derive(Clone, Debug)]
 pub(crate) struct MessageMemory {
-    /// For long messages.
+    /// Memory for long messages.
     pub(crate) long: Rc<Meter>,
-    /// For short ones.
+    /// Memory for short messages.
     pub(crate) short: Rc<Meter>,
 }
 
 impl MessageMemory {
-    /// Memory of these lengths.
+    /// Creates memory of these sizes.
     pub(crate) fn new(long: usize, short: usize) -> Self {
         Self { long: Meter::new(long), short: Meter::new(short) }
     }
 
-    /// What was given back since the start. It changes when a message that found no room may find some.
+    /// Returns the amount that was released since the start. When it changes, a message that found no room
+    /// may find some.
     pub(crate) fn released(&self) -> usize {
         self.long.released().wrapping_add(self.short.released())
     }
 }
 
-/// The account of one identity. Those that share a budget have all but their `limits` in common: rules tell them apart.
+/// The account of one identity. Identities with the same budget share all fields but `limits`, because limit
+/// rules distinguish them.
 #[derive(Clone, Debug)]
 pub(crate) struct Account {
-    /// Whose budget it is.
+    /// The name of the budget.
     pub(crate) budget: Rc<str>,
-    /// Bytes of its graph.
+    /// Bytes of the identity's graph.
     pub(crate) graph: Rc<Meter>,
-    /// Bytes of the routes that it asks for: on their own, so that one whose graph is full is served.
+    /// Bytes of the routes that the identity asks for. They are separate from the graph, so an identity with
+    /// a full graph is still served.
     pub(crate) routes: Rc<Meter>,
-    /// Relays for the routes that it asks for.
+    /// Relays for the routes that the identity asks for.
     pub(crate) relays: Rc<Meter>,
-    /// Lanes that these, and stand-ins of services, take.
+    /// Lanes of these relays, and of stand-ins of services.
     pub(crate) lanes: Rc<Meter>,
-    /// Control messages that it has not read.
+    /// Control messages that the identity has not read.
     pub(crate) unsent: Rc<Meter>,
-    /// Control messages of it that are decompressed and not handled.
+    /// Control messages of the identity that are decompressed and not handled.
     pub(crate) decoded: Rc<Meter>,
-    /// Uses of its endpoints that are denied here.
+    /// Uses of the identity's endpoints that are denied here.
     pub(crate) denied: Rc<Meter>,
-    /// Its publishers, servers and clients that are shown here.
+    /// The identity's publishers, servers and clients that are shown here.
     pub(crate) stand_ins: Rc<Meter>,
-    /// Stream data that it may send and that was not read.
+    /// Stream data that the identity may send and that this host has not read.
     pub(crate) unread: Rc<Meter>,
-    /// Memory for its messages that have not come whole, in bytes.
+    /// Memory for the identity's messages that have not arrived completely, in bytes.
     pub(crate) messages: MessageMemory,
-    /// Memory for the samples, requests and responses that its stand-ins hold, in bytes.
+    /// Memory for the samples, requests and responses in the identity's stand-ins, in bytes.
     pub(crate) held: Arc<MemoryBudget>,
     /// Bytes of refused routes that are remembered.
     pub(crate) refusals: Rc<Meter>,
-    /// Sessions that it proved to be its own.
+    /// Sessions that the identity proved to own.
     pub(crate) sessions: Rc<Meter>,
-    /// Its publishers, or clients, that each route shows.
+    /// The identity's publishers, or clients, that each route shows.
     writers: Rc<RefCell<HashMap<RouteKey, Weak<Meter>>>>,
-    /// How much of which topic may pass.
+    /// How much of each topic may pass.
     pub(crate) limits: Rc<IdentityLimits>,
-    /// When its changes are followed up.
+    /// When the identity's changes are processed.
     pub(crate) turns: Rc<RefCell<ChangeTurns>>,
     said: Rc<RefCell<TokenBucket>>,
 }
@@ -337,13 +344,14 @@ impl Account {
         }
     }
 
-    /// Its publishers, or clients, that a route shows, over all of its daemon ids.
+    /// Returns the meter of the identity's publishers, or clients, that a route shows, over all of its daemon
+    /// IDs.
     pub(crate) fn writers_of(&self, key: &RouteKey) -> Rc<Meter> {
         let mut writers = self.writers.borrow_mut();
         if let Some(meter) = writers.get(key).and_then(Weak::upgrade) {
             return meter;
         }
-        // Once for as many as there are.
+        // Cleaning only when the map is full keeps the cost per entry constant.
         if writers.len() == writers.capacity() {
             writers.retain(|_, meter| meter.strong_count() > 0);
         }
@@ -352,20 +360,21 @@ impl Account {
         meter
     }
 
-    /// Counts a control message of this cost. Returns how long the identity has to wait before its next one.
+    /// Charges a control message of this cost. Returns how long the identity must wait before its next
+    /// message.
     pub(crate) fn owe(&self, cost: u32, now: Duration) -> Duration {
         self.said.borrow_mut().owe(cost, now)
     }
 }
 
-/// What a frame costs before it is decompressed, by the length that its map will have; one of unknown
-/// type, which is not decompressed, by its own.
+/// Returns the cost of a frame before it is decompressed, from its decompressed length. A frame of unknown
+/// type is not decompressed, so its own length counts.
 pub(crate) fn cost_of_frame(frame: &[u8]) -> u32 {
     let unpacked = if is_known(frame) { unpacked_length(frame).min(MAX_INFLATED) } else { 0 };
     costs(unpacked.max(frame.len()) / BYTES)
 }
 
-/// What a message costs: about as many changes as it says.
+/// Returns the cost of a message: about the number of changes that it contains.
 pub(crate) fn cost(message: &LinkMessage) -> u32 {
     costs(match message {
         LinkMessage::Graph(graph) => {
@@ -374,7 +383,7 @@ pub(crate) fn cost(message: &LinkMessage) -> u32 {
             graph.added.len() + graph.removed.len() + toward
         }
         LinkMessage::Subscribe(subscribe) => 7 + subscribe.subscribers.len() + subscribe.last.len(),
-        // Flows that wait are tried again.
+        // Waiting flows are tried again.
         LinkMessage::Intake(_) => 63,
         LinkMessage::Unsubscribe(_)
         | LinkMessage::RouteRefused(_)
@@ -386,7 +395,7 @@ pub(crate) fn cost(message: &LinkMessage) -> u32 {
         LinkMessage::Owners(owners) => 7 * owners.proofs.len(),
         LinkMessage::Received(received) => received.flows.len() / LOOKED_UP,
         LinkMessage::RouteReady(ready) => ready.publishers.len() / LOOKED_UP,
-        // Keys are bounded where they are kept.
+        // The key store bounds the number of keys.
         LinkMessage::Keys(KeyMessage::Announce(key_ids)) => key_ids.len() / 8,
         LinkMessage::Keys(
             KeyMessage::Ready { .. } | KeyMessage::Failed { .. } | KeyMessage::Retire { .. },
@@ -399,7 +408,7 @@ pub(crate) fn cost(message: &LinkMessage) -> u32 {
     })
 }
 
-/// What a frame takes while it is decoded and handled, in bytes.
+/// Returns the memory in bytes that a frame takes while it is decoded and handled.
 pub(crate) fn decoded_length(frame: &[u8]) -> usize {
     if is_known(frame) {
         DECODED_TO_UNPACKED * unpacked_length(frame).max(frame.len()).min(MAX_INFLATED)
@@ -408,7 +417,7 @@ pub(crate) fn decoded_length(frame: &[u8]) -> usize {
     }
 }
 
-/// That of a message with so many elements: it costs something itself.
+/// Returns the cost of a message with so many elements: 1 for the message, and 1 for each.
 fn costs(elements: usize) -> u32 {
     u32::try_from(1 + elements).unwrap_or(u32::MAX)
 }
@@ -421,17 +430,19 @@ pub(crate) struct Accounts {
     relays: Rc<Meter>,
     lanes: Rc<Meter>,
     stand_ins: Rc<Meter>,
-    /// What all stand-ins hold, and what one identity's may.
+    /// The memory of all stand-ins, and the bound for one identity's.
     held: (Arc<MemoryBudget>, u64),
     open: HashMap<String, Weak<Account>>,
-    /// What passed of late, also of identities without a link: a new link gives them no more.
+    /// The recent traffic of identities, also of those without a link, so that a new link does not reset the
+    /// limits.
     limits: HashMap<String, Rc<IdentityLimits>>,
-    /// What the stand-ins of a budget hold. Readers may be at it when its last link is over.
+    /// The memory of the stand-ins of each budget. Readers may still use it after the budget's last link has
+    /// ended.
     held_by: HashMap<String, SharedWeak<MemoryBudget>>,
 }
 
 impl Accounts {
-    /// Accounts whose graphs may take so many bytes, and whose stand-ins may hold so many.
+    /// Creates accounts. A graph may take `graph` bytes, and an identity's stand-ins may hold `held` bytes.
     pub(crate) fn new(graph: usize, held: u64) -> Self {
         let [relays, lanes, stand_ins] = [(); 3].map(|()| Meter::new(OF_ALL));
         let held = (MemoryBudget::new(held.saturating_mul(HELD_BY_ALL)), held);
@@ -439,13 +450,13 @@ impl Accounts {
         Self { graph, relays, lanes, stand_ins, held, open, limits, held_by }
     }
 
-    /// The account of an identity that has a budget of its own.
+    /// Returns the account of an identity with a budget of its own.
     #[cfg(test)]
     pub(crate) fn of_one(&mut self, identity: &str) -> Rc<Account> {
         self.of(identity, identity)
     }
 
-    /// The account of an identity, which takes from this `budget`.
+    /// Returns the account of an identity that takes from `budget`.
     pub(crate) fn of(&mut self, identity: &str, budget: &str) -> Rc<Account> {
         if let Some(account) = self.open.get(identity).and_then(Weak::upgrade) {
             return account;

@@ -1,4 +1,4 @@
-//! What to do about a queue that others fill.
+//! Handling of a queue that other traffic fills.
 
 use std::{
     sync::Arc,
@@ -7,30 +7,30 @@ use std::{
 
 use quinn_proto::congestion::{Controller, Cubic, CubicConfig};
 
-/// A queue that stands for so long, while the window shrinks so often, may be of others.
+/// A queue may belong to others if it lasts for this time while the window shrinks this often.
 const STANDING: (Duration, u32) = (Duration::from_secs(1), 4);
-/// A queue that stands for so long before a window that cannot shrink may be of others, too.
+/// A queue may also belong to others if it lasts for this time while the window is too small to shrink.
 const UNCLEAR: Duration = Duration::from_secs(3);
-/// The window must shrink to this share before it says anything.
+/// A comparison needs a window that has shrunk to this share.
 const SHRUNK: f64 = 0.75;
-/// While CUBIC decides, the controller looks this often whether the queue is gone.
+/// Time between probes for the end of the queue, while CUBIC decides.
 const LOOK_EVERY: Duration = Duration::from_secs(2);
-/// Rounds of a look. The packets of the first one left before it.
+/// Rounds of a probe. The packets of the first round were sent before the probe.
 const LOOK_ROUNDS: u32 = 3;
-/// So many looks after the first one must find the same until the path counts as longer.
+/// The path counts as longer once this many probes in a row repeat the result of the one before.
 const ALIKE: u32 = 2;
 
-/// A queue that stands although the window shrinks.
+/// A queue that remains although the window shrinks.
 #[derive(Debug, Clone)]
 pub(super) struct Standing {
     since: Instant,
     /// The window before it shrank.
     peak: u64,
-    /// The window and the bytes a second to compare with. They are those of the second time: at the first one the rate
-    /// may be of the time before the queue.
+    /// The window and the rate in bytes per second to compare with. Both are from the second reduction: at
+    /// the first one the rate may still be from before the queue.
     window: u64,
     rate: f64,
-    /// Times that the window shrank since.
+    /// How often the window shrank since.
     times: u32,
 }
 
@@ -39,9 +39,9 @@ impl Standing {
         Self { since: now, peak: window, window, rate, times: 0 }
     }
 
-    /// Takes that the window is about to shrink once more. `least` is the smallest window. Returns the window from
-    /// before if others fill the queue: the rate shrank with the window. A queue of this link alone keeps its rate. A
-    /// window that was too small to shrink says nothing, and CUBIC finds out.
+    /// Records that the window is about to shrink. `least` is the smallest window. Returns the original
+    /// window if the queue belongs to others: the rate shrank with the window. A queue of this link alone
+    /// keeps its rate. A window that is too small to shrink is no evidence; CUBIC then finds out.
     pub(super) fn shrink(
         &mut self,
         now: Instant,
@@ -62,40 +62,41 @@ impl Standing {
     }
 }
 
-/// What a round of competition shows.
+/// The result of a round of competition.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Outcome {
-    /// CUBIC goes on.
+    /// CUBIC continues.
     Goes,
     /// The queue is gone.
     Over,
-    /// The path is longer than before: nobody else was there.
+    /// The path is longer than before, and no other traffic fills the queue.
     Longer(Duration),
 }
 
-/// CUBIC decides, since something else fills the queue or the path became longer. Now and then a look, with hardly
-/// anything on the way, shows which.
+/// The phase in which CUBIC decides, because other traffic fills the queue or the path became longer. From
+/// time to time a probe, with hardly anything in flight, shows which of the two.
 #[derive(Debug, Clone)]
 pub(super) struct Competition {
     cubic: Cubic,
     next_look: Instant,
-    /// Rounds that are left of a look.
+    /// Remaining rounds of a probe.
     looking: u32,
-    /// The shortest round trip of this look.
+    /// The shortest round trip of this probe.
     seen: Option<Duration>,
-    /// What the last look found.
+    /// The result of the last probe.
     before: Duration,
-    /// Looks in a row that found the same.
+    /// Consecutive probes with the same result.
     alike: u32,
 }
 
 impl Competition {
-    /// Begins with a window. `shortest` is what a round without much on the way has just shown.
+    /// Starts with a window. `shortest` is the round trip of a round that just had little in flight.
     pub(super) fn new(now: Instant, window: u64, mtu: u64, shortest: Duration) -> Self {
         let mut config = CubicConfig::default();
         config.initial_window(window * 10 / 7);
         let mut cubic = Cubic::new(Arc::new(config), now, mtu as u16);
-        // It begins as after a loss, with 0.7 of that window: a new one would double until it lost packets.
+        // CUBIC starts as after a loss, with 0.7 of that window: a new instance would double its window until
+        // it lost packets.
         cubic.on_congestion_event(now, now, false, 0);
         Self {
             cubic,
@@ -107,27 +108,28 @@ impl Competition {
         }
     }
 
-    /// CUBIC, to be told what happens; `None` during a look, which is not its doing.
+    /// Returns CUBIC, to report events to it; `None` during a probe, which CUBIC did not cause.
     pub(super) fn cubic(&mut self) -> Option<&mut Cubic> {
         (self.looking == 0).then_some(&mut self.cubic)
     }
 
-    /// CUBIC, to be told what is also true during a look.
+    /// Returns CUBIC, to report the events that also count during a probe.
     pub(super) fn cubic_always(&mut self) -> &mut Cubic {
         &mut self.cubic
     }
 
-    /// The window; `None` during a look, when it is the smallest.
+    /// Returns the window; `None` during a probe, which uses the smallest window.
     pub(super) fn window(&self) -> Option<u64> {
         (self.looking == 0).then(|| self.cubic.window())
     }
 
-    /// The window that CUBIC has.
+    /// Returns CUBIC's window.
     pub(super) fn share(&self) -> u64 {
         self.cubic.window()
     }
 
-    /// Ends a round on a path whose shortest round trip and wanted queue are these.
+    /// Ends a round. `shortest` is its shortest round trip, `path` that of the path, and `wanted` the wanted
+    /// queue.
     pub(super) fn end_round(
         &mut self,
         now: Instant,
@@ -153,7 +155,7 @@ impl Competition {
         if found.saturating_sub(path) < wanted {
             return Outcome::Over;
         }
-        // The queue of somebody else is never twice the same.
+        // A queue of other traffic never has the same length twice.
         let same = Duration::from_millis(1).max(found / 20);
         self.alike = if found.abs_diff(self.before) < same { self.alike + 1 } else { 0 };
         self.before = found;
@@ -172,7 +174,7 @@ mod tests {
     #[test]
     fn a_rate_that_falls_with_the_window_says_that_others_fill_the_queue() {
         let start = Instant::now();
-        // Of this link alone: the rate stays.
+        // The queue belongs to this link alone: the rate stays.
         let mut own = Standing::new(start, 100_000, 1e6);
         for time in 1..20_u32 {
             let window = 100_000 >> time.min(6);
@@ -198,7 +200,7 @@ mod tests {
         assert_eq!(standing.shrink(start + millis(3_000), 4_000, 5e4, 4_000), Some(100_000));
     }
 
-    /// Ends rounds of 40 ms until a look is over, which sees `shortest`.
+    /// Ends rounds of 40 ms until a probe is over, which measures `shortest`.
     fn look(competition: &mut Competition, now: &mut Instant, shortest: Duration) -> Outcome {
         loop {
             *now += millis(40);

@@ -37,36 +37,36 @@ use silence::UnansweredTime;
 
 use super::quic::marks::wrapped;
 
-/// The queue that is wanted: half as long as the path, within these.
+/// The wanted queue is half as long as the path, within these bounds.
 const WANTED: (Duration, Duration) = (Duration::from_millis(2), Duration::from_millis(10));
-/// The queue that is wanted, at least, in packets: a slow path cannot have a shorter one.
+/// The shortest wanted queue in packets: a slow path cannot have a shorter one.
 const PACKETS_WANTED: f64 = 2.0;
-/// The wanted queue is so many times what round trips differ by chance, at least.
+/// The wanted queue is at least this many times the random variation of round trips.
 const BY_CHANCE: u32 = 8;
-/// The smallest window in packets. QUIC sends while less than the window is on the way, so it is two whole packets and
-/// a third that is not: the second one is acknowledged at once.
+/// The smallest window in packets. QUIC sends while less than the window is in flight. So this is two whole
+/// packets and a third, partial one; the second packet is acknowledged at once.
 const FLOOR: u64 = 3;
 /// The window at the start in packets and in bytes: the larger of the two (RFC 9002, 7.2).
 const INITIAL: (u64, u64) = (10, 14_720);
 /// The share of the path that is filled after the window shrank: a little less than all of it, so that the queue
 /// empties. A path that is new was perhaps never seen without a queue, and is drained further.
 const DRAINED: (f64, f64) = (0.95, 0.75);
-/// Times that the window shrinks until a path is not new any more.
+/// Reductions of the window until a path is not new any more.
 const NEW: u32 = 4;
-/// What is left of the window when it shrinks, at least and at most.
+/// The smallest and the largest share of the window that remains after a reduction.
 const SHRUNK: (f64, f64) = (0.25, 0.9);
-/// A round trip that is so much longer than the path is acted upon before the round ends,
+/// A round trip is urgent if it exceeds the path by this time.
 const URGENT: Duration = Duration::from_millis(50);
-/// if so many follow each other.
+/// After this many urgent round trips in a row the controller reacts before the round ends.
 const URGENT_IN_A_ROW: u32 = 4;
 /// Packets at the beginning of a round that show a queue while the window doubles.
 const TELLING: u32 = 8;
-/// Rounds with more losses and no more bytes that end the start.
+/// Rounds with more losses and no more bytes after which the start ends.
 const IDLE: u32 = 3;
-/// What is left of the window after an ECN mark, and after a time without any acknowledgement.
+/// The share of the window that remains after an ECN mark, and after a time without any acknowledgement.
 const MARKED: (f64, f64) = (0.8, 0.5);
 
-/// The settings of [`Delay`]: none.
+/// The settings of [`Delay`], which has none.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct DelayConfig;
 
@@ -76,35 +76,35 @@ impl ControllerFactory for DelayConfig {
     }
 }
 
-/// Has the next packet leave although the window is full. It shows which packets before it are lost.
+/// Lets the next packet leave although the window is full. It shows which earlier packets are lost.
 pub(crate) fn let_probe_through(quic: &quinn_proto::Connection) {
-    // CUBIC and BBR have none.
+    // CUBIC and BBR have no such probe.
     if let Some(delay) = wrapped(quic).and_then(|controller| controller.downcast::<Delay>().ok()) {
         delay.silence.let_probe_through();
     }
 }
 
-/// What the window follows.
+/// The rule that the window follows.
 #[derive(Debug, Clone)]
 enum WindowPhase {
-    /// It doubles each round until a queue is seen, or until that does not pay.
+    /// The window doubles each round until there is a queue, or until doubling brings no more bytes through.
     Start {
         /// The most bytes a second that a round brought through.
         best: f64,
         /// Rounds with losses in which `best` did not grow.
         idle: u32,
     },
-    /// The queue.
+    /// The window follows the queue.
     Steady,
-    /// CUBIC.
+    /// The window follows CUBIC.
     Compete(Competition),
 }
 
-/// What a round has shown so far.
+/// The measurements of a round so far.
 #[derive(Debug, Clone)]
 struct WindowRound {
     started: Instant,
-    /// The packet whose acknowledgement ends it.
+    /// The packet whose acknowledgement ends the round.
     last_packet: u64,
     shortest: Option<Duration>,
     packets: u32,
@@ -126,8 +126,8 @@ impl WindowRound {
         }
     }
 
-    /// How long it has lasted. Acknowledgements of several round trips may come at one time, but a round is no shorter
-    /// than a round trip.
+    /// Returns how long the round has lasted. Acknowledgements of several round trips may arrive at once, but
+    /// a round is no shorter than a round trip.
     fn time(&self, now: Instant) -> Duration {
         let least = self.shortest.unwrap_or_default().max(Duration::from_micros(1));
         now.saturating_duration_since(self.started).max(least)
@@ -145,24 +145,24 @@ pub(crate) struct Delay {
     drains: u32,
     round: WindowRound,
     growth: Growth,
-    /// A queue that has stood since the window began to shrink.
+    /// A queue that has remained since the window began to shrink.
     standing: Option<Standing>,
     silence: UnansweredTime,
     last_sent: u64,
-    /// What shortest round trips of rounds differ by chance.
+    /// The random variation between the shortest round trips of rounds.
     jitter: Duration,
     last_shortest: Option<Duration>,
-    /// Bytes a second that came through lately.
+    /// Recent throughput in bytes per second.
     rate: f64,
     /// Bytes by which the window may grow in the next round.
     step: u64,
-    /// Rounds of packets that left before the window shrank: they say nothing of the smaller window.
+    /// Rounds of packets that were sent before the window shrank: they say nothing about the smaller window.
     settling: u32,
-    /// Round trips in a row that are urgent, and the shortest of them.
+    /// The number of urgent round trips in a row, and the shortest of them.
     urgent: (u32, Duration),
-    /// Bytes of the acknowledgements that are being handled.
+    /// Bytes of the acknowledgements that are being processed.
     acknowledged_now: u64,
-    /// Marks and losses of packets sent before this were obeyed.
+    /// The controller has reacted to marks and losses of packets sent before this time.
     obeyed: Option<Instant>,
 }
 
@@ -198,7 +198,7 @@ impl Delay {
         self.wanted_at_any_rate().max(Duration::from_secs_f64(packets))
     }
 
-    /// The queue that this link wants, were a packet no time.
+    /// Returns the queue that this link wants without regard to the length of packets.
     fn wanted_at_any_rate(&self) -> Duration {
         (self.path.get() / 2).max(self.jitter * BY_CHANCE).clamp(WANTED.0, WANTED.1)
     }
@@ -213,12 +213,12 @@ impl Delay {
         self.shrink(share.clamp(SHRUNK.0, SHRUNK.1));
     }
 
-    /// Leaves this share of the window.
+    /// Reduces the window to this share.
     fn shrink(&mut self, share: f64) {
         self.set_window((self.window as f64 * share) as u64);
     }
 
-    /// Sets another window, and begins anew to grow once the packets that are on the way have arrived.
+    /// Sets another window. Growth starts anew once the packets in flight have arrived.
     fn set_window(&mut self, window: u64) {
         self.window = window.max(FLOOR * self.mtu);
         self.step = self.mtu;
@@ -236,7 +236,7 @@ impl Delay {
         if self.settling > 0 {
             self.last_shortest = None;
         } else if let Some(last) = self.last_shortest.replace(shortest) {
-            // A queue of our own only grows while the window does: what shrinks then is by chance.
+            // A queue of this link only grows while the window does, so a decrease in this phase is random.
             self.jitter = (self.jitter * 7 + last.saturating_sub(shortest)) / 8;
         }
         let time = round.time(now);
@@ -256,12 +256,12 @@ impl Delay {
                     self.settling -= 1;
                     self.urgent = (0, Duration::MAX);
                 } else if is_app_limited {
-                    // The window is not what fills a queue, and a lone packet is acknowledged late.
+                    // The window does not fill a queue then, and a lone packet is acknowledged late.
                 } else if queue > self.wanted() * 2 {
                     self.end_round_of_queue(now, rate, shortest, queue);
                 } else {
                     self.growth.add(round.acknowledged, round.lost, time, self.mtu);
-                    // A window that was never half used says nothing of a larger one.
+                    // A window that was never half used says nothing about a larger one.
                     if round.most_in_flight >= self.window / 2 {
                         self.grow(queue);
                     }
@@ -270,8 +270,8 @@ impl Delay {
         }
     }
 
-    /// Whether the window doubles and the first packets of this round were in a queue already: at its end it would have
-    /// doubled once more.
+    /// Returns whether the window doubles and the first packets of this round already were in a queue. At the
+    /// end of the round it would have doubled once more.
     fn starts_too_fast(&self) -> bool {
         let is_start = matches!(self.phase, WindowPhase::Start { .. });
         let queue = self.round.shortest.unwrap_or_default().saturating_sub(self.path.get());
@@ -290,7 +290,7 @@ impl Delay {
         }
         *best = best.max(rate);
         if queue > wanted || *idle >= IDLE {
-            // The last round doubled the window, and nobody has seen yet what that does.
+            // The last round doubled the window, and the effect is not measured yet.
             let held = self.growth.held(*best, self.path.get() + queue);
             self.phase = WindowPhase::Steady;
             self.set_window(self.window.min(held.max(self.window / 4)));
@@ -325,7 +325,7 @@ impl Delay {
         self.set_window(share);
     }
 
-    /// Lets the window grow by a step, unless the last ones did not pay.
+    /// Lets the window grow by a step, unless the last steps brought no more bytes through.
     fn grow(&mut self, queue: Duration) {
         let rtt = self.path.get() + queue;
         if let Some(smaller) = self.growth.judge(self.window, self.mtu, FLOOR * self.mtu, rtt) {
@@ -430,7 +430,7 @@ impl Controller for Delay {
             let cubic = competition.cubic_always();
             return cubic.on_congestion_event(now, sent, is_persistent_congestion, lost_bytes);
         }
-        // A mark of a router comes as a congestion event that lost nothing.
+        // A router's mark arrives as a congestion event without losses.
         let (share, least) = match (is_persistent_congestion, lost_bytes) {
             // Chance does this too where little is sent and much is lost, and a window that has hardly any packet on
             // the way does not learn that it could have more.
@@ -456,7 +456,7 @@ impl Controller for Delay {
     fn window(&self) -> u64 {
         let floor = FLOOR * self.mtu;
         match &self.phase {
-            // It looks at the queue with few packets on the way.
+            // A probe measures the queue with few packets in flight.
             WindowPhase::Compete(competition) => competition.window().unwrap_or(floor).max(floor),
             _ => self.silence.widen(self.window, self.mtu),
         }

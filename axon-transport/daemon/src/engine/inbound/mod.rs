@@ -1,8 +1,8 @@
 //! Samples from one peer: out of QUIC streams into the rings of stand-ins.
 //!
-//! The streams of a flow are read one after the other, in the order in which they came, so that its samples stay in
-//! order when a successor takes over. A stream whose ring is full is not read on: QUIC's flow control holds back the
-//! peer.
+//! The streams of a flow are read one after the other, in the order of arrival, so that its samples stay in
+//! order when a successor takes over. While a ring is full, its stream is not read: QUIC's flow control then
+//! holds back the peer.
 
 mod delivery;
 #[cfg(test)]
@@ -46,24 +46,24 @@ use crate::{
     link::{CloseCode, ReceivedUpTo},
 };
 
-/// A stream may come before the route that it belongs to.
+/// Time for which a stream may wait for its route to arrive.
 const ARRIVAL: Duration = Duration::from_secs(2);
-/// A message longer than this waits for memory before anything of it is read. A shorter one takes some where it does not
-/// come whole.
+/// A message longer than this waits for memory before any byte of it is read. A shorter message takes memory
+/// only if it does not arrive at once.
 const LONG: usize = 32 << 10;
-/// Bytes of a stream that are read before others have their turn.
+/// Bytes of a stream that are read before other streams have their turn.
 const TURN: usize = 1 << 20;
-/// A stream whose ring was full tries again after this time, if no reader said that it made room.
+/// Time after which a stream with a full ring tries again if no reader signals room.
 const FULL_RETRY: Duration = Duration::from_millis(100);
-/// Why samples are lost that a link had not carried whole.
+/// The reason that is logged for samples that a link had not delivered completely.
 const ENDED: &str = "the link ended before they were read";
-/// What a stream is told whose route there is not.
+/// The code that stops a stream without a route.
 const NO_ROUTE: VarInt = VarInt::from_u32(CloseCode::OutOfOrder as u32);
 
-/// A data stream: its connection, and its number there.
+/// A data stream: its connection, and its number in that connection.
 type StreamKey = (u64, StreamId);
 
-/// The peer broke a rule: the code that ends its link, and why.
+/// A protocol violation of the peer: the code that ends its link, and the reason.
 pub(crate) type LinkViolation = (CloseCode, String);
 
 /// A route that this host asked for.
@@ -72,24 +72,24 @@ pub(crate) struct RouteIn {
     pub(crate) topic: Arc<str>,
     /// Topic and kind, for the envelope.
     pub(crate) route: Route,
-    /// The stand-ins that are written to, by the GID of the remote publisher, client or server.
+    /// The stand-ins that the samples are written to, by the GID of the remote publisher, client or server.
     pub(crate) writers: HashMap<Gid, Rc<StandIn>>,
-    /// Of responses: the local clients that they answer, and up to which number of its flow each has them.
+    /// For responses: the local clients, each with the number up to which it has the responses of its flow.
     clients: HashMap<Gid, u64>,
-    /// The limits on what the peer sends.
+    /// The limits on samples from the peer.
     pub(crate) limit: RouteLimit,
-    /// Whether all readers here are RELIABLE and KEEP_ALL.
+    /// Whether all local readers are RELIABLE and KEEP_ALL.
     pub(crate) keeps_all: bool,
 }
 
 impl RouteIn {
-    /// A route without writers.
+    /// Creates a route without writers.
     pub(crate) fn new(topic: Arc<str>, route: Route, limits: Vec<Rc<Limit>>) -> Self {
         let (writers, clients) = (HashMap::new(), HashMap::new());
         Self { topic, route, writers, clients, limit: RouteLimit::new(limits), keeps_all: false }
     }
 
-    /// The route's responses go to these local clients.
+    /// Replaces the local clients that the route's responses go to.
     pub(crate) fn set_clients(&mut self, clients: impl Iterator<Item = Gid>) {
         let before = std::mem::take(&mut self.clients);
         let has = |client: Gid| (client, before.get(&client).copied().unwrap_or(0));
@@ -108,40 +108,40 @@ impl RouteIn {
 pub(crate) struct Inbound {
     routes: HashMap<u32, RouteIn>,
     streams: HashMap<StreamKey, IncomingStream>,
-    /// The streams of each flow, in the order in which they came.
+    /// The streams of each flow, in order of arrival.
     turns: HashMap<(u32, Gid), VecDeque<StreamKey>>,
     ready: VecDeque<StreamKey>,
-    /// Streams that wait until a time at the latest.
+    /// Streams that wait, each with the time at which its wait ends.
     waiting: BTreeSet<(Duration, StreamKey)>,
     /// Streams that wait for room in a ring.
     full: HashSet<StreamKey>,
     /// Streams that wait for memory.
     without_room: StreamQueue,
     limited: Limited,
-    /// Memory for one short message where the identity has none left: those that have come whole are read one after the
-    /// other.
+    /// Memory for one short message if the identity has none left. Complete messages are then read one after
+    /// the other.
     spare: Rc<Meter>,
-    /// When streams try again whose ring was full: the reader that it waited for may be gone.
+    /// When streams with a full ring try again, since the reader that they wait for may be gone.
     full_retry: Option<Duration>,
-    /// The link whose peer was found to have more long messages in flight than it may.
+    /// The link whose peer had more long messages in flight than permitted.
     exceeded: Option<u64>,
-    /// Bytes that the memory for messages had released at the last look.
+    /// Bytes that the memory for messages had released at the last check.
     released: usize,
     receipts: Receipts,
-    /// The stand-in whose subscriptions were not woken for what was written.
+    /// The stand-in whose subscriptions were not woken yet for the written samples.
     written: Option<Rc<StandIn>>,
-    /// Where a short message is opened.
+    /// The buffer in which a short message's envelope is opened.
     envelope: Vec<u8>,
     counters: Rc<Counters>,
     intake: MessageMemory,
     max_message: u64,
-    /// CLOCK_MONOTONIC, in nanoseconds, when the engine's time was zero.
+    /// CLOCK_MONOTONIC, in nanoseconds, at the engine's time zero.
     epoch_nanos: u64,
     losses: LogLimit,
 }
 
 impl Inbound {
-    /// Takes nothing yet. `intake` is the memory for messages.
+    /// Creates an inbound side without routes. `intake` is the memory for messages.
     pub(crate) fn new(
         counters: Rc<Counters>,
         intake: MessageMemory,
@@ -172,18 +172,18 @@ impl Inbound {
         }
     }
 
-    /// The route of this number, for changes; [`handle_routes`](Self::handle_routes) has to follow.
+    /// Returns the routes, for changes. Call [`handle_routes`](Self::handle_routes) afterwards.
     pub(crate) fn routes(&mut self) -> &mut HashMap<u32, RouteIn> {
         &mut self.routes
     }
 
-    /// Routes or writers changed: streams may go on that waited for them.
+    /// Continues streams that waited for a route or writer, after these changed.
     pub(crate) fn handle_routes(&mut self) {
         let waiting: Vec<_> = self.waiting.iter().map(|(_, key)| *key).collect();
         waiting.into_iter().for_each(|key| self.make_ready(key));
     }
 
-    /// The peer opened a stream, or more of it arrived.
+    /// Handles a new stream of the peer, or more data on a stream.
     pub(crate) fn handle_readable(&mut self, link: u64, stream: StreamId) {
         self.streams.entry((link, stream)).or_default();
         self.make_ready((link, stream));
@@ -197,7 +197,7 @@ impl Inbound {
         }
     }
 
-    /// Readers made room in rings.
+    /// Continues streams that wait for room, after readers made some.
     pub(crate) fn handle_room(&mut self) {
         self.full_retry = None;
         for key in std::mem::take(&mut self.full) {
@@ -205,7 +205,7 @@ impl Inbound {
         }
     }
 
-    /// Lets streams go on that wait for memory, if another stream of the peer's identity gave some back.
+    /// Continues streams that wait for memory, if another stream of the peer's identity released some.
     pub(crate) fn look_for_memory(&mut self) {
         let released = self.intake.released();
         if !self.without_room.is_empty()
@@ -221,8 +221,8 @@ impl Inbound {
         }
     }
 
-    /// Returns how many bytes of this link's long messages wait for memory, if the peer may not have so many in flight.
-    /// Says so once for each link.
+    /// Returns how many bytes of this link's long messages wait for memory, if the peer may not have that
+    /// many in flight. Reports each link once.
     pub(crate) fn find_excess(&mut self, link: u64, most: u64) -> Option<u64> {
         if self.without_room.is_empty() || self.exceeded == Some(link) {
             return None;
@@ -246,12 +246,12 @@ impl Inbound {
         !self.full.is_empty()
     }
 
-    /// Whether there is something to read.
+    /// Returns whether a stream has data to read.
     pub(crate) fn has_work(&self) -> bool {
         !self.ready.is_empty()
     }
 
-    /// Streams that have something to read.
+    /// Counts the streams that have data to read.
     pub(crate) fn ready(&self) -> usize {
         self.ready.len()
     }
@@ -261,7 +261,7 @@ impl Inbound {
         self.forget(key);
     }
 
-    /// The next stream that has something to read, and its link.
+    /// Returns the next stream with data to read, and its link.
     pub(crate) fn next_ready(&mut self) -> Option<(u64, StreamId)> {
         let key = self.ready.pop_front()?;
         if let Some(stream) = self.streams.get_mut(&key) {
@@ -270,12 +270,12 @@ impl Inbound {
         Some(key)
     }
 
-    /// Streams of a link that are not read to their end.
+    /// Counts the streams of a link that are not read to their end.
     pub(crate) fn streams_of(&self, link: u64) -> usize {
         self.streams.keys().filter(|(of, _)| *of == link).count()
     }
 
-    /// A link is over: what of its streams was not read is lost.
+    /// Handles the end of a link: the unread data of its streams is lost.
     pub(crate) fn link_over(&mut self, link: u64, now: Duration) {
         let keys: Vec<_> = self.streams.keys().filter(|(of, _)| *of == link).copied().collect();
         for key in keys {
@@ -313,7 +313,7 @@ impl Inbound {
         parts.into_iter().flatten().min()
     }
 
-    /// Lets streams go on whose wait is over.
+    /// Continues streams whose wait is over.
     pub(crate) fn handle_timeout(&mut self, now: Duration) {
         if self.full_retry.is_some_and(|due| due <= now) {
             self.handle_room();
@@ -324,7 +324,7 @@ impl Inbound {
         self.handle_limits_due(now);
     }
 
-    /// The next acknowledgement that is due.
+    /// Returns the next acknowledgement that is due.
     pub(crate) fn poll_receipt(&mut self, now: Duration) -> Option<ReceivedUpTo> {
         self.receipts.poll_message(now)
     }

@@ -26,9 +26,9 @@ use crate::keys::{
 #[cfg(test)]
 pub(crate) mod tests;
 
-/// Time between two looks for keys whose time is over.
+/// Time between two removals of expired keys.
 const EXPIRE_EVERY: Duration = Duration::from_secs(1);
-/// Shortest time to the next poll of a peer's machines: a deadline of theirs may be over although they
+/// Shortest time to the next poll of a peer's machines. One of their deadlines may have passed while they
 /// wait for an answer of the KME.
 const SHORTEST_WAIT: Duration = Duration::from_millis(5);
 
@@ -41,9 +41,9 @@ pub(crate) struct Keyring {
     /// The time of the acceptor: the engine's, as of the last call.
     clock: Clock,
     dialler: BootstrapDialler,
-    /// Whether the dialler may have a request.
+    /// Whether the peer is in [`Keyring::touched`].
     dialler_touched: bool,
-    /// By number. A peer stays: its keys outlive connections.
+    /// The peers by number. A peer is never removed, because its keys outlive connections.
     peers: Vec<PeerKeys>,
     /// Numbers by SAE ID.
     numbers: HashMap<String, usize>,
@@ -66,7 +66,7 @@ struct PeerKeys {
     receiver: KeyReceiver,
     /// Whether it is in [`Keyring::touched`].
     touched: bool,
-    /// When its machines have to be polled without other cause.
+    /// When to poll the peer's machines without another cause.
     due: Option<Duration>,
 }
 
@@ -129,12 +129,12 @@ impl Keyring {
         self.acceptor.resolver(source)
     }
 
-    /// Whether and with which key to dial `sae` now.
+    /// Decides whether, and with which key, to dial `sae` now.
     pub(crate) fn dial(&mut self, now: Duration, sae: &str) -> DialDecision {
         self.dialler().dial(now, sae)
     }
 
-    /// The dialler, for how a dial ended.
+    /// Returns the dialler, to report how a dial ended.
     pub(crate) fn dialler(&mut self) -> &mut BootstrapDialler {
         self.dialler_touched = true;
         &mut self.dialler
@@ -198,8 +198,8 @@ impl Keyring {
         self.touch(number);
         self.peers[number].receiver.elect(connection);
         let sender = &mut self.peers[number].sender;
-        // RETIREs that the previous connection still gets: a successor has not closed it yet. If a third
-        // connection took its place before, nobody reads them.
+        // RETIRE messages that are still sent on the previous connection, which a successor has not closed
+        // yet. If a third connection took over in the meantime, these messages are lost.
         let owed = sender.attach(now, connection, exporters)?;
         self.messages.extend(owed);
         if let Some((key_id, key)) = first {
@@ -291,7 +291,7 @@ impl Keyring {
         Some(&mut self.peers[number].receiver)
     }
 
-    /// The next call to the KME, if any.
+    /// Returns the next request to the KME.
     pub(crate) fn poll_request(&mut self, now: Duration) -> Option<(RequestOrigin, KmeRequest)> {
         self.drain(now);
         if let Some(request) = self.acceptor.poll_request() {
@@ -325,7 +325,7 @@ impl Keyring {
         Some(connection)
     }
 
-    /// When to call [`handle_timeout`](Self::handle_timeout).
+    /// Returns when to call [`handle_timeout`](Self::handle_timeout).
     pub(crate) fn poll_timeout(&self) -> Duration {
         let due = self.peers.iter().filter_map(|peer| peer.due).min();
         due.map_or(self.expires, |due| due.min(self.expires))
@@ -353,7 +353,8 @@ impl Keyring {
         }
     }
 
-    /// For status: counters of the KME client, of the ledger of used keys, and of each peer's supply.
+    /// Returns the counters for status: of the KME client, of the ledger of used keys, and of each peer's
+    /// supply.
     pub(crate) fn status(
         &self,
         now: Duration,
@@ -374,7 +375,7 @@ impl Keyring {
         serde_json::json!({ "kme": kme, "peers": peers, "used_keys": used })
     }
 
-    /// The number of the peer `sae`, from now on if it has none.
+    /// Returns the number of the peer `sae`, and assigns one if it has none.
     fn number(&mut self, sae: &str) -> Result<usize, SupplyError> {
         if let Some(number) = self.numbers.get(sae) {
             return Ok(*number);
@@ -397,7 +398,7 @@ impl Keyring {
         number.ok_or(SupplyError::Unattached(connection))
     }
 
-    /// The number in an [`RequestOrigin`], if it is a peer's.
+    /// Returns the number in a [`RequestOrigin`] if it belongs to a peer.
     fn known(&self, number: u64) -> Option<usize> {
         usize::try_from(number).ok().filter(|number| *number < self.peers.len())
     }
@@ -408,7 +409,7 @@ impl Keyring {
         }
     }
 
-    /// Takes from the touched machines what they ask for and have to say.
+    /// Collects requests and messages from the touched machines.
     fn drain(&mut self, now: Duration) {
         self.set_time(now);
         if mem::take(&mut self.dialler_touched) {
@@ -444,7 +445,7 @@ impl Keyring {
 }
 
 impl PeerKeys {
-    /// Logs what the owner of this host should know of the keys.
+    /// Logs warnings about keys for the operator of this host.
     fn warn(&mut self, now: Duration, config: &QkdConfig) {
         if let Some(warning) = self.sender.warning(now) {
             tracing::warn!(peer = %self.sae, "{warning}");
@@ -455,7 +456,7 @@ impl PeerKeys {
     }
 }
 
-/// The peer's KME gave it another key than this host's KME gave here, under the same key_ID.
+/// Logs that the peer's KME and this host's KME gave different keys under the same key_ID.
 pub(crate) fn warn_disagreement(config: &QkdConfig, peer: &str, what: &impl fmt::Display) {
     tracing::warn!(
         "the KMEs disagree about {what}: SAE {} has one key from {}, SAE {peer} another one from \

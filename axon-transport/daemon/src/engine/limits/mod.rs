@@ -1,5 +1,5 @@
-//! How much of which topic may pass between this host and one identity: `[[limit]]` of the access rules and `max_hz` of
-//! `[[topic]]`.
+//! The limits on samples between this host and one identity, by topic: `[[limit]]` of the access rules and
+//! `max_hz` of `[[topic]]`.
 
 mod egress;
 mod flow_queue;
@@ -24,19 +24,19 @@ use axon_transport::{
 pub(crate) use self::{egress::Egress, interfaces::InterfaceLimits};
 use self::{egress::EgressCap, flow_queue::FlowQueue, rate_bucket::RateBucket};
 
-/// Limits that status lists.
+/// The most limits that status lists.
 const LISTED: usize = 64;
-/// Topics of which an identity's limits are remembered while no route has them: else a route that is asked for anew, or a
-/// new link, would have a full bucket.
+/// Topics whose limits are remembered while no route has them. Otherwise a route that is requested again, or
+/// a new link, would start with a full bucket.
 const REMEMBERED: usize = 1024;
-/// A flow that waits asks again after so long for each flow before it, at most.
+/// The longest time, per flow before it, after which a waiting flow asks again.
 const ASK_AGAIN: Duration = Duration::from_millis(20);
-/// How status shows the name of a limit of all topics together.
+/// The name in status of a limit on all topics together.
 const ALL_TOPICS: &str = "(all topics)";
-/// Characters of the topics that have a limit together, in status.
+/// Characters in status for the topics that share a limit.
 const SHOWN: usize = 80;
 
-/// What a limit is about.
+/// The scope of a limit.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 struct LimitScope {
     verb: Verb,
@@ -46,12 +46,12 @@ struct LimitScope {
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 enum Topics {
     One(Arc<str>),
-    /// All topics of an entry, which has these names.
+    /// All topics of an entry together; the text lists their names.
     Together(Arc<str>),
 }
 
 impl Topics {
-    /// As status shows them.
+    /// Returns the topics as status shows them.
     fn text(&self) -> String {
         match self {
             Self::One(topic) => topic.to_string(),
@@ -64,33 +64,33 @@ impl Topics {
     }
 }
 
-/// One limit on one topic, or on several together, and what it let pass.
+/// One limit on one topic, or on several together, with counters.
 #[derive(Debug)]
 pub(crate) struct Limit {
     rate: RateLimit,
     scope: LimitScope,
-    /// Where it is written.
+    /// The place of the limit in the settings.
     place: RefCell<String>,
-    /// The cause under which what it drops is counted.
+    /// The cause under which dropped samples are counted.
     cause: &'static str,
     bucket: RefCell<RateBucket>,
-    /// The flows that wait for it.
+    /// The flows that wait for the limit.
     line: RefCell<FlowQueue>,
     passed: Cell<u64>,
     dropped: Cell<u64>,
 }
 
-/// The limits of one identity, over all of its daemon ids and links.
+/// The limits of one identity, over all of its daemon IDs and links.
 #[derive(Debug, Default)]
 pub(crate) struct IdentityLimits {
     uses: RefCell<HashMap<LimitScope, Vec<Rc<Limit>>>>,
-    /// How many topics there were after those without a route were forgotten last.
+    /// The number of topics that were left when limits without a route were last forgotten.
     kept: Cell<usize>,
     egress: RefCell<Vec<Rc<EgressCap>>>,
 }
 
 impl IdentityLimits {
-    /// The limits on what a peer does with a topic or service; those that it has already stay as full as they are.
+    /// Returns the limits on a peer's use of a topic or service. Existing limits keep their fill level.
     pub(crate) fn of(
         &self,
         verb: Verb,
@@ -115,7 +115,7 @@ impl IdentityLimits {
         });
         let mut limits: Vec<Rc<Limit>> = Vec::new();
         for limit in found.chain(max_hz) {
-            // Two entries that say the same count once.
+            // Two identical entries count once.
             if !limits.iter().any(|other| Rc::ptr_eq(other, &limit)) {
                 limits.push(limit);
             }
@@ -143,7 +143,7 @@ impl IdentityLimits {
             *known.place.borrow_mut() = place();
             return Rc::clone(known);
         }
-        // Those that are not in force any more.
+        // Limits that are no longer in force are removed.
         limits.retain(|limit| Rc::strong_count(limit) > 1);
         let limit = Rc::new(Limit {
             bucket: RefCell::new(RateBucket::new(rate)),
@@ -159,7 +159,7 @@ impl IdentityLimits {
         limit
     }
 
-    /// Has a connection to the peer keep to the limits on all that is sent to it.
+    /// Applies the limits on everything that is sent to the peer to a connection.
     pub(crate) fn limit_egress(&self, egress: &mut Egress, permissions: &Permissions) {
         let mut all = self.egress.borrow_mut();
         let mut caps: Vec<Rc<EgressCap>> = Vec::new();
@@ -174,7 +174,7 @@ impl IdentityLimits {
         egress.set_peer(caps);
     }
 
-    /// Names the limits in the link's status: those that dropped most come first.
+    /// Adds the limits to the link's status. The limits that dropped the most come first.
     pub(crate) fn fill(&self, status: &mut LinkStatus) {
         let all = self.uses.borrow();
         let in_force = |limit: &&Rc<Limit>| Rc::strong_count(limit) > 1;
@@ -197,37 +197,37 @@ impl IdentityLimits {
     }
 }
 
-/// The limits on one route. Its copies are the same: what is [set](Self::set) counts for all.
+/// The limits on one route. Clones share them: [`set`](Self::set) applies to all.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct RouteLimit(Rc<RefCell<Vec<Rc<Limit>>>>);
 
-/// The next sample is beyond a limit.
+/// A limit that the next sample exceeds.
 #[derive(Clone, Debug)]
 pub(crate) struct Exceeded {
     limit: Rc<Limit>,
-    /// How long it is until it may pass.
+    /// Time until the sample may pass.
     pub(crate) wait: Duration,
 }
 
 impl Exceeded {
-    /// What becomes of it.
+    /// Returns what happens to the sample.
     pub(crate) fn over(&self) -> Over {
         self.limit.rate.over
     }
 
-    /// The cause under which it is counted if it is dropped.
+    /// Returns the cause under which a dropped sample is counted.
     pub(crate) fn cause(&self) -> &'static str {
         self.limit.cause
     }
 
-    /// So many samples were dropped for it.
+    /// Counts samples that were dropped because of the limit.
     pub(crate) fn dropped(&self, samples: u64) {
         self.limit.dropped.set(self.limit.dropped.get() + samples);
     }
 }
 
 impl RouteLimit {
-    /// With these limits.
+    /// Creates the limits of a route.
     pub(crate) fn new(limits: Vec<Rc<Limit>>) -> Self {
         Self(Rc::new(RefCell::new(limits)))
     }
@@ -237,13 +237,14 @@ impl RouteLimit {
         *self.0.borrow_mut() = limits;
     }
 
-    /// Whether all samples pass.
+    /// Returns whether the route has no limit.
     pub(crate) fn is_none(&self) -> bool {
         self.0.borrow().is_empty()
     }
 
-    /// Whether the next sample of a flow is beyond a limit. If it is beyond several, the one counts that opens for it last.
-    /// Flows that wait for a limit pass one after the other: the flow has a turn if it `may_wait` for that limit.
+    /// Returns the limit that the next sample of a flow exceeds. If it exceeds several, the limit that opens
+    /// last counts. Flows that wait for a limit pass one after the other. The flow joins that queue if it
+    /// `may_wait` for the limit.
     pub(crate) fn exceeded_by(
         &self,
         flow: &Gid,
@@ -255,7 +256,7 @@ impl RouteLimit {
         let (wait, last) = waits.max_by_key(|(wait, _)| *wait).filter(|(w, _)| !w.is_zero())?;
         for limit in limits.iter() {
             let mut line = limit.line.borrow_mut();
-            // It would keep others from limits that it cannot use yet.
+            // Otherwise the flow would keep others from limits that it cannot use yet.
             match Rc::ptr_eq(limit, last) && may_wait(limit.rate.over) {
                 true => line.wait(flow, now + wait),
                 false => line.leave(flow),
@@ -264,13 +265,13 @@ impl RouteLimit {
         Some(Exceeded { limit: Rc::clone(last), wait })
     }
 
-    /// How many samples of a flow may pass now, if they are as long as the last one.
+    /// Returns how many samples of a flow may pass now, if they are as long as the last one.
     pub(crate) fn passes(&self, flow: &Gid, now: Duration) -> usize {
         let limits = self.0.borrow();
         limits.iter().map(|limit| limit.passes(flow, now)).min().unwrap_or(usize::MAX)
     }
 
-    /// A sample of a flow passes.
+    /// Counts a sample of a flow that passes.
     pub(crate) fn pass(&self, flow: &Gid, length: usize, now: Duration) {
         for limit in &*self.0.borrow() {
             limit.bucket.borrow_mut().pass(length, now);
@@ -281,13 +282,13 @@ impl RouteLimit {
 }
 
 impl Limit {
-    /// How many samples of a flow may pass besides those of flows before it.
+    /// Returns how many samples of a flow may pass in addition to those of the flows before it.
     fn passes(&self, flow: &Gid, now: Duration) -> usize {
         let ahead = self.line.borrow_mut().ahead_of(flow, now);
         self.bucket.borrow().passes(now).saturating_sub(ahead)
     }
 
-    /// How long the next sample of a flow has to wait.
+    /// Returns how long the next sample of a flow must wait.
     fn wait_of(&self, flow: &Gid, now: Duration) -> Duration {
         if self.passes(flow, now) > 0 {
             return Duration::ZERO;
@@ -295,7 +296,7 @@ impl Limit {
         let ahead = self.line.borrow_mut().ahead_of(flow, now);
         let ahead = u32::try_from(ahead).unwrap_or(u32::MAX);
         let bucket = self.bucket.borrow();
-        // Samples before it may be shorter than the last one: it asks again in time.
+        // Earlier samples may be shorter than the last one, so the flow asks again in time.
         let turn = bucket.interval().min(ASK_AGAIN).saturating_mul(ahead);
         (bucket.open_at().saturating_sub(now) + turn).max(Duration::from_nanos(1))
     }
@@ -309,12 +310,12 @@ pub(crate) mod tests {
 
     const OF: Gid = Gid([1; 16]);
 
-    /// The permissions that rules give a peer.
+    /// Returns the permissions that rules give a peer.
     pub(crate) fn permissions(rules: &str) -> Permissions {
         AccessRules::parse(rules, "access.toml").unwrap().permissions(Party::Name("base"))
     }
 
-    /// The limits that the text of a `[[limit]]` sets on what a peer gets of a topic.
+    /// Returns the limits that the text of a `[[limit]]` sets on a peer's subscriptions to a topic.
     pub(crate) fn limits(text: &str) -> Vec<Rc<Limit>> {
         let rules = format!("[[limit]]\npeer = \"*\"\n{text}");
         IdentityLimits::default().of(
@@ -425,8 +426,9 @@ pub(crate) mod tests {
         );
     }
 
-    /// So many flows of a limit of samples a second: each has a sample each `every` milliseconds, and asks when it has one
-    /// and when its turn comes. How many samples of each pass in ten seconds.
+    /// Runs flows that share a limit of samples a second for ten seconds. Each flow has a sample every
+    /// `every` milliseconds, and asks when it has one and when its turn comes. Returns how many samples of
+    /// each flow pass.
     fn share(flows: &[u64], text: &str) -> Vec<u64> {
         let rules = format!("[[limit]]\npeer = \"*\"\ntogether = true\n{text}");
         let all = IdentityLimits::default();

@@ -1,4 +1,4 @@
-//! The QUIC connections of this host: which have something to do, when each is due, and whose turn it is to transmit.
+//! The QUIC connections of this host: which of them have work, when each is due, and which transmits next.
 
 use std::{
     collections::{BTreeSet, HashMap, VecDeque},
@@ -25,28 +25,29 @@ use crate::{
     link::CloseCode,
 };
 
-/// All connections of all endpoints. Each has a number that no other one of this daemon ever has.
+/// All connections of all endpoints. Each has a number that is unique in this daemon.
 pub(super) struct Connections {
     epoch: Instant,
     endpoints: QuicEndpoints,
     all: HashMap<u64, Connection>,
     handles: HashMap<(usize, ConnectionHandle), u64>,
     next_number: u64,
-    /// Connections with something to do.
+    /// Connections with work.
     dirty: VecDeque<u64>,
     /// Connections that may have something to transmit.
     transmitting: VecDeque<u64>,
-    /// Those of them whose limit lets no packet leave, by the time when it does. Of those that share a limit the one that
-    /// began to wait first is first: it has a number that rises.
+    /// Connections that a limit keeps from transmitting, by the time at which a packet may leave. Among
+    /// connections with the same limit, the one that began to wait first goes first: the second part is a
+    /// rising number.
     limited: BTreeSet<(Duration, u64, u64)>,
     next_wait: u64,
     deadlines: BTreeSet<(Instant, u64)>,
-    /// The limits on what leaves by each network interface.
+    /// The limits on packets that leave by each network interface.
     interfaces: InterfaceLimits,
 }
 
 impl Connections {
-    /// No connections yet. The engine's time was zero at `epoch`.
+    /// Creates an empty set. The engine's time was zero at `epoch`.
     pub(super) fn new(endpoints: QuicEndpoints, epoch: Instant) -> Self {
         Self {
             epoch,
@@ -83,23 +84,23 @@ impl Connections {
         Some(self.get(number)?.quic.remote_address())
     }
 
-    /// Whether there is one to this address.
+    /// Returns whether there is a connection to this address.
     pub(super) fn has(&self, address: IpAddr) -> bool {
         let address = address.to_canonical();
         self.all.values().any(|c| c.quic.remote_address().ip().to_canonical() == address)
     }
 
-    /// The numbers of all.
+    /// Returns the numbers of all connections.
     pub(super) fn numbers(&self) -> Vec<u64> {
         self.all.keys().copied().collect()
     }
 
-    /// Whether all are over.
+    /// Returns whether all connections have ended.
     pub(super) fn is_empty(&self) -> bool {
         self.all.is_empty()
     }
 
-    /// Handles a datagram of QUIC. Returns the connection that it begins, if it begins one.
+    /// Handles a QUIC datagram. Returns the connection that the datagram opens, if it opens one.
     pub(super) fn handle_datagram(
         &mut self,
         endpoint: usize,
@@ -125,7 +126,7 @@ impl Connections {
         }
     }
 
-    /// Begins a connection to an address. Returns its number.
+    /// Opens a connection to an address. Returns its number.
     ///
     /// # Errors
     /// QUIC refuses; `None` if no endpoint reaches the address.
@@ -142,7 +143,7 @@ impl Connections {
     /// Accepts a connection. Returns its number.
     ///
     /// # Errors
-    /// Why it failed at once. The peer has been told.
+    /// The connection failed at once. The peer has been informed.
     pub(super) fn accept(
         &mut self,
         endpoint: usize,
@@ -170,7 +171,7 @@ impl Connections {
         number
     }
 
-    /// Has a connection looked at in this pass.
+    /// Schedules a connection for this pass.
     pub(super) fn touch(&mut self, number: u64) {
         if let Some(connection) = self.all.get_mut(&number)
             && !std::mem::replace(&mut connection.is_dirty, true)
@@ -179,12 +180,12 @@ impl Connections {
         }
     }
 
-    /// Whether any has something to do.
+    /// Returns whether a connection has work.
     pub(super) fn has_work(&self) -> bool {
         !self.dirty.is_empty()
     }
 
-    /// The next connection with something to do. What it has for its endpoint is done.
+    /// Returns the next connection with work, after processing its events for its endpoint.
     pub(super) fn poll_dirty(&mut self) -> Option<u64> {
         while let Some(number) = self.dirty.pop_front() {
             let Some(connection) = self.all.get_mut(&number) else { continue };
@@ -200,8 +201,8 @@ impl Connections {
         None
     }
 
-    /// Writes what waits on the control stream, and notes when the connection is due and that it may transmit. One that
-    /// is drained is removed, unless it `stays`.
+    /// Writes the waiting data of the control stream, and records the connection's deadline and that it may
+    /// transmit. Removes a drained connection unless it `stays`.
     pub(super) fn note(&mut self, number: u64, stays: bool) {
         let Some(connection) = self.all.get_mut(&number) else { return };
         if connection.control.has_output() {
@@ -219,7 +220,7 @@ impl Connections {
     fn remove(&mut self, number: u64) {
         let Some(connection) = self.all.remove(&number) else { return };
         let handle = (connection.endpoint, connection.handle);
-        // QUIC may have given it to another connection since.
+        // QUIC may have reused the handle for another connection.
         if self.handles.get(&handle) == Some(&number) {
             self.handles.remove(&handle);
         }
@@ -237,7 +238,7 @@ impl Connections {
         }
     }
 
-    /// Closes a connection. Its last packets leave with the pass.
+    /// Closes a connection. Its last packets leave in this pass.
     pub(super) fn close(&mut self, number: u64, code: CloseCode, reason: &str, now: Instant) {
         let Some(connection) = self.all.get_mut(&number) else { return };
         connection.control.close();
@@ -255,7 +256,7 @@ impl Connections {
         [quic, control, limited].into_iter().flatten().min()
     }
 
-    /// Runs QUIC's timers, and has those connections looked at whose control streams may be read again.
+    /// Runs QUIC's timers, and schedules the connections whose control streams may be read again.
     pub(super) fn handle_timeout(&mut self, now: Duration) {
         let instant = self.epoch + now;
         while let Some((due, number)) = self.deadlines.first().copied()
@@ -280,7 +281,7 @@ impl Connections {
         paused.into_iter().for_each(|number| self.touch(number));
     }
 
-    /// Changes the limits of network interfaces, and has all connections keep to them.
+    /// Changes the limits of network interfaces, and applies them to all connections.
     pub(super) fn limit_interfaces(&mut self, change: impl FnOnce(&mut InterfaceLimits)) {
         change(&mut self.interfaces);
         for connection in self.all.values_mut() {
@@ -288,12 +289,12 @@ impl Connections {
         }
     }
 
-    /// Whether the owner has to list this host's network interfaces.
+    /// Returns whether the owner must list this host's network interfaces.
     pub(super) fn asks_for_interfaces(&mut self) -> bool {
         self.interfaces.asks()
     }
 
-    /// The next packets, and the endpoint that sends them. `buffer` is cleared and filled.
+    /// Returns the next packets and the endpoint that sends them. Clears and fills `buffer`.
     pub(super) fn poll_transmit(
         &mut self,
         max_datagrams: usize,

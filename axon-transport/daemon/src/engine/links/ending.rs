@@ -1,4 +1,4 @@
-//! The ends of links: lost connections, broken rules, the end of the daemon.
+//! The ends of links: lost connections, protocol violations, and the shutdown of the daemon.
 
 use std::{net::IpAddr, time::Duration};
 
@@ -23,7 +23,7 @@ impl Links {
         any
     }
 
-    /// A connection was lost.
+    /// Handles the loss of a connection.
     pub(super) fn handle_lost(&mut self, number: u64, reason: &ConnectionError, now: Duration) {
         let Some(link) = self.table.get_mut(number) else { return };
         match &mut link.phase {
@@ -49,38 +49,38 @@ impl Links {
             LinkPhase::Electing(_) | LinkPhase::Open | LinkPhase::Leaving(_) => {
                 let refusal = Refusal::of(reason);
                 let text = refusal.to_string();
-                // A stateless reset: another daemon has the peer's port.
+                // A stateless reset means that another daemon has the peer's port.
                 let restarted = matches!(reason, ConnectionError::Reset);
                 self.end_link_of(number, &text, Some(refusal), restarted, now);
             }
         }
     }
 
-    /// What is known of the peer of a link.
+    /// Returns how far the peer of a link is known.
     pub(in crate::engine) fn kind(&self, number: u64) -> RefusalKind {
         let address = self.connections.address(number);
         address.map_or(RefusalKind::Unproven, |address| self.authenticated(address.ip()))
     }
 
-    /// What is known of a peer at this address whose handshake is complete.
+    /// Returns how far a peer at this address is known after its handshake is complete.
     pub(super) fn authenticated(&self, address: IpAddr) -> RefusalKind {
         let proves = self.credentials.authenticates();
         if proves { RefusalKind::Peer } else { self.unauthenticated(address) }
     }
 
-    /// What is known of a host at this address, before it proves anything.
+    /// Returns how far a host at this address is known before it proves anything.
     pub(super) fn unauthenticated(&self, address: IpAddr) -> RefusalKind {
         let listed = self.admission.is_listed(address);
         if listed { RefusalKind::Listed } else { RefusalKind::Unproven }
     }
 
-    /// Ends a link since its host has another one.
+    /// Ends a link because its host has another one.
     pub(in crate::engine) fn replace(&mut self, number: u64, why: &str, now: Duration) {
         self.close_connection(number, CloseCode::Replaced, why, now);
         self.end_link_of(number, why, None, true, now);
     }
 
-    /// Ends a link whose peer broke a rule.
+    /// Ends a link whose peer violated the protocol.
     pub(in crate::engine) fn violation(
         &mut self,
         number: u64,
@@ -91,7 +91,7 @@ impl Links {
         self.violation_told(number, code, why, why, now);
     }
 
-    /// As [`violation`](Self::violation), with another text for the peer.
+    /// Ends a link as [`violation`](Self::violation) does, with another text for the peer.
     pub(in crate::engine) fn violation_told(
         &mut self,
         number: u64,
@@ -109,14 +109,14 @@ impl Links {
         self.end_link(number, why, None, now);
     }
 
-    /// Reports a connection that was dialled and whose opening failed.
+    /// Reports a dialled connection whose opening failed.
     pub(super) fn opening_failed(&mut self, number: u64) {
         if let Some(report) = self.dials.opening_failed(number) {
             self.outbox.report(report);
         }
     }
 
-    /// Closes a connection. Its last packets leave with the pass.
+    /// Closes a connection. Its last packets leave in this pass.
     pub(super) fn close_connection(
         &mut self,
         number: u64,
@@ -132,7 +132,7 @@ impl Links {
         self.connections.close(number, code, reason, instant);
     }
 
-    /// A link is over.
+    /// Ends a link.
     pub(super) fn end_link(
         &mut self,
         number: u64,
@@ -143,7 +143,7 @@ impl Links {
         self.end_link_of(number, reason, refusal, false, now);
     }
 
-    /// A link is over. `restarted`: another daemon of the peer's host takes the place of its own.
+    /// Ends a link. `restarted`: another daemon of the peer's host replaces its daemon.
     fn end_link_of(
         &mut self,
         number: u64,
@@ -173,12 +173,12 @@ impl Links {
         self.outbox.event(LinkEvent::Down { number, daemon, peer, reason, restarted });
     }
 
-    /// Whether all connections are over.
+    /// Returns whether all connections have ended.
     pub(in crate::engine) fn is_idle(&self) -> bool {
         self.connections.is_empty()
     }
 
-    /// Closes all links: this host's daemon ends.
+    /// Closes all links, because this host's daemon shuts down.
     pub(in crate::engine) fn close_all(&mut self, now: Duration) {
         self.closing = true;
         self.dials.clear();

@@ -9,25 +9,26 @@ use axon_transport::access::Party;
 use super::admission::place;
 use crate::link::LinkHello;
 
-/// As whom a peer proved itself.
+/// The identity that a peer proved.
 #[derive(Clone, Debug)]
 pub(crate) enum PeerIdentity {
-    /// By a KME key.
+    /// Proven by a KME key.
     Sae(String),
-    /// By a key that is pinned under this name.
+    /// Proven by a key that is pinned under this name.
     Pinned(String, SpkiDigest),
-    /// By a certificate that has this host's name.
+    /// Proven by a certificate for this host name.
     Host(String, SpkiDigest),
-    /// As the owner of a key that says nothing about who that is.
+    /// Unauthenticated: the peer only proved that it has this key, if any.
     Somebody(Option<SpkiDigest>),
 }
 
 impl PeerIdentity {
-    /// The peer of a link whose HELLO was checked. `key` is the one that it proved to have.
+    /// Returns the identity of a link's peer after its HELLO was checked. `key` is the key that the peer
+    /// proved.
     ///
     /// # Errors
-    /// The key is not pinned any more, or there is none. Rules about names would not apply to a link without a name, also once the pin
-    /// is there again.
+    /// The key is no longer pinned, or the peer proved none. Such a link is refused, because name rules would
+    /// not apply to a link without a name, even after the pin returns.
     pub(crate) fn of(
         qkd: bool,
         auth: Option<&Auth>,
@@ -49,8 +50,8 @@ impl PeerIdentity {
         }
     }
 
-    /// Whether both are the same host. A name may have another key by now; who has no name is one
-    /// for as long as it has its key.
+    /// Returns whether both identities are the same host. A name stays the same under another key. An
+    /// unauthenticated peer stays the same only while its key does.
     pub(crate) fn is(&self, other: &Self) -> bool {
         match (self, other) {
             (Self::Sae(one), Self::Sae(other)) => one == other,
@@ -64,13 +65,14 @@ impl PeerIdentity {
     /// The host's name as status shows it: the name that was proven, or else what the host `calls_itself`.
     pub(super) fn host_name(&self, calls_itself: &str) -> String {
         match self {
-            // What it calls itself is nobody's word but its own.
+            // The name that the peer gives itself is not proven.
             Self::Pinned(name, _) => name.clone(),
             _ => calls_itself.to_owned(),
         }
     }
 
-    /// Why a peer that proved a pinned name is not that peer any more: its key is pinned under another one now.
+    /// Returns why a peer that proved a pinned name is no longer that peer: its key is now pinned under
+    /// another name.
     pub(super) fn renamed(&self, auth: Option<&Auth>) -> Option<String> {
         let (Self::Pinned(name, key), Some(Auth::Pinned { trust, .. })) = (self, auth) else {
             return None;
@@ -79,7 +81,7 @@ impl PeerIdentity {
         Some(format!("its key is pinned in AXON_CLASSIC_TRUST as {now} now, not as {name}"))
     }
 
-    /// The peer as access rules know it, at the address of its link.
+    /// Returns the party that access rules apply to; `address` is the address of the peer's link.
     pub(crate) fn party(&self, address: SocketAddr) -> Party<'_> {
         match self {
             Self::Sae(name) | Self::Pinned(name, _) => Party::Name(name),
@@ -88,8 +90,8 @@ impl PeerIdentity {
         }
     }
 
-    /// Tells whether two daemons are on the same host, by what they proved; with nothing proven the
-    /// address.
+    /// Returns a string that is equal for two daemons on the same host, by their proven identity. For
+    /// unauthenticated peers it is the address.
     pub(crate) fn host_identity(&self, address: SocketAddr) -> String {
         match self {
             Self::Sae(sae) => format!("sae {sae}"),
@@ -99,8 +101,8 @@ impl PeerIdentity {
         }
     }
 
-    /// Tells whether two daemons share the budget of a peer: those of one host, and with nothing proven those of one IPv6
-    /// network, as a host may take any address in it.
+    /// Returns a string that is equal for two daemons with a common budget: daemons of one host, or
+    /// unauthenticated daemons of one IPv6 network, since a host may take any address in its network.
     pub(super) fn budget(&self, address: SocketAddr) -> String {
         match self {
             Self::Somebody(_) => format!("address {}", place(address.ip())),
@@ -136,7 +138,7 @@ mod tests {
         let of = |auth, key| PeerIdentity::of(false, auth, &hello(), key);
         let who = of(Some(&auth), Some(key)).unwrap();
         assert_eq!(who.party(([127, 0, 0, 1], 1).into()), Party::Name("arm"));
-        // Between the handshake and HELLO.
+        // The pin is removed between the handshake and HELLO.
         for gone in ["# nobody\n".to_owned(), format!("arm {key} 2024-02-29\n")] {
             trust.replace(pins(&gone));
             let why = of(Some(&auth), Some(key)).unwrap_err();

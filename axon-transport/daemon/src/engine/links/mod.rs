@@ -1,5 +1,5 @@
-//! All links of this host: from a dial, or an incoming handshake, over HELLO and election to the hand-over to a
-//! successor and the close.
+//! All links of this host: from a dial or an incoming handshake, over HELLO and election, to the hand-over to
+//! a successor and the close.
 
 mod admission;
 mod connections;
@@ -86,7 +86,7 @@ pub(super) struct Links {
     dials: Dials,
     admission: AddressAdmission,
     next_election: u64,
-    /// Whether the daemon ends: no link begins any more.
+    /// Whether the daemon is shutting down, so that no new link is opened.
     closing: bool,
     unfinished: UnfinishedConnections,
     /// The silent links that are probed, by the nonces of the probes.
@@ -96,10 +96,10 @@ pub(super) struct Links {
     looks: LookTimes,
 }
 
-/// Tells the wall-clock time.
+/// Returns the wall-clock time.
 pub(crate) type WallClock = Rc<dyn Fn() -> SystemTime>;
 
-/// The parts of [`Links`] that the daemon, or a simulation, makes.
+/// The parts of [`Links`] that the daemon or a simulation supplies.
 pub(crate) struct LinkParts {
     /// The settings.
     pub(crate) config: Arc<Config>,
@@ -107,25 +107,25 @@ pub(crate) struct LinkParts {
     pub(crate) credentials: Credentials,
     /// This side's HELLO.
     pub(crate) hello: LinkHello,
-    /// The key of which this side's id is made.
+    /// The key from which this side's ID is derived.
     pub(crate) daemon_key: Option<Arc<DaemonKey>>,
     /// The addresses that the endpoints are bound to.
     pub(crate) addresses: Vec<SocketAddr>,
     /// The settings of the endpoints.
     pub(crate) endpoint: Arc<quinn_proto::EndpointConfig>,
-    /// Where QUIC's events are written, if anywhere.
+    /// The destination of QUIC's event logs, if there is one.
     pub(crate) qlogs: Option<Rc<dyn Qlogs>>,
-    /// When the engine's time was zero.
+    /// The instant of the engine's time zero.
     pub(crate) epoch: Instant,
-    /// The wall clock. It dates the beginnings of links and ends pins, and decides nothing else.
+    /// The wall clock. It only dates the beginnings of links and the ends of pins.
     pub(crate) wall: WallClock,
 }
 
 impl Links {
-    /// No links yet.
+    /// Creates a set without links.
     ///
     /// # Errors
-    /// The settings make no TLS server.
+    /// The settings do not give a TLS server.
     pub(super) fn new(parts: LinkParts) -> Result<Self, GatewayError> {
         let LinkParts { config, credentials, hello, daemon_key, .. } = parts;
         let (addresses, endpoint) = (parts.addresses, parts.endpoint);
@@ -161,7 +161,7 @@ impl Links {
         })
     }
 
-    /// The transport settings of a new connection, where its events are written.
+    /// Returns the transport settings of a new connection whose events are logged.
     fn logged(&self, side: Side, peer: SocketAddr, now: Duration) -> Option<Arc<TransportConfig>> {
         let stream = qlog::stream(self.qlogs.as_deref(), side, peer, self.instant(now))?;
         Some(self.credentials.logged(stream, peer.ip()))
@@ -171,7 +171,7 @@ impl Links {
         self.epoch + now
     }
 
-    /// Handles a datagram that came to an endpoint.
+    /// Handles a datagram that arrived at an endpoint.
     pub(super) fn handle_datagram(
         &mut self,
         endpoint: usize,
@@ -195,22 +195,22 @@ impl Links {
         }
     }
 
-    /// Whether datagrams of discovery are held, since many came.
+    /// Returns whether discovery datagrams are held back because many arrived.
     pub(super) fn holds_discovery(&self) -> bool {
         self.inbox.is_holding()
     }
 
-    /// Has a connection looked at in this pass.
+    /// Schedules a connection for this pass.
     pub(super) fn touch(&mut self, number: u64) {
         self.connections.touch(number);
     }
 
-    /// The addresses of listed peers.
+    /// Sets the addresses of listed peers.
     pub(super) fn set_listed(&mut self, addresses: BTreeSet<IpAddr>) {
         self.admission.set_listed(addresses);
     }
 
-    /// Sends a datagram of discovery.
+    /// Sends a discovery datagram.
     pub(super) fn send_datagram(&mut self, to: SocketAddr, bytes: Vec<u8>) {
         self.connections.endpoints().send(to, bytes);
     }
@@ -225,7 +225,7 @@ impl Links {
         self.outbox.poll_event()
     }
 
-    /// Looks at the connections with something to do. Their events follow.
+    /// Processes the connections with work. Their events are available afterwards.
     pub(super) fn settle(&mut self, now: Duration) {
         for number in self.unfinished.take_unread() {
             self.connections.touch(number);
@@ -284,7 +284,7 @@ impl Links {
             // Data is sent over unidirectional streams.
             StreamEvent::Readable { id } if id.dir() == Dir::Bi => {}
             event => {
-                // Before the election a link carries nothing, whoever its peer says to be.
+                // Before the election a link carries no samples, whatever identity its peer claims.
                 let link = self.table.get(number).filter(|link| link.carries());
                 let peer = link.and_then(|link| link.peer.as_ref());
                 if let Some(daemon) = peer.map(|peer| peer.summary.hello.daemon) {
@@ -294,7 +294,7 @@ impl Links {
         }
     }
 
-    /// Reads the messages of a control stream that have come.
+    /// Reads the messages that have arrived on a control stream.
     fn read_control(&mut self, number: u64, now: Duration) {
         loop {
             let (Some(connection), Some(link)) =
@@ -320,7 +320,7 @@ impl Links {
                 Ok(ControlInput::NoRoom) => return self.unfinished.add_blocked(number),
                 Err(error) => return self.handle_control_error(number, error, now),
             }
-            // A message is handled before the next is decoded, so that a peer fills no queue here.
+            // Each message is handled before the next one is decoded, so that a peer fills no queue here.
             if self.outbox.has_events() {
                 return self.unfinished.add_unread(number);
             }
@@ -378,9 +378,9 @@ impl Links {
                     self.violation(number, code, &error.to_string(), now);
                 }
             }
-            // Over whichever link it comes: another one may have taken over meanwhile.
+            // The message counts on any link, because another link may have taken over meanwhile.
             LinkMessage::LinkClosed(closed) => self.closed_by_peer(daemon, closed),
-            // A predecessor's are old.
+            // Messages on a predecessor are out of date.
             _ if self.current(daemon) != Some(number) => {}
             message => {
                 if let LinkMessage::Graph(_) = &message {
@@ -408,17 +408,17 @@ impl Links {
         self.connections.get_mut(number)
     }
 
-    /// A link whose connection stands.
+    /// Returns a view of a link whose connection exists.
     pub(super) fn view(&self, number: u64) -> Option<LinkView<'_>> {
         Some(LinkView::new(self.connections.get(number)?, self.table.peer(number)))
     }
 
-    /// The peer of a link, as log and status name it.
+    /// Returns the peer of a link as log and status name it.
     pub(super) fn peer_text(&self, number: u64) -> String {
         self.view(number).map_or_else(String::new, |link| link.peer_text())
     }
 
-    /// Limits what a link sends as the rules say.
+    /// Applies the access rules' limits to the data that a link sends.
     pub(super) fn limit_egress(&mut self, number: u64, permissions: &Permissions) {
         if let (Some(peer), Some(connection)) =
             (self.table.peer(number), self.connections.get_mut(number))
@@ -427,7 +427,7 @@ impl Links {
         }
     }
 
-    /// Limits what leaves by network interfaces as the rules say.
+    /// Applies the access rules' limits to the data that leaves by network interfaces.
     pub(super) fn set_interface_rules(&mut self, rules: &AccessRules) {
         self.connections.limit_interfaces(|limits| limits.set_rules(rules));
     }
@@ -437,12 +437,12 @@ impl Links {
         self.connections.limit_interfaces(|limits| limits.set_interfaces(interfaces));
     }
 
-    /// Whether the owner has to list this host's network interfaces.
+    /// Returns whether the owner must list this host's network interfaces.
     pub(super) fn asks_for_interfaces(&mut self) -> bool {
         self.connections.asks_for_interfaces()
     }
 
-    /// Frames that came over a link.
+    /// Returns the number of frames that arrived over a link.
     pub(super) fn heard(&self, number: u64) -> u64 {
         self.connections.get(number).map_or(0, |c| frames_came(&c.quic.stats()))
     }
@@ -467,7 +467,7 @@ impl Links {
         parts.into_iter().flatten().min()
     }
 
-    /// Does what is due.
+    /// Does the work that is due.
     pub(super) fn handle_timeout(&mut self, now: Duration) {
         self.connections.handle_timeout(now);
         if let Some(keyring) = &mut self.keyring
@@ -513,12 +513,12 @@ impl Links {
         }
     }
 
-    /// Whether [`settle`](Self::settle) has something to do.
+    /// Returns whether [`settle`](Self::settle) has work.
     pub(super) fn has_work(&self) -> bool {
         self.connections.has_work() || self.unfinished.has_unread() || self.outbox.has_events()
     }
 
-    /// The next packets. `buffer` is cleared and filled.
+    /// Returns the next packets and the endpoint that sends them. Clears and fills `buffer`.
     pub(super) fn poll_transmit(
         &mut self,
         max_datagrams: usize,

@@ -1,43 +1,44 @@
-//! Publishers that ended: the samples that they left are sent as long as there is progress, then counted as lost.
-//! After its publisher's end only the daemon holds a ring in memory. So what these rings hold for one peer is bounded.
+//! Publishers that ended: their remaining samples are sent as long as there is progress, then counted as
+//! lost. After the end of a publisher only the daemon keeps its ring in memory. Therefore the memory that
+//! such rings hold for one peer is bounded.
 
 use std::{collections::HashMap, time::Duration};
 
 use axon_shm::ids::Gid;
 
-/// The samples of a publisher that ended are given up after this time without progress.
+/// The samples of an ended publisher are given up after this time without progress.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// Between two looks.
+/// Time between two checks.
 const LOOK: Duration = Duration::from_millis(250);
-/// Ended publishers whose samples wait for one peer.
+/// The most ended publishers whose samples wait for one peer.
 const MAX_PUBLISHERS: usize = 1024;
 
-/// Publishers that ended and whose samples are not all acknowledged.
+/// Ended publishers whose samples are not all acknowledged.
 #[derive(Debug)]
 pub(super) struct Endings {
     publishers: HashMap<Gid, Ending>,
     next: Option<Duration>,
-    /// Bytes that the samples of all of them may take.
+    /// Bytes that the samples of all ended publishers may take.
     most: u64,
-    /// Publishers that ended so far.
+    /// The number of publishers that ended so far.
     ended: u64,
 }
 
 #[derive(Debug)]
 struct Ending {
-    /// Its route, until the peer asks for that anew.
+    /// The publisher's route, until the peer asks for the route anew.
     route: u32,
-    /// The flow's progress at the last look, and since when it has been the same.
+    /// The flow's progress at the last check, and the time since which it has not changed.
     progress: (u64, u64),
     since: Duration,
-    /// Publishers that ended before it.
+    /// The number of publishers that ended before this one.
     number: u64,
-    /// Bytes and number of its samples at the first look. Nothing is published after it.
+    /// Bytes and number of the samples at the first check. Nothing is published afterwards.
     at_first: Option<(u64, u64)>,
 }
 
 impl Ending {
-    /// Bytes that so many samples take, estimated by those of the first look.
+    /// Estimates the bytes of so many samples from those of the first check.
     fn bytes_of(&mut self, samples: u64, measure: impl FnOnce() -> u64) -> u64 {
         let (bytes, of) = *self.at_first.get_or_insert_with(|| (measure(), samples.max(1)));
         let left = u128::from(bytes) * u128::from(samples.min(of)) / u128::from(of);
@@ -45,33 +46,33 @@ impl Ending {
     }
 }
 
-/// What is left of a publisher that ended.
+/// The rest of an ended publisher.
 #[derive(Debug)]
 pub(super) struct EndedFlow {
-    /// Its route now.
+    /// The publisher's current route.
     pub(super) route: u32,
     /// Samples that are not acknowledged.
     pub(super) samples: u64,
     /// The flow's progress.
     pub(super) progress: (u64, u64),
-    /// Whether the flow is excused: it waits for others.
+    /// Whether the flow is excused from making progress, because it waits for others.
     pub(super) is_excused: bool,
 }
 
-/// A publisher of which nothing is sent any more.
+/// A publisher that is finished: none of its samples is sent any more.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct FinishedPublisher {
     pub(super) publisher: Gid,
-    /// What is given up; `None`: nothing was left.
+    /// The samples that are given up; `None` if all were acknowledged.
     pub(super) given_up: Option<GivenUpSamples>,
 }
 
 /// Samples that are given up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct GivenUpSamples {
-    /// Their route.
+    /// The route of the samples.
     pub(super) route: u32,
-    /// How many.
+    /// The number of samples.
     pub(super) samples: u64,
     pub(super) why: GivenUpCause,
 }
@@ -79,9 +80,9 @@ pub(super) struct GivenUpSamples {
 /// Why samples are given up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum GivenUpCause {
-    /// They made no progress.
+    /// The samples made no progress.
     Stuck,
-    /// Together with those of publishers that ended later they exceed the bound.
+    /// The samples and those of publishers that ended later exceed the bound together.
     Bound,
 }
 
@@ -108,7 +109,7 @@ impl GivenUpCause {
     }
 }
 
-/// A publisher whose samples are sent on.
+/// An ended publisher whose samples are still being sent.
 struct DrainingPublisher {
     number: u64,
     publisher: Gid,
@@ -118,12 +119,12 @@ struct DrainingPublisher {
 }
 
 impl Endings {
-    /// No publisher ended. The samples of those that end may take `most` bytes. Those of one may take more.
+    /// Creates an empty set. `most` bounds the bytes of all samples. One publisher alone may exceed it.
     pub(super) fn new(most: u64) -> Self {
         Self { publishers: HashMap::new(), next: None, most, ended: 0 }
     }
 
-    /// A publisher ended.
+    /// Adds a publisher that ended.
     pub(super) fn add(&mut self, route: u32, publisher: Gid, now: Duration) {
         let (progress, since, number) = ((0, 0), now, self.ended);
         let ending = Ending { route, progress, since, number, at_first: None };
@@ -132,14 +133,14 @@ impl Endings {
         self.next = Some(now);
     }
 
-    /// When to look again.
+    /// Returns the time of the next check.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         self.next.filter(|_| !self.publishers.is_empty())
     }
 
-    /// Looks at all of them, if that is due. `left_of` says what is left of a publisher, whose route was the one that
-    /// it is given, and `bytes_of` how many bytes that takes. Returns, and forgets, those of which nothing is left, whose
-    /// samples make no progress, and the first of those that exceed the bound together.
+    /// Checks all publishers if that is due. `left_of` returns the rest of a publisher, given its last known
+    /// route. `bytes_of` returns the bytes of the rest. Removes and returns the publishers without a rest,
+    /// those without progress, and those that ended first, until the others fit the bound.
     pub(super) fn handle_timeout(
         &mut self,
         now: Duration,
@@ -176,7 +177,8 @@ impl Endings {
         over
     }
 
-    /// Forgets the publishers that ended first, until the others fit the bound. The last one stays.
+    /// Removes the publishers that ended first, until the others fit the bound. The last publisher stays in
+    /// any case.
     fn give_up_beyond(&mut self, mut waiting: Vec<DrainingPublisher>) -> Vec<FinishedPublisher> {
         let mut bytes = waiting.iter().fold(0u64, |sum, of| sum.saturating_add(of.bytes));
         let most = self.most;
@@ -214,7 +216,7 @@ mod tests {
         Endings::new(1000)
     }
 
-    /// Nothing is known of the length of samples.
+    /// A measure for tests in which the length of samples does not matter.
     fn no_bytes(_: u32, _: &Gid) -> u64 {
         0
     }
@@ -227,7 +229,8 @@ mod tests {
         Some(EndedFlow { route: 1, samples, progress: (progress, 0), is_excused })
     }
 
-    /// Looks until the publisher is over, `left` after the given time being what is left. Returns when it is over.
+    /// Runs the checks until the publisher is finished; `left` returns its rest at a given time. Returns the
+    /// time and the finished publisher.
     fn over_after(
         left: impl Fn(Duration) -> Option<EndedFlow>,
     ) -> (Duration, Vec<FinishedPublisher>) {
@@ -287,7 +290,8 @@ mod tests {
         assert_eq!(endings.handle_timeout(PATIENCE, |_, _| left(5, 0, false), no_bytes).len(), 1);
     }
 
-    /// The publishers with these numbers end, each with 5 samples in `bytes`. Returns those that the bound gives up.
+    /// Ends the publishers with these numbers, each with 5 samples in `bytes`. Returns the publishers that
+    /// the bound gives up.
     fn given_up_beyond(endings: &mut Endings, numbers: &[u16], bytes: u64) -> Vec<u8> {
         let gid = |number: u16| {
             let [high, low] = number.to_be_bytes();
@@ -305,7 +309,7 @@ mod tests {
         let mut endings = endings();
         assert!(given_up_beyond(&mut endings, &[3, 1], 500).is_empty());
         assert_eq!(given_up_beyond(&mut endings, &[2], 500), [3]);
-        // Longer than the bound: the last publisher waits alone.
+        // The samples exceed the bound alone, so the last publisher waits alone.
         assert_eq!(given_up_beyond(&mut endings, &[4], 1001), [1, 2]);
         assert!(given_up_beyond(&mut endings, &[], 0).is_empty());
         assert_eq!(given_up_beyond(&mut endings, &[5], 1), [4]);
@@ -329,7 +333,7 @@ mod tests {
                 .is_empty()
         );
         endings.add(1, Gid([2; 16]), LOOK);
-        // One of ten is left: 100 bytes.
+        // One sample of ten is left: 100 bytes.
         let left_of = |_, of: &Gid| left(if *of == PUBLISHER { 1 } else { 10 }, 1, false);
         assert!(endings.handle_timeout(LOOK, left_of, |_, _| 900).is_empty());
         endings.add(1, Gid([3; 16]), LOOK);

@@ -1,8 +1,8 @@
 //! Samples to one peer: from the rings of local publishers into QUIC streams.
 //!
-//! Samples wait here and not in QUIC, because QoS can act on them here. Of bulk, QUIC holds the congestion window and a
-//! little more ([`connection`](super::quic::connection)), so that the newest sample is soon the next. A pass costs the flows
-//! that have something to send, and no others.
+//! Samples wait in the rings and flows, not in QUIC, because QoS still applies to them there. QUIC holds bulk
+//! samples for the congestion window and a little more ([`connection`](super::quic::connection)), so that the
+//! newest sample is sent soon. A pass costs time only for the flows that have samples to send.
 
 mod backlog;
 pub(crate) mod budget;
@@ -55,13 +55,13 @@ use crate::{
     link::{CloseCode, Intake, ReceivedOf},
 };
 
-/// Flows look again after this time at a link that has no keys.
+/// Time after which flows check again whether a link has keys.
 const NO_CARRIER: Duration = Duration::from_secs(1);
 
-/// What the peer's owner has to know.
+/// An event for the owner of the peer.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum OutboundEvent {
-    /// Nothing is left of a publisher that ended.
+    /// An ended publisher has no samples left.
     Drained(Gid),
     /// Samples were given up.
     Lost {
@@ -69,10 +69,10 @@ pub(crate) enum OutboundEvent {
         topic: Arc<str>,
         /// The cause, as status shows it.
         cause: &'static str,
-        /// How many.
+        /// The number of samples.
         samples: u64,
     },
-    /// The peer does not read what it asked for over this route.
+    /// The peer does not read the samples of this route.
     Stalled(u32, StallCause),
 }
 
@@ -91,7 +91,7 @@ pub(crate) struct Outbound {
 }
 
 impl Outbound {
-    /// Serves nothing yet.
+    /// Creates an outbound side without routes.
     pub(crate) fn new(
         budget: Rc<Budget>,
         counters: Rc<Counters>,
@@ -114,7 +114,7 @@ impl Outbound {
         }
     }
 
-    /// Serves this route from now on, or changes it.
+    /// Adds or changes a route.
     pub(crate) fn set_route(&mut self, number: u32, route: RouteOut, now: Duration) {
         let RouteOut { sources, seen, unfinished, .. } = route;
         let shared = FlowRoute {
@@ -139,7 +139,7 @@ impl Outbound {
         }
     }
 
-    /// The route has these sources from now on.
+    /// Replaces the sources of a route.
     pub(crate) fn set_sources(&mut self, number: u32, sources: Vec<Source>, now: Duration) {
         self.update_sources(number, sources, HashMap::new(), now);
     }
@@ -157,7 +157,7 @@ impl Outbound {
             self.note_busy(id, now);
             self.schedule(id);
         }
-        // Samples may wait in any of its rings.
+        // Samples may wait in any of the route's rings.
         let waiting = self.table.routes.get(number).map_or_else(Vec::new, ServedFlows::with_data);
         waiting.into_iter().for_each(|of| self.take_in(number, of, now));
     }
@@ -174,7 +174,8 @@ impl Outbound {
         }
     }
 
-    /// Samples may wait for these sources, each of a writer. Those of other peers are among them.
+    /// Takes in samples that may wait at these sources, each with its writer. Sources of other peers may be
+    /// in the list.
     pub(crate) fn handle_active(&mut self, active: &[(Gid, Gid)], now: Duration) {
         for (source, writer) in active {
             let Some((number, source)) = self.table.routes.of_source(source) else { continue };
@@ -184,7 +185,7 @@ impl Outbound {
         }
     }
 
-    /// Samples of a publisher, or client, wait.
+    /// Takes in waiting samples of a publisher or client.
     fn take_in(&mut self, number: u32, of: Gid, now: Duration) {
         let Some(id) = self.table.find_or_insert(number, of, &self.budget) else { return };
         let Some((flow, served)) = self.table.get_mut(id) else { return };
@@ -194,29 +195,29 @@ impl Outbound {
         self.schedule(id);
     }
 
-    /// Samples of a flow wait.
+    /// Marks a flow as busy, because samples of it wait.
     fn note_busy(&mut self, id: FlowId, now: Duration) {
         if self.table.flows.set_busy(id) {
             self.stalls.handle_first(now);
         }
     }
 
-    /// The peer no longer wants this route.
+    /// Ends a route that the peer no longer wants.
     pub(crate) fn end_route(&mut self, number: u32) {
         let gone = self.table.remove_route(number);
         self.forget(gone);
     }
 
-    /// The peer does not read this route: as [`end_route`](Self::end_route), but the samples that are not
-    /// acknowledged are given up. Returns how many.
+    /// Ends a route that the peer does not read, and gives up its unacknowledged samples. Returns the number
+    /// of these samples.
     pub(crate) fn give_up_route(&mut self, number: u32) -> u64 {
         let given_up = self.table.give_up(number, &self.counters);
         self.end_route(number);
         given_up
     }
 
-    /// Takes the KEEP_ALL relays of a route, as many as `most` says, whose samples another daemon of the peer's host may
-    /// ask for. Nothing of their flows is given up. Returns also what is known of these.
+    /// Takes over up to `most` KEEP_ALL relays of a route, whose samples another daemon of the peer's host
+    /// may ask for. Nothing of their flows is given up. Also returns the unfinished flows.
     pub(crate) fn take_kept(
         &mut self,
         number: u32,
@@ -229,13 +230,13 @@ impl Outbound {
         (kept, unfinished)
     }
 
-    /// What is known of the flows of a service whose route is about to end: whatever follows it goes on with that, since
-    /// what it held is still there.
+    /// Returns the unfinished flows of a service's route that is about to end. The next route continues with
+    /// them, because their samples are still there.
     pub(crate) fn leave_service(&mut self, number: u32) -> UnfinishedFlows {
         self.leave(number, self.stalls.looked())
     }
 
-    /// What is known of the flows of a route that hold somebody up.
+    /// Returns the unfinished flows of a route: those that hold up a publisher, server or client.
     fn leave(&mut self, number: u32, now: Duration) -> UnfinishedFlows {
         let flows = self.table.kept_flows(number).into_iter();
         let known = flows.map(|(of, flow, sent_progress)| {
@@ -244,13 +245,14 @@ impl Outbound {
         known.collect()
     }
 
-    /// Whether samples of a publisher are left that wait to be acknowledged, or for a limit.
+    /// Returns whether samples of a publisher wait for their acknowledgement or for a limit.
     pub(crate) fn has_left(&self, number: u32, sources: &[Source], publisher: &Gid) -> bool {
         sources.iter().any(|source| source.has_unacknowledged(publisher))
             || self.table.holds_best_effort(number, publisher)
     }
 
-    /// A publisher of a route ended: the samples that it left are sent, and then [`OutboundEvent::Drained`] comes.
+    /// Handles the end of a publisher: its remaining samples are sent. Then [`OutboundEvent::Drained`]
+    /// follows.
     pub(crate) fn handle_publisher_ended(&mut self, number: u32, publisher: Gid, now: Duration) {
         self.endings.add(number, publisher, now);
     }
@@ -261,7 +263,7 @@ impl Outbound {
         }
     }
 
-    /// These flows are gone. Their numbers are free for others.
+    /// Forgets flows that are gone. Their numbers may be used for other flows.
     fn forget(&mut self, gone: impl IntoIterator<Item = FlowId>) {
         for id in gone {
             self.turns.forget(id);
@@ -270,7 +272,7 @@ impl Outbound {
         }
     }
 
-    /// Hands samples to QUIC until it takes no more, or none is left.
+    /// Passes samples to QUIC until QUIC takes no more or no sample is left.
     pub(crate) fn pump(&mut self, carrier: &mut Carrier<'_>, now: Duration) {
         for (stream, is_cut) in self.table.flows.take_ended_streams() {
             carrier.streams.remove(&stream);
@@ -318,12 +320,13 @@ impl Outbound {
         carrier.rest(blocked, self.turns.wait_for_quic(), now);
     }
 
-    /// The peer says how much it takes in over this link.
+    /// Sets how much the peer takes in over this link.
     pub(crate) fn set_intake(&mut self, intake: &Intake) {
         self.turns.credit().set(Some(intake));
     }
 
-    /// An order of this flow is answered: the sample is sent as this frame, or as it is.
+    /// Handles the answer to a compression order: the sample is sent as `frame`, or uncompressed if that is
+    /// `None`.
     pub(crate) fn handle_compressed(&mut self, id: FlowId, order: u64, frame: Option<Bytes>) {
         if let Some(flow) = self.table.flows.get_mut(id) {
             flow.handle_compressed(order, frame, &self.counters);
@@ -331,7 +334,7 @@ impl Outbound {
         }
     }
 
-    /// QUIC takes more of this flow's stream.
+    /// Continues a flow whose stream has room in QUIC again.
     pub(crate) fn handle_writable(&mut self, id: FlowId) {
         if let Some(flow) = self.table.flows.get_mut(id) {
             flow.blocked = false;
@@ -339,17 +342,17 @@ impl Outbound {
         }
     }
 
-    /// The peer allows more streams.
+    /// Continues flows that wait for a stream: the peer allows more streams.
     pub(crate) fn handle_streams_available(&mut self) {
         self.turns.handle_streams_available(&self.table.flows);
     }
 
-    /// There may be keys for messages.
+    /// Continues flows that wait for keys: there may be some now.
     pub(crate) fn handle_keys(&mut self) {
         self.turns.handle_keys(&self.table.flows);
     }
 
-    /// The peer's QUIC has all of a stream.
+    /// Handles the acknowledgement of a complete stream by the peer's QUIC.
     pub(crate) fn handle_finished(
         &mut self,
         id: FlowId,
@@ -396,7 +399,7 @@ impl Outbound {
         self.turns.handle_acknowledged();
     }
 
-    /// A new link carries all flows. What the old link did not deliver is sent again.
+    /// Moves all flows to a new link. Samples that the old link did not deliver are sent again.
     pub(crate) fn succeed(&mut self, mut old: Option<&mut quinn_proto::Connection>) {
         for (stream, is_cut) in self.table.flows.take_ended_streams() {
             if let Some(old) = old.as_deref_mut() {
@@ -414,8 +417,8 @@ impl Outbound {
         self.handle_keys();
     }
 
-    /// The link is over, and no other carries the flows: counts what did not arrive, and tells the publishers. Returns
-    /// the losses by topic.
+    /// Handles the end of the link without a successor: counts the samples that did not arrive, and reports
+    /// them to the publishers. Returns the losses by topic.
     pub(crate) fn link_over(&mut self) -> Vec<(Arc<str>, u64)> {
         self.table.link_over(&self.counters)
     }
@@ -432,8 +435,8 @@ impl Outbound {
         parts.into_iter().flatten().min()
     }
 
-    /// Does what is due. `heard` counts the frames that came over the link.
-    /// Without a carrier there are no keys for the link.
+    /// Does the work that is due. `heard` counts the frames that arrived over the link. Without a carrier
+    /// there are no keys for the link.
     pub(crate) fn handle_timeout(
         &mut self,
         mut carrier: Option<&mut Carrier<'_>>,
@@ -469,7 +472,8 @@ impl Outbound {
         self.look_at_stalls(heard, lacks_keys, now);
     }
 
-    /// Reports the publishers of which nothing is left, and gives up the samples of those that make no progress.
+    /// Reports the ended publishers without remaining samples, and gives up the samples of those without
+    /// progress.
     fn look_at_endings(&mut self, now: Duration) {
         let starves = self.stalls.starves();
         let left_of = |route, of: &Gid| self.table.left_of(route, of, starves);
@@ -487,7 +491,7 @@ impl Outbound {
         let GivenUpSamples { route: number, samples, why } = given_up;
         let Some(served) = self.table.routes.get(number) else { return };
         let topic = Arc::clone(&served.shared.topic);
-        // What BEST_EFFORT samples are left in the rings shows when they are taken.
+        // BEST_EFFORT samples in the rings are only counted when they are taken.
         let is_reliable = served.is_reliable(&of);
         let in_rings = served.give_up_ended(&of);
         let samples = if is_reliable { samples } else { samples + in_rings };
@@ -498,8 +502,8 @@ impl Outbound {
         self.events.push(OutboundEvent::Lost { topic, cause: "publisher_ended", samples });
     }
 
-    /// Reports the routes that made no progress for the limit. While this host's KME gives no keys, flows of which nothing is
-    /// in flight wait for that.
+    /// Reports the routes without progress for the limit. While this host's KME gives no keys, flows with
+    /// nothing in flight are excused.
     fn look_at_stalls(&mut self, heard: u64, lacks_keys: bool, now: Duration) {
         let (returned, is_awaited) = (self.turns.credit().returned(), self.turns.wait_for_credit());
         let peer = PeerActivity { heard, returned, is_awaited };
@@ -522,23 +526,23 @@ impl Outbound {
         self.table.count_overwritten(&self.counters);
     }
 
-    /// The next event.
+    /// Returns the next event.
     pub(crate) fn poll_event(&mut self) -> Option<OutboundEvent> {
         if self.events.is_empty() { None } else { Some(self.events.remove(0)) }
     }
 
-    /// What waits for the peer.
+    /// Returns the samples that wait for the peer.
     pub(crate) fn backlog(&self) -> Backlog {
         self.table.backlog()
     }
 
-    /// Whether there is anything to hand to QUIC.
+    /// Returns whether QUIC has to be given samples or the end of a stream.
     pub(crate) fn has_work(&self) -> bool {
         self.turns.has_work() || self.table.flows.has_ended_streams()
     }
 }
 
-/// Ends a stream. One on which a sample is cut off must not look whole.
+/// Ends a stream. Resets it if a sample on it is cut off, so that the sample does not look complete.
 fn end(quic: &mut quinn_proto::Connection, stream: StreamId, is_cut: bool) {
     let mut stream = quic.send_stream(stream);
     // Either error says that the stream is over.

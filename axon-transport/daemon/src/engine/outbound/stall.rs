@@ -1,12 +1,15 @@
-//! Finds routes that the peer asked for and does not read. A flow that waits for the credit of others is excused, as long
-//! as credit comes back. If none does, those who use it are judged, KEEP_ALL or not.
+//! Finds stalled routes: routes that the peer asked for and does not read. A flow that waits for the credit
+//! of other flows is excused as long as credit comes back. If none comes back, the flows that use credit are
+//! judged, KEEP_ALL or not.
 //!
-//! Time without progress is added up look by look. While the peer is silent it stands still: the link is at fault then.
-//! It goes on if the peer is heard, whatever of it is heard, or once it is silent for so long that it counts as gone.
-//! A flow that holds nobody up begins anew while the peer is silent, so that an outage drops nothing of it.
+//! Time without progress is added up at each check. It stands still while the peer is silent, because the
+//! link is then at fault. It continues when any frame of the peer arrives, or once the peer has been silent
+//! for so long that it counts as gone. A flow that holds up no publisher starts anew while the peer is
+//! silent, so an outage drops none of its samples.
 //!
-//! A peer that makes some progress now and then is judged by its [pace](Pace), which counts silence too. The next daemon
-//! of the peer's host goes on with both where the last one ended, so a new link or daemon id is no way around them.
+//! A peer that makes some progress now and then is judged by its [pace](Pace), which includes silent time.
+//! Both measures pass from one daemon of the peer's host to the next, so a new link or daemon ID does not
+//! reset them.
 
 #[cfg(test)]
 mod tests;
@@ -15,70 +18,73 @@ use std::{collections::HashMap, time::Duration};
 
 use super::schedule::FlowId;
 
-/// Between two looks.
+/// Time between two checks.
 const LOOK: Duration = Duration::from_secs(1);
-/// The longest time that one look counts: this host may have been stopped.
+/// The longest time that one check counts: this host may have been suspended.
 const LONGEST_LOOK: Duration = Duration::from_secs(2);
-/// After so long without anything of the peer the link is at fault, and time stands still for its routes.
+/// After this time without a frame of the peer, the link counts as faulty. Time then stands still for the
+/// peer's routes.
 const SILENT: Duration = Duration::from_secs(6);
-/// After so long a peer is gone, as the graph has it. From then on it may hold nobody up any more.
+/// After this time without a frame, a peer counts as gone, as in the graph. It may then hold up no publisher
+/// any more.
 const GONE: Duration = Duration::from_secs(20);
-/// A peer that holds a publisher up takes a [`SHARE`]th of what waits for it in so many times the limit.
+/// A peer that holds up a publisher must take a [`SHARE`]th of the waiting samples within this multiple of
+/// the limit.
 const PERIOD: u32 = 12;
 const SHARE: u64 = 64;
-/// One in so many seconds counts in which a flow that holds a publisher up waits for others of its peer. The peer decides
-/// how soon it takes in those.
+/// Divisor of the time in which a flow holds up a publisher while it waits for other flows of the same peer.
+/// The peer decides how fast it takes those.
 const OTHERS: u32 = 8;
 
-/// KEEP_ALL flows with samples that are not acknowledged.
+/// Progress of the KEEP_ALL flows with samples that are not acknowledged.
 #[derive(Debug)]
 pub(super) struct FlowStalls {
     limit: Duration,
     flows: HashMap<FlowId, Progress>,
-    /// Frames of the peer, and when there was a new one.
+    /// The number of the peer's frames, and the time of the last change.
     heard: (u64, Duration),
-    /// How often credit came back.
+    /// How often credit was returned.
     returned: u64,
-    /// For how long flows have waited for credit since some came back.
+    /// How long flows have waited for credit since some was last returned.
     starved: Duration,
-    /// When time was counted last.
+    /// When time was last counted.
     looked: Duration,
     next: Duration,
 }
 
-/// What is known of a flow that is judged.
+/// The progress of a judged flow.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Progress {
     at: (u64, u64),
     /// Time without progress.
     idle: Duration,
-    /// Publishes that had found no room when there was progress last.
+    /// Publishes that had found no room when there was last progress.
     refused: u64,
     pace: Pace,
-    /// Time in which there was no flow, and samples waited: the next look counts it.
+    /// Time in which samples waited without a flow. The next check counts it.
     kept: Duration,
 }
 
-/// How much a peer takes that holds a publisher up. All the time counts until the publisher has rested, or the peer has
-/// taken its share.
+/// How much a peer takes while it holds up a publisher. The time adds up until the publisher has rested, or
+/// the peer has taken its share.
 #[derive(Clone, Copy, Debug, Default)]
 struct Pace {
-    /// For how long it has held the publisher up.
+    /// How long the peer has held up the publisher.
     held: Duration,
-    /// For how long it has not.
+    /// How long the peer has not held up the publisher.
     free: Duration,
-    /// Samples that it has acknowledged since the beginning.
+    /// Samples that the peer has acknowledged since the start.
     taken: u64,
-    /// Samples that waited at the beginning.
+    /// Samples that waited at the start.
     waited: u64,
 }
 
-/// What the peer did so far.
+/// Counters of the peer's activity.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct PeerActivity {
-    /// Frames that came over the link.
+    /// Frames that arrived over the link.
     pub(super) heard: u64,
-    /// How often credit came back.
+    /// How often credit was returned.
     pub(super) returned: u64,
     /// Whether a flow waits for credit.
     pub(super) is_awaited: bool,
@@ -89,49 +95,51 @@ pub(super) struct PeerActivity {
 pub(super) struct BusyFlow {
     pub(super) id: FlowId,
     pub(super) route: u32,
-    /// Whether its route is known to be stalled.
+    /// Whether the flow's route is known to be stalled.
     pub(super) is_stalled: bool,
-    /// Samples that are acknowledged, and parts of them that are sent.
+    /// The number of acknowledged samples, and of sent parts of samples.
     pub(super) progress: (u64, u64),
-    /// Samples that a KEEP_ALL relay has its publisher keep, if there are any.
+    /// Samples that a KEEP_ALL relay makes its publisher keep; `None` if there are none.
     pub(super) keeps: Option<u64>,
-    /// How many publishes found no room, if that relay is why the next one may not.
+    /// How many publishes found no room, if that relay may be the reason for the next one.
     pub(super) refused: Option<u64>,
-    /// Whether it is of a service: calls may wait for a slow server as long as there is room for the next ones.
+    /// Whether the flow belongs to a service: calls may wait for a slow server while there is room for
+    /// further calls.
     pub(super) is_service: bool,
-    /// Whether it uses credit for which others may have to wait.
+    /// Whether the flow uses credit that others may have to wait for.
     pub(super) uses_credit: bool,
-    /// Whether it waits for others: none of its samples is in flight.
+    /// Whether the flow waits for others: none of its samples is in flight.
     pub(super) waits_for_others: bool,
-    /// Whether a limit of this host holds its samples.
+    /// Whether a limit of this host holds the flow's samples.
     pub(super) waits_for_limit: bool,
-    /// Whether nothing of it is in flight, and this host's KME gives no keys for the next sample.
+    /// Whether the flow has nothing in flight, and this host's KME gives no key for the next sample.
     pub(super) lacks_keys: bool,
-    /// Whether nothing of it waits, or is not acknowledged.
+    /// Whether the flow has no sample that waits or is not acknowledged.
     pub(super) is_quiet: bool,
 }
 
 /// Why a route counts as stalled.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum StallCause {
-    /// Nothing of it was read for the limit.
+    /// The peer read nothing of the route for the limit.
     NothingRead,
-    /// A publisher was held up, and less than a [`SHARE`]th of what it keeps was read in [`PERIOD`] times the limit.
+    /// A publisher was held up, and the peer read less than a [`SHARE`]th of its samples in [`PERIOD`] times
+    /// the limit.
     TooSlow,
-    /// A publisher was held up for as long, last since this host's KME gave no keys.
+    /// A publisher was held up for as long; at the end this host's KME gave no keys.
     NoKeys,
 }
 
-/// What a look found.
+/// The result of a check.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct StallReport {
-    /// Routes that made no progress for the limit, or too little.
+    /// Routes without progress for the limit, or with too little.
     pub(super) stalled: Vec<(u32, StallCause)>,
-    /// Flows that are busy no more.
+    /// Flows that are not busy any more.
     pub(super) quiet: Vec<FlowId>,
 }
 
-/// Whether a peer is heard.
+/// Whether frames of a peer arrive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Hearing {
     Heard,
@@ -152,12 +160,13 @@ impl FlowStalls {
         }
     }
 
-    /// A flow is gone. Its number is another's next.
+    /// Forgets a flow that is gone. Its number may be used for another flow.
     pub(super) fn forget(&mut self, flow: FlowId) {
         self.flows.remove(&flow);
     }
 
-    /// A flow is about to end, and another one may go on with its samples. Returns what is known of it.
+    /// Removes and returns the progress of a flow that is about to end. Another flow may continue with its
+    /// samples.
     pub(super) fn leave(&mut self, flow: &BusyFlow, now: Duration) -> Progress {
         let passed = now.saturating_sub(self.looked).min(LONGEST_LOOK);
         let (hearing, starves) = (self.hearing(now), self.starves());
@@ -167,13 +176,14 @@ impl FlowStalls {
         }
     }
 
-    /// When time was counted last.
+    /// Returns when time was last counted.
     pub(super) fn looked(&self) -> Duration {
         self.looked
     }
 
-    /// A flow that made this progress goes on with the samples of one that ended, and with what is known of that. If its
-    /// time is over it is looked at at once: no link needs to be long enough for a look.
+    /// Passes the progress `before` of an ended flow to a flow that continues with its samples; `at` is the
+    /// progress that the new flow made. If the time of the ended flow is up, the next check is due at once: a
+    /// peer cannot escape it by links that end before the first check.
     pub(super) fn inherit(
         &mut self,
         flow: FlowId,
@@ -188,24 +198,24 @@ impl FlowStalls {
         }
     }
 
-    /// Samples wait, and none did before: nobody looked while there was nothing.
+    /// Starts counting time when the first samples wait: there were no checks before.
     pub(super) fn handle_first(&mut self, now: Duration) {
         self.looked = self.looked.max(now);
         self.next = self.next.max(now + LOOK);
     }
 
-    /// Whether flows have waited for credit for the limit, and none came back. Then no flow that waits is excused any
-    /// more, and those that use credit are judged, too.
+    /// Returns whether flows have waited for credit for the limit without getting any. Then no waiting flow
+    /// is excused any more, and the flows that use credit are judged, too.
     pub(super) fn starves(&self) -> bool {
         self.starved >= self.limit
     }
 
-    /// When to look again, while flows are busy.
+    /// Returns the time of the next check while flows are busy.
     pub(super) fn poll_timeout(&self) -> Duration {
         self.next
     }
 
-    /// Looks at the busy flows, if that is due.
+    /// Checks the busy flows if that is due.
     pub(super) fn handle_timeout(
         &mut self,
         peer: PeerActivity,
@@ -273,7 +283,7 @@ impl Progress {
         Self { at: flow.progress, refused, ..Self::default() }
     }
 
-    /// The flow is looked at again after a time.
+    /// Updates the progress after the time `passed`.
     fn after(
         mut self,
         passed: Duration,
@@ -282,15 +292,17 @@ impl Progress {
         starves: bool,
         limit: Duration,
     ) -> Self {
-        // Sticky until there is progress: not every look is soon after a publish.
+        // Sticky until there is progress: not every check comes soon after a publish.
         let is_held = flow.refused.is_some_and(|refused| refused != self.refused);
         let moved = flow.progress != self.at;
-        // Another one may draw from the same store of keys, the peer among them: this counts as waiting for others.
+        // Other hosts, the peer among them, may use up the keys of the same store: that counts as waiting for
+        // others.
         let waits_for_others = (flow.waits_for_others && !starves) || flow.lacks_keys;
         match hearing {
             _ if moved || flow.waits_for_limit => self.idle = Duration::ZERO,
             _ if flow.is_service && !is_held && !starves => self.idle = Duration::ZERO,
-            // What others have it wait for is no fault of it. What went before stays: there was no progress since.
+            // The peer is not at fault while its flow waits for others. Earlier time stays, because there was
+            // no progress since.
             Hearing::Heard if waits_for_others => {}
             Hearing::Heard => self.idle += passed,
             Hearing::Silent | Hearing::Gone if !is_held => self.idle = Duration::ZERO,
@@ -300,7 +312,7 @@ impl Progress {
         let passed = passed + std::mem::take(&mut self.kept);
         self.pace.taken += flow.progress.0.saturating_sub(self.at.0);
         match is_held {
-            // The peer has all that passed.
+            // While a limit of this host holds the samples, no time counts against the peer.
             true if flow.waits_for_limit => self.pace.pay_back(passed),
             true if waits_for_others => self.pace.hold(passed / OTHERS, flow, limit),
             true => self.pace.hold(passed, flow, limit),
@@ -313,13 +325,13 @@ impl Progress {
         self
     }
 
-    /// The samples waited for so long, and no flow sent them. `idle` of it counts as time without progress.
+    /// Adds time in which the samples waited without a flow. `idle` of it counts as time without progress.
     pub(super) fn keep(&mut self, kept: Duration, idle: Duration) {
         self.kept += kept;
         self.idle += idle;
     }
 
-    /// The worse of two flows that go on as one, which made this progress.
+    /// Merges two flows that continue as one, and keeps the worse values. `at` is their common progress.
     pub(super) fn and(self, other: Self, at: (u64, u64)) -> Self {
         let pace = if other.pace.held > self.pace.held { other.pace } else { self.pace };
         Self {
@@ -333,7 +345,7 @@ impl Progress {
 }
 
 impl Pace {
-    /// Counts a time in which a flow held its publisher up. Where it took its share it begins anew.
+    /// Adds time in which a flow held up its publisher. Starts anew if the peer took its share.
     fn hold(&mut self, passed: Duration, flow: &BusyFlow, limit: Duration) {
         if self.held.is_zero() {
             (self.taken, self.waited) = (0, flow.keeps.unwrap_or_default());
@@ -345,7 +357,7 @@ impl Pace {
         }
     }
 
-    /// Counts a time in which a flow did not hold its publisher up. After a rest it begins anew.
+    /// Adds time in which a flow did not hold up its publisher. Starts anew after a rest.
     fn rest(&mut self, passed: Duration, limit: Duration) {
         self.free += passed;
         if self.free >= limit {
@@ -353,7 +365,7 @@ impl Pace {
         }
     }
 
-    /// Takes off a time in which a limit of this host held the publisher up.
+    /// Subtracts time in which a limit of this host held up the publisher.
     fn pay_back(&mut self, passed: Duration) {
         self.held = self.held.saturating_sub(passed);
     }

@@ -1,4 +1,4 @@
-//! What access rules let a peer do here, and what both hosts know to be denied.
+//! The rights that access rules give a peer on this host, and the denied uses that both hosts know of.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -35,16 +35,16 @@ use crate::{
     },
 };
 
-/// Uses that status lists.
+/// The most denied uses that status lists.
 const LISTED: usize = 64;
-/// Uses that status shows at the endpoints that wait for them.
+/// The most denied uses that status shows at the endpoints that wait for them.
 const AT_ENDPOINTS: usize = 1024;
-/// Bytes that count for a denied use besides its name and reason.
+/// Bytes that a denied use counts in addition to its name and reason.
 const ENTRY: usize = 200;
-/// Questions that wait for the peer's answer. The oldest is given up.
+/// The most questions that wait for the peer's answer. Beyond that the oldest is given up.
 const UNANSWERED: usize = 64;
 
-/// What somebody does with a topic or service.
+/// A use of a topic or service: a verb and the name.
 pub(super) type AccessUse = (Verb, String);
 
 /// The verbs that need an endpoint, as DENIED numbers them.
@@ -53,7 +53,7 @@ const VERBS: [Verb; 4] = [Verb::Publish, Verb::Subscribe, Verb::Serve, Verb::Cal
 /// All verbs, as ACCESS_CHECK numbers them.
 const CHECKED: [Verb; 5] = Verb::ALL;
 
-/// The endpoints that are there for a verb.
+/// Returns the kind of endpoint that a verb needs.
 fn kind_of(verb: Verb) -> EndpointKind {
     match verb {
         Verb::Publish => EndpointKind::Publisher,
@@ -64,20 +64,21 @@ fn kind_of(verb: Verb) -> EndpointKind {
     }
 }
 
-/// The rules about one peer.
+/// The access rules for one peer.
 pub(super) struct PeerAccess {
     permissions: Permissions,
-    /// The rules changed since the denied uses were judged.
+    /// Whether the rules changed since the denied uses were judged.
     changed: bool,
     rights: RightsByEndpoint,
-    /// Uses by endpoints of the peer that are denied here, with what remembers them. The peer was told.
+    /// Denied uses by the peer's endpoints on this host, each with its reason and its charge. The peer was
+    /// informed of them.
     here: BTreeMap<AccessUse, (String, Charge)>,
-    /// Uses by endpoints of this host that the peer's host denies, with what remembers them.
+    /// Uses by this host's endpoints that the peer's host denies, each with its reason and its charge.
     there: BTreeMap<AccessUse, (String, Charge)>,
-    /// What may be remembered of those there, and of those here, of all daemon ids of the peer's identity.
+    /// Bounds on `there` and on `here`, for all daemon IDs of the peer's identity.
     room: Rc<Meter>,
     places: Rc<Meter>,
-    /// The numbers of questions that the peer has not answered, and how many uses each is about.
+    /// The questions that the peer has not answered: the number of each, and how many uses it is about.
     asked: BTreeMap<u64, usize>,
     logged: LogLimit,
 }
@@ -102,7 +103,7 @@ impl PeerAccess {
         self.rights.clear();
     }
 
-    /// What the peer may see and use of an endpoint of this host.
+    /// Returns whether the peer may see and use an endpoint of this host.
     pub(super) fn judge(&mut self, endpoint: &Arc<Endpoint>) -> EndpointRights {
         self.rights.judge(&self.permissions, endpoint)
     }
@@ -112,7 +113,7 @@ impl PeerAccess {
         self.rights.retain(stands);
     }
 
-    /// Why the peer may not do this, if it may not.
+    /// Returns why the peer may not make this use; `None` if it may.
     pub(super) fn denial(&self, verb: Verb, name: &str) -> Option<String> {
         note_look();
         if self.permissions.are_unrestricted() {
@@ -122,8 +123,8 @@ impl PeerAccess {
         (!decision.allowed()).then(|| decision.to_string())
     }
 
-    /// These endpoints of the peer are denied now. Returns what the peer is told. The rules are asked about a use that is new,
-    /// and about all once they changed.
+    /// Updates the denied endpoints of the peer. Returns the messages for the peer. The rules are evaluated
+    /// for new uses, and for all uses after the rules changed.
     pub(super) fn set_denied<'a>(
         &mut self,
         peer: DaemonId,
@@ -131,7 +132,7 @@ impl PeerAccess {
         now: Duration,
     ) -> Vec<LinkMessage> {
         let uses = endpoints.filter_map(|e| Some((verb_of(e.kind)?, e.topic.as_str())));
-        // Those that the peer was told of stay: it would take one that is not named any more for allowed.
+        // Uses that the peer was informed of stay: a use that is not repeated would count as allowed.
         let told: BTreeSet<_> =
             self.here.keys().map(|(verb, name)| (*verb, name.as_str())).collect();
         let (mut known, mut new) = (BTreeSet::new(), BTreeSet::new());
@@ -149,14 +150,14 @@ impl PeerAccess {
         let anew = std::mem::take(&mut self.changed).then_some(known).into_iter().flatten();
         let rights: Vec<AccessUse> =
             anew.chain(new).map(|(verb, name)| (verb, name.to_owned())).collect();
-        // What goes makes room for what comes.
+        // Removed uses make room for new ones.
         lifted.iter().for_each(|used| drop(self.here.remove(used)));
         let mut denied = Vec::new();
         for used in rights {
             let mut place = None;
             if !self.here.contains_key(&used) {
-                // Uses for which there is no place are not judged: a peer with many of them would have the rules asked at each
-                // change of its graph.
+                // Uses without a place are not judged. Otherwise a peer with many of them would have the
+                // rules evaluated at each change of its graph.
                 place = self.places.charge(1);
                 if place.is_none() {
                     continue;
@@ -183,13 +184,14 @@ impl PeerAccess {
         parts(denied, lifted.iter().map(|used| message(used, "")).collect())
     }
 
-    /// Another connection takes over: what was said and not heard is said again, by both sides.
+    /// Moves to a new connection: both sides repeat their denied uses, because some messages may not have
+    /// arrived.
     pub(super) fn succeed(&mut self) -> Vec<LinkMessage> {
         self.there.clear();
         parts(self.here.iter().map(|(used, (why, _))| message(used, why)).collect(), Vec::new())
     }
 
-    /// The peer tells what is denied there. Returns what is not any more.
+    /// Handles the peer's report about uses that its host denies. Returns the uses that are no longer denied.
     pub(super) fn handle_denied(
         &mut self,
         peer: DaemonId,
@@ -213,7 +215,8 @@ impl PeerAccess {
         lifted.filter(|used| self.there.remove(used).is_some()).collect()
     }
 
-    /// Answers what the peer may do here. It learns no more than by announcing such endpoints, of which DENIED speaks.
+    /// Answers which uses the peer may make here. The peer could learn the same by announcing such endpoints,
+    /// because DENIED reports them.
     pub(super) fn answer(&self, check: &LinkAccessCheck) -> LinkMessage {
         let decisions = check.uses.iter().map(|used| {
             let decision =
@@ -224,7 +227,7 @@ impl PeerAccess {
         LinkMessage::AccessDecisions(AccessDecisions { number: check.number, decisions })
     }
 
-    /// Asks the peer what it lets this host do.
+    /// Asks the peer which uses it permits to this host.
     pub(super) fn ask(&mut self, number: u64, uses: Vec<CheckedUse>) -> LinkMessage {
         while self.asked.len() >= UNANSWERED {
             self.asked.pop_first();
@@ -233,7 +236,7 @@ impl PeerAccess {
         LinkMessage::AccessCheck(LinkAccessCheck { number, uses })
     }
 
-    /// The peer's answer, if this host asked. Each question has one.
+    /// Returns the peer's answer if this host asked the question. Each question has one answer.
     pub(super) fn take_decisions(&mut self, answer: AccessDecisions) -> Option<Vec<PeerDecision>> {
         let uses = self.asked.remove(&answer.number)?;
         let decisions = answer.decisions.into_iter();
@@ -248,7 +251,7 @@ impl PeerAccess {
         there.chain(self.here.iter().map(|(used, (why, _))| (used, "here", &**why)))
     }
 
-    /// Names the denied uses in the link's status.
+    /// Adds the denied uses to the link's status.
     pub(super) fn fill(&self, status: &mut LinkStatus) {
         for ((verb, name), by, why) in self.all().take(LISTED) {
             let whose = if by == "here" { "the peer's" } else { "ours" };
@@ -257,7 +260,7 @@ impl PeerAccess {
         status.more_denied = (self.here.len() + self.there.len()).saturating_sub(LISTED);
     }
 
-    /// The same for the status of this host's endpoints that wait.
+    /// Returns the denied uses for the status of this host's waiting endpoints.
     pub(super) fn refused_routes(&self) -> Vec<RefusedRoute> {
         let all = self.all().take(AT_ENDPOINTS).map(|((verb, name), by, why)| RefusedRoute {
             topic: name.clone(),

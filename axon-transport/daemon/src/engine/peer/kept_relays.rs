@@ -1,5 +1,5 @@
-//! KEEP_ALL relays of peers whose daemon was killed or restarted. They hold what the peer did not acknowledge, until
-//! the next daemon there asks for the topic for the same subscriptions.
+//! KEEP_ALL relays of peers whose daemon was killed or restarted. They hold the samples that the peer did not
+//! acknowledge, until the peer's next daemon asks for the topic for the same subscriptions.
 
 use std::{
     collections::HashMap,
@@ -15,16 +15,17 @@ use crate::engine::{
     rings::RingReader,
 };
 
-/// A relay is kept for so long.
+/// How long a relay is kept.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// Relays that are kept. An identity gets half of what the others leave. What further ones hold is given up at once.
+/// The most kept relays. An identity gets half of the rest. The samples of further relays are given up at
+/// once.
 const MOST: usize = 2048;
 
 /// The relays that are kept.
 pub(crate) struct KeptRelays {
     all: Vec<KeptRelay>,
     room: Rc<Meter>,
-    /// That of each identity.
+    /// The bound of each identity.
     rooms: HashMap<String, Weak<Meter>>,
 }
 
@@ -34,18 +35,18 @@ struct KeptRelay {
     key: RouteKey,
     spec: RelaySpec,
     reader: Rc<dyn RingReader>,
-    /// What is known of its route's flows, those of all its relays.
+    /// The unfinished flows of its route, including those of other relays of the route.
     unfinished: Rc<UnfinishedFlows>,
     since: Duration,
     until: Duration,
-    /// It counts among those that are kept, and still among the relays of the identity.
+    /// One charge as a kept relay, and one that still counts it among the identity's relays.
     _charges: [Charge; 2],
-    /// Those of its relay.
+    /// The charge for the relay's lanes.
     lanes: Charge,
 }
 
 impl KeptRelay {
-    /// Whether a peer with this identity may adopt it for a relay of this kind.
+    /// Returns whether a peer with this identity may adopt the relay for a relay of this kind.
     fn fits(&self, key: &RouteKey, spec: &RelaySpec, identity: &str) -> bool {
         let same = |gid| self.spec.stands_for.contains(gid);
         let is_same_topic = self.key == *key && self.spec.is(spec);
@@ -60,7 +61,7 @@ impl Default for KeptRelays {
 }
 
 impl KeptRelays {
-    /// What an identity may have kept.
+    /// Returns the bound for an identity's kept relays.
     fn room_of(&mut self, identity: &str) -> Rc<Meter> {
         if let Some(room) = self.rooms.get(identity).and_then(Weak::upgrade) {
             return room;
@@ -71,7 +72,7 @@ impl KeptRelays {
         room
     }
 
-    /// Takes the KEEP_ALL relays of a peer that is gone.
+    /// Takes over the KEEP_ALL relays of a peer that is gone.
     pub(crate) fn add(&mut self, peer: &mut Peer, now: Duration) {
         let room = self.room_of(&peer.identity);
         for (number, served) in peer.served.iter_mut() {
@@ -101,9 +102,9 @@ impl KeptRelays {
         }
     }
 
-    /// Charges the `lanes` of a new relay as many. If the peer is about to adopt one that was kept, the lanes of that make
-    /// room for them; it has none from then on, so [`adopt`](Self::adopt) has to follow. `None`: there are not so many, and
-    /// what is kept stays charged.
+    /// Charges `many` lanes for a new relay. If the peer is about to adopt a kept relay, the lanes of that
+    /// one are released to make room. The kept relay then has no lanes, so [`adopt`](Self::adopt) must
+    /// follow. Returns `None` if the lanes do not fit; the kept relay then keeps its charge.
     pub(super) fn charge_lanes(
         &mut self,
         key: &RouteKey,
@@ -125,10 +126,12 @@ impl KeptRelays {
         }
     }
 
-    /// The relay that was kept, of a peer with this identity, for one of the subscriptions for which a new one is to
-    /// stand. It begins with what was not acknowledged. Returns also what is known of the flows that it had: a daemon that
-    /// follows another one is no way around the `limit` on those that take nothing, or too little. All the time for which a
-    /// relay may be kept counts as half of the limit, so that a daemon that is slow to start has the other half.
+    /// Returns the relay that was kept, for a peer with this identity, for one of the subscriptions of a new
+    /// relay. It starts with the unacknowledged samples.
+    ///
+    /// Also returns the unfinished flows, so that a new daemon does not reset the `limit` on peers that take
+    /// nothing or too little. The longest time for which a relay is kept counts as half of the limit. So a
+    /// daemon that is slow to start has the other half.
     pub(super) fn adopt(
         &mut self,
         key: &RouteKey,
@@ -148,7 +151,7 @@ impl KeptRelays {
         Some((reader, unfinished))
     }
 
-    /// How many there are.
+    /// Returns the number of kept relays.
     #[cfg(test)]
     pub(crate) fn len(&self) -> usize {
         self.all.len()
@@ -159,7 +162,7 @@ impl KeptRelays {
         self.all.iter().map(|kept| kept.until).min()
     }
 
-    /// Gives up what relays hold that were kept until now. Returns the samples, by topic.
+    /// Gives up the samples of the relays whose time is over. Returns the samples by topic.
     pub(crate) fn give_up(&mut self, now: Duration) -> Vec<(String, u64)> {
         let mut lost = Vec::new();
         for KeptRelay { key, reader, .. } in self.all.extract_if(.., |kept| kept.until <= now) {

@@ -1,4 +1,4 @@
-//! A peer: its graph, the routes in both directions, and the samples that cross.
+//! A peer: its graph, the routes in both directions, and the samples that pass over them.
 
 mod access;
 mod asking;
@@ -62,14 +62,14 @@ use crate::{
     owner::Binding,
 };
 
-/// Between two looks at pairs that are being attached, at least.
+/// The shortest time between two checks of pairs that are being attached.
 const POLL: Duration = Duration::from_millis(5);
-/// The same for each of them: thousands of pairs that wait leave time for samples.
+/// The shortest time for each of these pairs, so that thousands of waiting pairs leave time for samples.
 const POLL_EACH: Duration = Duration::from_micros(4);
-/// Routes of a peer whose HELLO does not say how many it serves.
+/// The number of routes of a peer whose HELLO does not state how many it serves.
 pub(crate) const ROUTES_UNSAID: usize = 1024;
 
-/// What a peer does that reads a route of this kind.
+/// Returns the use that a peer makes of a route of this kind when it reads it.
 fn reader_of(kind: Kind) -> Verb {
     match kind {
         Kind::Topic => Verb::Subscribe,
@@ -78,7 +78,7 @@ fn reader_of(kind: Kind) -> Verb {
     }
 }
 
-/// The time until the next look at so many pairs.
+/// Returns the time until the next check of so many pairs.
 fn poll_after(pairs: usize) -> Duration {
     POLL.max(POLL_EACH * u32::try_from(pairs).unwrap_or(u32::MAX))
 }
@@ -88,25 +88,25 @@ pub(crate) struct Peer {
     pub(super) daemon: DaemonId,
     /// The link in use.
     pub(super) link: u64,
-    /// Who it proved to be.
+    /// The identity that the peer proved.
     identity: String,
     pub(super) counters: Rc<Counters>,
-    /// Its graph.
+    /// The peer's graph.
     pub(super) remote: PeerGraph,
     prover: Prover,
-    /// What it may do here.
+    /// The peer's rights on this host.
     access: PeerAccess,
-    /// Endpoints of it were ignored, since another peer had them.
+    /// Whether endpoints of the peer were ignored because another peer has the same ones.
     pub(super) displaced: bool,
-    /// The graph that it was sent.
+    /// The graph that was sent to the peer.
     shown_graph: ShownToPeer,
-    /// It has been silent for so long that the control plane takes it for gone.
+    /// Whether the peer has been silent for so long that the control plane counts it as gone.
     pub(super) silent: bool,
-    /// Its graph changed, and what follows was not done.
+    /// Whether the peer's graph changed and the change still has to be processed.
     pub(super) stirred: bool,
     refusal_said: bool,
     next_route: u32,
-    /// Routes that it serves at most.
+    /// The most routes that the peer serves.
     serves: usize,
     asked: BTreeMap<RouteKey, AskedRoute>,
     /// The routes of `asked`, by number.
@@ -116,7 +116,7 @@ pub(crate) struct Peer {
     refused: RefusedRoutes,
     pub(super) inbound: Inbound,
     pub(super) outbound: Outbound,
-    /// Publishers here that ended and whose samples have not all arrived: the peer sees them until then.
+    /// Ended publishers of this host whose samples have not all arrived. The peer sees them until then.
     ending: BTreeMap<Gid, RemoteEndpoint>,
     served: ServedRoutes,
     alive: Alive,
@@ -127,30 +127,30 @@ pub(crate) struct Peer {
 
 /// The parts of a new peer.
 pub(crate) struct PeerParts {
-    /// Its daemon.
+    /// The peer's daemon.
     pub(crate) daemon: DaemonId,
     /// The link in use.
     pub(crate) link: u64,
-    /// Who it proved to be.
+    /// The identity that the peer proved.
     pub(crate) identity: String,
-    /// Its account.
+    /// The identity's account.
     pub(crate) account: Rc<Account>,
-    /// Proves that sessions are of this host.
+    /// Proves to the peer that sessions belong to this host.
     pub(crate) prover: Prover,
-    /// What it may do here.
+    /// The peer's rights on this host.
     pub(crate) permissions: Permissions,
-    /// Counts its samples.
+    /// Counters of the peer's samples.
     pub(crate) counters: Rc<Counters>,
-    /// Samples from it.
+    /// Samples from the peer.
     pub(crate) inbound: Inbound,
-    /// Samples to it.
+    /// Samples to the peer.
     pub(crate) outbound: Outbound,
-    /// Routes that it serves at most.
+    /// The most routes that the peer serves.
     pub(crate) serves: usize,
 }
 
 impl Peer {
-    /// A peer whose graph is not known yet.
+    /// Creates a peer without a graph.
     pub(super) fn new(parts: PeerParts) -> Self {
         let PeerParts {
             daemon,
@@ -195,7 +195,7 @@ impl Peer {
         }
     }
 
-    /// A successor took over. The peer's routes stand; this side asks for its own again.
+    /// Moves the peer to a new link. The peer's routes stay; this side asks for its own routes again.
     pub(super) fn succeed(&mut self, link: u64, binding: Option<Binding>, local: &LocalEndpoints) {
         self.link = link;
         self.messages.succeed();
@@ -211,7 +211,7 @@ impl Peer {
         self.served.iter_mut().for_each(|(_, served)| served.repeated = false);
     }
 
-    /// Tells the peer which links are closed here.
+    /// Queues the list of links that are closed here.
     pub(super) fn say_closed(&mut self, closed: Option<LinkClosed>) {
         self.messages.say_closed(closed);
     }
@@ -221,15 +221,15 @@ impl Peer {
         self.messages.say(message);
     }
 
-    /// The next control message.
+    /// Returns the next control message.
     pub(super) fn poll_message(&mut self) -> Option<LinkMessage> {
         self.messages.poll()
     }
 
-    /// A message of the peer that concerns it alone.
+    /// Handles a message that concerns only this peer.
     ///
     /// # Errors
-    /// The peer broke a rule.
+    /// The peer violated the protocol.
     pub(super) fn handle_message(
         &mut self,
         message: LinkMessage,
@@ -275,7 +275,7 @@ impl Peer {
         Ok(())
     }
 
-    /// The endpoints of this host that the peer may see.
+    /// Returns the endpoints of this host that the peer may see.
     fn shown(&mut self, local: &LocalEndpoints) -> BTreeMap<Gid, RemoteEndpoint> {
         let listed = self.remote.endpoints().any(|remote| remote.toward.lists);
         let shown = local.iter().filter_map(|(gid, (endpoint, reach))| {
@@ -290,7 +290,7 @@ impl Peer {
         self.permitted(shown.collect())
     }
 
-    /// What access rules let the peer see of these.
+    /// Removes the endpoints that access rules hide from the peer.
     fn permitted(
         &mut self,
         mut all: BTreeMap<Gid, RemoteEndpoint>,
@@ -322,24 +322,24 @@ impl Peer {
         self.renew_limits(config);
     }
 
-    /// Asks the peer what its access rules let this host do.
+    /// Asks the peer whether its access rules permit these uses to this host.
     pub(super) fn check_access(&mut self, number: u64, uses: Vec<CheckedUse>) {
         let question = self.access.ask(number, uses);
         self.say(question);
     }
 
-    /// The peer answers a question about its access rules. `None`: it was not asked.
+    /// Handles the peer's answer about its access rules; `None` if there was no question.
     pub(super) fn take_decisions(&mut self, answer: AccessDecisions) -> Option<Vec<PeerDecision>> {
         self.access.take_decisions(answer)
     }
 
-    /// Tells the peer which of its endpoints access rules deny, if that changed.
+    /// Sends the peer the list of its endpoints that access rules deny, if the list changed.
     fn tell_denied(&mut self, now: Duration) {
         let messages = self.access.set_denied(self.daemon, self.remote.denied(), now);
         messages.into_iter().for_each(|message| self.say(message));
     }
 
-    /// The graph of this host changed: the peer is told, and routes follow.
+    /// Handles a change of this host's graph: sends it to the peer and updates the routes.
     pub(super) fn handle_local_graph(&mut self, with: &PeerContext<'_>, now: Duration) {
         self.keep_ending(with.local, now);
         self.fit_lanes(with, now);
@@ -347,7 +347,7 @@ impl Peer {
         self.update(with, now);
     }
 
-    /// Publishers that ended stay in the graph that the peer sees until their samples have arrived.
+    /// Keeps ended publishers in the graph that the peer sees until their samples have arrived.
     fn keep_ending(&mut self, local: &LocalEndpoints, now: Duration) {
         let ended = self.shown_graph.iter().filter(|(gid, shown)| {
             shown.remote.endpoint.kind == EndpointKind::Publisher
@@ -367,14 +367,14 @@ impl Peer {
         }
     }
 
-    /// Nothing is left of a publisher that ended.
+    /// Removes an ended publisher without remaining samples from the graph that the peer sees.
     pub(super) fn handle_drained(&mut self, gid: &Gid, local: &LocalEndpoints) {
         if self.ending.remove(gid).is_some() {
             self.send_graph(local, false);
         }
     }
 
-    /// Whether samples of publishers that ended are on their way.
+    /// Returns whether samples of ended publishers are still being sent.
     pub(super) fn is_draining(&self) -> bool {
         !self.ending.is_empty()
     }
@@ -391,7 +391,7 @@ impl Peer {
         }
     }
 
-    /// Tells the peer what changed in the graph of this host, or all of it.
+    /// Sends the peer the changes of this host's graph, or the whole graph.
     pub(super) fn send_graph(&mut self, local: &LocalEndpoints, whole: bool) {
         let visible = self.visible(local);
         self.prove(&visible);
@@ -407,7 +407,7 @@ impl Peer {
             .for_each(|message| self.messages.say(message));
     }
 
-    /// The peer asks for the whole graph.
+    /// Sends the whole graph, which the peer asked for.
     fn resync(&mut self, local: &LocalEndpoints, now: Duration) {
         if self.shown_graph.handle_resync(now) {
             self.prover.forget();
@@ -415,7 +415,7 @@ impl Peer {
         }
     }
 
-    /// A part of the peer's graph.
+    /// Takes in a part of the peer's graph.
     pub(super) fn take_graph(&mut self, graph: GraphUpdate) -> GraphTaken {
         let taken = self.remote.take(graph);
         if taken == (GraphTaken::Changed { whole: true }) {
@@ -424,22 +424,22 @@ impl Peer {
         taken
     }
 
-    /// The peer's graph changed, and this host follows.
+    /// Handles a change of the peer's graph.
     pub(super) fn handle_remote_graph(&mut self, with: &PeerContext<'_>, now: Duration) {
         self.tell_denied(now);
-        // Sessions there may list this host now, or no longer.
+        // A session of the peer may now list this host, or list it no longer.
         self.send_graph(with.local, false);
         self.update(with, now);
     }
 
-    /// Why a part of its graph is refused, if that is news.
+    /// Returns why a part of the peer's graph is refused, if that was not reported before.
     pub(super) fn newly_refused(&mut self) -> Option<String> {
         let refused = self.remote.refused().map(str::to_owned);
         let said = std::mem::replace(&mut self.refusal_said, refused.is_some());
         refused.filter(|_| !said)
     }
 
-    /// When its publishers' liveliness is told.
+    /// Returns when to report the liveliness of this host's publishers to the peer.
     fn alive_due(&self, now: Duration) -> Option<Duration> {
         self.alive.left(now).map(|left| now + left)
     }
@@ -457,7 +457,7 @@ impl Peer {
 
     fn handle_asserted(&self, asserted: &LivelinessAsserted) {
         let known = asserted.publishers.iter().filter_map(|gid| self.remote.get(gid));
-        // Its topic names the one route that may have a stand-in of it.
+        // The publisher's topic names the one route that may have its stand-in.
         let stand_ins = known.take(MAX_STAND_INS).filter_map(|publisher| {
             let asked = self.asked.get(&RouteKey::of(publisher)?)?;
             asked.stand_ins.get(&publisher.gid)
@@ -465,7 +465,8 @@ impl Peer {
         stand_ins.for_each(|stand_in| stand_in.ring().assert_alive());
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) is due, besides its samples.
+    /// Returns when [`handle_timeout`](Self::handle_timeout) is due. The peer's samples have timers of their
+    /// own.
     pub(super) fn poll_timeout(&self, now: Duration) -> Option<Duration> {
         let alive = self.alive_due(now);
         let (attaching, announcing) = (self.look_at_attaching, self.served.poll_timeout());
@@ -474,7 +475,7 @@ impl Peer {
         [attaching, announcing, alive, resync, asks, unanswered].into_iter().flatten().min()
     }
 
-    /// Does what is due.
+    /// Does the work that is due.
     pub(super) fn handle_timeout(&mut self, with: &PeerContext<'_>, now: Duration) {
         self.ask_for_attached(now);
         self.announce_ready(now);
@@ -504,7 +505,7 @@ impl Peer {
         Some(stalled)
     }
 
-    /// Adds its graph and refused routes to the link's status.
+    /// Adds the peer's graph and refused routes to the link's status.
     pub(super) fn fill(&self, status: &mut LinkStatus, now: Duration) {
         self.counters.fill(status);
         self.show_refused(status);
@@ -524,7 +525,7 @@ impl Peer {
         self.refused.held()
     }
 
-    /// Publishers, servers and clients of it that are shown here.
+    /// Counts the publishers, servers and clients of the peer that are shown here.
     #[cfg(test)]
     pub(super) fn stand_ins(&self) -> usize {
         self.asked.values().map(|asked| asked.stand_ins.len()).sum()

@@ -1,5 +1,5 @@
-//! Remembers peers that asked for a topic and stopped reading it, and how long they wait before they are
-//! served again. Plain data in, data out.
+//! Remembers peers that asked for a topic and stopped reading it, and how long they must wait to be served
+//! again. The module does no I/O.
 
 use std::{collections::HashMap, rc::Rc, time::Duration};
 
@@ -8,20 +8,20 @@ use crate::engine::account::{Charge, Meter};
 
 /// The longest wait.
 const LONGEST: Duration = Duration::from_secs(320);
-/// A peer that read for so long, and for so many limits, is as good as any. The longest hold that is not cut takes half of
-/// that, or waits would not double.
+/// A stall is forgiven after this time, and this multiple of the limit, of reading without a stall. The
+/// multiple is twice the longest time that a peer can hold up a publisher without being cut; otherwise waits
+/// would not double.
 const FORGIVEN: (Duration, u32) = (Duration::from_secs(600), 192);
-/// What is remembered of all peers, in bytes, and of one at most. Each gets half of what the others leave.
+/// Bytes that are remembered of all peers, and of one peer at most. Each peer gets half of the rest.
 const ROOM: (usize, usize) = (8 << 20, 1 << 20);
-/// Bytes that count for a stall besides its names.
+/// Bytes that a stall counts in addition to its names.
 const ENTRY: usize = 200;
-/// Peers of which something is remembered.
+/// The most peers that are remembered.
 const PEERS: usize = 4096;
-/// How often what is forgiven is looked for.
+/// Shortest time between two removals of forgiven stalls.
 const SWEEP: Duration = Duration::from_secs(1);
 
-/// What is known of peers that stalled, by who they proved to be, so that a new link or daemon id is no
-/// way around it.
+/// The stalls of all peers, by proven identity, so that a new link or daemon ID does not reset them.
 #[derive(Debug)]
 pub(crate) struct StallHistory {
     of: HashMap<String, OfPeer>,
@@ -34,7 +34,8 @@ pub(crate) struct StallHistory {
 struct OfPeer {
     room: Rc<Meter>,
     routes: HashMap<RouteKey, (RouteStall, Charge)>,
-    /// That of all routes for which there was no room. A peer gains nothing by stalling very many.
+    /// The stall of all routes for which there was no room. A peer gains nothing by stalling very many
+    /// routes.
     others: Option<RouteStall>,
 }
 
@@ -42,12 +43,12 @@ struct OfPeer {
 struct RouteStall {
     wait: Duration,
     until: Duration,
-    /// When nothing is known of it any more.
+    /// When the stall is forgotten.
     forgiven: Duration,
 }
 
 impl RouteStall {
-    /// A peer stalled, and this is what was known of it.
+    /// Creates the stall that follows an earlier one.
     fn after(before: Option<Self>, limit: Duration, now: Duration) -> Self {
         let before = before.filter(|before| !before.is_forgiven(now));
         let wait = before.map_or(limit, |before| (before.wait * 2).min(LONGEST.max(limit)));
@@ -61,12 +62,12 @@ impl RouteStall {
 }
 
 impl OfPeer {
-    /// What is known of a route.
+    /// Returns the stall of a route.
     fn get(&self, key: &RouteKey) -> Option<RouteStall> {
         self.routes.get(key).map(|(stall, _)| *stall).or(self.others)
     }
 
-    /// When the last wait is over.
+    /// Returns when the last wait is over.
     fn until(&self) -> Option<Duration> {
         let routes = self.routes.values().map(|(stall, _)| stall);
         routes.chain(&self.others).map(|stall| stall.until).max()
@@ -80,7 +81,8 @@ impl Default for StallHistory {
 }
 
 impl StallHistory {
-    /// A peer was disconnected from a topic after it read nothing for `limit`. How long it waits.
+    /// Records that a peer was disconnected from a topic after it read nothing for `limit`. Returns how long
+    /// the peer must wait.
     pub(crate) fn add(
         &mut self,
         who: &str,
@@ -110,7 +112,7 @@ impl StallHistory {
         stall.wait
     }
 
-    /// Forgets what is forgiven.
+    /// Removes forgiven stalls.
     fn sweep(&mut self, now: Duration) {
         if self.swept.is_some_and(|swept| now < swept + SWEEP) {
             return;
@@ -123,7 +125,7 @@ impl StallHistory {
         });
     }
 
-    /// How long this peer is not served this yet.
+    /// Returns how long the peer must still wait for this route.
     pub(crate) fn left(&self, who: &str, key: &RouteKey, now: Duration) -> Option<Duration> {
         let stall = self.of.get(who)?.get(key)?;
         Some(stall.until.saturating_sub(now)).filter(|left| !left.is_zero())
@@ -160,7 +162,7 @@ mod tests {
         assert_eq!(stalls.add("pin arm", &key(0), ten, now), ten);
     }
 
-    /// One that empties the store of keys is cut after 96 times the limit, each time.
+    /// A peer that empties the key store is cut after 96 times the limit, each time.
     #[test]
     fn a_peer_that_holds_up_as_long_as_it_can_each_time_waits_longer_each_time() {
         let (mut stalls, ten) = (StallHistory::default(), Duration::from_secs(10));
@@ -190,7 +192,7 @@ mod tests {
         stalls.add("pin leg", &key(1), ten, now);
         assert_eq!(stalls.left("pin leg", &key(1), now), Some(ten));
         assert_eq!(stalls.left("pin leg", &key(2), now), None);
-        // In time it is as good as any.
+        // After that time the peer counts as any other.
         let later = now + LONGEST + ten * FORGIVEN.1;
         stalls.add("pin tail", &key(0), ten, later);
         assert_eq!((stalls.of.len(), stalls.left("pin arm", &key(5), later)), (1, None));

@@ -1,5 +1,5 @@
-//! Services of which a peer does not take the responses. Its requests are not taken for a while either: each would be
-//! answered, and servers here would wait for room in the ring of its client.
+//! Services whose responses a peer does not take. The peer's requests are then not taken for a while either:
+//! each would be answered, and servers on this host would wait for room in the ring of its client.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -15,47 +15,48 @@ use super::{
 };
 use crate::engine::outbound::UnfinishedFlows;
 
-/// Between two looks at responses that the peer does not ask for.
+/// Time between two checks for responses that the peer does not ask for.
 const LOOK: Duration = Duration::from_secs(1);
-/// Services of a peer whose routes ended while something waited for it. Of more than these nothing is remembered.
+/// The most services with ended routes and unfinished flows that are remembered for a peer. Further ones are
+/// not.
 const LEFT: usize = 256;
 
-/// What is known of services whose requests or responses a peer does not take.
+/// The services whose requests or responses a peer does not take.
 #[derive(Default)]
 pub(super) struct UnansweredServices {
-    /// Requests that the peer is not asked for, and until when.
+    /// Request routes that the peer is not asked for, each with the end of that time.
     closed: BTreeMap<RouteKey, Duration>,
-    /// Routes of services that were given up since the peer did not take what they carried.
+    /// Routes of services that were given up because the peer did not take their samples.
     stalled: BTreeSet<RouteKey>,
-    /// Requests to which responses wait that the peer has not asked for.
+    /// Request routes whose responses wait for the peer to ask for them.
     awaited: BTreeMap<RouteKey, AwaitedResponses>,
-    /// What is known of routes that ended, until the peer asks for them again.
+    /// Unfinished flows of ended routes, until the peer asks for the routes again.
     left: BTreeMap<RouteKey, UnfinishedFlows>,
-    /// When responses that the peer does not ask for are looked at.
+    /// When to check for responses that the peer does not ask for.
     look: Option<Duration>,
 }
 
 /// Responses that wait for the peer to ask for them.
 #[derive(Clone, Copy, Debug)]
 struct AwaitedResponses {
-    /// Responses that had found no room when they were seen first.
+    /// Responses that had found no room at the first check.
     refused: u64,
-    /// For how long they have waited since, look by look.
+    /// How long the responses have waited since, added up at each check.
     waited: Duration,
 }
 
 impl UnansweredServices {
-    /// When something is due.
+    /// Returns the time of the next check, or of the next request route to ask for again.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         self.closed.values().copied().chain(self.look).min()
     }
 
-    /// A route of a service was given up.
+    /// Records that a route of a service was given up.
     pub(super) fn handle_stalled(&mut self, route: RouteKey) {
         self.stalled.insert(route);
     }
 
-    /// A route of a service ends. This is known of its flows.
+    /// Stores the unfinished flows of a service's route that ends.
     pub(super) fn leave(&mut self, route: &RouteKey, unfinished: UnfinishedFlows) {
         if !unfinished.is_empty() && self.left.len() < LEFT {
             self.left.insert(route.clone(), unfinished);
@@ -65,14 +66,14 @@ impl UnansweredServices {
         }
     }
 
-    /// The peer asks for a route of a service. Returns what is known of flows that it had.
+    /// Returns the unfinished flows of a service's route that the peer asks for again.
     pub(super) fn go_on(&mut self, route: &RouteKey) -> UnfinishedFlows {
         self.left.remove(route).unwrap_or_default()
     }
 }
 
 impl AskedRoute {
-    /// How many responses its clients have not taken, and how many more found no room.
+    /// Returns how many responses its clients have not taken, and how many more found no room.
     fn responses(&self) -> (u64, u64) {
         let clients = self.stand_ins.values();
         clients.fold((0, 0), |(waiting, refused), client| {
@@ -86,8 +87,9 @@ impl AskedRoute {
 }
 
 impl Peer {
-    /// Takes out of what is wanted the requests whose responses the peer did not take lately. Returns them. Those that it
-    /// is asked for stay, if it was another daemon of its host that took nothing.
+    /// Removes from the wanted routes the requests whose responses the peer has not taken lately, and returns
+    /// them. Requests that the peer is already asked for stay if another daemon of its host failed to take
+    /// the responses.
     pub(super) fn leave_out_unanswered(
         &mut self,
         wanted: &mut BTreeMap<RouteKey, WantedRoute>,
@@ -113,7 +115,7 @@ impl Peer {
         keys
     }
 
-    /// Looks for responses that the peer does not ask for, and asks again for requests whose time is over.
+    /// Checks for responses that the peer does not ask for, and asks again for requests whose time is over.
     pub(super) fn look_at_unanswered(&mut self, with: &PeerContext<'_>, now: Duration) {
         let closed = self.unanswered.closed.len();
         self.unanswered.closed.retain(|_, until| *until > now);
@@ -130,8 +132,8 @@ impl Peer {
         }
     }
 
-    /// Requests that this host asked for, and to which the peer has not asked for the responses. One whose server the peer
-    /// does not serve now is none of them: this host does not ask for its responses either.
+    /// Returns the request routes that this host asked for and whose responses the peer has not asked for. A
+    /// request route that the peer refuses to serve is left out.
     fn unasked_responses(&self) -> BTreeSet<RouteKey> {
         let requests = self.asked.keys().filter(|key| key.kind == Kind::Request);
         let unasked = requests.filter(|key| {
@@ -140,8 +142,9 @@ impl Peer {
         unasked.cloned().collect()
     }
 
-    /// Whether responses have waited for the limit, and left no room for others, that the peer does not ask for. It counts
-    /// as one that does not read them. One that asks for them for a while and takes none begins where it was.
+    /// Finds services whose responses have waited for the limit, and left no room for further ones, without
+    /// being asked for. The peer then counts as not reading them. A peer that asks for the responses for a
+    /// while and takes none continues where it was. Returns whether there was such a service.
     fn find_unasked_responses(
         &mut self,
         unasked: &BTreeSet<RouteKey>,

@@ -1,5 +1,5 @@
-//! The graph of a peer as this side holds it: as much of it as the peer's account has room for. Besides, the graph of
-//! this host as far as a peer was told of it, and the proofs that sessions are of their daemons.
+//! The graph of a peer as this side holds it: as much of it as the peer's account has room for. The
+//! submodules hold the graph that was sent to a peer, and the proofs that sessions belong to their daemons.
 
 pub(super) mod decisions;
 mod left_out;
@@ -28,25 +28,25 @@ use crate::{
     owner::{Binding, Prefix, Proof, prefix_of},
 };
 
-/// What changed in a peer's graph.
+/// The changes of a peer's graph.
 #[derive(Debug)]
 pub(crate) struct PeerGraphChange {
-    /// Whether it replaces everything that was known of the peer.
+    /// Whether the changes replace everything that was known of the peer.
     pub(crate) reset: bool,
-    /// Endpoints that came or changed.
+    /// Endpoints that were added or changed.
     pub(crate) added: Vec<RemoteEndpoint>,
-    /// Endpoints that went.
+    /// Endpoints that were removed.
     pub(crate) removed: Vec<Gid>,
 }
 
-/// What became of a GRAPH message.
+/// The result of a GRAPH message.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum GraphTaken {
-    /// It counts. `whole` when it was the end of a whole graph.
+    /// The message was applied. `whole`: it was the end of a whole graph.
     Changed { whole: bool },
-    /// More of it is to come.
+    /// More parts of the whole graph must follow.
     Part,
-    /// A version is missing: the whole graph must be asked for.
+    /// A version is missing, so the whole graph must be requested.
     Gap,
 }
 
@@ -54,9 +54,10 @@ pub(crate) enum GraphTaken {
 #[derive(Clone, Debug)]
 struct HeldEndpoint {
     remote: RemoteEndpoint,
-    /// Access rules deny it: for all others on this host it is not there.
+    /// Whether access rules deny the endpoint: it does not exist for the rest of this host.
     denied: bool,
-    /// Access rules of the peer deny this host the other end: it is shown, and in no pair.
+    /// Whether access rules of the peer deny this host the other end: the endpoint is shown, and is in no
+    /// pair.
     closed: bool,
     _charge: Rc<Charge>,
 }
@@ -69,17 +70,18 @@ pub(crate) struct PeerGraph {
     permissions: Permissions,
     all: BTreeMap<Gid, HeldEndpoint>,
     version: u64,
-    /// What came of a whole graph so far.
+    /// The part of a whole graph that has arrived so far.
     gathered: Option<BTreeMap<Gid, HeldEndpoint>>,
-    /// Endpoints that came, changed or went since the last [`changes`](Self::changes).
+    /// Endpoints that were added, changed or removed since the last call of [`changes`](Self::changes).
     changed: BTreeSet<Gid>,
-    /// Nothing was told of it yet.
+    /// Whether nothing of the graph was reported yet.
     fresh: bool,
     left_out: LeftOut,
 }
 
 impl PeerGraph {
-    /// That of a peer which must prove its sessions, if `proofs`, and which may do what the permissions say.
+    /// Creates an empty graph. `proofs`: the peer must prove its sessions. The permissions are the peer's
+    /// rights.
     pub(crate) fn new(account: Rc<Account>, proofs: bool, permissions: Permissions) -> Self {
         let proven = Proven::new(proofs, Rc::clone(&account.sessions));
         Self {
@@ -95,7 +97,7 @@ impl PeerGraph {
         }
     }
 
-    /// Takes a GRAPH in, as far as there is room.
+    /// Takes in a GRAPH message, as far as there is room.
     pub(crate) fn take(&mut self, graph: GraphUpdate) -> GraphTaken {
         let GraphUpdate { version, before, added, removed, more, localhost, listing, denied } =
             graph;
@@ -139,7 +141,7 @@ impl PeerGraph {
                 self.left_out.add_unproven(&endpoint);
                 continue;
             }
-            // What it replaces makes room for it.
+            // The replaced endpoint makes room for the new one.
             let before = self.all.remove(&gid);
             let known = before.is_some();
             drop(before);
@@ -153,7 +155,7 @@ impl PeerGraph {
         GraphTaken::Changed { whole: false }
     }
 
-    /// One more endpoint of a whole graph. One that is known already takes nothing more.
+    /// Adds an endpoint to a whole graph. A known endpoint takes no further memory.
     fn gather(
         &mut self,
         gathered: &mut BTreeMap<Gid, HeldEndpoint>,
@@ -175,13 +177,12 @@ impl PeerGraph {
         gathered.extend(held.map(|held| (gid, held)));
     }
 
-    /// Another connection takes over: on it the peer proves its sessions anew, before it says anything of
-    /// them.
+    /// Moves to another connection, on which the peer must prove its sessions again before it describes them.
     pub(crate) fn succeed(&mut self) {
         self.proven.succeed();
     }
 
-    /// Takes what the peer's daemon proves on the connection that `binding` is of.
+    /// Takes in the proofs of the peer's daemon on the connection with this `binding`.
     pub(crate) fn prove(
         &mut self,
         proofs: &[Proof],
@@ -204,7 +205,7 @@ impl PeerGraph {
         self.proven.owns(gid)
     }
 
-    /// A reader that the peer names in SUBSCRIBE is left out.
+    /// Records a reader in the peer's SUBSCRIBE that is left out.
     pub(crate) fn disown_reader(&mut self, gid: &Gid, topic: &str) {
         self.left_out.add_unproven_reader(gid, topic);
     }
@@ -236,13 +237,13 @@ impl PeerGraph {
         None
     }
 
-    /// What is told of it from now on is all of it.
+    /// Reports the whole graph from now on.
     pub(crate) fn tell_anew(&mut self) {
         self.fresh = true;
         self.changed.extend(self.all.keys());
     }
 
-    /// What changed since the last call.
+    /// Returns the changes since the last call.
     pub(crate) fn changes(&mut self) -> PeerGraphChange {
         let reset = std::mem::replace(&mut self.fresh, false);
         let (mut added, mut removed) = (Vec::new(), Vec::new());
@@ -260,13 +261,13 @@ impl PeerGraph {
         self.left_out.first()
     }
 
-    /// How many were left out since the peer said its whole graph.
+    /// Returns the number of endpoints that were left out since the peer last sent its whole graph.
     pub(crate) fn left_out(&self) -> u64 {
         self.left_out.count()
     }
 
-    /// Whether there is room by now for the first that was left out: the whole graph is worth asking
-    /// for.
+    /// Returns whether there is room now for the first left-out endpoint, so that the whole graph is worth
+    /// requesting.
     pub(crate) fn has_room_again(&self) -> bool {
         let needed = self.left_out.needed();
         self.gathered.is_none() && needed.is_some_and(|n| self.account.graph.charge(n).is_some())
@@ -277,7 +278,7 @@ impl PeerGraph {
         self.version
     }
 
-    /// How many endpoints there are.
+    /// Returns the number of endpoints.
     pub(crate) fn len(&self) -> usize {
         self.all.len()
     }
@@ -309,7 +310,7 @@ impl PeerGraph {
         self.all.values().filter(|held| held.denied).map(|held| &*held.remote.endpoint)
     }
 
-    /// Whether it has this endpoint, as was found in [`changes`](Self::changes).
+    /// Returns whether the graph has this endpoint, as reported by [`changes`](Self::changes).
     pub(crate) fn has(&self, gid: &Gid) -> bool {
         let held = self.all.get(gid).is_some_and(|held| !held.denied);
         held && !self.changed.contains(gid)
@@ -325,7 +326,7 @@ impl PeerGraph {
         self.all.values().filter(|held| !held.denied && !held.closed).map(|held| &held.remote)
     }
 
-    /// These endpoints are another daemon's.
+    /// Removes endpoints that belong to another daemon.
     pub(crate) fn forget(&mut self, gids: &[Gid]) {
         for gid in gids {
             self.all.remove(gid);
@@ -355,7 +356,7 @@ mod tests {
         endpoint(1, "/t").bytes()
     }
 
-    /// GIDs of what came and went.
+    /// Returns the GIDs of the added and of the removed endpoints.
     fn changes(remote: &mut PeerGraph) -> (Vec<u8>, Vec<u8>) {
         let PeerGraphChange { added, removed, .. } = remote.changes();
         let first = |gid: &Gid| gid.0[0];
@@ -389,7 +390,7 @@ mod tests {
         assert_eq!((remote.left_out(), changes(&mut remote).0.len()), (0, 1));
         remote.succeed();
         assert!(!remote.owns(&own));
-        // The old proof is of the other connection.
+        // The old proof is for the other connection.
         remote.prove(&[prove(&key, &first, from).unwrap()], &second, from, NOW);
         remote.take(all());
         assert_eq!((remote.left_out(), changes(&mut remote).1.len()), (1, 1));
@@ -409,13 +410,13 @@ mod tests {
             remote.take(graph(0, vec![endpoint(1, "/t")], vec![], false)),
             GraphTaken::Changed { whole: true }
         );
-        // Of the same identity under another daemon id.
+        // The same identity under another daemon ID.
         other.take(graph(0, vec![endpoint(2, "/t"), endpoint(3, "/u")], vec![], false));
         assert_eq!(changes(&mut other), (vec![2], vec![]));
         assert!(other.refused().unwrap().contains("the publisher of \"/u\" in node \"n\""));
         assert_eq!((other.left_out(), other.has_room_again()), (1, false));
         assert_eq!(remote.refused(), None);
-        // One goes: there is room for another, and for the one that was left out.
+        // One endpoint goes: there is room for another, and for the left-out one.
         remote.take(graph(1, vec![], vec![Gid([1; 16])], false));
         assert!(other.has_room_again());
         other.take(graph(0, vec![endpoint(2, "/t"), endpoint(3, "/u")], vec![], false));
@@ -437,7 +438,7 @@ mod tests {
         assert_eq!(remote.len(), 3, "until all of it is there");
         let rest = vec![parts.next().unwrap(), endpoint(4, "/t")];
         remote.take(graph(1, rest, vec![], false));
-        // The one that is gone made no room yet when the new one came.
+        // The removed endpoint had not made room yet when the new one arrived.
         assert_eq!((changes(&mut remote), remote.left_out()), ((vec![], vec![3]), 1));
         assert!(remote.has_room_again());
         assert_eq!(account.graph.held(), 2 * one());

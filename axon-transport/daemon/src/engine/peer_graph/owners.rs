@@ -1,4 +1,4 @@
-//! Proofs of which daemon a session belongs to: those that this daemon sends to a peer, and those that the
+//! Proofs that a session belongs to a daemon: the proofs that this daemon sends to a peer, and those that the
 //! peer sends.
 
 use std::{
@@ -17,27 +17,27 @@ use crate::{
     owner::{Binding, Prefix, Proof, SessionKeys, prefix, prefix_of, prove},
 };
 
-/// How often sessions without endpoints are looked for, where there are too many.
+/// Shortest time between two searches for sessions without endpoints, when there are too many sessions.
 const SWEEP: Duration = Duration::from_secs(1);
 
-/// Proves to one peer that sessions are this daemon's.
+/// Proves to one peer that sessions belong to this daemon.
 pub(crate) struct Prover {
     keys: Arc<SessionKeys>,
     daemon: DaemonId,
-    /// Whether proofs are asked for: where peers prove who they are.
+    /// Whether proofs are required: they are if peers authenticate.
     needed: bool,
     binding: Option<Binding>,
-    /// The sessions whose proofs the peer has, of those that were made on the connection in use.
+    /// The sessions whose proofs for the current connection the peer has.
     proved: HashSet<Prefix>,
-    /// The proofs: as long as the connection is the same, they are.
+    /// The proofs for the current connection. They stay valid as long as the connection does.
     made: HashMap<Prefix, Proof>,
-    /// The keys of sessions that the peer sees. A publisher that ended is seen longer than its session
-    /// is connected.
+    /// The keys of sessions that the peer sees. An ended publisher is visible for longer than its session is
+    /// connected.
     held: HashMap<Prefix, Arc<SessionKey>>,
 }
 
 impl Prover {
-    /// Proves sessions of `daemon` on the connection that has this binding, if `needed`.
+    /// Proves sessions of `daemon` on the connection with this binding, if `needed`.
     pub(crate) fn new(
         keys: &Arc<SessionKeys>,
         daemon: DaemonId,
@@ -57,24 +57,24 @@ impl Prover {
         prover
     }
 
-    /// Whether proofs are asked for.
+    /// Returns whether proofs are required.
     pub(crate) fn is_needed(&self) -> bool {
         self.needed
     }
 
-    /// Another connection takes over: everything is proved anew there.
+    /// Moves to another connection, on which all sessions must be proved again.
     pub(crate) fn succeed(&mut self, binding: Option<Binding>) {
         self.binding = binding.filter(|_| self.needed);
         self.made.clear();
         self.forget();
     }
 
-    /// The peer asks for everything: every proof is said again.
+    /// Makes every proof due again, because the peer asks for everything.
     pub(crate) fn forget(&mut self) {
         self.proved.clear();
     }
 
-    /// The proofs that the peer lacks for endpoints of these GIDs.
+    /// Returns the proofs that the peer lacks for endpoints of these GIDs.
     pub(crate) fn owed<'a>(&mut self, gids: impl Iterator<Item = &'a Gid>) -> Vec<LinkMessage> {
         let Some(binding) = self.binding else { return Vec::new() };
         let sessions: BTreeSet<Prefix> = gids.map(prefix_of).collect();
@@ -106,15 +106,15 @@ impl Prover {
     }
 }
 
-/// The sessions of a peer.
+/// The sessions that a peer proved to own.
 #[derive(Debug)]
 pub(crate) struct Proven {
-    /// Whether proofs are asked for: where peers prove who they are.
+    /// Whether proofs are required: they are if peers authenticate.
     needed: bool,
-    /// How many there may be, over all daemon ids of the peer's identity.
+    /// The bound on sessions, over all daemon IDs of the peer's identity.
     room: Rc<Meter>,
     sessions: HashMap<Prefix, Charge>,
-    /// Those that were proved since the last GRAPH, which may bring their endpoints.
+    /// Sessions that were proved since the last GRAPH. The next one may contain their endpoints.
     fresh: HashMap<Prefix, Charge>,
     swept: Option<Duration>,
 }
@@ -124,8 +124,8 @@ impl Proven {
         Self { needed, room, sessions: HashMap::new(), fresh: HashMap::new(), swept: None }
     }
 
-    /// Takes what the daemon `from` proves. `used` says of which sessions there are endpoints: the others
-    /// are forgotten where there are too many.
+    /// Takes in proofs of the daemon `from`. `used` returns whether a session has endpoints. If there are too
+    /// many sessions, those without endpoints are forgotten.
     pub(crate) fn take(
         &mut self,
         proofs: &[Proof],
@@ -139,7 +139,7 @@ impl Proven {
         }
         for proof in proofs {
             let session = prefix(&proof.claims());
-            // A signature costs time, and what is known is known.
+            // A signature takes time to verify, so a known session is not verified again.
             if self.has(&session) {
                 continue;
             }
@@ -157,13 +157,13 @@ impl Proven {
         }
     }
 
-    /// Another connection takes over: what was proved on the one before counts no more.
+    /// Moves to another connection: proofs of the previous connection do not count any more.
     pub(crate) fn succeed(&mut self) {
         self.sessions.clear();
         self.fresh.clear();
     }
 
-    /// A GRAPH came: a session that it says nothing of has no endpoint yet.
+    /// Handles the end of a GRAPH: a session that it does not mention has no endpoint yet.
     pub(crate) fn settle(&mut self) {
         self.sessions.extend(self.fresh.drain());
     }
@@ -200,7 +200,7 @@ mod tests {
         prove(key, &BINDING, HERE).unwrap()
     }
 
-    /// Adds sessions until there may be no more.
+    /// Adds sessions until the bound is reached.
     fn fill(proven: &mut Proven) {
         for number in proven.sessions.len() as u64.. {
             let Some(charge) = proven.room.charge(1) else { break };
@@ -305,7 +305,7 @@ mod tests {
         assert_eq!(proved(&prover.owed([&known, &other].into_iter())), 1);
         assert!(prover.owed([&known, &other].into_iter()).is_empty());
         prover.forget();
-        // Its session ended, and a publisher of its is still seen.
+        // The session ended, and one of its publishers is still visible.
         keys.remove(&own.id());
         assert_eq!(proved(&prover.owed([&known].into_iter())), 1);
         assert!(prover.owed([].into_iter()).is_empty());

@@ -1,43 +1,46 @@
-//! Numbers of the samples of one publisher that were dropped here. A link that breaks has what was not acknowledged sent
-//! again: what was dropped once is neither counted a second time nor delivered, and the publisher is told that it was lost.
+//! Numbers of one publisher's samples that were dropped here. After a link breaks, the peer sends the
+//! unacknowledged samples again. A sample that was dropped before is then neither delivered nor counted
+//! again, and the publisher learns that it was lost.
 
 use std::collections::VecDeque;
 
-/// As many runs are remembered. Of those that are joined it is known how many samples were dropped, and not which.
+/// The most runs that are remembered. For joined runs only the number of dropped samples is known, not which.
 const RUNS: usize = 64;
 
-/// Consecutive numbers of which some were dropped.
+/// A range of numbers, some of which were dropped.
 #[derive(Clone, Copy, Debug)]
 struct Run {
     first: u64,
     last: u64,
-    /// How many of them were dropped.
+    /// How many of the numbers were dropped.
     dropped: u64,
 }
 
-/// What became of a sample when it came before.
+/// What became of a sample at its first arrival.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum EarlierFate {
-    /// It was dropped, as far as is known.
+    /// The sample was dropped, as far as is known.
     Dropped,
-    /// It was handled, and is not reported as dropped.
+    /// The sample was handled and is not reported as dropped.
     Passed,
-    /// It did not come, or was delivered.
+    /// The sample did not arrive, or was delivered.
     Unknown,
 }
 
-/// Numbers that were dropped, in runs, oldest first.
+/// Dropped numbers in runs, oldest first.
 ///
-/// There is room for few. When more come, two neighbours are joined, and the numbers between them belong to the joined run.
-/// These came and were delivered, or never come: numbers rise. A publisher sends again all from some number on. So of a run
-/// that comes again as a whole it is told the true count. Of one that comes in part it is told at least what was dropped
-/// of that part. Therefore runs that are long ago are joined to longer ones than new runs: a link that breaks has the
-/// newest numbers sent again, and the part is a share of what is sent that does not grow.
+/// The number of runs is bounded. Beyond the bound two neighbours are joined, and the numbers between them
+/// belong to the joined run. Those numbers were delivered or never come, because numbers rise.
+///
+/// A publisher sends again all samples from some number on. If a run is repeated as a whole, the reported
+/// count is exact. If only a part is repeated, the reported count is at least the number of dropped samples
+/// in it. Therefore old runs are joined into longer ones than new runs: a broken link repeats the newest
+/// numbers, so the part is a bounded share of the repeated numbers.
 #[derive(Debug, Default)]
 pub(in crate::engine) struct DroppedRuns(VecDeque<Run>);
 
 impl DroppedRuns {
-    /// A sample was dropped. One whose number does not rise is not remembered.
+    /// Records a dropped sample. A sample whose number does not rise is not recorded.
     pub(in crate::engine) fn add(&mut self, sequence: u64) {
         match self.0.back_mut() {
             Some(newest) if newest.last >= sequence => return,
@@ -53,7 +56,7 @@ impl DroppedRuns {
         }
     }
 
-    /// Joins the two neighbours that are shortest together, measured by how long ago they are.
+    /// Joins the two neighbours that are shortest together in relation to their age.
     fn join(&mut self) {
         let Some(newest) = self.0.back().map(|run| run.last) else { return };
         let lengths = self.0.iter().zip(self.0.iter().skip(1)).map(|(one, next)| {
@@ -69,11 +72,12 @@ impl DroppedRuns {
         }
     }
 
-    /// What became of a sample that comes again.
+    /// Returns what became of a sample that arrives again.
     pub(in crate::engine) fn find(&self, sequence: u64) -> EarlierFate {
         let at = self.0.partition_point(|run| run.last < sequence);
         match self.0.get(at) {
-            // The last ones of a run are told as dropped, whichever were: so a part of it tells no fewer than there were.
+            // The last numbers of a run count as dropped, whichever really were. So any repeated end of a run
+            // reports no fewer than were dropped in it.
             Some(run) if run.last - sequence < run.dropped => EarlierFate::Dropped,
             Some(run) if sequence >= run.first => EarlierFate::Passed,
             _ => EarlierFate::Unknown,
@@ -109,8 +113,8 @@ mod tests {
         );
     }
 
-    /// Of numbers up to `newest` those were dropped of which `is` says so. What is told when all from any number on come
-    /// again is no less than what was dropped among them, and at most a third of them more.
+    /// Drops the numbers up to `newest` that `is` selects. Checks that, when all numbers from any one on are
+    /// repeated, the reported count is no less than the true one, and at most a third of the numbers more.
     fn tells_enough(newest: u64, is: impl Fn(u64) -> bool) {
         let mut dropped = DroppedRuns::default();
         (1..=newest).filter(|number| is(*number)).for_each(|number| dropped.add(number));

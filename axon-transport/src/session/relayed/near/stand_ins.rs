@@ -19,17 +19,17 @@ use crate::{
     wire::session::{RelayMatched, SessionMessage},
 };
 
-/// How long a client's requests wait for servers that it counts and that the daemon does not say yet
-/// that it is matched with.
+/// How long a client's requests wait for a server that the client already counts, until the daemon reports
+/// the match.
 const SETTLING: Duration = Duration::from_secs(1);
 
-/// What stands for one of them.
+/// The stand-in for one remote writer.
 pub(super) struct NearStandIn {
     remote_writer: RemoteWriter,
     since: Instant,
-    /// Whom it stands for is gone, and has left something.
+    /// Whether the remote writer is gone and has left messages.
     leaving: bool,
-    /// It comes from an earlier connection, and goes unless it is matched by then.
+    /// Set for a stand-in from an earlier connection: it ends at this time unless it is matched by then.
     kept_until: Option<Instant>,
 }
 
@@ -38,7 +38,7 @@ impl NearStandIn {
         &self.remote_writer
     }
 
-    /// It outlives its connection. Nobody counts it meanwhile.
+    /// Keeps the stand-in beyond its connection. No endpoint counts it meanwhile.
     pub(super) fn keep(&mut self, until: Instant) {
         self.kept_until.get_or_insert(until);
         if !std::mem::replace(&mut self.leaving, true) {
@@ -46,7 +46,7 @@ impl NearStandIn {
         }
     }
 
-    /// Until when it stays though nobody is matched with it.
+    /// Returns the time until which the stand-in stays without a match.
     pub(super) fn kept_until(&self) -> Option<Instant> {
         self.kept_until
     }
@@ -60,14 +60,14 @@ impl NearStandIn {
     }
 }
 
-/// What a connection leaves to the next one.
+/// The state that a connection leaves to the next one.
 #[derive(Default)]
 pub(super) struct LeftByConnection {
     pub(super) relays: BTreeMap<Gid, NearRelay>,
     pub(super) calls: KeptCalls,
 }
 
-/// The calls among that.
+/// The calls that a connection leaves to the next one.
 pub(super) struct KeptCalls {
     /// The daemon's process that carried them.
     pub(super) daemon: Option<DaemonId>,
@@ -85,33 +85,35 @@ impl Default for KeptCalls {
 }
 
 impl RelayConnection<'_> {
-    /// The daemon says with whom an endpoint of the session is matched. What it was matched with before
-    /// is let go of at once: another message may have it come back, and its channels begin anew then.
+    /// Handles the daemon's message that lists the matches of an endpoint of the session. Earlier matches
+    /// that are missing are dropped at once: a later message may restore one, and its channels then start
+    /// anew.
     pub(super) fn rematch(&mut self, matched: RelayMatched) {
         let RelayMatched { gid, others } = matched;
-        // A writer may have ended meanwhile.
+        // The endpoint may have ended meanwhile.
         if !self.own.contains_key(&gid) && !self.parting.contains(&gid) {
             return;
         }
         let others: BTreeSet<Gid> = others.into_iter().collect();
         let before = self.matched.insert(gid, others.clone()).unwrap_or_default();
-        // A new server has nothing to get: it awaits none of these requests.
+        // A server that was not matched before is not waiting for any of these requests.
         self.unanswered.resend(&gid, &others.difference(&before).copied().collect());
         if !before.is_subset(&others) {
             self.forget_unwanted();
         }
     }
 
-    /// The daemon has heard that an endpoint is gone, and says nothing of it any more. Until then it was
-    /// a reader for the daemon, and what is channelled to it may have gone on for the sake of another.
+    /// Handles the daemon's confirmation that an endpoint has ended. The daemon reports nothing about the
+    /// endpoint afterwards. Until then the endpoint still counted as a reader, so channels that only served
+    /// it may still be open.
     pub(super) fn part(&mut self, gid: &Gid) {
         if self.parting.remove(gid) && self.matched.remove(gid).is_some() {
             self.forget_unwanted();
         }
     }
 
-    /// Those who write for an endpoint of the session, and for which of them, as the daemon knows of
-    /// them.
+    /// Returns the remote writers that the daemon matched with the session's reading endpoints, each with
+    /// those endpoints.
     fn wanted(&self) -> BTreeMap<Gid, Vec<Gid>> {
         let mut wanted: BTreeMap<Gid, Vec<Gid>> = BTreeMap::new();
         let own = self.own.values().filter(|e| reads(e.kind)).map(|e| &e.gid);
@@ -148,7 +150,7 @@ impl RelayConnection<'_> {
                 continue;
             }
             if !self.stand_ins.contains_key(&writer) {
-                // The graph may say later who it is.
+                // The graph may describe the writer later.
                 let Some((_, endpoint)) = self.world.get(&writer) else { continue };
                 match RemoteWriter::carrying(&self.common.outside, endpoint.clone()) {
                     Ok(remote_writer) => {
@@ -177,7 +179,7 @@ impl RelayConnection<'_> {
                 }
                 continue;
             }
-            // All readers that are there, whether or not the daemon has named all of them: the first
+            // All present readers must be attached, even if the daemon has not named all of them: the first
             // samples are for them, too. A reader that is ending reads no more.
             let own = self.own.values().filter(|e| !self.ending.contains_key(&e.gid));
             let mut readers =
@@ -189,7 +191,8 @@ impl RelayConnection<'_> {
         Ok(())
     }
 
-    /// Has nobody count those who are gone from the graph, and stand for the sake of what they left.
+    /// Marks the stand-ins whose writer is gone from the graph, so that no endpoint counts them. They stay
+    /// for the messages that the writer has left.
     pub(super) fn note_leaving(&mut self) {
         for (gid, stand_in) in &mut self.stand_ins {
             let leaving = !self.world.contains_key(gid);
@@ -199,10 +202,10 @@ impl RelayConnection<'_> {
         }
     }
 
-    /// Whether a subscription or server receives from all stand-ins that there are for it: who outside
-    /// counts it may rely on it.
+    /// Returns whether a subscription or server is attached to all matching stand-ins. Remote endpoints that
+    /// count it may rely on that.
     pub(super) fn is_served(&self, reader: &Endpoint) -> bool {
-        // A client may be told of: its requests wait until it is served (`settling`).
+        // A client may be announced earlier: its requests wait until it is served (`settling`).
         !matches!(reader.kind, EndpointKind::Subscription | EndpointKind::Server)
             || self.stand_ins.values().map(NearStandIn::remote_writer).all(|remote_writer| {
                 pairing(remote_writer.endpoint(), reader) != Pairing::Match
@@ -210,7 +213,8 @@ impl RelayConnection<'_> {
             })
     }
 
-    /// By way of whom requests leave, and which wait; to whom responses may.
+    /// Updates the servers that requests go to, the clients whose requests must wait, and the clients that
+    /// may be answered.
     pub(super) fn update_calls(&mut self) -> Result<(), End> {
         self.settling.clear();
         let mut pairs = Vec::new();
@@ -225,7 +229,7 @@ impl RelayConnection<'_> {
                 if !matched.is_some_and(|all| all.contains(server))
                     && remote_writer.partners().contains(&client.gid)
                 {
-                    // It stands for the sake of another client, and this one counts it already.
+                    // The stand-in exists for another client, and this client counts it already.
                     let told = self.asking.get(&client.gid).copied().unwrap_or(stand_in.since);
                     let until = told.max(stand_in.since) + SETTLING;
                     let latest = self.settling.entry(client.gid).or_insert(until);
@@ -239,8 +243,8 @@ impl RelayConnection<'_> {
         self.tell_callers()
     }
 
-    /// Tells the daemon of the clients that have a stand-in, whose servers' responses may then
-    /// come.
+    /// Reports to the daemon the clients that have a stand-in. Responses of the session's servers to these
+    /// clients may then be sent.
     fn tell_callers(&mut self) -> Result<(), End> {
         let mut room = MAX_CALLERS;
         let mut changes = Vec::new();
@@ -264,7 +268,7 @@ impl RelayConnection<'_> {
             let more = now.len().cast_signed() - before.map_or(0, BTreeSet::len).cast_signed();
             changes.push((more, server.gid, now));
         }
-        // Those that have fewer first: in between there are not too many, either.
+        // Servers with fewer clients go first, so that the limit is never exceeded in between.
         changes.sort_by_key(|(more, ..)| *more);
         for (_, server, now) in changes {
             let others = now.iter().copied().collect();
@@ -280,13 +284,13 @@ impl RelayConnection<'_> {
         Ok(())
     }
 
-    /// How long until requests go whether or not all is settled.
+    /// Returns the time until the next client's requests are sent even if not all its servers are matched.
     pub(super) fn settled_in(&self) -> Option<Duration> {
         let until = self.settling.values().min()?;
         Some(until.saturating_duration_since(Instant::now()))
     }
 
-    /// Whether all requests of a client of the session are with the daemon.
+    /// Returns whether the daemon has all requests of a client of the session.
     pub(super) fn is_asked(&self, client: &Gid) -> bool {
         !self.unanswered.is_due(client)
             && self.pipe.outgoing.is_idle(&FlowChannel::of(*client))
@@ -295,7 +299,7 @@ impl RelayConnection<'_> {
             })
     }
 
-    /// Whether all responses of a server of the session are.
+    /// Returns whether the daemon has all responses of a server of the session.
     pub(super) fn is_answered(&self, server: &Gid) -> bool {
         let clients = self.callers.get(server).into_iter().flatten();
         let mut there = clients.filter_map(|client| Some((client, self.stand_ins.get(client)?)));

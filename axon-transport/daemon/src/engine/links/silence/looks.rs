@@ -1,20 +1,20 @@
-//! When all links are looked at: for silence each second, at their certificates each minute.
+//! The schedule of link checks: for silence every second, of certificates every minute.
 
 use std::time::Duration;
 
-/// Between two looks.
+/// Time between two checks.
 const EVERY: Duration = Duration::from_secs(1);
-/// Looks from one that checks certificates to the next.
+/// Checks per check of certificates.
 const MINUTE: u32 = 60;
 
-/// What a look is for.
+/// The scope of a check.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(in crate::engine::links) struct CheckKind {
-    /// Whether certificates are checked, too: that costs signatures.
+    /// Whether certificates are checked, too, which costs signature verifications.
     pub(in crate::engine::links) at_certificates: bool,
 }
 
-/// When the next look is due.
+/// When the next check is due.
 #[derive(Debug)]
 pub(in crate::engine::links) struct LookTimes {
     next: Duration,
@@ -22,17 +22,17 @@ pub(in crate::engine::links) struct LookTimes {
 }
 
 impl LookTimes {
-    /// The first look is due a second after the engine's start.
+    /// Creates a schedule whose first check is due a second after the engine's start.
     pub(in crate::engine::links) fn new() -> Self {
         Self { next: EVERY, passed: 0 }
     }
 
-    /// When the next look is due, while there are links.
+    /// Returns when the next check is due, while there are links.
     pub(in crate::engine::links) fn poll_timeout(&self) -> Duration {
         self.next
     }
 
-    /// The look that is due, if one is.
+    /// Returns the check that is due, if one is.
     pub(in crate::engine::links) fn take_due(&mut self, now: Duration) -> Option<CheckKind> {
         if now < self.next {
             return None;

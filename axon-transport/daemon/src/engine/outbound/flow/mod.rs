@@ -1,5 +1,5 @@
-//! One flow: the samples of a publisher, or of a client's service calls, towards one peer. It moves them from their
-//! rings into its queue, and from there into QUIC streams as the scheduler gives it turns.
+//! One flow: the samples of a publisher, or of a client's service calls, to one peer. The flow moves them
+//! from their rings into its queue, and from there into QUIC streams when the scheduler gives it a turn.
 
 mod batch;
 mod best_effort;
@@ -39,24 +39,25 @@ use crate::engine::{
     sample::frames::Frames,
 };
 
-/// Bytes that one turn writes before other flows have theirs.
+/// Bytes that one turn writes before other flows have their turns.
 const TURN: usize = 256 << 10;
 /// Why a flow has nothing to write now.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum FlowPause {
-    /// Its turn is over. More waits.
+    /// The turn is over. More samples wait.
     Turn,
-    /// It has nothing to send.
+    /// The flow has nothing to send.
     Empty,
-    /// QUIC takes no more, of this stream or of the connection, until it says so.
+    /// QUIC takes no more of this stream or connection until it signals room.
     Blocked,
-    /// The peer allows no more streams now.
+    /// The peer currently allows no more streams.
     NoStream,
     /// There is no key for the next message.
     NoKey,
-    /// The peer does not take in the next sample before others.
+    /// The peer takes in samples of other flows first.
     NoCredit,
-    /// The next sample is being compressed, or is, and those before it have to be acknowledged first.
+    /// The next sample is being compressed, or it is compressed and earlier samples must be acknowledged
+    /// first.
     Compressing,
 }
 
@@ -64,30 +65,30 @@ pub(super) enum FlowPause {
 pub(super) struct Flow {
     pub(super) info: FlowInfo,
     taking: FlowRings,
-    /// Samples for which the sender of message keys was not told that it will need keys.
+    /// Samples for which no message keys were requested from the key sender yet.
     undemanded: u32,
     queue: Queue,
     frames: Frames,
     reliable: ReliableStream,
     best_effort: BestEffort,
     compressing: Compressing,
-    /// Whether QUIC said that it takes no more.
+    /// Whether QUIC takes no more until it signals room.
     pub(super) blocked: bool,
-    /// Whether the peer did not take in its next sample when it had its last turn.
+    /// Whether the peer did not take in the next sample in the flow's last turn.
     pub(super) waits_for_credit: bool,
-    /// Its samples were given up.
+    /// Whether the flow's samples were given up.
     is_given_up: bool,
-    /// When [`handle_timeout`](Self::handle_timeout) is due, if it is.
+    /// When [`handle_timeout`](Self::handle_timeout) is due; `None` if it is not.
     pub(super) timer: Option<Duration>,
     acknowledged_samples: u64,
 }
 
 impl Flow {
-    /// A flow without sources.
+    /// Creates a flow without sources.
     pub(super) fn new(of: Gid, route: &FlowRoute, qos: &Qos, budget: &Rc<Budget>) -> Self {
         let info = FlowInfo::new(of, route);
         let kind = info.route.kind;
-        // Each response has a number that rises, so that the peer can acknowledge it and drop a second copy.
+        // Each response gets a rising number, so that the peer can acknowledge it and drop a duplicate.
         let is_numbered = info.acknowledged && kind == Kind::Response;
         Self {
             taking: FlowRings::new(
@@ -111,12 +112,12 @@ impl Flow {
         }
     }
 
-    /// Takes these sources; the peer has the samples up to number `seen`.
+    /// Replaces the sources. The peer has the samples up to number `seen`.
     pub(super) fn set_sources(&mut self, sources: &[Source], seen: Option<u64>) {
         self.taking.set_sources(sources, seen);
     }
 
-    /// Whether it has no sample that waits or is not acknowledged. There may be some in its rings.
+    /// Returns whether no taken sample waits or is unacknowledged. The rings may still hold samples.
     fn has_none(&self) -> bool {
         self.taking.is_idle()
             && self.queue.is_empty()
@@ -124,17 +125,17 @@ impl Flow {
             && self.best_effort.is_idle()
     }
 
-    /// Whether nothing of it waits or is not acknowledged, and no stream is open.
+    /// Returns whether no taken sample waits or is unacknowledged, and no stream is open.
     pub(super) fn is_idle(&self) -> bool {
         self.has_none() && !self.reliable.is_open()
     }
 
-    /// Whether nothing of it waits, in its rings either, or is not acknowledged.
+    /// Returns whether no sample waits, including in the rings, or is unacknowledged.
     pub(super) fn is_quiet(&self) -> bool {
         self.has_none() && !self.taking.has_more()
     }
 
-    /// Whether its stream carries nothing, and nothing in its rings is to be looked at: its timer is free.
+    /// Returns whether the flow's stream is idle and its rings need no check, so that its timer is free.
     pub(super) fn has_idle_stream(&self) -> bool {
         self.reliable.is_open()
             && self.queue.is_empty()
@@ -142,7 +143,7 @@ impl Flow {
             && !self.taking.has_more()
     }
 
-    /// The rank of what it sends next, or `None` if it has nothing to send.
+    /// Returns the rank of the next sample; `None` if there is nothing to send.
     pub(super) fn rank(&self) -> Option<Rank> {
         let length = match self.queue.peek() {
             _ if self.reliable.is_writing() => self.reliable.left(),
@@ -158,18 +159,19 @@ impl Flow {
         self.queue.delivery() == Delivery::Reliable
     }
 
-    /// Samples wait in a ring.
+    /// Records that samples wait in a ring.
     pub(super) fn handle_samples(&mut self) {
         self.taking.handle_samples();
     }
 
-    /// The limits changed: what waited may pass now.
+    /// Handles a change of the limits: waiting samples may pass now.
     pub(super) fn handle_limits(&mut self) {
         self.taking.handle_limits();
     }
 
-    /// Moves a burst of a KEEP_LAST publisher into the queue while QUIC takes nothing: in the ring it would be
-    /// overwritten. BEST_EFFORT samples stay there: only the newest will be sent. A KEEP_ALL publisher waits.
+    /// Moves a burst of a KEEP_LAST publisher into the queue while QUIC takes nothing, because it would be
+    /// overwritten in the ring. BEST_EFFORT samples stay in the ring, because only the newest will be sent. A
+    /// KEEP_ALL publisher waits.
     pub(super) fn take_burst(&mut self, sources: &[Source], counters: &Counters, now: Duration) {
         // A flow that is behind takes the newest sample once it can be sent.
         let waits = self.blocked || self.reliable.is_writing();
@@ -180,24 +182,24 @@ impl Flow {
         self.undemanded += taking.take_burst(sources, queue, &info.topic, counters, now);
     }
 
-    /// Whether samples that were sent may not have arrived. Where the peer acknowledges none, nothing says that they did.
+    /// Returns whether sent samples may not have arrived. That is always so if the peer acknowledges none.
     pub(super) fn is_on_the_way(&self) -> bool {
         !self.info.acknowledged || self.queue.has_sent() || !self.best_effort.is_idle()
     }
 
-    /// Whether a sample found no room.
+    /// Returns whether a sample found no room in the queue.
     pub(super) fn is_held(&self) -> bool {
         self.taking.is_held()
     }
 
-    /// Bytes that wait for QUIC, and the class of the sample that is next among them.
+    /// Returns the class of the next sample in the queue, and the bytes that wait there for QUIC.
     pub(super) fn waiting(&self) -> Option<(Class, usize)> {
         let next = self.queue.peek()?;
         let rank = self.info.rank(self.is_reliable(), next.payload.len());
         Some((rank.class, self.queue.waiting_bytes()))
     }
 
-    /// When the oldest sample that waits was taken from its ring.
+    /// Returns when the oldest waiting sample was taken from its ring.
     pub(super) fn oldest(&self) -> Option<Duration> {
         self.queue.oldest()
     }
@@ -211,7 +213,7 @@ impl Flow {
         self.taking.count_overwritten(sources, &self.info.topic, counters);
     }
 
-    /// Has a turn: hands samples to QUIC until its turn is over or QUIC takes no more.
+    /// Uses a turn: passes samples to QUIC until the turn is over or QUIC takes no more.
     pub(super) fn write(
         &mut self,
         sources: &[Source],
@@ -232,7 +234,7 @@ impl Flow {
             }
             let before = carrier.taken;
             let pause = match self.queue.delivery() {
-                // What is left of a batch goes first, however the next sample is delivered.
+                // The rest of a batch goes first, whatever the delivery of the next sample.
                 Delivery::BestEffort if !self.reliable.is_writing() => {
                     self.reliable.finish(carrier);
                     self.write_best_effort(carrier, counters, compression, done, now)
@@ -243,14 +245,14 @@ impl Flow {
             if pause == Some(FlowPause::Empty)
                 && let Some(wait) = self.taking.take_retry()
             {
-                // In a pass of its own, so that other flows and links have their turn.
+                // The retry gets a pass of its own, so that other flows and links have their turn.
                 self.set_timer(Some(now + wait));
                 return FlowPause::Empty;
             }
             match pause {
                 None if left == 0 => return FlowPause::Turn,
                 None => {}
-                // All that it looked at in this turn was sent before.
+                // All samples that this turn examined were sent before.
                 Some(FlowPause::Empty) if self.taking.goes_on() && self.queue.peek().is_none() => {
                     return FlowPause::Turn;
                 }
@@ -286,60 +288,61 @@ impl Flow {
         pause
     }
 
-    /// A new link carries the flow: what the old one did not deliver goes first.
+    /// Moves the flow to a new link. Samples that the old link did not deliver go first.
     pub(super) fn succeed(&mut self, mut old: Option<&mut Connection>, counters: &Counters) {
         self.reliable.leave(old.as_deref_mut(), &mut self.queue);
         self.best_effort.leave(old, counters, &self.info.topic);
-        // It has not asked for credit of the new link.
+        // The flow has not asked the new link for credit.
         (self.blocked, self.waits_for_credit) = (false, false);
     }
 
-    /// The streams that carry it, which end with it, and whether a sample is cut off there.
+    /// Takes the streams of a flow that ends, each with whether a sample is cut off on it.
     pub(super) fn take_streams(&mut self) -> impl Iterator<Item = (StreamId, bool)> + use<> {
         let cut = self.best_effort.take_cut().map(|stream| (stream, true));
         let is_cut = self.is_given_up;
         self.reliable.take().map(|stream| (stream, is_cut)).into_iter().chain(cut)
     }
 
-    /// Its samples that are not acknowledged are given up: its stream is cut off, so that what the peer has not read of it
-    /// uses up no window any more.
+    /// Gives up the unacknowledged samples: the stream is cut off, so that its unread data uses no window any
+    /// more.
     pub(super) fn give_up(&mut self) {
         self.is_given_up = self.queue.has_sent();
     }
 
-    /// Whether samples of it are in flight for which others may have to wait.
+    /// Returns whether the flow has samples in flight that others may have to wait for.
     pub(super) fn uses_credit(&self) -> bool {
         self.reliable.credit().is_used()
     }
 
-    /// Samples that the peer acknowledged, and how often QUIC took a quarter of a MiB that it had not taken before.
+    /// Returns the number of acknowledged samples, and how often QUIC took another quarter of a MiB for the
+    /// first time.
     pub(super) fn progress(&self) -> (u64, u64) {
         (self.acknowledged_samples, self.reliable.parts())
     }
 
-    /// How far QUIC took its samples.
+    /// Returns how far QUIC took the flow's samples.
     pub(super) fn sent_progress(&self) -> SentProgress {
         self.reliable.sent_progress()
     }
 
-    /// Goes on with the samples of a flow that ended.
+    /// Continues with the samples of a flow that ended.
     pub(super) fn go_on(&mut self, sent_progress: SentProgress) {
         self.reliable.go_on(sent_progress);
     }
 
-    /// Whether it waits for other flows: none of its samples is in flight, and the peer takes in theirs first. Then it is
-    /// no fault of its own that it makes no progress.
+    /// Returns whether the flow waits for other flows: none of its samples is in flight, and the peer takes
+    /// in theirs first. Then its lack of progress is not its own fault.
     pub(super) fn waits_for_others(&self) -> bool {
         self.waits_for_credit && !self.queue.has_sent() && self.best_effort.is_idle()
     }
 
-    /// Whether BEST_EFFORT samples of it wait for a limit.
+    /// Returns whether BEST_EFFORT samples of the flow wait for a limit.
     pub(super) fn holds_best_effort(&self) -> bool {
         self.taking.is_limited() && !self.is_reliable()
     }
 
-    /// What is left of the BEST_EFFORT samples of a publisher that ended: how many were taken from its rings, and how many
-    /// arrived so far. `None`: nothing is left, in its rings either.
+    /// Returns the BEST_EFFORT samples of an ended publisher that are still to be sent: how many were taken
+    /// from its rings, and how many arrived so far. Returns `None` if none are left, in its rings either.
     pub(super) fn best_effort_left(&self) -> Option<(u64, u64)> {
         let is_left = !self.is_reliable() && !self.is_quiet();
         is_left.then(|| {
@@ -347,12 +350,12 @@ impl Flow {
         })
     }
 
-    /// Whether it waits for a limit, and the peer has all that passed.
+    /// Returns whether the flow waits for a limit and the peer has all samples that passed it.
     pub(super) fn waits_for_limit(&self) -> bool {
         self.taking.is_limited() && self.queue.is_empty()
     }
 
-    /// The peer has the samples up to this number, and dropped some of them.
+    /// Handles an acknowledgement: the peer has the samples up to this number, except the dropped ones.
     pub(super) fn acknowledge(&mut self, sequence: u64, dropped: u64) -> Option<FlowProgress> {
         let (samples, newest) = self.queue.acknowledge(sequence);
         self.reliable.note_sent(&self.queue);
@@ -364,8 +367,8 @@ impl Flow {
         Some(done)
     }
 
-    /// Tells the sources of samples that a limit dropped: at once that they will not arrive, and that they may be
-    /// forgotten once the peer has all before them.
+    /// Reports samples that a limit dropped to the sources. The sources learn at once that the samples will
+    /// not arrive. They may forget the samples once the peer has all earlier ones.
     fn finish_dropped(&mut self, done: &mut FlowProgress) {
         done.given_up += self.taking.take_given_up();
         if self.queue.is_empty() {
@@ -373,7 +376,7 @@ impl Flow {
         }
     }
 
-    /// The reliable stream carries nothing more.
+    /// Finishes the reliable stream.
     pub(super) fn finish_stream(&mut self, carrier: &mut Carrier<'_>) {
         self.reliable.finish(carrier);
     }
@@ -449,7 +452,7 @@ impl Flow {
         }
     }
 
-    /// Sets the timer for what is left when there is no stream any more.
+    /// Sets the timer for the remaining work of a flow without a stream.
     pub(super) fn restart_timer(&mut self) {
         self.timer = self.best_effort.poll_timeout();
     }
@@ -463,7 +466,7 @@ impl Flow {
     ) {
         self.timer = None;
         if self.best_effort.handle_timeout(carrier, counters, &self.info.topic, now) {
-            // QUIC says nothing of a stream that was reset.
+            // QUIC signals no room for a stream that was reset.
             self.blocked = false;
         }
         self.set_timer(self.best_effort.poll_timeout());
@@ -471,7 +474,7 @@ impl Flow {
         self.set_timer(idle);
     }
 
-    /// The link is over and no other carries the flow. Returns the samples that were taken and did not leave.
+    /// Ends the flow with its link. Returns the samples that were taken and not sent.
     pub(super) fn end(&mut self, counters: &Counters) -> u64 {
         self.best_effort.link_over(counters, &self.info.topic);
         let held = self.taking.end();

@@ -28,51 +28,55 @@ use crate::engine::{
 
 /// Samples, and bytes, that one turn moves from the rings.
 const FILL: (usize, usize) = (1024, 256 << 10);
-/// Bytes of short samples that share memory. A part of it stays as long as one of them is not acknowledged.
+/// Bytes of short samples that share one piece of memory. The piece stays as long as one of them is not
+/// acknowledged.
 const SHARED: usize = 32 << 10;
-/// Takes in one turn that found only samples that were sent before.
+/// Takes in one turn that find only samples that were sent before.
 const REPEATS: u32 = 16;
 /// Takes in one turn of samples that a limit drops.
 const DROPS: usize = 64;
 /// A KEEP_ALL flow with so many bytes waiting leaves further samples in the ring, which keeps them.
 const AHEAD: usize = 1 << 20;
-/// Bytes that a KEEP_LAST flow moves that is behind. What it leaves in the ring is replaced there without a copy.
+/// Bytes that a KEEP_LAST flow that is behind moves. The samples that it leaves in the ring are replaced
+/// there without a copy.
 const BEHIND: usize = 64 << 10;
-/// Where a relay that may lose nothing waits for memory, it is looked at again after this.
+/// Time after which a relay that may lose nothing tries again when it waits for memory.
 const HELD_UP: Duration = Duration::from_millis(1);
-/// Turns that move a burst while QUIC takes nothing. A publisher that never rests must not keep the others waiting.
+/// Turns that move a burst while QUIC takes nothing. The bound keeps a busy publisher from delaying the
+/// others.
 const BURST: usize = 4;
 
-/// The samples of a flow that are in its rings.
+/// A flow's samples that are still in the rings.
 pub(super) struct FlowRings {
     /// The publisher, or the client of a service.
     of: Gid,
     kind: Kind,
-    /// The numbers that responses get, where they are acknowledged.
+    /// The numbers for responses if responses are acknowledged.
     responses: Option<ResponseNumbers>,
-    /// The samples of all sources, in one order.
+    /// The samples of all sources, merged in order.
     merge: Merge<RingSample>,
     /// Samples that were taken and are not in the queue.
     taken: VecDeque<RingSample>,
-    /// Whether the queue had no room for the first of them.
+    /// Whether the queue had no room for the first taken sample.
     held: bool,
     /// Whether the rings may hold more samples than the last turn moved.
     more: bool,
-    /// After what time that is looked at again, where the last turn moved none.
+    /// Time after which to check the rings again, if the last turn moved no sample.
     retry: Option<Duration>,
     /// Samples that each relay is known to have lost.
     known_lost: Vec<(Gid, u64)>,
     limit: RouteLimit,
-    /// The limit that the last turn came to. What newer samples replaced in the ring since is lost for it.
+    /// The limit that the last turn reached. Samples that newer ones have replaced in the ring since count as
+    /// lost by this limit.
     exceeded: Option<Exceeded>,
-    /// The newest sample that a limit dropped after it was taken, since the sources were told last.
+    /// The newest sample that a limit dropped after it was taken, since the last report to the sources.
     dropped: Option<u64>,
-    /// How many such samples the publisher was not told of.
+    /// Number of such samples that were not reported to the publisher.
     given_up: u64,
 }
 
 impl FlowRings {
-    /// Takes from nothing yet.
+    /// Creates the rings of a flow without sources.
     pub(super) fn new(
         of: Gid,
         kind: Kind,
@@ -96,12 +100,12 @@ impl FlowRings {
         }
     }
 
-    /// The limits changed: what waited may pass now.
+    /// Handles a change of the limits: waiting samples may pass now.
     pub(super) fn handle_limits(&mut self) {
         self.more |= self.exceeded.is_some();
     }
 
-    /// Whether samples wait, and a limit lets none pass.
+    /// Returns whether samples wait and a limit lets none pass.
     pub(super) fn is_limited(&self) -> bool {
         self.exceeded.is_some() && self.has_more()
     }
@@ -111,19 +115,19 @@ impl FlowRings {
         self.dropped.take()
     }
 
-    /// Takes how many samples a limit dropped of which the publisher was not told.
+    /// Takes the number of samples that a limit dropped and that were not reported to the publisher.
     pub(super) fn take_given_up(&mut self) -> u64 {
         std::mem::take(&mut self.given_up)
     }
 
-    /// Takes these sources; the peer has the samples up to number `seen`.
+    /// Replaces the sources. The peer has the samples up to number `seen`.
     pub(super) fn set_sources(&mut self, sources: &[Source], seen: Option<u64>) {
         self.merge.set(sources.iter().map(Source::gid));
         self.merge.pass(seen.unwrap_or(0));
         self.more = true;
     }
 
-    /// Samples wait in a ring.
+    /// Records that samples wait in a ring.
     pub(super) fn handle_samples(&mut self) {
         self.more = true;
     }
@@ -133,32 +137,33 @@ impl FlowRings {
         self.more || !self.taken.is_empty()
     }
 
-    /// Whether a sample found no room.
+    /// Returns whether a sample found no room in the queue.
     pub(super) fn is_held(&self) -> bool {
         self.held
     }
 
-    /// After what time the rings are to be looked at again, where the last turn moved nothing although samples wait.
+    /// Takes the time after which to check the rings again, if the last turn moved nothing although samples
+    /// wait.
     pub(super) fn take_retry(&mut self) -> Option<Duration> {
         self.retry.take()
     }
 
-    /// Whether the rings may hold samples that it did not come to.
+    /// Returns whether the rings may hold samples that the last turn did not reach.
     pub(super) fn goes_on(&self) -> bool {
         self.more && !self.held
     }
 
-    /// Whether it has taken no sample that is not in the queue.
+    /// Returns whether every taken sample is in the queue.
     pub(super) fn is_idle(&self) -> bool {
         self.taken.is_empty() && !self.merge.holds_any()
     }
 
-    /// How many samples it has taken that are not in the queue.
+    /// Returns the number of taken samples that are not in the queue.
     pub(super) fn waiting(&self) -> usize {
         self.taken.len() + self.merge.held()
     }
 
-    /// Forgets the samples that it has taken and that are not in the queue. Returns how many.
+    /// Forgets the taken samples that are not in the queue. Returns their number.
     pub(super) fn end(&mut self) -> usize {
         self.held = false;
         std::mem::take(&mut self.taken).len() + self.merge.held()
@@ -177,7 +182,7 @@ impl FlowRings {
             return 0;
         }
         if !queue.wants_more(now) {
-            // It is looked at again when what waits is sent.
+            // The flow is checked again when its waiting samples are sent.
             self.held = false;
             return 0;
         }
@@ -185,7 +190,7 @@ impl FlowRings {
         queue.set_qos(&first.map_or_else(Qos::keep_all, Source::qos));
         let most_bytes = self.leave_stale(sources, queue, now);
         let is_behind = queue.is_behind(now);
-        // What the queue drops for a newer sample must not hold memory that they share.
+        // The queue may drop a sample for a newer one. The dropped sample must not keep shared memory in use.
         let together = match queue.depth() {
             Some(depth) if is_behind || !queue.keeps_bursts() => depth.min(FILL.0),
             _ => FILL.0,
@@ -267,19 +272,20 @@ impl FlowRings {
         all
     }
 
-    /// Passes over the samples in the rings that the queue would drop for newer ones. Returns how many bytes are then
-    /// to be moved.
+    /// Skips the samples in the rings that the queue would drop for newer ones. Returns the number of bytes
+    /// to move then.
     fn leave_stale(&self, sources: &[Source], queue: &Queue, now: Duration) -> usize {
         let Some(depth) = queue.depth().filter(|_| queue.is_behind(now)) else { return FILL.1 };
         for source in sources.iter().filter(|source| source.reads(&self.of)) {
             source.skip_of(&self.of, depth);
         }
-        // What is best effort is judged by its age, so it has to be looked at; that is the depth at most.
+        // BEST_EFFORT samples are judged by their age, so all of them are examined: at most the depth.
         if queue.keeps_bursts() { BEHIND } else { usize::MAX }
     }
 
-    /// Counts the samples that newer ones replaced in the ring. The relay that asks for most loses the fewest: a sample
-    /// that it has is sent. What others lose meanwhile is noted, and does not count when one of them takes its place.
+    /// Counts the samples that newer ones replaced in the ring. Only the losses of the relay that asks for
+    /// most count, because it loses the fewest: a sample that it has is sent. The losses of the other relays
+    /// are recorded, so that they do not count when another relay takes its place.
     pub(super) fn count_overwritten(
         &mut self,
         sources: &[Source],
@@ -294,7 +300,7 @@ impl FlowRings {
                 Some((_, known)) => std::mem::replace(known, lost),
                 None => {
                     self.known_lost.push((relay, lost));
-                    // What a relay with history passes over when it begins is no loss.
+                    // Samples that a relay with history skips at its start are no loss.
                     let history = source.qos().durability == Durability::TransientLocal;
                     if history { lost } else { 0 }
                 }
@@ -309,7 +315,8 @@ impl FlowRings {
         counters.lost(topic, cause, lost);
     }
 
-    /// Whether the next sample may pass the limits. If not, it waits or samples are dropped, as the limit says.
+    /// Returns whether the next sample may pass the limits. If not, the sample waits or samples are dropped,
+    /// depending on the limit.
     fn pass_limit(
         &mut self,
         sources: &[Source],
@@ -321,11 +328,11 @@ impl FlowRings {
         let may_wait = |over| over != Over::DropNewest;
         let exceeded = self.limit.exceeded_by(&self.of, may_wait, now);
         if self.exceeded.is_some() || exceeded.is_some() {
-            // Until here it was another cause, or the limit that the last turn came to.
+            // Losses so far had another cause, or the limit that the last turn reached.
             self.count_overwritten(sources, topic, counters);
         }
-        // One ring keeps the newest samples, and replaces the others without a copy. But a KEEP_ALL publisher would wait,
-        // and of several rings each would keep others.
+        // A single ring keeps the newest samples and replaces the others without a copy. With a KEEP_ALL
+        // queue the publisher would wait instead, and several rings would each keep other samples.
         let in_ring = !queue.keeps_all() && sources.len() == 1;
         let (limit, most, waits) = match exceeded {
             None => match self.exceeded.take_if(|before| before.over() == Over::DropOldest) {
@@ -356,7 +363,7 @@ impl FlowRings {
             }
         };
         if !is_whole {
-            // There are newer ones: they are looked at before any passes.
+            // There are newer samples: they are examined before any sample passes.
             (self.retry, self.more, self.exceeded) = (Some(Duration::ZERO), true, Some(limit));
             return false;
         }
@@ -372,7 +379,7 @@ impl FlowRings {
         false
     }
 
-    /// Passes over the samples that waited for a limit, but for the newest `most`.
+    /// Skips the samples that waited for a limit, except the newest `most`.
     fn leave_oldest(
         &mut self,
         sources: &[Source],
@@ -387,7 +394,7 @@ impl FlowRings {
             source.skip_of(&self.of, most);
             newer += source.with_data_of(&self.of).len();
         }
-        // What was taken is older than what the ring holds.
+        // Taken samples are older than those in the ring.
         let keep = if newer > 0 { 0 } else { most };
         self.drop_taken(limit, keep, topic, counters);
         self.exceeded = Some(limit.clone());
@@ -395,7 +402,7 @@ impl FlowRings {
         self.exceeded = None;
     }
 
-    /// Drops what was taken but the newest `most` samples.
+    /// Drops the taken samples except the newest `most`.
     fn drop_taken(&mut self, limit: &Exceeded, most: usize, topic: &Arc<str>, counters: &Counters) {
         let mut dropped = 0;
         while self.taken.len() > most
@@ -409,8 +416,8 @@ impl FlowRings {
         counters.lost(topic, limit.cause(), dropped);
     }
 
-    /// Takes what the rings hold, and drops all of it but the newest `most` samples. Returns whether it came to the end: a
-    /// publisher that never rests must not keep the others waiting.
+    /// Takes the samples in the rings and drops all but the newest `most`. Returns whether it reached the
+    /// end. The number of rounds is bounded, so that a busy publisher does not delay the others.
     fn drop_for(
         &mut self,
         limit: &Exceeded,
@@ -432,7 +439,8 @@ impl FlowRings {
         false
     }
 
-    /// Takes the next samples, as many as `most` says. Whether there was any, even one that was sent before.
+    /// Takes the next samples, up to `most`. Returns whether there were any, including samples that were sent
+    /// before.
     fn take(&mut self, sources: &[Source], most: TakeLimit, now: Duration) -> bool {
         let Self { of, kind, responses, merge, taken, .. } = self;
         if *kind == Kind::Response {
@@ -467,8 +475,8 @@ impl FlowRings {
     }
 }
 
-/// What to take for a queue that has room for so many bytes, in memory, and is to get so many samples and bytes. It has
-/// room for all that is taken, unless that is one sample.
+/// Returns the limit for one take. The queue has `room` bytes of memory left and is to get at most `samples`
+/// and `bytes`. All taken samples fit, unless it is a single one.
 fn limit(room: usize, samples: usize, bytes: usize) -> TakeLimit {
     let half = room / 2;
     TakeLimit {

@@ -16,7 +16,7 @@ const FLOW: BusyFlow = BusyFlow {
     is_quiet: false,
 };
 
-/// Looks for twenty minutes at flows of a peer that is heard. Returns what was found first, and when.
+/// Checks the flows of a peer whose frames arrive, for twenty minutes. Returns the first result and its time.
 fn look(
     is_awaited: bool,
     busy: impl Fn(Duration) -> Vec<BusyFlow>,
@@ -38,7 +38,7 @@ fn secs(now: Duration) -> u64 {
     now.as_secs()
 }
 
-/// A flow whose publisher tries in vain to publish, from the beginning on.
+/// A flow whose publisher fails to publish from the beginning on.
 fn held(now: Duration) -> BusyFlow {
     BusyFlow { refused: Some(10 * now.as_secs()), ..FLOW }
 }
@@ -80,16 +80,16 @@ fn progress_waiting_for_others_and_limits_excuse() {
     assert_eq!(look(false, waits, |_| 0), None, "the peer has all that passed");
 }
 
-/// A peer whose KME draws from the same store can have this host's KME give none.
+/// A peer whose KME draws from the same store can make this host's KME run out of keys.
 #[test]
 fn a_kme_without_keys_excuses_for_longer_than_the_limit_and_not_for_good() {
     let lacks = |now| vec![BusyFlow { lacks_keys: true, ..held(now) }];
     let (at, found) = look(false, lacks, secs).expect("it is found");
     assert_eq!(found, stalled(StallCause::NoKeys));
     assert!(at >= LIMIT * PERIOD * OTHERS && at <= LIMIT * PERIOD * OTHERS + LIMIT, "{at:?}");
-    // One that holds nobody up is not judged.
+    // A flow that holds up no publisher is not judged.
     assert_eq!(look(false, |_| vec![BusyFlow { lacks_keys: true, ..FLOW }], secs), None);
-    // Nor does an outage that ends count for more than its share.
+    // An outage that ends does not count for more than its share either.
     let comes = |now: Duration| {
         let lacks_keys = !secs(now).is_multiple_of(100);
         vec![BusyFlow { lacks_keys, progress: (secs(now) / 100, 0), ..held(now) }]
@@ -100,7 +100,7 @@ fn a_kme_without_keys_excuses_for_longer_than_the_limit_and_not_for_good() {
 #[test]
 fn an_outage_excuses_a_flow_that_holds_nobody_up() {
     assert_eq!(look(false, |_| vec![FLOW], |_| 0), None);
-    // Others hold the publisher up, or it was held up before.
+    // Other flows hold up the publisher, or it was held up before.
     let before = BusyFlow { refused: Some(7), ..FLOW };
     assert_eq!(look(false, |_| vec![before], |_| 0), None);
 }
@@ -111,7 +111,7 @@ fn a_peer_that_sends_something_now_and_then_holds_no_publisher_up_for_long() {
         let heard = |now: Duration| secs(now) / every;
         let (at, found) = look(false, |now| vec![held(now)], heard).expect("it is found");
         assert_eq!(found, stalled(StallCause::NothingRead));
-        // It is heard for five seconds at least in each of these times.
+        // Frames arrive for at least five seconds in each of these periods.
         assert!(at <= LOOK + Duration::from_secs(2 * every) + GONE, "{every}: {at:?}");
     }
 }
@@ -121,7 +121,7 @@ fn a_host_that_is_switched_off_holds_a_publisher_up_until_it_is_gone_and_the_lim
     let (at, found) = look(false, |now| vec![held(now)], |_| 0).expect("it is found");
     assert_eq!(found, stalled(StallCause::NothingRead));
     assert!(at >= GONE && at <= GONE + LIMIT, "{at:?}");
-    // If it holds nobody up before it is gone, the limit begins then.
+    // If the peer holds up no publisher before it is gone, the limit starts then.
     let late = |now: Duration| vec![BusyFlow { refused: Some(secs(now).max(60)), ..FLOW }];
     let (at, _) = look(false, late, |_| 0).expect("it is found");
     assert_eq!(at, Duration::from_secs(60) + LIMIT);
@@ -148,12 +148,12 @@ fn a_peer_that_holds_a_publisher_up_takes_its_share_or_is_found_too_slow() {
     assert_eq!(found, stalled(StallCause::TooSlow));
     assert!(at >= period && at <= period + LIMIT, "{at:?}");
     assert_eq!(look(false, taking(9, 64 * 13), secs), None);
-    // Two in a second.
+    // Two samples in a second.
     let twice = |now: Duration| {
         vec![BusyFlow { progress: (2 * secs(now), 0), keeps: Some(8192), ..held(now) }]
     };
     assert_eq!(look(false, twice, secs), None);
-    // One that holds nobody up may be as slow as it is.
+    // A flow that holds up no publisher may be arbitrarily slow.
     let calm = |now: Duration| vec![BusyFlow { refused: Some(7), ..taking(9, 8192)(now)[0] }];
     assert_eq!(look(false, calm, secs), None);
 }
@@ -190,7 +190,7 @@ fn a_flow_that_waits_for_credit_is_judged_once_none_comes_back() {
         "from when it is judged"
     );
     assert_eq!(look(false, |_| vec![uses], secs), None);
-    // What is heard now and then is no way out of that either.
+    // Occasional frames do not avoid that either.
     let (at, _) = look(
         true,
         |now| vec![BusyFlow { waits_for_others: true, ..held(now) }],
@@ -226,8 +226,9 @@ fn a_number_that_was_forgotten_is_judged_anew() {
     assert_eq!(found, StallReport::default());
 }
 
-/// Daemons of one host take over from each other. Each is there for `life` and has its samples kept for `kept` after it;
-/// `flow` says what the flow looks like at a time, `progress` what it did in the life until then. When it is found.
+/// Daemons of one host take over from each other. Each lives for `life`, and its samples are kept for `kept`
+/// afterwards. `flow` returns the flow's state at a time, and `progress` its progress since the start of that
+/// life. Returns the first result and its time.
 fn one_after_another(
     life: Duration,
     kept: Duration,
@@ -263,7 +264,7 @@ fn one_daemon_after_another_is_no_way_around_the_limit() {
         let [life, kept] = [life, kept].map(Duration::from_millis);
         let (at, found) = one_after_another(life, kept, held, |_| (0, 0)).expect("it is found");
         assert_eq!(found, stalled(StallCause::NothingRead));
-        // Without what is kept, and without the first second of the first life.
+        // Allows for the time in which samples are kept, and for the first second of the first life.
         let lives = LIMIT.as_millis().div_ceil(life.as_millis()) as u32 + 4;
         assert!(at <= lives * (life + kept), "{life:?} {kept:?}: {at:?}");
     }
@@ -272,7 +273,7 @@ fn one_daemon_after_another_is_no_way_around_the_limit() {
 #[test]
 fn the_pace_goes_on_over_all_daemons_of_a_host() {
     let period = LIMIT * PERIOD;
-    // Each takes one sample of very many.
+    // Each daemon takes one sample of very many.
     let busy = |now: Duration| {
         let refused = Some(now.as_millis() as u64);
         BusyFlow { refused, keeps: Some(1 << 16), ..FLOW }
@@ -283,7 +284,7 @@ fn the_pace_goes_on_over_all_daemons_of_a_host() {
         let (at, found) = one_after_another(life, kept, busy, one).expect("it is found");
         assert_eq!(found, stalled(StallCause::TooSlow), "{life:?} {kept:?}");
         assert!(at <= period + 3 * (life + kept) + LOOK, "{life:?} {kept:?}: {at:?}");
-        // One that takes its share goes on.
+        // A peer that takes its share is not cut.
         let many = |since: Duration| (since.as_millis() as u64 * 2, 0);
         assert_eq!(one_after_another(life, kept, busy, many), None);
     }
@@ -315,17 +316,17 @@ fn an_excuse_now_and_then_is_no_way_out_of_the_pace() {
     let (at, found) = look(false, |now| vec![slow(now)], secs).expect("it is found");
     assert_eq!(found, stalled(StallCause::TooSlow));
     assert!(at <= LIMIT * PERIOD * 5 / 4 + LIMIT, "{at:?}");
-    // Nor is it one out of the limit.
+    // Excuses do not avoid the limit either.
     let busy = |now| vec![BusyFlow { progress: (0, 0), ..slow(now) }];
     let (at, found) = look(false, busy, secs).expect("it is found");
     assert_eq!(found, stalled(StallCause::NothingRead));
     assert!(at <= LIMIT * 5 / 4 + 3 * LOOK, "{at:?}");
-    // One that always waits for others of its peer, which takes those as slowly as it likes.
+    // The flow always waits for other flows of its peer, which takes those as slowly as it likes.
     let others = |now| vec![BusyFlow { waits_for_others: true, ..slow(now) }];
     let (at, found) = look(false, others, secs).expect("it is found");
     assert_eq!(found, stalled(StallCause::TooSlow));
     assert!(at <= LIMIT * PERIOD * OTHERS + LIMIT, "{at:?}");
-    // A limit of this host is no fault of the peer.
+    // The peer is not at fault for a limit of this host.
     let limited = |now: Duration| BusyFlow {
         progress: (secs(now) / 60, 0),
         waits_for_limit: !secs(now).is_multiple_of(3),
