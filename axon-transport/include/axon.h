@@ -468,7 +468,7 @@ typedef struct axon_message_info_t {
      */
     uint8_t own_session;
     /**
-     * Must be 0.
+     * 0.
      */
     uint8_t reserved[7];
 } axon_message_info_t;
@@ -887,7 +887,8 @@ axon_ret_t axon_session_client_describe(struct axon_client_t client,
  * # Safety
  * `count` points to room for a number.
  */
-axon_ret_t axon_session_client_matched(struct axon_client_t client, size_t *count);
+axon_ret_t axon_session_client_matched(struct axon_client_t client,
+                                       size_t *count);
 
 /**
  * Blocks until the service is available, for at most `timeout` nanoseconds (negative: without end).
@@ -1130,7 +1131,8 @@ axon_ret_t axon_session_server_describe(struct axon_server_t server,
  * # Safety
  * `count` points to room for a number.
  */
-axon_ret_t axon_session_server_matched(struct axon_server_t server, size_t *count);
+axon_ret_t axon_session_server_matched(struct axon_server_t server,
+                                       size_t *count);
 
 /**
  * Copies the next request to the memory that `room` returns, as `axon_session_subscription_take` does. The
@@ -1287,7 +1289,8 @@ axon_ret_t axon_session_sample_release(struct axon_sample_t sample);
  * # Safety
  * `lost` points to room for a number.
  */
-axon_ret_t axon_session_subscription_lost(struct axon_subscription_t subscription, uint64_t *lost);
+axon_ret_t axon_session_subscription_lost(struct axon_subscription_t subscription,
+                                          uint64_t *lost);
 
 /**
  * Sets the callback for new samples, which replaces the previous callback. When the call returns, the
@@ -1346,7 +1349,8 @@ axon_ret_t axon_session_event_destroy(struct axon_event_t event);
  * # Safety
  * `status` points to room for one status.
  */
-axon_ret_t axon_session_event_take(struct axon_event_t event, struct axon_event_status_t *status);
+axon_ret_t axon_session_event_take(struct axon_event_t event,
+                                   struct axon_event_status_t *status);
 
 /**
  * Sets the callback of this handle, which replaces the handle's previous callback. When the call returns,
@@ -1468,7 +1472,8 @@ axon_ret_t axon_session_node_destroy(struct axon_node_t node);
  * # Safety
  * `guard` points to room for a handle.
  */
-axon_ret_t axon_session_node_graph_guard(struct axon_node_t node, struct axon_guard_t *guard);
+axon_ret_t axon_session_node_graph_guard(struct axon_node_t node,
+                                         struct axon_guard_t *guard);
 
 /**
  * Checks whether a publisher that offers one profile matches a subscription that requests the other. The
@@ -1499,7 +1504,8 @@ const char *axon_session_policy_name(uint32_t policy);
  * # Safety
  * `options` points to room for options as the program's header declares them.
  */
-axon_ret_t axon_session_options_init(struct axon_session_options_t *options, uint32_t abi);
+axon_ret_t axon_session_options_init(struct axon_session_options_t *options,
+                                     uint32_t abi);
 
 /**
  * Checks the settings as `axon_session_open` does, without opening a session.
@@ -1565,7 +1571,8 @@ axon_ret_t axon_session_domain(struct axon_session_t session, uint32_t *domain);
  * # Safety
  * `connected` points to room for a number.
  */
-axon_ret_t axon_session_is_connected(struct axon_session_t session, uint8_t *connected);
+axon_ret_t axon_session_is_connected(struct axon_session_t session,
+                                     uint8_t *connected);
 
 /**
  * Creates a guard condition for a session. It does not keep the session open. After the session has ended,
