@@ -28,7 +28,8 @@ pub const AXON_RET_TIMEOUT: axon_ret_t = 2;
 pub const AXON_RET_INVALID_ARGUMENT: axon_ret_t = 3;
 /// A handle names no object: the handle is 0, was destroyed, or is of another kind.
 pub const AXON_RET_INVALID_HANDLE: axon_ret_t = 4;
-/// The process is out of memory, file descriptors or handles.
+/// Memory, file descriptors or handles are short: of the process, of the host's shared memory, or of the publisher,
+/// whose loans and readers hold the rest.
 pub const AXON_RET_BAD_ALLOC: axon_ret_t = 5;
 /// A setting is wrong. The text of the error names the variable.
 pub const AXON_RET_CONFIG: axon_ret_t = 6;

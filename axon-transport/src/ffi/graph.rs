@@ -187,8 +187,10 @@ pub unsafe extern "C" fn axon_session_graph_endpoints(
     })
 }
 
-/// Counts the endpoints of a kind (AXON_KIND_*) that have this topic or service name. Data already flows to
-/// every counted endpoint with a compatible profile.
+/// Counts the endpoints of a kind (AXON_KIND_*) that have this topic or service name. A publisher or
+/// subscription of another process counts once its pairs with the session's own endpoints are attached, at most a
+/// second after it was announced. So a sample that is published after the count reaches every counted subscription
+/// with a compatible profile, unless its process is stopped. For services, `axon_session_client_matched` tells more.
 ///
 /// # Safety
 /// `topic` is a string; `count` points to room for a number.

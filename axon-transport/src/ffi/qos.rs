@@ -16,8 +16,10 @@ use crate::qos::{
 
 /// Any policy: AXON's default, which is RELIABLE, VOLATILE, KEEP_LAST and AUTOMATIC.
 pub const AXON_CHOICE_DEFAULT: u32 = 0;
-/// Reliability, durability and liveliness: the highest level that matches most endpoints in the graph. It is
-/// chosen when the endpoint is created.
+/// Reliability, durability and liveliness: a level that matches every endpoint of the other side that the graph has
+/// for the topic. A subscription gets the highest one that all publishers offer. A publisher is RELIABLE and
+/// TRANSIENT_LOCAL, and MANUAL_BY_TOPIC only if a subscription requests that. The level is chosen when the endpoint is
+/// created, and not again. Clients and servers get the default.
 pub const AXON_CHOICE_BEST_AVAILABLE: u32 = 255;
 
 /// Samples arrive within the bounds of the history.

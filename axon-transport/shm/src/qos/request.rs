@@ -11,8 +11,9 @@ pub enum Choice<T> {
     /// AXON's own default: that of [`Qos::default`].
     #[default]
     SystemDefault,
-    /// What matches most of the endpoints that the graph holds when the endpoint is created, at
-    /// the highest level that does. It is not looked at again later.
+    /// A level that matches all endpoints of the other side that the graph holds for the topic when the endpoint is created.
+    /// A subscription gets the highest one that all publishers offer. A publisher offers the highest one, but MANUAL_BY_TOPIC
+    /// only where a subscription requests it. The level is not chosen again later. Clients and servers get the default.
     BestAvailable,
     /// This.
     Exactly(T),

@@ -32,7 +32,7 @@ struct ListeningState {
 }
 
 impl Listening {
-    /// Begins for a callback. Whether that is news for the control thread.
+    /// Begins for a callback. Returns whether the control thread has to be told.
     pub(in crate::session) fn begin_callback(
         &self,
         segment: &Arc<SessionSegment>,
@@ -45,7 +45,7 @@ impl Listening {
         Ok(new)
     }
 
-    /// A callback ended. Whether that is news for the control thread.
+    /// A callback ended. Returns whether the control thread has to be told.
     pub(in crate::session) fn end_callback(&self) -> bool {
         let mut state = self.lock();
         state.callbacks -= 1;
@@ -56,7 +56,7 @@ impl Listening {
         idle
     }
 
-    /// A task begins to wait, or may. Whether that is news for the control thread.
+    /// A task begins to wait, or may. Returns whether the control thread has to be told.
     pub(super) fn begin_task(&self, segment: &Arc<SessionSegment>) -> Result<bool, ShmError> {
         let mut state = self.lock();
         let new = state.lead(segment)?;

@@ -103,8 +103,8 @@ impl LossReport {
 }
 
 /// Returns how many samples count as lost if the other end reports `lost` ones between the numbers `before`
-/// and `number`. The report may come from another user's process, and the totals never shrink, so implausible
-/// reports are cut.
+/// and `number`. The report may come from another user's process, and the totals never shrink: so a report is
+/// cut to the missing numbers, and one that is still above [`MAX_GAP`] counts as 0.
 fn judge_loss(lost: u64, before: Option<u64>, number: u64) -> u64 {
     let missing = number.saturating_sub(before.unwrap_or(0)).saturating_sub(1);
     let lost = lost.min(missing);

@@ -193,7 +193,7 @@ impl EndpointEvents {
         changes
     }
 
-    /// An endpoint of the topic is not matched, for this reason. Whether that is news.
+    /// Counts an endpoint of the topic that is not matched for this reason. Returns whether it was not counted before.
     pub(in crate::session) fn incompatible(&self, other: Gid, why: Pairing) -> bool {
         let mut news = false;
         self.change(|inner| {

@@ -117,7 +117,7 @@ pub(crate) struct LinkParts {
     pub(crate) qlogs: Option<Rc<dyn Qlogs>>,
     /// The instant of the engine's time zero.
     pub(crate) epoch: Instant,
-    /// The wall clock. It only dates the beginnings of links and the ends of pins.
+    /// The wall clock. It dates the beginnings of links and decides when a pin has ended, and nothing else.
     pub(crate) wall: WallClock,
 }
 

@@ -9,7 +9,7 @@ use crate::{
 const LINKS: usize = 160;
 /// Connections that are being opened: 64, and 16 of listed peers, that were dialled to this host, and its own dials.
 const OPENING: usize = 64 + 16;
-/// Bytes of the messages of one identity that have not all come, as `account.rs` limits them.
+/// Bytes of the messages of one identity that have not all come, as `engine/account` limits them.
 const OF_IDENTITY: usize = 80 << 20;
 /// What a stream holds besides: the rest of a packet, or a message that came in one.
 const OF_STREAM: usize = 9_000;

@@ -142,8 +142,8 @@ impl MatchedReaders {
         self.forget_older(writer);
     }
 
-    /// The daemon said that the writer will not write any more: it has handed over all that there is.
-    /// Whether that is news.
+    /// The daemon said that the writer will not write any more, and that it has handed over everything. Returns whether a
+    /// reader of the writer stood as open until now.
     pub(in crate::session) fn end(&mut self, writer: &Gid) -> bool {
         self.pending.remove(writer);
         for slot in self.slots.of_mut(writer) {
@@ -153,7 +153,7 @@ impl MatchedReaders {
         self.end_where(|reader| reader.writer() == *writer)
     }
 
-    /// The writer is gone though more comes of it, or is not after all. Whether that is news.
+    /// The writer leaves, with samples still to come, or takes that back. Returns whether this changes a reader.
     pub(in crate::session) fn leave(&mut self, writer: &Gid, leaving: bool) -> bool {
         let mut news = false;
         for slot in self.slots.of_mut(writer) {

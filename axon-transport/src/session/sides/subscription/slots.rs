@@ -99,7 +99,7 @@ impl Slots {
         self.slots.iter_mut().for_each(|slot| slot.turn = TakeTurn::Open);
     }
 
-    /// There was no memory for the next sample of a reader. Returns whether that is news.
+    /// There was no memory for the next sample of a reader. Returns false while an earlier shortage still counts.
     pub(super) fn note_short(&mut self, index: usize) -> bool {
         self.slots[index].turn = TakeTurn::Short;
         let news = self.short_until().is_none();
