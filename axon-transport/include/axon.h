@@ -150,8 +150,10 @@
 #define AXON_CHOICE_DEFAULT 0
 
 /**
- * Reliability, durability and liveliness: the highest level that matches most endpoints in the graph. It is
- * chosen when the endpoint is created.
+ * Reliability, durability and liveliness: a level that matches every endpoint of the other side that the graph has
+ * for the topic. A subscription gets the highest one that all publishers offer. A publisher is RELIABLE and
+ * TRANSIENT_LOCAL, and MANUAL_BY_TOPIC only if a subscription requests that. The level is chosen when the endpoint is
+ * created, and not again. Clients and servers get the default.
  */
 #define AXON_CHOICE_BEST_AVAILABLE 255
 
@@ -806,7 +808,8 @@ typedef struct axon_wait_set_t {
 #define AXON_RET_INVALID_HANDLE 4
 
 /**
- * The process is out of memory, file descriptors or handles.
+ * Memory, file descriptors or handles are short: of the process, of the host's shared memory, or of the publisher,
+ * whose loans and readers hold the rest.
  */
 #define AXON_RET_BAD_ALLOC 5
 
@@ -1411,8 +1414,10 @@ axon_ret_t axon_session_graph_endpoints(struct axon_session_t session,
                                         void *user);
 
 /**
- * Counts the endpoints of a kind (AXON_KIND_*) that have this topic or service name. Data already flows to
- * every counted endpoint with a compatible profile.
+ * Counts the endpoints of a kind (AXON_KIND_*) that have this topic or service name. A publisher or
+ * subscription of another process counts once its pairs with the session's own endpoints are attached, at most a
+ * second after it was announced. So a sample that is published after the count reaches every counted subscription
+ * with a compatible profile, unless its process is stopped. For services, `axon_session_client_matched` tells more.
  *
  * # Safety
  * `topic` is a string; `count` points to room for a number.
