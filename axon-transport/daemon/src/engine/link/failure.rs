@@ -106,8 +106,7 @@ pub(crate) fn agreed(
 
 /// Refuses a peer while this host does not know whom to trust; `closed` says why.
 pub(crate) fn admits(closed: Option<String>) -> Result<(), LinkFailure> {
-    let told =
-        "this host cannot read its list of trusted peers, and refuses every peer; its log says more";
+    let told = "this host cannot read its list of trusted peers, and refuses every peer; its log says more";
     match closed {
         Some(why) => Err(LinkFailure::Quietly { code: CloseCode::NotAllowed, told, why }),
         None => Ok(()),
