@@ -172,7 +172,7 @@ impl Client {
         both(&self.requests, &self.responses, &self.session)
     }
 
-    /// For a relay: as [`servers`](Self::servers), with those of whom there is more to come.
+    /// The servers that a relay serves: [`servers`](Self::servers), and ended servers whose responses are still to come.
     pub(crate) fn attached(&self) -> Vec<Gid> {
         attached(&self.requests, &self.responses, &self.session)
     }

@@ -174,7 +174,7 @@ impl Server {
         both(&self.responses, &self.requests, &self.session)
     }
 
-    /// For a relay: as [`clients`](Self::clients), with those of whom there is more to come.
+    /// The clients that a relay serves: [`clients`](Self::clients), and ended clients whose requests are still to come.
     pub(crate) fn attached(&self) -> Vec<Gid> {
         attached(&self.responses, &self.requests, &self.session)
     }

@@ -72,12 +72,12 @@ impl<F> UndeliveredPackets<F> {
         })
     }
 
-    /// Takes those that await the end of this session's process.
+    /// Takes the packets that wait until the process of `session` has ended.
     pub(super) fn take_awaiting(&mut self, session: &SessionId) -> Vec<SessionPacket<F>> {
         self.take_where(|kept| kept.awaits.as_ref() == Some(session))
     }
 
-    /// Whether there are some that do.
+    /// Whether packets wait until the process of `session` has ended.
     pub(super) fn awaits(&self, session: &SessionId) -> bool {
         self.kept.iter().any(|kept| kept.awaits.as_ref() == Some(session))
     }

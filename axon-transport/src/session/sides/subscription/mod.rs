@@ -258,8 +258,8 @@ impl SubscriptionInner {
         }
     }
 
-    /// For the control thread: wakes the tasks for which something came. Whether some still wait, so that
-    /// whatever comes next must ring.
+    /// Wakes the tasks whose message or response came. Called by the control thread. Returns whether further tasks wait: then
+    /// a writer has to ring the doorbell for its next sample.
     pub(in crate::session) fn wake_tasks(&self, core: &SessionCore) -> bool {
         let calls = self.collect_responses(core);
         let receivers = self.wakers.wake_if(|| self.has_data());
