@@ -134,7 +134,7 @@ impl LinkedPeers {
 
     /// The graph of this host changed.
     pub(super) fn handle_local_graph(&mut self, local: LocalEndpoints, now: Duration) {
-        self.writers = WritersHere::of(&local);
+        self.writers = WritersHere::of(local.values().map(|(endpoint, _)| &**endpoint));
         self.local = local;
         let endpoints = self.all.values().map(|peer| peer.remote.len() + self.local.len());
         let took = ENDPOINT * u32::try_from(endpoints.sum::<usize>()).unwrap_or(u32::MAX);
@@ -170,7 +170,7 @@ impl LinkedPeers {
 
     /// Keeps the KEEP_ALL relays of a peer that is gone, for the next daemon of its host.
     pub(super) fn keep_relays(&mut self, peer: &mut Peer, now: Duration) {
-        self.kept.borrow_mut().add(peer, now);
+        peer.keep_relays(&mut self.kept.borrow_mut(), now);
     }
 
     /// Relays that are kept.

@@ -1,138 +1,125 @@
-//! The graph that the session shows, and the matches of its own endpoints.
+//! The graph that the session shows, as the daemon's messages change it.
 
-use std::{collections::BTreeSet, sync::Arc, time::Instant};
+use std::{
+    collections::{BTreeSet, HashMap},
+    sync::Arc,
+    time::Instant,
+};
 
-use super::{Control, Rematching};
+use super::arrivals::Arrivals;
 use crate::{
     graph::{Endpoint, EndpointKind, GraphEntry, GraphView, Pairing, pairing},
     ids::Gid,
     session::{
         core::SessionEvent,
-        sides::{Changes, EventSource, PublisherInner, SubscriptionInner},
+        sides::{EventSource, SubscriptionInner},
+        state::SessionShared,
     },
-    wire::session::{Pair, SessionGraph},
+    wire::session::Pair,
 };
 
-impl Control {
-    /// The daemon tells of a change, or a part of the whole.
-    pub(super) fn graph(&mut self, graph: SessionGraph) {
-        if graph.whole {
-            self.building = Some(GraphView::default());
-            self.topics.clear();
-            self.arrivals.restart();
-            self.peers.recount();
-            self.pairs.begin_whole();
+/// The graph that the session shows, as the daemon's messages change it.
+pub(super) struct GraphFollower {
+    shared: Arc<SessionShared>,
+    /// A full graph that is still incomplete.
+    building: Option<GraphView>,
+    arrivals: Arrivals,
+    /// The endpoints of the graph by topic. While a full graph is incomplete, this map is about that graph.
+    topics: HashMap<String, BTreeSet<Gid>>,
+    /// Whether the graph changed since it was last reported.
+    changed: bool,
+}
+
+impl GraphFollower {
+    /// Creates the follower of a graph that is empty yet.
+    pub(super) fn new(shared: Arc<SessionShared>) -> Self {
+        Self {
+            shared,
+            building: None,
+            arrivals: Arrivals::default(),
+            topics: HashMap::new(),
+            changed: false,
         }
-        let over = graph.ended.unwrap_or_default();
+    }
+
+    /// Forgets an incomplete graph of the daemon before.
+    pub(super) fn handle_connected(&mut self) {
+        self.building = None;
+    }
+
+    /// Begins a full graph, which replaces the one that is shown once it is complete.
+    pub(super) fn begin_whole(&mut self) {
+        self.building = Some(GraphView::default());
+        self.topics.clear();
+        self.arrivals.restart();
+    }
+
+    /// Removes endpoints that ended.
+    pub(super) fn remove(&mut self, removed: Vec<Gid>) {
         {
             let mut state = self.shared.state();
-            graph.removed.iter().for_each(|gid| {
+            removed.iter().for_each(|gid| {
                 state.graph.tombstones.remove(gid);
             });
         }
-        for gid in graph.removed {
-            self.disappear(&gid);
+        removed.iter().for_each(|gid| self.disappear(gid));
+    }
+
+    /// Adds endpoints, or what changed of them. They appear once their pairs with endpoints of this session are
+    /// attached.
+    pub(super) fn add(&mut self, added: impl IntoIterator<Item = GraphEntry>) {
+        added.into_iter().for_each(|entry| self.appear(entry));
+    }
+
+    /// Sets the version up to which the daemon has sent the graph.
+    pub(super) fn set_version(&mut self, version: u64) {
+        self.view(|view| view.version = version);
+    }
+
+    /// Shows the full graph that was begun, if any.
+    pub(super) fn end_whole(&mut self) {
+        let Some(mut view) = self.building.take() else { return };
+        let mut state = self.shared.state();
+        // The daemon may have sent the full graph before it received the newest endpoints.
+        for own in state.shown() {
+            let entry =
+                || GraphEntry { endpoint: Arc::new(own.clone()), daemon: None, reach: None };
+            view.endpoints.entry(own.gid).or_insert_with(entry);
         }
-        for item in graph.added {
-            self.appear(GraphEntry {
-                endpoint: Arc::new(item.endpoint),
-                daemon: item.daemon,
-                reach: item.reach,
-            });
-        }
-        self.view(|view| view.version = graph.version);
-        if !graph.more
-            && let Some(mut view) = self.building.take()
-        {
-            let mut state = self.shared.state();
-            // The daemon may have told of the whole before it heard of the newest of them.
-            for own in state.shown() {
-                let entry =
-                    || GraphEntry { endpoint: Arc::new(own.clone()), daemon: None, reach: None };
-                view.endpoints.entry(own.gid).or_insert_with(entry);
-            }
-            state.graph.view = Arc::new(view);
-        }
-        self.endpoints_over(&over);
-        if !graph.more {
-            let unrepeated = self.pairs.end_whole();
-            let told = unrepeated.is_some();
-            if let Some(unrepeated) = unrepeated {
-                self.drop_pairs(&unrepeated);
-                // An answer may have been among what was too much for this session.
-                self.shared.core.memory.begins_anew();
-            }
-            self.drop_unread(told);
-            self.graph_changed = true;
+        state.graph.view = Arc::new(view);
+    }
+
+    /// Records that the graph, or the availability of a service, changed.
+    pub(super) fn set_changed(&mut self) {
+        self.changed = true;
+    }
+
+    /// Shows the endpoint that waited for this pair and for no other.
+    pub(super) fn handle_matched(&mut self, pair: &Pair) {
+        if let Some(entry) = self.arrivals.pair_up(pair) {
+            self.show(entry);
         }
     }
 
-    /// A publisher's, server's or client's readers changed.
-    pub(super) fn writer_changed(&mut self, publisher: &Arc<PublisherInner>) {
-        self.rematching.writers.insert(publisher.endpoint.gid, publisher.clone());
-    }
-
-    /// A subscription's, server's or client's writers changed.
-    pub(super) fn reader_changed(&mut self, subscription: &Arc<SubscriptionInner>) {
-        self.rematching.readers.insert(subscription.endpoint.gid, subscription.clone());
-    }
-
-    /// Counts what became of pairs, once for each endpoint: where many come at a time, what is counted
-    /// is all of them each time.
-    pub(super) fn tell_matched(&mut self) {
-        let Rematching { writers, readers } = std::mem::take(&mut self.rematching);
-        let writers = writers.into_values().map(EventSource::Publisher);
-        for source in writers.chain(readers.into_values().map(EventSource::Subscription)) {
-            self.rematched(source.rematch(), &source);
-        }
-    }
-
-    fn rematched(&mut self, changes: Changes, source: &EventSource) {
-        let own = source.endpoint();
-        for other in changes.added {
-            self.stands(&match source {
-                EventSource::Publisher(_) => Pair { reader: other, writer: own.gid },
-                EventSource::Subscription(_) => Pair { reader: own.gid, writer: other },
-            });
-        }
-        self.note_timed(source);
-        // Whether a service is available is no more than that.
-        self.graph_changed |= matches!(own.kind, EndpointKind::Server | EndpointKind::Client);
-        self.shared.notify(Some(&SessionEvent::Matched(own.gid)));
-    }
-
-    /// Tells what other threads of the session changed.
-    pub(super) fn tell_rematched(&mut self) {
-        let (rematched, regraphed) = {
-            let mut state = self.shared.state();
-            (std::mem::take(&mut state.rematched), state.graph.take_changed())
-        };
-        self.graph_changed |= regraphed;
-        for (changes, source) in rematched {
-            self.rematched(changes, &source);
-        }
-    }
-
-    /// An endpoint of the session is gone: nobody waits for its pairs.
-    pub(super) fn own_gone(&mut self, gid: &Gid) {
+    /// Shows the endpoints that waited for pairs with this endpoint of the session alone, since it ended.
+    pub(super) fn handle_own_gone(&mut self, gid: &Gid) {
         for entry in self.arrivals.own_gone(gid) {
             self.show(entry);
         }
     }
 
-    /// Shows what has been held back for long enough, and tells of the graph where it changed.
-    pub(super) fn tell_graph(&mut self) {
+    /// Returns when the next endpoint has waited for its pairs for long enough.
+    pub(super) fn poll_timeout(&self) -> Option<Instant> {
+        self.arrivals.due()
+    }
+
+    /// Shows the endpoints that have waited for long enough, and reports the graph if it changed.
+    pub(super) fn report_changes(&mut self) {
         for entry in self.arrivals.overdue(Instant::now()) {
             self.show(entry);
         }
-        if std::mem::take(&mut self.graph_changed) {
+        if std::mem::take(&mut self.changed) {
             self.shared.notify(Some(&SessionEvent::Graph));
-        }
-    }
-
-    fn stands(&mut self, pair: &Pair) {
-        if let Some(entry) = self.arrivals.pair_up(pair) {
-            self.show(entry);
         }
     }
 
@@ -176,7 +163,7 @@ impl Control {
     }
 
     fn show(&mut self, entry: GraphEntry) {
-        self.graph_changed = true;
+        self.changed = true;
         self.topics.entry(entry.endpoint.topic.clone()).or_default().insert(entry.endpoint.gid);
         self.view(|view| drop(view.endpoints.insert(entry.endpoint.gid, entry)));
     }

@@ -9,19 +9,20 @@ use axon_shm::{
 
 use super::{Control, DaemonConnection, pair_log, peers::PeerError, stands_for};
 use crate::{
-    graph::EndpointKind,
+    graph::{EndpointKind, GraphEntry},
     ids::{Gid, SessionId},
-    session::sides::{Accept, NumberKind, PublisherInner, ServeRequest, SubscriptionInner},
+    session::sides::{Accept, NumberKind, ServeRequest, SubscriptionInner},
     wire::session::{
         Attach, Fence, Granted, MAX_DESCRIPTORS, Pair, RelayGivenUp, Segment, SegmentName,
-        SegmentOpened, SessionMessage, SessionRefused, StatusPart, Unmatch, Unmet, WriterLeaving,
+        SegmentOpened, SessionGraph, SessionMessage, SessionRefused, StatusPart, Unmatch, Unmet,
+        WriterLeaving,
     },
 };
 
 impl Control {
     pub(super) fn handle(&mut self, message: SessionMessage, descriptors: Vec<PassedFd>) {
         match message {
-            SessionMessage::Graph(graph) => self.graph(graph),
+            SessionMessage::Graph(graph) => self.handle_graph(graph),
             SessionMessage::Match(pair) => self.matched(pair),
             SessionMessage::Attach(attach) => self.attach(attach, descriptors),
             SessionMessage::Grant(grant) => self.grant(grant, descriptors),
@@ -55,6 +56,37 @@ impl Control {
         }
     }
 
+    /// Handles a change of the graph, or a part of the full graph.
+    fn handle_graph(&mut self, graph: SessionGraph) {
+        if graph.whole {
+            self.graph.begin_whole();
+            self.peers.recount();
+            self.pairs.begin_whole();
+        }
+        self.graph.remove(graph.removed);
+        self.graph.add(graph.added.into_iter().map(|item| GraphEntry {
+            endpoint: Arc::new(item.endpoint),
+            daemon: item.daemon,
+            reach: item.reach,
+        }));
+        self.graph.set_version(graph.version);
+        if !graph.more {
+            self.graph.end_whole();
+        }
+        self.endpoints_over(&graph.ended.unwrap_or_default());
+        if !graph.more {
+            let unrepeated = self.pairs.end_whole();
+            let told = unrepeated.is_some();
+            if let Some(unrepeated) = unrepeated {
+                self.drop_pairs(&unrepeated);
+                // An answer may have been among what was too much for this session.
+                self.shared.core.memory.begins_anew();
+            }
+            self.drop_unread(told);
+            self.graph.set_changed();
+        }
+    }
+
     fn status(&self, part: &StatusPart) {
         if self.shared.core.link.add_status(part) {
             // Those who wait for the whole.
@@ -63,14 +95,14 @@ impl Control {
     }
 
     /// Endpoints ended, perhaps while there was no daemon to say who was attached to them.
-    pub(super) fn endpoints_over(&mut self, gids: &[Gid]) {
+    fn endpoints_over(&mut self, gids: &[Gid]) {
         if gids.is_empty() {
             return;
         }
         // Thousands may end at a time, and be attached to one each.
         let gids: HashSet<Gid> = gids.iter().copied().collect();
         self.pairs.remove_endpoints(&gids);
-        let (publishers, subscriptions) = self.endpoints();
+        let (publishers, subscriptions) = self.shared.state().endpoints.all();
         for publisher in publishers {
             let attached = publisher.granted();
             let ended = attached.iter().filter(|gid| gids.contains(gid));
@@ -80,7 +112,7 @@ impl Control {
                 pair_log::over(&Pair { reader: **gid, writer }, "the reader ended");
             });
             if detached.count() > 0 {
-                self.writer_changed(&publisher);
+                self.matches.add_writer(&publisher);
             }
         }
         for subscription in subscriptions {
@@ -95,17 +127,17 @@ impl Control {
             let news = ended.count();
             drop(matched_readers);
             if news > 0 {
-                self.reader_changed(&subscription);
+                self.matches.add_reader(&subscription);
             }
         }
     }
 
     /// A writer has ended, or has not after all, and more comes of it.
     fn leave(&mut self, WriterLeaving { gid, leaving }: WriterLeaving) {
-        let (_, subscriptions) = self.endpoints();
+        let (_, subscriptions) = self.shared.state().endpoints.all();
         for subscription in subscriptions {
             if subscription.lock().leave(&gid, leaving) {
-                self.reader_changed(&subscription);
+                self.matches.add_reader(&subscription);
             }
         }
     }
@@ -148,15 +180,15 @@ impl Control {
 
     /// What the daemon told of and did not say again is over: it was unmatched while the session was
     /// too slow to be told.
-    pub(super) fn drop_pairs(&mut self, over: &HashSet<Pair>) {
-        let (publishers, subscriptions) = self.endpoints();
+    fn drop_pairs(&mut self, over: &HashSet<Pair>) {
+        let (publishers, subscriptions) = self.shared.state().endpoints.all();
         for publisher in publishers {
             let (writer, attached) = (publisher.endpoint.gid, publisher.granted());
             for reader in attached {
                 let pair = Pair { reader, writer };
                 if over.contains(&pair) && !self.is_own_pair(&pair) && publisher.detach(reader) {
                     pair_log::over(&pair, "the daemon did not repeat it to the writer");
-                    self.writer_changed(&publisher);
+                    self.matches.add_writer(&publisher);
                 }
             }
         }
@@ -178,7 +210,7 @@ impl Control {
             let news = gone.count();
             drop(matched_readers);
             if news > 0 {
-                self.reader_changed(&subscription);
+                self.matches.add_reader(&subscription);
             }
         }
     }
@@ -192,7 +224,7 @@ impl Control {
     /// so as it does not know of it: it was given up while there was no daemon, or while this
     /// session was too slow to be told. After everything has been `told` anew the daemon hears of
     /// what is read, so that it will say when that is given up.
-    pub(super) fn drop_unread(&mut self, told: bool) {
+    fn drop_unread(&mut self, told: bool) {
         let shared = self.shared.clone();
         let read = |writer: &Gid| {
             let subscriptions: Vec<_> =
@@ -311,7 +343,7 @@ impl Control {
                     relayed,
                 };
                 self.say(SessionMessage::Grant(grant));
-                self.writer_changed(&publisher);
+                self.matches.add_writer(&publisher);
             }
             Err(error) => {
                 let topic = &publisher.endpoint.topic;
@@ -382,7 +414,7 @@ impl Control {
                 };
                 subscription.lock().add(mapped, after, numbers);
                 drop(own_pairs);
-                self.reader_changed(&subscription);
+                self.matches.add_reader(&subscription);
                 // It may have history to take.
                 self.shared.core.segment.notify();
             }
@@ -459,7 +491,7 @@ impl Control {
         if let Some(subscription) = subscription {
             if subscription.lock().end(writer) {
                 pair_log::over(&pair, reason);
-                self.reader_changed(&subscription);
+                self.matches.add_reader(&subscription);
             }
             let topic = &subscription.endpoint.topic;
             tracing::debug!(topic, %writer, reason, "a publisher is not received from");
@@ -470,16 +502,10 @@ impl Control {
         let publisher = self.shared.state().endpoints.publishers.get(&pair.writer).cloned();
         if let Some(publisher) = publisher.filter(|p| p.detach(pair.reader)) {
             pair_log::over(pair, "the daemon said so to the writer");
-            self.writer_changed(&publisher);
+            self.matches.add_writer(&publisher);
         }
         if self.shared.core.segment.tidy_some() {
-            self.look_after_memory();
+            self.memory.check_later();
         }
-    }
-
-    pub(super) fn endpoints(&self) -> (Vec<Arc<PublisherInner>>, Vec<Arc<SubscriptionInner>>) {
-        let state = self.shared.state();
-        let publishers = state.endpoints.publishers.values().cloned().collect();
-        (publishers, state.endpoints.subscriptions.values().cloned().collect())
     }
 }

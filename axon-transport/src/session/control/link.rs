@@ -4,14 +4,10 @@ use std::{sync::mpsc::TryRecvError, time::Instant};
 
 use axon_shm::internal::descriptors::PassedFd;
 
-use super::{
-    Control, DaemonConnection,
-    announced::{AnnouncedPairs, AnnouncedSegments},
-    search::Search,
-};
+use super::{Control, DaemonConnection, announced::AnnouncedPairs, search::Search};
 use crate::{
     session::{
-        core::{Outgoing, SegmentChange, SessionEvent},
+        core::{Outgoing, SessionEvent},
         daemon::connect::Connected,
     },
     wire::session::SessionMessage,
@@ -20,9 +16,8 @@ use crate::{
 impl Control {
     pub(super) fn connected(&mut self, connected: Connected) {
         self.outbox.clear();
-        self.building = None;
+        self.graph.handle_connected();
         self.pairs = AnnouncedPairs::default();
-        self.segments = AnnouncedSegments::default();
         self.pause.handle_connected(Instant::now());
         self.retry = None;
         let daemon = connected.welcome.daemon;
@@ -48,10 +43,7 @@ impl Control {
             self.shared.core.link.connected(daemon, outgoing);
         }
         self.link = DaemonConnection::Socket(PassedFd::connection(connected.socket).trusted());
-        self.shared.core.memory.begins_anew();
-        for info in self.shared.core.segment.segments() {
-            self.tell_segment(SegmentChange::Opened(info.number));
-        }
+        self.memory.handle_connected(&mut self.outbox, &self.peers);
         tracing::debug!(%daemon, "a daemon took the session");
         self.shared.notify(Some(&SessionEvent::DaemonFound(daemon)));
     }

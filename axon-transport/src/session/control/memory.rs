@@ -1,43 +1,77 @@
 //! The session's own memory: announces new and closed segments to the daemon, and frees unused memory.
 
-use std::time::{Duration, Instant};
+use std::{
+    collections::BTreeSet,
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
-use super::Control;
+use super::{Outbox, announced::AnnouncedSegments, peers::Peers};
 use crate::{
-    session::core::SegmentChange,
+    ids::Gid,
+    session::{core::SegmentChange, state::SessionShared},
     wire::session::{SegmentName, SegmentOpened, SessionMessage},
 };
 
-/// How often the memory of large samples is looked after.
-const TEND: Duration = Duration::from_secs(1);
+/// The time between two checks of the memory of large samples.
+const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
-impl Control {
-    /// Takes what changed in the session's memory, and what its readers lack of others'.
-    pub(super) fn tell_segments(&mut self) {
-        for number in self.segments.untold() {
-            self.tell_segment(SegmentChange::Opened(number));
-        }
-        for change in self.shared.core.memory.take() {
-            self.tell_segment(change);
+/// The segments of the session's own memory.
+pub(super) struct AnnouncedMemory {
+    shared: Arc<SessionShared>,
+    /// The segments that were sent over this connection.
+    announced: AnnouncedSegments,
+    /// Publishers without prepared memory for their next large sample.
+    low: BTreeSet<Gid>,
+    /// When to check the memory of large samples; `None` if there is none.
+    check: Option<Instant>,
+}
+
+impl AnnouncedMemory {
+    /// Creates the memory of a session that announced none of it.
+    pub(super) fn new(shared: Arc<SessionShared>) -> Self {
+        Self { shared, announced: AnnouncedSegments::default(), low: BTreeSet::new(), check: None }
+    }
+
+    /// Announces all segments to a new daemon.
+    pub(super) fn handle_connected(&mut self, outbox: &mut Outbox, peers: &Peers) {
+        self.announced = AnnouncedSegments::default();
+        self.shared.core.memory.begins_anew();
+        for info in self.shared.core.segment.segments() {
+            self.handle_change(SegmentChange::Opened(info.number), outbox, peers);
         }
     }
 
-    pub(super) fn tell_segment(&mut self, change: SegmentChange) {
+    /// Returns whether the daemon was sent all segments.
+    pub(super) fn is_announced(&self) -> bool {
+        self.announced.are_complete()
+    }
+
+    /// Takes what changed in the session's memory, and which memory of other sessions its readers lack.
+    pub(super) fn announce(&mut self, outbox: &mut Outbox, peers: &Peers) {
+        for number in self.announced.untold() {
+            self.handle_change(SegmentChange::Opened(number), outbox, peers);
+        }
+        for change in self.shared.core.memory.take() {
+            self.handle_change(change, outbox, peers);
+        }
+    }
+
+    fn handle_change(&mut self, change: SegmentChange, outbox: &mut Outbox, peers: &Peers) {
         let session = self.shared.core.id;
         match change {
-            // Found here and noted there.
-            SegmentChange::Opened(number) if self.segments.is_told(number) => {}
+            // Both the list of segments and the list of changes have it.
+            SegmentChange::Opened(number) if self.announced.is_told(number) => {}
             SegmentChange::Opened(number) => match self.shared.core.segment.segment(number) {
                 Ok(Some((info, descriptor))) => {
-                    self.segments.tell(number);
+                    self.announced.tell(number);
                     let opened = SegmentOpened { session, segment: info.into() };
-                    self.outbox
-                        .push_back((SessionMessage::Segment(opened), vec![descriptor.into()]));
+                    outbox.push_back((SessionMessage::Segment(opened), vec![descriptor.into()]));
                 }
                 // It is gone again.
-                Ok(None) => self.segments.remove(number),
+                Ok(None) => self.announced.remove(number),
                 Err(error) => {
-                    if self.segments.fail(number) {
+                    if self.announced.fail(number) {
                         tracing::error!(
                             %error,
                             "no free file descriptor: new samples stay invisible to other processes until one is free"
@@ -46,50 +80,54 @@ impl Control {
                 }
             },
             SegmentChange::Gone(number) => {
-                self.segments.remove(number);
+                self.announced.remove(number);
                 let gone = SegmentName { session, number };
-                self.outbox.push_back((SessionMessage::SegmentGone(gone), Vec::new()));
+                outbox.push_back((SessionMessage::SegmentGone(gone), Vec::new()));
             }
             SegmentChange::Low(gid) => {
                 self.low.insert(gid);
             }
             SegmentChange::Wanted(session) => {
-                for number in self.peers.take_wanted(&session) {
+                for number in peers.take_wanted(&session) {
                     let need = SegmentName { session, number };
-                    self.outbox.push_back((SessionMessage::Need(need), Vec::new()));
+                    outbox.push_back((SessionMessage::Need(need), Vec::new()));
                 }
             }
         }
     }
 
-    /// Has memory ready for those that publish large samples.
+    /// Prepares memory for publishers of large samples.
     pub(super) fn prepare(&mut self) {
         for gid in std::mem::take(&mut self.low) {
             let publisher = self.shared.state().endpoints.publishers.get(&gid).cloned();
             if let Some(publisher) = publisher {
-                // What lacks then, its next publish says.
+                // What is still missing is found by the publisher's next publish.
                 publisher.rings.prepare();
-                self.look_after_memory();
+                self.check_later();
             }
         }
     }
 
-    /// There is memory that may have to be given back.
-    pub(super) fn look_after_memory(&mut self) {
-        self.reclaim_idle.get_or_insert_with(|| Instant::now() + TEND);
+    /// Has the memory checked later, since some of it may have to be freed.
+    pub(super) fn check_later(&mut self) {
+        self.check.get_or_insert_with(|| Instant::now() + CHECK_INTERVAL);
     }
 
-    /// Looks after the memory of large samples and of publishers that are gone. Memory that is given up may have to be opened anew,
-    /// and only a daemon can say so to the readers: so not while there is none.
-    pub(super) fn reclaim_idle(&mut self) {
+    /// Returns when [`handle_timeout`](Self::handle_timeout) is due.
+    pub(super) fn poll_timeout(&self) -> Option<Instant> {
+        self.check
+    }
+
+    /// Frees idle memory of large samples and memory of ended publishers, if the time for it has come. Only while
+    /// the session is linked: freed memory may have to be opened anew, and only a daemon can announce it to readers.
+    pub(super) fn handle_timeout(&mut self) {
         let now = Instant::now();
-        if !self.is_linked() || self.reclaim_idle.is_none_or(|due| now < due) {
+        if self.check.is_none_or(|due| now < due) {
             return;
         }
-        let publishers: Vec<_> =
-            self.shared.state().endpoints.publishers.values().cloned().collect();
+        let (publishers, _) = self.shared.state().endpoints.all();
         let more = publishers.iter().filter(|publisher| publisher.rings.reclaim_idle(now)).count();
         let more = self.shared.core.segment.tidy() || more > 0;
-        self.reclaim_idle = more.then(|| now + TEND);
+        self.check = more.then(|| now + CHECK_INTERVAL);
     }
 }

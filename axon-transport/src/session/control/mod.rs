@@ -7,6 +7,7 @@ mod graph;
 mod handle;
 mod link;
 pub(in crate::session) mod local;
+mod matches;
 mod memory;
 mod pair_log;
 mod pause;
@@ -15,7 +16,7 @@ mod search;
 mod time;
 
 use std::{
-    collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
+    collections::{BTreeMap, VecDeque},
     os::fd::{AsFd, BorrowedFd},
     sync::Arc,
     time::{Duration, Instant},
@@ -25,15 +26,17 @@ use axon_shm::{ExternalLeader, ShmError, internal::descriptors::PassedFd};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use self::{
-    announced::{AnnouncedPairs, AnnouncedSegments},
-    arrivals::Arrivals,
+    announced::AnnouncedPairs,
+    graph::GraphFollower,
     local::{Local, LocalRegistry},
+    matches::ChangedMatches,
+    memory::AnnouncedMemory,
     pause::ReconnectPause,
     peers::Peers,
     search::Search,
+    time::TimedEndpoints,
 };
 use crate::{
-    graph::GraphView,
     ids::Gid,
     session::{
         core::Outgoing,
@@ -42,7 +45,7 @@ use crate::{
             socket::{self, SocketError},
         },
         error::SessionError,
-        sides::{EventSource, PublisherInner, ServeRequest, SubscriptionInner},
+        sides::{EventSource, ServeRequest, SubscriptionInner},
         state::SessionShared,
     },
     wire::session::{Announce, EndpointRole, Gone, SessionMessage},
@@ -59,44 +62,26 @@ const STAY: Duration = Duration::from_secs(if cfg!(test) { 60 } else { 1 });
 /// The most remote subscriptions that a relay announces by GID; one packet has no room for more.
 const MAX_STANDS_FOR: usize = 1024;
 
+/// The messages that wait to be sent to the daemon, with their descriptors.
+type Outbox = VecDeque<(SessionMessage, Vec<PassedFd>)>;
+
+/// The control thread of a session.
 pub(in crate::session) struct Control {
     shared: Arc<SessionShared>,
     link: DaemonConnection,
     reconnects: bool,
     peers: Peers,
-    outbox: VecDeque<(SessionMessage, Vec<PassedFd>)>,
+    outbox: Outbox,
     buffer: Vec<u8>,
-    /// A full graph that is still incomplete.
-    building: Option<GraphView>,
+    graph: GraphFollower,
     /// The pairs that the daemon of this connection has reported.
     pairs: AnnouncedPairs,
-    /// When to check the memory of large samples; `None` if there is none.
-    reclaim_idle: Option<Instant>,
-    /// The segments of this session's memory that were sent over this connection.
-    segments: AnnouncedSegments,
-    /// Publishers without prepared memory for their next large sample.
-    low: BTreeSet<Gid>,
+    matches: ChangedMatches,
+    memory: AnnouncedMemory,
+    timed: TimedEndpoints,
     pause: ReconnectPause,
     /// When to request everything anew, after the process ran out of file descriptors.
     retry: Option<Instant>,
-    arrivals: Arrivals,
-    /// The endpoints of the graph by topic. While a full graph is incomplete, this map is about that graph.
-    topics: HashMap<String, BTreeSet<Gid>>,
-    /// Endpoints whose pairs changed since [`tell_matched`](Self::tell_matched).
-    rematching: Rematching,
-    /// Whether the graph changed since it was last reported.
-    graph_changed: bool,
-    /// Endpoints with deadlines or leases; `None` if the list must be rebuilt.
-    timed: Option<Vec<EventSource>>,
-    /// When to check these endpoints, by the monotonic clock.
-    alarm: Option<u64>,
-}
-
-/// Endpoints whose pairs changed, by GID.
-#[derive(Default)]
-struct Rematching {
-    writers: BTreeMap<Gid, Arc<PublisherInner>>,
-    readers: BTreeMap<Gid, Arc<SubscriptionInner>>,
 }
 
 /// The first peer that a session communicates with.
@@ -128,25 +113,19 @@ impl Control {
         let peers = Peers::new(shared.core.segment.clone(), shared.core.memory.clone())
             .map_err(ShmError::system("watching processes"))?;
         let mut control = Self {
+            graph: GraphFollower::new(Arc::clone(&shared)),
+            matches: ChangedMatches::new(Arc::clone(&shared)),
+            memory: AnnouncedMemory::new(Arc::clone(&shared)),
+            timed: TimedEndpoints::new(Arc::clone(&shared)),
             shared,
             link: DaemonConnection::Ended,
             reconnects,
             peers,
             outbox: VecDeque::new(),
             buffer: Vec::new(),
-            building: None,
             pairs: AnnouncedPairs::default(),
-            reclaim_idle: None,
-            segments: AnnouncedSegments::default(),
-            low: BTreeSet::new(),
             pause: ReconnectPause::new(Instant::now()),
             retry: None,
-            arrivals: Arrivals::default(),
-            topics: HashMap::new(),
-            rematching: Rematching::default(),
-            graph_changed: false,
-            timed: None,
-            alarm: None,
         };
         match start {
             FirstPeer::Daemon(connected) | FirstPeer::Socket(connected) => {
@@ -176,19 +155,21 @@ impl Control {
             }
             self.try_reconnected();
             self.try_again();
-            self.tell_rematched();
+            self.matches.report_others(&mut self.graph, &mut self.timed);
             // Match events come before the messages: an endpoint counts its matches before its peers learn of
             // their grants.
-            self.tell_matched();
+            self.report_matches();
             self.collect();
             self.send();
-            self.prepare();
-            self.look_at_time();
-            self.tell_graph();
+            self.memory.prepare();
+            self.timed.handle_timeout();
+            self.graph.report_changes();
             self.sleep();
             self.receive();
             self.remove_dead();
-            self.reclaim_idle();
+            if self.is_linked() {
+                self.memory.handle_timeout();
+            }
         }
         self.shared.part_leaving(true);
         // The end of the connection replaces the messages that were queued last, such as ENDPOINT_GONE. It
@@ -197,7 +178,7 @@ impl Control {
         let deadline = Instant::now() + FAREWELL;
         loop {
             self.shared.core.segment.tidy();
-            self.tell_segments();
+            self.announce_memory();
             self.tell_unmet();
             self.send_rest(deadline);
             let heard = !self.leaves_notices() || self.was_heard(deadline);
@@ -278,8 +259,17 @@ impl Control {
 
     /// Queues a message for the daemon. Segments that the message may refer to are queued first.
     fn say(&mut self, message: SessionMessage) {
-        self.tell_segments();
+        self.announce_memory();
         self.outbox.push_back((message, Vec::new()));
+    }
+
+    fn announce_memory(&mut self) {
+        self.memory.announce(&mut self.outbox, &self.peers);
+    }
+
+    /// Counts the pairs that changed, and reports them.
+    fn report_matches(&mut self) {
+        self.matches.report(&mut self.graph, &mut self.timed);
     }
 
     fn try_again(&mut self) {
@@ -293,7 +283,7 @@ impl Control {
     fn collect(&mut self) {
         let shared = self.shared.clone();
         if self.is_linked() {
-            self.tell_segments();
+            self.announce_memory();
         }
         let (mut gone, mut fences) = (Vec::new(), BTreeMap::new());
         // Under this lock endpoints and their queued messages change together.
@@ -307,14 +297,14 @@ impl Control {
             match outgoing {
                 Outgoing::Message(message) => {
                     if let SessionMessage::EndpointGone(Gone { gid }) = *message {
-                        self.timed = None;
+                        self.timed.handle_gone();
                         gone.push(gid);
                     }
                     self.say(*message);
                 }
                 Outgoing::Fence(fence) => {
-                    self.tell_segments();
-                    if self.segments.are_complete() {
+                    self.announce_memory();
+                    if self.memory.is_announced() {
                         self.outbox.push_back((SessionMessage::Fence(fence), Vec::new()));
                     } else {
                         fences.insert(fence.writer, Outgoing::Fence(fence));
@@ -322,7 +312,7 @@ impl Control {
                 }
                 Outgoing::Announce(gid) => {
                     if let Some(publisher) = state.endpoints.publishers.get(&gid) {
-                        self.note_timed(&EventSource::Publisher(publisher.clone()));
+                        self.timed.handle_changed(&EventSource::Publisher(publisher.clone()));
                         let announce = Announce {
                             endpoint: publisher.endpoint.clone(),
                             role: publisher.role,
@@ -332,7 +322,7 @@ impl Control {
                         };
                         self.say(SessionMessage::Endpoint(announce));
                     } else if let Some(subscription) = state.endpoints.subscriptions.get(&gid) {
-                        self.note_timed(&EventSource::Subscription(subscription.clone()));
+                        self.timed.handle_changed(&EventSource::Subscription(subscription.clone()));
                         let announce = Announce {
                             endpoint: subscription.endpoint.clone(),
                             role: subscription.role,
@@ -367,7 +357,7 @@ impl Control {
             shared.core.link.put_back(fences.into_values());
         }
         drop(state);
-        gone.iter().for_each(|gid| self.own_gone(gid));
+        gone.iter().for_each(|gid| self.graph.handle_own_gone(gid));
     }
 
     fn send(&mut self) {
@@ -377,7 +367,7 @@ impl Control {
                     for (message, descriptors) in local.exchange(Some((message, descriptors))) {
                         self.handle(message, descriptors);
                     }
-                    self.tell_matched();
+                    self.report_matches();
                 }
                 DaemonConnection::Socket(socket) => {
                     let packet = match message.encode() {
@@ -401,7 +391,7 @@ impl Control {
                                 && matches!(self.link, DaemonConnection::Socket(_))
                             {
                                 self.receive();
-                                self.tell_matched();
+                                self.report_matches();
                             }
                             if matches!(self.link, DaemonConnection::Socket(_)) {
                                 self.lost(&error);
@@ -429,30 +419,40 @@ impl Control {
         }
         // A full socket becomes writable later. A socket with too many descriptors in flight does not signal
         // when that ends.
-        let blocked = self.is_linked() && !(self.outbox.is_empty() && self.segments.are_complete());
+        let blocked = self.is_linked() && !(self.outbox.is_empty() && self.memory.is_announced());
         let looks = blocked || !self.shared.state().endpoints.leaving.is_empty();
         let nap = looks.then_some(Duration::from_millis(20));
-        let reclaim_idle = self.reclaim_idle.filter(|_| self.is_linked());
+        let memory = self.memory.poll_timeout().filter(|_| self.is_linked());
         let again = self.look_again();
-        let due = reclaim_idle
+        let due = memory
             .into_iter()
             .chain(self.retry)
-            .chain(self.arrivals.due())
+            .chain(self.graph.poll_timeout())
             .chain(again)
             .chain(until)
             .min();
         let due = due.map(|due| due.saturating_duration_since(Instant::now()));
-        let timeout = nap.into_iter().chain(due).chain(self.until_alarm()).min();
+        let timeout = nap.into_iter().chain(due).chain(self.timed.poll_timeout()).min();
         let timeout = timeout.and_then(|timeout| Timespec::try_from(timeout).ok());
         let _ = poll(&mut fds, timeout.as_ref());
         self.shared.core.waker.take();
+    }
+
+    /// Wakes the threads that wait if the time for it has come. Returns when it comes next.
+    fn look_again(&self) -> Option<Instant> {
+        let (due, next) = self.shared.core.listening.take_due(Instant::now());
+        if due {
+            self.shared.core.segment.mark_all_active();
+            self.shared.core.segment.notify();
+        }
+        next
     }
 
     /// Reports arrived samples to callbacks and tasks. Later samples ring, unless all tasks were woken and
     /// there is no callback: a task arms a ticket of its own before it sleeps again.
     fn tell_arrived(&self, listening: &ExternalLeader) {
         listening.clear();
-        let (_, subscriptions) = self.endpoints();
+        let (_, subscriptions) = self.shared.state().endpoints.all();
         // `count` wakes the tasks of all subscriptions; `any` would stop at the first with waiting tasks.
         let wake_tasks =
             || subscriptions.iter().filter(|of| of.wake_tasks(&self.shared.core)).count() > 0;
@@ -493,18 +493,18 @@ impl Control {
         if !self.peers.note_deaths() {
             return;
         }
-        let (publishers, subscriptions) = self.endpoints();
+        let (publishers, subscriptions) = self.shared.state().endpoints.all();
         for publisher in publishers {
             if publisher.drop_dead() {
-                self.writer_changed(&publisher);
+                self.matches.add_writer(&publisher);
                 // A server keeps the responses of a client that a daemon carried. If the client does not
                 // return, the responses are freed.
-                self.look_after_memory();
+                self.memory.check_later();
             }
         }
         for subscription in subscriptions {
             if subscription.lock().end_dead() {
-                self.reader_changed(&subscription);
+                self.matches.add_reader(&subscription);
             }
         }
     }

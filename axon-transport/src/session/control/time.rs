@@ -1,70 +1,79 @@
 //! Deadlines and leases: checked when the next one may expire, and never if none is finite.
 
-use std::time::{Duration, Instant};
+use std::{sync::Arc, time::Duration};
 
-use super::Control;
-use crate::session::{clock, sides::EventSource};
+use crate::session::{clock, sides::EventSource, state::SessionShared};
 
-impl Control {
-    pub(super) fn look_at_time(&mut self) {
+/// The endpoints of the session with deadlines or leases.
+pub(super) struct TimedEndpoints {
+    shared: Arc<SessionShared>,
+    /// The endpoints; `None` if the list must be rebuilt.
+    endpoints: Option<Vec<EventSource>>,
+    /// When to check them, in nanoseconds of the monotonic clock.
+    due: Option<u64>,
+}
+
+impl TimedEndpoints {
+    /// Creates the list of a session without endpoints.
+    pub(super) fn new(shared: Arc<SessionShared>) -> Self {
+        Self { shared, endpoints: None, due: None }
+    }
+
+    /// Records that an endpoint was created or that its matches changed. If it has a deadline or a lease, the list is
+    /// rebuilt.
+    pub(super) fn handle_changed(&mut self, source: &EventSource) {
+        let is_listed = |endpoints: &Vec<EventSource>| {
+            endpoints.iter().any(|other| other.endpoint().gid == source.endpoint().gid)
+        };
+        if is_timed(source) || self.endpoints.as_ref().is_some_and(is_listed) {
+            self.endpoints = None;
+        }
+    }
+
+    /// Records that an endpoint ended.
+    pub(super) fn handle_gone(&mut self) {
+        self.endpoints = None;
+    }
+
+    /// Returns the time until [`handle_timeout`](Self::handle_timeout) is due.
+    pub(super) fn poll_timeout(&self) -> Option<Duration> {
+        Some(Duration::from_nanos(self.due?.saturating_sub(clock::monotonic())))
+    }
+
+    /// Checks deadlines and leases if one may have expired or the list must be rebuilt.
+    pub(super) fn handle_timeout(&mut self) {
         let now = clock::monotonic();
-        let timed = match self.timed.take() {
-            Some(timed) if self.alarm.is_none_or(|alarm| alarm > now) => {
-                self.timed = Some(timed);
+        let endpoints = match self.endpoints.take() {
+            Some(endpoints) if self.due.is_none_or(|due| due > now) => {
+                self.endpoints = Some(endpoints);
                 return;
             }
-            Some(timed) => timed,
-            None => self.find_timed(),
+            Some(endpoints) => endpoints,
+            None => self.find(),
         };
-        let mut news = false;
-        self.alarm = None;
-        for source in &timed {
-            let (due, some) = source.look_at_time(now);
-            self.alarm = self.alarm.into_iter().chain(due).min();
-            news |= some;
+        let mut any_event = false;
+        self.due = None;
+        for source in &endpoints {
+            let (due, is_event) = source.look_at_time(now);
+            self.due = self.due.into_iter().chain(due).min();
+            any_event |= is_event;
         }
-        if news {
+        if any_event {
             // Wakes the threads that wait for events.
             self.shared.core.segment.notify();
         }
-        self.timed = Some(timed);
+        self.endpoints = Some(endpoints);
     }
 
-    /// Has those who wait look again, where the time for it has come. When it will, else.
-    pub(super) fn look_again(&self) -> Option<Instant> {
-        let (due, next) = self.shared.core.listening.take_due(Instant::now());
-        if due {
-            self.shared.core.segment.mark_all_active();
-            self.shared.core.segment.notify();
-        }
-        next
-    }
-
-    /// How long until the next look.
-    pub(super) fn until_alarm(&self) -> Option<Duration> {
-        let alarm = self.alarm?;
-        Some(Duration::from_nanos(alarm.saturating_sub(clock::monotonic())))
-    }
-
-    /// An endpoint came, or its matches changed. If it has times to be looked at, those of all are found anew.
-    pub(super) fn note_timed(&mut self, source: &EventSource) {
-        let watched = |timed: &Vec<EventSource>| {
-            timed.iter().any(|other| other.endpoint().gid == source.endpoint().gid)
-        };
-        if is_timed(source) || self.timed.as_ref().is_some_and(watched) {
-            self.timed = None;
-        }
-    }
-
-    fn find_timed(&self) -> Vec<EventSource> {
-        let (publishers, subscriptions) = self.endpoints();
+    fn find(&self) -> Vec<EventSource> {
+        let (publishers, subscriptions) = self.shared.state().endpoints.all();
         let publishers = publishers.into_iter().map(EventSource::Publisher);
         let all = publishers.chain(subscriptions.into_iter().map(EventSource::Subscription));
         all.filter(is_timed).collect()
     }
 }
 
-/// Whether somebody watches its deadlines or leases.
+/// Returns whether an endpoint has a deadline, or a lease of its own or of a publisher.
 fn is_timed(source: &EventSource) -> bool {
     match source {
         EventSource::Publisher(publisher) => {

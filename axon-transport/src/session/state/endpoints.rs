@@ -51,6 +51,14 @@ impl OwnEndpoints {
             .chain(subscriptions.map(|subscription| &subscription.endpoint))
     }
 
+    /// Returns the publishers and subscriptions, with those that are sides of services.
+    pub(in crate::session) fn all(
+        &self,
+    ) -> (Vec<Arc<PublisherInner>>, Vec<Arc<SubscriptionInner>>) {
+        let publishers = self.publishers.values().cloned().collect();
+        (publishers, self.subscriptions.values().cloned().collect())
+    }
+
     /// The GIDs of all of them.
     pub(in crate::session) fn gids(&self) -> BTreeSet<Gid> {
         let endpoints = self.publishers.keys().chain(self.subscriptions.keys());

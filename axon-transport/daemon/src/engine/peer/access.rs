@@ -20,8 +20,8 @@ use axon_transport::{
 };
 
 use super::{
-    refused::shown,
     rights::{EndpointRights, RightsByEndpoint},
+    routes::refused::shown,
 };
 use crate::{
     bridge::RefusedRoute,

@@ -1,4 +1,4 @@
-//! The routes that this host asks a peer for.
+//! What this host asks a peer for: the routes that follow from the graphs of both.
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap, HashSet},
@@ -11,79 +11,29 @@ use axon_shm::{
     ids::Gid,
     qos::{History, Reliability},
 };
-use axon_transport::graph::{Endpoint, EndpointKind};
+use axon_transport::{
+    graph::{Endpoint, EndpointKind},
+    internal::graph::verb_of,
+};
 
 use super::{
-    Peer, PeerContext, poll_after,
-    refused::{NO_STAND_IN, NOT_TAKEN, TOO_MANY_ASKED, TOO_MANY_LANES, TOO_MANY_WRITERS},
+    Peer, PeerContext,
+    access::AccessUse,
+    routes::{
+        asked::AskedRoute,
+        refused::{
+            NO_STAND_IN, NOT_TAKEN, RefusedSide, TOO_MANY_ASKED, TOO_MANY_LANES, TOO_MANY_WRITERS,
+        },
+    },
 };
 use crate::{
     engine::{
-        account::{Charge, Meter},
         inbound::RouteIn,
         peer::routes::{self, RouteKey, WantedRoute},
-        stand_in::{NoStandIn, StandIn},
+        stand_in::NoStandIn,
     },
-    link::{LastSeen, LinkMessage, Subscribe, Unsubscribe},
+    link::{LinkMessage, RouteRefused, Unsubscribe},
 };
-
-/// The peer is asked for a route once the local readers are attached, or after this time.
-const ATTACH_TIMEOUT: Duration = Duration::from_secs(1);
-
-/// A route that this host asked for.
-pub(super) struct AskedRoute {
-    pub(super) number: u32,
-    route: Route,
-    /// The readers and writers that it was last asked for.
-    wanted: WantedRoute,
-    /// Whether a writer of it is not shown.
-    incomplete: bool,
-    pub(super) stand_ins: HashMap<Gid, Rc<StandIn>>,
-    /// One for each stand-in, of what the route may show of the peer's identity.
-    places: Charge,
-    /// One for each stand-in and each writer here that it may read.
-    pub(super) lanes: Charge,
-    room: Rc<Meter>,
-}
-
-/// A route whose local readers are not all attached.
-pub(super) struct Attaching {
-    until: Duration,
-    awaited: Vec<(Rc<StandIn>, usize)>,
-}
-
-impl AskedRoute {
-    /// Keeps so many of its stand-ins, and gives up the others until there are lanes for them again.
-    pub(super) fn leave(&mut self, stand_ins: usize) {
-        let mut left = stand_ins;
-        self.stand_ins.retain(|_, _| {
-            left.checked_sub(1).is_some_and(|less| {
-                left = less;
-                true
-            })
-        });
-        let gone = self.places.amount().saturating_sub(self.stand_ins.len());
-        drop(self.places.split(gone));
-        self.incomplete = true;
-    }
-
-    /// Asks for it.
-    pub(super) fn message(&self, key: &RouteKey) -> LinkMessage {
-        let last = self.stand_ins.iter().filter_map(|(gid, stand_in)| {
-            Some(LastSeen { publisher: *gid, sequence: stand_in.last_sequence()? })
-        });
-        LinkMessage::Subscribe(Subscribe {
-            route: self.number,
-            topic: key.topic.clone(),
-            type_name: key.type_name.clone(),
-            kind: key.kind as u8,
-            subscribers: self.wanted.subscribers.clone(),
-            last: last.collect(),
-            acknowledges: Some(true),
-            short_headers: Some(key.kind == Kind::Topic),
-        })
-    }
-}
 
 impl Peer {
     /// Asks for the routes that follow from the graphs of both hosts.
@@ -102,7 +52,10 @@ impl Peer {
         let own =
             with.local.values().map(|(endpoint, reach)| (&**endpoint, reach.toward(self.daemon)));
         let mut wanted = routes::wanted(own, reachable);
-        let unanswered = self.leave_out_unanswered(&mut wanted, with, now);
+        let stalls = with.stalls.borrow();
+        let blocked = |responses: &RouteKey| stalls.left(&self.identity, responses, now);
+        let unanswered = self.unanswered.leave_out(&mut wanted, &self.asked, blocked, now);
+        drop(stalls);
         self.want(wanted, &unanswered, with, now);
         for key in &unanswered {
             self.does_not_ask(key, NOT_TAKEN, now);
@@ -129,21 +82,21 @@ impl Peer {
         with: &PeerContext<'_>,
         now: Duration,
     ) {
-        let gone: Vec<_> = self.asked.keys().filter(|k| !wanted.contains_key(k)).cloned().collect();
-        self.want_no_more(|key| wanted.contains_key(key) || unanswered.contains(key));
+        let asked = self.asked.iter().map(|(key, _)| key);
+        let gone: Vec<_> = asked.filter(|key| !wanted.contains_key(key)).cloned().collect();
+        let known = |key: &RouteKey| wanted.contains_key(key) || unanswered.contains(key);
+        self.refused.retain_unasked(known, &mut self.messages);
         let given_up = gone.len();
         for key in gone {
-            self.asks(&key);
-            self.refused.served(&key);
-            if let Some(asked) = self.asked.remove(&key) {
-                self.numbers.remove(&asked.number);
-                self.attaching.remove(&asked.number);
-                self.inbound.routes().remove(&asked.number);
-                self.say(LinkMessage::Unsubscribe(Unsubscribe { route: asked.number }));
+            self.refused.remove_unasked(&key, &mut self.messages);
+            self.refused.handle_served(&key);
+            if let Some(route) = self.asked.remove(&key) {
+                self.inbound.routes().remove(&route);
+                self.say(LinkMessage::Unsubscribe(Unsubscribe { route }));
             }
         }
         for (key, wanted) in wanted {
-            if self.asked.len() >= self.serves && !self.asked.contains_key(&key) {
+            if !self.asked.has_room_for(&key) {
                 self.does_not_ask(&key, TOO_MANY_ASKED, now);
                 continue;
             }
@@ -151,7 +104,9 @@ impl Peer {
         }
         self.inbound.handle_routes();
         if given_up > 0 {
-            self.ask_instead(given_up);
+            // Others that the peer refused may have their place.
+            let instead = self.refused.unserved_without_time(given_up);
+            self.ask_again(&instead);
         }
     }
 
@@ -166,19 +121,18 @@ impl Peer {
         if known.is_some_and(|asked| asked.wanted == wanted && !asked.incomplete) {
             return;
         }
-        let mut asked = match self.asked.remove(&key) {
+        let mut asked = match self.asked.take(&key) {
             Some(asked) => asked,
             None => {
                 let hash = TopicHash::new(with.config.domain, &key.topic, &key.type_name);
                 // The peer's graph has no name that is too long.
                 let Ok(topic) = hash else { return };
-                self.next_route += 1;
                 let room = self.remote.account().writers_of(&key);
                 AskedRoute {
                     places: room.nothing(),
                     lanes: self.remote.account().lanes.nothing(),
                     room,
-                    number: self.next_route - 1,
+                    number: self.asked.new_number(),
                     route: Route { kind: key.kind, topic },
                     wanted: WantedRoute::default(),
                     incomplete: false,
@@ -197,11 +151,11 @@ impl Peer {
             return;
         }
         if !asked.incomplete {
-            self.asks(&key);
+            self.refused.remove_unasked(&key, &mut self.messages);
         }
         let changed = asked.wanted.subscribers != wanted.subscribers || fresh;
         if !self.inbound.routes().contains_key(&asked.number) {
-            let limits = self.incoming_limits(&key, with.config);
+            let limits = self.limits(with.config).incoming(&key);
             let route = RouteIn::new(key.topic.as_str().into(), asked.route, limits);
             self.inbound.routes().insert(asked.number, route);
         }
@@ -218,12 +172,9 @@ impl Peer {
             let awaited = wanted.writers.iter().filter_map(|(writer, readers)| {
                 Some((Rc::clone(asked.stand_ins.get(&writer.gid)?), *readers))
             });
-            let attaching = Attaching { until: now + ATTACH_TIMEOUT, awaited: awaited.collect() };
-            self.attaching.insert(asked.number, attaching);
-            self.look_at_attaching = Some(now);
+            self.asked.ask_once_attached(asked.number, awaited.collect(), now);
         }
         asked.wanted = wanted;
-        self.numbers.insert(asked.number, key.clone());
         self.asked.insert(key, asked);
     }
 
@@ -277,43 +228,98 @@ impl Peer {
 
     /// Asks for the routes whose local readers are attached by now.
     pub(super) fn ask_for_attached(&mut self, now: Duration) {
-        if self.look_at_attaching.is_none_or(|due| due > now) {
-            return;
-        }
-        let mut asks = Vec::new();
+        let attached = self.asked.take_attached(now);
         let mut changed = false;
-        for (number, attaching) in &mut self.attaching {
-            let late = now >= attaching.until;
-            let ready = |(stand_in, readers): &mut (Rc<StandIn>, usize)| {
-                late || stand_in.ring().partners().len() >= *readers
-            };
-            let ready: Vec<_> = attaching.awaited.extract_if(.., ready).collect();
-            if let Some(route) = self.inbound.routes().get_mut(number)
-                && !ready.is_empty()
-            {
-                route.writers.extend(ready.into_iter().map(|(s, _)| (s.gid(), s)));
+        for (number, stand_ins) in attached.stand_ins {
+            if let Some(route) = self.inbound.routes().get_mut(&number) {
+                route.writers.extend(stand_ins.into_iter().map(|s| (s.gid(), s)));
                 changed = true;
-            }
-            if attaching.awaited.is_empty() {
-                asks.push(*number);
             }
         }
         if changed {
             self.inbound.handle_routes();
         }
-        asks.sort_unstable();
-        for number in asks {
-            self.attaching.remove(&number);
-            let key = self.numbers.get(&number).cloned();
-            if let Some((key, asked)) = key
-                .and_then(|key| Some((self.asked.get(&key)?, key)))
-                .map(|(asked, key)| (key, asked))
-            {
-                let message = asked.message(&key);
-                self.say(message);
-            }
+        attached.messages.into_iter().for_each(|message| self.messages.say(message));
+    }
+
+    /// Asks for routes again.
+    fn ask_again(&mut self, routes: &[RouteKey]) {
+        let messages = routes.iter().filter_map(|key| self.asked.message(key));
+        messages.for_each(|message| self.messages.say(message));
+    }
+
+    /// Asks again for refused routes whose time has come.
+    pub(super) fn ask_again_in_time(&mut self, now: Duration) {
+        let due = self.refused.take_due(now);
+        self.ask_again(&due);
+    }
+
+    /// Asks again for routes whose use the peer denied and now allows.
+    pub(super) fn ask_for_allowed(&mut self, uses: &[AccessUse]) {
+        let allowed = self.refused.unserved_where(|key| {
+            let verb = verb_of(RefusedSide::Peer.waits(key.kind));
+            uses.iter().any(|(used, name)| Some(*used) == verb && *name == key.topic)
+        });
+        self.ask_again(&allowed);
+    }
+
+    /// Records that the peer refuses a route.
+    pub(super) fn handle_route_refused(&mut self, refused: RouteRefused, now: Duration) {
+        let RouteRefused { route, reason, retry_s } = refused;
+        let Some(key) = self.asked.key_of(route).cloned() else { return };
+        let again = retry_s.map(|seconds| now + Duration::from_secs(seconds.into()));
+        self.refused.handle_unserved(key, &reason, again, now);
+    }
+
+    /// Records that the peer serves a route.
+    pub(super) fn handle_route_ready(&mut self, route: u32) {
+        if let Some(key) = self.asked.key_of(route) {
+            self.refused.handle_served(key);
         }
-        let waiting = self.attaching.len();
-        self.look_at_attaching = (waiting > 0).then(|| now + poll_after(waiting));
+    }
+
+    /// Gives up the stand-ins for which there are not enough lanes any more.
+    pub(super) fn fit_stand_ins(&mut self, with: &PeerContext<'_>, now: Duration) {
+        for key in self.asked.fit_lanes(with.writers) {
+            let Some(asked) = self.asked.get(&key) else { continue };
+            if let Some(route) = self.inbound.routes().get_mut(&asked.number) {
+                route.writers.retain(|gid, _| asked.stand_ins.contains_key(gid));
+            }
+            self.does_not_ask(&key, TOO_MANY_LANES, now);
+            self.inbound.handle_routes();
+        }
+    }
+
+    /// Does not ask for a route, or not for all of it.
+    fn does_not_ask(&mut self, key: &RouteKey, why: &'static str, now: Duration) {
+        self.refused.set_unasked(key, why, now, &mut self.messages);
+    }
+
+    /// Checks for responses that the peer does not ask for, and asks again for requests whose time is over.
+    pub(super) fn check_unanswered(&mut self, with: &PeerContext<'_>, now: Duration) {
+        let reopened = self.unanswered.reopen(now);
+        let limit = with.config.link.stalled;
+        let mut stalled = Vec::new();
+        if self.unanswered.is_due(now) {
+            let unasked = self.unasked_responses();
+            stalled = self.unanswered.check(&self.asked, &unasked, self.silent, limit, now);
+        }
+        for (responses, waiting) in &stalled {
+            with.stalls.borrow_mut().add(&self.identity, responses, limit, now);
+            self.counters.dropped("stalled", *waiting);
+        }
+        if reopened || !stalled.is_empty() {
+            self.update(with, now);
+        }
+    }
+
+    /// Returns the request routes that this host asked for and whose responses the peer has not asked for. A
+    /// request route that the peer refuses to serve is left out.
+    fn unasked_responses(&self) -> BTreeSet<RouteKey> {
+        let requests = self.asked.iter().filter(|(key, _)| key.kind == Kind::Request);
+        let unasked = requests.filter(|(key, _)| {
+            self.served.number_of(&key.other_way()).is_none() && !self.refused.is_unserved(key)
+        });
+        unasked.map(|(key, _)| key.clone()).collect()
     }
 }

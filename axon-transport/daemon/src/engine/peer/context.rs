@@ -5,7 +5,7 @@ use std::{cell::RefCell, collections::BTreeMap, sync::Arc};
 use axon_shm::ids::Gid;
 use axon_transport::{config::Config, graph::Endpoint, internal::graph::EndpointRange};
 
-use super::{kept_relays::KeptRelays, lanes::WritersHere, stalls::StallHistory};
+use super::{kept_relays::KeptRelays, routes::lanes::WritersHere, stalls::StallHistory};
 use crate::engine::{rings::Rings, stand_in::StandIns};
 
 /// The endpoints of applications on this host, and how far their sessions are discovered.

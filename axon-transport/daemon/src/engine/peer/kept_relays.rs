@@ -7,11 +7,10 @@ use std::{
     time::Duration,
 };
 
-use super::{Peer, routes::RelaySpec};
+use super::routes::{RelaySpec, RouteKey, served::ServedRoutes};
 use crate::engine::{
     account::{Charge, Meter},
-    outbound::{Source, UnfinishedFlows},
-    peer::routes::RouteKey,
+    outbound::{Outbound, Source, UnfinishedFlows},
     rings::RingReader,
 };
 
@@ -72,18 +71,24 @@ impl KeptRelays {
         room
     }
 
-    /// Takes over the KEEP_ALL relays of a peer that is gone.
-    pub(crate) fn add(&mut self, peer: &mut Peer, now: Duration) {
-        let room = self.room_of(&peer.identity);
-        for (number, served) in peer.served.iter_mut() {
+    /// Takes over the KEEP_ALL relays of a peer that is gone: `served` are its routes, `outbound` the samples to it.
+    pub(super) fn add(
+        &mut self,
+        identity: &str,
+        served: &mut ServedRoutes,
+        outbound: &mut Outbound,
+        now: Duration,
+    ) {
+        let room = self.room_of(identity);
+        for (number, served) in served.iter_mut() {
             let lanes = served.lanes.amount() / served.sources.len().max(1);
-            let (sources, unfinished) = peer.outbound.take_kept(number, room.left(), now);
+            let (sources, unfinished) = outbound.take_kept(number, room.left(), now);
             let unfinished = Rc::new(unfinished);
             for source in sources {
                 let Source::Relay(spec, reader) = source else { continue };
                 let Some(place) = room.charge(1) else { continue };
                 let charges = [place, served.relays.split(1)];
-                let identity = peer.identity.clone();
+                let identity = identity.to_owned();
                 let (key, since, until) = (served.key.clone(), now, now + PATIENCE);
                 let unfinished = Rc::clone(&unfinished);
                 let lanes = served.lanes.split(lanes);

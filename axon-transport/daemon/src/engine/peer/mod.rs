@@ -5,53 +5,50 @@ mod asking;
 mod context;
 mod control_queue;
 pub(super) mod kept_relays;
-mod lanes;
-mod limits;
-mod refused;
+mod local_graph;
 mod rights;
 pub(super) mod routes;
-mod served;
 mod serving;
 pub(super) mod stalls;
-mod unanswered;
 
-use std::{
-    collections::{BTreeMap, BTreeSet, HashMap},
-    rc::Rc,
-    sync::Arc,
-    time::Duration,
-};
+use std::{collections::BTreeSet, rc::Rc, time::Duration};
 
 use axon_envelope::Kind;
 use axon_shm::ids::{DaemonId, Gid};
 use axon_transport::{
     access::{Permissions, Verb},
-    config::{Config, DiscoveryRange},
-    graph::EndpointKind,
-    internal::{events::Alive, graph::RemoteEndpoint, wire::session::CheckedUse},
+    config::Config,
+    graph::Endpoint,
+    internal::{events::Alive, wire::session::CheckedUse},
     status::{LinkStatus, PeerDecision},
 };
 
 use self::{
     access::PeerAccess,
-    asking::{AskedRoute, Attaching},
     control_queue::ControlQueue,
-    refused::RefusedRoutes,
-    served::{ServedRoute, ServedRoutes},
-    serving::DENIED_AGAIN,
-    unanswered::UnansweredServices,
+    kept_relays::KeptRelays,
+    local_graph::{LocalGraph, Visibility},
+    routes::{
+        asked::AskedRoutes,
+        limits::PeerLimits,
+        refused::RefusedRoutes,
+        served::{DENIED_AGAIN, ServedRoute, ServedRoutes},
+        unanswered::UnansweredServices,
+    },
 };
 pub(crate) use self::{
     context::{LocalEndpoints, PeerContext},
-    lanes::WritersHere,
-    serving::{MAX_ROUTES, StalledRoute},
+    routes::{
+        lanes::WritersHere,
+        served::{MAX_ROUTES, StalledRoute},
+    },
 };
-use super::peer_graph::shown::{ShownEndpoint, ShownToPeer};
 use super::{
     inbound::Inbound,
     outbound::{Outbound, Source, StallCause},
 };
 use crate::{
+    bridge::RefusedRoute,
     engine::{
         account::{Account, MAX_STAND_INS},
         counters::Counters,
@@ -62,10 +59,6 @@ use crate::{
     owner::Binding,
 };
 
-/// The shortest time between two checks of pairs that are being attached.
-const POLL: Duration = Duration::from_millis(5);
-/// The shortest time for each of these pairs, so that thousands of waiting pairs leave time for samples.
-const POLL_EACH: Duration = Duration::from_micros(4);
 /// The number of routes of a peer whose HELLO does not state how many it serves.
 pub(crate) const ROUTES_UNSAID: usize = 1024;
 
@@ -78,11 +71,6 @@ fn reader_of(kind: Kind) -> Verb {
     }
 }
 
-/// Returns the time until the next check of so many pairs.
-fn poll_after(pairs: usize) -> Duration {
-    POLL.max(POLL_EACH * u32::try_from(pairs).unwrap_or(u32::MAX))
-}
-
 /// A peer with an elected link.
 pub(crate) struct Peer {
     pub(super) daemon: DaemonId,
@@ -93,31 +81,21 @@ pub(crate) struct Peer {
     pub(super) counters: Rc<Counters>,
     /// The peer's graph.
     pub(super) remote: PeerGraph,
-    prover: Prover,
     /// The peer's rights on this host.
     access: PeerAccess,
     /// Whether endpoints of the peer were ignored because another peer has the same ones.
     pub(super) displaced: bool,
-    /// The graph that was sent to the peer.
-    shown_graph: ShownToPeer,
+    /// The graph of this host that the peer is shown.
+    local_graph: LocalGraph,
     /// Whether the peer has been silent for so long that the control plane counts it as gone.
     pub(super) silent: bool,
     /// Whether the peer's graph changed and the change still has to be processed.
     pub(super) stirred: bool,
     refusal_said: bool,
-    next_route: u32,
-    /// The most routes that the peer serves.
-    serves: usize,
-    asked: BTreeMap<RouteKey, AskedRoute>,
-    /// The routes of `asked`, by number.
-    numbers: HashMap<u32, RouteKey>,
-    attaching: BTreeMap<u32, Attaching>,
-    look_at_attaching: Option<Duration>,
+    asked: AskedRoutes,
     refused: RefusedRoutes,
     pub(super) inbound: Inbound,
     pub(super) outbound: Outbound,
-    /// Ended publishers of this host whose samples have not all arrived. The peer sees them until then.
-    ending: BTreeMap<Gid, RemoteEndpoint>,
     served: ServedRoutes,
     alive: Alive,
     answering: BTreeSet<Gid>,
@@ -172,21 +150,14 @@ impl Peer {
             refused: RefusedRoutes::new(Rc::clone(&account.refusals)),
             access: PeerAccess::new(permissions.clone(), &account),
             remote: PeerGraph::new(account, prover.is_needed(), permissions),
-            prover,
+            local_graph: LocalGraph::new(daemon, prover),
             displaced: false,
-            shown_graph: ShownToPeer::default(),
             silent: false,
             stirred: false,
             refusal_said: false,
-            next_route: 1,
-            serves,
-            asked: BTreeMap::new(),
-            numbers: HashMap::new(),
-            attaching: BTreeMap::new(),
-            look_at_attaching: None,
+            asked: AskedRoutes::new(serves),
             inbound,
             outbound,
-            ending: BTreeMap::new(),
             served: ServedRoutes::default(),
             alive: Alive::default(),
             answering: BTreeSet::new(),
@@ -199,13 +170,11 @@ impl Peer {
     pub(super) fn succeed(&mut self, link: u64, binding: Option<Binding>, local: &LocalEndpoints) {
         self.link = link;
         self.messages.succeed();
-        self.prover.succeed(binding);
         self.remote.succeed();
-        let visible = self.visible(local);
-        self.prove(&visible);
-        let asks: Vec<_> = self.asked.iter().map(|(key, asked)| asked.message(key)).collect();
-        asks.into_iter().for_each(|message| self.say(message));
-        self.say_unasked_again();
+        let (visibility, graph, messages) = self.local_graph(local);
+        graph.succeed(binding, visibility, messages);
+        self.asked.messages().into_iter().for_each(|message| self.messages.say(message));
+        self.refused.succeed(&mut self.messages);
         let denied = self.access.succeed();
         denied.into_iter().for_each(|message| self.say(message));
         self.served.iter_mut().for_each(|(_, served)| served.repeated = false);
@@ -264,7 +233,7 @@ impl Peer {
                 let answer = self.access.answer(&check);
                 self.say(answer);
             }
-            LinkMessage::RouteUnasked(unasked) => self.handle_route_unasked(unasked, now),
+            LinkMessage::RouteUnasked(unasked) => self.refused.handle_route_unasked(unasked, now),
             LinkMessage::RouteReady(ready) => {
                 self.handle_route_ready(ready.route);
                 tracing::debug!(peer = %self.daemon, route = ready.route,
@@ -273,30 +242,6 @@ impl Peer {
             _ => {}
         }
         Ok(())
-    }
-
-    /// Returns the endpoints of this host that the peer may see.
-    fn shown(&mut self, local: &LocalEndpoints) -> BTreeMap<Gid, RemoteEndpoint> {
-        let listed = self.remote.endpoints().any(|remote| remote.toward.lists);
-        let shown = local.iter().filter_map(|(gid, (endpoint, reach))| {
-            let toward = reach.toward(self.daemon);
-            let shown = match toward.range {
-                DiscoveryRange::Off => false,
-                DiscoveryRange::Localhost => toward.lists || listed,
-                DiscoveryRange::Subnet => true,
-            };
-            shown.then(|| (*gid, RemoteEndpoint { endpoint: Arc::clone(endpoint), toward }))
-        });
-        self.permitted(shown.collect())
-    }
-
-    /// Removes the endpoints that access rules hide from the peer.
-    fn permitted(
-        &mut self,
-        mut all: BTreeMap<Gid, RemoteEndpoint>,
-    ) -> BTreeMap<Gid, RemoteEndpoint> {
-        all.retain(|_, e| self.access.judge(&e.endpoint).shown);
-        all
     }
 
     /// Replaces the access rules. Routes that they deny end at once; the graphs follow.
@@ -308,8 +253,7 @@ impl Peer {
     ) {
         self.access.set_permissions(permissions.clone());
         self.remote.set_permissions(permissions);
-        let ending = std::mem::take(&mut self.ending);
-        self.ending = self.permitted(ending);
+        self.local_graph.handle_permissions(&mut self.access);
         let denied = |served: &ServedRoute| {
             let why = self.access.denial(reader_of(served.key.kind), &served.key.topic)?;
             Some((served.key.clone(), why))
@@ -320,6 +264,31 @@ impl Peer {
             self.refuse(route, &key, why, Some(DENIED_AGAIN), now);
         }
         self.renew_limits(config);
+    }
+
+    /// Returns the limits that the access rules set for the peer.
+    fn limits<'a>(&'a self, config: &'a Config) -> PeerLimits<'a> {
+        let (account, permissions) = (self.remote.account(), self.access.permissions());
+        PeerLimits { account, permissions, config }
+    }
+
+    /// Gives the existing routes the limits that the access rules set now.
+    fn renew_limits(&mut self, config: &Config) {
+        let limits = self.limits(config);
+        let served = self.served.iter();
+        let outgoing = served.map(|(number, of)| (number, limits.outgoing(&of.key)));
+        let outgoing: Vec<_> = outgoing.collect();
+        let asked = self.asked.iter();
+        let incoming: Vec<_> = asked.map(|(key, of)| (of.number, limits.incoming(key))).collect();
+        for (number, limits) in outgoing {
+            self.outbound.set_limits(number, limits);
+        }
+        for (number, limits) in incoming {
+            if let Some(route) = self.inbound.routes().get_mut(&number) {
+                route.limit.set(limits);
+            }
+        }
+        self.inbound.handle_limits();
     }
 
     /// Asks the peer whether its access rules permit these uses to this host.
@@ -342,77 +311,60 @@ impl Peer {
     /// Handles a change of this host's graph: sends it to the peer and updates the routes.
     pub(super) fn handle_local_graph(&mut self, with: &PeerContext<'_>, now: Duration) {
         self.keep_ending(with.local, now);
-        self.fit_lanes(with, now);
+        self.fit_relays(with, now);
+        self.fit_stand_ins(with, now);
         self.send_graph(with.local, false);
         self.update(with, now);
     }
 
     /// Keeps ended publishers in the graph that the peer sees until their samples have arrived.
     fn keep_ending(&mut self, local: &LocalEndpoints, now: Duration) {
-        let ended = self.shown_graph.iter().filter(|(gid, shown)| {
-            shown.remote.endpoint.kind == EndpointKind::Publisher
-                && !local.contains_key(gid)
-                && !self.ending.contains_key(gid)
-        });
-        let carried = |gid: &Gid, shown: &ShownEndpoint| {
-            let number = self.served.number_of(&RouteKey::of(&shown.remote.endpoint)?)?;
+        let carried = |gid: &Gid, publisher: &Endpoint| {
+            let number = self.served.number_of(&RouteKey::of(publisher)?)?;
             let sources = &self.served.get(number)?.sources;
             self.outbound.has_left(number, sources, gid).then_some(number)
         };
-        let ended = ended
-            .filter_map(|(gid, shown)| Some((carried(gid, shown)?, *gid, shown.remote.clone())));
-        for (number, gid, shown) in ended.collect::<Vec<_>>() {
+        let ended = self.local_graph.ended_publishers(local).filter_map(|(gid, publisher)| {
+            Some((carried(gid, &publisher.endpoint)?, *gid, publisher.clone()))
+        });
+        for (number, gid, publisher) in ended.collect::<Vec<_>>() {
             self.outbound.handle_publisher_ended(number, gid, now);
-            self.ending.insert(gid, shown);
+            self.local_graph.keep(gid, publisher);
         }
     }
 
     /// Removes an ended publisher without remaining samples from the graph that the peer sees.
     pub(super) fn handle_drained(&mut self, gid: &Gid, local: &LocalEndpoints) {
-        if self.ending.remove(gid).is_some() {
+        if self.local_graph.remove_ended(gid) {
             self.send_graph(local, false);
         }
     }
 
     /// Returns whether samples of ended publishers are still being sent.
     pub(super) fn is_draining(&self) -> bool {
-        !self.ending.is_empty()
+        self.local_graph.is_draining()
     }
 
-    fn visible(&mut self, local: &LocalEndpoints) -> BTreeMap<Gid, RemoteEndpoint> {
-        let mut visible = self.ending.clone();
-        visible.extend(self.shown(local));
-        visible
-    }
-
-    fn prove(&mut self, visible: &BTreeMap<Gid, RemoteEndpoint>) {
-        for proofs in self.prover.owed(visible.keys()) {
-            self.say(proofs);
-        }
+    /// Returns the graph of this host that the peer is shown, with what it depends on and where its messages go.
+    fn local_graph<'a>(
+        &'a mut self,
+        local: &'a LocalEndpoints,
+    ) -> (Visibility<'a>, &'a mut LocalGraph, &'a mut ControlQueue) {
+        let listed = self.remote.endpoints().any(|remote| remote.toward.lists);
+        let visibility = Visibility { local, listed, access: &mut self.access };
+        (visibility, &mut self.local_graph, &mut self.messages)
     }
 
     /// Sends the peer the changes of this host's graph, or the whole graph.
     pub(super) fn send_graph(&mut self, local: &LocalEndpoints, whole: bool) {
-        let visible = self.visible(local);
-        self.prove(&visible);
-        let mut told = |remote: RemoteEndpoint| {
-            let denied = !self.access.judge(&remote.endpoint).usable;
-            ShownEndpoint { remote, denied }
-        };
-        let now: BTreeMap<_, _> = visible.into_iter().map(|(gid, e)| (gid, told(e))).collect();
-        self.access.retain_rights(|gid| local.contains_key(gid) || self.ending.contains_key(gid));
-        self.shown_graph
-            .tell(now, whole)
-            .into_iter()
-            .for_each(|message| self.messages.say(message));
+        let (visibility, graph, messages) = self.local_graph(local);
+        graph.send(visibility, whole, messages);
     }
 
     /// Sends the whole graph, which the peer asked for.
     fn resync(&mut self, local: &LocalEndpoints, now: Duration) {
-        if self.shown_graph.handle_resync(now) {
-            self.prover.forget();
-            self.send_graph(local, true);
-        }
+        let (visibility, graph, messages) = self.local_graph(local);
+        graph.resync(visibility, now, messages);
     }
 
     /// Takes in a part of the peer's graph.
@@ -469,8 +421,8 @@ impl Peer {
     /// own.
     pub(super) fn poll_timeout(&self, now: Duration) -> Option<Duration> {
         let alive = self.alive_due(now);
-        let (attaching, announcing) = (self.look_at_attaching, self.served.poll_timeout());
-        let (resync, asks) = (self.shown_graph.poll_timeout(), self.refused.poll_timeout());
+        let (attaching, announcing) = (self.asked.poll_timeout(), self.served.poll_timeout());
+        let (resync, asks) = (self.local_graph.poll_timeout(), self.refused.poll_timeout());
         let unanswered = self.unanswered.poll_timeout();
         [attaching, announcing, alive, resync, asks, unanswered].into_iter().flatten().min()
     }
@@ -480,11 +432,16 @@ impl Peer {
         self.ask_for_attached(now);
         self.announce_ready(now);
         self.tell_alive(now);
-        self.ask_again(now);
-        self.look_at_unanswered(with, now);
-        if self.shown_graph.owes_resync() {
+        self.ask_again_in_time(now);
+        self.check_unanswered(with, now);
+        if self.local_graph.owes_resync() {
             self.resync(with.local, now);
         }
+    }
+
+    /// Keeps the KEEP_ALL relays of the peer, which is gone, for its next daemon.
+    pub(super) fn keep_relays(&mut self, kept: &mut KeptRelays, now: Duration) {
+        kept.add(&self.identity, &mut self.served, &mut self.outbound, now);
     }
 
     /// Gives up a route that the peer does not read.
@@ -505,10 +462,15 @@ impl Peer {
         Some(stalled)
     }
 
+    /// Returns the refused routes for the status of the endpoints that wait for them.
+    pub(super) fn refused_routes(&self) -> Vec<RefusedRoute> {
+        self.refused.at_endpoints().chain(self.access.refused_routes()).collect()
+    }
+
     /// Adds the peer's graph and refused routes to the link's status.
     pub(super) fn fill(&self, status: &mut LinkStatus, now: Duration) {
         self.counters.fill(status);
-        self.show_refused(status);
+        self.refused.fill(status);
         self.access.fill(status);
         self.remote.account().limits.fill(status);
         self.outbound.backlog().fill(status, now);
@@ -528,6 +490,6 @@ impl Peer {
     /// Counts the publishers, servers and clients of the peer that are shown here.
     #[cfg(test)]
     pub(super) fn stand_ins(&self) -> usize {
-        self.asked.values().map(|asked| asked.stand_ins.len()).sum()
+        self.asked.iter().map(|(_, asked)| asked.stand_ins.len()).sum()
     }
 }

@@ -8,29 +8,26 @@ use axon_transport::EndpointSpec;
 
 use super::{
     Peer, PeerContext, reader_of,
-    refused::TOO_MANY_LANES,
-    served::{MissingRelay, ServedRoute},
+    routes::{
+        refused::TOO_MANY_LANES,
+        served::{DENIED_AGAIN, MAX_ROUTES, MissingRelay, ServedRoute, StalledRoute},
+    },
 };
 use crate::{
     engine::{
         account::Charge,
         limits::RouteLimit,
         outbound::{RouteOut, Source, StallCause, UnfinishedFlows},
-        peer::routes::{MAX_RELAYS_OF_ROUTE, RelaySpec, RouteKey, admit, relays},
+        peer::routes::{MAX_RELAYS_OF_ROUTE, RelaySpec, RouteKey, admit, kind_of, relays},
     },
     link::{LinkMessage, RouteSubscriber, Subscribe},
 };
 
 /// A peer that lacks relays may ask for them again after this time.
-pub(super) const ASK_AGAIN: Duration = Duration::from_secs(10);
-/// A peer whose route access rules deny asks for it again after this time, if DENIED does not tell it when.
-pub(super) const DENIED_AGAIN: Duration = Duration::from_secs(30);
+const ASK_AGAIN: Duration = Duration::from_secs(10);
 /// Memory of a route, in bytes, beside the names and subscribers of which it holds three copies.
 const ROUTE: usize = 2048;
 const COPIES: usize = 3;
-/// Routes that a peer is served. HELLO says it. What they take is bounded apart from it.
-pub(crate) const MAX_ROUTES: usize = 1 << 15;
-
 /// The relays of a route.
 struct Relays {
     sources: Vec<Source>,
@@ -42,23 +39,8 @@ struct Relays {
 }
 
 /// That some of the relays of a route are not there, and why.
-pub(super) fn missing(missing: usize, asked: usize, why: &str) -> String {
+fn missing(missing: usize, asked: usize, why: &str) -> String {
     format!("{missing} of {asked} kinds of subscriptions get nothing: {why}")
-}
-
-/// A route that was given up since the peer does not read it.
-pub(crate) struct StalledRoute {
-    /// The topic's name.
-    pub(crate) topic: String,
-    /// What both hosts show.
-    pub(crate) reason: String,
-    /// Samples that were lost.
-    pub(crate) samples: u64,
-}
-
-/// What a route carries, as a message says it.
-pub(super) fn kind_of(kind: u8) -> Option<Kind> {
-    [Kind::Topic, Kind::Request, Kind::Response].into_iter().find(|k| *k as u8 == kind)
 }
 
 impl Peer {
@@ -144,7 +126,7 @@ impl Peer {
             acknowledged,
             short_headers,
             compressed: with.config.topic_compression(&key.topic),
-            limit: RouteLimit::new(self.outgoing_limits(&key, with.config)),
+            limit: RouteLimit::new(self.limits(with.config).outgoing(&key)),
             sources: sources.clone(),
             seen,
             unfinished,
@@ -355,6 +337,29 @@ impl Peer {
             served.sources.clone_from(&sources);
             self.outbound.set_sources(number, sources, now);
         }
+    }
+
+    /// Gives up the relays for which there are not enough lanes any more.
+    pub(super) fn fit_relays(&mut self, with: &PeerContext<'_>, now: Duration) {
+        for (number, had) in self.served.fit_lanes(with.writers) {
+            let Some(served) = self.served.get(number) else { continue };
+            let (key, sources) = (served.key.clone(), served.sources.clone());
+            let why = missing(had - sources.len(), had, TOO_MANY_LANES);
+            self.outbound.set_sources(number, sources, now);
+            self.refuse(number, &key, why, Some(ASK_AGAIN), now);
+        }
+    }
+
+    /// Refuses a route that the peer asked for. The peer may ask again after `retry`.
+    pub(super) fn refuse(
+        &mut self,
+        number: u32,
+        key: &RouteKey,
+        reason: String,
+        retry: Option<Duration>,
+        now: Duration,
+    ) {
+        self.refused.refuse(number, key, reason, retry, now, &mut self.messages);
     }
 
     /// Says which routes have a writer by now.

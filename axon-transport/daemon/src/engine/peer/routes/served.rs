@@ -8,7 +8,10 @@ use std::{
 use axon_envelope::Kind;
 use axon_shm::ids::Gid;
 
-use super::{poll_after, routes::RouteKey};
+use super::{
+    RouteKey, check_after,
+    lanes::{self, WritersHere},
+};
 use crate::{
     engine::{account::Charge, outbound::Source},
     link::RouteReady,
@@ -17,28 +20,43 @@ use crate::{
 /// A route is said to be ready once it has a writer, or after this time.
 const READY_TIMEOUT: Duration = Duration::from_secs(2);
 
+/// A peer whose route access rules deny asks for it again after this time, if DENIED does not tell it when.
+pub(in crate::engine::peer) const DENIED_AGAIN: Duration = Duration::from_secs(30);
+/// Routes that a peer is served. HELLO says it. What they take is bounded apart from it.
+pub(crate) const MAX_ROUTES: usize = 1 << 15;
+
+/// A route that was given up since the peer does not read it.
+pub(crate) struct StalledRoute {
+    /// The topic's name.
+    pub(crate) topic: String,
+    /// What both hosts show.
+    pub(crate) reason: String,
+    /// Samples that were lost.
+    pub(crate) samples: u64,
+}
+
 /// A route that the peer asked for.
-pub(super) struct ServedRoute {
-    pub(super) key: RouteKey,
-    pub(super) subscribers: Vec<Gid>,
-    pub(super) sources: Vec<Source>,
-    pub(super) _room: Charge,
+pub(in crate::engine::peer) struct ServedRoute {
+    pub(in crate::engine::peer) key: RouteKey,
+    pub(in crate::engine::peer) subscribers: Vec<Gid>,
+    pub(in crate::engine::peer) sources: Vec<Source>,
+    pub(in crate::engine::peer) _room: Charge,
     /// One for each relay.
-    pub(super) relays: Charge,
+    pub(in crate::engine::peer) relays: Charge,
     /// One for each relay and each publisher here that it may read.
-    pub(super) lanes: Charge,
+    pub(in crate::engine::peer) lanes: Charge,
     /// Why some of the subscribers get nothing, and when the peer may ask again.
-    pub(super) without: Option<MissingRelay>,
+    pub(in crate::engine::peer) without: Option<MissingRelay>,
     /// Whether the peer asked for it over the link in use.
-    pub(super) repeated: bool,
+    pub(in crate::engine::peer) repeated: bool,
 }
 
 /// Why subscribers of a route have no relay, and after what time one may be had.
-pub(super) type MissingRelay = (String, Option<Duration>);
+pub(in crate::engine::peer) type MissingRelay = (String, Option<Duration>);
 
 /// Routes by number and by what they carry.
 #[derive(Default)]
-pub(super) struct ServedRoutes {
+pub(in crate::engine::peer) struct ServedRoutes {
     routes: HashMap<u32, ServedRoute>,
     numbers: HashMap<RouteKey, u32>,
     /// The routes of services.
@@ -49,48 +67,50 @@ pub(super) struct ServedRoutes {
 }
 
 impl ServedRoutes {
-    pub(super) fn len(&self) -> usize {
+    pub(in crate::engine::peer) fn len(&self) -> usize {
         self.routes.len()
     }
 
-    pub(super) fn get(&self, number: u32) -> Option<&ServedRoute> {
+    pub(in crate::engine::peer) fn get(&self, number: u32) -> Option<&ServedRoute> {
         self.routes.get(&number)
     }
 
-    pub(super) fn get_mut(&mut self, number: u32) -> Option<&mut ServedRoute> {
+    pub(in crate::engine::peer) fn get_mut(&mut self, number: u32) -> Option<&mut ServedRoute> {
         self.routes.get_mut(&number)
     }
 
     /// The number of the route that carries this.
-    pub(super) fn number_of(&self, key: &RouteKey) -> Option<u32> {
+    pub(in crate::engine::peer) fn number_of(&self, key: &RouteKey) -> Option<u32> {
         self.numbers.get(key).copied()
     }
 
-    pub(super) fn iter(&self) -> impl Iterator<Item = (u32, &ServedRoute)> {
+    pub(in crate::engine::peer) fn iter(&self) -> impl Iterator<Item = (u32, &ServedRoute)> {
         self.routes.iter().map(|(number, served)| (*number, served))
     }
 
-    pub(super) fn iter_mut(&mut self) -> impl Iterator<Item = (u32, &mut ServedRoute)> {
+    pub(in crate::engine::peer) fn iter_mut(
+        &mut self,
+    ) -> impl Iterator<Item = (u32, &mut ServedRoute)> {
         self.routes.iter_mut().map(|(number, served)| (*number, served))
     }
 
     /// The routes of services, by number.
-    pub(super) fn services(&self) -> impl Iterator<Item = (u32, &ServedRoute)> {
+    pub(in crate::engine::peer) fn services(&self) -> impl Iterator<Item = (u32, &ServedRoute)> {
         self.services.iter().filter_map(|number| Some((*number, self.routes.get(number)?)))
     }
 
     /// How many routes of services there are.
-    pub(super) fn service_count(&self) -> usize {
+    pub(in crate::engine::peer) fn service_count(&self) -> usize {
         self.services.len()
     }
 
     /// Whether a route is of a service.
-    pub(super) fn is_service(&self, number: u32) -> bool {
+    pub(in crate::engine::peer) fn is_service(&self, number: u32) -> bool {
         self.services.contains(&number)
     }
 
     /// Adds a route, in place of what [`take`](Self::take) took.
-    pub(super) fn insert(&mut self, number: u32, served: ServedRoute) {
+    pub(in crate::engine::peer) fn insert(&mut self, number: u32, served: ServedRoute) {
         self.numbers.insert(served.key.clone(), number);
         if served.key.kind != Kind::Topic {
             self.services.insert(number);
@@ -99,7 +119,7 @@ impl ServedRoutes {
     }
 
     /// Takes a route out, to be changed. The peer may still be waiting to be told that it is ready.
-    pub(super) fn take(&mut self, number: u32) -> Option<ServedRoute> {
+    pub(in crate::engine::peer) fn take(&mut self, number: u32) -> Option<ServedRoute> {
         self.services.remove(&number);
         let served = self.routes.remove(&number)?;
         self.numbers.remove(&served.key);
@@ -107,24 +127,46 @@ impl ServedRoutes {
     }
 
     /// Ends a route.
-    pub(super) fn remove(&mut self, number: u32) -> Option<ServedRoute> {
+    pub(in crate::engine::peer) fn remove(&mut self, number: u32) -> Option<ServedRoute> {
         self.announcing.remove(&number);
         self.take(number)
     }
 
+    /// Gives up the relays of topics for which there are not enough lanes any more, after the writers of this host
+    /// changed. Returns the routes that lost some, each with the number of relays that it had.
+    pub(in crate::engine::peer) fn fit_lanes(
+        &mut self,
+        writers: &WritersHere,
+    ) -> Vec<(u32, usize)> {
+        let mut shortened = Vec::new();
+        for (number, served) in &mut self.routes {
+            if served.key.kind != Kind::Topic {
+                continue;
+            }
+            let (each, had) = (writers.of_route(&served.key), served.sources.len());
+            let fitting = lanes::fit(&mut served.lanes, had, each);
+            if fitting < had {
+                served.sources.truncate(fitting);
+                drop(served.relays.split(had - fitting));
+                shortened.push((*number, had));
+            }
+        }
+        shortened
+    }
+
     /// Has the peer told when a route is ready.
-    pub(super) fn announce(&mut self, number: u32, now: Duration) {
+    pub(in crate::engine::peer) fn announce(&mut self, number: u32, now: Duration) {
         self.announcing.insert(number, now + READY_TIMEOUT);
         self.look_at_announcing = Some(now);
     }
 
     /// When [`take_ready`](Self::take_ready) is due.
-    pub(super) fn poll_timeout(&self) -> Option<Duration> {
+    pub(in crate::engine::peer) fn poll_timeout(&self) -> Option<Duration> {
         self.look_at_announcing
     }
 
     /// The routes that are ready by now and of which the peer was not told.
-    pub(super) fn take_ready(&mut self, now: Duration) -> Vec<RouteReady> {
+    pub(in crate::engine::peer) fn take_ready(&mut self, now: Duration) -> Vec<RouteReady> {
         if self.look_at_announcing.is_none_or(|due| due > now) {
             return Vec::new();
         }
@@ -139,7 +181,7 @@ impl ServedRoutes {
             waits
         });
         let waiting = self.announcing.len();
-        self.look_at_announcing = (waiting > 0).then(|| now + poll_after(waiting));
+        self.look_at_announcing = (waiting > 0).then(|| now + check_after(waiting));
         ready
     }
 }
@@ -192,7 +234,7 @@ mod tests {
         routes.announce(2, start);
         assert_eq!(routes.poll_timeout(), Some(start));
         assert!(routes.take_ready(start).is_empty());
-        assert_eq!(routes.poll_timeout(), Some(start + poll_after(2)));
+        assert_eq!(routes.poll_timeout(), Some(start + check_after(2)));
         assert!(routes.take_ready(start).is_empty(), "it is not due");
         routes.remove(2);
         let ready = routes.take_ready(start + READY_TIMEOUT);

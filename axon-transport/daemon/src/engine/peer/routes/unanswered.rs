@@ -8,11 +8,7 @@ use std::{
 
 use axon_envelope::Kind;
 
-use super::{
-    Peer, PeerContext,
-    asking::AskedRoute,
-    routes::{RouteKey, WantedRoute},
-};
+use super::{RouteKey, WantedRoute, asked::AskedRoutes};
 use crate::engine::outbound::UnfinishedFlows;
 
 /// Time between two checks for responses that the peer does not ask for.
@@ -23,7 +19,7 @@ const LEFT: usize = 256;
 
 /// The services whose requests or responses a peer does not take.
 #[derive(Default)]
-pub(super) struct UnansweredServices {
+pub(in crate::engine::peer) struct UnansweredServices {
     /// Request routes that the peer is not asked for, each with the end of that time.
     closed: BTreeMap<RouteKey, Duration>,
     /// Routes of services that were given up because the peer did not take their samples.
@@ -47,17 +43,17 @@ struct AwaitedResponses {
 
 impl UnansweredServices {
     /// Returns the time of the next check, or of the next request route to ask for again.
-    pub(super) fn poll_timeout(&self) -> Option<Duration> {
+    pub(in crate::engine::peer) fn poll_timeout(&self) -> Option<Duration> {
         self.closed.values().copied().chain(self.look).min()
     }
 
     /// Records that a route of a service was given up.
-    pub(super) fn handle_stalled(&mut self, route: RouteKey) {
+    pub(in crate::engine::peer) fn handle_stalled(&mut self, route: RouteKey) {
         self.stalled.insert(route);
     }
 
     /// Stores the unfinished flows of a service's route that ends.
-    pub(super) fn leave(&mut self, route: &RouteKey, unfinished: UnfinishedFlows) {
+    pub(in crate::engine::peer) fn leave(&mut self, route: &RouteKey, unfinished: UnfinishedFlows) {
         if !unfinished.is_empty() && self.left.len() < LEFT {
             self.left.insert(route.clone(), unfinished);
         }
@@ -67,115 +63,85 @@ impl UnansweredServices {
     }
 
     /// Returns the unfinished flows of a service's route that the peer asks for again.
-    pub(super) fn go_on(&mut self, route: &RouteKey) -> UnfinishedFlows {
+    pub(in crate::engine::peer) fn go_on(&mut self, route: &RouteKey) -> UnfinishedFlows {
         self.left.remove(route).unwrap_or_default()
     }
-}
 
-impl AskedRoute {
-    /// Returns how many responses its clients have not taken, and how many more found no room.
-    fn responses(&self) -> (u64, u64) {
-        let clients = self.stand_ins.values();
-        clients.fold((0, 0), |(waiting, refused), client| {
-            let (ring, of) = (client.ring(), client.gid());
-            (
-                waiting + ring.calls_of(&of),
-                refused.saturating_add(ring.refused_of(&of).unwrap_or(0)),
-            )
-        })
-    }
-}
-
-impl Peer {
     /// Removes from the wanted routes the requests whose responses the peer has not taken lately, and returns
-    /// them. Requests that the peer is already asked for stay if another daemon of its host failed to take
-    /// the responses.
-    pub(super) fn leave_out_unanswered(
+    /// them. `blocked` returns for how long responses are not to be asked for. Requests that the peer is already
+    /// asked for stay if another daemon of its host failed to take the responses.
+    pub(in crate::engine::peer) fn leave_out(
         &mut self,
         wanted: &mut BTreeMap<RouteKey, WantedRoute>,
-        with: &PeerContext<'_>,
+        asked: &AskedRoutes,
+        blocked: impl Fn(&RouteKey) -> Option<Duration>,
         now: Duration,
     ) -> BTreeSet<RouteKey> {
-        let stalls = with.stalls.borrow();
-        let stalled = std::mem::take(&mut self.unanswered.stalled);
+        let stalled = std::mem::take(&mut self.stalled);
         let left = |key: &RouteKey| {
             let responses = key.other_way();
-            if self.asked.contains_key(key) && !stalled.contains(&responses) {
+            if asked.get(key).is_some() && !stalled.contains(&responses) {
                 return None;
             }
-            stalls.left(&self.identity, &responses, now).map(|left| now + left)
+            blocked(&responses).map(|left| now + left)
         };
         let requests = wanted.keys().filter(|key| key.kind == Kind::Request);
         let closed: BTreeMap<_, _> =
             requests.filter_map(|key| Some((key.clone(), left(key)?))).collect();
         wanted.retain(|key, _| !closed.contains_key(key));
         let keys = closed.keys().cloned().collect();
-        self.unanswered.closed = closed;
-        self.unanswered.look.get_or_insert(now + LOOK);
+        self.closed = closed;
+        self.look.get_or_insert(now + LOOK);
         keys
     }
 
-    /// Checks for responses that the peer does not ask for, and asks again for requests whose time is over.
-    pub(super) fn look_at_unanswered(&mut self, with: &PeerContext<'_>, now: Duration) {
-        let closed = self.unanswered.closed.len();
-        self.unanswered.closed.retain(|_, until| *until > now);
-        let is_over = self.unanswered.closed.len() < closed;
-        let looks = self.unanswered.look.is_some_and(|look| look <= now);
-        let mut stalled = false;
-        if looks {
-            let unasked = self.unasked_responses();
-            self.unanswered.look = (!unasked.is_empty()).then(|| now + LOOK);
-            stalled = self.find_unasked_responses(&unasked, with, now);
-        }
-        if is_over || stalled {
-            self.update(with, now);
-        }
+    /// Forgets the request routes whose time is over. Returns whether there were any.
+    pub(in crate::engine::peer) fn reopen(&mut self, now: Duration) -> bool {
+        let closed = self.closed.len();
+        self.closed.retain(|_, until| *until > now);
+        self.closed.len() < closed
     }
 
-    /// Returns the request routes that this host asked for and whose responses the peer has not asked for. A
-    /// request route that the peer refuses to serve is left out.
-    fn unasked_responses(&self) -> BTreeSet<RouteKey> {
-        let requests = self.asked.keys().filter(|key| key.kind == Kind::Request);
-        let unasked = requests.filter(|key| {
-            self.served.number_of(&key.other_way()).is_none() && !self.is_refused(key)
-        });
-        unasked.cloned().collect()
+    /// Returns whether [`check`](Self::check) is due.
+    pub(in crate::engine::peer) fn is_due(&self, now: Duration) -> bool {
+        self.look.is_some_and(|look| look <= now)
     }
 
     /// Finds services whose responses have waited for the limit, and left no room for further ones, without
-    /// being asked for. The peer then counts as not reading them. A peer that asks for the responses for a
-    /// while and takes none continues where it was. Returns whether there was such a service.
-    fn find_unasked_responses(
+    /// being asked for: `unasked` are the requests of such services. The peer then counts as not reading them. A
+    /// peer that asks for the responses for a while and takes none continues where it was. Returns the routes of
+    /// the responses, each with the number of responses that wait.
+    pub(in crate::engine::peer) fn check(
         &mut self,
+        asked: &AskedRoutes,
         unasked: &BTreeSet<RouteKey>,
-        with: &PeerContext<'_>,
+        is_silent: bool,
+        limit: Duration,
         now: Duration,
-    ) -> bool {
-        let before = std::mem::take(&mut self.unanswered.awaited);
-        let limit = with.config.link.stalled;
-        let mut found = false;
-        for (key, asked) in &self.asked {
+    ) -> Vec<(RouteKey, u64)> {
+        self.look = (!unasked.is_empty()).then(|| now + LOOK);
+        let before = std::mem::take(&mut self.awaited);
+        let mut found = Vec::new();
+        for (key, route) in asked.iter() {
             let known = before.get(key).copied();
             if key.kind != Kind::Request || known.is_none() && !unasked.contains(key) {
                 continue;
             }
-            let (waiting, refused) = asked.responses();
+            let (waiting, refused) = route.responses();
             if waiting == 0 {
                 continue;
             }
             let mut awaited = known.unwrap_or(AwaitedResponses { refused, waited: Duration::ZERO });
-            if refused != awaited.refused && unasked.contains(key) && !self.silent {
+            if refused != awaited.refused && unasked.contains(key) && !is_silent {
                 awaited.waited += LOOK;
             }
             if awaited.waited < limit {
-                self.unanswered.awaited.insert(key.clone(), awaited);
+                self.awaited.insert(key.clone(), awaited);
                 continue;
             }
             let responses = key.other_way();
-            with.stalls.borrow_mut().add(&self.identity, &responses, limit, now);
-            self.counters.dropped("stalled", waiting);
-            self.unanswered.stalled.insert(responses);
-            found = true;
+            self.stalled.insert(responses.clone());
+            found.push((responses, waiting));
         }
         found
     }

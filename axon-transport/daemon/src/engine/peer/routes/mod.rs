@@ -1,10 +1,18 @@
 //! Which topics a peer must send here, and under which QoS the engine asks for them on the
-//! other side: plain data in, data out.
+//! other side: plain data in, data out. Beside it the routes that were asked for, served and refused.
+
+pub(in crate::engine::peer) mod asked;
+pub(in crate::engine::peer) mod lanes;
+pub(in crate::engine::peer) mod limits;
+pub(in crate::engine::peer) mod refused;
+pub(in crate::engine::peer) mod served;
+pub(in crate::engine::peer) mod unanswered;
 
 use std::{
     cmp::Reverse,
     collections::{BTreeMap, BTreeSet},
     fmt,
+    time::Duration,
 };
 
 use axon_envelope::Kind;
@@ -19,6 +27,10 @@ use axon_transport::{
 
 use crate::link::RouteSubscriber;
 
+/// The shortest time between two checks of pairs that are being attached.
+const CHECK: Duration = Duration::from_millis(5);
+/// The shortest time for each of these pairs, so that thousands of waiting pairs leave time for samples.
+const CHECK_EACH: Duration = Duration::from_micros(4);
 /// What a route carries: samples, requests or responses, of one name and type.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(crate) struct RouteKey {
@@ -43,7 +55,7 @@ impl fmt::Display for RouteKey {
 
 impl RouteKey {
     /// The key of what `writer` writes; `None` where it writes nothing.
-    pub(super) fn of(writer: &Endpoint) -> Option<Self> {
+    pub(in crate::engine::peer) fn of(writer: &Endpoint) -> Option<Self> {
         let kind = match writer.kind {
             EndpointKind::Publisher => Kind::Topic,
             EndpointKind::Client => Kind::Request,
@@ -68,6 +80,16 @@ impl RouteKey {
         };
         Self { kind, ..self.clone() }
     }
+}
+
+/// Returns what a route carries, from the number in a message.
+pub(in crate::engine::peer) fn kind_of(kind: u8) -> Option<Kind> {
+    [Kind::Topic, Kind::Request, Kind::Response].into_iter().find(|k| *k as u8 == kind)
+}
+
+/// Returns the time until the next check of so many pairs.
+pub(in crate::engine::peer) fn check_after(pairs: usize) -> Duration {
+    CHECK.max(CHECK_EACH * u32::try_from(pairs).unwrap_or(u32::MAX))
 }
 
 /// What one route needs from one peer.
@@ -115,7 +137,7 @@ pub(crate) fn wanted<'a>(
 }
 
 /// Relays for one route.
-pub(super) const MAX_RELAYS_OF_ROUTE: usize = 16;
+pub(in crate::engine::peer) const MAX_RELAYS_OF_ROUTE: usize = 16;
 
 /// One relay subscription that the sending side opens for a topic's route.
 #[derive(Clone, Debug, PartialEq, Eq)]

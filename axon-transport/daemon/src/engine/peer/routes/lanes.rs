@@ -1,0 +1,51 @@
+//! The lanes that a peer's relays and stand-ins take: one for each writer of this host that each of them reads.
+//!
+//! All lanes of all peers are of one session, which has a fixed number of them.
+
+use std::collections::HashMap;
+
+use axon_envelope::Kind;
+
+use axon_transport::graph::Endpoint;
+
+use super::RouteKey;
+use crate::engine::account::Charge;
+
+/// How many writers of this host there are for each route.
+#[derive(Debug, Default)]
+pub(crate) struct WritersHere(HashMap<RouteKey, usize>);
+
+impl WritersHere {
+    /// Counts those among the endpoints of this host.
+    pub(crate) fn of<'a>(local: impl IntoIterator<Item = &'a Endpoint>) -> Self {
+        let mut writers = HashMap::new();
+        for key in local.into_iter().filter_map(RouteKey::of) {
+            *writers.entry(key).or_default() += 1;
+        }
+        Self(writers)
+    }
+
+    /// Those that a relay of this route reads. Not all need match with it.
+    pub(in crate::engine::peer) fn of_route(&self, key: &RouteKey) -> usize {
+        self.0.get(key).copied().unwrap_or(0)
+    }
+
+    /// Those that a stand-in which writes for this route reads: of a topic none, of a service those in the other
+    /// direction.
+    pub(in crate::engine::peer) fn read_by_stand_in(&self, key: &RouteKey) -> usize {
+        if key.kind == Kind::Topic { 0 } else { self.of_route(&key.other_way()) }
+    }
+}
+
+/// Has `charge` count `readers` that take `each` lanes. Returns how many of the readers there is room for.
+pub(in crate::engine::peer) fn fit(charge: &mut Charge, readers: usize, each: usize) -> usize {
+    let mut fitting = readers;
+    while let Some(more @ 1..) = (fitting * each).checked_sub(charge.amount()) {
+        match charge.more(more) {
+            Some(more) => charge.add(more),
+            None => fitting -= 1,
+        }
+    }
+    drop(charge.split(charge.amount().saturating_sub(fitting * each)));
+    fitting
+}
