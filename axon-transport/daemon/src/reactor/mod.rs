@@ -107,6 +107,7 @@ async fn serve(
             qlogs: qlogs.map(|files| Rc::new(files) as Rc<dyn Qlogs>),
             epoch,
             wall: Rc::new(SystemTime::now),
+            seed: rand::random(),
             config,
         },
         rings: rings.clone(),

@@ -4,6 +4,7 @@ use std::{net::IpAddr, time::Duration};
 
 use axon_shm::ids::DaemonId;
 use quinn_proto::{Dir, StreamEvent, VarInt};
+use rand::RngExt;
 
 use super::identity::PeerIdentity;
 use super::{
@@ -138,7 +139,7 @@ impl Links {
             silence: LinkSilence::new(side, now),
         });
         if we_elect {
-            let elected = Elected { link: rand::random(), election: self.next_election };
+            let elected = Elected { link: self.random.random(), election: self.next_election };
             self.next_election += 1;
             self.send(number, &LinkMessage::Elected(elected), now);
             if let Some(peer) = self.table.peer_mut(number) {

@@ -35,6 +35,7 @@ use axon_transport::{
 };
 use bytes::BytesMut;
 use quinn_proto::{Dir, EcnCodepoint, Event, StreamEvent, Transmit, TransportConfig};
+use rand::{SeedableRng, rngs::StdRng};
 
 pub(crate) use self::admission::place;
 pub(super) use self::events::{LinkEvent, LinkReport};
@@ -80,6 +81,8 @@ pub(super) struct Links {
     qlogs: Option<Rc<dyn Qlogs>>,
     epoch: Instant,
     wall: WallClock,
+    /// Gives link ids and the nonces of probes.
+    random: StdRng,
     accounts: Accounts,
     connections: Connections,
     table: Table,
@@ -119,6 +122,8 @@ pub(crate) struct LinkParts {
     pub(crate) epoch: Instant,
     /// The wall clock. It dates the beginnings of links and decides when a pin has ended, and nothing else.
     pub(crate) wall: WallClock,
+    /// The seed of link ids and of the nonces of probes. A daemon takes it from the operating system.
+    pub(crate) seed: [u8; 32],
 }
 
 impl Links {
@@ -144,6 +149,7 @@ impl Links {
             qlogs,
             epoch,
             wall,
+            random: StdRng::from_seed(parts.seed),
             connections: Connections::new(
                 QuicEndpoints::new(&addresses, &endpoint, &server),
                 epoch,

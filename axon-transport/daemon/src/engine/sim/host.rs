@@ -140,6 +140,7 @@ impl Host {
         let resets = Stream::Host { host: self.number as u32, start: 0 };
         let mut endpoint = endpoint_config(&stream(self.seed, resets).random());
         endpoint.rng_seed(Some(random.random()));
+        let links_seed = random.random();
         let identity = match &self.config.security {
             axon_transport::config::Security::Classic(classic) => {
                 Some(Arc::new(Identity::load(classic, "host").unwrap()))
@@ -160,6 +161,7 @@ impl Host {
             endpoint: Arc::new(endpoint),
             qlogs: None,
             epoch: self.epoch,
+            seed: links_seed,
             wall: {
                 let wall = Rc::clone(&self.rings.wall);
                 Rc::new(move || wall.get())

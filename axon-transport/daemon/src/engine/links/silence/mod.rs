@@ -7,6 +7,7 @@ mod watch;
 use std::{net::SocketAddr, time::Duration};
 
 use bytes::BytesMut;
+use rand::RngExt;
 
 use self::watch::ProbeAction;
 pub(super) use self::{
@@ -72,7 +73,7 @@ impl Links {
             };
             let (traffic, daemon) =
                 (Traffic::from(&connection.quic.stats()), peer.summary.hello.daemon);
-            let look = peer.silence.handle_second(traffic, rand::random, now);
+            let look = peer.silence.handle_second(traffic, || self.random.random(), now);
             if look.gone {
                 self.outbox.event(LinkEvent::Silent(daemon));
             }
