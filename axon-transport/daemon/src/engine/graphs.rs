@@ -84,7 +84,7 @@ impl Engine {
         self.freed |= !removed.is_empty();
         let dead = self.taken_over(daemon, &mut added);
         // Before the dead links let go of their stand-ins: rings and readers stay as they are.
-        self.peers.with(daemon, |peer, with| peer.handle_remote_graph(with, now));
+        self.peers.with(daemon, |peer, with| peer.handle_remote_graph(now, with));
         self.end_dead(dead, now);
         let Some(peer) = self.peers.get(daemon) else { return 0 };
         let endpoints = peer.remote.len();
@@ -101,7 +101,7 @@ impl Engine {
             self.links.replace(link, "its host's daemon was restarted", now);
         }
         while let Some(event) = self.links.poll_event() {
-            self.handle_link_event(event, now);
+            self.handle_link_event(now, event);
         }
     }
 

@@ -124,14 +124,14 @@ impl Engine {
     /// Handles a datagram that came to a bound address.
     pub(crate) fn handle_datagram(
         &mut self,
+        now: Duration,
         endpoint: usize,
         from: SocketAddr,
         local: Option<IpAddr>,
         ecn: Option<EcnCodepoint>,
         bytes: BytesMut,
-        now: Duration,
     ) {
-        self.links.handle_datagram(endpoint, from, local, ecn, bytes, now);
+        self.links.handle_datagram(now, endpoint, from, local, ecn, bytes);
     }
 
     /// Whether datagrams of discovery are held, since many came.
@@ -140,7 +140,7 @@ impl Engine {
     }
 
     /// Handles an order of the control plane.
-    pub(crate) fn handle_order(&mut self, order: ToGateway, now: Duration) {
+    pub(crate) fn handle_order(&mut self, now: Duration, order: ToGateway) {
         match order {
             ToGateway::Dial { daemon, sae, addresses, listed, standing } => {
                 // Discovery did not hear yet that it is linked, or that its path works again.
@@ -168,8 +168,8 @@ impl Engine {
     }
 
     /// The graph of this host changed.
-    pub(crate) fn handle_local_graph(&mut self, local: LocalEndpoints, now: Duration) {
-        self.peers.handle_local_graph(local, now);
+    pub(crate) fn handle_local_graph(&mut self, now: Duration, local: LocalEndpoints) {
+        self.peers.handle_local_graph(now, local);
         self.effects.tell_draining(self.peers.are_draining());
     }
 
@@ -185,18 +185,18 @@ impl Engine {
     }
 
     /// The KME answered.
-    pub(crate) fn handle_key_event(&mut self, event: keys::KmeAnswer, now: Duration) {
-        self.links.handle_key_event(event, now);
+    pub(crate) fn handle_key_event(&mut self, now: Duration, event: keys::KmeAnswer) {
+        self.links.handle_key_event(now, event);
     }
 
     /// The ledger of used keys recorded the key of a connection; `first` if it was new.
-    pub(crate) fn handle_recorded(&mut self, link: u64, first: bool, now: Duration) {
-        self.links.handle_recorded(link, first, now);
+    pub(crate) fn handle_recorded(&mut self, now: Duration, link: u64, first: bool) {
+        self.links.handle_recorded(now, link, first);
     }
 
     /// A sample was compressed, or does not become shorter.
-    pub(crate) fn handle_compressed(&mut self, answer: CompressionAnswer, now: Duration) {
-        for asker in self.factory.compression().handle_answer(&answer, now) {
+    pub(crate) fn handle_compressed(&mut self, now: Duration, answer: CompressionAnswer) {
+        for asker in self.factory.compression().handle_answer(now, &answer) {
             if let Some(peer) = self.peers.get_mut(asker.daemon) {
                 let frame = answer.compressed.clone();
                 peer.outbound.handle_compressed(asker.flow, answer.number, frame);
@@ -222,7 +222,7 @@ impl Engine {
             let mut idle = true;
             while let Some(event) = self.links.poll_event() {
                 idle = false;
-                self.handle_link_event(event, now);
+                self.handle_link_event(now, event);
             }
             self.follow_graphs(now);
             if left > 0 {
@@ -247,7 +247,7 @@ impl Engine {
         self.collect(now);
     }
 
-    fn handle_link_event(&mut self, event: LinkEvent, now: Duration) {
+    fn handle_link_event(&mut self, now: Duration, event: LinkEvent) {
         match event {
             LinkEvent::Up { number, daemon, old, closed } => {
                 self.link_up(number, daemon, old, now);
@@ -258,13 +258,13 @@ impl Engine {
                 self.reports.hurry(now);
                 // Streams that the peer opened before this host knew it: QUIC told of them once.
                 let opened = StreamEvent::Opened { dir: Dir::Uni };
-                self.handle_stream(number, daemon, opened, now);
+                self.handle_stream(now, number, daemon, opened);
             }
             LinkEvent::Message(number, daemon, message, _room) => {
-                self.handle_message(number, daemon, message, now);
+                self.handle_message(now, number, daemon, message);
             }
             LinkEvent::Stream(number, daemon, event) => {
-                self.handle_stream(number, daemon, event, now)
+                self.handle_stream(now, number, daemon, event)
             }
             LinkEvent::Keys(daemon) => {
                 if let Some(peer) = self.peers.get_mut(daemon) {
@@ -350,10 +350,10 @@ impl Engine {
 
     fn handle_message(
         &mut self,
+        now: Duration,
         number: u64,
         daemon: DaemonId,
         message: LinkMessage,
-        now: Duration,
     ) {
         let Some(peer) = self.peers.get_mut(daemon).filter(|peer| peer.link == number) else {
             return;
@@ -383,7 +383,7 @@ impl Engine {
                     self.take_over_route(daemon, asks, now);
                 }
                 let handled =
-                    self.peers.with(daemon, |p, with| p.handle_message(message, with, now));
+                    self.peers.with(daemon, |p, with| p.handle_message(now, message, with));
                 if let Some(Err((code, why))) = handled {
                     self.links.violation(number, code, &why, now);
                 }
@@ -424,11 +424,11 @@ impl Engine {
             }
         }
         for (daemon, event) in events {
-            self.handle_outbound_event(daemon, event, now);
+            self.handle_outbound_event(now, daemon, event);
         }
     }
 
-    fn handle_outbound_event(&mut self, daemon: DaemonId, event: OutboundEvent, now: Duration) {
+    fn handle_outbound_event(&mut self, now: Duration, daemon: DaemonId, event: OutboundEvent) {
         match event {
             OutboundEvent::Drained(gid) => {
                 self.peers.with(daemon, |peer, with| peer.handle_drained(&gid, with.local));
@@ -440,7 +440,7 @@ impl Engine {
             OutboundEvent::Stalled(route, why) => {
                 let Some(Some(stalled)) = self
                     .peers
-                    .with(daemon, |peer, with| peer.handle_stalled(route, why, with, now))
+                    .with(daemon, |peer, with| peer.handle_stalled(now, route, why, with))
                 else {
                     return;
                 };
@@ -488,7 +488,7 @@ impl Engine {
             }
             let heard = self.links.heard(peer.link);
             let mut carrier = self.links.carrier(peer.link, now);
-            peer.outbound.handle_timeout(carrier.as_mut(), heard, now);
+            peer.outbound.handle_timeout(now, carrier.as_mut(), heard);
             self.links.touch(peer.link);
         }
         if self.reports.take_due(now) {

@@ -133,13 +133,13 @@ impl LinkedPeers {
     }
 
     /// The graph of this host changed.
-    pub(super) fn handle_local_graph(&mut self, local: LocalEndpoints, now: Duration) {
+    pub(super) fn handle_local_graph(&mut self, now: Duration, local: LocalEndpoints) {
         self.writers = WritersHere::of(local.values().map(|(endpoint, _)| &**endpoint));
         self.local = local;
         let endpoints = self.all.values().map(|peer| peer.remote.len() + self.local.len());
         let took = ENDPOINT * u32::try_from(endpoints.sum::<usize>()).unwrap_or(u32::MAX);
         self.follow_local_at = now + (OTHERS * took).min(LONGEST_PAUSE);
-        self.with_each(|peer, with| peer.handle_local_graph(with, now));
+        self.with_each(|peer, with| peer.handle_local_graph(now, with));
     }
 
     /// When the graph of this host should be followed next. What changes until then is followed together.
@@ -152,7 +152,7 @@ impl LinkedPeers {
         let mut active = std::mem::take(&mut self.active);
         self.rings.take_active(&mut active);
         for peer in self.all.values_mut() {
-            peer.outbound.handle_active(&active, now);
+            peer.outbound.handle_active(now, &active);
             peer.inbound.handle_room();
         }
         active.clear();
@@ -208,7 +208,7 @@ impl LinkedPeers {
         self.with_each(|peer, with| {
             peer.inbound.handle_timeout(now);
             if peer.poll_timeout(now).is_some_and(|due| due <= now) {
-                peer.handle_timeout(with, now);
+                peer.handle_timeout(now, with);
             }
         });
     }

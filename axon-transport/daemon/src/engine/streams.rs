@@ -11,10 +11,10 @@ use crate::link::CloseCode;
 impl Engine {
     pub(super) fn handle_stream(
         &mut self,
+        now: Duration,
         number: u64,
         daemon: DaemonId,
         event: StreamEvent,
-        now: Duration,
     ) {
         let Some(peer) = self.peers.get_mut(daemon) else { return };
         let in_use = peer.link == number;
@@ -38,7 +38,7 @@ impl Engine {
                 let Some(connection) = self.links.connection(number) else { return };
                 let Some(flow) = connection.flows.remove(&id) else { return };
                 if in_use {
-                    peer.outbound.handle_finished(flow, id, &mut connection.quic, now);
+                    peer.outbound.handle_finished(now, flow, id, &mut connection.quic);
                 }
             }
             StreamEvent::Stopped { id, .. } if in_use => {

@@ -143,7 +143,7 @@ impl Reactor {
     /// The control plane dropped the gateway's session.
     pub(super) async fn run(mut self) -> Result<(), GatewayError> {
         let local = local_graph(&self.session);
-        self.engine.handle_local_graph(local, self.now());
+        self.engine.handle_local_graph(self.now(), local);
         while !self.shutdown && !self.notices.is_lost() {
             let busy = self.pass();
             if self.shutdown {
@@ -189,7 +189,7 @@ impl Reactor {
                 break;
             }
             for answer in std::mem::take(&mut self.answers) {
-                self.engine.handle_key_event(answer, now);
+                self.engine.handle_key_event(now, answer);
             }
         }
         busy |= self.transmit(now);
@@ -205,7 +205,7 @@ impl Reactor {
             let (any, drained) = self.sockets.receive(|datagram| {
                 let ReceivedDatagram { socket, from, local, ecn, bytes } = datagram;
                 of_quic |= !bytes.first().is_some_and(|first| is_discovery(*first));
-                engine.handle_datagram(socket, from, local, ecn, bytes, now);
+                engine.handle_datagram(now, socket, from, local, ecn, bytes);
             });
             self.is_flooded = any && drained && !of_quic && engine.holds_discovery();
             busy |= any && !self.is_flooded;
@@ -213,14 +213,14 @@ impl Reactor {
         for input in self.inputs.take() {
             busy = true;
             match input {
-                ReactorInput::Order(order) => self.handle_order(order, now),
-                ReactorInput::Key(event) => self.engine.handle_key_event(event, now),
-                ReactorInput::Done(done) => self.handle_done(done, now),
+                ReactorInput::Order(order) => self.handle_order(now, order),
+                ReactorInput::Key(event) => self.engine.handle_key_event(now, event),
+                ReactorInput::Done(done) => self.handle_done(now, done),
             }
         }
         if self.engine.follow_local_at() <= now && self.notices.take_graph() {
             let local = local_graph(&self.session);
-            self.engine.handle_local_graph(local, now);
+            self.engine.handle_local_graph(now, local);
             busy = true;
         }
         if self.inputs.take_ring() {
@@ -231,22 +231,22 @@ impl Reactor {
         busy
     }
 
-    fn handle_order(&mut self, order: ToGateway, now: Duration) {
+    fn handle_order(&mut self, now: Duration, order: ToGateway) {
         match order {
             ToGateway::Shutdown => self.shutdown = true,
             ToGateway::Finish => {
                 self.finishing.get_or_insert_with(|| Finishing::new(now));
             }
-            order => self.engine.handle_order(order, now),
+            order => self.engine.handle_order(now, order),
         }
     }
 
-    fn handle_done(&mut self, done: TaskResult, now: Duration) {
+    fn handle_done(&mut self, now: Duration, done: TaskResult) {
         match done {
-            TaskResult::Recorded(link, first) => self.engine.handle_recorded(link, first, now),
+            TaskResult::Recorded(link, first) => self.engine.handle_recorded(now, link, first),
             TaskResult::Identity => self.engine.handle_identity(now),
             TaskResult::Interfaces(interfaces) => self.engine.handle_interfaces(interfaces),
-            TaskResult::Compressed(answer) => self.engine.handle_compressed(answer, now),
+            TaskResult::Compressed(answer) => self.engine.handle_compressed(now, answer),
             TaskResult::Keys(statistics) => {
                 self.key_reports.handle_report();
                 let (kme, used) = *statistics;
@@ -284,7 +284,7 @@ impl Reactor {
 
     fn record(&mut self, link: u64, key_id: String, now: Duration) {
         let Some((_, used)) = &self.kme else {
-            return self.engine.handle_recorded(link, false, now);
+            return self.engine.handle_recorded(now, link, false);
         };
         let (used, report) = (used.clone(), self.report_done.clone());
         spawn_blocking(move || {

@@ -26,11 +26,11 @@ impl LinkRate {
     /// A pass ended in which QUIC did not take all that there was, if the link `is_full`.
     pub(crate) fn handle_pass(
         &mut self,
+        now: Duration,
         is_full: bool,
         left: impl Fn() -> u64,
         window: u64,
         rtt: Duration,
-        now: Duration,
     ) {
         if !is_full {
             (self.begun, self.before) = (None, 0.0);
@@ -76,7 +76,7 @@ mod tests {
     /// A link that is full from this time on and carries so many bytes in each of so many milliseconds.
     fn run(rate: &mut LinkRate, from: u64, time: u64, left: &mut u64, each: u64) {
         for at in from..=from + time {
-            rate.handle_pass(true, || *left, WINDOW, RTT, ms(at));
+            rate.handle_pass(ms(at), true, || *left, WINDOW, RTT);
             *left += each;
         }
     }
@@ -101,7 +101,7 @@ mod tests {
     fn a_link_that_takes_all_is_not_measured() {
         let mut rate = LinkRate::default();
         for at in 0..1_000 {
-            rate.handle_pass(at % 40 != 0, || at * 1_000, WINDOW, RTT, ms(at));
+            rate.handle_pass(ms(at), at % 40 != 0, || at * 1_000, WINDOW, RTT);
         }
         assert_eq!(rate.get(ms(1_000)), None);
     }
@@ -131,10 +131,10 @@ mod tests {
     #[test]
     fn a_long_path_takes_a_longer_measure() {
         let (mut rate, rtt, window) = (LinkRate::default(), ms(100), 250_000);
-        let mut pass = |at| rate.handle_pass(true, || at * 2_500, window, rtt, ms(at));
+        let mut pass = |at| rate.handle_pass(ms(at), true, || at * 2_500, window, rtt);
         [0, 399, 400, 799].into_iter().for_each(&mut pass);
         assert_eq!(rate.get(ms(799)), None);
-        rate.handle_pass(true, || 800 * 2_500, window, rtt, ms(800));
+        rate.handle_pass(ms(800), true, || 800 * 2_500, window, rtt);
         assert_eq!(rate.get(ms(800)), Some(2.5e6));
     }
 
@@ -142,7 +142,7 @@ mod tests {
     fn a_rate_is_forgotten_once_the_link_was_not_full_for_long() {
         let (mut rate, mut left) = (LinkRate::default(), 0);
         run(&mut rate, 0, 100, &mut left, 1_000);
-        rate.handle_pass(false, || left, WINDOW, RTT, ms(101));
+        rate.handle_pass(ms(101), false, || left, WINDOW, RTT);
         assert_eq!(rate.get(ms(30_099)), Some(1e6));
         assert_eq!(rate.get(ms(30_100)), None);
     }

@@ -249,7 +249,7 @@ impl Compression {
     }
 
     /// The owner answers an order. Returns the flows that asked.
-    pub(crate) fn handle_answer(&self, answer: &CompressionAnswer, now: Duration) -> Vec<Asker> {
+    pub(crate) fn handle_answer(&self, now: Duration, answer: &CompressionAnswer) -> Vec<Asker> {
         let mut state = self.0.borrow_mut();
         state.used = now;
         let Some(PendingOrder { name, length, askers }) = state.pending.remove(&answer.number)

@@ -83,7 +83,7 @@ fn the_speed_of_the_compressor_counts() {
             };
             let took = Duration::from_secs_f64(payload.len() as f64 / speed);
             let answer = CompressionAnswer { number, compressed: None, took };
-            assert_eq!(compression.handle_answer(&answer, NOW), [asker(1)]);
+            assert_eq!(compression.handle_answer(NOW, &answer), [asker(1)]);
         }
     };
     run(1e9);
@@ -112,9 +112,9 @@ fn a_sample_of_a_topic_is_compressed_once_for_all_peers() {
         compressed: compressed.clone(),
         took: Duration::from_micros(20),
     };
-    assert_eq!(compression.handle_answer(&answer(1), NOW), [asker(1), asker(2)]);
-    assert_eq!(compression.handle_answer(&answer(1), NOW), [], "it comes once");
-    assert_eq!(compression.handle_answer(&answer(9), NOW), [], "nobody asked");
+    assert_eq!(compression.handle_answer(NOW, &answer(1)), [asker(1), asker(2)]);
+    assert_eq!(compression.handle_answer(NOW, &answer(1)), [], "it comes once");
+    assert_eq!(compression.handle_answer(NOW, &answer(9)), [], "nobody asked");
     assert_eq!(
         compression.ask(asker(3), name(1), &payload),
         Some(CompressionReply::Known(compressed))
@@ -130,7 +130,7 @@ fn what_is_not_worth_it_is_not_tried_for_another_peer() {
     let payload = noise(10_000);
     assert_eq!(compression.ask(asker(1), name(1), &payload), later(1));
     let answer = CompressionAnswer { number: 1, compressed: None, took: Duration::ZERO };
-    compression.handle_answer(&answer, NOW);
+    compression.handle_answer(NOW, &answer);
     assert_eq!(compression.ask(asker(2), name(1), &payload), Some(CompressionReply::Known(None)));
 }
 
@@ -141,8 +141,8 @@ fn orders_and_answers_that_are_kept_take_bounded_memory() {
     assert_eq!(compression.ask(asker(1), None, &long), later(1), "one of any length");
     assert_eq!(compression.ask(asker(1), None, &text(SHORTEST)), None);
     compression.handle_answer(
-        &CompressionAnswer { number: 1, compressed: None, took: Duration::ZERO },
         NOW,
+        &CompressionAnswer { number: 1, compressed: None, took: Duration::ZERO },
     );
     let payload = noise(1 << 20);
     for number in 1..=100 {
@@ -153,8 +153,8 @@ fn orders_and_answers_that_are_kept_take_bounded_memory() {
         };
         let compressed = Some(payload.slice(..700_000));
         compression.handle_answer(
-            &CompressionAnswer { number: order, compressed, took: Duration::ZERO },
             NOW,
+            &CompressionAnswer { number: order, compressed, took: Duration::ZERO },
         );
     }
     let state = compression.0.borrow();
@@ -168,8 +168,8 @@ fn orders_and_answers_that_are_kept_take_bounded_memory() {
             panic!("there is room")
         };
         compression.handle_answer(
-            &CompressionAnswer { number: order, compressed: None, took: Duration::ZERO },
             NOW,
+            &CompressionAnswer { number: order, compressed: None, took: Duration::ZERO },
         );
     }
     assert_eq!(compression.0.borrow().kept.len(), KEPT / SHORTEST);

@@ -103,12 +103,12 @@ impl Connections {
     /// Handles a QUIC datagram. Returns the connection that the datagram opens, if it opens one.
     pub(super) fn handle_datagram(
         &mut self,
+        now: Instant,
         endpoint: usize,
         from: SocketAddr,
         local: Option<IpAddr>,
         ecn: Option<EcnCodepoint>,
         bytes: BytesMut,
-        now: Instant,
     ) -> Option<Incoming> {
         match self.endpoints.handle(now, endpoint, from, local, ecn, bytes) {
             EndpointInput::Connection(handle, event) => {

@@ -17,14 +17,14 @@ impl Links {
         let mut any = false;
         while let Some((number, reason)) = self.unfinished.poll_lost() {
             any = true;
-            self.handle_lost(number, &reason, now);
+            self.handle_lost(now, number, &reason);
             self.connections.touch(number);
         }
         any
     }
 
     /// Handles the loss of a connection.
-    pub(super) fn handle_lost(&mut self, number: u64, reason: &ConnectionError, now: Duration) {
+    pub(super) fn handle_lost(&mut self, now: Duration, number: u64, reason: &ConnectionError) {
         let Some(link) = self.table.get_mut(number) else { return };
         match &mut link.phase {
             LinkPhase::Handshake(_, Some(dial)) => {

@@ -35,7 +35,7 @@ impl Links {
     }
 
     /// The KME answered, or the ledger of used keys.
-    pub(in crate::engine) fn handle_key_event(&mut self, event: keys::KmeAnswer, now: Duration) {
+    pub(in crate::engine) fn handle_key_event(&mut self, now: Duration, event: keys::KmeAnswer) {
         let Some(keyring) = &mut self.keyring else { return };
         match keyring.handle_answer(now, event) {
             Answered::Here => {}
@@ -50,7 +50,7 @@ impl Links {
     }
 
     /// The ledger of used keys recorded the key of a connection; `first` if it was new.
-    pub(in crate::engine) fn handle_recorded(&mut self, number: u64, first: bool, now: Duration) {
+    pub(in crate::engine) fn handle_recorded(&mut self, now: Duration, number: u64, first: bool) {
         if let Some(opening) = self.table.opening_mut(number) {
             opening.handle_recorded(now, first, self.keyring.as_mut());
             self.go_on_opening(number, now);

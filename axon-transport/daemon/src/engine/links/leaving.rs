@@ -126,7 +126,7 @@ impl Links {
         let silent = link.peer.as_ref().is_some_and(|peer| peer.silence.is_silent());
         let LinkPhase::Leaving(leaving) = &mut link.phase else { return };
         let sent = all_is_sent(&mut connection.quic);
-        match leaving.handle_progress(HandOverProgress { silent, sent, reading }, now) {
+        match leaving.handle_progress(now, HandOverProgress { silent, sent, reading }) {
             HandOverStep::Wait => {}
             HandOverStep::Finish => {
                 connection.control.finish();

@@ -180,22 +180,22 @@ impl Links {
     /// Handles a datagram that arrived at an endpoint.
     pub(super) fn handle_datagram(
         &mut self,
+        now: Duration,
         endpoint: usize,
         from: SocketAddr,
         local: Option<IpAddr>,
         ecn: Option<EcnCodepoint>,
         bytes: BytesMut,
-        now: Duration,
     ) {
         if bytes.first().is_some_and(|first| is_discovery(*first)) {
-            return self.handle_discovery(from, bytes, now);
+            return self.handle_discovery(now, from, bytes);
         }
         if let Some(keyring) = &self.keyring {
             keyring.set_time(now);
         }
         self.credentials.set_time(now);
         let instant = self.instant(now);
-        let incoming = self.connections.handle_datagram(endpoint, from, local, ecn, bytes, instant);
+        let incoming = self.connections.handle_datagram(instant, endpoint, from, local, ecn, bytes);
         if let Some(incoming) = incoming {
             self.accept(endpoint, incoming, now);
         }
@@ -251,14 +251,14 @@ impl Links {
         loop {
             let Some(connection) = self.connections.get_mut(number) else { return };
             match connection.quic.poll() {
-                Some(Event::Connected) => self.handle_connected(number, now),
+                Some(Event::Connected) => self.handle_connected(now, number),
                 Some(Event::ConnectionLost { reason }) => {
                     self.read_control(number, now);
                     match self.table.get(number) {
                         Some(Link { peer: Some(_), .. }) => {
                             self.unfinished.add_lost(number, reason)
                         }
-                        _ => self.handle_lost(number, &reason, now),
+                        _ => self.handle_lost(now, number, &reason),
                     }
                 }
                 Some(Event::Stream(event)) => self.handle_stream(number, event),
@@ -320,11 +320,11 @@ impl Links {
             let owe = |cost| account.as_ref().map_or(Duration::ZERO, |a| a.owe(cost, now));
             match connection.control.read(&mut connection.quic, owe, now) {
                 Ok(ControlInput::Message(message, room)) => {
-                    self.handle_message(number, *message, room, now);
+                    self.handle_message(now, number, *message, room);
                 }
                 Ok(ControlInput::Nothing) => return,
                 Ok(ControlInput::NoRoom) => return self.unfinished.add_blocked(number),
-                Err(error) => return self.handle_control_error(number, error, now),
+                Err(error) => return self.handle_control_error(now, number, error),
             }
             // Each message is handled before the next one is decoded, so that a peer fills no queue here.
             if self.outbox.has_events() {
@@ -333,7 +333,7 @@ impl Links {
         }
     }
 
-    fn handle_control_error(&mut self, number: u64, error: ControlError, now: Duration) {
+    fn handle_control_error(&mut self, now: Duration, number: u64, error: ControlError) {
         let Some(link) = self.table.get_mut(number) else { return };
         if let LinkPhase::Opening(opening) = &mut link.phase {
             match error {
@@ -357,10 +357,10 @@ impl Links {
 
     fn handle_message(
         &mut self,
+        now: Duration,
         number: u64,
         message: LinkMessage,
         room: Option<Charge>,
-        now: Duration,
     ) {
         let Some(link) = self.table.get_mut(number) else { return };
         if let LinkPhase::Opening(opening) = &mut link.phase {

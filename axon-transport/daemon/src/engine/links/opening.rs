@@ -101,7 +101,7 @@ impl Links {
     }
 
     /// The TLS handshake of a connection is complete.
-    pub(super) fn handle_connected(&mut self, number: u64, now: Duration) {
+    pub(super) fn handle_connected(&mut self, now: Duration, number: u64) {
         let Some(link) = self.table.get_mut(number) else { return };
         let LinkPhase::Handshake(_, dial) = link.phase else { return };
         match dial {

@@ -176,7 +176,7 @@ impl Outbound {
 
     /// Takes in samples that may wait at these sources, each with its writer. Sources of other peers may be
     /// in the list.
-    pub(crate) fn handle_active(&mut self, active: &[(Gid, Gid)], now: Duration) {
+    pub(crate) fn handle_active(&mut self, now: Duration, active: &[(Gid, Gid)]) {
         for (source, writer) in active {
             let Some((number, source)) = self.table.routes.of_source(source) else { continue };
             for of in source.with_data_of(writer) {
@@ -253,7 +253,7 @@ impl Outbound {
 
     /// Handles the end of a publisher: its remaining samples are sent. Then [`OutboundEvent::Drained`]
     /// follows.
-    pub(crate) fn handle_publisher_ended(&mut self, number: u32, publisher: Gid, now: Duration) {
+    pub(crate) fn handle_publisher_ended(&mut self, now: Duration, number: u32, publisher: Gid) {
         self.endings.add(number, publisher, now);
     }
 
@@ -298,7 +298,7 @@ impl Outbound {
             served.done(flow.info.of, done);
             let taken = carrier.taken - before;
             if carrier.loses && taken > 0 {
-                self.pings.handle_sent(turn.flow, carrier.quic.rtt(), now);
+                self.pings.handle_sent(now, turn.flow, carrier.quic.rtt());
             }
             self.turns.handle_sent(turn, taken);
             if flow.is_held() {
@@ -313,7 +313,7 @@ impl Outbound {
                 blocked = Some(blocked.map_or(limit, |least: u64| least.min(limit)));
             }
             self.table.flows.note_timer(turn.flow);
-            self.turns.handle_over(turn, pause, &mut self.table.flows, now);
+            self.turns.handle_over(now, turn, pause, &mut self.table.flows);
             carrier.closed_from = self.turns.closed_from();
         }
         self.table.flows.finish_idle_streams(self.turns.take_wanted_streams(), carrier);
@@ -355,13 +355,13 @@ impl Outbound {
     /// Handles the acknowledgement of a complete stream by the peer's QUIC.
     pub(crate) fn handle_finished(
         &mut self,
+        now: Duration,
         id: FlowId,
         stream: StreamId,
         quic: &mut quinn_proto::Connection,
-        now: Duration,
     ) {
         if let Some(flow) = self.table.flows.get_mut(id) {
-            flow.handle_finished(stream, quic, &self.counters, now);
+            flow.handle_finished(now, stream, quic, &self.counters);
             flow.blocked = false;
             self.schedule(id);
         }
@@ -439,14 +439,14 @@ impl Outbound {
     /// there are no keys for the link.
     pub(crate) fn handle_timeout(
         &mut self,
+        now: Duration,
         mut carrier: Option<&mut Carrier<'_>>,
         heard: u64,
-        now: Duration,
     ) {
         while let Some(id) = self.table.flows.take_due(now) {
             let Some((flow, served)) = self.table.get_mut(id) else { continue };
             match carrier.as_deref_mut() {
-                Some(carrier) => flow.handle_timeout(carrier, &self.counters, now),
+                Some(carrier) => flow.handle_timeout(now, carrier, &self.counters),
                 None => flow.timer = Some(now + NO_CARRIER),
             }
             // The publisher of an idle flow may be gone.
@@ -458,11 +458,11 @@ impl Outbound {
             self.table.flows.note_timer(id);
             self.schedule(id);
         }
-        self.turns.handle_timeout(&self.table.flows, now);
+        self.turns.handle_timeout(now, &self.table.flows);
         let rtt = carrier.as_deref().map_or(NO_CARRIER, |carrier| carrier.quic.rtt());
         let lacks_keys = carrier.as_deref().is_some_and(|carrier| carrier.seal.lacks_keys_of_kme());
         let is_on_the_way = |id| self.table.flows.get(id).is_some_and(Flow::is_on_the_way);
-        if self.pings.handle_timeout(rtt, now, is_on_the_way)
+        if self.pings.handle_timeout(now, rtt, is_on_the_way)
             && let Some(carrier) = carrier
         {
             carrier.quic.ping();
@@ -511,7 +511,7 @@ impl Outbound {
             .table
             .busy()
             .map(|flow| BusyFlow { lacks_keys: lacks_keys && !flow.uses_credit, ..flow });
-        let found = self.stalls.handle_timeout(peer, busy, now);
+        let found = self.stalls.handle_timeout(now, peer, busy);
         for (number, why) in found.stalled {
             if let Some(served) = self.table.routes.get_mut(number) {
                 served.stalled = true;

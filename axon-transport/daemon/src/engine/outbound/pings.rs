@@ -26,7 +26,7 @@ pub(super) struct Pings {
 
 impl Pings {
     /// A flow sent samples over a link that loses packets.
-    pub(super) fn handle_sent(&mut self, flow: FlowId, rtt: Duration, now: Duration) {
+    pub(super) fn handle_sent(&mut self, now: Duration, flow: FlowId, rtt: Duration) {
         self.flows.insert(flow, 0);
         self.sent = true;
         self.due.get_or_insert(now + LEAST.max(rtt / 2));
@@ -45,8 +45,8 @@ impl Pings {
     /// Whether a PING is to be sent now. `on_the_way` says whether a flow still has samples on the way.
     pub(super) fn handle_timeout(
         &mut self,
-        rtt: Duration,
         now: Duration,
+        rtt: Duration,
         on_the_way: impl Fn(FlowId) -> bool,
     ) -> bool {
         if self.due.is_none_or(|due| due > now) {
@@ -72,7 +72,7 @@ mod tests {
     fn count(pings: &mut Pings, on_the_way: impl Fn(Duration) -> bool) -> u32 {
         let mut sent = 0;
         while let Some(now) = pings.poll_timeout() {
-            sent += u32::from(pings.handle_timeout(RTT, now, |_| on_the_way(now)));
+            sent += u32::from(pings.handle_timeout(now, RTT, |_| on_the_way(now)));
         }
         sent
     }
@@ -81,11 +81,11 @@ mod tests {
     fn pings_follow_samples_until_they_have_arrived() {
         let mut pings = Pings::default();
         assert_eq!(pings.poll_timeout(), None);
-        pings.handle_sent(7, RTT, Duration::ZERO);
+        pings.handle_sent(Duration::ZERO, 7, RTT);
         assert_eq!(pings.poll_timeout(), Some(LEAST));
         // At 3 ms the sample itself had just been sent; then there are PINGs at 6, 9 and 12 ms.
         assert_eq!(count(&mut pings, |now| now < Duration::from_millis(15)), 3);
-        pings.handle_sent(7, RTT, Duration::ZERO);
+        pings.handle_sent(Duration::ZERO, 7, RTT);
         pings.forget(7);
         assert_eq!(count(&mut pings, |_| true), 0);
     }
@@ -93,7 +93,7 @@ mod tests {
     #[test]
     fn pings_end_where_nothing_says_that_a_sample_arrived() {
         let mut pings = Pings::default();
-        pings.handle_sent(7, RTT, Duration::ZERO);
+        pings.handle_sent(Duration::ZERO, 7, RTT);
         assert_eq!(count(&mut pings, |_| true), u32::from(MOST) - 1);
     }
 
@@ -102,8 +102,8 @@ mod tests {
         let mut pings = Pings::default();
         for time in 0..100 {
             let now = Duration::from_millis(time);
-            pings.handle_sent(7, RTT, now);
-            assert!(!pings.handle_timeout(RTT, now, |_| true), "{time}");
+            pings.handle_sent(now, 7, RTT);
+            assert!(!pings.handle_timeout(now, RTT, |_| true), "{time}");
         }
     }
 }

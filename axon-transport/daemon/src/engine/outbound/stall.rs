@@ -218,9 +218,9 @@ impl FlowStalls {
     /// Checks the busy flows if that is due.
     pub(super) fn handle_timeout(
         &mut self,
+        now: Duration,
         peer: PeerActivity,
         busy: impl Iterator<Item = BusyFlow>,
-        now: Duration,
     ) -> StallReport {
         let mut found = StallReport::default();
         if now < self.next {

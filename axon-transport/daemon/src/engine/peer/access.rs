@@ -194,9 +194,9 @@ impl PeerAccess {
     /// Handles the peer's report about uses that its host denies. Returns the uses that are no longer denied.
     pub(super) fn handle_denied(
         &mut self,
+        now: Duration,
         peer: DaemonId,
         denied: DeniedUses,
-        now: Duration,
     ) -> Vec<AccessUse> {
         let used = |of: DeniedUse| (VERBS[usize::from(of.verb.min(3))], of.name);
         for mut denied in denied.denied {

@@ -264,11 +264,11 @@ impl Peer {
     }
 
     /// Records that the peer refuses a route.
-    pub(super) fn handle_route_refused(&mut self, refused: RouteRefused, now: Duration) {
+    pub(super) fn handle_route_refused(&mut self, now: Duration, refused: RouteRefused) {
         let RouteRefused { route, reason, retry_s } = refused;
         let Some(key) = self.asked.key_of(route).cloned() else { return };
         let again = retry_s.map(|seconds| now + Duration::from_secs(seconds.into()));
-        self.refused.handle_unserved(key, &reason, again, now);
+        self.refused.handle_unserved(now, key, &reason, again);
     }
 
     /// Records that the peer serves a route.

@@ -201,9 +201,9 @@ impl Peer {
     /// The peer violated the protocol.
     pub(super) fn handle_message(
         &mut self,
+        now: Duration,
         message: LinkMessage,
         with: &PeerContext<'_>,
-        now: Duration,
     ) -> Result<(), (CloseCode, String)> {
         match message {
             LinkMessage::GraphResync(_) => self.resync(with.local, now),
@@ -224,16 +224,16 @@ impl Peer {
             LinkMessage::Asserted(asserted) => self.handle_asserted(&asserted),
             LinkMessage::Intake(intake) => self.outbound.set_intake(&intake),
             LinkMessage::Received(received) => self.outbound.handle_received(&received.flows),
-            LinkMessage::RouteRefused(refused) => self.handle_route_refused(refused, now),
+            LinkMessage::RouteRefused(refused) => self.handle_route_refused(now, refused),
             LinkMessage::Denied(denied) => {
-                let allowed = self.access.handle_denied(self.daemon, denied, now);
+                let allowed = self.access.handle_denied(now, self.daemon, denied);
                 self.ask_for_allowed(&allowed);
             }
             LinkMessage::AccessCheck(check) => {
                 let answer = self.access.answer(&check);
                 self.say(answer);
             }
-            LinkMessage::RouteUnasked(unasked) => self.refused.handle_route_unasked(unasked, now),
+            LinkMessage::RouteUnasked(unasked) => self.refused.handle_route_unasked(now, unasked),
             LinkMessage::RouteReady(ready) => {
                 self.handle_route_ready(ready.route);
                 tracing::debug!(peer = %self.daemon, route = ready.route,
@@ -309,7 +309,7 @@ impl Peer {
     }
 
     /// Handles a change of this host's graph: sends it to the peer and updates the routes.
-    pub(super) fn handle_local_graph(&mut self, with: &PeerContext<'_>, now: Duration) {
+    pub(super) fn handle_local_graph(&mut self, now: Duration, with: &PeerContext<'_>) {
         self.keep_ending(with.local, now);
         self.fit_relays(with, now);
         self.fit_stand_ins(with, now);
@@ -328,7 +328,7 @@ impl Peer {
             Some((carried(gid, &publisher.endpoint)?, *gid, publisher.clone()))
         });
         for (number, gid, publisher) in ended.collect::<Vec<_>>() {
-            self.outbound.handle_publisher_ended(number, gid, now);
+            self.outbound.handle_publisher_ended(now, number, gid);
             self.local_graph.keep(gid, publisher);
         }
     }
@@ -377,7 +377,7 @@ impl Peer {
     }
 
     /// Handles a change of the peer's graph.
-    pub(super) fn handle_remote_graph(&mut self, with: &PeerContext<'_>, now: Duration) {
+    pub(super) fn handle_remote_graph(&mut self, now: Duration, with: &PeerContext<'_>) {
         self.tell_denied(now);
         // A session of the peer may now list this host, or list it no longer.
         self.send_graph(with.local, false);
@@ -428,7 +428,7 @@ impl Peer {
     }
 
     /// Does the work that is due.
-    pub(super) fn handle_timeout(&mut self, with: &PeerContext<'_>, now: Duration) {
+    pub(super) fn handle_timeout(&mut self, now: Duration, with: &PeerContext<'_>) {
         self.ask_for_attached(now);
         self.announce_ready(now);
         self.tell_alive(now);
@@ -447,10 +447,10 @@ impl Peer {
     /// Gives up a route that the peer does not read.
     pub(super) fn handle_stalled(
         &mut self,
+        now: Duration,
         route: u32,
         why: StallCause,
         with: &PeerContext<'_>,
-        now: Duration,
     ) -> Option<StalledRoute> {
         let key = self.served.get(route)?.key.clone();
         let stalled = self.give_up_stalled(route, why, with, now)?;

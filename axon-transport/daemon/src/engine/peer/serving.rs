@@ -137,7 +137,7 @@ impl Peer {
         let adopted = sources.iter().filter(|source| adopted.contains(&source.gid()));
         for of in adopted.flat_map(Source::unacknowledged).map(|(of, _)| of) {
             if !with.local.contains_key(&of) {
-                self.outbound.handle_publisher_ended(number, of, now);
+                self.outbound.handle_publisher_ended(now, number, of);
             }
         }
         let served = ServedRoute {

@@ -298,6 +298,6 @@ impl Carrier<'_> {
             let stats = self.quic.stats();
             stats.udp_tx.bytes.saturating_sub(stats.path.lost_bytes)
         };
-        self.measured.handle_pass(is_full, left, self.window, self.quic.rtt(), now);
+        self.measured.handle_pass(now, is_full, left, self.window, self.quic.rtt());
     }
 }

@@ -93,22 +93,22 @@ impl SimDiscovery {
     }
 
     /// The path of a link works, or does not.
-    pub(super) fn handle_path(&mut self, daemon: DaemonId, works: bool, now: Duration) {
+    pub(super) fn handle_path(&mut self, now: Duration, daemon: DaemonId, works: bool) {
         let Some(link) = self.links.get_mut(&daemon) else { return };
         link.cut = !works;
         if link.cut {
-            self.handle_dial_failed(daemon, now);
+            self.handle_dial_failed(now, daemon);
         }
     }
 
     /// The link with a peer is no more.
-    pub(super) fn handle_link_down(&mut self, daemon: DaemonId, now: Duration) {
+    pub(super) fn handle_link_down(&mut self, now: Duration, daemon: DaemonId) {
         self.links.remove(&daemon);
-        self.handle_dial_failed(daemon, now);
+        self.handle_dial_failed(now, daemon);
     }
 
     /// A dial came to nothing.
-    pub(super) fn handle_dial_failed(&mut self, daemon: DaemonId, now: Duration) {
+    pub(super) fn handle_dial_failed(&mut self, now: Duration, daemon: DaemonId) {
         if let Some(peer) = self.peers.get_mut(&daemon) {
             let wait = if self.daemon < daemon { REDIAL } else { 2 * REDIAL };
             peer.dial_at = Some(now + wait);

@@ -351,23 +351,23 @@ impl Host {
     /// A datagram came.
     pub(super) fn handle_datagram(
         &mut self,
+        now: Duration,
         from: SocketAddr,
         ecn: Option<EcnCodepoint>,
         bytes: BytesMut,
-        now: Duration,
     ) {
         self.due.set(None);
         if let Some(engine) = &mut self.engine {
             let local = Some(IpAddr::V4(self.address));
-            engine.handle_datagram(0, from, local, ecn, bytes, now);
+            engine.handle_datagram(now, 0, from, local, ecn, bytes);
         }
     }
 
     /// The KME answered.
-    pub(super) fn handle_key_event(&mut self, event: crate::keys::KmeAnswer, now: Duration) {
+    pub(super) fn handle_key_event(&mut self, now: Duration, event: crate::keys::KmeAnswer) {
         self.due.set(None);
         if let Some(engine) = &mut self.engine {
-            engine.handle_key_event(event, now);
+            engine.handle_key_event(now, event);
         }
     }
 
@@ -398,13 +398,13 @@ impl Host {
             let range = EndpointRange { range: DiscoveryRange::Subnet, lists: Vec::new() };
             let endpoints = self.rings.endpoints().into_iter();
             let local = endpoints.map(|e| (e.gid, (e, range.clone()))).collect();
-            engine.handle_local_graph(local, now);
+            engine.handle_local_graph(now, local);
         }
         if let Some(rules) = self.rules.take() {
-            engine.handle_order(ToGateway::Rules(rules, 0), now);
+            engine.handle_order(now, ToGateway::Rules(rules, 0));
         }
         for question in std::mem::take(&mut self.questions) {
-            engine.handle_order(question, now);
+            engine.handle_order(now, question);
         }
         if std::mem::take(&mut self.rings_rang) {
             engine.handle_rings(now);
@@ -420,14 +420,14 @@ impl Host {
             }]);
         }
         while let Some((_, answer)) = self.compressed.pop_front_if(|(due, _)| *due <= now) {
-            engine.handle_compressed(answer, now);
+            engine.handle_compressed(now, answer);
         }
         for (link, key_id) in std::mem::take(&mut self.records) {
             let first = self.used.insert(key_id);
-            engine.handle_recorded(link, first, now);
+            engine.handle_recorded(now, link, first);
         }
         for dial in self.discovery.take_due(now) {
-            engine.handle_order(dial, now);
+            engine.handle_order(now, dial);
         }
         if engine.poll_timeout(now).is_some_and(|due| due <= now) {
             engine.handle_timeout(now);
@@ -478,14 +478,14 @@ impl Host {
             ToControl::LinkUp { daemon, address, .. } => {
                 self.discovery.handle_link_up(daemon, address);
             }
-            ToControl::Path { daemon, works } => self.discovery.handle_path(daemon, works, now),
+            ToControl::Path { daemon, works } => self.discovery.handle_path(now, daemon, works),
             ToControl::LinkDown { daemon, reason } => {
                 self.graph.remove(&daemon);
                 self.refusals.push_back((now, format!("down: {reason}")));
-                self.discovery.handle_link_down(daemon, now);
+                self.discovery.handle_link_down(now, daemon);
             }
             ToControl::DialFailed { daemon, .. } => {
-                self.discovery.handle_dial_failed(daemon, now);
+                self.discovery.handle_dial_failed(now, daemon);
             }
             ToControl::Refusal { peer, what, reason, .. } => {
                 self.refusals.push_back((now, format!("{peer}: {what}: {reason}")));
@@ -500,7 +500,7 @@ impl Host {
                         (Datagram::decode(bytes), &mut self.engine)
                     {
                         let bytes = Datagram::Echo { daemon: self.daemon, nonce }.encode();
-                        engine.handle_order(ToGateway::SendDatagram { to, bytes }, now);
+                        engine.handle_order(now, ToGateway::SendDatagram { to, bytes });
                     }
                 }
             }

@@ -141,10 +141,10 @@ impl Raw {
     /// A datagram came.
     pub(super) fn handle_datagram(
         &mut self,
+        now: Duration,
         from: SocketAddr,
         ecn: Option<EcnCodepoint>,
         bytes: BytesMut,
-        now: Duration,
     ) {
         let (now, mut buffer) = (self.epoch + now, Vec::new());
         let local = Some(self.address.into());

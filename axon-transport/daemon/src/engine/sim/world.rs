@@ -319,10 +319,10 @@ impl World {
             }
             let bytes = BytesMut::from(delivery.bytes);
             match self.hosts.get_mut(delivery.host) {
-                Some(host) => host.handle_datagram(delivery.from, delivery.ecn, bytes, now),
+                Some(host) => host.handle_datagram(now, delivery.from, delivery.ecn, bytes),
                 None => {
                     let raw = &mut self.raws[delivery.host - self.hosts.len()];
-                    raw.handle_datagram(delivery.from, delivery.ecn, bytes, now);
+                    raw.handle_datagram(now, delivery.from, delivery.ecn, bytes);
                 }
             }
             came.insert(delivery.host);
@@ -335,7 +335,7 @@ impl World {
         }
         let due: Vec<_> = self.answers.extract_if(.., |(at, ..)| *at <= now).collect();
         for (_, host, event) in due {
-            self.hosts[host].handle_key_event(event, now);
+            self.hosts[host].handle_key_event(now, event);
             self.pass(host);
         }
         for host in 0..self.hosts.len() {

@@ -81,8 +81,8 @@ impl Leaving {
 
     pub(in crate::engine::links) fn handle_progress(
         &mut self,
-        under_way: HandOverProgress,
         now: Duration,
+        under_way: HandOverProgress,
     ) -> HandOverStep {
         let HandOverProgress { silent, sent, reading } = under_way;
         if self.closed || (silent && self.succeeded) {
@@ -116,45 +116,45 @@ mod tests {
     fn it_closes_when_both_sides_have_sent_and_read_everything() {
         let mut leaving = Leaving::new(None, false, NOW);
         assert_eq!(
-            leaving.handle_progress(READ, NOW),
+            leaving.handle_progress(NOW, READ),
             HandOverStep::Wait,
             "the peer sends over it still"
         );
         leaving.handle_succeeded();
-        assert_eq!(leaving.handle_progress(BUSY, NOW), HandOverStep::Wait);
-        assert_eq!(leaving.handle_progress(SENT, NOW), HandOverStep::Finish);
+        assert_eq!(leaving.handle_progress(NOW, BUSY), HandOverStep::Wait);
+        assert_eq!(leaving.handle_progress(NOW, SENT), HandOverStep::Finish);
         assert_eq!(
-            leaving.handle_progress(READ, NOW),
+            leaving.handle_progress(NOW, READ),
             HandOverStep::Finish,
             "the peer's streams go on"
         );
         leaving.handle_ended();
-        assert_eq!(leaving.handle_progress(SENT, NOW), HandOverStep::Finish);
-        assert_eq!(leaving.handle_progress(READ, NOW), HandOverStep::Close);
+        assert_eq!(leaving.handle_progress(NOW, SENT), HandOverStep::Finish);
+        assert_eq!(leaving.handle_progress(NOW, READ), HandOverStep::Close);
     }
 
     #[test]
     fn a_peer_that_ends_no_control_stream_is_waited_for_some_seconds_at_a_time() {
         let mut leaving = Leaving::new(None, true, NOW);
-        assert_eq!(leaving.handle_progress(SENT, NOW), HandOverStep::Finish);
+        assert_eq!(leaving.handle_progress(NOW, SENT), HandOverStep::Finish);
         assert_eq!(leaving.poll_timeout(), Some(NOW + HAND_OVER));
         // A stream is being read when the time is over: as long again.
         let later = NOW + HAND_OVER;
-        assert_eq!(leaving.handle_progress(SENT, later), HandOverStep::Finish);
+        assert_eq!(leaving.handle_progress(later, SENT), HandOverStep::Finish);
         assert_eq!(leaving.poll_timeout(), Some(later + HAND_OVER));
-        assert_eq!(leaving.handle_progress(READ, later), HandOverStep::Finish);
-        assert_eq!(leaving.handle_progress(READ, later + HAND_OVER), HandOverStep::Close);
+        assert_eq!(leaving.handle_progress(later, READ), HandOverStep::Finish);
+        assert_eq!(leaving.handle_progress(later + HAND_OVER, READ), HandOverStep::Close);
     }
 
     #[test]
     fn a_silent_link_closes_once_the_peer_sends_over_the_successor() {
         let mut leaving = Leaving::new(None, false, NOW);
-        assert_eq!(leaving.handle_progress(SILENT, NOW), HandOverStep::Wait);
+        assert_eq!(leaving.handle_progress(NOW, SILENT), HandOverStep::Wait);
         leaving.handle_succeeded();
-        assert_eq!(leaving.handle_progress(SILENT, NOW), HandOverStep::Close);
+        assert_eq!(leaving.handle_progress(NOW, SILENT), HandOverStep::Close);
         let mut closed = Leaving::new(None, false, NOW);
         closed.handle_closed();
-        assert_eq!(closed.handle_progress(BUSY, NOW), HandOverStep::Close, "the peer said so");
+        assert_eq!(closed.handle_progress(NOW, BUSY), HandOverStep::Close, "the peer said so");
     }
 
     #[test]

@@ -25,7 +25,7 @@ const MAX_DISCOVERY: usize = 512;
 
 impl Links {
     /// A datagram of discovery, or the echo of a probe.
-    pub(super) fn handle_discovery(&mut self, from: SocketAddr, bytes: BytesMut, now: Duration) {
+    pub(super) fn handle_discovery(&mut self, now: Duration, from: SocketAddr, bytes: BytesMut) {
         if bytes.len() > MAX_DISCOVERY {
             return;
         }
@@ -57,7 +57,7 @@ impl Links {
             return;
         };
         let traffic = Traffic::from(&connection.quic.stats());
-        if peer.silence.handle_heard(traffic, now) {
+        if peer.silence.handle_heard(now, traffic) {
             self.outbox.event(LinkEvent::Back(peer.summary.hello.daemon));
         }
     }
@@ -73,7 +73,7 @@ impl Links {
             };
             let (traffic, daemon) =
                 (Traffic::from(&connection.quic.stats()), peer.summary.hello.daemon);
-            let look = peer.silence.handle_second(traffic, || self.random.random(), now);
+            let look = peer.silence.handle_second(now, traffic, || self.random.random());
             if look.gone {
                 self.outbox.event(LinkEvent::Silent(daemon));
             }
@@ -101,7 +101,7 @@ impl Links {
         let (address, daemon) = (connection.quic.remote_address(), peer.summary.hello.daemon);
         let (traffic, round_trip) =
             (Traffic::from(&connection.quic.stats()), connection.quic.rtt());
-        match peer.silence.handle_timeout(traffic, round_trip, now) {
+        match peer.silence.handle_timeout(now, traffic, round_trip) {
             Some(ProbeAction::Answered(nonce, was_cut)) => {
                 self.nonces.remove(&nonce);
                 if was_cut {

@@ -92,7 +92,7 @@ impl LinkSilence {
     /// Notes what had gone over the link when a datagram came. What is sent later has no answer yet. QUIC does not
     /// always send it again: its probes may ask for an acknowledgement alone. Returns whether a peer that was gone is
     /// back.
-    pub(super) fn handle_heard(&mut self, traffic: Traffic, now: Duration) -> bool {
+    pub(super) fn handle_heard(&mut self, now: Duration, traffic: Traffic) -> bool {
         if !traffic.has_come_since(self.heard) {
             return false;
         }
@@ -105,9 +105,9 @@ impl LinkSilence {
     /// look; they say what `nonce` returns.
     pub(super) fn handle_second(
         &mut self,
+        now: Duration,
         traffic: Traffic,
         nonce: impl FnOnce() -> Nonce,
-        now: Duration,
     ) -> LookResult {
         let before = std::mem::replace(&mut self.traffic, traffic);
         // It is no longer silent: what is under way arrives.
@@ -172,9 +172,9 @@ impl LinkSilence {
 
     pub(super) fn handle_timeout(
         &mut self,
+        now: Duration,
         traffic: Traffic,
         round_trip: Duration,
-        now: Duration,
     ) -> Option<ProbeAction> {
         let probing = self.probing.as_mut()?;
         if traffic.answered_since(probing.traffic) {
@@ -218,60 +218,60 @@ mod tests {
     #[test]
     fn a_link_that_is_asked_nothing_is_not_silent() {
         let mut silence = LinkSilence::new(Side::Client, START);
-        assert!(!silence.handle_heard(traffic(1, 1, 1), START));
+        assert!(!silence.handle_heard(START, traffic(1, 1, 1)));
         for number in 1..10 {
             assert_eq!(
-                silence.handle_second(traffic(1, 1, 1), || NONCE, second(number)),
+                silence.handle_second(second(number), traffic(1, 1, 1), || NONCE),
                 LookResult::default()
             );
         }
         assert_eq!(silence.poll_timeout(), None);
-        let look = silence.handle_second(traffic(1, 1, 1), || NONCE, second(10));
+        let look = silence.handle_second(second(10), traffic(1, 1, 1), || NONCE);
         assert_eq!(look, LookResult { gone: false, probed: true }, "keep-alives are lost");
     }
 
     #[test]
     fn a_question_without_an_answer_is_probed_and_an_echo_brings_a_successor() {
         let mut silence = LinkSilence::new(Side::Client, START);
-        silence.handle_heard(traffic(1, 1, 1), START);
-        silence.handle_second(traffic(1, 1, 1), || NONCE, second(1));
-        let look = silence.handle_second(traffic(1, 1, 2), || NONCE, second(2));
+        silence.handle_heard(START, traffic(1, 1, 1));
+        silence.handle_second(second(1), traffic(1, 1, 1), || NONCE);
+        let look = silence.handle_second(second(2), traffic(1, 1, 2), || NONCE);
         assert_eq!(look, LookResult { gone: false, probed: true });
         assert_eq!(
-            silence.handle_second(traffic(1, 1, 2), || [9; 8], second(3)),
+            silence.handle_second(second(3), traffic(1, 1, 2), || [9; 8]),
             LookResult::default()
         );
         let asked = traffic(1, 1, 2);
         assert_eq!(
-            silence.handle_timeout(asked, ROUND_TRIP, second(3)),
+            silence.handle_timeout(second(3), asked, ROUND_TRIP),
             Some(ProbeAction::Probe(NONCE))
         );
         silence.handle_echo(second(3));
         let due = silence.poll_timeout().unwrap();
-        assert_eq!(silence.handle_timeout(asked, ROUND_TRIP, due), Some(ProbeAction::Replace));
+        assert_eq!(silence.handle_timeout(due, asked, ROUND_TRIP), Some(ProbeAction::Replace));
         assert!(silence.is_silent());
         // An acknowledgement ends it.
         let answered = traffic(2, 2, 2);
         assert_eq!(
-            silence.handle_timeout(answered, ROUND_TRIP, due),
+            silence.handle_timeout(due, answered, ROUND_TRIP),
             Some(ProbeAction::Answered(NONCE, false))
         );
         assert_eq!(
-            (silence.poll_timeout(), silence.handle_timeout(answered, ROUND_TRIP, due)),
+            (silence.poll_timeout(), silence.handle_timeout(due, answered, ROUND_TRIP)),
             (None, None)
         );
-        silence.handle_second(answered, || NONCE, second(5));
+        silence.handle_second(second(5), answered, || NONCE);
         assert!(!silence.is_silent());
     }
 
     #[test]
     fn a_path_whose_probes_nobody_answers_is_said_to_be_cut_and_to_work_again() {
         let mut silence = LinkSilence::new(Side::Client, START);
-        silence.handle_second(traffic(0, 0, 1), || NONCE, second(1));
+        silence.handle_second(second(1), traffic(0, 0, 1), || NONCE);
         let asked = traffic(0, 0, 1);
         let probe = |silence: &mut LinkSilence| {
             let due = silence.poll_timeout().unwrap();
-            (due, silence.handle_timeout(asked, ROUND_TRIP, due).unwrap())
+            (due, silence.handle_timeout(due, asked, ROUND_TRIP).unwrap())
         };
         for answered in [false, true] {
             let found: Vec<_> = (0..20).map(|_| probe(&mut silence).1).collect();
@@ -284,7 +284,7 @@ mod tests {
                 let due = silence.poll_timeout().unwrap();
                 let more = traffic(1, 1, 1);
                 assert_eq!(
-                    silence.handle_timeout(more, ROUND_TRIP, due),
+                    silence.handle_timeout(due, more, ROUND_TRIP),
                     Some(ProbeAction::Answered(NONCE, true))
                 );
             } else {
@@ -303,11 +303,11 @@ mod tests {
         let slow = Duration::from_millis(900);
         let cut = slow * 2;
         let mut silence = LinkSilence::new(Side::Client, START);
-        silence.handle_second(traffic(0, 0, 1), || NONCE, second(1));
+        silence.handle_second(second(1), traffic(0, 0, 1), || NONCE);
         let begin = silence.poll_timeout().unwrap();
         loop {
             let due = silence.poll_timeout().unwrap();
-            let action = silence.handle_timeout(traffic(0, 0, 1), slow, due).unwrap();
+            let action = silence.handle_timeout(due, traffic(0, 0, 1), slow).unwrap();
             if due >= begin + cut {
                 assert_eq!(action, ProbeAction::ProbeCut(NONCE), "at once");
                 break;
@@ -321,7 +321,7 @@ mod tests {
     fn an_echo_of_no_probe_changes_nothing() {
         let mut silence = LinkSilence::new(Side::Server, START);
         assert!(!silence.handle_echo(START));
-        silence.handle_second(traffic(0, 0, 1), || NONCE, second(1));
+        silence.handle_second(second(1), traffic(0, 0, 1), || NONCE);
         let due = silence.poll_timeout();
         silence.handle_echo(second(1));
         assert_eq!(silence.poll_timeout(), due);
@@ -330,25 +330,25 @@ mod tests {
     #[test]
     fn a_peer_is_gone_after_a_time_and_back_with_an_acknowledgement() {
         let mut silence = LinkSilence::new(Side::Client, START);
-        let before = (1..20).map(|n| silence.handle_second(traffic(0, 0, 1), || NONCE, second(n)));
+        let before = (1..20).map(|n| silence.handle_second(second(n), traffic(0, 0, 1), || NONCE));
         assert!(before.collect::<Vec<_>>().iter().all(|look| !look.gone));
-        assert!(silence.handle_second(traffic(0, 0, 1), || NONCE, second(20)).gone);
-        assert!(!silence.handle_second(traffic(0, 0, 1), || NONCE, second(21)).gone, "once");
-        assert!(!silence.handle_heard(traffic(1, 0, 1), second(22)), "the path works one way");
+        assert!(silence.handle_second(second(20), traffic(0, 0, 1), || NONCE).gone);
+        assert!(!silence.handle_second(second(21), traffic(0, 0, 1), || NONCE).gone, "once");
+        assert!(!silence.handle_heard(second(22), traffic(1, 0, 1)), "the path works one way");
         assert!(silence.is_gone());
-        assert!(silence.handle_heard(traffic(2, 1, 1), second(23)));
+        assert!(silence.handle_heard(second(23), traffic(2, 1, 1)));
         assert!(!silence.is_gone());
     }
 
     #[test]
     fn a_superseded_link_is_silent_once_its_successor_is_heard_and_it_is_not() {
         let mut silence = LinkSilence::new(Side::Client, START);
-        silence.handle_heard(traffic(1, 1, 1), START);
+        silence.handle_heard(START, traffic(1, 1, 1));
         assert!(!silence.handle_superseded(traffic(1, 1, 1)));
         // The path may be cut for both.
         assert!(!silence.handle_second_superseded(second(2)));
         assert!(!silence.is_silent());
-        silence.handle_heard(traffic(2, 2, 2), second(4));
+        silence.handle_heard(second(4), traffic(2, 2, 2));
         assert!(!silence.handle_second_superseded(second(6)));
         assert!(silence.handle_second_superseded(second(7)));
         assert!(!silence.handle_second_superseded(second(8)), "once");
@@ -358,12 +358,12 @@ mod tests {
     #[test]
     fn a_superseded_link_is_probed_no_more() {
         let mut silence = LinkSilence::new(Side::Client, START);
-        silence.handle_second(traffic(0, 0, 1), || NONCE, second(1));
-        silence.handle_timeout(traffic(0, 0, 1), ROUND_TRIP, second(1));
+        silence.handle_second(second(1), traffic(0, 0, 1), || NONCE);
+        silence.handle_timeout(second(1), traffic(0, 0, 1), ROUND_TRIP);
         silence.handle_echo(second(1));
         let due = silence.poll_timeout().unwrap();
         assert_eq!(
-            silence.handle_timeout(traffic(0, 0, 1), ROUND_TRIP, due),
+            silence.handle_timeout(due, traffic(0, 0, 1), ROUND_TRIP),
             Some(ProbeAction::Replace)
         );
         assert!(silence.handle_superseded(traffic(0, 0, 1)));

@@ -192,10 +192,10 @@ impl BestEffort {
     /// The peer's QUIC has all of a sample, or wants no more of it.
     pub(super) fn handle_finished(
         &mut self,
+        now: Duration,
         stream: StreamId,
         quic: &mut Connection,
         counters: &Counters,
-        now: Duration,
     ) {
         let Some(at) = self.under_way.iter().position(|sample| sample.stream == stream) else {
             return;
@@ -235,10 +235,10 @@ impl BestEffort {
     /// Gives up the samples whose time is over. Returns whether there were any.
     pub(super) fn handle_timeout(
         &mut self,
+        now: Duration,
         carrier: &mut Carrier<'_>,
         counters: &Counters,
         topic: &Arc<str>,
-        now: Duration,
     ) -> bool {
         let mut late = Vec::new();
         late.extend(self.writing.take_if(|w| w.sample.deadline <= now).map(|w| w.stream));

@@ -422,12 +422,12 @@ impl Flow {
     /// The peer's QUIC has all of this best-effort stream.
     pub(super) fn handle_finished(
         &mut self,
+        now: Duration,
         stream: StreamId,
         quic: &mut Connection,
         counters: &Counters,
-        now: Duration,
     ) {
-        self.best_effort.handle_finished(stream, quic, counters, now);
+        self.best_effort.handle_finished(now, stream, quic, counters);
     }
 
     /// The peer stopped this stream.
@@ -460,17 +460,17 @@ impl Flow {
     /// Resets best-effort samples whose time is over, and finishes a stream that has been idle.
     pub(super) fn handle_timeout(
         &mut self,
+        now: Duration,
         carrier: &mut Carrier<'_>,
         counters: &Counters,
-        now: Duration,
     ) {
         self.timer = None;
-        if self.best_effort.handle_timeout(carrier, counters, &self.info.topic, now) {
+        if self.best_effort.handle_timeout(now, carrier, counters, &self.info.topic) {
             // QUIC signals no room for a stream that was reset.
             self.blocked = false;
         }
         self.set_timer(self.best_effort.poll_timeout());
-        let idle = self.reliable.handle_timeout(&self.queue, carrier, now);
+        let idle = self.reliable.handle_timeout(now, &self.queue, carrier);
         self.set_timer(idle);
     }
 

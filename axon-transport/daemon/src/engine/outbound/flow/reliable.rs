@@ -178,7 +178,7 @@ impl ReliableStream {
                 }
                 self.batch.drop_chunks(taken.chunks);
                 carrier.taken += taken.bytes as u64;
-                self.handle_taken(taken.bytes as u64, info, queue, counters, done, now);
+                self.handle_taken(now, taken.bytes as u64, info, queue, counters, done);
                 None
             }
             Err(WriteError::Blocked) => Some(FlowPause::Blocked),
@@ -212,12 +212,12 @@ impl ReliableStream {
     /// QUIC took so many bytes of the batch.
     fn handle_taken(
         &mut self,
+        now: Duration,
         bytes: u64,
         info: &FlowInfo,
         queue: &mut Queue,
         counters: &Counters,
         done: &mut FlowProgress,
-        now: Duration,
     ) {
         self.active_at = now;
         // Only these numbers rise.
@@ -365,9 +365,9 @@ impl ReliableStream {
     /// Finishes a stream that has been idle. Returns when to look again at one that is open.
     pub(super) fn handle_timeout(
         &mut self,
+        now: Duration,
         queue: &Queue,
         carrier: &mut Carrier<'_>,
-        now: Duration,
     ) -> Option<Duration> {
         self.stream?;
         let idle_at = self.active_at + STREAM_IDLE;

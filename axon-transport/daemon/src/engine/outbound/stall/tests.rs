@@ -26,7 +26,7 @@ fn look(
     while stalls.poll_timeout() < Duration::from_secs(1200) {
         let now = stalls.poll_timeout();
         let peer = PeerActivity { heard: heard(now), returned: 0, is_awaited };
-        let found = stalls.handle_timeout(peer, busy(now).into_iter(), now);
+        let found = stalls.handle_timeout(now, peer, busy(now).into_iter());
         if found != StallReport::default() {
             return Some((now, found));
         }
@@ -217,12 +217,12 @@ fn peer(heard: u64) -> PeerActivity {
 fn a_number_that_was_forgotten_is_judged_anew() {
     let mut stalls = FlowStalls::new(LIMIT, Duration::ZERO);
     for second in 1..=5 {
-        stalls.handle_timeout(peer(second), [FLOW].into_iter(), LOOK * second as u32);
+        stalls.handle_timeout(LOOK * second as u32, peer(second), [FLOW].into_iter());
     }
     assert_eq!(stalls.flows[&FLOW.id].idle, 4 * LOOK);
     stalls.forget(FLOW.id);
     stalls.forget(FLOW.id);
-    let found = stalls.handle_timeout(peer(6), [FLOW].into_iter(), LOOK + LIMIT);
+    let found = stalls.handle_timeout(LOOK + LIMIT, peer(6), [FLOW].into_iter());
     assert_eq!(found, StallReport::default());
 }
 
@@ -246,7 +246,7 @@ fn one_after_another(
         while stalls.poll_timeout() < end {
             now = stalls.poll_timeout();
             let found =
-                stalls.handle_timeout(peer(now.as_millis() as u64), [is(now)].into_iter(), now);
+                stalls.handle_timeout(now, peer(now.as_millis() as u64), [is(now)].into_iter());
             if found != StallReport::default() {
                 return Some((now, found));
             }
@@ -299,7 +299,7 @@ fn a_flow_goes_on_with_the_worse_of_what_is_known() {
         stalls.flows.insert(FLOW.id, known(LOOK));
         stalls.inherit(FLOW.id, (3, 0), known(idle), now);
         stalls.inherit(FLOW.id, (3, 0), known(LOOK), now);
-        stalls.handle_timeout(peer(1), [flow].into_iter(), now + LOOK)
+        stalls.handle_timeout(now + LOOK, peer(1), [flow].into_iter())
     };
     assert_eq!(after(BusyFlow { progress: (3, 0), ..FLOW }), stalled(StallCause::NothingRead));
     assert_eq!(after(BusyFlow { progress: (4, 0), ..FLOW }), StallReport::default());
@@ -351,9 +351,9 @@ fn silence_now_and_then_is_no_way_out_of_the_pace() {
 #[test]
 fn one_look_counts_for_two_seconds_at_most() {
     let mut stalls = FlowStalls::new(LIMIT, Duration::ZERO);
-    stalls.handle_timeout(peer(1), [FLOW].into_iter(), LOOK);
+    stalls.handle_timeout(LOOK, peer(1), [FLOW].into_iter());
     let after = Duration::from_secs(60);
-    let found = stalls.handle_timeout(peer(2), [FLOW].into_iter(), after);
+    let found = stalls.handle_timeout(after, peer(2), [FLOW].into_iter());
     assert_eq!(found, StallReport::default(), "this host was stopped");
     assert_eq!(stalls.flows[&FLOW.id].idle, LONGEST_LOOK);
 }

@@ -146,10 +146,10 @@ impl FlowTurns {
     /// it are tried again if there is no other turn.
     pub(super) fn handle_over(
         &mut self,
+        now: Duration,
         turn: FlowTurn,
         pause: FlowPause,
         flows: &mut Flows,
-        now: Duration,
     ) {
         match pause {
             FlowPause::Blocked => self.for_quic.insert(turn.flow),
@@ -208,7 +208,7 @@ impl FlowTurns {
     }
 
     /// Has the flows without a key look for one again, if that is due.
-    pub(super) fn handle_timeout(&mut self, flows: &Flows, now: Duration) {
+    pub(super) fn handle_timeout(&mut self, now: Duration, flows: &Flows) {
         if self.poll_timeout().is_some_and(|due| due <= now) {
             self.handle_keys(flows);
         }
@@ -246,7 +246,7 @@ mod tests {
     /// The next flow pauses so, and loses its turn.
     fn pause(turns: &mut FlowTurns, flows: &mut Flows, pause: FlowPause) -> FlowId {
         let turn = turns.next().unwrap();
-        turns.handle_over(turn, pause, flows, NOW);
+        turns.handle_over(NOW, turn, pause, flows);
         turn.flow
     }
 
@@ -277,11 +277,11 @@ mod tests {
         let (mut turns, mut flows) = turns(2);
         assert_eq!(pause(&mut turns, &mut flows, FlowPause::NoStream), 0);
         assert_eq!(pause(&mut turns, &mut flows, FlowPause::NoKey), 1);
-        turns.handle_timeout(&flows, NOW);
+        turns.handle_timeout(NOW, &flows);
         assert_eq!(next(&mut turns), None, "not at once");
         turns.handle_streams_available(&flows);
         assert_eq!((next(&mut turns), next(&mut turns)), (Some(0), None));
-        turns.handle_timeout(&flows, turns.poll_timeout().unwrap());
+        turns.handle_timeout(turns.poll_timeout().unwrap(), &flows);
         assert_eq!((next(&mut turns), next(&mut turns)), (Some(1), None));
         assert_eq!(turns.poll_timeout(), None);
     }
@@ -325,7 +325,7 @@ mod tests {
         share.set(UsedCredit::of(1, 1));
         let turn = turns.next().unwrap();
         drop(share);
-        turns.handle_over(turn, FlowPause::Empty, &mut flows, NOW);
+        turns.handle_over(NOW, turn, FlowPause::Empty, &mut flows);
         assert_eq!(next(&mut turns), Some(0));
     }
 

@@ -143,8 +143,8 @@ impl RefusedRoutes {
     /// Records that the peer does not ask for a route, or asks for it after all.
     pub(in crate::engine::peer) fn handle_route_unasked(
         &mut self,
-        message: RouteUnasked,
         now: Duration,
+        message: RouteUnasked,
     ) {
         let RouteUnasked { topic, type_name, kind, reason } = message;
         let Some(kind) = kind_of(kind) else { return };
@@ -187,10 +187,10 @@ impl RefusedRoutes {
     /// Records that the peer refuses to serve a route, and when to ask again, if at all.
     pub(in crate::engine::peer) fn handle_unserved(
         &mut self,
+        now: Duration,
         key: RouteKey,
         reason: &str,
         again: Option<Duration>,
-        now: Duration,
     ) {
         let reason = shown(reason);
         self.log(&key, &reason, now);

@@ -98,7 +98,7 @@ impl Way {
 
     fn timeout(&mut self) -> Option<Duration> {
         let now = self.pair.now();
-        self.reliable.handle_timeout(&self.queue, &mut self.pair.carrier(), now)
+        self.reliable.handle_timeout(now, &self.queue, &mut self.pair.carrier())
     }
 }
 
