@@ -536,6 +536,6 @@ impl Drop for Reader {
 }
 
 fn meta(record: &Record) -> Meta {
-    let Record { sequence, timestamp: source_timestamp, published, .. } = *record;
-    Meta { sequence, source_timestamp, published }
+    let Record { sequence, timestamp: source_nanos, published: published_nanos, .. } = *record;
+    Meta { sequence, source_nanos, published_nanos }
 }

@@ -131,7 +131,7 @@ mod tests {
     #[test]
     fn a_copied_sample_is_a_slice_of_its_own_bytes() {
         let taken =
-            Taken { meta: Meta { sequence: 1, source_timestamp: 2, published: 3 }, position: 0 };
+            Taken { meta: Meta { sequence: 1, source_nanos: 2, published_nanos: 3 }, position: 0 };
         // SAFETY: the sample has its bytes to itself.
         let trust = unsafe { TrustPublishers::new() };
         for bytes in [&b""[..], b"x", b"several"] {

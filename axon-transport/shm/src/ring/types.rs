@@ -1,6 +1,6 @@
 //! The types that a writer and a reader of a ring exchange with each other and with their owners.
 
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use crate::{
     ids::Gid,
@@ -51,34 +51,50 @@ pub struct Grant {
 pub struct Meta {
     /// The publisher's sequence number.
     pub sequence: u64,
-    /// When it was published, in nanoseconds since the Unix epoch.
-    pub source_timestamp: i64,
-    /// When it was published, in nanoseconds of this host's CLOCK_MONOTONIC: that of a sample from
-    /// another host is its arrival less its age. The publisher's lifespan counts from then. 0 is now
-    /// for a sample that is published, and stands in one that was taken where the lifespan is infinite.
-    pub published: u64,
+    /// [`source_time`](Self::source_time) in nanoseconds since the Unix epoch, as the ring stores it. For this
+    /// project's crates.
+    #[doc(hidden)]
+    pub source_nanos: i64,
+    /// [`published`](Self::published) in nanoseconds, as the ring stores it; 0 is `None`. For this project's crates.
+    #[doc(hidden)]
+    pub published_nanos: u64,
 }
 
 impl Meta {
-    /// Of a sample that is published now, with this number and source time.
+    /// Returns the data of a sample that is published now, with this number and source time.
     pub fn new(sequence: u64, source_time: SystemTime) -> Self {
         Self::at_nanos(sequence, unix_nanos(source_time))
     }
 
-    /// As [`new`](Self::new), with the source time in nanoseconds since the Unix epoch.
-    pub fn at_nanos(sequence: u64, source_timestamp: i64) -> Self {
-        Self { sequence, source_timestamp, published: 0 }
+    /// As [`new`](Self::new), with the source time in nanoseconds since the Unix epoch. For this project's crates.
+    #[doc(hidden)]
+    pub fn at_nanos(sequence: u64, source_nanos: i64) -> Self {
+        Self { sequence, source_nanos, published_nanos: 0 }
     }
 
-    /// With the time of publication in nanoseconds of this host's CLOCK_MONOTONIC.
+    /// Sets the time of publication, by this host's CLOCK_MONOTONIC, to another one than the time of the call. The
+    /// publisher's lifespan counts from then.
     #[must_use]
-    pub fn with_published(self, published: u64) -> Self {
-        Self { published, ..self }
+    pub fn with_published(self, published: Duration) -> Self {
+        self.with_published_nanos(u64::try_from(published.as_nanos()).unwrap_or(u64::MAX))
     }
 
-    /// The time of publication by the publisher's wall clock.
+    /// As [`with_published`](Self::with_published), in nanoseconds. For this project's crates.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn with_published_nanos(self, published_nanos: u64) -> Self {
+        Self { published_nanos, ..self }
+    }
+
+    /// Returns the time of publication by the publisher's wall clock.
     pub fn source_time(&self) -> SystemTime {
-        from_unix_nanos(self.source_timestamp)
+        from_unix_nanos(self.source_nanos)
+    }
+
+    /// Returns the time of publication by this host's CLOCK_MONOTONIC: of a sample from another host its arrival less
+    /// its age. `None` in a sample that was taken, where the publisher's lifespan is infinite.
+    pub fn published(&self) -> Option<Duration> {
+        (self.published_nanos > 0).then(|| Duration::from_nanos(self.published_nanos))
     }
 }
 

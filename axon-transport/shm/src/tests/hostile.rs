@@ -327,7 +327,7 @@ fn descriptors_in_places_that_make_no_sense_are_reported() {
         hostile.set_array(word);
         assert_eq!(
             reader.peek().unwrap(),
-            Some(Meta { sequence: 5, source_timestamp: 6, published: 0 })
+            Some(Meta { sequence: 5, source_nanos: 6, published_nanos: 0 })
         );
     }
 }

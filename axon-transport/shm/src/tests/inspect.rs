@@ -49,13 +49,13 @@ fn inspect_reports_each_readers_progress() {
         let at = ring.descriptor(position).unwrap();
         inspect::timestamp(file.as_fd(), at, position)
     };
-    assert_eq!(timestamp(99), Some(meta(100).source_timestamp));
+    assert_eq!(timestamp(99), Some(meta(100).source_nanos));
     assert_eq!(timestamp(3), None, "others stand there");
     assert_eq!(timestamp(u64::MAX), None);
     let mut out = Vec::new();
     let taken = reader.take(&mut out).unwrap().unwrap();
     let lane_now = lane(&theirs, &reader);
-    assert_eq!(lane_now.taken, Some(taken.meta.source_timestamp));
+    assert_eq!(lane_now.taken, Some(taken.meta.source_nanos));
     assert_eq!((lane_now.received, lane_now.skipped, lane_now.cursor), (1, 60, 61));
     drop(reader);
     assert_eq!(counts(&ours, &writer).window, 40, "nobody has said that it is gone");

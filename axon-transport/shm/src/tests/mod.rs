@@ -169,7 +169,7 @@ fn attach_to(
 }
 
 fn meta(sequence: u64) -> Meta {
-    Meta { sequence, source_timestamp: sequence.cast_signed() * 7 - 3, published: 0 }
+    Meta::at_nanos(sequence, sequence.cast_signed() * 7 - 3)
 }
 
 /// Bytes that differ by sequence number and place.

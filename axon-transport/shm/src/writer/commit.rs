@@ -180,7 +180,7 @@ impl Writer {
         let position = state.history.push(extent);
         let record = Record {
             sequence: meta.sequence,
-            timestamp: meta.source_timestamp,
+            timestamp: meta.source_nanos,
             published: self.published_at(meta),
             len: u32::try_from(len).expect("no longer than the largest message"),
             place,
@@ -193,7 +193,7 @@ impl Writer {
     /// The time from which the sample's lifespan counts; 0 where that is infinite.
     #[inline]
     fn published_at(&self, meta: Meta) -> u64 {
-        match (self.options.qos.lifespan, meta.published) {
+        match (self.options.qos.lifespan, meta.published_nanos) {
             (None, _) => 0,
             (Some(_), 0) => monotonic(),
             (Some(_), earlier) => earlier,

@@ -46,7 +46,7 @@ impl WriterNumbers {
         let meta = match numbering {
             Numbering::Given(meta) => meta,
             Numbering::Next(source_timestamp) => {
-                Meta { sequence: self.last.saturating_add(1), source_timestamp, published: 0 }
+                Meta::at_nanos(self.last.saturating_add(1), source_timestamp)
             }
         };
         self.last = meta.sequence;
@@ -66,7 +66,7 @@ mod tests {
     use super::*;
 
     fn given(sequence: u64) -> Numbering {
-        Numbering::Given(Meta { sequence, source_timestamp: 7, published: 8 })
+        Numbering::Given(Meta::at_nanos(sequence, 7).with_published_nanos(8))
     }
 
     #[test]
@@ -74,7 +74,7 @@ mod tests {
         let mut numbers = WriterNumbers::default();
         assert_eq!(numbers.number(Numbering::Next(5)).sequence, 1);
         let meta = numbers.number(given(40));
-        assert_eq!((meta.sequence, meta.source_timestamp, meta.published), (40, 7, 8));
+        assert_eq!((meta.sequence, meta.source_nanos, meta.published_nanos), (40, 7, 8));
         assert_eq!(numbers.number(Numbering::Next(5)).sequence, 41);
         assert_eq!(numbers.last(), 41);
         assert_eq!(

@@ -22,7 +22,7 @@ pub(crate) struct ResponseLog {
 }
 
 fn response(channel: &FlowChannel, meta: &Meta) -> Response {
-    (*channel, meta.sequence, meta.source_timestamp)
+    (*channel, meta.sequence, meta.source_nanos)
 }
 
 impl ResponseLog {

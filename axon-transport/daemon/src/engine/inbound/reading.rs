@@ -295,7 +295,7 @@ impl Inbound {
     /// What the ring gets to know of a sample.
     pub(super) fn meta(&self, told: ShortHeader, now: Duration) -> Meta {
         Meta::at_nanos(told.sequence, told.source_timestamp)
-            .with_published(self.published(told.age_ms, now))
+            .with_published_nanos(self.published(told.age_ms, now))
     }
 
     /// When a sample of this age was published, in nanoseconds of this host's CLOCK_MONOTONIC.

@@ -187,7 +187,7 @@ impl IncomingFlow {
             return Ok(None);
         }
         let SampleHeader { sequence, source_timestamp, lost, published, .. } = head;
-        let meta = Meta::at_nanos(sequence, source_timestamp).with_published(published);
+        let meta = Meta::at_nanos(sequence, source_timestamp).with_published_nanos(published);
         Ok(Some(InboundSample { channel: name, meta, lost, payload }))
     }
 

@@ -116,7 +116,8 @@ impl<S: SampleContent> OutgoingFlow<S> {
                 None if *credit < OVERHEAD => continue,
                 None => {
                     cost = OVERHEAD;
-                    let Meta { sequence, source_timestamp, published, .. } = sample.meta;
+                    let Meta { sequence, source_nanos, published_nanos, .. } = sample.meta;
+                    let (source_timestamp, published) = (source_nanos, published_nanos);
                     // No sample is longer than AXON_MAX_MESSAGE_MB allows, which is below 4 GiB.
                     let length = u32::try_from(sample.content.len()).unwrap_or(u32::MAX);
                     let lost = sample.lost;

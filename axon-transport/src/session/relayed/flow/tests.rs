@@ -27,7 +27,7 @@ fn incoming() -> IncomingFlow {
 }
 
 fn departing(sequence: u64, len: usize) -> OutboundSample<Vec<u8>> {
-    let meta = Meta::at_nanos(sequence, -(sequence as i64)).with_published(sequence * 5);
+    let meta = Meta::at_nanos(sequence, -(sequence as i64)).with_published_nanos(sequence * 5);
     let content = (0..len).map(|at| (at as u64 * 31 + sequence) as u8).collect();
     OutboundSample { meta, lost: sequence, content }
 }

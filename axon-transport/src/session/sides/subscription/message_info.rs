@@ -80,7 +80,7 @@ pub struct Lifetime {
 
 impl Lifetime {
     pub(super) fn of(meta: &Meta, lifespan: Duration) -> Self {
-        let age = clock::monotonic().saturating_sub(meta.published);
+        let age = clock::monotonic().saturating_sub(meta.published_nanos);
         Self { age: Duration::from_nanos(age), lifespan }
     }
 

@@ -171,7 +171,7 @@ impl Slots {
         for (index, slot) in open {
             // A writer whose memory is corrupt is chosen, so that taking finds out.
             let stamp = match slot.reader.peek() {
-                Ok(Some(meta)) => meta.source_timestamp,
+                Ok(Some(meta)) => meta.source_nanos,
                 Ok(None) => continue,
                 Err(_) => i64::MIN,
             };
@@ -349,6 +349,6 @@ mod tests {
             (3, 1, 2)
         );
         let next = slots.oldest().unwrap();
-        assert_eq!(slots[next].reader.peek().unwrap().unwrap().source_timestamp, 4);
+        assert_eq!(slots[next].reader.peek().unwrap().unwrap().source_nanos, 4);
     }
 }

@@ -201,7 +201,7 @@ impl<'a> Take<'a> {
         let info = MessageInfo {
             publisher: writer,
             sequence: meta.sequence,
-            source_timestamp: clock::from_unix_nanos(meta.source_timestamp),
+            source_timestamp: clock::from_unix_nanos(meta.source_nanos),
             received_timestamp,
             reception: readers.counts.received,
             lifetime,
