@@ -2,7 +2,7 @@
 
 use std::{io::Write as _, process::ExitCode};
 
-use axon_transport::config::DaemonPlace;
+use axon_transport::config::DaemonLocation;
 
 use crate::{failure::CliError, session::failure, text::printable};
 
@@ -11,7 +11,7 @@ use crate::{failure::CliError, session::failure, text::printable};
 /// # Errors
 /// There is no daemon, or its settings are wrong.
 pub(crate) fn run() -> Result<ExitCode, CliError> {
-    let report = axon_transport::daemon_reload_at(&DaemonPlace::from_env()?).map_err(failure)?;
+    let report = axon_transport::daemon_reload_at(&DaemonLocation::from_env()?).map_err(failure)?;
     if let Some(error) = &report.error {
         return Err(CliError::Setting(refused(error, &report.changed)));
     }

@@ -11,7 +11,7 @@
 use std::hint::black_box;
 
 use axon_transport::{
-    access::{AccessRules, Party, Verb},
+    access::{AccessRules, Principal, Verb},
     graph::{Endpoint, EndpointKind},
     ids::Gid,
     internal::graph::{permits, shows},
@@ -40,7 +40,7 @@ fn decisions(c: &mut Criterion) {
         (endpoint(EndpointKind::Publisher), endpoint(EndpointKind::Subscription));
     for count in [0, 10, 1000] {
         let rules = rules(count);
-        let peer = rules.permissions(Party::Name("base"));
+        let peer = rules.permissions(Principal::Name("base"));
         c.bench_function(&format!("one name, {count} rules"), |b| {
             b.iter(|| peer.allows(Verb::Publish, black_box("/robot/sensor_7/data")));
         });
@@ -50,7 +50,7 @@ fn decisions(c: &mut Criterion) {
             });
         });
         c.bench_function(&format!("compile for a peer, {count} rules"), |b| {
-            b.iter(|| rules.permissions(black_box(Party::Name("base"))));
+            b.iter(|| rules.permissions(black_box(Principal::Name("base"))));
         });
     }
 }
@@ -67,7 +67,7 @@ fn starred(c: &mut Criterion) {
     for count in [10, 100, 1000] {
         let text: String = (0..count).map(rule).collect();
         let rules = AccessRules::parse(&text, "access.toml").expect("rules");
-        let peer = rules.permissions(Party::Name("base"));
+        let peer = rules.permissions(Principal::Name("base"));
         assert!(!permits(&peer, &publisher) && !shows(&peer, &subscription));
         c.bench_function(&format!("a pair, {count} rules with stars side by side"), |b| {
             b.iter(|| {
@@ -95,14 +95,14 @@ fn limits(c: &mut Criterion) {
             0 => AccessRules::default(),
             _ => AccessRules::parse(&text, "access.toml").expect("limits"),
         };
-        let peer = rules.permissions(Party::Name("base"));
+        let peer = rules.permissions(Principal::Name("base"));
         let found = peer.limits(Verb::Publish, "/robot/sensor_7/data").count();
         assert_eq!(found, count.div_ceil(4) + (count + 2) / 4, "of {count}");
         c.bench_function(&format!("limits of a topic, {count} entries"), |b| {
             b.iter(|| peer.limits(Verb::Publish, black_box("/robot/sensor_7/data")).count());
         });
         c.bench_function(&format!("compile {count} limits for a peer"), |b| {
-            b.iter(|| rules.permissions(black_box(Party::Name("base"))));
+            b.iter(|| rules.permissions(black_box(Principal::Name("base"))));
         });
     }
 }

@@ -249,7 +249,7 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
         LinkMessage::RouteReady(link::RouteReady { route: 1, publishers: vec![gid] }),
         LinkMessage::Keepalive,
         LinkMessage::LinkClosed(link::LinkClosed { link: [3; 16] }),
-        LinkMessage::Intake(link::Intake { unread: 33 << 20, messages: 64 << 20 }),
+        LinkMessage::ReceiveLimits(link::ReceiveLimits { unread: 33 << 20, messages: 64 << 20 }),
         LinkMessage::Denied(link::DeniedUses {
             denied: vec![link::DeniedUse {
                 verb: 0,

@@ -3,8 +3,8 @@
 use std::{io::Write as _, process::ExitCode};
 
 use axon_transport::{
-    access::{AccessRules, InterfaceLimit, Party, Verb},
-    config::{Config, DaemonPlace},
+    access::{AccessRules, InterfaceLimit, Principal, Verb},
+    config::{Config, DaemonLocation},
     daemon_check_access_at,
     internal::graph::other_end,
     status::{LinkStatus, PeerDecision, Status},
@@ -70,7 +70,7 @@ pub(super) fn run(args: &cli::Check) -> Result<ExitCode, CliError> {
 
 /// The status of the daemon, where one runs.
 fn status() -> Option<Status> {
-    let place = DaemonPlace::from_env().ok()?;
+    let place = DaemonLocation::from_env().ok()?;
     serde_json::from_str(&axon_transport::daemon_status_at(&place).ok()?).ok()
 }
 
@@ -101,7 +101,7 @@ fn warn_of_other_rules(status: &Status, rules: &AccessRules) {
 
 /// What the peer's rules say of each of these uses by this host. A peer may have more than one link: what one of them denies
 /// is denied.
-fn there(status: &Status, peer: Party<'_>, uses: &[(Verb, String)]) -> Vec<String> {
+fn there(status: &Status, peer: Principal<'_>, uses: &[(Verb, String)]) -> Vec<String> {
     let links: Vec<_> = status.links.iter().filter(|link| is_of(link, peer)).collect();
     let answers: Vec<_> = links.iter().filter_map(|link| ask(link, uses)).collect();
     let of = |at: usize| {
@@ -117,7 +117,7 @@ fn there(status: &Status, peer: Party<'_>, uses: &[(Verb, String)]) -> Vec<Strin
 
 /// The decisions of the peer of one link, if it answers: a daemon of an earlier version does not.
 fn ask(link: &LinkStatus, uses: &[(Verb, String)]) -> Option<Vec<PeerDecision>> {
-    let place = DaemonPlace::from_env().ok()?;
+    let place = DaemonLocation::from_env().ok()?;
     let mut decisions = Vec::new();
     for part in uses.chunks(AT_ONCE) {
         match daemon_check_access_at(&place, &link.peer, part) {
@@ -169,10 +169,10 @@ fn heard(status: &Status, links: &[&LinkStatus], verb: Verb, name: &str) -> Stri
 }
 
 /// Whether a link is of this peer, as rules name it. What a host calls itself proves nothing.
-fn is_of(link: &LinkStatus, peer: Party<'_>) -> bool {
-    match (Party::parse(&link.party), peer) {
-        (Ok(Party::Name(of)), Party::Certificate(name)) => of.eq_ignore_ascii_case(name),
-        (Ok(Party::Address(of)), Party::Address(ip)) => of.to_canonical() == ip.to_canonical(),
+fn is_of(link: &LinkStatus, peer: Principal<'_>) -> bool {
+    match (Principal::parse(&link.party), peer) {
+        (Ok(Principal::Name(of)), Principal::Certificate(name)) => of.eq_ignore_ascii_case(name),
+        (Ok(Principal::Address(of)), Principal::Address(ip)) => of.to_canonical() == ip.to_canonical(),
         (Ok(of), peer) => of == peer,
         (Err(_), _) => false,
     }
@@ -201,7 +201,7 @@ mod tests {
         let mut status = Status::default();
         (status.links, status.topics) = (vec![link("base"), base], vec![topic]);
         let there = |peer, verb, name| {
-            let of_peer = |link: &&LinkStatus| is_of(link, Party::Name(peer));
+            let of_peer = |link: &&LinkStatus| is_of(link, Principal::Name(peer));
             let links: Vec<_> = status.links.iter().filter(of_peer).collect();
             heard(&status, &links, verb, name)
         };
@@ -214,13 +214,13 @@ mod tests {
 
     #[test]
     fn a_link_is_of_the_party_that_rules_know_it_as() {
-        let address = |text: &str| Party::Address(text.parse().unwrap());
+        let address = |text: &str| Principal::Address(text.parse().unwrap());
         assert!(is_of(&link("address:10.0.0.7"), address("::ffff:10.0.0.7")));
         assert!(!is_of(&link("address:10.0.0.7"), address("10.0.0.8")));
-        assert!(!is_of(&link("address:10.0.0.7"), Party::Name("address:10.0.0.7")));
-        assert!(is_of(&link("base"), Party::Name("base")));
-        assert!(!is_of(&link("base"), Party::Name("Base")));
-        assert!(is_of(&link("base.example"), Party::Certificate("Base.Example")));
-        assert!(!is_of(&link(""), Party::Name("")), "a daemon of an earlier version");
+        assert!(!is_of(&link("address:10.0.0.7"), Principal::Name("address:10.0.0.7")));
+        assert!(is_of(&link("base"), Principal::Name("base")));
+        assert!(!is_of(&link("base"), Principal::Name("Base")));
+        assert!(is_of(&link("base.example"), Principal::Certificate("Base.Example")));
+        assert!(!is_of(&link(""), Principal::Name("")), "a daemon of an earlier version");
     }
 }

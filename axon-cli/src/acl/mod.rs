@@ -10,7 +10,7 @@ mod write;
 use std::{path::Path, process::ExitCode};
 
 use axon_transport::{
-    access::{AccessRules, Party},
+    access::{AccessRules, Principal},
     config::{ClassicAuth, Config, Security},
     internal::config::parse_rules_file,
 };
@@ -29,12 +29,12 @@ pub(crate) fn run(args: &Acl) -> Result<ExitCode, CliError> {
 }
 
 /// The party that a name stands for: with certificates upper and lower case are the same.
-fn party(name: &str) -> Result<Party<'_>, &'static str> {
+fn party(name: &str) -> Result<Principal<'_>, &'static str> {
     let with_certificates = Config::from_env().is_ok_and(
         |config| matches!(config.security, Security::Classic(c) if c.auth == ClassicAuth::Ca),
     );
-    Party::parse(name).map(|party| match party {
-        Party::Name(name) if with_certificates => Party::Certificate(name),
+    Principal::parse(name).map(|party| match party {
+        Principal::Name(name) if with_certificates => Principal::Certificate(name),
         other => other,
     })
 }

@@ -197,7 +197,7 @@ mod tests {
             let uses = Uses { publish: names(&[name]), ..Uses::default() };
             let text = uses.toml("allow", "base");
             let rules = verify(&text).unwrap();
-            let base = axon_transport::access::Party::Name("base");
+            let base = axon_transport::access::Principal::Name("base");
             let publish = axon_transport::access::Verb::Publish;
             assert!(rules.check(base, publish, name).allowed(), "{text}");
             assert!(!rules.check(base, publish, "/other").allowed(), "{text}");

@@ -7,7 +7,7 @@ use std::{
 };
 
 use axon_transport::{
-    config::DaemonPlace,
+    config::DaemonLocation,
     internal::session::unix_nanos,
     status::{LinkStatus, RelayStatus, SessionStatus, Status, TopicStatus},
 };
@@ -37,7 +37,7 @@ pub(crate) fn run(args: &cli::Status) -> Result<ExitCode, CliError> {
         Err(failure) => Some(failure),
     };
     let status = wrong.as_ref().map(CliError::report);
-    let json = match DaemonPlace::from_env().map(|place| axon_transport::daemon_status_at(&place)) {
+    let json = match DaemonLocation::from_env().map(|place| axon_transport::daemon_status_at(&place)) {
         Ok(Ok(json)) => json,
         Ok(Err(error)) => {
             let failure = crate::session::failure(error);

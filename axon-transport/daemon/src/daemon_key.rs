@@ -7,7 +7,7 @@ use ed25519_dalek::{Signature, VerifyingKey};
 use minicbor::{Decode, Encode};
 use sha2::{Digest, Sha256};
 
-use crate::owner::Binding;
+use crate::owner::ChannelBinding;
 
 const ID: &[u8] = b"axon daemon id 1";
 const SIGNED: &[u8] = b"axon daemon proof 1";
@@ -28,7 +28,7 @@ impl DaemonKey {
     }
 
     /// Proves the id on the connection that `binding` is of. `None` in a forked process, which has no keys.
-    pub fn prove(&self, binding: &Binding) -> Option<DaemonProof> {
+    pub fn prove(&self, binding: &ChannelBinding) -> Option<DaemonProof> {
         let signature = self.0.sign(&signed(binding, self.id()))?;
         Some(DaemonProof { key: *self.0.public(), signature })
     }
@@ -49,7 +49,7 @@ fn id_of(public: &[u8; 32]) -> DaemonId {
     DaemonId(id)
 }
 
-fn signed(binding: &Binding, id: DaemonId) -> Vec<u8> {
+fn signed(binding: &ChannelBinding, id: DaemonId) -> Vec<u8> {
     [SIGNED, binding, &id.0].concat()
 }
 
@@ -67,7 +67,7 @@ pub struct DaemonProof {
 
 impl DaemonProof {
     /// Whether it proves this id on the connection that `binding` is of.
-    pub fn proves(&self, id: DaemonId, binding: &Binding) -> bool {
+    pub fn proves(&self, id: DaemonId, binding: &ChannelBinding) -> bool {
         let signature = Signature::from_bytes(&self.signature);
         id_of(&self.key) == id
             && VerifyingKey::from_bytes(&self.key)

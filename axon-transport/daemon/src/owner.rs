@@ -13,32 +13,32 @@ use ed25519_dalek::{Signature, VerifyingKey};
 use minicbor::{Decode, Encode};
 
 const SIGNED: &[u8] = b"axon session owner 1";
-/// The label of the TLS exporter of [`Binding`].
+/// The label of the TLS exporter of [`ChannelBinding`].
 pub const EXPORTER: &[u8] = b"EXPORTER-axon-session-owner";
 
 /// 32 bytes that both ends of one connection know and no other connection has.
-pub type Binding = [u8; 32];
+pub type ChannelBinding = [u8; 32];
 /// What the GIDs of one session begin with.
-pub type Prefix = [u8; 12];
+pub type SessionPrefix = [u8; 12];
 
 /// Proves, on the connection that `binding` is of, that the daemon `from` has the session of `key`. `None` in a
 /// forked process, which has no keys.
-pub fn prove(key: &SessionKey, binding: &Binding, from: DaemonId) -> Option<Proof> {
+pub fn prove(key: &SessionKey, binding: &ChannelBinding, from: DaemonId) -> Option<Proof> {
     let signature = key.sign(&signed(binding, from, &key.id()))?;
     Some(Proof { key: *key.public(), signature })
 }
 
-fn signed(binding: &Binding, from: DaemonId, id: &SessionId) -> Vec<u8> {
+fn signed(binding: &ChannelBinding, from: DaemonId, id: &SessionId) -> Vec<u8> {
     [SIGNED, binding, &from.0, &id.0].concat()
 }
 
 /// The GIDs of a session begin with this.
-pub fn prefix(id: &SessionId) -> Prefix {
+pub fn prefix(id: &SessionId) -> SessionPrefix {
     prefix_of(&Gid(id.0))
 }
 
 /// What a GID begins with.
-pub fn prefix_of(gid: &Gid) -> Prefix {
+pub fn prefix_of(gid: &Gid) -> SessionPrefix {
     let mut prefix = [0; 12];
     prefix.copy_from_slice(&gid.0[..12]);
     prefix
@@ -64,7 +64,7 @@ impl Proof {
 
     /// The session that the daemon `from` proves to have on the connection that `binding` is of; `None`
     /// when the signature is not right.
-    pub fn session(&self, binding: &Binding, from: DaemonId) -> Option<SessionId> {
+    pub fn session(&self, binding: &ChannelBinding, from: DaemonId) -> Option<SessionId> {
         let id = self.claims();
         let key = VerifyingKey::from_bytes(&self.key).ok()?;
         let signature = Signature::from_bytes(&self.signature);
@@ -75,7 +75,7 @@ impl Proof {
 /// The keys of the sessions of a daemon: the control plane puts them there, the gateway proves with
 /// them.
 #[derive(Debug, Default)]
-pub struct SessionKeys(Mutex<HashMap<Prefix, Arc<SessionKey>>>);
+pub struct SessionKeys(Mutex<HashMap<SessionPrefix, Arc<SessionKey>>>);
 
 impl SessionKeys {
     pub(crate) fn insert(&self, key: Arc<SessionKey>) {
@@ -86,11 +86,11 @@ impl SessionKeys {
         self.lock().remove(&prefix(id));
     }
 
-    pub(crate) fn get(&self, prefix: &Prefix) -> Option<Arc<SessionKey>> {
+    pub(crate) fn get(&self, prefix: &SessionPrefix) -> Option<Arc<SessionKey>> {
         self.lock().get(prefix).cloned()
     }
 
-    fn lock(&self) -> std::sync::MutexGuard<'_, HashMap<Prefix, Arc<SessionKey>>> {
+    fn lock(&self) -> std::sync::MutexGuard<'_, HashMap<SessionPrefix, Arc<SessionKey>>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -14,7 +14,7 @@ use std::{
 use alone::alone;
 use axon_shm::PublishError;
 use axon_transport::{
-    Client, EndpointSpec, OnNew, Server, Waitable,
+    Client, EndpointSpec, NewDataCallback, Server, Waitable,
     graph::EndpointKind,
     ids::Gid,
     qos::{History, Qos},
@@ -212,7 +212,7 @@ fn a_waiting_end_is_woken_and_told() {
     client.send_request(b"x").unwrap();
     assert_eq!(session.wait_for(&both, None).unwrap(), [0]);
     let (sender, told) = std::sync::mpsc::channel();
-    let tell = |sender: &std::sync::mpsc::Sender<u64>| -> OnNew {
+    let tell = |sender: &std::sync::mpsc::Sender<u64>| -> NewDataCallback {
         let sender = sender.clone();
         Arc::new(move |new| {
             let _ = sender.send(new);
@@ -348,7 +348,7 @@ fn a_callback_that_is_set_late_is_told_of_what_can_be_taken() {
         client.send_request(b"x").unwrap();
     }
     let (sender, told) = std::sync::mpsc::channel();
-    let tell: OnNew = Arc::new(move |new| {
+    let tell: NewDataCallback = Arc::new(move |new| {
         let _ = sender.send(new);
     });
     server.set_on_new_request(Some(tell)).unwrap();

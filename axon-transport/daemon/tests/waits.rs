@@ -14,7 +14,7 @@ use std::{
 
 use alone::alone;
 use axon_transport::{
-    EndpointSpec, GuardCondition, OnNew, Publisher, Session, SessionError, Subscription, Waitable,
+    EndpointSpec, GuardCondition, NewDataCallback, Publisher, Session, SessionError, Subscription, Waitable,
     qos::Qos,
 };
 
@@ -315,7 +315,7 @@ fn a_callback_that_is_set_while_another_thread_unsets_it_is_told_or_gone() {
     let both = Barrier::new(2);
     for round in 0..500 {
         let (sender, told) = std::sync::mpsc::channel();
-        let callback: OnNew = Arc::new(move |new| sender.send(new).unwrap());
+        let callback: NewDataCallback = Arc::new(move |new| sender.send(new).unwrap());
         thread::scope(|scope| {
             scope.spawn(|| {
                 both.wait();

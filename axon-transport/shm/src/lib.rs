@@ -85,7 +85,7 @@ pub mod internal {
             segment_message::{Segment, SegmentName, SegmentOpened},
         },
         wake::{ForwardedWakeups, Purpose, WakeCheck},
-        writer::{Carried, MAX_GAP, Writer},
+        writer::{CarrierState, MAX_GAP, Writer},
     };
 
     /// What rings and lanes say of themselves.

@@ -2,7 +2,7 @@
 
 use std::{fmt, num::NonZeroU32, sync::Arc};
 
-use super::{Party, TopicPattern, Verb, party::PartyPattern, pattern::segment_fits};
+use super::{Principal, TopicPattern, Verb, party::PartyPattern, pattern::segment_fits};
 
 /// The samples that a limit lets pass. The time of a sample is that at which this host's daemon has it.
 #[derive(Clone, Debug, PartialEq)]
@@ -153,7 +153,7 @@ impl fmt::Display for PlacedLimit {
 }
 
 impl LimitRule {
-    pub(super) fn names(&self, party: Party<'_>) -> bool {
+    pub(super) fn names(&self, party: Principal<'_>) -> bool {
         self.peers.iter().any(|peer| peer.fits(party))
     }
 

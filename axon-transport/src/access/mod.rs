@@ -46,7 +46,7 @@ pub use decision::Decision;
 pub use limit::{EgressLimit, InterfaceLimit, Over, PlacedLimit, RateLimit};
 pub use parse::AccessError;
 pub(crate) use party::HostPattern;
-pub use party::Party;
+pub use party::Principal;
 pub use pattern::TopicPattern;
 pub use permissions::Permissions;
 pub use rules::{AccessRules, Expectation, Verb};

@@ -10,7 +10,7 @@ use toml::{
 };
 
 use super::{
-    AccessRules, Expectation, Party, TopicPattern, Verb,
+    AccessRules, Expectation, Principal, TopicPattern, Verb,
     party::PartyPattern,
     ros,
     rules::{Rule, RuleFile},
@@ -277,7 +277,7 @@ impl<'t> RuleFileReader<'t> {
                 ("peer", _, Some(text), _) => {
                     let wrong =
                         |what| self.wrong(value.span(), format!("peer {text:?}; accepted: {what}"));
-                    Party::parse(text).map_err(wrong)?;
+                    Principal::parse(text).map_err(wrong)?;
                     peer = Some(text.to_owned());
                 }
                 ("allowed", _, _, Some(whether)) => allowed = Some(whether),

@@ -7,7 +7,7 @@ use super::pattern::segment_fits;
 /// Another host or another user, as rules know it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
-pub enum Party<'a> {
+pub enum Principal<'a> {
     /// A host that proved to have this name: that of its pin, or its SAE ID.
     Name(&'a str),
     /// A host whose certificate has this name. Upper and lower case are the same.
@@ -18,7 +18,7 @@ pub enum Party<'a> {
     User(u32),
 }
 
-impl fmt::Display for Party<'_> {
+impl fmt::Display for Principal<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Name(name) | Self::Certificate(name) => f.write_str(name),
@@ -28,7 +28,7 @@ impl fmt::Display for Party<'_> {
     }
 }
 
-impl<'a> Party<'a> {
+impl<'a> Principal<'a> {
     /// The party that a text names as rules do: `uid:1001`, `address:10.0.0.7`, or a name.
     ///
     /// # Errors
@@ -92,15 +92,15 @@ impl PartyPattern {
         }
     }
 
-    pub(super) fn fits(&self, party: Party<'_>) -> bool {
+    pub(super) fn fits(&self, party: Principal<'_>) -> bool {
         match (self, party) {
-            (Self::All, _) | (Self::Users, Party::User(_)) => true,
-            (Self::User(own), Party::User(uid)) => *own == uid,
-            (Self::Address(pattern), Party::Address(ip)) => {
+            (Self::All, _) | (Self::Users, Principal::User(_)) => true,
+            (Self::User(own), Principal::User(uid)) => *own == uid,
+            (Self::Address(pattern), Principal::Address(ip)) => {
                 segment_fits(pattern, &ip.to_canonical().to_string())
             }
-            (Self::Name(pattern), Party::Name(name)) => segment_fits(pattern, name),
-            (Self::Name(pattern), Party::Certificate(name)) => {
+            (Self::Name(pattern), Principal::Name(name)) => segment_fits(pattern, name),
+            (Self::Name(pattern), Principal::Certificate(name)) => {
                 segment_fits(&pattern.to_ascii_lowercase(), &name.to_ascii_lowercase())
             }
             _ => false,

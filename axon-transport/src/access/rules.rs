@@ -3,7 +3,7 @@
 use std::{fmt, sync::Arc};
 
 use super::{
-    Decision, Party, Permissions, TopicPattern,
+    Decision, Principal, Permissions, TopicPattern,
     limit::{InterfaceLimit, LimitRule},
     party::{HostPattern, PartyPattern},
     permissions::{Compiled, DefaultDecision, VerbPatterns},
@@ -78,7 +78,7 @@ pub(super) struct Rule {
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Expectation {
-    /// The party, as [`Party::parse`] reads it.
+    /// The party, as [`Principal::parse`] reads it.
     pub peer: String,
     /// What it does.
     pub verb: Verb,
@@ -91,7 +91,7 @@ pub struct Expectation {
 }
 
 impl Rule {
-    fn names(&self, party: Party<'_>) -> bool {
+    fn names(&self, party: Principal<'_>) -> bool {
         self.peers.iter().any(|peer| peer.fits(party))
     }
 }
@@ -120,7 +120,7 @@ impl AccessRules {
     }
 
     /// What the rules let one party do. It takes the time of reading all rules once.
-    pub fn permissions(&self, party: Party<'_>) -> Permissions {
+    pub fn permissions(&self, party: Principal<'_>) -> Permissions {
         let limits = self.limits.iter().filter(|limit| limit.names(party)).cloned().collect();
         let Some(rules) = &self.rules else { return Permissions::new(None, limits) };
         let (mut allow, mut deny) = (VerbPatterns::default(), VerbPatterns::default());
@@ -143,7 +143,7 @@ impl AccessRules {
 
     /// Whether a party may do this with the topic, service or node of this full name, and which rule decides. To ask
     /// more than once about one party, take its [`permissions`](Self::permissions).
-    pub fn check(&self, party: Party<'_>, verb: Verb, name: &str) -> Decision {
+    pub fn check(&self, party: Principal<'_>, verb: Verb, name: &str) -> Decision {
         self.permissions(party).check(verb, name)
     }
 

@@ -34,38 +34,38 @@ publish = "/cmd_vel"
 fn the_example_lets_the_base_publish_and_the_guest_subscribe() {
     let rules = rules(ROBOT);
     let check = |party, verb, name| rules.check(party, verb, name).to_string();
-    let base = Party::Name("base");
+    let base = Principal::Name("base");
     assert_eq!(check(base, Verb::Publish, "/cmd_vel"), "allowed by line 4 of access.toml");
     assert_eq!(check(base, Verb::Call, "/robot/arm/set_mode"), "allowed by line 5 of access.toml");
     let none = "denied: no [[allow]] in access.toml permits this";
     assert_eq!(check(base, Verb::Call, "/robot/arm/left/set_mode"), none);
     assert_eq!(check(base, Verb::Subscribe, "/cmd_vel"), none);
-    let guest = Party::Name("operator-guest");
+    let guest = Principal::Name("operator-guest");
     assert_eq!(check(guest, Verb::Publish, "/cmd_vel"), "denied by line 14 of access.toml");
     assert!(rules.check(guest, Verb::Subscribe, "/scan").allowed());
-    let user = Party::User(1001);
+    let user = Principal::User(1001);
     assert!(rules.check(user, Verb::Subscribe, "/anything").allowed());
     assert_eq!(check(user, Verb::Publish, "/anything"), none);
-    let other = check(Party::Name("stranger"), Verb::Publish, "/cmd_vel");
+    let other = check(Principal::Name("stranger"), Verb::Publish, "/cmd_vel");
     assert_eq!(other, "allowed: no rule in access.toml denies this");
     let closed = format!("default = \"deny\"\n{ROBOT}");
     let closed = AccessRules::parse(&closed, "access.toml").unwrap();
-    let other = closed.check(Party::Name("stranger"), Verb::Publish, "/cmd_vel");
+    let other = closed.check(Principal::Name("stranger"), Verb::Publish, "/cmd_vel");
     let by_default = "denied: default = \"deny\" in access.toml, and no [[allow]] names the peer";
     assert_eq!((other.to_string(), other.line()), (by_default.to_owned(), None));
 }
 
 #[test]
 fn without_rules_all_is_allowed_and_a_file_without_any_is_refused() {
-    assert!(AccessRules::default().permissions(Party::User(1)).are_unrestricted());
+    assert!(AccessRules::default().permissions(Principal::User(1)).are_unrestricted());
     for text in ["", "# nothing", "[[expect]]\npeer = \"a\"\nsee = \"/x\"\nallowed = true"] {
         assert!(error(text).what.contains("no rules"), "{text}");
     }
     let open = rules("default = \"allow\"");
-    assert!(!open.is_empty() && open.check(Party::Name("a"), Verb::See, "/x").allowed());
+    assert!(!open.is_empty() && open.check(Principal::Name("a"), Verb::See, "/x").allowed());
     let closed = rules("default = \"deny\"");
     for verb in Verb::ALL {
-        assert!(!closed.check(Party::Name("a"), verb, "/x").allowed());
+        assert!(!closed.check(Principal::Name("a"), verb, "/x").allowed());
     }
 }
 
@@ -84,7 +84,7 @@ fn one_line_lets_a_peer_use_an_action_or_serve_it_or_set_parameters() {
         "#,
     );
     let all = |party, verb: Verb, names: &[&str]| {
-        names.iter().all(|name| rules.check(Party::Name(party), verb, name).allowed())
+        names.iter().all(|name| rules.check(Principal::Name(party), verb, name).allowed())
     };
     let services = ["send_goal", "cancel_goal", "get_result"].map(|s| format!("/dock/_action/{s}"));
     let services = services.each_ref().map(String::as_str);
@@ -107,7 +107,7 @@ fn a_denial_of_parameters_or_lifecycle_takes_the_services_of_the_node_and_nothin
         let rules = rules(&format!(
             "[[deny]]\npeer = \"base\"\nparameters = {names}\n[[deny]]\npeer = \"manager\"\nlifecycle = {names}"
         ));
-        let check = |party, verb, name: &str| rules.check(Party::Name(party), verb, name);
+        let check = |party, verb, name: &str| rules.check(Principal::Name(party), verb, name);
         for service in ros::PARAMETER_SERVICES {
             let decision = check("base", Verb::Call, &format!("{node}/{service}"));
             assert_eq!(decision.line(), Some(3), "{names} {service}");
@@ -142,21 +142,21 @@ fn a_pattern_of_one_kind_fits_no_party_of_another() {
         "#,
     );
     let sees = |party| rules.check(party, Verb::See, "/x").allowed();
-    assert!(sees(Party::User(1001)) && !sees(Party::User(1002)));
-    assert!(!sees(Party::Name("uid:1001")) && !sees(Party::Name("address:10.0.0.1")));
-    assert!(sees(Party::Address([10, 0, 0, 7].into())));
-    assert!(sees(Party::Address("::ffff:10.0.0.7".parse().unwrap())));
-    assert!(!sees(Party::Address([10, 0, 1, 7].into())));
+    assert!(sees(Principal::User(1001)) && !sees(Principal::User(1002)));
+    assert!(!sees(Principal::Name("uid:1001")) && !sees(Principal::Name("address:10.0.0.1")));
+    assert!(sees(Principal::Address([10, 0, 0, 7].into())));
+    assert!(sees(Principal::Address("::ffff:10.0.0.7".parse().unwrap())));
+    assert!(!sees(Principal::Address([10, 0, 1, 7].into())));
     let other = "default = \"deny\"\n[[allow]]\npeer = [\"address:FE80::1\", \"address:::ffff:10.1.1.1\"]\nsee = \"**\"";
     let other = AccessRules::parse(other, "f").unwrap();
     for address in ["fe80::1", "10.1.1.1"] {
-        let party = Party::Address(address.parse().unwrap());
+        let party = Principal::Address(address.parse().unwrap());
         assert!(other.check(party, Verb::See, "/x").allowed(), "{address}");
     }
-    assert!(sees(Party::Certificate("base.example")) && sees(Party::Name("Base.Example")));
-    assert!(!sees(Party::Name("base.example")), "another pin");
-    assert!(sees(Party::Name("localhost")), "a host may have a name that begins with local");
-    assert!(sees(Party::Name("local")) && !sees(Party::User(7)), "local* is a host's name");
+    assert!(sees(Principal::Certificate("base.example")) && sees(Principal::Name("Base.Example")));
+    assert!(!sees(Principal::Name("base.example")), "another pin");
+    assert!(sees(Principal::Name("localhost")), "a host may have a name that begins with local");
+    assert!(sees(Principal::Name("local")) && !sees(Principal::User(7)), "local* is a host's name");
 }
 
 #[test]
@@ -206,7 +206,7 @@ fn hostile_files_are_refused_in_bounded_time() {
 fn hostile_names_are_judged_as_they_are_written() {
     let rules =
         rules("default = \"deny\"\n[[allow]]\npeer = \"a\"\npublish = [\"/robot/*/x\", \"/ä/**\"]");
-    let may = |name: &str| rules.check(Party::Name("a"), Verb::Publish, name).allowed();
+    let may = |name: &str| rules.check(Principal::Name("a"), Verb::Publish, name).allowed();
     assert!(may("/robot/arm/x") && may("/ä") && may("/ä/b/c"));
     // The same letter, written in another way, is another name.
     assert!(!may("/a\u{308}/b"));

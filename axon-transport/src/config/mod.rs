@@ -44,7 +44,7 @@ pub use model::{
     LinkCompression, LinkConfig, LinkPoll, PeerAddress, QkdConfig, QkdKex, QkdPeers, QuicCipher,
     Security, SecurityMode,
 };
-pub use place::DaemonPlace;
+pub use place::DaemonLocation;
 pub use summary::security_settings;
 pub use topics::{TopicPriority, TopicRule};
 

@@ -16,14 +16,14 @@ use super::{
 /// Where the daemon of this user and domain listens, and whose it may be. It is known although other
 /// settings, or the files that they name, are wrong: for tools that look at a daemon, and open no session.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct DaemonPlace {
+pub struct DaemonLocation {
     pub(super) domain: u32,
     pub(super) runtime_dir: Option<PathBuf>,
     pub(super) socket_in_runtime_dir: bool,
     pub(super) trusted_uids: Vec<u32>,
 }
 
-impl DaemonPlace {
+impl DaemonLocation {
     /// The place by the environment of this process and the `axon.toml` that [`Config::from_env`] would
     /// read. A file that cannot be read, or that is no TOML, counts as none.
     ///
@@ -64,7 +64,7 @@ impl DaemonPlace {
     }
 }
 
-impl From<&Config> for DaemonPlace {
+impl From<&Config> for DaemonLocation {
     fn from(config: &Config) -> Self {
         Self {
             domain: config.domain,

@@ -141,7 +141,7 @@ fn check_parties(rules: &AccessRules, file: &Path, security: &Security) -> Resul
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::access::{Party, Verb};
+    use crate::access::{Principal, Verb};
 
     const RULES: &str = "[[deny]]\npeer = \"*\"\ncall = \"/reboot\"\n";
 
@@ -156,7 +156,7 @@ mod tests {
         ] {
             let rules = parse(&format!("{settings}{RULES}"), "robot.toml").unwrap();
             let line = 3 + settings.matches('\n').count();
-            let decision = rules.check(Party::User(7), Verb::Call, "/reboot");
+            let decision = rules.check(Principal::User(7), Verb::Call, "/reboot");
             assert_eq!(decision.line(), Some(line as u32), "{settings}");
         }
     }

@@ -61,14 +61,14 @@ impl EventKind {
 /// How often something happened.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
-pub struct Counted {
+pub struct CountStatus {
     /// In all.
     pub total: u64,
     /// Since the status was last taken.
     pub change: u64,
 }
 
-impl Counted {
+impl CountStatus {
     /// So often in all, and since the status was last taken.
     pub fn new(total: u64, change: u64) -> Self {
         Self { total, change }
@@ -101,7 +101,7 @@ impl Matched {
 #[non_exhaustive]
 pub struct IncompatibleQos {
     /// How many, ever.
-    pub count: Counted,
+    pub count: CountStatus,
     /// A policy that kept the last of them apart.
     pub last_policy: Option<Incompatible>,
 }
@@ -124,7 +124,7 @@ pub struct LivelinessChanged {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum EventStatus {
     /// Of an event that is counted and no more.
-    Counted(Counted),
+    Counted(CountStatus),
     /// Of [`EventKind::SubscriptionMatched`] and [`EventKind::PublicationMatched`].
     Matched(Matched),
     /// Of [`EventKind::RequestedQosIncompatible`] and [`EventKind::OfferedQosIncompatible`].
@@ -140,11 +140,11 @@ pub(crate) struct Statuses {
     matched: Matched,
     liveliness: LivelinessChanged,
     incompatible_qos: IncompatibleQos,
-    incompatible_type: Counted,
-    deadline: Counted,
+    incompatible_type: CountStatus,
+    deadline: CountStatus,
     /// A publisher's leases that ran out.
-    lease: Counted,
-    lost: Counted,
+    lease: CountStatus,
+    lost: CountStatus,
     /// Occurrences of each event since its status was last taken.
     unread: [u64; EventKind::ALL.len()],
 }
@@ -166,10 +166,10 @@ impl Statuses {
             matched: Matched::default(),
             liveliness: LivelinessChanged::default(),
             incompatible_qos: IncompatibleQos::default(),
-            incompatible_type: Counted::default(),
-            deadline: Counted::default(),
-            lease: Counted::default(),
-            lost: Counted::default(),
+            incompatible_type: CountStatus::default(),
+            deadline: CountStatus::default(),
+            lease: CountStatus::default(),
+            lost: CountStatus::default(),
             unread: [0; EventKind::ALL.len()],
         }
     }
@@ -293,7 +293,7 @@ impl Statuses {
     }
 }
 
-impl Counted {
+impl CountStatus {
     fn add(&mut self, count: u64) {
         // Losses are counted by numbers that another host says.
         self.total = self.total.saturating_add(count);
@@ -383,7 +383,7 @@ mod tests {
         statuses.incompatible_qos(Incompatible::Durability);
         statuses.incompatible_qos(Incompatible::Reliability);
         let expected = |change| {
-            let count = Counted { total: 2, change };
+            let count = CountStatus { total: 2, change };
             let last_policy = Some(Incompatible::Reliability);
             Some(EventStatus::IncompatibleQos(IncompatibleQos { count, last_policy }))
         };

@@ -2,7 +2,7 @@
 
 use std::{ffi::c_void, sync::Arc};
 
-use crate::session::OnNew;
+use crate::session::NewDataCallback;
 
 /// A function that receives the number of new events: those since its last call, at least one. The session's
 /// thread may call the function. Two threads never call it at once. The function must not block. It may call
@@ -21,7 +21,7 @@ unsafe impl Send for User {}
 unsafe impl Sync for User {}
 
 /// Converts a callback of the program to the closure that the session calls.
-pub(super) fn told(callback: axon_callback_t, user: *const c_void) -> Option<OnNew> {
+pub(super) fn told(callback: axon_callback_t, user: *const c_void) -> Option<NewDataCallback> {
     let function = callback?;
     let user = User(user);
     Some(Arc::new(move |count: u64| {

@@ -61,7 +61,7 @@ pub fn shows(party: &Permissions, endpoint: &Endpoint) -> bool {
 mod tests {
     use super::*;
     use crate::{
-        access::{AccessRules, Party},
+        access::{AccessRules, Principal},
         ids::Gid,
     };
 
@@ -69,7 +69,7 @@ mod tests {
     fn a_party_is_shown_endpoints_that_it_may_see_or_needs() {
         let rules = "[[allow]]\npeer = \"a\"\npublish = \"/in\"\nsubscribe = \"/out\"\nserve = \"/s\"\n\
                      call = \"/c\"\nsee = [\"/seen\", \"/ns/node\", \"/root\"]";
-        let party = AccessRules::parse(rules, "f").unwrap().permissions(Party::Name("a"));
+        let party = AccessRules::parse(rules, "f").unwrap().permissions(Principal::Name("a"));
         use EndpointKind::{Client, Node, Publisher, Server, Subscription};
         let of = |kind, topic: &str| {
             let mut endpoint = Endpoint::example(Gid([1; 16]), kind);
@@ -108,7 +108,7 @@ mod tests {
             assert_eq!(shows(&party, &node), sees, "{node:?}");
         }
         let hidden = "[[deny]]\npeer = \"a\"\nsee = \"/secret\"";
-        let hidden = AccessRules::parse(hidden, "f").unwrap().permissions(Party::Name("a"));
+        let hidden = AccessRules::parse(hidden, "f").unwrap().permissions(Principal::Name("a"));
         for kind in [Publisher, Subscription, Server, Client] {
             let [secret, other] = ["/secret", "/x"].map(|topic| of(kind, topic));
             assert!(!shows(&hidden, &secret) && !permits(&hidden, &secret), "{kind:?}");
@@ -116,7 +116,7 @@ mod tests {
         }
         let both =
             "[[deny]]\npeer = \"a\"\nsee = \"**\"\n[[allow]]\npeer = \"a\"\nsubscribe = \"/scan\"";
-        let both = AccessRules::parse(both, "f").unwrap().permissions(Party::Name("a"));
+        let both = AccessRules::parse(both, "f").unwrap().permissions(Principal::Name("a"));
         assert!(
             shows(&both, &of(Publisher, "/scan")) && permits(&both, &of(Subscription, "/scan"))
         );
@@ -136,7 +136,7 @@ mod tests {
             ("[[deny]]\npeer = \"a\"\nsee = \"**\"".to_owned(), false),
             ("[[deny]]\npeer = \"a\"\nsee = \"/*\"".to_owned(), true),
         ] {
-            let party = AccessRules::parse(&rules, "f").unwrap().permissions(Party::Name("a"));
+            let party = AccessRules::parse(&rules, "f").unwrap().permissions(Principal::Name("a"));
             let node = of(Node, "").with_node("node", "/ns");
             assert_eq!(permits(&party, &node), has_nodes, "{rules}");
         }

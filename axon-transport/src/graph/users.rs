@@ -5,7 +5,7 @@
 use std::collections::HashMap;
 
 use super::{Endpoint, permits, shows, verb_of};
-use crate::access::{AccessRules, Party, Permissions};
+use crate::access::{AccessRules, Principal, Permissions};
 
 /// The rules, compiled for each user who has a session, or had one.
 #[derive(Debug, Default)]
@@ -21,12 +21,12 @@ impl Users {
 
     pub(crate) fn add(&mut self, user: u32) {
         let rules = &self.rules;
-        self.permissions.entry(user).or_insert_with(|| rules.permissions(Party::User(user)));
+        self.permissions.entry(user).or_insert_with(|| rules.permissions(Principal::User(user)));
     }
 
     pub(crate) fn set_rules(&mut self, rules: AccessRules) {
         for (user, permissions) in &mut self.permissions {
-            *permissions = rules.permissions(Party::User(*user));
+            *permissions = rules.permissions(Principal::User(*user));
         }
         self.rules = rules;
     }

@@ -35,5 +35,5 @@ pub use self::{
     handle::Session,
     interface::{Node, Ready, Waitable},
     options::{DaemonCommand, EndpointSpec, SessionOptions},
-    sides::{Lifetime, MessageInfo, OnNew, TakeLimit},
+    sides::{Lifetime, MessageInfo, NewDataCallback, TakeLimit},
 };

@@ -16,7 +16,7 @@ use std::{
 
 use axon_transport::{
     EndpointSpec, Event, Publisher, Session, Subscription,
-    config::DaemonPlace,
+    config::DaemonLocation,
     daemon_reload_at,
     events::{EventKind, EventStatus},
     qos::{Durability, Qos},
@@ -62,7 +62,7 @@ struct Hosts {
     peer: &'static str,
     rules: PathBuf,
     /// Where the robot's daemon is, whatever its rules are.
-    place: DaemonPlace,
+    place: DaemonLocation,
     _keys: tempfile::TempDir,
 }
 
@@ -72,7 +72,7 @@ impl Hosts {
         let rules = robot.dir.path().join("access.toml");
         robot.set("AXON_ACCESS_FILE", rules.to_str().unwrap());
         fs::write(&rules, "default = \"allow\"").unwrap();
-        let place = DaemonPlace::from(&robot.config());
+        let place = DaemonLocation::from(&robot.config());
         let mut hosts = Self { robot, base, peer, rules, place, _keys: keys };
         hosts.write(ROBOT);
         hosts.robot.start();

@@ -9,7 +9,7 @@ use std::{
 use axon_transport::internal::session::from_unix_nanos;
 use axon_transport::{
     EndpointSpec, Event, Publisher, Session, Subscription, Waitable,
-    events::{Counted, EventKind, EventStatus, LivelinessChanged, Matched},
+    events::{CountStatus, EventKind, EventStatus, LivelinessChanged, Matched},
     qos::{Durability, Incompatible, Liveliness, Qos, Reliability},
 };
 use rustix::process::Signal;
@@ -39,7 +39,7 @@ fn occurs(session: &Session, event: &Event) {
     assert_eq!(session.wait_for(&[Waitable::Event(event)], Some(PATIENCE)).unwrap(), [0]);
 }
 
-fn counted(event: &Event) -> Counted {
+fn counted(event: &Event) -> CountStatus {
     let EventStatus::Counted(status) = event.take() else { unreachable!() };
     status
 }
@@ -121,7 +121,7 @@ fn each_policy_that_falls_short_is_reported_on_both_hosts() {
             for (session, event, total) in [(&here, &offers, total), (&there, &requests, 1)] {
                 occurs(session, event);
                 let EventStatus::IncompatibleQos(status) = event.take() else { unreachable!() };
-                assert_eq!(status.count, Counted::new(total, 1));
+                assert_eq!(status.count, CountStatus::new(total, 1));
                 assert_eq!(status.last_policy, Some(policy));
             }
             assert!(publisher.matched().is_empty() && subscription.matched().is_empty());
@@ -143,7 +143,7 @@ fn another_type_is_reported_on_both_hosts() {
         let requests = subscription.event(EventKind::SubscriptionIncompatibleType).unwrap();
         for (session, event, total) in [(&here, &offers, total), (&there, &requests, 1)] {
             occurs(session, event);
-            assert_eq!(counted(event), Counted::new(total, 1));
+            assert_eq!(counted(event), CountStatus::new(total, 1));
         }
         assert!(publisher.matched().is_empty() && subscription.matched().is_empty());
     }

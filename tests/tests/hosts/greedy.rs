@@ -12,7 +12,7 @@ use axon_tests::Sizes;
 use axon_tls::identity::{Auth, KeyAlgorithm, SigningKey, Trust, TrustFile};
 use axon_transport::{
     EndpointSpec,
-    config::DaemonPlace,
+    config::DaemonLocation,
     daemon_reload_at,
     graph::{Endpoint, EndpointKind},
     ids::{DaemonId, Gid, SessionId},
@@ -76,7 +76,7 @@ impl Camera {
     /// Has host A read these access rules.
     pub(crate) fn set_rules(&self, rules: &str) {
         fs::write(self.dir.path().join("access.toml"), rules).unwrap();
-        let report = daemon_reload_at(&DaemonPlace::from(&self.a.config())).unwrap();
+        let report = daemon_reload_at(&DaemonLocation::from(&self.a.config())).unwrap();
         assert_eq!((report.changed, report.error), (vec!["access rules".to_owned()], None));
     }
 

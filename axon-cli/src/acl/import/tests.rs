@@ -1,6 +1,6 @@
 //! Documents of SROS2, and documents that want to do harm.
 
-use axon_transport::access::{AccessRules, Party, Verb};
+use axon_transport::access::{AccessRules, Principal, Verb};
 
 use super::{Notes, import};
 
@@ -37,7 +37,7 @@ fn refused(document: &str) -> String {
 }
 
 fn may(text: &str, verb: Verb, name: &str) -> bool {
-    AccessRules::parse(text, "imported").unwrap().check(Party::Name("base"), verb, name).allowed()
+    AccessRules::parse(text, "imported").unwrap().check(Principal::Name("base"), verb, name).allowed()
 }
 
 #[test]

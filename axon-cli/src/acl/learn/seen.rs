@@ -6,7 +6,7 @@ use std::{
 };
 
 use axon_transport::{
-    access::{Party, TopicPattern, Verb},
+    access::{Principal, TopicPattern, Verb},
     internal::graph::other_end,
 };
 
@@ -64,8 +64,8 @@ impl Name {
     /// Whether a rule can name it and nobody else.
     fn is_sayable(&self) -> bool {
         let text = self.text();
-        let is = match Party::parse(&text) {
-            Ok(Party::User(_)) => matches!(self, Self::User(_)),
+        let is = match Principal::parse(&text) {
+            Ok(Principal::User(_)) => matches!(self, Self::User(_)),
             Ok(_) => matches!(self, Self::Host(_)),
             Err(_) => false,
         };
@@ -180,7 +180,7 @@ impl Seen {
         let rules = verify(text)?;
         for (name, seen) in self.parties.iter().filter(|(name, _)| name.is_sayable()) {
             let name = name.text();
-            let Ok(party) = Party::parse(&name) else { continue };
+            let Ok(party) = Principal::parse(&name) else { continue };
             let permissions = rules.permissions(party);
             let sayable = |uses: &&Use| is_literal(&uses.1);
             let lost = seen.used().find(|(verb, topic)| !permissions.allows(*verb, topic));
@@ -325,7 +325,7 @@ mod tests {
     }
 
     fn allows(text: &str, name: &str, verb: Verb, topic: &str) -> bool {
-        verify(text).unwrap().check(Party::parse(name).unwrap(), verb, topic).allowed()
+        verify(text).unwrap().check(Principal::parse(name).unwrap(), verb, topic).allowed()
     }
 
     #[test]
@@ -455,7 +455,7 @@ mod tests {
         let text = seen.rules(false).unwrap();
         assert_eq!(verify(&text).unwrap().expectations().len(), MOST_EXPECTATIONS);
         assert!(text.contains("# 904 more uses are expected"), "{}", text.len());
-        let rules = verify(&text).unwrap().permissions(Party::Name("base"));
+        let rules = verify(&text).unwrap().permissions(Principal::Name("base"));
         assert!(names.iter().all(|name| rules.allows(Verb::Subscribe, name)));
     }
 }

@@ -35,7 +35,7 @@ use crate::{
     },
     error::GatewayError,
     link::{CloseCode, Elected, GraphUpdate, LinkMessage, Owners, Subscribe},
-    owner::{Binding, EXPORTER, prove},
+    owner::{ChannelBinding, EXPORTER, prove},
 };
 
 /// Time for the daemon to close a link that it refuses.
@@ -176,7 +176,7 @@ impl AcceptedLink {
             .with_qos(Qos::keep_all());
         let graph =
             GraphUpdate { version: 1, before: 0, added: vec![endpoint], ..GraphUpdate::default() };
-        let mut binding = Binding::default();
+        let mut binding = ChannelBinding::default();
         self.connection
             .export_keying_material(&mut binding, EXPORTER, b"")
             .map_err(|_| internal("the connection has no exporter"))?;

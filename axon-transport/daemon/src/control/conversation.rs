@@ -46,7 +46,7 @@ pub(super) async fn converse(
         let sent = {
             let _turn = turn.lock().await;
             let sent = send_some(control, socket, &id, bell);
-            if matches!(sent, Ok(Sent::Some)) {
+            if matches!(sent, Ok(SendOutcome::Some)) {
                 // With the turn in hand: else all sessions of the process do a part before the others are
                 // looked at.
                 tokio::task::yield_now().await;
@@ -54,9 +54,9 @@ pub(super) async fn converse(
             sent
         };
         let full = match sent {
-            Ok(Sent::All) => false,
-            Ok(Sent::Full) => true,
-            Ok(Sent::Some) => continue,
+            Ok(SendOutcome::All) => false,
+            Ok(SendOutcome::Full) => true,
+            Ok(SendOutcome::Some) => continue,
             Err(error) => {
                 take_rest(control, socket, &id, bell, turn).await;
                 return error.to_string();
@@ -76,8 +76,8 @@ pub(super) async fn converse(
                     send_some(control, socket, &id, bell)
                 };
                 match sent {
-                    Ok(Sent::Full) => ready.clear_ready(),
-                    Ok(Sent::All | Sent::Some) => {}
+                    Ok(SendOutcome::Full) => ready.clear_ready(),
+                    Ok(SendOutcome::All | SendOutcome::Some) => {}
                     Err(error) => {
                         take_rest(control, socket, &id, bell, turn).await;
                         return error.to_string();
@@ -126,7 +126,7 @@ async fn take_rest(
 }
 
 /// What came of sending.
-enum Sent {
+enum SendOutcome {
     /// Nothing waits any more.
     All,
     /// Some waits, and the others have their turn first.
@@ -141,11 +141,11 @@ fn send_some(
     socket: &AsyncFd<PassedFd>,
     id: &SessionId,
     bell: &Rc<Notify>,
-) -> Result<Sent, SocketError> {
+) -> Result<SendOutcome, SocketError> {
     let control = &mut *control.borrow_mut();
     // What waits is for the connection on which the session came back.
     if !control.is_current(id, bell) {
-        return Ok(Sent::All);
+        return Ok(SendOutcome::All);
     }
     let sent = send_packets(control, socket, id);
     if control.registry.has_fences() {
@@ -158,7 +158,7 @@ fn send_packets(
     control: &mut ControlPlane,
     socket: &AsyncFd<PassedFd>,
     id: &SessionId,
-) -> Result<Sent, SocketError> {
+) -> Result<SendOutcome, SocketError> {
     let (registry, begin) = (&mut control.registry, Instant::now());
     while let Some(output) = registry.poll_output(id) {
         let descriptors: Vec<BorrowedFd<'_>> =
@@ -171,15 +171,15 @@ fn send_packets(
             Err(SocketError::NotReady) => {
                 drop(descriptors);
                 registry.return_output(id, output);
-                return Ok(Sent::Full);
+                return Ok(SendOutcome::Full);
             }
             Err(error) => return Err(error),
         }
         if begin.elapsed() >= PART {
-            return Ok(Sent::Some);
+            return Ok(SendOutcome::Some);
         }
     }
-    Ok(Sent::All)
+    Ok(SendOutcome::All)
 }
 
 /// Receives one packet. Where descriptors are short, the spare ones make room for those that come with it, so that the

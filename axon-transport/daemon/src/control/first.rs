@@ -22,7 +22,7 @@ use super::{
 const UNKNOWN: u32 = 8;
 
 /// What a connection begins with.
-pub(super) struct FirstMessage {
+pub(super) struct PreHelloMessage {
     pub(super) hello: SessionHello,
     pub(super) descriptors: Vec<PassedFd>,
     /// What came before: the key that the session's id is made of.
@@ -31,7 +31,7 @@ pub(super) struct FirstMessage {
     pub(super) is_crowded: bool,
 }
 
-impl FirstMessage {
+impl PreHelloMessage {
     /// Whether the key that came, if one did, is that of the id.
     pub(super) fn is_its_own(&self) -> Result<(), Box<SessionRefused>> {
         match &self.key {
@@ -50,7 +50,7 @@ pub(super) async fn first(
     spare: &SpareDescriptors,
     socket: &AsyncFd<PassedFd>,
     has_room: impl Fn() -> bool,
-) -> Option<FirstMessage> {
+) -> Option<PreHelloMessage> {
     let mut buffer = Vec::new();
     let mut unknown = 0;
     let mut key = None;
@@ -62,11 +62,11 @@ pub(super) async fn first(
                 return None;
             };
             let descriptors = Vec::new();
-            return Some(FirstMessage { hello, descriptors, key, is_crowded: true });
+            return Some(PreHelloMessage { hello, descriptors, key, is_crowded: true });
         }
         match receive(spare, fd, &mut buffer) {
             Ok(ReceivedMessage { message: SessionMessage::Hello(hello), descriptors }) => {
-                return Some(FirstMessage { hello, descriptors, key, is_crowded: false });
+                return Some(PreHelloMessage { hello, descriptors, key, is_crowded: false });
             }
             Ok(ReceivedMessage { message: SessionMessage::Unknown(OWNER), descriptors })
                 if key.is_none() && descriptors.is_empty() =>

@@ -38,8 +38,8 @@ use tokio::{io::unix::AsyncFd, sync::Notify, task::spawn_local, time::timeout};
 use super::{
     conversation::{converse, say},
     descriptors::DescriptorRoom,
-    first::{FirstMessage, first},
-    pending::{MOST, MOST_WHERE_SHORT, PendingConnections, Stranger},
+    first::{PreHelloMessage, first},
+    pending::{MOST, MOST_WHERE_SHORT, PendingConnections, PendingConnection},
     plane::ControlPlane,
     turns::ProcessTurn,
 };
@@ -139,7 +139,7 @@ pub(super) async fn serve(
     control: Rc<RefCell<ControlPlane>>,
     socket: PassedFd,
     inside: InternalPeer,
-    stranger: Option<Stranger>,
+    stranger: Option<PendingConnection>,
 ) {
     let Ok(peer) = peer_process(&socket) else { return };
     if !control.borrow().admission.trusts(peer.uid) {
@@ -264,11 +264,11 @@ fn shown(name: &str) -> String {
 fn relay(
     control: &Rc<RefCell<ControlPlane>>,
     socket: AsyncFd<PassedFd>,
-    first: FirstMessage,
+    first: PreHelloMessage,
     peer: PeerProcess,
 ) {
     let its_own = first.is_its_own();
-    let FirstMessage { mut hello, descriptors, key, .. } = first;
+    let PreHelloMessage { mut hello, descriptors, key, .. } = first;
     hello.name = shown(&hello.name);
     let mut state = control.borrow_mut();
     let reason = hello.relay.clone().unwrap_or_default();
@@ -347,12 +347,12 @@ struct Admitted {
 fn admit(
     control: &Rc<RefCell<ControlPlane>>,
     socket: &AsyncFd<PassedFd>,
-    first: FirstMessage,
+    first: PreHelloMessage,
     peer: PeerProcess,
     inside: &InternalPeer,
 ) -> Option<Admitted> {
     let its_own = first.is_its_own();
-    let FirstMessage { mut hello, descriptors, mut key, is_crowded } = first;
+    let PreHelloMessage { mut hello, descriptors, mut key, is_crowded } = first;
     hello.name = shown(&hello.name);
     let control = &mut *control.borrow_mut();
     let gateway = matches!(inside, InternalPeer::Gateway);

@@ -28,7 +28,7 @@ struct SilentConnection {
 
 /// One of them, until it is dropped.
 #[derive(Debug)]
-pub(super) struct Stranger {
+pub(super) struct PendingConnection {
     strangers: PendingConnections,
     number: u64,
     replaced: Rc<Notify>,
@@ -36,7 +36,7 @@ pub(super) struct Stranger {
 
 impl PendingConnections {
     /// A connection of process `pid` came. If there are more than `most`, one of them has to go.
-    pub(super) fn add(&self, pid: u32, most: usize) -> Stranger {
+    pub(super) fn add(&self, pid: u32, most: usize) -> PendingConnection {
         let mut waiting = self.0.borrow_mut();
         let (number, replaced) = (waiting.next, Rc::new(Notify::new()));
         waiting.next += 1;
@@ -48,7 +48,7 @@ impl PendingConnections {
             victim.notify_one();
         }
         drop(waiting);
-        Stranger { strangers: self.clone(), number, replaced }
+        PendingConnection { strangers: self.clone(), number, replaced }
     }
 }
 
@@ -63,14 +63,14 @@ impl SilentConnection {
     }
 }
 
-impl Stranger {
+impl PendingConnection {
     /// Waits until another connection takes its place.
     pub(super) async fn replaced(&self) {
         self.replaced.notified().await;
     }
 }
 
-impl Drop for Stranger {
+impl Drop for PendingConnection {
     fn drop(&mut self) {
         self.strangers.0.borrow_mut().connections.remove(&self.number);
     }
@@ -84,7 +84,7 @@ mod tests {
     fn the_oldest_of_the_process_with_the_most_connections_makes_room() {
         let strangers = PendingConnections::default();
         let there =
-            |stranger: &Stranger| strangers.0.borrow().connections.contains_key(&stranger.number);
+            |stranger: &PendingConnection| strangers.0.borrow().connections.contains_key(&stranger.number);
         let honest = strangers.add(7, MOST);
         let crowd: Vec<_> = (0..3 * MOST).map(|_| strangers.add(9, MOST)).collect();
         let late = strangers.add(8, MOST);

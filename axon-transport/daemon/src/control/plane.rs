@@ -38,7 +38,7 @@ use super::{
         questions::{AccessQuestions, NOT_LINKED},
         waiting::NotifiedEndpoints,
     },
-    turns::ProcessTurns,
+    turns::ProcessScheduler,
 };
 use crate::{
     bridge::{RefusalKind, RefusedRoute, ToControl, TrafficRules},
@@ -98,7 +98,7 @@ pub(super) struct ControlPlane {
     /// Where linked peers are.
     linked: BTreeMap<DaemonId, IpAddr>,
     wakers: HashMap<SessionId, Rc<Notify>>,
-    pub(super) turns: ProcessTurns,
+    pub(super) turns: ProcessScheduler,
     /// Wakes the task that flushes the graph.
     pub(super) changed: Rc<Notify>,
     /// Whether there is an application, and what wakes the task that waits for that to change.
@@ -156,7 +156,7 @@ impl ControlPlane {
             names: BTreeMap::new(),
             linked: BTreeMap::new(),
             wakers: HashMap::new(),
-            turns: ProcessTurns::default(),
+            turns: ProcessScheduler::default(),
             config,
             changed: Rc::default(),
             needed: false,

@@ -253,7 +253,7 @@ mod tests {
     use crate::bridge::ToControl;
     use crate::control::descriptors::SpareDescriptors;
     use axon_transport::{
-        access::{Party, Verb},
+        access::{Principal, Verb},
         config::{TopicPattern, TopicPriority, TopicRule},
     };
 
@@ -277,7 +277,7 @@ mod tests {
         assert_eq!(report.needs_restart, ["ROS_DOMAIN_ID", "[link]"]);
         assert_eq!((control.config.domain, control.config.link.mtu), (0, 1452));
         let denied = |rules: &axon_transport::access::AccessRules| {
-            !rules.check(Party::User(7), Verb::Publish, "/y").allowed()
+            !rules.check(Principal::User(7), Verb::Publish, "/y").allowed()
         };
         assert!(seen.has_changed().unwrap() && denied(&seen.borrow_and_update().1.access));
         assert!(control.wanted.borrow().hosts.iter().any(|(host, _)| host == "10.0.0.7"));

@@ -19,9 +19,9 @@ pub(super) type ProcessTurn = Rc<Mutex<()>>;
 
 /// The turns of all processes that have sessions.
 #[derive(Debug, Default)]
-pub(super) struct ProcessTurns(HashMap<u32, Weak<Mutex<()>>>);
+pub(super) struct ProcessScheduler(HashMap<u32, Weak<Mutex<()>>>);
 
-impl ProcessTurns {
+impl ProcessScheduler {
     /// That of the sessions of process `pid`.
     pub(super) fn of(&mut self, pid: u32) -> ProcessTurn {
         if let Some(turn) = self.0.get(&pid).and_then(Weak::upgrade) {
@@ -40,7 +40,7 @@ mod tests {
 
     #[test]
     fn sessions_of_a_process_share_a_turn_and_nothing_is_left_of_it() {
-        let mut turns = ProcessTurns::default();
+        let mut turns = ProcessScheduler::default();
         let (one, again, other) = (turns.of(1), turns.of(1), turns.of(2));
         let held = one.try_lock().unwrap();
         assert!(again.try_lock().is_err() && other.try_lock().is_ok());
@@ -59,7 +59,7 @@ mod tests {
 
         let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
         LocalSet::new().block_on(&runtime, async {
-            let (mut turns, parts) = (ProcessTurns::default(), Rc::new(Cell::new(0_u32)));
+            let (mut turns, parts) = (ProcessScheduler::default(), Rc::new(Cell::new(0_u32)));
             for _ in 0..1000 {
                 let (turn, parts) = (turns.of(1), Rc::clone(&parts));
                 spawn_local(async move {

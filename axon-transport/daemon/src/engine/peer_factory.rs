@@ -15,7 +15,7 @@ use super::{
     peer::{Peer, PeerParts, ROUTES_UNSAID},
     peer_graph::owners::Prover,
 };
-use crate::owner::{Binding, SessionKeys};
+use crate::owner::{ChannelBinding, SessionKeys};
 
 /// What all peers have in common.
 pub(super) struct PeerFactory {
@@ -39,7 +39,7 @@ pub(super) struct FirstLink {
     pub(super) account: Rc<Account>,
     /// What access rules let the peer do.
     pub(super) permissions: Permissions,
-    pub(super) binding: Option<Binding>,
+    pub(super) binding: Option<ChannelBinding>,
     /// Routes that the peer's HELLO says it serves at most.
     pub(super) routes: Option<u32>,
     /// Whether sessions prove that they are of their host.

@@ -13,7 +13,7 @@ use axon_transport::config::{Config, TopicRule};
 
 use super::{
     peer::{
-        LocalEndpoints, Peer, PeerContext, WritersHere, kept_relays::KeptRelays,
+        LocalEndpoints, Peer, PeerContext, LocalWriterCounts, kept_relays::KeptRelays,
         stalls::StallHistory,
     },
     rings::Rings,
@@ -35,7 +35,7 @@ pub(super) struct LinkedPeers {
     stalls: RefCell<StallHistory>,
     kept: RefCell<KeptRelays>,
     local: LocalEndpoints,
-    writers: WritersHere,
+    writers: LocalWriterCounts,
     waiting_for_room: bool,
     /// Readers with samples to take; kept for its memory.
     active: Vec<(Gid, Gid)>,
@@ -54,7 +54,7 @@ impl LinkedPeers {
             stalls: RefCell::default(),
             kept: RefCell::default(),
             local: LocalEndpoints::new(),
-            writers: WritersHere::default(),
+            writers: LocalWriterCounts::default(),
             waiting_for_room: false,
             active: Vec::new(),
             follow_local_at: Duration::ZERO,
@@ -134,7 +134,7 @@ impl LinkedPeers {
 
     /// The graph of this host changed.
     pub(super) fn handle_local_graph(&mut self, now: Duration, local: LocalEndpoints) {
-        self.writers = WritersHere::of(local.values().map(|(endpoint, _)| &**endpoint));
+        self.writers = LocalWriterCounts::of(local.values().map(|(endpoint, _)| &**endpoint));
         self.local = local;
         let endpoints = self.all.values().map(|peer| peer.remote.len() + self.local.len());
         let took = ENDPOINT * u32::try_from(endpoints.sum::<usize>()).unwrap_or(u32::MAX);
@@ -219,7 +219,7 @@ fn peer_context<'a>(
     rings: &'a dyn Rings,
     stand_ins: &'a StandIns,
     (stalls, kept): (&'a RefCell<StallHistory>, &'a RefCell<KeptRelays>),
-    (local, writers): (&'a LocalEndpoints, &'a WritersHere),
+    (local, writers): (&'a LocalEndpoints, &'a LocalWriterCounts),
 ) -> PeerContext<'a> {
     PeerContext { rings, stand_ins, local, writers, config, stalls, kept }
 }

@@ -19,7 +19,7 @@ use axon_transport::config::{ClassicAuth, ClassicConfig};
 
 use self::{
     load::IdentityFiles,
-    watch::{FilesChange, Watch},
+    watch::{FilesChange, FileWatcher},
 };
 use crate::error::GatewayError;
 
@@ -36,7 +36,7 @@ pub(crate) struct Identity {
     sources: IdentityFiles,
     host: String,
     in_force: RwLock<InForce>,
-    watch: Mutex<Watch>,
+    watch: Mutex<FileWatcher>,
 }
 
 struct InForce {
@@ -54,7 +54,7 @@ impl Identity {
     pub(crate) fn load(classic: &ClassicConfig, node: &str) -> Result<Self, GatewayError> {
         let sources = IdentityFiles::of(classic)?;
         // Before they are read: what is written meanwhile is read again.
-        let watch = Watch::new(sources.files());
+        let watch = FileWatcher::new(sources.files());
         let auth = sources.load(None)?.put_in_force();
         let host = sources.host(&auth, node)?;
         let in_force = RwLock::new(InForce { auth, closed: None });

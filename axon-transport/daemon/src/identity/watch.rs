@@ -22,19 +22,19 @@ pub(super) enum FilesChange {
 
 /// Files, and what was seen of them.
 #[derive(Debug)]
-pub(super) struct Watch {
+pub(super) struct FileWatcher {
     files: Vec<NamedFile>,
     /// As they were when they were read.
-    read: Option<Vec<Seen>>,
+    read: Option<Vec<FileStamps>>,
     /// As they were at the last look.
-    seen: Vec<Seen>,
+    seen: Vec<FileStamps>,
     restless_since: Option<Instant>,
 }
 
 /// A file, or why there is none to use.
-type Seen = Result<FileStamp, String>;
+type FileStamps = Result<FileStamp, String>;
 
-impl Watch {
+impl FileWatcher {
     /// Files that are about to be read for the first time.
     pub(super) fn new(files: Vec<NamedFile>) -> Self {
         let seen: Vec<_> = files.iter().map(NamedFile::stamp).collect();
@@ -81,7 +81,7 @@ impl Watch {
         true
     }
 
-    fn stamps(&self) -> Vec<Seen> {
+    fn stamps(&self) -> Vec<FileStamps> {
         self.files.iter().map(NamedFile::stamp).collect()
     }
 }

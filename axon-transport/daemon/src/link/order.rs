@@ -35,7 +35,7 @@ enum OrderStep {
 
 /// Judges each message that arrives on a connection's control stream.
 #[derive(Clone, Debug)]
-pub struct Order {
+pub struct MessageOrder {
     side: Side,
     qkd: bool,
     /// Whether the peer is the one that elects.
@@ -44,7 +44,7 @@ pub struct Order {
     hello_seen: bool,
 }
 
-impl Order {
+impl MessageOrder {
     /// The order for a fresh connection, in qkd or classic.
     pub fn new(side: Side, qkd: bool) -> Self {
         Self { side, qkd, peer_elects: false, step: OrderStep::Hello, hello_seen: false }
@@ -132,7 +132,7 @@ impl LinkMessage {
             Self::RouteUnasked(_) => "ROUTE_UNASKED",
             Self::Owners(_) => "OWNERS",
             Self::LinkClosed(_) => "LINK_CLOSED",
-            Self::Intake(_) => "INTAKE",
+            Self::ReceiveLimits(_) => "INTAKE",
             Self::Denied(_) => "DENIED",
             Self::AccessCheck(_) => "ACCESS_CHECK",
             Self::AccessDecisions(_) => "ACCESS_DECISIONS",

@@ -32,7 +32,7 @@ fn a_hello_that_differs_is_refused_by_name() {
 fn nothing_precedes_hello_proof_and_election() {
     let others: Vec<_> = messages().into_iter().skip(1).collect();
     for side in [Side::Client, Side::Server] {
-        let mut order = Order::new(side, true);
+        let mut order = MessageOrder::new(side, true);
         for m in &others {
             assert!(order.accept(m).is_err(), "{} before HELLO", m.name());
         }
@@ -63,7 +63,7 @@ fn nothing_precedes_hello_proof_and_election() {
 
 #[test]
 fn the_higher_id_cannot_elect_and_classic_knows_no_keys() {
-    let mut order = Order::new(Side::Server, false);
+    let mut order = MessageOrder::new(Side::Server, false);
     order.accept(&messages()[0]).unwrap();
     order.hello_checked(false);
     assert!(order.accept(&elected()).is_err());

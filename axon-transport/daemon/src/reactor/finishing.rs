@@ -10,7 +10,7 @@ const LOOK: Duration = Duration::from_millis(20);
 
 /// The progress of a shutdown.
 #[derive(Debug)]
-pub(super) struct Finishing {
+pub(super) struct ShutdownDrain {
     begun: Duration,
     /// Bytes that had left the queues at the last look, and since when the number is the same.
     released: usize,
@@ -20,7 +20,7 @@ pub(super) struct Finishing {
     empty: bool,
 }
 
-impl Finishing {
+impl ShutdownDrain {
     /// A shutdown that begins now.
     pub(super) fn new(now: Duration) -> Self {
         Self { begun: now, released: 0, since: now, next: now + LOOK, empty: false }
@@ -53,7 +53,7 @@ mod tests {
     #[test]
     fn it_ends_when_nothing_waits_twice_or_without_progress() {
         let looks = |at: fn(u32) -> (usize, usize)| {
-            let mut finishing = Finishing::new(Duration::ZERO);
+            let mut finishing = ShutdownDrain::new(Duration::ZERO);
             (1..).find(|look| finishing.is_over(at(*look), LOOK * *look))
         };
         let [patience, longest] = [PATIENCE, LONGEST].map(|t| t.div_duration_f64(LOOK) as u32);

@@ -21,7 +21,7 @@ use tokio::{
 use super::{
     compressor::CompressorThread,
     control_outbox::ControlOutbox,
-    finishing::Finishing,
+    finishing::ShutdownDrain,
     inputs::{Inputs, ReactorInput, TaskResult},
     key_reports::KeyReports,
     poll_rule::{PollDecision, PollRule},
@@ -90,7 +90,7 @@ pub(super) struct Reactor {
     is_flooded: bool,
     /// Packets may be left that the last pass did not send.
     has_packets: bool,
-    finishing: Option<Finishing>,
+    finishing: Option<ShutdownDrain>,
     shutdown: bool,
     key_reports: KeyReports,
     looks: PollRule,
@@ -235,7 +235,7 @@ impl Reactor {
         match order {
             ToGateway::Shutdown => self.shutdown = true,
             ToGateway::Finish => {
-                self.finishing.get_or_insert_with(|| Finishing::new(now));
+                self.finishing.get_or_insert_with(|| ShutdownDrain::new(now));
             }
             order => self.engine.handle_order(now, order),
         }
@@ -353,7 +353,7 @@ impl Reactor {
             std::thread::sleep(REST.min(due));
         }
         let now = self.now();
-        let finishing = self.finishing.as_ref().map(Finishing::poll_timeout);
+        let finishing = self.finishing.as_ref().map(ShutdownDrain::poll_timeout);
         let keys = self.kme.as_ref().and_then(|_| self.key_reports.poll_timeout());
         let follow = self.notices.has_graph().then(|| self.engine.follow_local_at());
         let due = [self.engine.poll_timeout(now), finishing, keys, follow];

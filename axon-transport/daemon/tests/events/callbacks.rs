@@ -8,7 +8,7 @@ use std::{
 };
 
 use axon_transport::{
-    EndpointSpec, Event, OnNew, Session,
+    EndpointSpec, Event, NewDataCallback, Session,
     events::{EventKind, EventStatus},
     ids::Gid,
     qos::{Liveliness, Qos},
@@ -156,7 +156,7 @@ impl Scene<'_> {
 /// Who was told how often, one call after another.
 type Calls = Arc<Mutex<Vec<(ThreadId, u64)>>>;
 
-fn recorder() -> (OnNew, Calls) {
+fn recorder() -> (NewDataCallback, Calls) {
     let calls = Calls::default();
     let told = calls.clone();
     (Arc::new(move |new| told.lock().unwrap().push((thread::current().id(), new))), calls)

@@ -24,8 +24,8 @@ use std::{
 use alone::alone;
 use axon_transport::internal::session::from_unix_nanos;
 use axon_transport::{
-    EndpointSpec, Event, OnNew, Publisher, Session, Subscription, Waitable,
-    events::{Counted, EventKind, EventStatus, LivelinessChanged, Matched},
+    EndpointSpec, Event, NewDataCallback, Publisher, Session, Subscription, Waitable,
+    events::{CountStatus, EventKind, EventStatus, LivelinessChanged, Matched},
     qos::{Durability, Incompatible, Liveliness, Qos, Reliability},
 };
 use pair::Pair;
@@ -56,7 +56,7 @@ fn matched(event: &Event) -> Matched {
     status
 }
 
-fn counted(event: &Event) -> Counted {
+fn counted(event: &Event) -> CountStatus {
     let EventStatus::Counted(status) = event.take() else { panic!("{event:?}") };
     status
 }
@@ -66,7 +66,7 @@ fn liveliness_of(event: &Event) -> LivelinessChanged {
     status
 }
 
-fn counter() -> (OnNew, Arc<AtomicU64>) {
+fn counter() -> (NewDataCallback, Arc<AtomicU64>) {
     let count = Arc::new(AtomicU64::new(0));
     let told = count.clone();
     let tell = move |new| {
@@ -171,7 +171,7 @@ fn incompatible_profiles_are_reported_at_both_ends_with_the_policy() {
                 {
                     await_event(session, end);
                     let EventStatus::IncompatibleQos(status) = end.take() else { panic!() };
-                    assert_eq!(status.count, Counted::new(total, 1));
+                    assert_eq!(status.count, CountStatus::new(total, 1));
                     assert_eq!(status.last_policy, Some(policy));
                 }
                 assert!(subscription.matched().is_empty() && publisher.matched().is_empty());
@@ -192,8 +192,8 @@ fn another_type_under_the_same_name_is_reported_at_both_ends() {
             let requested = of_subscription(&subscription, EventKind::SubscriptionIncompatibleType);
             await_event(&pair.here, &offered);
             await_event(&pair.there, &requested);
-            assert_eq!(counted(&offered), Counted::new(total, 1));
-            assert_eq!(counted(&requested), Counted::new(1, 1));
+            assert_eq!(counted(&offered), CountStatus::new(total, 1));
+            assert_eq!(counted(&requested), CountStatus::new(1, 1));
             assert!(publisher.matched().is_empty());
         }
         let unknown = pair.there.create_subscription(spec(Qos::default())).unwrap();
@@ -272,7 +272,7 @@ fn a_lease_that_is_not_asserted_runs_out_and_comes_back() {
         let changed = of_subscription(&subscription, EventKind::LivelinessChanged);
         let lost = of_publisher(&publisher, EventKind::LivelinessLost);
         await_event(&pair.here, &lost);
-        assert_eq!(counted(&lost), Counted::new(1, 1));
+        assert_eq!(counted(&lost), CountStatus::new(1, 1));
         until("it counts as not alive", || {
             await_event(&pair.there, &changed);
             let status = liveliness_of(&changed);

@@ -5,7 +5,7 @@ use std::cell::{Cell, RefCell};
 
 use axon_transport::{
     Event, Publisher, Subscription,
-    events::{Counted, EventKind, EventStatus},
+    events::{CountStatus, EventKind, EventStatus},
 };
 
 use super::orders::Reported;
@@ -124,7 +124,7 @@ fn counted(event: &Event, sum: &mut u64) -> u64 {
     status.total
 }
 
-fn added(sum: &mut u64, status: Counted) {
+fn added(sum: &mut u64, status: CountStatus) {
     *sum += status.change;
     assert_eq!(*sum, status.total, "{status:?}");
 }

@@ -4,7 +4,7 @@
 use axon_transport::internal::session::from_unix_nanos;
 use axon_transport::{
     Event, Waitable,
-    events::{Counted, EventKind, EventStatus, LivelinessChanged},
+    events::{CountStatus, EventKind, EventStatus, LivelinessChanged},
     qos::Liveliness,
 };
 
@@ -12,7 +12,7 @@ use super::*;
 
 const MILLI: Duration = Duration::from_millis(1);
 
-fn await_counted(session: &Session, event: &Event) -> Counted {
+fn await_counted(session: &Session, event: &Event) -> CountStatus {
     let ready = session.wait_for(&[Waitable::Event(event)], Some(PATIENCE)).unwrap();
     assert_eq!(ready, [0], "{event:?}");
     let EventStatus::Counted(counted) = event.take() else { panic!("{event:?}") };

@@ -10,12 +10,12 @@ use super::{ATTEMPTS, Attachment, KNOWN, ReadObstacle, Reader, awaited::Wait};
 use crate::{
     error::TakeError,
     memory::{copy, segment::Map},
-    reader::sample::Extract,
+    reader::sample::MappedRange,
     ring::{
         layout::{self, Array, COPIED, COPIED_ALWAYS},
         protocol::{self, PayloadLocation, PositionState, Record, RecordRead, View},
     },
-    session::peer::Found,
+    session::peer::SegmentLookup,
 };
 
 /// Where a ring's descriptors were found.
@@ -150,9 +150,9 @@ impl Reader {
         let wrong = ReadObstacle::Corrupt("its descriptors are nowhere");
         let Some(Array { at, descriptors }) = Array::from_word(word) else { return Err(wrong) };
         let map = match self.reads.peer.find(at.segment) {
-            Found::Map(map) => map,
-            Found::Refused => return Err(wrong),
-            Found::Absent => return Err(ReadObstacle::Missing(at.segment)),
+            SegmentLookup::Map(map) => map,
+            SegmentLookup::Refused => return Err(wrong),
+            SegmentLookup::Absent => return Err(ReadObstacle::Missing(at.segment)),
         };
         match at.words(descriptors * layout::DESCRIPTOR, map.words().len()) {
             Some(words) => Ok(Descriptors { word, map, words }),
@@ -202,7 +202,7 @@ impl Reader {
         let map = match known.and_then(|(_, map)| map.upgrade()) {
             Some(map) => map,
             None => match self.reads.peer.find(at.segment) {
-                Found::Map(map) => {
+                SegmentLookup::Map(map) => {
                     // Few are in use at a time, and one that is not here is found again.
                     self.maps.retain(|(number, _)| *number != at.segment);
                     if self.maps.len() >= KNOWN {
@@ -211,10 +211,10 @@ impl Reader {
                     self.maps.push((at.segment, Arc::downgrade(&map)));
                     map
                 }
-                Found::Refused => {
+                SegmentLookup::Refused => {
                     return Err(ReadObstacle::Corrupt("a sample is in memory that was refused"));
                 }
-                Found::Absent => return Err(ReadObstacle::Missing(at.segment)),
+                SegmentLookup::Absent => return Err(ReadObstacle::Missing(at.segment)),
             },
         };
         let outside = ReadObstacle::Corrupt("a sample lies outside its segment");
@@ -222,10 +222,10 @@ impl Reader {
         if slot {
             let words = at.words_of(len, limit).ok_or(outside)?;
             let skip = (at.offset % 8) as usize;
-            return Ok(Bytes::Slot(Extract { map, words, skip }));
+            return Ok(Bytes::Slot(MappedRange { map, words, skip }));
         }
         let words = at.words(len, limit).ok_or(outside)?;
-        Ok(Bytes::Block(Extract { map, words, skip: 0 }))
+        Ok(Bytes::Block(MappedRange { map, words, skip: 0 }))
     }
 
     /// Whether a pin keeps the sample in place; else it is copied as one in a block is.
@@ -294,7 +294,7 @@ pub(super) enum Bytes {
     /// In its descriptor.
     Inline,
     /// To be copied, and checked afterwards.
-    Block(Extract),
+    Block(MappedRange),
     /// To be pinned, if the reader [may](Reader::may_pin).
-    Slot(Extract),
+    Slot(MappedRange),
 }

@@ -35,7 +35,7 @@ use crate::{
         activity::WatchKey,
         attachment::{Attachment, Pinning},
         lane::Lane,
-        peer::{Found, RingPeer},
+        peer::{SegmentLookup, RingPeer},
     },
     sync::Ordering,
     wake::{Purpose, settle},
@@ -71,7 +71,7 @@ pub struct ReaderOptions {
 /// Goes on after the publisher's death until it is drained. Dropping it tells the publisher; the
 /// samples that were taken from it stay.
 pub struct Reader {
-    reads: Reads,
+    reads: ReaderConfig,
     attachment: Arc<Attachment>,
     /// `None` until the first look-up.
     descriptors: Option<Descriptors>,
@@ -99,7 +99,7 @@ enum ReadObstacle {
 }
 
 /// What does not change.
-struct Reads {
+struct ReaderConfig {
     writer: Gid,
     peer: RingPeer,
     grant: Grant,
@@ -128,7 +128,7 @@ impl Reader {
         if !lane.is_meant_by(grant) {
             return refuse("its grant is not for this reader");
         }
-        let Found::Map(map) = peer.find(ring.segment) else {
+        let SegmentLookup::Map(map) = peer.find(ring.segment) else {
             return refuse("the segment that its ring is in did not come");
         };
         let Some(words) = ring.words(layout::RING, map.words().len()) else {
@@ -158,7 +158,7 @@ impl Reader {
             skipped: 0,
             corrupt: None,
             given_up: false,
-            reads: Reads { writer, peer, grant, depth, max_message, in_place, tells, watch: None },
+            reads: ReaderConfig { writer, peer, grant, depth, max_message, in_place, tells, watch: None },
         })
     }
 
@@ -174,7 +174,7 @@ impl Reader {
             let more = |(tail, head): (u64, u64)| {
                 tail > self.cursor || head.saturating_sub(self.cursor) > self.reads.depth
             };
-            return !matches!(self.reads.peer.find(segment), Found::Absent)
+            return !matches!(self.reads.peer.find(segment), SegmentLookup::Absent)
                 // It may not be needed any more.
                 || protocol::bounds(self.attachment.ring()).is_ok_and(more)
                 // It is to be asked for again, or given up.
@@ -382,7 +382,7 @@ impl Reader {
     /// whose samples another reader has, too.
     pub fn skip_missing(&mut self) -> bool {
         // It may have come since it was looked for.
-        let lacks = |segment| matches!(self.reads.peer.find(segment), Found::Absent);
+        let lacks = |segment| matches!(self.reads.peer.find(segment), SegmentLookup::Absent);
         if self.given_up || !self.awaited.segment().is_some_and(lacks) {
             return false;
         }

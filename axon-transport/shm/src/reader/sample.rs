@@ -49,22 +49,22 @@ use crate::{
 pub struct Sample {
     taken: Taken,
     len: usize,
-    data: Data,
+    data: SampleBytes,
 }
 
-enum Data {
+enum SampleBytes {
     Copied(Vec<u8>),
-    Pinned { there: Extract, pin: Pin },
+    Pinned { there: MappedRange, pin: Pin },
 }
 
 /// Bytes of a map: those of `words`, without the first `skip` bytes.
-pub(crate) struct Extract {
+pub(crate) struct MappedRange {
     pub(crate) map: Arc<Map>,
     pub(crate) words: Range<usize>,
     pub(crate) skip: usize,
 }
 
-impl Extract {
+impl MappedRange {
     #[inline]
     pub(crate) fn words(&self) -> &[AtomicU64] {
         &self.map.words()[self.words.clone()]
@@ -74,13 +74,13 @@ impl Extract {
 impl Sample {
     /// A sample of its own bytes.
     pub(crate) fn copied(taken: Taken, bytes: Vec<u8>) -> Self {
-        Self { taken, len: bytes.len(), data: Data::Copied(bytes) }
+        Self { taken, len: bytes.len(), data: SampleBytes::Copied(bytes) }
     }
 
     /// `len` bytes there, which the words hold and which `pin` pins.
-    pub(crate) fn pinned(taken: Taken, len: usize, there: Extract, pin: Pin) -> Self {
+    pub(crate) fn pinned(taken: Taken, len: usize, there: MappedRange, pin: Pin) -> Self {
         debug_assert!(there.skip + len <= there.words().len() * 8);
-        Self { taken, len, data: Data::Pinned { there, pin } }
+        Self { taken, len, data: SampleBytes::Pinned { there, pin } }
     }
 
     /// What goes with it.
@@ -110,13 +110,13 @@ impl Sample {
     /// Whether it is in the publisher's memory.
     #[inline]
     pub fn is_borrowed(&self) -> bool {
-        matches!(self.data, Data::Pinned { .. })
+        matches!(self.data, SampleBytes::Pinned { .. })
     }
 
     /// Whether this is a forked child, which has no share in it.
     #[inline]
     pub(super) fn is_forked(&self) -> bool {
-        matches!(&self.data, Data::Pinned { pin, .. } if pin.attachment().lane.is_forked())
+        matches!(&self.data, SampleBytes::Pinned { pin, .. } if pin.attachment().lane.is_forked())
     }
 
     /// Copies bytes from `at` on to the front of `out`, as many as there are and fit, and returns
@@ -129,9 +129,9 @@ impl Sample {
         }
         let out = &mut out[..count];
         match &self.data {
-            Data::Copied(bytes) => out.copy_from_slice(&bytes[at.min(self.len)..][..count]),
-            Data::Pinned { pin, .. } if pin.attachment().lane.is_forked() => return 0,
-            Data::Pinned { there, .. } => copy::read_at(there.words(), there.skip + at, out),
+            SampleBytes::Copied(bytes) => out.copy_from_slice(&bytes[at.min(self.len)..][..count]),
+            SampleBytes::Pinned { pin, .. } if pin.attachment().lane.is_forked() => return 0,
+            SampleBytes::Pinned { there, .. } => copy::read_at(there.words(), there.skip + at, out),
         }
         count
     }
@@ -146,13 +146,13 @@ impl Sample {
     pub fn write_to(&self, out: &mut [MaybeUninit<u8>]) -> bool {
         assert!(out.len() <= self.len);
         match &self.data {
-            Data::Copied(bytes) => {
+            SampleBytes::Copied(bytes) => {
                 for (to, byte) in out.iter_mut().zip(bytes) {
                     to.write(*byte);
                 }
             }
-            Data::Pinned { pin, .. } if pin.attachment().lane.is_forked() => return false,
-            Data::Pinned { there, .. } => copy::copy(there.words(), there.skip, out),
+            SampleBytes::Pinned { pin, .. } if pin.attachment().lane.is_forked() => return false,
+            SampleBytes::Pinned { there, .. } => copy::copy(there.words(), there.skip, out),
         }
         true
     }
@@ -163,17 +163,17 @@ impl Sample {
     /// There is no memory for them.
     pub fn copy_to(&self, out: &mut Vec<u8>) -> Result<(), TryReserveError> {
         match &self.data {
-            Data::Copied(bytes) => {
+            SampleBytes::Copied(bytes) => {
                 out.clear();
                 out.try_reserve(bytes.len())?;
                 out.extend_from_slice(bytes);
                 Ok(())
             }
-            Data::Pinned { pin, .. } if pin.attachment().lane.is_forked() => {
+            SampleBytes::Pinned { pin, .. } if pin.attachment().lane.is_forked() => {
                 out.clear();
                 Ok(())
             }
-            Data::Pinned { there, .. } => copy::copy_out(there.words(), there.skip, self.len, out),
+            SampleBytes::Pinned { there, .. } => copy::copy_out(there.words(), there.skip, self.len, out),
         }
     }
 
@@ -190,8 +190,8 @@ impl Sample {
     #[inline]
     pub fn as_ptr(&self) -> *const u8 {
         match &self.data {
-            Data::Copied(bytes) => bytes.as_ptr(),
-            Data::Pinned { there, .. } => {
+            SampleBytes::Copied(bytes) => bytes.as_ptr(),
+            SampleBytes::Pinned { there, .. } => {
                 there.words().as_ptr().cast::<u8>().wrapping_add(there.skip)
             }
         }

@@ -26,7 +26,7 @@ use crate::{
         layout::{self, Location, SegmentKind},
     },
     session::{attachment::Attachment, lane::LaneView, segment::SessionSegment},
-    wake::{Bell, Purpose, due, waits},
+    wake::{DoorbellSender, Purpose, due, waits},
 };
 
 /// What a session hands over so that others can share memory with it, in the order in which the
@@ -103,7 +103,7 @@ pub struct PeerSession {
     first: Arc<Map>,
     further: Mutex<FurtherSegments>,
     wanting: OnceLock<Box<dyn Fn() + Send + Sync>>,
-    bell: Bell,
+    bell: DoorbellSender,
     pidfd: PassedFd,
     /// The last ticket of each of its armed words that this process rang for.
     rung: [AtomicU64; 2],
@@ -136,7 +136,7 @@ struct AnnouncedSegment {
 }
 
 /// What became of the look for a segment of another session.
-pub(crate) enum Found {
+pub(crate) enum SegmentLookup {
     Map(Arc<Map>),
     /// It was not as it must be.
     Refused,
@@ -165,7 +165,7 @@ impl PeerSession {
         others: impl IntoIterator<Item = &'a Arc<Self>>,
     ) -> Result<Arc<Self>, ShmError> {
         let PeerDescriptors { segment, doorbell, pidfd } = descriptors;
-        let bell = Bell::received(doorbell).ok_or(ShmError::Refused {
+        let bell = DoorbellSender::received(doorbell).ok_or(ShmError::Refused {
             what: "its doorbell is no unix socket that keeps packets",
         })?;
         let process = process(&pidfd)
@@ -271,17 +271,17 @@ impl PeerSession {
 
     /// Whether a segment has come.
     pub fn has_segment(&self, number: u32) -> bool {
-        !matches!(self.find(number), Found::Absent)
+        !matches!(self.find(number), SegmentLookup::Absent)
     }
 
-    pub(crate) fn find(&self, number: u32) -> Found {
+    pub(crate) fn find(&self, number: u32) -> SegmentLookup {
         if number == 0 {
-            return Found::Map(Arc::clone(&self.first));
+            return SegmentLookup::Map(Arc::clone(&self.first));
         }
         match self.further().maps.get(&number) {
-            Some(AnnouncedSegment { map: Some(map), .. }) => Found::Map(Arc::clone(map)),
-            Some(AnnouncedSegment { map: None, .. }) => Found::Refused,
-            None => Found::Absent,
+            Some(AnnouncedSegment { map: Some(map), .. }) => SegmentLookup::Map(Arc::clone(map)),
+            Some(AnnouncedSegment { map: None, .. }) => SegmentLookup::Refused,
+            None => SegmentLookup::Absent,
         }
     }
 
@@ -439,15 +439,15 @@ impl RingPeer {
     /// The lane that the session has there.
     pub(crate) fn lane(&self, at: Location) -> Result<LaneView, ShmError> {
         match self.find(at.segment) {
-            Found::Map(map) => LaneView::new(&map, at),
-            Found::Refused | Found::Absent => None,
+            SegmentLookup::Map(map) => LaneView::new(&map, at),
+            SegmentLookup::Refused | SegmentLookup::Absent => None,
         }
         .ok_or(ShmError::Refused { what: "it has no such lane" })
     }
 
-    pub(crate) fn find(&self, number: u32) -> Found {
+    pub(crate) fn find(&self, number: u32) -> SegmentLookup {
         match self {
-            Self::Local(session) => session.map(number).map_or(Found::Absent, Found::Map),
+            Self::Local(session) => session.map(number).map_or(SegmentLookup::Absent, SegmentLookup::Map),
             Self::Remote(session) => session.find(number),
         }
     }

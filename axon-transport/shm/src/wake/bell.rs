@@ -18,9 +18,9 @@ const NAP: Duration = Duration::from_millis(1);
 
 /// One end of a pair of unix sockets. A process that holds it can ring, and nothing worse: it cannot take
 /// rings away, nor keep another from ringing but by closing the bell for all, which is noticed.
-pub(crate) struct Bell(PassedFd);
+pub(crate) struct DoorbellSender(PassedFd);
 
-impl Bell {
+impl DoorbellSender {
     pub(super) fn new(fd: PassedFd) -> Self {
         Self(fd)
     }
@@ -52,7 +52,7 @@ impl Bell {
     }
 }
 
-impl AsFd for Bell {
+impl AsFd for DoorbellSender {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.0.as_fd()
     }

@@ -9,8 +9,8 @@ use std::{
 use rustix::{event::Timespec, io::Errno};
 
 use super::{
-    Bell, arm, disarm,
-    receiver::{BellReceiver, CLOSED, Drained, HeardBells},
+    DoorbellSender, arm, disarm,
+    receiver::{DoorbellReceiver, CLOSED, Drained, HeardBells},
     spin::Spin,
 };
 
@@ -50,7 +50,7 @@ pub(crate) trait WakeListener: Send + Sync {
 /// The others sleep until then. All tickets are given out under the lock, so the armed
 /// words only rise and a ringer never mistakes a new ticket for one it has rung for.
 pub(crate) struct Doorbell {
-    receiver: BellReceiver,
+    receiver: DoorbellReceiver,
     waiters: Mutex<Waiters>,
     spin: Spin,
     /// Signalled by a leader that has given up its lead on request.
@@ -106,7 +106,7 @@ impl Follower {
 impl Doorbell {
     pub(crate) fn new() -> Result<Self, Errno> {
         Ok(Self {
-            receiver: BellReceiver::new()?,
+            receiver: DoorbellReceiver::new()?,
             waiters: Mutex::default(),
             spin: Spin::new(),
             way: Condvar::new(),
@@ -114,7 +114,7 @@ impl Doorbell {
     }
 
     /// The end that others ring.
-    pub(crate) fn bell(&self) -> &Bell {
+    pub(crate) fn bell(&self) -> &DoorbellSender {
         self.receiver.bell()
     }
 
@@ -388,7 +388,7 @@ impl Drop for Waiting<'_> {
 
 impl Waiters {
     /// Gives out a new ticket.
-    fn arm(&mut self, receiver: &BellReceiver, words: &[&AtomicU64]) {
+    fn arm(&mut self, receiver: &DoorbellReceiver, words: &[&AtomicU64]) {
         if self.queued {
             let drained = receiver.drain();
             self.queued = drained == Drained::Some;
@@ -407,7 +407,7 @@ impl Waiters {
     }
 
     /// The bell is of no use any more: there is a look for news by time.
-    fn give_up(&mut self, receiver: &BellReceiver, what: &str) {
+    fn give_up(&mut self, receiver: &DoorbellReceiver, what: &str) {
         self.closed = true;
         receiver.give_up();
         self.pace(receiver);
@@ -417,7 +417,7 @@ impl Waiters {
     }
 
     /// Has who listens woken for nothing as often as is needed.
-    fn pace(&self, receiver: &BellReceiver) {
+    fn pace(&self, receiver: &DoorbellReceiver) {
         let interval = match self.leader {
             _ if self.closed => Some(CLOSED),
             // Threads that listen see to it themselves.

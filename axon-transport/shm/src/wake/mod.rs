@@ -13,7 +13,7 @@ mod ticket;
 #[cfg(test)]
 mod tests;
 
-pub(crate) use bell::Bell;
+pub(crate) use bell::DoorbellSender;
 pub(crate) use doorbell::{Doorbell, PURPOSES, WakeListener};
 pub use doorbell::{ForwardedWakeups, Purpose, WakeCheck};
 pub(crate) use ticket::{arm, disarm, due, settle, waits};

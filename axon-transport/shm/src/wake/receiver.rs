@@ -19,7 +19,7 @@ use rustix::{
     },
 };
 
-use super::Bell;
+use super::DoorbellSender;
 use crate::os::descriptors::{PassedFd, carries_descriptors};
 
 /// Rings that one system call takes.
@@ -37,13 +37,13 @@ const TICK: u64 = 2;
 ///
 /// The ends are of packets and edge-triggered: each ring is an event, whether those before it have
 /// been taken or not. So who is woken need not take any, and is back in one system call.
-pub(super) struct BellReceiver {
+pub(super) struct DoorbellReceiver {
     set: OwnedFd,
     /// Where the kernel cannot keep descriptors out of it, it closes like one of another process.
     heard: PassedFd,
     /// Packets may carry descriptors.
     rights: bool,
-    bell: Bell,
+    bell: DoorbellSender,
     /// Never handed out: an eventfd that this process wakes itself with.
     own_wakeup: OwnedFd,
     tick: OwnedFd,
@@ -62,7 +62,7 @@ pub(super) struct HeardBells {
     pub(super) tick: bool,
 }
 
-impl BellReceiver {
+impl DoorbellReceiver {
     pub(super) fn new() -> Result<Self, Errno> {
         let (heard, given) =
             socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None)?;
@@ -78,11 +78,11 @@ impl BellReceiver {
         epoll::add(&set, &own_wakeup, epoll::EventData::new_u64(OWN_WAKEUP), edge)?;
         let level = epoll::EventFlags::IN;
         epoll::add(&set, &tick, epoll::EventData::new_u64(TICK), level)?;
-        Ok(Self { set, heard, rights, bell: Bell::new(given.into()), own_wakeup, tick })
+        Ok(Self { set, heard, rights, bell: DoorbellSender::new(given.into()), own_wakeup, tick })
     }
 
     /// The end that rings.
-    pub(super) fn bell(&self) -> &Bell {
+    pub(super) fn bell(&self) -> &DoorbellSender {
         &self.bell
     }
 
@@ -197,7 +197,7 @@ pub(super) enum Drained {
     Rights,
 }
 
-impl AsFd for BellReceiver {
+impl AsFd for DoorbellReceiver {
     /// Readable when there is something to take.
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.set.as_fd()

@@ -16,7 +16,7 @@ use rustix::{
     net::{RecvFlags, Shutdown, recv, shutdown},
 };
 
-use super::{Bell, Doorbell, Purpose, WakeCheck, arm, disarm, due, receiver::whole_millis, settle};
+use super::{DoorbellSender, Doorbell, Purpose, WakeCheck, arm, disarm, due, receiver::whole_millis, settle};
 use crate::{
     ids::SessionId,
     os::descriptors::{
@@ -200,7 +200,7 @@ fn ringing_never_blocks() {
     let flags = fcntl_getfl(&fd).unwrap();
     // As of all that hold it.
     fcntl_setfl(&fd, flags - OFlags::NONBLOCK).unwrap();
-    let bell = Bell::received(fd).unwrap();
+    let bell = DoorbellSender::received(fd).unwrap();
     for _ in 0..10_000 {
         bell.ring();
     }
@@ -214,7 +214,7 @@ fn ringing_never_blocks() {
 #[test]
 fn a_full_queue_swallows_no_ring() {
     let session = SessionSegment::create(SessionId::random()).unwrap();
-    let bell = Bell::received(handed_out(&session)).unwrap();
+    let bell = DoorbellSender::received(handed_out(&session)).unwrap();
     let turn = AtomicU64::new(0);
     let (rounds, over) = (2000, AtomicBool::new(false));
     thread::scope(|scope| {
@@ -335,7 +335,7 @@ impl WakeCheck for Flag {
 #[test]
 fn of_those_that_follow_the_right_one_is_woken() {
     let session = SessionSegment::create(SessionId::random()).unwrap();
-    let bell = Bell::received(handed_out(&session)).unwrap();
+    let bell = DoorbellSender::received(handed_out(&session)).unwrap();
     let flags: Vec<Arc<Flag>> = (0..4).map(|_| Arc::default()).collect();
     let start = Instant::now();
     thread::scope(|scope| {

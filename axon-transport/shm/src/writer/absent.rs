@@ -14,7 +14,7 @@ const ABSENCE: Duration = Duration::from_secs(10);
 
 /// Of a reader that carries samples to another process: what keeps them for it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Carried {
+pub enum CarrierState {
     /// It is attached.
     Attached,
     /// The process that carried them ended. They are kept until this for the next one.
@@ -23,10 +23,10 @@ pub enum Carried {
 
 /// The absent readers of one ring.
 #[derive(Debug, Default)]
-pub(crate) struct Absences(Vec<Absent>);
+pub(crate) struct DepartedReaders(Vec<DepartedReader>);
 
 #[derive(Debug)]
-struct Absent {
+struct DepartedReader {
     gid: Gid,
     /// The subscriptions of another host that it stood for.
     stood_for: Vec<Gid>,
@@ -35,11 +35,11 @@ struct Absent {
     until: Instant,
 }
 
-impl Absences {
+impl DepartedReaders {
     /// Keeps samples from `position` on for a reader.
     pub(crate) fn add(&mut self, gid: Gid, stood_for: Vec<Gid>, position: u64) {
         self.0.retain(|absent| absent.gid != gid);
-        self.0.push(Absent { gid, stood_for, position, until: Instant::now() + ABSENCE });
+        self.0.push(DepartedReader { gid, stood_for, position, until: Instant::now() + ABSENCE });
     }
 
     /// The reader is there again, or another one that stands for the same subscriptions.
@@ -58,7 +58,7 @@ impl Absences {
         }
         let now = Instant::now();
         let over = self.0.extract_if(.., |absent| absent.until <= now);
-        over.fold(0, |all, Absent { gid, position, .. }| {
+        over.fold(0, |all, DepartedReader { gid, position, .. }| {
             let samples = head.saturating_sub(position);
             tracing::warn!(
                 reader = %gid, samples,
@@ -76,7 +76,7 @@ impl Absences {
 
     /// Those that were not absent for too long. There seldom are any: no clock is read then.
     #[inline]
-    fn there(&self) -> impl Iterator<Item = &Absent> {
+    fn there(&self) -> impl Iterator<Item = &DepartedReader> {
         self.0.iter().filter(|absent| absent.until > Instant::now())
     }
 
@@ -88,7 +88,7 @@ impl Absences {
 
     /// Where a reader goes on that stands for these subscriptions.
     pub(crate) fn position_of(&self, gid: &Gid, stands_for: &[Gid]) -> Option<u64> {
-        let same = |absent: &&Absent| {
+        let same = |absent: &&DepartedReader| {
             absent.gid == *gid || absent.stood_for.iter().any(|of| stands_for.contains(of))
         };
         self.there().filter(same).map(|absent| absent.position).min()
@@ -112,7 +112,7 @@ mod tests {
 
     #[test]
     fn samples_are_kept_from_the_oldest_position_until_the_reader_is_back() {
-        let mut absences = Absences::default();
+        let mut absences = DepartedReaders::default();
         assert!(absences.is_empty() && absences.oldest().is_none() && absences.left().is_none());
         let [one, other] = [1, 2].map(|byte| Gid([byte; 16]));
         absences.add(one, Vec::new(), 7);
@@ -135,7 +135,7 @@ mod tests {
 
     #[test]
     fn a_relay_goes_on_where_one_for_the_same_subscriptions_ended() {
-        let mut absences = Absences::default();
+        let mut absences = DepartedReaders::default();
         let [old, new, here, there, later] = [1, 2, 3, 4, 5].map(|byte| Gid([byte; 16]));
         absences.add(old, vec![here, there], 7);
         assert_eq!(absences.position_of(&new, &[later]), None);

@@ -9,7 +9,7 @@ use crate::{
 };
 
 /// One reader of a ring.
-pub(super) struct Attached {
+pub(super) struct AttachedReader {
     pub(super) info: ReaderInfo,
     lane: LaneView,
     tenancy: LaneId,
@@ -52,7 +52,7 @@ impl LaneGivenUp {
     }
 }
 
-impl Attached {
+impl AttachedReader {
     /// A reader that begins where it was granted to.
     pub(super) fn new(
         info: ReaderInfo,

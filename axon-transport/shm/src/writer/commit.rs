@@ -22,7 +22,7 @@ use crate::{
     writer::{
         Writer,
         header::Dropped,
-        history::Extent,
+        history::SampleStorage,
         loan::{Lender, Loan, LoanLocation},
         room::PublishObstacle,
     },
@@ -30,7 +30,7 @@ use crate::{
 
 /// When readers that sleep are woken for a sample.
 #[derive(Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Bells {
+pub(crate) enum WakeTiming {
     /// When it is published.
     Now,
     /// When the publisher [announces](Writer::announce) it.
@@ -61,7 +61,7 @@ impl Writer {
         numbering: Numbering,
         payload: &[u8],
         deadline: Duration,
-        bells: Bells,
+        bells: WakeTiming,
     ) -> Result<(u64, Published), PublishError> {
         let bytes = self.check(payload.len())?;
         let mut deadline = PublishDeadline::new(deadline);
@@ -92,7 +92,7 @@ impl Writer {
         numbering: Numbering,
         payload: RingPayload<'_>,
         mut deadline: PublishDeadline,
-        bells: Bells,
+        bells: WakeTiming,
     ) -> Result<(u64, Published), PublishError> {
         // A loan may have been made before the fork.
         if self.is_forked() {
@@ -106,16 +106,16 @@ impl Writer {
             self.make_place(state)?;
             let (extent, place) = match payload {
                 RingPayload::Bytes(bytes) if bytes.len() <= INLINE => {
-                    (Extent::Inline, PayloadLocation::Inline)
+                    (SampleStorage::Inline, PayloadLocation::Inline)
                 }
                 RingPayload::Bytes(bytes) => {
                     let block = self.copy_in(state, bytes)?;
-                    (Extent::Block(block), PayloadLocation::Block(block.at))
+                    (SampleStorage::Block(block), PayloadLocation::Block(block.at))
                 }
                 RingPayload::Written { at, lead, len: sample, lent } => {
                     let len = Area::rounded(lent as u64);
                     let first = Location { offset: at.offset + lead as u64, ..at };
-                    (Extent::Slot { at, len, sample: sample as u64 }, PayloadLocation::Slot(first))
+                    (SampleStorage::Slot { at, len, sample: sample as u64 }, PayloadLocation::Slot(first))
                 }
             };
             let meta = state.numbers.number(numbering);
@@ -123,7 +123,7 @@ impl Writer {
             if state.reader_set.has_followers() {
                 self.session.journal().note(self.number);
             }
-            if bells == Bells::Later {
+            if bells == WakeTiming::Later {
                 return Ok((meta, Some(position), None));
             }
             settle::<AtomicU64>();
@@ -168,7 +168,7 @@ impl Writer {
         &self,
         state: &mut WriterState,
         meta: Meta,
-        extent: Extent,
+        extent: SampleStorage,
         place: PayloadLocation,
         payload: RingPayload<'_>,
     ) -> u64 {

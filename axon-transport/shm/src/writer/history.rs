@@ -15,7 +15,7 @@ pub(crate) struct SampleHistory {
     head: u64,
     tail: u64,
     /// By descriptor.
-    extents: Box<[Extent]>,
+    extents: Box<[SampleStorage]>,
     blocks: Blocks,
     pinned: RetireList,
     /// Bytes that samples and loans take; what is in the retire list does not count.
@@ -29,7 +29,7 @@ pub(crate) struct SampleHistory {
 
 /// What memory a sample takes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) enum Extent {
+pub(crate) enum SampleStorage {
     /// None but its descriptor.
     #[default]
     Inline,
@@ -53,7 +53,7 @@ impl SampleHistory {
         Self {
             head: 0,
             tail: 0,
-            extents: vec![Extent::Inline; descriptors as usize].into_boxed_slice(),
+            extents: vec![SampleStorage::Inline; descriptors as usize].into_boxed_slice(),
             blocks: Blocks::default(),
             pinned: RetireList::default(),
             used: 0,
@@ -90,7 +90,7 @@ impl SampleHistory {
 
     /// Twice as many descriptors.
     pub(crate) fn grow(&mut self) {
-        let mut extents = vec![Extent::Inline; 2 * self.extents.len()].into_boxed_slice();
+        let mut extents = vec![SampleStorage::Inline; 2 * self.extents.len()].into_boxed_slice();
         for position in self.tail..self.head {
             extents[index(&extents, position)] = self.extents[index(&self.extents, position)];
         }
@@ -110,8 +110,8 @@ impl SampleHistory {
     /// All blocks, of samples that stand and of those to come.
     pub(crate) fn all_blocks(&mut self) -> Vec<Block> {
         let standing = self.extents.iter().filter_map(|extent| match extent {
-            Extent::Block(block) => Some(*block),
-            Extent::Inline | Extent::Slot { .. } => None,
+            SampleStorage::Block(block) => Some(*block),
+            SampleStorage::Inline | SampleStorage::Slot { .. } => None,
         });
         standing.chain(self.blocks.drain()).collect()
     }
@@ -121,13 +121,13 @@ impl SampleHistory {
         while self.tail < floor.min(self.head) {
             let at = index(&self.extents, self.tail);
             match std::mem::take(&mut self.extents[at]) {
-                Extent::Inline => {}
-                Extent::Block(block) => {
+                SampleStorage::Inline => {}
+                SampleStorage::Block(block) => {
                     self.blocks.put(block);
                     self.used -= block.len;
                     self.placed -= 1;
                 }
-                Extent::Slot { at, len, sample } => {
+                SampleStorage::Slot { at, len, sample } => {
                     self.pinned.retire(self.tail, at, len, sample);
                     self.used -= len;
                     self.placed -= 1;
@@ -175,10 +175,10 @@ impl SampleHistory {
     /// without more memory. Takes its time where samples differ in length.
     pub(crate) fn is_short_of(&self, len: u64) -> bool {
         let alike = match self.extents[index(&self.extents, self.tail)] {
-            Extent::Slot { len: oldest, .. } => {
+            SampleStorage::Slot { len: oldest, .. } => {
                 oldest >= len && classes::class(oldest) == classes::class(len)
             }
-            Extent::Inline | Extent::Block(_) => false,
+            SampleStorage::Inline | SampleStorage::Block(_) => false,
         };
         !self.has_room(len) && !alike && !self.would_hold(len, 1, false)
     }
@@ -188,11 +188,11 @@ impl SampleHistory {
     pub(crate) fn would_hold(&self, len: u64, kept: u64, grow: bool) -> bool {
         let placed = (self.tail..self.head)
             .map(|position| self.extents[index(&self.extents, position)])
-            .filter(|extent| *extent != Extent::Inline)
+            .filter(|extent| *extent != SampleStorage::Inline)
             .take(self.placed.saturating_sub(kept) as usize);
         let slots = placed.filter_map(|extent| match extent {
-            Extent::Slot { at, len, .. } => Some((at, len)),
-            Extent::Inline | Extent::Block(_) => None,
+            SampleStorage::Slot { at, len, .. } => Some((at, len)),
+            SampleStorage::Inline | SampleStorage::Block(_) => None,
         });
         self.pinned.would_hold(len, slots, grow)
     }
@@ -239,15 +239,15 @@ impl SampleHistory {
     }
 
     /// The next position is taken by a sample. There must be a [place](Self::make_place) for it.
-    pub(crate) fn push(&mut self, extent: Extent) -> u64 {
+    pub(crate) fn push(&mut self, extent: SampleStorage) -> u64 {
         let position = self.head;
         match extent {
-            Extent::Inline => {}
-            Extent::Block(block) => {
+            SampleStorage::Inline => {}
+            SampleStorage::Block(block) => {
                 self.placed += 1;
                 self.used += block.len;
             }
-            Extent::Slot { .. } => {
+            SampleStorage::Slot { .. } => {
                 self.placed += 1;
                 self.pinned.published();
             }
@@ -266,7 +266,7 @@ impl SampleHistory {
     }
 }
 
-fn index(extents: &[Extent], position: u64) -> usize {
+fn index(extents: &[SampleStorage], position: u64) -> usize {
     (position & (extents.len() as u64 - 1)) as usize
 }
 
@@ -295,7 +295,7 @@ mod tests {
             if position > 0 {
                 assert!(history.tail() < position, "the last one stands");
             }
-            history.push(Extent::Slot { at, len: max, sample: max });
+            history.push(SampleStorage::Slot { at, len: max, sample: max });
             places.push(at);
         }
         assert!(places.iter().all(|at| at.offset <= max), "memory stays near the live window");
@@ -306,9 +306,9 @@ mod tests {
         let mut history = SampleHistory::new(4, 0);
         for _ in 0..3 {
             history.make_place(|_| false).unwrap();
-            history.push(Extent::Inline);
+            history.push(SampleStorage::Inline);
         }
-        history.push(Extent::Inline);
+        history.push(SampleStorage::Inline);
         assert_eq!(history.make_place(|position| position > 0), Err(OldestInUse));
         assert_eq!(history.make_place(|_| true), Ok(()));
         assert_eq!((history.tail(), history.head()), (1, 4));
@@ -319,7 +319,7 @@ mod tests {
         let size = 1 << 16;
         let mut history = history(4, 2 * size, 0);
         let first = history.lend(size).unwrap();
-        let position = history.push(Extent::Slot { at: first, len: size, sample: size });
+        let position = history.push(SampleStorage::Slot { at: first, len: size, sample: size });
         history.release_below(1);
         let second = history.lend(size).unwrap();
         assert_ne!(first, second, "nobody has looked at the pins");
@@ -342,13 +342,13 @@ mod tests {
             if !history.has_room_for_descriptor() {
                 history.make_room(0, |_| true).unwrap();
             }
-            history.push(Extent::Inline);
+            history.push(SampleStorage::Inline);
         }
         assert_eq!(history.head() - history.tail(), 100);
         for position in history.head()..history.head() + 1000 {
             history.make_room(128, |_| true).unwrap();
             let at = Location { segment: 0, offset: position * 128 };
-            history.push(Extent::Block(Block { at, len: 128 }));
+            history.push(SampleStorage::Block(Block { at, len: 128 }));
         }
         assert_eq!(history.head() - history.tail(), 50);
         // One stays, whatever it takes.
@@ -367,7 +367,7 @@ mod tests {
             history.make_place(|_| true).unwrap();
             let at = Location { segment: 0, offset: round * 128 };
             expected.push_back(Block { at, len: 128 });
-            history.push(Extent::Block(expected[expected.len() - 1]));
+            history.push(SampleStorage::Block(expected[expected.len() - 1]));
             while (expected.len() as u64) > history.head() - history.tail() {
                 expected.pop_front();
             }

@@ -19,7 +19,7 @@ use crate::{
         layout::{ALIGNED, Location},
         types::{Meta, Published},
     },
-    writer::{Bells, Numbering, PATIENCE, PublishDeadline, RingPayload, Writer},
+    writer::{WakeTiming, Numbering, PATIENCE, PublishDeadline, RingPayload, Writer},
 };
 
 /// Memory to be filled and published: shared memory where such a sample is read in place. Dropping
@@ -185,7 +185,7 @@ impl<'a> Loan<'a> {
             LoanMemory::Published => unreachable!("publishing takes the loan"),
         };
         let taken = matches!(payload, RingPayload::Written { .. });
-        let (sequence, published) = self.writer.commit(numbering, payload, deadline, Bells::Now)?;
+        let (sequence, published) = self.writer.commit(numbering, payload, deadline, WakeTiming::Now)?;
         // What nobody reads has not become a sample, and its memory is given back.
         if taken && published.position.is_some() {
             self.memory = LoanMemory::Published;

@@ -15,9 +15,9 @@ mod state;
 
 use std::{sync::Arc, time::Duration};
 
-pub use self::{absent::Carried, numbers::MAX_GAP};
+pub use self::{absent::CarrierState, numbers::MAX_GAP};
 pub(super) use self::{
-    commit::{Bells, PublishDeadline},
+    commit::{WakeTiming, PublishDeadline},
     numbers::Numbering,
     state::WriterState,
 };
@@ -302,7 +302,7 @@ impl Writer {
     }
 
     /// Whether it keeps samples for this reader, which carries them to another process; `None` for any other reader.
-    pub fn carried(&self, reader: &Gid) -> Option<Carried> {
+    pub fn carried(&self, reader: &Gid) -> Option<CarrierState> {
         if self.is_forked() {
             return None;
         }
@@ -330,7 +330,7 @@ impl Writer {
     /// The sample was not published; what to do is in the error.
     #[inline]
     pub fn publish(&self, meta: Meta, payload: &[u8]) -> Result<Published, PublishError> {
-        self.publish_within(Numbering::Given(meta), payload, PATIENCE, Bells::Now)
+        self.publish_within(Numbering::Given(meta), payload, PATIENCE, WakeTiming::Now)
             .map(|(_, published)| published)
     }
 
@@ -341,7 +341,7 @@ impl Writer {
     #[inline]
     pub fn try_publish(&self, meta: Meta, payload: &[u8]) -> Result<Published, PublishError> {
         let numbering = Numbering::Given(meta);
-        self.publish_within(numbering, payload, Duration::ZERO, Bells::Now)
+        self.publish_within(numbering, payload, Duration::ZERO, WakeTiming::Now)
             .map(|(_, published)| published)
     }
 
@@ -357,7 +357,7 @@ impl Writer {
         payload: &[u8],
     ) -> Result<Published, PublishError> {
         let numbering = Numbering::Given(meta);
-        self.publish_within(numbering, payload, Duration::ZERO, Bells::Later)
+        self.publish_within(numbering, payload, Duration::ZERO, WakeTiming::Later)
             .map(|(_, published)| published)
     }
 
@@ -369,7 +369,7 @@ impl Writer {
     #[inline]
     pub fn publish_next(&self, source_timestamp: i64, payload: &[u8]) -> Result<u64, PublishError> {
         let numbering = Numbering::Next(source_timestamp);
-        self.publish_within(numbering, payload, PATIENCE, Bells::Now).map(|(sequence, _)| sequence)
+        self.publish_within(numbering, payload, PATIENCE, WakeTiming::Now).map(|(sequence, _)| sequence)
     }
 
     /// As [`publish_next`](Self::publish_next), but does not wait.
@@ -383,7 +383,7 @@ impl Writer {
         payload: &[u8],
     ) -> Result<u64, PublishError> {
         let numbering = Numbering::Next(source_timestamp);
-        self.publish_within(numbering, payload, Duration::ZERO, Bells::Now)
+        self.publish_within(numbering, payload, Duration::ZERO, WakeTiming::Now)
             .map(|(sequence, _)| sequence)
     }
 

@@ -19,8 +19,8 @@ use crate::{
     },
     wake::Purpose,
     writer::{
-        absent::{Absences, Carried},
-        attached::Attached,
+        absent::{DepartedReaders, CarrierState},
+        attached::AttachedReader,
     },
 };
 
@@ -31,9 +31,9 @@ pub(crate) struct ReaderSet {
     heeds_depths: bool,
     /// The most samples that the ring can hold.
     capacity: u64,
-    readers: Vec<Attached>,
+    readers: Vec<AttachedReader>,
     /// Carriers (readers that deliver samples to another process or host) whose process has ended.
-    absent: Absences,
+    absent: DepartedReaders,
     /// The lanes of all readers, and of detached readers that may still hold samples.
     pin_lanes: PinLanes,
     /// The sessions of the readers, each once. A publish shares the list and wakes the sessions after it has
@@ -50,7 +50,7 @@ pub(crate) struct ReaderSet {
 
 /// The positions from which on samples are kept.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Floors {
+pub(crate) struct LowWatermarks {
     /// The floor of samples that are given up last: the windows of all readers, and the untaken samples of
     /// KEEP_ALL readers.
     pub(crate) retained: u64,
@@ -67,7 +67,7 @@ impl ReaderSet {
             heeds_depths: false,
             capacity,
             readers: Vec::new(),
-            absent: Absences::default(),
+            absent: DepartedReaders::default(),
             pin_lanes: PinLanes::new(pool),
             peers: Arc::new([]),
             window: 0,
@@ -85,9 +85,9 @@ impl ReaderSet {
 
     /// Returns the readers for which more than the window is kept, each with whether the publisher waits for
     /// the reader.
-    fn heeded(&self) -> impl Iterator<Item = (&Attached, bool)> {
+    fn heeded(&self) -> impl Iterator<Item = (&AttachedReader, bool)> {
         let all = self.heeds_depths;
-        let heeded = move |reader: &&Attached| {
+        let heeded = move |reader: &&AttachedReader| {
             !reader.dead && (all || reader.info.qos.history == History::KeepAll)
         };
         self.readers.iter().filter(heeded).map(move |reader| {
@@ -127,7 +127,7 @@ impl ReaderSet {
 
     pub(crate) fn readers(&self) -> Vec<Gid> {
         let mut gids = Vec::new();
-        for Attached { info, .. } in &self.readers {
+        for AttachedReader { info, .. } in &self.readers {
             match &info.stands_for {
                 Some(others) => gids.extend_from_slice(others),
                 None => gids.push(info.gid),
@@ -187,7 +187,7 @@ impl ReaderSet {
         self.detach(info.gid, head);
         self.joined(&info);
         self.absent.end(&info.gid, &stands_for);
-        self.readers.push(Attached::new(info, lane, tenancy, grant, carries));
+        self.readers.push(AttachedReader::new(info, lane, tenancy, grant, carries));
         Ok(grant)
     }
 
@@ -299,7 +299,7 @@ impl ReaderSet {
         self.drop_those(|reader| reader.dead || matches!(reader.position(), None | Some(u64::MAX)))
     }
 
-    fn drop_those(&mut self, gone: impl Fn(&Attached) -> bool) -> Vec<Gid> {
+    fn drop_those(&mut self, gone: impl Fn(&AttachedReader) -> bool) -> Vec<Gid> {
         let mut gids = Vec::new();
         self.readers.retain(|reader| {
             let gone = gone(reader);
@@ -317,9 +317,9 @@ impl ReaderSet {
 
     /// Returns the positions from which on samples are kept, now that `head` is the next position.
     #[inline]
-    pub(crate) fn floors(&self, head: u64) -> Floors {
+    pub(crate) fn floors(&self, head: u64) -> LowWatermarks {
         let holds = holds(&self.offered);
-        let mut floors = Floors { retained: head.saturating_sub(self.window), held: u64::MAX };
+        let mut floors = LowWatermarks { retained: head.saturating_sub(self.window), held: u64::MAX };
         for (reader, waits) in self.heeded() {
             if let Some(floor) = reader.floor(head) {
                 floors.retained = floors.retained.min(floor);
@@ -355,13 +355,13 @@ impl ReaderSet {
         done.chain(absent).min().unwrap_or(head)
     }
 
-    fn carriers(&self) -> impl Iterator<Item = &Attached> {
+    fn carriers(&self) -> impl Iterator<Item = &AttachedReader> {
         self.readers.iter().filter(|reader| !reader.dead && reader.is_carrier())
     }
 
     /// Returns whether a carrier has not taken the sample at `tail`.
     pub(crate) fn has_carrier_behind(&self, tail: u64) -> bool {
-        self.carriers().filter_map(Attached::position).any(|position| position <= tail)
+        self.carriers().filter_map(AttachedReader::position).any(|position| position <= tail)
     }
 
     /// Returns whether samples are kept for a carrier whose process has ended.
@@ -370,12 +370,12 @@ impl ReaderSet {
     }
 
     /// Returns why samples are kept for this carrier; `None` if none are.
-    pub(crate) fn carried(&mut self, reader: &Gid, head: u64) -> Option<Carried> {
+    pub(crate) fn carried(&mut self, reader: &Gid, head: u64) -> Option<CarrierState> {
         self.mark_dead(head);
         if self.carriers().any(|known| known.info.gid == *reader) {
-            return Some(Carried::Attached);
+            return Some(CarrierState::Attached);
         }
-        self.absent.until(reader).map(Carried::Absent)
+        self.absent.until(reader).map(CarrierState::Absent)
     }
 
     /// Returns the time until the first absent carrier is given up.
@@ -415,7 +415,7 @@ impl ReaderSet {
     /// samples are counted at their destination.
     pub(crate) fn unmet(&self, head: u64) -> Vec<(Gid, u64)> {
         let readers = self.asking(head).filter(|reader| !reader.is_carrier());
-        let samples = |reader: &Attached| (head - reader.grant.first).min(depth(&reader.info.qos));
+        let samples = |reader: &AttachedReader| (head - reader.grant.first).min(depth(&reader.info.qos));
         readers.map(|reader| (reader.info.gid, samples(reader))).collect()
     }
 
@@ -427,7 +427,7 @@ impl ReaderSet {
 
     /// Returns the readers of other, living sessions that have samples to take and have not taken up their
     /// grant.
-    fn asking(&self, head: u64) -> impl Iterator<Item = &Attached> {
+    fn asking(&self, head: u64) -> impl Iterator<Item = &AttachedReader> {
         self.readers.iter().filter(move |reader| reader.is_asking(head))
     }
 

@@ -1,6 +1,6 @@
 use super::*;
 
-fn limits(rules: &AccessRules, party: Party<'_>, verb: Verb, name: &str) -> Vec<String> {
+fn limits(rules: &AccessRules, party: Principal<'_>, verb: Verb, name: &str) -> Vec<String> {
     rules.permissions(party).limits(verb, name).map(PlacedLimit::to_string).collect()
 }
 
@@ -18,7 +18,7 @@ over = "drop-oldest"   # drop-newest, hold (KEEP_ALL alone)
 "#,
     );
     let shown = ["line 2 of access.toml: 30 a second, 4 MB/s, 5 at once, drop-oldest"];
-    for party in [Party::Name("base"), Party::Address([10, 0, 0, 1].into())] {
+    for party in [Principal::Name("base"), Principal::Address([10, 0, 0, 1].into())] {
         for verb in [Verb::Publish, Verb::Subscribe] {
             assert_eq!(limits(&rules, party, verb, "/camera/left"), shown);
             assert!(limits(&rules, party, verb, "/scan").is_empty());
@@ -38,7 +38,7 @@ fn each_limit_that_names_the_peer_and_the_use_counts() {
          [[limit]]\npeer = \"base\"\ncall = \"/set\"\nrate = 2\nover = \"hold\"",
     );
     let lines = |party, verb, name| -> Vec<_> {
-        let permissions = rules.permissions(Party::Name(party));
+        let permissions = rules.permissions(Principal::Name(party));
         permissions.limits(verb, name).map(|limit| limit.line).collect()
     };
     assert_eq!(lines("guest-1", Verb::Subscribe, "/b/x"), [1, 4]);
@@ -46,7 +46,7 @@ fn each_limit_that_names_the_peer_and_the_use_counts() {
     assert_eq!(lines("guest-2", Verb::Subscribe, "/a"), [1]);
     assert_eq!(lines("base", Verb::Subscribe, "/a"), [4]);
     assert_eq!(lines("base", Verb::Call, "/set"), [8]);
-    let of_all = rules.permissions(Party::Name("guest-2"));
+    let of_all = rules.permissions(Principal::Name("guest-2"));
     let of_all = of_all.limits(Verb::Subscribe, "/a").next().unwrap().limit.clone();
     assert!(of_all.together, "without topics it is about all of them together");
 }
@@ -118,7 +118,7 @@ fn egress_limits_all_that_is_sent_and_no_topic() {
         "[[limit]]\npeer = \"guest\"\negress = \"2 MB/s\"\n[[limit]]\npeer = \"*\"\negress = \"54 Mbit/s\"",
     );
     let of = |name| -> Vec<_> {
-        let permissions = rules.permissions(Party::Name(name));
+        let permissions = rules.permissions(Principal::Name(name));
         assert_eq!(permissions.limits(Verb::Subscribe, "/a").count(), 0);
         permissions.egress().map(|limit| (limit.line, limit.to_string())).collect()
     };
@@ -139,7 +139,7 @@ fn a_limit_of_interfaces_is_about_no_peer() {
     assert_eq!(lines("wlan0"), [(1, 2e6), (4, 2.5e6)]);
     assert_eq!(lines("usb0"), [(1, 2e6)]);
     assert!(lines("eth0").is_empty());
-    let permissions = rules.permissions(Party::Name("base"));
+    let permissions = rules.permissions(Principal::Name("base"));
     assert!(permissions.egress().next().is_none());
     assert!(rules.is_empty() && rules.limits_anything());
     assert_eq!(rules.file(), Some("access.toml"));

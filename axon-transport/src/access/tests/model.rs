@@ -31,29 +31,29 @@ const NAMES: [&str; 9] = [
     "/a/_action/status",
 ];
 
-fn parties() -> [Party<'static>; 9] {
+fn parties() -> [Principal<'static>; 9] {
     [
-        Party::Name("base"),
-        Party::Name("op-1"),
-        Party::Name("op-2"),
-        Party::Name("host.example"),
-        Party::Certificate("host.example"),
-        Party::Address([10, 0, 0, 7].into()),
-        Party::Address([10, 0, 1, 7].into()),
-        Party::User(7),
-        Party::User(8),
+        Principal::Name("base"),
+        Principal::Name("op-1"),
+        Principal::Name("op-2"),
+        Principal::Name("host.example"),
+        Principal::Certificate("host.example"),
+        Principal::Address([10, 0, 0, 7].into()),
+        Principal::Address([10, 0, 1, 7].into()),
+        Principal::User(7),
+        Principal::User(8),
     ]
 }
 
 impl ModelRule {
-    fn names(&self, party: Party<'_>) -> bool {
+    fn names(&self, party: Principal<'_>) -> bool {
         match (self.peer, party) {
             ("*", _) => true,
-            ("local", Party::User(_)) | ("uid:7", Party::User(7)) => true,
-            ("address:10.0.0.*", Party::Address(ip)) => ip.to_string().starts_with("10.0.0."),
-            ("op*", Party::Name(name)) => name.starts_with("op"),
-            (peer, Party::Name(name)) => peer == name,
-            (peer, Party::Certificate(name)) => peer.eq_ignore_ascii_case(name),
+            ("local", Principal::User(_)) | ("uid:7", Principal::User(7)) => true,
+            ("address:10.0.0.*", Principal::Address(ip)) => ip.to_string().starts_with("10.0.0."),
+            ("op*", Principal::Name(name)) => name.starts_with("op"),
+            (peer, Principal::Name(name)) => peer == name,
+            (peer, Principal::Certificate(name)) => peer.eq_ignore_ascii_case(name),
             _ => false,
         }
     }
@@ -99,7 +99,7 @@ impl ModelRule {
 fn decision(
     rules: &[ModelRule],
     deny: bool,
-    party: Party<'_>,
+    party: Principal<'_>,
     verb: Verb,
     name: &str,
 ) -> (bool, Option<u32>) {

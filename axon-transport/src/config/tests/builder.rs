@@ -104,7 +104,7 @@ fn a_built_config_equals_that_of_its_environment() {
     assert_eq!(built.link.compression, LinkCompression::Never);
     assert_eq!((built.domain, built.static_peers.len()), (232, 2));
     assert_eq!(built.range, DiscoveryRange::Localhost);
-    let peer = crate::access::Party::Name("sae-b");
+    let peer = crate::access::Principal::Name("sae-b");
     assert!(!built.access.check(peer, crate::access::Verb::Publish, "/scan").allowed());
 }
 

@@ -2,12 +2,12 @@
 
 use super::*;
 
-fn place(env: &[(&str, &str)], toml: Option<&str>) -> Result<DaemonPlace, ConfigError> {
+fn place(env: &[(&str, &str)], toml: Option<&str>) -> Result<DaemonLocation, ConfigError> {
     let mut disk = Disk::new();
     if let Some(toml) = toml {
         disk.put("/f/axon.toml", 0o644, toml);
     }
-    DaemonPlace::resolve(pairs(env), Some(Path::new("/f/axon.toml")), &disk)
+    DaemonLocation::resolve(pairs(env), Some(Path::new("/f/axon.toml")), &disk)
 }
 
 #[test]
@@ -18,11 +18,11 @@ fn a_place_is_where_the_whole_configuration_says() {
         &[("AXON_RUNTIME_DIR", "/f/run"), ("AXON_TRUSTED_UIDS", "0;7")],
     ] {
         let config = resolve(env, &[]).unwrap();
-        assert_eq!(place(env, None).unwrap(), DaemonPlace::from(&config));
+        assert_eq!(place(env, None).unwrap(), DaemonLocation::from(&config));
     }
     let toml = "runtime_dir = '/f/run'\ntrusted_uids = [7]";
     let config = with_file(&[], toml).unwrap();
-    assert_eq!(place(&[], Some(toml)).unwrap(), DaemonPlace::from(&config));
+    assert_eq!(place(&[], Some(toml)).unwrap(), DaemonLocation::from(&config));
 }
 
 #[test]

@@ -13,7 +13,7 @@ use crate::{
     graph::Endpoint,
     ids::Gid,
     qos::QosRequest,
-    session::{Client, EndpointSpec, OnNew, Publisher, Server, SessionError, Subscription},
+    session::{Client, EndpointSpec, NewDataCallback, Publisher, Server, SessionError, Subscription},
 };
 
 /// The largest size of a type's hash in bytes.
@@ -101,7 +101,7 @@ pub(super) trait EndpointObject {
 
 /// An endpoint that takes messages.
 pub(super) trait Taking: EndpointObject {
-    fn set_on_new(&self, callback: Option<OnNew>) -> Result<(), SessionError>;
+    fn set_on_new(&self, callback: Option<NewDataCallback>) -> Result<(), SessionError>;
     fn tell_no_more(&self);
 }
 
@@ -118,7 +118,7 @@ macro_rules! objects {
         }
 
         $(impl Taking for $object {
-            fn set_on_new(&self, callback: Option<OnNew>) -> Result<(), SessionError> {
+            fn set_on_new(&self, callback: Option<NewDataCallback>) -> Result<(), SessionError> {
                 self.$set(callback)
             }
 

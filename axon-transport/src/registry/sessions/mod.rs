@@ -22,7 +22,7 @@ pub use self::{
     outbox::SessionPacket,
 };
 use self::{
-    left::{LeftBehind, packets_of_grant},
+    left::{RetainedState, packets_of_grant},
     memory::NotTaken,
     outbox::Pushed,
 };
@@ -44,7 +44,7 @@ pub(super) struct Sessions<F> {
     /// The first endpoint of each session that was refused, and why.
     refused: Vec<(SessionId, String)>,
     /// What they left to readers that are not here.
-    left: LeftBehind<F>,
+    left: RetainedState<F>,
 }
 
 impl<F> Default for Sessions<F> {
@@ -53,7 +53,7 @@ impl<F> Default for Sessions<F> {
             entries: BTreeMap::new(),
             ready: BTreeSet::new(),
             refused: Vec::new(),
-            left: LeftBehind::default(),
+            left: RetainedState::default(),
         }
     }
 }

@@ -15,25 +15,25 @@ use crate::{graph::GraphEntry, ids::Gid, wire::session::Pair};
 pub(in crate::session) const PATIENCE: Duration = Duration::from_secs(1);
 
 #[derive(Default)]
-pub(super) struct Arrivals {
-    arriving: HashMap<Gid, Arriving>,
+pub(super) struct PendingEndpoints {
+    arriving: HashMap<Gid, PendingEndpoint>,
     /// Until when those were to be held back that were arriving when everything began to be told
     /// anew.
     before: HashMap<Gid, Instant>,
 }
 
-struct Arriving {
+struct PendingEndpoint {
     entry: GraphEntry,
     missing: BTreeSet<Pair>,
     until: Instant,
 }
 
-impl Arrivals {
+impl PendingEndpoints {
     /// Holds `entry` back until the pairs in `missing` stand.
     pub(super) fn hold(&mut self, entry: GraphEntry, missing: BTreeSet<Pair>, now: Instant) {
         let gid = entry.endpoint.gid;
         let until = self.before.remove(&gid).unwrap_or(now + PATIENCE);
-        self.arriving.insert(gid, Arriving { entry, missing, until });
+        self.arriving.insert(gid, PendingEndpoint { entry, missing, until });
     }
 
     /// Those that are held back.
@@ -83,7 +83,7 @@ impl Arrivals {
         self.before = arriving.into_iter().map(|(gid, arriving)| (gid, arriving.until)).collect();
     }
 
-    fn take_where(&mut self, mut which: impl FnMut(&mut Arriving) -> bool) -> Vec<GraphEntry> {
+    fn take_where(&mut self, mut which: impl FnMut(&mut PendingEndpoint) -> bool) -> Vec<GraphEntry> {
         let taken = self.arriving.extract_if(|_, arriving| which(arriving));
         taken.map(|(_, arriving)| arriving.entry).collect()
     }
@@ -115,7 +115,7 @@ mod tests {
 
     #[test]
     fn an_endpoint_appears_with_the_last_of_its_pairs() {
-        let (mut arrivals, now) = (Arrivals::default(), Instant::now());
+        let (mut arrivals, now) = (PendingEndpoints::default(), Instant::now());
         arrivals.hold(entry(9), [pair(1, 9), pair(9, 2), pair(3, 9)].into(), now);
         assert!(arrivals.pair_up(&pair(1, 9)).is_none());
         assert!(arrivals.pair_up(&pair(1, 9)).is_none(), "once more");
@@ -129,7 +129,7 @@ mod tests {
 
     #[test]
     fn none_is_held_back_for_ever() {
-        let (mut arrivals, now) = (Arrivals::default(), Instant::now());
+        let (mut arrivals, now) = (PendingEndpoints::default(), Instant::now());
         arrivals.hold(entry(8), [pair(1, 8)].into(), now);
         arrivals.hold(entry(9), [pair(1, 9)].into(), now + PATIENCE / 2);
         assert_eq!(arrivals.due(), Some(now + PATIENCE));

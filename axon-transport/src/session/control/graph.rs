@@ -6,7 +6,7 @@ use std::{
     time::Instant,
 };
 
-use super::arrivals::Arrivals;
+use super::arrivals::PendingEndpoints;
 use crate::{
     graph::{Endpoint, EndpointKind, GraphEntry, GraphView, Pairing, pairing},
     ids::Gid,
@@ -23,7 +23,7 @@ pub(super) struct GraphFollower {
     shared: Arc<SessionShared>,
     /// A full graph that is still incomplete.
     building: Option<GraphView>,
-    arrivals: Arrivals,
+    arrivals: PendingEndpoints,
     /// The endpoints of the graph by topic. While a full graph is incomplete, this map is about that graph.
     topics: HashMap<String, BTreeSet<Gid>>,
     /// Whether the graph changed since it was last reported.
@@ -36,7 +36,7 @@ impl GraphFollower {
         Self {
             shared,
             building: None,
-            arrivals: Arrivals::default(),
+            arrivals: PendingEndpoints::default(),
             topics: HashMap::new(),
             changed: false,
         }

@@ -7,7 +7,7 @@ use axon_shm::{
     internal::{Grant, Location, ReaderInfo, RingPeer, Terms, descriptors::PassedFd},
 };
 
-use super::{Control, DaemonConnection, pair_log, peers::PeerError, stands_for};
+use super::{ControlThread, DaemonConnection, pair_log, peers::PeerError, stands_for};
 use crate::{
     graph::{EndpointKind, GraphEntry},
     ids::{Gid, SessionId},
@@ -19,7 +19,7 @@ use crate::{
     },
 };
 
-impl Control {
+impl ControlThread {
     pub(super) fn handle(&mut self, message: SessionMessage, descriptors: Vec<PassedFd>) {
         match message {
             SessionMessage::Graph(graph) => self.handle_graph(graph),

@@ -4,7 +4,7 @@ use std::{sync::mpsc::TryRecvError, time::Instant};
 
 use axon_shm::internal::descriptors::PassedFd;
 
-use super::{Control, DaemonConnection, announced::AnnouncedPairs, search::Search};
+use super::{ControlThread, DaemonConnection, announced::AnnouncedPairs, search::Search};
 use crate::{
     session::{
         core::{Outgoing, SessionEvent},
@@ -13,7 +13,7 @@ use crate::{
     wire::session::SessionMessage,
 };
 
-impl Control {
+impl ControlThread {
     pub(super) fn connected(&mut self, connected: Connected) {
         self.outbox.clear();
         self.graph.handle_connected();

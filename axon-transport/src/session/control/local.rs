@@ -30,7 +30,7 @@ struct LocalRegistryState {
 
 /// A session's end of it.
 #[derive(Debug)]
-pub(in crate::session) struct Local {
+pub(in crate::session) struct InProcessDaemon {
     id: SessionId,
     local_registry: Arc<LocalRegistry>,
 }
@@ -70,7 +70,7 @@ impl LocalRegistryState {
     }
 }
 
-impl Local {
+impl InProcessDaemon {
     /// A registry of its own, where nobody else is and nothing is handed to anybody.
     pub(in crate::session) fn alone(session: &SessionCore) -> Self {
         Self::enter(Arc::default(), session, None)
@@ -135,7 +135,7 @@ impl Local {
     }
 }
 
-impl Drop for Local {
+impl Drop for InProcessDaemon {
     fn drop(&mut self) {
         let mut inside = self.local_registry.lock();
         inside.wakers.remove(&self.id);

@@ -28,7 +28,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use self::{
     announced::AnnouncedPairs,
     graph::GraphFollower,
-    local::{Local, LocalRegistry},
+    local::{InProcessDaemon, LocalRegistry},
     matches::ChangedMatches,
     memory::AnnouncedMemory,
     pause::ReconnectPause,
@@ -66,7 +66,7 @@ const MAX_STANDS_FOR: usize = 1024;
 type Outbox = VecDeque<(SessionMessage, Vec<PassedFd>)>;
 
 /// The control thread of a session.
-pub(in crate::session) struct Control {
+pub(in crate::session) struct ControlThread {
     shared: Arc<SessionShared>,
     link: DaemonConnection,
     reconnects: bool,
@@ -98,12 +98,12 @@ pub(in crate::session) enum FirstPeer {
 
 enum DaemonConnection {
     Socket(PassedFd),
-    Local(Local),
+    Local(InProcessDaemon),
     Reconnecting(Search),
     Ended,
 }
 
-impl Control {
+impl ControlThread {
     pub(in crate::session) fn new(
         shared: Arc<SessionShared>,
         start: FirstPeer,
@@ -133,10 +133,10 @@ impl Control {
             }
             FirstPeer::LocalRegistry(local_registry) => {
                 control.link =
-                    DaemonConnection::Local(Local::join(local_registry, &control.shared.core)?);
+                    DaemonConnection::Local(InProcessDaemon::join(local_registry, &control.shared.core)?);
             }
             FirstPeer::Alone => {
-                control.link = DaemonConnection::Local(Local::alone(&control.shared.core))
+                control.link = DaemonConnection::Local(InProcessDaemon::alone(&control.shared.core))
             }
         }
         Ok(control)

@@ -15,7 +15,7 @@ use super::{
 };
 use crate::{
     access::Verb,
-    config::{Config, DaemonPlace, DaemonPolicy},
+    config::{Config, DaemonLocation, DaemonPolicy},
     ids::{DaemonId, SessionId},
     session::{error::SessionError, options::SessionOptions},
     status::{PeerDecisions, ReloadReport},
@@ -49,7 +49,7 @@ const PEER_ANSWER: Duration = Duration::from_secs(3);
 /// # Errors
 /// [`SessionError::NoDaemon`] when there is none.
 pub fn daemon_status(config: &Config) -> Result<String, SessionError> {
-    daemon_status_at(&DaemonPlace::from(config))
+    daemon_status_at(&DaemonLocation::from(config))
 }
 
 /// The same where no more is known than where that daemon is: other settings may be wrong.
@@ -63,7 +63,7 @@ pub fn daemon_status(config: &Config) -> Result<String, SessionError> {
 ///
 /// # Errors
 /// As [`daemon_status`].
-pub fn daemon_status_at(place: &DaemonPlace) -> Result<String, SessionError> {
+pub fn daemon_status_at(place: &DaemonLocation) -> Result<String, SessionError> {
     let config = Config { daemon: DaemonPolicy::Require, ..place.config() };
     let options = SessionOptions::new("status").role(SessionRole::Tool);
     let connected = Caller::new(&config, &options, SessionId::random()).connect()?;
@@ -88,7 +88,7 @@ pub fn daemon_status_at(place: &DaemonPlace) -> Result<String, SessionError> {
 ///
 /// # Errors
 /// As [`daemon_status`]. A daemon of an earlier version does not answer.
-pub fn daemon_reload_at(place: &DaemonPlace) -> Result<ReloadReport, SessionError> {
+pub fn daemon_reload_at(place: &DaemonLocation) -> Result<ReloadReport, SessionError> {
     let config = Config { daemon: DaemonPolicy::Require, ..place.config() };
     let options = SessionOptions::new("reload").role(SessionRole::Tool);
     let connected = Caller::new(&config, &options, SessionId::random()).connect()?;
@@ -122,7 +122,7 @@ pub fn daemon_reload_at(place: &DaemonPlace) -> Result<ReloadReport, SessionErro
 /// # Errors
 /// As [`daemon_status`]. [`SessionError::Silent`] also where the peer does not answer, as a daemon of an earlier version.
 pub fn daemon_check_access_at(
-    place: &DaemonPlace,
+    place: &DaemonLocation,
     peer: &str,
     uses: &[(Verb, String)],
 ) -> Result<PeerDecisions, SessionError> {

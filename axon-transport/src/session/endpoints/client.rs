@@ -12,7 +12,7 @@ use crate::{
         clock,
         error::{RecvError, SessionError},
         handle::Session,
-        sides::{MessageInfo, OnNew, PublisherInner, SubscriptionInner},
+        sides::{MessageInfo, NewDataCallback, PublisherInner, SubscriptionInner},
     },
 };
 
@@ -186,7 +186,7 @@ impl Client {
     ///
     /// # Errors
     /// As there.
-    pub fn set_on_new_response(&self, callback: Option<OnNew>) -> Result<(), SessionError> {
+    pub fn set_on_new_response(&self, callback: Option<NewDataCallback>) -> Result<(), SessionError> {
         set_callback(&self.responses, callback, &self.session)
     }
 

@@ -6,7 +6,7 @@ use crate::{
     events::{EventKind, EventStatus, Statuses},
     session::{
         handle::Session,
-        sides::{Callback, EventSource, OnNew},
+        sides::{Callback, EventSource, NewDataCallback},
     },
 };
 
@@ -80,7 +80,7 @@ impl Event {
     /// handle told nobody of, it is told at once, on this thread; the rest on the control thread, or
     /// where another endpoint of the session comes or goes. It must neither block nor panic, nor hold
     /// the session. It ends with this handle.
-    pub fn set_callback(&self, callback: Option<OnNew>) {
+    pub fn set_callback(&self, callback: Option<NewDataCallback>) {
         if !self.session.is_forked() {
             self.source.events().tell(self.kind, &self.callback);
             self.callback.set(callback);

@@ -12,7 +12,7 @@ use crate::{
         clock,
         error::{RecvError, SessionError},
         handle::Session,
-        sides::{MessageInfo, OnNew, PublisherInner, RingsByClient, SubscriptionInner},
+        sides::{MessageInfo, NewDataCallback, PublisherInner, RingsByClient, SubscriptionInner},
     },
 };
 
@@ -188,7 +188,7 @@ impl Server {
     ///
     /// # Errors
     /// As there.
-    pub fn set_on_new_request(&self, callback: Option<OnNew>) -> Result<(), SessionError> {
+    pub fn set_on_new_request(&self, callback: Option<NewDataCallback>) -> Result<(), SessionError> {
         set_callback(&self.requests, callback, &self.session)
     }
 

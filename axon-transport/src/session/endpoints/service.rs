@@ -12,7 +12,7 @@ use crate::{
     session::{
         error::SessionError,
         handle::Session,
-        sides::{OnNew, PublisherInner, SubscriptionInner},
+        sides::{NewDataCallback, PublisherInner, SubscriptionInner},
     },
 };
 
@@ -66,7 +66,7 @@ pub(super) fn attached(
 /// Has a callback told of new messages.
 pub(super) fn set_callback(
     inner: &SubscriptionInner,
-    callback: Option<OnNew>,
+    callback: Option<NewDataCallback>,
     session: &Session,
 ) -> Result<(), SessionError> {
     if session.is_forked() {

@@ -12,7 +12,7 @@ use crate::{
     session::{
         error::{RecvError, SessionError},
         handle::Session,
-        sides::{EventSource, MessageInfo, OnNew, SubscriptionInner},
+        sides::{EventSource, MessageInfo, NewDataCallback, SubscriptionInner},
     },
 };
 
@@ -125,7 +125,7 @@ impl Subscription {
     /// # Errors
     /// In a forked child, or when an event loop of the program's listens already
     /// (an [`ExternalLeader`](axon_shm::ExternalLeader)).
-    pub fn set_on_new_sample(&self, callback: Option<OnNew>) -> Result<(), SessionError> {
+    pub fn set_on_new_sample(&self, callback: Option<NewDataCallback>) -> Result<(), SessionError> {
         if self.session.is_forked() {
             return Err(ShmError::Forked.into());
         }

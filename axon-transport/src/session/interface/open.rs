@@ -8,7 +8,7 @@ use crate::{
     config::{Config, DaemonPolicy},
     ids::SessionId,
     session::{
-        control::{Control, FirstPeer, local::LocalRegistry},
+        control::{ControlThread, FirstPeer, local::LocalRegistry},
         daemon::connect::Caller,
         error::SessionError,
         handle::{Handle, Session},
@@ -94,7 +94,7 @@ impl Session {
         let shared = SessionShared::new(config.clone(), options, segment)
             .map_err(system("creating an eventfd"))?;
         let shared = Arc::new(shared);
-        let control = Control::new(shared.clone(), start)?;
+        let control = ControlThread::new(shared.clone(), start)?;
         let blocked = BlockedSignals::all();
         let thread = std::thread::Builder::new()
             .name("axon-ctl".into())

@@ -113,7 +113,7 @@ fn judge_loss(lost: u64, before: Option<u64>, number: u64) -> u64 {
 
 /// One end of a relay's connection: sends samples within the other end's credit, and publishes the samples
 /// that arrive.
-pub struct Pipe {
+pub struct RelaySocket {
     socket: PassedFd,
     buffer: Vec<u8>,
     /// Packets that are sent before any piece of a sample.
@@ -147,7 +147,7 @@ pub struct Pipe {
     losses: LogLimit,
 }
 
-impl Pipe {
+impl RelaySocket {
     /// Creates an end that has sent and received nothing.
     pub fn new(socket: PassedFd, incoming: IncomingFlow, tally: Arc<RelayCounters>) -> Self {
         Self {
@@ -423,7 +423,7 @@ impl Pipe {
     }
 }
 
-impl Pipe {
+impl RelaySocket {
     /// Sleeps for at most `left`, until there is work. `end` is the other end's process, whose descriptor
     /// becomes readable when the process ends; the other end then counts as gone.
     pub fn sleep(

@@ -35,7 +35,7 @@ use std::{
 /// assert_eq!(new.load(Ordering::Relaxed), 1);
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
-pub type OnNew = Arc<dyn Fn(u64) + Send + Sync>;
+pub type NewDataCallback = Arc<dyn Fn(u64) + Send + Sync>;
 
 /// What is to be told, and to whom.
 #[derive(Default)]
@@ -46,7 +46,7 @@ pub(in crate::session) struct Callback {
 
 #[derive(Default)]
 struct CallbackState {
-    function: Option<OnNew>,
+    function: Option<NewDataCallback>,
     untold: u64,
     /// The thread that is in a function. Another thread that has something to tell meanwhile leaves it to
     /// that thread: two in the same function that both wait for the other to return would wait for ever.
@@ -77,7 +77,7 @@ impl Callback {
     /// Has `function` told from now on, and at once of what nobody was told, unless it [ended](Self::end).
     /// The one before is not called any more once this returns, but by the calling thread that is in
     /// it, which tells `function` when it has left it.
-    pub(in crate::session) fn set(&self, function: Option<OnNew>) {
+    pub(in crate::session) fn set(&self, function: Option<NewDataCallback>) {
         let Ok(()) = self.replace(function, Ok::<_, Infallible>);
     }
 
@@ -86,7 +86,7 @@ impl Callback {
     /// any more where it fails.
     pub(in crate::session) fn replace<E>(
         &self,
-        function: Option<OnNew>,
+        function: Option<NewDataCallback>,
         recount: impl FnOnce(u64) -> Result<u64, E>,
     ) -> Result<(), E> {
         let mut state = self.vacate();
@@ -171,7 +171,7 @@ mod tests {
 
     use super::*;
 
-    fn counter() -> (OnNew, Arc<AtomicU64>) {
+    fn counter() -> (NewDataCallback, Arc<AtomicU64>) {
         let told = Arc::new(AtomicU64::new(0));
         let count = told.clone();
         let add = move |new| {
@@ -229,7 +229,7 @@ mod tests {
     }
 
     /// A function that says that it was entered, and returns when it is told to.
-    fn gate() -> (OnNew, mpsc::Receiver<u64>, mpsc::Sender<()>, Arc<AtomicBool>) {
+    fn gate() -> (NewDataCallback, mpsc::Receiver<u64>, mpsc::Sender<()>, Arc<AtomicBool>) {
         let (entered, entries) = mpsc::channel();
         let (go, goes) = mpsc::channel();
         let (inside, goes) = (Arc::new(AtomicBool::new(false)), Mutex::new(goes));

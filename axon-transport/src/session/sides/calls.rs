@@ -10,7 +10,7 @@ use std::{
 
 use axon_shm::{
     Sample,
-    internal::{Carried, Writer},
+    internal::{CarrierState, Writer},
 };
 
 use crate::{ids::Gid, session::core::SessionCore};
@@ -45,7 +45,7 @@ impl Calls {
 
     /// Whether a server that is not read may still answer: a daemon carries its requests, or carried them, and the ring
     /// keeps them for the next daemon.
-    fn carried(&self, server: &Gid) -> Option<Carried> {
+    fn carried(&self, server: &Gid) -> Option<CarrierState> {
         self.ring.get()?.carried(server)
     }
 
@@ -143,8 +143,8 @@ impl Calls {
         let lost: HashSet<Gid> = gone
             .into_iter()
             .filter(|server| match self.carried(server) {
-                Some(Carried::Attached) => false,
-                Some(Carried::Absent(until)) => {
+                Some(CarrierState::Attached) => false,
+                Some(CarrierState::Absent(until)) => {
                     again = Some(again.map_or(until, |before| before.min(until)));
                     false
                 }

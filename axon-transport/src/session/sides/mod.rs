@@ -20,6 +20,6 @@ pub(in crate::session) use self::{
     subscription::{Accept, NumberKind, ServeRequest, SubscriptionInner},
 };
 pub use self::{
-    callback::OnNew,
+    callback::NewDataCallback,
     subscription::{Lifetime, MessageInfo, TakeLimit},
 };

@@ -219,7 +219,7 @@ fn a_topic_crosses_as_often_as_its_max_hz_says_and_the_daemon_follows_the_file()
     until("the robot counts what does not cross", || dropped() > 0);
     // The next one would cross after a hundred seconds.
     write("1000");
-    let report = daemon_reload_at(&DaemonPlace::from(&robot.config())).unwrap();
+    let report = daemon_reload_at(&DaemonLocation::from(&robot.config())).unwrap();
     assert_eq!((report.changed, report.error), (vec!["[[topic]]".to_owned()], None));
     scan.publish(&(SAMPLES + 1).to_be_bytes()).unwrap();
     let mut crossed = 0;

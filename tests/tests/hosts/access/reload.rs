@@ -21,7 +21,7 @@ fn unlisted() -> [Host; 2] {
 /// Writes `axon.toml` of a host, and has its daemon read it. Returns what changed.
 fn rewrite(host: &Host, toml: &str) -> Vec<String> {
     fs::write(host.dir.path().join("axon.toml"), toml).unwrap();
-    let report = daemon_reload_at(&DaemonPlace::from(&host.config())).unwrap();
+    let report = daemon_reload_at(&DaemonLocation::from(&host.config())).unwrap();
     assert_eq!(report.error, None);
     report.changed
 }
@@ -49,7 +49,7 @@ fn log_levels_follow_the_settings() {
     (0..10).for_each(|_| uses());
     assert_eq!(a.log_bytes(), before, "nothing below an error");
     // A level that there is not changes nothing, and is named.
-    let place = DaemonPlace::from(&a.config());
+    let place = DaemonLocation::from(&a.config());
     fs::write(a.dir.path().join("axon.toml"), "log = \"axon_daemon=loud\"").unwrap();
     let error = daemon_reload_at(&place).unwrap().error.expect("why not");
     assert!(error.contains("log") && error.contains("loud"), "{error}");

@@ -58,7 +58,7 @@ fn path_of(host: &Host) -> PathBuf {
 
 fn change(host: &Host, rules: &str) {
     fs::write(path_of(host), rules).unwrap();
-    let report = daemon_reload_at(&DaemonPlace::from(&host.config())).unwrap();
+    let report = daemon_reload_at(&DaemonLocation::from(&host.config())).unwrap();
     assert_eq!((report.changed, report.error), (vec!["access rules".to_owned()], None));
 }
 

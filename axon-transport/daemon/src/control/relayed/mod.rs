@@ -32,7 +32,7 @@ use axon_transport::{
                 ArrivalPool, ChangeSignal, LINGER, MAX_CALLERS, MAX_ENDPOINTS,
                 calls::{self, CallChannels},
                 flow::{FlowChannel, IncomingFlow},
-                pipe::{End, LossReport, Pipe},
+                pipe::{End, LossReport, RelaySocket},
             },
         },
         wire::session::{
@@ -115,7 +115,7 @@ impl DaemonRelay {
         let incoming = IncomingFlow::new(config.max_message, pool);
         Ok(RelayedSession {
             id,
-            pipe: Pipe::new(socket, incoming, Arc::clone(&tally)),
+            pipe: RelaySocket::new(socket, incoming, Arc::clone(&tally)),
             tally,
             losses,
             writers: BTreeMap::new(),
@@ -145,14 +145,14 @@ fn failed(error: &SessionError) -> End {
 
 /// Samples of one publisher that do not get where they are to go.
 #[derive(Default)]
-struct Unreached {
+struct UndeliverableSamples {
     /// Those that came and could not be written.
     unwritten: u64,
     /// How many its process was told of.
     told: u64,
 }
 
-impl Unreached {
+impl UndeliverableSamples {
     /// How many are to be told of, if readers gave up so many in all.
     fn given_up_since(&mut self, given_up: u64) -> u64 {
         let all = given_up.saturating_add(self.unwritten);
@@ -163,7 +163,7 @@ impl Unreached {
 /// A session that is served.
 struct RelayedSession {
     id: SessionId,
-    pipe: Pipe,
+    pipe: RelaySocket,
     tally: Arc<RelayCounters>,
     /// What the daemon counts as lost.
     losses: Arc<Losses>,
@@ -181,7 +181,7 @@ struct RelayedSession {
     callers: BTreeMap<Gid, BTreeSet<Gid>>,
     alive: Alive,
     /// What its publishers lost.
-    unreached: BTreeMap<Gid, Unreached>,
+    unreached: BTreeMap<Gid, UndeliverableSamples>,
     /// The graph as it was told.
     graph: Arc<GraphView>,
     /// The pairs, an endpoint of the session first, of which the other is gone and has left something,

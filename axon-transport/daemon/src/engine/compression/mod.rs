@@ -95,7 +95,7 @@ impl Compressor {
 
 /// The flow that asks for a sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Asker {
+pub(crate) struct RequestingFlow {
     /// The peer.
     pub(crate) daemon: DaemonId,
     /// The flow towards it.
@@ -128,7 +128,7 @@ pub(crate) enum CompressionReply {
 struct PendingOrder {
     name: Option<SampleName>,
     length: usize,
-    askers: Vec<Asker>,
+    askers: Vec<RequestingFlow>,
 }
 
 #[derive(Debug)]
@@ -173,7 +173,7 @@ impl PeerCompression {
         name: Option<SampleName>,
         payload: &Bytes,
     ) -> Option<CompressionReply> {
-        self.all.ask(Asker { daemon: self.daemon, flow }, name, payload)
+        self.all.ask(RequestingFlow { daemon: self.daemon, flow }, name, payload)
     }
 }
 
@@ -214,7 +214,7 @@ impl Compression {
     /// A flow asks for a sample, which has a name if it is a topic's. `None`: too much is being compressed.
     pub(crate) fn ask(
         &self,
-        by: Asker,
+        by: RequestingFlow,
         name: Option<SampleName>,
         payload: &Bytes,
     ) -> Option<CompressionReply> {
@@ -249,7 +249,7 @@ impl Compression {
     }
 
     /// The owner answers an order. Returns the flows that asked.
-    pub(crate) fn handle_answer(&self, now: Duration, answer: &CompressionAnswer) -> Vec<Asker> {
+    pub(crate) fn handle_answer(&self, now: Duration, answer: &CompressionAnswer) -> Vec<RequestingFlow> {
         let mut state = self.0.borrow_mut();
         state.used = now;
         let Some(PendingOrder { name, length, askers }) = state.pending.remove(&answer.number)

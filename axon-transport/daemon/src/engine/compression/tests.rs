@@ -2,8 +2,8 @@ use rand::{Rng, SeedableRng, rngs::StdRng};
 
 use super::*;
 
-fn asker(flow: FlowId) -> Asker {
-    Asker { daemon: DaemonId([1; 16]), flow }
+fn asker(flow: FlowId) -> RequestingFlow {
+    RequestingFlow { daemon: DaemonId([1; 16]), flow }
 }
 
 /// A name of a sample of ten thousand bytes.

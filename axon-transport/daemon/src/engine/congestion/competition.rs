@@ -22,7 +22,7 @@ const ALIKE: u32 = 2;
 
 /// A queue that remains although the window shrinks.
 #[derive(Debug, Clone)]
-pub(super) struct Standing {
+pub(super) struct PersistentQueue {
     since: Instant,
     /// The window before it shrank.
     peak: u64,
@@ -34,7 +34,7 @@ pub(super) struct Standing {
     times: u32,
 }
 
-impl Standing {
+impl PersistentQueue {
     pub(super) fn new(now: Instant, window: u64, rate: f64) -> Self {
         Self { since: now, peak: window, window, rate, times: 0 }
     }
@@ -175,12 +175,12 @@ mod tests {
     fn a_rate_that_falls_with_the_window_says_that_others_fill_the_queue() {
         let start = Instant::now();
         // The queue belongs to this link alone: the rate stays.
-        let mut own = Standing::new(start, 100_000, 1e6);
+        let mut own = PersistentQueue::new(start, 100_000, 1e6);
         for time in 1..20_u32 {
             let window = 100_000 >> time.min(6);
             assert_eq!(own.shrink(start + millis(200) * time, window, 1e6, 1_000), None);
         }
-        let mut others = Standing::new(start, 100_000, 1e6);
+        let mut others = PersistentQueue::new(start, 100_000, 1e6);
         let mut shrink = |time: u32, window: u64| {
             others.shrink(start + millis(200) * time, window, window as f64 * 10.0, 1_000)
         };
@@ -193,7 +193,7 @@ mod tests {
     #[test]
     fn a_queue_that_stands_before_the_smallest_window_is_not_of_this_link() {
         let start = Instant::now();
-        let mut standing = Standing::new(start, 100_000, 1e6);
+        let mut standing = PersistentQueue::new(start, 100_000, 1e6);
         for time in 1..=5 {
             assert_eq!(standing.shrink(start + millis(590) * time, 4_000, 5e4, 4_000), None);
         }

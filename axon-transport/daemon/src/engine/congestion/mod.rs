@@ -30,7 +30,7 @@ use quinn_proto::{
     congestion::{Controller, ControllerFactory, ControllerMetrics},
 };
 
-use competition::{Competition, Outcome, Standing};
+use competition::{Competition, Outcome, PersistentQueue};
 use growth::{Growth, TRIAL};
 use path::Path;
 use silence::UnansweredTime;
@@ -146,7 +146,7 @@ pub(crate) struct Delay {
     round: WindowRound,
     growth: Growth,
     /// A queue that has remained since the window began to shrink.
-    standing: Option<Standing>,
+    standing: Option<PersistentQueue>,
     silence: UnansweredTime,
     last_sent: u64,
     /// The random variation between the shortest round trips of rounds.
@@ -299,7 +299,7 @@ impl Delay {
 
     fn end_round_of_queue(&mut self, now: Instant, rate: f64, shortest: Duration, queue: Duration) {
         let window = self.window;
-        let standing = self.standing.get_or_insert_with(|| Standing::new(now, window, rate));
+        let standing = self.standing.get_or_insert_with(|| PersistentQueue::new(now, window, rate));
         if let Some(peak) = standing.shrink(now, window, rate, FLOOR * self.mtu) {
             self.standing = None;
             self.phase = WindowPhase::Compete(Competition::new(now, peak, self.mtu, shortest));

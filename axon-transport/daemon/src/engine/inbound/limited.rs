@@ -17,12 +17,12 @@ use crate::engine::limits::RouteLimit;
 
 /// Streams that are not read on until their limit opens.
 #[derive(Debug, Default)]
-pub(super) struct Limited {
+pub(super) struct RateLimitedStreams {
     due: BTreeSet<(Duration, StreamKey)>,
     of: HashMap<StreamKey, Duration>,
 }
 
-impl Limited {
+impl RateLimitedStreams {
     pub(super) fn hold(&mut self, stream: StreamKey, until: Duration) {
         self.forget(&stream);
         self.due.insert((until, stream));

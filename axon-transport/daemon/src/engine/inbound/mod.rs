@@ -31,7 +31,7 @@ use quinn_proto::{StreamId, VarInt};
 pub(crate) use self::incoming::StreamHeader;
 use self::{
     incoming::{IncomingStream, StreamStep},
-    limited::Limited,
+    limited::RateLimitedStreams,
     receipts::Receipts,
     stream_queue::StreamQueue,
 };
@@ -117,7 +117,7 @@ pub(crate) struct Inbound {
     full: HashSet<StreamKey>,
     /// Streams that wait for memory.
     without_room: StreamQueue,
-    limited: Limited,
+    limited: RateLimitedStreams,
     /// Memory for one short message if the identity has none left. Complete messages are then read one after
     /// the other.
     spare: Rc<Meter>,
@@ -156,7 +156,7 @@ impl Inbound {
             waiting: BTreeSet::new(),
             full: HashSet::new(),
             without_room: StreamQueue::default(),
-            limited: Limited::default(),
+            limited: RateLimitedStreams::default(),
             spare: Meter::new(LONG),
             full_retry: None,
             exceeded: None,

@@ -23,7 +23,7 @@ use crate::engine::{
 const LENGTH: usize = 4;
 
 /// Where the samples of a run go.
-struct RunTarget {
+struct BatchTarget {
     header: StreamHeader,
     route: Route,
     stand_in: Rc<StandIn>,
@@ -34,7 +34,7 @@ struct RunTarget {
 
 /// What is to be acknowledged after a run.
 #[derive(Default)]
-struct RunProgress {
+struct BatchProgress {
     newest: Option<u64>,
     samples: u64,
     bytes: usize,
@@ -66,7 +66,7 @@ impl Inbound {
         };
         let most = self.max_message + MAX_OVERHEAD as u64;
         let (to, mut came) =
-            (RunTarget { header, route, stand_in, most, now }, RunProgress::default());
+            (BatchTarget { header, route, stand_in, most, now }, BatchProgress::default());
         let mut envelope = std::mem::take(&mut self.envelope);
         let next = self.deliver_all(&to, stream, open, &mut envelope, &mut came);
         self.envelope = envelope;
@@ -90,11 +90,11 @@ impl Inbound {
     /// stream goes on with.
     fn deliver_all(
         &mut self,
-        to: &RunTarget,
+        to: &BatchTarget,
         stream: &mut IncomingStream,
         open: &mut Open<'_>,
         envelope: &mut Vec<u8>,
-        came: &mut RunProgress,
+        came: &mut BatchProgress,
     ) -> Result<Option<StreamStep>, LinkViolation> {
         let now = to.now;
         let IncomingStream { chunk, headers, short_since, .. } = stream;

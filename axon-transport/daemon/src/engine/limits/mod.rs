@@ -304,7 +304,7 @@ impl Limit {
 
 #[cfg(test)]
 pub(crate) mod tests {
-    use axon_transport::access::{AccessRules, Party};
+    use axon_transport::access::{AccessRules, Principal};
 
     use super::*;
 
@@ -312,7 +312,7 @@ pub(crate) mod tests {
 
     /// Returns the permissions that rules give a peer.
     pub(crate) fn permissions(rules: &str) -> Permissions {
-        AccessRules::parse(rules, "access.toml").unwrap().permissions(Party::Name("base"))
+        AccessRules::parse(rules, "access.toml").unwrap().permissions(Principal::Name("base"))
     }
 
     /// Returns the limits that the text of a `[[limit]]` sets on a peer's subscriptions to a topic.

@@ -113,7 +113,7 @@ mod tests {
 
     fn limit(rate: Option<f64>, bytes: Option<f64>, burst: u32) -> RateLimit {
         let rules = AccessRules::parse("[[limit]]\npeer = \"*\"\nrate = 1\n", "f").unwrap();
-        let permissions = rules.permissions(axon_transport::access::Party::Name("x"));
+        let permissions = rules.permissions(axon_transport::access::Principal::Name("x"));
         let placed = permissions.limits(axon_transport::access::Verb::Publish, "/t").next();
         let mut limit = placed.unwrap().limit.clone();
         (limit.rate, limit.bytes, limit.burst) = (rate, bytes, NonZeroU32::new(burst).unwrap());

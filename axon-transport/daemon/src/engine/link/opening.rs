@@ -23,7 +23,7 @@ use crate::{
         refusal::Refusal,
     },
     keys::{Answer, Completion, Exporters, KmeRequest, RequestOrigin},
-    link::{CloseCode, FrameError, LinkHello, LinkMessage, Order, Side, check},
+    link::{CloseCode, FrameError, LinkHello, LinkMessage, MessageOrder, Side, check},
 };
 
 #[cfg(test)]
@@ -59,7 +59,7 @@ pub(crate) struct Opening {
     chain: Option<Vec<CertificateDer<'static>>>,
     negotiated: Option<Negotiated>,
     exporters: Option<Exporters>,
-    order: Order,
+    order: MessageOrder,
     step: OpeningStep,
     /// When the step ends at the latest.
     until: Option<Duration>,
@@ -88,7 +88,7 @@ pub(crate) struct OpenedConnection {
     /// What the handshake agreed on.
     pub(crate) negotiated: Negotiated,
     /// Judges the next messages.
-    pub(crate) order: Order,
+    pub(crate) order: MessageOrder,
     /// The key material of the connection, in messages10. Its receiver is attached to the keyring.
     pub(crate) sealing: Option<Sealing>,
 }
@@ -151,7 +151,7 @@ impl Opening {
             chain: ca.then_some(chain),
             negotiated: None,
             exporters,
-            order: Order::new(side, qkd),
+            order: MessageOrder::new(side, qkd),
             step: OpeningStep::Hello(None),
             until: None,
             greeted: false,

@@ -24,11 +24,11 @@ use crate::{
             opening::{OpenedConnection, Sealing},
             target::DialTarget,
         },
-        links::link::Summary,
+        links::link::EstablishedPeer,
         quic::transport::{LINK_WINDOW, STREAMS_OPEN, window_credit},
         refusal::Refusal,
     },
-    link::{Candidate, CloseCode, Elected, Intake, LinkHello, LinkMessage, Side, new_wins},
+    link::{Candidate, CloseCode, Elected, ReceiveLimits, LinkHello, LinkMessage, Side, new_wins},
 };
 
 /// The peer elects one of its connections within this time.
@@ -124,7 +124,7 @@ impl Links {
         link.place = None;
         link.phase = LinkPhase::Electing(now + ELECTION_TIMEOUT);
         link.peer = Some(LinkPeer {
-            summary: Summary { hello, negotiated, who },
+            summary: EstablishedPeer { hello, negotiated, who },
             proven,
             order,
             candidate,
@@ -305,7 +305,7 @@ impl Links {
     fn tell_intake(&mut self, number: u64, now: Duration) {
         let Some(peer) = self.table.peer(number) else { return };
         let (unread, messages) = (window(peer).into(), MESSAGES.0 as u64);
-        self.send(number, &LinkMessage::Intake(Intake { unread, messages }), now);
+        self.send(number, &LinkMessage::ReceiveLimits(ReceiveLimits { unread, messages }), now);
     }
 
     /// Bytes of long samples that the peer may have in flight over a link.

@@ -4,7 +4,7 @@ use std::{fmt, net::SocketAddr};
 
 use axon_tls::identity::{Auth, SpkiDigest};
 
-use axon_transport::access::Party;
+use axon_transport::access::Principal;
 
 use super::admission::place;
 use crate::link::LinkHello;
@@ -82,11 +82,11 @@ impl PeerIdentity {
     }
 
     /// Returns the party that access rules apply to; `address` is the address of the peer's link.
-    pub(crate) fn party(&self, address: SocketAddr) -> Party<'_> {
+    pub(crate) fn party(&self, address: SocketAddr) -> Principal<'_> {
         match self {
-            Self::Sae(name) | Self::Pinned(name, _) => Party::Name(name),
-            Self::Host(name, _) => Party::Certificate(name),
-            Self::Somebody(_) => Party::Address(address.ip().to_canonical()),
+            Self::Sae(name) | Self::Pinned(name, _) => Principal::Name(name),
+            Self::Host(name, _) => Principal::Certificate(name),
+            Self::Somebody(_) => Principal::Address(address.ip().to_canonical()),
         }
     }
 
@@ -137,7 +137,7 @@ mod tests {
         let auth = Auth::Pinned { key: SigningKey::generate().unwrap(), trust: trust.clone() };
         let of = |auth, key| PeerIdentity::of(false, auth, &hello(), key);
         let who = of(Some(&auth), Some(key)).unwrap();
-        assert_eq!(who.party(([127, 0, 0, 1], 1).into()), Party::Name("arm"));
+        assert_eq!(who.party(([127, 0, 0, 1], 1).into()), Principal::Name("arm"));
         // The pin is removed between the handshake and HELLO.
         for gone in ["# nobody\n".to_owned(), format!("arm {key} 2024-02-29\n")] {
             trust.replace(pins(&gone));

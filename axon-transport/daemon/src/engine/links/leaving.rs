@@ -8,7 +8,7 @@ use super::{
     LinkEvent, Links,
     link::{
         Link, LinkPhase,
-        hand_over::{HandOverProgress, HandOverStep, Leaving},
+        hand_over::{HandOverProgress, HandOverStep, DrainingLink},
     },
     silence::Traffic,
 };
@@ -28,7 +28,7 @@ impl Links {
         let silent = peer.silence.handle_superseded(Traffic::from(&stats));
         let succeeded = ours > peer.summary.hello.daemon;
         let (who, elected) = (peer.summary.who.clone(), peer.elected);
-        link.phase = LinkPhase::Leaving(Leaving::new(peer.age.until(), succeeded, now));
+        link.phase = LinkPhase::Leaving(DrainingLink::new(peer.age.until(), succeeded, now));
         self.nonces.retain(|_, number| *number != old);
         tracing::debug!(link = old, silent, "the link is superseded");
         let of_identity = self.table.leaving().filter(|(_, peer)| peer.summary.who.is(&who));

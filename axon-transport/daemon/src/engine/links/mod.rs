@@ -46,8 +46,8 @@ use self::{
     events::LinkOutbox,
     inbox::DiscoveryInbox,
     link::{Link, LinkPhase, view::LinkView},
-    silence::{LookTimes, Nonce, frames_came},
-    table::Table,
+    silence::{CheckSchedule, Nonce, frames_came},
+    table::LinkTable,
     unfinished::UnfinishedConnections,
 };
 use super::{
@@ -85,7 +85,7 @@ pub(super) struct Links {
     random: StdRng,
     accounts: Accounts,
     connections: Connections,
-    table: Table,
+    table: LinkTable,
     dials: Dials,
     admission: AddressAdmission,
     next_election: u64,
@@ -96,7 +96,7 @@ pub(super) struct Links {
     nonces: HashMap<Nonce, u64>,
     inbox: DiscoveryInbox,
     outbox: LinkOutbox,
-    looks: LookTimes,
+    looks: CheckSchedule,
 }
 
 /// Returns the wall-clock time.
@@ -154,7 +154,7 @@ impl Links {
                 QuicEndpoints::new(&addresses, &endpoint, &server),
                 epoch,
             ),
-            table: Table::default(),
+            table: LinkTable::default(),
             dials: Dials::default(),
             admission: AddressAdmission::new(),
             next_election: 1,
@@ -163,7 +163,7 @@ impl Links {
             nonces: HashMap::new(),
             inbox: DiscoveryInbox::new(),
             outbox: LinkOutbox::default(),
-            looks: LookTimes::new(),
+            looks: CheckSchedule::new(),
         })
     }
 

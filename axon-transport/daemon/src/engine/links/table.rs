@@ -12,12 +12,12 @@ use crate::engine::link::opening::Opening;
 
 /// All links.
 #[derive(Default)]
-pub(super) struct Table {
+pub(super) struct LinkTable {
     links: HashMap<u64, Link>,
     current: HashMap<DaemonId, u64>,
 }
 
-impl Table {
+impl LinkTable {
     /// Adds a link.
     pub(super) fn insert(&mut self, number: u64, link: Link) {
         self.links.insert(number, link);

@@ -15,8 +15,8 @@ const MAX_PUBLISHERS: usize = 1024;
 
 /// Ended publishers whose samples are not all acknowledged.
 #[derive(Debug)]
-pub(super) struct Endings {
-    publishers: HashMap<Gid, Ending>,
+pub(super) struct PublisherDrains {
+    publishers: HashMap<Gid, PublisherDrain>,
     next: Option<Duration>,
     /// Bytes that the samples of all ended publishers may take.
     most: u64,
@@ -25,7 +25,7 @@ pub(super) struct Endings {
 }
 
 #[derive(Debug)]
-struct Ending {
+struct PublisherDrain {
     /// The publisher's route, until the peer asks for the route anew.
     route: u32,
     /// The flow's progress at the last check, and the time since which it has not changed.
@@ -37,7 +37,7 @@ struct Ending {
     at_first: Option<(u64, u64)>,
 }
 
-impl Ending {
+impl PublisherDrain {
     /// Estimates the bytes of so many samples from those of the first check.
     fn bytes_of(&mut self, samples: u64, measure: impl FnOnce() -> u64) -> u64 {
         let (bytes, of) = *self.at_first.get_or_insert_with(|| (measure(), samples.max(1)));
@@ -48,7 +48,7 @@ impl Ending {
 
 /// The rest of an ended publisher.
 #[derive(Debug)]
-pub(super) struct EndedFlow {
+pub(super) struct DrainedFlow {
     /// The publisher's current route.
     pub(super) route: u32,
     /// Samples that are not acknowledged.
@@ -118,7 +118,7 @@ struct DrainingPublisher {
     bytes: u64,
 }
 
-impl Endings {
+impl PublisherDrains {
     /// Creates an empty set. `most` bounds the bytes of all samples. One publisher alone may exceed it.
     pub(super) fn new(most: u64) -> Self {
         Self { publishers: HashMap::new(), next: None, most, ended: 0 }
@@ -127,7 +127,7 @@ impl Endings {
     /// Adds a publisher that ended.
     pub(super) fn add(&mut self, route: u32, publisher: Gid, now: Duration) {
         let (progress, since, number) = ((0, 0), now, self.ended);
-        let ending = Ending { route, progress, since, number, at_first: None };
+        let ending = PublisherDrain { route, progress, since, number, at_first: None };
         self.publishers.entry(publisher).or_insert(ending);
         self.ended += 1;
         self.next = Some(now);
@@ -144,7 +144,7 @@ impl Endings {
     pub(super) fn handle_timeout(
         &mut self,
         now: Duration,
-        left_of: impl Fn(u32, &Gid) -> Option<EndedFlow>,
+        left_of: impl Fn(u32, &Gid) -> Option<DrainedFlow>,
         bytes_of: impl Fn(u32, &Gid) -> u64,
     ) -> Vec<FinishedPublisher> {
         let (mut over, mut waiting) = (Vec::new(), Vec::new());
@@ -157,7 +157,7 @@ impl Endings {
                 over.push(FinishedPublisher { publisher: *publisher, given_up: None });
                 return false;
             };
-            let EndedFlow { route, samples, progress, is_excused } = left;
+            let DrainedFlow { route, samples, progress, is_excused } = left;
             ending.route = route;
             if progress != ending.progress || is_excused {
                 (ending.progress, ending.since) = (progress, now);
@@ -212,8 +212,8 @@ mod tests {
 
     const PUBLISHER: Gid = Gid([1; 16]);
 
-    fn endings() -> Endings {
-        Endings::new(1000)
+    fn endings() -> PublisherDrains {
+        PublisherDrains::new(1000)
     }
 
     /// A measure for tests in which the length of samples does not matter.
@@ -225,14 +225,14 @@ mod tests {
         Some(GivenUpSamples { route, samples, why: GivenUpCause::Stuck })
     }
 
-    fn left(samples: u64, progress: u64, is_excused: bool) -> Option<EndedFlow> {
-        Some(EndedFlow { route: 1, samples, progress: (progress, 0), is_excused })
+    fn left(samples: u64, progress: u64, is_excused: bool) -> Option<DrainedFlow> {
+        Some(DrainedFlow { route: 1, samples, progress: (progress, 0), is_excused })
     }
 
     /// Runs the checks until the publisher is finished; `left` returns its rest at a given time. Returns the
     /// time and the finished publisher.
     fn over_after(
-        left: impl Fn(Duration) -> Option<EndedFlow>,
+        left: impl Fn(Duration) -> Option<DrainedFlow>,
     ) -> (Duration, Vec<FinishedPublisher>) {
         let mut endings = endings();
         assert_eq!(endings.poll_timeout(), None);
@@ -273,7 +273,7 @@ mod tests {
     fn a_route_that_was_asked_for_anew_is_remembered() {
         let mut endings = endings();
         endings.add(1, PUBLISHER, Duration::ZERO);
-        let moved = |route: u32| EndedFlow { route, ..left(5, 0, false).unwrap() };
+        let moved = |route: u32| DrainedFlow { route, ..left(5, 0, false).unwrap() };
         assert!(endings.handle_timeout(Duration::ZERO, |_, _| Some(moved(2)), no_bytes).is_empty());
         let given_up = endings.handle_timeout(PATIENCE, |route, _| Some(moved(route)), no_bytes);
         assert_eq!(given_up[0].given_up, stuck(2, 5));
@@ -292,7 +292,7 @@ mod tests {
 
     /// Ends the publishers with these numbers, each with 5 samples in `bytes`. Returns the publishers that
     /// the bound gives up.
-    fn given_up_beyond(endings: &mut Endings, numbers: &[u16], bytes: u64) -> Vec<u8> {
+    fn given_up_beyond(endings: &mut PublisherDrains, numbers: &[u16], bytes: u64) -> Vec<u8> {
         let gid = |number: u16| {
             let [high, low] = number.to_be_bytes();
             Gid([high, low, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0])

@@ -38,21 +38,21 @@ pub(crate) use self::{
 };
 use self::{
     budget::Budget,
-    ending::{Endings, FinishedPublisher, GivenUpSamples},
+    ending::{PublisherDrains, FinishedPublisher, GivenUpSamples},
     flow::{Flow, FlowPause},
     pings::Pings,
     served::{FlowRoute, ServedFlows},
     source::FlowProgress,
     stall::{BusyFlow, FlowStalls, PeerActivity},
     table::FlowTable,
-    turns::FlowTurns,
+    turns::FlowScheduler,
 };
 use super::{
     compression::PeerCompression, congestion::let_probe_through, quic::connection::Carrier,
 };
 use crate::{
     engine::{counters::Counters, limits::Limit},
-    link::{CloseCode, Intake, ReceivedOf},
+    link::{CloseCode, ReceiveLimits, ReceivedOf},
 };
 
 /// Time after which flows check again whether a link has keys.
@@ -79,8 +79,8 @@ pub(crate) enum OutboundEvent {
 /// The samples to one peer.
 pub(crate) struct Outbound {
     table: FlowTable,
-    turns: FlowTurns,
-    endings: Endings,
+    turns: FlowScheduler,
+    endings: PublisherDrains,
     stalls: FlowStalls,
     pings: Pings,
     budget: Rc<Budget>,
@@ -102,8 +102,8 @@ impl Outbound {
     ) -> Self {
         Self {
             table: FlowTable::default(),
-            turns: FlowTurns::new(Rc::clone(&budget)),
-            endings: Endings::new(budget.of_daemon()),
+            turns: FlowScheduler::new(Rc::clone(&budget)),
+            endings: PublisherDrains::new(budget.of_daemon()),
             stalls: FlowStalls::new(stalled_after, now),
             pings: Pings::default(),
             budget,
@@ -321,7 +321,7 @@ impl Outbound {
     }
 
     /// Sets how much the peer takes in over this link.
-    pub(crate) fn set_intake(&mut self, intake: &Intake) {
+    pub(crate) fn set_intake(&mut self, intake: &ReceiveLimits) {
         self.turns.credit().set(Some(intake));
     }
 

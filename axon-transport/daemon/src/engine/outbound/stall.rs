@@ -141,7 +141,7 @@ pub(super) struct StallReport {
 
 /// Whether frames of a peer arrive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Hearing {
+enum LinkActivity {
     Heard,
     Silent,
     Gone,
@@ -231,7 +231,7 @@ impl FlowStalls {
         let hearing = self.listen(peer.heard, now);
         if peer.returned != self.returned || !peer.is_awaited {
             (self.returned, self.starved) = (peer.returned, Duration::ZERO);
-        } else if hearing == Hearing::Heard {
+        } else if hearing == LinkActivity::Heard {
             self.starved += passed;
         }
         let starves = self.starves();
@@ -261,18 +261,18 @@ impl FlowStalls {
         found
     }
 
-    fn listen(&mut self, heard: u64, now: Duration) -> Hearing {
+    fn listen(&mut self, heard: u64, now: Duration) -> LinkActivity {
         if heard != self.heard.0 {
             self.heard = (heard, now);
         }
         self.hearing(now)
     }
 
-    fn hearing(&self, now: Duration) -> Hearing {
+    fn hearing(&self, now: Duration) -> LinkActivity {
         match now.saturating_sub(self.heard.1) {
-            short if short < SILENT => Hearing::Heard,
-            long if long < GONE => Hearing::Silent,
-            _ => Hearing::Gone,
+            short if short < SILENT => LinkActivity::Heard,
+            long if long < GONE => LinkActivity::Silent,
+            _ => LinkActivity::Gone,
         }
     }
 }
@@ -288,7 +288,7 @@ impl Progress {
         mut self,
         passed: Duration,
         flow: &BusyFlow,
-        hearing: Hearing,
+        hearing: LinkActivity,
         starves: bool,
         limit: Duration,
     ) -> Self {
@@ -303,11 +303,11 @@ impl Progress {
             _ if flow.is_service && !is_held && !starves => self.idle = Duration::ZERO,
             // The peer is not at fault while its flow waits for others. Earlier time stays, because there was
             // no progress since.
-            Hearing::Heard if waits_for_others => {}
-            Hearing::Heard => self.idle += passed,
-            Hearing::Silent | Hearing::Gone if !is_held => self.idle = Duration::ZERO,
-            Hearing::Silent => {}
-            Hearing::Gone => self.idle += passed,
+            LinkActivity::Heard if waits_for_others => {}
+            LinkActivity::Heard => self.idle += passed,
+            LinkActivity::Silent | LinkActivity::Gone if !is_held => self.idle = Duration::ZERO,
+            LinkActivity::Silent => {}
+            LinkActivity::Gone => self.idle += passed,
         }
         let passed = passed + std::mem::take(&mut self.kept);
         self.pace.taken += flow.progress.0.saturating_sub(self.at.0);

@@ -287,7 +287,7 @@ fn parts(denied: Vec<DeniedUse>, lifted: Vec<DeniedUse>) -> Vec<LinkMessage> {
 
 #[cfg(test)]
 mod tests {
-    use axon_transport::access::{AccessRules, Party};
+    use axon_transport::access::{AccessRules, Principal};
 
     use super::*;
     use crate::engine::account::Accounts;
@@ -307,7 +307,7 @@ mod tests {
     #[test]
     fn denied_uses_are_bounded_over_all_daemons_of_an_identity() {
         let rules = AccessRules::parse("default = \"deny\"", "access.toml").unwrap();
-        let permissions = rules.permissions(Party::Address("10.0.0.1".parse().unwrap()));
+        let permissions = rules.permissions(Principal::Address("10.0.0.1".parse().unwrap()));
         let account = Accounts::new(1 << 20, 1 << 20).of_one("a");
         let [mut one, mut other] = [(); 2].map(|()| PeerAccess::new(permissions.clone(), &account));
         let daemons = [DaemonId([1; 16]), DaemonId([2; 16])];

@@ -5,7 +5,7 @@ use std::{cell::RefCell, collections::BTreeMap, sync::Arc};
 use axon_shm::ids::Gid;
 use axon_transport::{config::Config, graph::Endpoint, internal::graph::EndpointRange};
 
-use super::{kept_relays::KeptRelays, routes::lanes::WritersHere, stalls::StallHistory};
+use super::{kept_relays::KeptRelays, routes::lanes::LocalWriterCounts, stalls::StallHistory};
 use crate::engine::{rings::Rings, stand_in::StandIns};
 
 /// The endpoints of applications on this host, and how far their sessions are discovered.
@@ -20,7 +20,7 @@ pub(crate) struct PeerContext<'a> {
     /// The endpoints of this host.
     pub(crate) local: &'a LocalEndpoints,
     /// How many writers of each route are among them.
-    pub(crate) writers: &'a WritersHere,
+    pub(crate) writers: &'a LocalWriterCounts,
     /// The settings of this host.
     pub(crate) config: &'a Config,
     /// Routes that were given up.

@@ -12,16 +12,16 @@ use super::{access::PeerAccess, context::LocalEndpoints, control_queue::ControlQ
 use crate::{
     engine::peer_graph::{
         owners::Prover,
-        shown::{ShownEndpoint, ShownToPeer},
+        shown::{AdvertisedEndpoint, AdvertisedGraph},
     },
-    owner::Binding,
+    owner::ChannelBinding,
 };
 
 /// The graph of this host as one peer is shown it.
 pub(super) struct LocalGraph {
     peer: DaemonId,
     /// The graph that was sent to the peer.
-    shown: ShownToPeer,
+    shown: AdvertisedGraph,
     /// Proves to the peer that sessions belong to this host.
     prover: Prover,
     /// Ended publishers of this host whose samples have not all arrived. The peer sees them until then.
@@ -41,13 +41,13 @@ pub(super) struct Visibility<'a> {
 impl LocalGraph {
     /// Creates the graph of a peer that was shown nothing.
     pub(super) fn new(peer: DaemonId, prover: Prover) -> Self {
-        Self { peer, shown: ShownToPeer::default(), prover, ending: BTreeMap::new() }
+        Self { peer, shown: AdvertisedGraph::default(), prover, ending: BTreeMap::new() }
     }
 
     /// Proves over a new link what was proven over the link before.
     pub(super) fn succeed(
         &mut self,
-        binding: Option<Binding>,
+        binding: Option<ChannelBinding>,
         by: Visibility<'_>,
         messages: &mut ControlQueue,
     ) {
@@ -63,7 +63,7 @@ impl LocalGraph {
         self.prove(&visible, messages);
         let mut told = |remote: RemoteEndpoint| {
             let denied = !access.judge(&remote.endpoint).usable;
-            ShownEndpoint { remote, denied }
+            AdvertisedEndpoint { remote, denied }
         };
         let now: BTreeMap<_, _> = visible.into_iter().map(|(gid, e)| (gid, told(e))).collect();
         access.retain_rights(|gid| local.contains_key(gid) || self.ending.contains_key(gid));

@@ -39,7 +39,7 @@ use self::{
 pub(crate) use self::{
     context::{LocalEndpoints, PeerContext},
     routes::{
-        lanes::WritersHere,
+        lanes::LocalWriterCounts,
         served::{MAX_ROUTES, StalledRoute},
     },
 };
@@ -56,7 +56,7 @@ use crate::{
         peer_graph::{GraphTaken, PeerGraph, owners::Prover},
     },
     link::{AccessDecisions, CloseCode, GraphUpdate, LinkClosed, LinkMessage, LivelinessAsserted},
-    owner::Binding,
+    owner::ChannelBinding,
 };
 
 /// The number of routes of a peer whose HELLO does not state how many it serves.
@@ -167,7 +167,7 @@ impl Peer {
     }
 
     /// Moves the peer to a new link. The peer's routes stay; this side asks for its own routes again.
-    pub(super) fn succeed(&mut self, link: u64, binding: Option<Binding>, local: &LocalEndpoints) {
+    pub(super) fn succeed(&mut self, link: u64, binding: Option<ChannelBinding>, local: &LocalEndpoints) {
         self.link = link;
         self.messages.succeed();
         self.remote.succeed();
@@ -222,7 +222,7 @@ impl Peer {
                 self.stirred |= of_service && self.services_changed();
             }
             LinkMessage::Asserted(asserted) => self.handle_asserted(&asserted),
-            LinkMessage::Intake(intake) => self.outbound.set_intake(&intake),
+            LinkMessage::ReceiveLimits(intake) => self.outbound.set_intake(&intake),
             LinkMessage::Received(received) => self.outbound.handle_received(&received.flows),
             LinkMessage::RouteRefused(refused) => self.handle_route_refused(now, refused),
             LinkMessage::Denied(denied) => {

@@ -60,7 +60,7 @@ impl RightsByEndpoint {
 #[cfg(test)]
 mod tests {
     use axon_transport::{
-        access::{AccessRules, Party},
+        access::{AccessRules, Principal},
         graph::EndpointKind,
     };
 
@@ -69,7 +69,7 @@ mod tests {
 
     fn rules(text: &str) -> Permissions {
         let rules = AccessRules::parse(text, "access.toml").unwrap();
-        rules.permissions(Party::Address("10.0.0.1".parse().unwrap()))
+        rules.permissions(Principal::Address("10.0.0.1".parse().unwrap()))
     }
 
     fn publisher(topic: &str) -> Arc<Endpoint> {
@@ -101,7 +101,7 @@ mod tests {
     #[test]
     fn nothing_is_remembered_where_there_are_no_rules() {
         let mut judged = RightsByEndpoint::default();
-        let none = AccessRules::default().permissions(Party::Name("base"));
+        let none = AccessRules::default().permissions(Principal::Name("base"));
         let judgement = judged.judge(&none, &publisher("/t"));
         assert!(judgement.shown && judgement.usable && judged.0.is_empty());
     }

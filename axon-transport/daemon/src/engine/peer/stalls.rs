@@ -24,14 +24,14 @@ const SWEEP: Duration = Duration::from_secs(1);
 /// The stalls of all peers, by proven identity, so that a new link or daemon ID does not reset them.
 #[derive(Debug)]
 pub(crate) struct StallHistory {
-    of: HashMap<String, OfPeer>,
+    of: HashMap<String, PeerStalls>,
     room: Rc<Meter>,
     swept: Option<Duration>,
 }
 
 /// The stalls of one peer.
 #[derive(Debug)]
-struct OfPeer {
+struct PeerStalls {
     room: Rc<Meter>,
     routes: HashMap<RouteKey, (RouteStall, Charge)>,
     /// The stall of all routes for which there was no room. A peer gains nothing by stalling very many
@@ -61,7 +61,7 @@ impl RouteStall {
     }
 }
 
-impl OfPeer {
+impl PeerStalls {
     /// Returns the stall of a route.
     fn get(&self, key: &RouteKey) -> Option<RouteStall> {
         self.routes.get(key).map(|(stall, _)| *stall).or(self.others)
@@ -96,7 +96,7 @@ impl StallHistory {
             let first = first.map(|(who, _)| who.clone());
             first.map(|who| self.of.remove(&who));
         }
-        let of = self.of.entry(who.to_owned()).or_insert_with(|| OfPeer {
+        let of = self.of.entry(who.to_owned()).or_insert_with(|| PeerStalls {
             room: Meter::within(&self.room, ROOM.1),
             routes: HashMap::new(),
             others: None,

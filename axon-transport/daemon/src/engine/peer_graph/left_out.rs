@@ -5,21 +5,21 @@ use axon_transport::graph::{Endpoint, EndpointKind};
 
 /// Endpoints that were left out since the peer said its whole graph: the first of them, and how many there were.
 #[derive(Debug, Default)]
-pub(super) struct LeftOut {
-    first: Option<FirstLeftOut>,
+pub(super) struct OmittedEndpoints {
+    first: Option<FirstOmission>,
     count: u64,
 }
 
 /// An endpoint that was left out.
 #[derive(Debug)]
-struct FirstLeftOut {
+struct FirstOmission {
     /// It by name, and why.
     text: String,
     /// Bytes that it would take; `None` when bytes are not what is missing.
     bytes: Option<usize>,
 }
 
-impl LeftOut {
+impl OmittedEndpoints {
     /// There is no room for an endpoint, as the peer's graph `has` too much. So many `bytes` would do, if bytes are what
     /// is missing.
     pub(super) fn add_for_room(
@@ -54,7 +54,7 @@ impl LeftOut {
 
     fn add(&mut self, bytes: Option<usize>, text: impl FnOnce() -> String) {
         self.count += 1;
-        self.first.get_or_insert_with(|| FirstLeftOut { text: text(), bytes });
+        self.first.get_or_insert_with(|| FirstOmission { text: text(), bytes });
     }
 
     /// The first endpoint, and why it was left out.
@@ -98,7 +98,7 @@ mod tests {
         let named = |topic: &str| {
             Endpoint::new(Gid([1; 16]), EndpointKind::Server, topic, "T").with_node("n", "/")
         };
-        let mut left_out = LeftOut::default();
+        let mut left_out = OmittedEndpoints::default();
         assert_eq!((left_out.first(), left_out.needed(), left_out.count()), (None, None, 0));
         left_out.add_for_room(&named("/a"), Some(100), || "more than 3 MiB".into());
         left_out.add_unproven(&named("/b"));
@@ -111,7 +111,7 @@ mod tests {
 
     #[test]
     fn a_name_that_a_peer_made_very_long_or_unreadable_is_cut_and_escaped() {
-        let mut left_out = LeftOut::default();
+        let mut left_out = OmittedEndpoints::default();
         left_out.add_unproven_reader(&Gid([2; 16]), &"\n".repeat(5000));
         let text = left_out.first().unwrap();
         assert!(text.len() < 400 && !text.contains('\n'), "{text}");

@@ -21,11 +21,11 @@ use axon_transport::{
     internal::graph::{LIMITS, RemoteEndpoint, permits},
 };
 
-use self::{decisions::note_look, left_out::LeftOut, owners::Proven, terms::GraphTerms};
+use self::{decisions::note_look, left_out::OmittedEndpoints, owners::Proven, terms::GraphTerms};
 use crate::{
     engine::account::{Account, Charge},
     link::GraphUpdate,
-    owner::{Binding, Prefix, Proof, prefix_of},
+    owner::{ChannelBinding, SessionPrefix, Proof, prefix_of},
 };
 
 /// The changes of a peer's graph.
@@ -76,7 +76,7 @@ pub(crate) struct PeerGraph {
     changed: BTreeSet<Gid>,
     /// Whether nothing of the graph was reported yet.
     fresh: bool,
-    left_out: LeftOut,
+    left_out: OmittedEndpoints,
 }
 
 impl PeerGraph {
@@ -93,7 +93,7 @@ impl PeerGraph {
             gathered: None,
             changed: BTreeSet::new(),
             fresh: true,
-            left_out: LeftOut::default(),
+            left_out: OmittedEndpoints::default(),
         }
     }
 
@@ -104,7 +104,7 @@ impl PeerGraph {
         let terms = GraphTerms::new([localhost, listing, denied]);
         if before == 0 {
             self.gathered = Some(BTreeMap::new());
-            self.left_out = LeftOut::default();
+            self.left_out = OmittedEndpoints::default();
         } else if before != self.version {
             return GraphTaken::Gap;
         }
@@ -186,12 +186,12 @@ impl PeerGraph {
     pub(crate) fn prove(
         &mut self,
         proofs: &[Proof],
-        binding: &Binding,
+        binding: &ChannelBinding,
         from: DaemonId,
         now: Duration,
     ) {
         let all = &self.all;
-        let used = |session: &Prefix| {
+        let used = |session: &SessionPrefix| {
             let mut first = [0; 16];
             first[..session.len()].copy_from_slice(session);
             let next = all.range(Gid(first)..).next();

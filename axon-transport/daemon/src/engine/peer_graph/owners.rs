@@ -14,7 +14,7 @@ use axon_transport::internal::SessionKey;
 use crate::{
     engine::account::{Charge, Meter},
     link::{LinkMessage, MAX_PROOFS, Owners},
-    owner::{Binding, Prefix, Proof, SessionKeys, prefix, prefix_of, prove},
+    owner::{ChannelBinding, SessionPrefix, Proof, SessionKeys, prefix, prefix_of, prove},
 };
 
 /// Shortest time between two searches for sessions without endpoints, when there are too many sessions.
@@ -26,14 +26,14 @@ pub(crate) struct Prover {
     daemon: DaemonId,
     /// Whether proofs are required: they are if peers authenticate.
     needed: bool,
-    binding: Option<Binding>,
+    binding: Option<ChannelBinding>,
     /// The sessions whose proofs for the current connection the peer has.
-    proved: HashSet<Prefix>,
+    proved: HashSet<SessionPrefix>,
     /// The proofs for the current connection. They stay valid as long as the connection does.
-    made: HashMap<Prefix, Proof>,
+    made: HashMap<SessionPrefix, Proof>,
     /// The keys of sessions that the peer sees. An ended publisher is visible for longer than its session is
     /// connected.
-    held: HashMap<Prefix, Arc<SessionKey>>,
+    held: HashMap<SessionPrefix, Arc<SessionKey>>,
 }
 
 impl Prover {
@@ -42,7 +42,7 @@ impl Prover {
         keys: &Arc<SessionKeys>,
         daemon: DaemonId,
         needed: bool,
-        binding: Option<Binding>,
+        binding: Option<ChannelBinding>,
     ) -> Self {
         let mut prover = Self {
             keys: Arc::clone(keys),
@@ -63,7 +63,7 @@ impl Prover {
     }
 
     /// Moves to another connection, on which all sessions must be proved again.
-    pub(crate) fn succeed(&mut self, binding: Option<Binding>) {
+    pub(crate) fn succeed(&mut self, binding: Option<ChannelBinding>) {
         self.binding = binding.filter(|_| self.needed);
         self.made.clear();
         self.forget();
@@ -77,7 +77,7 @@ impl Prover {
     /// Returns the proofs that the peer lacks for endpoints of these GIDs.
     pub(crate) fn owed<'a>(&mut self, gids: impl Iterator<Item = &'a Gid>) -> Vec<LinkMessage> {
         let Some(binding) = self.binding else { return Vec::new() };
-        let sessions: BTreeSet<Prefix> = gids.map(prefix_of).collect();
+        let sessions: BTreeSet<SessionPrefix> = gids.map(prefix_of).collect();
         self.proved.retain(|session| sessions.contains(session));
         self.made.retain(|session, _| sessions.contains(session));
         self.held.retain(|session, _| sessions.contains(session));
@@ -113,9 +113,9 @@ pub(crate) struct Proven {
     needed: bool,
     /// The bound on sessions, over all daemon IDs of the peer's identity.
     room: Rc<Meter>,
-    sessions: HashMap<Prefix, Charge>,
+    sessions: HashMap<SessionPrefix, Charge>,
     /// Sessions that were proved since the last GRAPH. The next one may contain their endpoints.
-    fresh: HashMap<Prefix, Charge>,
+    fresh: HashMap<SessionPrefix, Charge>,
     swept: Option<Duration>,
 }
 
@@ -129,9 +129,9 @@ impl Proven {
     pub(crate) fn take(
         &mut self,
         proofs: &[Proof],
-        binding: &Binding,
+        binding: &ChannelBinding,
         from: DaemonId,
-        used: impl Fn(&Prefix) -> bool,
+        used: impl Fn(&SessionPrefix) -> bool,
         now: Duration,
     ) {
         if !self.needed {
@@ -173,7 +173,7 @@ impl Proven {
         !self.needed || self.has(&prefix_of(gid))
     }
 
-    fn has(&self, session: &Prefix) -> bool {
+    fn has(&self, session: &SessionPrefix) -> bool {
         self.sessions.contains_key(session) || self.fresh.contains_key(session)
     }
 }
@@ -183,7 +183,7 @@ mod tests {
     use super::*;
     use crate::engine::account::MAX_PROVEN;
 
-    const BINDING: Binding = [7; 32];
+    const BINDING: ChannelBinding = [7; 32];
     const HERE: DaemonId = DaemonId([1; 16]);
 
     fn key() -> SessionKey {
@@ -210,7 +210,7 @@ mod tests {
         }
     }
 
-    fn full_of(sessions: impl IntoIterator<Item = Prefix>) -> Proven {
+    fn full_of(sessions: impl IntoIterator<Item = SessionPrefix>) -> Proven {
         let mut proven = Proven::new(true, Meter::new(MAX_PROVEN));
         for session in sessions {
             let charge = proven.room.charge(1).unwrap();
@@ -237,7 +237,7 @@ mod tests {
     fn sessions_without_endpoints_make_room_for_others() {
         let (used, new) = (key(), key());
         let mut proven = full_of([prefix(&used.id())]);
-        let is_used = |session: &Prefix| *session == prefix(&used.id());
+        let is_used = |session: &SessionPrefix| *session == prefix(&used.id());
         proven.take(&[proof(&new)], &BINDING, HERE, is_used, NOW);
         assert!(proven.owns(&gid(&used)) && proven.owns(&gid(&new)));
         assert_eq!(proven.sessions.len(), 1);

@@ -14,7 +14,7 @@ const RESYNC: Duration = Duration::from_secs(1);
 
 /// An endpoint of this host that a peer is shown.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(in crate::engine) struct ShownEndpoint {
+pub(in crate::engine) struct AdvertisedEndpoint {
     /// The endpoint, and its range towards the peer.
     pub(in crate::engine) remote: RemoteEndpoint,
     /// Access rules deny the peer the other end.
@@ -23,8 +23,8 @@ pub(in crate::engine) struct ShownEndpoint {
 
 /// The graph of this host as far as a peer was told of it.
 #[derive(Default)]
-pub(in crate::engine) struct ShownToPeer {
-    endpoints: BTreeMap<Gid, ShownEndpoint>,
+pub(in crate::engine) struct AdvertisedGraph {
+    endpoints: BTreeMap<Gid, AdvertisedEndpoint>,
     version: u64,
     /// When the peer had the whole graph last because it asked for that.
     resynced: Option<Duration>,
@@ -32,9 +32,9 @@ pub(in crate::engine) struct ShownToPeer {
     resync_due: bool,
 }
 
-impl ShownToPeer {
+impl AdvertisedGraph {
     /// The endpoints that the peer knows.
-    pub(in crate::engine) fn iter(&self) -> impl Iterator<Item = (&Gid, &ShownEndpoint)> {
+    pub(in crate::engine) fn iter(&self) -> impl Iterator<Item = (&Gid, &AdvertisedEndpoint)> {
         self.endpoints.iter()
     }
 
@@ -62,7 +62,7 @@ impl ShownToPeer {
     /// graph.
     pub(in crate::engine) fn tell(
         &mut self,
-        now: BTreeMap<Gid, ShownEndpoint>,
+        now: BTreeMap<Gid, AdvertisedEndpoint>,
         whole: bool,
     ) -> Vec<LinkMessage> {
         let before = if whole { BTreeMap::new() } else { std::mem::take(&mut self.endpoints) };
@@ -99,8 +99,8 @@ impl ShownToPeer {
 }
 
 /// A GRAPH that adds these. Its versions and what it removes are the caller's.
-fn added(part: &[&ShownEndpoint]) -> GraphUpdate {
-    let named = |is: fn(&ShownEndpoint) -> bool| {
+fn added(part: &[&AdvertisedEndpoint]) -> GraphUpdate {
+    let named = |is: fn(&AdvertisedEndpoint) -> bool| {
         let gids = part.iter().filter(|told| is(told)).map(|told| told.remote.endpoint.gid);
         Some(gids.collect::<Vec<Gid>>()).filter(|gids| !gids.is_empty())
     };
@@ -119,11 +119,11 @@ mod tests {
     use axon_transport::graph::EndpointKind;
 
     /// Endpoints of these numbers; those from 1000 on are denied.
-    fn endpoints(numbers: impl IntoIterator<Item = u32>) -> BTreeMap<Gid, ShownEndpoint> {
+    fn endpoints(numbers: impl IntoIterator<Item = u32>) -> BTreeMap<Gid, AdvertisedEndpoint> {
         let of = |number: u32| {
             let gid = Gid((u128::from(number % 1000)).to_be_bytes());
             let remote = Endpoint::new(gid, EndpointKind::Publisher, "/t", "T").into();
-            (gid, ShownEndpoint { remote, denied: number >= 1000 })
+            (gid, AdvertisedEndpoint { remote, denied: number >= 1000 })
         };
         numbers.into_iter().map(of).collect()
     }
@@ -139,7 +139,7 @@ mod tests {
 
     #[test]
     fn a_peer_is_told_what_changed_and_of_nothing_twice() {
-        let mut told = ShownToPeer::default();
+        let mut told = AdvertisedGraph::default();
         assert_eq!(said(told.tell(endpoints(1..4), false)), [(1, 0, 3, 0, false)]);
         assert!(told.tell(endpoints(1..4), false).is_empty());
         assert_eq!(said(told.tell(endpoints([2, 3, 4, 5]), false)), [(2, 1, 2, 1, false)]);
@@ -149,7 +149,7 @@ mod tests {
 
     #[test]
     fn a_whole_graph_begins_at_version_0_and_is_sent_if_it_is_empty() {
-        let mut told = ShownToPeer::default();
+        let mut told = AdvertisedGraph::default();
         told.tell(endpoints(1..4), false);
         assert_eq!(said(told.tell(endpoints(2..4), true)), [(2, 0, 2, 0, false)]);
         assert_eq!(said(told.tell(endpoints([]), true)), [(3, 0, 0, 0, false)]);
@@ -159,7 +159,7 @@ mod tests {
 
     #[test]
     fn a_peer_that_asks_again_and_again_gets_the_whole_graph_once_a_second() {
-        let mut told = ShownToPeer::default();
+        let mut told = AdvertisedGraph::default();
         let at = Duration::from_millis;
         assert!(told.handle_resync(at(100)) && !told.owes_resync());
         assert!(!told.handle_resync(at(200)) && !told.handle_resync(at(1099)));

@@ -18,7 +18,7 @@ use crate::{
         outbound::{Class, FlowId, Priorities, Rank},
         sample::protection::Seal,
     },
-    owner::{Binding, EXPORTER},
+    owner::{ChannelBinding, EXPORTER},
 };
 
 /// Bulk that QUIC holds at most. Below that it is the congestion window and a little more: as much as may be on the
@@ -128,7 +128,7 @@ impl Connection {
     }
 
     /// Bytes that both ends of the connection share and no other connection has.
-    pub(in crate::engine) fn binding(&self) -> Option<Binding> {
+    pub(in crate::engine) fn binding(&self) -> Option<ChannelBinding> {
         let mut binding = [0; 32];
         let session = self.quic.crypto_session();
         session.export_keying_material(&mut binding, EXPORTER, b"").ok()?;

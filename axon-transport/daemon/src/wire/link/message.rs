@@ -288,7 +288,7 @@ pub struct RouteUnasked {
 /// What the sender of this message takes in over this link at a time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
-pub struct Intake {
+pub struct ReceiveLimits {
     /// Bytes that it has not read: the connection's window.
     #[n(0)]
     pub unread: u64,
@@ -417,7 +417,7 @@ pub enum LinkMessage {
     /// A silent link that this one succeeds is closed.
     LinkClosed(LinkClosed),
     /// How much the sender takes in at a time.
-    Intake(Intake),
+    ReceiveLimits(ReceiveLimits),
     /// Uses that the sender's access rules deny to the receiver.
     Denied(DeniedUses),
     /// Asks whether the receiver's access rules allow uses.
@@ -446,7 +446,7 @@ impl LinkMessage {
             Self::Owners(m) => (12, to_map(m)),
             Self::LinkClosed(m) => (13, to_map(m)),
             Self::RouteUnasked(m) => (14, to_map(m)),
-            Self::Intake(m) => (15, to_map(m)),
+            Self::ReceiveLimits(m) => (15, to_map(m)),
             Self::Denied(m) => (20, to_map(m)),
             Self::AccessCheck(m) => (21, to_map(m)),
             Self::AccessDecisions(m) => (22, to_map(m)),
@@ -480,7 +480,7 @@ impl LinkMessage {
             12 => Self::Owners(from_map(kind, map)?),
             13 => Self::LinkClosed(from_map(kind, map)?),
             14 => Self::RouteUnasked(from_map(kind, map)?),
-            15 => Self::Intake(from_map(kind, map)?),
+            15 => Self::ReceiveLimits(from_map(kind, map)?),
             16..=19 => Self::Keys(
                 KeyMessage::decode(kind, map)
                     .map_err(|e| FrameError::Malformed { kind, reason: e.to_string() })?,
@@ -562,7 +562,7 @@ impl LinkMessage {
             | Self::GraphResync(_)
             | Self::Unsubscribe(_)
             | Self::Keepalive
-            | Self::Intake(_)
+            | Self::ReceiveLimits(_)
             | Self::LinkClosed(_) => Ok(()),
             // Their decoder bounds them.
             Self::Keys(_) => Ok(()),

@@ -14,7 +14,7 @@ pub use frame::{
     FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, read_length, unpacked_length,
 };
 pub use message::{
-    AccessDecisions, DeniedUse, DeniedUses, Elected, GraphResync, GraphUpdate, Intake, LastSeen,
+    AccessDecisions, DeniedUse, DeniedUses, Elected, GraphResync, GraphUpdate, ReceiveLimits, LastSeen,
     LinkAccessCheck, LinkClosed, LinkHello, LinkMessage, LivelinessAsserted, MAX_DENIED,
     MAX_PROOFS, Owners, ReceivedOf, ReceivedUpTo, RouteReady, RouteRefused, RouteSubscriber,
     RouteUnasked, Subscribe, Unsubscribe, UseDecision,

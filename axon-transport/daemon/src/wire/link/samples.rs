@@ -95,7 +95,7 @@ pub(crate) fn messages() -> Vec<LinkMessage> {
         LinkMessage::Asserted(LivelinessAsserted { publishers: vec![Gid([7; 16]), Gid([8; 16])] }),
         LinkMessage::Owners(Owners { proofs: vec![Proof { key: [1; 32], signature: [2; 64] }; 2] }),
         LinkMessage::LinkClosed(LinkClosed { link: [3; 16] }),
-        LinkMessage::Intake(Intake { unread: 33 << 20, messages: 64 << 20 }),
+        LinkMessage::ReceiveLimits(ReceiveLimits { unread: 33 << 20, messages: 64 << 20 }),
         LinkMessage::Denied(DeniedUses {
             denied: vec![DeniedUse { verb: 0, name: "/cmd_vel".into(), reason: "line 4".into() }],
             lifted: vec![DeniedUse { verb: 3, name: "/dock".into(), reason: String::new() }],

@@ -11,20 +11,20 @@ use crate::ids::SessionId;
 
 /// The segments of sessions that ended.
 #[derive(Debug)]
-pub(super) struct LeftMemory<F> {
+pub(super) struct RetainedMemory<F> {
     /// How many segments are kept at most, as many descriptors of the daemon's.
     most: usize,
     /// In the order in which the sessions ended.
     sessions: VecDeque<(SessionId, OwnMemory<F>)>,
 }
 
-impl<F> Default for LeftMemory<F> {
+impl<F> Default for RetainedMemory<F> {
     fn default() -> Self {
         Self::new(0)
     }
 }
 
-impl<F> LeftMemory<F> {
+impl<F> RetainedMemory<F> {
     /// Keeps `most` segments.
     pub(super) fn new(most: usize) -> Self {
         Self { most, sessions: VecDeque::new() }

@@ -5,7 +5,7 @@ mod earlier_grants;
 mod memory;
 mod undelivered;
 
-use self::{earlier_grants::EarlierGrants, memory::LeftMemory, undelivered::UndeliveredPackets};
+use self::{earlier_grants::EarlierGrants, memory::RetainedMemory, undelivered::UndeliveredPackets};
 use super::{
     entry::SessionEntry,
     memory::{OwnMemory, RegisteredSegment},
@@ -18,28 +18,28 @@ use crate::{
 
 /// What sessions left to readers.
 #[derive(Debug)]
-pub(super) struct LeftBehind<F> {
+pub(super) struct RetainedState<F> {
     /// Memory of those that ended.
-    memory: LeftMemory<F>,
+    memory: RetainedMemory<F>,
     /// What is for readers whose sessions are not here.
     undelivered: UndeliveredPackets<F>,
     earlier_grants: EarlierGrants,
 }
 
-impl<F> Default for LeftBehind<F> {
+impl<F> Default for RetainedState<F> {
     fn default() -> Self {
         Self {
-            memory: LeftMemory::default(),
+            memory: RetainedMemory::default(),
             undelivered: UndeliveredPackets::default(),
             earlier_grants: EarlierGrants::default(),
         }
     }
 }
 
-impl<F> LeftBehind<F> {
+impl<F> RetainedState<F> {
     /// From now on keeps segments of sessions that end, `most` at a time.
     pub(super) fn keep_memory(&mut self, most: usize) {
-        self.memory = LeftMemory::new(most);
+        self.memory = RetainedMemory::new(most);
     }
 
     /// Whether segments of sessions that end are kept.

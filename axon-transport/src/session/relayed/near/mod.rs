@@ -15,13 +15,13 @@ use std::{
 use axon_shm::{ExternalLeader, internal::descriptors::PassedFd};
 
 use self::{
-    relays::NearRelay,
-    stand_ins::{KeptCalls, LeftByConnection, NearStandIn},
+    relays::SessionRelay,
+    stand_ins::{KeptCalls, LeftByConnection, SessionStandIn},
 };
 use super::{
     calls::{self, CallChannels},
     flow::{ArrivalPool, FlowChannel, IncomingFlow},
-    pipe::{End, LossReport, Pipe},
+    pipe::{End, LossReport, RelaySocket},
     unanswered::Unanswered,
 };
 use crate::{
@@ -46,7 +46,7 @@ use crate::{
 };
 
 /// What outlives a connection.
-struct Common {
+struct RelayContext {
     /// The session.
     shared: Arc<SessionShared>,
     local_registry: Arc<LocalRegistry>,
@@ -75,7 +75,7 @@ pub(in crate::session) fn start(
     outside.set_listener(change_signal.listener());
     let finish = Arc::new(AtomicBool::new(false));
     let leader = outside.segment().external_leader()?;
-    let common = Common {
+    let common = RelayContext {
         shared,
         local_registry,
         outside,
@@ -89,7 +89,7 @@ pub(in crate::session) fn start(
         .map_err(system("starting the relay's thread"))
 }
 
-impl Common {
+impl RelayContext {
     fn run(self, connected: Connected) {
         let mut next = Some(connected);
         let mut kept = LeftByConnection::default();
@@ -111,15 +111,15 @@ impl Common {
             self.shared.set_daemon(None);
             next = self.reconnect(since.elapsed() < Duration::from_secs(1), &mut kept);
         }
-        kept.relays.values().for_each(NearRelay::give_up);
+        kept.relays.values().for_each(SessionRelay::give_up);
     }
 }
 
 /// One connection.
 struct RelayConnection<'a> {
-    common: &'a Common,
+    common: &'a RelayContext,
     daemon: DaemonId,
-    pipe: Pipe,
+    pipe: RelaySocket,
     /// The session's endpoints that the daemon was told of.
     own: BTreeMap<Gid, Arc<Endpoint>>,
     /// Those that it does not take.
@@ -134,8 +134,8 @@ struct RelayConnection<'a> {
     /// With whom the daemon says they are matched.
     matched: HashMap<Gid, BTreeSet<Gid>>,
     /// One for each of its publishers of which something crosses.
-    relays: BTreeMap<Gid, NearRelay>,
-    stand_ins: BTreeMap<Gid, NearStandIn>,
+    relays: BTreeMap<Gid, SessionRelay>,
+    stand_ins: BTreeMap<Gid, SessionStandIn>,
     /// What the session's clients ask.
     calls: CallChannels,
     /// Their requests that have no response.
@@ -152,7 +152,7 @@ struct RelayConnection<'a> {
 }
 
 impl<'a> RelayConnection<'a> {
-    fn new(common: &'a Common, connected: Connected, kept: LeftByConnection) -> Self {
+    fn new(common: &'a RelayContext, connected: Connected, kept: LeftByConnection) -> Self {
         let LeftByConnection { relays, calls } = kept;
         let KeptCalls { stand_ins, calls, mut unanswered, response_log, .. } =
             calls.for_daemon(connected.welcome.daemon);
@@ -164,7 +164,7 @@ impl<'a> RelayConnection<'a> {
         let incoming =
             IncomingFlow::new(common.shared.core.config.max_message, ArrivalPool::new(u64::MAX));
         let socket = PassedFd::connection(connected.socket).trusted();
-        let mut pipe = Pipe::new(socket, incoming, Arc::new(RelayCounters::default()));
+        let mut pipe = RelaySocket::new(socket, incoming, Arc::new(RelayCounters::default()));
         pipe.response_log = Some(response_log);
         Self {
             common,
@@ -202,19 +202,19 @@ impl<'a> RelayConnection<'a> {
             let waits = self.held_back
                 || !self.ending.is_empty()
                 || !self.settling.is_empty()
-                || self.stand_ins.values().any(NearStandIn::is_kept)
-                || self.relays.values().any(NearRelay::is_carried_over);
+                || self.stand_ins.values().any(SessionStandIn::is_kept)
+                || self.relays.values().any(SessionRelay::is_carried_over);
             if signalled || changed || waits {
                 self.update()?;
             }
-            let leased = self.relays.values().flat_map(NearRelay::assertions);
+            let leased = self.relays.values().flat_map(SessionRelay::assertions);
             for publishers in
                 self.alive.due_assertions(Duration::from_nanos(clock::monotonic()), leased)
             {
                 self.pipe.say(&SessionMessage::Asserted(Asserted { publishers }))?;
             }
             let stand_ins = &self.stand_ins;
-            let find = |gid: &Gid| stand_ins.get(gid).map(NearStandIn::remote_writer);
+            let find = |gid: &Gid| stand_ins.get(gid).map(SessionStandIn::remote_writer);
             let credits = self.pipe.write(find, |gid, loss| {
                 let first = matches!(loss, LossReport::Before { first: true, .. });
                 common.shared.lost(gid, loss.samples(), first);
@@ -258,7 +258,7 @@ impl<'a> RelayConnection<'a> {
                 .into_iter()
                 .chain(self.settled_in())
                 .chain(self.kept_for())
-                .chain(self.relays.values().filter_map(NearRelay::waits_for))
+                .chain(self.relays.values().filter_map(SessionRelay::waits_for))
                 .chain(end)
                 .min();
             self.pipe.sleep(&common.leader, &common.change_signal, None, left);
@@ -403,7 +403,7 @@ impl<'a> RelayConnection<'a> {
     fn announce_ended(&mut self) -> Result<(), End> {
         let kept = self.relays.values_mut().filter(|relay| relay.is_carried_over());
         let untold = kept.filter(|relay| !self.own.contains_key(&relay.publisher().gid));
-        let untold: Vec<_> = untold.map(NearRelay::resume).collect();
+        let untold: Vec<_> = untold.map(SessionRelay::resume).collect();
         for endpoint in untold {
             self.announce(&endpoint)?;
             self.ending.insert(endpoint.gid, false);

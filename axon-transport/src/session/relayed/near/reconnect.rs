@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::{Common, stand_ins::LeftByConnection};
+use super::{RelayContext, stand_ins::LeftByConnection};
 use crate::{
     config::{Config, DaemonPolicy},
     session::{
@@ -20,7 +20,7 @@ use crate::{
 const MIN_PAUSE: Duration = Duration::from_millis(100);
 const MAX_PAUSE: Duration = Duration::from_secs(2);
 
-impl Common {
+impl RelayContext {
     pub(super) fn finishes(&self) -> bool {
         // Pairs with the release store as the session ends.
         self.finish.load(Ordering::Acquire)

@@ -24,7 +24,7 @@ use crate::{
     },
 };
 
-pub(super) struct NearRelay {
+pub(super) struct SessionRelay {
     subscription: Subscription,
     /// Its publisher, which may have ended.
     publisher: Arc<Endpoint>,
@@ -46,7 +46,7 @@ struct Awaits {
 /// How long samples that a daemon did not confirm are kept for their readers, once that daemon is gone.
 pub(super) const ABSENCE: Duration = Duration::from_secs(10);
 
-impl NearRelay {
+impl SessionRelay {
     /// When its publisher was last alive, if that has a lease.
     pub(super) fn assertions(&self) -> Vec<(Gid, u64)> {
         self.subscription.assertions()
@@ -136,7 +136,7 @@ impl NearRelay {
 }
 
 /// Lets go of the relays that waited for too long while there is no daemon.
-pub(super) fn drop_overdue(kept: &mut BTreeMap<Gid, NearRelay>) {
+pub(super) fn drop_overdue(kept: &mut BTreeMap<Gid, SessionRelay>) {
     kept.retain(|_, relay| {
         let waits = relay.waits();
         if !waits {
@@ -148,7 +148,7 @@ pub(super) fn drop_overdue(kept: &mut BTreeMap<Gid, NearRelay>) {
 
 impl RelayConnection<'_> {
     /// The relays that outlive the connection.
-    pub(super) fn keep_relays(&mut self) -> BTreeMap<Gid, NearRelay> {
+    pub(super) fn keep_relays(&mut self) -> BTreeMap<Gid, SessionRelay> {
         let mut relays = std::mem::take(&mut self.relays);
         relays.retain(|_, relay| relay.outlive_connection());
         relays
@@ -165,7 +165,7 @@ impl RelayConnection<'_> {
             let known = self.relays.get(&gid);
             let rest =
                 self.ending.contains_key(&gid) && known.is_some_and(|r| !r.is_carried_over());
-            if history || rest || known.is_some_and(NearRelay::waits) || !readers.is_empty() {
+            if history || rest || known.is_some_and(SessionRelay::waits) || !readers.is_empty() {
                 wanted.insert(gid, readers);
             }
         }
@@ -195,7 +195,7 @@ impl RelayConnection<'_> {
             let outside = &self.common.outside;
             match outside.create_relay_of(publisher, spec, gids, holds(qos)) {
                 Ok(subscription) => {
-                    let relay = NearRelay {
+                    let relay = SessionRelay {
                         subscription,
                         publisher: endpoint,
                         stands_for,

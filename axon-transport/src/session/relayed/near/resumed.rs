@@ -12,7 +12,7 @@ use std::{
 use super::{
     RelayConnection,
     relays::{ABSENCE, drop_overdue},
-    stand_ins::{KeptCalls, LeftByConnection, NearStandIn},
+    stand_ins::{KeptCalls, LeftByConnection, SessionStandIn},
 };
 use crate::{
     graph::EndpointKind,
@@ -42,7 +42,7 @@ impl KeptCalls {
 }
 
 /// Lets go of the stand-ins that waited for too long: the clients see these servers go.
-fn forget_overdue(stand_ins: &mut BTreeMap<Gid, NearStandIn>, unanswered: &mut Unanswered) {
+fn forget_overdue(stand_ins: &mut BTreeMap<Gid, SessionStandIn>, unanswered: &mut Unanswered) {
     let now = Instant::now();
     let overdue: Vec<Gid> =
         stand_ins.iter().filter(|(_, one)| one.is_overdue(now)).map(|(gid, _)| *gid).collect();
@@ -99,7 +99,7 @@ impl RelayConnection<'_> {
 
     /// How long the first of them still waits.
     pub(super) fn kept_for(&self) -> Option<Duration> {
-        let until = self.stand_ins.values().filter_map(NearStandIn::kept_until).min()?;
+        let until = self.stand_ins.values().filter_map(SessionStandIn::kept_until).min()?;
         Some(until.saturating_duration_since(Instant::now()))
     }
 }

@@ -5,7 +5,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::{RelayConnection, relays::NearRelay};
+use super::{RelayConnection, relays::SessionRelay};
 use crate::{
     graph::{Endpoint, EndpointKind, Pairing, pairing, reads},
     ids::{DaemonId, Gid},
@@ -24,7 +24,7 @@ use crate::{
 const SETTLING: Duration = Duration::from_secs(1);
 
 /// The stand-in for one remote writer.
-pub(super) struct NearStandIn {
+pub(super) struct SessionStandIn {
     remote_writer: RemoteWriter,
     since: Instant,
     /// Whether the remote writer is gone and has left messages.
@@ -33,7 +33,7 @@ pub(super) struct NearStandIn {
     kept_until: Option<Instant>,
 }
 
-impl NearStandIn {
+impl SessionStandIn {
     pub(super) fn remote_writer(&self) -> &RemoteWriter {
         &self.remote_writer
     }
@@ -63,7 +63,7 @@ impl NearStandIn {
 /// The state that a connection leaves to the next one.
 #[derive(Default)]
 pub(super) struct LeftByConnection {
-    pub(super) relays: BTreeMap<Gid, NearRelay>,
+    pub(super) relays: BTreeMap<Gid, SessionRelay>,
     pub(super) calls: KeptCalls,
 }
 
@@ -71,7 +71,7 @@ pub(super) struct LeftByConnection {
 pub(super) struct KeptCalls {
     /// The daemon's process that carried them.
     pub(super) daemon: Option<DaemonId>,
-    pub(super) stand_ins: BTreeMap<Gid, NearStandIn>,
+    pub(super) stand_ins: BTreeMap<Gid, SessionStandIn>,
     pub(super) calls: CallChannels,
     pub(super) unanswered: Unanswered,
     pub(super) response_log: ResponseLog,
@@ -156,7 +156,7 @@ impl RelayConnection<'_> {
                     Ok(remote_writer) => {
                         self.stand_ins.insert(
                             writer,
-                            NearStandIn {
+                            SessionStandIn {
                                 remote_writer,
                                 since: Instant::now(),
                                 leaving: false,
@@ -207,7 +207,7 @@ impl RelayConnection<'_> {
     pub(super) fn is_served(&self, reader: &Endpoint) -> bool {
         // A client may be announced earlier: its requests wait until it is served (`settling`).
         !matches!(reader.kind, EndpointKind::Subscription | EndpointKind::Server)
-            || self.stand_ins.values().map(NearStandIn::remote_writer).all(|remote_writer| {
+            || self.stand_ins.values().map(SessionStandIn::remote_writer).all(|remote_writer| {
                 pairing(remote_writer.endpoint(), reader) != Pairing::Match
                     || remote_writer.partners().contains(&reader.gid)
             })

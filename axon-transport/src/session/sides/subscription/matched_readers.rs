@@ -7,7 +7,7 @@ use axon_shm::internal::{Grant, Lane, Location, MAX_GAP, Reader};
 use super::{
     counts::Counts,
     matched_reader::{MatchedReader, NumberKind},
-    remembered::Remembered,
+    remembered::DepartedWriters,
     slots::Slots,
 };
 use crate::ids::Gid;
@@ -22,7 +22,7 @@ pub(in crate::session) struct MatchedReaders {
     /// Lanes given to writers that have not granted yet, and the number behind which each is to go on.
     pending: HashMap<Gid, (Lane, Option<u64>)>,
     /// The last sequence number taken of each writer that is gone.
-    last: Remembered,
+    last: DepartedWriters,
     /// Whether the subscription wants every sample.
     keeps_all: bool,
     /// Whether it is of a client or server. What of its calls was not taken comes again with the next daemon.

@@ -35,7 +35,7 @@ pub use self::{
     taking::TakeLimit,
 };
 use super::{
-    callback::{Callback, OnNew},
+    callback::{Callback, NewDataCallback},
     calls::Calls,
     events::{Changes, EndpointEvents},
     wakers::Wakers,
@@ -303,7 +303,7 @@ impl SubscriptionInner {
 
     pub(in crate::session) fn set_on_new_sample(
         &self,
-        callback: Option<OnNew>,
+        callback: Option<NewDataCallback>,
         core: &SessionCore,
     ) -> Result<(), ShmError> {
         let listens = callback.is_some();

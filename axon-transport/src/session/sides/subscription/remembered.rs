@@ -11,12 +11,12 @@ pub(super) const REMEMBERED: usize = 2048;
 /// twice. A remote writer comes back with its link, a client with the next daemon. Those that left longest ago are
 /// forgotten first.
 #[derive(Default)]
-pub(super) struct Remembered {
+pub(super) struct DepartedWriters {
     newer: HashMap<Gid, u64>,
     older: HashMap<Gid, u64>,
 }
 
-impl Remembered {
+impl DepartedWriters {
     /// A writer is gone.
     pub(super) fn add(&mut self, writer: Gid, last: u64) {
         if self.newer.len() >= REMEMBERED {
@@ -44,7 +44,7 @@ mod tests {
     #[test]
     fn writers_that_were_there_last_are_remembered_and_the_newest_number_counts() {
         let gid = |number: u64| Gid((u128::from(number)).to_be_bytes());
-        let mut remembered = Remembered::default();
+        let mut remembered = DepartedWriters::default();
         remembered.add(gid(0), 1);
         (1..5 * REMEMBERED as u64).for_each(|number| remembered.add(gid(number), number));
         assert!(remembered.newer.len() + remembered.older.len() <= 2 * REMEMBERED);

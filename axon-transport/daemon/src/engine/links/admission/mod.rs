@@ -4,7 +4,7 @@ mod shares;
 
 use std::{collections::BTreeSet, net::IpAddr, rc::Rc, time::Duration};
 
-pub(super) use self::shares::HandshakePlace;
+pub(super) use self::shares::HandshakeSlot;
 pub(crate) use self::shares::place;
 use self::shares::{HandshakeShares, LoggedRefusals, gives_way};
 
@@ -40,7 +40,7 @@ impl AddressAdmission {
     }
 
     /// A place for a handshake from this address.
-    pub(super) fn enter(&self, address: IpAddr) -> Option<HandshakePlace> {
+    pub(super) fn enter(&self, address: IpAddr) -> Option<HandshakeSlot> {
         self.handshakes.enter(address, self.listed.contains(&address.to_canonical()))
     }
 

@@ -38,7 +38,7 @@ pub(crate) struct HandshakeShares {
 
 /// A handshake that counts until this is dropped.
 #[derive(Debug)]
-pub(crate) struct HandshakePlace {
+pub(crate) struct HandshakeSlot {
     of: Rc<HandshakeShares>,
     at: IpAddr,
 }
@@ -50,7 +50,7 @@ impl HandshakeShares {
 
     /// A place for one more from this address: it may have as many as are free, so that another
     /// address always finds one. A listed peer has some that nobody else gets.
-    pub(crate) fn enter(self: &Rc<Self>, address: IpAddr, listed: bool) -> Option<HandshakePlace> {
+    pub(crate) fn enter(self: &Rc<Self>, address: IpAddr, listed: bool) -> Option<HandshakeSlot> {
         let at = place(address);
         let mut under_way = self.under_way.borrow_mut();
         let all: usize = under_way.values().sum();
@@ -61,11 +61,11 @@ impl HandshakeShares {
             return None;
         }
         *under_way.entry(at).or_default() += 1;
-        Some(HandshakePlace { of: Rc::clone(self), at })
+        Some(HandshakeSlot { of: Rc::clone(self), at })
     }
 }
 
-impl Drop for HandshakePlace {
+impl Drop for HandshakeSlot {
     fn drop(&mut self) {
         let mut under_way = self.of.under_way.borrow_mut();
         if let Some(count) = under_way.get_mut(&self.at) {

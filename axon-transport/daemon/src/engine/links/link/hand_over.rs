@@ -11,7 +11,7 @@ const HAND_OVER: Duration = Duration::from_secs(5);
 /// successor, has ended its control stream or had patience with this side for long enough. If it is silent, or the peer
 /// closed it, nothing more arrives.
 #[derive(Clone, Copy, Debug)]
-pub(in crate::engine::links) struct Leaving {
+pub(in crate::engine::links) struct DrainingLink {
     /// When it ends at the latest, in qkd.
     until: Option<Duration>,
     /// The peer sends over the successor.
@@ -45,7 +45,7 @@ pub(in crate::engine::links) enum HandOverStep {
     Close,
 }
 
-impl Leaving {
+impl DrainingLink {
     /// A successor took over. The link's keys may be used `until` a time.
     pub(in crate::engine::links) fn new(
         until: Option<Duration>,
@@ -114,7 +114,7 @@ mod tests {
 
     #[test]
     fn it_closes_when_both_sides_have_sent_and_read_everything() {
-        let mut leaving = Leaving::new(None, false, NOW);
+        let mut leaving = DrainingLink::new(None, false, NOW);
         assert_eq!(
             leaving.handle_progress(NOW, READ),
             HandOverStep::Wait,
@@ -135,7 +135,7 @@ mod tests {
 
     #[test]
     fn a_peer_that_ends_no_control_stream_is_waited_for_some_seconds_at_a_time() {
-        let mut leaving = Leaving::new(None, true, NOW);
+        let mut leaving = DrainingLink::new(None, true, NOW);
         assert_eq!(leaving.handle_progress(NOW, SENT), HandOverStep::Finish);
         assert_eq!(leaving.poll_timeout(), Some(NOW + HAND_OVER));
         // A stream is being read when the time is over: as long again.
@@ -148,22 +148,22 @@ mod tests {
 
     #[test]
     fn a_silent_link_closes_once_the_peer_sends_over_the_successor() {
-        let mut leaving = Leaving::new(None, false, NOW);
+        let mut leaving = DrainingLink::new(None, false, NOW);
         assert_eq!(leaving.handle_progress(NOW, SILENT), HandOverStep::Wait);
         leaving.handle_succeeded();
         assert_eq!(leaving.handle_progress(NOW, SILENT), HandOverStep::Close);
-        let mut closed = Leaving::new(None, false, NOW);
+        let mut closed = DrainingLink::new(None, false, NOW);
         closed.handle_closed();
         assert_eq!(closed.handle_progress(NOW, BUSY), HandOverStep::Close, "the peer said so");
     }
 
     #[test]
     fn a_link_whose_keys_age_has_time_for_a_hand_over_and_no_more() {
-        let late = Leaving::new(Some(NOW), true, NOW);
+        let late = DrainingLink::new(Some(NOW), true, NOW);
         assert!(!late.is_over(NOW) && late.is_over(NOW + HAND_OVER));
         let until = NOW + 2 * HAND_OVER;
-        let early = Leaving::new(Some(until), true, NOW);
+        let early = DrainingLink::new(Some(until), true, NOW);
         assert_eq!(early.poll_timeout(), Some(until));
-        assert!(!Leaving::new(None, true, NOW).is_over(Duration::MAX));
+        assert!(!DrainingLink::new(None, true, NOW).is_over(Duration::MAX));
     }
 }

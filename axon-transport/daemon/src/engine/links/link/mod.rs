@@ -14,16 +14,16 @@ use axon_tls::Negotiated;
 use axon_transport::status::LinkStatus;
 use rustls_pki_types::CertificateDer;
 
-use self::{age::Age, hand_over::Leaving};
+use self::{age::Age, hand_over::DrainingLink};
 use super::identity::PeerIdentity;
 use crate::{
     engine::{
         account::{Account, Charge},
         link::opening::{Opening, Sealing},
-        links::{admission::HandshakePlace, silence::LinkSilence},
+        links::{admission::HandshakeSlot, silence::LinkSilence},
     },
     keys::Resolver,
-    link::{Candidate, Elected, LinkHello, Order, Side},
+    link::{Candidate, Elected, LinkHello, MessageOrder, Side},
 };
 
 /// How far a link has come.
@@ -37,7 +37,7 @@ pub(super) enum LinkPhase {
     /// It carries samples.
     Open,
     /// A successor took over: it delivers what is under way.
-    Leaving(Leaving),
+    Leaving(DrainingLink),
 }
 
 /// A link.
@@ -49,14 +49,14 @@ pub(super) struct Link {
     /// The peer, once HELLO was checked and its name proven.
     pub(super) peer: Option<LinkPeer>,
     /// The place of its handshake among those under way.
-    pub(super) place: Option<HandshakePlace>,
+    pub(super) place: Option<HandshakeSlot>,
     /// Tells why a PSK was not found.
     pub(super) resolver: Option<Arc<Resolver>>,
 }
 
 /// What is kept of a link's beginning.
 #[derive(Clone)]
-pub(crate) struct Summary {
+pub(crate) struct EstablishedPeer {
     /// The peer's HELLO.
     pub(crate) hello: LinkHello,
     /// What the handshake agreed on.
@@ -65,7 +65,7 @@ pub(crate) struct Summary {
     pub(crate) who: PeerIdentity,
 }
 
-impl Summary {
+impl EstablishedPeer {
     /// The status of a link, as far as its beginning says it.
     pub(super) fn status(&self, since: SystemTime) -> LinkStatus {
         let mut link = LinkStatus::default();
@@ -83,10 +83,10 @@ impl Summary {
 
 /// The peer of a link.
 pub(super) struct LinkPeer {
-    pub(super) summary: Summary,
+    pub(super) summary: EstablishedPeer,
     /// Whether it proved that its daemon id is its own.
     pub(super) proven: bool,
-    pub(super) order: Order,
+    pub(super) order: MessageOrder,
     pub(super) candidate: Candidate,
     /// Key material of the connection, until it is elected.
     pub(super) sealing: Option<Sealing>,

@@ -8,12 +8,12 @@ use axon_transport::{
 };
 use quinn_proto::StreamId;
 
-use super::{LinkPeer, Summary};
+use super::{LinkPeer, EstablishedPeer};
 use crate::{
     engine::{
         account::Account, link::failure::peer_text, outbound::FlowId, quic::connection::Connection,
     },
-    owner::Binding,
+    owner::ChannelBinding,
 };
 
 /// A link whose connection stands: the connection, and its peer once that proved its name.
@@ -31,7 +31,7 @@ impl<'a> LinkView<'a> {
     }
 
     /// The beginning of the link.
-    pub(in crate::engine) fn summary(&self) -> Option<&'a Summary> {
+    pub(in crate::engine) fn summary(&self) -> Option<&'a EstablishedPeer> {
         Some(&self.peer?.summary)
     }
 
@@ -67,7 +67,7 @@ impl<'a> LinkView<'a> {
     }
 
     /// Bytes that both ends of the connection share and no other connection has.
-    pub(in crate::engine) fn binding(&self) -> Option<Binding> {
+    pub(in crate::engine) fn binding(&self) -> Option<ChannelBinding> {
         self.connection.binding()
     }
 

@@ -16,12 +16,12 @@ pub(in crate::engine::links) struct CheckKind {
 
 /// When the next check is due.
 #[derive(Debug)]
-pub(in crate::engine::links) struct LookTimes {
+pub(in crate::engine::links) struct CheckSchedule {
     next: Duration,
     passed: u32,
 }
 
-impl LookTimes {
+impl CheckSchedule {
     /// Creates a schedule whose first check is due a second after the engine's start.
     pub(in crate::engine::links) fn new() -> Self {
         Self { next: EVERY, passed: 0 }
@@ -49,7 +49,7 @@ mod tests {
 
     #[test]
     fn each_second_has_a_look_and_each_minute_one_at_certificates() {
-        let mut looks = LookTimes::new();
+        let mut looks = CheckSchedule::new();
         let mut at_certificates = Vec::new();
         for second in 1..=120 {
             assert_eq!(looks.poll_timeout(), Duration::from_secs(second));
@@ -62,7 +62,7 @@ mod tests {
 
     #[test]
     fn looks_that_were_missed_are_not_made_up_for() {
-        let mut looks = LookTimes::new();
+        let mut looks = CheckSchedule::new();
         let now = Duration::from_secs(100);
         assert_eq!(looks.take_due(now), Some(CheckKind { at_certificates: false }));
         assert_eq!((looks.take_due(now), looks.poll_timeout()), (None, now + EVERY));

@@ -11,7 +11,7 @@ use rand::RngExt;
 
 use self::watch::ProbeAction;
 pub(super) use self::{
-    looks::LookTimes,
+    looks::CheckSchedule,
     prober::{Traffic, frames_came},
     watch::{LinkSilence, Nonce},
 };

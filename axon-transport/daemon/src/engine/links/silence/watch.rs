@@ -53,7 +53,7 @@ pub(in crate::engine::links) type Nonce = [u8; 8];
 
 /// What a look at a link found.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) struct LookResult {
+pub(super) struct CheckResult {
     /// The peer is taken for gone from now on.
     pub(super) gone: bool,
     /// The link's path is probed from now on.
@@ -108,7 +108,7 @@ impl LinkSilence {
         now: Duration,
         traffic: Traffic,
         nonce: impl FnOnce() -> Nonce,
-    ) -> LookResult {
+    ) -> CheckResult {
         let before = std::mem::replace(&mut self.traffic, traffic);
         // It is no longer silent: what is under way arrives.
         self.silent &= !traffic.answered_since(before);
@@ -123,7 +123,7 @@ impl LinkSilence {
             let (prober, nonce) = (Prober::new(self.side), nonce());
             self.probing = Some(Probing { prober, nonce, begun: now, traffic, said_cut: false });
         }
-        LookResult { gone, probed }
+        CheckResult { gone, probed }
     }
 
     /// A probe was answered. Returns whether it was said that the path is cut.
@@ -222,12 +222,12 @@ mod tests {
         for number in 1..10 {
             assert_eq!(
                 silence.handle_second(second(number), traffic(1, 1, 1), || NONCE),
-                LookResult::default()
+                CheckResult::default()
             );
         }
         assert_eq!(silence.poll_timeout(), None);
         let look = silence.handle_second(second(10), traffic(1, 1, 1), || NONCE);
-        assert_eq!(look, LookResult { gone: false, probed: true }, "keep-alives are lost");
+        assert_eq!(look, CheckResult { gone: false, probed: true }, "keep-alives are lost");
     }
 
     #[test]
@@ -236,10 +236,10 @@ mod tests {
         silence.handle_heard(START, traffic(1, 1, 1));
         silence.handle_second(second(1), traffic(1, 1, 1), || NONCE);
         let look = silence.handle_second(second(2), traffic(1, 1, 2), || NONCE);
-        assert_eq!(look, LookResult { gone: false, probed: true });
+        assert_eq!(look, CheckResult { gone: false, probed: true });
         assert_eq!(
             silence.handle_second(second(3), traffic(1, 1, 2), || [9; 8]),
-            LookResult::default()
+            CheckResult::default()
         );
         let asked = traffic(1, 1, 2);
         assert_eq!(

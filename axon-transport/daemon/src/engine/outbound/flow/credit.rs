@@ -16,11 +16,11 @@ use crate::{
         outbound::schedule::{FlowId, RANKS},
         quic::transport::{LINK_WINDOW, STREAM_WINDOW, window_credit},
     },
-    link::Intake,
+    link::ReceiveLimits,
 };
 
 /// What a peer has that does not say it: as much as the second link of an identity has, and all memory for messages.
-const UNSAID: Intake = Intake { unread: (LINK_WINDOW as u64) + (16 << 20), messages: 64 << 20 };
+const UNSAID: ReceiveLimits = ReceiveLimits { unread: (LINK_WINDOW as u64) + (16 << 20), messages: 64 << 20 };
 /// The part of the credit that counts as little: a quarter.
 const LITTLE: u64 = 4;
 /// No peer has less: with nothing, a sample of one publisher would keep out those of all others.
@@ -79,7 +79,7 @@ impl PeerCredit {
     }
 
     /// The peer said what it has; `None`: it has not said it over this link.
-    pub(in crate::engine::outbound) fn set(&self, intake: Option<&Intake>) {
+    pub(in crate::engine::outbound) fn set(&self, intake: Option<&ReceiveLimits>) {
         let most = limit(intake.unwrap_or(&UNSAID));
         let before = self.most.replace(most);
         if most.window > before.window || most.memory > before.memory {
@@ -150,7 +150,7 @@ impl Drop for CreditShare {
 }
 
 /// What samples in flight may use at a peer that has this much. One that says nearly nothing is taken to have [`LEAST`].
-fn limit(intake: &Intake) -> UsedCredit {
+fn limit(intake: &ReceiveLimits) -> UsedCredit {
     let (unread, memory) = (intake.unread.max(LEAST), intake.messages.max(LEAST));
     UsedCredit { window: window_credit(unread), memory }
 }
@@ -224,7 +224,7 @@ mod tests {
 
     fn credit(unread: u64, messages: u64) -> Rc<PeerCredit> {
         let credit = PeerCredit::new();
-        credit.set(Some(&Intake { unread, messages }));
+        credit.set(Some(&ReceiveLimits { unread, messages }));
         credit
     }
 
@@ -262,7 +262,7 @@ mod tests {
 
     #[test]
     fn a_peer_that_says_little_is_sent_one_sample_at_a_time() {
-        for intake in [Intake { unread: 0, messages: 0 }, Intake { unread: 1, messages: u64::MAX }]
+        for intake in [ReceiveLimits { unread: 0, messages: 0 }, ReceiveLimits { unread: 1, messages: u64::MAX }]
         {
             let credit = PeerCredit::new();
             credit.set(Some(&intake));

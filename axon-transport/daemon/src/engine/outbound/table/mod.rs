@@ -10,7 +10,7 @@ use axon_shm::{ids::Gid, qos::Qos};
 pub(super) use self::flows::Flows;
 use self::routes::Routes;
 use super::{
-    backlog::Backlog, budget::Budget, ending::EndedFlow, flow::Flow, progress::SentProgress,
+    backlog::Backlog, budget::Budget, ending::DrainedFlow, flow::Flow, progress::SentProgress,
     schedule::FlowId, served::ServedFlows, source::Source, stall::BusyFlow,
 };
 use crate::engine::counters::Counters;
@@ -136,7 +136,7 @@ impl FlowTable {
 
     /// What is left of a publisher that ended, whose route had this number. While the link `starves`, no flow that waits
     /// for others is excused.
-    pub(super) fn left_of(&self, number: u32, of: &Gid, starves: bool) -> Option<EndedFlow> {
+    pub(super) fn left_of(&self, number: u32, of: &Gid, starves: bool) -> Option<DrainedFlow> {
         let route = self.routes.successor_of(number, of);
         let flow = self.find(route, of).and_then(|id| self.flows.get(id));
         let (samples, progress) = match self.routes.get(route)?.unacknowledged().get(of) {
@@ -144,7 +144,7 @@ impl FlowTable {
             None => flow.and_then(Flow::best_effort_left).map(|(left, sent)| (left, (sent, 0)))?,
         };
         let is_excused = !starves && flow.is_some_and(Flow::waits_for_others);
-        Some(EndedFlow { route, samples, progress, is_excused })
+        Some(DrainedFlow { route, samples, progress, is_excused })
     }
 
     /// Bytes of its ring that the samples of a publisher take that are not acknowledged.

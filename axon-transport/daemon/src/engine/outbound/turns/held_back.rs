@@ -9,7 +9,7 @@ const KEY_RETRY: Duration = Duration::from_millis(250);
 
 /// The flows, by what they are without.
 #[derive(Debug)]
-pub(super) struct HeldBackFlows {
+pub(super) struct BlockedFlows {
     stream: BTreeSet<FlowId>,
     key: BTreeSet<FlowId>,
     key_retry: Option<Duration>,
@@ -18,7 +18,7 @@ pub(super) struct HeldBackFlows {
     released: usize,
 }
 
-impl HeldBackFlows {
+impl BlockedFlows {
     /// No flow lacks anything.
     pub(super) fn new(budget: &Budget) -> Self {
         Self {

@@ -12,14 +12,14 @@ const MOST: i64 = 4 * QUANTUM;
 
 /// What is lent to ranks.
 #[derive(Debug, Default)]
-pub(super) struct Lending {
+pub(super) struct StarvationCredit {
     /// The bytes that are lent to each rank; `None`: it does not wait.
     saved: [Option<i64>; RANKS],
     /// The rank that sent last in its own right.
     lender: Option<Rank>,
 }
 
-impl Lending {
+impl StarvationCredit {
     /// A flow of this rank waits for QUIC.
     pub(super) fn handle_blocked(&mut self, rank: Rank) {
         self.saved[rank.place()].get_or_insert(0);
@@ -68,7 +68,7 @@ mod tests {
 
     #[test]
     fn a_rank_that_waits_has_an_eighth_of_what_a_higher_one_sends() {
-        let mut lending = Lending::default();
+        let mut lending = StarvationCredit::default();
         [SMALL, BULK].iter().for_each(|rank| lending.handle_blocked(*rank));
         let mut sent = [0; 2];
         for _ in 0..1000 {
@@ -86,7 +86,7 @@ mod tests {
 
     #[test]
     fn a_rank_that_sends_in_its_own_right_is_lent_nothing() {
-        let mut lending = Lending::default();
+        let mut lending = StarvationCredit::default();
         lending.handle_blocked(BULK);
         for _ in 0..1000 {
             lending.handle_sent(SMALL, 100);
@@ -98,7 +98,7 @@ mod tests {
 
     #[test]
     fn a_higher_rank_borrows_nothing_of_a_lower_one() {
-        let mut lending = Lending::default();
+        let mut lending = StarvationCredit::default();
         lending.handle_blocked(HIGH);
         (0..100).for_each(|_| lending.handle_sent(BULK, 1 << 20));
         assert_eq!(lending.borrow(HIGH), None);
@@ -106,7 +106,7 @@ mod tests {
 
     #[test]
     fn what_is_saved_has_a_bound() {
-        let mut lending = Lending::default();
+        let mut lending = StarvationCredit::default();
         lending.handle_blocked(BULK);
         lending.handle_sent(SMALL, 1 << 30);
         lending.handle_borrowed(BULK, MOST as u64 - 1);

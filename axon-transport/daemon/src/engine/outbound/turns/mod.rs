@@ -5,7 +5,7 @@ mod lending;
 
 use std::{collections::HashSet, rc::Rc, time::Duration};
 
-use self::{held_back::HeldBackFlows, lending::Lending};
+use self::{held_back::BlockedFlows, lending::StarvationCredit};
 use super::{
     budget::Budget,
     flow::{CreditQueue, Flow, FlowPause, PeerCredit},
@@ -24,10 +24,10 @@ pub(super) struct FlowTurn {
 }
 
 /// The turns of the flows towards one peer.
-pub(super) struct FlowTurns {
+pub(super) struct FlowScheduler {
     schedule: Schedule,
-    lending: Lending,
-    without: HeldBackFlows,
+    lending: StarvationCredit,
+    without: BlockedFlows,
     credit: Rc<PeerCredit>,
     /// The flows that wait for credit.
     for_credit: CreditQueue,
@@ -38,13 +38,13 @@ pub(super) struct FlowTurns {
     frees_streams: bool,
 }
 
-impl FlowTurns {
+impl FlowScheduler {
     /// No flow has a turn.
     pub(super) fn new(budget: Rc<Budget>) -> Self {
         Self {
             schedule: Schedule::default(),
-            lending: Lending::default(),
-            without: HeldBackFlows::new(&budget),
+            lending: StarvationCredit::default(),
+            without: BlockedFlows::new(&budget),
             credit: PeerCredit::new(),
             for_credit: CreditQueue::default(),
             budget,
@@ -228,9 +228,9 @@ mod tests {
     const NOW: Duration = Duration::from_secs(1);
 
     /// So many flows, each of which has something to send, and their turns.
-    fn turns(count: usize) -> (FlowTurns, Flows) {
+    fn turns(count: usize) -> (FlowScheduler, Flows) {
         let mut flows = Flows::default();
-        let mut turns = FlowTurns::new(Budget::new(1 << 20).of_peer());
+        let mut turns = FlowScheduler::new(Budget::new(1 << 20).of_peer());
         for number in 0..count {
             let id = flows.insert(flow(number as u8));
             flows.get_mut(id).unwrap().handle_samples();
@@ -239,12 +239,12 @@ mod tests {
         (turns, flows)
     }
 
-    fn next(turns: &mut FlowTurns) -> Option<FlowId> {
+    fn next(turns: &mut FlowScheduler) -> Option<FlowId> {
         turns.next().map(|turn| turn.flow)
     }
 
     /// The next flow pauses so, and loses its turn.
-    fn pause(turns: &mut FlowTurns, flows: &mut Flows, pause: FlowPause) -> FlowId {
+    fn pause(turns: &mut FlowScheduler, flows: &mut Flows, pause: FlowPause) -> FlowId {
         let turn = turns.next().unwrap();
         turns.handle_over(NOW, turn, pause, flows);
         turn.flow

@@ -11,7 +11,7 @@ use axon_shm::ids::Gid;
 
 use super::{
     RouteKey, WantedRoute, check_after,
-    lanes::{self, WritersHere},
+    lanes::{self, LocalWriterCounts},
 };
 use crate::{
     engine::{
@@ -41,7 +41,7 @@ pub(in crate::engine::peer) struct AskedRoute {
 }
 
 /// A route whose local readers are not all attached.
-struct Attaching {
+struct PendingAttachment {
     until: Duration,
     /// Stand-ins, each with the number of readers that attach to it.
     awaited: Vec<(Rc<StandIn>, usize)>,
@@ -109,7 +109,7 @@ pub(in crate::engine::peer) struct AskedRoutes {
     routes: BTreeMap<RouteKey, AskedRoute>,
     keys: HashMap<u32, RouteKey>,
     /// Routes that the peer is asked for once their local readers are attached.
-    attaching: BTreeMap<u32, Attaching>,
+    attaching: BTreeMap<u32, PendingAttachment>,
     look_at_attaching: Option<Duration>,
 }
 
@@ -189,7 +189,7 @@ impl AskedRoutes {
         awaited: Vec<(Rc<StandIn>, usize)>,
         now: Duration,
     ) {
-        self.attaching.insert(number, Attaching { until: now + ATTACH_TIMEOUT, awaited });
+        self.attaching.insert(number, PendingAttachment { until: now + ATTACH_TIMEOUT, awaited });
         self.look_at_attaching = Some(now);
     }
 
@@ -230,7 +230,7 @@ impl AskedRoutes {
 
     /// Gives up the stand-ins for which there are not enough lanes any more, after the writers of this host
     /// changed. Returns the routes that lost some.
-    pub(in crate::engine::peer) fn fit_lanes(&mut self, writers: &WritersHere) -> Vec<RouteKey> {
+    pub(in crate::engine::peer) fn fit_lanes(&mut self, writers: &LocalWriterCounts) -> Vec<RouteKey> {
         let mut shortened = Vec::new();
         for (key, asked) in &mut self.routes {
             let (each, had) = (writers.read_by_stand_in(key), asked.stand_ins.len());

@@ -13,9 +13,9 @@ use crate::engine::account::Charge;
 
 /// How many writers of this host there are for each route.
 #[derive(Debug, Default)]
-pub(crate) struct WritersHere(HashMap<RouteKey, usize>);
+pub(crate) struct LocalWriterCounts(HashMap<RouteKey, usize>);
 
-impl WritersHere {
+impl LocalWriterCounts {
     /// Counts those among the endpoints of this host.
     pub(crate) fn of<'a>(local: impl IntoIterator<Item = &'a Endpoint>) -> Self {
         let mut writers = HashMap::new();

@@ -10,7 +10,7 @@ use axon_shm::ids::Gid;
 
 use super::{
     RouteKey, check_after,
-    lanes::{self, WritersHere},
+    lanes::{self, LocalWriterCounts},
 };
 use crate::{
     engine::{account::Charge, outbound::Source},
@@ -136,7 +136,7 @@ impl ServedRoutes {
     /// changed. Returns the routes that lost some, each with the number of relays that it had.
     pub(in crate::engine::peer) fn fit_lanes(
         &mut self,
-        writers: &WritersHere,
+        writers: &LocalWriterCounts,
     ) -> Vec<(u32, usize)> {
         let mut shortened = Vec::new();
         for (number, served) in &mut self.routes {
