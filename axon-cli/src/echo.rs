@@ -24,7 +24,7 @@ const HEAD: usize = 16;
 const DEPTH: u32 = 1_000;
 
 /// Time in which a topic that is there shows up in the graph.
-const AT_ONCE: Duration = Duration::from_secs(1);
+const GRAPH_DELAY: Duration = Duration::from_secs(1);
 
 /// Runs `axon echo`.
 pub(crate) fn run(args: &cli::Echo) -> Result<(), CliError> {
@@ -122,7 +122,7 @@ fn find_type(session: &Session, topic: &str) -> String {
         found = known.map(|endpoint| endpoint.type_name.clone());
         found.is_some()
     };
-    if !session.wait_graph(AT_ONCE, &mut look) {
+    if !session.wait_graph(GRAPH_DELAY, &mut look) {
         say(format_args!("axon echo: waiting for {} to appear", text::printable(topic)));
         while !session.wait_graph(Duration::from_secs(3_600), &mut look) {}
     }

@@ -26,9 +26,9 @@ const READ_AHEAD: usize = 64;
 /// The end of a replay waits so long while other hosts acknowledge nothing.
 const UNACKNOWLEDGED: Duration = Duration::from_secs(15);
 /// The status counts losses of links once a second. After this time it has those of the replay.
-const REPORTED: Duration = Duration::from_millis(1_200);
+const STATUS_INTERVAL: Duration = Duration::from_millis(1_200);
 /// Between two looks at what is not acknowledged.
-const LOOK: Duration = Duration::from_millis(10);
+const CHECK_INTERVAL: Duration = Duration::from_millis(10);
 
 impl Profile {
     /// The policies of the profile.
@@ -123,7 +123,7 @@ pub(crate) fn run(args: &cli::Play) -> Result<(), CliError> {
     ));
     if let Some(others) = served.others() {
         let dropped = dropped_before.and_then(|before| {
-            thread::sleep(REPORTED);
+            thread::sleep(STATUS_INTERVAL);
             before.since(&Dropped::of(&session, &names)?)
         });
         say(format_args!("axon play: {}", unpromised(&others, &outcome, dropped)));
@@ -206,7 +206,7 @@ fn wait_acknowledged(publishers: &[Publisher], patience: Duration) {
     let left = || publishers.iter().map(Publisher::unacknowledged).sum::<u64>();
     let (mut least, mut since) = (left(), Instant::now());
     while least > 0 && since.elapsed() < patience {
-        thread::sleep(LOOK);
+        thread::sleep(CHECK_INTERVAL);
         let now = left();
         if now < least {
             (least, since) = (now, Instant::now());

@@ -22,8 +22,8 @@ pub use axon_shm as shm;
 pub use axon_shm::{ids, qos};
 pub use session::{
     CallError, Client, DaemonCommand, EndpointSpec, Event, GuardCondition, Lifetime, Loan,
-    MessageInfo, Messages, Node, NewDataCallback, Publisher, Ready, RecvError, Server, Session, SessionError,
-    SessionEvent, SessionOptions, Subscription, TrustedSubscription, Waitable,
+    MessageInfo, Messages, NewDataCallback, Node, Publisher, Ready, RecvError, Server, Session,
+    SessionError, SessionEvent, SessionOptions, Subscription, TrustedSubscription, Waitable,
     daemon_check_access_at, daemon_reload_at, daemon_status, daemon_status_at,
 };
 

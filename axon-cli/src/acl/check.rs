@@ -18,7 +18,7 @@ use crate::{
 };
 
 /// Uses that a peer is asked about at a time.
-const AT_ONCE: usize = 32;
+const USES_PER_QUESTION: usize = 32;
 
 /// Runs `axon acl check`.
 pub(super) fn run(args: &cli::Check) -> Result<ExitCode, CliError> {
@@ -119,7 +119,7 @@ fn there(status: &Status, peer: Principal<'_>, uses: &[(Verb, String)]) -> Vec<S
 fn ask(link: &LinkStatus, uses: &[(Verb, String)]) -> Option<Vec<PeerDecision>> {
     let place = DaemonLocation::from_env().ok()?;
     let mut decisions = Vec::new();
-    for part in uses.chunks(AT_ONCE) {
+    for part in uses.chunks(USES_PER_QUESTION) {
         match daemon_check_access_at(&place, &link.peer, part) {
             Ok(answer) if answer.decisions.len() == part.len() => {
                 decisions.extend(answer.decisions);
@@ -172,7 +172,9 @@ fn heard(status: &Status, links: &[&LinkStatus], verb: Verb, name: &str) -> Stri
 fn is_of(link: &LinkStatus, peer: Principal<'_>) -> bool {
     match (Principal::parse(&link.party), peer) {
         (Ok(Principal::Name(of)), Principal::Certificate(name)) => of.eq_ignore_ascii_case(name),
-        (Ok(Principal::Address(of)), Principal::Address(ip)) => of.to_canonical() == ip.to_canonical(),
+        (Ok(Principal::Address(of)), Principal::Address(ip)) => {
+            of.to_canonical() == ip.to_canonical()
+        }
         (Ok(of), peer) => of == peer,
         (Err(_), _) => false,
     }

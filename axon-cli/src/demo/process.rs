@@ -20,7 +20,7 @@ use tokio::{
 use super::{DemoError, events::Event};
 
 /// How long a child has to end by itself.
-const PATIENCE: Duration = Duration::from_secs(5);
+const EXIT_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Longest piece of a log that goes into an error.
 const TAIL: usize = 600;
@@ -104,7 +104,7 @@ impl Process {
     /// Ends the child: by itself when it does so in time, else killed.
     pub(crate) async fn stop(mut self) {
         self.release().await;
-        let _ = tokio::time::timeout(PATIENCE, self.child.wait()).await;
+        let _ = tokio::time::timeout(EXIT_TIMEOUT, self.child.wait()).await;
     }
 
     fn ended(&mut self) -> DemoError {

@@ -37,16 +37,17 @@ pub(crate) fn run(args: &cli::Status) -> Result<ExitCode, CliError> {
         Err(failure) => Some(failure),
     };
     let status = wrong.as_ref().map(CliError::report);
-    let json = match DaemonLocation::from_env().map(|place| axon_transport::daemon_status_at(&place)) {
-        Ok(Ok(json)) => json,
-        Ok(Err(error)) => {
-            let failure = crate::session::failure(error);
-            let said = failure.report();
-            return Ok(status.unwrap_or(said));
-        }
-        // It was said: no other setting is worth a second line.
-        Err(error) => return status.ok_or(error.into()),
-    };
+    let json =
+        match DaemonLocation::from_env().map(|place| axon_transport::daemon_status_at(&place)) {
+            Ok(Ok(json)) => json,
+            Ok(Err(error)) => {
+                let failure = crate::session::failure(error);
+                let said = failure.report();
+                return Ok(status.unwrap_or(said));
+            }
+            // It was said: no other setting is worth a second line.
+            Err(error) => return status.ok_or(error.into()),
+        };
     let text = if args.json {
         let value: Value = serde_json::from_str(&json).map_err(CliError::failed)?;
         let json = serde_json::to_string_pretty(&value).map_err(CliError::failed)?;

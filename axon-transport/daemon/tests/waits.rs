@@ -14,8 +14,8 @@ use std::{
 
 use alone::alone;
 use axon_transport::{
-    EndpointSpec, GuardCondition, NewDataCallback, Publisher, Session, SessionError, Subscription, Waitable,
-    qos::Qos,
+    EndpointSpec, GuardCondition, NewDataCallback, Publisher, Session, SessionError, Subscription,
+    Waitable, qos::Qos,
 };
 
 const PATIENCE: Duration = Duration::from_secs(60);

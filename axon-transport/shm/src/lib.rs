@@ -96,8 +96,8 @@ pub mod internal {
     /// Descriptors that go from process to process.
     pub mod descriptors {
         pub use crate::os::descriptors::{
-            FEW, PassedFd, SocketPacket, carries_descriptors, close_queue_is_full, is_clogged,
-            is_scarce, is_tight, limit, look, open, receive, receive_few, share,
+            FEW_DESCRIPTORS, PassedFd, SocketPacket, carries_descriptors, close_queue_is_full,
+            is_clogged, is_scarce, is_tight, limit, look, open, receive, receive_few, share,
         };
     }
 }

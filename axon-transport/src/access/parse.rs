@@ -17,7 +17,7 @@ use super::{
 };
 
 /// As many rules as a file may have.
-const MOST: usize = 4096;
+const MAX_RULES: usize = 4096;
 /// As many patterns and names as its rules may have together, those of actions and parameters counted one by one.
 const MOST_PATTERNS: usize = 65_536;
 /// The keys of a file that are rules. All others are settings of `axon.toml`.
@@ -146,8 +146,8 @@ impl<'t> RuleFileReader<'t> {
     ) -> Result<Vec<(&'v DeTable<'i>, Range<usize>)>, AccessError> {
         let entries = value.get_ref().as_array();
         let entries = entries.ok_or_else(|| self.wrong(value.span(), format!("write {header}")))?;
-        if entries.len() > MOST {
-            let what = format!("at most {MOST} entries {header}");
+        if entries.len() > MAX_RULES {
+            let what = format!("at most {MAX_RULES} entries {header}");
             return Err(self.wrong(value.span(), what));
         }
         let table = |entry: &'v Value<'i>| {

@@ -3,7 +3,7 @@
 use std::fmt;
 
 /// The longest pattern, in bytes.
-const LONGEST: usize = 1024;
+const MAX_PATTERN_BYTES: usize = 1024;
 
 /// Names of topics, services and nodes: `*` stands for any characters but `/`, and `**` as a whole segment for any number
 /// of segments, none included. `**` alone fits each name, also one that does not begin with `/`.
@@ -16,7 +16,7 @@ impl TopicPattern {
     /// # Errors
     /// The text is no pattern; the error says what is one.
     pub fn new(text: &str) -> Result<Self, &'static str> {
-        if text.len() > LONGEST {
+        if text.len() > MAX_PATTERN_BYTES {
             return Err("at most 1,024 bytes");
         }
         if text == "**" {
@@ -140,7 +140,7 @@ mod tests {
 
     #[test]
     fn what_is_no_pattern_is_refused() {
-        let long = format!("/{}", "a".repeat(LONGEST));
+        let long = format!("/{}", "a".repeat(MAX_PATTERN_BYTES));
         for text in ["", "cmd_vel", "/", "/a//b", "/a/", "/a**", "/a/***", &long] {
             TopicPattern::new(text).unwrap_err();
         }

@@ -3,7 +3,7 @@
 use std::{fmt, sync::Arc};
 
 use super::{
-    Decision, Principal, Permissions, TopicPattern,
+    Decision, Permissions, Principal, TopicPattern,
     limit::{InterfaceLimit, LimitRule},
     party::{HostPattern, PartyPattern},
     permissions::{Compiled, DefaultDecision, VerbPatterns},

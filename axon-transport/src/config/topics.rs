@@ -4,7 +4,7 @@ use super::{ConfigError, LinkCompression, resolve::COMPRESSION};
 use crate::access::{RateLimit, TopicPattern, parse::limit::rate};
 
 /// As many entries as a file may have. A topic is compared with each of them when it is matched.
-const MOST: usize = 1024;
+const MAX_ENTRIES: usize = 1024;
 /// The names of the priorities.
 const PRIORITIES: [(&str, TopicPriority); 3] =
     [("high", TopicPriority::High), ("normal", TopicPriority::Normal), ("low", TopicPriority::Low)];
@@ -61,9 +61,11 @@ pub(super) fn rules(value: toml::Value, place: &str) -> Result<Vec<TopicRule>, C
     let toml::Value::Array(entries) = value else {
         return Err(ConfigError::name("topic", "entries that begin with [[topic]]").at(place));
     };
-    if entries.len() > MOST {
+    if entries.len() > MAX_ENTRIES {
         let read = entries.len().to_string();
-        return Err(ConfigError::value("topic", &read, format!("{MOST} entries at most")).at(place));
+        return Err(
+            ConfigError::value("topic", &read, format!("{MAX_ENTRIES} entries at most")).at(place)
+        );
     }
     let numbered = (1..).zip(entries);
     numbered.map(|(number, entry)| rule(entry, &format!("entry {number} of {place}"))).collect()

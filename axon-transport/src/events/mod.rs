@@ -13,4 +13,6 @@ pub(crate) use alive::Alive;
 pub(crate) use deadline::Deadline;
 pub(crate) use liveliness::{Lease, Liveness};
 pub(crate) use status::Statuses;
-pub use status::{CountStatus, EventKind, EventStatus, IncompatibleQos, LivelinessChanged, Matched};
+pub use status::{
+    CountStatus, EventKind, EventStatus, IncompatibleQos, LivelinessChanged, Matched,
+};

@@ -5,7 +5,7 @@
 use std::collections::HashMap;
 
 use super::{Endpoint, permits, shows, verb_of};
-use crate::access::{AccessRules, Principal, Permissions};
+use crate::access::{AccessRules, Permissions, Principal};
 
 /// The rules, compiled for each user who has a session, or had one.
 #[derive(Debug, Default)]

@@ -1,7 +1,7 @@
 //! Expressions for names of DDS: those of POSIX's `fnmatch` without flags, in which `*` and `?` stand for slashes, too.
 
 /// The longest expression, in bytes.
-const LONGEST: usize = 4096;
+const MAX_EXPRESSION_BYTES: usize = 4096;
 
 /// An expression that is known to be well-formed.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -27,7 +27,7 @@ impl Expression {
     /// # Errors
     /// What `fnmatch` would fit no name with, or each locale another one, and what is too long.
     pub fn new(text: &str) -> Result<Self, &'static str> {
-        if text.len() > LONGEST {
+        if text.len() > MAX_EXPRESSION_BYTES {
             return Err("longer than 4,096 bytes");
         }
         let mut rest = text;
@@ -245,7 +245,7 @@ mod tests {
 
     #[test]
     fn an_expression_that_fnmatch_knows_otherwise_is_refused() {
-        let long = "a".repeat(LONGEST + 1);
+        let long = "a".repeat(MAX_EXPRESSION_BYTES + 1);
         for wrong in ["a\\", "[[=a=]]", "[[.a.]]", "[[:vowel:]]", "[a-[:digit:]]", &long] {
             Expression::new(wrong).unwrap_err();
         }
@@ -254,8 +254,8 @@ mod tests {
 
     #[test]
     fn many_stars_take_no_more_than_the_product_of_both_lengths() {
-        let expression = Expression::new(&"*a".repeat(LONGEST / 2)).unwrap();
-        assert!(!expression.fits(&"a".repeat(LONGEST / 2 - 1)));
+        let expression = Expression::new(&"*a".repeat(MAX_EXPRESSION_BYTES / 2)).unwrap();
+        assert!(!expression.fits(&"a".repeat(MAX_EXPRESSION_BYTES / 2 - 1)));
         assert!(!expression.fits(&format!("{}b", "a".repeat(50_000))));
     }
 }

@@ -16,7 +16,7 @@ pub use status::{PoolStatus, Stock};
 /// Time between two looks at the KME's stock.
 const STATUS_EVERY: Duration = Duration::from_secs(5);
 /// First and longest pause after a failure that cost no key.
-const PAUSE: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(2));
+const RETRY_PAUSE: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(2));
 /// First and longest pause after a failure that may have cost keys.
 const PAUSE_LOST: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(30));
 /// Longest pause that a KME can ask for.
@@ -440,7 +440,8 @@ impl<K> Core<K> {
             return;
         }
         self.failed_at = Some(now);
-        let (first, longest) = if class == FailureClass::KeysLost { PAUSE_LOST } else { PAUSE };
+        let (first, longest) =
+            if class == FailureClass::KeysLost { PAUSE_LOST } else { RETRY_PAUSE };
         let full = (first * (1 << self.failures.min(10))).min(longest);
         let pause = full / 2 + full / 2 * u32::from((self.jitter)()) / 255;
         self.not_before = self.not_before.max(now.saturating_add(pause));

@@ -11,7 +11,7 @@ use super::{LedgerError, PoolShared};
 use crate::{Client, Error, Key, Status, tls};
 
 /// Sleep where nothing is to come by itself.
-const LONG: Duration = Duration::from_secs(3600);
+const IDLE_SLEEP: Duration = Duration::from_secs(3600);
 
 /// How a call ended.
 enum Ended {
@@ -47,7 +47,7 @@ pub(super) async fn run(client: Client, shared: Arc<PoolShared>) {
             while let Some(ask) = state.core.poll(now) {
                 calls.spawn(call(client.clone(), Arc::clone(&shared), ask));
             }
-            state.core.poll_timeout().map_or(now + LONG, |at| at.min(now + LONG))
+            state.core.poll_timeout().map_or(now + IDLE_SLEEP, |at| at.min(now + IDLE_SLEEP))
         };
         tokio::select! {
             Some(ended) = calls.join_next() => {

@@ -23,7 +23,7 @@ use crate::subject;
 /// Open connections of one KME.
 const MAX_CONNECTIONS: usize = 1024;
 /// Time for a handshake where others wait for a place.
-const PATIENCE: Duration = Duration::from_secs(1);
+const HANDSHAKE_TIMEOUT_WHEN_FULL: Duration = Duration::from_secs(1);
 /// Time for a request to come whole, and for its answer to be taken.
 const IDLE_TIME: Duration = Duration::from_secs(60);
 /// Bytes of further requests that are taken in before an answer has gone out.
@@ -70,7 +70,7 @@ pub(super) async fn serve(
 }
 
 /// Connections that have not proved who they are, oldest first. Where all places are taken, one of
-/// them gives way after [`PATIENCE`], so that a peer without a certificate shuts nobody out for long.
+/// them gives way after [`HANDSHAKE_TIMEOUT_WHEN_FULL`], so that a peer without a certificate shuts nobody out for long.
 #[derive(Default)]
 struct Strangers(VecDeque<Stranger>);
 
@@ -102,7 +102,9 @@ impl Strangers {
     }
 
     fn turn_away_old(&mut self) {
-        while let Some(oldest) = self.oldest().filter(|oldest| oldest.since.elapsed() >= PATIENCE) {
+        while let Some(oldest) =
+            self.oldest().filter(|oldest| oldest.since.elapsed() >= HANDSHAKE_TIMEOUT_WHEN_FULL)
+        {
             oldest.task.abort();
             self.0.pop_front();
         }
@@ -119,7 +121,7 @@ impl Strangers {
             tokio::select! {
                 biased;
                 place = &mut place => return place.ok(),
-                () = sleep_until(oldest.since + PATIENCE) => oldest.task.abort(),
+                () = sleep_until(oldest.since + HANDSHAKE_TIMEOUT_WHEN_FULL) => oldest.task.abort(),
             }
             // It is gone, even if its task does not say so yet.
             self.0.pop_front();
@@ -222,7 +224,8 @@ mod tests {
         let mut handles = Vec::new();
         let began = Instant::now();
         for number in 0..20 {
-            let room = timeout(PATIENCE * 60, strangers.make_room(&places)).await;
+            let room =
+                timeout(HANDSHAKE_TIMEOUT_WHEN_FULL * 60, strangers.make_room(&places)).await;
             let place = room.expect("a stranger gives way").unwrap();
             let task = tasks.spawn(async move {
                 let _place = place;
@@ -232,7 +235,10 @@ mod tests {
             strangers.add(task, Arc::new(AtomicBool::new(number == 0)));
         }
         // Sixteen too many, three at a time.
-        assert!(began.elapsed() >= PATIENCE * 6 && began.elapsed() < PATIENCE * 7);
+        assert!(
+            began.elapsed() >= HANDSHAKE_TIMEOUT_WHEN_FULL * 6
+                && began.elapsed() < HANDSHAKE_TIMEOUT_WHEN_FULL * 7
+        );
         let still: Vec<bool> = handles.iter().map(|task| !task.is_finished()).collect();
         let newest = handles.len() + 1 - PLACES;
         let expected: Vec<bool> = (0..handles.len()).map(|at| at == 0 || at >= newest).collect();

@@ -3,7 +3,7 @@
 use axon_transport::{access::TopicPattern, internal::sros2::names::TopicPart};
 
 /// As many patterns as one expression may become.
-const MOST: usize = 16;
+const MAX_PATTERNS: usize = 16;
 
 /// What an expression of DDS stands for, and the patterns that fit the same names of ROS.
 ///
@@ -40,7 +40,7 @@ fn patterns(name: &str) -> Result<Vec<String>, &'static str> {
     let mut all = vec![String::new()];
     for segment in name.split('/').skip(1) {
         let ways = ways(segment);
-        if all.len() * ways.len() > MOST {
+        if all.len() * ways.len() > MAX_PATTERNS {
             return Err("too many * within segments");
         }
         let longer =
@@ -66,7 +66,7 @@ fn ways(segment: &str) -> Vec<String> {
     let mut all = vec![if segment.starts_with('*') { "**/*" } else { "" }.to_owned()];
     for (index, piece) in inner.split('*').filter(|piece| !piece.is_empty()).enumerate() {
         let between: &[&str] = if index == 0 { &[""] } else { &["*", "*/**/*"] };
-        if all.len() > MOST {
+        if all.len() > MAX_PATTERNS {
             break;
         }
         let longer = |before: &String| {

@@ -37,7 +37,10 @@ fn refused(document: &str) -> String {
 }
 
 fn may(text: &str, verb: Verb, name: &str) -> bool {
-    AccessRules::parse(text, "imported").unwrap().check(Principal::Name("base"), verb, name).allowed()
+    AccessRules::parse(text, "imported")
+        .unwrap()
+        .check(Principal::Name("base"), verb, name)
+        .allowed()
 }
 
 #[test]

@@ -25,7 +25,7 @@ use super::cli;
 use crate::{failure::CliError, interrupt, logging, say::say, session};
 
 /// Between two looks while nothing changes.
-const LOOK: Duration = Duration::from_millis(100);
+const CHECK_INTERVAL: Duration = Duration::from_millis(100);
 /// How long changes of the graph are collected.
 const MOMENT: Duration = Duration::from_millis(10);
 /// Between two looks at the daemon's status, if there is no new host or session.
@@ -174,7 +174,7 @@ impl Watch {
         let is_terminal = io::stderr().is_terminal();
         while !self.interrupt.is_triggered() {
             let elapsed = begin.elapsed();
-            let left = time.map_or(LOOK, |time| time.saturating_sub(elapsed));
+            let left = time.map_or(CHECK_INTERVAL, |time| time.saturating_sub(elapsed));
             if self.ask() {
                 version = None;
             }
@@ -204,7 +204,8 @@ impl Watch {
             }
             // Changes of a moment are looked at together.
             std::thread::sleep(MOMENT.min(left));
-            self.session.wait_graph(LOOK.min(left), |graph| version != Some(graph.version));
+            self.session
+                .wait_graph(CHECK_INTERVAL.min(left), |graph| version != Some(graph.version));
         }
         if is_terminal {
             let _ = write!(io::stderr().lock(), "\r\x1b[K");

@@ -11,7 +11,7 @@ use axon_transport::qos::Qos;
 use super::{Channel, End, Load, Medium, Motion, Result, Side, agree, stamp};
 
 /// Longer than any machine needs to connect.
-const PATIENCE: Option<Duration> = Some(Duration::from_secs(60));
+const CONNECT_TIMEOUT: Option<Duration> = Some(Duration::from_secs(60));
 /// As `Subscriber::recv` sleeps.
 const LONGEST_SLEEP: Option<Duration> = Some(Duration::from_secs(1));
 /// Up to here what is published is copied in any case, so that `take_into` is the shorter way.
@@ -35,21 +35,21 @@ impl Medium for Axon {
         let options = PublisherOptions::new(qos).budget(budget).expected_len(load.size as u64);
         let publisher = Publisher::new(&context, options)?;
         let connect = |socket: &OwnedFd| {
-            Subscriber::connect(&context, socket, SubscriberOptions::new(qos), PATIENCE)
+            Subscriber::connect(&context, socket, SubscriberOptions::new(qos), CONNECT_TIMEOUT)
         };
         // A socket for each direction.
         let subscriber = match side {
             Side::Near => {
                 let [(there, first), (back, second)] = [Channel::pair()?, Channel::pair()?];
                 channel.hand_over(&(), &[first.as_fd(), second.as_fd()])?;
-                publisher.serve(&there, PATIENCE)?;
+                publisher.serve(&there, CONNECT_TIMEOUT)?;
                 connect(&back.into())?
             }
             Side::Far => {
                 let ((), fds) = channel.take_over()?;
                 let [there, back] = fds.try_into().map_err(|_| "another number of descriptors")?;
                 let subscriber = connect(&there)?;
-                publisher.serve(&back, PATIENCE)?;
+                publisher.serve(&back, CONNECT_TIMEOUT)?;
                 subscriber
             }
         };

@@ -27,7 +27,7 @@ use crate::bench::harness::{Channel, End, Error, Load, Medium, Result, Side, agr
 const BATCH: usize = 64 << 10;
 const HEADER: usize = 4;
 /// Between two looks at whether a turn is over.
-const LOOK: Duration = Duration::from_millis(1);
+const CHECK_INTERVAL: Duration = Duration::from_millis(1);
 /// As a daemon's.
 const SOCKET_BUFFER: usize = 8 << 20;
 /// As a daemon's.
@@ -208,7 +208,7 @@ impl End for BareEnd {
         // Not in the reactor: this is between turns, and the channel is one that blocks.
         self.runtime.block_on(async {
             while !channel.is_readable()? {
-                tokio::time::sleep(LOOK).await;
+                tokio::time::sleep(CHECK_INTERVAL).await;
             }
             Ok(())
         })

@@ -26,7 +26,7 @@ use super::harness::{
 pub(super) const READERS: [usize; 3] = [1, 4, READERS_AT_MOST];
 /// Between the moment at which all have read a message and the next one: longer than anybody looks before
 /// it sleeps.
-const PAUSE: Duration = Duration::from_micros(200);
+const MESSAGE_INTERVAL: Duration = Duration::from_micros(200);
 /// Between two looks at whether all have read.
 const NAP: Duration = Duration::from_micros(100);
 
@@ -171,7 +171,7 @@ impl Turns<'_> {
         let mut times = [Vec::new(), Vec::new()];
         let before = cpu::own();
         for _ in 0..messages {
-            thread::sleep(PAUSE);
+            thread::sleep(MESSAGE_INTERVAL);
             self.published += 1;
             let number = self.published;
             stamp(&mut self.bytes, u64::from(number));

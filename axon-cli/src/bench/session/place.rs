@@ -17,7 +17,7 @@ use serde_json::Value;
 use crate::bench::harness::Result;
 
 /// Longer than any machine needs to start a daemon or to match two endpoints.
-pub(in crate::bench) const PATIENCE: Duration = Duration::from_secs(60);
+pub(in crate::bench) const MATCH_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// What a host's processes have in their environment.
 pub(in crate::bench) type Settings = Vec<(String, String)>;
@@ -49,7 +49,7 @@ impl BenchHost {
         let daemon = command.stdin(Stdio::piped()).stdout(Stdio::null()).spawn()?;
         let config = config(&settings)?;
         let place = Self { _dir: dir, settings, daemon };
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Instant::now() + MATCH_TIMEOUT;
         while daemon_status(&config).is_err() {
             if Instant::now() > deadline {
                 return Err("its daemon does not come up".into());

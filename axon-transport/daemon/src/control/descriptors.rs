@@ -19,7 +19,7 @@ const IN_GATEWAY: u64 = 2;
 /// A relayed session: its connection, a socket pair, and what a session in this process opens.
 const OF_RELAYED: u64 = 24;
 /// What stays free for links, key requests, files and callers. Of a low limit a sixth.
-const KEPT: u64 = 40;
+const RESERVED_DESCRIPTORS: u64 = 40;
 /// Descriptors that are given up for a moment to answer a caller. Of a low limit an eighth.
 const SPARE: u64 = 24;
 
@@ -68,7 +68,7 @@ impl DescriptorRoom {
 
     /// Those that nobody's session may take.
     fn kept(&self) -> u64 {
-        self.owed + KEPT.min(self.limit / 6)
+        self.owed + RESERVED_DESCRIPTORS.min(self.limit / 6)
     }
 
     /// Those that sessions may still take.
@@ -161,7 +161,7 @@ mod tests {
 
     #[test]
     fn session_is_refused_where_it_would_take_what_is_kept() {
-        let last = 1024 - KEPT - OF_SESSION - IN_GATEWAY;
+        let last = 1024 - RESERVED_DESCRIPTORS - OF_SESSION - IN_GATEWAY;
         assert_eq!(room(1024, last, 0).refuses_session(false), None);
         let text = room(1024, last + 1, 0).refuses_session(false).unwrap();
         assert!(text.contains("of its 1024 file descriptors open, for 9 sessions"), "{text}");

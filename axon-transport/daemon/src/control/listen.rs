@@ -39,7 +39,7 @@ use super::{
     conversation::{converse, say},
     descriptors::DescriptorRoom,
     first::{PreHelloMessage, first},
-    pending::{MOST, MOST_WHERE_SHORT, PendingConnections, PendingConnection},
+    pending::{MAX_PENDING_CONNECTIONS, MOST_WHERE_SHORT, PendingConnection, PendingConnections},
     plane::ControlPlane,
     turns::ProcessTurn,
 };
@@ -50,9 +50,9 @@ use crate::{
 };
 
 /// How long a connection may take to say HELLO.
-const HELLO: Duration = Duration::from_secs(5);
+const HELLO_TIMEOUT: Duration = Duration::from_secs(5);
 /// Between attempts when no connection can be accepted.
-const PAUSE: Duration = Duration::from_millis(50);
+const RETRY_INTERVAL: Duration = Duration::from_millis(50);
 
 /// Accepts sessions for as long as it is polled.
 pub(super) async fn accept(control: Rc<RefCell<ControlPlane>>, listeners: Vec<OwnedFd>) {
@@ -85,7 +85,7 @@ async fn accept_at(
             if !std::mem::replace(&mut full, true) {
                 tracing::error!("too many connections wait to be closed: no more are accepted");
             }
-            tokio::time::sleep(PAUSE).await;
+            tokio::time::sleep(RETRY_INTERVAL).await;
             continue;
         }
         full = false;
@@ -103,7 +103,11 @@ async fn accept_at(
             Ok(Ok(socket)) => {
                 let socket = PassedFd::connection(socket);
                 let pid = peer_process(&socket).map_or(0, |peer| peer.pid);
-                let most = if descriptors::is_tight() { MOST_WHERE_SHORT } else { MOST };
+                let most = if descriptors::is_tight() {
+                    MOST_WHERE_SHORT
+                } else {
+                    MAX_PENDING_CONNECTIONS
+                };
                 let stranger = strangers.add(pid, most);
                 spawn_local(serve(control.clone(), socket, InternalPeer::No, Some(stranger)));
                 // Those that were served meanwhile go on.
@@ -114,7 +118,7 @@ async fn accept_at(
                 if let Some(times) = failures.count(begun.elapsed()) {
                     tracing::warn!(%error, times, "a session could not be accepted");
                 }
-                tokio::time::sleep(PAUSE).await;
+                tokio::time::sleep(RETRY_INTERVAL).await;
             }
             Err(_not_ready) => {}
         }
@@ -163,7 +167,7 @@ pub(super) async fn serve(
         }
     };
     let first = tokio::select! {
-        first = timeout(HELLO, first(&spare, &socket, has_room)) => first,
+        first = timeout(HELLO_TIMEOUT, first(&spare, &socket, has_room)) => first,
         () = replaced => {
             return tracing::warn!(
                 pid = peer.pid,

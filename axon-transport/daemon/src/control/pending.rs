@@ -10,7 +10,7 @@ use std::{
 use tokio::sync::Notify;
 
 /// Connections that may be without a HELLO at a time.
-pub(super) const MOST: usize = 256;
+pub(super) const MAX_PENDING_CONNECTIONS: usize = 256;
 /// The same where the daemon's descriptors are short.
 pub(super) const MOST_WHERE_SHORT: usize = 8;
 
@@ -83,13 +83,19 @@ mod tests {
     #[test]
     fn the_oldest_of_the_process_with_the_most_connections_makes_room() {
         let strangers = PendingConnections::default();
-        let there =
-            |stranger: &PendingConnection| strangers.0.borrow().connections.contains_key(&stranger.number);
-        let honest = strangers.add(7, MOST);
-        let crowd: Vec<_> = (0..3 * MOST).map(|_| strangers.add(9, MOST)).collect();
-        let late = strangers.add(8, MOST);
+        let there = |stranger: &PendingConnection| {
+            strangers.0.borrow().connections.contains_key(&stranger.number)
+        };
+        let honest = strangers.add(7, MAX_PENDING_CONNECTIONS);
+        let crowd: Vec<_> = (0..3 * MAX_PENDING_CONNECTIONS)
+            .map(|_| strangers.add(9, MAX_PENDING_CONNECTIONS))
+            .collect();
+        let late = strangers.add(8, MAX_PENDING_CONNECTIONS);
         assert!(there(&honest) && there(&late));
-        assert_eq!(crowd.iter().filter(|stranger| there(stranger)).count(), MOST - 2);
+        assert_eq!(
+            crowd.iter().filter(|stranger| there(stranger)).count(),
+            MAX_PENDING_CONNECTIONS - 2
+        );
         assert!(!there(&crowd[0]) && there(crowd.last().unwrap()), "the oldest go");
         drop((honest, late, crowd));
         assert!(strangers.0.borrow().connections.is_empty());
@@ -98,9 +104,15 @@ mod tests {
     #[test]
     fn of_many_processes_with_one_each_the_oldest_makes_room() {
         let strangers = PendingConnections::default();
-        let crowd: Vec<_> = (0..2 * MOST).map(|pid| strangers.add(pid as u32, MOST)).collect();
+        let crowd: Vec<_> = (0..2 * MAX_PENDING_CONNECTIONS)
+            .map(|pid| strangers.add(pid as u32, MAX_PENDING_CONNECTIONS))
+            .collect();
         let there: Vec<_> = strangers.0.borrow().connections.keys().copied().collect();
-        assert_eq!(there, (MOST as u64..2 * MOST as u64).collect::<Vec<_>>());
+        assert_eq!(
+            there,
+            (MAX_PENDING_CONNECTIONS as u64..2 * MAX_PENDING_CONNECTIONS as u64)
+                .collect::<Vec<_>>()
+        );
         drop(crowd);
     }
 }

@@ -69,7 +69,7 @@ impl Start {
 const FIRST_SESSION: Duration = Duration::from_secs(10);
 
 /// Segments that are kept of sessions that ended, at most.
-const LEFT: usize = 256;
+const MAX_RETAINED_SEGMENTS: usize = 256;
 /// Within what time sessions return that lost the daemon before: a process may be stopped for a while.
 const RETURN: Duration = Duration::from_secs(20);
 
@@ -346,7 +346,10 @@ async fn serve(
 
 /// Keeps what sessions leave that end, until those that read it have come from the daemon before.
 async fn keep_left_memory(control: Rc<RefCell<ControlPlane>>) {
-    control.borrow_mut().registry.keep_left_memory(LEFT.min(descriptors::share() / 4));
+    control
+        .borrow_mut()
+        .registry
+        .keep_left_memory(MAX_RETAINED_SEGMENTS.min(descriptors::share() / 4));
     tokio::time::sleep(RETURN).await;
     control.borrow_mut().registry.keep_left_memory(0);
 }

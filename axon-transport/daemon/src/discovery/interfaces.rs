@@ -12,7 +12,7 @@ use nix::{
 };
 
 /// Most addresses looked at; a host with more has the rest ignored.
-const MOST: usize = 64;
+const MAX_ADDRESSES: usize = 64;
 
 /// One address of one network interface that is up.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -79,7 +79,7 @@ pub(crate) fn interfaces() -> io::Result<Vec<Interface>> {
                 loopback: entry.flags.contains(InterfaceFlags::IFF_LOOPBACK),
             })
         })
-        .take(MOST)
+        .take(MAX_ADDRESSES)
         .collect();
     found.sort();
     Ok(found)

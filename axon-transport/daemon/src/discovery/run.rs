@@ -34,7 +34,7 @@ const TOGETHER: usize = 64;
 const TOGETHER_SHARED: usize = 512;
 /// Datagrams at the shared port that are looked at as they come, at once and each second. Of others those of this time
 /// are looked at together.
-const AT_ONCE: (u32, u32) = (32, 16);
+const DATAGRAM_BURST: (u32, u32) = (32, 16);
 const REST: Duration = Duration::from_millis(20);
 /// Most addresses of one name.
 const MOST_OF_A_NAME: usize = 4;
@@ -183,7 +183,7 @@ impl DiscoveryIo {
             start: Instant::now(),
             peers: PeerDiscovery::new(LocalDaemon::of(config, daemon), rand::random()),
             socket: None,
-            at_once: TokenBucket::new(AT_ONCE.0, AT_ONCE.1),
+            at_once: TokenBucket::new(DATAGRAM_BURST.0, DATAGRAM_BURST.1),
             multicast: false,
             domain: config.domain,
             bind: config.bind_addrs.clone(),

@@ -13,7 +13,7 @@ use axon_transport::config::{Config, TopicRule};
 
 use super::{
     peer::{
-        LocalEndpoints, Peer, PeerContext, LocalWriterCounts, kept_relays::KeptRelays,
+        LocalEndpoints, LocalWriterCounts, Peer, PeerContext, kept_relays::KeptRelays,
         stalls::StallHistory,
     },
     rings::Rings,

@@ -6,7 +6,7 @@ use super::{effects::Effects, links::Links, peers::LinkedPeers};
 use crate::bridge::ToControl;
 
 /// Between two reports.
-const EVERY: Duration = Duration::from_secs(1);
+const REPORT_INTERVAL: Duration = Duration::from_secs(1);
 
 /// When the next report is due.
 #[derive(Debug)]
@@ -17,7 +17,7 @@ pub(super) struct Reports {
 impl Reports {
     /// The first report is due a second after the engine's start.
     pub(super) fn new() -> Self {
-        Self { next: EVERY }
+        Self { next: REPORT_INTERVAL }
     }
 
     /// A link changed: the next report is due now.
@@ -34,7 +34,7 @@ impl Reports {
     pub(super) fn take_due(&mut self, now: Duration) -> bool {
         let is_due = now >= self.next;
         if is_due {
-            self.next = now + EVERY;
+            self.next = now + REPORT_INTERVAL;
         }
         is_due
     }
@@ -76,14 +76,14 @@ mod tests {
 
     #[test]
     fn reports_are_a_second_apart_unless_a_link_changes() {
-        let (mut reports, half) = (Reports::new(), EVERY / 2);
+        let (mut reports, half) = (Reports::new(), REPORT_INTERVAL / 2);
         assert!(!reports.take_due(half));
-        assert!(reports.take_due(EVERY + half), "late is not never");
-        assert_eq!(reports.poll_timeout(), 2 * EVERY + half);
-        assert!(!reports.take_due(2 * EVERY));
-        reports.hurry(2 * EVERY);
-        assert_eq!(reports.poll_timeout(), 2 * EVERY);
-        assert!(reports.take_due(2 * EVERY) && !reports.take_due(2 * EVERY));
-        assert_eq!(reports.poll_timeout(), 3 * EVERY);
+        assert!(reports.take_due(REPORT_INTERVAL + half), "late is not never");
+        assert_eq!(reports.poll_timeout(), 2 * REPORT_INTERVAL + half);
+        assert!(!reports.take_due(2 * REPORT_INTERVAL));
+        reports.hurry(2 * REPORT_INTERVAL);
+        assert_eq!(reports.poll_timeout(), 2 * REPORT_INTERVAL);
+        assert!(reports.take_due(2 * REPORT_INTERVAL) && !reports.take_due(2 * REPORT_INTERVAL));
+        assert_eq!(reports.poll_timeout(), 3 * REPORT_INTERVAL);
     }
 }

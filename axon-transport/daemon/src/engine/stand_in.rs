@@ -135,7 +135,7 @@ pub(crate) struct StandIns {
 const KNOWN: usize = 64;
 /// The most gone publishers whose numbers are remembered, so that a publisher that returns continues from its
 /// number. Beyond that, each identity keeps its newest entries up to an equal share.
-const REMEMBERED: usize = if cfg!(test) { 60 } else { 1 << 16 };
+const MAX_GONE_PUBLISHERS: usize = if cfg!(test) { 60 } else { 1 << 16 };
 
 impl StandIns {
     /// Returns the stand-in for `remote`: the existing one, or a new one that is charged to `account`.
@@ -190,7 +190,7 @@ fn forget(known: &mut HashMap<Gid, Known>, now: Duration) {
     for (gid, known) in known.iter().filter(|(_, known)| !is_there(known)) {
         gone.entry(Rc::clone(&known.identity)).or_default().push((known.numbers.at(), *gid));
     }
-    let share = share(gone.values().map(Vec::len).collect(), REMEMBERED);
+    let share = share(gone.values().map(Vec::len).collect(), MAX_GONE_PUBLISHERS);
     for mut of_identity in gone.into_values().filter(|gone| gone.len() > share) {
         of_identity.sort_unstable();
         let oldest = of_identity.len() - share;

@@ -19,7 +19,7 @@ use axon_transport::config::{ClassicAuth, ClassicConfig};
 
 use self::{
     load::IdentityFiles,
-    watch::{FilesChange, FileWatcher},
+    watch::{FileWatcher, FilesChange},
 };
 use crate::error::GatewayError;
 

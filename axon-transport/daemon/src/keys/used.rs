@@ -16,7 +16,7 @@ const IN_FILE: usize = 262_144;
 /// Key_IDs that are written once the file can be written again.
 const UNWRITTEN: usize = 65_536;
 /// Time between two tries to open the file of a daemon that has not ended yet.
-const AGAIN: Duration = Duration::from_secs(1);
+const RETRY_INTERVAL: Duration = Duration::from_secs(1);
 
 /// A record of the key_IDs of all keys that the KME gave this host. It holds no key. If its file
 /// cannot be kept, the record lasts as long as the daemon, and the log says so once.
@@ -101,7 +101,7 @@ impl UsedKeys {
 
 impl Used {
     fn record(&mut self, key_ids: &[String]) -> Vec<bool> {
-        if self.tried.is_some_and(|at| at.elapsed() >= AGAIN) {
+        if self.tried.is_some_and(|at| at.elapsed() >= RETRY_INTERVAL) {
             self.open();
         }
         let known = |id: &String| self.file.as_ref().is_some_and(|file| file.contains(id));
@@ -238,7 +238,7 @@ mod tests {
         assert!(used.statistics().trouble.is_some_and(|why| why.contains("in use")));
         assert_eq!(used.record(&ids(&["b"])), [true]);
         drop(old);
-        std::thread::sleep(AGAIN);
+        std::thread::sleep(RETRY_INTERVAL);
         assert_eq!(used.record(&ids(&["a", "b", "c"])), [false, false, true]);
         assert_eq!(used.statistics().trouble, None);
         drop(used);

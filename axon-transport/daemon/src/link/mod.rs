@@ -10,10 +10,10 @@ mod order;
 pub(crate) use crate::wire::link::is_known;
 pub use crate::wire::link::{
     AccessDecisions, CloseCode, DeniedUse, DeniedUses, Elected, FrameError, GraphResync,
-    GraphUpdate, ReceiveLimits, LastSeen, LinkAccessCheck, LinkClosed, LinkHello, LinkMessage,
-    LivelinessAsserted, MAX_DENIED, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, MAX_PROOFS,
-    Owners, ReceivedOf, ReceivedUpTo, RouteReady, RouteRefused, RouteSubscriber, RouteUnasked,
-    Subscribe, Unsubscribe, UseDecision, read_length, unpacked_length,
+    GraphUpdate, LastSeen, LinkAccessCheck, LinkClosed, LinkHello, LinkMessage, LivelinessAsserted,
+    MAX_DENIED, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, MAX_PROOFS, Owners, ReceiveLimits,
+    ReceivedOf, ReceivedUpTo, RouteReady, RouteRefused, RouteSubscriber, RouteUnasked, Subscribe,
+    Unsubscribe, UseDecision, read_length, unpacked_length,
 };
 pub use election::{Candidate, new_wins};
 pub use hello::{PROTOCOL, TermMismatch, check};

@@ -3,10 +3,10 @@
 use std::time::Duration;
 
 /// Limits of the whole, and of a time without progress.
-const LONGEST: Duration = Duration::from_secs(5);
-const PATIENCE: Duration = Duration::from_secs(2);
+const DRAIN_TIMEOUT: Duration = Duration::from_secs(5);
+const PROGRESS_TIMEOUT: Duration = Duration::from_secs(2);
 /// Between two looks. A sample that was just published is read from its ring within this time.
-const LOOK: Duration = Duration::from_millis(20);
+const CHECK_INTERVAL: Duration = Duration::from_millis(20);
 
 /// The progress of a shutdown.
 #[derive(Debug)]
@@ -23,7 +23,7 @@ pub(super) struct ShutdownDrain {
 impl ShutdownDrain {
     /// A shutdown that begins now.
     pub(super) fn new(now: Duration) -> Self {
-        Self { begun: now, released: 0, since: now, next: now + LOOK, empty: false }
+        Self { begun: now, released: 0, since: now, next: now + CHECK_INTERVAL, empty: false }
     }
 
     /// When to [look](Self::is_over) again.
@@ -35,14 +35,14 @@ impl ShutdownDrain {
     /// bytes alone do not show progress, since publishers go on.
     pub(super) fn is_over(&mut self, backlog: (usize, usize), now: Duration) -> bool {
         let (waiting, released) = backlog;
-        self.next = now + LOOK;
+        self.next = now + CHECK_INTERVAL;
         if released != self.released {
             (self.released, self.since) = (released, now);
         }
         let was_empty = std::mem::replace(&mut self.empty, waiting == 0);
         (was_empty && self.empty)
-            || now.saturating_sub(self.begun) >= LONGEST
-            || now.saturating_sub(self.since) >= PATIENCE
+            || now.saturating_sub(self.begun) >= DRAIN_TIMEOUT
+            || now.saturating_sub(self.since) >= PROGRESS_TIMEOUT
     }
 }
 
@@ -54,9 +54,10 @@ mod tests {
     fn it_ends_when_nothing_waits_twice_or_without_progress() {
         let looks = |at: fn(u32) -> (usize, usize)| {
             let mut finishing = ShutdownDrain::new(Duration::ZERO);
-            (1..).find(|look| finishing.is_over(at(*look), LOOK * *look))
+            (1..).find(|look| finishing.is_over(at(*look), CHECK_INTERVAL * *look))
         };
-        let [patience, longest] = [PATIENCE, LONGEST].map(|t| t.div_duration_f64(LOOK) as u32);
+        let [patience, longest] =
+            [PROGRESS_TIMEOUT, DRAIN_TIMEOUT].map(|t| t.div_duration_f64(CHECK_INTERVAL) as u32);
         assert_eq!(looks(|_| (0, 9)), Some(2), "a publisher may have written just now");
         assert_eq!(looks(|look| (3_usize.saturating_sub(look as usize), look as usize)), Some(4));
         assert_eq!(looks(|_| (7, 0)), Some(patience));

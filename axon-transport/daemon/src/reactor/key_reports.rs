@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 /// Between two reports of the keys.
-const EVERY: Duration = Duration::from_secs(1);
+const REPORT_INTERVAL: Duration = Duration::from_secs(1);
 
 /// The reports of the keys. One is under way at a time: a disk that hangs gets no queue of them.
 #[derive(Debug, Default)]
@@ -22,7 +22,7 @@ impl KeyReports {
     pub(super) fn begin(&mut self, now: Duration) -> bool {
         let due = self.poll_timeout().is_some_and(|due| due <= now);
         if due {
-            (self.next, self.is_asked) = (now + EVERY, true);
+            (self.next, self.is_asked) = (now + REPORT_INTERVAL, true);
         }
         due
     }
@@ -47,7 +47,7 @@ mod tests {
         reports.handle_report();
         assert!(reports.begin(later));
         reports.handle_report();
-        assert!(!reports.begin(later + EVERY / 2));
-        assert_eq!(reports.poll_timeout(), Some(later + EVERY));
+        assert!(!reports.begin(later + REPORT_INTERVAL / 2));
+        assert_eq!(reports.poll_timeout(), Some(later + REPORT_INTERVAL));
     }
 }

@@ -40,9 +40,9 @@ use crate::{
 };
 
 /// Packets that one pass sends before it takes in what has come, in system calls.
-const SENDS: usize = 64;
+const MAX_SENDS: usize = 64;
 /// Between two looks at the files of the identity: a change is in force within a second.
-const LOOK: Duration = Duration::from_millis(250);
+const IDENTITY_CHECK_INTERVAL: Duration = Duration::from_millis(250);
 /// How long the last packets of closed connections may take.
 const GOODBYE: Duration = Duration::from_millis(500);
 /// In a flood of discovery datagrams the thread sleeps so long and takes in what came meanwhile.
@@ -309,7 +309,7 @@ impl Reactor {
     /// Sends packets, up to a bound. Returns whether there was any.
     fn transmit(&mut self, now: Duration) -> bool {
         self.has_packets = false;
-        for sent in 0..SENDS {
+        for sent in 0..MAX_SENDS {
             if !self.sockets.flush() {
                 return sent > 0;
             }
@@ -429,7 +429,7 @@ impl Reactor {
 
 /// Looks at the files of the identity until the reactor is gone.
 async fn watch_files(identity: Arc<Identity>, report: mpsc::UnboundedSender<TaskResult>) {
-    let mut looks = tokio::time::interval(LOOK);
+    let mut looks = tokio::time::interval(IDENTITY_CHECK_INTERVAL);
     // After a stall, two looks at once would miss a write in between.
     looks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     while !report.is_closed() {

@@ -9,13 +9,13 @@ use std::time::Duration;
 use axon_transport::config::LinkPoll;
 
 /// How long one look lasts.
-const LOOK: Duration = Duration::from_micros(50);
+const POLL_TIME: Duration = Duration::from_micros(50);
 /// Looks that are judged together.
 const TRIAL: u32 = 16;
 /// At least one look in so many has to find an input.
-const PAYS: u32 = 4;
+const MIN_HIT_DIVISOR: u32 = 4;
 /// Passes without a look after a trial that did not pay, at first and at most. Each such trial doubles them.
-const PAUSE: (u32, u32) = (64, 4096);
+const SKIPPED_PASSES: (u32, u32) = (64, 4096);
 
 /// What the reactor does after a pass.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -48,14 +48,14 @@ impl PollRule {
             LinkPoll::Adaptive if processors < 2 => LinkPoll::Never,
             poll => poll,
         };
-        Self { poll, made: 0, found: 0, skipped: 0, pause: PAUSE.0 }
+        Self { poll, made: 0, found: 0, skipped: 0, pause: SKIPPED_PASSES.0 }
     }
 
     /// What to do after a pass, which had work if it was `busy`.
     pub(super) fn after_pass(&mut self, busy: bool) -> PollDecision {
         match self.poll {
             LinkPoll::Always => PollDecision::On,
-            LinkPoll::Adaptive if busy && self.skipped == 0 => PollDecision::For(LOOK),
+            LinkPoll::Adaptive if busy && self.skipped == 0 => PollDecision::For(POLL_TIME),
             LinkPoll::Adaptive => {
                 self.skipped = self.skipped.saturating_sub(u32::from(busy));
                 PollDecision::Not
@@ -69,12 +69,12 @@ impl PollRule {
         self.made += 1;
         self.found += u32::from(found);
         // The rest of the trial cannot change its result.
-        let lost = self.made - self.found > TRIAL - TRIAL / PAYS;
+        let lost = self.made - self.found > TRIAL - TRIAL / MIN_HIT_DIVISOR;
         if lost {
             self.skipped = self.pause;
-            self.pause = (self.pause * 2).min(PAUSE.1);
+            self.pause = (self.pause * 2).min(SKIPPED_PASSES.1);
         } else if self.made == TRIAL {
-            self.pause = PAUSE.0;
+            self.pause = SKIPPED_PASSES.0;
         }
         if lost || self.made == TRIAL {
             (self.made, self.found) = (0, 0);
@@ -111,7 +111,7 @@ mod tests {
     fn a_daemon_whose_inputs_follow_each_other_looks_after_each_pass() {
         let mut adaptive = PollRule::new(LinkPoll::Adaptive, 2);
         assert_eq!(looks(&mut adaptive, 10_000, |_| true), 10_000);
-        assert_eq!(looks(&mut adaptive, 10_000, |pass| pass % PAYS == 0), 10_000);
+        assert_eq!(looks(&mut adaptive, 10_000, |pass| pass % MIN_HIT_DIVISOR == 0), 10_000);
         // It notices that they stopped, and soon that they began again.
         assert!(looks(&mut adaptive, 100, |_| false) < 50);
         assert!(looks(&mut adaptive, 1_000, |_| true) > 800);
@@ -121,11 +121,11 @@ mod tests {
     fn a_pass_without_work_is_not_followed_by_a_look() {
         let mut adaptive = PollRule::new(LinkPoll::Adaptive, 2);
         assert_eq!(adaptive.after_pass(false), PollDecision::Not);
-        assert_eq!(adaptive.after_pass(true), PollDecision::For(LOOK));
+        assert_eq!(adaptive.after_pass(true), PollDecision::For(POLL_TIME));
         // Nor does it shorten a pause.
         looks(&mut adaptive, 13, |_| false);
         assert!((0..1_000).all(|_| adaptive.after_pass(false) == PollDecision::Not));
-        assert_eq!(looks(&mut adaptive, PAUSE.0, |_| true), 0);
+        assert_eq!(looks(&mut adaptive, SKIPPED_PASSES.0, |_| true), 0);
         assert_eq!(looks(&mut adaptive, 1, |_| true), 1);
     }
 

@@ -20,9 +20,9 @@ use axon_shm::ids::DaemonId;
 use crate::{engine::quic::qlog::Qlogs, link::Side};
 
 /// The longest file, in bytes.
-const LONGEST: usize = 16 << 20;
+const MAX_FILE_BYTES: usize = 16 << 20;
 /// Files in the directory. The oldest goes for a new one.
-const MOST: usize = 64;
+const MAX_FILES: usize = 64;
 /// A connection hands on its events when there are so many bytes.
 const TOGETHER: usize = 16 << 10;
 /// Orders that wait for the disk.
@@ -106,7 +106,7 @@ struct EventWriter {
 
 impl EventWriter {
     fn new(number: u64, orders: SyncSender<QlogOrder>) -> Self {
-        Self { number, orders, buffer: Vec::new(), whole: 0, left: LONGEST, is_over: false }
+        Self { number, orders, buffer: Vec::new(), whole: 0, left: MAX_FILE_BYTES, is_over: false }
     }
 
     fn hand_on(&mut self) {
@@ -188,8 +188,8 @@ impl Disk {
 
     fn open(&mut self, number: u64, name: &str) -> io::Result<()> {
         DirBuilder::new().recursive(true).mode(0o700).create(&self.directory)?;
-        if self.open.len() >= MOST {
-            return Err(io::Error::other(format!("{MOST} connections write already")));
+        if self.open.len() >= MAX_FILES {
+            return Err(io::Error::other(format!("{MAX_FILES} connections write already")));
         }
         self.make_room()?;
         let mut options = OpenOptions::new();
@@ -207,7 +207,7 @@ impl Disk {
             .filter(|name| name.starts_with(NAME.0) && name.ends_with(NAME.1))
             .collect();
         names.sort_unstable();
-        let too_many = (names.len() + 1).saturating_sub(MOST);
+        let too_many = (names.len() + 1).saturating_sub(MAX_FILES);
         names.retain(|name| self.open.values().all(|(open, _)| open != name));
         for name in names.iter().take(too_many) {
             match fs::remove_file(self.directory.join(name)) {
@@ -269,16 +269,16 @@ mod tests {
 
     #[test]
     fn a_file_ends_with_a_whole_record_before_it_is_too_long() {
-        let (orders, taken) = sync_channel(2 * LONGEST / TOGETHER);
+        let (orders, taken) = sync_channel(2 * MAX_FILE_BYTES / TOGETHER);
         let mut writer = EventWriter::new(1, orders);
         let record = [&[b'x'; 999][..], b"\n"].concat();
-        (0..2 * LONGEST / record.len()).for_each(|_| writer.write_all(&record).unwrap());
+        (0..2 * MAX_FILE_BYTES / record.len()).for_each(|_| writer.write_all(&record).unwrap());
         drop(writer);
         let written = taken.iter().map(|order| match order {
             QlogOrder::Write(1, records) => records.len(),
             _ => 0,
         });
-        assert_eq!(written.sum::<usize>(), LONGEST / record.len() * record.len());
+        assert_eq!(written.sum::<usize>(), MAX_FILE_BYTES / record.len() * record.len());
     }
 
     #[test]
@@ -289,7 +289,7 @@ mod tests {
         }
         fs::write(dir.path().join("axon-00000000000001-old.sqlog"), "").unwrap();
         let (files, last) = start(dir.path());
-        for _ in 0..MOST + 5 {
+        for _ in 0..MAX_FILES + 5 {
             let mut writer = loop {
                 // The queue may be full for a while.
                 if let Some(writer) = files.open(Side::Client) {
@@ -301,7 +301,7 @@ mod tests {
         }
         end(files, last);
         let names = names(dir.path());
-        assert_eq!(names.len(), MOST + 3, "{names:?}");
+        assert_eq!(names.len(), MAX_FILES + 3, "{names:?}");
         assert!(!names.iter().any(|name| name.contains("old")), "{names:?}");
         assert!(names.contains(&"axon-notes.txt".to_owned()));
     }
@@ -312,16 +312,16 @@ mod tests {
         let mut disk = Disk::new(dir.path());
         let name = |number: u64| format!("{}{number:014}{}", NAME.0, NAME.1);
         disk.carry_out(QlogOrder::Open(0, name(0)));
-        for number in 1..2 * MOST as u64 {
+        for number in 1..2 * MAX_FILES as u64 {
             disk.carry_out(QlogOrder::Open(number, name(number)));
             disk.carry_out(QlogOrder::Close(number));
         }
         assert!(names(dir.path()).contains(&name(0)));
-        assert_eq!(names(dir.path()).len(), MOST);
+        assert_eq!(names(dir.path()).len(), MAX_FILES);
         for number in 200..300 {
             disk.carry_out(QlogOrder::Open(number, name(number)));
         }
-        assert_eq!((disk.open.len(), names(dir.path()).len()), (MOST, MOST));
+        assert_eq!((disk.open.len(), names(dir.path()).len()), (MAX_FILES, MAX_FILES));
         assert!(disk.is_said && disk.open.contains_key(&0));
     }
 

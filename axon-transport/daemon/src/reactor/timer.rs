@@ -16,7 +16,7 @@ use tokio::{io::unix::AsyncFd, time::sleep};
 use crate::watch::watch;
 
 /// Longer waits do without a system call for their end.
-const SHORT: Duration = Duration::from_millis(100);
+const TIMERFD_THRESHOLD: Duration = Duration::from_millis(100);
 
 /// Waits until a time. Where the kernel gives no timer, tokio's do.
 pub(super) struct Timer(Option<AsyncFd<PassedFd>>);
@@ -35,7 +35,9 @@ impl Timer {
     pub(super) async fn wait(&self, left: Option<Duration>) {
         let Some(left) = left else { return pending().await };
         match &self.0 {
-            Some(timer) if left < SHORT && set(timer, left).is_ok() => expire(timer).await,
+            Some(timer) if left < TIMERFD_THRESHOLD && set(timer, left).is_ok() => {
+                expire(timer).await
+            }
             _ => sleep(left).await,
         }
     }

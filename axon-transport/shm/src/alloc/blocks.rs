@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use crate::{alloc::heap::Block, ring::layout::Location};
 
 /// What a ring keeps for lengths that it seems not to need any more, in bytes.
-const KEPT: u64 = 64 << 10;
+const MAX_IDLE_BYTES: u64 = 64 << 10;
 
 /// Blocks by their length, those that were used last to be used next.
 #[derive(Debug, Default)]
@@ -31,7 +31,7 @@ impl Blocks {
 
     /// Whether so much is here that it should go back before more is asked for.
     pub(crate) fn are_many(&self) -> bool {
-        self.bytes > KEPT
+        self.bytes > MAX_IDLE_BYTES
     }
 
     /// Gives all of them away.

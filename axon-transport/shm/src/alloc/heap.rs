@@ -25,7 +25,7 @@ use crate::{
 
 /// Readers may take this long to map a segment before objects that they read move there without
 /// them: one that is stopped must not keep a ring small.
-const PATIENCE: Duration = Duration::from_secs(1);
+const MAP_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Memory of one object.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -134,7 +134,7 @@ impl Heap {
         let mut parts = self.parts();
         let usable = |part: &HeapPart| {
             let number = part.segment.number();
-            number == 0 || mapped(number) || part.since.elapsed() >= PATIENCE
+            number == 0 || mapped(number) || part.since.elapsed() >= MAP_TIMEOUT
         };
         let mut found = None;
         let mut elsewhere = false;

@@ -29,7 +29,7 @@ use crate::{
 };
 
 /// Segments of one other context that are kept to be mapped later, at most.
-const MANY: usize = 64;
+const MAX_KEPT_SEGMENTS: usize = 64;
 
 /// The memory, doorbell and identity that publishers and subscribers of a process share. Starts no
 /// thread. Clones are the same context; all methods may be called from any thread.
@@ -136,7 +136,7 @@ impl Context {
                     let of = |other: &&Unmapped| other.0.as_ptr() == Arc::as_ptr(from);
                     // Each of its lines tells of it.
                     let known = unmapped.iter().filter(of).any(|(_, other, _)| *other == opened);
-                    if !known && unmapped.iter().filter(of).count() < MANY {
+                    if !known && unmapped.iter().filter(of).count() < MAX_KEPT_SEGMENTS {
                         unmapped.push((Arc::downgrade(from), opened, fd));
                     }
                 }

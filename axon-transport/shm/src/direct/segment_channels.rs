@@ -24,9 +24,9 @@ use crate::{
 
 /// What may stand in a line: some twenty packets. Each segment among them keeps its memory, though
 /// its publisher may have given it up since.
-const ROOM: usize = 8 << 10;
+const QUEUE_BYTES: usize = 8 << 10;
 /// How often those that could not be told of something are tried again, at most.
-const PAUSE: Duration = Duration::from_millis(10);
+const RETRY_INTERVAL: Duration = Duration::from_millis(10);
 
 /// All of a context's lines.
 pub(crate) struct SegmentChannels {
@@ -163,7 +163,7 @@ impl SegmentChannels {
     ) -> Result<(), ConnectError> {
         let PublisherAnswer { reader, writer, ring, .. } = *granted;
         // One that cannot be set holds more, which is its own harm.
-        let _ = sockopt::set_socket_send_buffer_size(&socket, ROOM);
+        let _ = sockopt::set_socket_send_buffer_size(&socket, QUEUE_BYTES);
         let mut line =
             SegmentChannel { reader, writer, peer, socket, told: Vec::new(), ended: false };
         let mut state = self.lock();
@@ -227,7 +227,7 @@ impl SegmentChannels {
 
     #[cold]
     fn retry(&self, state: MutexGuard<'_, ChannelsState>, session: &SessionSegment) {
-        if state.tried.is_none_or(|tried| tried.elapsed() >= PAUSE) {
+        if state.tried.is_none_or(|tried| tried.elapsed() >= RETRY_INTERVAL) {
             self.catch_up(state, session);
         }
     }

@@ -26,7 +26,7 @@ use crate::{
 /// No sleep is longer: what a publisher stored last and did not live to ring for is found then.
 const LONGEST_SLEEP: Duration = Duration::from_secs(1);
 /// Updates that one look reads at most. A socket holds fewer, unless the other end fills it all the time.
-const NEWS: u32 = 64;
+const MAX_UPDATES: u32 = 64;
 
 /// What a [`Subscriber`] asks for.
 ///
@@ -235,7 +235,7 @@ impl Subscriber {
             return;
         }
         let line = line.lock().unwrap_or_else(PoisonError::into_inner);
-        for _ in 0..NEWS {
+        for _ in 0..MAX_UPDATES {
             match ConnectChannel::new(line.as_fd(), Some(Duration::ZERO)).take_update() {
                 Ok(news) => self.context.hear(publisher, news),
                 // What finds no room here is there the next time, too.

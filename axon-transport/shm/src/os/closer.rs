@@ -31,7 +31,7 @@ pub(super) enum FdClass {
 /// Threads of each lane, at most.
 const THREADS: [usize; 3] = [1, 32, 8];
 /// Descriptors that wait for each lane, from which on no more are taken in.
-const MANY: [usize; 3] = [usize::MAX, 1024, 256];
+const MAX_WAITING: [usize; 3] = [usize::MAX, 1024, 256];
 
 /// Descriptors of others that are open, also those that wait to be closed.
 pub(super) static OPEN: AtomicU64 = AtomicU64::new(0);
@@ -52,7 +52,7 @@ impl FdClass {
 
     /// Whether so many wait that no more should be taken in.
     pub(super) fn is_full(self) -> bool {
-        self.waiting() >= MANY[self as usize]
+        self.waiting() >= MAX_WAITING[self as usize]
     }
 
     /// How many wait for a thread.

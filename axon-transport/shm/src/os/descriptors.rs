@@ -29,7 +29,7 @@ const SMALL: i64 = (1 << 20) / 512;
 /// The most descriptors that the system lets a packet carry.
 const SCM_MAX_FD: usize = 253;
 /// Descriptors of a packet that [`receive_few`] receives at most.
-pub const FEW: usize = 16;
+pub const FEW_DESCRIPTORS: usize = 16;
 /// More than a packet can carry, with what else a process opens meanwhile. Of a limit so low that this is more
 /// than half of it, half.
 const RESERVE: u64 = 400;
@@ -212,7 +212,7 @@ pub fn is_scarce(limit: u64) -> bool {
 /// short, few are too many, and so are those that sessions sent: what waits is open.
 pub fn close_queue_is_full() -> bool {
     let waits = || FdClass::Stranger.waiting().max(FdClass::Session.waiting());
-    FdClass::Stranger.is_full() || (is_tight() && waits() >= FEW)
+    FdClass::Stranger.is_full() || (is_tight() && waits() >= FEW_DESCRIPTORS)
 }
 
 /// Half of the descriptors of others that this process can hold.
@@ -280,18 +280,19 @@ pub(crate) fn receive_whole(socket: impl AsFd, buffer: &mut [u8]) -> Result<Sock
     Ok(packet)
 }
 
-/// As [`receive`], for a packet of at most [`FEW`] descriptors: closes none of them for the last time, and needs no room
+/// As [`receive`], for a packet of at most [`FEW_DESCRIPTORS`] descriptors: closes none of them for the last time, and needs no room
 /// for more. A packet with more descriptors is reported as truncated and stays in the socket. A packet for whose descriptors
 /// the process has no room is reported as lost and stays, too.
 pub fn receive_few(socket: impl AsFd, buffer: &mut [u8]) -> Result<SocketPacket, Errno> {
-    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(FEW))];
+    let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(FEW_DESCRIPTORS))];
     let packet = receive_with(&socket, buffer, RecvFlags::PEEK, &mut space)?;
     // By its alignment the space may have room for one more.
-    let more = packet.descriptors.len() > FEW;
+    let more = packet.descriptors.len() > FEW_DESCRIPTORS;
     if !packet.lost && !more {
         take_seen(&socket);
     }
-    let truncated = packet.truncated || more || packet.lost && packet.descriptors.len() == FEW;
+    let truncated =
+        packet.truncated || more || packet.lost && packet.descriptors.len() == FEW_DESCRIPTORS;
     Ok(SocketPacket { truncated, lost: packet.lost || more, ..packet })
 }
 
@@ -449,16 +450,20 @@ pub(crate) mod tests {
         let send = |count: usize| {
             let files: Vec<_> = (0..count).map(|_| tempfile::tempfile().unwrap()).collect();
             let rights: Vec<_> = files.iter().map(AsFd::as_fd).collect();
-            let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(FEW * 2))];
+            let mut space =
+                [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(FEW_DESCRIPTORS * 2))];
             let mut control = SendAncillaryBuffer::new(&mut space);
             assert!(control.push(SendAncillaryMessage::ScmRights(&rights)));
             sendmsg(&theirs, &[IoSlice::new(b"xy")], &mut control, SendFlags::empty()).unwrap();
         };
-        send(FEW);
-        send(FEW + 1);
+        send(FEW_DESCRIPTORS);
+        send(FEW_DESCRIPTORS + 1);
         let mut buffer = [0; 2];
         let packet = receive_few(&ours, &mut buffer).unwrap();
-        assert_eq!((packet.bytes, packet.descriptors.len(), packet.lost), (2, FEW, false));
+        assert_eq!(
+            (packet.bytes, packet.descriptors.len(), packet.lost),
+            (2, FEW_DESCRIPTORS, false)
+        );
         for _ in 0..2 {
             let packet = receive_few(&ours, &mut buffer).unwrap();
             assert!(packet.truncated && packet.lost, "it is still there");

@@ -35,7 +35,7 @@ use crate::{
         activity::WatchKey,
         attachment::{Attachment, Pinning},
         lane::Lane,
-        peer::{SegmentLookup, RingPeer},
+        peer::{RingPeer, SegmentLookup},
     },
     sync::Ordering,
     wake::{Purpose, settle},
@@ -158,7 +158,16 @@ impl Reader {
             skipped: 0,
             corrupt: None,
             given_up: false,
-            reads: ReaderConfig { writer, peer, grant, depth, max_message, in_place, tells, watch: None },
+            reads: ReaderConfig {
+                writer,
+                peer,
+                grant,
+                depth,
+                max_message,
+                in_place,
+                tells,
+                watch: None,
+            },
         })
     }
 

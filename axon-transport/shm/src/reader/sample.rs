@@ -173,7 +173,9 @@ impl Sample {
                 out.clear();
                 Ok(())
             }
-            SampleBytes::Pinned { there, .. } => copy::copy_out(there.words(), there.skip, self.len, out),
+            SampleBytes::Pinned { there, .. } => {
+                copy::copy_out(there.words(), there.skip, self.len, out)
+            }
         }
     }
 

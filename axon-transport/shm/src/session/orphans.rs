@@ -26,7 +26,7 @@ pub(crate) struct Orphan {
 }
 
 /// So many of them are looked at whenever one comes or a reader leaves.
-const FEW: usize = 64;
+const CHECKS_PER_CALL: usize = 64;
 
 /// The memory of a session's publishers that are gone.
 #[derive(Default)]
@@ -53,7 +53,7 @@ impl Orphans {
         {
             let mut state = self.lock();
             state.calls += 1;
-            if state.all.len() > FEW && state.calls < state.all.len() {
+            if state.all.len() > CHECKS_PER_CALL && state.calls < state.all.len() {
                 return true;
             }
         }

@@ -447,7 +447,9 @@ impl RingPeer {
 
     pub(crate) fn find(&self, number: u32) -> SegmentLookup {
         match self {
-            Self::Local(session) => session.map(number).map_or(SegmentLookup::Absent, SegmentLookup::Map),
+            Self::Local(session) => {
+                session.map(number).map_or(SegmentLookup::Absent, SegmentLookup::Map)
+            }
             Self::Remote(session) => session.find(number),
         }
     }

@@ -10,13 +10,13 @@ use rustix::{event::Timespec, io::Errno};
 
 use super::{
     DoorbellSender, arm, disarm,
-    receiver::{DoorbellReceiver, CLOSED, Drained, HeardBells},
+    receiver::{CLOSED, DoorbellReceiver, Drained, HeardBells},
     spin::Spin,
 };
 
 /// The longest sleep of a waiter where nobody watches the processes that are to ring: the waiter then
 /// finds news of a process that ended before it rang. Tests sleep for ever, so that they notice.
-const LONGEST: Option<Duration> = if cfg!(test) { None } else { Some(Duration::from_secs(1)) };
+const MAX_SLEEP: Option<Duration> = if cfg!(test) { None } else { Some(Duration::from_secs(1)) };
 
 /// What a waiter waits for; each has its own armed word.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -428,7 +428,7 @@ impl Waiters {
     }
 
     fn longest(&self) -> Option<Duration> {
-        LONGEST.filter(|_| !self.watched)
+        MAX_SLEEP.filter(|_| !self.watched)
     }
 
     fn not_too_long(&self, left: Option<Duration>) -> Option<Duration> {

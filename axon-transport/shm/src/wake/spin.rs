@@ -9,16 +9,16 @@ use std::{
 
 /// About what a sleep and the ring that ends it cost both sides together on a virtual machine, where they
 /// cost most: with less, two who wait for each other never get to know that looking is worth it.
-const MOST: Duration = Duration::from_micros(50);
+const MAX_SPIN: Duration = Duration::from_micros(50);
 
 /// Looks between two looks at the clock, which takes longer than one.
-const LOOKS: u32 = 8;
+const MAX_SPINS: u32 = 8;
 
 /// Short sleeps, at most, that have to follow a look in vain before the next look.
-const PATIENCE: u32 = 1023;
+const MAX_SLEEPS_BEFORE_SPIN: u32 = 1023;
 
 /// Looks for as long as that has lately been worth its while: a sleep that turns out shorter than
-/// [`MOST`] makes it look longer, one that does not half as long. A look in vain ends it, and the
+/// [`MAX_SPIN`] makes it look longer, one that does not half as long. A look in vain ends it, and the
 /// more of them follow each other, the more short sleeps it takes to look again: who is waited for
 /// may be on this very processor, and not run for as long as somebody looks out for it.
 pub(super) struct Spin {
@@ -36,7 +36,7 @@ impl Spin {
     pub(super) fn new() -> Self {
         // On one processor who is looked out for cannot run meanwhile.
         let alone = available_parallelism().is_ok_and(|n| n.get() == 1);
-        Self::up_to(if alone { Duration::ZERO } else { MOST })
+        Self::up_to(if alone { Duration::ZERO } else { MAX_SPIN })
     }
 
     fn up_to(most: Duration) -> Self {
@@ -59,7 +59,7 @@ impl Spin {
         let mut end = now + Duration::from_nanos(u64::from(budget));
         end = deadline.map_or(end, |deadline| end.min(deadline));
         while now < end {
-            for _ in 0..LOOKS {
+            for _ in 0..MAX_SPINS {
                 spin_loop();
                 if ready() {
                     self.patience.store(1, Ordering::Relaxed);
@@ -71,7 +71,7 @@ impl Spin {
         let patience = self.patience.load(Ordering::Relaxed);
         self.now.store(0, Ordering::Relaxed);
         self.pause.store(patience, Ordering::Relaxed);
-        self.patience.store((patience * 2 + 1).min(PATIENCE), Ordering::Relaxed);
+        self.patience.store((patience * 2 + 1).min(MAX_SLEEPS_BEFORE_SPIN), Ordering::Relaxed);
         false
     }
 

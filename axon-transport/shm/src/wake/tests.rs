@@ -16,7 +16,9 @@ use rustix::{
     net::{RecvFlags, Shutdown, recv, shutdown},
 };
 
-use super::{DoorbellSender, Doorbell, Purpose, WakeCheck, arm, disarm, due, receiver::whole_millis, settle};
+use super::{
+    Doorbell, DoorbellSender, Purpose, WakeCheck, arm, disarm, due, receiver::whole_millis, settle,
+};
 use crate::{
     ids::SessionId,
     os::descriptors::{

@@ -115,7 +115,10 @@ impl Writer {
                 RingPayload::Written { at, lead, len: sample, lent } => {
                     let len = Area::rounded(lent as u64);
                     let first = Location { offset: at.offset + lead as u64, ..at };
-                    (SampleStorage::Slot { at, len, sample: sample as u64 }, PayloadLocation::Slot(first))
+                    (
+                        SampleStorage::Slot { at, len, sample: sample as u64 },
+                        PayloadLocation::Slot(first),
+                    )
                 }
             };
             let meta = state.numbers.number(numbering);

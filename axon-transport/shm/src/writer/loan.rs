@@ -19,7 +19,9 @@ use crate::{
         layout::{ALIGNED, Location},
         types::{Meta, Published},
     },
-    writer::{WakeTiming, Numbering, PATIENCE, PublishDeadline, RingPayload, Writer},
+    writer::{
+        KEEP_ALL_PUBLISH_TIMEOUT, Numbering, PublishDeadline, RingPayload, WakeTiming, Writer,
+    },
 };
 
 /// Memory to be filled and published: shared memory where such a sample is read in place. Dropping
@@ -153,7 +155,8 @@ impl<'a> Loan<'a> {
             return Err(PublishError::Incomplete { len: most, written });
         }
         let numbering = Numbering::Next(source_timestamp);
-        self.commit(len, numbering, PublishDeadline::new(PATIENCE)).map(|(sequence, _)| sequence)
+        self.commit(len, numbering, PublishDeadline::new(KEEP_ALL_PUBLISH_TIMEOUT))
+            .map(|(sequence, _)| sequence)
     }
 
     #[inline]
@@ -163,7 +166,7 @@ impl<'a> Loan<'a> {
             let (len, written) = (len as u64, self.written as u64);
             return Err(PublishError::Incomplete { len, written });
         }
-        self.commit(len, numbering, PublishDeadline::new(PATIENCE))
+        self.commit(len, numbering, PublishDeadline::new(KEEP_ALL_PUBLISH_TIMEOUT))
     }
 
     pub(crate) fn commit(
@@ -185,7 +188,8 @@ impl<'a> Loan<'a> {
             LoanMemory::Published => unreachable!("publishing takes the loan"),
         };
         let taken = matches!(payload, RingPayload::Written { .. });
-        let (sequence, published) = self.writer.commit(numbering, payload, deadline, WakeTiming::Now)?;
+        let (sequence, published) =
+            self.writer.commit(numbering, payload, deadline, WakeTiming::Now)?;
         // What nobody reads has not become a sample, and its memory is given back.
         if taken && published.position.is_some() {
             self.memory = LoanMemory::Published;

@@ -17,7 +17,7 @@ use std::{sync::Arc, time::Duration};
 
 pub use self::{absent::CarrierState, numbers::MAX_GAP};
 pub(super) use self::{
-    commit::{WakeTiming, PublishDeadline},
+    commit::{PublishDeadline, WakeTiming},
     numbers::Numbering,
     state::WriterState,
 };
@@ -54,7 +54,7 @@ use crate::{
 };
 
 /// How long a publish waits for a KEEP_ALL reader.
-pub(super) const PATIENCE: Duration = Duration::from_millis(100);
+pub(super) const KEEP_ALL_PUBLISH_TIMEOUT: Duration = Duration::from_millis(100);
 /// How often a publish looks for the reader that is in its way before it gives up on the answer.
 pub(super) const LOOKS: u32 = 1000;
 /// Descriptors up to which a ring grows for its readers' depths.
@@ -330,8 +330,13 @@ impl Writer {
     /// The sample was not published; what to do is in the error.
     #[inline]
     pub fn publish(&self, meta: Meta, payload: &[u8]) -> Result<Published, PublishError> {
-        self.publish_within(Numbering::Given(meta), payload, PATIENCE, WakeTiming::Now)
-            .map(|(_, published)| published)
+        self.publish_within(
+            Numbering::Given(meta),
+            payload,
+            KEEP_ALL_PUBLISH_TIMEOUT,
+            WakeTiming::Now,
+        )
+        .map(|(_, published)| published)
     }
 
     /// As [`publish`](Self::publish), but does not wait: [`PublishError::Blocked`] at once.
@@ -369,7 +374,8 @@ impl Writer {
     #[inline]
     pub fn publish_next(&self, source_timestamp: i64, payload: &[u8]) -> Result<u64, PublishError> {
         let numbering = Numbering::Next(source_timestamp);
-        self.publish_within(numbering, payload, PATIENCE, WakeTiming::Now).map(|(sequence, _)| sequence)
+        self.publish_within(numbering, payload, KEEP_ALL_PUBLISH_TIMEOUT, WakeTiming::Now)
+            .map(|(sequence, _)| sequence)
     }
 
     /// As [`publish_next`](Self::publish_next), but does not wait.
@@ -456,8 +462,10 @@ impl Writer {
             return Ok(Loan::copied(lender, lead, len));
         }
         let bytes = Area::rounded((lead + len) as u64);
-        let place =
-            self.retry_until(&mut PublishDeadline::new(PATIENCE), |state| self.lend(state, bytes))?;
+        let place = self
+            .retry_until(&mut PublishDeadline::new(KEEP_ALL_PUBLISH_TIMEOUT), |state| {
+                self.lend(state, bytes)
+            })?;
         Ok(Loan::placed(lender, lead, len, place))
     }
 

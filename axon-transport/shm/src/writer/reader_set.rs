@@ -19,7 +19,7 @@ use crate::{
     },
     wake::Purpose,
     writer::{
-        absent::{DepartedReaders, CarrierState},
+        absent::{CarrierState, DepartedReaders},
         attached::AttachedReader,
     },
 };
@@ -319,7 +319,8 @@ impl ReaderSet {
     #[inline]
     pub(crate) fn floors(&self, head: u64) -> LowWatermarks {
         let holds = holds(&self.offered);
-        let mut floors = LowWatermarks { retained: head.saturating_sub(self.window), held: u64::MAX };
+        let mut floors =
+            LowWatermarks { retained: head.saturating_sub(self.window), held: u64::MAX };
         for (reader, waits) in self.heeded() {
             if let Some(floor) = reader.floor(head) {
                 floors.retained = floors.retained.min(floor);
@@ -415,7 +416,8 @@ impl ReaderSet {
     /// samples are counted at their destination.
     pub(crate) fn unmet(&self, head: u64) -> Vec<(Gid, u64)> {
         let readers = self.asking(head).filter(|reader| !reader.is_carrier());
-        let samples = |reader: &AttachedReader| (head - reader.grant.first).min(depth(&reader.info.qos));
+        let samples =
+            |reader: &AttachedReader| (head - reader.grant.first).min(depth(&reader.info.qos));
         readers.map(|reader| (reader.info.gid, samples(reader))).collect()
     }
 

@@ -13,7 +13,9 @@ use crate::{
     graph::Endpoint,
     ids::Gid,
     qos::QosRequest,
-    session::{Client, EndpointSpec, NewDataCallback, Publisher, Server, SessionError, Subscription},
+    session::{
+        Client, EndpointSpec, NewDataCallback, Publisher, Server, SessionError, Subscription,
+    },
 };
 
 /// The largest size of a type's hash in bytes.

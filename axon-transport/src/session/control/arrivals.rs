@@ -1,7 +1,7 @@
 //! Remote endpoints that the graph does not show yet. An endpoint appears once its pairs with the session's own
 //! endpoints are attached, so that a counted endpoint can be reached.
 //!
-//! Plain data. An endpoint is delayed for [`PATIENCE`] at most: a stopped process must not hide endpoints from other
+//! Plain data. An endpoint is delayed for [`ARRIVAL_TIMEOUT`] at most: a stopped process must not hide endpoints from other
 //! processes.
 
 use std::{
@@ -12,7 +12,7 @@ use std::{
 use crate::{graph::GraphEntry, ids::Gid, wire::session::Pair};
 
 /// How long an endpoint is held back at most.
-pub(in crate::session) const PATIENCE: Duration = Duration::from_secs(1);
+pub(in crate::session) const ARRIVAL_TIMEOUT: Duration = Duration::from_secs(1);
 
 #[derive(Default)]
 pub(super) struct PendingEndpoints {
@@ -32,7 +32,7 @@ impl PendingEndpoints {
     /// Holds `entry` back until the pairs in `missing` stand.
     pub(super) fn hold(&mut self, entry: GraphEntry, missing: BTreeSet<Pair>, now: Instant) {
         let gid = entry.endpoint.gid;
-        let until = self.before.remove(&gid).unwrap_or(now + PATIENCE);
+        let until = self.before.remove(&gid).unwrap_or(now + ARRIVAL_TIMEOUT);
         self.arriving.insert(gid, PendingEndpoint { entry, missing, until });
     }
 
@@ -83,7 +83,10 @@ impl PendingEndpoints {
         self.before = arriving.into_iter().map(|(gid, arriving)| (gid, arriving.until)).collect();
     }
 
-    fn take_where(&mut self, mut which: impl FnMut(&mut PendingEndpoint) -> bool) -> Vec<GraphEntry> {
+    fn take_where(
+        &mut self,
+        mut which: impl FnMut(&mut PendingEndpoint) -> bool,
+    ) -> Vec<GraphEntry> {
         let taken = self.arriving.extract_if(|_, arriving| which(arriving));
         taken.map(|(_, arriving)| arriving.entry).collect()
     }
@@ -131,15 +134,15 @@ mod tests {
     fn none_is_held_back_for_ever() {
         let (mut arrivals, now) = (PendingEndpoints::default(), Instant::now());
         arrivals.hold(entry(8), [pair(1, 8)].into(), now);
-        arrivals.hold(entry(9), [pair(1, 9)].into(), now + PATIENCE / 2);
-        assert_eq!(arrivals.due(), Some(now + PATIENCE));
+        arrivals.hold(entry(9), [pair(1, 9)].into(), now + ARRIVAL_TIMEOUT / 2);
+        assert_eq!(arrivals.due(), Some(now + ARRIVAL_TIMEOUT));
         assert!(arrivals.overdue(now).is_empty());
-        assert_eq!(shown(arrivals.overdue(now + PATIENCE)), [gid(8)]);
+        assert_eq!(shown(arrivals.overdue(now + ARRIVAL_TIMEOUT)), [gid(8)]);
         // Being told of it again and again makes it no longer.
         arrivals.restart();
         assert!(arrivals.due().is_none());
-        arrivals.hold(entry(9), [pair(1, 9)].into(), now + PATIENCE);
-        assert_eq!(arrivals.due(), Some(now + PATIENCE / 2 + PATIENCE));
+        arrivals.hold(entry(9), [pair(1, 9)].into(), now + ARRIVAL_TIMEOUT);
+        assert_eq!(arrivals.due(), Some(now + ARRIVAL_TIMEOUT / 2 + ARRIVAL_TIMEOUT));
         assert_eq!(shown(arrivals.remove(&gid(9))), [gid(9)]);
         assert!(arrivals.pair_up(&pair(1, 9)).is_none());
     }

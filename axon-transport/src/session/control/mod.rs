@@ -132,8 +132,10 @@ impl ControlThread {
                 control.connected(connected)
             }
             FirstPeer::LocalRegistry(local_registry) => {
-                control.link =
-                    DaemonConnection::Local(InProcessDaemon::join(local_registry, &control.shared.core)?);
+                control.link = DaemonConnection::Local(InProcessDaemon::join(
+                    local_registry,
+                    &control.shared.core,
+                )?);
             }
             FirstPeer::Alone => {
                 control.link = DaemonConnection::Local(InProcessDaemon::alone(&control.shared.core))

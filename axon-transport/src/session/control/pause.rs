@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 const MIN_PAUSE: Duration = Duration::from_millis(100);
 const MAX_PAUSE: Duration = Duration::from_secs(2);
 /// A connection that lasted less was as good as refused.
-const BRIEF: Duration = Duration::from_secs(1);
+const MIN_CONNECTION_TIME: Duration = Duration::from_secs(1);
 
 /// The pause before the search for a daemon: a connection that does not last is not made again at once, at the cost of
 /// all other sessions.
@@ -27,7 +27,7 @@ impl ReconnectPause {
 
     /// Returns how long the search waits.
     pub(super) fn handle_lost(&mut self, now: Instant) -> Duration {
-        self.pause = if now.saturating_duration_since(self.since) < BRIEF {
+        self.pause = if now.saturating_duration_since(self.since) < MIN_CONNECTION_TIME {
             next(self.pause)
         } else {
             Duration::ZERO
@@ -51,11 +51,11 @@ mod tests {
         let mut pause = ReconnectPause::new(now);
         for millis in [100, 200, 400, 800, 1600, 2000, 2000] {
             pause.handle_connected(now);
-            now += BRIEF / 2;
+            now += MIN_CONNECTION_TIME / 2;
             assert_eq!(pause.handle_lost(now), Duration::from_millis(millis));
         }
         pause.handle_connected(now);
-        now += BRIEF;
+        now += MIN_CONNECTION_TIME;
         assert_eq!(pause.handle_lost(now), Duration::ZERO, "it lasted");
         pause.handle_connected(now);
         assert_eq!(pause.handle_lost(now), MIN_PAUSE);

@@ -98,7 +98,7 @@ pub enum AddressError {
 }
 
 /// Between attempts to reach the owner of a name.
-const PAUSE: Duration = Duration::from_millis(10);
+const RETRY_INTERVAL: Duration = Duration::from_millis(10);
 /// How often the owner of a name is called that may be about to listen.
 const CALLS: u32 = 20;
 
@@ -313,7 +313,7 @@ fn is_served(name: &str) -> Result<bool, AddressError> {
         match call(&name) {
             Ok(socket) => return Ok(is_own(&socket)),
             // A daemon that is starting has bound it and does not listen yet.
-            Err(_) => std::thread::sleep(PAUSE),
+            Err(_) => std::thread::sleep(RETRY_INTERVAL),
         }
     }
     Ok(false)

@@ -24,7 +24,7 @@ use crate::{
 };
 
 /// How long a daemon may take to come up and answer.
-const PATIENCE: Duration = Duration::from_secs(20);
+const DAEMON_CONNECT_TIMEOUT: Duration = Duration::from_secs(20);
 /// How soon a daemon is to answer that has the address.
 const AFTER: Duration = Duration::from_millis(500);
 /// How often an address may be found bound with nobody listening there. A daemon listens at once.
@@ -66,7 +66,7 @@ impl<'a> Caller<'a> {
     /// Connects to the daemon, which is started when there is none and the policy says so.
     pub(crate) fn connect(&self) -> Result<Connected, SessionError> {
         let address = Address::of(self.config);
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Instant::now() + DAEMON_CONNECT_TIMEOUT;
         let mut pause = Duration::from_millis(2);
         // A daemon that is on its way out, or another's that comes up, is worth some patience
         // before one is started: only one of many that start at once gets the address.
@@ -144,7 +144,7 @@ impl<'a> Caller<'a> {
         &self,
         socket: OwnedFd,
     ) -> Result<Connected, SessionError> {
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Instant::now() + DAEMON_CONNECT_TIMEOUT;
         self.greet(socket, "the daemon's socket pair", std::process::id(), deadline).map_err(
             |attempt| match attempt {
                 Attempt::Final(error) => error,

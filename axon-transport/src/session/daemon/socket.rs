@@ -114,7 +114,7 @@ pub fn receive_few(
     socket: impl AsFd,
     buffer: &mut Vec<u8>,
 ) -> Result<ReceivedMessage, SocketError> {
-    const { assert!(MAX_DESCRIPTORS <= descriptors::FEW) };
+    const { assert!(MAX_DESCRIPTORS <= descriptors::FEW_DESCRIPTORS) };
     buffer.resize(MAX_PACKET + 1, 0);
     let packet = match descriptors::receive_few(&socket, buffer) {
         Err(Errno::CONNRESET) => descriptors::receive_few(&socket, buffer),

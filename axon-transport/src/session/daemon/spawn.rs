@@ -31,7 +31,7 @@ pub const SPAWNED: &str = "--spawned";
 pub const DETACHED: &str = "--detached";
 
 /// How long a daemon may take to say how it is.
-const PATIENCE: Duration = Duration::from_secs(15);
+const DAEMON_START_TIMEOUT: Duration = Duration::from_secs(15);
 /// The most that is read from the start-up pipe.
 const MAX_REPORT: usize = 8192;
 
@@ -239,14 +239,17 @@ fn chosen(config: &Config) -> [(&'static str, String); 3] {
 }
 
 fn read_report(pipe: OwnedFd, cancelled: &dyn Fn() -> bool) -> String {
-    let deadline = Instant::now() + PATIENCE;
+    let deadline = Instant::now() + DAEMON_START_TIMEOUT;
     let mut file = std::fs::File::from(pipe);
     let mut report = Vec::new();
     let mut buffer = [0; 1024];
     while !report.contains(&b'\n') && report.len() < MAX_REPORT {
         let left = deadline.saturating_duration_since(Instant::now());
         if left.is_zero() || cancelled() {
-            return format!("error: it did not come up within {} s", PATIENCE.as_secs());
+            return format!(
+                "error: it did not come up within {} s",
+                DAEMON_START_TIMEOUT.as_secs()
+            );
         }
         let slice = Timespec::try_from(left.min(Duration::from_millis(100))).unwrap_or_default();
         let mut fds = [PollFd::new(&file, PollFlags::IN)];

@@ -186,7 +186,10 @@ impl Client {
     ///
     /// # Errors
     /// As there.
-    pub fn set_on_new_response(&self, callback: Option<NewDataCallback>) -> Result<(), SessionError> {
+    pub fn set_on_new_response(
+        &self,
+        callback: Option<NewDataCallback>,
+    ) -> Result<(), SessionError> {
         set_callback(&self.responses, callback, &self.session)
     }
 

@@ -17,7 +17,7 @@ use crate::{
 };
 
 /// How long a response waits for a client whose request came before it could be answered.
-const PATIENCE: Duration = Duration::from_millis(100);
+const CLIENT_MATCH_TIMEOUT: Duration = Duration::from_millis(100);
 
 /// Answers requests. Thread-safe.
 ///
@@ -110,7 +110,7 @@ impl Server {
         // Its request may have come before it could be answered.
         let settled = || ring().is_some() || !self.requests.lock().writers().contains(&client);
         if !settled() {
-            self.session.wait_changed(PATIENCE, settled);
+            self.session.wait_changed(CLIENT_MATCH_TIMEOUT, settled);
         }
         let Some(ring) = ring() else { return Ok(()) };
         let meta = Meta::at_nanos(sequence, clock::wall());
@@ -188,7 +188,10 @@ impl Server {
     ///
     /// # Errors
     /// As there.
-    pub fn set_on_new_request(&self, callback: Option<NewDataCallback>) -> Result<(), SessionError> {
+    pub fn set_on_new_request(
+        &self,
+        callback: Option<NewDataCallback>,
+    ) -> Result<(), SessionError> {
         set_callback(&self.requests, callback, &self.session)
     }
 

@@ -76,10 +76,10 @@ pub enum Waitable<'a> {
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Ready(SmallVec<[usize; FEW]>);
+pub struct Ready(SmallVec<[usize; USUAL_READY]>);
 
 /// So many are mostly ready at the same time, at most.
-const FEW: usize = 8;
+const USUAL_READY: usize = 8;
 
 /// The part of a [`Waitable`] that is looked at.
 #[derive(Clone, Copy)]

@@ -6,9 +6,9 @@
 use std::time::{Duration, Instant};
 
 /// Pairs on one host take less than this.
-const SHORT: Duration = Duration::from_millis(5);
+const LOCAL_PAIR_TIME: Duration = Duration::from_millis(5);
 /// After a longer wait others do not wait for so many times as long.
-const PAUSE: u32 = 9;
+const PAUSE_FACTOR: u32 = 9;
 
 /// The waits of one session.
 #[derive(Debug, Default)]
@@ -24,8 +24,8 @@ impl PairWaits {
 
     /// One that did has waited for so long.
     pub(super) fn waited(&mut self, time: Duration, now: Instant) {
-        if time > SHORT {
-            self.not_before = Some(now + PAUSE * time);
+        if time > LOCAL_PAIR_TIME {
+            self.not_before = Some(now + PAUSE_FACTOR * time);
         }
     }
 }
@@ -56,8 +56,8 @@ mod tests {
         let (mut waits, mut now) = (PairWaits::default(), Instant::now());
         for _ in 0..1000 {
             assert!(waits.are_due(now));
-            now += SHORT;
-            waits.waited(SHORT, now);
+            now += LOCAL_PAIR_TIME;
+            waits.waited(LOCAL_PAIR_TIME, now);
         }
     }
 }

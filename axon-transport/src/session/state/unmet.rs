@@ -9,7 +9,7 @@ use std::collections::VecDeque;
 use crate::wire::session::Unmet;
 
 /// Pairs that a session remembers.
-const REMEMBERED: usize = 1024;
+const MAX_UNMET_PAIRS: usize = 1024;
 
 /// The pairs of a session's publishers that ended with readers that had not taken up their grant.
 #[derive(Debug, Default)]
@@ -29,11 +29,11 @@ impl UnmetPairs {
     }
 
     pub(in crate::session) fn remember(&mut self, unmet: Unmet) {
-        if self.pairs.len() == REMEMBERED {
+        if self.pairs.len() == MAX_UNMET_PAIRS {
             self.pairs.pop_front();
             if !std::mem::replace(&mut self.full, true) {
                 tracing::warn!(
-                    "more than {REMEMBERED} readers were never told of a publisher of this session \
+                    "more than {MAX_UNMET_PAIRS} readers were never told of a publisher of this session \
                      that ended: the oldest of them do not count what they lost if the daemon is \
                      killed before it has told them"
                 );
@@ -52,9 +52,9 @@ mod tests {
     fn the_oldest_pair_is_forgotten_beyond_the_bound() {
         let mut pairs = UnmetPairs::default();
         let [reader, writer] = [1, 2].map(|session| Gid::new(SessionId([session; 16]), 1));
-        for samples in 0..=REMEMBERED as u64 {
+        for samples in 0..=MAX_UNMET_PAIRS as u64 {
             pairs.remember(Unmet { reader, writer, samples });
         }
-        assert_eq!((pairs.iter().count(), pairs.pairs[0].samples), (REMEMBERED, 1));
+        assert_eq!((pairs.iter().count(), pairs.pairs[0].samples), (MAX_UNMET_PAIRS, 1));
     }
 }

@@ -220,7 +220,7 @@ fn in_time(mut attempt: impl FnMut() -> bool) {
     for _ in 0..100 {
         let begun = Instant::now();
         let held = attempt();
-        if begun.elapsed() < arrivals::PATIENCE {
+        if begun.elapsed() < arrivals::ARRIVAL_TIMEOUT {
             assert!(held, "it was counted before it was reached");
             return;
         }

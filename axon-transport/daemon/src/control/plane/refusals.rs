@@ -10,7 +10,7 @@ use axon_transport::status::RefusalStatus;
 use crate::{bridge::RefusalKind, engine::links::place};
 
 /// Refusals that are remembered.
-const MOST: usize = 32;
+const MAX_REFUSALS: usize = 32;
 /// Of these, refusals of somebody who proves nothing.
 const MOST_UNPROVEN: usize = 8;
 
@@ -33,7 +33,7 @@ impl Refusals {
         let own = self.0.iter().filter(|(kind, _)| RefusalShare::of(*kind) == share).count();
         if share == RefusalShare::Unproven && own >= MOST_UNPROVEN {
             self.make_room(share, source(&new));
-        } else if self.0.len() >= MOST {
+        } else if self.0.len() >= MAX_REFUSALS {
             self.make_room(self.largest(share), source(&new));
         }
         self.0.push((kind, new));
@@ -202,12 +202,12 @@ mod tests {
             }
             (0..1000).for_each(|n| add(&mut refusals, flood, "flood", &n.to_string()));
             assert_eq!(of(&refusals, "honest").len(), 10, "{flood:?}");
-            assert_eq!(of(&refusals, "flood").len(), MOST - 10, "all places are of use");
+            assert_eq!(of(&refusals, "flood").len(), MAX_REFUSALS - 10, "all places are of use");
             // Another kind has its share when it comes late.
             let late = kinds.into_iter().find(|kind| *kind != flood).unwrap();
             (5..11).for_each(|n| add(&mut refusals, late, "honest", &format!("{late:?} {n}")));
             assert_eq!(of(&refusals, "honest").len(), 16, "{flood:?}");
-            assert_eq!(refusals.iter().count(), MOST);
+            assert_eq!(refusals.iter().count(), MAX_REFUSALS);
         }
     }
 

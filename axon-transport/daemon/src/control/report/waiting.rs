@@ -18,7 +18,7 @@ use axon_transport::internal::{
 use crate::bridge::RefusedRoute;
 
 /// Endpoints that are told of one peer's routes, while it is linked.
-const MOST: usize = 4096;
+const MAX_WAITING_ENDPOINTS: usize = 4096;
 
 type DaemonRegistry = Registry<Arc<PassedFd>>;
 
@@ -90,7 +90,10 @@ impl NotifiedEndpoints {
             let told = self.0.entry(peer.to_owned()).or_default();
             let gid = local.endpoint.gid;
             // One that is told everything anew would not hear of it: it is told with the next report.
-            if told.len() == MOST || registry.is_told_anew(&local.session) || !told.insert(gid) {
+            if told.len() == MAX_WAITING_ENDPOINTS
+                || registry.is_told_anew(&local.session)
+                || !told.insert(gid)
+            {
                 continue;
             }
             let text = format!(

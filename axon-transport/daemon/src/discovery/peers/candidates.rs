@@ -5,7 +5,7 @@ use std::net::{IpAddr, SocketAddr};
 use crate::discovery::Interface;
 
 /// Most addresses in one dial.
-const MOST: usize = 8;
+const MAX_DIAL_ADDRESSES: usize = 8;
 
 /// What this host's addresses say about others.
 #[derive(Debug, Default)]
@@ -61,7 +61,7 @@ impl LocalAddresses {
             let good = is_unicast(address.ip())
                 && self.can_reach(address.ip())
                 && (local || !address.ip().is_loopback());
-            if good && !candidates.contains(address) && candidates.len() < MOST {
+            if good && !candidates.contains(address) && candidates.len() < MAX_DIAL_ADDRESSES {
                 candidates.push(*address);
             }
         }

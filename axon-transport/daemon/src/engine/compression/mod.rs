@@ -31,11 +31,11 @@ const SHARE: f64 = 0.3;
 /// What a sample takes to the compressor's thread and back.
 const THERE_AND_BACK: Duration = Duration::from_micros(100);
 /// The share of a sample that compression has to save, as a divisor.
-const SAVES: usize = 10;
+const MIN_SAVING_DIVISOR: usize = 10;
 /// Bytes that are with the compressor at once, unless it is one sample.
-const MOST: usize = 4 << 20;
+const MAX_COMPRESSOR_BYTES: usize = 4 << 20;
 /// Compressed samples that are kept for the other peers that will ask for them, in bytes.
-const KEPT: usize = 4 << 20;
+const MAX_SHARED_BYTES: usize = 4 << 20;
 /// The compressor's speed is that of about so many last bytes.
 const MEASURED: f64 = (8 << 20) as f64;
 /// Its speed before the first sample, in bytes a second.
@@ -80,7 +80,7 @@ impl Compressor {
         now: impl Fn() -> Duration,
     ) -> CompressionAnswer {
         let begun = now();
-        let most = order.payload.len() - order.payload.len().div_ceil(SAVES);
+        let most = order.payload.len() - order.payload.len().div_ceil(MIN_SAVING_DIVISOR);
         let compressed = self.0.as_mut().and_then(|zstd| {
             let mut frame = Vec::with_capacity(most);
             // An error: the frame would be longer.
@@ -229,7 +229,7 @@ impl Compression {
             }
         }
         let length = payload.len();
-        if state.pending_bytes > 0 && state.pending_bytes + length > MOST {
+        if state.pending_bytes > 0 && state.pending_bytes + length > MAX_COMPRESSOR_BYTES {
             return None;
         }
         state.number += 1;
@@ -249,7 +249,11 @@ impl Compression {
     }
 
     /// The owner answers an order. Returns the flows that asked.
-    pub(crate) fn handle_answer(&self, now: Duration, answer: &CompressionAnswer) -> Vec<RequestingFlow> {
+    pub(crate) fn handle_answer(
+        &self,
+        now: Duration,
+        answer: &CompressionAnswer,
+    ) -> Vec<RequestingFlow> {
         let mut state = self.0.borrow_mut();
         state.used = now;
         let Some(PendingOrder { name, length, askers }) = state.pending.remove(&answer.number)
@@ -276,7 +280,7 @@ impl OrderState {
         } else {
             self.kept_order.push_back(name);
         }
-        while self.kept_bytes > KEPT
+        while self.kept_bytes > MAX_SHARED_BYTES
             && let Some(oldest) =
                 self.kept_order.pop_front().and_then(|name| self.kept.remove(&name))
         {

@@ -159,7 +159,7 @@ fn orders_and_answers_that_are_kept_take_bounded_memory() {
     }
     let state = compression.0.borrow();
     assert_eq!((state.pending_bytes, state.pending.len(), state.named.len()), (0, 0, 0));
-    assert!(state.kept_bytes <= KEPT && state.kept.len() == 5, "{}", state.kept.len());
+    assert!(state.kept_bytes <= MAX_SHARED_BYTES && state.kept.len() == 5, "{}", state.kept.len());
     drop(state);
     for number in 101..=100_000 {
         let Some(CompressionReply::Later(order)) =
@@ -172,7 +172,7 @@ fn orders_and_answers_that_are_kept_take_bounded_memory() {
             &CompressionAnswer { number: order, compressed: None, took: Duration::ZERO },
         );
     }
-    assert_eq!(compression.0.borrow().kept.len(), KEPT / SHORTEST);
+    assert_eq!(compression.0.borrow().kept.len(), MAX_SHARED_BYTES / SHORTEST);
 }
 
 #[test]

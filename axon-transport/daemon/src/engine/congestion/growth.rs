@@ -19,7 +19,7 @@ const PAYS: f64 = 0.3;
 const AVERAGED: f64 = 1.0 / 16.0;
 const MOST_DISPERSED: f64 = 8.0;
 /// Rounds to wait before growth is tried again where it did not pay, at first and at most.
-const PATIENCE: (u32, u32) = (4, 64);
+const RETRY_ROUNDS: (u32, u32) = (4, 64);
 
 /// Some rounds over which the window may have grown.
 #[derive(Debug, Clone)]
@@ -174,7 +174,7 @@ impl Growth {
         self.cut = Some(lost);
         self.trial = Trial::new(smaller, is_futile.then_some(rate));
         if is_futile {
-            self.patience = (self.patience * 2).clamp(PATIENCE.0, PATIENCE.1);
+            self.patience = (self.patience * 2).clamp(RETRY_ROUNDS.0, RETRY_ROUNDS.1);
             self.waiting = self.patience;
         }
         Some(smaller)

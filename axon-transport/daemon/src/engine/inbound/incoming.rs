@@ -16,7 +16,7 @@ pub(super) const RELIABLE: u8 = 1;
 /// A stream of one BEST_EFFORT sample.
 pub(super) const BEST_EFFORT: u8 = 2;
 /// A flag: the messages have short headers.
-const SHORT: u8 = 1;
+const SHORT_HEADERS: u8 = 1;
 /// A flag: RECEIVED is awaited for these requests or responses, and responses are numbered by their flow.
 const ACKNOWLEDGED: u8 = 2;
 
@@ -51,7 +51,7 @@ impl StreamHeader {
         if !matches!(kind, RELIABLE | BEST_EFFORT) {
             return Err("a data stream of unknown kind");
         }
-        if flags[0] & !(SHORT | ACKNOWLEDGED) != 0 || flags[1..] != [0; 2] {
+        if flags[0] & !(SHORT_HEADERS | ACKNOWLEDGED) != 0 || flags[1..] != [0; 2] {
             return Err("a data stream with unknown flags");
         }
         let (mut number, mut gid) = ([0; 4], [0; 16]);
@@ -59,7 +59,7 @@ impl StreamHeader {
         gid.copy_from_slice(of);
         Ok(Self {
             reliable: kind == RELIABLE,
-            short: flags[0] & SHORT != 0,
+            short: flags[0] & SHORT_HEADERS != 0,
             acknowledged: flags[0] & ACKNOWLEDGED != 0,
             route: u32::from_be_bytes(number),
             of: Gid(gid),
@@ -76,7 +76,7 @@ impl StreamHeader {
     pub(crate) fn encode(&self) -> [u8; HEADER] {
         let mut header = [0; HEADER];
         header[0] = if self.reliable { RELIABLE } else { BEST_EFFORT };
-        header[1] = if self.short { SHORT } else { 0 };
+        header[1] = if self.short { SHORT_HEADERS } else { 0 };
         header[1] |= if self.acknowledged { ACKNOWLEDGED } else { 0 };
         header[4..8].copy_from_slice(&self.route.to_be_bytes());
         header[8..].copy_from_slice(&self.of.0);

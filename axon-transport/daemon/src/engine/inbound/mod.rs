@@ -50,7 +50,7 @@ use crate::{
 const ARRIVAL: Duration = Duration::from_secs(2);
 /// A message longer than this waits for memory before any byte of it is read. A shorter message takes memory
 /// only if it does not arrive at once.
-const LONG: usize = 32 << 10;
+const LONG_MESSAGE_BYTES: usize = 32 << 10;
 /// Bytes of a stream that are read before other streams have their turn.
 const TURN: usize = 1 << 20;
 /// Time after which a stream with a full ring tries again if no reader signals room.
@@ -157,7 +157,7 @@ impl Inbound {
             full: HashSet::new(),
             without_room: StreamQueue::default(),
             limited: RateLimitedStreams::default(),
-            spare: Meter::new(LONG),
+            spare: Meter::new(LONG_MESSAGE_BYTES),
             full_retry: None,
             exceeded: None,
             released: intake.released(),

@@ -7,7 +7,7 @@ use axon_shm::{Meta, ids::Gid};
 use bytes::Bytes;
 
 use super::{
-    ARRIVAL, ENDED, Inbound, LONG, LinkViolation, NO_ROUTE, StreamKey, TURN,
+    ARRIVAL, ENDED, Inbound, LONG_MESSAGE_BYTES, LinkViolation, NO_ROUTE, StreamKey, TURN,
     incoming::{HEADER, IncomingStream, OpenedMessage, Piece, StreamHeader, StreamStep},
 };
 use crate::{
@@ -131,7 +131,7 @@ impl Inbound {
                 Ok(StepOutcome::Go)
             }
             StreamStep::Room(length) => {
-                if length > LONG {
+                if length > LONG_MESSAGE_BYTES {
                     // One message may always be read, however long.
                     let Some(room) = self.intake.long.charge(length.min(self.intake.long.most()))
                     else {
@@ -253,7 +253,7 @@ impl Inbound {
     ) -> Result<StepOutcome, LinkViolation> {
         let length = unpacked_length(&header, self.max_message).map_err(refused)?;
         let has = stream.room.as_ref().map_or(0, Charge::amount);
-        let is_long = length > LONG;
+        let is_long = length > LONG_MESSAGE_BYTES;
         let most = if is_long { self.intake.long.most() } else { length };
         let more = length.min(most).saturating_sub(has);
         if more > 0 && stream.unpacked.is_none() {

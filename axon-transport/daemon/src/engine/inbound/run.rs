@@ -6,7 +6,7 @@ use axon_envelope::{Kind, Route};
 use bytes::{Buf, Bytes};
 
 use super::{
-    ENDED, Inbound, LONG, LinkViolation, RouteIn, StreamKey,
+    ENDED, Inbound, LONG_MESSAGE_BYTES, LinkViolation, RouteIn, StreamKey,
     incoming::{IncomingStream, OpenedMessage, StreamHeader, StreamStep},
     reading::{StepOutcome, malformed, permit_short, refused, told},
 };
@@ -164,5 +164,5 @@ impl Inbound {
 fn next_body(chunk: &Bytes, most: u64) -> Option<&[u8]> {
     let (length, rest) = chunk.split_first_chunk::<LENGTH>()?;
     let length = u32::from_be_bytes(*length) as usize;
-    if length > LONG || length as u64 > most { None } else { rest.get(..length) }
+    if length > LONG_MESSAGE_BYTES || length as u64 > most { None } else { rest.get(..length) }
 }

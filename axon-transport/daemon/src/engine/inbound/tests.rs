@@ -282,7 +282,7 @@ fn a_short_header_that_is_none_ends_the_link() {
 #[test]
 fn steps_read_samples_that_are_long_or_of_a_service() {
     let mut way = Way::new(Kind::Topic, true, 1000);
-    let piece = way.message(1, &[0; super::LONG]);
+    let piece = way.message(1, &[0; super::LONG_MESSAGE_BYTES]);
     assert!(matches!(way.read(piece.clone()), Ok(None)));
     assert_eq!(way.stream.chunk.len(), piece.len());
     let mut way = Way::new(Kind::Request, false, 1000);

@@ -12,7 +12,7 @@ use axon_transport::{access::EgressLimit, status::LimitStatus};
 use super::{interfaces::InterfaceLimits, rate_bucket::BucketLevel};
 
 /// What may leave at once, in seconds of the limit, and at least in bytes: a few packets.
-const AT_ONCE: (f64, f64) = (0.005, 6000.0);
+const BURST: (f64, f64) = (0.005, 6000.0);
 /// Packets are handed to the kernel together up to so many bytes.
 const PACKET: f64 = 1500.0;
 /// QUIC holds what leaves in so much longer than a round trip.
@@ -40,7 +40,7 @@ impl EgressCap {
     }
 
     fn new(limit: &EgressLimit, interface: Option<String>) -> Self {
-        let most = (limit.bytes * AT_ONCE.0).max(AT_ONCE.1);
+        let most = (limit.bytes * BURST.0).max(BURST.1);
         let level = RefCell::new(BucketLevel::full(limit.bytes, most));
         Self { limit: limit.clone(), interface, level, packets: Cell::default() }
     }

@@ -25,10 +25,10 @@ pub(crate) use self::{egress::Egress, interfaces::InterfaceLimits};
 use self::{egress::EgressCap, flow_queue::FlowQueue, rate_bucket::RateBucket};
 
 /// The most limits that status lists.
-const LISTED: usize = 64;
+const MAX_LISTED_LIMITS: usize = 64;
 /// Topics whose limits are remembered while no route has them. Otherwise a route that is requested again, or
 /// a new link, would start with a full bucket.
-const REMEMBERED: usize = 1024;
+const MAX_IDLE_TOPICS: usize = 1024;
 /// The longest time, per flow before it, after which a waiting flow asks again.
 const ASK_AGAIN: Duration = Duration::from_millis(20);
 /// The name in status of a limit on all topics together.
@@ -133,7 +133,7 @@ impl IdentityLimits {
         let mut all = self.uses.borrow_mut();
         let in_use =
             |limits: &Vec<Rc<Limit>>| limits.iter().any(|limit| Rc::strong_count(limit) > 1);
-        if all.len() >= REMEMBERED.max(2 * self.kept.get()) && !all.contains_key(&scope) {
+        if all.len() >= MAX_IDLE_TOPICS.max(2 * self.kept.get()) && !all.contains_key(&scope) {
             all.retain(|_, limits| in_use(limits));
             self.kept.set(all.len());
         }
@@ -184,8 +184,8 @@ impl IdentityLimits {
             other.dropped.cmp(&one.dropped).then_with(|| key(one).cmp(&key(other)))
         });
         status.limits.extend(self.egress.borrow().iter().map(|cap| cap.status()));
-        status.more_limits = limits.len().saturating_sub(LISTED);
-        status.limits.extend(limits.iter().take(LISTED).map(|limit| {
+        status.more_limits = limits.len().saturating_sub(MAX_LISTED_LIMITS);
+        status.limits.extend(limits.iter().take(MAX_LISTED_LIMITS).map(|limit| {
             let mut of = LimitStatus::default();
             of.verb = limit.scope.verb.name().to_owned();
             of.name = limit.scope.topics.text();
@@ -412,7 +412,7 @@ pub(crate) mod tests {
         for number in 0..100_000 {
             of(&all, Verb::Subscribe, &format!("/{number}"), rules);
         }
-        assert!(all.uses.borrow().len() <= REMEMBERED, "{}", all.uses.borrow().len());
+        assert!(all.uses.borrow().len() <= MAX_IDLE_TOPICS, "{}", all.uses.borrow().len());
     }
 
     #[test]

@@ -28,7 +28,7 @@ use crate::{
         quic::transport::{LINK_WINDOW, STREAMS_OPEN, window_credit},
         refusal::Refusal,
     },
-    link::{Candidate, CloseCode, Elected, ReceiveLimits, LinkHello, LinkMessage, Side, new_wins},
+    link::{Candidate, CloseCode, Elected, LinkHello, LinkMessage, ReceiveLimits, Side, new_wins},
 };
 
 /// The peer elects one of its connections within this time.

@@ -8,12 +8,12 @@ use std::{net::SocketAddr, time::Duration};
 use crate::discovery::Datagrams;
 
 /// Datagrams that go on at once, and how many more of them each second.
-const AT_ONCE: f64 = 32.0;
+const DATAGRAM_BURST: f64 = 32.0;
 const A_SECOND: f64 = 16.0;
 /// How long others are held at most.
-const HOLD: Duration = Duration::from_millis(40);
+const MAX_DATAGRAM_HOLD: Duration = Duration::from_millis(40);
 /// Datagrams that are held at most. The last quarter is for the addresses of listed peers and of links.
-const MOST: usize = 512;
+const MAX_HELD_DATAGRAMS: usize = 512;
 
 /// The datagrams that are held.
 #[derive(Debug)]
@@ -28,7 +28,12 @@ pub(super) struct DiscoveryInbox {
 impl DiscoveryInbox {
     /// An empty inbox.
     pub(super) fn new() -> Self {
-        Self { held: Datagrams::default(), due: None, tokens: AT_ONCE, filled: Duration::ZERO }
+        Self {
+            held: Datagrams::default(),
+            due: None,
+            tokens: DATAGRAM_BURST,
+            filled: Duration::ZERO,
+        }
     }
 
     /// A datagram came. `known` says whether it came from the address of a listed peer or of a link.
@@ -40,17 +45,17 @@ impl DiscoveryInbox {
         now: Duration,
     ) {
         let held = self.held.len();
-        if held >= MOST || (held >= MOST / 4 * 3 && !known()) {
+        if held >= MAX_HELD_DATAGRAMS || (held >= MAX_HELD_DATAGRAMS / 4 * 3 && !known()) {
             return;
         }
         self.held.push(from, bytes);
         let passed = now.saturating_sub(self.filled).as_secs_f64();
-        (self.tokens, self.filled) = ((self.tokens + passed * A_SECOND).min(AT_ONCE), now);
+        (self.tokens, self.filled) = ((self.tokens + passed * A_SECOND).min(DATAGRAM_BURST), now);
         let due = if self.tokens >= 1.0 {
             self.tokens -= 1.0;
             now
         } else {
-            now + HOLD
+            now + MAX_DATAGRAM_HOLD
         };
         self.due = Some(self.due.map_or(due, |other| other.min(due)));
     }
@@ -118,7 +123,7 @@ mod tests {
         inbox.add(from(2), &[8], || true, at(0));
         (0..10_000).for_each(|_| inbox.add(from(3), &[9; 512], || true, at(0)));
         let taken = inbox.take(at(0)).unwrap();
-        assert_eq!(taken.len(), MOST);
-        assert_eq!(taken.iter().nth(MOST / 4 * 3), Some((from(2), &[8][..])));
+        assert_eq!(taken.len(), MAX_HELD_DATAGRAMS);
+        assert_eq!(taken.iter().nth(MAX_HELD_DATAGRAMS / 4 * 3), Some((from(2), &[8][..])));
     }
 }

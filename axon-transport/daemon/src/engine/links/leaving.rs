@@ -8,7 +8,7 @@ use super::{
     LinkEvent, Links,
     link::{
         Link, LinkPhase,
-        hand_over::{HandOverProgress, HandOverStep, DrainingLink},
+        hand_over::{DrainingLink, HandOverProgress, HandOverStep},
     },
     silence::Traffic,
 };

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 /// The longest burst.
-const LONGEST: Duration = Duration::from_millis(500);
+const MAX_BURST: Duration = Duration::from_millis(500);
 
 /// The time for which samples may wait before the flow is behind. It is used up while samples wait, and comes back as
 /// fast while none does. So a flow that catches up for a moment, between two samples that are too many, stays behind.
@@ -19,7 +19,7 @@ pub(super) struct Burst {
 
 impl Default for Burst {
     fn default() -> Self {
-        Self { left: LONGEST, since: None, caught_up_at: Duration::ZERO }
+        Self { left: MAX_BURST, since: None, caught_up_at: Duration::ZERO }
     }
 }
 
@@ -28,7 +28,7 @@ impl Burst {
     pub(super) fn handle_waiting(&mut self, now: Duration) {
         if self.since.is_none() {
             let idle = now.saturating_sub(self.caught_up_at);
-            self.left = self.left.saturating_add(idle).min(LONGEST);
+            self.left = self.left.saturating_add(idle).min(MAX_BURST);
             self.since = Some(now);
         }
     }

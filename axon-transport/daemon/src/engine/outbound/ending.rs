@@ -7,9 +7,9 @@ use std::{collections::HashMap, time::Duration};
 use axon_shm::ids::Gid;
 
 /// The samples of an ended publisher are given up after this time without progress.
-const PATIENCE: Duration = Duration::from_secs(10);
+const PROGRESS_TIMEOUT: Duration = Duration::from_secs(10);
 /// Time between two checks.
-const LOOK: Duration = Duration::from_millis(250);
+const CHECK_INTERVAL: Duration = Duration::from_millis(250);
 /// The most ended publishers whose samples wait for one peer.
 const MAX_PUBLISHERS: usize = 1024;
 
@@ -151,7 +151,7 @@ impl PublisherDrains {
         if self.poll_timeout().is_none_or(|due| due > now) {
             return over;
         }
-        self.next = Some(now + LOOK);
+        self.next = Some(now + CHECK_INTERVAL);
         self.publishers.retain(|publisher, ending| {
             let Some(left) = left_of(ending.route, publisher) else {
                 over.push(FinishedPublisher { publisher: *publisher, given_up: None });
@@ -162,7 +162,7 @@ impl PublisherDrains {
             if progress != ending.progress || is_excused {
                 (ending.progress, ending.since) = (progress, now);
             }
-            let waits = now.saturating_sub(ending.since) < PATIENCE;
+            let waits = now.saturating_sub(ending.since) < PROGRESS_TIMEOUT;
             if waits {
                 let (number, publisher) = (ending.number, *publisher);
                 let bytes = ending.bytes_of(samples, || bytes_of(route, &publisher));
@@ -257,16 +257,16 @@ mod tests {
     fn samples_without_progress_are_given_up() {
         let given_up = FinishedPublisher { publisher: PUBLISHER, given_up: stuck(1, 5) };
         let (at, over) = over_after(|_| left(5, 0, false));
-        assert_eq!((at, over), (PATIENCE, vec![given_up]));
+        assert_eq!((at, over), (PROGRESS_TIMEOUT, vec![given_up]));
     }
 
     #[test]
     fn progress_and_an_excuse_begin_the_patience_again() {
         let last = Duration::from_secs(30);
         let (at, _) = over_after(|now| left(5, now.min(last).as_secs(), false));
-        assert_eq!(at, last + PATIENCE);
+        assert_eq!(at, last + PROGRESS_TIMEOUT);
         let (at, _) = over_after(|now| left(5, 0, now <= last));
-        assert_eq!(at, last + PATIENCE);
+        assert_eq!(at, last + PROGRESS_TIMEOUT);
     }
 
     #[test]
@@ -275,7 +275,8 @@ mod tests {
         endings.add(1, PUBLISHER, Duration::ZERO);
         let moved = |route: u32| DrainedFlow { route, ..left(5, 0, false).unwrap() };
         assert!(endings.handle_timeout(Duration::ZERO, |_, _| Some(moved(2)), no_bytes).is_empty());
-        let given_up = endings.handle_timeout(PATIENCE, |route, _| Some(moved(route)), no_bytes);
+        let given_up =
+            endings.handle_timeout(PROGRESS_TIMEOUT, |route, _| Some(moved(route)), no_bytes);
         assert_eq!(given_up[0].given_up, stuck(2, 5));
     }
 
@@ -283,11 +284,16 @@ mod tests {
     fn a_publisher_that_ends_twice_has_the_patience_of_its_first_end() {
         let mut endings = endings();
         endings.add(1, PUBLISHER, Duration::ZERO);
-        endings.add(1, PUBLISHER, PATIENCE / 2);
+        endings.add(1, PUBLISHER, PROGRESS_TIMEOUT / 2);
         assert!(
-            endings.handle_timeout(PATIENCE / 2, |_, _| left(5, 0, false), no_bytes).is_empty()
+            endings
+                .handle_timeout(PROGRESS_TIMEOUT / 2, |_, _| left(5, 0, false), no_bytes)
+                .is_empty()
         );
-        assert_eq!(endings.handle_timeout(PATIENCE, |_, _| left(5, 0, false), no_bytes).len(), 1);
+        assert_eq!(
+            endings.handle_timeout(PROGRESS_TIMEOUT, |_, _| left(5, 0, false), no_bytes).len(),
+            1
+        );
     }
 
     /// Ends the publishers with these numbers, each with 5 samples in `bytes`. Returns the publishers that
@@ -332,12 +338,12 @@ mod tests {
                 .handle_timeout(Duration::ZERO, |_, _| left(10, 0, false), |_, _| 1000)
                 .is_empty()
         );
-        endings.add(1, Gid([2; 16]), LOOK);
+        endings.add(1, Gid([2; 16]), CHECK_INTERVAL);
         // One sample of ten is left: 100 bytes.
         let left_of = |_, of: &Gid| left(if *of == PUBLISHER { 1 } else { 10 }, 1, false);
-        assert!(endings.handle_timeout(LOOK, left_of, |_, _| 900).is_empty());
-        endings.add(1, Gid([3; 16]), LOOK);
-        let over = endings.handle_timeout(LOOK, left_of, |_, _| 1);
+        assert!(endings.handle_timeout(CHECK_INTERVAL, left_of, |_, _| 900).is_empty());
+        endings.add(1, Gid([3; 16]), CHECK_INTERVAL);
+        let over = endings.handle_timeout(CHECK_INTERVAL, left_of, |_, _| 1);
         assert_eq!(over.len(), 1, "one byte too many");
         assert_eq!((over[0].publisher, over[0].given_up.unwrap().samples), (PUBLISHER, 1));
     }

@@ -38,7 +38,7 @@ pub(crate) use self::{
 };
 use self::{
     budget::Budget,
-    ending::{PublisherDrains, FinishedPublisher, GivenUpSamples},
+    ending::{FinishedPublisher, GivenUpSamples, PublisherDrains},
     flow::{Flow, FlowPause},
     pings::Pings,
     served::{FlowRoute, ServedFlows},

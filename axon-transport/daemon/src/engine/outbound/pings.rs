@@ -10,9 +10,9 @@ use std::{collections::HashMap, time::Duration};
 use super::schedule::FlowId;
 
 /// PINGs follow each other at half a round trip, at least at this distance.
-const LEAST: Duration = Duration::from_millis(3);
+const MIN_PING_INTERVAL: Duration = Duration::from_millis(3);
 /// PINGs after the last sample of a flow, where no acknowledgement ends them.
-const MOST: u8 = 100;
+const MAX_PINGS: u8 = 100;
 
 /// The samples on the way that PINGs follow.
 #[derive(Debug, Default)]
@@ -29,7 +29,7 @@ impl Pings {
     pub(super) fn handle_sent(&mut self, now: Duration, flow: FlowId, rtt: Duration) {
         self.flows.insert(flow, 0);
         self.sent = true;
-        self.due.get_or_insert(now + LEAST.max(rtt / 2));
+        self.due.get_or_insert(now + MIN_PING_INTERVAL.max(rtt / 2));
     }
 
     /// A flow is gone.
@@ -54,10 +54,10 @@ impl Pings {
         }
         self.flows.retain(|flow, pings| {
             *pings += 1;
-            *pings <= MOST && on_the_way(*flow)
+            *pings <= MAX_PINGS && on_the_way(*flow)
         });
         let is_over = self.flows.is_empty();
-        self.due = (!is_over).then(|| now + LEAST.max(rtt / 2));
+        self.due = (!is_over).then(|| now + MIN_PING_INTERVAL.max(rtt / 2));
         !std::mem::take(&mut self.sent) && !is_over
     }
 }
@@ -82,7 +82,7 @@ mod tests {
         let mut pings = Pings::default();
         assert_eq!(pings.poll_timeout(), None);
         pings.handle_sent(Duration::ZERO, 7, RTT);
-        assert_eq!(pings.poll_timeout(), Some(LEAST));
+        assert_eq!(pings.poll_timeout(), Some(MIN_PING_INTERVAL));
         // At 3 ms the sample itself had just been sent; then there are PINGs at 6, 9 and 12 ms.
         assert_eq!(count(&mut pings, |now| now < Duration::from_millis(15)), 3);
         pings.handle_sent(Duration::ZERO, 7, RTT);
@@ -94,7 +94,7 @@ mod tests {
     fn pings_end_where_nothing_says_that_a_sample_arrived() {
         let mut pings = Pings::default();
         pings.handle_sent(Duration::ZERO, 7, RTT);
-        assert_eq!(count(&mut pings, |_| true), u32::from(MOST) - 1);
+        assert_eq!(count(&mut pings, |_| true), u32::from(MAX_PINGS) - 1);
     }
 
     #[test]

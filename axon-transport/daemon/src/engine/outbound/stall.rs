@@ -19,7 +19,7 @@ use std::{collections::HashMap, time::Duration};
 use super::schedule::FlowId;
 
 /// Time between two checks.
-const LOOK: Duration = Duration::from_secs(1);
+const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 /// The longest time that one check counts: this host may have been suspended.
 const LONGEST_LOOK: Duration = Duration::from_secs(2);
 /// After this time without a frame of the peer, the link counts as faulty. Time then stands still for the
@@ -156,7 +156,7 @@ impl FlowStalls {
             returned: 0,
             starved: Duration::ZERO,
             looked: now,
-            next: now + LOOK,
+            next: now + CHECK_INTERVAL,
         }
     }
 
@@ -201,7 +201,7 @@ impl FlowStalls {
     /// Starts counting time when the first samples wait: there were no checks before.
     pub(super) fn handle_first(&mut self, now: Duration) {
         self.looked = self.looked.max(now);
-        self.next = self.next.max(now + LOOK);
+        self.next = self.next.max(now + CHECK_INTERVAL);
     }
 
     /// Returns whether flows have waited for credit for the limit without getting any. Then no waiting flow
@@ -227,7 +227,7 @@ impl FlowStalls {
             return found;
         }
         let passed = now.saturating_sub(self.looked).min(LONGEST_LOOK);
-        (self.looked, self.next) = (now, now + LOOK);
+        (self.looked, self.next) = (now, now + CHECK_INTERVAL);
         let hearing = self.listen(peer.heard, now);
         if peer.returned != self.returned || !peer.is_awaited {
             (self.returned, self.starved) = (peer.returned, Duration::ZERO);

@@ -15,10 +15,10 @@ use crate::engine::{
 };
 
 /// How long a relay is kept.
-const PATIENCE: Duration = Duration::from_secs(10);
+const RELAY_RETENTION: Duration = Duration::from_secs(10);
 /// The most kept relays. An identity gets half of the rest. The samples of further relays are given up at
 /// once.
-const MOST: usize = 2048;
+const MAX_KEPT_RELAYS: usize = 2048;
 
 /// The relays that are kept.
 pub(crate) struct KeptRelays {
@@ -55,7 +55,7 @@ impl KeptRelay {
 
 impl Default for KeptRelays {
     fn default() -> Self {
-        Self { all: Vec::new(), room: Meter::new(MOST), rooms: HashMap::new() }
+        Self { all: Vec::new(), room: Meter::new(MAX_KEPT_RELAYS), rooms: HashMap::new() }
     }
 }
 
@@ -66,7 +66,7 @@ impl KeptRelays {
             return room;
         }
         self.rooms.retain(|_, room| room.strong_count() > 0);
-        let room = Meter::within(&self.room, MOST);
+        let room = Meter::within(&self.room, MAX_KEPT_RELAYS);
         self.rooms.insert(identity.to_owned(), Rc::downgrade(&room));
         room
     }
@@ -89,7 +89,7 @@ impl KeptRelays {
                 let Some(place) = room.charge(1) else { continue };
                 let charges = [place, served.relays.split(1)];
                 let identity = identity.to_owned();
-                let (key, since, until) = (served.key.clone(), now, now + PATIENCE);
+                let (key, since, until) = (served.key.clone(), now, now + RELAY_RETENTION);
                 let unfinished = Rc::clone(&unfinished);
                 let lanes = served.lanes.split(lanes);
                 self.all.push(KeptRelay {
@@ -149,8 +149,8 @@ impl KeptRelays {
         let KeptRelay { reader, since, unfinished, .. } = self.all.swap_remove(at);
         reader.take_back();
         reader.set_stands_for(spec.stands_for.clone());
-        let kept = now.saturating_sub(since).min(PATIENCE);
-        let idle = limit * kept.as_millis() as u32 / (2 * PATIENCE.as_millis() as u32);
+        let kept = now.saturating_sub(since).min(RELAY_RETENTION);
+        let idle = limit * kept.as_millis() as u32 / (2 * RELAY_RETENTION.as_millis() as u32);
         let mut unfinished = Rc::unwrap_or_clone(unfinished);
         unfinished.values_mut().for_each(|flow| flow.keep(kept, idle));
         Some((reader, unfinished))

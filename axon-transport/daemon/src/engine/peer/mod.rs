@@ -167,7 +167,12 @@ impl Peer {
     }
 
     /// Moves the peer to a new link. The peer's routes stay; this side asks for its own routes again.
-    pub(super) fn succeed(&mut self, link: u64, binding: Option<ChannelBinding>, local: &LocalEndpoints) {
+    pub(super) fn succeed(
+        &mut self,
+        link: u64,
+        binding: Option<ChannelBinding>,
+        local: &LocalEndpoints,
+    ) {
         self.link = link;
         self.messages.succeed();
         self.remote.succeed();

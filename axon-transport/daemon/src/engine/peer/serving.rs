@@ -26,8 +26,8 @@ use crate::{
 /// A peer that lacks relays may ask for them again after this time.
 const ASK_AGAIN: Duration = Duration::from_secs(10);
 /// Memory of a route, in bytes, beside the names and subscribers of which it holds three copies.
-const ROUTE: usize = 2048;
-const COPIES: usize = 3;
+const ROUTE_BYTES: usize = 2048;
+const NAME_COPIES: usize = 3;
 /// The relays of a route.
 struct Relays {
     sources: Vec<Source>,
@@ -54,7 +54,7 @@ impl Peer {
         with: &PeerContext<'_>,
         now: Duration,
     ) -> Result<(), String> {
-        let bytes = ROUTE + COPIES * subscribe.bytes();
+        let bytes = ROUTE_BYTES + NAME_COPIES * subscribe.bytes();
         let Subscribe { route: number, topic, type_name, kind, last, .. } = subscribe;
         let subscribers = self.proven_only(subscribe.subscribers, &topic);
         let hash =

@@ -25,7 +25,7 @@ use self::{decisions::note_look, left_out::OmittedEndpoints, owners::Proven, ter
 use crate::{
     engine::account::{Account, Charge},
     link::GraphUpdate,
-    owner::{ChannelBinding, SessionPrefix, Proof, prefix_of},
+    owner::{ChannelBinding, Proof, SessionPrefix, prefix_of},
 };
 
 /// The changes of a peer's graph.

@@ -14,7 +14,7 @@ use axon_transport::internal::SessionKey;
 use crate::{
     engine::account::{Charge, Meter},
     link::{LinkMessage, MAX_PROOFS, Owners},
-    owner::{ChannelBinding, SessionPrefix, Proof, SessionKeys, prefix, prefix_of, prove},
+    owner::{ChannelBinding, Proof, SessionKeys, SessionPrefix, prefix, prefix_of, prove},
 };
 
 /// Shortest time between two searches for sessions without endpoints, when there are too many sessions.

@@ -5,7 +5,7 @@
 //! and the age in milliseconds. So most samples have 4 to 7 bytes of it where an inner header has 64.
 
 /// The longest header: two numbers of 64 bits and one of 32.
-const MOST: usize = 10 + 10 + 5;
+const MAX_HEADER_BYTES: usize = 10 + 10 + 5;
 
 /// What is told of a sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -25,7 +25,7 @@ pub(crate) struct ShortHeaders {
 
 /// A header's bytes.
 pub(crate) struct Encoded {
-    bytes: [u8; MOST],
+    bytes: [u8; MAX_HEADER_BYTES],
     length: usize,
 }
 
@@ -52,7 +52,7 @@ impl Encoded {
 impl ShortHeaders {
     /// Writes the header of the next sample.
     pub(crate) fn write(&mut self, told: ShortHeader) -> Encoded {
-        let mut encoded = Encoded { bytes: [0; MOST], length: 0 };
+        let mut encoded = Encoded { bytes: [0; MAX_HEADER_BYTES], length: 0 };
         // Differences wrap: a number or time of any value can follow any other.
         encoded.put(told.sequence.wrapping_sub(self.sequence));
         let later = told.source_timestamp.wrapping_sub(self.source_timestamp);

@@ -18,7 +18,7 @@ use secrecy::ExposeSecret;
 
 use super::{
     Completion,
-    limits::{Buckets, HandshakeSource, IN_FLIGHT, KEPT, PER_SOURCE, ProofBackoff},
+    limits::{Buckets, HandshakeSource, IN_FLIGHT, PER_SOURCE, ProofBackoff, RESERVED_IN_FLIGHT},
     seen_set::{Fingerprint, SeenSet, fingerprint},
 };
 use crate::keys::{
@@ -371,7 +371,7 @@ impl AcceptorState {
         if self.pending.len() >= IN_FLIGHT {
             return Some("16 in flight");
         }
-        if !known && strangers >= IN_FLIGHT - KEPT {
+        if !known && strangers >= IN_FLIGHT - RESERVED_IN_FLIGHT {
             return Some("8 in flight for addresses that never authenticated");
         }
         let same = |p: &&Pending| p.source == source && p.identity.client_sae() == sae;

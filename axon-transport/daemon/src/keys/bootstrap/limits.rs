@@ -11,7 +11,7 @@ use crate::token_bucket::TokenBucket;
 /// Calls in flight for handshakes.
 pub(super) const IN_FLIGHT: usize = 16;
 /// Those of them that only addresses which authenticated before may use.
-pub(super) const KEPT: usize = 8;
+pub(super) const RESERVED_IN_FLIGHT: usize = 8;
 /// Calls in flight for one source and SAE.
 pub(super) const PER_SOURCE: usize = 2;
 /// Calls a second for one SAE.

@@ -8,7 +8,7 @@ use std::{
 use crate::keys::request::{FailureKind, KeyPurpose, KmeRequest, RequestFailure};
 
 /// Time between two lines about one call and SAE: a KME that comes and goes is not worth more.
-const EVERY: Duration = Duration::from_secs(10);
+const LOG_INTERVAL: Duration = Duration::from_secs(10);
 /// `dec_keys` calls in a row that are refused before that is worth a line: a peer names keys again
 /// that its KME gave away, and KMEs relay keys late.
 const REFUSED: u64 = 20;
@@ -70,7 +70,7 @@ impl Outages {
         outage.calls += 1;
         let since = *outage.since.get_or_insert(now);
         let told = outage.kind == Some(failure.kind);
-        let early = outage.said.is_some_and(|at| now.saturating_duration_since(at) < EVERY);
+        let early = outage.said.is_some_and(|at| now.saturating_duration_since(at) < LOG_INTERVAL);
         if told || early || refused && outage.calls < REFUSED {
             return None;
         }

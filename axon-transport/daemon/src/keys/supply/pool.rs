@@ -23,10 +23,10 @@ const REFUSED: (Duration, Duration) = (Duration::from_millis(100), Duration::fro
 const MAKE_UP: u32 = 4;
 /// Rounds that are remembered, so that a peer that is well again is served again soon.
 const ROUNDS_MAX: u32 = 10;
-/// Rounds in a row after which no more than [`FEW`] keys are had ahead, until one is READY.
+/// Rounds in a row after which no more than [`FEW_KEYS`] keys are had ahead, until one is READY.
 const ROUNDS_OF_MANY: u32 = 2;
 /// See [`ROUNDS_OF_MANY`].
-const FEW: usize = 4;
+const FEW_KEYS: usize = 4;
 
 /// A key that no connection knows of.
 pub(super) struct UnusedKey {
@@ -68,7 +68,7 @@ impl KeyStock {
     /// `ahead` keys are to be on their way or ready, where `elsewhere` of them are the sender's.
     pub(super) fn plan(&mut self, ahead: usize, elsewhere: usize) {
         let few = self.rounds >= ROUNDS_OF_MANY;
-        self.core.set_target(if few { ahead.min(FEW) } else { ahead });
+        self.core.set_target(if few { ahead.min(FEW_KEYS) } else { ahead });
         self.core.set_elsewhere(elsewhere);
     }
 

@@ -19,9 +19,9 @@ use crate::keys::{
 };
 
 /// How long unused keys of a lost connection wait to be announced on the next one.
-const KEPT_FOR: Duration = Duration::from_secs(120);
+const KEY_RETENTION: Duration = Duration::from_secs(120);
 /// How many of them.
-const KEPT: usize = 512;
+const MAX_RETAINED_KEYS: usize = 512;
 
 /// The keys of one peer's messages to this host.
 pub struct KeyReceiver {
@@ -213,7 +213,7 @@ impl KeyReceiver {
         for link in self.links.values_mut() {
             self.counts.add(link.opener.expire(now));
         }
-        self.kept.retain(|(since, ..)| now.saturating_sub(*since) < KEPT_FOR);
+        self.kept.retain(|(since, ..)| now.saturating_sub(*since) < KEY_RETENTION);
     }
 
     /// How it stands.
@@ -287,7 +287,7 @@ impl KeyReceiver {
     }
 
     fn keep(&mut self, now: Duration, key_id: KeyId, key: KmeKey) {
-        if self.kept.len() >= KEPT {
+        if self.kept.len() >= MAX_RETAINED_KEYS {
             self.kept.pop_front();
         }
         self.kept.push_back((now, key_id, key));

@@ -17,9 +17,9 @@ use crate::{
 /// How long the whole proof may take at most: four calls of the longest that may be set.
 const DEADLINE: Duration = Duration::from_secs(60);
 /// Calls to `enc_keys`, where it is certain that those before cost no key.
-const TRIES: u32 = 3;
+const MAX_CALLS: u32 = 3;
 /// Wait before such a call is made again.
-const PAUSE: Duration = Duration::from_millis(500);
+const RETRY_INTERVAL: Duration = Duration::from_millis(500);
 
 /// Has the client of one connection prove its name.
 pub struct ClientProof {
@@ -105,7 +105,7 @@ impl ClientProof {
             client_sae: client_sae.to_owned(),
             ready: Arc::clone(exporters.ready()),
             deadline: now + DEADLINE,
-            tries: TRIES,
+            tries: MAX_CALLS,
             step: ProofStep::Ask { not_before: now },
         }
     }
@@ -144,7 +144,7 @@ impl ClientProof {
         };
         let nothing_lost = failure.kind.is_transient() && failure.kind != FailureKind::Ambiguous;
         self.step = if nothing_lost && self.tries > 0 {
-            ProofStep::Ask { not_before: now + PAUSE }
+            ProofStep::Ask { not_before: now + RETRY_INTERVAL }
         } else {
             ProofStep::Failed(ProofFailure::NoKey { sae: self.client_sae.clone(), failure })
         };

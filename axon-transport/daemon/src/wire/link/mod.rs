@@ -14,8 +14,8 @@ pub use frame::{
     FrameError, MAX_FRAME, MAX_FRAME_BEFORE_HELLO, MAX_INFLATED, read_length, unpacked_length,
 };
 pub use message::{
-    AccessDecisions, DeniedUse, DeniedUses, Elected, GraphResync, GraphUpdate, ReceiveLimits, LastSeen,
+    AccessDecisions, DeniedUse, DeniedUses, Elected, GraphResync, GraphUpdate, LastSeen,
     LinkAccessCheck, LinkClosed, LinkHello, LinkMessage, LivelinessAsserted, MAX_DENIED,
-    MAX_PROOFS, Owners, ReceivedOf, ReceivedUpTo, RouteReady, RouteRefused, RouteSubscriber,
-    RouteUnasked, Subscribe, Unsubscribe, UseDecision,
+    MAX_PROOFS, Owners, ReceiveLimits, ReceivedOf, ReceivedUpTo, RouteReady, RouteRefused,
+    RouteSubscriber, RouteUnasked, Subscribe, Unsubscribe, UseDecision,
 };

@@ -5,7 +5,9 @@ mod earlier_grants;
 mod memory;
 mod undelivered;
 
-use self::{earlier_grants::EarlierGrants, memory::RetainedMemory, undelivered::UndeliveredPackets};
+use self::{
+    earlier_grants::EarlierGrants, memory::RetainedMemory, undelivered::UndeliveredPackets,
+};
 use super::{
     entry::SessionEntry,
     memory::{OwnMemory, RegisteredSegment},

@@ -18,7 +18,7 @@ use crate::wire::session::{Credit, SampleFragment, SampleHeader};
 const SESSION: u64 = 64 << 20;
 /// Bytes beyond its window above which a sample is long: there is one at a time, so that those which
 /// are not read leave room for others.
-pub(super) const LONG: u64 = SESSION / 8;
+pub(super) const LONG_SAMPLE_BYTES: u64 = SESSION / 8;
 
 /// A sample that has come whole.
 #[derive(Debug, PartialEq, Eq)]
@@ -212,7 +212,7 @@ impl IncomingFlow {
     }
 
     fn reserve(&mut self, name: FlowChannel, bytes: u64) -> bool {
-        let is_long = bytes > LONG;
+        let is_long = bytes > LONG_SAMPLE_BYTES;
         let fits = if is_long { self.long.is_none() } else { self.reserved + bytes <= SESSION };
         if !fits {
             return false;

@@ -7,7 +7,7 @@ use std::{
 
 use proptest::prelude::*;
 
-use super::{incoming::LONG, *};
+use super::{incoming::LONG_SAMPLE_BYTES, *};
 use crate::wire::session::{SampleFragment, SampleHeader};
 
 const MAX: u64 = 1 << 20;
@@ -111,7 +111,14 @@ fn a_long_sample_waits_for_room_and_gives_it_back() {
 #[test]
 fn a_long_sample_that_is_not_read_holds_up_none_but_long_ones() {
     let mut incoming = IncomingFlow::new(1 << 30, ArrivalPool::new(u64::MAX));
-    let lengths = [63 << 20, 200 << 20, LONG as u32, LONG as u32, 40 << 20, 100_000];
+    let lengths = [
+        63 << 20,
+        200 << 20,
+        LONG_SAMPLE_BYTES as u32,
+        LONG_SAMPLE_BYTES as u32,
+        40 << 20,
+        100_000,
+    ];
     for (number, length) in (0..).zip(lengths) {
         incoming.open(channel(number), 0);
         assert_eq!(incoming.piece(piece(number, head(length), 0)), Ok(None));
@@ -131,7 +138,7 @@ fn a_long_sample_that_is_not_read_holds_up_none_but_long_ones() {
     // Those that are not long are not without a bound, either.
     for number in 6..20 {
         incoming.open(channel(number), 0);
-        assert_eq!(incoming.piece(piece(number, head(LONG as u32), 0)), Ok(None));
+        assert_eq!(incoming.piece(piece(number, head(LONG_SAMPLE_BYTES as u32), 0)), Ok(None));
     }
     let more = granted(&mut incoming).len();
     assert!((2..=6).contains(&more), "{more} of at most eight in all");

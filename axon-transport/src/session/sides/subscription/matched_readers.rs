@@ -13,7 +13,7 @@ use super::{
 use crate::ids::Gid;
 
 /// Rings that a KEEP_ALL subscription, a client or a server reads of what a writer left, each by way of another daemon.
-const LEFT: usize = 8;
+const MAX_EARLIER_RINGS: usize = 8;
 
 #[derive(Default)]
 pub(in crate::session) struct MatchedReaders {
@@ -201,7 +201,7 @@ impl MatchedReaders {
             let [older, newer, ..] = of[..] else { return };
             let same = self.slots[newer].reader.is_of_ring(&self.slots[older].reader);
             let keeps = self.keeps_all || self.of_service;
-            if over <= if keeps && !same { LEFT } else { 1 } {
+            if over <= if keeps && !same { MAX_EARLIER_RINGS } else { 1 } {
                 return;
             }
             let mut slot = self.slots.remove(older);

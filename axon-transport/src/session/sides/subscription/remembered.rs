@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use crate::ids::Gid;
 
 /// So many writers that were there last are remembered in any case, and twice as many at most.
-pub(super) const REMEMBERED: usize = 2048;
+pub(super) const MAX_DEPARTED_WRITERS: usize = 2048;
 
 /// The last sequence number taken of each writer that is gone: what one that comes back sends again must not be taken
 /// twice. A remote writer comes back with its link, a client with the next daemon. Those that left longest ago are
@@ -19,7 +19,7 @@ pub(super) struct DepartedWriters {
 impl DepartedWriters {
     /// A writer is gone.
     pub(super) fn add(&mut self, writer: Gid, last: u64) {
-        if self.newer.len() >= REMEMBERED {
+        if self.newer.len() >= MAX_DEPARTED_WRITERS {
             self.older = std::mem::take(&mut self.newer);
         }
         self.newer.insert(writer, last);
@@ -46,15 +46,15 @@ mod tests {
         let gid = |number: u64| Gid((u128::from(number)).to_be_bytes());
         let mut remembered = DepartedWriters::default();
         remembered.add(gid(0), 1);
-        (1..5 * REMEMBERED as u64).for_each(|number| remembered.add(gid(number), number));
-        assert!(remembered.newer.len() + remembered.older.len() <= 2 * REMEMBERED);
-        let newest = 5 * REMEMBERED as u64 - 1;
-        for number in newest - REMEMBERED as u64 + 1..=newest {
+        (1..5 * MAX_DEPARTED_WRITERS as u64).for_each(|number| remembered.add(gid(number), number));
+        assert!(remembered.newer.len() + remembered.older.len() <= 2 * MAX_DEPARTED_WRITERS);
+        let newest = 5 * MAX_DEPARTED_WRITERS as u64 - 1;
+        for number in newest - MAX_DEPARTED_WRITERS as u64 + 1..=newest {
             assert_eq!(remembered.get(&gid(number)), Some(number));
         }
         assert_eq!(remembered.get(&gid(0)), None);
         // One that is in both.
-        let twice = newest - REMEMBERED as u64 + 1;
+        let twice = newest - MAX_DEPARTED_WRITERS as u64 + 1;
         remembered.add(gid(twice), 7);
         (0..10).for_each(|number| remembered.add(gid(1 << 40 | number), number));
         assert_eq!(remembered.get(&gid(twice)), Some(7));

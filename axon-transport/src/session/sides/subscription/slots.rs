@@ -10,7 +10,7 @@ use super::matched_reader::{MatchedReader, TakeTurn};
 use crate::ids::Gid;
 
 /// How long nobody is woken for a sample that there was no memory to take.
-const SHORT: Duration = Duration::from_secs(1);
+const NO_MEMORY_PAUSE: Duration = Duration::from_secs(1);
 
 /// Readers in the order in which their publishers granted them. A publisher that granted anew has several.
 #[derive(Default)]
@@ -109,7 +109,7 @@ impl Slots {
 
     /// Until when there is nothing to take, as there is no memory to take it.
     pub(super) fn short_until(&self) -> Option<Instant> {
-        self.short.map(|since| since + SHORT).filter(|until| *until > Instant::now())
+        self.short.map(|since| since + NO_MEMORY_PAUSE).filter(|until| *until > Instant::now())
     }
 
     /// Whether there is something to take.

@@ -8,7 +8,7 @@ use axon_transport::{
 };
 use quinn_proto::StreamId;
 
-use super::{LinkPeer, EstablishedPeer};
+use super::{EstablishedPeer, LinkPeer};
 use crate::{
     engine::{
         account::Account, link::failure::peer_text, outbound::FlowId, quic::connection::Connection,

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 /// Time between two checks.
-const EVERY: Duration = Duration::from_secs(1);
+const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 /// Checks per check of certificates.
 const MINUTE: u32 = 60;
 
@@ -24,7 +24,7 @@ pub(in crate::engine::links) struct CheckSchedule {
 impl CheckSchedule {
     /// Creates a schedule whose first check is due a second after the engine's start.
     pub(in crate::engine::links) fn new() -> Self {
-        Self { next: EVERY, passed: 0 }
+        Self { next: CHECK_INTERVAL, passed: 0 }
     }
 
     /// Returns when the next check is due, while there are links.
@@ -37,7 +37,7 @@ impl CheckSchedule {
         if now < self.next {
             return None;
         }
-        self.next = now + EVERY;
+        self.next = now + CHECK_INTERVAL;
         self.passed = self.passed.wrapping_add(1);
         Some(CheckKind { at_certificates: self.passed.is_multiple_of(MINUTE) })
     }
@@ -65,6 +65,6 @@ mod tests {
         let mut looks = CheckSchedule::new();
         let now = Duration::from_secs(100);
         assert_eq!(looks.take_due(now), Some(CheckKind { at_certificates: false }));
-        assert_eq!((looks.take_due(now), looks.poll_timeout()), (None, now + EVERY));
+        assert_eq!((looks.take_due(now), looks.poll_timeout()), (None, now + CHECK_INTERVAL));
     }
 }

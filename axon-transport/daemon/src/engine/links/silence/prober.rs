@@ -19,7 +19,7 @@ const PROBE_EVERY: Duration = Duration::from_millis(250);
 const GRACE: Duration = Duration::from_millis(300);
 
 /// After a long silence QUIC's next packet is as far away as the silence was long.
-const LONG: Duration = Duration::from_secs(1);
+const LONG_SILENCE: Duration = Duration::from_secs(1);
 
 const GRACE_AFTER_LONG: Duration = Duration::from_millis(50);
 
@@ -28,7 +28,7 @@ const DIALLED: Duration = Duration::from_millis(100);
 
 /// When a successor did not come about, the next one is dialled after this, and after twice as long each time: a dial may
 /// cost a key.
-const AGAIN: Duration = Duration::from_secs(1);
+const FIRST_REDIAL_PAUSE: Duration = Duration::from_secs(1);
 
 const AGAIN_AT_MOST: Duration = Duration::from_secs(8);
 
@@ -149,7 +149,7 @@ impl Prober {
         if self.dialled.is_some_and(|(at, pause)| now < at + pause) {
             return;
         }
-        let grace = if now < LONG { GRACE } else { GRACE_AFTER_LONG };
+        let grace = if now < LONG_SILENCE { GRACE } else { GRACE_AFTER_LONG };
         let more = if self.side == Side::Client { Duration::ZERO } else { DIALLED };
         (self.next, self.due) = (Step::Replace, now + grace + more);
     }
@@ -189,7 +189,7 @@ impl Prober {
                 self.asked += 1;
             }
             Step::Replace => {
-                let pause = self.dialled.map_or(AGAIN, |(_, pause)| 2 * pause);
+                let pause = self.dialled.map_or(FIRST_REDIAL_PAUSE, |(_, pause)| 2 * pause);
                 self.dialled = Some((now, pause.min(AGAIN_AT_MOST)));
             }
         }

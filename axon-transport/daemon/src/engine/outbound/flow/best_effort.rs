@@ -24,9 +24,9 @@ use crate::{
 };
 
 /// A sample without a lifespan that is older than this once it has crossed the link is dropped for a newer one.
-pub(super) const LIFE: Duration = Duration::from_millis(200);
+pub(super) const DEFAULT_LIFESPAN: Duration = Duration::from_millis(200);
 /// A sample that QUIC did not deliver within this time is given up.
-const LONGEST: Duration = Duration::from_secs(10);
+const DELIVERY_TIMEOUT: Duration = Duration::from_secs(10);
 /// So many samples may be under way whatever the congestion window.
 const ALWAYS: usize = 2;
 
@@ -103,7 +103,7 @@ impl BestEffort {
         if self.under_way.len() >= ALWAYS && under_way >= carrier.window() {
             return Some(FlowPause::Blocked);
         }
-        counters.lost(&info.topic, "late", queue.drop_late(LIFE, self.took, now));
+        counters.lost(&info.topic, "late", queue.drop_late(DEFAULT_LIFESPAN, self.took, now));
         queue.peek().is_none().then_some(FlowPause::Empty)
     }
 
@@ -150,7 +150,7 @@ impl BestEffort {
             let priority = rank.of_stream() - i32::from(!self.under_way.is_empty());
             let _ = carrier.quic.send_stream(stream).set_priority(priority);
             carrier.streams.insert(stream, carrier.flow);
-            let left = sample.lifespan_left(now).unwrap_or(LONGEST).min(LONGEST);
+            let left = sample.lifespan_left(now).unwrap_or(DELIVERY_TIMEOUT).min(DELIVERY_TIMEOUT);
             let bytes = pending.iter().map(|piece| piece.len() as u64).sum();
             credit.set(uses);
             let (begun, deadline) = (now, now + left);

@@ -20,13 +20,14 @@ use crate::{
 };
 
 /// What a peer has that does not say it: as much as the second link of an identity has, and all memory for messages.
-const UNSAID: ReceiveLimits = ReceiveLimits { unread: (LINK_WINDOW as u64) + (16 << 20), messages: 64 << 20 };
+const UNSAID: ReceiveLimits =
+    ReceiveLimits { unread: (LINK_WINDOW as u64) + (16 << 20), messages: 64 << 20 };
 /// The part of the credit that counts as little: a quarter.
 const LITTLE: u64 = 4;
 /// No peer has less: with nothing, a sample of one publisher would keep out those of all others.
-const LEAST: u64 = 1 << 20;
+const MIN_CREDIT: u64 = 1 << 20;
 /// A sample longer than this needs memory for messages. The receiver counts from 32 KiB on, header and seal included.
-const LONG: usize = 31 << 10;
+const LONG_SAMPLE_BYTES: usize = 31 << 10;
 /// Memory that the receiver counts for header and seal.
 const OVERHEAD: u64 = 1 << 10;
 /// Small samples of one flow may be in flight up to so many bytes, whatever the credit.
@@ -44,7 +45,7 @@ pub(in crate::engine::outbound) struct UsedCredit {
 impl UsedCredit {
     /// What samples of one stream use: `bytes` in all, the longest of `longest` bytes.
     pub(in crate::engine::outbound) fn of(bytes: usize, longest: usize) -> Self {
-        let memory = if longest > LONG { longest as u64 + OVERHEAD } else { 0 };
+        let memory = if longest > LONG_SAMPLE_BYTES { longest as u64 + OVERHEAD } else { 0 };
         Self { window: (bytes as u64).min(STREAM_WINDOW.1), memory }
     }
 }
@@ -149,9 +150,9 @@ impl Drop for CreditShare {
     }
 }
 
-/// What samples in flight may use at a peer that has this much. One that says nearly nothing is taken to have [`LEAST`].
+/// What samples in flight may use at a peer that has this much. One that says nearly nothing is taken to have [`MIN_CREDIT`].
 fn limit(intake: &ReceiveLimits) -> UsedCredit {
-    let (unread, memory) = (intake.unread.max(LEAST), intake.messages.max(LEAST));
+    let (unread, memory) = (intake.unread.max(MIN_CREDIT), intake.messages.max(MIN_CREDIT));
     UsedCredit { window: window_credit(unread), memory }
 }
 
@@ -262,8 +263,10 @@ mod tests {
 
     #[test]
     fn a_peer_that_says_little_is_sent_one_sample_at_a_time() {
-        for intake in [ReceiveLimits { unread: 0, messages: 0 }, ReceiveLimits { unread: 1, messages: u64::MAX }]
-        {
+        for intake in [
+            ReceiveLimits { unread: 0, messages: 0 },
+            ReceiveLimits { unread: 1, messages: u64::MAX },
+        ] {
             let credit = PeerCredit::new();
             credit.set(Some(&intake));
             let (mut one, two) = (credit.share(), credit.share());

@@ -20,7 +20,7 @@ use quinn_proto::{Connection, StreamId};
 
 pub(super) use self::credit::{CreditQueue, PeerCredit, UsedCredit};
 use self::{
-    best_effort::{BestEffort, LIFE},
+    best_effort::{BestEffort, DEFAULT_LIFESPAN},
     compressing::Compressing,
     info::FlowInfo,
     reliable::{ReliableStream, STREAM_IDLE, TOGETHER},
@@ -226,7 +226,7 @@ impl Flow {
         let mut left = if carrier.lender.is_some() { TOGETHER } else { TURN };
         loop {
             if !self.reliable.is_writing() && !self.best_effort.is_writing() {
-                if !self.queue.holds_next(LIFE, now) {
+                if !self.queue.holds_next(DEFAULT_LIFESPAN, now) {
                     self.undemanded += self.fill(sources, counters, now);
                 }
                 carrier.seal.demand(std::mem::take(&mut self.undemanded), now);

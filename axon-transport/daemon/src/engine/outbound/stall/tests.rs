@@ -61,7 +61,7 @@ fn a_peer_that_lets_bytes_pass_and_takes_none_of_few_samples_is_too_slow() {
 #[test]
 fn a_route_without_progress_is_stalled_after_the_limit_and_told_of_once() {
     let two = [FLOW, BusyFlow { id: 4, ..FLOW }];
-    let found = Some((LOOK + LIMIT, stalled(StallCause::NothingRead)));
+    let found = Some((CHECK_INTERVAL + LIMIT, stalled(StallCause::NothingRead)));
     assert_eq!(look(false, |_| two.into(), secs), found);
     assert_eq!(look(false, |now| vec![held(now)], secs), found);
     assert_eq!(look(false, |_| vec![BusyFlow { is_stalled: true, ..FLOW }], secs), None);
@@ -112,7 +112,7 @@ fn a_peer_that_sends_something_now_and_then_holds_no_publisher_up_for_long() {
         let (at, found) = look(false, |now| vec![held(now)], heard).expect("it is found");
         assert_eq!(found, stalled(StallCause::NothingRead));
         // Frames arrive for at least five seconds in each of these periods.
-        assert!(at <= LOOK + Duration::from_secs(2 * every) + GONE, "{every}: {at:?}");
+        assert!(at <= CHECK_INTERVAL + Duration::from_secs(2 * every) + GONE, "{every}: {at:?}");
     }
 }
 
@@ -179,7 +179,7 @@ fn a_flow_that_waits_for_credit_is_judged_once_none_comes_back() {
     let (at, found) = look(true, |_| vec![waits], secs).unwrap();
     assert_eq!(
         (at, found),
-        (2 * LIMIT - LOOK, stalled(StallCause::NothingRead)),
+        (2 * LIMIT - CHECK_INTERVAL, stalled(StallCause::NothingRead)),
         "the last excuse"
     );
     let uses = BusyFlow { keeps: None, uses_credit: true, ..FLOW };
@@ -204,7 +204,7 @@ fn a_flow_that_waits_for_credit_is_judged_once_none_comes_back() {
 fn a_quiet_flow_is_busy_no_more_unless_it_is_judged() {
     let quiet = BusyFlow { keeps: None, is_quiet: true, ..FLOW };
     let found = StallReport { stalled: Vec::new(), quiet: vec![3] };
-    assert_eq!(look(false, |_| vec![quiet], secs), Some((LOOK, found)));
+    assert_eq!(look(false, |_| vec![quiet], secs), Some((CHECK_INTERVAL, found)));
     let (_, found) = look(false, |_| vec![BusyFlow { is_quiet: true, ..FLOW }], secs).unwrap();
     assert!(found.quiet.is_empty(), "it is judged");
 }
@@ -217,12 +217,12 @@ fn peer(heard: u64) -> PeerActivity {
 fn a_number_that_was_forgotten_is_judged_anew() {
     let mut stalls = FlowStalls::new(LIMIT, Duration::ZERO);
     for second in 1..=5 {
-        stalls.handle_timeout(LOOK * second as u32, peer(second), [FLOW].into_iter());
+        stalls.handle_timeout(CHECK_INTERVAL * second as u32, peer(second), [FLOW].into_iter());
     }
-    assert_eq!(stalls.flows[&FLOW.id].idle, 4 * LOOK);
+    assert_eq!(stalls.flows[&FLOW.id].idle, 4 * CHECK_INTERVAL);
     stalls.forget(FLOW.id);
     stalls.forget(FLOW.id);
-    let found = stalls.handle_timeout(LOOK + LIMIT, peer(6), [FLOW].into_iter());
+    let found = stalls.handle_timeout(CHECK_INTERVAL + LIMIT, peer(6), [FLOW].into_iter());
     assert_eq!(found, StallReport::default());
 }
 
@@ -283,7 +283,7 @@ fn the_pace_goes_on_over_all_daemons_of_a_host() {
         let one = |since: Duration| (u64::from(since * 2 > life), 0);
         let (at, found) = one_after_another(life, kept, busy, one).expect("it is found");
         assert_eq!(found, stalled(StallCause::TooSlow), "{life:?} {kept:?}");
-        assert!(at <= period + 3 * (life + kept) + LOOK, "{life:?} {kept:?}: {at:?}");
+        assert!(at <= period + 3 * (life + kept) + CHECK_INTERVAL, "{life:?} {kept:?}: {at:?}");
         // A peer that takes its share is not cut.
         let many = |since: Duration| (since.as_millis() as u64 * 2, 0);
         assert_eq!(one_after_another(life, kept, busy, many), None);
@@ -292,14 +292,14 @@ fn the_pace_goes_on_over_all_daemons_of_a_host() {
 
 #[test]
 fn a_flow_goes_on_with_the_worse_of_what_is_known() {
-    let (now, idle) = (Duration::from_secs(5), LIMIT - LOOK);
+    let (now, idle) = (Duration::from_secs(5), LIMIT - CHECK_INTERVAL);
     let known = |idle| Progress { idle, ..Progress::default() };
     let after = |flow: BusyFlow| {
         let mut stalls = FlowStalls::new(LIMIT, now);
-        stalls.flows.insert(FLOW.id, known(LOOK));
+        stalls.flows.insert(FLOW.id, known(CHECK_INTERVAL));
         stalls.inherit(FLOW.id, (3, 0), known(idle), now);
-        stalls.inherit(FLOW.id, (3, 0), known(LOOK), now);
-        stalls.handle_timeout(now + LOOK, peer(1), [flow].into_iter())
+        stalls.inherit(FLOW.id, (3, 0), known(CHECK_INTERVAL), now);
+        stalls.handle_timeout(now + CHECK_INTERVAL, peer(1), [flow].into_iter())
     };
     assert_eq!(after(BusyFlow { progress: (3, 0), ..FLOW }), stalled(StallCause::NothingRead));
     assert_eq!(after(BusyFlow { progress: (4, 0), ..FLOW }), StallReport::default());
@@ -320,7 +320,7 @@ fn an_excuse_now_and_then_is_no_way_out_of_the_pace() {
     let busy = |now| vec![BusyFlow { progress: (0, 0), ..slow(now) }];
     let (at, found) = look(false, busy, secs).expect("it is found");
     assert_eq!(found, stalled(StallCause::NothingRead));
-    assert!(at <= LIMIT * 5 / 4 + 3 * LOOK, "{at:?}");
+    assert!(at <= LIMIT * 5 / 4 + 3 * CHECK_INTERVAL, "{at:?}");
     // The flow always waits for other flows of its peer, which takes those as slowly as it likes.
     let others = |now| vec![BusyFlow { waits_for_others: true, ..slow(now) }];
     let (at, found) = look(false, others, secs).expect("it is found");
@@ -351,7 +351,7 @@ fn silence_now_and_then_is_no_way_out_of_the_pace() {
 #[test]
 fn one_look_counts_for_two_seconds_at_most() {
     let mut stalls = FlowStalls::new(LIMIT, Duration::ZERO);
-    stalls.handle_timeout(LOOK, peer(1), [FLOW].into_iter());
+    stalls.handle_timeout(CHECK_INTERVAL, peer(1), [FLOW].into_iter());
     let after = Duration::from_secs(60);
     let found = stalls.handle_timeout(after, peer(2), [FLOW].into_iter());
     assert_eq!(found, StallReport::default(), "this host was stopped");
@@ -363,9 +363,9 @@ fn nobody_looks_for_a_second_after_the_first_sample() {
     let mut stalls = FlowStalls::new(LIMIT, Duration::ZERO);
     let now = Duration::from_secs(100);
     stalls.handle_first(now);
-    assert_eq!(stalls.poll_timeout(), now + LOOK);
+    assert_eq!(stalls.poll_timeout(), now + CHECK_INTERVAL);
     stalls.handle_first(Duration::ZERO);
-    assert_eq!(stalls.poll_timeout(), now + LOOK);
+    assert_eq!(stalls.poll_timeout(), now + CHECK_INTERVAL);
 }
 
 #[test]
@@ -375,5 +375,5 @@ fn a_server_that_takes_its_time_is_judged_once_a_client_finds_no_room() {
     assert_eq!(look(false, |now| vec![BusyFlow { refused: Some(7), ..service(now) }], secs), None);
     assert_eq!(look(false, |now| vec![BusyFlow { refused: None, ..service(now) }], secs), None);
     let found = look(false, |now| vec![service(now)], secs);
-    assert_eq!(found, Some((LOOK + LIMIT, stalled(StallCause::NothingRead))));
+    assert_eq!(found, Some((CHECK_INTERVAL + LIMIT, stalled(StallCause::NothingRead))));
 }

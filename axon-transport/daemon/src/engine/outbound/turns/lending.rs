@@ -8,7 +8,7 @@ use crate::engine::outbound::schedule::{RANKS, Rank};
 const SHARE: i64 = 8;
 /// Bytes that are lent at least, and as many as a rank saves at most.
 const QUANTUM: i64 = 64 << 10;
-const MOST: i64 = 4 * QUANTUM;
+const MAX_CREDIT: i64 = 4 * QUANTUM;
 
 /// What is lent to ranks.
 #[derive(Debug, Default)]
@@ -32,7 +32,7 @@ impl StarvationCredit {
         self.lender = Some(rank);
         let share = i64::try_from(bytes).unwrap_or(i64::MAX) / SHARE;
         for saved in self.saved[at + 1..].iter_mut().flatten() {
-            *saved = (*saved + share).min(MOST);
+            *saved = (*saved + share).min(MAX_CREDIT);
         }
     }
 
@@ -109,7 +109,7 @@ mod tests {
         let mut lending = StarvationCredit::default();
         lending.handle_blocked(BULK);
         lending.handle_sent(SMALL, 1 << 30);
-        lending.handle_borrowed(BULK, MOST as u64 - 1);
+        lending.handle_borrowed(BULK, MAX_CREDIT as u64 - 1);
         assert_eq!(lending.borrow(BULK), None);
     }
 }

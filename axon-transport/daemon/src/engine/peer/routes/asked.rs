@@ -230,7 +230,10 @@ impl AskedRoutes {
 
     /// Gives up the stand-ins for which there are not enough lanes any more, after the writers of this host
     /// changed. Returns the routes that lost some.
-    pub(in crate::engine::peer) fn fit_lanes(&mut self, writers: &LocalWriterCounts) -> Vec<RouteKey> {
+    pub(in crate::engine::peer) fn fit_lanes(
+        &mut self,
+        writers: &LocalWriterCounts,
+    ) -> Vec<RouteKey> {
         let mut shortened = Vec::new();
         for (key, asked) in &mut self.routes {
             let (each, had) = (writers.read_by_stand_in(key), asked.stand_ins.len());

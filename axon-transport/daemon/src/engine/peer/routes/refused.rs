@@ -20,13 +20,13 @@ use crate::{
 };
 
 /// Names that status lists.
-const LISTED: usize = 64;
+const MAX_LISTED_ROUTES: usize = 64;
 /// Bytes that count for a refused route besides its names and reason.
-const ENTRY: usize = 200;
+const ENTRY_BYTES: usize = 200;
 /// Routes of a peer that status shows at the endpoints that wait for them.
-const AT_ENDPOINTS: usize = 1024;
+const MAX_ROUTES_AT_ENDPOINTS: usize = 1024;
 /// Characters of a peer's reason that are shown.
-const REASON: usize = 200;
+const MAX_REASON_CHARS: usize = 200;
 /// What is shown where there is no room for a reason.
 const UNREMEMBERED: &str = "too many are refused to remember why";
 
@@ -87,7 +87,7 @@ impl RefusedRoutes {
 
     /// Returns the reason with the charge for remembering it; `None` if there is no room.
     fn remember(&self, key: &RouteKey, text: String) -> Option<RefusalReason> {
-        let charge = self.room.charge(ENTRY + key.bytes() + text.len())?;
+        let charge = self.room.charge(ENTRY_BYTES + key.bytes() + text.len())?;
         Some(RefusalReason { text, _charge: Some(charge) })
     }
 
@@ -261,7 +261,7 @@ impl RefusedRoutes {
         let mut listed = BTreeSet::new();
         // Of thousands nothing but the number is shown.
         for (key, by, why) in self.all() {
-            if listed.len() < LISTED {
+            if listed.len() < MAX_LISTED_ROUTES {
                 listed.insert(key);
                 status.routes_refused.insert(key.to_string(), format!("{}: {why}", by.text()));
             } else if !listed.contains(key) {
@@ -272,7 +272,7 @@ impl RefusedRoutes {
 
     /// Returns the refused routes for the status of the endpoints that wait for them.
     pub(in crate::engine::peer) fn at_endpoints(&self) -> impl Iterator<Item = RefusedRoute> {
-        self.all().take(AT_ENDPOINTS).map(|(key, by, why)| RefusedRoute {
+        self.all().take(MAX_ROUTES_AT_ENDPOINTS).map(|(key, by, why)| RefusedRoute {
             topic: key.topic.clone(),
             type_name: Some(key.type_name.clone()),
             waits: by.waits(key.kind),
@@ -326,7 +326,7 @@ impl RefusedSide {
 
 /// A reason of the peer, as it is shown.
 pub(in crate::engine::peer) fn shown(reason: &str) -> String {
-    reason.chars().filter(|c| !c.is_control()).take(REASON).collect()
+    reason.chars().filter(|c| !c.is_control()).take(MAX_REASON_CHARS).collect()
 }
 
 fn unasked(key: &RouteKey, reason: Option<&str>) -> LinkMessage {

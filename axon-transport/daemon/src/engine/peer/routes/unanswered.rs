@@ -12,10 +12,10 @@ use super::{RouteKey, WantedRoute, asked::AskedRoutes};
 use crate::engine::outbound::UnfinishedFlows;
 
 /// Time between two checks for responses that the peer does not ask for.
-const LOOK: Duration = Duration::from_secs(1);
+const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 /// The most services with ended routes and unfinished flows that are remembered for a peer. Further ones are
 /// not.
-const LEFT: usize = 256;
+const MAX_UNFINISHED_SERVICES: usize = 256;
 
 /// The services whose requests or responses a peer does not take.
 #[derive(Default)]
@@ -54,7 +54,7 @@ impl UnansweredServices {
 
     /// Stores the unfinished flows of a service's route that ends.
     pub(in crate::engine::peer) fn leave(&mut self, route: &RouteKey, unfinished: UnfinishedFlows) {
-        if !unfinished.is_empty() && self.left.len() < LEFT {
+        if !unfinished.is_empty() && self.left.len() < MAX_UNFINISHED_SERVICES {
             self.left.insert(route.clone(), unfinished);
         }
         if route.kind == Kind::Response {
@@ -91,7 +91,7 @@ impl UnansweredServices {
         wanted.retain(|key, _| !closed.contains_key(key));
         let keys = closed.keys().cloned().collect();
         self.closed = closed;
-        self.look.get_or_insert(now + LOOK);
+        self.look.get_or_insert(now + CHECK_INTERVAL);
         keys
     }
 
@@ -119,7 +119,7 @@ impl UnansweredServices {
         limit: Duration,
         now: Duration,
     ) -> Vec<(RouteKey, u64)> {
-        self.look = (!unasked.is_empty()).then(|| now + LOOK);
+        self.look = (!unasked.is_empty()).then(|| now + CHECK_INTERVAL);
         let before = std::mem::take(&mut self.awaited);
         let mut found = Vec::new();
         for (key, route) in asked.iter() {
@@ -133,7 +133,7 @@ impl UnansweredServices {
             }
             let mut awaited = known.unwrap_or(AwaitedResponses { refused, waited: Duration::ZERO });
             if refused != awaited.refused && unasked.contains(key) && !is_silent {
-                awaited.waited += LOOK;
+                awaited.waited += CHECK_INTERVAL;
             }
             if awaited.waited < limit {
                 self.awaited.insert(key.clone(), awaited);
