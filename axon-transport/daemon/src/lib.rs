@@ -1,6 +1,7 @@
 #![doc = include_str!("../README.md")]
 #![deny(unsafe_code)]
 
+mod async_fd;
 mod attempt;
 mod bridge;
 mod check;
@@ -18,7 +19,6 @@ mod reactor;
 #[cfg(test)]
 mod residue;
 mod token_bucket;
-mod watch;
 mod wire;
 
 /// The system's allocator, which in a daemon erases each block of at most 64 KiB before it is freed, and when it

@@ -97,7 +97,7 @@ pub enum ShmError {
     #[error(
         "the servers of a relayed session may have {0} clients: share memory, or use more processes"
     )]
-    NoRoom(usize),
+    TooManyClients(usize),
     /// The session has given out all numbers for segments of its memory.
     #[error("session {0} has opened as many segments as a session may: open another session")]
     NoNumber(SessionId),

@@ -15,14 +15,14 @@ pub struct RateLimit {
     /// How many may pass at once after a pause.
     pub burst: NonZeroU32,
     /// What becomes of the others.
-    pub over: Over,
+    pub overflow: Overflow,
     /// Whether all topics together may have so much. Else each may.
     pub together: bool,
 }
 
 /// The policy for samples beyond a limit.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Over {
+pub enum Overflow {
     /// The newest waits until it may pass. It replaces the one that waited before.
     #[default]
     DropOldest,
@@ -33,7 +33,7 @@ pub enum Over {
     Hold,
 }
 
-impl Over {
+impl Overflow {
     /// All policies.
     pub const ALL: [Self; 3] = [Self::DropOldest, Self::DropNewest, Self::Hold];
 
@@ -51,7 +51,13 @@ impl RateLimit {
     /// So many samples a second of each topic, of which the newest waits for its turn.
     pub(crate) fn of_rate(rate: f64) -> Self {
         let burst = NonZeroU32::MIN;
-        Self { rate: Some(rate), bytes: None, burst, over: Over::DropOldest, together: false }
+        Self {
+            rate: Some(rate),
+            bytes: None,
+            burst,
+            overflow: Overflow::DropOldest,
+            together: false,
+        }
     }
 }
 
@@ -67,7 +73,7 @@ impl fmt::Display for RateLimit {
         if self.rate.is_some() && self.burst > NonZeroU32::MIN {
             write!(f, ", {} at once", self.burst)?;
         }
-        write!(f, ", {}", self.over.name())?;
+        write!(f, ", {}", self.overflow.name())?;
         if self.together { f.write_str(", all topics together") } else { Ok(()) }
     }
 }

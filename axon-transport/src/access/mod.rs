@@ -43,7 +43,7 @@ mod starred_segments;
 mod tests;
 
 pub use decision::Decision;
-pub use limit::{EgressLimit, InterfaceLimit, Over, PlacedLimit, RateLimit};
+pub use limit::{EgressLimit, InterfaceLimit, Overflow, PlacedLimit, RateLimit};
 pub use parse::AccessError;
 pub(crate) use party::HostPattern;
 pub use party::Principal;

@@ -9,6 +9,7 @@ mod clock;
 mod control;
 mod core;
 pub mod daemon;
+mod endpoint_state;
 mod endpoints;
 mod error;
 mod handle;
@@ -17,7 +18,6 @@ pub mod merge;
 mod options;
 mod relay_thread;
 pub mod relayed;
-mod sides;
 mod state;
 #[cfg(test)]
 mod tests;
@@ -27,6 +27,7 @@ pub use self::{
     clock::{from_unix_nanos, unix_nanos},
     core::{GuardCondition, SessionEvent},
     daemon::{daemon_check_access_at, daemon_reload_at, daemon_status, daemon_status_at},
+    endpoint_state::{Lifetime, MessageInfo, NewDataCallback, TakeLimit},
     endpoints::{
         CallError, Client, Event, Loan, Messages, Publisher, RemoteWriter, Server, Subscription,
         TrustedSubscription, Written,
@@ -35,5 +36,4 @@ pub use self::{
     handle::Session,
     interface::{Node, Ready, Waitable},
     options::{DaemonCommand, EndpointSpec, SessionOptions},
-    sides::{Lifetime, MessageInfo, NewDataCallback, TakeLimit},
 };

@@ -36,17 +36,17 @@ use rustix::{
 use tokio::{io::unix::AsyncFd, sync::Notify, task::spawn_local, time::timeout};
 
 use super::{
-    conversation::{converse, say},
     descriptors::DescriptorRoom,
-    first::{PreHelloMessage, first},
+    handshake::{PreHelloMessage, first},
     pending::{MAX_PENDING_CONNECTIONS, MOST_WHERE_SHORT, PendingConnection, PendingConnections},
     plane::ControlPlane,
-    turns::ProcessTurn,
+    scheduler::ProcessTurn,
+    session_connection::{converse, say},
 };
 use crate::{
+    async_fd::{watch, watch_shared},
     bridge::RefusalKind,
     control::relayed::DaemonRelay,
-    watch::{watch, watch_shared},
 };
 
 /// How long a connection may take to say HELLO.

@@ -5,11 +5,10 @@
 //! own. The two threads share only `bridge`. Samples between processes of this host pass through neither.
 
 mod admission;
-mod conversation;
+mod daemonize;
 mod descriptors;
-mod detach;
-mod first;
 mod gateway;
+mod handshake;
 mod listen;
 pub mod log;
 mod losses;
@@ -20,7 +19,8 @@ mod reload;
 mod remote;
 mod report;
 mod run;
-mod turns;
+mod scheduler;
+mod session_connection;
 
 pub use gateway::GatewayEntry;
 pub use run::{DaemonError, DaemonOptions, Start, main, run};

@@ -38,7 +38,7 @@ use super::{
         questions::{AccessQuestions, NOT_LINKED},
         waiting::NotifiedEndpoints,
     },
-    turns::ProcessScheduler,
+    scheduler::ProcessScheduler,
 };
 use crate::{
     bridge::{RefusalKind, RefusedRoute, ToControl, TrafficRules},

@@ -25,8 +25,8 @@ use tokio::{
 };
 
 use super::{
+    daemonize::{Report, detach, start_detached},
     descriptors::SpareDescriptors,
-    detach::{Report, detach, start_detached},
     gateway::GatewayEntry,
     listen::accept,
     log,

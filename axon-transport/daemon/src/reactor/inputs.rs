@@ -14,11 +14,11 @@ use tokio::{
 
 use super::rings::ShmRings;
 use crate::{
+    async_fd::watch,
     bridge::ToGateway,
     discovery::Interface,
     engine::compression::CompressionAnswer,
     keys::{Events, KmeAnswer, Statistics, UsedStatistics},
-    watch::watch,
 };
 
 /// Inputs of one kind that one pass takes.

@@ -7,7 +7,6 @@
 mod bind;
 mod compressor;
 mod control_outbox;
-mod finishing;
 mod inputs;
 mod key_reports;
 mod kme;
@@ -16,6 +15,7 @@ mod poll_rule;
 mod qlog;
 mod rings;
 mod session;
+mod shutdown;
 mod sockets;
 mod timer;
 

@@ -21,12 +21,12 @@ use tokio::{
 use super::{
     compressor::CompressorThread,
     control_outbox::ControlOutbox,
-    finishing::ShutdownDrain,
     inputs::{Inputs, ReactorInput, TaskResult},
     key_reports::KeyReports,
     poll_rule::{PollDecision, PollRule},
     rings::ShmRings,
     session::{Notices, local_graph},
+    shutdown::ShutdownDrain,
     sockets::{ReceivedDatagram, Sockets},
     timer::Timer,
 };

@@ -13,7 +13,7 @@ use rustix::{
 };
 use tokio::{io::unix::AsyncFd, time::sleep};
 
-use crate::watch::watch;
+use crate::async_fd::watch;
 
 /// Longer waits do without a system call for their end.
 const TIMERFD_THRESHOLD: Duration = Duration::from_millis(100);

@@ -2,10 +2,10 @@
 
 mod awaited;
 mod batch;
-mod find;
+mod next_sample;
 pub(crate) mod sample;
 pub(crate) mod slice;
-mod under_way;
+mod unconfirmed;
 
 use std::{
     sync::{Arc, Weak, atomic::AtomicU64},
@@ -14,8 +14,8 @@ use std::{
 
 use self::{
     awaited::AwaitedSegment,
-    find::{Bytes, Descriptors},
-    under_way::UnconfirmedSamples,
+    next_sample::{Bytes, Descriptors},
+    unconfirmed::UnconfirmedSamples,
 };
 use crate::{
     alloc::pin_limit::PinLimit,

@@ -24,7 +24,7 @@ use crate::{
         header::Dropped,
         history::SampleStorage,
         loan::{Lender, Loan, LoanLocation},
-        room::PublishObstacle,
+        reclaim::PublishObstacle,
     },
 };
 

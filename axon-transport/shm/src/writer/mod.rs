@@ -1,26 +1,26 @@
 //! The publishing end of a ring.
 
-pub(crate) mod absent;
 mod attached;
 mod commit;
 mod delivery;
+pub(crate) mod departed_readers;
 mod header;
 pub(crate) mod history;
 pub(crate) mod loan;
 mod numbers;
 pub(crate) mod reader_set;
-pub(crate) mod room;
+pub(crate) mod reclaim;
 pub(crate) mod samples;
 mod state;
 
 use std::{sync::Arc, time::Duration};
 
-pub use self::{absent::CarrierState, numbers::MAX_GAP};
 pub(super) use self::{
     commit::{PublishDeadline, WakeTiming},
     numbers::Numbering,
     state::WriterState,
 };
+pub use self::{departed_readers::CarrierState, numbers::MAX_GAP};
 
 use crate::{
     alloc::{

@@ -19,8 +19,8 @@ use crate::{
     },
     wake::Purpose,
     writer::{
-        absent::{CarrierState, DepartedReaders},
         attached::AttachedReader,
+        departed_readers::{CarrierState, DepartedReaders},
     },
 };
 

@@ -26,7 +26,7 @@ use crate::{
         header::Dropped,
         history::OldestInUse,
         loan::LoanLocation,
-        room::{PinnedMemory, PublishObstacle, least_kept, no_memory},
+        reclaim::{PinnedMemory, PublishObstacle, least_kept, no_memory},
     },
 };
 

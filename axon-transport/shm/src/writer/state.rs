@@ -1,7 +1,7 @@
 //! What a publisher's lock protects.
 
 use super::{
-    history::SampleHistory, numbers::WriterNumbers, reader_set::ReaderSet, room::Maps,
+    history::SampleHistory, numbers::WriterNumbers, reader_set::ReaderSet, reclaim::Maps,
     samples::Samples,
 };
 use crate::{

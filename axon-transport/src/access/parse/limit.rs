@@ -7,7 +7,7 @@ use toml::de::{DeTable, DeValue};
 use super::{AccessError, RuleFileReader, Value};
 use crate::access::{
     TopicPattern, Verb,
-    limit::{EgressLimit, InterfaceLimit, LimitKind, LimitRule, Over, PlacedLimit, RateLimit},
+    limit::{EgressLimit, InterfaceLimit, LimitKind, LimitRule, Overflow, PlacedLimit, RateLimit},
     party::PartyPattern,
 };
 
@@ -98,7 +98,7 @@ struct Parts {
     rate: Option<f64>,
     bytes: Option<f64>,
     burst: Option<NonZeroU32>,
-    over: Option<Over>,
+    over: Option<Overflow>,
     together: Option<bool>,
     egress: Option<f64>,
 }
@@ -206,7 +206,7 @@ impl RuleFileReader<'_> {
                     parts.burst = Some(burst.ok_or_else(|| wrong(&text, accepted))?);
                 }
                 ("over", DeValue::String(text)) => {
-                    let over = Over::ALL.into_iter().find(|over| over.name() == text);
+                    let over = Overflow::ALL.into_iter().find(|over| over.name() == text);
                     let accepted = "drop-oldest, drop-newest, hold";
                     let wrong = || wrong(&format!("{text:?}"), accepted);
                     parts.over = Some(over.ok_or_else(wrong)?);
@@ -263,7 +263,9 @@ impl RuleFileReader<'_> {
             return Err("[[limit]] without rate, bytes and egress: write at least one of them");
         }
         let calls = uses.iter().any(|(verb, _)| *verb == Verb::Call);
-        if calls && (over != Some(Over::Hold) || uses.iter().any(|(verb, _)| *verb != Verb::Call)) {
+        if calls
+            && (over != Some(Overflow::Hold) || uses.iter().any(|(verb, _)| *verb != Verb::Call))
+        {
             return Err(
                 "[[limit]] of call: write over = \"hold\", since no request is dropped, and no topic",
             );
@@ -278,7 +280,7 @@ impl RuleFileReader<'_> {
             rate,
             bytes,
             burst: burst.unwrap_or(TWO),
-            over: over.unwrap_or_default(),
+            overflow: over.unwrap_or_default(),
             together: together.unwrap_or(is_of_peer),
         };
         let names: BTreeSet<_> = uses.iter().map(|(_, pattern)| pattern.to_string()).collect();

@@ -5,9 +5,9 @@
 //! sessions, and later segments when they are opened. If a segment is missing nevertheless, the session asks for it.
 
 mod entry;
-mod left;
 mod memory;
 mod outbox;
+mod retained;
 mod shares;
 
 use std::{
@@ -22,9 +22,9 @@ pub use self::{
     outbox::SessionPacket,
 };
 use self::{
-    left::{RetainedState, packets_of_grant},
     memory::NotTaken,
     outbox::Pushed,
+    retained::{RetainedState, packets_of_grant},
 };
 use super::limits::{MAX_SEGMENTS, MAX_SESSIONS, Violation};
 use crate::{

@@ -6,13 +6,13 @@ use std::{
     time::Instant,
 };
 
-use super::arrivals::PendingEndpoints;
+use super::pending_endpoints::PendingEndpoints;
 use crate::{
     graph::{Endpoint, EndpointKind, GraphEntry, GraphView, Pairing, pairing},
     ids::Gid,
     session::{
         core::SessionEvent,
-        sides::{EventSource, SubscriptionInner},
+        endpoint_state::{EventSource, SubscriptionInner},
         state::SessionShared,
     },
     wire::session::Pair,

@@ -8,7 +8,7 @@ use crate::{
     ids::Gid,
     session::{
         core::SessionEvent,
-        sides::{Changes, EventSource, PublisherInner, SubscriptionInner},
+        endpoint_state::{Changes, EventSource, PublisherInner, SubscriptionInner},
         state::SessionShared,
     },
     wire::session::Pair,

@@ -2,16 +2,16 @@
 //! watches the processes of peers, and connects to the next daemon when the connection is lost.
 
 mod announced;
-pub(in crate::session) mod arrivals;
 mod graph;
-mod handle;
+pub(in crate::session) mod in_process;
 mod link;
-pub(in crate::session) mod local;
 mod matches;
 mod memory;
+mod messages;
 mod pair_log;
 mod pause;
 mod peers;
+pub(in crate::session) mod pending_endpoints;
 mod search;
 mod time;
 
@@ -28,7 +28,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use self::{
     announced::AnnouncedPairs,
     graph::GraphFollower,
-    local::{InProcessDaemon, LocalRegistry},
+    in_process::{InProcessDaemon, LocalRegistry},
     matches::ChangedMatches,
     memory::AnnouncedMemory,
     pause::ReconnectPause,
@@ -44,8 +44,8 @@ use crate::{
             connect::Connected,
             socket::{self, SocketError},
         },
+        endpoint_state::{EventSource, ServeRequest, SubscriptionInner},
         error::SessionError,
-        sides::{EventSource, ServeRequest, SubscriptionInner},
         state::SessionShared,
     },
     wire::session::{Announce, EndpointRole, Gone, SessionMessage},

@@ -2,7 +2,7 @@
 
 use std::{sync::Arc, time::Duration};
 
-use crate::session::{clock, sides::EventSource, state::SessionShared};
+use crate::session::{clock, endpoint_state::EventSource, state::SessionShared};
 
 /// The endpoints of the session with deadlines or leases.
 pub(super) struct TimedEndpoints {

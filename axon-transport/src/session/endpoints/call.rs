@@ -15,8 +15,8 @@ use super::client::Client;
 use crate::session::{
     clock,
     core::{Listener, SessionCore},
+    endpoint_state::{ServerGone, SubscriptionInner},
     error::RecvError,
-    sides::{ServerGone, SubscriptionInner},
 };
 
 /// Why a call has no response.

@@ -10,9 +10,9 @@ use crate::{
     ids::Gid,
     session::{
         clock,
+        endpoint_state::{MessageInfo, NewDataCallback, PublisherInner, SubscriptionInner},
         error::{RecvError, SessionError},
         handle::Session,
-        sides::{MessageInfo, NewDataCallback, PublisherInner, SubscriptionInner},
     },
 };
 

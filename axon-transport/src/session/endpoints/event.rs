@@ -5,8 +5,8 @@ use std::{fmt, sync::Arc};
 use crate::{
     events::{EventKind, EventStatus, Statuses},
     session::{
+        endpoint_state::{Callback, EventSource, NewDataCallback},
         handle::Session,
-        sides::{Callback, EventSource, NewDataCallback},
     },
 };
 

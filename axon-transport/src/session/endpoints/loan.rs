@@ -8,7 +8,7 @@ use std::{
 
 use axon_shm::PublishError;
 
-use crate::session::{clock, sides::PublisherInner};
+use crate::session::{clock, endpoint_state::PublisherInner};
 
 /// A sample that the application writes in place, from the front or as a slice. Dropping the loan without
 /// calling [`publish`](Self::publish) discards the sample.

@@ -31,8 +31,8 @@ use futures_core::{FusedStream, Stream};
 use super::{server::Server, subscription::Subscription};
 use crate::session::{
     core::{Listener, SessionCore},
+    endpoint_state::{MessageInfo, SubscriptionInner},
     error::RecvError,
-    sides::{MessageInfo, SubscriptionInner},
 };
 
 /// Messages that a stream hands out without a pause. Then it lets its task's runtime run others.

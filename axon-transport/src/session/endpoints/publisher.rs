@@ -18,8 +18,8 @@ use crate::{
     ids::Gid,
     session::{
         clock,
+        endpoint_state::{EventSource, PublisherInner},
         handle::Session,
-        sides::{EventSource, PublisherInner},
     },
 };
 

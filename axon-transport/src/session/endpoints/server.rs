@@ -10,9 +10,11 @@ use crate::{
     ids::Gid,
     session::{
         clock,
+        endpoint_state::{
+            MessageInfo, NewDataCallback, PublisherInner, RingsByClient, SubscriptionInner,
+        },
         error::{RecvError, SessionError},
         handle::Session,
-        sides::{MessageInfo, NewDataCallback, PublisherInner, RingsByClient, SubscriptionInner},
     },
 };
 

@@ -10,9 +10,9 @@ use axon_shm::{Sample, ShmError};
 use crate::{
     ids::Gid,
     session::{
+        endpoint_state::{NewDataCallback, PublisherInner, SubscriptionInner},
         error::SessionError,
         handle::Session,
-        sides::{NewDataCallback, PublisherInner, SubscriptionInner},
     },
 };
 

@@ -10,9 +10,9 @@ use crate::{
     graph::Endpoint,
     ids::Gid,
     session::{
+        endpoint_state::{EventSource, MessageInfo, NewDataCallback, SubscriptionInner},
         error::{RecvError, SessionError},
         handle::Session,
-        sides::{EventSource, MessageInfo, NewDataCallback, SubscriptionInner},
     },
 };
 

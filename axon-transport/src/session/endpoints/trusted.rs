@@ -5,7 +5,7 @@ use std::{ops::Deref, time::Duration};
 use axon_shm::{SampleSlice, TrustPublishers};
 
 use super::subscription::Subscription;
-use crate::session::{error::RecvError, sides::MessageInfo};
+use crate::session::{endpoint_state::MessageInfo, error::RecvError};
 
 /// A [`Subscription`] whose publishers are trusted, so that samples are read in place as `&[u8]`.
 ///

@@ -13,11 +13,11 @@ use crate::{
     qos::Qos,
     session::{
         core::Outgoing,
+        endpoint_state::{PublisherInner, RingsByClient, SubscriptionInner, WriterRings},
         endpoints::{Client, Publisher, Server, Subscription},
         error::SessionError,
         handle::Session,
         options::EndpointSpec,
-        sides::{PublisherInner, RingsByClient, SubscriptionInner, WriterRings},
     },
     wire::session::EndpointRole,
 };

@@ -7,11 +7,11 @@ use crate::{
     qos::Qos,
     session::{
         core::GuardCondition,
+        endpoint_state::SubscriptionInner,
         endpoints::{Client, Publisher, Server, Subscription},
         error::SessionError,
         handle::Session,
         options::EndpointSpec,
-        sides::SubscriptionInner,
     },
     wire::session::EndpointRole,
 };

@@ -21,11 +21,11 @@ use crate::{
         control::FirstPeer,
         core::Outgoing,
         daemon::connect::Caller,
+        endpoint_state::{Lifetime, MessageInfo, SubscriptionInner, TakeLimit},
         endpoints::{Publisher, Server, Subscription},
         error::SessionError,
         handle::Session,
         options::{EndpointSpec, SessionOptions},
-        sides::{Lifetime, MessageInfo, SubscriptionInner, TakeLimit},
     },
     wire::session::{EndpointRole, RelayGivenUp, SessionMessage, SessionRole},
 };

@@ -8,12 +8,12 @@ use crate::{
     config::{Config, DaemonPolicy},
     ids::SessionId,
     session::{
-        control::{ControlThread, FirstPeer, local::LocalRegistry},
+        control::{ControlThread, FirstPeer, in_process::LocalRegistry},
         daemon::connect::Caller,
         error::SessionError,
         handle::{Handle, Session},
         options::SessionOptions,
-        relayed::near,
+        relayed::session_end,
         state::SessionShared,
     },
     session_key::SessionKey,
@@ -74,7 +74,7 @@ impl Session {
         let segment = SessionSegment::create(SessionId::random())?;
         let start = FirstPeer::LocalRegistry(Arc::clone(&local_registry));
         let outside = Self::of(Self::start(config, outside, segment, start)?);
-        handle.relay = Some(near::start(
+        handle.relay = Some(session_end::start(
             Arc::clone(&handle.shared),
             local_registry,
             outside,

@@ -12,10 +12,10 @@ use crate::{
     events::EventKind,
     session::{
         core::{Guard, GuardCondition, SessionCore},
+        endpoint_state::{EventSource, SubscriptionInner},
         endpoints::{Client, Event, Server, Subscription},
         error::SessionError,
         handle::Session,
-        sides::{EventSource, SubscriptionInner},
     },
 };
 

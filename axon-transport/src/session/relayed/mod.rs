@@ -14,9 +14,9 @@ use std::time::Duration;
 
 pub mod calls;
 pub mod flow;
-pub(super) mod near;
 pub mod pipe;
 mod response_log;
+pub(super) mod session_end;
 mod unanswered;
 
 pub use self::flow::ArrivalPool;

@@ -11,7 +11,7 @@ use crate::{
     ids::Gid,
     session::{
         core::GuardCondition,
-        sides::{PublisherInner, SubscriptionInner},
+        endpoint_state::{PublisherInner, SubscriptionInner},
     },
     wire::session::EndpointRole,
 };

@@ -23,8 +23,8 @@ pub(in crate::session) use self::permit::check_domain;
 use self::{endpoints::OwnEndpoints, graph::ShownGraph, pair_waits::PairWaits, unmet::UnmetPairs};
 use super::{
     core::{DaemonLink, GuardCondition, Outgoing, SessionCore, SessionEvent},
+    endpoint_state::{Changes, ClientLimit, EventSource, PublisherInner},
     options::SessionOptions,
-    sides::{Changes, ClientLimit, EventSource, PublisherInner},
 };
 use crate::{
     config::Config,

@@ -22,7 +22,7 @@ use crate::{
     ids::Gid,
     session::{
         core::Outgoing,
-        sides::{Accept, EventSource, NumberKind, PublisherInner, SubscriptionInner},
+        endpoint_state::{Accept, EventSource, NumberKind, PublisherInner, SubscriptionInner},
     },
     wire::session::EndpointRole,
 };

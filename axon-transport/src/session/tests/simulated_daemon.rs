@@ -8,7 +8,7 @@ use axon_shm::{
 use super::*;
 use crate::{
     graph::{Endpoint, EndpointKind},
-    session::control::arrivals,
+    session::control::pending_endpoints,
     wire::session::{GraphItem, RelayGivenUp},
 };
 
@@ -220,7 +220,7 @@ fn in_time(mut attempt: impl FnMut() -> bool) {
     for _ in 0..100 {
         let begun = Instant::now();
         let held = attempt();
-        if begun.elapsed() < arrivals::ARRIVAL_TIMEOUT {
+        if begun.elapsed() < pending_endpoints::ARRIVAL_TIMEOUT {
             assert!(held, "it was counted before it was reached");
             return;
         }

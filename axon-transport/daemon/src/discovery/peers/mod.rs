@@ -9,10 +9,10 @@ mod candidates;
 mod dialling;
 mod eviction;
 mod local;
-mod moved;
 mod probing;
 mod receiving;
 mod record;
+mod relocation;
 #[cfg(test)]
 mod tests;
 

@@ -6,7 +6,7 @@ use std::{
 };
 
 use axon_envelope::Kind;
-use axon_transport::access::Over;
+use axon_transport::access::Overflow;
 
 use super::{
     Inbound, StreamKey,
@@ -76,16 +76,16 @@ impl Inbound {
         now: Duration,
     ) -> Result<OpenedMessage, Option<StepOutcome>> {
         let Some((header, Some(route))) = stream.header else {
-            return Err(Some(StepOutcome::Over));
+            return Err(Some(StepOutcome::Overflow));
         };
         let keeps_all = self.routes.get(&header.route).is_some_and(|route| route.keeps_all);
         let may_wait = route.kind == Kind::Request || header.reliable && keeps_all;
         // Streams that wait for one limit are read on in turn.
-        let waits = |over| may_wait && over == Over::Hold;
+        let waits = |over| may_wait && over == Overflow::Hold;
         let Some(exceeded) = limit.exceeded_by(&header.of, waits, now) else {
             return Ok(message);
         };
-        if waits(exceeded.over()) {
+        if waits(exceeded.overflow()) {
             self.limited.hold(key, now + exceeded.wait);
             return Err(Some(wait(stream, StreamStep::Ring(message))));
         }

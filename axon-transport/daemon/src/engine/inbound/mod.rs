@@ -11,7 +11,7 @@ mod incoming;
 mod limited;
 mod reading;
 mod receipts;
-mod run;
+mod short_batch;
 mod stream_queue;
 #[cfg(test)]
 mod tests;

@@ -16,7 +16,7 @@ use std::{
 
 use axon_shm::ids::Gid;
 use axon_transport::{
-    access::{Over, Permissions, PlacedLimit, RateLimit, Verb},
+    access::{Overflow, Permissions, PlacedLimit, RateLimit, Verb},
     config::Config,
     status::{LimitStatus, LinkStatus},
 };
@@ -211,8 +211,8 @@ pub(crate) struct Exceeded {
 
 impl Exceeded {
     /// Returns what happens to the sample.
-    pub(crate) fn over(&self) -> Over {
-        self.limit.rate.over
+    pub(crate) fn overflow(&self) -> Overflow {
+        self.limit.rate.overflow
     }
 
     /// Returns the cause under which a dropped sample is counted.
@@ -248,7 +248,7 @@ impl RouteLimit {
     pub(crate) fn exceeded_by(
         &self,
         flow: &Gid,
-        may_wait: impl Fn(Over) -> bool,
+        may_wait: impl Fn(Overflow) -> bool,
         now: Duration,
     ) -> Option<Exceeded> {
         let limits = self.0.borrow();
@@ -257,7 +257,7 @@ impl RouteLimit {
         for limit in limits.iter() {
             let mut line = limit.line.borrow_mut();
             // Otherwise the flow would keep others from limits that it cannot use yet.
-            match Rc::ptr_eq(limit, last) && may_wait(limit.rate.over) {
+            match Rc::ptr_eq(limit, last) && may_wait(limit.rate.overflow) {
                 true => line.wait(flow, now + wait),
                 false => line.leave(flow),
             }
@@ -379,7 +379,7 @@ pub(crate) mod tests {
         let limit = of(&IdentityLimits::default(), Verb::Subscribe, "/a", rules);
         limit.pass(&OF, 1, Duration::ZERO);
         let exceeded = limit.exceeded_by(&OF, |_| false, Duration::ZERO).unwrap();
-        assert_eq!(exceeded.over(), Over::DropNewest);
+        assert_eq!(exceeded.overflow(), Overflow::DropNewest);
         assert_eq!(exceeded.wait.as_millis(), 500);
         let at = Duration::from_millis(501);
         assert!(limit.exceeded_by(&OF, |_| false, at).is_none());

@@ -243,7 +243,7 @@ impl Links {
         {
             tracing::error!(peer = %daemon, %error, "no message keys for this link");
         }
-        self.tell_intake(number, now);
+        self.send_receive_limits(number, now);
         self.dials.opened(number);
         self.table.put_in_use(daemon, number);
         let closed = current.and_then(|old| self.hand_over(old, now));
@@ -302,7 +302,7 @@ impl Links {
     }
 
     /// Tells the peer how much it may have in flight.
-    fn tell_intake(&mut self, number: u64, now: Duration) {
+    fn send_receive_limits(&mut self, number: u64, now: Duration) {
         let Some(peer) = self.table.peer(number) else { return };
         let (unread, messages) = (window(peer).into(), MESSAGES.0 as u64);
         self.send(number, &LinkMessage::ReceiveLimits(ReceiveLimits { unread, messages }), now);
@@ -316,7 +316,7 @@ impl Links {
     pub(super) fn widen_all(&mut self, now: Duration) {
         for number in self.table.open() {
             if self.widen(number) {
-                self.tell_intake(number, now);
+                self.send_receive_limits(number, now);
             }
         }
     }

@@ -4,6 +4,7 @@
 mod admission;
 mod connections;
 mod dials;
+mod draining;
 mod election;
 mod ending;
 mod events;
@@ -13,7 +14,6 @@ mod held;
 mod identity;
 mod inbox;
 mod keys;
-mod leaving;
 mod link;
 mod opening;
 mod silence;

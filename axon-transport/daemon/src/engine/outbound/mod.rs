@@ -7,8 +7,9 @@
 mod backlog;
 pub(crate) mod budget;
 mod burst;
-mod ending;
+mod drains;
 mod flow;
+mod flow_scheduler;
 #[cfg(test)]
 mod model;
 mod pings;
@@ -19,7 +20,6 @@ mod served;
 mod source;
 mod stall;
 mod table;
-mod turns;
 mod unfinished;
 
 use std::{collections::HashMap, rc::Rc, sync::Arc, time::Duration};
@@ -38,14 +38,14 @@ pub(crate) use self::{
 };
 use self::{
     budget::Budget,
-    ending::{FinishedPublisher, GivenUpSamples, PublisherDrains},
+    drains::{FinishedPublisher, GivenUpSamples, PublisherDrains},
     flow::{Flow, FlowPause},
+    flow_scheduler::FlowScheduler,
     pings::Pings,
     served::{FlowRoute, ServedFlows},
     source::FlowProgress,
     stall::{BusyFlow, FlowStalls, PeerActivity},
     table::FlowTable,
-    turns::FlowScheduler,
 };
 use super::{
     compression::PeerCompression, congestion::let_probe_through, quic::connection::Carrier,
@@ -321,7 +321,7 @@ impl Outbound {
     }
 
     /// Sets how much the peer takes in over this link.
-    pub(crate) fn set_intake(&mut self, intake: &ReceiveLimits) {
+    pub(crate) fn set_receive_limits(&mut self, intake: &ReceiveLimits) {
         self.turns.credit().set(Some(intake));
     }
 

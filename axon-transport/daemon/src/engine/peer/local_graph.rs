@@ -11,8 +11,8 @@ use axon_transport::{
 use super::{access::PeerAccess, context::LocalEndpoints, control_queue::ControlQueue};
 use crate::{
     engine::peer_graph::{
+        advertised::{AdvertisedEndpoint, AdvertisedGraph},
         owners::Prover,
-        shown::{AdvertisedEndpoint, AdvertisedGraph},
     },
     owner::ChannelBinding,
 };

@@ -227,7 +227,7 @@ impl Peer {
                 self.stirred |= of_service && self.services_changed();
             }
             LinkMessage::Asserted(asserted) => self.handle_asserted(&asserted),
-            LinkMessage::ReceiveLimits(intake) => self.outbound.set_intake(&intake),
+            LinkMessage::ReceiveLimits(intake) => self.outbound.set_receive_limits(&intake),
             LinkMessage::Received(received) => self.outbound.handle_received(&received.flows),
             LinkMessage::RouteRefused(refused) => self.handle_route_refused(now, refused),
             LinkMessage::Denied(denied) => {

@@ -1,10 +1,10 @@
 //! The graph of a peer as this side holds it: as much of it as the peer's account has room for. The
 //! submodules hold the graph that was sent to a peer, and the proofs that sessions belong to their daemons.
 
+pub(super) mod advertised;
 pub(super) mod decisions;
-mod left_out;
+mod omitted;
 pub(super) mod owners;
-pub(super) mod shown;
 mod terms;
 
 use std::{
@@ -21,7 +21,7 @@ use axon_transport::{
     internal::graph::{LIMITS, RemoteEndpoint, permits},
 };
 
-use self::{decisions::note_look, left_out::OmittedEndpoints, owners::Proven, terms::GraphTerms};
+use self::{decisions::note_look, omitted::OmittedEndpoints, owners::Proven, terms::GraphTerms};
 use crate::{
     engine::account::{Account, Charge},
     link::GraphUpdate,

@@ -1,7 +1,7 @@
 //! Links that do not answer: their path is probed, and a successor is dialled once it works.
 
-mod looks;
 mod prober;
+mod schedule;
 mod watch;
 
 use std::{net::SocketAddr, time::Duration};
@@ -11,8 +11,8 @@ use rand::RngExt;
 
 use self::watch::ProbeAction;
 pub(super) use self::{
-    looks::CheckSchedule,
     prober::{Traffic, frames_came},
+    schedule::CheckSchedule,
     watch::{LinkSilence, Nonce},
 };
 use crate::{

@@ -8,7 +8,7 @@ use axon_shm::{
     qos::{Durability, Qos},
 };
 use axon_transport::{
-    access::Over,
+    access::Overflow,
     internal::session::{
         TakeLimit,
         merge::{Merge, MergedSample},
@@ -325,7 +325,7 @@ impl FlowRings {
         counters: &Counters,
         now: Duration,
     ) -> bool {
-        let may_wait = |over| over != Over::DropNewest;
+        let may_wait = |over| over != Overflow::DropNewest;
         let exceeded = self.limit.exceeded_by(&self.of, may_wait, now);
         if self.exceeded.is_some() || exceeded.is_some() {
             // Losses so far had another cause, or the limit that the last turn reached.
@@ -335,7 +335,8 @@ impl FlowRings {
         // queue the publisher would wait instead, and several rings would each keep other samples.
         let in_ring = !queue.keeps_all() && sources.len() == 1;
         let (limit, most, waits) = match exceeded {
-            None => match self.exceeded.take_if(|before| before.over() == Over::DropOldest) {
+            None => match self.exceeded.take_if(|before| before.overflow() == Overflow::DropOldest)
+            {
                 Some(before) => (before, self.limit.passes(&self.of, now).max(1), false),
                 None => {
                     self.exceeded = None;
@@ -343,22 +344,22 @@ impl FlowRings {
                 }
             },
             Some(exceeded) => {
-                let most = match exceeded.over() {
-                    Over::DropOldest => 1,
-                    Over::DropNewest => 0,
-                    Over::Hold => usize::MAX,
+                let most = match exceeded.overflow() {
+                    Overflow::DropOldest => 1,
+                    Overflow::DropNewest => 0,
+                    Overflow::Hold => usize::MAX,
                 };
                 (exceeded, most, true)
             }
         };
-        let is_whole = match limit.over() {
-            Over::Hold => true,
-            Over::DropOldest if in_ring && waits => true,
-            Over::DropOldest if in_ring => {
+        let is_whole = match limit.overflow() {
+            Overflow::Hold => true,
+            Overflow::DropOldest if in_ring && waits => true,
+            Overflow::DropOldest if in_ring => {
                 self.leave_oldest(sources, &limit, most, topic, counters);
                 true
             }
-            Over::DropOldest | Over::DropNewest => {
+            Overflow::DropOldest | Overflow::DropNewest => {
                 self.drop_for(&limit, most, sources, topic, counters, now)
             }
         };
@@ -370,9 +371,9 @@ impl FlowRings {
         if !waits {
             return true;
         }
-        let may_pass_later = limit.over() != Over::DropNewest;
+        let may_pass_later = limit.overflow() != Overflow::DropNewest;
         if may_pass_later {
-            self.more |= in_ring || limit.over() == Over::Hold;
+            self.more |= in_ring || limit.overflow() == Overflow::Hold;
             self.retry = self.has_more().then_some(limit.wait);
         }
         self.exceeded = Some(limit);

@@ -10,7 +10,7 @@ use axon_shm::{ids::Gid, qos::Qos};
 pub(super) use self::flows::Flows;
 use self::routes::Routes;
 use super::{
-    backlog::Backlog, budget::Budget, ending::DrainedFlow, flow::Flow, progress::SentProgress,
+    backlog::Backlog, budget::Budget, drains::DrainedFlow, flow::Flow, progress::SentProgress,
     schedule::FlowId, served::ServedFlows, source::Source, stall::BusyFlow,
 };
 use crate::engine::counters::Counters;

@@ -31,7 +31,7 @@ use crate::{
     registry::RelayCounters,
     session::{
         clock,
-        control::local::LocalRegistry,
+        control::in_process::LocalRegistry,
         core::ChangeSignal,
         daemon::{connect::Connected, socket::SocketError},
         error::SessionError,

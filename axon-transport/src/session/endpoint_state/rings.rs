@@ -56,7 +56,7 @@ impl ClientLimit {
         let more = |taken| (taken < self.most).then_some(taken + 1);
         match self.taken.fetch_update(Ordering::Relaxed, Ordering::Relaxed, more) {
             Ok(_) => Ok(ClientSlot(Arc::clone(self))),
-            Err(_) => Err(ShmError::NoRoom(self.most)),
+            Err(_) => Err(ShmError::TooManyClients(self.most)),
         }
     }
 }

@@ -1,11 +1,11 @@
 //! Which flow sends next, and what the flows that cannot send wait for: QUIC, a stream, a key, room or credit.
 
 mod held_back;
-mod lending;
+mod starvation;
 
 use std::{collections::HashSet, rc::Rc, time::Duration};
 
-use self::{held_back::BlockedFlows, lending::StarvationCredit};
+use self::{held_back::BlockedFlows, starvation::StarvationCredit};
 use super::{
     budget::Budget,
     flow::{CreditQueue, Flow, FlowPause, PeerCredit},

@@ -304,7 +304,7 @@ mod tests {
     use super::*;
     use crate::{
         ids::SessionId,
-        session::sides::subscription::{matched_reader::NumberKind, tests::reading},
+        session::endpoint_state::subscription::{matched_reader::NumberKind, tests::reading},
     };
 
     /// Readers of the rings of these writers in turn, each with samples of these times.

@@ -2,10 +2,10 @@
 //! one stream.
 
 mod counts;
+mod departed_writers;
 mod matched_reader;
 mod matched_readers;
 mod message_info;
-mod remembered;
 mod slots;
 mod taking;
 #[cfg(test)]

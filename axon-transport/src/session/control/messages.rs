@@ -11,7 +11,7 @@ use super::{ControlThread, DaemonConnection, pair_log, peers::PeerError, stands_
 use crate::{
     graph::{EndpointKind, GraphEntry},
     ids::{Gid, SessionId},
-    session::sides::{Accept, NumberKind, ServeRequest, SubscriptionInner},
+    session::endpoint_state::{Accept, NumberKind, ServeRequest, SubscriptionInner},
     wire::session::{
         Attach, Fence, Granted, MAX_DESCRIPTORS, Pair, RelayGivenUp, Segment, SegmentName,
         SegmentOpened, SessionGraph, SessionMessage, SessionRefused, StatusPart, Unmatch, Unmet,

@@ -23,7 +23,7 @@ use super::{
     descriptors::{DescriptorRoom, SpareDescriptors},
     plane::ControlPlane,
     report::send_status,
-    turns::{PART, ProcessTurn},
+    scheduler::{PART, ProcessTurn},
 };
 
 /// Packets that may wait for a session whose own are taken: its endpoints may make more of them than

@@ -14,8 +14,8 @@ use zeroize::Zeroize;
 
 use super::{
     admission::unshared,
-    conversation::{receive, say},
     descriptors::SpareDescriptors,
+    session_connection::{receive, say},
 };
 
 /// Messages of unknown types that may come before HELLO.

@@ -6,8 +6,8 @@ use axon_shm::internal::{Grant, Lane, Location, MAX_GAP, Reader};
 
 use super::{
     counts::Counts,
+    departed_writers::DepartedWriters,
     matched_reader::{MatchedReader, NumberKind},
-    remembered::DepartedWriters,
     slots::Slots,
 };
 use crate::ids::Gid;
