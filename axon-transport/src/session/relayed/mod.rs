@@ -1,9 +1,9 @@
 //! Sessions that share no memory: their samples pass through the daemon, over the session socket.
 //!
-//! The daemon treats such a session much like another host. In its own process a separate registry and gateway
-//! session represent everything outside the process (`near`). Relays read the samples that the application
-//! publishes, and stand-ins write the samples that it subscribes to. Everything else works as with shared memory. In
-//! the daemon (axon-daemon's `control::relayed`) a session of the same id holds the application's endpoints, in memory that every
+//! The daemon treats such a session much like another host. In its own process a separate registry and gateway session
+//! represent everything outside the process (`near`). Relays read the samples that the application publishes, and
+//! stand-ins write the samples that it subscribes to. Everything else works as with shared memory. In the daemon
+//! (axon-daemon's `control::relayed`) a session of the same id holds the application's endpoints, in memory that every
 //! session can map. Other sessions, on this host and elsewhere, see an ordinary session. Clients and servers have
 //! stand-ins and cross as topics do (`calls`). Liveliness is sent separately.
 //!
