@@ -12,10 +12,10 @@ use axon_transport::{
     },
 };
 
-/// The setting that says where access rules are.
+/// The setting that names the file of access rules.
 const ACCESS_FILE: &str = "AXON_ACCESS_FILE";
 
-/// What a daemon compares sessions with.
+/// The daemon's settings, with which it compares sessions.
 #[derive(Debug)]
 pub(super) struct Admission {
     uid: u32,
@@ -29,7 +29,7 @@ impl Admission {
         Self { uid, config, settings }
     }
 
-    /// The settings that may change while the daemon runs have changed.
+    /// Takes over the settings that may change while the daemon runs.
     pub(super) fn set_config(&mut self, config: &Arc<Config>) {
         self.config = Arc::clone(config);
         self.settings.retain(|(name, _)| name != ACCESS_FILE);
@@ -37,28 +37,28 @@ impl Admission {
         self.settings.extend(file.map(|file| (ACCESS_FILE.to_owned(), file)));
     }
 
-    /// The settings that the last session was compared with.
+    /// Returns the settings with which the last session was compared.
     pub(super) fn settings(&self) -> &[(String, String)] {
         &self.settings
     }
 
-    /// Whether a process of this user may speak at all.
+    /// Returns whether a process of this user may send messages at all.
     pub(super) fn trusts(&self, uid: u32) -> bool {
         uid == self.uid || self.config.trusted_uids.contains(&uid)
     }
 
-    /// As [`trusts`](Self::trusts), for a session that is about to be admitted.
+    /// Like [`trusts`](Self::trusts), for a session that is about to be admitted.
     pub(super) fn still_trusts(&self, uid: u32) -> Result<(), Box<SessionRefused>> {
         let text = || format!("user {uid} is not trusted (AXON_TRUSTED_UIDS of the daemon)");
         if self.trusts(uid) { Ok(()) } else { Err(plain(text())) }
     }
 
-    /// Whether it is another user than the daemon's.
+    /// Returns whether this user is another one than the daemon's.
     pub(super) fn is_another(&self, uid: u32) -> bool {
         uid != self.uid
     }
 
-    /// Checks a HELLO, and hands out its descriptors. `inside` is the daemon's own gateway.
+    /// Checks a HELLO, and returns its descriptors. `inside` marks the daemon's own gateway.
     pub(super) fn check(
         &mut self,
         hello: &SessionHello,
@@ -80,7 +80,7 @@ impl Admission {
         if hello.relay.is_some() && hello.role != SessionRole::Application {
             return Err(plain("only an application's session is relayed".into()));
         }
-        // A tool only asks, also why others are refused.
+        // A tool only asks, for example why sessions are refused.
         if hello.role == SessionRole::Tool {
             return Ok(None);
         }
@@ -88,7 +88,7 @@ impl Admission {
             self.read_files_again();
             self.compare(&hello.settings)?;
         }
-        // A pair hands over memory in which the samples of other topics are as well.
+        // A pair shares memory that also contains the samples of other topics.
         if hello.relay.is_none() && self.is_another(peer.uid) && !self.config.access.is_empty() {
             let text = "access rules are in force, and its user is another than the daemon's";
             return Err(unshared(text.into()));
@@ -110,7 +110,7 @@ impl Admission {
                     .into(),
             ));
         }
-        // The daemon reads it, and a read of anything else may block.
+        // The daemon reads the segment, and reading any other file may block.
         if !segment.is_memfd() {
             return Err(plain("the segment in HELLO is no memfd".into()));
         }
@@ -128,8 +128,8 @@ impl Admission {
         Ok(Some([segment, doorbell, pidfd]))
     }
 
-    /// The files of the classic identity may change while the daemon runs: its gateway reads them
-    /// again, and a session has read them as they are now.
+    /// Reads the hashes of the classic identity's files again: the files may change while the daemon runs. Its gateway
+    /// reads them again, and a session has read their present content.
     fn read_files_again(&mut self) {
         let Ok(now) = security_settings(&self.config) else { return };
         let files = |name: &str, value: &str| {
@@ -149,7 +149,7 @@ impl Admission {
         };
         let names = self.settings.iter().chain(theirs).map(|(name, _)| name);
         for name in names {
-            // A session without rules is not less protected where there are some.
+            // A session without rules is not less protected if the daemon has some.
             if name == ACCESS_FILE && find(theirs, name) == "unset" {
                 continue;
             }
@@ -172,7 +172,7 @@ fn differs(
     Box::new(SessionRefused { variable, ours, theirs, text, endpoint: None })
 }
 
-/// No memory can be shared with it: it may come back to be relayed.
+/// Returns the refusal of a session that cannot share memory: it may connect again to be relayed.
 pub(super) fn unshared(text: String) -> Box<SessionRefused> {
     let [ours, theirs] = ["on", "off"].map(str::to_owned);
     Box::new(SessionRefused { variable: SHM.into(), ours, theirs, text, endpoint: None })
@@ -327,7 +327,7 @@ mod tests {
         let fds = vec![null(), null(), own()];
         let refused = admission().check(&hello(), fds, peer, false).unwrap_err();
         assert!(refused.text.contains("memfd"));
-        // As SO_PEERCRED shows who is in a PID namespace of its own.
+        // SO_PEERCRED shows a process in a PID namespace of its own so.
         let hidden = PeerProcess { pid: 0, ..peer };
         let fds = vec![memfd(), null(), own()];
         let refused = admission().check(&hello(), fds, hidden, false).unwrap_err();

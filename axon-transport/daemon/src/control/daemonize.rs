@@ -17,22 +17,22 @@ use axon_transport::{
 
 use super::log;
 
-/// The daemon's end of the start-up pipe. In the foreground there is none.
+/// The daemon's end of the start-up pipe. A daemon in the foreground has none.
 #[derive(Debug)]
 pub(super) struct Report {
     pipe: Option<OwnedFd>,
 }
 
 impl Report {
-    /// Nobody waits.
+    /// Returns a report that no process waits for.
     pub(super) fn none() -> Self {
         Self { pipe: None }
     }
 
-    /// Takes standard output, which goes to the null device from now on.
+    /// Takes over standard output as the pipe; standard output goes to the null device from now on.
     ///
     /// # Errors
-    /// What the system says.
+    /// The error of a system call.
     pub(super) fn from_stdout() -> std::io::Result<Self> {
         let pipe = rustix::stdio::stdout().try_clone_to_owned()?;
         let null = std::fs::OpenOptions::new().write(true).open("/dev/null")?;
@@ -40,30 +40,30 @@ impl Report {
         Ok(Self { pipe: Some(pipe) })
     }
 
-    /// The daemon takes sessions.
+    /// Reports that the daemon accepts sessions.
     pub(super) fn ready(&mut self) {
         self.say("ready\n");
     }
 
-    /// Another daemon has the address.
+    /// Reports that another daemon has the address.
     pub(super) fn taken(&mut self) {
         self.say("taken\n");
     }
 
-    /// The daemon gives up.
+    /// Reports that the daemon gives up.
     pub(super) fn error(&mut self, text: &str) {
         self.say(&format!("error: {}\n", text.replace('\n', " ")));
     }
 
     fn say(&mut self, text: &str) {
         if let Some(pipe) = self.pipe.take() {
-            // The process that started this one may have gone meanwhile.
+            // The process that started this one may have ended meanwhile.
             let _ = std::fs::File::from(pipe).write_all(text.as_bytes());
         }
     }
 }
 
-/// The first process: starts the second one with the same arguments, and is done.
+/// Runs the first process: starts the second one with the same arguments, and is done.
 ///
 /// # Errors
 /// When it cannot be started.
@@ -73,10 +73,10 @@ pub(super) fn start_detached() -> std::io::Result<()> {
     Command::new(std::env::current_exe()?).args(arguments).arg(DETACHED).spawn().map(drop)
 }
 
-/// The second process: leaves the session's terminal, directory and descriptors.
+/// Runs the second process: leaves the session's terminal, directory and descriptors.
 ///
 /// # Errors
-/// What the system says.
+/// The error of a system call.
 pub(super) fn detach(config: Option<&Config>) -> std::io::Result<()> {
     rustix::process::setsid()?;
     rustix::process::chdir("/")?;
@@ -84,7 +84,7 @@ pub(super) fn detach(config: Option<&Config>) -> std::io::Result<()> {
         && let Some(dir) = &config.runtime_dir
         && private_directory(dir).is_ok()
     {
-        // Without its log a daemon works as well.
+        // A daemon also works without its log.
         let _ = log::keep_in(&dir.join(format!("axon-{}.log", config.domain)));
     }
     Ok(())

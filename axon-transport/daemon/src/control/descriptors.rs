@@ -1,7 +1,7 @@
-//! How many sessions and segments the daemon's descriptors allow.
+//! Limits the sessions and segments to the daemon's descriptors.
 //!
-//! A process may take no more than stays free for all others: the first one gets half, the next one a third. So there
-//! is always room for another process's first session, however much the others want.
+//! A process may take no more descriptors than stay free for all others: the first process gets half, the next one a
+//! third. So another process's first session always fits, however much the others want.
 
 use std::{cell::RefCell, os::fd::OwnedFd};
 
@@ -12,34 +12,34 @@ use axon_transport::internal::{
 };
 use rustix::event::{EventfdFlags, eventfd};
 
-/// A session's connection, segment, doorbell and pidfd.
+/// Descriptors of a session: its connection, segment, doorbell and pidfd.
 const OF_SESSION: u64 = 4;
-/// A session's doorbell and pidfd, in the gateway, once another host has to do with one of its endpoints.
+/// Descriptors of a session in the gateway, once another host uses one of its endpoints: its doorbell and pidfd.
 const IN_GATEWAY: u64 = 2;
-/// A relayed session: its connection, a socket pair, and what a session in this process opens.
+/// Descriptors of a relayed session: its connection, a socket pair, and those that a session in this process opens.
 const OF_RELAYED: u64 = 24;
-/// What stays free for links, key requests, files and callers. Of a low limit a sixth.
+/// Number of descriptors that stay free for links, key requests, files and callers; at most a sixth of the limit.
 const RESERVED_DESCRIPTORS: u64 = 40;
-/// Descriptors that are given up for a moment to answer a caller. Of a low limit an eighth.
+/// Number of descriptors that are closed for a moment to answer a caller; at most an eighth of the limit.
 const SPARE: u64 = 24;
 
-/// What the daemon's descriptors are used for.
+/// The use of the daemon's descriptors.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct DescriptorRoom {
     /// The soft RLIMIT_NOFILE.
     limit: u64,
-    /// Those that are open.
+    /// Number of open descriptors.
     open: u64,
-    /// Those that the gateway may yet open for the sessions that there are.
+    /// Number of descriptors that the gateway may still open for the present sessions.
     owed: u64,
-    /// The sessions with descriptors, without the gateway's own.
+    /// Number of sessions with descriptors, without the gateway's own.
     sessions: usize,
-    /// Those that are held for the sessions of one process.
+    /// Number of descriptors held for the sessions of one process.
     held: u64,
 }
 
 impl DescriptorRoom {
-    /// The room for process `pid`. `None` where there is no limit.
+    /// Computes the use for process `pid`. Returns `None` if there is no limit.
     pub(super) fn of<F: Clone>(registry: &Registry<F>, pid: u32) -> Option<Self> {
         let limit = descriptors::limit()?;
         let mut room = Self { limit, open: descriptors::open(), owed: 0, sessions: 0, held: 0 };
@@ -66,22 +66,22 @@ impl DescriptorRoom {
         }
     }
 
-    /// Those that nobody's session may take.
+    /// Returns the number of descriptors that no session may take.
     fn kept(&self) -> u64 {
         self.owed + RESERVED_DESCRIPTORS.min(self.limit / 6)
     }
 
-    /// Those that sessions may still take.
+    /// Returns the number of descriptors that sessions may still take.
     fn free(&self) -> u64 {
         self.limit.saturating_sub(self.open + self.kept())
     }
 
-    /// Why there is none for another session, if so.
+    /// Returns the reason why there is no descriptor for another session, if so.
     pub(super) fn refuses_session(&self, is_relayed: bool) -> Option<String> {
         self.refuses(if is_relayed { OF_RELAYED } else { OF_SESSION } + IN_GATEWAY)
     }
 
-    /// Why there is none for another segment of a session, if so.
+    /// Returns the reason why there is no descriptor for another segment of a session, if so.
     pub(super) fn refuses_segment(&self) -> Option<String> {
         self.refuses(1)
     }
@@ -111,13 +111,13 @@ impl DescriptorRoom {
     }
 }
 
-/// Descriptors that are kept so that there are some when none can be opened: with them the daemon accepts and answers a
-/// caller. Opened first, they have low numbers, and so are of use as well after the limit was lowered.
+/// Descriptors that are kept in reserve: when none can be opened, the daemon frees them to accept and answer a caller.
+/// They are opened first and so have low numbers, which makes them useful even after the limit was lowered.
 #[derive(Debug, Default)]
 pub(super) struct SpareDescriptors(RefCell<Vec<OwnedFd>>);
 
 impl SpareDescriptors {
-    /// Opens those that are missing.
+    /// Opens the missing spare descriptors.
     pub(super) fn fill(&self) {
         let limit = descriptors::limit().unwrap_or(u64::MAX);
         let most = usize::try_from(SPARE.min(limit / 8)).unwrap_or_default();
@@ -129,20 +129,20 @@ impl SpareDescriptors {
         }
     }
 
-    /// Gives them up until what is returned is dropped.
+    /// Closes them until the returned value is dropped.
     pub(super) fn lend(&self) -> LentDescriptors<'_> {
         self.0.borrow_mut().clear();
         LentDescriptors(self)
     }
 
-    /// Whether a caller may keep the one that it was answered with.
+    /// Returns whether a caller may keep the descriptor with which it was answered.
     pub(super) fn can_keep_caller(&self) -> bool {
         self.fill();
         self.0.borrow().len() > 1
     }
 }
 
-/// See [`SpareDescriptors::lend`].
+/// The loan of the spare descriptors; see [`SpareDescriptors::lend`].
 pub(super) struct LentDescriptors<'a>(&'a SpareDescriptors);
 
 impl Drop for LentDescriptors<'_> {

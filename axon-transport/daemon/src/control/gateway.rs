@@ -24,14 +24,14 @@ use super::{
 };
 use crate::bridge::{CHANNEL, GatewayParts, ToControl, ToGateway};
 
-/// What runs on the gateway's thread.
+/// The function that runs on the gateway's thread.
 pub type GatewayEntry = fn(GatewayParts) -> Result<(), String>;
 
-/// How long the first gateway may take to stand.
+/// Maximum time that the first gateway may take to start.
 const START: Duration = Duration::from_secs(10);
-/// How long a gateway may take to say goodbye.
+/// Maximum time that a gateway may take to say goodbye.
 const GOODBYE: Duration = Duration::from_secs(2);
-/// How long a gateway must have run for its failure not to lengthen the pause.
+/// Minimum run time of a gateway after which its failure does not lengthen the pause.
 const STEADY: Duration = Duration::from_secs(60);
 
 /// A gateway that runs, or ran.
@@ -42,7 +42,7 @@ pub(super) struct RunningGateway {
 }
 
 impl RunningGateway {
-    /// Starts one.
+    /// Starts a gateway.
     pub(super) fn start(
         control: &Rc<RefCell<ControlPlane>>,
         entry: GatewayEntry,
@@ -77,17 +77,17 @@ impl RunningGateway {
         Ok(Self { orders, events, end })
     }
 
-    /// Waits until it stands.
+    /// Waits until the gateway has started.
     ///
     /// # Errors
-    /// Why it does not.
+    /// The reason why it has not started.
     pub(super) async fn stands(
         &mut self,
         control: &Rc<RefCell<ControlPlane>>,
     ) -> Result<(), String> {
         let started = async {
             tokio::select! {
-                // One that stood and failed since then did stand.
+                // A gateway that started and has failed since then did start.
                 biased;
                 event = self.events.recv() => event,
                 why = &mut self.end => return Err(why.unwrap_or_else(|_| "ended".into())),
@@ -99,7 +99,7 @@ impl RunningGateway {
                 control.borrow_mut().gateway_says(event);
                 Ok(())
             }
-            // It closed the channel before it ended: the end says why.
+            // It closed the channel before it ended: the end has the reason.
             Ok(Err(why)) if why.is_empty() => {
                 Err((&mut self.end).await.unwrap_or_else(|_| "ended".into()))
             }
@@ -108,7 +108,7 @@ impl RunningGateway {
         }
     }
 
-    /// What the gateway says next; `Err` with the reason when it has ended.
+    /// Returns the gateway's next message; `Err` with the reason if it has ended.
     pub(super) async fn next(&mut self) -> Result<ToControl, String> {
         match self.events.recv().await {
             Some(event) => Ok(event),
@@ -116,8 +116,8 @@ impl RunningGateway {
         }
     }
 
-    /// Gives an order, unless the gateway is gone or so far behind that the channel is full.
-    /// Whether it was given.
+    /// Sends an order, unless the gateway is gone or so far behind that the channel is full. Returns whether it was
+    /// sent.
     pub(super) fn order(&self, order: ToGateway) -> bool {
         let sent = self.orders.try_send(order);
         if let Err(TrySendError::Full(order)) = &sent {
@@ -126,7 +126,7 @@ impl RunningGateway {
         sent.is_ok()
     }
 
-    /// Has it say goodbye, and waits for that, but not for ever.
+    /// Makes the gateway say goodbye, and waits for that for a limited time.
     pub(super) async fn end(mut self) {
         let goodbye = async {
             if self.orders.send(ToGateway::Shutdown).await.is_ok() {

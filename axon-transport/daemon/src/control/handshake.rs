@@ -18,21 +18,21 @@ use super::{
     session_connection::{receive, say},
 };
 
-/// Messages of unknown types that may come before HELLO.
+/// Maximum number of messages of unknown types before HELLO.
 const UNKNOWN: u32 = 8;
 
-/// What a connection begins with.
+/// The first messages of a connection.
 pub(super) struct PreHelloMessage {
     pub(super) hello: SessionHello,
     pub(super) descriptors: Vec<PassedFd>,
-    /// What came before: the key that the session's id is made of.
+    /// The key that came before HELLO, from which the session's id is made.
     pub(super) key: Option<Arc<SessionKey>>,
-    /// Its descriptors were left where they are, since there is no room for them.
+    /// True if its descriptors were left in the socket, because there is no space for them.
     pub(super) is_crowded: bool,
 }
 
 impl PreHelloMessage {
-    /// Whether the key that came, if one did, is that of the id.
+    /// Returns whether the key, if one came, matches the id.
     pub(super) fn is_its_own(&self) -> Result<(), Box<SessionRefused>> {
         match &self.key {
             Some(key) if key.id() != self.hello.session => {
@@ -44,8 +44,8 @@ impl PreHelloMessage {
     }
 }
 
-/// Waits for HELLO; `None` when something else comes. Where descriptors are short and there is no room for another
-/// session, those of HELLO stay in the socket: its sender could make their closing last.
+/// Waits for HELLO. Returns `None` if another message comes. If descriptors are short and there is none for another
+/// session, those of HELLO stay in the socket: its sender could delay their close.
 pub(super) async fn first(
     spare: &SpareDescriptors,
     socket: &AsyncFd<PassedFd>,
@@ -71,19 +71,19 @@ pub(super) async fn first(
             Ok(ReceivedMessage { message: SessionMessage::Unknown(OWNER), descriptors })
                 if key.is_none() && descriptors.is_empty() =>
             {
-                // One that is no key ends the connection: it comes once at most.
+                // A packet that is no key ends the connection, so there is at most one.
                 let its_key = SessionKey::from_packet(&buffer);
                 buffer.zeroize();
                 key = Some(Arc::new(its_key?));
             }
-            // A later version may say something first; a flood would keep everybody else waiting.
+            // A later version may send other messages first; a flood of them would keep all other connections waiting.
             Ok(ReceivedMessage { message: SessionMessage::Unknown(_), descriptors })
                 if unknown < UNKNOWN && descriptors.is_empty() =>
             {
                 unknown += 1;
             }
             Err(SocketError::NotReady) => ready.clear_ready(),
-            // Not for want of room here: somebody keeps them back.
+            // The cause is not a lack of descriptors here: some process keeps them back.
             Err(SocketError::NoDescriptors)
                 if !descriptors::is_clogged() && spare.can_keep_caller() =>
             {
@@ -93,7 +93,7 @@ pub(super) async fn first(
             }
             Ok(_) | Err(_) => return None,
         }
-        // A socket that stays readable must not keep the others, or the time limit, from their turn.
+        // A socket that stays readable must not keep other connections, or the time limit, from their turn.
         tokio::task::yield_now().await;
     }
 }

@@ -49,16 +49,16 @@ use crate::{
     control::relayed::DaemonRelay,
 };
 
-/// How long a connection may take to say HELLO.
+/// Maximum time that a connection may take to send HELLO.
 const HELLO_TIMEOUT: Duration = Duration::from_secs(5);
-/// Between attempts when no connection can be accepted.
+/// Pause between attempts when no connection can be accepted.
 const RETRY_INTERVAL: Duration = Duration::from_millis(50);
 
 /// Accepts sessions for as long as it is polled.
 pub(super) async fn accept(control: Rc<RefCell<ControlPlane>>, listeners: Vec<OwnedFd>) {
     let strangers = PendingConnections::default();
     let mut listeners = listeners.into_iter();
-    // A path, a name, or both.
+    // The listener at a path, the one at a name, or both.
     let [first, second] = [listeners.next(), listeners.next()].map(|listener| async {
         if let Some(listener) = listener {
             accept_at(control.clone(), listener, strangers.clone()).await;
@@ -81,7 +81,7 @@ async fn accept_at(
     loop {
         let Ok(mut ready) = listener.readable().await else { return };
         if descriptors::close_queue_is_full() {
-            // Those that have a session keep it.
+            // Existing sessions stay.
             if !std::mem::replace(&mut full, true) {
                 tracing::error!("too many connections wait to be closed: no more are accepted");
             }
@@ -91,7 +91,7 @@ async fn accept_at(
         full = false;
         let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
         let accept = |l: &AsyncFd<PassedFd>| match accept_with(l.get_ref(), flags) {
-            // The caller is told why it is refused.
+            // A spare descriptor serves to send the caller the reason for its refusal.
             Err(Errno::MFILE | Errno::NFILE) => {
                 let _lent = spare.lend();
                 accept_with(l.get_ref(), flags)
@@ -110,11 +110,11 @@ async fn accept_at(
                 };
                 let stranger = strangers.add(pid, most);
                 spawn_local(serve(control.clone(), socket, InternalPeer::No, Some(stranger)));
-                // Those that were served meanwhile go on.
+                // Lets the tasks of other connections continue.
                 tokio::task::yield_now().await;
             }
             Ok(Err(error)) => {
-                // Out of descriptors, or the caller has gone: neither ends the daemon.
+                // No descriptor is left, or the caller has gone: neither ends the daemon.
                 if let Some(times) = failures.count(begun.elapsed()) {
                     tracing::warn!(%error, times, "a session could not be accepted");
                 }
@@ -125,20 +125,20 @@ async fn accept_at(
     }
 }
 
-/// Whose end of a socket pair it is that the daemon serves.
+/// The owner of the other end of the socket that the daemon serves.
 pub(super) enum InternalPeer {
-    /// Nobody's: somebody connected.
+    /// No internal peer: a process connected.
     No,
-    /// The gateway's.
+    /// The gateway.
     Gateway,
-    /// That of a relayed session of process `pid`.
+    /// A relayed session of process `pid`.
     Relay { pid: u32, uid: u32, tally: Arc<RelayCounters>, key: Option<Arc<SessionKey>> },
 }
 
-/// How often it is looked whether a session that hung up came back.
+/// Interval at which the daemon checks whether a session that hung up came back.
 const AWAIT_PROCESS: Duration = Duration::from_secs(1);
 
-/// Serves one connection to its end. It is a `stranger` until it said HELLO.
+/// Serves one connection to its end. It counts as a `stranger` until it sent HELLO.
 pub(super) async fn serve(
     control: Rc<RefCell<ControlPlane>>,
     socket: PassedFd,
@@ -201,8 +201,8 @@ pub(super) async fn serve(
     await_process(&control, &id, &death).await;
 }
 
-/// Waits until the process of a session that hung up has ended, if readers are to be handed what it left. It may come
-/// back before.
+/// Waits until the process of a session that hung up has ended, if readers are to get its remaining memory. The session
+/// may come back before.
 async fn await_process(
     control: &RefCell<ControlPlane>,
     id: &SessionId,
@@ -217,7 +217,7 @@ async fn await_process(
     }
 }
 
-/// Refuses somebody, and shows it.
+/// Refuses a connection, and shows the refusal in log and status.
 fn refuse(
     control: &mut ControlPlane,
     socket: &AsyncFd<PassedFd>,
@@ -243,7 +243,7 @@ fn refuse_for_room(
     say(socket, SessionMessage::Refused(SessionRefused::because(why)), &[]);
 }
 
-/// Why there are no descriptors for a session, if so. What a tool needs is its connection.
+/// Returns the reason why there are no descriptors for a session, if so. A tool needs only its connection.
 fn no_room(
     control: &ControlPlane,
     role: SessionRole,
@@ -259,12 +259,12 @@ fn no_room(
     }
 }
 
-/// What is shown of a session in log and status.
+/// Returns the name of a session as it is shown in log and status.
 fn shown(name: &str) -> String {
     text::plain(name, 64)
 }
 
-/// Has a session relayed whose memory is not shared.
+/// Starts the relay of a session whose memory is not shared.
 fn relay(
     control: &Rc<RefCell<ControlPlane>>,
     socket: AsyncFd<PassedFd>,
@@ -325,12 +325,12 @@ fn relay(
     }
 }
 
-/// How far a session is discovered, as it says.
+/// Returns the discovery scope that a session requests.
 fn scope_of(hello: &SessionHello) -> Scope {
     Scope::of(hello.range, hello.static_peers.clone().unwrap_or_default())
 }
 
-/// The daemon's settings with the range of a relayed session, under whose id they are used.
+/// Returns the daemon's settings with the range of a relayed session, whose id they are used under.
 fn scoped(config: &Config, scope: Scope) -> Arc<Config> {
     let Scope { range, static_peers, .. } = scope;
     let mut own = config.clone();
@@ -338,13 +338,13 @@ fn scoped(config: &Config, scope: Scope) -> Arc<Config> {
     Arc::new(own)
 }
 
-/// A session that is served.
+/// An admitted session.
 struct Admitted {
     id: SessionId,
     bell: Rc<Notify>,
-    /// Its process's.
+    /// The turn of its process.
     turn: ProcessTurn,
-    /// Tells that its process ended.
+    /// The pidfd that shows that its process ended.
     death: Option<AsyncFd<Arc<PassedFd>>>,
 }
 
@@ -363,7 +363,7 @@ fn admit(
     // The settings may have changed since the connection was accepted.
     let uid = if let InternalPeer::Relay { uid, .. } = inside { *uid } else { peer.uid };
     let trusted = its_own.and_then(|()| control.admission.still_trusts(uid));
-    // The connection of a relayed session was let in with this one.
+    // The connection of a relayed session was admitted together with this one.
     if trusted.is_ok()
         && matches!(inside, InternalPeer::No)
         && let Some(why) = no_room(control, hello.role, peer.pid, false)
@@ -372,7 +372,7 @@ fn admit(
         return None;
     }
     if is_crowded {
-        // There is room again: it comes again.
+        // There are descriptors again: the session connects again.
         return None;
     }
     let checked =
@@ -385,7 +385,8 @@ fn admit(
         }
     };
     let pid = if let InternalPeer::Relay { pid, .. } = inside { *pid } else { peer.pid };
-    // Endpoints are named after their session's id: a session with another's id could end them.
+    // Endpoints are named after their session's id: a session with the id of another one could end the other one's
+    // endpoints.
     if let Some(pid) = taken_by(control, &hello.session, pid) {
         let text = format!("process {pid} has a session with this one's id or one like it");
         refuse(control, socket, &hello.name, peer, SessionRefused::because(text));
@@ -411,7 +412,7 @@ fn admit(
         refuse(control, socket, &name, peer, SessionRefused::because(violation.to_string()));
         return None;
     }
-    // What another user may do, the access rules say.
+    // Access rules decide what another user may do.
     if control.admission.is_another(uid) {
         control.registry.set_user(&session, uid);
     }
@@ -438,8 +439,8 @@ fn admit(
     Some(Admitted { id: session, bell, turn, death })
 }
 
-/// The process of a session whose endpoints have the same GIDs as those of `session`, of process
-/// `pid`, would have. The session itself may come back.
+/// Returns the process of a session whose endpoints would have the same GIDs as those of `session`, of process `pid`.
+/// The session itself may come back.
 fn taken_by(control: &ControlPlane, session: &SessionId, pid: u32) -> Option<u32> {
     let alike = |id: &SessionId| Gid::new(*id, 0) == Gid::new(*session, 0);
     let mut others = control.registry.sessions();

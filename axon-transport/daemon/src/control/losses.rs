@@ -1,5 +1,5 @@
-//! Samples that did not get where they were to go, by topic and cause. The control plane and the threads of relayed
-//! sessions count them.
+//! Counts samples that did not reach their destination, by topic and cause. The control plane and the threads of
+//! relayed sessions count them.
 
 use std::{
     collections::BTreeMap,
@@ -8,17 +8,17 @@ use std::{
 
 use crate::bridge::OTHER_TOPICS;
 
-/// Topics that are told apart.
+/// Maximum number of topics that are counted separately.
 const MAX_TOPICS: usize = 1024;
 
 pub(super) type ByTopic = BTreeMap<String, BTreeMap<&'static str, u64>>;
 
-/// Counts them. Thread-safe.
+/// The counts of lost samples. Thread-safe.
 #[derive(Debug, Default)]
 pub(crate) struct Losses(Mutex<ByTopic>);
 
 impl Losses {
-    /// Samples of a topic are lost.
+    /// Counts lost samples of a topic.
     pub(super) fn add(&self, topic: &str, cause: &'static str, samples: u64) {
         let mut all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let there = all.contains_key(topic) || all.len() < MAX_TOPICS;
@@ -27,7 +27,7 @@ impl Losses {
         *count = count.saturating_add(samples);
     }
 
-    /// All of them.
+    /// Returns all counts.
     pub(super) fn all(&self) -> ByTopic {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }

@@ -9,24 +9,25 @@ use std::{
 
 use tokio::sync::Notify;
 
-/// Connections that may be without a HELLO at a time.
+/// Maximum number of connections without a HELLO at a time.
 pub(super) const MAX_PENDING_CONNECTIONS: usize = 256;
-/// The same where the daemon's descriptors are short.
+/// The maximum if the daemon's descriptors are short.
 pub(super) const MOST_WHERE_SHORT: usize = 8;
 
-/// Those of all processes. Of too many the process goes short that has the most of them, by the one
-/// that has said nothing for longest: a process that speaks as it connects is not held up by others.
+/// The connections without HELLO of all processes. If there are too many, the process with the most of them loses the
+/// connection that has been silent longest: other processes do not delay a process that sends HELLO as it connects.
 #[derive(Clone, Debug, Default)]
 pub(super) struct PendingConnections(Rc<RefCell<SilentConnection>>);
 
 #[derive(Debug, Default)]
 struct SilentConnection {
     next: u64,
-    /// By the order in which they came: the process, and what tells that another one takes its place.
+    /// The connections in order of arrival: the process of each, and the signal that another connection takes its
+    /// place.
     connections: BTreeMap<u64, (u32, Rc<Notify>)>,
 }
 
-/// One of them, until it is dropped.
+/// A connection that has not sent HELLO, until it is dropped.
 #[derive(Debug)]
 pub(super) struct PendingConnection {
     strangers: PendingConnections,
@@ -35,7 +36,7 @@ pub(super) struct PendingConnection {
 }
 
 impl PendingConnections {
-    /// A connection of process `pid` came. If there are more than `most`, one of them has to go.
+    /// Adds a connection of process `pid`. If there are more than `most`, one of them has to go.
     pub(super) fn add(&self, pid: u32, most: usize) -> PendingConnection {
         let mut waiting = self.0.borrow_mut();
         let (number, replaced) = (waiting.next, Rc::new(Notify::new()));

@@ -51,57 +51,57 @@ pub(super) struct ControlPlane {
     pub(super) config: Arc<Config>,
     pub(super) admission: Admission,
     pub(super) id: DaemonId,
-    /// The key of which it is made.
+    /// The key from which the id is made.
     pub(super) daemon_key: Option<Arc<DaemonKey>>,
     pub(super) started: Instant,
     pub(super) address: Address,
     pub(super) registry: Registry<Arc<PassedFd>>,
     pub(super) links: BTreeMap<String, LinkStatus>,
-    /// Routes that do not cross these links.
+    /// The refused routes by link.
     pub(super) refused_routes: BTreeMap<String, Vec<RefusedRoute>>,
-    /// The sessions that were told of them.
+    /// The endpoints whose sessions were notified of the refused routes.
     told: NotifiedEndpoints,
     pub(super) refusals: Refusals,
-    /// Descriptors for callers that are refused for want of any.
+    /// Descriptors to answer callers when no other descriptor is left.
     pub(super) spare: Rc<SpareDescriptors>,
-    /// Sessions that were refused for want of descriptors.
+    /// Number of sessions that were refused for want of descriptors.
     pub(super) crowded_out: u64,
     crowded_log: LogLimit,
-    /// Samples that did not get to other hosts, or that ended relayed sessions left.
+    /// Samples that did not reach other hosts, or that ended relayed sessions left.
     pub(super) lost: Arc<Losses>,
-    /// Whether samples of publishers that ended are on their way to other hosts.
+    /// True if samples of ended publishers are in flight to other hosts.
     draining: bool,
     pub(super) keys: serde_json::Value,
     pub(super) port: Option<u16>,
     pub(super) gateway: String,
     /// The sessions' own keys, with which the gateway proves that they are this daemon's.
     pub(super) keys_of_sessions: Arc<SessionKeys>,
-    /// For the samples that arrive over relays.
+    /// The memory for samples that arrive over relays.
     pub(super) pool: Arc<ArrivalPool>,
-    /// Memory that sessions try whether they can map it.
+    /// Memory with which sessions check that they can map the daemon's memory.
     pub(super) probe: Option<OwnedFd>,
-    /// Packets that were exchanged with sessions.
+    /// Counters of the packets exchanged with sessions.
     pub(super) traffic: TrafficStatus,
-    /// The rules for the gateway, and how often they changed.
+    /// The rules for the gateway, and the number of changes.
     pub(super) rules: watch::Sender<(u64, TrafficRules)>,
-    /// The number of those that the gateway says it has.
+    /// The number of the rules that the gateway reported to be in force.
     pub(super) rules_in_force: watch::Sender<u64>,
-    /// Wakes the task that reads the settings again, and the sessions that asked for it.
+    /// Wakes the task that reads the settings again; `reload_asked` has the sessions that asked for it.
     pub(super) reload: Rc<Notify>,
     pub(super) reload_asked: Vec<SessionId>,
     /// Questions about the access rules of peers.
     pub(super) questions: AccessQuestions,
-    /// The range and the hosts of discovery: what the widest session needs.
+    /// The range and the hosts of discovery that the widest session needs.
     pub(super) wanted: watch::Sender<DiscoveryNeeds>,
-    /// The addresses that names of static peers have.
+    /// The addresses of the names of static peers.
     names: BTreeMap<String, Vec<IpAddr>>,
-    /// Where linked peers are.
+    /// The addresses of linked peers.
     linked: BTreeMap<DaemonId, IpAddr>,
     wakers: HashMap<SessionId, Rc<Notify>>,
     pub(super) turns: ProcessScheduler,
     /// Wakes the task that flushes the graph.
     pub(super) changed: Rc<Notify>,
-    /// Whether there is an application, and what wakes the task that waits for that to change.
+    /// True if there is an application. `need` wakes the task that waits for a change of that.
     needed: bool,
     pub(super) need: Rc<Notify>,
 }
@@ -164,7 +164,7 @@ impl ControlPlane {
         }
     }
 
-    /// The bell of a session's task.
+    /// Creates the bell of a session's task.
     pub(super) fn add_waker(&mut self, id: SessionId) -> Rc<Notify> {
         let bell = Rc::new(Notify::new());
         // The task of a connection that is replaced ends at once, and with it its descriptors.
@@ -174,9 +174,8 @@ impl ControlPlane {
         bell
     }
 
-    /// A session's task ends: removes a part of the session's remaining state; returns whether there is
-    /// more.
-    /// `bell` is its own: a session that came back has another.
+    /// Removes a part of the remaining state of a session whose task ends. Returns whether there is more. `bell` is the
+    /// task's own: a session that came back has another.
     pub(super) fn remove_some(&mut self, id: &SessionId, bell: &Rc<Notify>) -> bool {
         if !self.is_current(id, bell) {
             return false;
@@ -199,12 +198,12 @@ impl ControlPlane {
         self.keys_of_sessions.remove(id);
     }
 
-    /// Whether `bell` is still that of the session's task.
+    /// Returns whether `bell` is still that of the session's task.
     pub(super) fn is_current(&self, id: &SessionId, bell: &Rc<Notify>) -> bool {
         self.wakers.get(id).is_some_and(|current| Rc::ptr_eq(current, bell))
     }
 
-    /// Wakes the tasks of sessions that got something to be told.
+    /// Wakes the tasks of sessions that have new messages.
     pub(super) fn settle(&mut self) {
         self.registry.answer_fences();
         for (id, why) in self.registry.take_refused() {
@@ -229,18 +228,18 @@ impl ControlPlane {
         }
     }
 
-    /// Tells discovery which hosts the sessions that there are want.
+    /// Sends discovery the hosts that the present sessions want.
     pub(super) fn look_for_hosts(&self) {
         let wanted = DiscoveryNeeds::of(&self.config, self.registry.scopes());
         self.wanted.send_if_modified(|known| std::mem::replace(known, wanted.clone()) != wanted);
     }
 
-    /// Whether there is an application, or something on its way to another host.
+    /// Returns whether there is an application, or a sample in flight to another host.
     pub(super) fn is_needed(&self) -> bool {
         self.draining || self.registry.is_needed()
     }
 
-    /// Logs and shows that somebody is refused.
+    /// Logs a refusal, and shows it in the status.
     pub(super) fn refused(
         &mut self,
         kind: RefusalKind,
@@ -252,7 +251,7 @@ impl ControlPlane {
         self.refusals.add(kind, RefusalStatus::new(SystemTime::now(), peer, what, reason));
     }
 
-    /// A session is refused for want of descriptors. All those of a host may come again and again.
+    /// Records that a session is refused for want of descriptors. All sessions of a host may come again and again.
     pub(super) fn refused_for_room(&mut self, peer: String, reason: String) {
         const WHAT: &str = "descriptors";
         self.crowded_out += 1;
@@ -265,7 +264,7 @@ impl ControlPlane {
         self.refusals.add(RefusalKind::Local, refusal);
     }
 
-    /// What the gateway says, but for what concerns discovery alone.
+    /// Handles a message of the gateway, except for discovery's part of it.
     pub(super) fn gateway_says(&mut self, message: ToControl) {
         match message {
             ToControl::Rules(number) => drop(self.rules_in_force.send_replace(number)),
@@ -321,14 +320,14 @@ impl ControlPlane {
         self.settle();
     }
 
-    /// The addresses that names of static peers have now.
+    /// Sets the present addresses of the names of static peers.
     pub(super) fn named(&mut self, names: BTreeMap<String, Vec<IpAddr>>) {
         self.names = names;
         self.relist();
         self.settle();
     }
 
-    /// Whether there is a link with this daemon.
+    /// Returns whether there is a link with this daemon.
     pub(super) fn is_linked(&self, daemon: &DaemonId) -> bool {
         self.linked.contains_key(daemon)
     }
@@ -340,8 +339,8 @@ impl ControlPlane {
         }
     }
 
-    /// Decides anew which linked peers each session lists: those whose link is at an address that one
-    /// of its static peers has. What beacons say of addresses does not count, as anybody can write it.
+    /// Decides anew which linked peers each session lists: the peers whose link is at an address of one of its static
+    /// peers. Addresses in beacons do not count, because any host can write them.
     pub(super) fn relist(&mut self) {
         let (names, linked) = (&self.names, &self.linked);
         self.registry.relist(|peers| {
@@ -357,7 +356,7 @@ impl ControlPlane {
         });
     }
 
-    /// The gateway is no more, and with it everything that was known of other hosts.
+    /// Handles the end of the gateway, and forgets everything about other hosts.
     pub(super) fn gateway_ended(&mut self, why: &str) {
         self.gateway = why.to_owned();
         self.port = None;

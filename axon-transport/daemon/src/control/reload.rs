@@ -1,6 +1,6 @@
 //! Reads the settings again that may change while the daemon runs: on SIGHUP, and when `axon reload` asks for it.
 //!
-//! Where something is wrong with them, nothing changes.
+//! If a setting is wrong, nothing changes.
 
 use std::{cell::RefCell, ffi::OsString, rc::Rc, sync::Arc, time::Duration};
 
@@ -14,10 +14,10 @@ use tokio::{signal::unix::Signal, time::timeout};
 use super::{log, plane::ControlPlane};
 use crate::bridge::TrafficRules;
 
-/// How long the gateway may take to have new rules.
+/// Maximum time that the gateway may take to put new rules in force.
 const IN_FORCE: Duration = Duration::from_secs(10);
 
-/// The environment that a daemon read its settings from.
+/// The environment from which a daemon reads its settings.
 #[derive(Clone, Debug)]
 pub(super) struct SettingsSource {
     /// Settings that name files, as absolute paths.
@@ -25,12 +25,12 @@ pub(super) struct SettingsSource {
 }
 
 impl SettingsSource {
-    /// That of this process, whose current directory relative paths begin in.
+    /// Returns the environment of this process. Relative paths begin in its current directory.
     pub(super) fn environment() -> Self {
         Self { paths: absolute_paths() }
     }
 
-    /// Reads them.
+    /// Reads the settings.
     ///
     /// # Errors
     /// A setting that is wrong.
@@ -54,7 +54,7 @@ pub(super) async fn reload(
         }
         // Sessions that ask from here on are answered by the next reading.
         let asking = std::mem::take(&mut control.borrow_mut().reload_asked);
-        // It reads files, and a file system may hang.
+        // Reading files may hang with their file system.
         let mut report = match source.clone() {
             Some(source) => {
                 let read = tokio::task::spawn_blocking(move || source.read()).await;
@@ -84,7 +84,7 @@ pub(super) async fn reload(
 /// Waits until the gateway has the rules in force: a session that asked may rely on them once it is answered.
 ///
 /// # Errors
-/// It did not say so in time.
+/// The gateway did not report that in time.
 async fn wait_in_force(control: &Rc<RefCell<ControlPlane>>) -> Result<(), String> {
     let (number, mut in_force) = {
         let control = control.borrow();
@@ -118,7 +118,7 @@ fn log_report(report: &ReloadReport) {
 }
 
 impl ControlPlane {
-    /// A session asks for the settings to be read again. Other users may not.
+    /// Handles a session's request to read the settings again. Other users may not request that.
     pub(super) fn ask_reload(&mut self, id: &SessionId) {
         let user = self.registry.session(id).and_then(|entry| entry.user);
         if let Some(user) = user {
@@ -135,7 +135,7 @@ impl ControlPlane {
         self.registry.tell_status(id, text.into());
     }
 
-    /// Takes what may change of settings that were read.
+    /// Takes over the settings that may change from settings that were read.
     fn take_settings(&mut self, read: Result<Config, ConfigError>) -> ReloadReport {
         let mut report = ReloadReport::default();
         let new = match read {
@@ -180,8 +180,8 @@ impl ControlPlane {
 }
 
 impl ControlPlane {
-    /// Ends the sessions of users who are not trusted any more, and those that share memory and would not be let in with
-    /// it now.
+    /// Ends the sessions of users that are not trusted any more, and the sessions that share memory and would not be
+    /// admitted with that now.
     fn end_excluded(&mut self) {
         let has_rules = !self.config.access.is_empty();
         let excluded = self.registry.sessions().filter_map(|(id, entry)| {
@@ -196,7 +196,7 @@ impl ControlPlane {
     }
 }
 
-/// Why settings that were read are not taken, though each of them is valid.
+/// Returns the reason why settings that were read are not taken over, though each of them is valid.
 fn unfit(old: &Config, new: &Config) -> Option<&'static str> {
     // Rules are checked against the mode that they are read with.
     if format!("{:?}", old.security) != format!("{:?}", new.security) {
@@ -216,7 +216,7 @@ fn unfit(old: &Config, new: &Config) -> Option<&'static str> {
     )
 }
 
-/// Settings by name, as text that differs where they do.
+/// Settings by name, as text that differs if the settings differ.
 type NamedSettings = Vec<(&'static str, String)>;
 
 fn variable(config: &Config) -> NamedSettings {
@@ -282,7 +282,7 @@ mod tests {
         assert!(seen.has_changed().unwrap() && denied(&seen.borrow_and_update().1.access));
         assert!(control.wanted.borrow().hosts.iter().any(|(host, _)| host == "10.0.0.7"));
         assert_eq!(seen.borrow().1.topics, new.topics);
-        // Rules that are gone do not let everything in.
+        // Missing rules do not allow everything.
         let mut without = new.clone();
         without.access = Default::default();
         let report = control.take_settings(Ok(without));
@@ -292,7 +292,7 @@ mod tests {
         let pinned = Config::builder().classic_key(key.path()).classic_trust(key.path());
         let report = control.take_settings(Ok(pinned.build().unwrap()));
         assert!(report.error.unwrap().contains("security differ from those in force"));
-        // Nor do limits.
+        // The same for limits.
         let mut limited = new.clone();
         let limits = format!("{rules}\n[[limit]]\npeer = \"*\"\nrate = 1");
         limited.access = axon_transport::access::AccessRules::parse(&limits, "f").unwrap();
@@ -300,12 +300,12 @@ mod tests {
         assert!(seen.borrow_and_update().1.access.limits_anything());
         let report = control.take_settings(Ok(new));
         assert!(report.error.unwrap().contains("no [[limit]] any more"));
-        // The same once more is no change.
+        // Reading the same settings again is no change.
         assert_eq!(control.take_settings(Ok(limited)).changed, Vec::<String>::new());
         assert!(!seen.has_changed().unwrap());
     }
 
-    /// A daemon whose gateway stands and has not taken the rules that were read.
+    /// A daemon whose gateway has started and has not taken over the rules that were read.
     fn reloaded() -> Rc<RefCell<ControlPlane>> {
         let mut control = control(Config::default());
         control.gateway_says(ToControl::Started { port: 1 });

@@ -26,12 +26,12 @@ use crate::{
     discovery::{self, DiscoveryAction, DiscoveryEvent},
 };
 
-/// Between two attempts to give an order to a gateway that is busy.
+/// Pause between two attempts to send an order to a busy gateway.
 const BUSY: Duration = Duration::from_millis(10);
-/// How long a gateway may take to finish: longer than it waits for what it has on its way.
+/// Maximum time that a gateway may take to finish: longer than it waits for its samples in flight.
 const FINISH: Duration = Duration::from_secs(6);
 
-/// The gateway of every daemon that is not told otherwise.
+/// The default gateway of a daemon.
 pub(super) const GATEWAY: Option<GatewayEntry> =
     Some(|parts| crate::reactor::run(parts).map_err(|error| error.to_string()));
 
@@ -41,13 +41,13 @@ pub(super) struct DaemonGateway {
     running: Option<RunningGateway>,
     pause: RestartPause,
     discovery: Option<Discovery>,
-    /// Whether the id was proven.
+    /// The linked daemons, each with whether its id was proven.
     linked: BTreeMap<DaemonId, bool>,
-    /// Addresses of listed peers, as the gateway was told.
+    /// Addresses of listed peers, as sent to the gateway.
     listed: BTreeSet<IpAddr>,
-    /// The gateway has nothing on its way any more, or it does not get on.
+    /// True if the gateway has nothing in flight any more, or makes no progress.
     finished: bool,
-    /// The rules in force, and when to tell the gateway of them again.
+    /// The rules in force; `rules_due` is the time at which to send them to the gateway again.
     rules: watch::Receiver<(u64, TrafficRules)>,
     rules_due: Option<Instant>,
 }
@@ -59,10 +59,10 @@ struct Discovery {
 }
 
 impl DaemonGateway {
-    /// Starts the gateway, waits until it stands, and starts discovery.
+    /// Starts the gateway, waits until it has started, and starts discovery.
     ///
     /// # Errors
-    /// Why the gateway does not stand.
+    /// The reason why the gateway has not started.
     pub(super) async fn start(
         control: &Rc<RefCell<ControlPlane>>,
         entry: Option<GatewayEntry>,
@@ -90,14 +90,14 @@ impl DaemonGateway {
         Ok(remote)
     }
 
-    /// Who is told of changes of this host's graph.
+    /// Returns the sender for changes of this host's graph.
     pub(super) fn digests(&self) -> Option<mpsc::Sender<DiscoveryEvent>> {
         self.discovery.as_ref().map(|discovery| discovery.events.clone())
     }
 
-    /// The daemon is to end: has what waits for other hosts arrive first, as far as that gets on.
+    /// Lets the samples queued for other hosts arrive before the daemon ends, as far as that makes progress.
     pub(super) async fn finish(&mut self, control: &Rc<RefCell<ControlPlane>>) {
-        // An order that finds the channel full is dropped: this one is given again.
+        // An order that finds the channel full is dropped: this one is sent again.
         let finish = async {
             while self.running.is_some() && !self.order(ToGateway::Finish) {
                 tokio::time::sleep(BUSY).await;
@@ -111,8 +111,8 @@ impl DaemonGateway {
         }
     }
 
-    /// Passes on what the gateway and discovery say, and starts a gateway that failed again, until it
-    /// [has finished](Self::finish).
+    /// Passes on the messages of the gateway and of discovery, and restarts a failed gateway, until the gateway [has
+    /// finished](Self::finish).
     pub(super) async fn run(&mut self, control: &Rc<RefCell<ControlPlane>>) {
         let Some(entry) = self.entry else { return std::future::pending().await };
         let questions = control.borrow().questions.bell();
@@ -145,15 +145,15 @@ impl DaemonGateway {
         }
     }
 
-    /// Gives the gateway the rules in force. An order that finds the channel full is given again.
+    /// Sends the gateway the rules in force. An order that finds the channel full is sent again.
     fn order_rules(&mut self) {
         let (number, rules) = self.rules.borrow_and_update().clone();
-        // A gateway that is started later is told when it stands.
+        // A gateway that is started later gets the rules when it has started.
         let missed = self.running.is_some() && !self.order(ToGateway::Rules(rules, number));
         self.rules_due = missed.then(|| Instant::now() + BUSY);
     }
 
-    /// Gives the gateway the questions of tools about the rules of peers.
+    /// Sends the gateway the questions of tools about the rules of peers.
     fn pass_questions(&mut self, control: &Rc<RefCell<ControlPlane>>) {
         let mut control = control.borrow_mut();
         while let Some((number, daemon, uses)) = control.questions.poll() {
@@ -169,7 +169,7 @@ impl DaemonGateway {
         match &event {
             ToControl::Started { port } => {
                 self.order(ToGateway::Listed(self.listed.clone()));
-                // They may have changed since it was started. It says that they count.
+                // The rules may have changed since the gateway was started. It reports when they are in force.
                 self.order_rules();
                 self.tell(DiscoveryEvent::QuicPort(*port));
             }
@@ -220,12 +220,12 @@ impl DaemonGateway {
                 self.order(ToGateway::Listed(self.listed.clone()));
                 control.borrow_mut().named(names);
             }
-            // In a flood of beacons a thousand times a second.
+            // In a flood of beacons, this happens a thousand times a second.
             DiscoveryAction::Gone { daemon } => tracing::trace!(%daemon, "a peer is gone"),
         }
     }
 
-    /// Whether the gateway got it.
+    /// Returns whether the gateway got the order.
     fn order(&self, order: ToGateway) -> bool {
         self.running.as_ref().is_some_and(|running| running.order(order))
     }
@@ -259,7 +259,7 @@ impl DaemonGateway {
         self.discovery = Some(discovery);
     }
 
-    /// Says goodbye.
+    /// Lets discovery and the gateway say goodbye.
     pub(super) async fn end(mut self) {
         if let Some(Discovery { events, mut actions, task }) = self.discovery.take() {
             drop(events);
@@ -270,7 +270,7 @@ impl DaemonGateway {
                     }
                 }
             };
-            // It says what it has to say at once.
+            // Discovery sends its last datagrams at once.
             let patience = Duration::from_millis(500);
             let _ = tokio::time::timeout(patience, goodbye).await;
             task.abort();
@@ -294,7 +294,7 @@ impl Discovery {
     }
 
     fn tell(&self, event: DiscoveryEvent) {
-        // Anybody can send datagrams: they leave room for what the gateway says of links.
+        // Any host can send datagrams: they leave space for the gateway's messages about links.
         let crowded = self.events.capacity() < CHANNEL / 4;
         if matches!(event, DiscoveryEvent::Datagrams(_)) && crowded {
             return;
@@ -305,7 +305,7 @@ impl Discovery {
     }
 }
 
-/// What the gateway says next, or why it says nothing any more.
+/// Returns the gateway's next message, or the reason for its end.
 async fn said(running: Option<&mut RunningGateway>) -> Result<ToControl, String> {
     match running {
         Some(running) => running.next().await,
@@ -321,7 +321,7 @@ async fn due(at: Option<Instant>) {
     }
 }
 
-/// What discovery wants next.
+/// Returns discovery's next action.
 async fn wanted(discovery: Option<&mut Discovery>) -> Option<DiscoveryAction> {
     match discovery {
         Some(discovery) => discovery.actions.recv().await,

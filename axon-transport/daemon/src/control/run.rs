@@ -36,23 +36,23 @@ use super::{
 };
 use crate::discovery::DiscoveryEvent;
 
-/// Changes of the graph within this time go out together.
+/// Time within which changes of the graph are sent together.
 const COALESCE: Duration = Duration::from_millis(5);
 
-/// How a daemon process came to be.
+/// The way in which a daemon process was started.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Start {
-    /// By hand or by a service manager: it stays in the foreground until a signal ends it.
+    /// Started by hand or by a service manager: it stays in the foreground until a signal ends it.
     Foreground,
-    /// By a session (`--spawned`): starts the real daemon and ends.
+    /// Started by a session (`--spawned`): starts the real daemon and ends.
     Spawned,
-    /// By the process before (`--detached`): the real daemon.
+    /// Started by the first process (`--detached`): the real daemon.
     Detached,
 }
 
 impl Start {
-    /// What the arguments of a daemon program say: none, or the one flag that a session adds to its
-    /// [`DaemonCommand`](axon_transport::DaemonCommand). `None` for any others.
+    /// Parses the arguments of a daemon program: none, or the one flag that a session adds to its
+    /// [`DaemonCommand`](axon_transport::DaemonCommand). Returns `None` for any others.
     pub fn from_arguments(arguments: impl IntoIterator<Item = OsString>) -> Option<Self> {
         let mut arguments = arguments.into_iter();
         let start = match arguments.next() {
@@ -65,35 +65,35 @@ impl Start {
     }
 }
 
-/// How long a daemon waits for its first session at least.
+/// Minimum time that a daemon waits for its first session.
 const FIRST_SESSION: Duration = Duration::from_secs(10);
 
-/// Segments that are kept of sessions that ended, at most.
+/// Maximum number of segments that are kept of ended sessions.
 const MAX_RETAINED_SEGMENTS: usize = 256;
-/// Within what time sessions return that lost the daemon before: a process may be stopped for a while.
+/// Time within which sessions that lost the previous daemon return: a process may be stopped for a while.
 const RETURN: Duration = Duration::from_secs(20);
 
-/// What a daemon runs with besides its configuration.
+/// The options of a daemon besides its configuration.
 #[derive(Debug)]
 pub struct DaemonOptions {
-    /// The process that waits for the daemon to be ready.
+    /// The report to the process that waits for the daemon to be ready.
     report: Report,
     /// The gateway to other hosts. Without one, the daemon serves this host alone.
     gateway: Option<GatewayEntry>,
     stays: bool,
-    /// Where the settings are from, to be read again.
+    /// The source of the settings, to read them again.
     settings: Option<SettingsSource>,
 }
 
 impl DaemonOptions {
-    /// Whether it stays when no session needs it. Otherwise, and by default, it ends after its grace time.
+    /// Sets whether the daemon stays when no session needs it. Otherwise, and by default, it ends after its grace time.
     #[must_use]
     pub fn stays(mut self, whether: bool) -> Self {
         self.stays = whether;
         self
     }
 
-    /// Another gateway than the real one, for tests.
+    /// Sets another gateway than the real one, for tests.
     #[doc(hidden)]
     #[must_use]
     pub fn gateway(mut self, gateway: GatewayEntry) -> Self {
@@ -108,36 +108,36 @@ impl Default for DaemonOptions {
     }
 }
 
-/// Why a daemon does not run.
+/// The reason why a daemon does not run.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum DaemonError {
-    /// A setting, or a file that it names.
+    /// A setting, or a file that it names, is wrong.
     #[error(transparent)]
     Config(#[from] ConfigError),
     /// Another daemon serves this user and domain.
     #[error("another daemon serves {0} already")]
     Taken(String),
-    /// The session socket.
+    /// The session socket cannot be used.
     #[error("the session socket: {0}")]
     Address(#[from] AddressError),
-    /// The gateway to other hosts does not start.
+    /// The gateway to other hosts did not start.
     #[error("the gateway: {0}")]
     Gateway(String),
-    /// The system refused.
+    /// A system call failed.
     #[error("{what}: {source}")]
     System {
-        /// What was tried.
+        /// The operation.
         what: &'static str,
-        /// What the system said.
+        /// The error of the system.
         source: std::io::Error,
     },
 }
 
-/// The whole of a daemon program's `main`: reads the configuration from the environment and the files
-/// that it names, detaches if it is to, sets logging up (to standard error, which is the log file by then), and runs. A
-/// setting or a file that cannot be used ends it with status 2 before it makes anything. Call it before
-/// anything else opens a file or starts a thread.
+/// Runs a whole daemon program: reads the configuration from the environment and the files that it names, detaches if
+/// requested, sets up logging (to standard error, which is the log file by then), and runs. A setting or a file that
+/// cannot be used ends the program with status 2 before it creates anything. Call it from `main`, before other code
+/// opens a file or starts a thread.
 pub fn main(start: Start) -> ExitCode {
     survive_file_size_limit();
     let fail = |report: &mut Report, text: &str, status: u8| {
@@ -164,13 +164,13 @@ pub fn main(start: Start) -> ExitCode {
     } else {
         Report::none()
     };
-    // Before the process leaves the directory that relative paths begin in.
+    // Read before the process leaves the directory in which relative paths begin.
     let settings = SettingsSource::environment();
     let config = match settings.read() {
         Ok(config) => config,
         Err(error) => return fail(&mut report, &error.to_string(), 2),
     };
-    // It reads the private key.
+    // The check reads the private key.
     harden();
     if let Err(error) = crate::check(&config) {
         return fail(&mut report, &error.to_string(), 2);
@@ -186,7 +186,7 @@ pub fn main(start: Start) -> ExitCode {
     let options = DaemonOptions { report, stays: !detached, settings, ..DaemonOptions::default() };
     match run(config, options) {
         Ok(()) => ExitCode::SUCCESS,
-        // Losing the race to start is how all but one end.
+        // All daemons but one lose the race to start.
         Err(DaemonError::Taken(_)) if detached => ExitCode::SUCCESS,
         Err(error @ DaemonError::Config(_)) => {
             eprint_line(&error.to_string());
@@ -203,7 +203,7 @@ pub fn main(start: Start) -> ExitCode {
 /// until no session has needed it for its grace time.
 ///
 /// # Errors
-/// When it cannot start. What goes wrong later is logged and shown in its status.
+/// When it cannot start. Later errors are logged and shown in its status.
 pub fn run(config: Config, mut options: DaemonOptions) -> Result<(), DaemonError> {
     let started = start(config, &options);
     let (control, listeners, _bound) = match started {
@@ -226,7 +226,7 @@ pub fn run(config: Config, mut options: DaemonOptions) -> Result<(), DaemonError
     let outcome = local.block_on(&runtime, serve(control.clone(), listeners, options));
     let address = control.borrow().address.clone();
     address.remove();
-    // A session that is being served, or a gateway that hangs, does not hold up the end.
+    // A session that is being served, or a gateway that hangs, does not delay the end.
     runtime.shutdown_background();
     outcome
 }
@@ -234,13 +234,13 @@ pub fn run(config: Config, mut options: DaemonOptions) -> Result<(), DaemonError
 type Started =
     (ControlPlane, Vec<OwnedFd>, axon_transport::internal::session::daemon::address::Lock);
 
-/// Everything before the runtime: the socket first, since it is the lock.
+/// Prepares everything before the runtime: the socket first, because it is the lock.
 fn start(config: Config, _options: &DaemonOptions) -> Result<Started, DaemonError> {
     erase_from_now_on();
     harden();
     let config = config.with_rules_of_host()?;
     let settings = security_settings(&config)?;
-    // Before anything else takes their low numbers.
+    // Opened before other descriptors take the low numbers.
     let spare = SpareDescriptors::default();
     spare.fill();
     let address = Address::of(&config);
@@ -259,8 +259,8 @@ fn start(config: Config, _options: &DaemonOptions) -> Result<Started, DaemonErro
     Ok((ControlPlane::new(Arc::new(config), settings, spare), listeners, lock))
 }
 
-/// Keys live in this process: no core file, no debugger of the same user. And a robot has many
-/// sessions with four descriptors each.
+/// Hardens the process, because it holds keys: no core file, no debugger of the same user. Also raises the limit of
+/// descriptors: a robot has many sessions with four descriptors each.
 fn harden() {
     let refused = |what, error: rustix::io::Errno| tracing::warn!(what, %error, "could not harden the process");
     if let Err(error) = set_dumpable_behavior(DumpableBehavior::NotDumpable) {
@@ -334,17 +334,17 @@ async fn serve(
         }
         None => tracing::info!("no session needs the daemon any more"),
     }
-    // The address is free from here on: who connects now starts a new daemon.
+    // The address is free from here on: a process that connects now starts a new daemon.
     accepting.abort();
     let _ = accepting.await;
     flushing.abort();
-    // It holds a sender, and discovery ends when there is none.
+    // The task holds a sender, and discovery ends when there is none.
     let _ = flushing.await;
     remote.end().await;
     Ok(())
 }
 
-/// Keeps what sessions leave that end, until those that read it have come from the daemon before.
+/// Keeps the memory of sessions that end, until its readers have come back from the previous daemon.
 async fn keep_left_memory(control: Rc<RefCell<ControlPlane>>) {
     control
         .borrow_mut()
@@ -354,8 +354,8 @@ async fn keep_left_memory(control: Rc<RefCell<ControlPlane>>) {
     control.borrow_mut().registry.keep_left_memory(0);
 }
 
-/// Sends changes of the graph a moment after they happened, and tells discovery, whose beacons say
-/// whether a peer has missed some.
+/// Sends changes of the graph a moment after they happened, and notifies discovery, whose beacons show whether a peer
+/// has missed some.
 async fn flush(control: Rc<RefCell<ControlPlane>>, digests: Option<mpsc::Sender<DiscoveryEvent>>) {
     loop {
         if control.borrow().registry.needs_flush() {
@@ -364,7 +364,7 @@ async fn flush(control: Rc<RefCell<ControlPlane>>, digests: Option<mpsc::Sender<
             control.registry.flush();
             control.settle();
             if let Some(digests) = &digests {
-                // One that is dropped is overtaken by the next.
+                // The next digest replaces a dropped one.
                 let _ = digests.try_send(DiscoveryEvent::GraphDigest(control.registry.digest()));
             }
         }
@@ -373,7 +373,7 @@ async fn flush(control: Rc<RefCell<ControlPlane>>, digests: Option<mpsc::Sender<
     }
 }
 
-/// Ends when there was no application for the grace time.
+/// Waits until there was no application for the grace time.
 async fn unneeded(control: &Rc<RefCell<ControlPlane>>) {
     let grace = control.borrow().config.link.grace;
     let changed = control.borrow().need.clone();
@@ -393,8 +393,8 @@ async fn unneeded(control: &Rc<RefCell<ControlPlane>>) {
     }
 }
 
-/// The one line of a program that cannot go on.
+/// Prints the one line of a program that cannot continue.
 fn eprint_line(text: &str) {
-    // Where it cannot be written, the exit status remains.
+    // If it cannot be written, the exit status still shows the failure.
     let _ = writeln!(std::io::stderr(), "axon: {}", text.replace('\n', " "));
 }

@@ -11,10 +11,10 @@ use std::{
 
 use tokio::sync::Mutex;
 
-/// The time after which the others have their turn.
+/// The time of one part of work, after which other processes have their turn.
 pub(super) const PART: Duration = Duration::from_millis(1);
 
-/// What a session's task holds while it does a part of its process's work. First come, first served.
+/// The lock that a session's task holds while it does a part of its process's work. First come, first served.
 pub(super) type ProcessTurn = Rc<Mutex<()>>;
 
 /// The turns of all processes that have sessions.
@@ -22,7 +22,7 @@ pub(super) type ProcessTurn = Rc<Mutex<()>>;
 pub(super) struct ProcessScheduler(HashMap<u32, Weak<Mutex<()>>>);
 
 impl ProcessScheduler {
-    /// That of the sessions of process `pid`.
+    /// Returns the turn of the sessions of process `pid`.
     pub(super) fn of(&mut self, pid: u32) -> ProcessTurn {
         if let Some(turn) = self.0.get(&pid).and_then(Weak::upgrade) {
             return turn;
@@ -50,7 +50,7 @@ mod tests {
         assert_eq!(turns.0.len(), 2);
     }
 
-    /// Counted in parts, not in time: how long a part takes is the machine's affair.
+    /// Counted in parts, not in time: the time of a part depends on the machine.
     #[test]
     fn process_with_a_thousand_busy_sessions_has_one_part_between_two_of_another_process() {
         use std::cell::Cell;
@@ -67,7 +67,7 @@ mod tests {
                         {
                             let _turn = turn.lock().await;
                             parts.set(parts.get() + 1);
-                            // As a conversation does after each part.
+                            // A conversation does this after each part.
                             yield_now().await;
                         }
                     }
@@ -75,7 +75,7 @@ mod tests {
             }
             let turn = turns.of(2);
             let other = spawn_local(async move {
-                // All of them have begun.
+                // All tasks have begun.
                 while parts.get() < 10_000 {
                     yield_now().await;
                 }

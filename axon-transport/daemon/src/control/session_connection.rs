@@ -26,13 +26,13 @@ use super::{
     scheduler::{PART, ProcessTurn},
 };
 
-/// Packets that may wait for a session whose own are taken: its endpoints may make more of them than
-/// it reads.
+/// Maximum number of packets queued for a session while its own packets are accepted: its endpoints may cause more
+/// packets than it reads.
 const UNREAD: usize = MAX_QUEUE / 4;
-/// Parts of work, each of [`PART`], that what a session left behind in its socket may take.
+/// Maximum number of parts of work, each of [`PART`], for the packets that a session left in its socket.
 const REST: usize = 1000;
 
-/// Moves packets both ways until the session ends; why it did.
+/// Moves packets both ways until the session ends. Returns the reason for the end.
 pub(super) async fn converse(
     control: &Rc<RefCell<ControlPlane>>,
     socket: &AsyncFd<PassedFd>,
@@ -47,8 +47,8 @@ pub(super) async fn converse(
             let _turn = turn.lock().await;
             let sent = send_some(control, socket, &id, bell);
             if matches!(sent, Ok(SendOutcome::Some)) {
-                // With the turn in hand: else all sessions of the process do a part before the others are
-                // looked at.
+                // The task yields while it holds the turn: otherwise all sessions of the process would do a part before
+                // other processes are served.
                 tokio::task::yield_now().await;
             }
             sent
@@ -84,7 +84,7 @@ pub(super) async fn converse(
                     }
                 }
             }
-            // Too many descriptors in flight: nothing says when that is over.
+            // Too many descriptors are in flight: nothing signals the end of that.
             () = tokio::time::sleep(Duration::from_millis(20)), if full => {}
             ready = socket.readable(), if queued < UNREAD => {
                 let Ok(mut ready) = ready else { return "its socket cannot be watched".into() };
@@ -105,8 +105,8 @@ pub(super) async fn converse(
     }
 }
 
-/// Takes what a session sent before its process or its connection ended: memory in which its readers find
-/// the last samples.
+/// Receives the messages that a session sent before its process or its connection ended: they announce memory in which
+/// its readers find the last samples.
 async fn take_rest(
     control: &Rc<RefCell<ControlPlane>>,
     socket: &AsyncFd<PassedFd>,
@@ -125,17 +125,17 @@ async fn take_rest(
     }
 }
 
-/// What came of sending.
+/// The result of sending.
 enum SendOutcome {
-    /// Nothing waits any more.
+    /// No packet waits any more.
     All,
-    /// Some waits, and the others have their turn first.
+    /// Packets wait, and other processes have their turn first.
     Some,
     /// The socket is full.
     Full,
 }
 
-/// Sends what waits for a session, for as long as a turn is.
+/// Sends queued packets to a session for the time of one turn.
 fn send_some(
     control: &Rc<RefCell<ControlPlane>>,
     socket: &AsyncFd<PassedFd>,
@@ -143,7 +143,7 @@ fn send_some(
     bell: &Rc<Notify>,
 ) -> Result<SendOutcome, SocketError> {
     let control = &mut *control.borrow_mut();
-    // What waits is for the connection on which the session came back.
+    // The queued packets are for the connection on which the session came back.
     if !control.is_current(id, bell) {
         return Ok(SendOutcome::All);
     }
@@ -182,8 +182,8 @@ fn send_packets(
     Ok(SendOutcome::All)
 }
 
-/// Receives one packet. Where descriptors are short, the spare ones make room for those that come with it, so that the
-/// daemon can refuse what the packet asks for.
+/// Receives one packet. If descriptors are short, it frees the spare ones for the packet's descriptors, so that the
+/// daemon can refuse the packet's request.
 pub(super) fn receive(
     spare: &SpareDescriptors,
     socket: &PassedFd,
@@ -205,7 +205,7 @@ pub(super) fn receive(
     }
 }
 
-/// Takes packets for as long as a turn is, or until as many as `unread` wait for the session to read them;
+/// Receives packets for the time of one turn, or until `unread` packets wait for the session to read them. Returns
 /// whether the socket is empty now.
 fn receive_some(
     control: &Rc<RefCell<ControlPlane>>,
@@ -230,8 +230,8 @@ fn receive_some(
             Ok(ReceivedMessage { message: SessionMessage::AccessCheck(check), .. }) => {
                 control.ask_decisions(id, check);
             }
-            // The one thing that is handed over after HELLO, and the only one that the daemon reads:
-            // reading anything else may block.
+            // A memfd is the only descriptor that is handed over after HELLO, and the only one that the daemon reads:
+            // reading any other file may block.
             Ok(ReceivedMessage { descriptors, .. })
                 if !descriptors.iter().all(PassedFd::is_memfd) =>
             {
@@ -241,8 +241,8 @@ fn receive_some(
             }
             Ok(ReceivedMessage { message, descriptors }) => {
                 control.traffic.packets_in += 1;
-                // Without a segment it goes on; without its connection it would have to come back, with all
-                // that it has.
+                // The session continues without a segment. Without its connection, it would have to come back with all
+                // its endpoints.
                 if matches!(message, SessionMessage::Segment(_))
                     && let Some(why) = no_room_for_segment(control, id)
                 {
@@ -273,7 +273,7 @@ fn receive_some(
     outcome
 }
 
-/// Why the daemon has no descriptor for another segment of a session, if so.
+/// Returns the reason why the daemon has no descriptor for another segment of a session, if so.
 fn no_room_for_segment(control: &ControlPlane, id: &SessionId) -> Option<String> {
     let pid = control.registry.session(id)?.pid;
     DescriptorRoom::of(&control.registry, pid)?.refuses_segment()
@@ -286,7 +286,7 @@ async fn ended(death: Option<&AsyncFd<Arc<PassedFd>>>) {
     }
 }
 
-/// Says something to somebody new, whose socket has room; whether it was said.
+/// Sends a message to a new connection, whose socket has space. Returns whether it was sent.
 pub(super) fn say(
     socket: &AsyncFd<PassedFd>,
     message: SessionMessage,

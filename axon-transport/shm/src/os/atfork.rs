@@ -26,7 +26,7 @@ use crate::error::ShmError;
 /// A writable map, in a list that the child walks without a lock: entries are reused and never
 /// freed.
 struct WritableMap {
-    /// 0 while nobody uses the entry, [`TAKEN`] while it is filled in.
+    /// 0 while the entry is unused, [`TAKEN`] while it is filled in.
     base: AtomicUsize,
     bytes: AtomicUsize,
     next: *const WritableMap,
@@ -35,16 +35,16 @@ struct WritableMap {
 // SAFETY: all of it is atomic but for `next`, which stays as it is once others can see the entry.
 unsafe impl Sync for WritableMap {}
 
-/// No map begins there.
+/// An address at which no map begins.
 const TAKEN: usize = 1;
 
 static ENTRIES: AtomicPtr<WritableMap> = AtomicPtr::new(ptr::null_mut());
 
-/// Keeps a map's place in children, until it is dropped.
+/// Keeps a map's address inaccessible in children until it is dropped.
 pub(crate) struct KeptAddress(&'static WritableMap);
 
 impl KeptAddress {
-    /// Of the map at `base`, which children do not get.
+    /// Keeps the address of the map at `base`, which children do not get.
     pub(crate) fn keep(base: NonNull<c_void>, bytes: usize) -> Result<Self, ShmError> {
         static HANDLER: OnceLock<i32> = OnceLock::new();
         let failed = *HANDLER.get_or_init(|| {

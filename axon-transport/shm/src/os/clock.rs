@@ -4,14 +4,14 @@ use std::time::{Duration, SystemTime};
 
 use rustix::time::{ClockId, clock_gettime};
 
-/// Nanoseconds of the monotonic clock, which is the same in all processes of a host.
+/// Returns the nanoseconds of the monotonic clock, which is the same in all processes of a host.
 #[inline]
 pub fn monotonic() -> u64 {
     let now = clock_gettime(ClockId::Monotonic);
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
 }
 
-/// Nanoseconds since the Unix epoch.
+/// Returns the wall clock's nanoseconds since the Unix epoch.
 #[inline]
 pub fn wall() -> i64 {
     let now = clock_gettime(ClockId::Realtime);

@@ -17,26 +17,26 @@ use crate::os::{
     signals::BlockedSignals,
 };
 
-/// Whose threads close a descriptor. None waits for what another's wait for.
+/// The class whose threads close a descriptor. No class waits for descriptors of another class.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum FdClass {
-    /// Memory: it may take long to give back, and cannot block.
+    /// Memory: giving it back may take long, but cannot block.
     Memory,
-    /// What a session of this user, or of a trusted one, sent.
+    /// A descriptor that a session of this user, or of a trusted one, sent.
     Session,
-    /// Connections of anybody.
+    /// Connections of any process.
     Stranger,
 }
 
-/// Threads of each lane, at most.
+/// Maximum number of threads of each class.
 const THREADS: [usize; 3] = [1, 32, 8];
-/// Descriptors that wait for each lane, from which on no more are taken in.
+/// Number of waiting descriptors of each class from which on no more are accepted.
 const MAX_WAITING: [usize; 3] = [usize::MAX, 1024, 256];
 
-/// Descriptors of others that are open, also those that wait to be closed.
+/// Number of open descriptors from other processes, including descriptors that wait to be closed.
 pub(super) static OPEN: AtomicU64 = AtomicU64::new(0);
 
-/// One is open no more.
+/// Counts one descriptor less.
 pub(super) fn closed() {
     OPEN.fetch_sub(1, Ordering::Relaxed);
 }
@@ -45,17 +45,17 @@ impl FdClass {
     pub(super) fn close(self, fd: OwnedFd) {
         match current() {
             Some(closer) => closer.crews[self as usize].close(fd),
-            // That it may block here is better than to keep it for ever.
+            // Blocking here is better than keeping it open for ever.
             None => drop(fd),
         }
     }
 
-    /// Whether so many wait that no more should be taken in.
+    /// Returns whether so many descriptors wait that no more should be accepted.
     pub(super) fn is_full(self) -> bool {
         self.waiting() >= MAX_WAITING[self as usize]
     }
 
-    /// How many wait for a thread.
+    /// Returns the number of descriptors that wait for a thread.
     pub(super) fn waiting(self) -> usize {
         current().map_or(0, |closer| closer.crews[self as usize].lock().waiting.len())
     }
@@ -66,12 +66,12 @@ impl FdClass {
     }
 }
 
-/// The threads of a process: a forked child has none of its parent's.
+/// The closing threads of a process: a forked child has none of its parent's.
 struct Closer {
     crews: [CloserPool; 3],
 }
 
-/// The threads of a lane. One that finds nothing to do waits, and ends when another waits already.
+/// The threads of a class. A thread that finds nothing to do waits, and ends if another waits already.
 struct CloserPool {
     most: usize,
     state: Mutex<CloserState>,
@@ -81,14 +81,15 @@ struct CloserPool {
 #[derive(Default)]
 struct CloserState {
     threads: usize,
-    /// Those of them that wait.
+    /// Number of the threads that wait.
     idle: usize,
     waiting: Vec<OwnedFd>,
 }
 
 static CLOSER: PerProcess<Closer> = PerProcess::new();
 
-/// That of this process; `None` where there is no memory to tell it from its parent's by.
+/// Returns the closer of this process; `None` if there is no memory for the token that distinguishes it from its
+/// parent's.
 fn current() -> Option<&'static Closer> {
     let new = |_| Closer {
         crews: THREADS.map(|most| CloserPool {
@@ -101,11 +102,11 @@ fn current() -> Option<&'static Closer> {
 }
 
 impl Closer {
-    /// Takes over what waited in the parent when this process was forked. By now its descriptors may
-    /// be the last of what they stand for.
+    /// Takes over the descriptors that waited in the parent when this process was forked. By now they may be the last
+    /// references to their objects.
     fn inherit(&'static self, before: &Closer) {
         for (crew, before) in self.crews.iter().zip(&before.crews) {
-            // One that was locked at the fork is for ever; what it holds stays open here.
+            // A list that was locked at the fork stays locked for ever; its descriptors stay open here.
             let left = before.state.try_lock().map(|mut state| std::mem::take(&mut state.waiting));
             left.unwrap_or_default().into_iter().for_each(|fd| crew.close(fd));
         }
@@ -129,7 +130,7 @@ impl CloserPool {
         let started = thread::Builder::new().name("axon-close".into()).spawn(|| self.run());
         drop(blocked);
         if let Err(error) = started {
-            // The next one that is closed starts a thread for both.
+            // The next descriptor to close starts a thread for both.
             tracing::error!(%error, "no thread to close another process's descriptor on");
             self.lock().threads -= 1;
         }
@@ -155,14 +156,14 @@ impl CloserPool {
         }
     }
 
-    /// It is held for no longer than a push or pop takes, and by threads of this process only.
+    /// Takes the lock, which is held only for a push or pop, and by threads of this process only.
     fn lock(&self) -> MutexGuard<'_, CloserState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// Has a socket of a network not linger over what its peer does not take. To ask and to set may block
-/// as the close may.
+/// Disables lingering of a network socket for data that its peer does not take. Reading and setting the option may
+/// block as the close may.
 fn disable_linger(fd: &OwnedFd) {
     let internet = [AddressFamily::INET, AddressFamily::INET6];
     if sockopt::socket_domain(fd.as_fd()).is_ok_and(|domain| internet.contains(&domain)) {

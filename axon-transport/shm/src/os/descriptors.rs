@@ -24,93 +24,91 @@ use rustix::{
 
 use super::closer::{self, FdClass, OPEN};
 
-/// A memfd that holds less, in blocks of 512 bytes, is closed at once.
+/// Size in blocks of 512 bytes below which a memfd is closed at once.
 const SMALL: i64 = (1 << 20) / 512;
-/// The most descriptors that the system lets a packet carry.
+/// Maximum number of descriptors that the system allows in a packet.
 const SCM_MAX_FD: usize = 253;
-/// Descriptors of a packet that [`receive_few`] receives at most.
+/// Maximum number of descriptors in a packet that [`receive_few`] receives.
 pub const FEW_DESCRIPTORS: usize = 16;
-/// More than a packet can carry, with what else a process opens meanwhile. Of a limit so low that this is more
-/// than half of it, half.
+/// Number of descriptors to keep free: more than a packet can carry, with other descriptors that a process opens
+/// meanwhile. If this is more than half of the limit, half of the limit applies.
 const RESERVE: u64 = 400;
 
-/// A descriptor to be sent to another process, or [received](Self::received) from one. One that was
-/// received is closed without making the thread that drops it wait.
+/// A descriptor to be sent to another process, or [received](Self::received) from one. Dropping a received one does not
+/// make the dropping thread wait for the close.
 pub struct PassedFd {
     /// `None` only while it is dropped.
     fd: Option<OwnedFd>,
     origin: FdOrigin,
 }
 
-/// Where it is from, which decides how it is closed.
+/// The origin of a descriptor, which decides how it is closed.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum FdOrigin {
     Own,
     /// Another process sent it.
     Passed,
-    /// The socket itself, in whose queue there may be such.
+    /// A socket whose queue may contain descriptors of other processes.
     Connection(FdClass),
 }
 
 impl PassedFd {
-    /// One that another process sent, and that can be anything.
+    /// Wraps a descriptor that another process sent, and that can be of any kind.
     pub fn received(fd: OwnedFd) -> Self {
         Self::new(fd, FdOrigin::Passed)
     }
 
-    /// A connection, with whatever stands in its queue. Its other end is told at once when it is
-    /// dropped.
+    /// Wraps a connection, with the contents of its queue. When it is dropped, its other end learns that at once.
     pub fn connection(fd: OwnedFd) -> Self {
         Self::new(fd, FdOrigin::Connection(FdClass::Stranger))
     }
 
-    /// The connection of somebody who may have a session.
+    /// Marks the connection as one of a process that may have a session.
     pub fn trusted(mut self) -> Self {
         self.origin = FdOrigin::Connection(FdClass::Session);
         self
     }
 
     fn new(fd: OwnedFd, origin: FdOrigin) -> Self {
-        // It guards nothing: `is_short` may be off by those that come and go at the moment.
+        // The counter guards nothing: the functions that read it may miss descriptors that are opened or closed at the
+        // moment.
         OPEN.fetch_add(1, Ordering::Relaxed);
         Self { fd: Some(fd), origin }
     }
 
-    /// Another descriptor of the same thing.
+    /// Duplicates the descriptor.
     ///
     /// # Errors
     /// The process has no descriptors left.
     pub fn try_clone(&self) -> io::Result<Self> {
         let origin = match self.origin {
-            // It is not over with a copy of its descriptor.
+            // The connection must not end with a duplicate of its descriptor.
             FdOrigin::Connection(_) => FdOrigin::Passed,
             origin => origin,
         };
         Ok(Self::new(self.as_fd().try_clone_to_owned()?, origin))
     }
 
-    /// Whether it is memory that can be sealed, or a file of a tmpfs, which is as good. Asks no file
-    /// system.
+    /// Returns whether it is memory that can be sealed, or a file of a tmpfs, which is as good. Calls no file system.
     pub fn is_memfd(&self) -> bool {
         fcntl_get_seals(self).is_ok()
     }
 
-    /// Which file it is, by device and inode, where it is a memfd. Others could take their time to
-    /// tell.
+    /// Returns the device and inode of the file, if it is a memfd. Other file systems could delay the answer.
     pub fn memory(&self) -> Option<(u64, u64)> {
         let found = self.is_memfd().then(|| fstat(self).ok()).flatten()?;
         Some((found.st_dev, found.st_ino))
     }
 
-    /// Whether it stands for a process. Takes no lock of the file behind it, which its
-    /// sender could hold. Only a pidfd can be waited for, though by nobody but the process's parent (Linux 5.4).
+    /// Returns whether it refers to a process. Takes no lock of the file behind it, which its sender could hold. Only a
+    /// pidfd can be waited for, though only by the process's parent (Linux 5.4).
     pub fn is_pidfd(&self) -> bool {
         let look = WaitIdOptions::EXITED | WaitIdOptions::NOHANG | WaitIdOptions::NOWAIT;
         matches!(waitid(WaitId::PidFd(self.as_fd()), look), Ok(_) | Err(Errno::CHILD))
     }
 
-    /// Who closes it, unless that can be done at once. Asks nothing that a file system of somebody
-    /// else's could answer late.
+    /// Returns the class that closes it; `None` if it can be closed at once. Calls no file system of another user,
+    /// which could delay the answer.
     fn lane(&self) -> Option<FdClass> {
         match self.origin {
             FdOrigin::Own => None,
@@ -125,7 +123,7 @@ impl PassedFd {
 }
 
 impl From<OwnedFd> for PassedFd {
-    /// One of our own.
+    /// Wraps a descriptor of this process.
     fn from(fd: OwnedFd) -> Self {
         Self::new(fd, FdOrigin::Own)
     }
@@ -152,8 +150,8 @@ impl fmt::Debug for PassedFd {
 impl Drop for PassedFd {
     fn drop(&mut self) {
         if matches!(self.origin, FdOrigin::Connection(_)) {
-            // It leaves the queue alone, so it does not block, and the other end need not wait for
-            // the closing to know.
+            // This does not touch the queue, so it does not block, and the other end learns of the end before the
+            // close.
             let _ = shutdown(&*self, Shutdown::Both);
         }
         let lane = self.lane();
@@ -168,28 +166,28 @@ impl Drop for PassedFd {
     }
 }
 
-/// Whether the descriptors of a packet might find no room, so that only [`receive_few`] should receive it. The kernel
-/// closes what does not fit in the thread that receives.
+/// Returns whether there may be too few free descriptors for a packet, so that only [`receive_few`] should receive it.
+/// The kernel closes descriptors that do not fit in the receiving thread.
 pub fn is_tight() -> bool {
     let open = OPEN.load(Ordering::Relaxed);
     limit().is_some_and(|limit| open + RESERVE > limit)
 }
 
-/// How many descriptors this process may have: its soft RLIMIT_NOFILE. `None`: any number.
+/// Returns the maximum number of descriptors of this process: its soft RLIMIT_NOFILE. `None`: any number.
 pub fn limit() -> Option<u64> {
     getrlimit(Resource::Nofile).current
 }
 
-/// How many descriptors this process has open, those of its other threads included.
+/// Returns the number of open descriptors of this process, including those of its other threads.
 pub fn open() -> u64 {
     const TABLE: &str = "/proc/self/fd";
-    // Linux 6.2 and later say it without opening anything.
+    // Linux 6.2 and later return it without opening a descriptor.
     if let Ok(Ok(open @ 1..)) = stat(TABLE).map(|found| u64::try_from(found.st_size)) {
         return open;
     }
-    // The listing's own descriptor counts itself.
+    // The listing includes its own descriptor.
     let listed = std::fs::read_dir(TABLE).map(|all| all.count() as u64);
-    // Where nothing can be opened, nothing is left.
+    // If nothing can be opened, no descriptor is left.
     listed.unwrap_or_else(|_| limit().unwrap_or_else(|| OPEN.load(Ordering::Relaxed)))
 }
 
@@ -197,25 +195,26 @@ fn reserve(limit: u64) -> u64 {
     RESERVE.min(limit / 2)
 }
 
-/// Whether so many descriptors that sessions sent wait to be closed that no more should be taken in.
+/// Returns whether so many descriptors from sessions wait to be closed that no more should be accepted.
 pub fn is_clogged() -> bool {
     FdClass::Session.is_full()
 }
 
-/// Whether what this process may have open at most, `limit`, leaves no room for all that a packet can
-/// carry: a peer that sends descriptors that are slow to close can then hold this process up.
+/// Returns whether `limit`, the maximum number of open descriptors of this process, leaves no space for all that a
+/// packet can carry: a peer that sends descriptors which are slow to close can then block this process.
 pub fn is_scarce(limit: u64) -> bool {
     reserve(limit) < RESERVE
 }
 
-/// Whether so many connections of strangers wait to be closed that nobody's should be accepted. Where descriptors are
-/// short, few are too many, and so are those that sessions sent: what waits is open.
+/// Returns whether so many connections of strangers wait to be closed that no connection should be accepted. If
+/// descriptors are short, a few are too many, and descriptors from sessions count as well: waiting descriptors are
+/// open.
 pub fn close_queue_is_full() -> bool {
     let waits = || FdClass::Stranger.waiting().max(FdClass::Session.waiting());
     FdClass::Stranger.is_full() || (is_tight() && waits() >= FEW_DESCRIPTORS)
 }
 
-/// Half of the descriptors of others that this process can hold.
+/// Returns half of the number of descriptors from other processes that this process can hold.
 pub fn share() -> usize {
     let limit = limit().unwrap_or(u64::MAX);
     usize::try_from((limit - reserve(limit)) / 2).unwrap_or(usize::MAX)
@@ -223,13 +222,13 @@ pub fn share() -> usize {
 
 /// A packet of a socket.
 pub struct SocketPacket {
-    /// How long it is, as far as it was received.
+    /// The received length in bytes.
     pub bytes: usize,
-    /// It was longer than the buffer.
+    /// True if the packet was longer than the buffer.
     pub truncated: bool,
-    /// This process could not hold all of its descriptors.
+    /// True if this process could not hold all of its descriptors.
     pub lost: bool,
-    /// Those that came with it.
+    /// The descriptors that came with it.
     pub descriptors: Vec<PassedFd>,
 }
 
@@ -262,16 +261,16 @@ fn receive_with(
     Ok(SocketPacket {
         bytes: got.bytes,
         truncated: got.flags.contains(ReturnFlags::TRUNC),
-        // There is room for whatever can come.
+        // The control buffer has space for the maximum number of descriptors.
         lost: got.flags.contains(ReturnFlags::CTRUNC),
         descriptors,
     })
 }
 
-/// As [`receive`], but a packet for whose descriptors there is no room stays where it is.
+/// Like [`receive`], but a packet stays in the socket if there is no space for its descriptors.
 pub(crate) fn receive_whole(socket: impl AsFd, buffer: &mut [u8]) -> Result<SocketPacket, Errno> {
     let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(SCM_MAX_FD))];
-    // To look gives descriptors of the same things.
+    // Peeking duplicates the descriptors.
     let packet = receive_with(&socket, buffer, RecvFlags::PEEK, &mut space)?;
     if packet.lost {
         return Err(Errno::MFILE);
@@ -280,13 +279,13 @@ pub(crate) fn receive_whole(socket: impl AsFd, buffer: &mut [u8]) -> Result<Sock
     Ok(packet)
 }
 
-/// As [`receive`], for a packet of at most [`FEW_DESCRIPTORS`] descriptors: closes none of them for the last time, and needs no room
-/// for more. A packet with more descriptors is reported as truncated and stays in the socket. A packet for whose descriptors
-/// the process has no room is reported as lost and stays, too.
+/// Like [`receive`], for a packet of at most [`FEW`] descriptors: closes none of them for the last time, and needs no
+/// space for more. A packet with more descriptors is reported as truncated and stays in the socket. If the process has
+/// no space for the descriptors of a packet, the packet is reported as lost and stays, too.
 pub fn receive_few(socket: impl AsFd, buffer: &mut [u8]) -> Result<SocketPacket, Errno> {
     let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(FEW_DESCRIPTORS))];
     let packet = receive_with(&socket, buffer, RecvFlags::PEEK, &mut space)?;
-    // By its alignment the space may have room for one more.
+    // Because of its alignment, the space may fit one descriptor more.
     let more = packet.descriptors.len() > FEW_DESCRIPTORS;
     if !packet.lost && !more {
         take_seen(&socket);
@@ -296,7 +295,7 @@ pub fn receive_few(socket: impl AsFd, buffer: &mut [u8]) -> Result<SocketPacket,
     Ok(SocketPacket { truncated, lost: packet.lost || more, ..packet })
 }
 
-/// Takes a packet that was looked at: what goes with it is not closed for the last time here.
+/// Takes a packet that was peeked at: its descriptors are not closed for the last time here.
 fn take_seen(socket: impl AsFd) {
     let mut none = RecvAncillaryBuffer::default();
     let mut byte = [0];
@@ -305,16 +304,14 @@ fn take_seen(socket: impl AsFd) {
     {}
 }
 
-/// Copies the next packet of a socket, which stays where it is with its descriptors. Returns its length, as far as there
-/// is room for it.
+/// Copies the next packet of a socket, which stays there with its descriptors. Returns its length, as far as it fits.
 pub fn look(socket: impl AsFd, buffer: &mut [u8]) -> Result<usize, Errno> {
     let flags = RecvFlags::DONTWAIT | RecvFlags::PEEK;
     let mut none = RecvAncillaryBuffer::default();
     Ok(recvmsg(socket, &mut [IoSliceMut::new(buffer)], &mut none, flags)?.bytes)
 }
 
-/// Whether the next packet of a socket has descriptors, which stay where they are: nothing is closed
-/// by asking.
+/// Returns whether the next packet of a socket has descriptors, which stay there: this closes nothing.
 pub fn carries_descriptors(socket: impl AsFd) -> bool {
     let flags = RecvFlags::DONTWAIT | RecvFlags::PEEK;
     let mut byte = [0];
@@ -341,7 +338,7 @@ pub(crate) mod tests {
 
     use super::*;
 
-    /// A socket whose last close takes hours, since it lingers over what its peer does not read.
+    /// Creates a socket whose last close takes hours, because it lingers over data that its peer does not read.
     pub(crate) fn reluctant() -> (OwnedFd, TcpStream) {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         sockopt::set_socket_recv_buffer_size(&listener, 4096).unwrap();
@@ -354,7 +351,7 @@ pub(crate) mod tests {
         (ours.into(), peer)
     }
 
-    /// A packet with a descriptor, which is from then on in nobody's hands but the receiver's.
+    /// Sends a packet with a descriptor, to which only the receiver then has a reference.
     pub(crate) fn send_away(socket: impl AsFd, bytes: &[u8], fd: OwnedFd) {
         let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(1))];
         let mut control = SendAncillaryBuffer::new(&mut space);
@@ -367,7 +364,7 @@ pub(crate) mod tests {
         socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None).unwrap()
     }
 
-    /// A unix socket with a reluctant one in its queue, which has the last reference to it.
+    /// Creates a unix socket whose queue has the last reference to a reluctant socket.
     fn hiding() -> (OwnedFd, TcpStream) {
         let (fd, peer) = reluctant();
         let (ours, theirs) = pair();
@@ -388,7 +385,7 @@ pub(crate) mod tests {
             drop(PassedFd::received(fd));
             peers.push(peer);
         }
-        // All threads are blocked. A connection's other end hears of its end all the same.
+        // All threads are blocked. A connection's other end learns of its end all the same.
         let (ours, theirs) = pair();
         drop(PassedFd::connection(ours).trusted());
         await_end(&theirs);
@@ -401,7 +398,7 @@ pub(crate) mod tests {
         {
             std::thread::yield_now();
         }
-        // As have strangers, whose connections are as many.
+        // Strangers have their own threads, too; they have as many connections.
         for _ in 0..FdClass::Stranger.threads() + 2 {
             let (fd, peer) = hiding();
             drop(PassedFd::connection(fd));

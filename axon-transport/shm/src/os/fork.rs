@@ -20,7 +20,7 @@ use crate::error::ShmError;
 
 const PAGE: usize = 4096;
 
-/// Names the process that took it; a forked child no longer matches it.
+/// A token of the process that took it; a forked child no longer matches it.
 #[derive(Clone, Copy)]
 pub struct ForkToken {
     page: &'static AtomicU64,
@@ -28,7 +28,7 @@ pub struct ForkToken {
 }
 
 impl ForkToken {
-    /// The token of the calling process.
+    /// Returns the token of the calling process.
     pub fn current() -> Result<Self, ShmError> {
         // Inherited over a fork, so that a child never reuses a value of its ancestors.
         static LAST: AtomicU64 = AtomicU64::new(0);
@@ -44,21 +44,21 @@ impl ForkToken {
         Ok(Self { page, value: page.load(Ordering::Relaxed) })
     }
 
-    /// Another in each process of a line of forks, and never 0.
+    /// Returns a value that is different in each process of a line of forks, and never 0.
     #[inline]
     pub fn value(&self) -> u64 {
         self.value
     }
 
-    /// Whether the calling process is a fork of the one that took the token.
+    /// Returns whether the calling process is a fork of the one that took the token.
     #[inline]
     pub fn is_forked(&self) -> bool {
         self.page.load(Ordering::Relaxed) != self.value
     }
 }
 
-/// The page of this process, once there is one. Finding it takes no lock, which a thread of the parent's
-/// could hold at a fork for ever.
+/// The page of this process, once there is one. Finding it takes no lock: a thread of the parent could hold a lock for
+/// ever after a fork.
 struct WipedPage(AtomicPtr<AtomicU64>);
 
 impl WipedPage {
@@ -66,7 +66,7 @@ impl WipedPage {
         Self(AtomicPtr::new(ptr::null_mut()))
     }
 
-    /// The page. Where there is none, `map` makes one; where it fails, the next call tries again.
+    /// Returns the page. If there is none, `map` creates one; if that fails, the next call tries again.
     fn get(
         &self,
         map: impl FnOnce() -> Result<NonNull<AtomicU64>, Errno>,
@@ -94,7 +94,7 @@ impl WipedPage {
     }
 }
 
-/// A page of zeros, to be shared as an atomic once nobody unmaps it.
+/// Maps a page of zeros, to be shared as an atomic once no code unmaps it.
 fn map_wiped_page() -> Result<NonNull<AtomicU64>, Errno> {
     // SAFETY: a fresh private mapping at an address of the kernel's choice aliases nothing.
     let base = unsafe {

@@ -9,34 +9,34 @@ use std::{
     sync::atomic::{AtomicBool, Ordering},
 };
 
-/// Blocks up to this size are erased. What holds keys is shorter; longer blocks hold payloads, and
-/// erasing these would cost as much as copying them.
+/// Maximum size of erased blocks. Blocks with keys are shorter; longer blocks hold payloads, and erasing them would
+/// cost as much as copying them.
 const LONGEST_ERASED: usize = 64 << 10;
 
-/// Whether this process has asked for it.
+/// True if this process has called [`erase_from_now_on`].
 static ERASES: AtomicBool = AtomicBool::new(false);
 
-/// The system's allocator, which erases each block of at most 64 KiB before it is freed, and when it grows
+/// The system's allocator, with erasure: it erases each block of at most 64 KiB before it is freed, and when it grows
 /// into another one. It erases nothing before [`erase_from_now_on`] is called; until then it costs one load.
 #[derive(Debug, Clone, Copy)]
 pub struct ErasingHeap;
 
-/// Erases what is freed from here on, if [`ErasingHeap`] is this program's allocator.
+/// Erases blocks that are freed from now on, if [`ErasingHeap`] is this program's allocator.
 pub fn erase_from_now_on() {
-    // Relaxed: a thread that does not see it yet has no keys yet. Those that have are started, or
-    // sent what they have, after this.
+    // Relaxed: a thread that does not see it yet has no keys yet. Threads with keys are started, or receive their keys,
+    // after this.
     ERASES.store(true, Ordering::Relaxed);
 }
 
-/// Gives what the allocator keeps of freed memory back to the system, where the allocator can. Takes
-/// milliseconds, and other threads may wait meanwhile for memory.
+/// Returns the allocator's free memory to the system, if the allocator can do that. Takes milliseconds, and other
+/// threads may wait meanwhile for memory.
 pub fn return_free_memory() {
     #[cfg(target_env = "gnu")]
     // SAFETY: it takes no pointer, and may be called from any thread at any time.
     let _ = unsafe { libc::malloc_trim(0) };
 }
 
-/// Whether a block of this layout is erased.
+/// Returns whether a block of this layout is erased.
 fn is_erased(layout: Layout) -> bool {
     // Relaxed: see `erase_from_now_on`.
     layout.size() <= LONGEST_ERASED && ERASES.load(Ordering::Relaxed)
@@ -51,7 +51,7 @@ unsafe fn erase(block: *mut u8, size: usize) {
     unsafe { block.write_bytes(0, size) };
     // SAFETY: as above, and all of it was just written.
     let erased = unsafe { slice::from_raw_parts(block, size) };
-    // Or the compiler leaves the erasure out, since the block is freed.
+    // Without this, the compiler omits the erasure, because the block is freed.
     zeroize::optimization_barrier(erased);
 }
 
@@ -101,7 +101,7 @@ unsafe impl GlobalAlloc for ErasingHeap {
 mod tests {
     use super::*;
 
-    /// A block that this allocator gave, with a pattern in it.
+    /// A block of this allocator, with a pattern in it.
     fn block(layout: Layout) -> *mut u8 {
         // SAFETY: the layouts below have sizes other than zero.
         let block = unsafe { ErasingHeap.alloc(layout) };

@@ -6,7 +6,7 @@
 
 #![allow(unsafe_code)]
 
-/// Has every descriptor but the standard streams closed when this process execs, as it is about to.
+/// Marks every descriptor except the standard streams to be closed when this process execs, which it is about to do.
 pub fn close_inherited() {
     // SAFETY: the system call takes plain integers and closes nothing: it only marks descriptors,
     // which no owner of one can tell.
@@ -31,7 +31,7 @@ fn mark_listed() {
     }
 }
 
-/// Has a write beyond RLIMIT_FSIZE (`ulimit -f`) fail with EFBIG and not end the process.
+/// Makes a write beyond RLIMIT_FSIZE (`ulimit -f`) fail with EFBIG instead of ending the process.
 pub fn survive_file_size_limit() {
     // SAFETY: SIG_IGN installs no handler, and no other code of this process handles SIGXFSZ.
     unsafe { libc::signal(libc::SIGXFSZ, libc::SIG_IGN) };

@@ -1,4 +1,4 @@
-//! The process at the other end of a unix socket, as the kernel knows it.
+//! The process at the other end of a unix socket, as reported by the kernel.
 
 #![allow(unsafe_code)]
 
@@ -12,36 +12,36 @@ use rustix::{
 /// The process at the other end, as the kernel recorded it at connect time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PeerProcess {
-    /// Its user.
+    /// The user id of the process.
     pub uid: u32,
-    /// Its process; 0 when that is in a PID namespace which this one does not see.
+    /// The process id; 0 if the process is in a PID namespace that this one does not see.
     pub pid: u32,
 }
 
-/// Who is at the other end (SO_PEERCRED).
+/// Returns the process at the other end (SO_PEERCRED).
 ///
 /// # Errors
-/// What the system says.
+/// The error of the system call.
 pub fn peer_process(socket: impl AsFd) -> rustix::io::Result<PeerProcess> {
-    // Not rustix's: its process ids are never 0, as this one may be.
+    // rustix is not used: its process ids are never 0, and this one may be.
     let mut found = libc::ucred { pid: 0, uid: u32::MAX, gid: u32::MAX };
     // SAFETY: the option's value is a `ucred`, of which all bit patterns are valid.
     unsafe { option(socket.as_fd(), libc::SO_PEERCRED, &mut found) }?;
     Ok(PeerProcess { uid: found.uid, pid: u32::try_from(found.pid).unwrap_or(0) })
 }
 
-/// The same process by a descriptor that means no other, even when it has ended.
+/// Returns a pidfd of the process at the other end, which refers to no other process, even when that one has ended.
 ///
 /// # Errors
-/// ESRCH when it has ended and been forgotten, if the kernel has no descriptor for that; else what the
-/// system says.
+/// ESRCH if the process has ended and was reaped, if the kernel has no descriptor for that; otherwise the error of the
+/// system call.
 pub fn peer_pidfd(socket: impl AsFd) -> rustix::io::Result<OwnedFd> {
     let mut found: libc::c_int = -1;
     // SAFETY: the option's value is an `int`.
     match unsafe { option(socket.as_fd(), libc::SO_PEERPIDFD, &mut found) } {
         // SAFETY: it is a descriptor that the kernel has just made for this call.
         Ok(()) => Ok(unsafe { OwnedFd::from_raw_fd(found) }),
-        // Before Linux 6.5 there is only its number, which could be another's by now.
+        // Before Linux 6.5 there is only its number, which another process could have by now.
         Err(Errno::NOPROTOOPT) => {
             let pid = peer_process(socket)?.pid.cast_signed();
             let pid = Pid::from_raw(pid).ok_or(Errno::NODATA)?;
@@ -51,7 +51,7 @@ pub fn peer_pidfd(socket: impl AsFd) -> rustix::io::Result<OwnedFd> {
     }
 }
 
-/// An option of the socket's.
+/// Reads an option of the socket.
 ///
 /// # Safety
 /// Its value is a `T`, of which all bit patterns are valid.

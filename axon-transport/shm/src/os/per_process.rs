@@ -9,18 +9,18 @@ use std::{
 
 use crate::{error::ShmError, os::fork::ForkToken};
 
-/// Whether this process has more rights than its caller, as the kernel says (AT_SECURE): its program is
+/// Returns whether this process has more rights than its caller, as the kernel says (AT_SECURE): its program is
 /// set-uid or set-gid, or has file capabilities.
 pub fn is_elevated() -> bool {
     // SAFETY: looks a number up in what the kernel gave the process at its start.
     unsafe { libc::getauxval(libc::AT_SECURE) != 0 }
 }
 
-/// A place for one `T` a process, which stands until the process ends. Finding it takes no lock, so
-/// that none which a thread of the parent's held at the fork is in a child's way.
+/// A place for one `T` per process, which exists until the process ends. Finding it takes no lock, so a lock that a
+/// thread of the parent held at the fork does not block a child.
 pub struct PerProcess<T: 'static>(AtomicPtr<Made<T>>);
 
-/// One of them, and those of the processes that this one is a fork of: their locks may be held for ever.
+/// The `T` of a process, and those of the processes that it is a fork of: their locks may be held for ever.
 pub struct Made<T: 'static> {
     token: ForkToken,
     before: Option<&'static Made<T>>,
@@ -28,17 +28,17 @@ pub struct Made<T: 'static> {
 }
 
 impl<T: Send + Sync> PerProcess<T> {
-    /// A place without one.
+    /// Creates an empty place.
     #[expect(clippy::new_without_default, reason = "it is for statics, which cannot be made so")]
     pub const fn new() -> Self {
         Self(AtomicPtr::new(ptr::null_mut()))
     }
 
-    /// This process's. Where there is none yet it is made, and `adopt` is called once with it and
-    /// that of the process that this one is a fork of, if that had one.
+    /// Returns this process's `T`. If there is none yet, `make` creates it, and `adopt` is called once with it and the
+    /// `T` of the process that this one is a fork of, if that had one.
     ///
     /// # Errors
-    /// There is no memory to tell this process from its forks by.
+    /// There is no memory for the token that distinguishes this process from its forks.
     pub fn get(
         &self,
         make: impl Fn(ForkToken) -> T,
@@ -68,7 +68,7 @@ impl<T: Send + Sync> PerProcess<T> {
         }
     }
 
-    /// The last that was made, in this process or in one that it is a fork of.
+    /// Returns the last one that was created, in this process or in one that it is a fork of.
     #[inline]
     pub fn latest(&self) -> Option<&'static Made<T>> {
         // SAFETY: null, or made by `Box::into_raw` and never freed once it is here.
@@ -77,19 +77,19 @@ impl<T: Send + Sync> PerProcess<T> {
 }
 
 impl<T> Made<T> {
-    /// Whether it is of a process that the calling one is a fork of.
+    /// Returns whether it belongs to a process that the calling one is a fork of.
     #[inline]
     pub fn is_forked(&self) -> bool {
         self.token.is_forked()
     }
 
-    /// The `T` of this process.
+    /// Returns the `T`.
     #[inline]
     pub fn value(&self) -> &T {
         &self.value
     }
 
-    /// Those of the processes that its own is a fork of, the nearest first.
+    /// Returns the `T`s of the processes that its own is a fork of, the nearest first.
     pub fn ancestors(&self) -> impl Iterator<Item = &'static T> {
         std::iter::successors(self.before, |made| made.before).map(|made| &made.value)
     }

@@ -34,13 +34,13 @@ use crate::{
     sync::{LockWord, Site},
 };
 
-/// How often a thread yields before it naps, where the kernel does not wait for it.
+/// Number of times that a thread yields before it naps, if the kernel does not wait for it.
 const YIELDS: u32 = 10;
 const NAP: Duration = Duration::from_micros(50);
 
-/// A value that one thread of this process at a time may use.
+/// A value that one thread of this process may use at a time.
 pub(crate) struct PiMutex<T> {
-    /// 0 when free, else the holder's thread id; the kernel adds a bit when others wait.
+    /// 0 if free, otherwise the holder's thread id; the kernel adds a bit when other threads wait.
     word: AtomicU32,
     process: ForkToken,
     value: UnsafeCell<T>,
@@ -52,7 +52,7 @@ unsafe impl<T: Send> Send for PiMutex<T> {}
 unsafe impl<T: Send> Sync for PiMutex<T> {}
 
 impl<T> PiMutex<T> {
-    /// A free mutex of the calling process.
+    /// Creates a free mutex of the calling process.
     ///
     /// # Errors
     /// The process cannot tell whether it is a fork.
@@ -61,7 +61,7 @@ impl<T> PiMutex<T> {
         Ok(Self { word: AtomicU32::new(0), process, value: UnsafeCell::new(value) })
     }
 
-    /// Waits until it is free and takes it. Not in a child of the process that made it.
+    /// Waits until the mutex is free and takes it. Must not be called in a child of the process that created it.
     ///
     /// # Panics
     /// The calling thread holds it already.
@@ -79,8 +79,8 @@ impl<T> PiMutex<T> {
     fn wait(&self, thread: u32) {
         for look in 0u32.. {
             match futex::lock_pi(&self.word, futex::Flags::PRIVATE, None) {
-                // The kernel has stored this thread's id. It changes hands under the kernel's own
-                // locks; the load is the language's word for that, and pairs with `unlock`.
+                // The kernel has stored this thread's id. The lock changes hands under the kernel's own locks; the load
+                // expresses that in the language, and pairs with `unlock`.
                 Ok(()) => {
                     self.word.load(Ordering::Acquire);
                     return;
@@ -88,8 +88,8 @@ impl<T> PiMutex<T> {
                 Err(Errno::DEADLK) => panic!("a thread takes a mutex that it holds"),
                 // A guard stays with its thread and is dropped there.
                 Err(Errno::SRCH) => panic!("a thread ended and kept a mutex"),
-                // The holder is about to end, memory for the wait is short, or the kernel lacks
-                // these futexes. To yield would not let a thread of lower priority run.
+                // The holder is about to end, memory for the wait is short, or the kernel lacks these futexes. Yielding
+                // would not let a thread of lower priority run.
                 Err(_) if look < YIELDS => thread::yield_now(),
                 Err(_) => thread::sleep(NAP),
             }
@@ -108,19 +108,19 @@ impl<T> PiMutex<T> {
 
     #[cold]
     fn hand_on(&self) {
-        // It fails only for one who does not hold the lock.
+        // It fails only if the thread does not hold the lock.
         let handed = futex::unlock_pi(&self.word, futex::Flags::PRIVATE);
         debug_assert!(handed.is_ok(), "a mutex was not held: {handed:?}");
     }
 }
 
-/// Takes a lock that is free; false when it is not. Pairs with [`let_go`].
+/// Takes a free lock. Returns false if it is not free. Pairs with [`let_go`].
 #[inline(always)]
 pub(crate) fn take(word: &impl LockWord, thread: u32) -> bool {
     word.swap_if(0, thread, Site::TakeSwap.order())
 }
 
-/// Lets go of a lock that nobody waits for; false when somebody does. Pairs with [`take`].
+/// Releases a lock that no thread waits for. Returns false if a thread waits. Pairs with [`take`].
 #[inline(always)]
 pub(crate) fn let_go(word: &impl LockWord, thread: u32) -> bool {
     word.swap_if(thread, 0, Site::LetGoSwap.order())
@@ -135,9 +135,9 @@ impl<T> fmt::Debug for PiMutex<T> {
 /// A [`PiMutex`] that is held, until this is dropped.
 pub(crate) struct PiGuard<'a, T> {
     mutex: &'a PiMutex<T>,
-    /// The holder.
+    /// The holder's thread id.
     thread: u32,
-    /// Only the holder may let go, so a guard stays with its thread.
+    /// Only the holder may release the lock, so a guard stays with its thread.
     _stays: PhantomData<*const ()>,
 }
 
@@ -167,7 +167,7 @@ impl<T> Drop for PiGuard<'_, T> {
     }
 }
 
-/// The calling thread's id, asked of the kernel once in each process.
+/// Returns the calling thread's id, which each process requests once per thread from the kernel.
 #[inline]
 fn thread_id(process: ForkToken) -> u32 {
     thread_local! {
@@ -281,12 +281,12 @@ mod tests {
                 drop(mutex.lock());
             });
             if let Err(error) = heard.recv().unwrap() {
-                // Past the harness, which would show it only beside a failure.
+                // Bypasses the harness, which would show it only beside a failure.
                 let mut stderr = std::io::stderr();
                 let _ = writeln!(stderr, "skipped: SCHED_FIFO is not permitted here: {error}");
                 return;
             }
-            // As the kernel shows real-time priorities (proc(5)).
+            // The kernel shows real-time priorities so (proc(5)).
             let inherited = -1 - PRIORITY;
             let start = Instant::now();
             while priority() != inherited {
@@ -298,7 +298,7 @@ mod tests {
         });
     }
 
-    /// The calling thread's priority, that of others included.
+    /// Returns the calling thread's priority, including inherited ones.
     fn priority() -> i32 {
         let stat = fs::read_to_string("/proc/thread-self/stat").unwrap();
         let (_, fields) = stat.rsplit_once(") ").unwrap();

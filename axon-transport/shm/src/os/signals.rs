@@ -4,8 +4,8 @@
 
 use std::mem::MaybeUninit;
 
-/// Blocks every signal in the calling thread until it is dropped. A thread that is started
-/// meanwhile starts, and stays, with every signal blocked.
+/// Blocks every signal in the calling thread until it is dropped. A thread that is started meanwhile starts, and stays,
+/// with every signal blocked.
 #[derive(Debug)]
 pub struct BlockedSignals {
     before: libc::sigset_t,
@@ -14,7 +14,7 @@ pub struct BlockedSignals {
 }
 
 impl BlockedSignals {
-    /// Blocks all of them from now on.
+    /// Blocks all signals from now on.
     pub fn all() -> Self {
         let mut all = MaybeUninit::<libc::sigset_t>::uninit();
         let mut before = MaybeUninit::<libc::sigset_t>::uninit();

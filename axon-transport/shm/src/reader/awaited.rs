@@ -1,25 +1,25 @@
-//! Memory of a publisher's session that a reader needs to go on and that has not come.
+//! Memory of a publisher's session that a reader needs in order to continue and that has not come.
 
 use std::time::{Duration, Instant};
 
-/// How often a reader asks for memory that has not come, and how long it waits for it once it was told
-/// that the publisher is gone.
+/// Interval at which a reader asks for memory that has not come; also the time that it waits for the memory after it
+/// learned that the publisher is gone.
 const MISSING: Duration = Duration::from_secs(1);
-/// How long a reader waits for memory of a process that has ended where nobody has said so: the
-/// daemon hands over what the process left, and may be slow. It waits once for all that the process left.
+/// Time that a reader waits for memory of a process that has ended without a report of that: the daemon hands over the
+/// remaining memory of the process, and may be slow. The reader waits once for all of that memory.
 const MISSING_DEAD: Duration = Duration::from_secs(10);
 
-/// The segment that a reader waits for, if it waits for one, and for how long it waits.
+/// The segment that a reader waits for, if any, and the state of the wait.
 #[derive(Default)]
 pub(super) struct AwaitedSegment {
     missing: Option<Missing>,
-    /// Whether memory of the publisher's process, which has ended, was waited for in vain.
+    /// True if memory of the publisher's process, which has ended, was waited for in vain.
     waited: bool,
-    /// Whether the publisher is known to be gone.
+    /// True if the publisher is known to be gone.
     ended: bool,
 }
 
-/// A segment that is needed to go on.
+/// A segment that the reader needs in order to continue.
 #[derive(Clone, Copy)]
 struct Missing {
     segment: u32,
@@ -27,37 +27,38 @@ struct Missing {
     asked: Instant,
 }
 
-/// What a reader does about a segment that has not come.
+/// The reaction of a reader to a segment that has not come.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Wait {
-    /// Asks for it, and waits.
+    /// Asks for the segment, and waits.
     Ask,
-    /// Waits.
+    /// Waits for the segment.
     Longer,
-    /// Waits no longer: it will not come.
+    /// Stops waiting: the segment will not come.
     InVain,
 }
 
 impl AwaitedSegment {
-    /// The segment that is needed to go on and has not come.
+    /// Returns the segment that the reader needs in order to continue and that has not come.
     #[inline]
     pub(super) fn segment(&self) -> Option<u32> {
         self.missing.map(|missing| missing.segment)
     }
 
-    /// When the reader looks again for it.
+    /// Returns when the reader looks again for it.
     #[inline]
     pub(super) fn look_again(&self) -> Option<Instant> {
         self.missing.map(|missing| missing.asked + MISSING)
     }
 
-    /// Nothing is needed to go on.
+    /// Records that the reader needs no segment in order to continue.
     #[inline]
     pub(super) fn clear(&mut self) {
         self.missing = None;
     }
 
-    /// The publisher is gone, and all of its memory was handed over: what does not come soon never will.
+    /// Records that the publisher is gone, and that all of its memory was handed over: memory that does not come soon
+    /// never will.
     pub(super) fn end(&mut self) {
         if !std::mem::replace(&mut self.ended, true) {
             // The next take asks for it once more, and waits for the answer.
@@ -65,8 +66,8 @@ impl AwaitedSegment {
         }
     }
 
-    /// A segment is needed to go on, and has not come. `is_dead` finds out whether the publisher's process has ended: a
-    /// system call.
+    /// Returns the reaction to a segment that the reader needs and that has not come. `is_dead` finds out whether the
+    /// publisher's process has ended, by a system call.
     pub(super) fn handle_missing(
         &mut self,
         segment: u32,
@@ -79,7 +80,7 @@ impl AwaitedSegment {
             return Wait::Ask;
         };
         let waited = now.duration_since(missing.since);
-        // It asks a second time in between.
+        // The wait is two intervals long, because the reader asks a second time in between.
         let dead = if self.waited { MISSING } else { MISSING_DEAD };
         if self.ended && waited >= 2 * MISSING || waited >= dead && is_dead() {
             self.waited |= is_dead();
@@ -97,7 +98,7 @@ impl AwaitedSegment {
 mod tests {
     use super::*;
 
-    /// What the reader does about a segment, by the second from when it found the segment missing.
+    /// The reactions of the reader, by the second since it found the segment missing.
     fn waits(awaited: &mut AwaitedSegment, segment: u32, seconds: u64, is_dead: bool) -> Vec<Wait> {
         let start = Instant::now();
         let at = |second| start + Duration::from_secs(second);

@@ -1,17 +1,16 @@
-//! Takes several samples into one buffer, and tells their publisher once.
+//! Takes several samples into one buffer, and notifies their publisher once.
 
 use super::{ATTEMPTS, Reader};
 use crate::{error::TakeError, ring::types::Taken};
 
 impl Reader {
-    /// Takes the next sample, and adds its payload to `out`; returns its length besides. `None` also where `out` has
-    /// bytes and would have more than `most` with the payload.
+    /// Takes the next sample, and appends its payload to `out`; also returns the payload's length. Returns `None` also
+    /// if `out` is not empty and would be longer than `most` with the payload.
     ///
-    /// The publisher sees that the sample was taken, and may wait for that, after
-    /// [`tell_taken`](Self::tell_taken).
+    /// The publisher, which may wait for the sample to be taken, sees that only after [`tell_taken`](Self::tell_taken).
     ///
     /// # Errors
-    /// As for [`take`](Self::take). `out` is as it was.
+    /// As for [`take`](Self::take). `out` is unchanged.
     pub fn take_behind(
         &mut self,
         out: &mut Vec<u8>,
@@ -25,7 +24,8 @@ impl Reader {
                 break;
             }
             if before == 0 {
-                // Waiting samples usually have one length. If the memory for all is missing, that for this one may suffice.
+                // Waiting samples usually have one length. If there is not enough memory for all of them, there may be
+                // enough for this one.
                 let waiting = usize::try_from(self.unread()).unwrap_or(usize::MAX);
                 let _ = out.try_reserve_exact(len.saturating_mul(waiting).min(most).max(len));
             }
@@ -41,7 +41,7 @@ impl Reader {
         Ok(None)
     }
 
-    /// Shows the publisher what was [taken](Self::take_behind), and wakes it if it waits for that.
+    /// Shows the publisher which samples were [taken](Self::take_behind), and wakes it if it waits for that.
     pub fn tell_taken(&self) {
         if !self.attachment.lane.is_forked() {
             self.tell_cursor();

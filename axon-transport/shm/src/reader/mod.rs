@@ -41,12 +41,12 @@ use crate::{
     wake::{Purpose, settle},
 };
 
-/// How often a take follows a publisher that keeps overtaking it before it lets go.
+/// Maximum number of attempts of a take if a publisher keeps overtaking it.
 const ATTEMPTS: u32 = 16;
-/// Segments of samples that a reader finds without a lock.
+/// Number of segments that a reader finds without a lock.
 const KNOWN: usize = 4;
 
-/// What a reader must know of the ring that it is granted.
+/// The data that a reader needs about the ring that it is granted.
 pub struct ReaderOptions {
     /// The subscription.
     pub reader: Gid,
@@ -54,13 +54,13 @@ pub struct ReaderOptions {
     pub writer: Gid,
     /// The publisher's session.
     pub peer: RingPeer,
-    /// Where the ring is in that session's memory.
+    /// The ring's location in that session's memory.
     pub ring: Location,
     /// The lane by which the reader attached.
     pub lane: Lane,
-    /// The publisher's answer.
+    /// The publisher's grant.
     pub grant: Grant,
-    /// What the subscription requests.
+    /// The QoS that the subscription requests.
     pub qos: Qos,
     /// The largest sample to expect, in bytes.
     pub max_message: u64,
@@ -68,37 +68,37 @@ pub struct ReaderOptions {
 
 /// One subscription's view of one publisher's ring.
 ///
-/// Goes on after the publisher's death until it is drained. Dropping it tells the publisher; the
-/// samples that were taken from it stay.
+/// Continues after the publisher's death until it is drained. Dropping it notifies the publisher; samples that were
+/// taken from it stay valid.
 pub struct Reader {
     reads: ReaderConfig,
     attachment: Arc<Attachment>,
     /// `None` until the first look-up.
     descriptors: Option<Descriptors>,
-    /// Maps of the segments that samples were in.
+    /// Maps of the segments of recent samples.
     maps: Vec<(u32, Weak<Map>)>,
     awaited: AwaitedSegment,
     cursor: u64,
-    /// Samples that the caller releases explicitly. Boxed: few readers have any, and the fields that each take reads
+    /// Samples that the caller confirms explicitly. Boxed: few readers have any, and the fields that each take reads
     /// stay together.
     under_way: Option<Box<UnconfirmedSamples>>,
-    /// The head at the last look.
+    /// The head when it was last read.
     seen: u64,
     received: u64,
     lost: u64,
     skipped: u64,
     corrupt: Option<&'static str>,
-    /// The publisher is gone, and its descriptors are in memory that never came.
+    /// True if the reader gave up the ring: the publisher is gone, and memory of it never came.
     given_up: bool,
 }
 
-/// What is in the way of a reader.
+/// The reason why a reader cannot read a sample.
 enum ReadObstacle {
     Missing(u32),
     Corrupt(&'static str),
 }
 
-/// What does not change.
+/// The constant properties of a reader.
 struct ReaderConfig {
     writer: Gid,
     peer: RingPeer,
@@ -107,9 +107,9 @@ struct ReaderConfig {
     max_message: u64,
     /// The longest sample that may be pinned, in bytes.
     in_place: u64,
-    /// Whether a publisher may wait for it.
+    /// True if a publisher may wait for it.
     tells: bool,
-    /// Has its session find it when there is something to take.
+    /// The entry by which its session finds the reader when there may be samples to take.
     watch: Option<WatchKey>,
 }
 
@@ -117,8 +117,7 @@ impl Reader {
     /// Checks a ring and opens the lane.
     ///
     /// # Errors
-    /// There is no ring of this publisher's in that place, or the segment that it is in has not
-    /// come.
+    /// There is no ring of this publisher at that location, or the segment that contains it has not come.
     pub fn map(options: ReaderOptions) -> Result<Self, ShmError> {
         let ReaderOptions { reader, writer, peer, ring, lane, grant, qos, max_message } = options;
         if lane.is_forked() {
@@ -171,11 +170,11 @@ impl Reader {
         })
     }
 
-    /// Whether there is something to take: a look at one line that the publisher writes with each
-    /// sample, and one that it seldom writes.
+    /// Returns whether there is a sample to take. Reads one cache line that the publisher writes with each sample, and
+    /// one that it seldom writes.
     #[inline]
     pub fn has_data(&self) -> bool {
-        // A publisher of the same session is not there in a forked child.
+        // In a forked child, a publisher of the same session does not exist.
         if self.corrupt.is_some() || self.given_up || self.attachment.lane.is_forked() {
             return false;
         }
@@ -184,9 +183,9 @@ impl Reader {
                 tail > self.cursor || head.saturating_sub(self.cursor) > self.reads.depth
             };
             return !matches!(self.reads.peer.find(segment), SegmentLookup::Absent)
-                // It may not be needed any more.
+                // The segment may not be needed any more.
                 || protocol::bounds(self.attachment.ring()).is_ok_and(more)
-                // It is to be asked for again, or given up.
+                // The segment has to be requested again, or given up.
                 || self.awaited.look_again().is_some_and(|due| Instant::now() >= due);
         }
         let word = protocol::array(self.attachment.ring());
@@ -198,7 +197,7 @@ impl Reader {
                     found = resolved;
                     &found
                 }
-                // The next take asks for it, or says what is wrong.
+                // The next take requests the segment, or reports the error.
                 Err(_) => return true,
             },
         };
@@ -213,7 +212,7 @@ impl Reader {
         }
     }
 
-    /// How many samples are to be taken; at most the subscription's depth.
+    /// Returns the number of samples to take; at most the subscription's depth.
     #[inline]
     pub fn unread(&self) -> u64 {
         if self.given_up || self.attachment.lane.is_forked() {
@@ -221,23 +220,23 @@ impl Reader {
         }
         match (self.corrupt, protocol::bounds(self.attachment.ring())) {
             (None, Ok((tail, head))) => {
-                // The stamp of the last one may have come before the head.
+                // The stamp of the last sample may have come before the head.
                 let unread = head.saturating_sub(self.cursor.max(tail));
                 unread.max(u64::from(self.has_data())).min(self.reads.depth)
             }
-            // The next take says what is wrong.
+            // The next take reports the error.
             (None, Err(_)) => 1,
             (Some(_), _) => 0,
         }
     }
 
-    /// Those of them that are below a position.
+    /// Returns the number of unread samples below a position.
     #[inline]
     pub fn unread_below(&self, position: u64) -> u64 {
         self.unread().min(position.saturating_sub(self.cursor))
     }
 
-    /// What goes with the next sample, without taking it.
+    /// Returns the metadata of the next sample, without taking it.
     ///
     /// # Errors
     /// The ring cannot be read.
@@ -246,16 +245,15 @@ impl Reader {
         Ok(self.find()?.map(|record| meta(&record)))
     }
 
-    /// Takes the next sample, with its payload in place of what `out` held.
+    /// Takes the next sample. Its payload replaces the content of `out`.
     ///
-    /// Samples that are older than the subscription's depth are skipped; samples within it that
-    /// the publisher has overwritten are lost. Both are counted. `None` when there is nothing, or
-    /// when the publisher was faster time and again ([`has_data`](Self::has_data) then holds).
+    /// Samples beyond the subscription's depth are skipped; samples within it that the publisher has overwritten are
+    /// lost. Both are counted. Returns `None` if there is no sample, or if the publisher was faster again and again
+    /// ([`has_data`](Self::has_data) is then true).
     ///
     /// # Errors
-    /// The ring cannot be read, or the sample is longer than the subscription expects: that one is
-    /// passed over and lost. Or memory for it is short: it can be taken later. `out` holds nothing
-    /// useful.
+    /// The ring cannot be read, or the sample is longer than the subscription expects: that sample is skipped and lost.
+    /// Or memory for it is short: it can be taken later. The content of `out` is of no use then.
     #[inline]
     pub fn take(&mut self, out: &mut Vec<u8>) -> Result<Option<Taken>, TakeError> {
         for _ in 0..ATTEMPTS {
@@ -269,7 +267,7 @@ impl Reader {
         Ok(None)
     }
 
-    /// As [`take`](Self::take), but a large sample stays where it is.
+    /// Like [`take`](Self::take), but a large sample stays in place.
     ///
     /// # Errors
     /// As for [`take`](Self::take).
@@ -298,7 +296,7 @@ impl Reader {
         Ok(None)
     }
 
-    /// As [`take_sample`](Self::take_sample), but always a copy.
+    /// Like [`take_sample`](Self::take_sample), but always copies.
     ///
     /// # Errors
     /// As for [`take`](Self::take).
@@ -307,8 +305,8 @@ impl Reader {
         Ok(self.take(&mut out)?.map(|taken| Sample::copied(taken, out)))
     }
 
-    /// Drops the oldest sample that is to be taken, as one skipped rather than lost: for a
-    /// subscription whose depth is shared by several publishers. False when there is none.
+    /// Skips the oldest untaken sample, which then counts as skipped, not as lost: for a subscription whose depth
+    /// several publishers share. Returns false if there is none.
     pub fn skip(&mut self) -> bool {
         match self.find() {
             Ok(Some(_)) => {
@@ -321,76 +319,76 @@ impl Reader {
         }
     }
 
-    /// Samples taken.
+    /// Returns the number of samples taken.
     #[inline]
     pub fn received(&self) -> u64 {
         self.received
     }
 
-    /// Samples overwritten before they could be taken, within the subscription's depth.
+    /// Returns the number of samples overwritten before they could be taken, within the subscription's depth.
     #[inline]
     pub fn lost(&self) -> u64 {
         self.lost
     }
 
-    /// Samples passed over because more recent ones fill the subscription's depth.
+    /// Returns the number of samples skipped because more recent ones fill the subscription's depth.
     #[inline]
     pub fn skipped(&self) -> u64 {
         self.skipped
     }
 
-    /// The publisher.
+    /// Returns the publisher.
     #[inline]
     pub fn writer(&self) -> Gid {
         self.reads.writer
     }
 
-    /// The publisher's session.
+    /// Returns the publisher's session.
     pub(super) fn peer(&self) -> &RingPeer {
         &self.reads.peer
     }
 
-    /// The grant by which it reads.
+    /// Returns the grant by which it reads.
     #[inline]
     pub fn grant(&self) -> Grant {
         self.reads.grant
     }
 
-    /// The position that it takes next.
+    /// Returns the position that it takes next.
     #[inline]
     pub fn position(&self) -> u64 {
         self.cursor
     }
 
-    /// Where its lane is.
+    /// Returns the location of its lane.
     #[inline]
     pub fn lane(&self) -> Location {
         self.attachment.lane.location()
     }
 
-    /// Whether it reads the ring that another does.
+    /// Returns whether it reads the same ring as another reader.
     #[inline]
     pub fn is_of_ring(&self, other: &Self) -> bool {
         std::ptr::eq(self.attachment.ring(), other.attachment.ring())
     }
 
-    /// When to look again for memory that is needed to go on and has not come.
+    /// Returns when to look again for memory that is needed in order to continue and has not come.
     #[inline]
     pub fn look_again(&self) -> Option<Instant> {
         self.awaited.look_again()
     }
 
-    /// The number of the segment of the publisher's session that is needed to go on and has not
+    /// Returns the number of the segment of the publisher's session that is needed in order to continue and has not
     /// come.
     pub fn missing(&self) -> Option<u32> {
         self.awaited.segment()
     }
 
-    /// Gives up the remaining samples if memory that the reader needs to go on has not come; returns
-    /// whether it gave up. These samples count as skipped: for a reader whose publisher is gone and
-    /// whose samples another reader has, too.
+    /// Gives up the remaining samples if memory that the reader needs in order to continue has not come. Returns
+    /// whether it gave them up. These samples count as skipped: for a reader whose publisher is gone and whose samples
+    /// another reader has, too.
     pub fn skip_missing(&mut self) -> bool {
-        // It may have come since it was looked for.
+        // The segment may have come since the last look-up.
         let lacks = |segment| matches!(self.reads.peer.find(segment), SegmentLookup::Absent);
         if self.given_up || !self.awaited.segment().is_some_and(lacks) {
             return false;
@@ -403,36 +401,36 @@ impl Reader {
         true
     }
 
-    /// Whether there is nothing to take now, nor will be when the segments come that are on their
-    /// way. For one whose publisher is gone.
+    /// Returns whether there is nothing to take now, nor when the segments in flight come. For a reader whose publisher
+    /// is gone.
     pub fn is_drained(&self) -> bool {
         self.awaited.segment().is_none() && !self.has_data()
     }
 
-    /// Notes that the publisher is gone and that all of its memory was handed over, whether or not its
-    /// process has ended: memory that does not come soon never will.
+    /// Records that the publisher is gone and that all of its memory was handed over, whether or not its process has
+    /// ended: memory that does not come soon never will.
     pub fn end(&mut self) {
         self.awaited.end();
     }
 
-    /// How many samples have come since the grant, whatever became of them.
+    /// Returns how many samples have come since the grant, whether taken, skipped or lost.
     #[inline]
     pub fn arrived(&self) -> u64 {
         if self.corrupt.is_some() || self.attachment.lane.is_forked() {
             return 0;
         }
         let head = protocol::bounds(self.attachment.ring()).map_or(self.cursor, |(_, head)| head);
-        // A sample may be taken by its stamp before the head says so.
+        // A sample may be taken by its stamp before the head includes it.
         head.max(self.cursor).saturating_sub(self.reads.grant.first)
     }
 
-    /// The ring's header, which is not there in a forked child of the publisher's.
+    /// Returns the ring's header; `None` in a forked child of the reader's process.
     #[inline]
     pub(super) fn ring_words(&self) -> Option<&[AtomicU64]> {
         (!self.attachment.lane.is_forked()).then(|| self.attachment.ring())
     }
 
-    /// Whether the publisher's process has ended: a system call. Drain before dropping.
+    /// Returns whether the publisher's process has ended, by a system call. Drain the reader before dropping it.
     pub fn writer_dead(&self) -> bool {
         self.reads.peer.is_dead()
     }
@@ -448,7 +446,7 @@ impl Reader {
         TakeError::Corrupt { writer: self.reads.writer, what }
     }
 
-    /// The sample at the cursor is the caller's.
+    /// Counts the sample at the cursor as taken, and shows that to its publisher.
     #[inline]
     fn taken(&mut self, record: &Record) -> Taken {
         let taken = self.taken_untold(record);
@@ -456,7 +454,7 @@ impl Reader {
         taken
     }
 
-    /// As [`taken`](Self::taken), but its publisher does not hear of it.
+    /// Like [`taken`](Self::taken), but does not show it to the publisher.
     #[inline]
     fn taken_untold(&mut self, record: &Record) -> Taken {
         let taken = Taken { meta: meta(record), position: self.cursor };
@@ -483,19 +481,20 @@ impl Reader {
         self.make_room_known();
     }
 
-    /// Has its session find it by [`take_active`](crate::session::segment::SessionSegment::take_active) when there may
-    /// be something to take, and now, where the session [follows](crate::session::segment::SessionSegment::follow).
+    /// Makes its session find the reader by [`take_active`](crate::session::segment::SessionSegment::take_active) when
+    /// there may be samples to take, and now, if the session
+    /// [follows](crate::session::segment::SessionSegment::follow).
     pub fn follow(&mut self, reader: Gid) {
         let Some(words) = self.ring_words() else { return };
-        // Relaxed: written before anybody was told where the ring is. Another number hides no ring for ever: each look
-        // passes over some in turn.
+        // Relaxed: written before any reader learned where the ring is. A wrong number hides no ring for ever: each
+        // look includes some readers in turn.
         let ring = words[layout::ring::NUMBER].load(Ordering::Relaxed) as u32;
         let session = self.attachment.lane.session();
         let (pair, peer) = ((reader, self.reads.writer), self.reads.peer.remote());
         self.reads.watch = session.activity().watch(pair, peer, session.journal(), ring);
     }
 
-    /// Has its session find it at the next look, if it is followed.
+    /// Makes its session find the reader at the next look, if it is followed.
     pub fn mark_active(&self) {
         // In a forked child, a thread of the parent may have held the lock.
         if let Some(watch) = &self.reads.watch
@@ -505,13 +504,13 @@ impl Reader {
         }
     }
 
-    /// Has its publisher woken by whatever is taken, if it waits for that: of what stands for others.
+    /// Makes each take wake its publisher, if that waits: for a reader that stands for remote ones.
     #[inline]
     pub fn tell_progress(&mut self) {
         self.reads.tells = true;
     }
 
-    /// Has its publisher, in another session, woken when it may go on: one that waits for KEEP_LAST, too.
+    /// Makes each take wake its publisher in another session, even one that waits for a KEEP_LAST reader.
     #[inline]
     pub fn tell_room(&mut self) {
         self.reads.tells |= self.reads.peer.remote().is_some();
@@ -525,7 +524,7 @@ impl Reader {
         }
     }
 
-    /// What the publisher says of its times.
+    /// Returns the times in the publisher's ring.
     pub fn times(&self) -> Times {
         self.ring_words().map_or_else(Times::default, read)
     }
@@ -533,9 +532,9 @@ impl Reader {
 
 impl Drop for Reader {
     fn drop(&mut self) {
-        // The lane closes with the last sample; until then it only stops to hold the publisher.
+        // The lane closes with the last sample; until then the reader only stops holding up the publisher.
         if self.attachment.lane.is_forked() {
-            // A thread of the parent may have held its lock.
+            // A thread of the parent may have held the entry's lock.
             std::mem::forget(self.reads.watch.take());
             return;
         }

@@ -18,9 +18,9 @@ use crate::{
     session::peer::SegmentLookup,
 };
 
-/// Where a ring's descriptors were found.
+/// The location of a ring's descriptors.
 pub(super) struct Descriptors {
-    /// What the ring said.
+    /// The ring's word that describes the location.
     pub(super) word: u64,
     map: Arc<Map>,
     words: Range<usize>,
@@ -35,7 +35,7 @@ impl Descriptors {
 }
 
 impl Reader {
-    /// The record at the cursor, once that is past all that is skipped or lost.
+    /// Returns the record at the cursor, after moving the cursor past all skipped and lost samples.
     pub(super) fn find(&mut self) -> Result<Option<Record>, TakeError> {
         if self.attachment.lane.is_forked() {
             return Err(TakeError::Forked);
@@ -49,13 +49,13 @@ impl Reader {
         match self.find_sane() {
             Ok(found) => {
                 if found.is_none() {
-                    // Nothing at the cursor needs it.
+                    // Nothing at the cursor needs the segment.
                     self.awaited.clear();
                 }
                 Ok(found)
             }
             Err(ReadObstacle::Missing(segment)) if self.lacks(segment) => {
-                // None of what is there will ever be found.
+                // The descriptors will never be found, and so no sample.
                 self.give_all_up().map_err(|what| self.corrupt(what)).map(|()| None)
             }
             Err(ReadObstacle::Missing(_)) => Ok(None),
@@ -76,13 +76,13 @@ impl Reader {
             match view.state(cursor) {
                 PositionState::Ahead if cursor >= self.seen => return Ok(None),
                 PositionState::Here => {
-                    // One look tells whether more than the depth is unread, if that many can be.
+                    // One read tells whether more samples than the depth are unread, if that many are possible.
                     let descriptors = (view.array.len() / layout::DESCRIPTOR_WORDS) as u64;
                     let late =
                         depth < descriptors && view.state(cursor + depth) != PositionState::Ahead;
                     let mut head = 0;
                     if late {
-                        // The head may not say so yet, or never, if the publisher died.
+                        // The head may not include it yet, or never, if the publisher died.
                         head = if view.stands(cursor) { cursor + depth + 1 } else { 0 };
                     } else {
                         match view.look(cursor) {
@@ -106,13 +106,12 @@ impl Reader {
         Ok(None)
     }
 
-    /// Counts what is skipped and what is lost, by what the head, which is at least `least`, and
-    /// the tail say.
+    /// Counts the skipped and the lost samples, by the tail and by the head, which is at least `least`.
     fn count(&mut self, least: u64) -> Result<(), ReadObstacle> {
         let (tail, head) =
             protocol::bounds(self.attachment.ring()).map_err(ReadObstacle::Corrupt)?;
         let head = head.max(least);
-        // A sample may be taken by its stamp before the head says so.
+        // A sample may be taken by its stamp before the head includes it.
         if head + 1 < self.cursor {
             return Err(ReadObstacle::Corrupt("its head went back"));
         }
@@ -129,13 +128,13 @@ impl Reader {
         Ok(())
     }
 
-    /// Passes over all samples that are to be taken but the newest `depth`, without a look at their bytes. As if the
-    /// subscription had that depth, they count as skipped, and those among the rest that were overwritten as lost.
+    /// Skips all untaken samples but the newest `depth`, without reading their bytes. As if the subscription had that
+    /// depth, they count as skipped; samples among the rest that were overwritten count as lost.
     pub fn skip_to_depth(&mut self, depth: u64) {
         if self.corrupt.is_some() || self.given_up || self.attachment.lane.is_forked() {
             return;
         }
-        // The next take says what is wrong with the memory.
+        // The next take reports an error of the memory.
         let Ok((_, head)) = protocol::bounds(self.attachment.ring()) else { return };
         let unread = head.saturating_sub(self.cursor);
         if unread > depth {
@@ -145,7 +144,7 @@ impl Reader {
         }
     }
 
-    /// Where the descriptors are that the ring's word speaks of.
+    /// Returns the location of the descriptors that the ring's word describes.
     pub(super) fn resolve(&self, word: u64) -> Result<Descriptors, ReadObstacle> {
         let wrong = ReadObstacle::Corrupt("its descriptors are nowhere");
         let Some(Array { at, descriptors }) = Array::from_word(word) else { return Err(wrong) };
@@ -160,8 +159,8 @@ impl Reader {
         }
     }
 
-    /// As [`find`](Self::find), and where its bytes are; without what is longer than the
-    /// subscription expects.
+    /// Like [`find`](Self::find), with the location of the sample's bytes. Samples that are longer than the
+    /// subscription expects are skipped.
     pub(super) fn find_whole(&mut self) -> Result<Option<(Record, Bytes)>, TakeError> {
         for _ in 0..ATTEMPTS {
             let Some(record) = self.find()? else { return Ok(None) };
@@ -187,7 +186,7 @@ impl Reader {
         Ok(None)
     }
 
-    /// Where the bytes of a record that stood are.
+    /// Returns the location of the bytes of a record that was valid when it was read.
     fn locate(&mut self, record: &Record) -> Result<Bytes, ReadObstacle> {
         let (at, slot) = match record.place {
             PayloadLocation::Inline => return Ok(Bytes::Inline),
@@ -203,7 +202,7 @@ impl Reader {
             Some(map) => map,
             None => match self.reads.peer.find(at.segment) {
                 SegmentLookup::Map(map) => {
-                    // Few are in use at a time, and one that is not here is found again.
+                    // Few segments are in use at a time, and one that is not cached is looked up again.
                     self.maps.retain(|(number, _)| *number != at.segment);
                     if self.maps.len() >= KNOWN {
                         self.maps.remove(0);
@@ -228,13 +227,13 @@ impl Reader {
         Ok(Bytes::Block(MappedRange { map, words, skip: 0 }))
     }
 
-    /// Whether a pin keeps the sample in place; else it is copied as one in a block is.
+    /// Returns whether a pin may keep the sample in place; otherwise it is copied like a sample in a block.
     pub(super) fn may_pin(&self, record: &Record) -> bool {
         u64::from(record.len) <= self.reads.in_place
     }
 
-    /// Adds a copy of the payload at the cursor to `out`; false when the publisher was faster, and what was added is
-    /// of no use.
+    /// Appends a copy of the payload at the cursor to `out`. Returns false if the publisher was faster; the appended
+    /// bytes are then of no use.
     pub(super) fn copy_to(
         &self,
         record: &Record,
@@ -259,8 +258,8 @@ impl Reader {
         Ok(view.stands(self.cursor))
     }
 
-    /// Notes that `segment` has not come, and has it asked for again at times. True when it never
-    /// will: then none of the samples in it can be read.
+    /// Records that `segment` has not come, and requests it again from time to time. Returns true if it never will
+    /// come: none of the samples in it can be read then.
     fn lacks(&mut self, segment: u32) -> bool {
         let peer = &self.reads.peer;
         let wait = self.awaited.handle_missing(segment, Instant::now(), || peer.is_dead());
@@ -272,7 +271,7 @@ impl Reader {
         wait == Wait::InVain
     }
 
-    /// All that is published is lost, and nothing else will be.
+    /// Counts all published samples as lost, and gives up the ring.
     fn give_all_up(&mut self) -> Result<(), &'static str> {
         let (_, head) = protocol::bounds(self.attachment.ring())?;
         self.given_up = true;
@@ -282,19 +281,19 @@ impl Reader {
         Ok(())
     }
 
-    /// The sample at the cursor is lost.
+    /// Counts the sample at the cursor as lost.
     fn lose(&mut self) {
         self.lost += 1;
         self.advance(self.cursor + 1);
     }
 }
 
-/// Where a sample's bytes are.
+/// The location of a sample's bytes.
 pub(super) enum Bytes {
-    /// In its descriptor.
+    /// In the sample's descriptor.
     Inline,
-    /// To be copied, and checked afterwards.
+    /// In a block: they are copied, and checked afterwards.
     Block(MappedRange),
-    /// To be pinned, if the reader [may](Reader::may_pin).
+    /// In a slot: they are pinned, if the reader [may](Reader::may_pin).
     Slot(MappedRange),
 }

@@ -18,20 +18,18 @@ use crate::{
     session::attachment::Pin,
 };
 
-/// A sample, in the publisher's memory where it is long enough for that to pay, else in a copy.
+/// A sample, in the publisher's memory if it is long enough for that, or else in a copy.
 ///
-/// It stays as it was published for as long as this value lives, also after the subscription, the
-/// publisher and its process have ended; only then may the publisher use the memory again, which
-/// it never waits for. A subscription can have five such samples of one publisher; a sixth is
-/// copied, and so is one that is longer than its share of what the publisher can spare. It may be
-/// read and dropped by any thread.
+/// It stays as it was published for as long as this value lives, even after the subscription, the publisher and its
+/// process have ended. Only then may the publisher reuse the memory; it never waits for that. A subscription can have
+/// five such samples of one publisher; a sixth is copied, and so is one that is longer than its share of the memory
+/// that the publisher can spare. Any thread may read and drop it.
 ///
-/// A publisher in another process that does not keep to the protocol can still change the bytes.
-/// They are therefore read as values ([`read_at`](Self::read_at), [`copy_to`](Self::copy_to),
-/// [`reader`](Self::reader)), and as a slice only where the caller
-/// [vouches for the publisher](Self::into_slice).
+/// A publisher in another process that does not keep to the protocol can still change the bytes. They are therefore
+/// read as values ([`read_at`](Self::read_at), [`copy_to`](Self::copy_to), [`reader`](Self::reader)), and as a slice
+/// only if the caller [vouches for the publisher](Self::into_slice).
 ///
-/// What is read in place borrows the sample:
+/// Reading in place borrows the sample:
 ///
 /// ```compile_fail,E0505
 /// # use axon_shm::{Subscriber, TakeError};
@@ -45,7 +43,7 @@ use crate::{
 /// }
 /// ```
 ///
-/// A forked child has no share in it: it reads nothing there.
+/// A forked child has no access to it: it reads nothing there.
 pub struct Sample {
     taken: Taken,
     len: usize,
@@ -57,7 +55,7 @@ enum SampleBytes {
     Pinned { there: MappedRange, pin: Pin },
 }
 
-/// Bytes of a map: those of `words`, without the first `skip` bytes.
+/// Bytes of a map: the bytes of `words`, without the first `skip` bytes.
 pub(crate) struct MappedRange {
     pub(crate) map: Arc<Map>,
     pub(crate) words: Range<usize>,
@@ -72,55 +70,54 @@ impl MappedRange {
 }
 
 impl Sample {
-    /// A sample of its own bytes.
+    /// Creates a sample with its own bytes.
     pub(crate) fn copied(taken: Taken, bytes: Vec<u8>) -> Self {
         Self { taken, len: bytes.len(), data: SampleBytes::Copied(bytes) }
     }
 
-    /// `len` bytes there, which the words hold and which `pin` pins.
+    /// Creates a sample of `len` bytes at `there`, inside its words, which `pin` pins.
     pub(crate) fn pinned(taken: Taken, len: usize, there: MappedRange, pin: Pin) -> Self {
         debug_assert!(there.skip + len <= there.words().len() * 8);
         Self { taken, len, data: SampleBytes::Pinned { there, pin } }
     }
 
-    /// What goes with it.
+    /// Returns its metadata.
     #[inline]
     pub fn meta(&self) -> Meta {
         self.taken.meta
     }
 
-    /// Its position in the publisher's ring.
+    /// Returns its position in the publisher's ring.
     #[inline]
     pub fn position(&self) -> u64 {
         self.taken.position
     }
 
-    /// Its length in bytes.
+    /// Returns its length in bytes.
     #[inline]
     pub fn len(&self) -> usize {
         self.len
     }
 
-    /// Whether it has no bytes.
+    /// Returns whether it has no bytes.
     #[inline]
     pub fn is_empty(&self) -> bool {
         self.len == 0
     }
 
-    /// Whether it is in the publisher's memory.
+    /// Returns whether it is in the publisher's memory.
     #[inline]
     pub fn is_borrowed(&self) -> bool {
         matches!(self.data, SampleBytes::Pinned { .. })
     }
 
-    /// Whether this is a forked child, which has no share in it.
+    /// Returns whether this is a forked child, which has no access to it.
     #[inline]
     pub(super) fn is_forked(&self) -> bool {
         matches!(&self.data, SampleBytes::Pinned { pin, .. } if pin.attachment().lane.is_forked())
     }
 
-    /// Copies bytes from `at` on to the front of `out`, as many as there are and fit, and returns
-    /// how many.
+    /// Copies bytes from `at` on to the front of `out`, as many as there are and fit, and returns their number.
     #[inline]
     pub fn read_at(&self, at: usize, out: &mut [u8]) -> usize {
         let count = out.len().min(self.len.saturating_sub(at));
@@ -136,11 +133,10 @@ impl Sample {
         count
     }
 
-    /// Writes its first bytes to all of `out`, of which it has as many; false, with nothing written, in
-    /// a forked child.
+    /// Fills `out` with its first bytes. Returns false, with nothing written, in a forked child.
     ///
     /// # Panics
-    /// It has fewer.
+    /// `out` is longer than the sample.
     #[doc(hidden)]
     #[inline]
     pub fn write_to(&self, out: &mut [MaybeUninit<u8>]) -> bool {
@@ -157,10 +153,10 @@ impl Sample {
         true
     }
 
-    /// Replaces what `out` holds by the sample's bytes. In a forked child, by none.
+    /// Replaces the content of `out` by the sample's bytes; in a forked child, by none.
     ///
     /// # Errors
-    /// There is no memory for them.
+    /// There is no memory for the bytes.
     pub fn copy_to(&self, out: &mut Vec<u8>) -> Result<(), TryReserveError> {
         match &self.data {
             SampleBytes::Copied(bytes) => {
@@ -179,13 +175,13 @@ impl Sample {
         }
     }
 
-    /// Reads it from the front, for instance to deserialize it.
+    /// Returns a reader of the sample from the front, for instance to deserialize it.
     pub fn reader(&self) -> SampleReader<'_> {
         SampleReader { sample: self, at: 0 }
     }
 
-    /// Where its bytes are. Where it [is borrowed](Self::is_borrowed) they are aligned to 16, or those behind
-    /// the header that its publisher's [loan](crate::Publisher::loan_behind) had.
+    /// Returns the address of its bytes. If it [is borrowed](Self::is_borrowed), they are aligned to 16, or the bytes
+    /// behind the header of its publisher's [loan](crate::Publisher::loan_behind) are.
     ///
     /// They are readable for as long as the sample lives. A publisher that does not keep to the
     /// protocol may change them at any time, so an access must be atomic or volatile.
@@ -199,7 +195,7 @@ impl Sample {
         }
     }
 
-    /// Its bytes in place.
+    /// Returns its bytes in place.
     ///
     /// # Safety
     /// Where it [is borrowed](Self::is_borrowed), the publisher's process must be trusted not to

@@ -7,7 +7,7 @@ use std::{fmt, ops::Deref};
 use super::sample::Sample;
 use crate::ring::types::Meta;
 
-/// The caller's word that publishers do not write to a sample that is being read. It is given once, and turns
+/// The caller's promise that publishers do not write to a sample that is being read. It is given once, and turns
 /// samples into [slices](Sample::into_slice) without further `unsafe`.
 ///
 /// ```
@@ -44,8 +44,7 @@ impl TrustPublishers {
 
 /// The bytes of a [`Sample`] in place: a `&[u8]` wherever one is asked for.
 ///
-/// It keeps the sample from being overwritten, as the [`Sample`] does that it was made of. In a forked child it is
-/// empty.
+/// Like its [`Sample`], it keeps the sample from being overwritten. In a forked child it is empty.
 ///
 /// ```
 /// # use std::{os::unix::net::UnixDatagram, thread, time::Duration};
@@ -72,7 +71,7 @@ pub struct SampleSlice {
 }
 
 impl Sample {
-    /// Its bytes in place, for a caller that trusts its publisher. Nothing is copied.
+    /// Returns its bytes in place, for a caller that trusts its publisher. Nothing is copied.
     #[must_use]
     pub fn into_slice(self, _trust: TrustPublishers) -> SampleSlice {
         SampleSlice { sample: self }
@@ -80,17 +79,17 @@ impl Sample {
 }
 
 impl SampleSlice {
-    /// What goes with it.
+    /// Returns the sample's metadata.
     pub fn meta(&self) -> Meta {
         self.sample.meta()
     }
 
-    /// The sample, to be read as values.
+    /// Returns the sample, to be read as values.
     pub fn sample(&self) -> &Sample {
         &self.sample
     }
 
-    /// Back to the sample.
+    /// Returns the sample.
     pub fn into_sample(self) -> Sample {
         self.sample
     }

@@ -1,5 +1,5 @@
 //! Samples that a reader took and that another process or host still has to confirm. Relays use this: the publisher
-//! keeps such samples until the relay says that they arrived.
+//! keeps such samples until the relay confirms that they arrived.
 
 use std::collections::VecDeque;
 
@@ -12,11 +12,10 @@ use crate::{
     sync::Ordering,
 };
 
-/// The length of so many samples is looked at, or of less than twice as many.
+/// Number of samples whose length is read at least, if there are as many; it is always less than twice this number.
 const LOOKS: u64 = 1 << 13;
 
-/// Numbers and positions of samples that were taken and are not done with, and how many samples were given
-/// up so far.
+/// Numbers and positions of samples that were taken and are not confirmed, and the number of samples given up so far.
 #[derive(Default)]
 pub(super) struct UnconfirmedSamples(VecDeque<(u64, u64)>, u64);
 
@@ -25,7 +24,7 @@ impl UnconfirmedSamples {
         self.0.push_back((sequence, position));
     }
 
-    /// The position of the oldest.
+    /// Returns the position of the oldest one.
     #[inline]
     pub(super) fn first(&self) -> Option<u64> {
         self.0.front().map(|(_, position)| *position)
@@ -33,28 +32,29 @@ impl UnconfirmedSamples {
 }
 
 impl Reader {
-    /// What is taken from now on is done with when [`finish`](Self::finish) says so: until then its
-    /// publisher takes it as not taken.
+    /// Requires that samples taken from now on are confirmed by [`finish`](Self::finish): until then, they count as not
+    /// taken for their publisher.
     #[inline]
     pub fn finish_later(&mut self) {
         self.under_way.get_or_insert_default();
     }
 
-    /// Whether samples that were taken are not done with.
+    /// Returns whether there are samples that were taken and are not confirmed.
     #[inline]
     pub fn is_under_way(&self) -> bool {
         self.under_way.as_ref().is_some_and(|under_way| !under_way.0.is_empty())
     }
 
-    /// Samples that are not done with, those that were not taken among them.
+    /// Returns the number of unconfirmed samples, including untaken ones.
     #[inline]
     pub fn undone(&self) -> u64 {
         let under_way = self.under_way.as_ref().map_or(0, |under_way| under_way.0.len() as u64);
         under_way.saturating_add(self.unread())
     }
 
-    /// Bytes that these samples take, their descriptors included. Of many it looks at each nth one, and takes the others to be
-    /// like them. Another process wrote the lengths: any value is possible.
+    /// Returns the bytes that the [unconfirmed](Self::undone) samples take, including their descriptors. Of many
+    /// samples it reads the length of each nth one, and assumes the others to be like it. Another process wrote the
+    /// lengths: any value is possible.
     pub fn undone_bytes(&self) -> u64 {
         let undone = self.undone();
         if undone == 0 || self.attachment.lane.is_forked() {
@@ -81,8 +81,8 @@ impl Reader {
         described.saturating_add(lengths.sum::<u64>().saturating_mul(every))
     }
 
-    /// How many publishes found no room because KEEP_ALL readers were not done with the oldest sample. `None` where this
-    /// reader is done with it. Another process wrote the number, so any value is possible.
+    /// Returns how many publishes found no space because KEEP_ALL readers had not confirmed the oldest sample. Returns
+    /// `None` if this reader has confirmed it. Another process wrote the number, so any value is possible.
     pub fn refused(&self) -> Option<u64> {
         if self.attachment.lane.is_forked() {
             return None;
@@ -96,7 +96,7 @@ impl Reader {
         (first <= tail && first < head).then(refused)
     }
 
-    /// Samples up to this number are done with.
+    /// Confirms the samples up to this number.
     #[inline]
     pub fn finish(&mut self, sequence: u64) {
         let Some(under_way) = &mut self.under_way else { return };
@@ -109,8 +109,7 @@ impl Reader {
         self.tell_cursor();
     }
 
-    /// The message of this number, and all that were taken before it, are done with: for a writer whose numbers do not
-    /// rise.
+    /// Confirms the message of this number, and all messages taken before it: for a writer whose numbers do not rise.
     pub fn finish_through(&mut self, sequence: u64) {
         let Some(under_way) = &mut self.under_way else { return };
         if self.attachment.lane.is_forked() {
@@ -122,8 +121,8 @@ impl Reader {
         }
     }
 
-    /// So many samples do not get where they are to go: their publisher sees that no later than that they
-    /// are [done with](Self::finish).
+    /// Reports that `samples` samples do not reach their destination. The publisher sees that no later than that they
+    /// are [confirmed](Self::finish).
     pub fn give_up(&mut self, samples: u64) {
         let Some(under_way) = &mut self.under_way else { return };
         if !self.attachment.lane.is_forked() {
@@ -132,7 +131,7 @@ impl Reader {
         }
     }
 
-    /// What was taken and is not done with is to be taken once more.
+    /// Makes the samples that were taken and are not confirmed available again.
     pub fn take_back(&mut self) {
         let Some(under_way) = &mut self.under_way else { return };
         if self.attachment.lane.is_forked() {
@@ -146,8 +145,7 @@ impl Reader {
         }
     }
 
-    /// As [`take_back`](Self::take_back), and so is all that stands of what it was granted, done with or
-    /// not.
+    /// Like [`take_back`](Self::take_back), for all kept samples of its grant, confirmed or not.
     pub fn rewind(&mut self) {
         self.take_back();
         if self.under_way.is_none() || self.attachment.lane.is_forked() {

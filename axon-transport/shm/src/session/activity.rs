@@ -1,10 +1,10 @@
-//! Which readers of a session have something to look at: for a session that reads so many rings that it cannot look at
+//! Finds the readers of a session that may have samples: for a session that reads so many rings that it cannot check
 //! all of them whenever one of them rings.
 //!
-//! The session reads the [journal](crate::ring::journal) of each session whose rings it reads. What no journal says, its
-//! own threads [mark](Activity::mark): a reader that was just attached, whose writer ended, or whose memory came. Each
-//! look also passes over a few further readers in turn, so that in time all are looked at, whatever other sessions write
-//! to their journals.
+//! The session reads the [journal](crate::ring::journal) of each session whose rings it reads. Its own threads
+//! [mark](Activity::mark) readers for events that no journal contains: a reader that was just attached, whose writer
+//! ended, or whose memory came. Each look also includes a few further readers in turn, so that in time all are checked,
+//! whatever other sessions write to their journals.
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap},
@@ -21,24 +21,24 @@ use crate::{
     session::peer::PeerSession,
 };
 
-/// Readers that each look passes over in turn.
+/// Number of readers that each look includes in turn.
 const IN_TURN: usize = 2;
 
-/// The readers of a session, and which of them are to be looked at.
+/// The readers of a session, and the marks of readers to check.
 #[derive(Default)]
 pub(crate) struct Activity {
-    /// Whether somebody takes what is found. Otherwise nothing is kept.
+    /// True if a caller takes the marked readers. Otherwise nothing is kept.
     followed: AtomicBool,
     state: Mutex<ActivityState>,
 }
 
 #[derive(Default)]
 struct ActivityState {
-    /// By the address of the other session; 0 is this session itself.
+    /// The followed sessions by the address of the other session; 0 is this session itself.
     journals: HashMap<usize, Followed>,
     readers: Readers,
     next: u64,
-    /// How many calls of [`take`](Activity::take) there were.
+    /// Number of calls of [`take`](Activity::take).
     looks: u64,
 }
 
@@ -46,11 +46,11 @@ struct ActivityState {
 #[derive(Default)]
 struct Readers {
     all: BTreeMap<u64, Watched>,
-    /// Those that are to be looked at, each once.
+    /// The keys of the marked readers, each once.
     marked: Vec<u64>,
-    /// The reader that was passed over last.
+    /// The reader that was included in turn last.
     turn: u64,
-    /// How often one was marked, again or not.
+    /// Number of calls of `mark`, also for a marked reader.
     #[cfg(test)]
     marks: u64,
 }
@@ -60,15 +60,15 @@ struct Followed {
     /// `None` is this session itself.
     peer: Option<Arc<PeerSession>>,
     place: JournalCursor,
-    /// By number.
+    /// The rings by number.
     rings: HashMap<u32, Ring>,
 }
 
-/// The readers of the rings of one number. A session may give all of its rings the same one.
+/// The readers of the rings of one number. A session may give all its rings the same number.
 #[derive(Default)]
 struct Ring {
     keys: BTreeSet<u64>,
-    /// The last look in which the journal named it. It may name it in all of its entries.
+    /// The last look in which the journal named the ring. The journal may name it in all of its entries.
     named: u64,
 }
 
@@ -87,13 +87,13 @@ pub(crate) struct WatchKey {
 }
 
 impl Activity {
-    /// Somebody takes what is found, from now on.
+    /// Starts keeping marks, because a caller takes the marked readers from now on.
     pub(crate) fn follow(&self) {
         // Relaxed: there is no reader yet.
         self.followed.store(true, Ordering::Relaxed);
     }
 
-    /// Watches the ring of this number for a reader, which is to be looked at. `None` if nobody follows.
+    /// Watches the ring of this number for a reader, and marks the reader. Returns `None` if no caller follows.
     pub(crate) fn watch(
         self: &Arc<Self>,
         (reader, writer): (Gid, Gid),
@@ -123,8 +123,8 @@ impl Activity {
         Some(WatchKey { of: Arc::clone(self), key })
     }
 
-    /// The readers that are to be looked at now, each with its writer, are added to `found`. After
-    /// [`arm`](crate::wake::arm): what comes later rings.
+    /// Adds the marked readers, each with its writer, to `found`. Call it after [`arm`](crate::wake::arm): later
+    /// samples ring.
     pub(crate) fn take(&self, own: Journal<'_, AtomicU64>, found: &mut Vec<(Gid, Gid)>) {
         let mut state = self.lock();
         let ActivityState { journals, readers, looks, .. } = &mut *state;
@@ -149,14 +149,14 @@ impl Activity {
         readers.take(found);
     }
 
-    /// All readers are to be looked at.
+    /// Marks all readers.
     pub(crate) fn mark_all(&self) {
         let readers = &mut self.lock().readers;
         let keys: Vec<u64> = readers.all.keys().copied().collect();
         keys.into_iter().for_each(|key| readers.mark(key));
     }
 
-    /// How often a reader was marked since the start, again or not.
+    /// Returns the number of calls of `mark` since the start.
     #[cfg(test)]
     pub(crate) fn marks(&self) -> u64 {
         self.lock().readers.marks
@@ -189,7 +189,7 @@ impl Readers {
         }
     }
 
-    /// Adds those that are to be looked at to `found`.
+    /// Adds the marked readers to `found`, and clears the marks.
     fn take(&mut self, found: &mut Vec<(Gid, Gid)>) {
         for key in self.marked.drain(..) {
             if let Some(watched) = self.all.get_mut(&key) {
@@ -201,7 +201,7 @@ impl Readers {
 }
 
 impl WatchKey {
-    /// The reader is to be looked at, whatever its ring's journal says.
+    /// Marks the reader, whatever its ring's journal contains.
     pub(crate) fn mark(&self) {
         self.of.lock().readers.mark(self.key);
     }
@@ -222,7 +222,7 @@ impl Drop for WatchKey {
         }
         if followed.rings.is_empty() {
             let unfollowed = state.journals.remove(&journal);
-            // The session that is let go of is unmapped without the lock.
+            // The session is unmapped outside the lock.
             drop(state);
             drop(unfollowed);
         }

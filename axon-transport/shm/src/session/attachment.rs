@@ -15,16 +15,16 @@ use crate::{
 /// The record that is used while a sample is copied out; the others are for samples in use.
 const COPY: usize = RECORDS - 1;
 
-/// One reader's hold on one ring. It stands until the reader and all samples in use are dropped;
-/// only then does the lane say that the reader has left.
+/// One reader's attachment to one ring. It exists until the reader and all samples in use are dropped; only then does
+/// the lane show that the reader has left.
 pub(crate) struct Attachment {
     map: Arc<Map>,
-    /// Where the ring's header is in it.
+    /// The range of the ring's header in the map.
     ring: Range<usize>,
     pub(crate) lane: Lane,
 }
 
-/// What came of pinning a sample.
+/// The result of pinning a sample.
 pub(crate) enum Pinning<T> {
     Pinned(T),
     /// The publisher has given the sample up.
@@ -34,25 +34,25 @@ pub(crate) enum Pinning<T> {
 }
 
 impl Attachment {
-    /// A hold on the ring whose header is in these words of `map`.
+    /// Creates the attachment to the ring whose header is in these words of `map`.
     pub(crate) fn new(map: Arc<Map>, ring: Range<usize>, lane: Lane) -> Arc<Self> {
         Arc::new(Self { map, ring, lane })
     }
 
-    /// The ring's header.
+    /// Returns the ring's header.
     #[inline]
     pub(crate) fn ring(&self) -> &[AtomicU64] {
         &self.map.words()[self.ring.clone()]
     }
 
-    /// The highest number of the publisher's segments that came is `number`.
+    /// Records the highest number of the publisher's segments that have come.
     pub(crate) fn set_mapped(&self, number: u32) {
         if !self.lane.is_forked() {
             self.lane.set_mapped(number);
         }
     }
 
-    /// Keeps the sample at `position` in place for as long as the pin lives. For the reader itself,
+    /// Keeps the sample at `position` in place for as long as the pin lives. Only the reader itself may call this,
     /// which does one thing at a time: no other thread takes a record meanwhile.
     pub(crate) fn pin(self: &Arc<Self>, position: u64) -> Pinning<Pin> {
         let Some(record) = self.lane.free_record(COPY) else { return Pinning::NoRecord };
@@ -63,8 +63,8 @@ impl Attachment {
         }
     }
 
-    /// Runs `read` while the sample at `position` is kept in place; `None` when the publisher has
-    /// given it up. For the reader itself, which does one thing at a time.
+    /// Runs `read` while the sample at `position` is kept in place; returns `None` if the publisher has given it up.
+    /// Only the reader itself may call this, which does one thing at a time.
     pub(crate) fn while_pinned<T>(&self, position: u64, read: impl FnOnce() -> T) -> Option<T> {
         if !self.lane.pin(COPY, position, self.tail()) {
             return None;
@@ -102,7 +102,7 @@ impl Pin {
 
 impl Drop for Pin {
     fn drop(&mut self) {
-        // The parent's records are none of a forked child's business.
+        // A forked child must not change the parent's records.
         if !self.attachment.lane.is_forked() {
             self.attachment.lane.unpin(self.record);
         }

@@ -1,10 +1,10 @@
 //! The lane of a reader: its cursor, pins and counters. The lane is in the segment of the reader's session, where
 //! the publisher reads it.
 //!
-//! The first word of a lane identifies its user. 0 means that nobody uses the lane. A value with the highest bit set
-//! means that a reader has not seen its grant yet. Any other value is the grant's. No value is used twice. A
-//! publisher knows the word from the time of the reader's request, and the value that it granted. So it can detect
-//! that another reader uses the lane.
+//! The first word of a lane identifies its user. 0 means that the lane is unused. A value with the highest bit set
+//! means that a reader has not seen its grant yet. Any other value is the grant's. No value is used twice. A publisher
+//! knows the word from the time of the reader's request, and the value that it granted. So it can detect that another
+//! reader uses the lane.
 
 use std::sync::{Arc, atomic::AtomicU64};
 
@@ -27,54 +27,54 @@ use crate::{
 /// Set in the generation word of a lane that is not open yet.
 const ASKED: u64 = 1 << 63;
 
-/// The part of a generation that says which time of the lane's use it is for: a grant of another
-/// time would bring back, for the publisher that gave it then, a reader that has left.
+/// The part of a generation that tells the time of the lane's use: a grant for another time would bring back a reader
+/// that has left, for the publisher that gave the grant then.
 const TIME: u64 = (1 << 24) - 1;
 
-/// Of the word that says how many samples were given up, what is the number; the rest is [`TIME`]'s part
-/// of the generation.
+/// Number of bits for the count in the word of given-up samples. The rest of the word is [`TIME`]'s part of the
+/// generation.
 const GIVEN_UP_BITS: u32 = 40;
 const GIVEN_UP_MAX: u64 = (1 << GIVEN_UP_BITS) - 1;
 
-/// Whether a grant of this generation is for the `number`th time that the session uses a lane.
+/// Returns whether a grant of this generation is for the `number`th time that the session uses a lane.
 fn is_for(generation: u64, number: u64) -> bool {
     // Any other value leaves the lane without a reader, or to a reader that still asks.
     (1..ASKED).contains(&generation) && generation & TIME == number & TIME
 }
 
-/// How a reader stands with the publisher that looks at its lane.
+/// The state of a reader's lane, as its publisher sees it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum LaneState {
-    /// It has not seen its grant yet.
+    /// The reader has not seen its grant yet.
     Asked,
     Open,
-    /// It has left, and has read all that it pinned.
+    /// The reader has left, and has read everything that it pinned.
     Left,
 }
 
-/// What a publisher knows a reader's lane by.
+/// The values by which a publisher recognizes a reader's use of a lane.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct LaneId {
     /// The generation word when the reader asked.
     asked: u64,
-    /// The one that it was granted.
+    /// The generation that was granted.
     generation: u64,
 }
 
 impl LaneId {
-    /// Publisher: gives a generation to the reader that asked with this lane.
+    /// Publisher: grants a generation to the reader that asked with this lane.
     pub(crate) fn grant<W: Word>(lane: &[W], pin_limit: PinLimit) -> Self {
         let asked = lane[GENERATION].load(Site::GenerationLoad.order());
         let random = rand::random_range(1..ASKED >> 30) << 30;
         Self { asked, generation: random | pin_limit.bits() | asked & TIME }
     }
 
-    /// What its reader may pin.
+    /// Returns what its reader may pin.
     pub(crate) fn pin_limit(&self) -> PinLimit {
         PinLimit::of(self.generation)
     }
 
-    /// Publisher: whether the lane is as it was when the reader asked.
+    /// Publisher: returns whether the lane is as it was when the reader asked.
     pub(crate) fn is_asked<W: Word>(&self, lane: &[W]) -> bool {
         lane[GENERATION].load(Site::GenerationLoad.order()) == self.asked
     }
@@ -83,12 +83,12 @@ impl LaneId {
         self.generation
     }
 
-    /// Publisher: how many samples the reader gave up by now; those below its [cursor](Self::cursor) are
-    /// counted if that was looked at before. `None` once the lane has passed on to another reader.
+    /// Publisher: returns how many samples the reader gave up by now. Samples below its [cursor](Self::cursor) are
+    /// counted if the cursor was read before. Returns `None` once the lane has passed on to another reader.
     pub(crate) fn given_up<W: Word>(&self, lane: &[W]) -> Option<u64> {
         // Ordered by the cursor.
         match lane[GIVEN_UP].load(Ordering::Relaxed) {
-            // As readers of an older version leave it.
+            // Readers of an older version leave it so.
             0 => Some(0),
             word => {
                 (word >> GIVEN_UP_BITS == self.generation & TIME).then_some(word & GIVEN_UP_MAX)
@@ -96,11 +96,11 @@ impl LaneId {
         }
     }
 
-    /// Publisher: what the lane says of the reader now.
+    /// Publisher: returns the state that the lane shows now.
     #[inline]
     pub(crate) fn standing<W: Word>(&self, lane: &[W]) -> LaneState {
-        // Pairs with `open`: who sees the lane open sees its cursor; and with `close`: who sees it
-        // closed, or in other hands, writes after all reads.
+        // Pairs with `open`: a publisher that sees the lane open sees its cursor. Pairs with `close`: a publisher that
+        // sees it closed, or in other hands, writes after all reads.
         match lane[GENERATION].load(Site::GenerationLoad.order()) {
             0 => LaneState::Left,
             word if word == self.generation => LaneState::Open,
@@ -109,40 +109,40 @@ impl LaneId {
         }
     }
 
-    /// Publisher: the next position that the reader takes, if it has opened the lane.
+    /// Publisher: returns the next position that the reader takes, if it has opened the lane.
     #[inline]
     pub(crate) fn cursor<W: Word>(&self, lane: &[W]) -> Option<u64> {
         (self.standing(lane) == LaneState::Open).then(|| {
-            // Pairs with `advance`: what the reader has copied is not written over before.
+            // Pairs with `advance`: memory from which the reader has copied is not overwritten before.
             lane[CURSOR].load(Site::CursorLoad.order())
         })
     }
 }
 
-/// Publisher: the highest number of its segments that came to the reader.
+/// Publisher: returns the highest number of its segments that came to the reader.
 #[inline]
 pub(crate) fn mapped<W: Word>(lane: &[W]) -> u64 {
-    // Pairs with `set_mapped`: what is told of the segment from now on finds it there.
+    // Pairs with `set_mapped`: a sample that names the segment from now on finds it at the reader.
     lane[MAPPED].load(Site::MappedLoad.order())
 }
 
-/// Reader: this is the highest number of the segments of its publisher that came.
+/// Reader: records the highest number of its publisher's segments that came.
 pub(crate) fn set_mapped<W: Word>(lane: &[W], number: u64) {
     // Pairs with `mapped`.
     lane[MAPPED].store(number, Site::MappedStore.order());
 }
 
-/// Reader: is about to ask with this lane for the `number`th time that the session uses one.
+/// Reader: prepares to ask with this lane for the `number`th time that the session uses one.
 pub(crate) fn ask<W: Word>(lane: &[W], number: u64) {
     lane[MAPPED].store(0, Ordering::Relaxed);
     // Pairs with `standing`, for the publisher of the reader that had the lane before.
     lane[GENERATION].store(ASKED | number, Site::AskStore.order());
 }
 
-/// Reader: has seen its grant.
+/// Reader: opens the lane, having seen its grant.
 pub(crate) fn open<W: Word>(lane: &[W], grant: Grant) {
-    // The records are clear since the last pin was given up. To clear them once more could hide
-    // from the last reader's publisher that this one's reads come after that one's.
+    // The records are clear since the last pin was given up. Clearing them once more could hide from the last reader's
+    // publisher that this reader's reads come after that reader's.
     for word in [RECEIVED, LOST, SKIPPED, TAKEN] {
         lane[word].store(0, Ordering::Relaxed);
     }
@@ -152,27 +152,27 @@ pub(crate) fn open<W: Word>(lane: &[W], grant: Grant) {
     lane[GENERATION].store(grant.generation, Site::OpenStore.order());
 }
 
-/// Reader: has taken, or will not take, what is below `cursor`.
+/// Reader: records that it has taken, or will not take, the samples below `cursor`.
 #[inline]
 pub(crate) fn advance<W: Word>(lane: &[W], cursor: u64) {
     // Pairs with `cursor`.
     lane[CURSOR].store(cursor, Site::CursorStore.order());
 }
 
-/// Reader: gave up so many samples since it came. Before it is done with them.
+/// Reader: records how many samples it gave up since it came. Call it before the reader is done with them.
 pub(crate) fn give_up<W: Word>(lane: &[W], number: u64, samples: u64) {
     let word = (number & TIME) << GIVEN_UP_BITS | samples.min(GIVEN_UP_MAX);
     // `advance` shows it.
     lane[GIVEN_UP].store(word, Ordering::Relaxed);
 }
 
-/// Reader: has left, and pins nothing.
+/// Reader: records that it has left, and pins nothing.
 pub(crate) fn close<W: Word>(lane: &[W]) {
     // Pairs with `standing`.
     lane[GENERATION].store(0, Site::CloseStore.order());
 }
 
-/// Another session's lane, or one of our own, as a publisher sees it.
+/// A publisher's view of a lane of another session or its own.
 #[derive(Clone)]
 pub(crate) struct LaneView {
     map: Arc<Map>,
@@ -181,7 +181,7 @@ pub(crate) struct LaneView {
 }
 
 impl LaneView {
-    /// The lane at an offset of a map, if there can be one.
+    /// Returns the lane at an offset of a map, if the offset is valid.
     pub(crate) fn new(map: &Arc<Map>, at: Location) -> Option<Self> {
         let start = at.words(layout::LANE, map.words().len())?.start;
         Some(Self { map: Arc::clone(map), start })
@@ -193,42 +193,42 @@ impl LaneView {
     }
 }
 
-/// A place in a session's memory where one reader tells its publisher how far it is.
+/// Memory of a session in which one reader reports its progress to its publisher.
 ///
 /// Freed when dropped.
 pub struct Lane {
     session: Arc<SessionSegment>,
     object: HeapObject,
-    /// Which time it is that the session uses one.
+    /// The count of lanes that the session had given out, including this one.
     number: u64,
 }
 
 impl Lane {
-    /// The lane in `object`, for the `number`th time that the session gives one out.
+    /// Creates the lane in `object`, for the `number`th time that the session gives one out.
     pub(crate) fn new(session: Arc<SessionSegment>, object: HeapObject, number: u64) -> Self {
         let lane = Self { session, object, number };
         ask(lane.words(), number);
         lane
     }
 
-    /// Where it is, by which a publisher finds it.
+    /// Returns its location, by which a publisher finds it.
     #[inline]
     pub fn location(&self) -> Location {
         self.object.block.at
     }
 
-    /// Whether the calling process is a fork of the lane's: it must not touch the lane.
+    /// Returns whether the calling process is a fork of the lane's: it must not touch the lane.
     #[inline]
     pub(crate) fn is_forked(&self) -> bool {
         self.session.is_forked()
     }
 
-    /// The session of its reader.
+    /// Returns the session of its reader.
     pub(crate) fn session(&self) -> &Arc<SessionSegment> {
         &self.session
     }
 
-    /// Whether a grant may be the answer to this reader.
+    /// Returns whether a grant may be the answer to this reader.
     pub(crate) fn is_meant_by(&self, grant: Grant) -> bool {
         is_for(grant.generation, self.number)
     }
@@ -238,13 +238,13 @@ impl Lane {
         open(self.words(), grant);
     }
 
-    /// The sample that is taken now carries this source timestamp.
+    /// Records the source timestamp of the sample that is taken now.
     #[inline]
     pub(crate) fn taken(&self, timestamp: i64) {
         self.words()[TAKEN].store(timestamp.cast_unsigned(), Ordering::Relaxed);
     }
 
-    /// All below `cursor` is done with.
+    /// Records that the reader is done with all samples below `cursor`, and its counters.
     #[inline]
     pub(crate) fn advance(&self, cursor: u64, received: u64, lost: u64, skipped: u64) {
         let words = self.words();
@@ -254,22 +254,22 @@ impl Lane {
         advance(words, cursor);
     }
 
-    /// So many samples were given up since the lane was opened.
+    /// Records how many samples were given up since the lane was opened.
     pub(crate) fn give_up(&self, samples: u64) {
         give_up(self.words(), self.number, samples);
     }
 
-    /// The highest number of the publisher's segments that came is `number`.
+    /// Records the highest number of the publisher's segments that have come.
     pub(crate) fn set_mapped(&self, number: u32) {
         set_mapped(self.words(), number.into());
     }
 
-    /// Takes no more; what is pinned stays pinned.
+    /// Records that the reader takes no more samples; pinned samples stay pinned.
     pub(crate) fn leave(&self) {
         advance(self.words(), u64::MAX);
     }
 
-    /// A record [that pins nothing](pins::free), of the first `count`.
+    /// Returns a record [that pins nothing](pins::free), of the first `count`.
     #[inline]
     pub(crate) fn free_record(&self, count: usize) -> Option<usize> {
         pins::free(self.words(), count)

@@ -9,9 +9,9 @@ use crate::{session::segment::SessionSegment, wake::PURPOSES};
 
 /// Leads a session's waits from an event loop instead of a blocked thread.
 ///
-/// Each round: [`clear`](Self::clear), [`arm`](Self::arm), look for work; if there is some,
-/// [`disarm`](Self::disarm) and do it, else await that the descriptor is readable. Threads that
-/// wait meanwhile are woken by `clear`. In a forked child it does nothing.
+/// Each round: [`clear`](Self::clear), [`arm`](Self::arm), look for work. If there is some, [`disarm`](Self::disarm)
+/// and do it; otherwise wait until the descriptor is readable. `clear` wakes the threads that wait meanwhile. In a
+/// forked child it does nothing.
 ///
 /// ```
 /// use std::{os::unix::net::UnixDatagram, thread};
@@ -61,29 +61,29 @@ use crate::{session::segment::SessionSegment, wake::PURPOSES};
 /// # }
 /// ```
 ///
-/// The descriptor is an epoll instance, which any event loop takes, edge- or level-triggered. That of
-/// a [`Context`](crate::Context), which has no thread to watch other processes, is readable for
-/// nothing once a second, for the sake of what one of them did not live to ring for.
+/// The descriptor is an epoll instance, which any event loop accepts, edge- or level-triggered. The descriptor of a
+/// [`Context`](crate::Context), which has no thread to watch other processes, also becomes readable once a second, so
+/// that samples of a process that died before it rang are found.
 pub struct ExternalLeader {
     session: Arc<SessionSegment>,
 }
 
 impl ExternalLeader {
-    /// `None` when the session has an external leader already.
+    /// Returns `None` if the session has an external leader already.
     pub(crate) fn new(session: Arc<SessionSegment>) -> Option<Self> {
-        // Not made in vain: dropping it would end the other one's lead.
+        // Created only after success: dropping one would end the other leader's lead.
         session.doorbell_hub().lead_from_outside().then(|| Self { session })
     }
 
-    /// Takes the rings that came and makes the session's other waiters look again.
+    /// Takes the pending rings, and makes the session's other waiters look again.
     pub fn clear(&self) {
         if !self.session.is_forked() {
             self.session.doorbell_hub().take_from_outside(self.session.armed_words());
         }
     }
 
-    /// Arms a new ticket: whatever comes after it rings the doorbell. With `room`, so does room
-    /// for a publish that gave [`PublishError::Blocked`](crate::PublishError::Blocked).
+    /// Arms a new ticket: any later sample rings the doorbell. With `room`, so does space for a publish that returned
+    /// [`PublishError::Blocked`](crate::PublishError::Blocked).
     pub fn arm(&self, room: bool) {
         if !self.session.is_forked() {
             let purposes = if room { &PURPOSES[..] } else { &PURPOSES[..1] };

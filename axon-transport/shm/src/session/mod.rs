@@ -1,4 +1,4 @@
-//! A session, as its own process and as other sessions see it: segments, doorbell, lanes, and pinned samples.
+//! A session, from the view of its own process and of other sessions: segments, doorbell, lanes, and pinned samples.
 
 pub(crate) mod activity;
 pub(crate) mod attachment;

@@ -14,18 +14,18 @@ use crate::{
 
 /// One publisher's memory.
 pub(crate) struct Orphan {
-    /// Those who may be reading it.
+    /// The lanes of readers that may be reading the memory.
     pub(crate) pin_lanes: PinLanes,
-    /// Below this position are its samples.
+    /// The position behind its last sample.
     pub(crate) head: u64,
     pub(crate) blocks: Vec<Block>,
     /// The numbers of the segments of its large samples.
     pub(crate) samples: Vec<u32>,
-    /// What all of it takes of the memory that its publisher shared with others, until it is freed.
+    /// The memory that it takes from the shared budget of its publisher, until it is freed.
     pub(crate) _holding: Holding,
 }
 
-/// So many of them are looked at whenever one comes or a reader leaves.
+/// Maximum number of orphans that are all checked whenever one comes or a reader leaves.
 const CHECKS_PER_CALL: usize = 64;
 
 /// The memory of a session's publishers that are gone.
@@ -35,9 +35,9 @@ pub(crate) struct Orphans(Mutex<OrphansState>);
 #[derive(Default)]
 struct OrphansState {
     all: Vec<Orphan>,
-    /// How often [`sweep_some`](Orphans::sweep_some) was called since all were looked at.
+    /// Number of calls of [`sweep_some`](Orphans::sweep_some) since all were checked.
     calls: usize,
-    /// How many were looked at since the start.
+    /// Number of orphans checked since the start.
     #[cfg(test)]
     looks: usize,
 }
@@ -47,8 +47,9 @@ impl Orphans {
         self.lock().all.push(orphan);
     }
 
-    /// As [`sweep`](Self::sweep), but of many once for as many calls as there are: thousands of publishers end one after
-    /// the other, and a look at each asks whether its readers' processes live.
+    /// Like [`sweep`](Self::sweep). If there are many orphans, it checks them only once in as many calls as there are
+    /// orphans: thousands of publishers end one after the other, and each check asks whether the readers' processes
+    /// live.
     pub(crate) fn sweep_some(&self, heap: &Heap, segments: &Segments) -> bool {
         {
             let mut state = self.lock();
@@ -60,7 +61,7 @@ impl Orphans {
         self.sweep(heap, segments)
     }
 
-    /// Takes back what nobody reads any more. Whether something is left.
+    /// Frees memory that no reader reads any more. Returns whether some is left.
     pub(crate) fn sweep(&self, heap: &Heap, segments: &Segments) -> bool {
         let mut state = self.lock();
         state.calls = 0;
@@ -81,7 +82,7 @@ impl Orphans {
         !orphans.is_empty()
     }
 
-    /// Whether readers in other sessions have yet to take samples.
+    /// Returns whether readers in other sessions have yet to take samples.
     pub(crate) fn are_unread(&self) -> bool {
         self.lock().all.iter().any(|orphan| orphan.pin_lanes.lag_behind(orphan.head))
     }

@@ -29,13 +29,13 @@ use crate::{
     wake::{DoorbellSender, Purpose, due, waits},
 };
 
-/// What a session hands over so that others can share memory with it, in the order in which the
-/// descriptors are sent.
+/// The descriptors that a session hands over so that others can share memory with it, in the order in which they are
+/// sent.
 #[derive(Debug)]
 pub struct PeerDescriptors {
     /// The first segment of its memory.
     pub segment: PassedFd,
-    /// What wakes it: one end of a pair of unix sockets that keep packets apart.
+    /// The doorbell that wakes it: one end of a pair of unix sockets that preserve packet boundaries.
     pub doorbell: PassedFd,
     /// The pidfd of its process.
     pub pidfd: PassedFd,
@@ -54,8 +54,8 @@ impl PeerDescriptors {
         })
     }
 
-    /// The process that the pidfd refers to, to be compared with the credentials of the socket
-    /// it came over. `None` when it is no pidfd, or its process has ended.
+    /// Returns the process that the pidfd refers to, to be compared with the credentials of the socket that carried it.
+    /// Returns `None` if it is no pidfd, or if its process has ended.
     ///
     /// # Errors
     /// The process has no descriptors left to look it up with.
@@ -63,22 +63,22 @@ impl PeerDescriptors {
         process(&self.pidfd)
     }
 
-    /// Whether the pidfd is of the process that has this number in our PID namespace.
+    /// Returns whether the pidfd is of the process that has this number in our PID namespace.
     ///
     /// # Errors
-    /// Nobody has the number, or one of the two cannot be looked up.
+    /// No process has the number, or one of the two cannot be looked up.
     pub fn is_of(&self, pid: u32) -> io::Result<bool> {
         let number = i32::try_from(pid).ok().and_then(Pid::from_raw);
         let Some(number) = number else { return Ok(false) };
         let same = PassedFd::from(pidfd_open(number, PidfdFlags::empty())?);
-        // What /proc calls a process need not be its number here: it may be another namespace's.
+        // The number of a process in /proc may differ from its number here: /proc may be of another namespace.
         let shown = process(&same)?;
         Ok(shown.is_some() && shown == self.process()?)
     }
 }
 
 fn process(pidfd: &PassedFd) -> io::Result<Option<u32>> {
-    // What some things tell of themselves there takes locks that others can keep.
+    // For some kinds of descriptors, reading fdinfo takes locks that other processes can hold.
     if !pidfd.is_pidfd() {
         return Ok(None);
     }
@@ -89,15 +89,15 @@ fn process(pidfd: &PassedFd) -> io::Result<Option<u32>> {
     Ok(pid.and_then(|pid| pid.trim().parse().ok()).filter(|pid| *pid > 0))
 }
 
-/// Segments of another session that are kept in mind at most, whatever it opens.
+/// Maximum number of segments of another session that are kept, whatever it opens.
 const MAX_SEGMENTS: usize = 4096;
 
 /// Another session, mapped read-only.
 pub struct PeerSession {
     id: SessionId,
-    /// Its process, as it was at first.
+    /// Its process when it was mapped.
     process: Option<u32>,
-    /// What the memory of its process may take here.
+    /// The quota for memory of its process in this process.
     quota: Arc<Quota>,
     /// Its first segment.
     first: Arc<Map>,
@@ -107,40 +107,40 @@ pub struct PeerSession {
     pidfd: PassedFd,
     /// The last ticket of each of its armed words that this process rang for.
     rung: [AtomicU64; 2],
-    /// Memory of its came, for which readers may wait.
+    /// Set when memory of the session came, for which readers may wait.
     changed: AtomicBool,
 }
 
-/// What is known of the segments besides the first.
+/// The segments besides the first.
 #[derive(Default)]
 struct FurtherSegments {
-    /// By their numbers.
+    /// The segments by number.
     maps: BTreeMap<u32, AnnouncedSegment>,
-    /// The highest number of those that came.
+    /// The highest number of the segments that came.
     highest: u32,
-    /// Those that a reader has met and nobody has been asked for yet.
+    /// Segments that a reader needs and that have not been requested yet.
     wanted: BTreeSet<u32>,
-    /// The readers, whose lanes tell the session which of its segments they have.
+    /// The readers, whose lanes show the session which of its segments they have.
     readers: Vec<Weak<Attachment>>,
-    /// When there are so many of them, those that are gone are forgotten.
+    /// The number of readers at which dropped readers are removed.
     clean_at: usize,
-    /// How many subscribers a publisher has here, where nobody else looks after its memory.
+    /// Number of subscribers of each publisher here, if no other code manages its memory.
     subscribed: BTreeMap<Gid, usize>,
 }
 
-/// A segment that the session was said to have.
+/// A segment that the session has announced.
 struct AnnouncedSegment {
     kind: SegmentKind,
-    /// Absent for one that could not be used.
+    /// The map; absent if the segment could not be used.
     map: Option<Arc<Map>>,
 }
 
-/// What became of the look for a segment of another session.
+/// The result of looking up a segment of another session.
 pub(crate) enum SegmentLookup {
     Map(Arc<Map>),
-    /// It was not as it must be.
+    /// The segment was not valid.
     Refused,
-    /// It has not come yet.
+    /// The segment has not come yet.
     Absent,
 }
 
@@ -148,14 +148,14 @@ impl PeerSession {
     /// Checks and maps the first segment of session `id`.
     ///
     /// # Errors
-    /// The descriptors are not those of a session, or not of this one. Or there are too few of them,
-    /// or too little address space, to make use of them now.
+    /// The descriptors are not those of a session, or not of this one. Or this process has too few descriptors, or too
+    /// little address space, to use them now.
     pub fn map(id: SessionId, descriptors: PeerDescriptors) -> Result<Arc<Self>, ShmError> {
         Self::map_among(id, descriptors, [])
     }
 
-    /// As [`map`](Self::map), where `others` are mapped already: all sessions of one process together
-    /// get the address space of one.
+    /// Like [`map`](Self::map), if `others` are mapped already: all sessions of one process share the address space of
+    /// one.
     ///
     /// # Errors
     /// As for [`map`](Self::map).
@@ -192,8 +192,8 @@ impl PeerSession {
     /// Checks and maps a further segment of the session. One that is mapped already stays.
     ///
     /// # Errors
-    /// It is not what it was said to be: rings that use it cannot be read. Or it cannot be mapped
-    /// now: it counts as missing, and readers that need it ask for it again.
+    /// The segment is not what it was announced to be: rings that use it cannot be read. Or it cannot be mapped now: it
+    /// counts as missing, and readers that need it request it again.
     pub fn add_segment(&self, info: SegmentInfo, segment: impl AsFd) -> Result<(), ShmError> {
         let mut further = self.further();
         let known = further.maps.contains_key(&info.number);
@@ -210,7 +210,7 @@ impl PeerSession {
         let (map, result) = match map {
             Ok(map) => (Some(map), Ok(())),
             Err(error @ ShmError::Refused { .. }) => (None, Err(error)),
-            // It was none of its session's doing.
+            // The session did not cause this error.
             Err(error) => return Err(error),
         };
         further.maps.insert(info.number, AnnouncedSegment { kind: info.kind, map });
@@ -224,31 +224,31 @@ impl PeerSession {
             }
             None => false,
         });
-        // Pairs with `take_changed`: who sees it finds the segment.
+        // Pairs with `take_changed`: a thread that sees the flag finds the segment.
         self.changed.store(true, Ordering::Release);
         result
     }
 
-    /// Whether memory of its came since the last call.
+    /// Returns whether memory of the session came since the last call.
     pub(crate) fn take_changed(&self) -> bool {
         // Loads first: there is seldom any. Pairs with the store in `add_segment`.
         self.changed.load(Ordering::Relaxed) && self.changed.swap(false, Ordering::Acquire)
     }
 
-    /// The journal of the session. A first segment that is too short for one has none, and all rings are looked at.
+    /// Returns the journal of the session. A first segment that is too short for one has none, and then all rings are
+    /// checked.
     pub(crate) fn journal(&self) -> Journal<'_, AtomicU64> {
         let words = self.first.words();
         let entries = words.get(layout::session::JOURNAL).unwrap_or_default();
         Journal { noted: &words[layout::session::NOTED], entries }
     }
 
-    /// Forgets a segment that its session has given up. Samples in it stay for as long as they are
-    /// in use.
+    /// Forgets a segment that its session has closed. Samples in it stay for as long as they are in use.
     pub fn remove_segment(&self, number: u32) {
         self.further().maps.remove(&number);
     }
 
-    /// The segments that came, besides the first.
+    /// Returns the segments that came, besides the first.
     pub fn segments(&self) -> Vec<SegmentInfo> {
         let further = self.further();
         let info = |(number, told): (&u32, &AnnouncedSegment)| SegmentInfo {
@@ -258,18 +258,18 @@ impl PeerSession {
         further.maps.iter().map(info).collect()
     }
 
-    /// Has `ask` called when a reader finds that a segment is missing, which then
-    /// [`take_wanted`](Self::take_wanted) names. It must not block.
+    /// Sets `ask`, which is called when a reader finds that a segment is missing; [`take_wanted`](Self::take_wanted)
+    /// then returns the segment. It must not block.
     pub fn on_wanted(&self, ask: impl Fn() + Send + Sync + 'static) {
         let _ = self.wanting.set(Box::new(ask));
     }
 
-    /// The segments that readers have met and that have not come, each once.
+    /// Returns the segments that readers need and that have not come, each once.
     pub fn take_wanted(&self) -> BTreeSet<u32> {
         std::mem::take(&mut self.further().wanted)
     }
 
-    /// Whether a segment has come.
+    /// Returns whether a segment has come.
     pub fn has_segment(&self, number: u32) -> bool {
         !matches!(self.find(number), SegmentLookup::Absent)
     }
@@ -285,7 +285,7 @@ impl PeerSession {
         }
     }
 
-    /// A reader has met a segment that is missing.
+    /// Records that a reader needs a missing segment.
     pub(crate) fn want(&self, number: u32) {
         let mut further = self.further();
         let known = further.maps.contains_key(&number) || further.wanted.len() >= MAX_SEGMENTS;
@@ -297,10 +297,10 @@ impl PeerSession {
         }
     }
 
-    /// Has a reader tell the session which of its segments are mapped.
+    /// Makes a reader's lane show the session which of its segments are mapped.
     pub(crate) fn keep_told(&self, reader: &Arc<Attachment>) {
         let mut further = self.further();
-        // Once for as many as there were: of thousands of readers one comes at a time.
+        // Cleans up each time the number has doubled, since thousands of readers come one at a time.
         if further.readers.len() >= further.clean_at {
             further.readers.retain(|reader| reader.strong_count() > 0);
             further.clean_at = 2 * further.readers.len().max(8);
@@ -313,34 +313,34 @@ impl PeerSession {
         self.further.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Its id.
+    /// Returns the session's id.
     #[inline]
     pub fn id(&self) -> SessionId {
         self.id
     }
 
-    /// Whether its process has ended: a system call.
+    /// Returns whether its process has ended. Costs a system call.
     pub fn is_dead(&self) -> bool {
         let mut fds = [PollFd::from_borrowed_fd(self.pidfd.as_fd(), PollFlags::IN)];
         poll(&mut fds, Some(&Timespec::default())).is_ok_and(|ready| ready > 0)
     }
 
-    /// The number of its process; `None` once that has ended, or when it cannot be looked up.
+    /// Returns the number of its process; `None` once the process has ended, or if it cannot be looked up.
     pub fn process(&self) -> Option<u32> {
         process(&self.pidfd).ok().flatten()
     }
 
-    /// Whether it was `process`'s when it was mapped.
+    /// Returns whether it belonged to `process` when it was mapped.
     pub(crate) fn is_of(&self, process: u32) -> bool {
         self.process == Some(process)
     }
 
-    /// One more subscriber needs the memory of a publisher's large samples.
+    /// Counts one more subscriber that needs the memory of a publisher's large samples.
     pub(crate) fn subscribe(&self, publisher: Gid) {
         *self.further().subscribed.entry(publisher).or_default() += 1;
     }
 
-    /// One less does. With the last of them that memory goes, but for samples that are in use.
+    /// Counts one subscriber less. With the last subscriber, the memory is dropped, except for samples in use.
     pub(crate) fn unsubscribe(&self, publisher: Gid) {
         let mut further = self.further();
         let Some(count) = further.subscribed.get_mut(&publisher) else { return };
@@ -351,12 +351,12 @@ impl PeerSession {
         }
     }
 
-    /// Whether the two are sessions of one process.
+    /// Returns whether the two are sessions of one process.
     pub(crate) fn is_akin_to(&self, other: &Self) -> bool {
         self.id == other.id || (self.process.is_some() && self.process == other.process)
     }
 
-    /// Its process: readable once that has ended.
+    /// Returns the pidfd of its process, which is readable once the process has ended.
     pub fn pidfd(&self) -> BorrowedFd<'_> {
         self.pidfd.as_fd()
     }
@@ -393,7 +393,7 @@ pub enum RingPeer {
 }
 
 impl RingPeer {
-    /// The session's id.
+    /// Returns the session's id.
     #[inline]
     pub fn id(&self) -> SessionId {
         match self {
@@ -402,7 +402,7 @@ impl RingPeer {
         }
     }
 
-    /// Whether its process has ended; never true of our own.
+    /// Returns whether its process has ended; never true for this process.
     pub fn is_dead(&self) -> bool {
         match self {
             Self::Local(_) => false,
@@ -418,7 +418,7 @@ impl RingPeer {
         }
     }
 
-    /// Whether somebody there waits for `purpose` and this process has not rung for it yet.
+    /// Returns whether a thread there waits for `purpose` and this process has not rung for it yet.
     #[inline]
     pub(crate) fn waits(&self, purpose: Purpose) -> bool {
         match self {
@@ -427,7 +427,7 @@ impl RingPeer {
         }
     }
 
-    /// Rings if somebody there waits for `purpose` and this process has not rung for it yet.
+    /// Rings if a thread there waits for `purpose` and this process has not rung for it yet.
     #[inline]
     pub(crate) fn ring_if(&self, purpose: Purpose) {
         match self {
@@ -436,7 +436,7 @@ impl RingPeer {
         }
     }
 
-    /// The lane that the session has there.
+    /// Returns the session's lane at this location.
     pub(crate) fn lane(&self, at: Location) -> Result<LaneView, ShmError> {
         match self.find(at.segment) {
             SegmentLookup::Map(map) => LaneView::new(&map, at),

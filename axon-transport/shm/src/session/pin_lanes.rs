@@ -19,37 +19,37 @@ use crate::{
     sync::Word,
 };
 
-/// Lanes of one other process at most, each of which a publish may have to look at. What may be
-/// pinned over them is [bounded](crate::alloc::pin_limit) apart from it.
+/// Maximum number of lanes of one other process, because a publish may have to check each of them. The memory that they
+/// may pin is [bounded](crate::alloc::pin_limit) separately.
 pub(crate) const OF_PROCESS: usize = 1024;
 
-/// What readers pin: positions, and the longest sample that each pin keeps.
+/// The samples that readers pin: positions, and the longest sample that each pin keeps.
 #[derive(Default)]
 pub(crate) struct Pinned(Vec<(u64, u64)>);
 
 impl Pinned {
-    /// Finds out anew, by `look`.
+    /// Collects the pins anew, with `look`.
     pub(crate) fn refresh(&mut self, look: impl FnOnce(&mut Self)) {
         self.0.clear();
         look(self);
         self.0.sort_unstable();
     }
 
-    /// Whether a sample of `len` bytes is kept.
+    /// Returns whether a sample of `len` bytes is kept.
     pub(crate) fn keeps(&self, position: u64, len: u64) -> bool {
-        // The pin of it that keeps the longest comes last.
+        // The pin of a position that keeps the longest sample comes last.
         let end = self.0.partition_point(|(pinned, _)| *pinned <= position);
         self.0[..end].last().is_some_and(|pin| pin.0 == position && len <= pin.1)
     }
 }
 
-/// Adds to `found` the positions that a reader pins, and says how it stands. After
+/// Adds to `found` the positions that a reader pins, and returns the state of its lane. Call it after
 /// [`pins::about_to_scan`].
 #[inline]
 pub(crate) fn scan<W: Word>(tenancy: &LaneId, lane: &[W], found: &mut Pinned) -> LaneState {
     let standing = tenancy.standing(lane);
     let longest = tenancy.pin_limit().longest();
-    // One that has not seen its grant pins nothing, and one that does from now on sees the tail.
+    // A reader that has not seen its grant pins nothing; if it sees the grant from now on, it sees the tail.
     if standing == LaneState::Open && longest > 0 {
         found.0.extend(pins::scan(lane).map(|position| (position, longest)));
     }
@@ -59,12 +59,12 @@ pub(crate) fn scan<W: Word>(tenancy: &LaneId, lane: &[W], found: &mut Pinned) ->
 /// A reader that keeps samples.
 pub(crate) struct PinningReader {
     pub(crate) reader: Gid,
-    /// Its session, where that is not our own.
+    /// The reader's session, unless it is the publisher's own.
     pub(crate) peer: Option<Arc<PeerSession>>,
 }
 
 impl PinningReader {
-    /// Its process: read from the file system.
+    /// Returns its process, read from the file system.
     pub(crate) fn process(&self) -> Option<u32> {
         self.peer.as_ref().map_or(Some(std::process::id()), |peer| peer.process())
     }
@@ -74,7 +74,7 @@ impl PinningReader {
 pub(crate) struct PinLane {
     reader: Gid,
     session: SessionId,
-    /// Absent where the session is our own.
+    /// The reader's session; absent if it is the publisher's own.
     peer: Option<Arc<PeerSession>>,
     at: Location,
     lane: LaneView,
@@ -96,11 +96,11 @@ impl PinLane {
     }
 }
 
-/// All lanes to which a grant was given, until they say that their reader has left, or its process
-/// has ended. Detaching a reader ends nothing here: the reader may still hold samples.
+/// All lanes with a grant, until their reader has left or its process has ended. Detaching a reader does not remove its
+/// lane: the reader may still hold samples.
 pub(crate) struct PinLanes {
     all: Vec<PinLane>,
-    /// What they may keep.
+    /// The memory that they may pin.
     pool: PinPool,
 }
 
@@ -109,9 +109,8 @@ impl PinLanes {
         Self { all: Vec::new(), pool }
     }
 
-    /// Takes in the reader that asks with the lane that `peer` has `at` some place, before it hears
-    /// of its grant. As long as the lane stays as it is, the answer does, so that a reader that
-    /// keeps asking adds nothing.
+    /// Admits the reader that asks with the lane of `peer` at `at`, before it learns of its grant. While the lane stays
+    /// unchanged, the answer stays the same, so a reader that keeps asking adds nothing.
     ///
     /// # Errors
     /// Its process has [as many](OF_PROCESS) as it may.
@@ -134,7 +133,7 @@ impl PinLanes {
         if let Some(peer) = peer.remote() {
             let akin = |held: &&PinLane| held.peer.as_ref().is_some_and(|p| p.is_akin_to(peer));
             let is_full = |all: &[PinLane]| all.iter().filter(akin).count() >= OF_PROCESS;
-            // Some may have left.
+            // Some readers may have left.
             self.sweep(|_| false);
             if is_full(&self.all) && (!self.sweep(|_| true) || is_full(&self.all)) {
                 let what = "its process has as many readers of one publisher as it may";
@@ -151,12 +150,12 @@ impl PinLanes {
         Ok(tenancy)
     }
 
-    /// Adds to `found` the positions that are pinned, after [`pins::about_to_scan`].
+    /// Adds the pinned positions to `found`. Call it after [`pins::about_to_scan`].
     pub(crate) fn scan(&mut self, found: &mut Pinned) {
         self.all.retain(|held| scan(&held.tenancy, held.words(), found) != LaneState::Left);
     }
 
-    /// A reader that pins one of `positions`.
+    /// Returns a reader that pins one of `positions`.
     pub(crate) fn holder(&self, positions: &[u64]) -> Option<PinningReader> {
         let holds = |held: &&PinLane| {
             held.standing() == LaneState::Open
@@ -168,7 +167,7 @@ impl PinLanes {
             .map(|held| PinningReader { reader: held.reader, peer: held.peer.clone() })
     }
 
-    /// Forgets those that have left, and those of `suspects` whose process has ended. Whether
+    /// Forgets lanes whose reader has left, and lanes of `suspect` readers whose process has ended. Returns whether
     /// there were any.
     pub(crate) fn sweep(&mut self, suspect: impl Fn(&PinLane) -> bool) -> bool {
         let before = self.all.len();
@@ -182,7 +181,8 @@ impl PinLanes {
         self.all.is_empty()
     }
 
-    /// Whether a reader in another session has yet to take a sample below this position, or to take up its grant.
+    /// Returns whether a reader in another session has yet to take a sample below this position, or to take up its
+    /// grant.
     pub(crate) fn lag_behind(&self, head: u64) -> bool {
         self.all.iter().filter(|held| held.peer.is_some() && !held.is_dead()).any(|held| match held
             .standing()

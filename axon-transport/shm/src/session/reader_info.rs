@@ -9,27 +9,27 @@ pub struct ReaderInfo {
     pub gid: Gid,
     /// Its lane in its session's memory.
     pub lane: Location,
-    /// What it requests.
+    /// The QoS that it requests.
     pub qos: Qos,
     /// Its session.
     pub peer: RingPeer,
-    /// The subscriptions elsewhere that it stands for when it is a relay; `None` when it reads for itself.
+    /// The remote subscriptions that it stands for, if it is a relay; `None` if it reads for itself.
     pub stands_for: Option<Vec<Gid>>,
 }
 
 impl ReaderInfo {
-    /// Whether it reads for subscriptions elsewhere.
+    /// Returns whether it reads for remote subscriptions.
     pub(crate) fn is_relay(&self) -> bool {
         self.stands_for.as_ref().is_some_and(|gids| !gids.is_empty())
     }
 }
 
-/// What a reader says besides who it is.
+/// The terms of a reader's attachment, beside its identity.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Terms {
-    /// The last number that it has, where it was attached before.
+    /// The last number that it has, if it was attached before.
     pub after: Option<u64>,
-    /// It carries samples to another process: they are taken when that process has them, and kept for it
-    /// for a while when the reader's own ends.
+    /// True if it carries samples to another process: a sample counts as taken when that process has it, and is kept
+    /// for it for a while if the reader's own process ends.
     pub carries: bool,
 }

@@ -1,5 +1,5 @@
-//! A session's own memory: its segments, its lanes, and the words that say which of its threads sleep. Other
-//! sessions access it through its descriptors.
+//! A session's own memory: its segments, its lanes, and the words that show which of its threads sleep. Other sessions
+//! access it through its descriptors.
 
 use std::{
     os::fd::{AsFd, BorrowedFd, OwnedFd},
@@ -46,26 +46,26 @@ pub struct SessionSegment {
     orphans: Orphans,
     doorbell: Doorbell,
     lanes: Mutex<Lanes>,
-    /// The last ticket of each of our own armed words that we rang for.
+    /// The last ticket of each of its own armed words that this process rang for.
     rung: [AtomicU64; 2],
-    /// How many rings there have been, by which they are numbered.
+    /// Number of rings created so far, from which they are numbered.
     rings: AtomicU32,
     activity: Arc<Activity>,
 }
 
 #[derive(Default)]
 struct Lanes {
-    /// Those that nobody uses. Their memory never becomes something else: who looks at a lane that
-    /// has passed on must see that it has.
+    /// Unused lanes. Their memory never becomes anything else: a publisher that checks a lane which has passed on must
+    /// see that it has.
     free: Vec<HeapObject>,
-    /// How many there are.
+    /// Number of lanes created.
     made: u32,
-    /// How often one has been given out.
+    /// Number of times that a lane has been given out.
     given: u64,
 }
 
 impl SessionSegment {
-    /// Makes the memory of a new session.
+    /// Creates the memory of a new session.
     ///
     /// # Errors
     /// The system has no memory or descriptors left, or lacks sealed memfds.
@@ -86,19 +86,19 @@ impl SessionSegment {
         }))
     }
 
-    /// Its id.
+    /// Returns the session's id.
     #[inline]
     pub fn id(&self) -> SessionId {
         self.id
     }
 
-    /// Descriptors of their own for other sessions, which need them.
+    /// Duplicates the descriptors that other sessions need.
     ///
     /// # Errors
     /// The process has no descriptors left, is a fork of the session's, or the system lacks pidfds
     /// (Linux 5.3).
     pub fn descriptors(&self) -> Result<PeerDescriptors, ShmError> {
-        // Others would wait for the end of the wrong process.
+        // Other sessions would watch the wrong process.
         if self.is_forked() {
             return Err(ShmError::Forked);
         }
@@ -114,25 +114,25 @@ impl SessionSegment {
         })
     }
 
-    /// An epoll instance that is readable when the session was rung.
+    /// Returns an epoll instance that is readable when the session was rung.
     pub fn doorbell(&self) -> BorrowedFd<'_> {
         self.doorbell.as_fd()
     }
 
-    /// Has `listener` hear of all further segments of the session: other sessions must be told of
-    /// them, and given their descriptors. False when there is a listener already.
+    /// Sets the listener for all further segments of the session: other sessions must learn of them, and get their
+    /// descriptors. Returns false if there is a listener already.
     ///
     /// It is called while locks are held: it must neither block nor call into the session.
     pub fn on_segment(&self, listener: impl Fn(SegmentEvent<'_>) + Send + Sync + 'static) -> bool {
         self.segments.listen(Box::new(listener))
     }
 
-    /// The segments that there are besides the first, by their numbers.
+    /// Returns the segments besides the first, by number.
     pub fn segments(&self) -> Vec<SegmentInfo> {
         self.further().iter().map(|segment| segment.info).collect()
     }
 
-    /// What the segment `number` is and a duplicate of its descriptor; `None` when it is gone.
+    /// Returns the description of segment `number` and a duplicate of its descriptor; `None` if it is gone.
     ///
     /// # Errors
     /// The process has no descriptors left.
@@ -143,30 +143,30 @@ impl SessionSegment {
             .transpose()
     }
 
-    /// Takes back the memory of publishers that are gone and that nobody reads any more. Whether
-    /// some is left that somebody reads.
+    /// Frees the memory of publishers that are gone and that no reader reads any more. Returns whether some is left
+    /// that is still read.
     pub fn tidy(&self) -> bool {
         !self.is_forked() && self.orphans.sweep(&self.heap, &self.segments)
     }
 
-    /// Whether readers of other sessions have yet to take samples of publishers that are gone.
+    /// Returns whether readers of other sessions have yet to take samples of publishers that are gone.
     pub fn has_unread(&self) -> bool {
         !self.is_forked() && self.orphans.are_unread()
     }
 
-    /// How many publishers that are gone were looked at since the start.
+    /// Returns the number of checks of publishers that are gone since the start.
     #[cfg(test)]
     pub(crate) fn looks_at_orphans(&self) -> usize {
         self.orphans.looks()
     }
 
-    /// As [`tidy`](Self::tidy), but not whenever it is called where there are many publishers that are gone: call `tidy`
-    /// later if this returns true.
+    /// Like [`tidy`](Self::tidy), but if many publishers are gone, not every call frees memory: call `tidy` later if
+    /// this returns true.
     pub fn tidy_some(&self) -> bool {
         !self.is_forked() && self.orphans.sweep_some(&self.heap, &self.segments)
     }
 
-    /// A lane for a reader that is about to attach.
+    /// Returns a lane for a reader that is about to attach.
     ///
     /// # Errors
     /// All lanes are taken, or memory is short.
@@ -191,30 +191,31 @@ impl SessionSegment {
         Ok(Lane::new(Arc::clone(self), object, lanes.given))
     }
 
-    /// From now on readers that [are followed](crate::reader::Reader::follow) are found by
-    /// [`take_active`](Self::take_active), which somebody has to call when the doorbell rang.
+    /// From now on, [`take_active`](Self::take_active) finds readers that [are
+    /// followed](crate::reader::Reader::follow); the caller has to call it when the doorbell rang.
     pub fn follow(&self) {
         self.activity.follow();
     }
 
-    /// Adds to `found` the followed readers that may have something to take, each with its writer: those whose rings
-    /// got samples since the last call, and a few others. After the doorbell was armed: what comes later rings.
+    /// Adds to `found` the followed readers that may have samples to take, each with its writer: the readers whose
+    /// rings got samples since the last call, and a few others. Call it after the doorbell was armed: later samples
+    /// ring.
     pub fn take_active(&self, found: &mut Vec<(Gid, Gid)>) {
         if !self.is_forked() {
             self.activity.take(self.journal(), found);
         }
     }
 
-    /// The next [`take_active`](Self::take_active) finds all readers.
+    /// Makes the next [`take_active`](Self::take_active) find all readers.
     pub fn mark_all_active(&self) {
         if !self.is_forked() {
             self.activity.mark_all();
         }
     }
 
-    /// The number of a new ring.
+    /// Returns the number of a new ring.
     pub(crate) fn number_ring(&self) -> u32 {
-        // Relaxed: the number alone counts. Two rings of one number are looked at together.
+        // Relaxed: the number alone counts. Two rings of one number are checked together.
         self.rings.fetch_add(1, Ordering::Relaxed)
     }
 
@@ -228,10 +229,10 @@ impl SessionSegment {
         &self.activity
     }
 
-    /// Blocks until `ready`, which is asked again whenever a publisher or [`Self::notify`] rang,
-    /// or until `timeout` has passed. Returns what `ready` said last.
+    /// Blocks until `ready` returns true, or until `timeout` has passed. `ready` is called again whenever a publisher
+    /// or [`Self::notify`] rang. Returns the last result of `ready`.
     ///
-    /// Any number of threads may wait; none of our locks is held while `ready` runs.
+    /// Any number of threads may wait; no lock of the session is held while `ready` runs.
     #[inline]
     pub fn wait(&self, mut ready: impl FnMut() -> bool, timeout: Option<Duration>) -> bool {
         if self.is_forked() {
@@ -240,8 +241,8 @@ impl SessionSegment {
         self.doorbell.wait(self.armed_words(), Purpose::Samples, ready, None, &[], timeout)
     }
 
-    /// As [`wait`](Self::wait), for something that other threads can look for too, by what `look`
-    /// makes: this one is woken only when it is there.
+    /// Like [`wait`](Self::wait), for a condition that other threads can check, too, with the object that `look` makes:
+    /// this thread is woken only when the condition holds.
     #[inline]
     pub fn wait_for(
         &self,
@@ -256,8 +257,8 @@ impl SessionSegment {
         self.doorbell.wait(words, Purpose::Samples, ready, Some(look), &[], timeout)
     }
 
-    /// Has `elsewhere`, another session of this process where a thread waits, look again when `look` may
-    /// be ready, until what this returns is dropped. Somebody must listen for the session meanwhile.
+    /// Makes `elsewhere`, another session of this process where a thread waits, look again when `look` may be ready,
+    /// until the returned value is dropped. A thread must listen for this session meanwhile.
     pub fn forward_wakeups(
         &self,
         look: Arc<dyn WakeCheck>,
@@ -266,7 +267,7 @@ impl SessionSegment {
         self.doorbell.forward_wakeups(self.armed_words(), look, elsewhere.clone())
     }
 
-    /// Somebody calls [`notify`](Self::notify) when a process ends that might have rung.
+    /// Declares that another thread calls [`notify`](Self::notify) when a process ends that might have rung.
     pub fn is_watched(&self) {
         self.doorbell.is_watched();
     }
@@ -290,7 +291,7 @@ impl SessionSegment {
     /// Lets an event loop lead the session's waits.
     ///
     /// # Errors
-    /// There is one already, or this process is a fork of the session's.
+    /// The session has an external leader already, or this process is a fork of the session's.
     pub fn external_leader(self: &Arc<Self>) -> Result<ExternalLeader, ShmError> {
         if self.is_forked() {
             return Err(ShmError::Forked);
@@ -298,7 +299,7 @@ impl SessionSegment {
         ExternalLeader::new(Arc::clone(self)).ok_or(ShmError::AlreadyLed(self.id))
     }
 
-    /// Waits for room to publish; also looks again when one of `others` becomes readable.
+    /// Waits for space to publish; also checks again when one of `others` becomes readable.
     pub(crate) fn wait_for_room(
         &self,
         ready: impl FnMut() -> bool,
@@ -314,7 +315,7 @@ impl SessionSegment {
         &self.doorbell
     }
 
-    /// The word in which a waiter for that stores its ticket.
+    /// Returns the word in which a waiter for `purpose` stores its ticket.
     #[inline]
     pub fn armed_word(&self, purpose: Purpose) -> &AtomicU64 {
         &self.first.memory.words()[match purpose {
@@ -340,7 +341,7 @@ impl SessionSegment {
         }
     }
 
-    /// Whether the calling process is a fork of the session's.
+    /// Returns whether the calling process is a fork of the session's.
     #[inline]
     pub fn is_forked(&self) -> bool {
         self.first.memory.is_forked()
@@ -360,7 +361,7 @@ impl SessionSegment {
         self.heap.allocate(&self.segments, len, need, mapped)
     }
 
-    /// Has [room](Heap::foresee) for an object of the session.
+    /// Prepares [space](Heap::foresee) for an object of the session.
     pub(crate) fn foresee(&self, len: u64) {
         self.heap.foresee(&self.segments, len);
     }
@@ -369,32 +370,32 @@ impl SessionSegment {
         self.heap.release(block);
     }
 
-    /// The segments that there are besides the first.
+    /// Returns the segments besides the first.
     pub(crate) fn further(&self) -> Vec<Arc<OwnSegment>> {
         self.segments.further()
     }
 
-    /// A segment for the large samples of a publisher.
+    /// Opens a segment for the large samples of a publisher.
     pub(crate) fn open_samples(&self, gid: Gid, bytes: u64) -> Result<Arc<OwnSegment>, ShmError> {
         self.segments.open(SegmentKind::Samples(gid), bytes)
     }
 
-    /// A segment of the session.
+    /// Returns a segment of the session.
     pub(crate) fn own(&self, number: u32) -> Option<Arc<OwnSegment>> {
         self.segments.get(number)
     }
 
-    /// Nobody reads a segment of large samples any more.
+    /// Closes a segment of large samples that no reader reads any more.
     pub(crate) fn close_samples(&self, number: u32) {
         self.segments.close(number);
     }
 
-    /// Tells the session's owner.
+    /// Reports an event to the session's owner.
     pub(crate) fn tell(&self, event: SegmentEvent<'_>) {
         self.segments.tell(event);
     }
 
-    /// Keeps what a publisher leaves for as long as somebody reads it.
+    /// Keeps the memory of a dropped publisher for as long as it is read.
     pub(crate) fn adopt(&self, orphan: Orphan) {
         self.orphans.adopt(orphan);
         self.tidy_some();

@@ -1,5 +1,5 @@
-//! The message by which one process announces its segments to another. It is CBOR. It goes over the socket by which
-//! the processes connected, or through the daemon (`docs/formats.md`, sections 8 and 9).
+//! The message by which one process announces its segments to another. It is CBOR. It goes over the socket through
+//! which the processes connected, or through the daemon (`docs/formats.md`, sections 8 and 9).
 
 use minicbor::{Decode, Encode};
 
@@ -15,7 +15,7 @@ pub struct Segment {
     /// Its number.
     #[n(0)]
     pub number: u32,
-    /// The publisher whose samples are in it, where it is only one's.
+    /// The publisher whose samples are in it, if it belongs to one publisher.
     #[n(1)]
     pub publisher: Option<Gid>,
 }
@@ -37,7 +37,7 @@ impl From<Segment> for SegmentInfo {
     }
 }
 
-/// A session has one segment more.
+/// The message that a session has opened a segment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct SegmentOpened {
@@ -49,7 +49,7 @@ pub struct SegmentOpened {
     pub segment: Segment,
 }
 
-/// One segment of a session: that is gone, or that another one needs.
+/// The name of a segment of a session that is gone, or that another session needs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct SegmentName {

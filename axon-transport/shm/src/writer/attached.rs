@@ -1,4 +1,4 @@
-//! One reader that is attached to a ring, and how far it is.
+//! One reader that is attached to a ring, and its progress.
 
 use crate::{
     ring::{types::Grant, window::depth},
@@ -14,36 +14,39 @@ pub(super) struct AttachedReader {
     lane: LaneView,
     tenancy: LaneId,
     pub(super) grant: Grant,
-    /// Carries samples to another process.
+    /// True if the reader carries samples to another process.
     pub(super) carries: bool,
     pub(super) dead: bool,
-    /// Of a relay: the furthest position that it was seen to be done with.
+    /// The furthest position up to which a relay was seen to have delivered its samples.
     done: u64,
     given_up: LaneGivenUp,
 }
 
-/// The samples that a reader gave up, by its lane and by what its session said: both say the same, one of them later.
+/// The number of samples that a reader gave up, by its lane and by its session's messages. Both report the same
+/// samples, one of them later.
 #[derive(Debug, Default)]
 struct LaneGivenUp {
-    /// How many were counted.
+    /// The number that was counted.
     counted: u64,
-    /// How many its session said so far that it gave up, and how many its lane says.
+    /// The number that its session reported so far; `shown` is the number in its lane.
     told: u64,
     shown: u64,
 }
 
 impl LaneGivenUp {
-    /// Its lane says that it gave up so many in all.
+    /// Records the total in its lane.
     fn show(&mut self, samples: u64) {
         self.shown = self.shown.max(samples);
     }
 
-    /// Its session says that it gave up so many more, of those that were published `since` it came.
+    /// Records that its session reported `samples` samples more. The total is at most `since`, the number of samples
+    /// published since the reader attached.
     fn tell(&mut self, samples: u64, since: u64) {
         self.told = self.told.saturating_add(samples).min(since);
     }
 
-    /// How many there are that were not counted. Never more than were published `since` it came.
+    /// Counts the samples that were not counted, and returns their number. The total is never more than were published
+    /// `since` the reader attached.
     fn count_new(&mut self, since: u64) -> u64 {
         let said = self.shown.max(self.told);
         let new = said.min(since).saturating_sub(self.counted);
@@ -53,7 +56,7 @@ impl LaneGivenUp {
 }
 
 impl AttachedReader {
-    /// A reader that begins where it was granted to.
+    /// Creates a reader that begins at its grant.
     pub(super) fn new(
         info: ReaderInfo,
         lane: LaneView,
@@ -65,29 +68,30 @@ impl AttachedReader {
         Self { info, lane, tenancy, grant, carries, dead, done, given_up }
     }
 
-    /// The next position that the reader takes, as it says; `None` when it has left.
+    /// Returns the next position that the reader takes, as its lane reports it; `None` if it has left.
     pub(super) fn position(&self) -> Option<u64> {
         let lane = self.lane.words();
         match self.tenancy.standing(lane) {
-            // It may have left between the two looks, and then it holds nothing.
+            // It may have left between the two reads, and then it holds nothing.
             LaneState::Open => self.tenancy.cursor(lane),
             LaneState::Asked => Some(self.grant.first),
             LaneState::Left => None,
         }
     }
 
-    /// The same within what it may say, and up to `head`: which may be one of before it was attached.
+    /// Returns the [position](Self::position), limited to the reader's grant and to `head`. `head` may be a head from
+    /// before the reader attached.
     pub(super) fn cursor(&self, head: u64) -> Option<u64> {
         self.position().map(|cursor| cursor.max(self.grant.first).min(head))
     }
 
-    /// Whether it takes samples elsewhere: to another host, or to or from a process that shares no memory.
+    /// Returns whether it carries samples: to another host, or to or from a process that shares no memory.
     pub(super) fn is_carrier(&self) -> bool {
         self.carries || self.info.is_relay()
     }
 
-    /// Of a carrier: below this it is done. One that read for itself and has left wants nothing; what a
-    /// relay leaves is given up by the daemon's word only.
+    /// Returns the position below which a carrier has delivered its samples. A carrier that reads for itself and has
+    /// left wants nothing. Samples that a relay leaves are given up only when the daemon reports that.
     pub(super) fn delivered(&mut self, head: u64) -> Option<u64> {
         match &self.info.stands_for {
             Some(_) => Some(self.done_with(head)),
@@ -95,58 +99,59 @@ impl AttachedReader {
         }
     }
 
-    /// Of a relay: up to where it is done. One that has left is where it was seen last, until the daemon
-    /// says that it ended, or what it gave up.
+    /// Returns the position up to which a relay has delivered its samples. A relay that has left stays at the position
+    /// last seen, until the daemon reports that it ended, or what it gave up.
     fn done_with(&mut self, head: u64) -> u64 {
         let position = self.position().filter(|position| *position < u64::MAX);
-        // In this order. What was seen of the cursor counts with what was given up below it.
+        // The cursor is read first: the samples that were given up below it are then counted with it.
         if let (Some(position), true) = (position, self.look_for_given_up()) {
             self.done = self.done.max(position);
         }
         self.done.min(head)
     }
 
-    /// Notes what its lane says that it gave up; whether the lane still says that of this reader.
+    /// Records the number of given-up samples in its lane. Returns whether the lane still belongs to this reader.
     fn look_for_given_up(&mut self) -> bool {
         let shown = self.tenancy.given_up(self.lane.words());
         self.given_up.show(shown.unwrap_or_default());
         shown.is_some()
     }
 
-    /// How many samples were published since it came.
+    /// Returns the number of samples published since it attached.
     fn since(&self, head: u64) -> u64 {
         head.saturating_sub(self.grant.first)
     }
 
-    /// Its session says that it gave up so many samples more. Returns how many were not counted.
+    /// Records that its session reported `samples` given-up samples more. Returns how many were not counted yet.
     pub(super) fn give_up(&mut self, samples: u64, head: u64) -> u64 {
         self.given_up.tell(samples, self.since(head));
         self.newly_given_up(head)
     }
 
-    /// How many samples it gave up that were not counted.
+    /// Counts the given-up samples that were not counted yet, and returns their number.
     pub(super) fn newly_given_up(&mut self, head: u64) -> u64 {
         self.look_for_given_up();
         self.given_up.count_new(self.since(head))
     }
 
-    /// How many samples above this position were not counted as given up.
+    /// Returns the number of samples above this position that were not counted as given up.
     pub(super) fn left_above(&self, position: u64, head: u64) -> u64 {
         head.saturating_sub(position).saturating_sub(self.given_up.counted)
     }
 
-    /// The oldest position that it wants: KEEP_LAST passes over what is beyond its depth.
+    /// Returns the oldest position that it wants: KEEP_LAST skips samples beyond its depth.
     pub(super) fn floor(&self, head: u64) -> Option<u64> {
         let within = head.saturating_sub(depth(&self.info.qos));
         self.cursor(head).map(|cursor| cursor.max(within))
     }
 
-    /// Whether it has got one of the publisher's segments of this number or a later one.
+    /// Returns whether it has mapped the publisher's segment of this number or a later one.
     pub(super) fn has_mapped(&self, number: u32) -> bool {
         self.info.peer.remote().is_none() || lane::mapped(self.lane.words()) >= u64::from(number)
     }
 
-    /// Whether its session is another one that lives and has not taken up the grant, though there are samples for it.
+    /// Returns whether the reader belongs to another, living session and has not taken up its grant, though there are
+    /// samples for it.
     pub(super) fn is_asking(&self, head: u64) -> bool {
         self.info.peer.remote().is_some_and(|peer| !peer.is_dead())
             && self.grant.first < head

@@ -28,7 +28,7 @@ use crate::{
     },
 };
 
-/// When readers that sleep are woken for a sample.
+/// The time at which sleeping readers are woken for a sample.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) enum WakeTiming {
     /// When it is published.
@@ -37,7 +37,7 @@ pub(crate) enum WakeTiming {
     Later,
 }
 
-/// How long a publish waits altogether, from the first time on that it has to.
+/// The total time that a publish may wait, counted from its first wait.
 pub(crate) struct PublishDeadline {
     whole: Duration,
     end: Option<Instant>,
@@ -79,14 +79,14 @@ impl Writer {
             Ok(place) => place,
             Err(passed) => return Ok((passed.sequence, Published { position: None })),
         };
-        // Copied outside the lock: nobody else knows of the place yet.
+        // Copied outside the lock: no other thread knows the place yet.
         let mut loan = Loan::placed(Lender::Borrowed(self), 0, payload.len(), place);
         loan.copy_from_slice(payload);
         loan.commit(payload.len(), numbering, deadline)
     }
 
-    /// Publishes what has been, or is here, copied in. Memory that was lent and that no sample
-    /// takes is given back by its borrower.
+    /// Publishes a payload that has been copied in, or copies it in here. If no sample takes the lent memory, its
+    /// borrower gives it back.
     pub(crate) fn commit(
         &self,
         numbering: Numbering,
@@ -132,19 +132,19 @@ impl Writer {
             settle::<AtomicU64>();
             Ok((meta, Some(position), state.reader_set.waiting()))
         })?;
-        // A system call for each session that sleeps, without the lock.
+        // A system call for each sleeping session, outside the lock.
         for peer in waiting.iter().flat_map(|peers| &**peers) {
             peer.ring_if(Purpose::Samples);
         }
         Ok((meta.sequence, Published { position }))
     }
 
-    /// Wakes the readers that sleep, for samples that were published [without that](Self::try_publish_quietly).
+    /// Wakes sleeping readers, for samples that were [published quietly](Self::try_publish_quietly).
     pub fn announce(&self) {
         if self.is_forked() {
             return;
         }
-        // A reader that goes to sleep after this looks at the ring once more, and sees them.
+        // A reader that goes to sleep after this checks the ring once more, and sees the samples.
         settle::<AtomicU64>();
         let waiting = self.lock().reader_set.waiting();
         for peer in waiting.iter().flat_map(|peers| &**peers) {
@@ -152,17 +152,17 @@ impl Writer {
         }
     }
 
-    /// Whether nobody will ever read what is published now.
+    /// Returns whether no reader will ever read a sample that is published now.
     #[inline]
     pub(super) fn is_unread(&self, state: &WriterState) -> bool {
         state.reader_set.is_empty() && self.options.qos.durability == Durability::Volatile
     }
 
-    /// A sample that nobody reads.
+    /// Numbers and counts a sample that no reader reads.
     pub(super) fn pass(&self, state: &mut WriterState, numbering: Numbering) -> Meta {
         let meta = state.numbers.number(numbering);
         self.header.show_published(state.numbers.count());
-        // No sample to come asks for the memory of those that were in use.
+        // Reclaims here: no later sample would trigger it for the memory of earlier ones.
         self.reclaim(state);
         meta
     }
@@ -193,7 +193,7 @@ impl Writer {
         position
     }
 
-    /// The time from which the sample's lifespan counts; 0 where that is infinite.
+    /// Returns the time from which the sample's lifespan counts; 0 if the lifespan is infinite.
     #[inline]
     fn published_at(&self, meta: Meta) -> u64 {
         match (self.options.qos.lifespan, meta.published_nanos) {
@@ -203,7 +203,7 @@ impl Writer {
         }
     }
 
-    /// Tries until it works or `deadline` is at its end. The lock is not held in between.
+    /// Retries `attempt` until it succeeds or `deadline` is over. The lock is not held in between.
     pub(super) fn retry_until<T>(
         &self,
         deadline: &mut PublishDeadline,
@@ -252,12 +252,12 @@ impl Writer {
             match laggards {
                 Some((reader, _)) if left.is_zero() => {
                     let blocked = PublishError::Blocked { reader };
-                    // A caller that does not wait tries again: the reader makes room, memory or not.
+                    // A caller that does not wait tries again: the reader frees space, whether there is memory or not.
                     let short = short.filter(|_| !deadline.whole.is_zero());
                     return Err(short.unwrap_or(blocked));
                 }
                 Some((_, peers)) => self.await_room(&peers, left),
-                // The reader moved on between the two looks. A reader that keeps doing this is misbehaving.
+                // The reader made progress between the two reads. A reader that keeps doing this is misbehaving.
                 None if left.is_zero() && look >= LOOKS => {
                     return Err(PublishError::Blocked { reader: self.options.gid });
                 }

@@ -9,7 +9,7 @@ use super::{Writer, WriterState};
 use crate::{ids::Gid, ring::types::Grant, session::peer::PeerSession};
 
 impl Writer {
-    /// The number up to which all that was published has been handed to those who carry it elsewhere.
+    /// Returns the number up to which all published samples have been handed to the carriers.
     pub fn delivered_up_to(&self) -> u64 {
         let mut state = self.lock();
         let WriterState { history, reader_set, .. } = &mut *state;
@@ -17,8 +17,8 @@ impl Writer {
         state.number_before(position)
     }
 
-    /// Waits until those who carry samples elsewhere are done with all that was published so far;
-    /// whether none of it was given up. What was given up makes it false once.
+    /// Waits until the carriers have delivered all samples published so far. Returns whether none of them was given up.
+    /// Samples that were given up make it false once.
     pub fn wait_handed_over(&self, timeout: Duration) -> bool {
         if self.is_forked() {
             return true;
@@ -30,7 +30,7 @@ impl Writer {
                 let mut state = self.lock();
                 let WriterState { history, reader_set, known_given_up, .. } = &mut *state;
                 reader_set.mark_dead(history.head());
-                // In this order: what is handed over since it was given up is counted by then.
+                // In this order: samples that count as handed over because they were given up are counted by then.
                 let delivered_up_to = reader_set.delivered_up_to(published) >= published;
                 let given_up = reader_set.given_up(history.head());
                 if std::mem::replace(known_given_up, given_up) != given_up {
@@ -51,8 +51,8 @@ impl Writer {
         }
     }
 
-    /// Whether a KEEP_ALL reader of another session has not taken up its grant, which may not have come to it, though
-    /// there are samples for it.
+    /// Returns whether a KEEP_ALL reader of another session has samples to take and has not taken up its grant, which
+    /// may not have reached it.
     pub fn expects_readers(&self) -> bool {
         if self.is_forked() {
             return false;
@@ -61,7 +61,7 @@ impl Writer {
         state.reader_set.expects_readers(state.history.head())
     }
 
-    /// The readers of other sessions that have not taken up their grant, and how many samples there are for each.
+    /// Returns the readers of other sessions that have not taken up their grant, and the number of samples for each.
     pub fn unmet(&self) -> Vec<(Gid, u64)> {
         if self.is_forked() {
             return Vec::new();
@@ -70,7 +70,8 @@ impl Writer {
         state.reader_set.unmet(state.history.head())
     }
 
-    /// What was granted to readers of other sessions that have not taken it up, and the number in front of it.
+    /// Returns the grants that readers of other sessions have not taken up, each with the number in front of its first
+    /// sample.
     pub fn untaken_grants(&self) -> Vec<(Gid, Grant, u64)> {
         if self.is_forked() {
             return Vec::new();
@@ -80,7 +81,7 @@ impl Writer {
         untaken_grants.map(|(gid, grant)| (gid, grant, state.number_before(grant.first))).collect()
     }
 
-    /// Samples with which those who carry them elsewhere are not done.
+    /// Returns the number of samples that the carriers have not delivered.
     pub fn under_way(&self) -> u64 {
         if self.is_forked() {
             return 0;
@@ -92,7 +93,7 @@ impl Writer {
         head.saturating_sub(reader_set.delivered_up_to(head))
     }
 
-    /// Samples that those who carry them elsewhere gave up.
+    /// Returns the number of samples that the carriers gave up.
     pub fn given_up(&self) -> u64 {
         if self.is_forked() {
             return 0;
@@ -102,7 +103,7 @@ impl Writer {
         reader_set.given_up(history.head())
     }
 
-    /// One of them says that it gave up so many.
+    /// Counts samples that a carrier reports as given up.
     pub fn give_up(&self, reader: Gid, samples: u64) {
         if !self.is_forked() {
             let mut state = self.lock();

@@ -9,15 +9,15 @@ use std::time::{Duration, Instant};
 
 use crate::ids::Gid;
 
-/// How long samples are kept for a reader whose process ended.
+/// Time for which samples are kept for a reader whose process ended.
 const ABSENCE: Duration = Duration::from_secs(10);
 
-/// Of a reader that carries samples to another process: what keeps them for it.
+/// The reason why samples are kept for a reader that carries them to another process.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum CarrierState {
-    /// It is attached.
+    /// The reader is attached.
     Attached,
-    /// The process that carried them ended. They are kept until this for the next one.
+    /// The process that carried the samples ended. They are kept until this time for the next process.
     Absent(Instant),
 }
 
@@ -30,7 +30,7 @@ struct DepartedReader {
     gid: Gid,
     /// The subscriptions of another host that it stood for.
     stood_for: Vec<Gid>,
-    /// The oldest position that was not delivered.
+    /// The oldest position that is not delivered.
     position: u64,
     until: Instant,
 }
@@ -42,7 +42,7 @@ impl DepartedReaders {
         self.0.push(DepartedReader { gid, stood_for, position, until: Instant::now() + ABSENCE });
     }
 
-    /// The reader is there again, or another one that stands for the same subscriptions.
+    /// Ends the absence of a reader that is attached again, or whose subscriptions another reader stands for.
     pub(crate) fn end(&mut self, gid: &Gid, stands_for: &[Gid]) {
         self.0.retain_mut(|absent| {
             let stood = !absent.stood_for.is_empty();
@@ -51,7 +51,7 @@ impl DepartedReaders {
         });
     }
 
-    /// Forgets the readers that were absent for too long; how many samples below `head` are given up.
+    /// Forgets the readers that were absent for too long. Returns how many samples below `head` are given up.
     pub(crate) fn expire(&mut self, head: u64) -> u64 {
         if self.0.is_empty() {
             return 0;
@@ -68,25 +68,25 @@ impl DepartedReaders {
         })
     }
 
-    /// Whether nothing is kept for anybody.
+    /// Returns whether no samples are kept for an absent reader.
     #[inline]
     pub(crate) fn is_empty(&self) -> bool {
         self.there().next().is_none()
     }
 
-    /// Those that were not absent for too long. There seldom are any: no clock is read then.
+    /// Returns the readers that were not absent for too long. Usually there are none, and then no clock is read.
     #[inline]
     fn there(&self) -> impl Iterator<Item = &DepartedReader> {
         self.0.iter().filter(|absent| absent.until > Instant::now())
     }
 
-    /// How long until the first of them is given up.
+    /// Returns the time until the first absent reader is given up.
     pub(crate) fn left(&self) -> Option<Duration> {
         let until = self.0.iter().map(|absent| absent.until).min()?;
         Some(until.saturating_duration_since(Instant::now()))
     }
 
-    /// Where a reader goes on that stands for these subscriptions.
+    /// Returns the position at which a reader that stands for these subscriptions continues.
     pub(crate) fn position_of(&self, gid: &Gid, stands_for: &[Gid]) -> Option<u64> {
         let same = |absent: &&DepartedReader| {
             absent.gid == *gid || absent.stood_for.iter().any(|of| stands_for.contains(of))
@@ -94,12 +94,12 @@ impl DepartedReaders {
         self.there().filter(same).map(|absent| absent.position).min()
     }
 
-    /// Until when samples are kept for this reader, if they are.
+    /// Returns the time until which samples are kept for this reader, if they are.
     pub(crate) fn until(&self, gid: &Gid) -> Option<Instant> {
         self.there().filter(|absent| absent.gid == *gid).map(|absent| absent.until).max()
     }
 
-    /// The oldest position that is kept, and the reader that it is kept for.
+    /// Returns the oldest position that is kept, and its reader.
     #[inline]
     pub(crate) fn oldest(&self) -> Option<(u64, Gid)> {
         self.there().map(|absent| (absent.position, absent.gid)).min()
@@ -117,7 +117,7 @@ mod tests {
         let [one, other] = [1, 2].map(|byte| Gid([byte; 16]));
         absences.add(one, Vec::new(), 7);
         absences.add(other, Vec::new(), 5);
-        // It died once more before it had got on.
+        // The reader died once more before it had made progress.
         absences.add(one, Vec::new(), 6);
         assert_eq!(
             (absences.position_of(&one, &[]), absences.oldest()),

@@ -21,20 +21,19 @@ use crate::{
 #[derive(Clone)]
 pub(crate) struct RingHeader(HeapObject);
 
-/// Why a sample was dropped, as `axon status` counts it.
+/// The reason why a sample was dropped, as `axon status` counts it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Dropped {
-    /// A KEEP_ALL reader made no room in time.
+    /// A KEEP_ALL reader freed no space in time.
     Blocked,
     /// There was no memory.
     NoMemory,
-    /// Readers pin, or loans hold, the memory that there is.
+    /// Readers pin, or loans hold, the existing memory.
     Pinned,
 }
 
 impl Dropped {
-    /// How a publish that had `deadline` to succeed counts since it failed. A caller that gave it no time tries again,
-    /// so nothing is dropped yet.
+    /// Returns how a failed publish counts. A caller that gave it no time retries, so nothing is dropped yet.
     pub(super) fn by(error: &PublishError, deadline: Duration) -> Option<Self> {
         match error {
             PublishError::Blocked { .. } if !deadline.is_zero() => Some(Self::Blocked),
@@ -50,45 +49,45 @@ impl RingHeader {
         Self(ring)
     }
 
-    /// The header's memory.
+    /// Returns the header's memory block.
     #[inline]
     pub(super) fn block(&self) -> &Block {
         &self.0.block
     }
 
-    /// The header's memory, for what needs an object and uses none.
+    /// Returns the header's memory, for code that needs an object and does not use it.
     pub(super) fn object(&self) -> HeapObject {
         self.0.clone()
     }
 
-    /// The header's words, for the protocol between the publisher and its readers.
+    /// Returns the header's words, for the protocol between the publisher and its readers.
     #[inline]
     pub(crate) fn words(&self) -> &[AtomicU64] {
         self.0.words()
     }
 
-    /// The session's memory gave the ring `bytes` more.
+    /// Counts `bytes` that the ring got from the session's memory.
     pub(super) fn add_bytes(&self, bytes: u64) {
         self.update(BYTES, |now| now.wrapping_add(bytes));
     }
 
-    /// The session's memory has `bytes` of the ring's back.
+    /// Counts `bytes` that the ring gave back to the session's memory.
     pub(super) fn subtract_bytes(&self, bytes: u64) {
         self.update(BYTES, |now| now.wrapping_sub(bytes));
     }
 
-    /// The readers have changed.
+    /// Shows the window after the readers have changed.
     pub(super) fn show_window(&self, window: u64) {
         self.update(WINDOW, |_| window);
     }
 
-    /// So many samples were published, read or not.
+    /// Shows the number of published samples, read or not.
     #[inline]
     pub(super) fn show_published(&self, samples: u64) {
         Word::store(&self.words()[PUBLISHED], samples, Ordering::Relaxed);
     }
 
-    /// Counts a sample that was to be published or kept and was not.
+    /// Counts a sample that should have been published or kept and was not.
     #[cold]
     pub(super) fn count(&self, dropped: Dropped) {
         let word = match dropped {
@@ -99,25 +98,26 @@ impl RingHeader {
         self.update(word, |now| now.wrapping_add(1));
     }
 
-    /// A publish found no room since KEEP_ALL readers have not taken the oldest sample. It may wait for them.
+    /// Counts a publish that found no space because KEEP_ALL readers have not taken the oldest sample. It may wait for
+    /// them.
     #[cold]
     pub(super) fn count_refused(&self) {
         self.update(REFUSED, |now| now.wrapping_add(1));
     }
 
-    /// Says that a sample was published at `now`.
+    /// Records that a sample was published at `now`.
     #[inline]
     pub(super) fn note_sample(&self, now: u64) {
         Word::store(&self.words()[SAMPLED], now, Ordering::Relaxed);
     }
 
-    /// Says that the publisher is alive.
+    /// Asserts the publisher's liveliness at `now`.
     #[inline]
     pub(super) fn assert(&self, now: u64) {
         Word::store(&self.words()[ASSERTED], now, Ordering::Relaxed);
     }
 
-    /// What its readers see.
+    /// Returns the times that its readers see.
     pub(super) fn times(&self) -> Times {
         read(self.words())
     }

@@ -6,31 +6,31 @@ use crate::{
     ring::layout::{self, Location},
 };
 
-/// The samples that stand, oldest to newest, and what they take of memory.
+/// The kept samples, oldest to newest, and the memory that they take.
 ///
-/// Samples that readers copy out are in blocks, which are written over as soon as a sample is given
-/// up, for the readers find out. Samples that readers pin are in slots.
+/// Samples that readers copy out are in blocks. A block is overwritten as soon as its sample is given up, because
+/// readers detect that. Samples that readers pin are in slots.
 #[derive(Debug)]
 pub(crate) struct SampleHistory {
     head: u64,
     tail: u64,
-    /// By descriptor.
+    /// The memory of each sample, by descriptor.
     extents: Box<[SampleStorage]>,
     blocks: Blocks,
     pinned: RetireList,
-    /// Bytes that samples and loans take; what is in the retire list does not count.
+    /// Bytes that samples and loans take; slots in the retire list do not count.
     used: u64,
-    /// Samples in blocks and slots.
+    /// Number of samples in blocks and slots.
     placed: u64,
     budget: u64,
     /// Bytes of the budget that each sample takes beside its block or slot.
     overhead: u64,
 }
 
-/// What memory a sample takes.
+/// The memory that a sample takes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum SampleStorage {
-    /// None but its descriptor.
+    /// No memory beside its descriptor.
     #[default]
     Inline,
     Block(Block),
@@ -43,12 +43,12 @@ pub(crate) enum SampleStorage {
     },
 }
 
-/// The oldest sample may not be given up.
+/// The error that the oldest sample must not be given up.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct OldestInUse;
 
 impl SampleHistory {
-    /// A history of samples in `descriptors` descriptors.
+    /// Creates a history with `descriptors` descriptors.
     pub(crate) fn new(descriptors: u64, budget: u64) -> Self {
         Self {
             head: 0,
@@ -63,32 +63,32 @@ impl SampleHistory {
         }
     }
 
-    /// Descriptors take of the budget, too: it is all that bounds this history.
+    /// Counts descriptors in the budget, too, because the budget is the only bound of this history.
     pub(crate) fn count_descriptors(&mut self) {
         self.overhead = layout::DESCRIPTOR;
     }
 
-    /// The next position.
+    /// Returns the next position.
     pub(crate) fn head(&self) -> u64 {
         self.head
     }
 
-    /// The oldest position that stands.
+    /// Returns the oldest kept position.
     pub(crate) fn tail(&self) -> u64 {
         self.tail
     }
 
-    /// The most samples that can stand while another is written.
+    /// Returns the maximum number of samples that can be kept while another is written.
     pub(crate) fn capacity(&self) -> u64 {
         self.extents.len() as u64 - 1
     }
 
-    /// Whether the next position has no descriptor.
+    /// Returns whether the next position has no descriptor.
     pub(crate) fn is_full(&self) -> bool {
         self.head - self.tail > self.capacity()
     }
 
-    /// Twice as many descriptors.
+    /// Doubles the number of descriptors.
     pub(crate) fn grow(&mut self) {
         let mut extents = vec![SampleStorage::Inline; 2 * self.extents.len()].into_boxed_slice();
         for position in self.tail..self.head {
@@ -97,17 +97,17 @@ impl SampleHistory {
         self.extents = extents;
     }
 
-    /// The blocks for the next samples.
+    /// Returns the blocks for the next samples.
     pub(crate) fn blocks(&mut self) -> &mut Blocks {
         &mut self.blocks
     }
 
-    /// The slots.
+    /// Returns the slots.
     pub(crate) fn pinned(&mut self) -> &mut RetireList {
         &mut self.pinned
     }
 
-    /// All blocks, of samples that stand and of those to come.
+    /// Returns all blocks, of kept samples and for later samples.
     pub(crate) fn all_blocks(&mut self) -> Vec<Block> {
         let standing = self.extents.iter().filter_map(|extent| match extent {
             SampleStorage::Block(block) => Some(*block),
@@ -137,7 +137,7 @@ impl SampleHistory {
         }
     }
 
-    /// Makes sure that the next position has a descriptor, giving up the oldest that `may_go`.
+    /// Makes sure that the next position has a descriptor, and gives up the oldest samples that `may_go` for that.
     pub(crate) fn make_place(&mut self, may_go: impl Fn(u64) -> bool) -> Result<(), OldestInUse> {
         while self.is_full() {
             self.give_up_oldest(&may_go)?;
@@ -145,8 +145,8 @@ impl SampleHistory {
         Ok(())
     }
 
-    /// Gives up the oldest samples that `may_go` until `len` bytes more are within the budget. One
-    /// sample always stays, whatever its length.
+    /// Gives up the oldest samples that `may_go` until `len` more bytes are within the budget. One sample always stays,
+    /// whatever its length.
     pub(crate) fn make_room(
         &mut self,
         len: u64,
@@ -158,7 +158,7 @@ impl SampleHistory {
         Ok(())
     }
 
-    /// Gives up the oldest sample, if more than `kept` are in blocks or slots. Whether it did.
+    /// Gives up the oldest sample, if more than `kept` samples are in blocks or slots. Returns whether it did.
     pub(crate) fn shrink(
         &mut self,
         kept: u64,
@@ -171,8 +171,8 @@ impl SampleHistory {
         Ok(true)
     }
 
-    /// Whether it would be in vain to give up samples for one of `len` bytes, as the budget asks for,
-    /// without more memory. Takes its time where samples differ in length.
+    /// Returns whether giving up samples to keep the budget would still leave no memory for a sample of `len` bytes.
+    /// This is slow if samples differ in length.
     pub(crate) fn is_short_of(&self, len: u64) -> bool {
         let alike = match self.extents[index(&self.extents, self.tail)] {
             SampleStorage::Slot { len: oldest, .. } => {
@@ -183,8 +183,8 @@ impl SampleHistory {
         !self.has_room(len) && !alike && !self.would_hold(len, 1, false)
     }
 
-    /// Whether there would be a slot of `len` bytes if all samples were given up but `kept`, and nothing
-    /// that readers keep: with no more memory than there is, unless it can `grow`. Takes its time.
+    /// Returns whether there would be a slot of `len` bytes if all samples except `kept` were given up, and no slot
+    /// that readers pin: in the existing memory, unless it can `grow`. This is slow.
     pub(crate) fn would_hold(&self, len: u64, kept: u64, grow: bool) -> bool {
         let placed = (self.tail..self.head)
             .map(|position| self.extents[index(&self.extents, position)])
@@ -197,14 +197,15 @@ impl SampleHistory {
         self.pinned.would_hold(len, slots, grow)
     }
 
-    /// Takes `len` bytes that nobody reads for a loan.
+    /// Takes `len` bytes that no reader reads, for a loan.
     pub(crate) fn lend(&mut self, len: u64) -> Option<Location> {
         let at = self.pinned.lend(len)?;
         self.used += len;
         Some(at)
     }
 
-    /// The same, where it is within the budget as it is and slots [take turns](RetireList::lend_turn).
+    /// Like [`lend`](Self::lend), if the loan is within the budget without giving up samples and slots [take
+    /// turns](RetireList::lend_turn).
     pub(crate) fn lend_turn(&mut self, len: u64) -> Option<Location> {
         if !self.has_room(len) {
             return None;
@@ -214,14 +215,14 @@ impl SampleHistory {
         Some(at)
     }
 
-    /// Whether so much more is within the budget.
+    /// Returns whether `len` more bytes are within the budget.
     pub(crate) fn has_room(&self, len: u64) -> bool {
         let standing = self.head - self.tail;
         let counted = if self.overhead == 0 { self.placed } else { standing };
         counted <= 1 || self.used + self.overhead * (standing + 1) + len <= self.budget
     }
 
-    /// Whether the next sample's descriptor is within the budget.
+    /// Returns whether the next sample's descriptor is within the budget.
     pub(crate) fn has_room_for_descriptor(&self) -> bool {
         self.overhead == 0 || self.has_room(0)
     }
@@ -232,13 +233,13 @@ impl SampleHistory {
         self.used -= len;
     }
 
-    /// There is no memory for a loan.
+    /// Withdraws a loan for which there is no memory.
     pub(crate) fn withdraw(&mut self, at: Location, len: u64) {
         self.pinned.withdraw(at, len);
         self.used -= len;
     }
 
-    /// The next position is taken by a sample. There must be a [place](Self::make_place) for it.
+    /// Assigns the next position to a sample. There must be a [place](Self::make_place) for it.
     pub(crate) fn push(&mut self, extent: SampleStorage) -> u64 {
         let position = self.head;
         match extent {
@@ -351,7 +352,7 @@ mod tests {
             history.push(SampleStorage::Block(Block { at, len: 128 }));
         }
         assert_eq!(history.head() - history.tail(), 50);
-        // One stays, whatever it takes.
+        // One sample stays, whatever memory it takes.
         history.make_room(BUDGET, |_| true).unwrap();
         assert_eq!(history.head() - history.tail(), 1);
     }
@@ -374,7 +375,7 @@ mod tests {
         }
         assert_eq!(history.capacity(), 31);
         history.release_below(u64::MAX);
-        // The last that was given up is the first to be used again.
+        // The last slot that was given up is reused first.
         while let Some(block) = expected.pop_back() {
             assert_eq!(history.blocks().take(128), Some(block));
         }

@@ -24,14 +24,14 @@ use crate::{
     },
 };
 
-/// Memory to be filled and published: shared memory where such a sample is read in place. Dropping
-/// it gives it back.
+/// Memory to be filled and published: shared memory if such a sample is read in place. Dropping the loan gives the
+/// memory back.
 ///
-/// Written from the front through [`io::Write`], or anywhere as the slice that it dereferences to;
-/// what the slice holds at first is zeros or bytes of earlier samples. In a forked child it is of
-/// no use: dereferencing it panics, and using a slice that was borrowed before ends the child.
+/// It is written from the front through [`io::Write`], or anywhere as the slice that it dereferences to; the slice
+/// holds zeros or bytes of earlier samples at first. In a forked child it must not be used: dereferencing it panics,
+/// and using a slice that was borrowed before ends the child.
 ///
-/// It borrows its publisher, and to publish it is the end of it:
+/// It borrows its publisher, and publishing consumes it:
 ///
 /// ```compile_fail,E0505
 /// # use axon_shm::{PublishError, Publisher};
@@ -54,14 +54,14 @@ use crate::{
 /// ```
 pub struct Loan<'a> {
     writer: Lender<'a>,
-    /// Bytes of the memory before the first that is lent.
+    /// Bytes in front of the first lent byte.
     lead: usize,
     len: usize,
     written: usize,
     memory: LoanMemory,
 }
 
-/// Whose memory it is.
+/// The writer whose memory is lent.
 pub(crate) enum Lender<'a> {
     Borrowed(&'a Writer),
     Shared(Arc<Writer>),
@@ -80,16 +80,16 @@ impl Deref for Lender<'_> {
 }
 
 enum LoanMemory {
-    /// Of words that are aligned to 16.
+    /// Private memory, in words that are aligned to 16.
     Own(Vec<u128>),
     Shared(LoanLocation),
     Published,
 }
 
-/// Shared memory that was lent.
+/// Shared memory that is lent.
 pub(crate) struct LoanLocation {
     pub(crate) segment: Arc<OwnSegment>,
-    /// Where it is in the segment, in bytes.
+    /// Offset in the segment, in bytes.
     pub(crate) at: u64,
 }
 
@@ -105,16 +105,16 @@ impl<'a> Loan<'a> {
         Self { writer, lead, len, written: 0, memory: LoanMemory::Own(words) }
     }
 
-    /// `len` bytes there behind the first `lead`, all of which have been lent.
+    /// Creates a loan of `len` bytes behind the first `lead` bytes of `place`; all of them have been lent.
     pub(crate) fn placed(writer: Lender<'a>, lead: usize, len: usize, place: LoanLocation) -> Self {
         Self { writer, lead, len, written: 0, memory: LoanMemory::Shared(place) }
     }
 
-    /// Publishes it, waiting for a slot as [`Writer::publish`] does.
+    /// Publishes the loan, waiting for a slot as [`Writer::publish`] does.
     ///
     /// # Errors
-    /// It was neither written to the end nor borrowed as a slice, or as [`Writer::publish`]. The
-    /// loan is given back.
+    /// The loan was neither written to the end nor borrowed as a slice; or as for [`Writer::publish`]. The loan is
+    /// given back.
     #[inline]
     pub fn publish(self, meta: Meta) -> Result<Published, PublishError> {
         self.publish_as(Numbering::Given(meta)).map(|(_, published)| published)
@@ -146,7 +146,7 @@ impl<'a> Loan<'a> {
         self.publish_next(wall())
     }
 
-    /// As [`publish_next`](Self::publish_next), of its first `len` bytes.
+    /// Like [`publish_next`](Self::publish_next), for its first `len` bytes.
     #[doc(hidden)]
     #[inline]
     pub fn publish_front(self, len: usize, source_timestamp: i64) -> Result<u64, PublishError> {
@@ -183,7 +183,7 @@ impl<'a> Loan<'a> {
                 let (lead, lent) = (self.lead, self.lead + self.len);
                 RingPayload::Written { at: place.location(), lead, len, lent }
             }
-            // What has become short is copied from where it was written.
+            // A sample that is short after all is copied from the loan.
             LoanMemory::Own(_) | LoanMemory::Shared(_) => RingPayload::Bytes(&self[..len]),
             LoanMemory::Published => unreachable!("publishing takes the loan"),
         };
@@ -197,7 +197,7 @@ impl<'a> Loan<'a> {
         Ok((sequence, published))
     }
 
-    /// The address of the memory that is lent.
+    /// Returns the address of the lent memory.
     #[inline]
     fn lent(&self, place: &LoanLocation) -> NonNull<u8> {
         assert!(!self.writer.is_forked(), "a loan of shared memory, used after fork");
@@ -264,7 +264,7 @@ impl io::Write for Loan<'_> {
 
 impl Drop for Loan<'_> {
     fn drop(&mut self) {
-        // The history of a forked child is a copy that nobody uses, and its lock may be held.
+        // The history of a forked child is an unused copy, and its lock may be held.
         if let LoanMemory::Shared(place) = &self.memory
             && !self.writer.is_forked()
         {

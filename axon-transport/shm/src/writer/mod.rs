@@ -53,21 +53,22 @@ use crate::{
     },
 };
 
-/// How long a publish waits for a KEEP_ALL reader.
+/// Maximum time that a publish waits for a KEEP_ALL reader.
 pub(super) const KEEP_ALL_PUBLISH_TIMEOUT: Duration = Duration::from_millis(100);
-/// How often a publish looks for the reader that is in its way before it gives up on the answer.
+/// Maximum number of times that a publish looks for the reader that blocks it before it gives up.
 pub(super) const LOOKS: u32 = 1000;
-/// Descriptors up to which a ring grows for its readers' depths.
+/// Maximum number of descriptors to which a ring grows for its readers' depths.
 const DESCRIPTORS: u64 = 1 << 14;
-/// Descriptors up to which one grows for its own depth, whatever that is: they do not count for its budget.
+/// Maximum number of descriptors to which a ring grows for its own depth, whatever that is: they do not count in its
+/// budget.
 const DESCRIPTORS_KEEP_LAST: u64 = 1 << 18;
-/// Descriptors up to which one grows that keeps all until its readers have it, and no longer: beyond that
-/// it holds its publisher back.
+/// Maximum number of descriptors of a ring that keeps all samples only until its readers have them: beyond that, it
+/// holds its publisher back.
 const DESCRIPTORS_KEEP_ALL: u64 = 1 << 13;
 
 /// A publisher's ring. All methods may be called from any thread.
 ///
-/// Readers keep the ring mapped after it is dropped and drain what it holds.
+/// Readers keep the ring mapped after it is dropped and drain its samples.
 ///
 /// ```
 /// use axon_shm::{
@@ -119,14 +120,15 @@ pub struct Writer {
     options: RingOptions,
     pub(super) session: Arc<SessionSegment>,
     pub(super) header: RingHeader,
-    /// Its number in the session's journal.
+    /// The ring's number in the session's journal.
     pub(super) number: u32,
-    /// The most descriptors.
+    /// Maximum number of descriptors.
     pub(super) limit: u64,
     state: PiMutex<WriterState>,
 }
 
-/// The descriptors that a ring needs which keeps what fits in `budget`: a sample takes one at least.
+/// Returns the number of descriptors that a ring needs if it keeps everything that fits in `budget`: a sample takes at
+/// least one.
 fn most_descriptors(budget: u64) -> u64 {
     (budget / layout::DESCRIPTOR).max(layout::FIRST_DESCRIPTORS).next_power_of_two()
 }
@@ -136,16 +138,15 @@ fn most_descriptors(budget: u64) -> u64 {
 pub(super) enum RingPayload<'a> {
     /// At most [`COPIED`] bytes, copied in under the lock.
     Bytes(&'a [u8]),
-    /// Written to memory that was lent: where, how far behind its start, the sample's length, and how
-    /// much was lent.
+    /// Written to lent memory: its location, the offset of the sample, the sample's length, and the lent length.
     Written { at: Location, lead: usize, len: usize, lent: usize },
 }
 
 impl Writer {
-    /// Makes a ring. Its memory is taken as samples need it.
+    /// Creates a ring. It takes memory as samples need it.
     ///
     /// # Errors
-    /// The options exceed what a ring may take, or memory or descriptors are short.
+    /// The options exceed the limits of a ring, or memory or descriptors are short.
     pub fn create(session: Arc<SessionSegment>, options: RingOptions) -> Result<Self, ShmError> {
         if session.is_forked() {
             return Err(ShmError::Forked);
@@ -163,7 +164,7 @@ impl Writer {
             Keep::KeepAll => DESCRIPTORS_KEEP_ALL,
         }
         .min(layout::MAX_DESCRIPTORS);
-        // Readers are told of the segments with the ring.
+        // Readers learn of the segments together with the ring.
         let allocate = |len| {
             let object = session.allocate(len, Need::Now, |_| true)?;
             Ok::<HeapObject, ShmError>(object.expect("there is always one that will do"))
@@ -198,8 +199,8 @@ impl Writer {
         Ok(writer)
     }
 
-    /// As [`create`](Self::create), for requests or responses: of a KEEP_LAST reader in another session,
-    /// too, it gives up nothing that is within the depth.
+    /// Like [`create`](Self::create), for requests or responses: the ring gives up no sample that is within the depth
+    /// of a KEEP_LAST reader in another session.
     pub fn create_for_calls(
         session: Arc<SessionSegment>,
         options: RingOptions,
@@ -209,41 +210,41 @@ impl Writer {
         Ok(writer)
     }
 
-    /// Has the ring share a bound on memory with others: from then on it takes what it needs for samples of `budget`,
-    /// beside its first descriptors. Where that has no more, the ring does with what it has, like one whose host has no
-    /// memory; but its newest sample replaces even the last one that stands.
+    /// Makes the ring share a memory bound with others: from then on it takes the memory for its samples from `budget`,
+    /// beside its first descriptors. If the budget is used up, the ring manages with the memory that it has, like a
+    /// ring on a host without free memory; but then its newest sample replaces even the last kept one.
     pub fn share(&self, budget: &Arc<MemoryBudget>) {
         if !self.is_forked() {
             self.lock().holding = Holding::of(Arc::clone(budget));
         }
     }
 
-    /// The publisher's GID.
+    /// Returns the publisher's GID.
     #[inline]
     pub fn gid(&self) -> Gid {
         self.options.gid
     }
 
-    /// Where the ring is in its session's memory, for readers.
+    /// Returns the ring's location in its session's memory, for readers.
     #[inline]
     pub fn location(&self) -> Location {
         self.header.block().at
     }
 
-    /// Adds a reader, or answers with the grant that stands when it is attached by the same lane.
+    /// Adds a reader. If it is attached by the same lane already, returns its current grant.
     ///
     /// # Errors
-    /// Its session has no such lane, or its process as many readers of this publisher as it may.
+    /// The reader's session has no such lane, or its process has as many readers of this publisher as it may.
     pub fn attach(&self, reader: ReaderInfo) -> Result<Grant, ShmError> {
         Ok(self.attach_on(reader, Terms::default())?.0)
     }
 
-    /// As [`attach`](Self::attach), on a reader's terms: one that was attached before goes on with what
-    /// stands of the samples behind those that it has. Also returns the number of the sample in front of
-    /// the first that it is granted.
+    /// Like [`attach`](Self::attach), on a reader's terms: a reader that was attached before continues with the kept
+    /// samples behind the ones that it has. Also returns the number of the sample in front of the first that it is
+    /// granted.
     ///
     /// # Errors
-    /// As [`attach`](Self::attach).
+    /// As for [`attach`](Self::attach).
     pub fn attach_on(&self, reader: ReaderInfo, terms: Terms) -> Result<(Grant, u64), ShmError> {
         if self.is_forked() {
             return Err(ShmError::Forked);
@@ -258,24 +259,24 @@ impl Writer {
         granted.map(|grant| (grant, state.number_before(grant.first)))
     }
 
-    /// Forgets a reader; false when it was not attached. The samples that it keeps it may keep.
+    /// Forgets a reader. Returns false if it was not attached. The reader may keep the samples that it holds.
     pub fn detach(&self, reader: Gid) -> bool {
         !self.is_forked() && self.change(|reader_set, head| reader_set.detach(reader, head))
     }
 
-    /// Forgets the readers whose process has ended, and names them.
+    /// Forgets the readers whose process has ended, and returns them.
     pub fn drop_dead(&self) -> Vec<Gid> {
         if self.is_forked() { Vec::new() } else { self.change(ReaderSet::drop_dead) }
     }
 
-    /// As [`drop_dead`](Self::drop_dead), and those that have left without a word.
+    /// Like [`drop_dead`](Self::drop_dead), for readers that have left without a message as well.
     pub fn drop_gone(&self) -> Vec<Gid> {
         if self.is_forked() { Vec::new() } else { self.change(ReaderSet::drop_gone) }
     }
 
     fn change<T>(&self, by: impl FnOnce(&mut ReaderSet, u64) -> T) -> T {
         let mut state = self.lock();
-        // A session of which this was the last part is unmapped after the lock, and not under it.
+        // If this drops the last reference to a session, the session is unmapped after the lock, not under it.
         let peers = state.reader_set.peers();
         let WriterState { reader_set, history, .. } = &mut *state;
         let changed = by(reader_set, history.head());
@@ -285,23 +286,25 @@ impl Writer {
         changed
     }
 
-    /// The subscriptions that are attached; a relay shows as those that it stands for.
+    /// Returns the attached subscriptions; a relay counts as the subscriptions that it stands for.
     pub fn readers(&self) -> Vec<Gid> {
         if self.is_forked() { Vec::new() } else { self.lock().reader_set.readers() }
     }
 
-    /// Whether any reader is attached.
+    /// Returns whether any reader is attached.
     #[inline]
     pub fn has_readers(&self) -> bool {
         !self.is_forked() && !self.lock().reader_set.is_empty()
     }
 
-    /// Whether it keeps samples for a reader whose process ended, and that may come back by way of another.
+    /// Returns whether it keeps samples for a reader whose process ended and that may come back through another
+    /// process.
     pub fn has_absent_readers(&self) -> bool {
         !self.is_forked() && self.lock().reader_set.has_absent()
     }
 
-    /// Whether it keeps samples for this reader, which carries them to another process; `None` for any other reader.
+    /// Returns why samples are kept for this reader, which carries them to another process; `None` for any other
+    /// reader.
     pub fn carried(&self, reader: &Gid) -> Option<CarrierState> {
         if self.is_forked() {
             return None;
@@ -309,9 +312,8 @@ impl Writer {
         self.change(|reader_set, head| reader_set.carried(reader, head))
     }
 
-    /// If a sample would be read by nobody, now or later, uses up the next sequence number as if one
-    /// had been published, and returns it. `None` when somebody would. So a caller that has to
-    /// serialize first can save the work.
+    /// If no reader would read a sample, now or later, uses up the next sequence number as if a sample had been
+    /// published, and returns it; otherwise returns `None`. A caller that has to serialize first can save the work.
     ///
     /// # Errors
     /// The process forked.
@@ -323,11 +325,11 @@ impl Writer {
         Ok(self.is_unread(&state).then(|| self.pass(&mut state, Numbering::Next(0)).sequence))
     }
 
-    /// Publishes a sample. Where this publisher and a reader of another session are both RELIABLE
-    /// and KEEP_ALL, waits up to 100 ms for the reader to make room; never otherwise.
+    /// Publishes a sample. If this publisher and a reader of another session are both RELIABLE and KEEP_ALL, waits up
+    /// to 100 ms for the reader to free space; never waits otherwise.
     ///
     /// # Errors
-    /// The sample was not published; what to do is in the error.
+    /// The sample was not published; the error says what to do.
     #[inline]
     pub fn publish(&self, meta: Meta, payload: &[u8]) -> Result<Published, PublishError> {
         self.publish_within(
@@ -339,10 +341,10 @@ impl Writer {
         .map(|(_, published)| published)
     }
 
-    /// As [`publish`](Self::publish), but does not wait: [`PublishError::Blocked`] at once.
+    /// Like [`publish`](Self::publish), but does not wait: [`PublishError::Blocked`] at once.
     ///
     /// # Errors
-    /// As [`publish`](Self::publish).
+    /// As for [`publish`](Self::publish).
     #[inline]
     pub fn try_publish(&self, meta: Meta, payload: &[u8]) -> Result<Published, PublishError> {
         let numbering = Numbering::Given(meta);
@@ -350,11 +352,11 @@ impl Writer {
             .map(|(_, published)| published)
     }
 
-    /// As [`try_publish`](Self::try_publish), but a reader that sleeps may sleep on until the publisher
-    /// [announces](Self::announce) its samples: for several that are published together.
+    /// Like [`try_publish`](Self::try_publish), but a sleeping reader may sleep on until the publisher
+    /// [announces](Self::announce) its samples: for several samples that are published together.
     ///
     /// # Errors
-    /// As [`try_publish`](Self::try_publish).
+    /// As for [`try_publish`](Self::try_publish).
     #[inline]
     pub fn try_publish_quietly(
         &self,
@@ -366,11 +368,10 @@ impl Writer {
             .map(|(_, published)| published)
     }
 
-    /// As [`publish`](Self::publish), with the sequence number that follows the last, which is
-    /// returned.
+    /// Like [`publish`](Self::publish), with the sequence number after the last. Returns it.
     ///
     /// # Errors
-    /// As [`publish`](Self::publish).
+    /// As for [`publish`](Self::publish).
     #[inline]
     pub fn publish_next(&self, source_timestamp: i64, payload: &[u8]) -> Result<u64, PublishError> {
         let numbering = Numbering::Next(source_timestamp);
@@ -378,10 +379,10 @@ impl Writer {
             .map(|(sequence, _)| sequence)
     }
 
-    /// As [`publish_next`](Self::publish_next), but does not wait.
+    /// Like [`publish_next`](Self::publish_next), but does not wait.
     ///
     /// # Errors
-    /// As [`try_publish`](Self::try_publish).
+    /// As for [`try_publish`](Self::try_publish).
     #[inline]
     pub fn try_publish_next(
         &self,
@@ -393,7 +394,7 @@ impl Writer {
             .map(|(sequence, _)| sequence)
     }
 
-    /// Says that a sample was published at `now`.
+    /// Records that a sample was published at `now`.
     #[inline]
     pub fn note_sample(&self, now: u64) {
         if !self.is_forked() {
@@ -401,7 +402,7 @@ impl Writer {
         }
     }
 
-    /// Says that the publisher is alive.
+    /// Asserts the publisher's liveliness at `now`.
     #[inline]
     pub fn assert(&self, now: u64) {
         if !self.is_forked() {
@@ -409,17 +410,16 @@ impl Writer {
         }
     }
 
-    /// What its readers see.
+    /// Returns the times that its readers see.
     pub fn times(&self) -> Times {
         if self.is_forked() { Times::default() } else { self.header.times() }
     }
 
-    /// Lends `len` bytes to be written and then published: of shared memory where it is more than
-    /// 4 KiB, or 512 bytes if so many are [expected](RingOptions::expected). May wait as
-    /// [`publish`](Self::publish) does.
+    /// Lends `len` bytes to be written and then published: shared memory if it is more than 4 KiB, or more than 512
+    /// bytes if so many are [expected](RingOptions::expected). May wait as [`publish`](Self::publish) does.
     ///
     /// # Errors
-    /// As [`publish`](Self::publish).
+    /// As for [`publish`](Self::publish).
     #[inline]
     pub fn loan(&self, len: usize) -> Result<Loan<'_>, PublishError> {
         self.loan_behind(0, len)
@@ -428,13 +428,13 @@ impl Writer {
     /// Like [`loan`](Self::loan); the bytes after the header are 16-byte aligned.
     ///
     /// # Errors
-    /// As [`publish`](Self::publish).
+    /// As for [`publish`](Self::publish).
     #[inline]
     pub fn loan_behind(&self, header: usize, len: usize) -> Result<Loan<'_>, PublishError> {
         self.lend_to(Lender::Borrowed(self), header, len)
     }
 
-    /// As [`loan_behind`](Self::loan_behind), for who keeps the writer with it.
+    /// Like [`loan_behind`](Self::loan_behind), for a caller that keeps the writer with the loan.
     #[inline]
     pub fn loan_owned(
         self: &Arc<Self>,
@@ -444,7 +444,7 @@ impl Writer {
         self.lend_to(Lender::Shared(Arc::clone(self)), header, len)
     }
 
-    /// The longest loan in bytes that is copied after all.
+    /// Returns the longest loan in bytes that is copied after all.
     #[inline]
     pub(super) fn longest_copied(&self) -> u64 {
         if self.options.expected > COPIED_ALWAYS { COPIED_ALWAYS } else { COPIED }
@@ -499,7 +499,7 @@ impl Writer {
 
 impl Drop for Writer {
     fn drop(&mut self) {
-        // In a forked child all of it is the parent's.
+        // A forked child must not free the parent's memory.
         if self.is_forked() {
             return;
         }
@@ -509,7 +509,7 @@ impl Drop for Writer {
             let empty = WriterState::new(nobody, SampleHistory::new(1, 0), self.header.object());
             std::mem::replace(&mut *state, empty)
         };
-        // Readers drain what stands. After them nobody looks at any of it.
+        // Readers drain the kept samples. After that no process reads the memory.
         let mut blocks = vec![*self.header.block(), array.block];
         blocks.extend(history.all_blocks());
         let samples = history.pinned().segments().collect();

@@ -2,37 +2,37 @@
 
 use crate::{error::PublishError, ring::types::Meta};
 
-/// Samples that a publisher elsewhere may be ahead of the last one of its here: more than an hour of
+/// Maximum number of samples by which a remote publisher may be ahead of its last sample here: more than an hour of
 /// outage at a million samples a second.
 pub const MAX_GAP: u64 = 1 << 32;
-/// Samples that it may have published before the first one that comes here.
+/// Maximum number of samples that it may have published before the first one here.
 const MAX_FIRST: u64 = 1 << 48;
 
-/// How samples are numbered.
+/// The numbering of a sample.
 #[derive(Clone, Copy)]
 pub(crate) enum Numbering {
-    /// As given.
+    /// The sample has this number and time.
     Given(Meta),
-    /// One up from the last, with this source timestamp.
+    /// The next number after the last, with this source timestamp.
     Next(i64),
 }
 
-/// The last sample's number, and how many there were.
+/// The last sample's number, and the number of samples.
 #[derive(Debug, Default)]
 pub(crate) struct WriterNumbers {
     /// The last sample's sequence number.
     last: u64,
-    /// Samples published, read or not.
+    /// Number of samples published, read or not.
     published: u64,
 }
 
 impl WriterNumbers {
-    /// The last sample's sequence number.
+    /// Returns the last sample's sequence number.
     pub(super) fn last(&self) -> u64 {
         self.last
     }
 
-    /// Refuses a number from outside that would make readers count losses that cannot be.
+    /// Refuses a number from another host that would make readers count impossible losses.
     pub(super) fn judge(&self, numbering: Numbering) -> Result<(), PublishError> {
         let Numbering::Given(Meta { sequence, .. }) = numbering else { return Ok(()) };
         let last = self.last;
@@ -53,7 +53,7 @@ impl WriterNumbers {
         meta
     }
 
-    /// Counts a sample that is published now, read or not. Returns how many there were.
+    /// Counts a sample that is published now, read or not. Returns the total.
     #[inline]
     pub(super) fn count(&mut self) -> u64 {
         self.published += 1;

@@ -27,7 +27,7 @@ use crate::{
 /// The readers of one ring.
 pub(crate) struct ReaderSet {
     offered: Qos,
-    /// Whether the publisher also waits for KEEP_LAST readers, to keep the samples within their depths.
+    /// True if the publisher also waits for KEEP_LAST readers, to keep the samples within their depths.
     heeds_depths: bool,
     /// The most samples that the ring can hold.
     capacity: u64,
@@ -40,7 +40,7 @@ pub(crate) struct ReaderSet {
     /// unlocked.
     peers: Arc<[RingPeer]>,
     window: u64,
-    /// Whether a reader may follow the session's journal, so that each publish must note its sample there.
+    /// True if a reader may follow the session's journal, so that each publish must note its sample there.
     /// Relays may; so may readers in other sessions if the depths are enforced, that is, readers of requests
     /// and responses.
     followers: bool,
@@ -457,7 +457,7 @@ impl ReaderSet {
         let mut met = HashSet::new();
         let peers = self.readers.iter().map(|reader| &reader.info.peer);
         self.peers = peers.filter(|peer| met.insert(peer.id())).cloned().collect();
-        // Nothing watches the processes of detached readers any more.
+        // Forgets detached readers whose process ended: nothing watches their processes any more.
         let attached: HashSet<u64> =
             self.readers.iter().map(|reader| reader.grant.generation).collect();
         self.pin_lanes.sweep(|lane| !attached.contains(&lane.tenancy.generation()));

@@ -1,5 +1,5 @@
-//! Makes room for the next sample: finds a descriptor and a block, and drops old samples for them. Large
-//! samples have [memory of their own](super::samples).
+//! Makes space for the next sample: finds a descriptor and a block, and drops old samples for them. Large samples have
+//! [memory of their own](super::samples).
 
 use std::sync::{Arc, atomic::AtomicU64};
 
@@ -18,11 +18,11 @@ use crate::{
     writer::{Writer, WriterState, header::Dropped, history::OldestInUse},
 };
 
-/// Why an attempt to publish did not succeed.
+/// The reason why an attempt to publish did not succeed.
 pub(crate) enum PublishObstacle {
     /// A KEEP_ALL reader holds the oldest sample.
     OldestInUse {
-        /// Why there is no room for more than it holds, where that is for want of memory.
+        /// The reason why there is no space beside the held samples, if memory is short.
         short: Option<PublishError>,
     },
     Error(PublishError),
@@ -34,13 +34,12 @@ pub(crate) enum PublishObstacle {
 pub(crate) struct PinnedMemory {
     pub(crate) holder: PinningReader,
     pub(crate) samples: usize,
-    /// Why no further memory is available, unless the segments are full.
+    /// The reason why no further memory is available, unless the segments are full.
     pub(crate) short: Option<PublishError>,
 }
 
 impl PinnedMemory {
-    /// The error that the caller of a publish gets. Looks the process up, so not to be called under a
-    /// lock.
+    /// Returns the error for the caller of a publish. It looks up the process, so it must not be called under a lock.
     pub(crate) fn into_error(self) -> PublishError {
         let Self { holder, samples, short } = self;
         let keeper = PinHolder { reader: holder.reader, process: holder.process(), samples };
@@ -66,7 +65,7 @@ impl From<OldestInUse> for PublishObstacle {
     }
 }
 
-/// The maps of the segments that a ring's blocks are in: few.
+/// The maps of the few segments that contain a ring's blocks.
 #[derive(Default)]
 pub(crate) struct Maps(Vec<(u32, Arc<Map>)>);
 
@@ -89,7 +88,7 @@ impl Maps {
     }
 }
 
-/// The error that the caller of a publish gets.
+/// Returns the error for the caller of a publish.
 pub(crate) fn no_memory(error: ShmError) -> PublishError {
     match error {
         ShmError::NoMemory { needed, available } => {
@@ -102,8 +101,8 @@ pub(crate) fn no_memory(error: ShmError) -> PublishError {
     }
 }
 
-/// How many samples stay in a ring that has to do with the memory that it has. One, so that those who come later find it;
-/// but a ring that may have no more memory shows its newest sample rather than an old one.
+/// Returns how many samples stay in a ring that cannot get more memory: one, so that later readers find it; but a ring
+/// that has used up its budget prefers its newest sample to an old one.
 pub(crate) fn least_kept(short: &PublishError) -> u64 {
     u64::from(!matches!(short, PublishError::MemoryBudget { .. }))
 }
@@ -113,16 +112,16 @@ impl Writer {
     pub(crate) fn make_place(&self, state: &mut WriterState) -> Result<(), PublishObstacle> {
         if state.history.is_full() {
             let floors = state.reader_set.floors(state.history.head());
-            // What has been taken in is kept a little longer than the window asks for, so that the
-            // tail moves seldom and readers keep it in their caches.
+            // Samples are kept a little longer than the window requires, so that the tail moves seldom and readers keep
+            // it in their caches.
             let window = state.reader_set.window();
             let surplus = floors.retained.saturating_sub(state.history.tail());
             let wanted = window.saturating_add((window / 4).max(4));
             let mut short = None;
             if surplus == 0 || state.history.capacity() < wanted {
-                // A publish that waits for readers leaves them the time to map what they lack.
-                // Nor does one give up what it keeps for others because of a reader that lacks it.
-                // Nor does one lose what another host wants: the daemon is about to map it.
+                // A publish that waits for readers leaves them the time to map missing memory. A publisher that keeps
+                // samples for later readers does not give them up because one reader lacks the memory. And no sample
+                // that another host wants is lost: the daemon is about to map the memory.
                 let now = floors.held < u64::MAX
                     || state.reader_set.keeps_all()
                     || (surplus == 0 && state.reader_set.has_carrier_behind(state.history.tail()));
@@ -134,7 +133,7 @@ impl Writer {
             if history.is_full() && surplus > 0 {
                 history.release_below(history.tail() + surplus.div_ceil(2));
             }
-            // What all have taken goes without a loss.
+            // Dropping a sample that all readers have taken is no loss.
             let is_lost = history.is_full() && short.is_some() && history.tail() >= consumed;
             let made = history.make_place(|position| position < floors.held);
             made.map_err(|OldestInUse| PublishObstacle::OldestInUse { short })?;
@@ -150,11 +149,11 @@ impl Writer {
         Ok(())
     }
 
-    /// Moves to twice as many descriptors, if they are to be had where they are needed. If not, the
-    /// oldest samples go, and the next publish tries again.
+    /// Moves to twice as many descriptors, if the required memory is available. If not, the oldest samples go, and the
+    /// next publish tries again.
     ///
     /// # Errors
-    /// There is no memory for them.
+    /// There is no memory for the descriptors.
     fn grow(&self, state: &mut WriterState, need: Need) -> Result<(), ShmError> {
         let descriptors = 2 * (state.history.capacity() + 1);
         if descriptors > self.limit {
@@ -172,7 +171,7 @@ impl Writer {
                 return other.map(drop);
             }
         };
-        // Only what stands moves, so readers must not take more for standing.
+        // Only kept samples move, so readers must not count more samples as kept.
         self.show_tail(state);
         let history = &mut state.history;
         let (tail, head) = (history.tail(), history.head());
@@ -198,7 +197,7 @@ impl Writer {
     ) -> Result<Block, PublishObstacle> {
         debug_assert!(payload.len() as u64 <= COPIED);
         let bytes = Area::rounded(payload.len() as u64);
-        // Nobody asks without need how far readers are: they say so in cache lines of their own.
+        // The readers' positions are read only if necessary: they are in cache lines of their own.
         let at_hand =
             if state.history.has_room(bytes) { state.history.blocks().take(bytes) } else { None };
         let block = match at_hand {
@@ -211,7 +210,7 @@ impl Writer {
         Ok(block)
     }
 
-    /// A block for a sample, for which the oldest samples go if they have to.
+    /// Returns a block for a sample. The oldest samples are given up for it if necessary.
     fn block_with_room(
         &self,
         state: &mut WriterState,
@@ -243,7 +242,7 @@ impl Writer {
         }
     }
 
-    /// A new block of the session's memory.
+    /// Allocates a new block of the session's memory.
     fn block(&self, state: &mut WriterState, bytes: u64) -> Result<Block, PublishError> {
         if state.history.blocks().are_many() {
             self.give_blocks_back(state);
@@ -262,7 +261,7 @@ impl Writer {
     }
 
     fn give_blocks_back(&self, state: &mut WriterState) {
-        // Others write there from now on.
+        // Other rings write there from now on.
         self.show_tail(state);
         for block in state.history.blocks().drain() {
             self.header.subtract_bytes(block.len);
@@ -271,7 +270,7 @@ impl Writer {
         }
     }
 
-    /// Tells readers what has been given up. Before any of it is written over.
+    /// Shows readers which samples have been given up. It must be called before any of their memory is overwritten.
     pub(crate) fn show_tail(&self, state: &mut WriterState) {
         if state.shown_tail != state.history.tail() {
             state.shown_tail = state.history.tail();

@@ -30,22 +30,23 @@ use crate::{
     },
 };
 
-/// Segments of one publisher at most: while readers keep all that one holds, another takes over.
+/// Maximum number of segments of one publisher: while readers keep all samples of one segment, another takes over.
 const SEGMENTS: usize = 4;
-/// Bytes that are committed at most beyond what is needed.
+/// Maximum number of bytes that are committed beyond the need.
 const AHEAD: u64 = 1 << 20;
 
-/// The segment that takes samples in.
+/// The segment that takes new samples.
 pub(crate) struct Samples {
     segment: Arc<OwnSegment>,
     retention: Retention,
     /// The length in bytes of the last sample, when no slot is ready for another like it.
     ahead: Option<u64>,
-    /// Slots that may be taken before readers are looked at again.
+    /// Number of slots that may be taken before the readers are checked again.
     turns: u32,
 }
 
-/// Backs a segment with memory up to `end`, a little further when it keeps growing. Up to where.
+/// Backs a segment with memory up to `end`, and a little further if it keeps growing. Returns the new end of the backed
+/// memory.
 fn back(
     segment: &OwnSegment,
     holding: &mut Holding,
@@ -63,8 +64,8 @@ fn back(
 }
 
 impl Writer {
-    /// Has memory ready for one more sample like the last large one, so that publishing it waits
-    /// for none: for a caller that has time between samples. [`SegmentEvent::Low`] tells when to.
+    /// Prepares memory for one more sample like the last large one, so that publishing it does not wait for memory: for
+    /// a caller that has time between samples. [`SegmentEvent::Low`] reports when to call it.
     ///
     /// # Errors
     /// There is no memory, or the process forked.
@@ -92,8 +93,8 @@ impl Writer {
             }
             (segment, at, len, from, end)
         };
-        // It is nobody else's meanwhile, so this needs no lock. That a publish backs some of it,
-        // too, does no harm.
+        // The memory belongs to this call meanwhile, so this needs no lock. If a publish backs some of it, too, that
+        // does no harm.
         let committed = segment.memory.commit(from, end);
         if committed.is_ok() {
             segment.memory.touch(from, end);
@@ -104,7 +105,7 @@ impl Writer {
         match committed {
             Ok(()) => {
                 let slots = pinned.slots(at);
-                // What a publish backed meanwhile it took, too.
+                // A publish that backed some of it meanwhile has taken it from the budget, too.
                 holding.give_back(slots.backed().min(end) - from);
                 slots.back(end);
                 pinned.put_back(at, len);
@@ -117,9 +118,9 @@ impl Writer {
         committed
     }
 
-    /// Gives memory of large samples back that is not needed any more: all of it once there was
-    /// no such sample for ten seconds and none is wanted, else what is far more than was needed
-    /// for as long. To be called about once a second for as long as it says that there is any.
+    /// Gives memory of large samples back that is not needed any more: all of it if there was no such sample for ten
+    /// seconds and none is wanted, or else the part far above the need of the last ten seconds. To be called about once
+    /// a second while it returns true, which means that there is such memory.
     pub fn reclaim_idle(&self, now: Instant) -> bool {
         if self.is_forked() {
             return false;
@@ -134,7 +135,7 @@ impl Writer {
         history.release_below(floors.retained.max(reader_set.consumed(history.head())));
         self.reclaim(&mut state);
         let WriterState { history, samples, holding, .. } = &mut *state;
-        // Where other rings want for memory, what is not in use goes to them at once.
+        // If other rings are short of memory, unused memory goes to them at once.
         let short = holding.is_short();
         if let (Some(open), Some((used, backed))) = (samples.as_mut(), history.pinned().extent())
             && (open.retention.is_over(now, used, backed - SLOTS_AT) || short && used == 0)
@@ -146,12 +147,12 @@ impl Writer {
         state.history.pinned().segments().len() > 0
     }
 
-    /// Has a segment that takes samples in.
+    /// Makes sure that there is a segment that takes new samples.
     pub(crate) fn open_samples(&self, state: &mut WriterState) -> Result<(), ShmError> {
         if state.samples.is_none() { self.open_another(state) } else { Ok(()) }
     }
 
-    /// Has a new segment take samples in. What is in the last one stays there.
+    /// Opens a new segment for new samples. The samples in the last segment stay there.
     fn open_another(&self, state: &mut WriterState) -> Result<(), ShmError> {
         let options = self.options();
         let bytes = samples_bytes(options.budget, options.max_message, RECORDS as u64);
@@ -164,7 +165,7 @@ impl Writer {
         Ok(())
     }
 
-    /// Takes `bytes`, more than [`COPIED_ALWAYS`], that no reader reads.
+    /// Lends `bytes`, more than [`COPIED_ALWAYS`], that no reader reads.
     pub(crate) fn lend(
         &self,
         state: &mut WriterState,
@@ -177,12 +178,12 @@ impl Writer {
         }
         let floors = state.reader_set.floors(state.history.head());
         let may_go = |position| position < floors.held;
-        // What all readers have taken goes first: its memory is the warmest.
+        // Samples that all readers have taken go first: their memory is the warmest.
         let consumed = state.reader_set.consumed(state.history.head());
         state.history.release_below(floors.retained.max(consumed));
         let mut short = None;
         if state.history.is_short_of(bytes) {
-            // It takes more memory in any case, so that is had before anything is given up for it.
+            // This sample takes more memory in any case, so the memory is allocated before anything is given up for it.
             self.reclaim(state);
             match self.place(state, bytes, true) {
                 Ok(Some(place)) => {
@@ -205,7 +206,7 @@ impl Writer {
         let mut worthwhile = None;
         for look in 0.. {
             self.reclaim(state);
-            // Asked once: from then on only memory that there is.
+            // More memory is requested once: after that, only existing memory is used.
             match self.place(state, bytes, short.is_none()) {
                 Ok(Some(place)) => return Ok(place),
                 Ok(None) => {}
@@ -215,7 +216,7 @@ impl Writer {
                 }
             }
             let kept: Vec<u64> = state.history.pinned().retired().collect();
-            // Readers keep what there is of it, which is their right.
+            // Readers may keep all samples of a segment; another segment then takes over.
             let segments = state.history.pinned().segments().len();
             if short.is_none() && !kept.is_empty() && segments < SEGMENTS {
                 match self.open_another(state).map_err(no_memory) {
@@ -224,8 +225,8 @@ impl Writer {
                 }
                 continue;
             }
-            // What stands lower may be large enough, or backed already. But nothing is given up for
-            // a sample that not even all of it makes room for.
+            // Older samples may be large enough, or backed already. But nothing is given up for a sample that does not
+            // fit even after that.
             let history = &mut state.history;
             let stay = short.as_ref().map_or(1, least_kept);
             let would_hold = || history.would_hold(bytes, stay, short.is_none());
@@ -237,7 +238,7 @@ impl Writer {
                         }
                         continue;
                     }
-                    // Room that the reader makes will do, whether or not there is memory.
+                    // Space that the reader frees is enough, whether or not there is memory.
                     Err(OldestInUse) => return Err(PublishObstacle::OldestInUse { short }),
                     Ok(false) => {}
                 }
@@ -263,8 +264,8 @@ impl Writer {
         unreachable!("the looks are counted")
     }
 
-    /// A slot at hand, as long as slots take turns: to find out what readers have taken costs lines
-    /// that they have just written to, and need not be done for each sample.
+    /// Returns a free slot while slots take turns: finding out which samples readers have taken costs cache lines that
+    /// they have just written, and is not necessary for each sample.
     fn next_turn(&self, state: &mut WriterState, bytes: u64) -> Option<LoanLocation> {
         let WriterState { history, samples: Some(samples), .. } = state else { return None };
         let Some(turns) = samples.turns.checked_sub(1) else {
@@ -273,12 +274,12 @@ impl Writer {
         };
         let at = history.lend_turn(bytes)?;
         samples.turns = turns;
-        // That there is no memory for it only ends the turns.
+        // If there is no memory for it, only the turns end.
         self.settled(state, at, bytes, true).ok().flatten()
     }
 
-    /// A place in the segment that takes samples in; `None` when that is full, or has none that is
-    /// backed and must not `grow`.
+    /// Returns a place in the segment that takes new samples; `None` if it is full, or if it has no backed place and
+    /// must not `grow`.
     fn place(
         &self,
         state: &mut WriterState,
@@ -291,7 +292,7 @@ impl Writer {
         }
     }
 
-    /// What was lent, in memory that there is.
+    /// Returns the lent place, after backing it with memory.
     fn settled(
         &self,
         state: &mut WriterState,
@@ -329,12 +330,12 @@ impl Writer {
                 self.session.tell(SegmentEvent::Low(self.gid()));
             }
         }
-        // Readers that copy without a pin find out by this that it is written over.
+        // Readers that copy without a pin detect by this that the memory is overwritten.
         protocol::about_to_write::<AtomicU64>();
         Ok(Some(LoanLocation { segment, at: at.offset }))
     }
 
-    /// Frees what was given up and is not read by anybody.
+    /// Frees samples that were given up and that no reader reads.
     pub(crate) fn reclaim(&self, state: &mut WriterState) {
         if state.history.pinned().retired().len() > 0 {
             self.show_tail(state);
@@ -346,7 +347,7 @@ impl Writer {
         self.close_vacated(state);
     }
 
-    /// Gives segments up that were left and that nobody reads any more.
+    /// Closes segments that take no new samples and that no reader reads any more.
     fn close_vacated(&self, state: &mut WriterState) {
         for (number, backed) in state.history.pinned().vacated() {
             state.holding.give_back(backed);

@@ -1,4 +1,4 @@
-//! What a publisher's lock protects.
+//! The state that a publisher's lock protects.
 
 use super::{
     history::SampleHistory, numbers::WriterNumbers, reader_set::ReaderSet, reclaim::Maps,
@@ -10,24 +10,24 @@ use crate::{
     session::pin_lanes::Pinned,
 };
 
-/// The samples that stand, their readers and their memory.
+/// The kept samples, their readers and their memory.
 pub(crate) struct WriterState {
     pub(crate) history: SampleHistory,
     pub(crate) reader_set: ReaderSet,
     /// The descriptors.
     pub(super) array: HeapObject,
-    /// The segments that blocks are in.
+    /// The segments that contain the blocks.
     pub(super) maps: Maps,
-    /// Where the next samples go that readers pin, once there has been one.
+    /// The memory for large samples, which readers pin, once there has been one.
     pub(super) samples: Option<Samples>,
-    /// What it takes of the memory that it shares with other rings.
+    /// The memory that it takes from the budget shared with other rings.
     pub(super) holding: Holding,
     /// The tail as readers see it.
     pub(super) shown_tail: u64,
-    /// What was found pinned, kept for its memory.
+    /// The pins found by the last scan, kept to reuse the memory.
     pub(super) pinned: Pinned,
     pub(super) numbers: WriterNumbers,
-    /// Of the samples that relays gave up: those of which a wait said so.
+    /// Number of given-up samples that a wait has reported.
     pub(super) known_given_up: u64,
 }
 
@@ -47,19 +47,19 @@ impl WriterState {
         }
     }
 
-    /// The first position that stands whose sample has a higher number.
+    /// Returns the first kept position whose sample has a higher number.
     pub(super) fn position_after(&self, number: u64) -> u64 {
         let standing = self.history.tail()..self.history.head();
         let later = |position: &u64| protocol::number(self.array.words(), *position) > number;
         standing.rev().take_while(later).last().unwrap_or(self.history.head())
     }
 
-    /// Below this position every reader has taken what it wanted, and nobody asks for it again.
+    /// Returns the position below which every reader has taken what it wanted, and no reader asks for a sample again.
     pub(super) fn consumed(&self) -> u64 {
         self.reader_set.consumed(self.history.head())
     }
 
-    /// The number of the last sample in front of a position.
+    /// Returns the number of the last sample in front of a position.
     pub(super) fn number_before(&self, position: u64) -> u64 {
         let stands = position >= self.history.tail() && position < self.history.head();
         if stands {

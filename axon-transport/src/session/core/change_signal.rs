@@ -13,7 +13,7 @@ use rustix::event::{EventfdFlags, eventfd};
 
 use super::changes::SessionEvent;
 
-/// Becomes readable when something happened.
+/// An eventfd that becomes readable when something happened.
 #[derive(Debug)]
 pub struct ChangeSignal {
     wake: OwnedFd,
@@ -21,7 +21,7 @@ pub struct ChangeSignal {
 }
 
 impl ChangeSignal {
-    /// One that is not readable.
+    /// Creates a signal that is not readable.
     ///
     /// # Errors
     /// The process has no descriptors left.
@@ -30,7 +30,7 @@ impl ChangeSignal {
         Ok(Arc::new(Self { wake, lost: AtomicBool::new(false) }))
     }
 
-    /// The listener by which a session tells it of whatever changes.
+    /// Returns the listener through which a session signals its changes.
     pub fn listener(self: &Arc<Self>) -> impl Fn(&SessionEvent) + Send + Sync + 'static {
         let signal = Arc::clone(self);
         move |event| {
@@ -42,13 +42,13 @@ impl ChangeSignal {
         }
     }
 
-    /// Whether the session has no daemon any more.
+    /// Returns whether the session has no daemon any more.
     pub fn is_lost(&self) -> bool {
         self.lost.load(Ordering::Acquire)
     }
 
     pub(crate) fn wake(&self) {
-        // An eventfd whose counter is full is readable, which is all that is wanted.
+        // An eventfd whose counter is full is readable, too, so the error does not matter.
         let _ = rustix::io::write(&self.wake, &1u64.to_ne_bytes());
     }
 

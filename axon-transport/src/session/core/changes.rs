@@ -8,7 +8,7 @@ use std::{
 
 use crate::ids::{DaemonId, Gid};
 
-/// Something that a session's owner may want to hear of.
+/// A change that a session's owner may want to know about.
 ///
 /// ```
 /// use axon_transport::SessionEvent;
@@ -29,18 +29,17 @@ pub enum SessionEvent {
     Graph,
     /// The readers of this publisher, or the publishers of this subscription, changed.
     Matched(Gid),
-    /// The daemon is gone. Rings that are attached flow on.
+    /// The daemon is gone. Attached rings continue to carry samples.
     DaemonLost,
     /// A daemon, perhaps another one than before, knows the session's endpoints.
     DaemonFound(DaemonId),
-    /// The daemon does not take this endpoint: no other session hears of it, and the graph does not
-    /// show it.
+    /// The daemon refuses this endpoint: no other session learns of it, and the graph does not show it.
     Refused(Gid),
 }
 
 type Listener = Arc<dyn Fn(&SessionEvent) + Send + Sync>;
 
-/// The threads that wait for a change of the session, and the listener that is told of each.
+/// The threads that wait for a change of the session, and the listener that receives each event.
 #[derive(Default)]
 pub(in crate::session) struct ChangeWaiters {
     /// Counts changes that may end a wait.
@@ -50,13 +49,13 @@ pub(in crate::session) struct ChangeWaiters {
 }
 
 impl ChangeWaiters {
-    /// Has the threads that wait look again. The change is made before this is called.
+    /// Makes the waiting threads look again. The caller makes the change before this call.
     pub(in crate::session) fn notify(&self) {
         *self.lock() += 1;
         self.changed.notify_all();
     }
 
-    /// Waits for changes until `reached`, which runs without a lock.
+    /// Waits for changes until `reached` returns true; it runs without a lock. Returns false if the time is over.
     pub(in crate::session) fn wait(
         &self,
         timeout: Duration,
@@ -83,7 +82,7 @@ impl ChangeWaiters {
         }
     }
 
-    /// Has `listener` called for every event, in place of the one before.
+    /// Sets the listener that is called for every event, in place of the previous one.
     pub(in crate::session) fn set_listener(
         &self,
         listener: impl Fn(&SessionEvent) + Send + Sync + 'static,
@@ -92,7 +91,7 @@ impl ChangeWaiters {
         *slot = Some(Arc::new(listener));
     }
 
-    /// Tells the listener, if there is one.
+    /// Calls the listener, if there is one.
     pub(in crate::session) fn tell_listener(&self, event: &SessionEvent) {
         let listener = self.listener.lock().unwrap_or_else(PoisonError::into_inner).clone();
         if let Some(listener) = listener {

@@ -12,8 +12,8 @@ use axon_shm::internal::SessionSegment;
 
 use super::SessionCore;
 
-/// A condition that stands from when it is triggered until a wait has seen it. Thread-safe; cheap to
-/// clone, and all clones are the same condition.
+/// A condition that is set from its trigger until a wait has seen it. Thread-safe; cheap to clone, and all clones are
+/// the same condition.
 ///
 /// ```
 /// # use std::time::Duration;
@@ -50,12 +50,13 @@ impl GuardCondition {
         Self { inner: Arc::new(Guard { triggered: AtomicBool::new(false), segment, session }) }
     }
 
-    /// Triggers it. Async-signal-safe: a signal handler may, too. In a forked child it wakes nobody.
+    /// Triggers the condition. Async-signal-safe: a signal handler may call this, too. In a forked child it wakes no
+    /// thread.
     pub fn trigger(&self) {
         self.inner.trigger();
     }
 
-    /// Whether it stands.
+    /// Returns whether the condition is set.
     pub fn is_triggered(&self) -> bool {
         self.inner.is_triggered()
     }
@@ -66,10 +67,10 @@ impl GuardCondition {
 }
 
 impl Guard {
-    /// One load, one exchange, and a system call where it did not stand.
+    /// Sets the condition. Costs one load and one exchange, and a system call if the condition was not set.
     pub(in crate::session) fn trigger(&self) {
-        // Release pairs with the acquire of `is_triggered` and `take`: who sees it sees what was
-        // done before. A waiter that looked before this is woken by the call below.
+        // Release pairs with the acquire of `is_triggered` and `take`: a thread that sees the condition sees everything
+        // that was done before. A waiter that looked before this is woken by the call below.
         if !self.triggered.swap(true, Ordering::AcqRel) {
             self.segment.wake_listener();
         }
@@ -79,7 +80,7 @@ impl Guard {
         &self.segment
     }
 
-    /// Its session, where that is open still.
+    /// Returns its session, if that is still open.
     pub(in crate::session) fn session(&self) -> Option<Arc<SessionCore>> {
         self.session.upgrade()
     }

@@ -1,5 +1,5 @@
-//! What a session and its daemon have to say to each other beside samples: the messages that wait to be sent, and the
-//! answers that somebody waits for.
+//! The messages between a session and its daemon beside samples: the queue of outgoing messages, and the awaited
+//! answers.
 
 use std::{
     collections::VecDeque,
@@ -13,17 +13,17 @@ use crate::{
     wire::session::{Fence, Gone, SessionMessage, StatusPart},
 };
 
-/// Refusals that are kept for a process that is relayed, until it takes them. It is not told of those beyond.
+/// Maximum number of refusals that are kept for a relayed process until it takes them. Further refusals are dropped.
 const REFUSALS: usize = 256;
 
-/// Something for the daemon to be told.
+/// A message for the daemon.
 #[derive(Debug)]
 pub(in crate::session) enum Outgoing {
-    /// This endpoint of ours, as it is when the message is sent.
+    /// An endpoint of this session, as it is when the message is sent.
     Announce(Gid),
     /// A message without descriptors.
     Message(Box<SessionMessage>),
-    /// A question behind all that readers have to be sent.
+    /// A fence, sent behind everything that readers need.
     Fence(Fence),
 }
 
@@ -32,7 +32,7 @@ impl Outgoing {
         Self::Message(Box::new(message))
     }
 
-    /// An endpoint of ours is gone.
+    /// Creates the message that an endpoint of this session is gone.
     pub(in crate::session) fn gone(gid: Gid) -> Self {
         Self::message(SessionMessage::EndpointGone(Gone { gid }))
     }
@@ -50,29 +50,29 @@ struct LinkState {
     outgoing: VecDeque<Outgoing>,
     daemon: Option<DaemonId>,
     status: StatusAnswer,
-    /// What the daemon refused of no endpoint for good, for the process that the session relays.
+    /// The daemon's refusals that concern no endpoint permanently, for the process that the session relays.
     refusals: Vec<String>,
 }
 
 impl DaemonLink {
-    /// The daemon at the other end; `None` while there is none.
+    /// Returns the daemon at the other end; `None` while there is none.
     pub(in crate::session) fn daemon(&self) -> Option<DaemonId> {
         self.lock().daemon
     }
 
-    /// For a relay: there is a daemon now, or none any more.
+    /// Sets, for a relay, the daemon at the other end, or that there is none.
     pub(in crate::session) fn set_daemon(&self, daemon: Option<DaemonId>) {
         self.lock().daemon = daemon;
     }
 
-    /// A daemon took the session, and is to be told this in place of what was queued.
+    /// Records that a daemon accepted the session. `outgoing` replaces the queued messages.
     pub(in crate::session) fn connected(&self, daemon: DaemonId, outgoing: Vec<Outgoing>) {
         let mut state = self.lock();
         state.daemon = Some(daemon);
         state.outgoing = outgoing.into();
     }
 
-    /// The connection ended. Nobody answers a question for the status any more.
+    /// Records that the connection ended, so that a request for the status gets no answer any more.
     pub(in crate::session) fn lost(&self) {
         let mut state = self.lock();
         state.daemon = None;
@@ -81,12 +81,12 @@ impl DaemonLink {
         }
     }
 
-    /// Queues something for the daemon. The control thread has to be woken for it.
+    /// Queues a message for the daemon. The caller has to wake the control thread.
     pub(in crate::session) fn queue(&self, outgoing: Outgoing) {
         self.lock().outgoing.push_back(outgoing);
     }
 
-    /// Takes all that is queued.
+    /// Takes all queued messages.
     pub(in crate::session) fn take(&self) -> VecDeque<Outgoing> {
         mem::take(&mut self.lock().outgoing)
     }
@@ -107,14 +107,14 @@ impl DaemonLink {
         taken
     }
 
-    /// Queues again, ahead of what came meanwhile, what could not be said.
+    /// Queues messages again that could not be sent, ahead of messages that came meanwhile.
     pub(in crate::session) fn put_back(&self, outgoing: impl IntoIterator<Item = Outgoing>) {
         let mut state = self.lock();
         let later = mem::take(&mut state.outgoing);
         state.outgoing = outgoing.into_iter().chain(later).collect();
     }
 
-    /// Begins to wait for a status. False, where there is no daemon.
+    /// Begins to wait for a status. Returns false if there is no daemon.
     pub(in crate::session) fn ask_status(&self) -> bool {
         let mut state = self.lock();
         if state.daemon.is_some() {
@@ -123,7 +123,7 @@ impl DaemonLink {
         state.daemon.is_some()
     }
 
-    /// Adds a part of the status that was asked for. Whether it was the last.
+    /// Adds a part of the requested status. Returns whether it was the last part.
     pub(in crate::session) fn add_status(&self, part: &StatusPart) -> bool {
         let mut state = self.lock();
         let StatusAnswer::Parts(text) = &mut state.status else { return false };
@@ -132,17 +132,18 @@ impl DaemonLink {
         true
     }
 
-    /// Whether parts of a status are still to come.
+    /// Returns whether parts of a status are still to come.
     pub(in crate::session) fn awaits_status(&self) -> bool {
         matches!(self.lock().status, StatusAnswer::Parts(_))
     }
 
-    /// What became of the question for the status. Nobody waits for it any more.
+    /// Takes the result of the request for the status. The caller does not wait for it any more.
     pub(in crate::session) fn take_status(&self) -> StatusAnswer {
         mem::take(&mut self.lock().status)
     }
 
-    /// Keeps a refusal until it is taken; returns whether it is the first, for which its taker has to be woken.
+    /// Keeps a refusal until it is taken. Returns whether it is the first one, for which the process that takes
+    /// refusals has to be woken.
     pub(in crate::session) fn keep_refusal(&self, why: String) -> bool {
         let mut state = self.lock();
         let is_first = state.refusals.is_empty();
@@ -152,7 +153,7 @@ impl DaemonLink {
         is_first
     }
 
-    /// Takes the refusals that were kept.
+    /// Takes the kept refusals.
     pub(in crate::session) fn take_refusals(&self) -> Vec<String> {
         mem::take(&mut self.lock().refusals)
     }

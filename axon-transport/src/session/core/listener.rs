@@ -3,7 +3,7 @@
 use super::SessionCore;
 use crate::session::error::RecvError;
 
-/// Has the control thread listen for a task, until it is dropped.
+/// Makes the control thread listen for a task until it is dropped.
 pub(in crate::session) struct Listener<'a> {
     core: &'a SessionCore,
 }
@@ -20,7 +20,7 @@ impl<'a> Listener<'a> {
 
 impl Drop for Listener<'_> {
     fn drop(&mut self) {
-        // A forked child has none of the parent's locks.
+        // A forked child must not take the parent's locks.
         if !self.core.is_forked() && self.core.listening.end_task() {
             self.core.wake();
         }

@@ -1,5 +1,5 @@
-//! Counts the callbacks and tasks for which the control thread listens on the session's doorbell, and keeps the time at
-//! which those who wait look again without a ring.
+//! Counts the callbacks and tasks for which the control thread listens on the session's doorbell, and stores the time
+//! at which waiting threads and tasks look again without a ring.
 
 use std::{
     sync::{Arc, Mutex, MutexGuard, PoisonError},
@@ -8,8 +8,8 @@ use std::{
 
 use axon_shm::{ExternalLeader, ShmError, internal::SessionSegment};
 
-/// How long it still listens after the last task: most tasks wait again, and each end and begin costs several
-/// system calls.
+/// Time for which the control thread still listens after the last task: most tasks wait again, and each begin and end
+/// costs several system calls.
 const LINGER: Duration = Duration::from_secs(1);
 
 /// The leader by which the control thread listens, and the number of callbacks and tasks that need it.
@@ -22,17 +22,17 @@ pub(in crate::session) struct Listening {
 
 #[derive(Default)]
 struct ListeningState {
-    /// Subscriptions with a callback, and waits of other sessions. Each ring is answered for these.
+    /// Number of subscriptions with a callback, and of waits by other sessions. Each ring is answered for them.
     callbacks: usize,
-    /// Futures that wait, and streams that may wait again. These arm a ticket when they wait.
+    /// Number of waiting futures, and of streams that may wait again. They arm a ticket when they wait.
     tasks: usize,
     leader: Option<Arc<ExternalLeader>>,
-    /// When it ends, unless somebody wants it then. The control thread has a look at that time.
+    /// Time at which listening ends, unless it is needed then. The control thread checks at that time.
     until: Option<Instant>,
 }
 
 impl Listening {
-    /// Begins for a callback. Returns whether the control thread has to be told.
+    /// Begins to listen for a callback. Returns whether the control thread has to be woken.
     pub(in crate::session) fn begin_callback(
         &self,
         segment: &Arc<SessionSegment>,
@@ -40,12 +40,12 @@ impl Listening {
         let mut state = self.lock();
         let new = state.lead(segment)?;
         state.callbacks += 1;
-        // For a thread that is asleep already, having armed no ticket since the last one was used up.
+        // Wakes a thread that is asleep already and has armed no ticket since the last one was used up.
         state.arm();
         Ok(new)
     }
 
-    /// A callback ended. Returns whether the control thread has to be told.
+    /// Stops listening for a callback. Returns whether the control thread has to be woken.
     pub(in crate::session) fn end_callback(&self) -> bool {
         let mut state = self.lock();
         state.callbacks -= 1;
@@ -56,7 +56,7 @@ impl Listening {
         idle
     }
 
-    /// A task begins to wait, or may. Returns whether the control thread has to be told.
+    /// Begins to listen for a task that waits or may wait. Returns whether the control thread has to be woken.
     pub(super) fn begin_task(&self, segment: &Arc<SessionSegment>) -> Result<bool, ShmError> {
         let mut state = self.lock();
         let new = state.lead(segment)?;
@@ -64,7 +64,7 @@ impl Listening {
         Ok(new)
     }
 
-    /// A task ended. Whether the control thread must be woken. It need not be if it looks soon anyway.
+    /// Stops listening for a task. Returns whether the control thread must be woken: not if it checks soon anyway.
     pub(super) fn end_task(&self) -> bool {
         let mut state = self.lock();
         state.tasks -= 1;
@@ -76,13 +76,13 @@ impl Listening {
         self.lock().arm();
     }
 
-    /// Whether a callback is set, which is told of every sample.
+    /// Returns whether a callback is set, which receives every sample.
     pub(in crate::session) fn has_callbacks(&self) -> bool {
         self.lock().callbacks > 0
     }
 
-    /// The leader by which the control thread listens, and the time at which it must ask again. The control thread
-    /// must have dropped the leader that it got before.
+    /// Returns the leader by which the control thread listens, and the time at which it must call this again. The
+    /// control thread must have dropped the leader that it got before.
     pub(in crate::session) fn leader(&self) -> (Option<Arc<ExternalLeader>>, Option<Instant>) {
         let mut state = self.lock();
         if state.leader.is_none() {
@@ -102,7 +102,7 @@ impl Listening {
         (state.leader.clone(), state.until)
     }
 
-    /// Has those who wait look again then. Whether that is sooner than they would.
+    /// Makes waiting threads and tasks look again at `at`. Returns whether that is sooner than the time set before.
     pub(super) fn look_again(&self, at: Instant) -> bool {
         let mut again = self.again.lock().unwrap_or_else(PoisonError::into_inner);
         let sooner = again.is_none_or(|before| at < before);
@@ -112,7 +112,7 @@ impl Listening {
         sooner
     }
 
-    /// Whether those who wait have to look again now, and when they have to next.
+    /// Returns whether waiting threads and tasks have to look again now, and the next time at which they have to.
     pub(in crate::session) fn take_due(&self, now: Instant) -> (bool, Option<Instant>) {
         let mut again = self.again.lock().unwrap_or_else(PoisonError::into_inner);
         let due = again.take_if(|again| *again <= now).is_some();
@@ -125,7 +125,7 @@ impl Listening {
 }
 
 impl ListeningState {
-    /// Makes sure that there is a leader. Whether it is a new one.
+    /// Makes sure that there is a leader. Returns whether it is a new one.
     fn lead(&mut self, segment: &Arc<SessionSegment>) -> Result<bool, ShmError> {
         let new = self.leader.is_none();
         if new {

@@ -1,4 +1,4 @@
-//! Changes of shared memory that the control thread tells the daemon.
+//! Changes of shared memory that the control thread reports to the daemon.
 
 use std::sync::{
     Arc, Mutex, PoisonError,
@@ -10,18 +10,18 @@ use axon_shm::internal::{SegmentEvent, SessionSegment};
 use super::waker::ControlWaker;
 use crate::ids::{Gid, SessionId};
 
-/// What changed in the session's own memory, and whether other sessions' is missing. Of use under any
-/// lock.
+/// The changes of the session's own memory, and the requests for missing memory of other sessions. It may be used under
+/// any lock.
 pub(in crate::session) struct MemoryChanges {
     waker: Arc<ControlWaker>,
     changes: Mutex<Vec<SegmentChange>>,
-    /// Counts what readers have to be sent before they find samples.
+    /// Counts the handovers: events after which readers have to be sent more before they find samples.
     handovers: AtomicU64,
-    /// Counts the times that the daemon was told, or tells, everything from the beginning.
+    /// Counts how often the daemon received, or sent, everything from the beginning.
     connections: AtomicU64,
 }
 
-/// What became of the session's own memory, or is to be asked of another's.
+/// A change of the session's own memory, or a request for another session's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(in crate::session) enum SegmentChange {
     Opened(u32),
@@ -33,7 +33,7 @@ pub(in crate::session) enum SegmentChange {
 }
 
 impl MemoryChanges {
-    /// The changes of a session's memory from now on. `waker` wakes the control thread.
+    /// Follows the changes of a session's memory from now on. `waker` wakes the control thread.
     pub(in crate::session) fn follow(
         segment: &SessionSegment,
         waker: Arc<ControlWaker>,
@@ -60,32 +60,32 @@ impl MemoryChanges {
         }
     }
 
-    /// Readers have to be sent something more: memory that was opened, a grant, or all of it by another
-    /// daemon.
+    /// Counts a handover: readers have to be sent memory that was opened, a grant, or everything by another daemon.
     pub(in crate::session) fn hands_over(&self) {
         // Relaxed: this is counted before the writer's lock is taken, and the publishing thread reads it
         // under that lock or after.
         self.handovers.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// The daemon is another one, or tells everything anew: it may not answer what it was asked before.
+    /// Counts a new connection: the daemon is another one, or sends everything anew, and may not answer earlier fences.
     pub(in crate::session) fn begins_anew(&self) {
         // Relaxed: a question that is asked once more is answered once more.
         self.connections.fetch_add(1, Ordering::Relaxed);
         self.hands_over();
     }
 
-    /// How often that was so.
+    /// Returns the number of connections.
     pub(in crate::session) fn connections(&self) -> u64 {
         self.connections.load(Ordering::Relaxed)
     }
 
-    /// How often readers had to be sent something more. Read after a sample was published, it covers all that its readers need.
+    /// Returns the number of handovers. If it is read after a sample was published, it covers everything that the
+    /// sample's readers need.
     pub(in crate::session) fn handovers(&self) -> u64 {
         self.handovers.load(Ordering::Relaxed)
     }
 
-    /// Readers miss memory of another session.
+    /// Records that readers miss memory of another session.
     pub(in crate::session) fn want(&self, session: SessionId) {
         self.push(SegmentChange::Wanted(session));
     }

@@ -1,5 +1,5 @@
-//! The parts of a session that know none of its endpoints: its memory, its link to the daemon, and what threads and
-//! tasks of the program wait for. Endpoints, handles and the control thread build on them.
+//! The parts of a session that do not know its endpoints: its memory, its link to the daemon, and the objects that
+//! threads and tasks of the program wait for. Endpoints, handles and the control thread build on them.
 
 mod change_signal;
 mod changes;
@@ -34,7 +34,7 @@ pub(in crate::session) use self::{
 use super::options::SessionOptions;
 use crate::{config::Config, ids::SessionId};
 
-/// What all endpoints and threads of a session share.
+/// The state that all endpoints and threads of a session share.
 pub(in crate::session) struct SessionCore {
     pub(in crate::session) config: Config,
     pub(in crate::session) options: SessionOptions,
@@ -51,7 +51,7 @@ pub(in crate::session) struct SessionCore {
 }
 
 impl SessionCore {
-    /// The core of a new session.
+    /// Creates the core of a new session.
     ///
     /// # Errors
     /// The process has no descriptors left.
@@ -76,24 +76,24 @@ impl SessionCore {
         })
     }
 
-    /// Whether this is a forked child of the session's process. Of its locks some may be held for
-    /// ever then, by threads that were not forked with it.
+    /// Returns whether this process is a forked child of the session's process. In a forked child, threads that do not
+    /// exist there may hold some of the locks for ever.
     pub(in crate::session) fn is_forked(&self) -> bool {
         self.segment.is_forked()
     }
 
-    /// Has the control thread look around.
+    /// Wakes the control thread.
     pub(in crate::session) fn wake(&self) {
         self.waker.wake();
     }
 
-    /// Queues something for the daemon.
+    /// Queues a message for the daemon, and wakes the control thread.
     pub(in crate::session) fn tell(&self, outgoing: Outgoing) {
         self.link.queue(outgoing);
         self.wake();
     }
 
-    /// Has the control thread listen for samples on behalf of one subscription more.
+    /// Makes the control thread listen for samples for one subscription more.
     pub(in crate::session) fn listen(&self) -> Result<(), ShmError> {
         if self.listening.begin_callback(&self.segment)? {
             self.wake();
@@ -101,14 +101,14 @@ impl SessionCore {
         Ok(())
     }
 
-    /// One subscription has nobody any more who would hear.
+    /// Makes the control thread listen for one subscription less.
     pub(in crate::session) fn listen_no_more(&self) {
         if self.listening.end_callback() {
             self.wake();
         }
     }
 
-    /// Has those who wait look again then.
+    /// Makes waiting threads and tasks look again at `at`.
     pub(in crate::session) fn look_again(&self, at: Instant) {
         // The control thread itself asks for the same time again and again, and must not wake itself each time.
         if self.listening.look_again(at) {
@@ -123,23 +123,23 @@ impl SessionCore {
         self.wake();
     }
 
-    /// Whether the control thread has to end.
+    /// Returns whether the control thread has to end.
     pub(in crate::session) fn stops(&self) -> bool {
         // Pairs with the release store of `stop`.
         self.stopping.load(Ordering::Acquire)
     }
 
-    /// Tells the threads that wait, and the listener.
+    /// Wakes the waiting threads, and calls the listener with the event.
     pub(in crate::session) fn notify(&self, event: Option<&SessionEvent>) {
         self.changes.notify();
         let Some(event) = event else { return };
-        // Who waits for the control thread's end may hold what a listener waits for.
+        // A thread that waits for the end of the control thread may hold a lock that the listener waits for.
         if self.stops() {
             return;
         }
         if matches!(event, SessionEvent::Matched(_)) {
-            // A writer that died between its last sample and the doorbell leaves that sample to be
-            // found by who sleeps for samples.
+            // A writer may have died between its last sample and the doorbell. Waking the threads that sleep for
+            // samples lets them find that sample.
             self.segment.notify();
         }
         self.changes.tell_listener(event);

@@ -12,7 +12,7 @@ use rustix::event::{EventfdFlags, eventfd};
 pub(in crate::session) struct ControlWaker(OwnedFd);
 
 impl ControlWaker {
-    /// One that has woken nobody yet.
+    /// Creates a waker that is not set.
     ///
     /// # Errors
     /// The process has no descriptors left.
@@ -20,9 +20,9 @@ impl ControlWaker {
         Ok(Self(eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?))
     }
 
-    /// Has the control thread look around.
+    /// Wakes the control thread.
     pub(in crate::session) fn wake(&self) {
-        // An eventfd whose counter is full is readable, which is all that is wanted.
+        // An eventfd whose counter is full is readable, too, so the error does not matter.
         let _ = rustix::io::write(&self.0, &1u64.to_ne_bytes());
     }
 

@@ -27,39 +27,40 @@ use axon_shm::internal::{OwnLimit, peer_process};
 
 use crate::{config::Config, wire::session::PROTOCOL};
 
-/// Where the daemon of a user and domain listens.
+/// The address at which the daemon of a user and domain listens.
 #[derive(Clone, Debug)]
 pub struct Address {
     place: Option<SocketFiles>,
-    /// A name in the abstract namespace: a kill frees it, and no file system is needed.
+    /// A name in the abstract namespace: the end of the process frees it, and it needs no file system.
     name: Option<String>,
 }
 
-/// A socket in the file system, with what belongs to it.
+/// A socket in the file system, and its lock file.
 #[derive(Clone, Debug)]
 struct SocketFiles {
     socket: PathBuf,
     /// Locked by the daemon as long as it lives.
     lock: PathBuf,
-    /// Whether other users may connect. The daemon closes the connections of those that it does not trust.
+    /// True if other users may connect. The daemon closes the connections of users that it does not trust.
     shared: bool,
 }
 
-/// Sockets that listen (close-on-exec and non-blocking), and what keeps them ours.
+/// The listening sockets of an address (close-on-exec and non-blocking), and the lock that keeps the address for this
+/// process.
 #[derive(Debug)]
 pub struct Bound {
     listeners: Vec<OwnedFd>,
     lock: Lock,
 }
 
-/// Keeps an address ours until it is dropped.
+/// Keeps an address for this process until it is dropped.
 #[derive(Debug)]
 pub struct Lock {
     _file: Option<File>,
 }
 
 impl Bound {
-    /// The listeners, at least one, which may be closed before the lock is given up.
+    /// Returns the listeners, at least one, and the lock. The listeners may be closed before the lock is dropped.
     pub fn into_parts(self) -> (Vec<OwnedFd>, Lock) {
         (self.listeners, self.lock)
     }
@@ -71,39 +72,39 @@ pub(crate) struct SpawnLock {
     _kept: Option<OwnedFd>,
 }
 
-/// Why an address could not be used.
+/// The reason why an address could not be used.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum AddressError {
-    /// Nobody listens.
+    /// No process listens.
     #[error("no daemon listens there")]
     Absent,
-    /// Somebody listens, but has too many callers waiting to take another.
+    /// A process listens, but has too many callers waiting to accept another.
     #[error("the daemon there has too many callers waiting")]
     Busy,
-    /// Another daemon has it.
+    /// Another daemon has the address.
     #[error("another daemon has the address")]
     Taken,
     /// A path or directory is not usable.
     #[error("the runtime directory (AXON_RUNTIME_DIR, or XDG_RUNTIME_DIR) {}: {reason}", path.display())]
     Directory {
-        /// Which.
+        /// The path or directory.
         path: PathBuf,
-        /// What is wrong and what would be right.
+        /// The error, and the remedy.
         reason: String,
     },
-    /// The system refused.
+    /// A system call failed.
     #[error("the session socket: {0}{own}", own = OwnLimit(&(*.0).into()))]
     System(#[from] Errno),
 }
 
-/// Between attempts to reach the owner of a name.
+/// Pause between attempts to reach the owner of a name.
 const RETRY_INTERVAL: Duration = Duration::from_millis(10);
-/// How often the owner of a name is called that may be about to listen.
+/// Maximum number of attempts to reach the owner of a name that may be about to listen.
 const CALLS: u32 = 20;
 
 impl Address {
-    /// The address that `config` stands for.
+    /// Returns the address that `config` describes.
     pub fn of(config: &Config) -> Self {
         let domain = config.domain;
         let name = || {
@@ -120,7 +121,7 @@ impl Address {
                 Self { place: Some(place(dir, format!("axon-{domain}"))), name: None }
             }
             Some(dir) => {
-                // As with the name: a daemon serves one network namespace.
+                // As for the name: a daemon serves one network namespace.
                 let namespace =
                     std::fs::metadata("/proc/thread-self/ns/net").map_or(0, |m| m.ino());
                 let stem = format!("axon-{domain}-{namespace}");
@@ -130,10 +131,10 @@ impl Address {
         }
     }
 
-    /// Connects to the daemon there, without waiting for one that does not answer.
+    /// Connects to the daemon at the address, without waiting for a daemon that does not answer.
     ///
     /// # Errors
-    /// [`AddressError::Absent`] when there is none.
+    /// [`AddressError::Absent`] if there is no daemon.
     pub fn connect(&self) -> Result<OwnedFd, AddressError> {
         let at_place = |place: &SocketFiles| path_name(&place.socket).and_then(|path| call(&path));
         let at_name = |name: &String| abstract_name(name).and_then(|name| call(&name));
@@ -141,12 +142,12 @@ impl Address {
             (Some(place), None) => at_place(place),
             (None, Some(name)) => at_name(name),
             (Some(place), Some(name)) => {
-                // XDG_RUNTIME_DIR may be left from another user's login, and another user may have
-                // bound the name: neither keeps this one from a daemon of its own.
+                // XDG_RUNTIME_DIR may come from another user's login, and another user may have bound the name: neither
+                // must keep this user from a daemon of its own.
                 let own = |socket: &OwnedFd| is_own(socket);
                 match at_place(place) {
                     Err(AddressError::Busy) => Err(AddressError::Busy),
-                    // It is not that there is no daemon.
+                    // This process has no descriptors left: that does not mean that there is no daemon.
                     Err(AddressError::System(errno @ (Errno::MFILE | Errno::NFILE))) => {
                         Err(errno.into())
                     }
@@ -160,10 +161,10 @@ impl Address {
         }
     }
 
-    /// Takes the address, or says that another daemon has it. A stale socket file is replaced.
+    /// Binds the address. A stale socket file is replaced.
     ///
     /// # Errors
-    /// [`AddressError::Taken`] when another daemon has it.
+    /// [`AddressError::Taken`] if another daemon has the address.
     pub fn bind(&self) -> Result<Bound, AddressError> {
         let mut listeners = Vec::new();
         let mut lock = Lock { _file: None };
@@ -173,7 +174,7 @@ impl Address {
                 listeners.push(listener);
                 lock = Lock { _file: Some(file) };
             }
-            // XDG_RUNTIME_DIR may name the directory of a login that has ended: the name serves as well.
+            // XDG_RUNTIME_DIR may name the directory of a login that has ended: the abstract name is enough.
             Some(Err(error @ AddressError::Directory { .. })) if self.name.is_some() => {
                 tracing::warn!(%error, "the session socket has an abstract name only");
             }
@@ -195,7 +196,7 @@ impl Address {
         Ok(Bound { listeners, lock })
     }
 
-    /// Whether another user can keep the daemon of this one from the address.
+    /// Returns whether another user can take the address before this user's daemon.
     pub(crate) fn is_open_to_others(&self) -> bool {
         self.place.is_none()
     }
@@ -207,8 +208,8 @@ impl Address {
         }
     }
 
-    /// The turn to start a daemon here; `None` where another thread or process has it. What keeps it
-    /// is a bound name or a locked file: where neither can be had, nobody is kept from trying.
+    /// Takes the turn to start a daemon here. Returns `None` if another thread or process has it. A bound name or a
+    /// locked file holds the turn: if neither is possible, every caller gets a turn.
     pub(crate) fn turn(&self) -> Option<SpawnLock> {
         match self.try_turn() {
             Ok(kept) => Some(SpawnLock { _kept: Some(kept) }),
@@ -219,7 +220,7 @@ impl Address {
 
     fn try_turn(&self) -> Result<OwnedFd, Errno> {
         if let Some(place) = &self.place {
-            // What is wrong with the directory, the daemon says. Nothing is put into another user's.
+            // The daemon reports errors of the directory. Nothing is written to another user's directory.
             let ours = place.socket.parent().map(private_directory).is_none_or(|made| made.is_ok());
             if !ours {
                 return if self.name.is_some() { self.name_turn() } else { Err(Errno::ACCESS) };
@@ -247,7 +248,7 @@ impl Address {
 }
 
 impl SocketFiles {
-    /// Listens there, once the lock is had.
+    /// Takes the lock, then listens at the path.
     fn bind(&self) -> Result<(OwnedFd, File), AddressError> {
         let Self { socket, lock, shared } = self;
         if let Some(dir) = socket.parent() {
@@ -273,7 +274,7 @@ impl SocketFiles {
         }
         let listener = listen_at(&path_name(socket)?)?;
         if *shared {
-            // Who connects needs the right to write, and the umask takes that from others.
+            // A connecting process needs write permission, and the umask takes that from other users.
             let mode = std::fs::Permissions::from_mode(0o666);
             std::fs::set_permissions(socket, mode).map_err(|e| directory(socket, &e))?;
         }
@@ -306,13 +307,13 @@ fn call(name: &SocketAddrUnix) -> Result<OwnedFd, AddressError> {
     }
 }
 
-/// Whether a process of this user listens at a name that is bound.
+/// Returns whether a process of this user listens at a name that is bound.
 fn is_served(name: &str) -> Result<bool, AddressError> {
     let name = abstract_name(name)?;
     for _ in 0..CALLS {
         match call(&name) {
             Ok(socket) => return Ok(is_own(&socket)),
-            // A daemon that is starting has bound it and does not listen yet.
+            // A starting daemon has bound the name and does not listen yet.
             Err(_) => std::thread::sleep(RETRY_INTERVAL),
         }
     }
@@ -345,10 +346,10 @@ impl std::fmt::Display for Address {
     }
 }
 
-/// Makes `dir` with mode 0700, or checks that nobody but this user can write to it.
+/// Creates `dir` with mode 0700, or checks that only this user can write to it.
 ///
 /// # Errors
-/// Names the directory and what is wrong with it.
+/// An error that names the directory and the reason.
 pub fn private_directory(dir: &Path) -> Result<(), AddressError> {
     DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(|e| directory(dir, &e))?;
     let meta = std::fs::metadata(dir).map_err(|e| directory(dir, &e))?;

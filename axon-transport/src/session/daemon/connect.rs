@@ -23,18 +23,18 @@ use crate::{
     wire::session::{PROTOCOL, SessionHello, SessionMessage, SessionRole, Welcome},
 };
 
-/// How long a daemon may take to come up and answer.
+/// Maximum time that a daemon may take to start and answer.
 const DAEMON_CONNECT_TIMEOUT: Duration = Duration::from_secs(20);
-/// How soon a daemon is to answer that has the address.
+/// Time within which a daemon that has the address must answer.
 const AFTER: Duration = Duration::from_millis(500);
-/// How often an address may be found bound with nobody listening there. A daemon listens at once.
+/// Maximum number of times that an address may be bound without a listener. A daemon listens at once.
 const UNSERVED: u32 = 4;
-/// How long another may take to start a daemon before this one does, too.
+/// Maximum time that another process may take to start a daemon before this one starts one, too.
 const TURN: Duration = Duration::from_secs(5);
-/// What a daemon names that cannot share memory with a session.
+/// The variable that a daemon names in its refusal if it cannot share memory with the session.
 pub const SHM: &str = "AXON_SHM";
 
-/// A daemon that took the session.
+/// A connection to a daemon that accepted the session.
 #[derive(Debug)]
 pub(crate) struct Connected {
     pub(crate) socket: OwnedFd,
@@ -49,27 +49,27 @@ pub(crate) struct Caller<'a> {
     pub(crate) config: &'a Config,
     pub(crate) options: &'a SessionOptions,
     pub(crate) id: SessionId,
-    /// Absent for a tool, and for one that is relayed.
+    /// Absent for a tool, and for a relayed session.
     pub(crate) segment: Option<&'a SessionSegment>,
-    /// Why it is relayed, if so.
+    /// The reason why the session is relayed, if it is.
     pub(crate) relay: Option<&'a str>,
-    /// Whether the answer is no longer wanted.
+    /// Returns whether the caller does not need the connection any more.
     pub(crate) cancel: Option<&'a dyn Fn() -> bool>,
 }
 
 impl<'a> Caller<'a> {
-    /// A caller without a segment that is not relayed and waits as long as it takes.
+    /// Creates a caller without a segment that is not relayed and cannot be cancelled.
     pub(crate) fn new(config: &'a Config, options: &'a SessionOptions, id: SessionId) -> Self {
         Self { config, options, id, segment: None, relay: None, cancel: None }
     }
 
-    /// Connects to the daemon, which is started when there is none and the policy says so.
+    /// Connects to the daemon. If there is none and the policy allows it, starts one.
     pub(crate) fn connect(&self) -> Result<Connected, SessionError> {
         let address = Address::of(self.config);
         let deadline = Instant::now() + DAEMON_CONNECT_TIMEOUT;
         let mut pause = Duration::from_millis(2);
-        // A daemon that is on its way out, or another's that comes up, is worth some patience
-        // before one is started: only one of many that start at once gets the address.
+        // A daemon may be ending, or another process may be starting one: waits a little before starting one, because
+        // only one of many that start at once gets the address.
         let mut spawn_after = Instant::now();
         let (mut turn, mut gives_way_until) = (None, None);
         let mut taken = 0;
@@ -139,7 +139,7 @@ impl<'a> Caller<'a> {
         Ok(connected)
     }
 
-    /// HELLO and its answer, over a socket that is connected.
+    /// Exchanges HELLO and its answer over a connected socket.
     pub(in crate::session) fn greet_over(
         &self,
         socket: OwnedFd,
@@ -192,7 +192,7 @@ impl<'a> Caller<'a> {
                     Err(SocketError::NotReady) => {
                         self.await_socket(&socket, PollFlags::OUT, deadline, address)?;
                     }
-                    // It ended between our connecting and our speaking, and may have said why.
+                    // The daemon ended after the connection was made, and may have sent the reason.
                     Err(_) => return Err(refusal(&socket, address).unwrap_or(Attempt::Again)),
                 }
             }
@@ -253,7 +253,7 @@ impl<'a> Caller<'a> {
 }
 
 impl Caller<'_> {
-    /// A daemon of an earlier version would have its own range in place of the session's.
+    /// Refuses a daemon of an earlier version, which would apply its own range instead of the session's.
     fn check_range(&self, welcome: &Welcome, address: &str, pid: u32) -> Result<(), Attempt> {
         let applies = welcome.ranges.unwrap_or(false);
         let asks = self.options.role == SessionRole::Application
@@ -292,7 +292,7 @@ impl Caller<'_> {
     }
 }
 
-/// Looks whether the daemon's memory comes and can be mapped: as its does, so does that of others.
+/// Checks that the daemon's memory arrives and can be mapped: other processes' memory comes in the same way.
 fn look_into(descriptors: &[PassedFd]) -> Result<(), SessionError> {
     let Some(probe) = descriptors.first() else {
         return Err(SessionError::NotShared("descriptors of the daemon do not arrive".into()));
@@ -306,7 +306,7 @@ fn look_into(descriptors: &[PassedFd]) -> Result<(), SessionError> {
     }
 }
 
-/// What a daemon said that has closed the connection before it was spoken to.
+/// Returns the refusal of a daemon that closed the connection before HELLO was sent.
 fn refusal(socket: &OwnedFd, address: &str) -> Option<Attempt> {
     match socket::receive(socket, &mut Vec::new()).ok()?.message {
         SessionMessage::Refused(refused) if refused.variable.is_empty() => {
@@ -317,13 +317,13 @@ fn refusal(socket: &OwnedFd, address: &str) -> Option<Attempt> {
     }
 }
 
-/// What became of one attempt.
+/// The reason why one attempt failed.
 enum Attempt {
-    /// Nobody listens.
+    /// No process listens.
     Absent,
-    /// Somebody did, and went away.
+    /// A process listened, and ended or is busy.
     Again,
-    /// Trying again would not help.
+    /// An error that another attempt would not avoid.
     Final(SessionError),
 }
 

@@ -1,5 +1,5 @@
-//! The way to a daemon: its address, its start, the socket to it, and the questions that are asked over a connection of
-//! their own.
+//! The connection to a daemon: its address, its start, the socket to it, and requests that use a connection of their
+//! own.
 
 pub mod address;
 pub mod connect;

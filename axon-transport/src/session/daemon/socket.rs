@@ -16,7 +16,7 @@ use rustix::{
 
 use crate::wire::session::{CodecError, MAX_DESCRIPTORS, MAX_PACKET, SessionMessage};
 
-/// A message that arrived, and what came with it.
+/// A message that arrived, with its descriptors.
 #[derive(Debug)]
 pub struct ReceivedMessage {
     /// The message.
@@ -25,14 +25,14 @@ pub struct ReceivedMessage {
     pub descriptors: Vec<PassedFd>,
 }
 
-/// Why a packet was not sent or received.
+/// The reason why a packet was not sent or received.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum SocketError {
     /// The other end is gone.
     #[error("the other end closed the connection")]
     Closed,
-    /// Nothing to receive, or no room to send; try again when the socket is ready.
+    /// There is nothing to receive, or no space to send; try again when the socket is ready.
     #[error("the socket is not ready")]
     NotReady,
     /// A packet that breaks the protocol.
@@ -47,7 +47,7 @@ pub enum SocketError {
          RLIMIT_NOFILE (ulimit -n)"
     )]
     NoDescriptors,
-    /// The system refused.
+    /// A system call failed.
     #[error("{0}")]
     System(Errno),
 }
@@ -55,7 +55,7 @@ pub enum SocketError {
 impl From<Errno> for SocketError {
     fn from(errno: Errno) -> Self {
         match errno {
-            // Too many descriptors in flight passes as soon as somebody receives some.
+            // TOOMANYREFS ends when a process receives some of the descriptors in flight.
             Errno::AGAIN | Errno::NOBUFS | Errno::TOOMANYREFS => Self::NotReady,
             Errno::CONNRESET | Errno::PIPE | Errno::NOTCONN => Self::Closed,
             other => Self::System(other),
@@ -66,7 +66,7 @@ impl From<Errno> for SocketError {
 /// Sends one packet.
 ///
 /// # Errors
-/// [`SocketError::NotReady`] when the socket has no room; nothing was sent then.
+/// [`SocketError::NotReady`] if the socket has no space; nothing was sent then.
 pub fn send(
     socket: impl AsFd,
     packet: &[u8],
@@ -90,26 +90,27 @@ pub fn send(
     }
 }
 
-/// Receives one packet. `buffer` is room to reuse; it need not have any length.
+/// Receives one packet. `buffer` is memory to reuse; it may be empty.
 ///
 /// # Errors
-/// [`SocketError::NotReady`] when there is none. Every other error is final for the connection, but
-/// for [`SocketError::NoDescriptors`]: the packet is gone, and the next ones may come whole.
+/// [`SocketError::NotReady`] if there is none. Every other error is final for the connection, except
+/// [`SocketError::NoDescriptors`]: the packet is lost, and the next ones may arrive completely.
 pub fn receive(socket: impl AsFd, buffer: &mut Vec<u8>) -> Result<ReceivedMessage, SocketError> {
     buffer.resize(MAX_PACKET + 1, 0);
     let packet = match descriptors::receive(&socket, buffer) {
-        // Said once, before what the other end has sent: it closed without having read all of ours.
+        // Reported once, before the data of the other end: the other end closed without having read all of this end's
+        // data.
         Err(Errno::CONNRESET) => descriptors::receive(&socket, buffer),
         received => received,
     };
     received(packet?, buffer)
 }
 
-/// As [`receive`], where descriptors are short: needs room for no more than a packet may have, and closes none of them for
-/// the last time.
+/// Like [`receive`], for a process that is short of descriptors: needs space for no more descriptors than a packet may
+/// have, and closes none of them for the last time.
 ///
 /// # Errors
-/// As [`receive`]. A packet for whose descriptors there is no room stays where it is.
+/// As for [`receive`]. A packet stays in the socket if there is no space for its descriptors.
 pub fn receive_few(
     socket: impl AsFd,
     buffer: &mut Vec<u8>,
@@ -123,10 +124,10 @@ pub fn receive_few(
     received(packet?, buffer)
 }
 
-/// The next packet's message, which stays where it is, as do its descriptors.
+/// Returns the next packet's message. The packet and its descriptors stay in the socket.
 ///
 /// # Errors
-/// As [`receive`].
+/// As for [`receive`].
 pub fn look(socket: impl AsFd, buffer: &mut Vec<u8>) -> Result<SessionMessage, SocketError> {
     buffer.resize(MAX_PACKET + 1, 0);
     let bytes = descriptors::look(&socket, buffer)?;
@@ -150,8 +151,8 @@ fn received(packet: SocketPacket, buffer: &[u8]) -> Result<ReceivedMessage, Sock
     Ok(ReceivedMessage { message: SessionMessage::decode(&buffer[..bytes])?, descriptors })
 }
 
-/// Says that nothing more comes, and waits until the other end closes. Whether it had read everything by then; also true
-/// where it has not closed at the `deadline`.
+/// Shuts down sending, and waits until the other end closes. Returns whether the other end had read everything by then;
+/// also true if it has not closed at the `deadline`.
 pub fn finish(socket: impl AsFd, deadline: Instant) -> bool {
     if shutdown(&socket, Shutdown::Write).is_err() {
         return false;

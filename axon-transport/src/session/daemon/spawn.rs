@@ -27,20 +27,20 @@ use crate::{
 
 /// The flag of the first process.
 pub const SPAWNED: &str = "--spawned";
-/// The flag of the second.
+/// The flag of the second process.
 pub const DETACHED: &str = "--detached";
 
-/// How long a daemon may take to say how it is.
+/// Maximum time that a daemon may take to send its report.
 const DAEMON_START_TIMEOUT: Duration = Duration::from_secs(15);
-/// The most that is read from the start-up pipe.
+/// Maximum number of bytes read from the start-up pipe.
 const MAX_REPORT: usize = 8192;
 
-/// What a daemon reports.
+/// The report of a daemon that was started.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum SpawnOutcome {
-    /// It runs.
+    /// The daemon runs.
     Ready,
-    /// Another one has the address.
+    /// Another daemon has the address.
     Taken,
 }
 
@@ -73,8 +73,7 @@ pub(crate) fn spawn(
         .spawn()
         .map_err(|e| failed(format!("{e}{}", OwnLimit(&e))))?;
     let report = read_report(reader.into(), cancelled);
-    // The first process ends as soon as it has started the second, or did not. A program that is no
-    // daemon may stay.
+    // The first process ends as soon as it has started the second, or failed to. A program that is no daemon may stay.
     if !matches!(report.trim_end(), "ready" | "taken") {
         let _ = child.kill();
     }
@@ -90,7 +89,7 @@ pub(crate) fn spawn(
     }
 }
 
-/// The command for a daemon: `AXON_DAEMON_PATH`, the application's own, or a program in one of the
+/// Returns the command for a daemon: `AXON_DAEMON_PATH`, the application's own, or a program in one of the
 /// [folders](folders).
 fn find(config: &Config, command: Option<&DaemonCommand>) -> Result<DaemonCommand, SessionError> {
     if let Some(path) = &config.daemon_path {
@@ -107,11 +106,11 @@ fn find(config: &Config, command: Option<&DaemonCommand>) -> Result<DaemonComman
     })
 }
 
-/// The daemon, and the tool, which can be it.
+/// The names of the daemon's program, and of the tool, which can run as the daemon.
 const PROGRAMS: [&str; 2] = ["axon_daemon", TOOL];
 const TOOL: &str = "axon";
 
-/// The daemon in the first folder that has one, else the tool in the first that has it.
+/// Returns the daemon in the first folder that has one, or else the tool in the first folder that has it.
 fn program_in(folders: &[PathBuf]) -> Option<DaemonCommand> {
     PROGRAMS.into_iter().find_map(|name| {
         let program = folders.iter().map(|folder| folder.join(name)).find(|p| is_program(p))?;
@@ -119,15 +118,15 @@ fn program_in(folders: &[PathBuf]) -> Option<DaemonCommand> {
     })
 }
 
-/// How this program is started as a daemon: the tool has a command for it.
+/// Returns the command that starts this program as a daemon: the tool has a subcommand for it.
 fn named(program: &Path) -> DaemonCommand {
     let is_tool = program.file_name().is_some_and(|name| name == TOOL);
     let arguments = if is_tool { vec!["daemon".into()] } else { Vec::new() };
     DaemonCommand { program: program.to_owned(), arguments }
 }
 
-/// Whether this can be started as a daemon. This very program is passed over: an application that is called
-/// `axon` would start itself without end.
+/// Returns whether this can be started as a daemon. The running program itself is skipped: an application that is
+/// called `axon` would start itself without end.
 fn is_program(path: &Path) -> bool {
     let itself = || match (path.canonicalize(), std::env::current_exe()) {
         (Ok(path), Ok(itself)) => path == itself,
@@ -140,8 +139,8 @@ fn is_executable(path: &Path) -> bool {
     path.metadata().is_ok_and(|file| file.is_file() && file.permissions().mode() & 0o111 != 0)
 }
 
-/// Whether this belongs to this user or to root, and not every user may write it. Its group may: where each
-/// user has a group of their own, that is how files are made.
+/// Returns whether this belongs to this user or to root, and that not every user may write it. Its group may: if each
+/// user has a group of its own, files are created so.
 fn is_trusted(path: &Path) -> bool {
     path.metadata().is_ok_and(|file| {
         let ours = [0, rustix::process::geteuid().as_raw()].contains(&file.uid());
@@ -149,8 +148,8 @@ fn is_trusted(path: &Path) -> bool {
     })
 }
 
-/// Where a daemon's program is looked for, in this order: beside this program, beside the library that
-/// this code is in, in `PATH`, and where cargo installs programs. `variable` reads the environment.
+/// Returns the folders in which a daemon's program is searched, in this order: beside this program, beside the library
+/// that contains this code, in `PATH`, and where cargo installs programs. `variable` reads the environment.
 fn folders(variable: impl Fn(&str) -> Option<OsString>) -> Vec<PathBuf> {
     let beside = [std::env::current_exe().ok(), own_file()].into_iter().flatten();
     let beside = beside.filter_map(|file| Some(file.parent()?.to_path_buf()));
@@ -160,7 +159,7 @@ fn folders(variable: impl Fn(&str) -> Option<OsString>) -> Vec<PathBuf> {
         .or_else(|| variable("HOME").map(|home| Path::new(&home).join(".cargo")));
     let mut folders = Vec::new();
     for folder in beside.chain(std::env::split_paths(&path)).chain(cargo.map(|c| c.join("bin"))) {
-        // A relative one would be another one for each process.
+        // A relative path would be a different one for each process.
         if folder.is_absolute() && !folders.contains(&folder) {
             folders.push(folder);
         }
@@ -168,7 +167,7 @@ fn folders(variable: impl Fn(&str) -> Option<OsString>) -> Vec<PathBuf> {
     folders
 }
 
-/// The file that this code was loaded from: the library's where it is in one.
+/// Returns the file that this code was loaded from: the library, if it is in one.
 fn own_file() -> Option<PathBuf> {
     let here = own_file as *const () as usize;
     let maps = std::fs::read_to_string("/proc/self/maps").ok()?;
@@ -182,8 +181,8 @@ fn own_file() -> Option<PathBuf> {
     })
 }
 
-/// The environment of a daemon: what its system libraries need of this process's, the settings that
-/// [`daemon_env`](Config) says, and what each session has of its own.
+/// Returns the environment of a daemon: the variables of this process that its system libraries need, the settings of
+/// [`daemon_env`](Config), and the variables that differ between sessions.
 fn environment(
     config: &Config,
     own: impl IntoIterator<Item = (OsString, OsString)>,
@@ -204,9 +203,9 @@ fn environment(
     environment
 }
 
-/// Whether a daemon gets this variable: what it reads, where its settings are the environment's, and what
-/// its system libraries need. These take files from it, so one of a process with more rights than its
-/// caller gets what AXON reads alone.
+/// Returns whether a daemon inherits this variable: the variables that it reads, if its settings come from the
+/// environment, and the variables that its system libraries need. These libraries load files that such variables name,
+/// so the daemon of a process with more rights than its caller inherits only the variables that AXON reads.
 fn inherited(name: &OsStr, is_elevated: bool, settings: bool) -> bool {
     const SYSTEM: &[&str] = &[
         "HOME",
@@ -228,8 +227,8 @@ fn inherited(name: &OsStr, is_elevated: bool, settings: bool) -> bool {
     })
 }
 
-/// What a session may have been opened with in place of the environment's. A daemon that a session
-/// starts has no range of its own: each session, this one too, tells it theirs.
+/// Returns the settings that a session may have been opened with instead of the environment's. A daemon that a session
+/// starts has no range of its own: each session, including this one, sends its range to it.
 fn chosen(config: &Config) -> [(&'static str, String); 3] {
     [
         ("ROS_DOMAIN_ID", config.domain.to_string()),
@@ -347,7 +346,7 @@ mod tests {
         let daemon = file("axon_daemon", 0o644);
         let found = program_in(&folders).unwrap();
         assert_eq!((found.program, found.arguments), (tool, vec![OsString::from("daemon")]));
-        // Another's tool in an earlier folder.
+        // Another user's tool in an earlier folder.
         fs::write(other.path().join("axon"), "").unwrap();
         fs::set_permissions(other.path().join("axon"), fs::Permissions::from_mode(0o755)).unwrap();
         fs::set_permissions(&daemon, fs::Permissions::from_mode(0o757)).unwrap();

@@ -1,4 +1,4 @@
-//! Questions to a daemon over a connection of their own: its status, and what its tools ask.
+//! Requests to a daemon over a connection of their own: its status, and the requests of its tools.
 
 use std::{
     os::fd::OwnedFd,
@@ -22,13 +22,13 @@ use crate::{
     wire::session::{AccessCheck, CheckedUse, SessionMessage, SessionRole},
 };
 
-/// How long a daemon may take to answer.
+/// Maximum time that a daemon may take to answer.
 pub(in crate::session) const ANSWER: Duration = Duration::from_secs(5);
-/// How long a peer may take to answer: a lost packet is sent again by then.
+/// Maximum time that a peer may take to answer: a lost packet is retransmitted by then.
 const PEER_ANSWER: Duration = Duration::from_secs(3);
 
-/// The status of the daemon of this user and domain. Starts none, and is answered whatever the
-/// security settings.
+/// Returns the status of the daemon of this user and domain. Starts no daemon; the daemon answers whatever the security
+/// settings are.
 ///
 /// ```
 /// # use axon_transport::config::Config;
@@ -47,12 +47,12 @@ const PEER_ANSWER: Duration = Duration::from_secs(3);
 /// ```
 ///
 /// # Errors
-/// [`SessionError::NoDaemon`] when there is none.
+/// [`SessionError::NoDaemon`] if there is no daemon.
 pub fn daemon_status(config: &Config) -> Result<String, SessionError> {
     daemon_status_at(&DaemonLocation::from(config))
 }
 
-/// The same where no more is known than where that daemon is: other settings may be wrong.
+/// Like [`daemon_status`], if only the daemon's location is known: other settings may be wrong.
 ///
 /// ```no_run
 /// use axon_transport::{config::DaemonPlace, daemon_status_at};
@@ -62,7 +62,7 @@ pub fn daemon_status(config: &Config) -> Result<String, SessionError> {
 /// ```
 ///
 /// # Errors
-/// As [`daemon_status`].
+/// As for [`daemon_status`].
 pub fn daemon_status_at(place: &DaemonLocation) -> Result<String, SessionError> {
     let config = Config { daemon: DaemonPolicy::Require, ..place.config() };
     let options = SessionOptions::new("status").role(SessionRole::Tool);
@@ -71,9 +71,9 @@ pub fn daemon_status_at(place: &DaemonLocation) -> Result<String, SessionError> 
     status_text(ask(&connected.socket, &SessionMessage::StatusRequest, &address, ANSWER)?)
 }
 
-/// Has the daemon of this user and domain read again those of its settings that may change while it runs: access rules,
-/// peers, trusted users and the log filter, from its own environment and files. Where something is wrong with them, nothing
-/// changes, and the report says what.
+/// Makes the daemon of this user and domain read the settings again that may change while it runs: access rules, peers,
+/// trusted users and the log filter, from its own environment and files. If any of them is wrong, nothing changes, and
+/// the report gives the reason.
 ///
 /// ```no_run
 /// use axon_transport::{config::DaemonPlace, daemon_reload_at};
@@ -87,7 +87,7 @@ pub fn daemon_status_at(place: &DaemonLocation) -> Result<String, SessionError> 
 /// ```
 ///
 /// # Errors
-/// As [`daemon_status`]. A daemon of an earlier version does not answer.
+/// As for [`daemon_status`].
 pub fn daemon_reload_at(place: &DaemonLocation) -> Result<ReloadReport, SessionError> {
     let config = Config { daemon: DaemonPolicy::Require, ..place.config() };
     let options = SessionOptions::new("reload").role(SessionRole::Tool);
@@ -97,10 +97,10 @@ pub fn daemon_reload_at(place: &DaemonLocation) -> Result<ReloadReport, SessionE
     serde_json::from_str(&text).map_err(|e| SessionError::Protocol(format!("reload: {e}")))
 }
 
-/// Asks a linked peer, by way of the daemon of this user and domain, which of the peer's access rules decide what this
+/// Asks a linked peer, through the daemon of this user and domain, which of the peer's access rules decide what this
 /// host may do there: at most 32 uses at a time, each a verb and the name of a topic, service or node. `peer` is the
-/// daemon that [`LinkStatus::peer`](crate::status::LinkStatus::peer) names. A question that the daemon cannot pass on, such as
-/// of a peer that is not linked, is answered by [`PeerDecisions::error`].
+/// daemon that [`LinkStatus::peer`](crate::status::LinkStatus::peer) names. If the daemon cannot pass the question on,
+/// for example because the peer is not linked, [`PeerDecisions::error`] has the reason.
 ///
 /// ```no_run
 /// use axon_transport::{
@@ -120,7 +120,7 @@ pub fn daemon_reload_at(place: &DaemonLocation) -> Result<ReloadReport, SessionE
 /// ```
 ///
 /// # Errors
-/// As [`daemon_status`]. [`SessionError::Silent`] also where the peer does not answer, as a daemon of an earlier version.
+/// As for [`daemon_status`].
 pub fn daemon_check_access_at(
     place: &DaemonLocation,
     peer: &str,
@@ -139,12 +139,12 @@ pub fn daemon_check_access_at(
     serde_json::from_str(&text).map_err(|e| SessionError::Protocol(format!("access check: {e}")))
 }
 
-/// A status as text.
+/// Decodes a status as text.
 pub(in crate::session) fn status_text(bytes: Vec<u8>) -> Result<String, SessionError> {
     String::from_utf8(bytes).map_err(|e| SessionError::Protocol(format!("status: {e}")))
 }
 
-/// The text that answers a question.
+/// Sends a request, and returns the text of the answer.
 fn ask(
     socket: &OwnedFd,
     question: &SessionMessage,

@@ -2,19 +2,19 @@
 
 use crate::wire::session::StatusPart;
 
-/// The parts of a status that have come.
+/// The parts of a status that have arrived.
 #[derive(Debug, Default)]
 pub(in crate::session) struct StatusText {
     text: Vec<u8>,
     next: u32,
 }
 
-/// The longest status that is put together.
+/// Maximum length of a status in bytes.
 const MAX_STATUS: usize = 64 << 20;
 
 impl StatusText {
-    /// Adds the part that is due; the whole, once it was the last. The first one may come again, for
-    /// a caller that asks again; any other part is of an answer that nobody waits for any more.
+    /// Adds the next part. Returns the whole status if this was the last part. The first part may come again, for a
+    /// caller that asks again; any other part belongs to an answer that no caller waits for any more.
     pub(in crate::session) fn add(&mut self, part: &StatusPart) -> Option<Vec<u8>> {
         if part.part == 0 {
             *self = Self::default();

@@ -7,8 +7,8 @@ use std::{
     thread::{self, ThreadId},
 };
 
-/// Told how often something happened since it was told last; at least once. It may be called on the
-/// session's control thread, but never by two threads at once, and must neither block nor panic.
+/// A function that receives the number of events since its last call; at least one. It may be called on the session's
+/// control thread, but never by two threads at once, and must neither block nor panic.
 ///
 /// ```
 /// # use std::time::Duration;
@@ -37,7 +37,7 @@ use std::{
 /// ```
 pub type NewDataCallback = Arc<dyn Fn(u64) + Send + Sync>;
 
-/// What is to be told, and to whom.
+/// An application's callback, and the number of events that have not been reported to it.
 #[derive(Default)]
 pub(in crate::session) struct Callback {
     state: Mutex<CallbackState>,
@@ -48,15 +48,16 @@ pub(in crate::session) struct Callback {
 struct CallbackState {
     function: Option<NewDataCallback>,
     untold: u64,
-    /// The thread that is in a function. Another thread that has something to tell meanwhile leaves it to
-    /// that thread: two in the same function that both wait for the other to return would wait for ever.
+    /// The thread that runs the function. Another thread that has events to report meanwhile leaves them to that
+    /// thread: if two threads were in the same function and each waited for the other to return, they would wait for
+    /// ever.
     running: Option<ThreadId>,
-    /// There is to be no function any more.
+    /// Set by `end`: no function is stored any more.
     ended: bool,
 }
 
 impl Callback {
-    /// It happened `count` times more.
+    /// Adds `count` events, and reports them unless a call is under way.
     pub(in crate::session) fn add(&self, count: u64) {
         if count > 0 {
             self.lock().untold += count;
@@ -64,26 +65,27 @@ impl Callback {
         }
     }
 
-    /// It happened `count` times that nobody was told of.
+    /// Sets the number of unreported events to `count`.
     pub(in crate::session) fn recount(&self, count: u64) {
         self.lock().untold = count;
     }
 
-    /// Whether there is anybody to tell.
+    /// Returns whether a function is set.
     pub(in crate::session) fn is_set(&self) -> bool {
         self.lock().function.is_some()
     }
 
-    /// Has `function` told from now on, and at once of what nobody was told, unless it [ended](Self::end).
-    /// The one before is not called any more once this returns, but by the calling thread that is in
-    /// it, which tells `function` when it has left it.
+    /// Replaces the function and reports the unreported events to it at once, unless this callback has
+    /// [ended](Self::end). Once this returns, the previous function is not called any more. The exception is a call
+    /// from within the previous function: it goes on, and the calling thread reports to `function` after it has left
+    /// it.
     pub(in crate::session) fn set(&self, function: Option<NewDataCallback>) {
         let Ok(()) = self.replace(function, Ok::<_, Infallible>);
     }
 
-    /// As [`set`](Self::set), where `recount` says of how often it happened untold what that is now. It
-    /// runs under the lock, at the moment from which `function` is told of the rest. Nobody is told
-    /// any more where it fails.
+    /// Like [`set`](Self::set). `recount` receives the number of unreported events and returns the number that counts
+    /// from now on. It runs under the lock, at the moment from which `function` is responsible for later events. If it
+    /// fails, no function is set.
     pub(in crate::session) fn replace<E>(
         &self,
         function: Option<NewDataCallback>,
@@ -100,21 +102,21 @@ impl Callback {
         Ok(())
     }
 
-    /// Nobody is told any more, whatever is set from now on. What was set is not called any more once
-    /// this returns, but by the calling thread that is in it.
+    /// Removes the function for good: a function that is set later is ignored. Once this returns, the function is not
+    /// called any more. The exception is a call from within the function: that call goes on.
     pub(in crate::session) fn end(&self) {
         self.lock().ended = true;
         drop(self.vacate());
     }
 
-    /// Has nobody told, and waits for the call that is under way on another thread.
+    /// Removes the function, and waits for a call that is under way on another thread.
     fn vacate(&self) -> MutexGuard<'_, CallbackState> {
         let me = thread::current().id();
         let mut state = self.lock();
         loop {
             if let Some(before) = state.function.take() {
                 drop(state);
-                // What it captured may be anything.
+                // Dropped outside the lock: the drop runs code of the application.
                 drop(before);
                 state = self.lock();
             } else if state.running.is_some_and(|running| running != me) {
@@ -146,7 +148,7 @@ impl Callback {
     }
 }
 
-/// A call that is under way, until it is dropped.
+/// Marks a call as under way until it is dropped.
 struct Running<'a>(&'a Callback);
 
 impl Drop for Running<'_> {
@@ -228,7 +230,7 @@ mod tests {
         assert_eq!(told.load(Ordering::SeqCst), 2);
     }
 
-    /// A function that says that it was entered, and returns when it is told to.
+    /// A function that reports that it was entered, and returns when the test says so.
     fn gate() -> (NewDataCallback, mpsc::Receiver<u64>, mpsc::Sender<()>, Arc<AtomicBool>) {
         let (entered, entries) = mpsc::channel();
         let (go, goes) = mpsc::channel();
@@ -275,7 +277,7 @@ mod tests {
                     Ok::<_, Infallible>(untold.min(2))
                 });
             });
-            // Nobody is told from the moment at which it begins to wait.
+            // The function is removed as soon as `replace` begins to wait.
             while callback.is_set() {
                 thread::yield_now();
             }
@@ -304,7 +306,7 @@ mod tests {
                 thread::yield_now();
             }
             callback.add(3);
-            // It waits, too.
+            // `set` waits, too.
             let setting = scope.spawn(|| callback.set(Some(late.clone())));
             go.send(()).unwrap();
             ending.join().unwrap();

@@ -1,4 +1,4 @@
-//! Requests for whose responses tasks wait. Each task receives the response to its own request.
+//! Requests of tasks that wait for the responses. Each task receives the response to its own request.
 
 use std::{
     collections::{HashMap, HashSet},
@@ -15,7 +15,7 @@ use axon_shm::{
 
 use crate::{ids::Gid, session::core::SessionCore};
 
-/// Responses that are looked at before others have their turn.
+/// Maximum number of responses that one `collect` handles before the control thread goes on with other work.
 const BATCH: usize = 256;
 
 /// The calls of a client that are under way.
@@ -27,42 +27,42 @@ pub(in crate::session) struct Calls {
 }
 
 struct Call {
-    /// To which its request went.
+    /// The servers that received the request.
     servers: Vec<Gid>,
     waker: Option<Waker>,
     outcome: Option<Result<Sample, ServerGone>>,
 }
 
-/// All servers of a call are gone, and none answered.
+/// The error of a call whose servers are all gone without a response.
 pub(in crate::session) struct ServerGone;
 
 impl Calls {
-    /// The ring of the client's requests.
+    /// Sets the ring of the client's requests.
     pub(in crate::session) fn set_ring(&self, ring: Arc<Writer>) {
-        // There is one.
+        // A client has one ring.
         let _ = self.ring.set(ring);
     }
 
-    /// Whether a server that is not read may still answer: a daemon carries its requests, or carried them, and the ring
-    /// keeps them for the next daemon.
+    /// Returns how a daemon carries, or carried, the requests to a server that is not read. Such a server may still
+    /// answer: the ring keeps the requests for the next daemon.
     fn carried(&self, server: &Gid) -> Option<CarrierState> {
         self.ring.get()?.carried(server)
     }
 
-    /// Sends a request, and has its response kept. Its number.
+    /// Sends a request, and keeps its response when it comes. Returns the number of the request.
     pub(in crate::session) fn begin<E>(
         &self,
         servers: Vec<Gid>,
         send: impl FnOnce() -> Result<u64, E>,
     ) -> Result<u64, E> {
-        // A response that comes before its number is in the table would be nobody's.
+        // The lock is held while the request is sent: a response whose number is not in the table would be dropped.
         let mut calls = self.lock();
         let number = send()?;
         calls.insert(number, Call { servers, waker: None, outcome: None });
         Ok(number)
     }
 
-    /// What became of a call; else `waker` is woken when something does.
+    /// Takes the outcome of a call, if there is one. Otherwise `waker` is woken when there is.
     pub(in crate::session) fn outcome(
         &self,
         number: u64,
@@ -78,14 +78,15 @@ impl Calls {
         outcome
     }
 
-    /// Nobody waits for a call any more.
+    /// Removes a call whose task does not wait any more.
     pub(in crate::session) fn end(&self, number: u64) {
         let call = self.lock().remove(&number);
         drop(call);
     }
 
-    /// Hands out the responses that came, and drops those that nobody waits for. Whether a call still waits. `take`
-    /// takes the next response, with the number of its request; `keep_unread` leaves those of the servers that are not read.
+    /// Hands the responses to their calls, and drops responses that no call waits for. Returns whether a call still
+    /// waits. `take` takes the next response, with the number of its request. `keep_unread` reduces a set of servers to
+    /// the servers that are not read.
     pub(super) fn collect(
         &self,
         core: &SessionCore,
@@ -127,8 +128,8 @@ impl Calls {
         waiting > 0
     }
 
-    /// Once all responses that came are taken: those of whose servers none is left, and nothing more can come, get no
-    /// response any more. How many these are, and when to look again.
+    /// Fails the calls whose servers are all gone and can send nothing more. The caller has taken all responses before.
+    /// Returns the number of failed calls, and when to look again.
     fn fail_those_without_server(
         &self,
         calls: &mut HashMap<u64, Call>,
@@ -138,7 +139,7 @@ impl Calls {
         let mut gone: HashSet<Gid> =
             calls.values().flat_map(|call| &call.servers).copied().collect();
         keep_unread(&mut gone);
-        // After that: one that comes back is attached before it is read.
+        // Called after `keep_unread`: a server that comes back is attached before it is read.
         let mut again = None::<Instant>;
         let lost: HashSet<Gid> = gone
             .into_iter()
@@ -162,7 +163,7 @@ impl Calls {
         (failed, again)
     }
 
-    /// How many calls are under way.
+    /// Returns the number of calls under way.
     #[cfg(test)]
     pub(in crate::session) fn count(&self) -> usize {
         self.lock().len()

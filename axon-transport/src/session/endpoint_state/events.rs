@@ -1,4 +1,4 @@
-//! The events of an endpoint: their statuses, and the callbacks that are told of them.
+//! The events of an endpoint: their statuses, and the callbacks that receive them.
 
 use std::{
     cmp::Ordering,
@@ -16,7 +16,7 @@ use crate::{
     qos::{Liveliness, Qos},
 };
 
-/// Who is matched that was not, and who is not that was.
+/// Endpoints that became matched, and endpoints that are not matched any more.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(in crate::session) struct Changes {
     pub(in crate::session) added: Vec<Gid>,
@@ -29,7 +29,7 @@ impl Changes {
     }
 }
 
-/// The same, with the leases of those that are new.
+/// Like [`Changes`], with the lease of each new endpoint.
 #[derive(Default)]
 struct Moved {
     added: Vec<(Gid, Option<u64>)>,
@@ -37,7 +37,7 @@ struct Moved {
 }
 
 impl Moved {
-    /// What makes `after` of `before`, both in order.
+    /// Returns the difference between `before` and `after`, which are both sorted.
     fn between(before: &[Gid], after: &[(Gid, Option<u64>)]) -> Self {
         let mut moved = Self::default();
         let (mut before, mut after) = (before.iter().peekable(), after.iter().peekable());
@@ -65,20 +65,20 @@ pub(in crate::session) struct EndpointEvents {
 
 struct EventsInner {
     statuses: Statuses,
-    /// Of all handles of events that have one.
+    /// The callbacks of all event handles that have one.
     callbacks: Vec<(EventKind, Arc<Callback>)>,
-    /// In order.
+    /// The matched endpoints, sorted.
     matched: Vec<Gid>,
-    /// Those of the topic that do not go with this one, and have been counted.
+    /// Endpoints of the topic that are incompatible with this one and have been counted.
     incompatible: BTreeSet<Gid>,
-    /// A subscription's publishers.
+    /// The liveness of a subscription's publishers.
     liveness: Liveness,
-    /// A publisher's own lease, where it may run out.
+    /// A publisher's own lease, if it can run out.
     lease: Option<Lease>,
     deadline: Option<Deadline>,
 }
 
-/// The shortest time between two looks at deadlines and leases.
+/// Minimum time between two checks of deadlines and leases, in nanoseconds.
 const SHORTEST: u64 = 1_000_000;
 
 impl EndpointEvents {
@@ -115,7 +115,7 @@ impl EndpointEvents {
         inner.statuses.take(kind).expect("checked when the event was made")
     }
 
-    /// Has a callback told of an event from now on, and of what happened since its status was taken.
+    /// Registers a callback for an event. It also receives the number of occurrences since the status was taken.
     pub(in crate::session) fn tell(&self, kind: EventKind, callback: &Arc<Callback>) {
         let mut inner = self.lock();
         if !inner.callbacks_of(kind).any(|known| Arc::ptr_eq(known, callback)) {
@@ -136,14 +136,14 @@ impl EndpointEvents {
         self.lock().matched.clone()
     }
 
-    /// Those that a publisher sends to are these now. They are looked up under the lock: of two
-    /// threads that do so, the later one knows the later state.
+    /// Updates the readers that a publisher sends to. `now` runs under the lock: of two threads that call this, the
+    /// later one sees the later state.
     pub(in crate::session) fn readers(&self, now: impl FnOnce() -> Vec<Gid>) -> Changes {
         self.rematch(|| now().into_iter().map(|gid| (gid, None)).collect(), |_, _| {})
     }
 
-    /// As [`readers`](Self::readers), those that a subscription receives from, with the leases that
-    /// they offer.
+    /// Like [`readers`](Self::readers), for the writers that a subscription receives from, each with the lease that it
+    /// offers.
     pub(in crate::session) fn writers(
         &self,
         now: impl FnOnce() -> Vec<(Gid, Option<u64>)>,
@@ -215,7 +215,7 @@ impl EndpointEvents {
         news
     }
 
-    /// An endpoint that was incompatible is gone.
+    /// Forgets an incompatible endpoint that is gone.
     pub(in crate::session) fn forget(&self, other: &Gid) {
         self.lock().incompatible.remove(other);
     }
@@ -228,7 +228,8 @@ impl EndpointEvents {
         }
     }
 
-    /// What has passed for a publisher until `now`. When to look again.
+    /// Counts a publisher's missed deadlines and its lost liveliness until `now`. Returns when to look again, and
+    /// whether an event occurred.
     pub(in crate::session) fn offered(
         &self,
         qos: &Qos,
@@ -244,7 +245,7 @@ impl EndpointEvents {
                 if lease.ran_out(now) {
                     inner.statuses.liveliness_lost();
                 }
-                // Where it has run out, one looks whether it is asserted again.
+                // After the lease has run out, the check repeats to see whether it is asserted again.
                 due = earlier(due, lease.due().or(third(qos.lease.map(nanoseconds), now)));
             }
             due = earlier(due, inner.deadlines(qos, times.sampled, now));
@@ -252,8 +253,8 @@ impl EndpointEvents {
         (due.map(|due| due.max(now + SHORTEST)), news)
     }
 
-    /// What has passed for a subscription until `now`, where its publishers say this of themselves.
-    /// When to look again.
+    /// Counts a subscription's missed deadlines and the liveliness of its publishers until `now`, by the times that the
+    /// publishers report. Returns when to look again, and whether an event occurred.
     pub(in crate::session) fn requested(
         &self,
         qos: &Qos,
@@ -277,13 +278,13 @@ impl EndpointEvents {
                 inner.statuses.liveliness_changed(alive, not_alive);
             }
             due = inner.liveness.due();
-            // One that is not alive may be so again.
+            // A publisher that is not alive may become alive again.
             let leases = writers.iter().filter_map(|(_, times)| times.lease).min();
             if inner.liveness.any_dead() {
                 due = earlier(due, third(leases, now));
             }
             if writers.is_empty() {
-                // It runs from the first sample of the next one on.
+                // The deadline starts again with the first sample of the next publisher.
                 inner.deadline = qos.deadline.map(nanoseconds).map(Deadline::new);
             } else {
                 let sampled = writers.iter().filter_map(|(_, times)| times.sampled).max();
@@ -293,7 +294,7 @@ impl EndpointEvents {
         (due.map(|due| due.max(now + SHORTEST)), news)
     }
 
-    /// Changes statuses and tells those who are to be told. Whether anything occurred.
+    /// Changes statuses, and calls the callbacks of the events that occurred. Returns whether an event occurred.
     fn change(&self, change: impl FnOnce(&mut EventsInner)) -> bool {
         let mut told = Vec::new();
         let mut news = false;
@@ -325,8 +326,7 @@ impl EventsInner {
         self.callbacks.iter().filter(move |(of, _)| *of == kind).map(|(_, callback)| callback)
     }
 
-    /// Counts the deadlines that have passed, where the newest sample is of `sampled`. When to look
-    /// again.
+    /// Counts the missed deadlines; the newest sample was published at `sampled`. Returns when to look again.
     fn deadlines(&mut self, qos: &Qos, sampled: Option<u64>, now: u64) -> Option<u64> {
         let deadline = self.deadline.as_mut()?;
         if let Some(sampled) = sampled {
@@ -336,7 +336,7 @@ impl EventsInner {
         if missed > 0 {
             self.statuses.deadlines_missed(missed);
         }
-        // The first sample, from which it runs, may come at any time.
+        // The deadline runs from the first sample, which may come at any time.
         let after = |period| now.saturating_add(nanoseconds(period));
         deadline.due().or(qos.deadline.map(after))
     }

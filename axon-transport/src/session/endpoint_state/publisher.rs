@@ -32,34 +32,34 @@ pub(in crate::session) struct PublisherInner {
     pub(in crate::session) role: EndpointRole,
     pub(in crate::session) rings: WriterRings,
     pub(in crate::session) events: EndpointEvents,
-    /// A publication says that the publisher is alive, and nothing else but the program does.
+    /// True if a publication asserts the liveliness, and otherwise only the application does.
     pub(in crate::session) asserts: bool,
-    /// Its samples come from a process of this host that shares no memory.
+    /// True if the samples come from a process of this host that shares no memory.
     pub(in crate::session) relayed: bool,
-    /// Readers that were granted; a relay as itself.
+    /// Readers that have a grant; a relay is listed under its own GID.
     attached: Mutex<BTreeSet<Gid>>,
     sending: Mutex<Sending>,
 }
 
-/// How far readers were sent what they need to find a publisher's samples, by the session's count of
+/// Progress of sending readers the memory that they need to find a publisher's samples, by the session's count of
 /// [handovers](crate::session::core::MemoryChanges::handovers).
 #[derive(Default)]
 struct Sending {
-    /// What the daemon was asked, and has not answered.
+    /// The fence that the daemon has not answered yet.
     asked: Option<PendingFence>,
-    /// What it said was sent.
+    /// The count of handovers in the daemon's last answer.
     sent: Option<u64>,
-    /// The number of the last sample that can be found by that.
+    /// The number of the last sample that readers can find with the memory sent until then.
     number: u64,
 }
 
-/// A question to the daemon.
+/// A fence that was sent to the daemon.
 #[derive(Clone, Copy)]
 struct PendingFence {
-    /// Which connection to a daemon it was said on: another one does not answer it.
+    /// The connection to a daemon that carried the fence: another connection does not answer it.
     connection: u64,
     handovers: u64,
-    /// The last sample that had been handed over as it was asked.
+    /// The last sample that had been handed over when the fence was sent.
     number: u64,
 }
 
@@ -83,7 +83,8 @@ impl PublisherInner {
         self
     }
 
-    /// Serves a reader on its terms: what it is granted, the number in front of that, and in which ring.
+    /// Attaches a reader on its terms. Returns the grant, the number in front of the granted samples, and the location
+    /// of the ring.
     pub(in crate::session) fn attach(
         &self,
         reader: ReaderInfo,
@@ -95,8 +96,8 @@ impl PublisherInner {
         Ok(granted)
     }
 
-    /// Whether it has samples for a reader that has not taken up its grant and must not lose one: a daemon that was
-    /// killed may not have passed the grant on.
+    /// Returns whether it has samples for a reader that has not taken up its grant and must not lose one: a daemon that
+    /// was killed may not have passed the grant on.
     pub(in crate::session) fn expects_readers(&self) -> bool {
         let WriterRings::Shared(writer) = &self.rings else { return false };
         self.endpoint.kind == EndpointKind::Publisher
@@ -105,7 +106,7 @@ impl PublisherInner {
             && writer.expects_readers()
     }
 
-    /// The readers of other sessions that have not taken up their grant, and how many samples there are for each.
+    /// Returns the readers of other sessions that have not taken up their grant, and the number of samples for each.
     pub(in crate::session) fn unmet(&self) -> Vec<(Gid, u64)> {
         let WriterRings::Shared(writer) = &self.rings else { return Vec::new() };
         let counted =
@@ -113,7 +114,7 @@ impl PublisherInner {
         if counted { writer.unmet() } else { Vec::new() }
     }
 
-    /// What it granted to readers of other sessions that have not taken it up, said once more.
+    /// Returns the grants for readers of other sessions that have not taken them up, to send them once more.
     pub(in crate::session) fn untaken_grants(&self, session: SessionId) -> Vec<Granted> {
         let counted = self.endpoint.kind == EndpointKind::Publisher
             && self.role == EndpointRole::Application
@@ -134,13 +135,13 @@ impl PublisherInner {
         writer.untaken_grants().into_iter().map(granted).collect()
     }
 
-    /// Whether it was attached.
+    /// Detaches a reader. Returns whether it was attached.
     pub(in crate::session) fn detach(&self, reader: Gid) -> bool {
         self.attached().remove(&reader);
         self.rings.detach(reader)
     }
 
-    /// Whether any reader's process was dead.
+    /// Detaches the readers whose process is dead. Returns whether there were any.
     pub(in crate::session) fn drop_dead(&self) -> bool {
         let dead = self.rings.drop_dead();
         let mut attached = self.attached();
@@ -150,19 +151,19 @@ impl PublisherInner {
         !dead.is_empty()
     }
 
-    /// The number up to which its samples are with those who carry them to other processes and hosts, and
-    /// can be read by all others whatever becomes of this process: these were sent the memory that they
-    /// are in. The session's memory wakes the thread that waits for that.
+    /// Returns the number up to which the samples are safe whatever becomes of this process: the carriers to other
+    /// processes and hosts have them, and all other readers can read them, since they were sent the memory that the
+    /// samples are in. The session's memory wakes the thread that waits for this.
     pub(in crate::session) fn delivered_up_to(&self, core: &SessionCore) -> u64 {
         let WriterRings::Shared(writer) = &self.rings else { return 0 };
         let (began, number) = (core.memory.connections(), writer.delivered_up_to());
-        // In this order: it counts what the readers of those samples have to be sent.
+        // Read after the number of the sample: the count then covers the memory that the readers of those samples need.
         let handovers = core.memory.handovers();
         let mut sending = self.sending();
         if sending.sent == Some(handovers) {
             sending.number = sending.number.max(number);
         } else if sending.asked.is_none_or(|asked| asked.connection != began) {
-            // One at a time: where there is always something more to be sent, each is answered.
+            // One fence at a time: even where there is always more to be sent, each fence is answered.
             sending.asked = Some(PendingFence { connection: began, handovers, number });
             let fence = Fence { writer: self.endpoint.gid, number: handovers };
             core.tell(Outgoing::Fence(fence));
@@ -170,7 +171,8 @@ impl PublisherInner {
         number.min(sending.number)
     }
 
-    /// The daemon says that readers were sent what they needed as this count was reached.
+    /// Records the daemon's answer: readers were sent the memory that they needed when the session's count was
+    /// `handovers`.
     pub(in crate::session) fn was_sent(&self, handovers: u64) {
         let mut sending = self.sending();
         if let Some(asked) = sending.asked.take_if(|asked| asked.handovers == handovers) {
@@ -183,7 +185,7 @@ impl PublisherInner {
         self.sending.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The readers that were granted.
+    /// Returns the readers that have a grant.
     pub(in crate::session) fn granted(&self) -> Vec<Gid> {
         self.attached().iter().copied().collect()
     }
@@ -192,13 +194,13 @@ impl PublisherInner {
         self.attached.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// What became of its matches since it was asked last.
+    /// Updates the matched readers. Returns the changes since the last call.
     pub(in crate::session) fn rematch(&self) -> Changes {
         self.events.readers(|| self.rings.readers())
     }
 
-    /// Counts the deadlines that passed, and asserts or watches the lease. When to look again, and
-    /// whether something happened.
+    /// Counts the missed deadlines, and asserts or watches the lease. Returns when to look again, and whether an event
+    /// occurred.
     pub(in crate::session) fn look_at_time(&self, now: u64) -> (Option<u64>, bool) {
         let qos = &self.endpoint.qos;
         let WriterRings::Shared(writer) = &self.rings else { return (None, false) };
@@ -216,7 +218,7 @@ impl PublisherInner {
         (Some(due.map_or(next, |due| due.min(next))), news)
     }
 
-    /// Notes what was published, where somebody watches the time.
+    /// Records a publication, if a deadline or the liveliness depends on it.
     pub(in crate::session) fn published<T>(
         &self,
         result: Result<T, PublishError>,

@@ -21,29 +21,30 @@ use crate::ids::Gid;
 pub(in crate::session) enum WriterRings {
     /// A publisher's samples, or a client's requests.
     Shared(Arc<Writer>),
-    /// A server's responses, which are nobody's but the client's who asked.
+    /// A server's responses: each client reads only its own ring.
     Each(Arc<RingsByClient>),
 }
 
-/// A server's rings by client. Each is made when its client comes, and goes with it. The ring of a client that is
-/// reached through a daemon stays for a while when that daemon's process ends: the client may not have all responses.
+/// A server's rings by client. Each is created when its client comes, and is removed with it. If a daemon carries the
+/// client and the daemon's process ends, the ring stays for a while: the client may not have all responses.
 pub(in crate::session) struct RingsByClient {
     session: Arc<SessionSegment>,
     options: RingOptions,
     room: Arc<ClientLimit>,
-    /// The memory that they share with rings of other endpoints.
+    /// The memory budget that they share with rings of other endpoints.
     budget: Option<Arc<MemoryBudget>>,
     rings: Mutex<BTreeMap<Gid, (Arc<Writer>, ClientSlot)>>,
 }
 
-/// How many clients the servers of a session have, and may have: each counted once for each of them.
+/// The number of clients that the servers of a session have and may have. A client counts once for each server that it
+/// uses.
 #[derive(Debug)]
 pub(in crate::session) struct ClientLimit {
     most: usize,
     taken: AtomicUsize,
 }
 
-/// Of one client of one server.
+/// The slot of one client of one server in a [`ClientLimit`].
 struct ClientSlot(Arc<ClientLimit>);
 
 impl ClientLimit {
@@ -75,7 +76,7 @@ impl WriterRings {
         }
     }
 
-    /// Serves a reader: what it is granted, the number in front of that, and in which ring.
+    /// Attaches a reader. Returns the grant, the number in front of the granted samples, and the location of the ring.
     pub(in crate::session) fn attach(
         &self,
         reader: ReaderInfo,
@@ -89,7 +90,7 @@ impl WriterRings {
         Ok((grant, after, writer.location()))
     }
 
-    /// Whether it is one of them that is there.
+    /// Returns whether one of the rings is at this location.
     pub(in crate::session) fn has(&self, at: Location) -> bool {
         match self {
             Self::Shared(writer) => writer.location() == at,
@@ -97,7 +98,7 @@ impl WriterRings {
         }
     }
 
-    /// Whether it was attached.
+    /// Detaches a reader. Returns whether it was attached.
     pub(in crate::session) fn detach(&self, reader: Gid) -> bool {
         match self {
             Self::Shared(writer) => writer.detach(reader),
@@ -113,14 +114,14 @@ impl WriterRings {
         }
     }
 
-    /// A relay gave up so many samples.
+    /// Counts samples that a relay gave up.
     pub(in crate::session) fn give_up(&self, reader: Gid, samples: u64) {
         if let Self::Shared(writer) = self {
             writer.give_up(reader, samples);
         }
     }
 
-    /// Forgets the readers whose process has ended, and names them.
+    /// Forgets the readers whose process has ended, and returns them.
     pub(in crate::session) fn drop_dead(&self) -> Vec<Gid> {
         match self {
             Self::Shared(writer) => writer.drop_dead(),
@@ -136,7 +137,7 @@ impl WriterRings {
         }
     }
 
-    /// Who is served; a relay shows as those that it stands for.
+    /// Returns the attached readers; a relay counts as the readers that it stands for.
     pub(in crate::session) fn readers(&self) -> Vec<Gid> {
         match self {
             Self::Shared(writer) => writer.readers(),
@@ -148,7 +149,7 @@ impl WriterRings {
         }
     }
 
-    /// Looks after the memory of large samples; whether there is more to do later.
+    /// Reclaims idle memory of large samples. Returns whether there is more to do later.
     pub(in crate::session) fn reclaim_idle(&self, now: Instant) -> bool {
         match self {
             Self::Shared(writer) => writer.reclaim_idle(now),
@@ -160,7 +161,8 @@ impl WriterRings {
         }
     }
 
-    /// Opens memory for large samples before they come. What lacks then, the next publish says.
+    /// Opens memory for large samples before they come. The next publish reports an error, if the memory is still
+    /// missing.
     pub(in crate::session) fn prepare(&self) {
         if let Self::Shared(writer) = self {
             let _ = writer.prepare();
@@ -178,13 +180,13 @@ impl RingsByClient {
         Self { session, options, room, budget, rings: Mutex::default() }
     }
 
-    /// The ring of a client; `None` when it is not, or no more, served.
+    /// Returns the ring of a client; `None` if the client is not, or not any more, served.
     pub(in crate::session) fn ring(&self, client: &Gid) -> Option<Arc<Writer>> {
         self.lock().get(client).map(|(ring, _)| ring.clone())
     }
 
-    /// Drops the rings of clients whose daemon ended and that did not come back by way of the next; whether there
-    /// are some that still may.
+    /// Drops the rings of clients whose daemon ended and that did not come back by way of the next daemon. Returns
+    /// whether clients remain that may still come back.
     fn drop_abandoned(&self) -> bool {
         let mut rings = self.lock();
         let mut absent = false;
@@ -192,7 +194,7 @@ impl RingsByClient {
             if !ring.readers().is_empty() {
                 return true;
             }
-            // What it kept is given up, and the log says so.
+            // Gives up the samples that the ring kept, and logs that.
             ring.drop_dead();
             let kept = ring.has_absent_readers();
             absent |= kept;

@@ -1,4 +1,4 @@
-//! A side of an endpoint, for those who treat both alike.
+//! A side of an endpoint, for code that treats both sides alike.
 
 use std::sync::Arc;
 
@@ -9,7 +9,7 @@ use super::{
 };
 use crate::{events::EventKind, graph::Endpoint};
 
-/// Whose event it is.
+/// The side of the endpoint that an event belongs to.
 #[derive(Clone)]
 pub(in crate::session) enum EventSource {
     Publisher(Arc<PublisherInner>),
@@ -31,7 +31,7 @@ impl EventSource {
         }
     }
 
-    /// What became of its matches since it was asked last.
+    /// Updates the matched endpoints. Returns the changes since the last call.
     pub(in crate::session) fn rematch(&self) -> Changes {
         match self {
             Self::Publisher(inner) => inner.rematch(),
@@ -39,7 +39,8 @@ impl EventSource {
         }
     }
 
-    /// Counts what has passed until `now`. When to look again, and whether something happened.
+    /// Counts missed deadlines and changes of liveliness until `now`. Returns when to look again, and whether an event
+    /// occurred.
     pub(in crate::session) fn look_at_time(&self, now: u64) -> (Option<u64>, bool) {
         match self {
             Self::Publisher(inner) => inner.look_at_time(now),
@@ -47,7 +48,7 @@ impl EventSource {
         }
     }
 
-    /// Whether `kind` occurred since its status was taken.
+    /// Returns whether `kind` occurred since its status was taken.
     pub(in crate::session) fn has(&self, kind: EventKind) -> bool {
         if let (Self::Subscription(inner), EventKind::MessageLost) = (self, kind) {
             inner.look_for_losses();
@@ -55,7 +56,8 @@ impl EventSource {
         self.events().unread(kind) > 0
     }
 
-    /// The same for other threads than the one that waits: while a thread is taking, it may.
+    /// Like [`has`](Self::has), for other threads than the waiting one: while a thread is taking samples, this returns
+    /// true.
     pub(in crate::session) fn may_have(&self, kind: EventKind) -> bool {
         let losing = match (self, kind) {
             (Self::Subscription(inner), EventKind::MessageLost) => inner.may_have_losses(),

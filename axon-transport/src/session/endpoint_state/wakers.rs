@@ -6,8 +6,8 @@ use std::{
     task::Waker,
 };
 
-/// The wakers of the tasks that wait at an endpoint. All of them are woken at once: which of several tasks gets a
-/// message is theirs to find out, so none is left asleep when another that was woken is dropped.
+/// The wakers of the tasks that wait at an endpoint. All of them are woken at once, and the tasks find out which of
+/// them gets a message: none stays asleep when another woken task is dropped.
 #[derive(Default)]
 pub(in crate::session) struct Wakers {
     list: Mutex<List>,
@@ -20,8 +20,8 @@ struct List {
 }
 
 impl Wakers {
-    /// Keeps `waker` as that of the task `id`, which is new where it is `None`. Whether the task was not waiting
-    /// before, so that it has to look once more.
+    /// Stores `waker` for the task `id`, which becomes a new one if it is `None`. Returns whether the task was not
+    /// waiting before, so that it has to look once more.
     pub(in crate::session) fn set(&self, id: &mut Option<u64>, waker: &Waker) -> bool {
         // Cloned outside the lock: it is foreign code.
         let waker = waker.clone();
@@ -42,7 +42,7 @@ impl Wakers {
         replaced.is_none()
     }
 
-    /// The task waits no more.
+    /// Removes a task that does not wait any more.
     pub(in crate::session) fn remove(&self, id: u64) {
         let mut list = self.lock();
         let at = list.waiting.iter().position(|(other, _)| *other == id);
@@ -51,7 +51,7 @@ impl Wakers {
         drop(removed);
     }
 
-    /// Wakes all tasks if there is something. Whether some wait in vain.
+    /// Wakes all tasks if `something` returns true. Returns whether tasks still wait because it returned false.
     pub(in crate::session) fn wake_if(&self, something: impl FnOnce() -> bool) -> bool {
         if self.lock().waiting.is_empty() {
             return false;
@@ -139,7 +139,7 @@ mod tests {
         assert!(!wakers.wake_if(|| unreachable!("nobody waits")));
     }
 
-    /// What a runtime does whose last reference to a task is its waker.
+    /// A waker that owns the last reference to its task, as in some runtimes.
     struct Owns(Arc<Wakers>, u64);
 
     impl Wake for Owns {

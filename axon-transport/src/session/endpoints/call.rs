@@ -1,4 +1,4 @@
-//! Calls of services: requests with a future, or a thread, that waits for the response.
+//! Calls of services: requests for which a future, or a thread, waits for the response.
 
 use std::{
     future::poll_fn,
@@ -19,7 +19,7 @@ use crate::session::{
     error::RecvError,
 };
 
-/// Why a call has no response.
+/// The reason why a call has no response.
 ///
 /// ```
 /// # use std::time::Duration;
@@ -46,22 +46,22 @@ pub enum CallError {
     /// All servers that the request was sent to are gone, and none of them answered.
     #[error("the server or the link to it was lost before the response arrived")]
     ServerGone,
-    /// The request could not be sent. [`PublishError::Blocked`] says that a server does not take its requests and
-    /// that there is no room for more: the call does not wait for room.
+    /// The request could not be sent. [`PublishError::Blocked`] means that a server does not take its requests and that
+    /// there is no space for more: the call does not wait for space.
     #[error(transparent)]
     Send(#[from] PublishError),
-    /// The response could not be waited for: it did not come in time, or as [`RecvError`] says.
+    /// The wait for the response failed: it did not come in time, or for another reason of [`RecvError`].
     #[error(transparent)]
     Recv(#[from] RecvError),
     /// The response came, and there is no memory for it.
     #[error("no memory for a response of {len} bytes")]
     NoMemory {
-        /// Its length.
+        /// The length of the response.
         len: usize,
     },
 }
 
-/// A call that is under way, until it is dropped.
+/// A call under way. Dropping it gives the call up.
 struct Calling<'a> {
     inner: &'a SubscriptionInner,
     core: &'a SessionCore,
@@ -76,7 +76,7 @@ impl Calling<'_> {
         }
         let look = || self.inner.calls.outcome(self.number, context.waker());
         let outcome = look().or_else(|| {
-            // The order is that of the head of `messages`.
+            // The order of the steps is explained at the head of `messages`.
             self.core.listening.arm();
             self.inner.collect_responses(self.core);
             look()
@@ -90,7 +90,7 @@ impl Calling<'_> {
 
 impl Drop for Calling<'_> {
     fn drop(&mut self) {
-        // A forked child has none of the parent's locks.
+        // A forked child must not take the parent's locks.
         if !self.core.is_forked() {
             self.inner.calls.end(self.number);
         }
@@ -98,19 +98,19 @@ impl Drop for Calling<'_> {
 }
 
 impl Client {
-    /// Sends a request and waits for its response, without a thread that waits: for a task of any runtime.
+    /// Sends a request and waits for its response without blocking a thread: for a task of any runtime.
     ///
-    /// Any number of calls may be under way at the same time. Of several servers the first response counts. A
-    /// future that is dropped gives its call up: its response is discarded when it comes, by the next call at the
-    /// latest. For a timeout, use the runtime's, or [`call_blocking`](Self::call_blocking): a response that is lost
-    /// with a link to another host is lost without a word if the server stays.
+    /// Any number of calls may be under way at the same time. Of several servers, the first response counts. Dropping
+    /// the future gives up its call: its response is discarded when it comes, by the next call at the latest. For a
+    /// timeout, use the runtime's, or [`call_blocking`](Self::call_blocking): a response that is lost with a link to
+    /// another host is lost without an error if the server stays.
     ///
-    /// While a call waits, responses to what [`send_request`](Self::send_request) sent are discarded, and
-    /// [`take_response`](Self::take_response) may take what a call waits for: a client either calls, or sends
-    /// and takes.
+    /// While a call waits, responses to requests of [`send_request`](Self::send_request) are discarded, and
+    /// [`take_response`](Self::take_response) may take the response of a call: use a client either for calls, or to
+    /// send and take.
     ///
     /// # Errors
-    /// What [`CallError`] lists.
+    /// [`CallError`] lists them.
     pub async fn call(&self, payload: &[u8]) -> Result<Vec<u8>, CallError> {
         let (inner, core) = (&*self.responses, self.session.core());
         if core.is_forked() {
@@ -131,8 +131,8 @@ impl Client {
         Ok(response)
     }
 
-    /// As [`call`](Self::call), for a thread that waits, for at most `timeout`; without end where it is `None`.
-    /// Not for a callback or listener, which runs on the thread that would wake it.
+    /// Like [`call`](Self::call), but blocks the thread for at most `timeout`, or without limit if it is `None`. It
+    /// must not be used in a callback or listener, which runs on the thread that would wake it.
     ///
     /// # Errors
     /// As for [`call`](Self::call), and [`RecvError::TimedOut`].
@@ -145,7 +145,7 @@ impl Client {
     }
 }
 
-/// The output of a future, if it has one in time.
+/// Runs a future on this thread. Returns its output, or `None` if it has none in time.
 fn block_on<F: Future>(future: F, timeout: Option<Duration>) -> Option<F::Output> {
     struct Unpark(Thread);
 

@@ -1,4 +1,4 @@
-//! A client of a service, as its application holds it.
+//! A client of a service: the application's handle.
 
 use std::{fmt, sync::Arc, time::Duration};
 
@@ -59,51 +59,52 @@ impl Client {
         Self { requests, ring, responses, session }
     }
 
-    /// Its GID.
+    /// Returns the client's GID.
     pub fn gid(&self) -> Gid {
         self.requests.endpoint.gid
     }
 
-    /// Itself, as others see it.
+    /// Returns the endpoint that describes the client in the graph.
     pub fn endpoint(&self) -> &Endpoint {
         &self.requests.endpoint
     }
 
-    /// Sends a request to every server that is there, and returns its number. Where there is none,
-    /// nobody will answer: see [`is_available`](Self::is_available).
+    /// Sends a request to every available server, and returns its number. If there is no server, there will be no
+    /// response: see [`is_available`](Self::is_available).
     ///
     /// # Errors
-    /// [`PublishError::Blocked`] after 100 ms when a server does not take its requests and there is
-    /// no room for more; the others say what does not fit.
+    /// [`PublishError::Blocked`] after 100 ms if a server does not take its requests and there is no space for more.
+    /// The other variants name the limit that was exceeded.
     pub fn send_request(&self, payload: &[u8]) -> Result<u64, PublishError> {
         self.ring.publish_next(clock::wall(), payload)
     }
 
-    /// For who speaks for it: a request under the number that it has there, without waiting for room.
+    /// Sends a request for a remote client, under the number that it has there, without waiting for space.
     pub(crate) fn try_forward(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
         self.ring.try_publish(meta, payload).map(drop)
     }
 
-    /// For a relay: the next response of one server.
+    /// Takes the next response of one server, for a relay.
     pub(crate) fn take_response_from(&self, server: &Gid) -> Option<Sample> {
         take_from_one(&self.responses, &self.session, server)
     }
 
-    /// For a relay: the response of this number, and all that it took of this server before, are where they are to go.
+    /// Confirms, for a relay, the delivery of the response of this number, and of all responses that the relay took
+    /// from this server before.
     pub(crate) fn finish_through(&self, server: &Gid, number: u64) {
         if !self.session.is_forked() {
             self.responses.lock().finish_through(server, number);
         }
     }
 
-    /// For a relay: responses that it took and that are not where they are to go are to be taken once more.
+    /// Makes responses available again, for a relay, that it took and whose delivery is not confirmed.
     pub(crate) fn take_back(&self) {
         if !self.session.is_forked() {
             self.responses.lock().take_back(false);
         }
     }
 
-    /// For a relay: how many responses of all servers it has not taken.
+    /// Returns, for a relay, the number of unconfirmed responses of all servers, including untaken ones.
     pub(crate) fn unread(&self) -> u64 {
         if self.session.is_forked() {
             return 0;
@@ -111,8 +112,8 @@ impl Client {
         self.responses.lock().slots().undone().into_values().fold(0, u64::saturating_add)
     }
 
-    /// For a relay: how many responses of all servers found no room, if those that it has not taken are why the next ones
-    /// may not.
+    /// Returns, for a relay, how many responses of all servers found no space, if its unconfirmed responses may be the
+    /// reason.
     pub(crate) fn refused(&self) -> Option<u64> {
         if self.session.is_forked() {
             return None;
@@ -123,7 +124,7 @@ impl Client {
         refused.reduce(u64::saturating_add)
     }
 
-    /// Whether there is a response of this server to be taken.
+    /// Returns whether there is a response of this server to be taken.
     pub(crate) fn has_response_from(&self, server: &Gid) -> bool {
         !self.session.is_forked() && self.responses.lock().slots().has_from(server)
     }
@@ -132,19 +133,19 @@ impl Client {
         await_both(&self.requests, &self.responses, &self.session);
     }
 
-    /// The next response, into `out`, which it replaces. `None` when there is none. What is known of
-    /// it names the server, and the number of the request that it answers.
+    /// Takes the next response into `out`, whose content it replaces. Returns `None` if there is none. The returned
+    /// information names the server, and the number of the request that it answers.
     pub fn take_response(&self, out: &mut Vec<u8>) -> Option<MessageInfo> {
         self.responses.take_bytes(self.session.core(), out)
     }
 
-    /// As [`take_response`](Self::take_response), in place, as
-    /// [`Subscription::take_sample`](crate::Subscription::take_sample).
+    /// Like [`take_response`](Self::take_response), in place, as
+    /// [`Subscription::take_sample`](crate::Subscription::take_sample) does.
     pub fn take_response_sample(&self) -> Option<(MessageInfo, Sample)> {
         self.responses.take_sample(self.session.core())
     }
 
-    /// As [`take_response`](Self::take_response), after waiting for at most `timeout`.
+    /// Like [`take_response`](Self::take_response), after waiting for at most `timeout`.
     ///
     /// # Errors
     /// [`RecvError::TimedOut`], and [`RecvError::Forked`] in a forked child.
@@ -156,33 +157,33 @@ impl Client {
         self.responses.recv(self.session.core(), timeout, || self.take_response(out))
     }
 
-    /// Whether there is a server that a request sent now reaches, and whose response reaches this
-    /// client.
+    /// Returns whether there is a server that a request sent now reaches, and whose response reaches this client.
     pub fn is_available(&self) -> bool {
         !self.servers().is_empty()
     }
 
-    /// Waits until a server [is available](Self::is_available); whether one is.
+    /// Waits until a server [is available](Self::is_available). Returns whether one is.
     pub fn wait_available(&self, timeout: Duration) -> bool {
         self.session.wait_changed(timeout, || self.is_available())
     }
 
-    /// The servers that it reaches and that reach it.
+    /// Returns the servers that it reaches and that reach it.
     pub fn servers(&self) -> Vec<Gid> {
         both(&self.requests, &self.responses, &self.session)
     }
 
-    /// The servers that a relay serves: [`servers`](Self::servers), and ended servers whose responses are still to come.
+    /// Returns the servers that a relay serves: [`servers`](Self::servers), and ended servers whose responses are still
+    /// to come.
     pub(crate) fn attached(&self) -> Vec<Gid> {
         attached(&self.requests, &self.responses, &self.session)
     }
 
-    /// Whether there is a response to be taken.
+    /// Returns whether there is a response to take.
     pub fn has_response(&self) -> bool {
         !self.session.is_forked() && self.responses.has_data()
     }
 
-    /// As [`Subscription::set_on_new_sample`](crate::Subscription::set_on_new_sample), of responses.
+    /// Like [`Subscription::set_on_new_sample`](crate::Subscription::set_on_new_sample), for responses.
     ///
     /// # Errors
     /// As there.
@@ -193,7 +194,7 @@ impl Client {
         set_callback(&self.responses, callback, &self.session)
     }
 
-    /// As [`Subscription::tell_no_more`](crate::Subscription::tell_no_more).
+    /// Like [`Subscription::tell_no_more`](crate::Subscription::tell_no_more).
     pub(crate) fn tell_no_more(&self) {
         if !self.session.is_forked() {
             self.responses.tell_no_more(self.session.core());

@@ -37,7 +37,7 @@ pub struct Event {
     source: EventSource,
     kind: EventKind,
     pub(in crate::session) session: Session,
-    /// Its own, which the endpoint knows from when it is first set.
+    /// The callback of this handle. The endpoint knows it from the first `set_callback` on.
     callback: Arc<Callback>,
 }
 
@@ -52,18 +52,18 @@ impl Event {
         (kind.is_publishers() == publishers).then_some(Self { source, kind, session, callback })
     }
 
-    /// Which it is.
+    /// Returns the kind of the event.
     pub fn kind(&self) -> EventKind {
         self.kind
     }
 
-    /// Whether it occurred since its status was last taken. False in a forked child.
+    /// Returns whether it occurred since its status was last taken. Returns false in a forked child.
     pub fn is_ready(&self) -> bool {
         !self.session.is_forked() && self.source.has(self.kind)
     }
 
-    /// The status; its changes are counted anew from here. In a forked child, one of which nothing
-    /// ever happened.
+    /// Takes the status; its changes are counted anew from here. In a forked child, this returns the status of an event
+    /// that never occurred.
     pub fn take(&self) -> EventStatus {
         if self.session.is_forked() {
             let mut nothing = match self.source {
@@ -75,11 +75,11 @@ impl Event {
         self.source.events().take(self.kind)
     }
 
-    /// Has `callback` told of it from now on, in place of the one that this handle had before, which is
-    /// not called any more once this returns. What happened since the status was last taken, and this
-    /// handle told nobody of, it is told at once, on this thread; the rest on the control thread, or
-    /// where another endpoint of the session comes or goes. It must neither block nor panic, nor hold
-    /// the session. It ends with this handle.
+    /// Sets the callback for this event. The previous callback of this handle is not called any more once this returns.
+    /// The new callback receives at once, on this thread, the number of occurrences since the status was last taken
+    /// that this handle has not reported. Later occurrences are reported on the control thread, or on a thread that
+    /// adds or removes another endpoint of the session. The callback must neither block nor panic, nor hold the
+    /// session. It ends with this handle.
     pub fn set_callback(&self, callback: Option<NewDataCallback>) {
         if !self.session.is_forked() {
             self.source.events().tell(self.kind, &self.callback);
@@ -87,8 +87,8 @@ impl Event {
         }
     }
 
-    /// The callback has returned and is not called any more once this returns, whatever is set from now
-    /// on: for a handle that other threads may still use though it has ended.
+    /// Ends the callback for good. Once this returns, the callback has returned and is not called any more, whatever is
+    /// set later: for a handle that other threads may still use although it has ended.
     pub(crate) fn tell_no_more(&self) {
         if !self.session.is_forked() {
             self.callback.end();
@@ -96,7 +96,7 @@ impl Event {
         }
     }
 
-    /// What a wait set looks at.
+    /// Returns the parts that a wait set checks.
     pub(in crate::session) fn parts(&self) -> (&EventSource, EventKind) {
         (&self.source, self.kind)
     }

@@ -43,7 +43,7 @@ impl Loan<'_> {
     /// Publishes it, stamped with the current time, and returns its sequence number.
     ///
     /// # Errors
-    /// When fewer bytes were written than were asked for, and as for [`Publisher::publish`](super::Publisher::publish).
+    /// When fewer bytes were written than the loan has, and as for [`Publisher::publish`](super::Publisher::publish).
     pub fn publish(self) -> Result<u64, PublishError> {
         self.publisher.published(self.loan.publish_next(clock::wall()))
     }
@@ -79,20 +79,20 @@ impl io::Write for Loan<'_> {
     }
 }
 
-/// A sample that is being written, of which nothing but its start may be published.
+/// A sample that is being written, of which a part from the front may be published.
 pub(crate) struct OwnedLoan {
     pub(super) loan: axon_shm::Loan<'static>,
     pub(super) publisher: Arc<PublisherInner>,
 }
 
 impl OwnedLoan {
-    /// Where it is written. It stays there.
+    /// Returns the address of the sample, which does not move.
     pub(crate) fn as_mut_ptr(&mut self) -> *mut u8 {
         self.loan.as_mut_ptr()
     }
 
-    /// Publishes the first `len` bytes, with a time of the caller's or the current one, and returns
-    /// the sequence number.
+    /// Publishes the first `len` bytes, with the caller's source timestamp in nanoseconds or the current time, and
+    /// returns the sequence number.
     pub(crate) fn publish(
         self,
         len: usize,

@@ -3,7 +3,7 @@
 //! The session's control thread listens on the doorbell for them, as it does for callbacks, and wakes the tasks
 //! whose endpoint has a message. A task does four things before it sleeps, in this order:
 //!
-//! 1. It has the control thread [listen](crate::session::core::Listener).
+//! 1. It makes the control thread [listen](crate::session::core::Listener).
 //! 2. It puts its waker in the endpoint's `Wakers`.
 //! 3. It [arms](crate::session::core::Listening::arm) a new ticket of the doorbell.
 //! 4. It looks for a message once more.
@@ -35,7 +35,7 @@ use crate::session::{
     error::RecvError,
 };
 
-/// Messages that a stream hands out without a pause. Then it lets its task's runtime run others.
+/// Maximum number of messages that a stream returns without a pause. It then lets its runtime run other tasks.
 const IN_A_ROW: u32 = 32;
 
 /// A task that waits at an endpoint.
@@ -43,7 +43,7 @@ struct Receiver<'a> {
     inner: &'a SubscriptionInner,
     core: &'a SessionCore,
     listener: Option<Listener<'a>>,
-    /// Its number among the endpoint's wakers, once it has waited.
+    /// The task's number in the endpoint's wakers, once it has waited.
     id: Option<u64>,
 }
 
@@ -52,7 +52,7 @@ impl<'a> Receiver<'a> {
         Self { inner, core, listener: None, id: None }
     }
 
-    /// What `take` finds, once it finds something.
+    /// Returns what `take` finds, once it finds a message.
     fn poll<T>(
         &mut self,
         context: &Context<'_>,
@@ -63,7 +63,7 @@ impl<'a> Receiver<'a> {
         }
         let mut taken = take();
         if taken.is_none() {
-            // The order is that of the module's head.
+            // The order of the steps is explained at the head of the module.
             if self.listener.is_none() {
                 self.listener = Some(Listener::new(self.core)?);
             }
@@ -86,18 +86,18 @@ impl<'a> Receiver<'a> {
 
 impl Drop for Receiver<'_> {
     fn drop(&mut self) {
-        // A forked child has none of the parent's locks.
+        // A forked child must not take the parent's locks.
         if !self.core.is_forked() {
             self.wait_no_more();
         }
     }
 }
 
-/// The messages of an endpoint as a [`Stream`]: of [`Subscription::stream`] and [`Server::stream`].
+/// The messages of an endpoint as a [`Stream`], from [`Subscription::stream`] or [`Server::stream`].
 ///
-/// It goes on for as long as it is polled, whatever publishers come and go. It ends after an error, which no
-/// later poll could mend. After 32 messages without a pause it has its task polled again, so that others of
-/// the same thread are not kept waiting by a publisher that never rests.
+/// The stream continues for as long as it is polled, even if publishers come and go. It ends after an error: no later
+/// poll could succeed. After 32 messages without a pause it wakes its own task and returns `Pending`, so that a
+/// publisher which never pauses does not keep other tasks of the thread waiting.
 ///
 /// ```
 /// # use axon_transport::{
@@ -134,7 +134,7 @@ impl<'a> Messages<'a> {
 }
 
 impl Messages<'_> {
-    /// The next message; `None` after an error. Like `StreamExt::next`, without a crate that has it.
+    /// Returns the next message; `None` after an error. Like `StreamExt::next`, without a crate that has it.
     pub async fn next(&mut self) -> Option<Result<(MessageInfo, Vec<u8>), RecvError>> {
         poll_fn(|context| Pin::new(&mut *self).poll_next(context)).await
     }
@@ -177,10 +177,10 @@ impl fmt::Debug for Messages<'_> {
 }
 
 impl Subscription {
-    /// As [`recv`](Self::recv), without end and without a thread that waits: for a task of any runtime.
+    /// Like [`recv`](Self::recv), without limit and without blocking a thread: for a task of any runtime.
     ///
-    /// The session's control thread wakes the task. Several tasks may wait at one subscription; each sample goes
-    /// to one of them. A future that is dropped takes no sample with it. For a timeout, use the runtime's.
+    /// The session's control thread wakes the task. Several tasks may wait at one subscription; each sample goes to one
+    /// of them. Dropping the future loses no sample. For a timeout, use the runtime's.
     ///
     /// ```
     /// # use std::{pin::pin, task::{Context, Poll, Waker}};
@@ -216,37 +216,37 @@ impl Subscription {
     /// ```
     ///
     /// # Errors
-    /// [`RecvError::Forked`] in a forked child, and [`RecvError::AlreadyLed`] when an event loop of the program's
-    /// listens already.
+    /// [`RecvError::Forked`] in a forked child, and [`RecvError::AlreadyLed`] if an event loop of the program listens
+    /// already.
     pub async fn recv_async(&self) -> Result<(MessageInfo, Vec<u8>), RecvError> {
         recv(&self.inner, self.session.core()).await
     }
 
-    /// As [`recv_async`](Self::recv_async), in place, as [`take_sample`](Self::take_sample).
+    /// Like [`recv_async`](Self::recv_async), in place, as [`take_sample`](Self::take_sample) does.
     ///
     /// # Errors
-    /// As [`recv_async`](Self::recv_async).
+    /// As for [`recv_async`](Self::recv_async).
     pub async fn recv_sample_async(&self) -> Result<(MessageInfo, Sample), RecvError> {
         let mut receiver = Receiver::new(&self.inner, self.session.core());
         poll_fn(|context| receiver.poll(context, || self.take_sample())).await
     }
 
-    /// The samples one after the other, as [`recv_async`](Self::recv_async) gives them.
+    /// Returns a stream of the samples, each as [`recv_async`](Self::recv_async) returns it.
     pub fn stream(&self) -> Messages<'_> {
         Messages::new(&self.inner, self.session.core())
     }
 }
 
 impl Server {
-    /// The next request, as [`Subscription::recv_async`] gives samples.
+    /// Returns the next request, as [`Subscription::recv_async`] returns samples.
     ///
     /// # Errors
-    /// As there.
+    /// As for [`Subscription::recv_async`].
     pub async fn recv_request_async(&self) -> Result<(MessageInfo, Vec<u8>), RecvError> {
         recv(&self.requests, self.session.core()).await
     }
 
-    /// The requests one after the other, as [`recv_request_async`](Self::recv_request_async) gives them.
+    /// Returns a stream of the requests, each as [`recv_request_async`](Self::recv_request_async) returns it.
     pub fn stream(&self) -> Messages<'_> {
         Messages::new(&self.requests, self.session.core())
     }

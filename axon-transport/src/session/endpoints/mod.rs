@@ -1,4 +1,5 @@
-//! Endpoints, as the application and those who speak for other processes hold them. Each handle keeps its session open.
+//! The handles of endpoints, for the application and for code that represents other processes. Each handle keeps its
+//! session open.
 
 mod call;
 mod client;

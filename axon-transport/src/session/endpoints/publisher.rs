@@ -1,4 +1,4 @@
-//! A publisher, as its application holds it.
+//! A publisher: the application's handle.
 
 use std::{
     fmt,
@@ -23,7 +23,7 @@ use crate::{
     },
 };
 
-/// Sends the samples of a topic. Thread-safe. When it is dropped, readers still take what it left.
+/// Sends the samples of a topic. Thread-safe. After it is dropped, readers still take its remaining samples.
 ///
 /// ```
 /// # use std::time::Duration;
@@ -50,12 +50,12 @@ pub struct Publisher {
 }
 
 impl Publisher {
-    /// Its GID.
+    /// Returns the publisher's GID.
     pub fn gid(&self) -> Gid {
         self.inner.endpoint.gid
     }
 
-    /// Itself, as others see it.
+    /// Returns the endpoint that describes the publisher in the graph.
     pub fn endpoint(&self) -> &Endpoint {
         &self.inner.endpoint
     }
@@ -63,13 +63,13 @@ impl Publisher {
     /// Publishes a sample, stamped with the current time, and returns its sequence number.
     ///
     /// # Errors
-    /// [`PublishError::Blocked`] after 100 ms when a KEEP_ALL reader makes no room; the others say
-    /// what does not fit. A sample that was refused has no sequence number: nobody counts it lost.
+    /// [`PublishError::Blocked`] after 100 ms if a KEEP_ALL reader frees no space. The other variants name the limit
+    /// that was exceeded. A refused sample has no sequence number and does not count as lost.
     pub fn publish(&self, payload: &[u8]) -> Result<u64, PublishError> {
         self.inner.published(self.writer.publish_next(clock::wall(), payload))
     }
 
-    /// As [`publish`](Self::publish), with a source timestamp of the caller's: of 1677 to 2262, in
+    /// Like [`publish`](Self::publish), with the caller's source timestamp, between the years 1677 and 2262, in
     /// nanoseconds.
     ///
     /// # Errors
@@ -83,9 +83,9 @@ impl Publisher {
         self.inner.published(self.writer.publish_next(source_timestamp, payload))
     }
 
-    /// If a sample would be read by nobody, now or later, uses up the next sequence number and
-    /// returns it; `None` when somebody would. Where nobody reads, publishing does the same, but
-    /// a caller that has to serialize first can save the work.
+    /// If no reader would read a sample, now or later, uses up the next sequence number and returns it; otherwise
+    /// returns `None`. Without readers, publishing does the same, but a caller that has to serialize first can save the
+    /// work.
     ///
     /// # Errors
     /// [`PublishError::Forked`].
@@ -94,8 +94,8 @@ impl Publisher {
         if skipped.is_some() { self.inner.published(Ok(skipped)) } else { Ok(None) }
     }
 
-    /// Says that it is alive. Where its liveliness is MANUAL_BY_TOPIC, so does every publication;
-    /// where it is AUTOMATIC, its session says so.
+    /// Asserts the liveliness of the publisher. With MANUAL_BY_TOPIC, every publication does this, too; with AUTOMATIC,
+    /// the session does it.
     ///
     /// # Errors
     /// [`PublishError::Forked`].
@@ -109,11 +109,11 @@ impl Publisher {
         Ok(())
     }
 
-    /// Waits until every sample published so far is acknowledged; whether it is.
+    /// Waits until every sample published so far is acknowledged. Returns whether it is.
     ///
-    /// Between processes of this host that share memory a sample is acknowledged at once, whether or not it
-    /// has been taken. What it says of another host depends on the QoS of the publisher and of each
-    /// subscription there that it matches:
+    /// Between processes of this host that share memory, a sample is acknowledged at once, whether or not it has been
+    /// taken. For another host, the meaning depends on the QoS of the publisher and of each subscription there that it
+    /// matches:
     ///
     /// - Both RELIABLE and KEEP_ALL: the host has the sample in the ring from which its subscriptions take.
     /// - Both RELIABLE, one of them KEEP_LAST: that ring has the newest samples that were published, as many
@@ -121,40 +121,39 @@ impl Publisher {
     ///   acknowledged, too, though newer ones may have replaced them on the way.
     /// - One of them BEST_EFFORT: nothing. The sample was sent or dropped.
     ///
-    /// A host that has no such subscription any more waits for nothing. A peer that runs a version of AXON
-    /// which sends no acknowledgements counts as having a sample when it was handed to the link.
+    /// A host that has no such subscription any more is not waited for. A peer with a version of AXON that sends no
+    /// acknowledgements counts as having a sample when the sample was handed to the link.
     ///
     /// Returns false, once and at once, when samples were [given up](Self::given_up) since the last call:
     /// their link broke, the peer stopped reading, a limit dropped them, or this host's daemon was killed.
     ///
-    /// Where one of two processes of this host shares no memory (`AXON_SHM`), a sample of a RELIABLE and
-    /// KEEP_ALL publisher for a subscription like it is acknowledged when the other process has it. Until
-    /// then it is kept, and goes to the next daemon if this one ends. For other subscriptions it is when
-    /// this host's daemon has taken it over. One that ends waits for that no longer than a second.
+    /// If one of two processes of this host shares no memory (`AXON_SHM`), a sample of a RELIABLE and KEEP_ALL
+    /// publisher for a RELIABLE and KEEP_ALL subscription is acknowledged when the other process has it. Until then it
+    /// is kept, and goes to the next daemon if this one ends. For other subscriptions, it is acknowledged when this
+    /// host's daemon has taken it over. A process that ends waits for that for at most a second.
     pub fn wait_acknowledged(&self, timeout: Duration) -> bool {
         self.session.is_forked() || self.writer.wait_handed_over(timeout)
     }
 
-    /// Samples for other hosts that are not [acknowledged](Self::wait_acknowledged) yet.
+    /// Returns the number of samples for other hosts that are not [acknowledged](Self::wait_acknowledged) yet.
     pub fn unacknowledged(&self) -> u64 {
         self.writer.under_way()
     }
 
-    /// Samples that were never acknowledged, and will not be: for other hosts, or lost in the daemon where
-    /// it carries this session's samples. Some of them may have arrived. Samples that newer ones replaced,
-    /// for a KEEP_LAST or BEST_EFFORT subscription, are not among them.
+    /// Returns the number of samples that were never acknowledged, and will not be: for other hosts, or lost in the
+    /// daemon if it carries this session's samples. Some of them may have arrived. Samples that newer ones replaced,
+    /// for a KEEP_LAST or BEST_EFFORT subscription, do not count.
     pub fn given_up(&self) -> u64 {
         self.writer.given_up()
     }
 
-    /// One of its events; `None` where `kind` is a subscription's.
+    /// Returns one of its events; `None` if `kind` belongs to subscriptions.
     pub fn event(&self, kind: EventKind) -> Option<Event> {
         Event::new(EventSource::Publisher(self.inner.clone()), kind, self.session.clone())
     }
 
-    /// Room for a sample of exactly `len` bytes, to serialize into: in shared memory where it is
-    /// more than 4 KiB, or more than 512 bytes if so many are
-    /// [expected](crate::EndpointSpec::expected_len).
+    /// Reserves space for a sample of exactly `len` bytes, to serialize into: in shared memory if it is more than 4
+    /// KiB, or more than 512 bytes if so many are [expected](crate::EndpointSpec::expected_len).
     ///
     /// # Errors
     /// As for [`publish`](Self::publish).
@@ -162,26 +161,26 @@ impl Publisher {
         Ok(Loan { loan: self.writer.loan(len)?, publisher: &self.inner })
     }
 
-    /// The readers that receive from it; a relay shows as the remote ones it stands for.
+    /// Returns the readers that receive from it; a relay counts as the remote readers that it stands for.
     pub fn matched(&self) -> Vec<Gid> {
         self.writer.readers()
     }
 
-    /// Waits until at least `count` readers receive from it; whether they do.
+    /// Waits until at least `count` readers receive from it. Returns whether they do.
     pub fn wait_matched(&self, count: usize, timeout: Duration) -> bool {
         self.session.wait_changed(timeout, || self.matched().len() >= count)
     }
 }
 
 impl Publisher {
-    /// The number up to which its samples are with those who carry them to other processes and hosts, and
-    /// can be read by all others whatever becomes of this process: these were sent the memory that they
-    /// are in. The session's memory wakes the thread that waits for that.
+    /// Returns the number up to which the samples are safe whatever becomes of this process: the carriers to other
+    /// processes and hosts have them, and all other readers can read them, since they were sent the memory that the
+    /// samples are in. The session's memory wakes the thread that waits for this.
     pub(crate) fn delivered_up_to(&self) -> u64 {
         self.inner.delivered_up_to(self.session.core())
     }
 
-    /// As [`loan`](Self::loan), of `len` bytes at most, for who cannot borrow the publisher. What is
+    /// Like [`loan`](Self::loan), of at most `len` bytes, for a caller that cannot borrow the publisher. The part
     /// behind the first `header` bytes is aligned to 16.
     pub(crate) fn loan_owned(&self, header: usize, len: usize) -> Result<OwnedLoan, PublishError> {
         Ok(OwnedLoan { loan: self.writer.loan_owned(header, len)?, publisher: self.inner.clone() })

@@ -14,29 +14,29 @@ use crate::{
     wire::session::{EndpointRole, SessionMessage, WriterLeaving},
 };
 
-/// What stands for it here. Of a service it reads, too: a client's is given the responses that go to
-/// where the client is, and a server's the requests.
+/// Stand-in for a remote writer, by kind. The stand-ins of a service read, too: a client's stand-in takes the responses
+/// for the client, and a server's stand-in takes the requests.
 pub enum RemoteWriter {
-    /// Of a publisher.
+    /// The stand-in of a publisher.
     Publisher(Publisher),
-    /// Of a service's client.
+    /// The stand-in of a service's client.
     Client(Client),
-    /// Of a service's server.
+    /// The stand-in of a service's server.
     Server(Server),
 }
 
-/// What became of a message that was to be written.
+/// The result of writing a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Written {
-    /// Its readers have it.
+    /// The readers have the message.
     Yes,
     /// The client that it answers is gone.
     Nobody,
 }
 
 impl RemoteWriter {
-    /// A stand-in for `remote`, under its GID, which takes the memory for what it holds of `budget`. For gateways
-    /// alone; a daemon refuses it from anybody else.
+    /// Creates a stand-in for `remote`, under its GID, which takes the memory for its messages from `budget`. Only
+    /// gateways may call this; a daemon refuses it from any other session.
     ///
     /// # Errors
     /// When there is no memory.
@@ -48,8 +48,8 @@ impl RemoteWriter {
         Self::new(session, remote, EndpointRole::StandIn, false, Some(budget))
     }
 
-    /// As [`stand_in`](Self::stand_in). A client says which of the responses that it takes are
-    /// [where they are to go](Self::finish_through): until then its servers keep them.
+    /// Like [`stand_in`](Self::stand_in). A client confirms which of the responses that it takes [are
+    /// delivered](Self::finish_through): until then its servers keep them.
     ///
     /// # Errors
     /// When there is no memory.
@@ -57,8 +57,8 @@ impl RemoteWriter {
         Self::new(session, remote, EndpointRole::StandIn, true, None)
     }
 
-    /// An endpoint of `session` as another process of the session describes it, under its GID there. A client
-    /// [says](Self::finish_through) which responses that process has, and a server which
+    /// Creates an endpoint of `session` as another process of the session describes it, under its GID there. A client
+    /// [confirms](Self::finish_through) the responses that the other process has, and a server the
     /// [requests](Self::finish_requests).
     ///
     /// # Errors
@@ -74,7 +74,7 @@ impl RemoteWriter {
         carries: bool,
         budget: Option<&Arc<MemoryBudget>>,
     ) -> Result<Self, SessionError> {
-        // What it takes is another's, whose depth counts there.
+        // It takes the messages for another endpoint, whose depth applies there.
         let all = Qos::keep_all();
         Ok(match of.kind {
             EndpointKind::Client => {
@@ -89,7 +89,7 @@ impl RemoteWriter {
         })
     }
 
-    /// What it stands for.
+    /// Returns the endpoint that it stands for.
     pub fn endpoint(&self) -> &Endpoint {
         match self {
             Self::Publisher(publisher) => publisher.endpoint(),
@@ -98,8 +98,8 @@ impl RemoteWriter {
         }
     }
 
-    /// Those here whom it reaches and who, where it is of a service, reach it; whether or not they
-    /// have ended but for what they left.
+    /// Returns the local endpoints that it reaches and, for a service, that also reach it. Endpoints that have ended
+    /// and still have messages are included.
     pub fn partners(&self) -> Vec<Gid> {
         match self {
             Self::Publisher(publisher) => publisher.matched(),
@@ -108,8 +108,8 @@ impl RemoteWriter {
         }
     }
 
-    /// Says that it has ended but for what is to be written, or that it has not: nobody counts it
-    /// until then, and those who read it get the rest.
+    /// Announces that the remote writer has ended except for messages still to be written, or that it has not ended. No
+    /// endpoint counts it meanwhile, and its readers get the rest.
     pub fn leave(&self, leaving: bool) {
         let session = match self {
             Self::Publisher(publisher) => &publisher.session,
@@ -120,10 +120,10 @@ impl RemoteWriter {
         session.core().tell(Outgoing::message(SessionMessage::Leaving(leaving)));
     }
 
-    /// Writes a sample, a request, or a response to `client`, without waiting for room.
+    /// Writes a sample, a request, or a response to `client`, without waiting for space.
     ///
     /// # Errors
-    /// [`PublishError::Blocked`] when there is none; the others say what does not fit.
+    /// [`PublishError::Blocked`] if there is no space. The other variants name the limit that was exceeded.
     pub fn try_write(
         &self,
         client: &Gid,
@@ -144,8 +144,8 @@ impl RemoteWriter {
         Ok(if there { Written::Yes } else { Written::Nobody })
     }
 
-    /// As [`try_write`](Self::try_write), but readers of a sample that sleep may sleep on until
-    /// [`announce`](Self::announce): for several that are written together.
+    /// Like [`try_write`](Self::try_write), but sleeping readers of a sample may sleep on until
+    /// [`announce`](Self::announce): for several messages that are written together.
     ///
     /// # Errors
     /// As for [`try_write`](Self::try_write).
@@ -163,15 +163,15 @@ impl RemoteWriter {
         }
     }
 
-    /// Wakes the readers that sleep, for samples that were written [quietly](Self::try_write_quietly).
+    /// Wakes sleeping readers, for samples that were written [quietly](Self::try_write_quietly).
     pub fn announce(&self) {
         if let Self::Publisher(publisher) = self {
             publisher.announce();
         }
     }
 
-    /// The number up to which what it has written is where it is to go, as far as that takes longer than
-    /// writing it.
+    /// Returns the number up to which its written samples are delivered, for a writer whose delivery takes longer than
+    /// the write.
     pub fn delivered_up_to(&self) -> Option<u64> {
         match self {
             Self::Publisher(publisher) => Some(publisher.delivered_up_to()),
@@ -179,7 +179,7 @@ impl RemoteWriter {
         }
     }
 
-    /// How many responses to `client` are written and not where they are to go.
+    /// Returns the number of responses to `client` that are written and not delivered.
     pub fn undelivered(&self, client: &Gid) -> u64 {
         match self {
             Self::Server(server) => server.undelivered(client),
@@ -187,15 +187,15 @@ impl RemoteWriter {
         }
     }
 
-    /// Of a client that carries: the response of this number, and all that it took of `server` before, are where they
-    /// are to go.
+    /// Confirms, for a client that carries, the delivery of the response of this number, and of all responses that it
+    /// took from `server` before.
     pub fn finish_through(&self, server: &Gid, number: u64) {
         if let Self::Client(client) = self {
             client.finish_through(server, number);
         }
     }
 
-    /// Of a server that carries: the requests of `client` up to this number are where they are to go. Until then the
+    /// Confirms, for a server that carries, the delivery of the requests of `client` up to this number. Until then the
     /// client keeps them.
     pub fn finish_requests(&self, client: &Gid, number: u64) {
         if let Self::Server(server) = self {
@@ -203,15 +203,15 @@ impl RemoteWriter {
         }
     }
 
-    /// Of a client that carries: responses that are not [where they are to go](Self::finish_through) are to be taken
-    /// once more.
+    /// Makes responses available again, for a client that carries, whose delivery is [not
+    /// confirmed](Self::finish_through).
     pub(crate) fn take_back(&self) {
         if let Self::Client(client) = self {
             client.take_back();
         }
     }
 
-    /// The number of written samples that do not reach their reader, if the publisher waits for readers. All
+    /// Returns the number of written samples that do not reach their reader, if the publisher waits for readers. All
     /// samples below a number that was [handed over](Self::delivered_up_to) before are counted.
     pub fn given_up(&self) -> Option<u64> {
         match self {
@@ -220,7 +220,7 @@ impl RemoteWriter {
         }
     }
 
-    /// The next request or response of `writer`, in place.
+    /// Takes the next request or response of `writer`, in place.
     pub fn take_from(&self, writer: &Gid) -> Option<Sample> {
         match self {
             Self::Publisher(_) => None,
@@ -229,7 +229,7 @@ impl RemoteWriter {
         }
     }
 
-    /// Whether there is a request or response of `writer` to be taken.
+    /// Returns whether there is a request or response of `writer` to take.
     pub fn has_from(&self, writer: &Gid) -> bool {
         match self {
             Self::Publisher(_) => false,
@@ -238,7 +238,8 @@ impl RemoteWriter {
         }
     }
 
-    /// Of a server: how many requests of `client` it has not taken. Of a client, which `client` names: how many responses.
+    /// Returns, for a server, the number of unconfirmed requests of `client`, including untaken ones. For a client,
+    /// which `client` names, returns the number of unconfirmed responses.
     pub fn unread_of(&self, client: &Gid) -> u64 {
         match self {
             Self::Server(server) => server.unread_of(client),
@@ -247,8 +248,8 @@ impl RemoteWriter {
         }
     }
 
-    /// Of a server: how many requests of `client` found no room, if one that it has not taken is why the next one may not.
-    /// Of a client, which `client` names: the same of responses.
+    /// Returns, for a server, how many requests of `client` found no space, if an unconfirmed request may be the
+    /// reason. For a client, which `client` names, returns the same of responses.
     pub fn refused_of(&self, client: &Gid) -> Option<u64> {
         match self {
             Self::Server(server) => server.refused_of(client),
@@ -257,10 +258,10 @@ impl RemoteWriter {
         }
     }
 
-    /// Asserts its liveliness: the process that speaks for the writer says that it is alive.
+    /// Asserts its liveliness, because the process that represents the writer reports that it is alive.
     pub fn assert_alive(&self) {
         if let Self::Publisher(publisher) = self {
-            // Only a forked child is refused.
+            // Fails only in a forked child.
             let _ = publisher.assert_liveliness();
         }
     }

@@ -1,4 +1,4 @@
-//! A server of a service, as its application holds it.
+//! A server of a service: the application's handle.
 
 use std::{fmt, sync::Arc, time::Duration};
 
@@ -18,7 +18,7 @@ use crate::{
     },
 };
 
-/// How long a response waits for a client whose request came before it could be answered.
+/// Maximum time that a response waits for a client whose request came before the client could be answered.
 const CLIENT_MATCH_TIMEOUT: Duration = Duration::from_millis(100);
 
 /// Answers requests. Thread-safe.
@@ -60,29 +60,29 @@ impl Server {
         Self { responses, rings, requests, session }
     }
 
-    /// Its GID.
+    /// Returns the server's GID.
     pub fn gid(&self) -> Gid {
         self.responses.endpoint.gid
     }
 
-    /// Itself, as others see it.
+    /// Returns the endpoint that describes the server in the graph.
     pub fn endpoint(&self) -> &Endpoint {
         &self.responses.endpoint
     }
 
-    /// The next request, into `out`, which it replaces. `None` when there is none. What is known of
-    /// it names the client, and the number that the response must carry.
+    /// Takes the next request into `out`, whose content it replaces. Returns `None` if there is none. The returned
+    /// information names the client, and the number that the response must carry.
     pub fn take_request(&self, out: &mut Vec<u8>) -> Option<MessageInfo> {
         self.requests.take_bytes(self.session.core(), out)
     }
 
-    /// As [`take_request`](Self::take_request), in place, as
-    /// [`Subscription::take_sample`](crate::Subscription::take_sample).
+    /// Like [`take_request`](Self::take_request), in place, as
+    /// [`Subscription::take_sample`](crate::Subscription::take_sample) does.
     pub fn take_request_sample(&self) -> Option<(MessageInfo, Sample)> {
         self.requests.take_sample(self.session.core())
     }
 
-    /// As [`take_request`](Self::take_request), after waiting for at most `timeout`.
+    /// Like [`take_request`](Self::take_request), after waiting for at most `timeout`.
     ///
     /// # Errors
     /// [`RecvError::TimedOut`], and [`RecvError::Forked`] in a forked child.
@@ -94,11 +94,11 @@ impl Server {
         self.requests.recv(self.session.core(), timeout, || self.take_request(out))
     }
 
-    /// Answers request `sequence` of `client`. A client that is gone is no error.
+    /// Sends the response to request `sequence` of `client`. A client that is gone is no error.
     ///
     /// # Errors
-    /// [`PublishError::Blocked`] after 100 ms when the client does not take its responses and there
-    /// is no room for more; the others say what does not fit.
+    /// [`PublishError::Blocked`] after 100 ms if the client does not take its responses and there is no space for more.
+    /// The other variants name the limit that was exceeded.
     pub fn send_response(
         &self,
         client: Gid,
@@ -109,7 +109,7 @@ impl Server {
             return Err(PublishError::Forked);
         }
         let ring = || self.rings.ring(&client);
-        // Its request may have come before it could be answered.
+        // A request may come before its client can be answered.
         let settled = || ring().is_some() || !self.requests.lock().writers().contains(&client);
         if !settled() {
             self.session.wait_changed(CLIENT_MATCH_TIMEOUT, settled);
@@ -119,8 +119,8 @@ impl Server {
         ring.publish(meta, payload).map(drop)
     }
 
-    /// For who speaks for it: gives `client` a response without waiting for room. `false` when there is no
-    /// such client any more.
+    /// Sends a response to `client` for a remote server, without waiting for space. Returns false if there is no such
+    /// client any more.
     pub(crate) fn try_respond(
         &self,
         client: &Gid,
@@ -131,30 +131,30 @@ impl Server {
         ring.try_publish(meta, payload).map(|_| true)
     }
 
-    /// For a relay: how many responses to this client are in its ring and are not where they are to go.
+    /// Returns, for a relay, the number of responses to this client that are in its ring and not delivered.
     pub(crate) fn undelivered(&self, client: &Gid) -> u64 {
         self.rings.ring(client).map_or(0, |ring| ring.under_way())
     }
 
-    /// For a relay: the next request of one client.
+    /// Takes the next request of one client, for a relay.
     pub(crate) fn take_request_from(&self, client: &Gid) -> Option<Sample> {
         take_from_one(&self.requests, &self.session, client)
     }
 
-    /// For a relay: requests of this client up to this number are where they are to go.
+    /// Confirms, for a relay, the delivery of the requests of this client up to this number.
     pub(crate) fn finish_requests(&self, client: &Gid, number: u64) {
         if !self.session.is_forked() {
             self.requests.lock().finish_of(client, number);
         }
     }
 
-    /// For a relay: how many requests of this client it has not taken.
+    /// Returns, for a relay, the number of unconfirmed requests of this client, including untaken ones.
     pub(crate) fn unread_of(&self, client: &Gid) -> u64 {
         if self.session.is_forked() { 0 } else { self.requests.lock().slots().undone_of(client) }
     }
 
-    /// For a relay: how many requests of this client found no room, if one that it has not taken is why the next one may
-    /// not.
+    /// Returns, for a relay, how many requests of this client found no space, if an unconfirmed request may be the
+    /// reason.
     pub(crate) fn refused_of(&self, client: &Gid) -> Option<u64> {
         if self.session.is_forked() {
             return None;
@@ -162,7 +162,7 @@ impl Server {
         self.requests.lock().slots().refused_of(client)
     }
 
-    /// Whether there is a request of this client to be taken.
+    /// Returns whether there is a request of this client to take.
     pub(crate) fn has_request_from(&self, client: &Gid) -> bool {
         !self.session.is_forked() && self.requests.lock().slots().has_from(client)
     }
@@ -171,22 +171,23 @@ impl Server {
         await_both(&self.responses, &self.requests, &self.session);
     }
 
-    /// The clients that reach it and that it reaches.
+    /// Returns the clients that reach it and that it reaches.
     pub fn clients(&self) -> Vec<Gid> {
         both(&self.responses, &self.requests, &self.session)
     }
 
-    /// The clients that a relay serves: [`clients`](Self::clients), and ended clients whose requests are still to come.
+    /// Returns the clients that a relay serves: [`clients`](Self::clients), and ended clients whose requests are still
+    /// to come.
     pub(crate) fn attached(&self) -> Vec<Gid> {
         attached(&self.responses, &self.requests, &self.session)
     }
 
-    /// Whether there is a request to be taken.
+    /// Returns whether there is a request to take.
     pub fn has_request(&self) -> bool {
         !self.session.is_forked() && self.requests.has_data()
     }
 
-    /// As [`Subscription::set_on_new_sample`](crate::Subscription::set_on_new_sample), of requests.
+    /// Like [`Subscription::set_on_new_sample`](crate::Subscription::set_on_new_sample), for requests.
     ///
     /// # Errors
     /// As there.
@@ -197,7 +198,7 @@ impl Server {
         set_callback(&self.requests, callback, &self.session)
     }
 
-    /// As [`Subscription::tell_no_more`](crate::Subscription::tell_no_more).
+    /// Like [`Subscription::tell_no_more`](crate::Subscription::tell_no_more).
     pub(crate) fn tell_no_more(&self) {
         if !self.session.is_forked() {
             self.requests.tell_no_more(self.session.core());

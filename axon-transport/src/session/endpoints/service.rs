@@ -1,5 +1,5 @@
-//! Services: requests that clients send to all servers, and responses that each server sends only to the client that
-//! asked.
+//! Services: requests that clients send to all servers, and responses that each server sends only to the requesting
+//! client.
 //!
 //! A client has one ring, which its servers read; a server has a ring for each of its clients. A KEEP_ALL reader
 //! skips no untaken message. A KEEP_LAST reader keeps the newest untaken messages of each client or server, up to
@@ -16,7 +16,7 @@ use crate::{
     },
 };
 
-/// The next message of one writer, in place.
+/// Takes the next message of one writer, in place.
 pub(super) fn take_from_one(
     inner: &SubscriptionInner,
     session: &Session,
@@ -35,7 +35,7 @@ pub(super) fn await_both(writes: &PublisherInner, reads: &SubscriptionInner, ses
     });
 }
 
-/// Endpoints that are attached in both directions.
+/// Returns the endpoints that are attached in both directions.
 pub(super) fn both(
     writes: &PublisherInner,
     reads: &SubscriptionInner,
@@ -49,7 +49,7 @@ pub(super) fn both(
     gids
 }
 
-/// Attached endpoints, including ended ones with pending data.
+/// Returns the attached endpoints, including ended ones with pending data.
 pub(super) fn attached(
     writes: &PublisherInner,
     reads: &SubscriptionInner,
@@ -63,7 +63,7 @@ pub(super) fn attached(
     gids
 }
 
-/// Has a callback told of new messages.
+/// Sets the callback for new messages.
 pub(super) fn set_callback(
     inner: &SubscriptionInner,
     callback: Option<NewDataCallback>,

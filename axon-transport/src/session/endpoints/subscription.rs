@@ -1,4 +1,4 @@
-//! A subscription, as its application holds it.
+//! A subscription: the application's handle.
 
 use std::{fmt, sync::Arc, time::Duration};
 
@@ -44,36 +44,35 @@ pub struct Subscription {
 }
 
 impl Subscription {
-    /// Its GID.
+    /// Returns the subscription's GID.
     pub fn gid(&self) -> Gid {
         self.inner.endpoint.gid
     }
 
-    /// Itself, as others see it.
+    /// Returns the endpoint that describes the subscription in the graph.
     pub fn endpoint(&self) -> &Endpoint {
         &self.inner.endpoint
     }
 
-    /// The oldest sample by source timestamp among all publishers, into `out`, which it replaces.
-    /// `None` when there is none.
+    /// Takes the oldest sample by source timestamp among all publishers into `out`, whose content it replaces. Returns
+    /// `None` if there is none.
     ///
-    /// A publisher whose sample is in memory that this process has not been told of yet, such as its
-    /// first one of more than 4 KiB, holds up none of the others: newer samples of theirs come first.
-    /// Clocks are taken at their word. Where KEEP_LAST's depth passes samples over, they are those
-    /// with the oldest timestamps: a publisher whose clock is ahead has the others' passed over.
+    /// A sample may be in memory that this process has not received yet, such as a publisher's first sample of more
+    /// than 4 KiB. Its publisher holds up no other publisher: their newer samples come first. The timestamps are not
+    /// checked. If KEEP_LAST's depth skips samples, it skips the samples with the oldest timestamps: a publisher whose
+    /// clock is ahead makes the samples of the others be skipped.
     pub fn take(&self, out: &mut Vec<u8>) -> Option<MessageInfo> {
         self.inner.take_bytes(self.session.core(), out)
     }
 
-    /// As [`take`](Self::take), but a sample of more than 4 KiB, or a loan of more than 512 bytes whose
-    /// publisher [expects](crate::EndpointSpec::expected_len) so many, stays in the publisher's memory
-    /// for as long as it is kept, unless `AXON_SHM_COPY` asks for copies.
+    /// Like [`take`](Self::take), but a sample of more than 4 KiB, or a loan of more than 512 bytes whose publisher
+    /// [expects](crate::EndpointSpec::expected_len) so many, stays in the publisher's memory for as long as it is kept,
+    /// unless `AXON_SHM_COPY` requests copies.
     pub fn take_sample(&self) -> Option<(MessageInfo, Sample)> {
         self.inner.take_sample(self.session.core())
     }
 
-    /// As [`take`](Self::take), after waiting for a sample for at most `timeout`; without end where it is
-    /// `None`.
+    /// Like [`take`](Self::take), after waiting for a sample for at most `timeout`, or without limit if it is `None`.
     ///
     /// # Errors
     /// [`RecvError::TimedOut`], and [`RecvError::Forked`] in a forked child.
@@ -85,12 +84,12 @@ impl Subscription {
         self.inner.recv(self.session.core(), timeout, || self.take(out))
     }
 
-    /// Whether there is something to take.
+    /// Returns whether there is a sample to take.
     pub fn has_data(&self) -> bool {
         !self.session.is_forked() && self.inner.has_data()
     }
 
-    /// The publishers it receives from.
+    /// Returns the publishers that it receives from.
     pub fn matched(&self) -> Vec<Gid> {
         if self.session.is_forked() {
             return Vec::new();
@@ -98,13 +97,13 @@ impl Subscription {
         self.inner.matched()
     }
 
-    /// Waits until it receives from at least `count` publishers; whether it does.
+    /// Waits until it receives from at least `count` publishers. Returns whether it does.
     pub fn wait_matched(&self, count: usize, timeout: Duration) -> bool {
         self.session.wait_changed(timeout, || self.matched().len() >= count)
     }
 
-    /// Samples that were lost: overwritten before they were taken, missing in memory that is gone, or published for this
-    /// subscription by a publisher that ended before this process was told of it.
+    /// Returns the number of lost samples: overwritten before they were taken, missing in memory that is gone, or
+    /// published for this subscription by a publisher that ended before this process learned of it.
     pub fn lost(&self) -> u64 {
         if self.session.is_forked() {
             return 0;
@@ -112,19 +111,19 @@ impl Subscription {
         self.inner.lost()
     }
 
-    /// Samples that were older than their publisher's lifespan when they would have been taken.
+    /// Returns the number of samples that were older than their publisher's lifespan when their turn came.
     pub fn expired(&self) -> u64 {
         if self.session.is_forked() { 0 } else { self.inner.expired() }
     }
 
-    /// Has `callback` told of new samples from now on, in place of the one before, which is not
-    /// called any more once this returns. Those that are there to be taken, and that nobody was told of, it is
-    /// told at once, on this thread; others as they come, on the control thread. It must neither block nor
-    /// panic, nor hold the session.
+    /// Sets the callback for new samples. The previous callback is not called any more once this returns. The new
+    /// callback receives at once, on this thread, the number of untaken samples that no callback has received. Later
+    /// samples are reported on the control thread as they come. The callback must neither block nor panic, nor hold the
+    /// session.
     ///
     /// # Errors
-    /// In a forked child, or when an event loop of the program's listens already
-    /// (an [`ExternalLeader`](axon_shm::ExternalLeader)).
+    /// In a forked child, or if an event loop of the program listens already (an
+    /// [`ExternalLeader`](axon_shm::ExternalLeader)).
     pub fn set_on_new_sample(&self, callback: Option<NewDataCallback>) -> Result<(), SessionError> {
         if self.session.is_forked() {
             return Err(ShmError::Forked.into());
@@ -132,20 +131,20 @@ impl Subscription {
         Ok(self.inner.set_on_new_sample(callback, self.session.core())?)
     }
 
-    /// The callback has returned and is not called any more once this returns, whatever is set from now
-    /// on: for one that other threads may still use though it has ended.
+    /// Ends the callback for good. Once this returns, the callback has returned and is not called any more, whatever is
+    /// set later: for a handle that other threads may still use although it has ended.
     pub(crate) fn tell_no_more(&self) {
         if !self.session.is_forked() {
             self.inner.tell_no_more(self.session.core());
         }
     }
 
-    /// One of its events; `None` where `kind` is a publisher's.
+    /// Returns one of its events; `None` if `kind` belongs to publishers.
     pub fn event(&self, kind: EventKind) -> Option<Event> {
         Event::new(EventSource::Subscription(self.inner.clone()), kind, self.session.clone())
     }
 
-    /// Samples taken.
+    /// Returns the number of samples taken.
     pub fn received(&self) -> u64 {
         if self.session.is_forked() { 0 } else { self.inner.received() }
     }

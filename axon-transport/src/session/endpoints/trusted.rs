@@ -40,9 +40,9 @@ pub struct TrustedSubscription {
 }
 
 impl Subscription {
-    /// Takes samples as slices from now on. [`TrustPublishers::new`] says what that asks of the publishers: of each
-    /// that the subscription matches, and of the daemon for those on other hosts. A copy, which
-    /// [`take`](Self::take) and [`recv`](Self::recv) make, asks nothing of anybody.
+    /// Takes samples as slices from now on. [`TrustPublishers::new`] lists the conditions for the publishers: for each
+    /// that the subscription matches, and for the daemon if publishers are on other hosts. Copies, which
+    /// [`take`](Self::take) and [`recv`](Self::recv) make, have no conditions.
     #[must_use]
     pub fn trusting(self, trust: TrustPublishers) -> TrustedSubscription {
         TrustedSubscription { subscription: self, trust }
@@ -50,13 +50,13 @@ impl Subscription {
 }
 
 impl TrustedSubscription {
-    /// As [`Subscription::take_sample`], as a slice.
+    /// Like [`Subscription::take_sample`], as a slice.
     pub fn take_slice(&self) -> Option<(MessageInfo, SampleSlice)> {
         let (info, sample) = self.subscription.take_sample()?;
         Some((info, sample.into_slice(self.trust)))
     }
 
-    /// As [`take_slice`](Self::take_slice), after waiting for at most `timeout`; without end where it is `None`.
+    /// Like [`take_slice`](Self::take_slice), after waiting for at most `timeout`, or without limit if it is `None`.
     ///
     /// # Errors
     /// [`RecvError::TimedOut`], and [`RecvError::Forked`] in a forked child.
@@ -68,16 +68,16 @@ impl TrustedSubscription {
         inner.recv(session.core(), timeout, || self.take_slice())
     }
 
-    /// As [`recv_slice`](Self::recv_slice), without end, for a task of any runtime.
+    /// Like [`recv_slice`](Self::recv_slice), without limit, for a task of any runtime.
     ///
     /// # Errors
-    /// As [`Subscription::recv_async`].
+    /// As for [`Subscription::recv_async`].
     pub async fn recv_slice_async(&self) -> Result<(MessageInfo, SampleSlice), RecvError> {
         let (info, sample) = self.subscription.recv_sample_async().await?;
         Ok((info, sample.into_slice(self.trust)))
     }
 
-    /// Back to a subscription that trusts nobody.
+    /// Returns the subscription, which does not trust its publishers.
     pub fn into_inner(self) -> Subscription {
         self.subscription
     }

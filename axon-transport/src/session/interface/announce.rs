@@ -37,7 +37,7 @@ impl Session {
         Ok(endpoint)
     }
 
-    /// An endpoint with a GID of its own.
+    /// Describes an endpoint, with a GID of its own.
     pub(in crate::session) fn describe(
         &self,
         spec: EndpointSpec,
@@ -72,7 +72,8 @@ impl Session {
         })
     }
 
-    /// A publisher that is alive when it is said to be. It takes the memory for its samples of `budget`, if there is one.
+    /// Adds a publisher whose liveliness is asserted explicitly. It takes the memory for its samples from `budget`, if
+    /// there is one.
     pub(in crate::session) fn add_asserted(
         &self,
         endpoint: Endpoint,
@@ -105,8 +106,8 @@ impl Session {
         Subscription { inner, session: self.clone() }
     }
 
-    /// A client, of whose responses those stand that `reads` asks for. One that `carries` them to another process says
-    /// which of them are there.
+    /// Adds a client. `reads` decides how many untaken responses it keeps. With `carries`, it carries the responses to
+    /// another process and confirms their delivery.
     pub(in crate::session) fn add_client(
         &self,
         endpoint: Endpoint,
@@ -125,8 +126,8 @@ impl Session {
         Ok(Client::new(requests, responses, writer, self.clone()))
     }
 
-    /// A server, of whose requests those stand that `reads` asks for. One that `carries` them to another process says
-    /// which of them are there.
+    /// Adds a server. `reads` decides how many untaken requests it keeps. With `carries`, it carries the requests to
+    /// another process and confirms their delivery.
     pub(in crate::session) fn add_server(
         &self,
         endpoint: Endpoint,
@@ -145,7 +146,7 @@ impl Session {
         Server::new(responses, requests, by_client, self.clone())
     }
 
-    /// The two sides of an endpoint that writes and reads.
+    /// Creates and announces the two sides of an endpoint that writes and reads.
     fn add_both(
         &self,
         endpoint: Endpoint,
@@ -168,7 +169,7 @@ impl Session {
         RingOptions { gid: endpoint.gid, qos, budget, max_message, expected: 0 }
     }
 
-    /// Keeps an endpoint's sides for the control thread, and has it told of.
+    /// Stores an endpoint's sides for the control thread, and queues its announcement.
     fn announce(
         &self,
         writes: Option<&Arc<PublisherInner>>,

@@ -17,8 +17,8 @@ use crate::{
 };
 
 impl Session {
-    /// A publisher. It is matched with those readers that the graph shows, unless they take more
-    /// than some milliseconds; others are matched later: see [`Publisher::wait_matched`].
+    /// Creates a publisher. It is matched with the readers that the graph shows, unless they take more than some
+    /// milliseconds; other readers are matched later: see [`Publisher::wait_matched`].
     ///
     /// # Errors
     /// When the specification is out of bounds or there is no memory.
@@ -32,8 +32,8 @@ impl Session {
         Ok(publisher)
     }
 
-    /// A subscription. It is matched with those publishers that the graph shows, unless they take
-    /// more than some milliseconds; others are matched later: see [`Subscription::wait_matched`].
+    /// Creates a subscription. It is matched with the publishers that the graph shows, unless they take more than some
+    /// milliseconds; other publishers are matched later: see [`Subscription::wait_matched`].
     ///
     /// # Errors
     /// When the specification is out of bounds.
@@ -49,8 +49,8 @@ impl Session {
         Ok(subscription)
     }
 
-    /// A server of a service. Its clients are matched as a publisher's readers are. Of requests that
-    /// nobody took a KEEP_LAST server keeps the newest of each client, as many as its depth.
+    /// Creates a server of a service. Its clients are matched as a publisher's readers are. A KEEP_LAST server keeps
+    /// the newest untaken requests of each client, as many as its depth.
     ///
     /// # Errors
     /// When the specification is out of bounds.
@@ -63,9 +63,9 @@ impl Session {
         Ok(server)
     }
 
-    /// A client of a service. Its servers are matched as a publisher's readers are; see
-    /// [`Client::wait_available`]. Of responses that nobody took a KEEP_LAST client keeps the newest of
-    /// each server, as many as its depth.
+    /// Creates a client of a service. Its servers are matched as a publisher's readers are; see
+    /// [`Client::wait_available`]. A KEEP_LAST client keeps the newest untaken responses of each server, as many as its
+    /// depth.
     ///
     /// # Errors
     /// When the specification is out of bounds or there is no memory.
@@ -102,14 +102,14 @@ impl Session {
         Ok(self.adopt_node(described))
     }
 
-    /// A condition that the program triggers itself, for wait sets of the session.
+    /// Creates a condition that the program triggers itself, for wait sets of the session.
     pub fn create_guard_condition(&self) -> GuardCondition {
         GuardCondition::new(self.core())
     }
 
-    /// Creates a relay as [`create_relay`](Self::create_relay) does, for one publisher. A publisher that `waits` keeps a
-    /// sample until the relay [acknowledges](Subscription::acknowledge_of) it. That holds even where the relay stands for
-    /// no remote subscription.
+    /// Creates a relay as [`create_relay`](Self::create_relay) does, for one publisher. A publisher that `waits` keeps
+    /// a sample until the relay [acknowledges](Subscription::acknowledge_of) it. That holds even where the relay stands
+    /// for no remote subscription.
     pub(crate) fn create_relay_of(
         &self,
         publisher: Gid,
@@ -135,7 +135,8 @@ impl Session {
     }
 }
 
-/// What a client or server of this profile asks of those that it reads: nothing is lost but for its depth.
+/// Returns the QoS that a client or server of this profile requests for reading: no message is lost except for its
+/// depth.
 fn unread(qos: &Qos) -> Qos {
     Qos::keep_all().with_history(qos.history).with_depth(qos.depth)
 }

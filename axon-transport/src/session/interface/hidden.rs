@@ -1,5 +1,5 @@
 //! Methods of an application's types for the daemon, its relays and stand-ins, and this crate. They are hidden in the
-//! documentation, are no part of the interface, and change with any release.
+//! documentation, are no part of the interface, and may change with any release.
 
 use std::{
     collections::{BTreeMap, HashMap},
@@ -32,7 +32,7 @@ use crate::{
 
 #[doc(hidden)]
 impl MessageInfo {
-    /// Of a sample with this number, of no particular time.
+    /// Creates the information of a sample with this number and no particular time.
     pub fn of(publisher: Gid, sequence: u64) -> Self {
         let [source_timestamp, received_timestamp] = [SystemTime::UNIX_EPOCH; 2];
         let (reception, lifetime) = (sequence, None);
@@ -42,7 +42,7 @@ impl MessageInfo {
 
 #[doc(hidden)]
 impl Lifetime {
-    /// A sample of this age and lifespan.
+    /// Creates the lifetime of a sample with this age and lifespan.
     pub fn new(age: Duration, lifespan: Duration) -> Self {
         Self { age, lifespan }
     }
@@ -50,7 +50,7 @@ impl Lifetime {
 
 #[doc(hidden)]
 impl Session {
-    /// A session over a socket that is connected to a daemon. It ends with that connection.
+    /// Opens a session over a socket that is connected to a daemon. It ends with that connection.
     ///
     /// # Errors
     /// When the daemon refuses it.
@@ -62,8 +62,8 @@ impl Session {
         Self::over_as(SessionId::random(), socket, config, options)
     }
 
-    /// As [`over`](Self::over), under a given id: for the daemon, in whose memory the endpoints of a
-    /// relayed session are.
+    /// Like [`over`](Self::over), under a given id: for the daemon, whose memory holds the endpoints of a relayed
+    /// session.
     pub fn over_as(
         id: SessionId,
         socket: OwnedFd,
@@ -76,15 +76,15 @@ impl Session {
         Ok(Self::of(Self::start(config, options, segment, FirstPeer::Socket(connected))?))
     }
 
-    /// A subscription as another process of the session describes it, under its GID there. Where it
-    /// keeps all, what it takes is acknowledged when it [says so](Subscription::acknowledge_of).
+    /// Creates a subscription as another process of the session describes it, under its GID there. If it is RELIABLE
+    /// and KEEP_ALL, samples that it takes are acknowledged only by [`acknowledge_of`](Subscription::acknowledge_of).
     pub fn adopt_subscription(&self, endpoint: Endpoint) -> Subscription {
         let mut inner = SubscriptionInner::new(endpoint, EndpointRole::Application, Vec::new());
         inner.carries = inner.keeps_all();
         self.add_reader(inner)
     }
 
-    /// As [`adopt_subscription`](Self::adopt_subscription), a node.
+    /// Like [`adopt_subscription`](Self::adopt_subscription), for a node.
     pub fn adopt_node(&self, endpoint: Endpoint) -> Node {
         let gid = endpoint.gid;
         let changed = self.create_guard_condition();
@@ -97,8 +97,8 @@ impl Session {
         Node::new(endpoint, changed, self.clone())
     }
 
-    /// A local reader that carries samples to subscriptions on another host, `stands_for`. For the
-    /// gateway alone; a daemon refuses it from anybody else.
+    /// Creates a local reader that carries samples to the subscriptions `stands_for` on another host. Only the gateway
+    /// may call this; a daemon refuses it from any other session.
     ///
     /// # Errors
     /// When the specification is out of bounds.
@@ -110,17 +110,17 @@ impl Session {
         self.add_relay(spec, None, stands_for, false)
     }
 
-    /// The session's segment, for waiting in other ways.
+    /// Returns the session's segment, for waiting in other ways.
     pub fn segment(&self) -> &Arc<SessionSegment> {
         &self.core().segment
     }
 
-    /// Its endpoints that the daemon does not take, and why.
+    /// Returns the endpoints that the daemon has refused, each with the reason.
     pub fn refused(&self) -> BTreeMap<Gid, String> {
         self.shared().state().graph.refused.clone()
     }
 
-    /// What the daemon refused since the last call of no endpoint for good, where the options say that it is kept.
+    /// Takes the refusals since the last call that concern no endpoint permanently, if the options keep them.
     pub fn take_refusals(&self) -> Vec<String> {
         self.core().link.take_refusals()
     }
@@ -128,21 +128,21 @@ impl Session {
 
 #[doc(hidden)]
 impl SessionOptions {
-    /// Another kind of session.
+    /// Sets the kind of the session.
     #[must_use]
     pub fn role(mut self, role: SessionRole) -> Self {
         self.role = role;
         self
     }
 
-    /// Keeps what the daemon refuses of no endpoint for good.
+    /// Keeps the daemon's refusals that concern no endpoint permanently.
     #[must_use]
     pub fn keep_refusals(mut self) -> Self {
         self.keeps_refusals = true;
         self
     }
 
-    /// How many clients its servers may have, each counted once for each of them.
+    /// Sets the maximum number of clients of its servers. A client counts once for each server.
     #[must_use]
     pub fn callers(mut self, most: usize) -> Self {
         self.callers = most;
@@ -160,15 +160,15 @@ impl Publisher {
         self.inner.published(self.writer.publish(meta, payload)).map(drop)
     }
 
-    /// As [`publish_with`](Self::publish_with), but never waits for room.
+    /// Like [`publish_with`](Self::publish_with), but never waits for space.
     ///
     /// # Errors
-    /// [`PublishError::Blocked`] at once when there is none.
+    /// [`PublishError::Blocked`] at once if there is no space.
     pub fn try_publish_with(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
         self.inner.published(self.writer.try_publish(meta, payload)).map(drop)
     }
 
-    /// As [`try_publish_with`](Self::try_publish_with), but readers that sleep may sleep on until
+    /// Like [`try_publish_with`](Self::try_publish_with), but sleeping readers may sleep on until
     /// [`announce`](Self::announce).
     ///
     /// # Errors
@@ -177,8 +177,7 @@ impl Publisher {
         self.inner.published(self.writer.try_publish_quietly(meta, payload)).map(drop)
     }
 
-    /// Wakes the readers that sleep, for samples that were published
-    /// [quietly](Self::try_publish_quietly).
+    /// Wakes sleeping readers, for samples that were published [quietly](Self::try_publish_quietly).
     pub fn announce(&self) {
         self.writer.announce();
     }
@@ -186,8 +185,8 @@ impl Publisher {
 
 #[doc(hidden)]
 impl Subscription {
-    /// For a relay: the publishers that may still send samples. A publisher that has ended is among them while
-    /// samples of it are on their way.
+    /// Returns, for a relay, the publishers that may still send samples. A publisher that has ended is included while
+    /// its samples are in flight.
     pub fn attached(&self) -> Vec<Gid> {
         let mut gids = self.matched();
         if !self.session.is_forked() {
@@ -196,8 +195,8 @@ impl Subscription {
         gids
     }
 
-    /// For a relay: the next sample of one publisher, and how many of that publisher's this
-    /// subscription has lost by then.
+    /// Takes, for a relay, the next sample of one publisher. Returns it and the number of that publisher's samples that
+    /// this subscription has lost by then.
     pub fn take_from(&self, writer: &Gid) -> Option<(Sample, u64)> {
         if self.session.is_forked() {
             return None;
@@ -205,12 +204,12 @@ impl Subscription {
         self.inner.sample_of(writer)
     }
 
-    /// For a relay: how many samples of this publisher newer ones replaced before they were taken.
+    /// Returns, for a relay, how many samples of this publisher newer samples replaced before they were taken.
     pub fn lost_of(&self, writer: &Gid) -> u64 {
         if self.session.is_forked() { 0 } else { self.inner.lock().lost_of(writer) }
     }
 
-    /// For a relay: passes over all samples of this publisher but the newest `depth`, which count as
+    /// Skips, for a relay, all samples of this publisher but the newest `depth`. The skipped samples count as
     /// [lost](Self::lost_of).
     pub fn skip_of(&self, writer: &Gid, depth: u64) {
         if !self.session.is_forked() {
@@ -218,8 +217,8 @@ impl Subscription {
         }
     }
 
-    /// For a relay: what was taken and not acknowledged is to be taken once more; where its publisher
-    /// keeps a history, all of that.
+    /// Makes samples available again, for a relay, that were taken and not acknowledged. If the subscription is
+    /// TRANSIENT_LOCAL, this covers the whole history that the publisher keeps.
     pub fn take_back(&self) {
         if !self.session.is_forked() {
             let history = self.inner.qos.durability == Durability::TransientLocal;
@@ -227,50 +226,51 @@ impl Subscription {
         }
     }
 
-    /// For a relay: samples of this publisher up to this number are where they are to go. Until then
-    /// nobody takes them as acknowledged.
+    /// Acknowledges, for a relay, the samples of this publisher up to this number. Until then, they do not count as
+    /// acknowledged.
     pub fn acknowledge_of(&self, writer: &Gid, sequence: u64) {
         if !self.session.is_forked() {
             self.inner.lock().finish_of(writer, sequence);
         }
     }
 
-    /// For a relay: samples that are not acknowledged, those that were not taken among them, by
-    /// publisher.
+    /// Returns, for a relay, the number of samples that are not acknowledged, including untaken ones, by publisher.
     pub fn unacknowledged(&self) -> HashMap<Gid, u64> {
         if self.session.is_forked() { HashMap::new() } else { self.inner.lock().slots().undone() }
     }
 
-    /// For a relay: bytes that the samples of this publisher take that are not acknowledged.
+    /// Returns, for a relay, the bytes of the samples of this publisher that are not acknowledged.
     pub fn unacknowledged_bytes_of(&self, writer: &Gid) -> u64 {
         if self.session.is_forked() { 0 } else { self.inner.lock().slots().undone_bytes_of(writer) }
     }
 
-    /// For a relay: how many publishes of this publisher found no room since readers were not done with its oldest sample,
-    /// if this one is not.
+    /// Returns, for a relay, how many publishes of this publisher found no space because readers had not acknowledged
+    /// its oldest sample, if this subscription has not acknowledged it.
     pub fn refused_of(&self, writer: &Gid) -> Option<u64> {
         if self.session.is_forked() { None } else { self.inner.lock().slots().refused_of(writer) }
     }
 
-    /// For a relay: so many samples of this publisher do not get where they are to go. It is told.
+    /// Gives up, for a relay, `samples` samples of this publisher that do not reach their destination. Tells the
+    /// publisher.
     pub fn give_up(&self, writer: Gid, samples: u64) {
         if self.session.is_forked() {
             return;
         }
-        // The publisher sees it before it sees that they are acknowledged. Its process is told besides: it
-        // may be of an older version, and the publisher may wait for acknowledgements.
+        // The publisher sees the count before it sees that the samples are acknowledged. Its process also receives a
+        // message: it may be of an older version, and the publisher may wait for acknowledgements.
         self.inner.lock().give_up_of(&writer, samples);
         let given_up = RelayGivenUp { reader: self.gid(), writer, samples };
         self.session.core().tell(Outgoing::message(SessionMessage::GivenUp(given_up)));
     }
 
-    /// For a relay: the next sample of one publisher, as bytes.
+    /// Takes, for a relay, the next sample of one publisher, as bytes.
     pub fn take_of(&self, writer: &Gid) -> Option<(MessageInfo, Vec<u8>)> {
         self.inner.take_of(self.session.core(), writer)
     }
 
-    /// For a relay: the next samples of one publisher, with their payloads one behind the other in `out`, which
-    /// they replace. `each` is told where a sample's payload is. Returns how many samples it took.
+    /// Takes, for a relay, the next samples of one publisher, with their payloads one behind the other in `out`, whose
+    /// content they replace. `each` receives the position of each sample's payload. Returns the number of samples
+    /// taken.
     pub fn take_many_of(
         &self,
         writer: &Gid,
@@ -281,7 +281,7 @@ impl Subscription {
         self.inner.take_many_of(self.session.core(), writer, most, out, each)
     }
 
-    /// The publishers of which there is something to take.
+    /// Returns the publishers that have a sample to take.
     pub fn with_data(&self) -> Vec<Gid> {
         if self.session.is_forked() {
             Vec::new()
@@ -290,33 +290,34 @@ impl Subscription {
         }
     }
 
-    /// Whether it reads what this publisher writes or wrote, or may do so soon.
+    /// Returns whether it reads this publisher, including samples of an earlier attachment, or may do so soon.
     pub fn reads(&self, writer: &Gid) -> bool {
         !self.session.is_forked() && self.inner.lock().reads(writer)
     }
 
-    /// Whether it is RELIABLE and KEEP_ALL.
+    /// Returns whether it is RELIABLE and KEEP_ALL.
     pub fn may_lose_nothing(&self) -> bool {
         self.inner.keeps_all()
     }
 
-    /// Whether samples of `writer` wait that cannot be taken yet, for want of its memory or of our own.
+    /// Returns whether samples of `writer` wait that cannot be taken yet, for want of its memory or of this process's
+    /// own.
     pub fn is_held_up(&self, writer: &Gid) -> bool {
         !self.session.is_forked() && self.inner.lock().slots().is_held_up(writer)
     }
 
-    /// For a relay: after what time [`take_of`](Self::take_of) may have a sample of this publisher, where it had none
-    /// although some wait. It had passed over samples that do not count, or there was no memory for one.
+    /// Returns, for a relay, the time after which [`take_of`](Self::take_of) may return a sample of this publisher, if
+    /// it returned none although some wait: it had skipped samples that do not count, or there was no memory for one.
     pub fn retry_of(&self, writer: &Gid) -> Option<Duration> {
         if self.session.is_forked() { None } else { self.inner.lock().slots().retry_of(writer) }
     }
 
-    /// Whether there is something to take of this publisher.
+    /// Returns whether there is a sample of this publisher to take.
     pub fn has_from(&self, writer: &Gid) -> bool {
         !self.session.is_forked() && self.inner.lock().slots().has_from(writer)
     }
 
-    /// The publishers that have a lease, and when each was last alive, by the monotonic clock.
+    /// Returns the publishers that have a lease, and when each was last alive, by the monotonic clock.
     pub fn assertions(&self) -> Vec<(Gid, u64)> {
         if self.session.is_forked() {
             return Vec::new();
@@ -324,7 +325,7 @@ impl Subscription {
         self.inner.lock().slots().assertions()
     }
 
-    /// For a relay: the remote subscriptions that it stands for from now on.
+    /// Sets, for a relay, the remote subscriptions that it stands for from now on.
     pub fn set_stands_for(&self, gids: Vec<Gid>) {
         if self.session.is_forked() {
             return;
@@ -336,12 +337,12 @@ impl Subscription {
 
 #[doc(hidden)]
 impl Server {
-    /// As [`take_request_from`](Self::take_request_from), as bytes.
+    /// Like [`take_request_from`](Self::take_request_from), as bytes.
     pub fn take_request_of(&self, client: &Gid) -> Option<(MessageInfo, Vec<u8>)> {
         self.requests.take_of(self.session.core(), client)
     }
 
-    /// The clients of which there is a request to be taken.
+    /// Returns the clients that have a request to take.
     pub fn with_requests(&self) -> Vec<Gid> {
         if self.session.is_forked() {
             Vec::new()
@@ -350,7 +351,7 @@ impl Server {
         }
     }
 
-    /// Whether it reads what this client asks or asked, or may do so soon.
+    /// Returns whether it reads this client's requests, including requests of an earlier attachment, or may do so soon.
     pub fn reads(&self, client: &Gid) -> bool {
         !self.session.is_forked() && self.requests.lock().reads(client)
     }

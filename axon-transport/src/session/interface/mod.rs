@@ -1,4 +1,4 @@
-//! What an application asks of a session: one file for each chapter of the interface.
+//! The interface of a session for applications: one file for each chapter.
 
 mod announce;
 mod create;

@@ -14,8 +14,8 @@ use crate::{
     },
 };
 
-/// A node of a session. It is in the graph for as long as this stands, with endpoints or without;
-/// its endpoints do not end with it. Thread-safe.
+/// A node of a session. It is in the graph until it is dropped, with or without endpoints; its endpoints do not end
+/// with it. Thread-safe.
 ///
 /// AXON gives names no meaning: two nodes may have the same one, and the graph lists both.
 ///
@@ -45,38 +45,38 @@ impl Node {
         Self { endpoint, graph, session }
     }
 
-    /// Triggered after every change of the graph, once [`Session::graph`] shows it; and when a
-    /// service or a client of the session finds, or loses, its other end.
+    /// Returns a condition that is triggered after every change of the graph, once [`Session::graph`] shows it, and
+    /// when a service or a client of the session finds or loses its other end.
     pub fn graph_changed(&self) -> &GuardCondition {
         &self.graph
     }
 
-    /// Its GID.
+    /// Returns the node's GID.
     pub fn gid(&self) -> Gid {
         self.endpoint.gid
     }
 
-    /// Its name.
+    /// Returns the node's name.
     pub fn name(&self) -> &str {
         &self.endpoint.node
     }
 
-    /// Its namespace.
+    /// Returns the node's namespace.
     pub fn namespace(&self) -> &str {
         &self.endpoint.namespace
     }
 
-    /// The security enclave that it runs in.
+    /// Returns the security enclave that it runs in.
     pub fn enclave(&self) -> &str {
         &self.endpoint.enclave
     }
 
-    /// Its session.
+    /// Returns the node's session.
     pub fn session(&self) -> &Session {
         &self.session
     }
 
-    /// As [`Session::create_publisher`], of this node, whatever node `spec` names.
+    /// Like [`Session::create_publisher`], for this node, whatever node `spec` names.
     ///
     /// # Errors
     /// When the specification is out of bounds or there is no memory.
@@ -84,7 +84,7 @@ impl Node {
         self.session.create_publisher(self.own(spec))
     }
 
-    /// As [`Session::create_subscription`], of this node, whatever node `spec` names.
+    /// Like [`Session::create_subscription`], for this node, whatever node `spec` names.
     ///
     /// # Errors
     /// When the specification is out of bounds.
@@ -92,7 +92,7 @@ impl Node {
         self.session.create_subscription(self.own(spec))
     }
 
-    /// As [`Session::create_server`], of this node, whatever node `spec` names.
+    /// Like [`Session::create_server`], for this node, whatever node `spec` names.
     ///
     /// # Errors
     /// When the specification is out of bounds.
@@ -100,7 +100,7 @@ impl Node {
         self.session.create_server(self.own(spec))
     }
 
-    /// As [`Session::create_client`], of this node, whatever node `spec` names.
+    /// Like [`Session::create_client`], for this node, whatever node `spec` names.
     ///
     /// # Errors
     /// When the specification is out of bounds or there is no memory.

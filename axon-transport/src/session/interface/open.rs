@@ -21,9 +21,8 @@ use crate::{
 };
 
 impl Session {
-    /// Opens a session with the daemon of this user and domain, which is started when there is
-    /// none and `AXON_DAEMON` is `spawn`. Under `off`, endpoints of the session reach each other
-    /// and nobody else.
+    /// Opens a session with the daemon of this user and domain. If there is no daemon and `AXON_DAEMON` is `spawn`, it
+    /// starts one. Under `off`, endpoints of the session reach only each other.
     ///
     /// # Errors
     /// When the daemon cannot be reached or started, or has other security settings: the error
@@ -55,8 +54,8 @@ impl Session {
         Self::relayed(config, options, id, reason)
     }
 
-    /// A session whose samples pass through the daemon. It has the world outside in its own process:
-    /// a session that stands for it, and a registry that brings the two together.
+    /// Opens a session whose samples pass through the daemon. In this process, a second session represents the
+    /// endpoints outside, and a local registry connects the two sessions.
     fn relayed(
         config: &Config,
         options: SessionOptions,
@@ -106,7 +105,7 @@ impl Session {
     }
 }
 
-/// Says once in a process which variables begin as settings do and are none.
+/// Warns once per process about variables that begin like settings and are none.
 fn warn_of_unknown_variables(config: &Config) {
     static SAID: Once = Once::new();
     if let Some(line) = config.unknown_variables() {

@@ -21,7 +21,7 @@ use crate::{
 };
 
 impl Session {
-    /// The daemon's status: the JSON of [`Status`](crate::status::Status).
+    /// Returns the daemon's status: the JSON of [`Status`](crate::status::Status).
     ///
     /// # Errors
     /// When there is no daemon or it does not answer in time.

@@ -19,7 +19,7 @@ use crate::{
     },
 };
 
-/// Something to wait for.
+/// An object to wait for.
 ///
 /// ```
 /// # use std::time::Duration;
@@ -46,20 +46,20 @@ use crate::{
 #[derive(Clone, Copy, Debug)]
 #[non_exhaustive]
 pub enum Waitable<'a> {
-    /// Ready while there is something to take.
+    /// Ready while there is a sample to take.
     Subscription(&'a Subscription),
     /// Ready while there is a request to take.
     Server(&'a Server),
     /// Ready while there is a response to take.
     Client(&'a Client),
-    /// Ready once it was triggered. The wait that finds it so resets it.
+    /// Ready once it was triggered. The wait that finds it ready resets it.
     GuardCondition(&'a GuardCondition),
-    /// Ready while it occurred and its status was not taken since.
+    /// Ready if it occurred since its status was last taken.
     Event(&'a Event),
 }
 
-/// What was found ready: its indices among all that was waited for, in order. A slice; no allocation
-/// where it is a few.
+/// The indices of the ready objects among all waitables, in order. It is a slice, and a small number of indices needs
+/// no allocation.
 ///
 /// ```
 /// # use std::time::Duration;
@@ -78,10 +78,10 @@ pub enum Waitable<'a> {
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Ready(SmallVec<[usize; USUAL_READY]>);
 
-/// So many are mostly ready at the same time, at most.
+/// Number of indices that need no allocation: usually no more objects are ready at the same time.
 const USUAL_READY: usize = 8;
 
-/// The part of a [`Waitable`] that is looked at.
+/// The part of a [`Waitable`] that is checked.
 #[derive(Clone, Copy)]
 enum Part<'a> {
     Data(&'a Arc<SubscriptionInner>),
@@ -89,21 +89,22 @@ enum Part<'a> {
     Event(&'a EventSource, EventKind),
 }
 
-/// The same, kept for others to look at.
+/// An owned [`Part`], which other threads can check.
 enum OwnedWaitable {
     Data(Arc<SubscriptionInner>),
     Guard(Arc<Guard>),
     Event(EventSource, EventKind),
 }
 
-/// The objects that a thread waits for, without keeping them from ending.
+/// The objects that a thread waits for. The set does not keep them from ending.
 pub(crate) struct WeakWaitSet {
     parts: Vec<OwnedWaitable>,
-    /// The sessions that it belongs to, but for the one that waits.
+    /// The sessions of the objects, except the waiting one.
     others: Vec<Arc<SessionCore>>,
 }
 
-/// While another session is waited at, its control thread listens for it, and passes on what comes.
+/// A wait for objects of another session: until it is dropped, that session's control thread listens and forwards the
+/// wake-ups.
 struct ForeignWait<'a> {
     other: &'a SessionCore,
     _forwarded: ForwardedWakeups<'a>,
@@ -127,13 +128,13 @@ impl Drop for ForeignWait<'_> {
 }
 
 impl Session {
-    /// Waits until at least one of `waitables` is ready, for at most `timeout`: for ever where it is
-    /// `None`, and not at all where it is zero. The indices of all that are ready then, in order; none
-    /// if the time is over.
+    /// Waits until at least one of `waitables` is ready, for at most `timeout`: without limit if it is `None`, and not
+    /// at all if it is zero. Returns the indices of all objects that are ready then, in order; none if the time is
+    /// over.
     ///
-    /// Any number of threads may wait at the same time. One that waits for what another waits for,
-    /// too, is no error, but a guard condition then stands for one of them only. What belongs to
-    /// another session of this process can be waited for as well, and takes a thread more on its way.
+    /// Any number of threads may wait at the same time. Two threads may wait for the same object, but a guard condition
+    /// wakes only one of them. Objects of another session of this process are allowed, too; their wake-ups pass through
+    /// one more thread.
     ///
     /// ```
     /// use std::time::Duration;
@@ -158,8 +159,8 @@ impl Session {
     /// ```
     ///
     /// # Errors
-    /// [`SessionError::OtherSession`] when one is of another session that is closed or led by an event
-    /// loop, and in a forked child.
+    /// [`SessionError::OtherSession`] if an object belongs to another session that is closed or led by an event loop;
+    /// an error in a forked child.
     pub fn wait_for(
         &self,
         waitables: &[Waitable<'_>],
@@ -176,7 +177,7 @@ impl Session {
         self.wait_until(take, watch, timeout)
     }
 
-    /// What [`wait_watch`](Self::wait_watch) waits for.
+    /// Creates the set that [`wait_watch`](Self::wait_watch) waits for.
     pub(crate) fn watch(
         &self,
         waitables: &[Waitable<'_>],
@@ -194,7 +195,7 @@ impl Session {
         Ok(Arc::new(WeakWaitSet { parts, others }))
     }
 
-    /// As [`wait_for`](Self::wait_for).
+    /// Like [`wait_for`](Self::wait_for).
     pub(crate) fn wait_watch(
         &self,
         watch: &Arc<WeakWaitSet>,
@@ -210,8 +211,8 @@ impl Session {
         self.wait_until(take, || watch.clone(), timeout)
     }
 
-    /// Waits until `take` finds something. `watch` is for other threads to look at, and made where one
-    /// has to.
+    /// Waits until `take` finds a ready object. `watch` creates the set that other threads check; it is called only if
+    /// another thread needs it.
     fn wait_until(
         &self,
         mut take: impl FnMut() -> Ready,
@@ -231,7 +232,7 @@ impl Session {
     }
 }
 
-/// Where there is a `true`.
+/// Returns the indices of the `true` items.
 fn indices(all: impl Iterator<Item = bool>) -> Ready {
     Ready(all.enumerate().filter_map(|(index, there)| there.then_some(index)).collect())
 }
@@ -251,7 +252,7 @@ impl<const N: usize> PartialEq<[usize; N]> for Ready {
 }
 
 impl Waitable<'_> {
-    /// What is looked at.
+    /// Returns the part that is checked.
     fn part(&self) -> Part<'_> {
         match self {
             Waitable::Subscription(subscription) => Part::Data(&subscription.inner),
@@ -265,7 +266,7 @@ impl Waitable<'_> {
         }
     }
 
-    /// The segment of the session that it belongs to.
+    /// Returns the segment of the session that it belongs to.
     fn segment(&self) -> &Arc<SessionSegment> {
         match self {
             Waitable::Subscription(subscription) => subscription.session.segment(),
@@ -276,7 +277,7 @@ impl Waitable<'_> {
         }
     }
 
-    /// Its session, where that is open.
+    /// Returns its session, if that is open.
     fn session(&self) -> Option<Arc<SessionCore>> {
         let session = match self {
             Waitable::Subscription(subscription) => &subscription.session,
@@ -290,7 +291,7 @@ impl Waitable<'_> {
 }
 
 impl Part<'_> {
-    /// Whether it is ready. A guard condition that is stands no more.
+    /// Returns whether it is ready. Resets a guard condition that is ready.
     fn take(self) -> bool {
         match self {
             Part::Data(inner) => inner.has_data(),
@@ -299,8 +300,8 @@ impl Part<'_> {
         }
     }
 
-    /// The same for other threads than the one that waits. It changes nothing: while a thread is taking, it
-    /// may be.
+    /// Like [`take`](Self::take), for other threads than the waiting one. It changes nothing, and returns true while a
+    /// thread is taking samples.
     fn may_be_ready(self) -> bool {
         match self {
             Part::Data(inner) => inner.ready(),

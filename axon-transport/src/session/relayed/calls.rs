@@ -17,17 +17,17 @@ use crate::{
     },
 };
 
-/// The channels to the other end that a relay's clients and servers call for, and how far they have got.
+/// The progress of the requests that a relay's clients send to the other end.
 #[derive(Default)]
 pub struct CallChannels {
-    /// The requests of each client that is on this side, by way of the servers here.
+    /// The requests of each client on this side, read through the stand-ins of the servers.
     requests: BTreeMap<Gid, Merge<Sample>>,
-    /// The number up to which the other end has them, where it says so.
+    /// The number up to which the other end has confirmed the requests of a client.
     done: BTreeMap<Gid, u64>,
 }
 
 impl CallChannels {
-    /// From now on these are the pairs of client and server by way of whose servers requests are taken.
+    /// Sets the pairs of client and server through which requests are taken.
     pub fn set(&mut self, pairs: impl Iterator<Item = (Gid, Gid)>) {
         let mut servers: BTreeMap<Gid, Vec<Gid>> = BTreeMap::new();
         for (client, server) in pairs {
@@ -40,7 +40,7 @@ impl CallChannels {
         }
     }
 
-    /// The next request of `client` that has not been sent. It came to each of the servers.
+    /// Takes the next request of `client` that has not been sent. The request came to each of the servers.
     pub fn request<'a>(
         &mut self,
         client: &Gid,
@@ -52,8 +52,8 @@ impl CallChannels {
         next.map(OutboundSample::from)
     }
 
-    /// As [`request`](Self::request), for the session's end: one that is to be sent again comes first, and each is kept
-    /// until it has a response.
+    /// Like [`request`](Self::request), for the session's end: a request that is due to be sent again comes first, and
+    /// each request is kept until it has a response.
     pub(super) fn request_to_send<'a>(
         &mut self,
         client: &Gid,
@@ -72,12 +72,12 @@ impl CallChannels {
         Some(request)
     }
 
-    /// Takes the requests that were sent by way of another server; whether there are more.
+    /// Takes the requests that were sent by way of another server. Returns whether there are more.
     pub fn pass_over<'a>(&mut self, find: impl Fn(&Gid) -> Option<&'a RemoteWriter>) -> bool {
         let mut more = false;
         for (client, requests) in &mut self.requests {
             more |= requests.pass_over(|server| find(server)?.take_from(client).map(taken));
-            // The other end has what was passed over.
+            // The other end has the requests that were passed over.
             if requests.readers().nth(1).is_some()
                 && let Some(number) = self.done.get(client)
             {
@@ -87,7 +87,8 @@ impl CallChannels {
         more
     }
 
-    /// The other end has the requests of `client` up to this number: the client need not keep them.
+    /// Records that the other end has the requests of `client` up to this number, so that the client need not keep
+    /// them.
     pub fn finish<'a>(
         &mut self,
         client: &Gid,
@@ -100,7 +101,7 @@ impl CallChannels {
         }
     }
 
-    /// Whether a request of `client` came by way of `server` and is still to be sent.
+    /// Returns whether a request of `client` came by way of `server` and is still to be sent.
     pub fn holds(&self, client: &Gid, server: &Gid) -> bool {
         self.requests.get(client).is_some_and(|requests| requests.holds(server))
     }
@@ -116,7 +117,7 @@ fn finish<'a>(
     servers.for_each(|server| server.finish_requests(client, number));
 }
 
-/// The next response on `channel`; `client` finds the one that it is for.
+/// Takes the next response on `channel`. The stand-in of the channel's client reads it.
 pub fn response<'a>(
     channel: &FlowChannel,
     find: impl Fn(&Gid) -> Option<&'a RemoteWriter>,

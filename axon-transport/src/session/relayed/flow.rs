@@ -22,34 +22,34 @@ pub use self::{
 };
 use crate::{ids::Gid, session::merge::MergedSample, wire::session::Credit};
 
-/// Bytes that a channel may have under way without asking.
+/// Bytes that a channel may have in flight without asking.
 pub const WINDOW: u64 = 32 << 10;
-/// What a sample counts for besides its bytes.
+/// Bytes of credit that a sample costs besides its payload.
 pub const OVERHEAD: u64 = 128;
-/// Most bytes of a sample in one packet.
+/// Maximum number of bytes of a sample in one packet.
 pub const PIECE: usize = 31 << 10;
 
-/// Samples that follow each other.
+/// A sequence of samples under common flow control.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct FlowChannel {
-    /// Who wrote them.
+    /// The writer of the samples.
     pub writer: Gid,
-    /// The one whose responses they are, where a server did.
+    /// The client that receives the responses, if the writer is a server.
     pub client: Option<Gid>,
 }
 
 impl FlowChannel {
-    /// That of a publisher's samples, or a client's requests.
+    /// Returns the channel of a publisher's samples, or a client's requests.
     pub fn of(writer: Gid) -> Self {
         Self { writer, client: None }
     }
 
-    /// That of a server's responses to a client.
+    /// Returns the channel of a server's responses to a client.
     pub fn between(server: Gid, client: Gid) -> Self {
         Self { writer: server, client: Some(client) }
     }
 
-    /// Samples up to this number are where they are to go.
+    /// Returns the credit message that confirms the delivery of samples up to this number.
     pub(crate) fn done(self, sequence: u64) -> Credit {
         Credit { done: Some(sequence), ..self.credit(0, None) }
     }
@@ -59,15 +59,15 @@ impl FlowChannel {
     }
 }
 
-/// A sample's bytes.
+/// The bytes of a sample.
 pub trait SampleContent {
-    /// How many there are.
+    /// Returns the number of bytes.
     fn len(&self) -> usize;
-    /// Whether there are none.
+    /// Returns whether there are no bytes.
     fn is_empty(&self) -> bool {
         self.len() == 0
     }
-    /// Copies those from `at` on to the front of `out`, as many as there are and fit.
+    /// Copies the bytes from `at` on to the front of `out`, as many as there are and fit. Returns their number.
     fn read_at(&self, at: usize, out: &mut [u8]) -> usize;
 }
 
@@ -81,12 +81,12 @@ impl SampleContent for Vec<u8> {
     }
 }
 
-/// The bytes of a sample that goes.
+/// The payload of a sample that is sent.
 #[derive(Debug)]
 pub enum SamplePayload {
-    /// They stay in the ring.
+    /// The payload stays in the ring.
     Ring(Sample),
-    /// They are kept, to be sent again.
+    /// The payload is kept, to be sent again.
     Kept(Arc<[u8]>),
 }
 
@@ -117,9 +117,9 @@ fn read_at(bytes: &[u8], at: usize, out: &mut [u8]) -> usize {
 pub struct OutboundSample<S> {
     /// Its number and time.
     pub meta: Meta,
-    /// Samples of its publisher that were lost since the one before.
+    /// Number of its publisher's samples that were lost since the previous one.
     pub lost: u64,
-    /// Its bytes, which may stay where they are.
+    /// Its payload, which may stay where it is.
     pub content: S,
 }
 

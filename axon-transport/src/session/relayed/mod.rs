@@ -1,9 +1,9 @@
 //! Sessions that share no memory: their samples pass through the daemon, over the session socket.
 //!
-//! The daemon treats such a session much like another host. In its own process a separate registry and gateway
-//! session represent everything outside the process (`near`). Relays read the samples that the application
-//! publishes, and stand-ins write the samples that it subscribes to. Everything else works as with shared memory. In
-//! the daemon (axon-daemon's `control::relayed`) a session of the same id holds the application's endpoints, in memory that every
+//! The daemon treats such a session much like another host. In its own process a separate registry and gateway session
+//! represent everything outside the process (`near`). Relays read the samples that the application publishes, and
+//! stand-ins write the samples that it subscribes to. Everything else works as with shared memory. In the daemon
+//! (axon-daemon's `control::relayed`) a session of the same id holds the application's endpoints, in memory that every
 //! session can map. Other sessions, on this host and elsewhere, see an ordinary session. Clients and servers have
 //! stand-ins and cross as topics do (`calls`). Liveliness is sent separately.
 //!
@@ -22,13 +22,13 @@ mod unanswered;
 pub use self::flow::ArrivalPool;
 pub use super::core::ChangeSignal;
 
-/// Relayed sessions of one daemon: each costs it two threads and memory of its own.
+/// Maximum number of relayed sessions of one daemon. Each costs the daemon two threads and memory of its own.
 pub const MAX_SESSIONS: usize = 32;
-/// Publishers, subscriptions, clients, and servers, of a relayed session.
+/// Maximum number of publishers, subscriptions, clients, and servers of a relayed session.
 pub const MAX_ENDPOINTS: usize = 1024;
-/// Clients elsewhere that a relayed session's servers answer, each counted once for each of them.
+/// Maximum number of remote clients that a relayed session's servers answer. A client counts once for each server.
 pub const MAX_CALLERS: usize = 1024;
-/// Others that one endpoint is said to be matched with; one packet holds no more.
+/// Maximum number of matches of one endpoint that are reported: one packet holds no more.
 pub const MAX_MATCHED: usize = 1024;
-/// How long an end that ends waits for what was written before to have gone on.
+/// Time that an ending end waits for the delivery of earlier messages.
 pub const LINGER: Duration = Duration::from_secs(1);

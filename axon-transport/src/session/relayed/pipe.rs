@@ -44,7 +44,7 @@ const BATCH: usize = 64;
 /// Time between checks for changes that nothing signals.
 const NAP: Duration = Duration::from_millis(5);
 
-/// Why a relay ends.
+/// The reason for the end of a relay.
 #[derive(Debug, thiserror::Error)]
 pub enum End {
     /// The socket failed.
@@ -73,7 +73,7 @@ struct Unacknowledged {
     said: u64,
     /// The number of the last written sample.
     last: u64,
-    /// The number to report once the last sample is delivered: that of the last one that arrived, written or
+    /// The number to report once the last sample is delivered: the number of the last sample that arrived, written or
     /// not.
     then: u64,
 }
@@ -85,7 +85,7 @@ pub enum LossReport {
     Before {
         /// The number of samples.
         samples: u64,
-        /// Whether no sample of the channel arrived before.
+        /// True if no sample of the channel arrived before.
         first: bool,
     },
     /// A sample that arrived and could not be written.
@@ -126,7 +126,7 @@ pub struct RelaySocket {
     arrived: BTreeMap<FlowChannel, VecDeque<InboundSample>>,
     /// Channels with a handled sample, each with the highest number that arrived.
     begun: BTreeMap<FlowChannel, u64>,
-    /// Whether an arrived sample waits for a reader to make room.
+    /// True if an arrived sample waits for a reader to make room.
     blocked: bool,
     /// Channels whose samples are written and not all delivered.
     written: BTreeMap<FlowChannel, Unacknowledged>,
@@ -212,7 +212,7 @@ impl RelaySocket {
         self.begun.retain(|channel, _| keep(channel));
     }
 
-    /// Whether a sample waits for a reader.
+    /// Returns whether a sample waits for a reader.
     pub fn is_blocked(&self) -> bool {
         self.blocked
     }

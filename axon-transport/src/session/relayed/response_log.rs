@@ -1,4 +1,4 @@
-//! The responses that a relayed session's clients were given: a copy of one may come through the next daemon.
+//! The responses that a relayed session's clients have received: the next daemon may send a copy of one.
 
 use std::collections::{BTreeSet, VecDeque};
 
@@ -6,18 +6,18 @@ use axon_shm::Meta;
 
 use super::flow::FlowChannel;
 
-/// Responses that are remembered. A server that was not told of more than these before its daemon ended sends one of
-/// them once more.
+/// Maximum number of remembered responses. A server with more unconfirmed responses at the end of its daemon sends one
+/// of them once more.
 const MAX_RESPONSES: usize = 4096;
 
-/// A response: a server that answers a request twice does so at two times.
+/// The key of a response: its channel, number and time. A server that answers a request twice does so at two times.
 type Response = (FlowChannel, u64, i64);
 
-/// The last responses that came.
+/// The last responses that arrived.
 #[derive(Debug, Default)]
 pub(crate) struct ResponseLog {
     known: BTreeSet<Response>,
-    /// In the order in which they came.
+    /// The responses in order of arrival.
     order: VecDeque<Response>,
 }
 
@@ -26,12 +26,12 @@ fn response(channel: &FlowChannel, meta: &Meta) -> Response {
 }
 
 impl ResponseLog {
-    /// Whether it came before.
+    /// Returns whether this response arrived before.
     pub(super) fn has(&self, channel: &FlowChannel, meta: &Meta) -> bool {
         channel.client.is_some() && self.known.contains(&response(channel, meta))
     }
 
-    /// It came.
+    /// Records a response that arrived.
     pub(super) fn add(&mut self, channel: &FlowChannel, meta: &Meta) {
         let response = response(channel, meta);
         if channel.client.is_none() || !self.known.insert(response) {
@@ -61,7 +61,7 @@ mod tests {
         assert!(log.has(&channel, &of(7, 100)));
         assert!(!log.has(&channel, &of(7, 101)) && !log.has(&channel, &of(8, 100)));
         assert!(!log.has(&FlowChannel::between(server, other), &of(7, 100)));
-        // A topic's samples have numbers of their own.
+        // The samples of a topic have their own numbers.
         log.add(&FlowChannel::of(server), &of(9, 100));
         assert!(!log.has(&FlowChannel::of(server), &of(9, 100)));
     }

@@ -12,18 +12,18 @@ use axon_shm::Meta;
 use super::flow::{OutboundSample, SamplePayload};
 use crate::ids::Gid;
 
-/// Requests that are kept.
+/// Maximum number of requests that are kept.
 const MAX_REQUESTS: usize = 4096;
-/// Bytes of theirs, or one longer request.
+/// Maximum number of bytes of the kept requests; a single request may be longer.
 const MAX_BYTES: usize = 32 << 20;
 
 /// The requests of all clients of a session.
 #[derive(Debug, Default)]
 pub(crate) struct Unanswered {
-    /// By client and number.
+    /// The requests by client and number.
     requests: BTreeMap<(Gid, u64), Request>,
     bytes: usize,
-    /// Requests that were not kept since this was last asked: there were too many.
+    /// Number of requests that were not kept since the last call of `take_unkept`, because there were too many.
     unkept: u64,
 }
 
@@ -33,12 +33,12 @@ struct Request {
     payload: Arc<[u8]>,
     /// The servers that have not answered it.
     awaits: BTreeSet<Gid>,
-    /// Whether it is to be sent again.
+    /// True if it is to be sent again.
     due: bool,
 }
 
 impl Unanswered {
-    /// A request was sent to these servers.
+    /// Keeps a request that was sent to these servers.
     pub(crate) fn add(&mut self, client: Gid, meta: Meta, payload: Vec<u8>, awaits: BTreeSet<Gid>) {
         if awaits.is_empty() {
             return;
@@ -52,7 +52,7 @@ impl Unanswered {
         while self.requests.len() > MAX_REQUESTS
             || self.bytes > MAX_BYTES && self.requests.len() > 1
         {
-            // It forgets the oldest request of this client, or of any client if this one has none.
+            // The oldest request of this client is forgotten, or of any client if this one has no older request.
             let of = (client, 0)..(client, meta.sequence);
             let oldest = self.requests.range(of).next().or_else(|| self.requests.iter().next());
             let Some(oldest) = oldest.map(|(key, _)| *key) else { break };
@@ -61,7 +61,7 @@ impl Unanswered {
         }
     }
 
-    /// A server answered a request.
+    /// Records that a server answered a request.
     pub(crate) fn answered(&mut self, client: Gid, server: &Gid, number: u64) {
         let Some(request) = self.requests.get_mut(&(client, number)) else { return };
         request.awaits.remove(server);
@@ -70,14 +70,15 @@ impl Unanswered {
         }
     }
 
-    /// These servers are reached by `client` from now on, and get the requests that they have not answered.
+    /// Marks the requests of `client` that these servers have not answered as due, because the servers are matched
+    /// again.
     pub(crate) fn resend(&mut self, client: &Gid, servers: &BTreeSet<Gid>) {
         for request in self.of(client) {
             request.due |= !request.awaits.is_disjoint(servers);
         }
     }
 
-    /// The next request of `client` that is to be sent again.
+    /// Returns the next request of `client` that is due to be sent again.
     pub(crate) fn next_due(&mut self, client: &Gid) -> Option<OutboundSample<SamplePayload>> {
         let request = self.of(client).find(|request| request.due)?;
         request.due = false;
@@ -85,12 +86,12 @@ impl Unanswered {
         Some(OutboundSample { meta: request.meta, lost: 0, content })
     }
 
-    /// Whether a request of `client` is to be sent again.
+    /// Returns whether a request of `client` is to be sent again.
     pub(crate) fn is_due(&self, client: &Gid) -> bool {
         self.requests.range(all_of(client)).any(|(_, request)| request.due)
     }
 
-    /// A server does not answer any more. How many requests nobody else will answer.
+    /// Forgets a server that does not answer any more. Returns the number of requests that no other server will answer.
     pub(crate) fn forget_server(&mut self, server: &Gid) -> usize {
         let before = self.requests.len();
         for request in self.requests.values_mut() {
@@ -100,17 +101,17 @@ impl Unanswered {
         before - self.requests.len()
     }
 
-    /// A client is gone.
+    /// Forgets a client that is gone.
     pub(crate) fn forget_client(&mut self, client: &Gid) {
         self.retain(|of, _| of != client);
     }
 
-    /// The clients that `are_there` are left.
+    /// Forgets the clients for which `are_there` returns false.
     pub(crate) fn keep_clients(&mut self, are_there: impl Fn(&Gid) -> bool) {
         self.retain(|client, _| are_there(client));
     }
 
-    /// Requests that were not kept since this was last asked.
+    /// Returns the number of requests that were not kept since the last call.
     pub(crate) fn take_unkept(&mut self) -> u64 {
         std::mem::take(&mut self.unkept)
     }

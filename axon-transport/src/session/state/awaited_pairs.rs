@@ -1,4 +1,4 @@
-//! New endpoints wait for those that they are matched with.
+//! Makes new endpoints wait for the endpoints that they are matched with.
 
 use std::time::{Duration, Instant};
 
@@ -8,13 +8,13 @@ use crate::{
     ids::Gid,
 };
 
-/// How long a new endpoint waits.
+/// Maximum time that a new endpoint waits.
 const PAIRS: Duration = Duration::from_millis(50);
 
 impl SessionShared {
-    /// Waits until a new endpoint is matched with all that the graph shows and that go with it: a
-    /// caller that counts them reaches them. Not for long, and not where nobody could do it. Those of other hosts are
-    /// not awaited while many endpoints are created ([`PairWaits`](super::pair_waits::PairWaits)).
+    /// Waits until a new endpoint is matched with all compatible endpoints that the graph shows: a caller that counts
+    /// them reaches them. The wait is short, and there is none on the control thread or without a daemon. Endpoints of
+    /// other hosts are not awaited while many endpoints are created ([`PairWaits`](super::pair_waits::PairWaits)).
     pub(in crate::session) fn await_pairs(&self, own: &Endpoint, matched: impl Fn(&Gid) -> bool) {
         if self.control.get() == Some(&std::thread::current().id()) {
             return;

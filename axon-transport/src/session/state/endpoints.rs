@@ -16,28 +16,28 @@ use crate::{
     wire::session::EndpointRole,
 };
 
-/// The endpoints and nodes of a session, those that it has for other processes among them.
+/// The endpoints and nodes of a session, including endpoints that it has for other processes.
 #[derive(Default)]
 pub(in crate::session) struct OwnEndpoints {
     last_number: u32,
-    /// With what tells of changes of the graph.
+    /// The nodes, each with the condition that is triggered by changes of the graph.
     pub(in crate::session) nodes: HashMap<Gid, (Endpoint, GuardCondition)>,
     pub(in crate::session) publishers: HashMap<Gid, Arc<PublisherInner>>,
     pub(in crate::session) subscriptions: HashMap<Gid, Arc<SubscriptionInner>>,
-    /// Publishers that the application has dropped, and until when they stay at most.
+    /// Publishers that the application has dropped, each with the time until which it stays at most.
     pub(in crate::session) leaving: BTreeMap<Gid, Instant>,
     /// Applications' endpoints of both kinds by topic or service.
     pub(in crate::session) topics: HashMap<String, BTreeSet<Gid>>,
 }
 
 impl OwnEndpoints {
-    /// The number of a new one.
+    /// Returns the number of a new endpoint.
     pub(in crate::session) fn next_number(&mut self) -> u32 {
         self.last_number += 1;
         self.last_number
     }
 
-    /// The nodes and endpoints of the session's application.
+    /// Returns the nodes and endpoints of the session's application.
     pub(in crate::session) fn own(&self) -> impl Iterator<Item = &Endpoint> {
         let application = |role| role == EndpointRole::Application;
         let nodes = self.nodes.values().map(|(node, _)| node);
@@ -59,7 +59,7 @@ impl OwnEndpoints {
         (publishers, self.subscriptions.values().cloned().collect())
     }
 
-    /// The GIDs of all of them.
+    /// Returns the GIDs of all nodes and endpoints.
     pub(in crate::session) fn gids(&self) -> BTreeSet<Gid> {
         let endpoints = self.publishers.keys().chain(self.subscriptions.keys());
         self.nodes.keys().chain(endpoints).copied().collect()

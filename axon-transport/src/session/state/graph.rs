@@ -11,21 +11,20 @@ use crate::{
     ids::Gid,
 };
 
-/// The graph as the daemon described it, with the session's own endpoints as they are.
+/// The graph as the daemon described it, with the session's own endpoints.
 #[derive(Default)]
 pub(in crate::session) struct ShownGraph {
     pub(in crate::session) view: Arc<GraphView>,
-    /// Own endpoints that the daemon refused, and why. No other session learns of them.
+    /// Own endpoints that the daemon refused, each with the reason. No other session learns of them.
     pub(in crate::session) refused: BTreeMap<Gid, String>,
     /// Ended endpoints, until a daemon has announced their end.
     pub(in crate::session) tombstones: BTreeSet<Gid>,
-    /// Whether it changed since the control thread last reported it.
+    /// True if it changed since the control thread last reported it.
     changed: bool,
 }
 
 impl ShownGraph {
-    /// Shows what the session has made, whatever the daemon does meanwhile: the caller that
-    /// made it finds it in the graph, unless the daemon has refused it.
+    /// Shows an own endpoint in the graph: the caller that created it finds it there, unless the daemon has refused it.
     pub(in crate::session) fn show(&mut self, own: &Endpoint) {
         if self.refused.contains_key(&own.gid) {
             return;
@@ -42,14 +41,14 @@ impl ShownGraph {
         }
     }
 
-    /// An own endpoint is gone: nobody here counts it any more, whatever the daemon has heard.
+    /// Removes an own endpoint that is gone from the graph, whatever the daemon knows.
     pub(in crate::session) fn remove_dead(&mut self, gid: &Gid) {
         self.tombstones.insert(*gid);
         self.refused.remove(gid);
         self.hide(gid);
     }
 
-    /// Whether it changed since this was asked last.
+    /// Returns whether it changed since the last call.
     pub(in crate::session) fn take_changed(&mut self) -> bool {
         mem::take(&mut self.changed)
     }

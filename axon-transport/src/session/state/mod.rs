@@ -33,17 +33,17 @@ use crate::{
     wire::session::{SessionMessage, Unmet},
 };
 
-/// A session: its [core](SessionCore), and the endpoints and the graph that the core knows nothing of.
+/// A session: its [core](SessionCore), and the endpoints and the graph that the core does not know.
 pub(in crate::session) struct SessionShared {
     pub(in crate::session) core: Arc<SessionCore>,
-    /// The control thread, once it runs.
+    /// The id of the control thread, once it runs.
     pub(in crate::session) control: OnceLock<ThreadId>,
-    /// One status request at a time.
+    /// The lock that allows one status request at a time.
     pub(in crate::session) asking: Mutex<()>,
     pair_waits: Mutex<PairWaits>,
-    /// Held while pairs of the session's own endpoints come or go.
+    /// The lock that is held while pairs of the session's own endpoints come or go.
     own_pairs: Mutex<()>,
-    /// For the clients of its servers.
+    /// The limit for the clients of its servers.
     pub(in crate::session) room: Arc<ClientLimit>,
     state: Mutex<SessionState>,
 }
@@ -52,19 +52,19 @@ pub(in crate::session) struct SessionShared {
 pub(in crate::session) struct SessionState {
     pub(in crate::session) endpoints: OwnEndpoints,
     pub(in crate::session) graph: ShownGraph,
-    /// Readers that never took up what publishers granted that have ended.
+    /// Readers that never took up the grants of publishers that have ended.
     pub(in crate::session) unmet: UnmetPairs,
     /// Pairs that other threads matched or unmatched, for the control thread to report.
     pub(in crate::session) rematched: Vec<(Changes, EventSource)>,
 }
 
 impl SessionState {
-    /// The application's nodes and endpoints that the graph shows.
+    /// Returns the application's nodes and endpoints that the graph shows.
     pub(in crate::session) fn shown(&self) -> impl Iterator<Item = &Endpoint> {
         self.endpoints.own().filter(|own| !self.graph.refused.contains_key(&own.gid))
     }
 
-    /// The daemon does not take one of its own: it is in nobody's graph, and so not in this one.
+    /// Records that the daemon refused an own endpoint: it is in no session's graph, and so not in this one.
     fn refuse(&mut self, gid: Gid, why: String) {
         // It may have ended meanwhile.
         if self.endpoints.own().any(|own| own.gid == gid) {
@@ -73,20 +73,21 @@ impl SessionState {
         }
     }
 
-    /// Another daemon may take those that the last one refused.
+    /// Forgets the refusals of the last daemon: another daemon may accept the endpoints.
     pub(in crate::session) fn forget_refusals(&mut self) {
         let refused = std::mem::take(&mut self.graph.refused);
         let own = self.endpoints.own().filter(|own| refused.contains_key(&own.gid));
         own.for_each(|own| self.graph.show(own));
     }
 
-    /// One of its own is gone. The daemon hears of it, too.
+    /// Removes an own endpoint that is gone, and queues the message for the daemon.
     fn remove_dead(&mut self, gid: &Gid, link: &DaemonLink) {
         self.graph.remove_dead(gid);
         link.queue(Outgoing::gone(*gid));
     }
 
-    /// A publisher ends. Has to be called before the daemon is told so.
+    /// Reports the readers of an ending publisher that have not taken up their grant. It must be called before the end
+    /// of the publisher is queued for the daemon.
     fn leave_unmet(&mut self, publisher: &PublisherInner, link: &DaemonLink) {
         let writer = publisher.endpoint.gid;
         for (reader, samples) in publisher.unmet() {
@@ -98,7 +99,7 @@ impl SessionState {
 }
 
 impl SessionShared {
-    /// The state of a new session, which has no endpoint yet.
+    /// Creates the state of a new session, which has no endpoint yet.
     ///
     /// # Errors
     /// The process has no descriptors left.
@@ -119,7 +120,7 @@ impl SessionShared {
         })
     }
 
-    /// For a relay: there is a daemon now, or none any more.
+    /// Sets, for a relay, the daemon, or that there is none.
     pub(in crate::session) fn set_daemon(&self, daemon: Option<DaemonId>) {
         {
             let mut state = self.state();
@@ -131,14 +132,14 @@ impl SessionShared {
         self.notify(Some(&daemon.map_or(SessionEvent::DaemonLost, SessionEvent::DaemonFound)));
     }
 
-    /// The daemon does not take an endpoint of the session's own.
+    /// Records that the daemon refused an endpoint of the session.
     pub(in crate::session) fn refuse(&self, gid: Gid, why: String) {
         self.state().refuse(gid, why);
         self.notify(Some(&SessionEvent::Refused(gid)));
         self.core.wake();
     }
 
-    /// The daemon refuses something that it may allow later. A session that relays a process keeps the reason for it.
+    /// Records a refusal that may be lifted later. A session that relays a process keeps the reason for it.
     pub(in crate::session) fn keep_refusal(&self, why: String) {
         // The relay is woken for the first refusal. It takes all at once.
         if self.core.options.keeps_refusals && self.core.link.keep_refusal(why) {
@@ -146,8 +147,8 @@ impl SessionShared {
         }
     }
 
-    /// For a relay: so many samples of `writer` were lost on their way to the session's
-    /// subscriptions, before the `first` that comes through this daemon or later.
+    /// Counts, for a relay, `samples` samples of `writer` that were lost on their way to the session's subscriptions.
+    /// With `first`, they were lost before the first sample that comes through this daemon or later.
     pub(in crate::session) fn lost(&self, writer: &Gid, samples: u64, first: bool) {
         let subscriptions: Vec<_> =
             self.state().endpoints.subscriptions.values().cloned().collect();
@@ -158,12 +159,13 @@ impl SessionShared {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// How new endpoints wait for those of other hosts.
+    /// Returns the state of the waits for endpoints of other hosts.
     fn pair_waits(&self) -> MutexGuard<'_, PairWaits> {
         self.pair_waits.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Waits for changes of the session until `reached`, which runs without a lock.
+    /// Waits for changes of the session until `reached` returns true; it runs without a lock. Returns false if the time
+    /// is over.
     pub(in crate::session) fn wait_changed(
         &self,
         timeout: Duration,
@@ -172,7 +174,7 @@ impl SessionShared {
         self.core.changes.wait(timeout, reached)
     }
 
-    /// Tells those who wait, the nodes' conditions for a change of the graph, and the listener.
+    /// Wakes the waiting threads, triggers the nodes' conditions if the graph changed, and calls the listener.
     pub(in crate::session) fn notify(&self, event: Option<&SessionEvent>) {
         if matches!(event, Some(SessionEvent::Graph)) {
             let guards: Vec<GuardCondition> = {

@@ -1,6 +1,6 @@
-//! Pairs of endpoints within one session. The thread that creates the second endpoint attaches them, and
-//! the thread that drops the first one detaches them, before the call returns. A publisher may stay longer for readers of
-//! other sessions.
+//! Pairs of endpoints within one session. The thread that creates the second endpoint attaches them, and the thread
+//! that drops the first one detaches them, before the call returns. A publisher may stay longer for readers of other
+//! sessions.
 //!
 //! The daemon announces such a pair like any other, when the pair is already attached. A writer that is asked again
 //! for the same lane repeats its grant. If the thread cannot attach the pair at once, for example for lack of
@@ -27,17 +27,17 @@ use crate::{
     wire::session::EndpointRole,
 };
 
-/// How long a publisher that the application has dropped stays for readers that have not taken up their grant.
+/// Maximum time that a publisher which the application has dropped stays for readers that have not taken up their
+/// grant.
 const EXPECTED: Duration = Duration::from_secs(if cfg!(test) { 3600 } else { 10 });
 
 impl SessionShared {
-    /// Under this lock, the pairs of a session's own endpoints come and go with them.
+    /// Takes the lock under which pairs of the session's own endpoints come and go.
     pub(in crate::session) fn lock_own_pairs(&self) -> MutexGuard<'_, ()> {
         self.own_pairs.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Attaches a new endpoint to those of its session that go with it, and shows it in the session's
-    /// graph.
+    /// Attaches a new endpoint to the matching endpoints of its session, and shows it in the session's graph.
     pub(in crate::session) fn meet(&self, own: &Endpoint) {
         let held = self.lock_own_pairs();
         let pairs = self.pairs_of(&own.gid);
@@ -83,7 +83,7 @@ impl SessionShared {
     fn join(&self, writer: &PublisherInner, reader: &SubscriptionInner) -> Result<(), ShmError> {
         let (from, gid, peer) =
             (writer.endpoint.gid, reader.endpoint.gid, RingPeer::Local(self.core.segment.clone()));
-        // All of it under one lock: between two parts, the control thread would ask by another lane.
+        // One lock covers all steps: between two steps, the control thread would request another lane.
         let mut matched_readers = reader.lock();
         let lane = matched_readers.lane_for(from, || self.core.segment.allocate_lane())?.lane;
         let reads = ReaderInfo { gid, lane, qos: reader.qos, peer: peer.clone(), stands_for: None };
@@ -96,9 +96,9 @@ impl SessionShared {
         Ok(())
     }
 
-    /// The application is done with an endpoint or a node: parts it from the others of the session, and takes it out of
-    /// what the session has. A publisher stays for readers that have not taken up their grant, unseen here, for
-    /// [`EXPECTED`] at most.
+    /// Removes an endpoint or node that the application has dropped: detaches it from the other endpoints of the
+    /// session, and removes it from the session. A publisher stays for readers that have not taken up their grant,
+    /// hidden in this session's graph, for at most [`EXPECTED`].
     pub(in crate::session) fn part(&self, gid: &Gid) {
         let link = &self.core.link;
         let held = self.lock_own_pairs();
@@ -122,7 +122,7 @@ impl SessionShared {
         let reads = subscription.as_ref().map(|s| (&s.endpoint, s.role));
         let mut others = Vec::new();
         match writes.or(reads) {
-            // Their GIDs are not in the graph, or stand for what is.
+            // Their GIDs are not in the graph, or stand for remote endpoints in it.
             Some((_, EndpointRole::StandIn | EndpointRole::Relay)) => {
                 link.queue(Outgoing::gone(*gid))
             }
@@ -156,7 +156,7 @@ impl SessionShared {
         self.rematch(others);
     }
 
-    /// Lets go of the publishers that stayed and are not needed any more, or of all; whether there are others.
+    /// Removes the publishers that stayed and are not needed any more, or all. Returns whether others remain.
     pub(in crate::session) fn part_leaving(&self, all: bool) -> bool {
         let link = &self.core.link;
         let mut state = self.state();
@@ -184,7 +184,7 @@ impl SessionShared {
         others
     }
 
-    /// Counts the changes to the pairs of `endpoints`. The control thread tells the rest.
+    /// Counts the changes to the pairs of `endpoints`. The control thread reports them.
     fn rematch(&self, endpoints: Vec<EventSource>) {
         let news = endpoints.into_iter().map(|endpoint| (endpoint.rematch(), endpoint));
         let news: Vec<_> = news.filter(|(changes, _)| !changes.is_empty()).collect();

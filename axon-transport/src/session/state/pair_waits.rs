@@ -1,5 +1,6 @@
-//! How long new endpoints wait for endpoints of other hosts. One that waits is a convenience; a thousand that are created
-//! one after the other would keep their program waiting for a minute, while they could be matched together.
+//! Limits how long new endpoints wait for endpoints of other hosts. For one endpoint, the wait is convenient; a
+//! thousand endpoints that are created one after the other would keep their program waiting for a minute, while they
+//! could be matched together.
 //!
 //! Plain data.
 
@@ -7,7 +8,7 @@ use std::time::{Duration, Instant};
 
 /// Pairs on one host take less than this.
 const LOCAL_PAIR_TIME: Duration = Duration::from_millis(5);
-/// After a longer wait others do not wait for so many times as long.
+/// Factor for the pause after a longer wait: for so many times its duration, other endpoints do not wait.
 const PAUSE_FACTOR: u32 = 9;
 
 /// The waits of one session.
@@ -17,12 +18,12 @@ pub(super) struct PairWaits {
 }
 
 impl PairWaits {
-    /// Whether a new endpoint waits for those of other hosts now.
+    /// Returns whether a new endpoint waits for endpoints of other hosts now.
     pub(super) fn are_due(&self, now: Instant) -> bool {
         self.not_before.is_none_or(|due| due <= now)
     }
 
-    /// One that did has waited for so long.
+    /// Records that an endpoint has waited for this time.
     pub(super) fn waited(&mut self, time: Duration, now: Instant) {
         if time > LOCAL_PAIR_TIME {
             self.not_before = Some(now + PAUSE_FACTOR * time);
@@ -38,7 +39,7 @@ mod tests {
     fn endpoints_wait_a_tenth_of_the_time_where_each_takes_long() {
         let (mut waits, mut now) = (PairWaits::default(), Instant::now());
         let mut waited = 0;
-        // A millisecond for each endpoint, and fifty where it waits.
+        // Each endpoint takes a millisecond, or fifty if it waits.
         for _ in 0..1000 {
             if waits.are_due(now) {
                 let time = Duration::from_millis(50);

@@ -9,7 +9,7 @@ use crate::{
     session::{error::SessionError, options::SessionOptions},
 };
 
-/// Checks that the session's permissions, if it has some, count now and in its domain.
+/// Checks that the session's permissions, if it has some, are valid now and in its domain.
 pub(in crate::session) fn check_domain(
     config: &Config,
     options: &SessionOptions,
@@ -77,7 +77,7 @@ mod tests {
         let denied = session.create_publisher(spec("/in")).unwrap_err().to_string();
         let expected = "/in: enclave /arm may not publish rt/in: no rule allows it, and line 6 of p denies the rest";
         assert_eq!(denied, expected);
-        // The graph has no endpoint that was denied. The endpoints that were allowed work.
+        // The graph contains no denied endpoint. The allowed endpoints work.
         assert_eq!(session.graph().endpoints.len(), 4, "{:?}", session.graph());
         publisher.publish(b"x").unwrap();
     }

@@ -1,17 +1,17 @@
-//! Readers that never took up what a publisher granted them before it ended. They are told how many samples they lost,
-//! by way of the daemon.
+//! Readers that never took up the grant of a publisher before it ended. The daemon tells them how many samples they
+//! lost.
 //!
-//! A daemon that is killed takes the grant with it that it did not pass on, and a reader whose process is stopped comes
-//! to the next daemon late. So the session remembers what it told, and tells each daemon anew.
+//! A daemon that is killed loses a grant that it did not pass on, and a reader whose process is stopped comes to the
+//! next daemon late. So the session remembers these messages, and sends them to each daemon.
 
 use std::collections::VecDeque;
 
 use crate::wire::session::Unmet;
 
-/// Pairs that a session remembers.
+/// Maximum number of pairs that a session remembers.
 const MAX_UNMET_PAIRS: usize = 1024;
 
-/// The pairs of a session's publishers that ended with readers that had not taken up their grant.
+/// The pairs of a session's ended publishers and the readers that had not taken up their grant.
 #[derive(Debug, Default)]
 pub(in crate::session) struct UnmetPairs {
     pairs: VecDeque<Unmet>,
@@ -23,7 +23,7 @@ impl UnmetPairs {
         self.pairs.is_empty()
     }
 
-    /// What each daemon is told.
+    /// Returns the pairs that each daemon receives.
     pub(in crate::session) fn iter(&self) -> impl Iterator<Item = Unmet> {
         self.pairs.iter().copied()
     }

@@ -22,16 +22,16 @@ use tracing_subscriber::{
 pub(super) use self::output::keep_in;
 use self::throttle::Throttle;
 
-/// Sends what this process logs to standard error, filtered by `AXON_LOG`. For a program's `main`;
-/// where a subscriber is set already, that one stays.
+/// Sends this process's log lines to standard error, filtered by `AXON_LOG`. For a program's `main`; if a subscriber is
+/// set already, that one stays.
 pub fn start(config: &Config) {
     // A program that checks its configuration refuses a wrong filter; warnings are shown without one.
     let filter = EnvFilter::try_new(&config.log).unwrap_or_else(|_| EnvFilter::new("warn"));
     let lines = tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(|| output::LogOutput)
-        // What cannot be written is dropped; the default prints that to standard error, and panics
-        // where that fails as well.
+        // A line that cannot be written is dropped; the default prints that to standard error, and panics if that fails
+        // as well.
         .log_internal_errors(false)
         .event_format(LineFormat { format: Format::default(), throttle: Throttle::default() })
         .with_filter_reloading();
@@ -43,22 +43,22 @@ pub fn start(config: &Config) {
     let _ = SET_FILTER.set(Box::new(move |new| drop(filter.reload(new))));
 }
 
-/// Changes the filter of the subscriber that [`start`] set.
+/// The function that changes the filter of the subscriber that [`start`] set.
 type SetFilter = Box<dyn Fn(EnvFilter) + Send + Sync>;
 
 static SET_FILTER: OnceLock<SetFilter> = OnceLock::new();
 
-/// Filters by this `AXON_LOG` from now on.
+/// Sets the filter to this `AXON_LOG` text.
 pub(super) fn set_filter(text: &str) {
     if let (Some(set), Ok(filter)) = (SET_FILTER.get(), EnvFilter::try_new(text)) {
         set(filter);
     }
 }
 
-/// One line for each event, of plain characters, and not too many of a kind.
+/// The format of log lines: one line for each event, of plain characters, with a rate limit for each kind.
 struct LineFormat {
     format: Format,
-    /// By the place in the code, and not by the text: the cause of a flood may choose the text.
+    /// The throttle counts by the place in the code, not by the text: the cause of a flood may choose the text.
     throttle: Throttle<callsite::Identifier>,
 }
 
@@ -80,7 +80,7 @@ where
                 None => return Ok(()),
             }
         } else {
-            // DEBUG and TRACE are only on where somebody asked for all details.
+            // DEBUG and TRACE are only on if a user asked for all details.
             0
         };
         let mut line = String::new();

@@ -8,14 +8,14 @@ use std::{
     sync::{Mutex, OnceLock, PoisonError},
 };
 
-/// Size of a log file, in bytes, at which a new one is begun. The one before is kept.
+/// Size of a log file, in bytes, at which a new one is begun. The previous one is kept.
 const MAX_FILE: u64 = 8 << 20;
 
-/// The file that standard error is, once [`keep_in`] has made it one.
+/// The path of the file that standard error goes to, once [`keep_in`] was called.
 static KEPT: OnceLock<Mutex<PathBuf>> = OnceLock::new();
 
-/// Has standard error go to the file `path` from now on, and rotates the file at 8 MiB: what was
-/// in it is then in `path` with `.1` at its end.
+/// Redirects standard error to the file `path`, and rotates the file at 8 MiB: its previous content is then in `path`
+/// with `.1` at its end.
 ///
 /// # Errors
 /// The file cannot be opened.
@@ -29,7 +29,7 @@ fn open(path: &Path) -> io::Result<File> {
     OpenOptions::new().create(true).append(true).mode(0o600).open(path)
 }
 
-/// Standard error. Writing to it never fails: what cannot be written is dropped.
+/// Standard error. Writing to it never fails: a line that cannot be written is dropped.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct LogOutput;
 
@@ -51,7 +51,7 @@ impl Write for LogOutput {
 /// Begins a new file if `more` bytes would make the present one longer than `most`.
 fn rotate(path: &Path, more: u64, most: u64) {
     let stderr = rustix::stdio::stderr();
-    // Asked of the file, since panics and libraries write to it as well.
+    // The size is read from the file, because panics and libraries write to it as well.
     let long = rustix::fs::fstat(stderr).is_ok_and(|stat| stat.st_size as u64 + more > most);
     if !long {
         return;
@@ -62,7 +62,7 @@ fn rotate(path: &Path, more: u64, most: u64) {
         .and_then(|()| open(path))
         .and_then(|file| Ok(rustix::stdio::dup2_stderr(file.as_fd())?));
     if renewed.is_err() {
-        // The directory has gone or is full: the bound holds all the same.
+        // The directory is gone or full: the size limit still applies.
         let _ = rustix::fs::ftruncate(stderr, 0);
     }
 }

@@ -7,9 +7,9 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// Lines of one kind that may follow each other at once.
+/// Maximum number of lines of one kind that may follow each other at once.
 const BURST: u32 = 10;
-/// After a burst, one line in this time.
+/// Interval of further lines after a burst.
 const INTERVAL: Duration = Duration::from_secs(1);
 
 /// A token bucket for each kind of line.
@@ -30,7 +30,8 @@ impl<K> Default for Throttle<K> {
 }
 
 impl<K: Eq + Hash> Throttle<K> {
-    /// Whether a line of `kind` is logged at `now`; with it, how many were left out before it.
+    /// Returns `None` if a line of `kind` is not logged at `now`; otherwise the number of lines of this kind that were
+    /// left out before it.
     pub(super) fn admit(&self, kind: K, now: Instant) -> Option<u64> {
         let mut buckets = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let bucket =

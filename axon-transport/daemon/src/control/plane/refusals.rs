@@ -1,4 +1,4 @@
-//! Who was refused of late, for `axon status`, and the lines of the log that say so.
+//! The recent refusals, for `axon status`, and their lines in the log.
 
 use std::{
     collections::HashMap,
@@ -9,21 +9,22 @@ use axon_transport::status::RefusalStatus;
 
 use crate::{bridge::RefusalKind, engine::links::place};
 
-/// Refusals that are remembered.
+/// Maximum number of remembered refusals.
 const MAX_REFUSALS: usize = 32;
-/// Of these, refusals of somebody who proves nothing.
+/// Maximum number of remembered refusals of hosts that prove nothing.
 const MOST_UNPROVEN: usize = 8;
 
 /// The last refusals, oldest first.
 ///
-/// Kinds share the room, and so do the addresses of hosts that prove nothing. The kind with the most refusals makes room,
-/// and within it the address with the most: its oldest refusal goes. A flood of one kind, or from one address, replaces its
-/// own refusals.
+/// Kinds share the room, and so do the addresses of hosts that prove nothing. The kind with the most refusals makes
+/// room, and within it the address with the most: its oldest refusal goes. A flood of one kind, or from one address,
+/// replaces its own refusals.
 #[derive(Debug, Default)]
 pub(in crate::control) struct Refusals(Vec<(RefusalKind, RefusalStatus)>);
 
 impl Refusals {
-    /// Adds a refusal. The same one takes the place of the earlier: a dialler has another port each time.
+    /// Adds a refusal. It replaces the same earlier one; ports do not count, because a dialler has another port each
+    /// time.
     pub(in crate::control) fn add(&mut self, kind: RefusalKind, new: RefusalStatus) {
         let peer = without_ports(&new.peer);
         self.0.retain(|(_, old)| {
@@ -39,17 +40,17 @@ impl Refusals {
         self.0.push((kind, new));
     }
 
-    /// Forgets the refusals of this peer for this.
+    /// Forgets the refusals of this peer for `what`.
     pub(in crate::control) fn forget(&mut self, peer: &str, what: &str) {
         self.0.retain(|(_, old)| old.peer != peer || old.what != what);
     }
 
-    /// All of them, oldest first.
+    /// Returns all refusals, oldest first.
     pub(in crate::control) fn iter(&self) -> impl Iterator<Item = &RefusalStatus> {
         self.0.iter().map(|(_, refusal)| refusal)
     }
 
-    /// The share that has most of the room, once `newcomer` has one more.
+    /// Returns the share with the most refusals, once `newcomer` has one more.
     fn largest(&self, newcomer: RefusalShare) -> RefusalShare {
         let mut held = HashMap::from([(newcomer, 1)]);
         for (kind, _) in &self.0 {
@@ -76,7 +77,7 @@ impl Refusals {
     }
 }
 
-/// Who shares a part of the room.
+/// The kinds of refusals that share space.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 enum RefusalShare {
     Unproven,
@@ -96,7 +97,7 @@ impl RefusalShare {
     }
 }
 
-/// The words of a peer's text. An address is `Ok`.
+/// Returns the words of a peer's text. An address is `Ok`.
 fn words(peer: &str) -> impl Iterator<Item = Result<IpAddr, &str>> {
     peer.split(' ').map(|word| match word.trim_end_matches(',').parse::<SocketAddr>() {
         Ok(address) => Ok(address.ip().to_canonical()),
@@ -104,12 +105,12 @@ fn words(peer: &str) -> impl Iterator<Item = Result<IpAddr, &str>> {
     })
 }
 
-/// A peer's text with addresses alone.
+/// Returns a peer's text with its addresses without ports.
 fn without_ports(peer: &str) -> Vec<Result<IpAddr, &str>> {
     words(peer).collect()
 }
 
-/// Where a refusal comes from. The rest of the text may be a stranger's words.
+/// Returns the address that a refusal comes from. The rest of the text may be chosen by a stranger.
 fn source(refusal: &RefusalStatus) -> Option<IpAddr> {
     words(&refusal.peer).filter_map(Result::ok).last().map(place)
 }
@@ -140,7 +141,7 @@ mod tests {
         refusals.add(kind, RefusalStatus::new(SystemTime::UNIX_EPOCH, peer, what, reason));
     }
 
-    /// The reasons of those that are remembered of peers that begin so.
+    /// Returns the reasons of the remembered refusals of peers whose text begins so.
     fn of(refusals: &Refusals, peer: &str) -> Vec<String> {
         let of = refusals.iter().filter(|refusal| refusal.peer.starts_with(peer));
         of.map(|refusal| refusal.reason.clone()).collect()

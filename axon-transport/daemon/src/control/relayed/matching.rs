@@ -31,22 +31,22 @@ use axon_transport::{
 
 use super::{ENDED, RelayedSession};
 
-/// Partners of a session's endpoints that are gone and whose last samples are kept until it takes them.
-/// Those samples are in memory of a process that may have ended.
+/// Maximum number of partners of a session's endpoints that are gone and whose last samples are kept until the session
+/// takes them. Those samples are in memory of a process that may have ended.
 const MAX_LEFT: usize = 256;
 
-/// A publisher's samples: they cross once, whatever the number of subscriptions.
+/// A publisher's samples on their way to the session: they cross once, whatever the number of subscriptions.
 #[derive(Default)]
 pub(super) struct RelayedSource {
     samples: Merge<Sample>,
-    /// How much of its history has been asked for.
+    /// The number of samples of its history that have been requested.
     history: Option<u32>,
-    /// The number up to which the session has them.
+    /// The number up to which the session has confirmed them.
     pub(super) done: Option<u64>,
 }
 
 impl RelayedSource {
-    /// Has its publisher know what the session has, by way of all subscriptions.
+    /// Acknowledges to its publisher, through all subscriptions, the samples that the session has.
     pub(super) fn acknowledge(&self, to: &BTreeMap<Gid, Subscription>, writer: &Gid) {
         let Some(done) = self.done else { return };
         let readers = self.samples.readers().filter_map(|reader| to.get(reader));
@@ -55,7 +55,7 @@ impl RelayedSource {
 }
 
 impl RelayedSession {
-    /// Tells what changed in the graph.
+    /// Sends the changes of the graph.
     pub(super) fn tell_graph(&mut self) -> Result<(), End> {
         let now = self.session.graph();
         let before = std::mem::replace(&mut self.graph, Arc::clone(&now));
@@ -79,8 +79,8 @@ impl RelayedSession {
         all.into_iter().try_for_each(|part| self.pipe.say(&SessionMessage::Graph(part)))
     }
 
-    /// Tells with whom the session's endpoints are matched, and decides by which of them what others
-    /// write goes to it.
+    /// Sends the matches of the session's endpoints, and decides through which endpoints remote messages are taken for
+    /// the session.
     pub(super) fn match_up(&mut self) -> Result<(), End> {
         let mut matched: BTreeMap<Gid, BTreeSet<Gid>> = BTreeMap::new();
         let partners = self.writers.iter().map(|(gid, writer)| (gid, writer.partners()));
@@ -106,7 +106,7 @@ impl RelayedSession {
         Ok(())
     }
 
-    /// Adds those that were there before and have left something: that comes first.
+    /// Adds partners that are gone and have left messages to `matched`: these messages come first.
     fn keep_what_is_left(&mut self, matched: &mut BTreeMap<Gid, BTreeSet<Gid>>) {
         let mut rest = BTreeSet::new();
         for (gid, others) in matched.iter() {
@@ -126,7 +126,7 @@ impl RelayedSession {
         }
     }
 
-    /// Whether what `other` wrote for an endpoint of the session has not all been taken by it.
+    /// Returns whether an endpoint of the session has not taken all messages of `other`.
     fn has_left(&self, gid: &Gid, other: &Gid) -> bool {
         if let Some(remote_writer) = self.writers.get(gid) {
             return remote_writer.has_from(other)
@@ -138,7 +138,7 @@ impl RelayedSession {
             || !self.pipe.outgoing.is_idle(&FlowChannel::of(*other))
     }
 
-    /// Gives up what `other`, which is gone, has left for an endpoint of a session that does not take it.
+    /// Gives up the remaining messages of `other`, which is gone, because the session's endpoint does not take them.
     fn discard(&self, gid: &Gid, other: &Gid) {
         let take = || match self.writers.get(gid) {
             Some(remote_writer) => remote_writer.take_from(other),
@@ -163,8 +163,8 @@ impl RelayedSession {
         }
     }
 
-    /// Tells with whom an endpoint is matched. What that opens and closes is so from here on, in the
-    /// order in which the session hears it.
+    /// Sends the matches of an endpoint, and opens and closes its channels from here on, in the order in which the
+    /// session receives the messages.
     fn tell(&mut self, gid: Gid, others: BTreeSet<Gid>) -> Result<(), End> {
         let shown = others.iter().copied().collect();
         self.pipe.say(&SessionMessage::Matched(RelayMatched { gid, others: shown }))?;
@@ -178,7 +178,7 @@ impl RelayedSession {
         Ok(())
     }
 
-    /// On which channels the session gets what `others` write for an endpoint of its.
+    /// Returns the channels on which the session gets the messages of `others` for one of its endpoints.
     fn channels(&self, gid: &Gid, others: &BTreeSet<Gid>) -> Vec<FlowChannel> {
         match self.writers.get(gid) {
             Some(RemoteWriter::Publisher(_)) => Vec::new(),
@@ -189,7 +189,7 @@ impl RelayedSession {
         }
     }
 
-    /// The channels to the session, as it has been told with whom its endpoints are matched.
+    /// Returns the channels to the session, according to the matches that were sent to it.
     fn wanted(&self) -> BTreeSet<FlowChannel> {
         self.told.iter().flat_map(|(gid, others)| self.channels(gid, others)).collect()
     }
@@ -200,7 +200,7 @@ impl RelayedSession {
         self.pipe.outgoing.retain(|channel| wanted.contains(channel));
     }
 
-    /// By way of which subscriptions each publisher's samples are taken: of all that there are.
+    /// Sets the subscriptions through which each publisher's samples are taken: all that are matched with it.
     fn ask(&mut self) {
         let mut asked: BTreeMap<Gid, (Vec<Gid>, Option<u32>)> = BTreeMap::new();
         for (gid, writers) in &self.told {
@@ -264,7 +264,7 @@ fn taken(
     Some(MergedSample { number: content.meta().sequence, lost, content })
 }
 
-/// On which channel the session gets what `other` writes for one of its clients or servers.
+/// Returns the channel on which the session gets the messages of `other` for one of its clients or servers.
 fn channel(of: &RemoteWriter, other: Gid) -> FlowChannel {
     match of {
         RemoteWriter::Client(client) => FlowChannel::between(other, client.gid()),

@@ -46,14 +46,14 @@ use rustix::io::Errno;
 use self::matching::{RelayedSource, take};
 use super::losses::Losses;
 
-/// Why samples of a writer that ended are lost.
+/// The cause under which samples of an ended writer count as lost.
 const ENDED: &str = "publisher_ended";
 
-/// What a relay is started with.
+/// The arguments of a relay's start.
 pub(crate) struct DaemonRelay {
     /// The session's connection.
     pub(crate) socket: PassedFd,
-    /// One end of a socket pair, at whose other end the control plane serves.
+    /// One end of a socket pair. The control plane serves the other end.
     pub(crate) inside: OwnedFd,
     pub(crate) config: Arc<Config>,
     /// The session's name and id.
@@ -91,7 +91,7 @@ impl DaemonRelay {
         let process = match peer_pidfd(&socket) {
             Ok(process) => Some(process),
             Err(Errno::SRCH) => return Err(End::Gone),
-            // It is served as long as somebody holds the connection.
+            // The session is served as long as any process holds the connection.
             Err(error) => {
                 tracing::debug!(session = %id, %error, "no pidfd of the session's process: its end shows when the socket closes");
                 None
@@ -143,58 +143,58 @@ fn failed(error: &SessionError) -> End {
     End::Other(error.to_string())
 }
 
-/// Samples of one publisher that do not get where they are to go.
+/// Counts of one publisher's samples that do not reach their destination.
 #[derive(Default)]
 struct UndeliverableSamples {
-    /// Those that came and could not be written.
+    /// Samples that arrived and could not be written.
     unwritten: u64,
-    /// How many its process was told of.
+    /// Number of samples that were reported to its process.
     told: u64,
 }
 
 impl UndeliverableSamples {
-    /// How many are to be told of, if readers gave up so many in all.
+    /// Returns the number of samples to report, if readers gave up `given_up` samples in all.
     fn given_up_since(&mut self, given_up: u64) -> u64 {
         let all = given_up.saturating_add(self.unwritten);
         all.saturating_sub(std::mem::replace(&mut self.told, all))
     }
 }
 
-/// A session that is served.
+/// A relayed session.
 struct RelayedSession {
     id: SessionId,
     pipe: RelaySocket,
     tally: Arc<RelayCounters>,
-    /// What the daemon counts as lost.
+    /// The daemon's counts of lost samples.
     losses: Arc<Losses>,
     /// Its publishers, clients and servers.
     writers: BTreeMap<Gid, RemoteWriter>,
     subscriptions: BTreeMap<Gid, Subscription>,
     nodes: BTreeMap<Gid, Node>,
-    /// The others that each endpoint was said to be matched with.
+    /// The matches of each endpoint that were sent to the session.
     told: BTreeMap<Gid, BTreeSet<Gid>>,
     /// The publishers whose samples the session gets.
     sources: BTreeMap<Gid, RelayedSource>,
-    /// What is asked of its servers.
+    /// The requests to its servers.
     calls: CallChannels,
-    /// The clients that its process has for each of its servers: whose responses may come.
+    /// The clients for which its process has stand-ins, by server: responses to them may come.
     callers: BTreeMap<Gid, BTreeSet<Gid>>,
     alive: Alive,
-    /// What its publishers lost.
+    /// The undeliverable samples of its publishers.
     unreached: BTreeMap<Gid, UndeliverableSamples>,
-    /// The graph as it was told.
+    /// The graph that was sent to the session.
     graph: Arc<GraphView>,
-    /// The pairs, an endpoint of the session first, of which the other is gone and has left something,
-    /// in the order in which they went.
+    /// The pairs of an endpoint of the session and a partner that is gone and has left messages, in the order in which
+    /// the partners went.
     left: VecDeque<(Gid, Gid)>,
-    /// Those of them that were given up.
+    /// The rate limit of log lines about pairs in `left` that were given up.
     given_up: LogLimit,
     /// When the session began: leases and log lines count from there.
     begun: Instant,
     leader: ExternalLeader,
     change_signal: Arc<ChangeSignal>,
     process: Option<OwnedFd>,
-    /// Last: what is above is of it.
+    /// The last field: the fields above belong to the session, and are dropped first.
     session: Session,
 }
 
@@ -207,8 +207,8 @@ impl RelayedSession {
             self.leader.arm(waits);
             let signalled = self.change_signal.take() | !std::mem::replace(&mut begun, true);
             if self.change_signal.is_lost() {
-                // Most often the daemon ends, and its process with it. Its readers shall not say before
-                // that they have left: what they had not delivered is kept for the next daemon.
+                // Usually the daemon and its process are ending. Its readers must not report before that they have
+                // left: their undelivered samples are kept for the next daemon.
                 self.pipe.hang_up();
                 std::thread::sleep(LINGER);
                 return Err(End::Other("the control plane dropped it".into()));
@@ -255,7 +255,7 @@ impl RelayedSession {
         }
     }
 
-    /// Writes what came, and tells the process what became of it.
+    /// Writes the messages that came, and reports the results to the process.
     fn write(&mut self) -> Result<(), End> {
         let (writers, tally, unreached) = (&self.writers, &self.tally, &mut self.unreached);
         let losses = &self.losses;
@@ -282,7 +282,7 @@ impl RelayedSession {
             };
             let samples = self.unreached.entry(writer).or_default().given_up_since(given_up);
             if samples > 0 {
-                // Ahead of the credit by which they count as acknowledged.
+                // Sent ahead of the credit by which the samples count as acknowledged.
                 self.pipe.say(&SessionMessage::GivenUp(RelayGivenUp {
                     reader: writer,
                     writer,
@@ -293,8 +293,8 @@ impl RelayedSession {
         self.pipe.give_back(credits)
     }
 
-    /// The process is gone, and was heard to the end: what it wrote goes to readers while they make room for it,
-    /// though nobody counts it any more.
+    /// Writes the remaining messages of a process that is gone, after all of them were received, for as long as readers
+    /// free space for them. No endpoint counts its endpoints any more.
     fn drain(mut self) -> Result<(), End> {
         let mut end = Instant::now() + LINGER;
         self.subscriptions.clear();
@@ -319,7 +319,7 @@ impl RelayedSession {
         Err(SocketError::Closed.into())
     }
 
-    /// Counts and logs by topic what the process, which is gone, left of its writers, because no reader takes it.
+    /// Counts and logs by topic the remaining samples of the ended process, because no reader takes them.
     fn discard_all(&self, left: &BTreeMap<Gid, u64>) {
         let mut topics: BTreeMap<&str, u64> = BTreeMap::new();
         for (gid, samples) in left {
@@ -449,8 +449,8 @@ impl RelayedSession {
         Ok(())
     }
 
-    /// An endpoint is gone. What it was sent is not wanted any more from here on, as both ends know by
-    /// the answer: its channels must not be taken for those of another that come after them.
+    /// Removes an endpoint that is gone. Messages for it are not wanted any more from here on, which both ends know
+    /// from the answer: its channels must not be mistaken for later channels of the same name.
     fn forget(&mut self, gid: &Gid) {
         if self.writers.remove(gid).is_some() {
             self.pipe.retain(|channel| channel.writer != *gid);
@@ -464,7 +464,8 @@ impl RelayedSession {
         }
     }
 
-    /// The process holds stand-ins for these clients of a server. Their responses pass through it.
+    /// Records the clients of a server for which the process has stand-ins. The responses to them pass through the
+    /// process.
     fn callers(&mut self, matched: RelayMatched) -> Result<(), End> {
         let RelayMatched { gid, others } = matched;
         let others: BTreeSet<Gid> = others.into_iter().collect();
@@ -488,7 +489,7 @@ impl RelayedSession {
         Ok(())
     }
 
-    /// What the control plane does not take, its process is told of as of what is refused here.
+    /// Sends the process the refusals of the control plane, like those of the relay itself.
     fn tell_refused(&mut self) -> Result<(), End> {
         for (gid, text) in self.session.refused() {
             self.forget(&gid);

@@ -1,4 +1,4 @@
-//! Asks peers what their access rules let this host do, for tools that want to know.
+//! Asks peers, for tools, what their access rules let this host do.
 
 use axon_shm::ids::{DaemonId, SessionId};
 use axon_transport::{
@@ -12,7 +12,7 @@ use axon_transport::{
 use super::{super::plane::ControlPlane, questions::NOT_LINKED};
 
 impl ControlPlane {
-    /// A session asks what a peer lets this host do. Other users may not.
+    /// Handles a session's question what a peer lets this host do. Other users may not ask.
     pub(in crate::control) fn ask_decisions(&mut self, id: &SessionId, check: AccessCheck) {
         let user = self.registry.session(id).and_then(|entry| entry.user);
         let AccessCheck { daemon, uses } = check;
@@ -35,7 +35,7 @@ impl ControlPlane {
         }
     }
 
-    /// A question has an answer.
+    /// Sends the answer to a question.
     pub(in crate::control) fn answer_decisions(
         &mut self,
         number: u64,
@@ -46,7 +46,8 @@ impl ControlPlane {
         }
     }
 
-    /// The link with a peer is over, or the gateway with all links: nobody answers.
+    /// Answers the questions to a peer whose link is over, or all questions if the gateway ended: no other answer will
+    /// come.
     pub(in crate::control) fn forget_questions(&mut self, daemon: Option<DaemonId>) {
         for number in self.questions.of(daemon) {
             self.answer_decisions(number, Err(NOT_LINKED.to_owned()));

@@ -21,13 +21,13 @@ use self::topics::topics;
 use super::plane::ControlPlane;
 use crate::discovery::DiscoveryNeeds;
 
-/// Characters of a GID in hexadecimal that its session decides.
+/// Number of hexadecimal characters of a GID that its session determines.
 const GID_PREFIX: usize = 24;
 
-/// Answers a session that asks for the status. One that asks again before it has taken the
-/// answer gets the same one from its beginning.
+/// Answers a session that asks for the status. A session that asks again before it has taken the answer gets the same
+/// answer from its beginning.
 pub(super) fn send_status(control: &mut ControlPlane, id: &SessionId) {
-    // Another user may have begun to read a status before there were rules.
+    // Another user may have begun to read a status before there were access rules.
     let user = control.registry.session(id).and_then(|entry| entry.user);
     let limited = user.is_some() && !control.config.access.is_empty();
     if !limited && control.registry.repeat_status(id) {
@@ -106,14 +106,14 @@ fn status(control: &ControlPlane) -> Status {
     status
 }
 
-/// What another user of the host may know of a daemon that has access rules.
+/// Returns the part of the status that another user of the host may see if the daemon has access rules.
 fn without_details(control: &ControlPlane) -> Status {
     let mut status = of_daemon(control);
     status.withheld = true;
     status
 }
 
-/// What the daemon itself is.
+/// Returns the part of the status about the daemon itself.
 fn of_daemon(control: &ControlPlane) -> Status {
     let mut status = Status::default();
     status.daemon = control.id.to_string();

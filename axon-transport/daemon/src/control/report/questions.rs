@@ -9,13 +9,14 @@ use axon_shm::ids::{DaemonId, SessionId};
 use axon_transport::internal::wire::session::CheckedUse;
 use tokio::sync::Notify;
 
-/// Why a peer was not asked.
+/// The reason why a peer was not asked.
 pub(in crate::control) const NOT_LINKED: &str = "there is no link with this peer";
 
-/// Questions that wait for an answer. The session of the oldest is told that there are too many.
+/// Maximum number of questions that wait for an answer. Beyond that, the session of the oldest is told that there are
+/// too many.
 const WAITING: usize = 64;
 
-/// A question that the gateway is to pass on: its number, the peer, and the uses that it is about.
+/// A question for the gateway to pass on: its number, the peer, and the uses that it is about.
 type Question = (u64, DaemonId, Vec<CheckedUse>);
 
 /// The questions that wait.
@@ -23,23 +24,23 @@ type Question = (u64, DaemonId, Vec<CheckedUse>);
 pub(in crate::control) struct AccessQuestions {
     number: u64,
     unsent: VecDeque<Question>,
-    /// Who asked, and which peer.
+    /// The asking session and the peer of each question.
     waiting: BTreeMap<u64, (SessionId, DaemonId)>,
     bell: Rc<Notify>,
 }
 
 impl AccessQuestions {
-    /// Rings when there is one for the gateway.
+    /// Returns the bell that rings when there is a question for the gateway.
     pub(in crate::control) fn bell(&self) -> Rc<Notify> {
         Rc::clone(&self.bell)
     }
 
-    /// The next question for the gateway.
+    /// Returns the next question for the gateway.
     pub(in crate::control) fn poll(&mut self) -> Option<Question> {
         self.unsent.pop_front()
     }
 
-    /// Takes a question. Returns the number of another one that waits no longer.
+    /// Adds a question. Returns the number of the oldest one if too many wait.
     pub(super) fn push(
         &mut self,
         id: SessionId,
@@ -54,13 +55,13 @@ impl AccessQuestions {
         (self.waiting.len() > WAITING).then_some(oldest)
     }
 
-    /// A question is answered. Returns who asked.
+    /// Removes an answered question. Returns the session that asked.
     pub(super) fn remove(&mut self, number: u64) -> Option<SessionId> {
         self.unsent.retain(|(unsent, ..)| *unsent != number);
         self.waiting.remove(&number).map(|(id, _)| id)
     }
 
-    /// The numbers of those that this peer has to answer; of all where none is named.
+    /// Returns the numbers of the questions that this peer has to answer; of all questions if no peer is named.
     pub(super) fn of(&self, daemon: Option<DaemonId>) -> Vec<u64> {
         let of = |asked: &DaemonId| daemon.is_none_or(|daemon| daemon == *asked);
         let waiting = self.waiting.iter().filter(|(_, (_, asked))| of(asked));

@@ -31,17 +31,17 @@ use axon_transport::{
 use super::waiting::waiting;
 use crate::{bridge::RefusedRoute, control::losses::ByTopic};
 
-/// Publishers, readers, and endpoints whose routes are refused, of a topic that the status lists.
+/// Maximum number of publishers, of readers, and of endpoints with refused routes that the status lists for a topic.
 const LISTED: usize = 64;
-/// Readers that are looked at for one status: so many that it still takes a fraction of a second.
+/// Maximum number of readers that are read for one status: few enough that it takes a fraction of a second.
 const LOOKED_AT: usize = 1 << 16;
-/// Pairs out of range that the status lists, of all topics.
+/// Maximum number of pairs out of range that the status lists, over all topics.
 const KEPT_APART: usize = 64;
 
 type Sessions = Registry<Arc<PassedFd>>;
 type ShmSession = SessionEntry<Arc<PassedFd>>;
 
-/// All topics with an endpoint somewhere.
+/// Returns all topics that have an endpoint on any host.
 pub(super) fn topics(
     registry: &Sessions,
     lost: &ByTopic,
@@ -116,7 +116,7 @@ pub(super) fn topics(
     topics
 }
 
-/// Names the endpoints that wait for routes that peers, or this host, refused.
+/// Adds the endpoints that wait for routes which peers, or this host, refused.
 fn show_refused(
     registry: &Sessions,
     topics: &mut BTreeMap<(String, String), TopicStatus>,
@@ -128,7 +128,7 @@ fn show_refused(
             show_at(entry(topics, &local.endpoint), &local.endpoint, (*host).to_owned(), reason);
         }
     }
-    // Those that this daemon does not take.
+    // Adds the endpoints that this daemon refused.
     for (_, session) in registry.sessions() {
         for (endpoint, why) in session.refused_endpoints() {
             show_at(entry(topics, endpoint), endpoint, String::new(), why.to_owned());
@@ -204,14 +204,14 @@ fn reader(
     reader
 }
 
-/// Samples that stand and that the reader has not taken.
+/// Returns the number of kept samples that the reader has not taken.
 fn unread(counts: &RingCounts, lane: &LaneCounts) -> u64 {
     let (tail, head) = counts.standing;
     head.saturating_sub(lane.cursor.max(tail))
 }
 
-/// When the oldest sample was published that the reader has not taken. Where that does not stand
-/// any more, the one before it, which the reader has taken: hardly older on a topic so busy.
+/// Returns the publication time of the oldest sample that the reader has not taken. If that sample is not kept any
+/// more, returns the time of the one before it, which the reader has taken: it is hardly older on such a busy topic.
 fn oldest_unread(writer: &ShmSession, counts: &RingCounts, lane: &LaneCounts) -> Option<i64> {
     let (tail, _) = counts.standing;
     if let (true, Some(taken)) = (lane.cursor < tail, lane.taken) {
@@ -255,18 +255,18 @@ fn add(sum: &mut u64, count: u64) {
     *sum = sum.saturating_add(count);
 }
 
-/// `None` for KEEP_ALL.
+/// Returns the depth; `None` for KEEP_ALL.
 fn depth(qos: &Qos) -> Option<u32> {
     (qos.history == History::KeepLast).then_some(qos.depth)
 }
 
-/// What a publisher counts, and its session.
+/// Returns a publisher's session and its counters.
 fn ring<'a>(registry: &'a Sessions, local: &LocalEndpoint) -> Option<(&'a ShmSession, RingCounts)> {
     let (session, at) = (registry.session(&local.session)?, local.ring?);
     Some((session, RingCounts::read(memory(session, at)?, at)?))
 }
 
-/// The segment that an object of a session is in.
+/// Returns the segment that contains an object of a session.
 fn memory(session: &ShmSession, at: Location) -> Option<BorrowedFd<'_>> {
     match (at.segment, &session.descriptors) {
         (0, Some([first, ..])) => Some(first.as_fd()),
@@ -274,10 +274,10 @@ fn memory(session: &ShmSession, at: Location) -> Option<BorrowedFd<'_>> {
     }
 }
 
-/// Whether a process is stopped, by a signal or a debugger.
+/// Returns whether a process is stopped, by a signal or a debugger.
 fn is_stopped(pid: u32) -> bool {
     let Ok(stat) = std::fs::read(format!("/proc/{pid}/stat")) else { return false };
-    // The name before it may hold anything.
+    // The name in front of it may contain any characters.
     let state = stat.iter().rposition(|byte| *byte == b')').and_then(|end| stat.get(end + 2));
     matches!(state, Some(b'T' | b't'))
 }

@@ -1,5 +1,5 @@
-//! The endpoints of this host that wait for routes which another host, or this one, refuses. Status shows them, and their
-//! sessions are told.
+//! The endpoints of this host that wait for routes which another host, or this one, refuses. The status shows them, and
+//! their sessions are notified.
 
 use std::{
     collections::{BTreeMap, HashMap, HashSet},
@@ -17,12 +17,12 @@ use axon_transport::internal::{
 
 use crate::bridge::RefusedRoute;
 
-/// Endpoints that are told of one peer's routes, while it is linked.
+/// Maximum number of endpoints that are notified of one peer's routes while it is linked.
 const MAX_WAITING_ENDPOINTS: usize = 4096;
 
 type DaemonRegistry = Registry<Arc<PassedFd>>;
 
-/// Each endpoint that waits for one of these routes.
+/// Returns each endpoint that waits for one of the routes, with the route.
 pub(super) fn waiting<'a, 'r>(
     registry: &'a DaemonRegistry,
     routes: &'r [RefusedRoute],
@@ -45,17 +45,17 @@ pub(super) fn waiting<'a, 'r>(
     all
 }
 
-/// The endpoints whose sessions were told, by peer: each is told once while the peer is linked.
+/// The endpoints whose sessions were notified, by peer. Each is notified once while the peer is linked.
 #[derive(Debug, Default)]
 pub(in crate::control) struct NotifiedEndpoints(BTreeMap<String, HashSet<Gid>>);
 
 impl NotifiedEndpoints {
-    /// A peer's link is over.
+    /// Forgets a peer whose link is over.
     pub(in crate::control) fn forget(&mut self, peer: &str) {
         self.0.remove(peer);
     }
 
-    /// Tells the sessions of endpoints that wait for these routes to or from `peer`, which is the host `host`.
+    /// Notifies the sessions of endpoints that wait for these routes to or from `peer`, which is the host `host`.
     pub(in crate::control) fn tell(
         &mut self,
         registry: &mut DaemonRegistry,
@@ -81,7 +81,7 @@ impl NotifiedEndpoints {
         routes: &[RefusedRoute],
     ) -> Vec<(SessionId, String)> {
         let mut untold = Vec::new();
-        // Other users are shown neither hosts nor rules.
+        // Other users must see neither hosts nor rules.
         let is_own = |local: &LocalEndpoint| {
             registry.session(&local.session).is_some_and(|session| session.user.is_none())
         };
@@ -132,7 +132,7 @@ mod tests {
         registry.handle_message(&SESSION, SessionMessage::Endpoint(announce), vec![]).unwrap();
     }
 
-    /// What the session is told.
+    /// Returns the messages that the session gets.
     fn heard(registry: &mut DaemonRegistry) -> Vec<String> {
         let packets = std::iter::from_fn(|| registry.poll_output(&SESSION));
         let texts =
@@ -166,7 +166,7 @@ mod tests {
         for part in ["\"/a\"", "\"base\"", "refused by the peer: no room"] {
             assert!(texts[0].contains(part), "{texts:?}");
         }
-        // The next report has it as well. One that came later is told.
+        // The next report has it as well. An endpoint that came later is notified.
         announce(&mut registry, 3, "/a");
         told.tell(&mut registry, "peer", "base", &routes);
         let texts = heard(&mut registry);
@@ -175,7 +175,7 @@ mod tests {
         told.forget("peer");
         told.tell(&mut registry, "peer", "base", &routes);
         assert_eq!(heard(&mut registry).len(), 2);
-        // Another user's session is told nothing.
+        // Another user's session gets no message.
         told.forget("peer");
         registry.set_user(&SESSION, 7);
         told.tell(&mut registry, "peer", "base", &routes);

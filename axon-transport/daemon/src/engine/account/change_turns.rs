@@ -1,17 +1,17 @@
-//! The pace at which a peer's control messages are followed: turns for the work that they bring, so that a busy peer
-//! leaves time for the others.
+//! Limits the pace of work on a peer's control messages: turns for the work that they cause, so that a busy peer leaves
+//! time for other peers.
 
 use std::time::Duration;
 
 use crate::token_bucket::TokenBucket;
 
-/// Turns at once, and a second.
+/// Number of turns at once, and per second.
 const TURNS: (u32, u32) = (32, 10);
-/// After a turn as many times as long as it took are the others'.
+/// Factor for the pause after a turn: other peers have so many times its duration.
 const OTHERS: u32 = 9;
 
-/// When what follows from a peer's changes is worked out next. What changes in between is taken
-/// together: the newest state counts.
+/// The time of the next turn, in which the consequences of a peer's changes are computed. Changes in between are
+/// handled together: the newest state counts.
 #[derive(Debug)]
 pub(crate) struct ChangeTurns {
     bucket: TokenBucket,
@@ -25,17 +25,17 @@ impl Default for ChangeTurns {
 }
 
 impl ChangeTurns {
-    /// How long it is until the next one.
+    /// Returns the time until the next turn.
     pub(crate) fn wait(&mut self, now: Duration) -> Duration {
         self.rest(now).max(self.bucket.wait(now))
     }
 
-    /// Whether it is time; the turn is taken then.
+    /// Takes a turn if it is time for one. Returns whether it did.
     pub(crate) fn take(&mut self, now: Duration) -> bool {
         self.rest(now).is_zero() && self.bucket.take(now)
     }
 
-    /// A turn that began at `began` is over.
+    /// Records that a turn which began at `began` is over.
     pub(crate) fn over(&mut self, began: Duration, now: Duration) {
         self.not_before = Some(now + now.saturating_sub(began) * OTHERS);
     }

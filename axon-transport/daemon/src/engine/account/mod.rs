@@ -1,8 +1,8 @@
-//! Limits what one peer may make this daemon hold, over all of its daemon ids and links.
+//! Limits the resources that one peer may make this daemon hold, over all of its daemon ids and links.
 //!
-//! A peer here is an identity: its proven SAE ID, pinned name or certificate host, else its address. Addresses of one IPv6
-//! network share what they may take, as a host may have any of them. A [`Charge`] holds what counts for a [`Meter`], and
-//! gives it back when it is dropped.
+//! A peer here is an identity: its proven SAE ID, pinned name or certificate host, or else its address. Addresses of
+//! one IPv6 network share their limits, because a host may have any of them. A [`Charge`] holds an amount of a
+//! [`Meter`], and gives it back when it is dropped.
 
 pub(in crate::engine) mod change_turns;
 #[cfg(test)]
@@ -307,9 +307,9 @@ pub(crate) struct Account {
     pub(crate) sessions: Rc<Meter>,
     /// The identity's publishers, or clients, that each route shows.
     writers: Rc<RefCell<HashMap<RouteKey, Weak<Meter>>>>,
-    /// How much of each topic may pass.
+    /// The limits on the traffic of each topic.
     pub(crate) limits: Rc<IdentityLimits>,
-    /// When the identity's changes are processed.
+    /// The turns in which the identity's changes are processed.
     pub(crate) turns: Rc<RefCell<ChangeTurns>>,
     said: Rc<RefCell<TokenBucket>>,
 }

@@ -1,4 +1,4 @@
-//! Delivers whole messages to the rings of stand-ins: once each, as far as limits and room allow.
+//! Delivers whole messages to the rings of stand-ins: once each, as far as limits and space allow.
 
 use std::{rc::Rc, time::Duration};
 
@@ -13,9 +13,9 @@ use super::{
 };
 use crate::engine::{rings::RingError, sample::dropped::EarlierFate, stand_in::StandIn};
 
-/// A message waits for so long while other rings of its peer have the memory that it needs. Their readers may never take
-/// what these hold, and history stays for as long as its publisher. A ring that has samples itself is full, and waits for
-/// its own readers.
+/// Maximum time that a message waits while other rings of its peer have the memory that it needs. The readers of these
+/// rings may never take their samples, and history stays for as long as its publisher. A ring that has samples itself
+/// is full, and waits for its own readers.
 const LONGEST_SHORT: Duration = Duration::from_secs(60);
 
 impl Inbound {
@@ -65,7 +65,7 @@ impl Inbound {
             return StepOutcome::Go;
         }
         if !header.reliable && last >= Some(sequence) {
-            // A newer one overtook it: readers drop it.
+            // A newer sample overtook it: readers drop it.
             self.counters.lost(&self.topic(header.route), "late", 1);
             self.release(stream);
             return StepOutcome::Over;
@@ -109,7 +109,8 @@ impl Inbound {
         if header.reliable { StepOutcome::Go } else { StepOutcome::Over }
     }
 
-    /// Goes on after a message that was dropped and counted. The peer is told where it waits to hear of it.
+    /// Continues after a message that was dropped and counted. Reports that to the peer if it waits for an
+    /// acknowledgement.
     fn after_drop(
         &mut self,
         stream: &mut IncomingStream,
@@ -125,8 +126,8 @@ impl Inbound {
         if header.reliable { StepOutcome::Go } else { StepOutcome::Over }
     }
 
-    /// Writes a sample to its ring. Whether it is there; `None`: the ring is full. `short_since` says since when it has been
-    /// for want of memory alone.
+    /// Writes a sample to its ring. Returns whether it was written; `None` if the ring is full. `short_since` is the
+    /// time since which memory alone has been missing.
     pub(super) fn write(
         &mut self,
         stand_in: &Rc<StandIn>,
@@ -174,13 +175,14 @@ impl Inbound {
         }
     }
 
-    /// Whether what its stream has next may wait here: calls, and samples whose publisher waits for its readers anyway.
+    /// Returns whether the stream's next message may wait here: calls may, and samples whose publisher waits for its
+    /// readers anyway.
     pub(super) fn may_wait(&self, header: StreamHeader) -> bool {
         let waits = |route: &RouteIn| route.route.kind != Kind::Topic || route.keeps_all;
         header.reliable && self.routes.get(&header.route).is_some_and(waits)
     }
 
-    /// The message's ring is full.
+    /// Makes a message wait because its ring is full.
     pub(super) fn wait_for_room(
         &mut self,
         key: StreamKey,

@@ -1,15 +1,16 @@
-//! What the samples from one peer take of this host's memory, for the simulator.
+//! The memory of this host that the samples from one peer take, for the simulator.
 
 use super::Inbound;
 
 impl Inbound {
-    /// Streams that are being read, and the bytes that were read from QUIC and are not delivered.
+    /// Returns the number of streams that are being read, and of the bytes that were read from QUIC and are not
+    /// delivered.
     pub(in crate::engine) fn held(&self) -> (usize, usize) {
         let bytes = self.streams.values().map(super::incoming::IncomingStream::held).sum();
         (self.streams.len(), bytes)
     }
 
-    /// Entries of lists that have one a stream at most.
+    /// Returns the length of the longest list that has at most one entry for each stream.
     pub(in crate::engine) fn listed(&self) -> usize {
         let turns = self.turns.values().map(std::collections::VecDeque::len).sum::<usize>();
         let lists = [

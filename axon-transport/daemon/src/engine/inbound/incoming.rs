@@ -9,7 +9,7 @@ use quinn_proto::{ReadError, ReadableError, StreamId};
 
 use crate::engine::{account::Charge, sample::short_header::ShortHeaders};
 
-/// Bytes of a stream's header.
+/// Length of a stream's header in bytes.
 pub(super) const HEADER: usize = 24;
 /// A stream of RELIABLE samples, of requests, or of responses.
 pub(super) const RELIABLE: u8 = 1;
@@ -17,21 +17,21 @@ pub(super) const RELIABLE: u8 = 1;
 pub(super) const BEST_EFFORT: u8 = 2;
 /// A flag: the messages have short headers.
 const SHORT_HEADERS: u8 = 1;
-/// A flag: RECEIVED is awaited for these requests or responses, and responses are numbered by their flow.
+/// A flag: the sender waits for RECEIVED for these requests or responses, and responses are numbered by their flow.
 const ACKNOWLEDGED: u8 = 2;
 
-/// What a stream carries, as its header says.
+/// The header of a stream, which describes its content.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct StreamHeader {
-    /// Whether it carries RELIABLE samples, requests or responses, one after the other.
+    /// True if it carries RELIABLE samples, requests or responses, one after the other.
     pub(crate) reliable: bool,
-    /// Whether its messages have short headers.
+    /// True if its messages have short headers.
     pub(crate) short: bool,
-    /// Whether its requests or responses are acknowledged. Whether samples of a topic are, SUBSCRIBE says.
+    /// True if its requests or responses are acknowledged. For samples of a topic, SUBSCRIBE decides.
     pub(crate) acknowledged: bool,
     /// The receiver's number for the route.
     pub(crate) route: u32,
-    /// The publisher; of responses the client.
+    /// The publisher, or for responses the client.
     pub(crate) of: Gid,
 }
 
@@ -66,13 +66,13 @@ impl StreamHeader {
         })
     }
 
-    /// The header of a stream of samples that has no flags.
+    /// Creates the header of a stream of samples without flags.
     #[cfg(test)]
     pub(crate) fn plain(route: u32, of: Gid) -> Self {
         Self { reliable: true, short: false, acknowledged: false, route, of }
     }
 
-    /// The header's bytes.
+    /// Returns the header's bytes.
     pub(crate) fn encode(&self) -> [u8; HEADER] {
         let mut header = [0; HEADER];
         header[0] = if self.reliable { RELIABLE } else { BEST_EFFORT };
@@ -84,18 +84,18 @@ impl StreamHeader {
     }
 }
 
-/// What came of asking a stream for bytes.
+/// The result of reading bytes from a stream.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Piece {
-    /// All of them.
+    /// All the bytes.
     Whole(Bytes),
     /// Not all have arrived.
     Later,
-    /// The stream ended before.
+    /// The stream ended before all of them.
     End,
 }
 
-/// What a stream waits for.
+/// The next step of a stream, which names what the stream waits for.
 #[derive(Debug)]
 pub(super) enum StreamStep {
     /// Its header.
@@ -112,9 +112,9 @@ pub(super) enum StreamStep {
     Unpack(inner::Header, Bytes),
     /// The stand-in of the message's writer, until this time.
     Writer(OpenedMessage, Duration),
-    /// Room in the ring.
+    /// Space in the ring.
     Ring(OpenedMessage),
-    /// Its end: nothing more is wanted from it.
+    /// Its end: no more data is wanted from it.
     Over,
 }
 
@@ -122,7 +122,7 @@ pub(super) enum StreamStep {
 #[derive(Debug)]
 pub(super) struct OpenedMessage {
     pub(super) writer: Gid,
-    /// Its number in its flow, which rises. Of a topic, and of requests, it is the sample's own.
+    /// Its number in its flow, which rises. For a topic, and for requests, it is the sample's own number.
     pub(super) number: u64,
     pub(super) meta: axon_shm::Meta,
     pub(super) payload: Bytes,
@@ -133,17 +133,17 @@ pub(super) struct OpenedMessage {
 pub(super) struct IncomingStream {
     pub(super) step: StreamStep,
     pub(super) header: Option<(StreamHeader, Option<Route>)>,
-    /// The last short header, where the messages have such.
+    /// The last short header, if the messages have short headers.
     pub(super) headers: Option<ShortHeaders>,
-    /// The rest of what QUIC gave last.
+    /// The rest of the last chunk from QUIC.
     pub(super) chunk: Bytes,
     /// A piece that came in several chunks.
     pub(super) gathered: BytesMut,
-    /// The memory of a message that has not come whole.
+    /// The memory of a message that has not arrived completely.
     pub(super) room: Option<Charge>,
-    /// The memory by which it is longer once it is decompressed.
+    /// The additional memory of the decompressed message.
     pub(super) unpacked: Option<Charge>,
-    /// Since when its message has waited for memory that other rings have.
+    /// The time since which its message has waited for memory that other rings have.
     pub(super) short_since: Option<Duration>,
     pub(super) is_ready: bool,
 }
@@ -165,12 +165,12 @@ impl Default for IncomingStream {
 }
 
 impl IncomingStream {
-    /// Whether the next `length` bytes were read from QUIC already.
+    /// Returns whether the next `length` bytes were read from QUIC already.
     pub(super) fn has(&self, length: usize) -> bool {
         self.gathered.len() + self.chunk.len() >= length
     }
 
-    /// The next `length` bytes of the stream. A piece within one chunk is not copied.
+    /// Returns the next `length` bytes of the stream. A piece within one chunk is not copied.
     pub(super) fn take(
         &mut self,
         length: usize,
@@ -202,9 +202,9 @@ impl IncomingStream {
         }
     }
 
-    /// Whether a stream from which nothing more is wanted is at its end. QUIC forgets a stream, and allows the peer
-    /// another one, once its end was read; the end may come with the last bytes, and then nothing says that it came. A
-    /// peer that sends more is told to stop.
+    /// Returns whether a stream from which no more data is wanted is at its end. QUIC forgets a stream, and allows the
+    /// peer another one, once its end was read. The end may come with the last bytes, without a separate event. A peer
+    /// that sends more gets a STOP_SENDING.
     pub(super) fn is_over(&mut self, id: StreamId, quic: &mut quinn_proto::Connection) -> bool {
         (self.chunk, self.gathered) = (Bytes::new(), BytesMut::new());
         match next_chunk(id, quic) {
@@ -220,7 +220,7 @@ impl IncomingStream {
 
 #[cfg(test)]
 impl IncomingStream {
-    /// Bytes of samples that were read from QUIC and are not delivered.
+    /// Returns the bytes of samples that were read from QUIC and are not delivered.
     pub(super) fn held(&self) -> usize {
         let message = match &self.step {
             StreamStep::Writer(message, _) | StreamStep::Ring(message) => message.payload.len(),
@@ -231,7 +231,7 @@ impl IncomingStream {
     }
 }
 
-/// A stream that ended, was reset, or was stopped.
+/// The error of a stream that ended, was reset, or was stopped.
 struct StreamEnd;
 
 fn next_chunk(
@@ -246,7 +246,7 @@ fn next_chunk(
         }
     };
     let next = chunks.next(usize::MAX);
-    // The window that it wants to announce leaves with the pass.
+    // QUIC sends the new window at the end of the pass.
     let _ = chunks.finalize();
     match next {
         Ok(Some(chunk)) => Ok(Some(chunk.bytes)),

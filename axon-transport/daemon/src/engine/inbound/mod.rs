@@ -78,7 +78,7 @@ pub(crate) struct RouteIn {
     clients: HashMap<Gid, u64>,
     /// The limits on samples from the peer.
     pub(crate) limit: RouteLimit,
-    /// Whether all local readers are RELIABLE and KEEP_ALL.
+    /// True if all local readers are RELIABLE and KEEP_ALL.
     pub(crate) keeps_all: bool,
 }
 
@@ -121,7 +121,7 @@ pub(crate) struct Inbound {
     /// Memory for one short message if the identity has none left. Complete messages are then read one after
     /// the other.
     spare: Rc<Meter>,
-    /// When streams with a full ring try again, since the reader that they wait for may be gone.
+    /// The time at which streams with a full ring try again, since the reader that they wait for may be gone.
     full_retry: Option<Duration>,
     /// The link whose peer had more long messages in flight than permitted.
     exceeded: Option<u64>,
@@ -241,7 +241,7 @@ impl Inbound {
         Some(waits)
     }
 
-    /// Whether a stream waits for room in a ring.
+    /// Returns whether a stream waits for room in a ring.
     pub(crate) fn waits_for_room(&self) -> bool {
         !self.full.is_empty()
     }
@@ -305,7 +305,7 @@ impl Inbound {
         }
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) or [`poll_receipt`](Self::poll_receipt) is due.
+    /// Returns when [`handle_timeout`](Self::handle_timeout) or [`poll_receipt`](Self::poll_receipt) is due.
     pub(crate) fn poll_timeout(&self) -> Option<Duration> {
         let waiting = self.waiting.first().map(|(due, _)| *due);
         let limited = self.limited.poll_timeout();

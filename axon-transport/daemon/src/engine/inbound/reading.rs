@@ -25,7 +25,7 @@ use crate::{
 };
 
 impl Inbound {
-    /// Reads a stream as far as it goes. Returns how many bytes that were, or became by decompression.
+    /// Reads a stream as far as possible. Returns the number of bytes read, including those gained by decompression.
     ///
     /// # Errors
     /// The peer broke a rule.
@@ -132,7 +132,7 @@ impl Inbound {
             }
             StreamStep::Room(length) => {
                 if length > LONG_MESSAGE_BYTES {
-                    // One message may always be read, however long.
+                    // One message may always be read, whatever its length.
                     let Some(room) = self.intake.long.charge(length.min(self.intake.long.most()))
                     else {
                         self.without_room.add(key);
@@ -144,7 +144,7 @@ impl Inbound {
                 Ok(StepOutcome::Go)
             }
             StreamStep::Body(length) => {
-                // One that has come whole is held by nobody.
+                // A message that has arrived completely needs no charge.
                 if stream.room.is_none() && !stream.has(length) {
                     let room = self.intake.short.charge(length);
                     let Some(room) = room.or_else(|| self.spare.charge(length)) else {
@@ -172,7 +172,7 @@ impl Inbound {
         }
     }
 
-    /// Begins to read a stream once its route is there and it is its turn.
+    /// Begins to read a stream once its route exists and it is the stream's turn.
     fn begin(
         &mut self,
         key: StreamKey,
@@ -199,7 +199,7 @@ impl Inbound {
         self.waiting.remove(&(until, key));
         let turns = self.turns.get(&(header.route, header.of));
         if turns.is_some_and(|turns| turns.front() != Some(&key)) {
-            // The stream before it ends at some time, and then it is ready.
+            // When the previous stream ends, this one becomes ready.
             return wait(stream, StreamStep::Turn(Duration::MAX));
         }
         stream.step = StreamStep::Length;
@@ -240,8 +240,8 @@ impl Inbound {
         Ok(StepOutcome::Go)
     }
 
-    /// Decompresses a message once there is memory for it: a few bytes may become a long one, which then waits for its
-    /// ring.
+    /// Decompresses a message once there is memory for it: a few bytes may become a long message, which then waits for
+    /// its ring.
     fn unpack(
         &mut self,
         key: StreamKey,
@@ -275,7 +275,7 @@ impl Inbound {
         Ok(StepOutcome::Go)
     }
 
-    /// A message of a stream. Its writer was judged before.
+    /// Creates the message of a stream. Its writer was checked before.
     fn message(
         &self,
         of_stream: StreamHeader,
@@ -292,16 +292,16 @@ impl Inbound {
         OpenedMessage { writer: Gid(header.gid), number, meta, payload }
     }
 
-    /// What the ring gets to know of a sample.
+    /// Returns the metadata of a sample for the ring.
     pub(super) fn meta(&self, told: ShortHeader, now: Duration) -> Meta {
         Meta::at_nanos(told.sequence, told.source_timestamp)
             .with_published_nanos(self.published(told.age_ms, now))
     }
 
-    /// When a sample of this age was published, in nanoseconds of this host's CLOCK_MONOTONIC.
+    /// Returns when a sample of this age was published, in nanoseconds of this host's CLOCK_MONOTONIC.
     fn published(&self, age_ms: u32, now: Duration) -> u64 {
         let arrived = self.epoch_nanos.saturating_add(now.as_nanos() as u64);
-        // Zero would say that the lifespan is infinite.
+        // Zero would mean an infinite lifespan.
         arrived.saturating_sub(u64::from(age_ms) * 1_000_000).max(1)
     }
 
@@ -328,10 +328,10 @@ impl Inbound {
     }
 }
 
-/// What a step says.
+/// The result of a step.
 #[derive(Debug)]
 pub(super) enum StepOutcome {
-    /// Take the next one.
+    /// Take the next step.
     Go,
     /// Nothing more can be done now.
     Wait,
@@ -344,7 +344,7 @@ pub(super) fn wait(stream: &mut IncomingStream, step: StreamStep) -> StepOutcome
     StepOutcome::Wait
 }
 
-/// Whether a stream of this route may have short headers.
+/// Checks that a stream of this route may have short headers.
 ///
 /// # Errors
 /// The peer broke the format.
@@ -355,7 +355,7 @@ pub(super) fn permit_short(route: Route, open: &Open<'_>) -> Result<(), LinkViol
     }
 }
 
-/// What a message's inner header tells besides its writer.
+/// Returns the data of a message's inner header besides its writer.
 pub(super) fn told(header: &inner::Header) -> ShortHeader {
     let inner::Header { sequence, source_timestamp, age_ms, .. } = *header;
     ShortHeader { sequence, source_timestamp, age_ms }
@@ -380,7 +380,7 @@ fn open_body(
     route: Route,
     now: Duration,
 ) -> Result<Option<(inner::Header, Bytes)>, RefusedMessage> {
-    // An envelope is opened in place, so in memory of its own.
+    // An envelope is opened in place, so it needs memory of its own.
     match open {
         Open::Link => {
             let opened = OpenedSample::plain(&body)?;

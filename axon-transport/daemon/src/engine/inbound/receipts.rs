@@ -10,42 +10,42 @@ use crate::link::{ReceivedOf, ReceivedUpTo};
 const DELAY: Duration = Duration::from_millis(10);
 const SAMPLES: u64 = 64;
 const BYTES: u64 = 256 << 10;
-/// Flows in one message.
+/// Maximum number of flows in one message.
 const FLOWS: usize = 4096;
 
 #[derive(Debug, Default)]
 struct DueReceipt {
-    /// The first that was noted.
+    /// The number of the first sample that was noted.
     first: Option<u64>,
     sequence: u64,
     dropped: u64,
 }
 
 impl DueReceipt {
-    /// Notes a sample of this number.
+    /// Records a sample of this number.
     fn note(&mut self, sequence: u64) {
         self.first.get_or_insert(sequence);
         self.sequence = self.sequence.max(sequence);
     }
 }
 
-/// What is to be acknowledged.
+/// The samples to be acknowledged.
 #[derive(Debug, Default)]
 pub(super) struct Receipts {
     due: HashMap<(u32, Gid), DueReceipt>,
     samples: u64,
     bytes: u64,
-    /// When the next message leaves.
+    /// The time at which the next message is sent.
     at: Option<Duration>,
 }
 
 impl Receipts {
-    /// A sample is in the ring, or was before.
+    /// Records a sample that is in the ring, or was before.
     pub(super) fn came(&mut self, flow: (u32, Gid), sequence: u64, bytes: usize, now: Duration) {
         self.came_all(flow, sequence, 1, bytes, now);
     }
 
-    /// As [`came`](Self::came), of so many samples, the newest of which has this number.
+    /// Like [`came`](Self::came), for `samples` samples, the newest of which has this number.
     pub(super) fn came_all(
         &mut self,
         flow: (u32, Gid),
@@ -58,7 +58,7 @@ impl Receipts {
         self.note(samples, bytes, now);
     }
 
-    /// A sample was dropped here.
+    /// Records a sample that was dropped here.
     pub(super) fn dropped(&mut self, flow: (u32, Gid), sequence: u64, now: Duration) {
         let due = self.due.entry(flow).or_default();
         due.note(sequence);
@@ -66,7 +66,8 @@ impl Receipts {
         self.note(1, 0, now);
     }
 
-    /// A sample that was dropped here comes again, over a new link. Its publisher may not know of it.
+    /// Records that a sample which was dropped here comes again, over a new link. Its publisher may not know of the
+    /// drop.
     pub(super) fn dropped_again(&mut self, flow: (u32, Gid), sequence: u64, now: Duration) {
         let due = self.due.entry(flow).or_default();
         let is_due = due.first.is_some_and(|first| (first..=due.sequence).contains(&sequence));
@@ -83,12 +84,12 @@ impl Receipts {
         self.at = Some(self.at.map_or(at, |other| other.min(at)));
     }
 
-    /// When [`poll_message`](Self::poll_message) has one.
+    /// Returns when [`poll_message`](Self::poll_message) has a message.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         self.at
     }
 
-    /// The next message that is due.
+    /// Returns the next message that is due.
     pub(super) fn poll_message(&mut self, now: Duration) -> Option<ReceivedUpTo> {
         if self.at.is_none_or(|at| at > now) {
             return None;

@@ -1,4 +1,4 @@
-//! Delivers the short samples that lie whole in the piece that QUIC gave last, without a step of the stream for each.
+//! Delivers the short samples that are complete in the last chunk from QUIC, without a step of the stream for each.
 
 use std::{rc::Rc, time::Duration};
 
@@ -19,20 +19,20 @@ use crate::engine::{
     stand_in::StandIn,
 };
 
-/// Bytes of the length before each message.
+/// Size in bytes of the length in front of each message.
 const LENGTH: usize = 4;
 
-/// Where the samples of a run go.
+/// The destination of the samples of a run.
 struct BatchTarget {
     header: StreamHeader,
     route: Route,
     stand_in: Rc<StandIn>,
-    /// The longest message.
+    /// The maximum length of a message.
     most: u64,
     now: Duration,
 }
 
-/// What is to be acknowledged after a run.
+/// The samples to be acknowledged after a run.
 #[derive(Default)]
 struct BatchProgress {
     newest: Option<u64>,
@@ -41,8 +41,8 @@ struct BatchProgress {
 }
 
 impl Inbound {
-    /// Delivers the whole samples of a RELIABLE stream of a topic that are at hand. `None`: the stream goes on with a
-    /// step.
+    /// Delivers the complete samples of a topic's RELIABLE stream that have arrived. Returns `None` if the stream
+    /// continues with a step.
     ///
     /// # Errors
     /// The peer broke a rule.
@@ -57,7 +57,7 @@ impl Inbound {
         if !header.reliable || route.kind != Kind::Topic || !stream.gathered.is_empty() {
             return Ok(None);
         }
-        // Where there are limits, each sample has a step of its own.
+        // If there are limits, each sample has a step of its own.
         let unlimited = |of: &&RouteIn| of.limit.is_none();
         let writers = |of: &RouteIn| of.writers.get(&header.of).cloned();
         let Some(stand_in) = self.routes.get(&header.route).filter(unlimited).and_then(writers)
@@ -86,8 +86,8 @@ impl Inbound {
         }
     }
 
-    /// Delivers samples until none is whole, or one has to wait: for room in the ring, or to be decompressed. What the
-    /// stream goes on with.
+    /// Delivers samples until none is complete, or one has to wait: for space in the ring, or for its decompression.
+    /// Returns the stream's next step.
     fn deliver_all(
         &mut self,
         to: &BatchTarget,
@@ -105,7 +105,7 @@ impl Inbound {
                     headers.read(body).map_err(malformed)?
                 }
                 None => {
-                    // It is opened in place.
+                    // The envelope is opened in place.
                     envelope.clear();
                     envelope.extend_from_slice(body);
                     let opened = open.open(envelope, to.route, now).map_err(refused)?;
@@ -160,7 +160,7 @@ impl Inbound {
     }
 }
 
-/// The body at the front of a chunk, if it is whole and short.
+/// Returns the body at the front of a chunk, if it is complete and short.
 fn next_body(chunk: &Bytes, most: u64) -> Option<&[u8]> {
     let (length, rest) = chunk.split_first_chunk::<LENGTH>()?;
     let length = u32::from_be_bytes(*length) as usize;

@@ -1,10 +1,10 @@
-//! Streams that wait in line, each once.
+//! A queue of streams, each at most once.
 
 use std::collections::{HashSet, VecDeque};
 
 use super::StreamKey;
 
-/// A line of streams.
+/// A queue of streams.
 #[derive(Debug, Default)]
 pub(super) struct StreamQueue {
     order: VecDeque<StreamKey>,
@@ -12,7 +12,7 @@ pub(super) struct StreamQueue {
 }
 
 impl StreamQueue {
-    /// Adds a stream behind the others, unless it is in line.
+    /// Adds a stream behind the others, unless it is in the queue.
     pub(super) fn add(&mut self, key: StreamKey) {
         if self.all.insert(key) {
             self.order.push_back(key);
@@ -26,23 +26,23 @@ impl StreamQueue {
         }
     }
 
-    /// Removes all, in order.
+    /// Removes and returns all streams, in order.
     pub(super) fn take(&mut self) -> VecDeque<StreamKey> {
         self.all.clear();
         std::mem::take(&mut self.order)
     }
 
-    /// Whether nobody is in line.
+    /// Returns whether the queue is empty.
     pub(super) fn is_empty(&self) -> bool {
         self.order.is_empty()
     }
 
-    /// The streams in line.
+    /// Returns the streams in the queue.
     pub(super) fn iter(&self) -> impl Iterator<Item = &StreamKey> {
         self.order.iter()
     }
 
-    /// How many are in line.
+    /// Returns the number of streams in the queue.
     #[cfg(test)]
     pub(super) fn len(&self) -> usize {
         self.order.len()

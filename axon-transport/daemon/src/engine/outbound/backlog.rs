@@ -1,4 +1,4 @@
-//! What waits for one peer, for status.
+//! The samples that wait for one peer, for status.
 
 use std::time::Duration;
 
@@ -11,12 +11,12 @@ use super::schedule::Class;
 pub(crate) struct Backlog {
     /// Bytes that wait for QUIC, by the class of their flow's next sample.
     pub(super) bytes: [usize; 4],
-    /// When the oldest sample that waits was taken from its ring.
+    /// The time at which the oldest waiting sample was taken from its ring.
     pub(crate) oldest: Option<Duration>,
 }
 
 impl Backlog {
-    /// Puts it into the status of a link.
+    /// Writes the backlog into the status of a link.
     pub(crate) fn fill(&self, status: &mut LinkStatus, now: Duration) {
         let of = |class: Class| self.bytes[class as usize] as u64;
         status.waiting_bytes = self.bytes.iter().sum::<usize>() as u64;

@@ -18,7 +18,7 @@ pub(crate) struct Budget {
 }
 
 impl Budget {
-    /// The budget of a daemon.
+    /// Creates the budget of a daemon.
     pub(crate) fn new(bytes: u64) -> Rc<Self> {
         let most = usize::try_from(bytes).unwrap_or(usize::MAX);
         Rc::new(Self {
@@ -30,7 +30,7 @@ impl Budget {
         })
     }
 
-    /// The share of one peer.
+    /// Creates the share of one peer.
     pub(crate) fn of_peer(self: &Rc<Self>) -> Rc<Self> {
         Rc::new(Self {
             most: self.most / PEER,
@@ -41,17 +41,17 @@ impl Budget {
         })
     }
 
-    /// Bytes that all queues of the daemon may hold.
+    /// Returns the bytes that all queues of the daemon may hold.
     pub(super) fn of_daemon(&self) -> u64 {
         self.parent.as_ref().map_or(self.most as u64, |parent| parent.of_daemon())
     }
 
-    /// Bytes that one flow may hold.
+    /// Returns the bytes that one flow may hold.
     pub(super) fn of_flow(&self) -> usize {
         self.of_flow
     }
 
-    /// Bytes that are free here and in the whole daemon.
+    /// Returns the bytes that are free here and in the whole daemon.
     pub(super) fn free(&self) -> usize {
         let free = self.most.saturating_sub(self.taken.get());
         self.parent.as_ref().map_or(free, |parent| free.min(parent.free()))
@@ -84,13 +84,13 @@ impl Budget {
         }
     }
 
-    /// Bytes that are taken now.
+    /// Returns the bytes that are taken now.
     pub(crate) fn taken(&self) -> usize {
         self.taken.get()
     }
 
-    /// Bytes given back since the start, in the whole daemon. It changes when a flow that found no room may try
-    /// again.
+    /// Returns the bytes given back since the start, in the whole daemon. If it changes, a flow that found no space may
+    /// try again.
     pub(crate) fn released(&self) -> usize {
         self.parent.as_ref().map_or(self.released.get(), |parent| parent.released())
     }

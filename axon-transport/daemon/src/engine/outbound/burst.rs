@@ -1,19 +1,20 @@
-//! Whether the samples of a KEEP_LAST flow are a burst, which is lossless, or the flow is behind.
+//! Decides whether the samples of a KEEP_LAST flow are a burst, which is lossless, or the flow is behind.
 
 use std::time::Duration;
 
-/// The longest burst.
+/// The maximum length of a burst.
 const MAX_BURST: Duration = Duration::from_millis(500);
 
-/// The time for which samples may wait before the flow is behind. It is used up while samples wait, and comes back as
-/// fast while none does. So a flow that catches up for a moment, between two samples that are too many, stays behind.
+/// The time for which samples may wait before the flow is behind. It is used up while samples wait, and comes back at
+/// the same rate while none waits. So a flow that catches up for a moment, between two samples that are too many, stays
+/// behind.
 #[derive(Debug)]
 pub(super) struct Burst {
-    /// What was left when samples began to wait, or when the flow caught up.
+    /// The time that was left when samples began to wait, or when the flow caught up.
     left: Duration,
-    /// Since when samples wait, here or in the ring; `None`: none does.
+    /// The time since which samples wait, here or in the ring; `None` if none waits.
     since: Option<Duration>,
-    /// When the flow caught up.
+    /// The time at which the flow caught up.
     caught_up_at: Duration,
 }
 
@@ -24,7 +25,7 @@ impl Default for Burst {
 }
 
 impl Burst {
-    /// A sample waits.
+    /// Records that a sample waits.
     pub(super) fn handle_waiting(&mut self, now: Duration) {
         if self.since.is_none() {
             let idle = now.saturating_sub(self.caught_up_at);
@@ -33,7 +34,7 @@ impl Burst {
         }
     }
 
-    /// No sample waits.
+    /// Records that no sample waits.
     pub(super) fn handle_caught_up(&mut self, now: Duration) {
         if let Some(since) = self.since.take() {
             self.left = self.left.saturating_sub(now.saturating_sub(since));
@@ -41,7 +42,7 @@ impl Burst {
         }
     }
 
-    /// Whether samples have waited for so long that this is no burst.
+    /// Returns whether samples have waited for so long that this is no burst.
     pub(super) fn is_over(&self, now: Duration) -> bool {
         self.since.is_some_and(|since| now.saturating_sub(since) >= self.left)
     }

@@ -55,7 +55,7 @@ pub(super) struct DrainedFlow {
     pub(super) samples: u64,
     /// The flow's progress.
     pub(super) progress: (u64, u64),
-    /// Whether the flow is excused from making progress, because it waits for others.
+    /// True if the flow is excused from making progress, because it waits for others.
     pub(super) is_excused: bool,
 }
 
@@ -87,8 +87,8 @@ pub(super) enum GivenUpCause {
 }
 
 impl GivenUpCause {
-    /// Logs that samples of a publisher that ended are lost. Each reason has its own line: the log's rate limit is by line
-    /// of code.
+    /// Logs that samples of a publisher that ended are lost. Each reason has its own line: the log's rate limit is by
+    /// line of code.
     pub(super) fn warn(self, topic: &str, publisher: &Gid, samples: u64) {
         match self {
             Self::Stuck => tracing::warn!(

@@ -367,7 +367,7 @@ impl Outbound {
         }
     }
 
-    /// The peer wants no more of a stream.
+    /// Handles that the peer wants no more of a stream.
     pub(crate) fn handle_stopped(
         &mut self,
         id: FlowId,
@@ -382,7 +382,8 @@ impl Outbound {
         self.schedule(id);
     }
 
-    /// The peer acknowledges samples. Numbers that were not sent to it, and more drops than samples, are ignored.
+    /// Handles acknowledgements of the peer. Numbers that were not sent to it, and more drops than samples, are
+    /// ignored.
     pub(crate) fn handle_received(&mut self, flows: &[ReceivedOf]) {
         for ReceivedOf { route, publisher, sequence, dropped } in flows {
             let Some(served) = self.table.routes.get(*route) else { continue };
@@ -423,7 +424,7 @@ impl Outbound {
         self.table.link_over(&self.counters)
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) is due.
+    /// Returns when [`handle_timeout`](Self::handle_timeout) is due.
     pub(crate) fn poll_timeout(&self) -> Option<Duration> {
         let parts = [
             self.table.flows.poll_timeout(),
@@ -545,7 +546,7 @@ impl Outbound {
 /// Ends a stream. Resets it if a sample on it is cut off, so that the sample does not look complete.
 fn end(quic: &mut quinn_proto::Connection, stream: StreamId, is_cut: bool) {
     let mut stream = quic.send_stream(stream);
-    // Either error says that the stream is over.
+    // Either error means that the stream is over.
     let _ = match is_cut {
         true => stream.reset(VarInt::from_u32(CloseCode::Goodbye.code())).map_err(drop),
         false => stream.finish().map_err(drop),

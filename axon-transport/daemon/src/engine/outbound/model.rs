@@ -1,4 +1,4 @@
-//! What the tests of the samples to a peer have in place of rings and routes.
+//! Models of rings and routes for the tests of the samples to a peer.
 
 use std::{
     cell::{Cell, RefCell},
@@ -28,14 +28,14 @@ pub(super) struct ModelRing {
     pub(super) published: Cell<u64>,
     pub(super) copied: Cell<u64>,
     pub(super) lost: Cell<u64>,
-    /// The most samples that were taken together.
+    /// Maximum number of samples that were taken together.
     pub(super) most_together: Cell<usize>,
-    /// How many samples are published when one is copied, and how often.
+    /// The number of samples that are published when one is copied, and the number of times.
     pub(super) meanwhile: Cell<(u64, u64)>,
 }
 
 impl ModelRing {
-    /// The ring of `publisher`, which is empty.
+    /// Creates the empty ring of `publisher`.
     pub(super) fn new(reader: Gid, publisher: Gid) -> Rc<Self> {
         Rc::new(Self {
             reader,
@@ -49,14 +49,14 @@ impl ModelRing {
         })
     }
 
-    /// Its reader as a source with this QoS.
+    /// Returns its reader as a source with this QoS.
     pub(super) fn source(self: &Rc<Self>, qos: Qos) -> Source {
         let spec =
             RelaySpec { qos, depth: qos.depth, type_hash: Vec::new(), stands_for: Vec::new() };
         Source::Relay(spec, Rc::clone(self) as Rc<dyn RingReader>)
     }
 
-    /// Publishes so many samples of this length.
+    /// Publishes `samples` samples of this length.
     pub(super) fn publish(&self, samples: u64, length: usize) {
         for _ in 0..samples {
             self.published.set(self.published.get() + 1);
@@ -151,7 +151,7 @@ impl RingReader for ModelRing {
     fn set_stands_for(&self, _gids: Vec<Gid>) {}
 }
 
-/// A route of a topic whose samples the peer acknowledges.
+/// Creates a route of a topic whose samples the peer acknowledges.
 pub(super) fn route(number: u32, priority: TopicPriority) -> FlowRoute {
     FlowRoute {
         number,
@@ -167,7 +167,7 @@ pub(super) fn route(number: u32, priority: TopicPriority) -> FlowRoute {
     }
 }
 
-/// A flow without sources, of the publisher with this number, over route 1.
+/// Creates a flow without sources, of the publisher with this number, over route 1.
 pub(super) fn flow(publisher: u8) -> Flow {
     let (route, budget) = (route(1, TopicPriority::Normal), Budget::new(1 << 20).of_peer());
     Flow::new(Gid([publisher; 16]), &route, &Qos::default(), &budget)

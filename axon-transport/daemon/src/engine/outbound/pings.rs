@@ -1,48 +1,49 @@
 //! Finds lost packets of short samples early on links that lose many.
 //!
 //! QUIC notices that a packet is lost when a later one is acknowledged. A camera sends later ones all the time. A
-//! command does not: then QUIC waits for a timer that doubles each time, and at 40 % of loss that soon takes longer than
-//! a command is worth. So while samples are on the way over a link that loses packets, and no other was handed to QUIC,
-//! a PING follows them every few milliseconds. Each one that is acknowledged shows which packets before it are lost.
+//! command does not: then QUIC waits for a timer that doubles each time, and at 40 % of loss that soon takes longer
+//! than a command is worth. So while samples are on the way over a link that loses packets, and no other was handed to
+//! QUIC, a PING follows them every few milliseconds. Each one that is acknowledged shows which packets before it are
+//! lost.
 
 use std::{collections::HashMap, time::Duration};
 
 use super::schedule::FlowId;
 
-/// PINGs follow each other at half a round trip, at least at this distance.
+/// Minimum distance of PINGs, which otherwise follow each other at half a round trip.
 const MIN_PING_INTERVAL: Duration = Duration::from_millis(3);
-/// PINGs after the last sample of a flow, where no acknowledgement ends them.
+/// Maximum number of PINGs after the last sample of a flow, if no acknowledgement ends them.
 const MAX_PINGS: u8 = 100;
 
-/// The samples on the way that PINGs follow.
+/// The samples in flight that PINGs follow.
 #[derive(Debug, Default)]
 pub(super) struct Pings {
-    /// Flows with samples on the way, and the PINGs since the last one.
+    /// Flows with samples in flight, and the number of PINGs since the last sample.
     flows: HashMap<FlowId, u8>,
     due: Option<Duration>,
-    /// Whether samples were sent since the last PING: they show the same.
+    /// True if samples were sent since the last PING: they have the same effect.
     sent: bool,
 }
 
 impl Pings {
-    /// A flow sent samples over a link that loses packets.
+    /// Records that a flow sent samples over a link that loses packets.
     pub(super) fn handle_sent(&mut self, now: Duration, flow: FlowId, rtt: Duration) {
         self.flows.insert(flow, 0);
         self.sent = true;
         self.due.get_or_insert(now + MIN_PING_INTERVAL.max(rtt / 2));
     }
 
-    /// A flow is gone.
+    /// Forgets a flow that is gone.
     pub(super) fn forget(&mut self, flow: FlowId) {
         self.flows.remove(&flow);
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) is due.
+    /// Returns when [`handle_timeout`](Self::handle_timeout) is due.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         self.due
     }
 
-    /// Whether a PING is to be sent now. `on_the_way` says whether a flow still has samples on the way.
+    /// Returns whether a PING is to be sent now. `on_the_way` returns whether a flow still has samples in flight.
     pub(super) fn handle_timeout(
         &mut self,
         now: Duration,
@@ -68,7 +69,7 @@ mod tests {
 
     const RTT: Duration = Duration::from_millis(4);
 
-    /// The number of PINGs until nothing is due.
+    /// Returns the number of PINGs until nothing is due.
     fn count(pings: &mut Pings, on_the_way: impl Fn(Duration) -> bool) -> u32 {
         let mut sent = 0;
         while let Some(now) = pings.poll_timeout() {

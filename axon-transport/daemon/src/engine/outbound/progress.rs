@@ -1,7 +1,7 @@
-//! How far QUIC took the samples of a flow, over all links that carried them.
+//! Measures how far QUIC took the samples of a flow, over all links that carried them.
 
-/// The newest number of which QUIC took anything, and how many bytes of that sample. What it takes again over another link
-/// is no progress, whether the same flow sends it or the one that follows it.
+/// The newest number of which QUIC took any byte, and the bytes taken of that sample. Bytes that QUIC takes again over
+/// another link are no progress, whether the same flow sends them or its successor.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct SentProgress {
     sequence: u64,
@@ -9,7 +9,7 @@ pub(super) struct SentProgress {
 }
 
 impl SentProgress {
-    /// QUIC has so many bytes of a sample. Returns how many of them it took for the first time.
+    /// Records that QUIC has `bytes` bytes of a sample. Returns how many of them it took for the first time.
     pub(super) fn advance(&mut self, sequence: u64, bytes: u64) -> u64 {
         let known = if sequence == self.sequence { self.bytes } else { 0 };
         let to = Self { sequence, bytes };
@@ -31,7 +31,7 @@ mod tests {
         let taken = [(1, 10), (1, 30), (2, 5), (1, 40), (2, 5), (2, 3), (2, 7), (9, 0), (9, 1)];
         let new = taken.map(|(sequence, bytes)| sent_progress.advance(sequence, bytes));
         assert_eq!(new, [10, 20, 5, 0, 0, 0, 2, 0, 1]);
-        // A flow that follows goes on from there.
+        // A successor continues from there.
         let mut next = SentProgress::default().max(sent_progress);
         assert_eq!([(1, 50), (9, 4)].map(|(s, b)| next.advance(s, b)), [0, 3]);
     }

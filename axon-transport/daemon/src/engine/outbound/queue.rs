@@ -1,9 +1,9 @@
 //! The queue of one flow: samples that wait to be sent, and samples that were sent and are not acknowledged.
 //!
-//! KEEP_LAST never blocks its publisher. A [burst](Burst) is lossless: the flow holds as many samples as its bytes allow.
-//! A flow that had some waiting for too long is behind: it holds its depth, and drops the oldest. What does not fit within
-//! the depth stays in the ring. KEEP_ALL drops nothing: what does not fit stays in the ring, and in time holds the publisher
-//! back.
+//! KEEP_LAST never blocks its publisher. A [burst](Burst) is lossless: the flow holds as many samples as its bytes
+//! allow. A flow whose samples waited for too long is behind: it holds its depth, and drops the oldest. Samples that do
+//! not fit within the depth stay in the ring. KEEP_ALL drops nothing: samples that do not fit stay in the ring, and in
+//! time hold the publisher back.
 
 #[cfg(test)]
 mod tests;
@@ -17,15 +17,15 @@ use bytes::Bytes;
 use super::{budget::Budget, burst::Burst, flow::UsedCredit};
 use crate::engine::rings::RingSample;
 
-/// What became of a sample that was offered.
+/// The result of offering a sample.
 #[derive(Debug)]
 pub(super) enum Offered {
-    /// It waits. So many older samples were dropped for it.
+    /// The sample waits, and older samples were dropped for it.
     Queued {
-        /// Samples dropped.
+        /// Number of samples dropped.
         dropped: u64,
     },
-    /// There is no room, and nothing may be dropped.
+    /// There is no space, and nothing may be dropped.
     Full(RingSample),
 }
 
@@ -65,7 +65,7 @@ pub(super) struct Queue {
     /// Bytes of all samples, waiting and sent.
     bytes: usize,
     sent_bytes: usize,
-    /// At least the length of the longest sample among those that were sent.
+    /// An upper bound of the length of the longest sent sample.
     longest_sent: usize,
     /// The highest number that was ever sent.
     newest_sent: u64,
@@ -73,7 +73,7 @@ pub(super) struct Queue {
 }
 
 impl Queue {
-    /// An empty queue. A RELIABLE sample keeps its place until it is acknowledged, or [written](Self::written).
+    /// Creates an empty queue. A RELIABLE sample keeps its place until it is acknowledged, or [written](Self::written).
     pub(super) fn new(qos: &Qos, budget: Rc<Budget>) -> Self {
         Self {
             policy: Policy::of(qos),
@@ -88,7 +88,7 @@ impl Queue {
         }
     }
 
-    /// Takes the QoS of another relay, since the peer's subscriptions changed.
+    /// Takes over the QoS of another relay, because the peer's subscriptions changed.
     pub(super) fn set_qos(&mut self, qos: &Qos) {
         let before = self.policy.is_reliable();
         self.policy = Policy::of(qos);
@@ -99,26 +99,27 @@ impl Queue {
         }
     }
 
-    /// How the samples are delivered.
+    /// Returns the delivery of the samples.
     pub(super) fn delivery(&self) -> Delivery {
         if self.policy.is_reliable() { Delivery::Reliable } else { Delivery::BestEffort }
     }
 
-    /// Whether samples waited for so long that this is no burst.
+    /// Returns whether samples waited for so long that this is no burst.
     pub(super) fn is_behind(&self, now: Duration) -> bool {
         self.burst.is_over(now)
     }
 
-    /// The ring holds no sample. If none waits here either, the flow has caught up.
+    /// Records that the ring holds no sample. If none waits here either, the flow has caught up.
     pub(super) fn handle_empty_ring(&mut self, now: Duration) {
         if self.waiting.is_empty() {
             self.burst.handle_caught_up(now);
         }
     }
 
-    /// Whether the engine should move samples from the ring into the queue now. A KEEP_LAST flow that is behind, or
-    /// has no bytes left for a sample like its last, leaves them in the ring, where newer samples replace them without
-    /// a copy. What it holds of a burst beyond its depth makes way for them.
+    /// Returns whether the engine should move samples from the ring into the queue now. A KEEP_LAST flow that is
+    /// behind, or has no bytes left for a sample like its last, leaves them in the ring, where newer samples replace
+    /// them without a copy. A flow that is behind and holds more of a burst than its depth drops the surplus for new
+    /// samples.
     pub(super) fn wants_more(&self, now: Duration) -> bool {
         match (self.policy, self.waiting.back()) {
             (Policy::KeepAll | Policy::BestEffort(_), _) | (_, None) => true,
@@ -127,23 +128,23 @@ impl Queue {
         }
     }
 
-    /// Bytes, in memory, of the samples that would find room.
+    /// Returns the number of bytes, in memory, of the samples that would still fit.
     pub(super) fn room(&self) -> usize {
         let left = self.budget.of_flow().saturating_sub(self.bytes);
         if self.policy.is_reliable() { left.min(self.budget.free()) } else { left }
     }
 
-    /// Whether RELIABLE samples were sent and are not acknowledged.
+    /// Returns whether RELIABLE samples were sent and are not acknowledged.
     pub(super) fn has_sent(&self) -> bool {
         !self.sent.is_empty()
     }
 
-    /// Whether it is RELIABLE and KEEP_ALL.
+    /// Returns whether it is RELIABLE and KEEP_ALL.
     pub(super) fn keeps_all(&self) -> bool {
         self.policy == Policy::KeepAll
     }
 
-    /// The history's depth; `None` for RELIABLE and KEEP_ALL.
+    /// Returns the history's depth; `None` for RELIABLE and KEEP_ALL.
     pub(super) fn depth(&self) -> Option<usize> {
         match self.policy {
             Policy::KeepAll => None,
@@ -151,7 +152,7 @@ impl Queue {
         }
     }
 
-    /// Whether it takes bursts of which the ring keeps the newest samples alone.
+    /// Returns whether it takes bursts of which the ring alone would keep only the newest samples.
     pub(super) fn keeps_bursts(&self) -> bool {
         matches!(self.policy, Policy::KeepLast(_))
     }
@@ -165,7 +166,8 @@ impl Queue {
             Policy::KeepLast(_) => usize::MAX,
             Policy::BestEffort(depth) => depth,
         };
-        // Samples that are never dropped for want of bytes: an acknowledgement says that the newest of the depth arrived.
+        // Samples that are never dropped for want of bytes: an acknowledgement means that the newest of the depth
+        // arrived.
         let kept = match self.policy {
             Policy::KeepAll => usize::MAX,
             Policy::KeepLast(depth) => depth,
@@ -183,13 +185,13 @@ impl Queue {
         Offered::Queued { dropped }
     }
 
-    /// Takes so many bytes of the budget. The only sample of a queue always fits.
+    /// Takes `size` bytes of the budget. Returns whether it did. The only sample of a queue always fits.
     fn takes(&self, size: usize) -> bool {
         let fits = self.bytes + size <= self.budget.of_flow();
         if !self.policy.is_reliable() {
             return fits || self.waiting.is_empty();
         }
-        // The next sample is on its way while the peer acknowledges the one before it, however long they are.
+        // The next sample is in flight while the peer acknowledges the previous one, whatever their lengths.
         let is_next = self.waiting.is_empty() && self.sent.len() == 1;
         if (fits || is_next) && self.budget.try_take(size) {
             return true;
@@ -217,13 +219,13 @@ impl Queue {
         Some(sample)
     }
 
-    /// The next sample to send.
+    /// Returns the next sample to send.
     pub(super) fn peek(&self) -> Option<&RingSample> {
         self.waiting.front()
     }
 
-    /// The first samples that wait, up to so many bytes, for their owner to ask whether they become shorter: where only the
-    /// newest samples are kept, the first alone.
+    /// Returns the first waiting samples, up to `bytes` bytes, so that the caller can ask whether they become shorter;
+    /// only the first sample if only the newest samples are kept.
     pub(super) fn next_ones(
         &mut self,
         bytes: usize,
@@ -243,9 +245,9 @@ impl Queue {
         })
     }
 
-    /// Whether the next sample is compressed, or is about to be, and a newer one would take its place: within its `life` it is
-    /// sent before that, or a publisher that is fast enough would have none of its samples sent. A KEEP_LAST flow leaves
-    /// newer ones in the ring.
+    /// Returns whether the next sample is compressed, or is about to be, and a newer one would replace it. Within its
+    /// `life` it is sent before that; otherwise none of the samples of a fast publisher would be sent. A KEEP_LAST flow
+    /// leaves newer samples in the ring.
     pub(super) fn holds_next(&self, life: Duration, now: Duration) -> bool {
         let is_held = |next: &RingSample| {
             (next.is_asked() || next.is_compressed()) && now.saturating_sub(next.taken) < life
@@ -253,16 +255,16 @@ impl Queue {
         matches!(self.policy, Policy::BestEffort(_)) && self.peek().is_some_and(is_held)
     }
 
-    /// An order is answered: the sample that it is about is sent as this frame, or as it is. Returns its length, if it waits
-    /// here.
+    /// Handles the answer to a compression order: its sample is sent as this frame, or uncompressed. Returns the
+    /// sample's length, if it waits here.
     pub(super) fn set_compressed(&mut self, order: u64, frame: Option<Bytes>) -> Option<usize> {
         let sample = self.waiting.iter_mut().find(|sample| sample.is_asked_by(order))?;
         sample.set_compressed(frame);
         Some(sample.length())
     }
 
-    /// The next RELIABLE sample to send. It stays in the queue until it is acknowledged or written; there is none
-    /// while several such samples fill the flow's share.
+    /// Takes the next RELIABLE sample to send. It stays in the queue until it is acknowledged or written. Returns
+    /// `None` while several such samples fill the flow's share.
     pub(super) fn send(&mut self) -> Option<&RingSample> {
         let size = self.waiting.front()?.size();
         if self.sent.len() > 1 && self.sent_bytes + size > self.budget.of_flow() {
@@ -276,12 +278,12 @@ impl Queue {
         self.sent.back()
     }
 
-    /// The credit that the samples use that were sent and are not acknowledged.
+    /// Returns the credit used by the samples that were sent and are not acknowledged.
     pub(super) fn credit(&self) -> UsedCredit {
         UsedCredit::of(self.sent_bytes, self.longest_sent())
     }
 
-    /// The credit that they will use if this sample is sent, too.
+    /// Returns the credit that they will use if this sample is sent, too.
     pub(super) fn credit_with(&self, next: &RingSample) -> UsedCredit {
         UsedCredit::of(self.sent_bytes + next.size(), self.longest_sent().max(next.size()))
     }
@@ -290,7 +292,7 @@ impl Queue {
         if self.sent.is_empty() { 0 } else { self.longest_sent }
     }
 
-    /// Takes back the sample that was sent last: it could not be sealed.
+    /// Takes back the sample that was sent last, because it could not be sealed.
     pub(super) fn take_back(&mut self) {
         if let Some(sample) = self.sent.pop_back() {
             self.sent_bytes -= sample.size();
@@ -303,14 +305,14 @@ impl Queue {
         self.pop()
     }
 
-    /// The oldest samples that were sent, this many, are with QUIC, and the peer does not acknowledge them.
+    /// Removes the oldest sent samples, this many, which are with QUIC and which the peer does not acknowledge.
     pub(super) fn written(&mut self, samples: usize) {
         for _ in 0..samples {
             self.pop_sent();
         }
     }
 
-    /// Drops waiting samples that would arrive too late, the oldest first: at the end of their lifespan or, where that is
+    /// Drops waiting samples that would arrive too late, the oldest first: at the end of their lifespan or, if that is
     /// infinite, older than `life` once they have crossed the link, which takes `transit`. The newest sample is dropped
     /// for its lifespan alone.
     pub(super) fn drop_late(&mut self, life: Duration, transit: Duration, now: Duration) -> u64 {
@@ -330,15 +332,15 @@ impl Queue {
         dropped
     }
 
-    /// The peer has the samples up to this number. Returns how many samples that were, and the newest of them. A
-    /// number that was never sent acknowledges nothing.
+    /// Handles an acknowledgement: the peer has the samples up to this number. Returns how many samples that were, and
+    /// the newest of them. A number that was never sent acknowledges nothing.
     pub(super) fn acknowledge(&mut self, sequence: u64) -> (u64, Option<u64>) {
         let most = sequence.min(self.newest_sent);
         let is_taken = |sample: &&RingSample| sample.info.sequence <= most;
         let (mut samples, mut newest) = (0, None);
         loop {
             let taken = if self.sent.is_empty() {
-                // It was sent over a link that ended, and waits to be sent again.
+                // The sample was sent over a link that ended, and waits to be sent again.
                 self.waiting.front().filter(is_taken).is_some().then(|| self.pop()).flatten()
             } else {
                 self.sent.front().filter(is_taken).is_some().then(|| self.pop_sent()).flatten()
@@ -356,7 +358,8 @@ impl Queue {
         Some(sample)
     }
 
-    /// Removes all samples that were sent and are not acknowledged. Returns how many, and the highest number.
+    /// Removes all samples that were sent and are not acknowledged. Returns their number, and the highest sequence
+    /// number.
     pub(super) fn give_up_sent(&mut self) -> (u64, Option<u64>) {
         let (mut samples, mut newest) = (0, None);
         while let Some(sample) = self.pop_sent() {
@@ -365,7 +368,7 @@ impl Queue {
         (samples, newest)
     }
 
-    /// The link ended: samples that are not acknowledged are sent again, before all others.
+    /// Queues unacknowledged samples again, before all others, because the link ended.
     pub(super) fn rewind(&mut self) {
         while let Some(sample) = self.sent.pop_back() {
             self.waiting.push_front(sample);
@@ -373,22 +376,22 @@ impl Queue {
         self.sent_bytes = 0;
     }
 
-    /// Samples that wait to be sent.
+    /// Returns the number of samples that wait to be sent.
     pub(super) fn waiting(&self) -> u64 {
         self.waiting.len() as u64
     }
 
-    /// Bytes that wait to be sent.
+    /// Returns the number of bytes that wait to be sent.
     pub(super) fn waiting_bytes(&self) -> usize {
         self.bytes - self.sent_bytes
     }
 
-    /// When the oldest waiting sample was taken from its ring.
+    /// Returns when the oldest waiting sample was taken from its ring.
     pub(super) fn oldest(&self) -> Option<Duration> {
         self.waiting.front().map(|sample| sample.taken)
     }
 
-    /// Whether it holds no sample at all.
+    /// Returns whether it holds no sample at all.
     pub(super) fn is_empty(&self) -> bool {
         self.waiting.is_empty() && self.sent.is_empty()
     }

@@ -1,7 +1,7 @@
-//! Which flow sends next. Plain data: it knows flows by number, and no QUIC types.
+//! Decides which flow sends next. Plain data: it knows flows by number, and no QUIC types.
 //!
-//! A higher rank goes first: the priority of the topic, and within a priority the class. Within a rank flows take turns.
-//! What keeps a rank from starving is [`turns`](super::turns).
+//! A higher rank goes first: the priority of the topic, and within a priority the class. Within a rank flows take
+//! turns. [`turns`](super::turns) keeps a rank from starving.
 
 use std::collections::VecDeque;
 
@@ -10,15 +10,15 @@ use axon_transport::config::TopicPriority;
 /// The number of a flow towards one peer.
 pub(crate) type FlowId = usize;
 
-/// A sample of at most so many bytes is small.
+/// Maximum length of a small sample in bytes.
 pub(super) const SMALL: usize = 4096;
-/// Classes, and ranks.
+/// Number of classes; `RANKS` is the number of ranks.
 const CLASSES: usize = 4;
 pub(super) const RANKS: usize = 3 * CLASSES;
-/// What a priority adds to that of QUIC's streams. It leaves room below each class.
+/// Distance of two topic priorities in the priorities of QUIC's streams. It leaves space below each class.
 const PRIORITY: i32 = 8;
 
-/// What a flow sends next. Control messages go before all classes: QUIC itself sends their stream first.
+/// The class of a flow's next sample. Control messages go before all classes: QUIC itself sends their stream first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Class {
     /// Requests and responses of services and actions.
@@ -32,7 +32,7 @@ pub(crate) enum Class {
 }
 
 impl Class {
-    /// The class of a flow that sends a sample of this length.
+    /// Returns the class of a flow that sends a sample of this length.
     pub(super) fn of(service: bool, reliable: bool, length: usize) -> Self {
         match (service, reliable) {
             (true, _) => Self::Service,
@@ -43,17 +43,17 @@ impl Class {
     }
 }
 
-/// What goes before what.
+/// The rank of a sample, which decides the order of sending.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Rank {
-    /// Of the topic.
+    /// The priority of the topic.
     pub(crate) priority: TopicPriority,
-    /// Of the sample.
+    /// The class of the sample.
     pub(crate) class: Class,
 }
 
 impl Rank {
-    /// The priority of its QUIC streams. QUIC shares the link evenly among streams of the same priority.
+    /// Returns the priority of its QUIC streams. QUIC shares the link evenly among streams of the same priority.
     pub(super) fn of_stream(self) -> i32 {
         let class = match self.class {
             Class::Service => 3,
@@ -64,7 +64,7 @@ impl Rank {
         self.priority as i32 * PRIORITY + class
     }
 
-    /// Its place among all ranks, the first one to go being 0.
+    /// Returns its place among all ranks; the first to send is at 0.
     pub(in crate::engine) fn place(self) -> usize {
         (TopicPriority::High as usize - self.priority as usize) * CLASSES + self.class as usize
     }
@@ -75,23 +75,23 @@ impl Rank {
 pub(crate) struct Priorities([usize; 3]);
 
 impl Priorities {
-    /// There is a route of this priority.
+    /// Counts a route of this priority.
     pub(super) fn add(&mut self, priority: TopicPriority) {
         self.0[priority as usize] += 1;
     }
 
-    /// There is one less.
+    /// Counts a route of this priority less.
     pub(super) fn remove(&mut self, priority: TopicPriority) {
         self.0[priority as usize] -= 1;
     }
 
-    /// How many priorities below this one have routes.
+    /// Returns how many priorities below this one have routes.
     pub(crate) fn below(&self, priority: TopicPriority) -> u64 {
         self.0[..priority as usize].iter().filter(|routes| **routes > 0).count() as u64
     }
 }
 
-/// The flows that have something to send. Each is in the queue of one rank, under which it was added.
+/// The flows that have samples to send. Each is in the queue of the rank under which it was added.
 #[derive(Debug, Default)]
 pub(super) struct Schedule {
     ranks: [VecDeque<FlowId>; RANKS],
@@ -100,19 +100,19 @@ pub(super) struct Schedule {
 }
 
 impl Schedule {
-    /// Whether it has a flow.
+    /// Returns whether it contains a flow.
     pub(super) fn contains(&self, flow: FlowId) -> bool {
         self.rank_of.get(flow).is_some_and(Option::is_some)
     }
 
-    /// Adds a flow behind the others of its rank. One that it has keeps its place.
+    /// Adds a flow behind the others of its rank. A flow that is in a queue keeps its place.
     pub(super) fn push(&mut self, flow: FlowId, rank: Rank) {
         if self.note(flow, rank) {
             self.ranks[rank.place()].push_back(flow);
         }
     }
 
-    /// Adds a flow before the others of its rank. One that it has keeps its place.
+    /// Adds a flow before the others of its rank. A flow that is in a queue keeps its place.
     pub(super) fn push_first(&mut self, flow: FlowId, rank: Rank) {
         if self.note(flow, rank) {
             self.ranks[rank.place()].push_front(flow);
@@ -130,8 +130,8 @@ impl Schedule {
         is_new
     }
 
-    /// The next flow, with the rank under which it was added. Ranks that `borrows` says, by their place, go before all
-    /// others.
+    /// Takes the next flow, with the rank under which it was added. Ranks for whose place `borrows` returns true go
+    /// before all others.
     pub(super) fn pop(&mut self, borrows: impl Fn(usize) -> bool) -> Option<(FlowId, Rank)> {
         let borrowers = self.ranks.iter_mut().enumerate().filter(|(at, _)| borrows(*at));
         let borrower = borrowers.map(|(_, rank)| rank).find_map(VecDeque::pop_front);
@@ -146,7 +146,7 @@ impl Schedule {
         }
     }
 
-    /// Whether no flow has anything to send.
+    /// Returns whether no flow has samples to send.
     pub(super) fn is_empty(&self) -> bool {
         self.ranks.iter().all(VecDeque::is_empty)
     }
@@ -229,7 +229,7 @@ mod tests {
         let ranks = priorities.iter().flat_map(|priority| classes.map(|class| (*priority, class)));
         let ranks: Vec<_> = ranks.map(|(priority, class)| Rank { priority, class }).collect();
         assert!(ranks.is_sorted_by(|one, next| one.place() + 1 == next.place()));
-        // A second sample of best effort under way is one below its class.
+        // A second BEST_EFFORT sample in flight is one below its class.
         assert!(ranks.is_sorted_by(|one, next| one.of_stream() > next.of_stream()));
         assert!(ranks[3].of_stream() - 1 > ranks[4].of_stream());
     }

@@ -1,4 +1,4 @@
-//! A route that the peer asked for, and what its sources are told.
+//! A route that the peer asked for, and the reports to its sources.
 
 use std::{cell::Cell, collections::HashMap, rc::Rc, sync::Arc, time::Duration};
 
@@ -23,21 +23,21 @@ pub(crate) struct RouteOut {
     pub(crate) topic: Arc<str>,
     /// Topic and kind, for the envelope.
     pub(crate) route: Route,
-    /// Of the topic.
+    /// The priority of the topic.
     pub(crate) priority: TopicPriority,
-    /// Whether the peer acknowledges the samples.
+    /// True if the peer acknowledges the samples.
     pub(crate) acknowledged: bool,
-    /// Whether the peer reads short headers.
+    /// True if the peer reads short headers.
     pub(crate) short_headers: bool,
-    /// Whether its samples may be compressed.
+    /// True if its samples may be compressed.
     pub(crate) compressed: bool,
-    /// The limits on what the peer gets of it.
+    /// The limits on the route's samples to the peer.
     pub(crate) limit: RouteLimit,
-    /// Where its samples are taken.
+    /// The sources of its samples.
     pub(crate) sources: Vec<Source>,
     /// The newest sample of each publisher that the peer has already.
     pub(crate) seen: HashMap<Gid, u64>,
-    /// The flows of an earlier daemon of the peer's host that go on.
+    /// The flows of an earlier daemon of the peer's host that continue.
     pub(crate) unfinished: UnfinishedFlows,
 }
 
@@ -55,13 +55,13 @@ pub(super) struct FlowRoute {
     pub(super) credit: Rc<PeerCredit>,
 }
 
-/// Numbers the responses of this daemon in the order in which they are taken. A flow that ends and begins again, or that of
-/// a link after the last one, goes on with higher ones, so no peer takes a response for one that it has.
+/// Numbers the responses of this daemon in the order in which they are taken. A flow that ends and begins again, or the
+/// flow of the next link, continues with higher numbers, so no peer mistakes a response for one that it has.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct ResponseNumbers(Rc<Cell<u64>>);
 
 impl ResponseNumbers {
-    /// The next number.
+    /// Returns the next number.
     pub(super) fn next(&self) -> u64 {
         self.0.set(self.0.get() + 1);
         self.0.get()
@@ -71,7 +71,7 @@ impl ResponseNumbers {
 /// A route and its flows.
 pub(super) struct ServedFlows {
     pub(super) shared: FlowRoute,
-    /// Its peer reads nothing, as its owner knows.
+    /// True if its peer is known not to read the route.
     pub(super) stalled: bool,
     pub(super) sources: Vec<Source>,
     pub(super) seen: HashMap<Gid, u64>,
@@ -79,7 +79,7 @@ pub(super) struct ServedFlows {
 }
 
 impl ServedFlows {
-    /// A route without sources.
+    /// Creates a route without sources.
     pub(super) fn new(shared: FlowRoute) -> Self {
         Self {
             shared,
@@ -90,32 +90,34 @@ impl ServedFlows {
         }
     }
 
-    /// Whether it is of a service.
+    /// Returns whether it belongs to a service.
     pub(super) fn is_service(&self) -> bool {
         self.shared.route.kind != Kind::Topic
     }
 
-    /// The first source that reads this publisher or client.
+    /// Returns the first source that reads this publisher or client.
     pub(super) fn source_of(&self, of: &Gid) -> Option<&Source> {
         self.sources.iter().find(|source| source.reads(of))
     }
 
-    /// Whether a source reads this publisher or client.
+    /// Returns whether a source reads this publisher or client.
     pub(super) fn reads(&self, of: &Gid) -> bool {
         self.source_of(of).is_some()
     }
 
-    /// Whether samples of this publisher count until they are acknowledged.
+    /// Returns whether samples of this publisher count until they are acknowledged.
     pub(super) fn is_reliable(&self, of: &Gid) -> bool {
         self.source_of(of).is_some_and(|s| s.qos().reliability == Reliability::Reliable)
     }
 
-    /// Samples that KEEP_ALL relays have a publisher keep, or calls that a stand-in has a client keep, if there are any.
+    /// Returns the number of samples that KEEP_ALL relays make a publisher keep, or of calls that a stand-in makes a
+    /// client keep, if there are any.
     pub(super) fn keeps(&self, of: &Gid) -> Option<u64> {
         self.keeping(of).filter_map(|source| source.kept_of(of)).max()
     }
 
-    /// How many publishes of a publisher found no room, if a KEEP_ALL relay is why the next one may not. The same of calls.
+    /// Returns how many publishes of a publisher found no space, if a KEEP_ALL relay may be the reason for the next
+    /// one; for calls, the same.
     pub(super) fn refused(&self, of: &Gid) -> Option<u64> {
         self.keeping(of).filter_map(|source| source.refused_of(of)).max()
     }
@@ -125,7 +127,7 @@ impl ServedFlows {
         self.sources.iter().filter(keeping).filter(|source| source.reads(of))
     }
 
-    /// The publishers, or clients, that have samples to take, each once.
+    /// Returns the publishers, or clients, that have samples to take, each once.
     pub(super) fn with_data(&self) -> Vec<Gid> {
         let mut waiting: Vec<Gid> = self.sources.iter().flat_map(Source::with_data).collect();
         if self.sources.len() > 1 {
@@ -135,7 +137,7 @@ impl ServedFlows {
         waiting
     }
 
-    /// Tells the sources up to which number they may forget the samples of a publisher.
+    /// Reports to the sources up to which number they may forget the samples of a publisher.
     pub(super) fn done(&self, of: Gid, FlowProgress { sequence, given_up }: FlowProgress) {
         if given_up > 0
             && let Some(source) = self.source_of(&of)
@@ -148,7 +150,7 @@ impl ServedFlows {
         }
     }
 
-    /// RELIABLE samples that are not acknowledged, by publisher.
+    /// Returns the number of unacknowledged RELIABLE samples, by publisher.
     pub(super) fn unacknowledged(&self) -> HashMap<Gid, u64> {
         let mut most = HashMap::new();
         for (of, samples) in self.sources.iter().flat_map(Source::unacknowledged) {
@@ -158,17 +160,17 @@ impl ServedFlows {
         most
     }
 
-    /// Bytes of its ring that the samples of this publisher take that are not acknowledged.
+    /// Returns the bytes of its ring that the unacknowledged samples of this publisher take.
     pub(super) fn unacknowledged_bytes_of(&self, of: &Gid) -> u64 {
         let of = self.sources.iter().map(|source| source.unacknowledged_bytes_of(of));
         of.max().unwrap_or(0)
     }
 
-    /// Gives up all samples of a publisher that ended. Returns how many were in a ring.
+    /// Gives up all samples of a publisher that ended. Returns the number of samples in a ring.
     pub(super) fn give_up_ended(&self, of: &Gid) -> u64 {
         let mut most = 0;
         for source in self.sources.iter().filter(|source| source.reads(of)) {
-            // Nothing more is sent of it.
+            // No more samples of it are sent.
             let taken = std::iter::from_fn(|| source.take_of(of, Duration::ZERO)).count();
             source.acknowledge_of(of, u64::MAX);
             most = most.max(taken as u64);
@@ -176,7 +178,7 @@ impl ServedFlows {
         most
     }
 
-    /// Tells the publishers which samples will not reach the peer. Returns how many.
+    /// Reports the undeliverable samples to the publishers. Returns their number.
     pub(super) fn give_up(&self) -> u64 {
         let mut all = 0;
         for (of, samples) in self.unacknowledged() {

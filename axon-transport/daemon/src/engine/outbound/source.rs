@@ -1,4 +1,4 @@
-//! Where the samples of a route are taken.
+//! The sources of a route's samples.
 
 use std::{collections::HashMap, rc::Rc, time::Duration};
 
@@ -15,16 +15,16 @@ use crate::engine::{
     stand_in::StandIn,
 };
 
-/// Samples that one flow sent, dropped, or has done with since they were taken up last.
+/// Samples that one flow sent, dropped, or finished since the last report.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct FlowProgress {
     /// The sources may forget the samples up to this number.
     pub(super) sequence: Option<u64>,
-    /// Samples among them that will never reach the peer.
+    /// Number of samples among them that will never reach the peer.
     pub(super) given_up: u64,
 }
 
-/// One sample, however long.
+/// The limit of one sample, whatever its length.
 const ONE: TakeLimit = TakeLimit { samples: 1, bytes: 0 };
 
 /// A source of samples.
@@ -32,12 +32,12 @@ const ONE: TakeLimit = TakeLimit { samples: 1, bytes: 0 };
 pub(crate) enum Source {
     /// Reads the local publishers of a topic.
     Relay(RelaySpec, Rc<dyn RingReader>),
-    /// Reads what local endpoints of a service send to the peer's client or server.
+    /// Reads the messages of a service's local endpoints for the peer's client or server.
     StandIn(Rc<StandIn>),
 }
 
 impl Source {
-    /// The publishers, or clients, that have samples to take.
+    /// Returns the publishers, or clients, that have samples to take.
     pub(super) fn with_data(&self) -> Vec<Gid> {
         match self {
             Self::Relay(_, reader) => reader.with_data(),
@@ -45,7 +45,7 @@ impl Source {
         }
     }
 
-    /// The publishers, or clients, that have samples to take, of which `writer` wrote some.
+    /// Returns the publishers, or clients, that have samples to take, some of them written by `writer`.
     pub(super) fn with_data_of(&self, writer: &Gid) -> Vec<Gid> {
         match self {
             Self::Relay(_, reader) => {
@@ -56,7 +56,7 @@ impl Source {
         }
     }
 
-    /// Whether it reads this publisher or client.
+    /// Returns whether it reads this publisher or client.
     pub(super) fn reads(&self, of: &Gid) -> bool {
         match self {
             Self::Relay(_, reader) => reader.reads(of),
@@ -64,7 +64,7 @@ impl Source {
         }
     }
 
-    /// The reader's own GID.
+    /// Returns the reader's own GID.
     pub(crate) fn gid(&self) -> Gid {
         match self {
             Self::Relay(_, reader) => reader.gid(),
@@ -79,7 +79,7 @@ impl Source {
         taken
     }
 
-    /// Takes the next samples of a publisher or client, as many as `most` says. Returns how many.
+    /// Takes the next samples of a publisher or client, up to `most`. Returns their number.
     pub(super) fn take_many(
         &self,
         of: &Gid,
@@ -107,14 +107,14 @@ impl Source {
         }
     }
 
-    /// Passes over all samples of this publisher but the newest `depth`.
+    /// Skips all samples of this publisher but the newest `depth`.
     pub(super) fn skip_of(&self, of: &Gid, depth: usize) {
         if let Self::Relay(_, reader) = self {
             reader.skip_of(of, depth as u64);
         }
     }
 
-    /// Whether it may lose no sample of a publisher, and has some that it cannot give yet.
+    /// Returns whether it may lose no sample of a publisher, and has some that it cannot return yet.
     pub(super) fn is_held_up(&self, of: &Gid) -> bool {
         match self {
             Self::Relay(spec, reader) => {
@@ -126,7 +126,7 @@ impl Source {
         }
     }
 
-    /// After what time a sample of this publisher may be taken, where none could be although some wait.
+    /// Returns the time after which a sample of this publisher may be taken, if none could be although some wait.
     pub(super) fn retry_of(&self, of: &Gid) -> Option<Duration> {
         match self {
             Self::Relay(_, reader) => reader.retry_of(of),
@@ -134,7 +134,7 @@ impl Source {
         }
     }
 
-    /// How many samples of this publisher newer ones replaced before they were taken, or were passed over.
+    /// Returns how many samples of this publisher newer samples replaced before they were taken, or were skipped.
     pub(super) fn lost_of(&self, of: &Gid) -> u64 {
         match self {
             Self::Relay(_, reader) => reader.lost_of(of),
@@ -142,7 +142,7 @@ impl Source {
         }
     }
 
-    /// How its samples are queued. No request or response is dropped.
+    /// Returns the QoS with which its samples are queued. No request or response is dropped.
     pub(super) fn qos(&self) -> Qos {
         match self {
             Self::Relay(spec, _) => spec.queued(),
@@ -150,20 +150,21 @@ impl Source {
         }
     }
 
-    /// Whether it is a relay of RELIABLE and KEEP_ALL subscriptions: its publishers keep what it has not acknowledged.
+    /// Returns whether it is a relay of RELIABLE and KEEP_ALL subscriptions: its publishers keep samples that it has
+    /// not acknowledged.
     pub(super) fn keeps_all(&self) -> bool {
         matches!(self, Self::Relay(spec, _) if spec.qos.reliability == Reliability::Reliable
             && spec.qos.history == History::KeepAll)
     }
 
-    /// The samples of this publisher up to this number reached the peer, or never will.
+    /// Acknowledges the samples of this publisher up to this number: they reached the peer, or never will.
     pub(super) fn acknowledge_of(&self, of: &Gid, sequence: u64) {
         if let Self::Relay(_, reader) = self {
             reader.acknowledge_of(of, sequence);
         }
     }
 
-    /// RELIABLE samples that are not acknowledged, by publisher.
+    /// Returns the number of unacknowledged RELIABLE samples, by publisher.
     pub(crate) fn unacknowledged(&self) -> HashMap<Gid, u64> {
         match self {
             Self::Relay(spec, reader) if spec.qos.reliability == Reliability::Reliable => {
@@ -173,7 +174,7 @@ impl Source {
         }
     }
 
-    /// How many samples of this publisher, calls or responses it has the publisher, client or server keep.
+    /// Returns how many samples, calls or responses it makes this publisher, client or server keep.
     pub(super) fn kept_of(&self, of: &Gid) -> Option<u64> {
         match self {
             Self::Relay(..) => self.unacknowledged().get(of).copied(),
@@ -183,12 +184,12 @@ impl Source {
         }
     }
 
-    /// Whether it has such samples of this publisher.
+    /// Returns whether it has unacknowledged samples of this publisher.
     pub(crate) fn has_unacknowledged(&self, of: &Gid) -> bool {
         self.reads(of) && self.unacknowledged().contains_key(of)
     }
 
-    /// Bytes of its ring that the samples of this publisher take that are not acknowledged.
+    /// Returns the bytes of its ring that the unacknowledged samples of this publisher take.
     pub(super) fn unacknowledged_bytes_of(&self, of: &Gid) -> u64 {
         match self {
             Self::Relay(_, reader) => reader.unacknowledged_bytes_of(of),
@@ -196,7 +197,7 @@ impl Source {
         }
     }
 
-    /// How many publishes of this publisher found no room, if it is this source that may leave none to the next one.
+    /// Returns how many publishes of this publisher found no space, if this source may be the reason for the next one.
     pub(super) fn refused_of(&self, of: &Gid) -> Option<u64> {
         match self {
             Self::Relay(_, reader) => reader.refused_of(of),
@@ -204,14 +205,14 @@ impl Source {
         }
     }
 
-    /// So many samples of a publisher will never reach the peer.
+    /// Gives up `samples` samples of a publisher, which will never reach the peer.
     pub(super) fn give_up(&self, of: Gid, samples: u64) {
         if let Self::Relay(_, reader) = self {
             reader.give_up(of, samples);
         }
     }
 
-    /// The publishers, or the local endpoints of a service, that it reads.
+    /// Returns the publishers, or the local endpoints of a service, that it reads.
     pub(crate) fn writers(&self) -> Vec<Gid> {
         match self {
             Self::Relay(_, reader) => reader.matched(),
@@ -219,7 +220,7 @@ impl Source {
         }
     }
 
-    /// Whether it is the same source as `other`.
+    /// Returns whether it is the same source as `other`.
     pub(crate) fn is(&self, other: &Self) -> bool {
         match (self, other) {
             (Self::Relay(_, one), Self::Relay(_, other)) => Rc::ptr_eq(one, other),

@@ -86,7 +86,7 @@ pub(super) struct PeerActivity {
     pub(super) heard: u64,
     /// How often credit was returned.
     pub(super) returned: u64,
-    /// Whether a flow waits for credit.
+    /// True if a flow waits for credit.
     pub(super) is_awaited: bool,
 }
 
@@ -95,7 +95,7 @@ pub(super) struct PeerActivity {
 pub(super) struct BusyFlow {
     pub(super) id: FlowId,
     pub(super) route: u32,
-    /// Whether the flow's route is known to be stalled.
+    /// True if the flow's route is known to be stalled.
     pub(super) is_stalled: bool,
     /// The number of acknowledged samples, and of sent parts of samples.
     pub(super) progress: (u64, u64),
@@ -103,18 +103,18 @@ pub(super) struct BusyFlow {
     pub(super) keeps: Option<u64>,
     /// How many publishes found no room, if that relay may be the reason for the next one.
     pub(super) refused: Option<u64>,
-    /// Whether the flow belongs to a service: calls may wait for a slow server while there is room for
+    /// True if the flow belongs to a service: calls may wait for a slow server while there is room for
     /// further calls.
     pub(super) is_service: bool,
-    /// Whether the flow uses credit that others may have to wait for.
+    /// True if the flow uses credit that others may have to wait for.
     pub(super) uses_credit: bool,
-    /// Whether the flow waits for others: none of its samples is in flight.
+    /// True if the flow waits for others: none of its samples is in flight.
     pub(super) waits_for_others: bool,
-    /// Whether a limit of this host holds the flow's samples.
+    /// True if a limit of this host holds the flow's samples.
     pub(super) waits_for_limit: bool,
-    /// Whether the flow has nothing in flight, and this host's KME gives no key for the next sample.
+    /// True if the flow has nothing in flight, and this host's KME gives no key for the next sample.
     pub(super) lacks_keys: bool,
-    /// Whether the flow has no sample that waits or is not acknowledged.
+    /// True if the flow has no sample that waits or is not acknowledged.
     pub(super) is_quiet: bool,
 }
 

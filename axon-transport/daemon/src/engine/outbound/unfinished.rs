@@ -1,4 +1,4 @@
-//! What is known of flows whose daemon is gone, for the next daemon of the same identity.
+//! The state of flows whose daemon is gone, for the next daemon of the same identity.
 
 use std::{collections::HashMap, time::Duration};
 
@@ -6,21 +6,21 @@ use axon_shm::ids::Gid;
 
 use super::{progress::SentProgress, stall::Progress};
 
-/// The flow of a publisher that ended with samples that are not acknowledged. It is no larger than a few words, and there
-/// is one at most for each lane of the relays that are kept.
+/// The flow of a publisher that ended with unacknowledged samples. It is only a few words long, and there is at most
+/// one for each lane of the kept relays.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct UnfinishedFlow {
-    /// What the peer did, and did not do.
+    /// The peer's progress, and its time without progress.
     pub(super) progress: Progress,
-    /// How far QUIC took its samples.
+    /// The position up to which QUIC took its samples.
     pub(super) sent_progress: SentProgress,
 }
 
-/// Those of one route, by publisher.
+/// The unfinished flows of one route, by publisher.
 pub(crate) type UnfinishedFlows = HashMap<Gid, UnfinishedFlow>;
 
 impl UnfinishedFlow {
-    /// The worse of two flows of one publisher, which go on as one.
+    /// Merges two flows of one publisher that continue as one, and keeps the worse values.
     pub(crate) fn and(self, other: Self) -> Self {
         Self {
             progress: self.progress.and(other.progress, (0, 0)),
@@ -28,7 +28,8 @@ impl UnfinishedFlow {
         }
     }
 
-    /// The samples waited for so long while no daemon of the peer was there. `idle` of it counts as time without progress.
+    /// Adds the time for which the samples waited while no daemon of the peer existed. `idle` of it counts as time
+    /// without progress.
     pub(crate) fn keep(&mut self, kept: Duration, idle: Duration) {
         self.progress.keep(kept, idle);
     }

@@ -1,4 +1,4 @@
-//! The endpoints of this host as a peer is told of them.
+//! The endpoints of this host as they are sent to a peer.
 
 use std::{collections::BTreeMap, time::Duration};
 
@@ -7,38 +7,39 @@ use axon_transport::{config::DiscoveryRange, graph::Endpoint, internal::graph::R
 
 use crate::link::{GraphUpdate, LinkMessage};
 
-/// Endpoints in one message of a graph.
+/// Maximum number of endpoints in one message of a graph.
 const GRAPH_PART: usize = 512;
-/// A whole graph is sent so often at most.
+/// Minimum time between two whole graphs.
 const RESYNC: Duration = Duration::from_secs(1);
 
-/// An endpoint of this host that a peer is shown.
+/// An endpoint of this host that is shown to a peer.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(in crate::engine) struct AdvertisedEndpoint {
     /// The endpoint, and its range towards the peer.
     pub(in crate::engine) remote: RemoteEndpoint,
-    /// Access rules deny the peer the other end.
+    /// True if access rules deny the peer the other end.
     pub(in crate::engine) denied: bool,
 }
 
-/// The graph of this host as far as a peer was told of it.
+/// The part of this host's graph that was sent to a peer.
 #[derive(Default)]
 pub(in crate::engine) struct AdvertisedGraph {
     endpoints: BTreeMap<Gid, AdvertisedEndpoint>,
     version: u64,
-    /// When the peer had the whole graph last because it asked for that.
+    /// The last time at which the peer got the whole graph because it asked for it.
     resynced: Option<Duration>,
-    /// It asked again too early.
+    /// True if it asked again too early.
     resync_due: bool,
 }
 
 impl AdvertisedGraph {
-    /// The endpoints that the peer knows.
+    /// Returns the endpoints that the peer knows.
     pub(in crate::engine) fn iter(&self) -> impl Iterator<Item = (&Gid, &AdvertisedEndpoint)> {
         self.endpoints.iter()
     }
 
-    /// The peer asks for the whole graph, or asked for it too early. Returns whether it gets it now.
+    /// Handles the peer's request for the whole graph, or an earlier one that came too early. Returns whether the peer
+    /// gets the graph now.
     pub(in crate::engine) fn handle_resync(&mut self, now: Duration) -> bool {
         let recent = |sent| now.saturating_sub(sent) < RESYNC;
         self.resync_due = self.resynced.is_some_and(recent);
@@ -48,18 +49,18 @@ impl AdvertisedGraph {
         !self.resync_due
     }
 
-    /// Whether the peer still has to get the whole graph.
+    /// Returns whether the peer still has to get the whole graph.
     pub(in crate::engine) fn owes_resync(&self) -> bool {
         self.resync_due
     }
 
-    /// When the peer gets the whole graph for which it asked too early.
+    /// Returns when the peer gets the whole graph for which it asked too early.
     pub(in crate::engine) fn poll_timeout(&self) -> Option<Duration> {
         self.resync_due.then(|| self.resynced.unwrap_or_default() + RESYNC)
     }
 
-    /// The peer may see these endpoints now. Returns the messages that tell it what changed, or all of them for the `whole`
-    /// graph.
+    /// Sets the endpoints that the peer may see now. Returns the messages with the changes, or with all endpoints for
+    /// the `whole` graph.
     pub(in crate::engine) fn tell(
         &mut self,
         now: BTreeMap<Gid, AdvertisedEndpoint>,
@@ -98,7 +99,7 @@ impl AdvertisedGraph {
     }
 }
 
-/// A GRAPH that adds these. Its versions and what it removes are the caller's.
+/// Creates a GRAPH that adds these endpoints. The caller sets its versions and the removed endpoints.
 fn added(part: &[&AdvertisedEndpoint]) -> GraphUpdate {
     let named = |is: fn(&AdvertisedEndpoint) -> bool| {
         let gids = part.iter().filter(|told| is(told)).map(|told| told.remote.endpoint.gid);
@@ -118,7 +119,7 @@ mod tests {
     use super::*;
     use axon_transport::graph::EndpointKind;
 
-    /// Endpoints of these numbers; those from 1000 on are denied.
+    /// Creates endpoints with these numbers; those from 1000 on are denied.
     fn endpoints(numbers: impl IntoIterator<Item = u32>) -> BTreeMap<Gid, AdvertisedEndpoint> {
         let of = |number: u32| {
             let gid = Gid((u128::from(number % 1000)).to_be_bytes());
@@ -128,7 +129,7 @@ mod tests {
         numbers.into_iter().map(of).collect()
     }
 
-    /// Version, version before, and how many endpoints come and go, with whether more follows.
+    /// Returns the version, the previous version, the numbers of added and removed endpoints, and whether more follows.
     fn said(messages: Vec<LinkMessage>) -> Vec<(u64, u64, usize, usize, bool)> {
         let of = |message| match message {
             LinkMessage::Graph(g) => (g.version, g.before, g.added.len(), g.removed.len(), g.more),

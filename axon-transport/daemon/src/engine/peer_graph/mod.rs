@@ -1,5 +1,5 @@
-//! The graph of a peer as this side holds it: as much of it as the peer's account has room for. The
-//! submodules hold the graph that was sent to a peer, and the proofs that sessions belong to their daemons.
+//! The graph of a peer as this side holds it: as much of it as fits in the peer's account. The submodules hold the
+//! graph that was sent to a peer, and the proofs that sessions belong to their daemons.
 
 pub(super) mod advertised;
 pub(super) mod decisions;
@@ -31,7 +31,7 @@ use crate::{
 /// The changes of a peer's graph.
 #[derive(Debug)]
 pub(crate) struct PeerGraphChange {
-    /// Whether the changes replace everything that was known of the peer.
+    /// True if the changes replace everything that was known of the peer.
     pub(crate) reset: bool,
     /// Endpoints that were added or changed.
     pub(crate) added: Vec<RemoteEndpoint>,
@@ -54,9 +54,9 @@ pub(crate) enum GraphTaken {
 #[derive(Clone, Debug)]
 struct HeldEndpoint {
     remote: RemoteEndpoint,
-    /// Whether access rules deny the endpoint: it does not exist for the rest of this host.
+    /// True if access rules deny the endpoint: it does not exist for the rest of this host.
     denied: bool,
-    /// Whether access rules of the peer deny this host the other end: the endpoint is shown, and is in no
+    /// True if access rules of the peer deny this host the other end: the endpoint is shown, and is in no
     /// pair.
     closed: bool,
     _charge: Rc<Charge>,
@@ -74,7 +74,7 @@ pub(crate) struct PeerGraph {
     gathered: Option<BTreeMap<Gid, HeldEndpoint>>,
     /// Endpoints that were added, changed or removed since the last call of [`changes`](Self::changes).
     changed: BTreeSet<Gid>,
-    /// Whether nothing of the graph was reported yet.
+    /// True if nothing of the graph was reported yet.
     fresh: bool,
     left_out: OmittedEndpoints,
 }
@@ -97,7 +97,7 @@ impl PeerGraph {
         }
     }
 
-    /// Takes in a GRAPH message, as far as there is room.
+    /// Takes in a GRAPH message, as far as there is space.
     pub(crate) fn take(&mut self, graph: GraphUpdate) -> GraphTaken {
         let GraphUpdate { version, before, added, removed, more, localhost, listing, denied } =
             graph;
@@ -200,7 +200,7 @@ impl PeerGraph {
         self.proven.take(proofs, binding, from, used, now);
     }
 
-    /// Whether the peer may speak for an endpoint of this GID.
+    /// Returns whether the peer may speak for an endpoint of this GID.
     pub(crate) fn owns(&self, gid: &Gid) -> bool {
         self.proven.owns(gid)
     }
@@ -256,7 +256,7 @@ impl PeerGraph {
         PeerGraphChange { reset, added, removed }
     }
 
-    /// The first endpoint that was left out of the graph, and why; `None` when it is complete.
+    /// Returns the first endpoint that was left out of the graph, with the reason; `None` if the graph is complete.
     pub(crate) fn refused(&self) -> Option<&str> {
         self.left_out.first()
     }
@@ -273,7 +273,7 @@ impl PeerGraph {
         self.gathered.is_none() && needed.is_some_and(|n| self.account.graph.charge(n).is_some())
     }
 
-    /// The version that this side holds.
+    /// Returns the version that this side holds.
     pub(crate) fn version(&self) -> u64 {
         self.version
     }
@@ -283,12 +283,12 @@ impl PeerGraph {
         self.all.len()
     }
 
-    /// The peer's account.
+    /// Returns the peer's account.
     pub(crate) fn account(&self) -> &Rc<Account> {
         &self.account
     }
 
-    /// One endpoint.
+    /// Returns one endpoint.
     pub(crate) fn get(&self, gid: &Gid) -> Option<&Endpoint> {
         self.all.get(gid).map(|held| &*held.remote.endpoint)
     }
@@ -305,7 +305,7 @@ impl PeerGraph {
         }
     }
 
-    /// Endpoints that access rules deny.
+    /// Returns the endpoints that access rules deny.
     pub(crate) fn denied(&self) -> impl Iterator<Item = &Endpoint> {
         self.all.values().filter(|held| held.denied).map(|held| &*held.remote.endpoint)
     }
@@ -316,12 +316,12 @@ impl PeerGraph {
         held && !self.changed.contains(gid)
     }
 
-    /// The endpoints that access rules permit.
+    /// Returns the endpoints that access rules permit.
     pub(crate) fn endpoints(&self) -> impl Iterator<Item = &RemoteEndpoint> {
         self.all.values().filter(|held| !held.denied).map(|held| &held.remote)
     }
 
-    /// The endpoints that access rules of neither host keep out of pairs with this host's.
+    /// Returns the endpoints that the access rules of both hosts allow in pairs with this host's.
     pub(crate) fn usable(&self) -> impl Iterator<Item = &RemoteEndpoint> {
         self.all.values().filter(|held| !held.denied && !held.closed).map(|held| &held.remote)
     }

@@ -3,7 +3,7 @@
 use axon_shm::ids::Gid;
 use axon_transport::graph::{Endpoint, EndpointKind};
 
-/// Endpoints that were left out since the peer said its whole graph: the first of them, and how many there were.
+/// Endpoints that were left out since the peer sent its whole graph: the first of them, and their number.
 #[derive(Debug, Default)]
 pub(super) struct OmittedEndpoints {
     first: Option<FirstOmission>,
@@ -13,15 +13,15 @@ pub(super) struct OmittedEndpoints {
 /// An endpoint that was left out.
 #[derive(Debug)]
 struct FirstOmission {
-    /// It by name, and why.
+    /// The endpoint's name, and the reason.
     text: String,
-    /// Bytes that it would take; `None` when bytes are not what is missing.
+    /// Bytes that it would take; `None` if bytes are not what is missing.
     bytes: Option<usize>,
 }
 
 impl OmittedEndpoints {
-    /// There is no room for an endpoint, as the peer's graph `has` too much. So many `bytes` would do, if bytes are what
-    /// is missing.
+    /// Records an endpoint for which there is no space, because the peer's graph `has` too much. So many `bytes` would
+    /// be enough, if bytes are what is missing.
     pub(super) fn add_for_room(
         &mut self,
         endpoint: &Endpoint,
@@ -33,12 +33,12 @@ impl OmittedEndpoints {
         });
     }
 
-    /// An endpoint is of a session that the peer did not prove.
+    /// Records an endpoint of a session that the peer did not prove.
     pub(super) fn add_unproven(&mut self, endpoint: &Endpoint) {
         self.add_unproven_as(&endpoint.gid, || named(endpoint));
     }
 
-    /// As [`add_unproven`](Self::add_unproven), of a reader that SUBSCRIBE names for a topic.
+    /// Like [`add_unproven`](Self::add_unproven), for a reader that SUBSCRIBE names for a topic.
     pub(super) fn add_unproven_reader(&mut self, gid: &Gid, topic: &str) {
         self.add_unproven_as(gid, || format!("the reader of {}", short(topic)));
     }
@@ -57,17 +57,17 @@ impl OmittedEndpoints {
         self.first.get_or_insert_with(|| FirstOmission { text: text(), bytes });
     }
 
-    /// The first endpoint, and why it was left out.
+    /// Returns the first endpoint, with the reason why it was left out.
     pub(super) fn first(&self) -> Option<&str> {
         self.first.as_ref().map(|first| first.text.as_str())
     }
 
-    /// Bytes that the first endpoint would take, if bytes are what is missing.
+    /// Returns the bytes that the first endpoint would take, if bytes are what is missing.
     pub(super) fn needed(&self) -> Option<usize> {
         self.first.as_ref()?.bytes
     }
 
-    /// How many were left out.
+    /// Returns the number of endpoints that were left out.
     pub(super) fn count(&self) -> u64 {
         self.count
     }
@@ -77,7 +77,7 @@ fn short(name: &str) -> String {
     format!("{:?}", name.chars().take(100).collect::<String>())
 }
 
-/// An endpoint for log and status, with whatever names a peer gave it.
+/// Describes an endpoint for log and status; the peer may have given it any names.
 fn named(endpoint: &Endpoint) -> String {
     let what = match endpoint.kind {
         EndpointKind::Publisher => "the publisher of",

@@ -24,7 +24,7 @@ const SWEEP: Duration = Duration::from_secs(1);
 pub(crate) struct Prover {
     keys: Arc<SessionKeys>,
     daemon: DaemonId,
-    /// Whether proofs are required: they are if peers authenticate.
+    /// True if proofs are required: they are if peers authenticate.
     needed: bool,
     binding: Option<ChannelBinding>,
     /// The sessions whose proofs for the current connection the peer has.
@@ -109,7 +109,7 @@ impl Prover {
 /// The sessions that a peer proved to own.
 #[derive(Debug)]
 pub(crate) struct Proven {
-    /// Whether proofs are required: they are if peers authenticate.
+    /// True if proofs are required: they are if peers authenticate.
     needed: bool,
     /// The bound on sessions, over all daemon IDs of the peer's identity.
     room: Rc<Meter>,
@@ -168,7 +168,7 @@ impl Proven {
         self.sessions.extend(self.fresh.drain());
     }
 
-    /// Whether the peer may speak for this endpoint.
+    /// Returns whether the peer may speak for this endpoint.
     pub(crate) fn owns(&self, gid: &Gid) -> bool {
         !self.needed || self.has(&prefix_of(gid))
     }

@@ -1,11 +1,11 @@
-//! What a GRAPH message says about the endpoints that it adds.
+//! The terms of a GRAPH message about the endpoints that it adds.
 
 use std::collections::BTreeSet;
 
 use axon_shm::ids::Gid;
 use axon_transport::{config::DiscoveryRange, internal::graph::RangeToHost};
 
-/// The endpoints of a GRAPH message that the message says more about.
+/// The endpoints of a GRAPH message for which it has terms.
 pub(super) struct GraphTerms {
     localhost: BTreeSet<Gid>,
     listing: BTreeSet<Gid>,
@@ -13,22 +13,22 @@ pub(super) struct GraphTerms {
 }
 
 impl GraphTerms {
-    /// What the fields of a message say: endpoints with the range LOCALHOST, of sessions that list this host as a static
-    /// peer, and whose other end access rules of the peer deny this host.
+    /// Creates the terms from the fields of a message: endpoints with the range LOCALHOST, endpoints of sessions that
+    /// list this host as a static peer, and endpoints whose other end the peer's access rules deny this host.
     pub(super) fn new(fields: [Option<Vec<Gid>>; 3]) -> Self {
         let [localhost, listing, denied] =
             fields.map(|gids| gids.unwrap_or_default().into_iter().collect());
         Self { localhost, listing, denied }
     }
 
-    /// The range of an endpoint towards this host.
+    /// Returns the range of an endpoint towards this host.
     pub(super) fn toward(&self, gid: &Gid) -> RangeToHost {
         let near = self.localhost.contains(gid);
         let range = if near { DiscoveryRange::Localhost } else { DiscoveryRange::Subnet };
         RangeToHost { range, lists: self.listing.contains(gid) }
     }
 
-    /// Whether access rules of the peer deny this host the other end of an endpoint.
+    /// Returns whether access rules of the peer deny this host the other end of an endpoint.
     pub(super) fn denies(&self, gid: &Gid) -> bool {
         self.denied.contains(gid)
     }

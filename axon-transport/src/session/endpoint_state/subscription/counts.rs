@@ -1,7 +1,6 @@
-//! What a subscription counts.
+//! The counters of a subscription.
 
-/// Counts samples of the publishers of a subscription. What their readers count while they are attached, the caller
-/// names as `attached`.
+/// The sample counters of a subscription. The caller passes the counts of the attached readers as `attached`.
 #[derive(Default)]
 pub(super) struct Counts {
     /// Samples that were taken.
@@ -14,42 +13,42 @@ pub(super) struct Counts {
     reported: u64,
     /// Samples that came from writers that are gone.
     arrived: u64,
-    /// All samples that somebody was told of.
+    /// All samples that were announced to the callback.
     announced: u64,
 }
 
 impl Counts {
-    /// These were lost, and no attached reader counts them.
+    /// Counts losses that no attached reader counts.
     pub(super) fn add_lost(&mut self, samples: u64) {
         self.lost = self.lost.saturating_add(samples);
     }
 
-    /// A reader that had counted these is given up.
+    /// Takes over the counts of a reader that is given up.
     pub(super) fn retire(&mut self, lost: u64, arrived: u64) {
         self.add_lost(lost);
         self.arrived += arrived;
     }
 
-    /// All losses.
+    /// Returns all losses.
     pub(super) fn losses(&self, attached: u64) -> u64 {
         self.lost.saturating_add(attached)
     }
 
-    /// Whether losses are to be reported, or fewer than before are known.
+    /// Returns whether there are losses to report, or fewer losses than were reported.
     pub(super) fn has_new_losses(&self, attached: u64) -> bool {
         self.losses(attached) != self.reported
     }
 
-    /// Losses since this was last asked.
+    /// Returns the losses since the last call.
     pub(super) fn new_losses(&mut self, attached: u64) -> u64 {
         let losses = self.losses(attached);
         losses.saturating_sub(std::mem::replace(&mut self.reported, losses))
     }
 
-    /// Samples that came since this was last asked.
+    /// Returns the samples that came since the last call.
     pub(super) fn new_arrivals(&mut self, attached: u64) -> u64 {
         let arrived = self.arrived + attached;
-        // A writer whose memory is corrupt takes its numbers with it.
+        // The sum can fall: the count of a writer is lost when its memory is corrupt.
         arrived.saturating_sub(std::mem::replace(&mut self.announced, arrived))
     }
 }

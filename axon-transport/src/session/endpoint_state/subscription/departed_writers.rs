@@ -4,12 +4,12 @@ use std::collections::HashMap;
 
 use crate::ids::Gid;
 
-/// So many writers that were there last are remembered in any case, and twice as many at most.
+/// Minimum number of departed writers that are remembered; the maximum is twice as many.
 pub(super) const MAX_DEPARTED_WRITERS: usize = 2048;
 
-/// The last sequence number taken of each writer that is gone: what one that comes back sends again must not be taken
-/// twice. A remote writer comes back with its link, a client with the next daemon. Those that left longest ago are
-/// forgotten first.
+/// The last sequence number taken of each writer that is gone, so that samples which a returning writer sends again are
+/// not taken twice. A remote writer comes back with its link, a client with the next daemon. The writers that left
+/// longest ago are forgotten first.
 #[derive(Default)]
 pub(super) struct DepartedWriters {
     newer: HashMap<Gid, u64>,
@@ -17,7 +17,7 @@ pub(super) struct DepartedWriters {
 }
 
 impl DepartedWriters {
-    /// A writer is gone.
+    /// Remembers the last number of a writer that is gone.
     pub(super) fn add(&mut self, writer: Gid, last: u64) {
         if self.newer.len() >= MAX_DEPARTED_WRITERS {
             self.older = std::mem::take(&mut self.newer);
@@ -25,12 +25,12 @@ impl DepartedWriters {
         self.newer.insert(writer, last);
     }
 
-    /// The last number of a writer that was here before.
+    /// Returns the last number of a writer that was here before.
     pub(super) fn get(&self, writer: &Gid) -> Option<u64> {
         self.newer.get(writer).or_else(|| self.older.get(writer)).copied()
     }
 
-    /// The same. It is back.
+    /// Like [`get`](Self::get), and forgets the writer, since it is back.
     pub(super) fn remove(&mut self, writer: &Gid) -> Option<u64> {
         let older = self.older.remove(writer);
         self.newer.remove(writer).or(older)
@@ -53,7 +53,7 @@ mod tests {
             assert_eq!(remembered.get(&gid(number)), Some(number));
         }
         assert_eq!(remembered.get(&gid(0)), None);
-        // One that is in both.
+        // A writer that is in both maps.
         let twice = newest - MAX_DEPARTED_WRITERS as u64 + 1;
         remembered.add(gid(twice), 7);
         (0..10).for_each(|number| remembered.add(gid(1 << 40 | number), number));

@@ -1,4 +1,4 @@
-//! The reader of one publisher's ring, and what the numbers of its samples tell.
+//! The reader of one publisher's ring, and the losses that the samples' numbers show.
 
 use std::time::Duration;
 
@@ -6,20 +6,20 @@ use axon_shm::internal::{MAX_GAP, Reader};
 
 use crate::session::clock;
 
-/// What a writer's numbers tell of losses that the ring's positions do not.
+/// The losses that a writer's numbers show and the ring's positions do not.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(in crate::session) enum NumberKind {
     None,
-    /// It stands in for one elsewhere: what was lost on the way to its ring.
+    /// The writer is a local stand-in for a remote writer: the numbers show the losses on the way to its ring.
     All,
-    /// What was lost since it was here before.
+    /// The numbers show the losses since the writer was attached before.
     Since,
-    /// What was lost between the last sample that it brought before and its first. Later losses are said
-    /// aloud.
+    /// The numbers show the losses between the last sample of the previous attachment and the first of this one. Later
+    /// losses are reported explicitly.
     Between,
 }
 
-/// What the take that is under way found at a reader.
+/// The result of the current take at one reader.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) enum TakeTurn {
     /// Nothing yet: the reader may have a sample.
@@ -34,48 +34,48 @@ pub(super) enum TakeTurn {
 /// A reader of a ring that a publisher granted.
 pub(in crate::session) struct MatchedReader {
     pub(super) reader: Reader,
-    /// When it was mapped: what was published before is no news. By the monotonic clock.
+    /// Time at which the ring was mapped, by the monotonic clock. Samples published before do not count for deadlines.
     pub(super) since: u64,
-    /// The age at which its samples are not delivered any more.
+    /// The age above which its samples are not delivered any more.
     pub(super) lifespan: Option<Duration>,
-    /// Within what the writer says that it is alive.
+    /// The lease of the writer: it asserts its liveliness at least that often. In nanoseconds.
     pub(super) lease: Option<u64>,
-    /// The writer is gone: take what it left, then unmap.
+    /// True if the writer is gone: its remaining samples are taken, then the ring is unmapped.
     pub(super) over: bool,
-    /// It is gone, too, but what it left is still to come.
+    /// True if the writer is leaving, and some of its samples are still to come.
     pub(super) leaving: bool,
     pub(super) turn: TakeTurn,
-    /// The last sequence number taken of its writer, by way of whatever reader; of one that was attached
-    /// before and has taken nothing, the one in front of its first.
+    /// The last sequence number taken of its writer, by any reader. If the writer was attached before and no sample was
+    /// taken, the number in front of its first sample.
     pub(super) last: Option<u64>,
-    /// The number in front of the first that this reader was granted.
+    /// The number in front of the first sample that this reader was granted.
     after: Option<u64>,
-    /// The gaps in its numbers, where they tell of losses.
+    /// The gaps in the numbers, if they show losses.
     gaps: Option<Gaps>,
     numbers: NumberKind,
-    /// A number of its writer was known when it was granted.
+    /// True if a number of the writer was known when the reader was granted.
     pub(super) resumed: bool,
-    /// What was missing while they were looked at.
+    /// Losses that the numbers showed while they were examined.
     missed: u64,
 }
 
-/// Samples of a publisher on another host that never came to the ring that stands in for it here:
-/// numbers that no position of the ring has.
+/// Samples of a publisher on another host that never came to the ring of its local stand-in: numbers without a position
+/// in the ring.
 #[derive(Default)]
 struct Gaps {
-    /// Sequence number of the newest sample, and the position after that of the last one.
+    /// Sequence number of the newest sample, and the position behind the last one.
     before: Option<(u64, u64)>,
     lost: u64,
 }
 
 impl Gaps {
-    /// A sample of this number was at this position.
+    /// Counts the numbers missing before the sample with this number at this position.
     fn pass(&mut self, sequence: u64, position: u64) {
         let newest = self.before.map_or(sequence, |(newest, next)| {
-            // What was overwritten on this side is counted there, by its positions.
+            // Samples overwritten on this side are counted by their positions.
             let missing = sequence.saturating_sub(newest).saturating_sub(1);
             let lost = missing.saturating_sub(position.saturating_sub(next));
-            // The writer's process may say any number. A loss that cannot be is not counted.
+            // The writer's process may send any number. A loss that is not possible is not counted.
             if missing <= MAX_GAP {
                 self.lost = self.lost.saturating_add(lost);
             }
@@ -86,8 +86,8 @@ impl Gaps {
 }
 
 impl MatchedReader {
-    /// A reader that was granted what comes `after` a number. `last` is the last number taken of a writer that was
-    /// attached before, in which case the reader has `resumed`.
+    /// Creates a reader that was granted the samples `after` a number. `last` is the last number taken of a writer that
+    /// was attached before, in which case the reader has `resumed`.
     pub(super) fn new(
         reader: Reader,
         after: Option<u64>,
@@ -109,7 +109,7 @@ impl MatchedReader {
             leaving: false,
             turn: TakeTurn::Open,
             last,
-            // One that speaks for another has no number before it has a sample.
+            // A stand-in has no number before it has a sample.
             after: after.filter(|number| *number > 0),
             gaps: told.then(Gaps::default),
             numbers,
@@ -119,12 +119,12 @@ impl MatchedReader {
         }
     }
 
-    /// Whether the writer is one of those that the subscription is matched with.
+    /// Returns whether the subscription counts as matched with the writer.
     pub(super) fn counts(&self) -> bool {
         !self.over && !self.leaving
     }
 
-    /// A sample was taken.
+    /// Records that a sample was taken.
     pub(super) fn passed(&mut self, sequence: u64) {
         let Some(gaps) = &mut self.gaps else { return };
         let position = self.reader.position().saturating_sub(1);
@@ -138,18 +138,18 @@ impl MatchedReader {
         }
     }
 
-    /// The number up to which nothing is to come any more.
+    /// Returns the number up to which no sample is to come any more.
     pub(super) fn reached(&self) -> Option<u64> {
         self.last.or(self.after)
     }
 
-    /// Its samples that were lost, here and before they came here.
+    /// Returns the writer's samples that were lost, in this ring and before they came to it.
     pub(super) fn lost(&self) -> u64 {
         let before = self.gaps.as_ref().map_or(0, |gaps| gaps.lost);
         self.reader.lost().saturating_add(before).saturating_add(self.missed)
     }
 
-    /// Whether its writer sends once more, in another ring than the `earlier` reader's, what was not confirmed.
+    /// Returns whether its writer sends the unconfirmed samples once more, in another ring than the `earlier` reader's.
     pub(super) fn sends_again(&self, earlier: &Self) -> bool {
         self.reader.writer() == earlier.reader.writer()
             && self.resumed
@@ -169,12 +169,12 @@ mod tests {
             gaps.pass(sequence, position);
         }
         assert_eq!(gaps.lost, 2, "7 and 8");
-        // Overwritten here: numbers and positions are missing alike.
+        // Overwritten in this ring: numbers and positions are missing alike.
         gaps.pass(19, 12);
         assert_eq!(gaps.lost, 2);
         gaps.pass(30, 20);
         assert_eq!(gaps.lost, 5, "three of ten were lost on the way");
-        // What comes again has a position, and makes up for no number.
+        // A repeated sample has a position, and makes up for no number.
         gaps.pass(29, 21);
         gaps.pass(30, 22);
         gaps.pass(32, 23);

@@ -12,35 +12,36 @@ use super::{
 };
 use crate::ids::Gid;
 
-/// Rings that a KEEP_ALL subscription, a client or a server reads of what a writer left, each by way of another daemon.
+/// Maximum number of ended rings of one writer, each by way of another daemon, that a KEEP_ALL subscription, a client
+/// or a server still reads.
 const MAX_EARLIER_RINGS: usize = 8;
 
 #[derive(Default)]
 pub(in crate::session) struct MatchedReaders {
     pub(super) slots: Slots,
     pub(super) counts: Counts,
-    /// Lanes given to writers that have not granted yet, and the number behind which each is to go on.
+    /// Lanes given to writers that have not granted yet, and the number behind which each writer is to continue.
     pending: HashMap<Gid, (Lane, Option<u64>)>,
     /// The last sequence number taken of each writer that is gone.
     last: DepartedWriters,
-    /// Whether the subscription wants every sample.
+    /// True if the subscription wants every sample.
     keeps_all: bool,
-    /// Whether it is of a client or server. What of its calls was not taken comes again with the next daemon.
+    /// True if it belongs to a client or server. The next daemon sends their untaken requests and responses again.
     of_service: bool,
-    /// Writers whose memory was not usable, of which the others have to be told.
+    /// Writers whose memory was not usable. They still have to be detached.
     pub(super) discarded: Vec<Gid>,
 }
 
-/// How a writer is asked to serve.
+/// A request to a writer to serve a reader.
 pub(in crate::session) struct ServeRequest {
     pub(in crate::session) lane: Location,
-    /// The last number that the reader has of it, where it was attached before.
+    /// The last number that the reader has of the writer, if it was attached before.
     pub(in crate::session) after: Option<u64>,
 }
 
-/// What a grant calls for.
+/// The reaction to a grant.
 pub(in crate::session) enum Accept {
-    /// Nothing: it repeats the one that stands, or nobody asked.
+    /// Nothing: the grant repeats the current one, or it was not requested.
     Stands,
     /// Map the ring with this lane.
     Map(Lane),
@@ -49,17 +50,17 @@ pub(in crate::session) enum Accept {
 }
 
 impl MatchedReaders {
-    /// Those of a subscription that wants every sample, or does not.
+    /// Creates the readers of a subscription; `keeps_all` if it wants every sample.
     pub(super) fn new(keeps_all: bool) -> Self {
         Self { keeps_all, ..Self::default() }
     }
 
-    /// The readers of a client or server.
+    /// Creates the readers of a client or server.
     pub(super) fn of_service() -> Self {
         Self { of_service: true, ..Self::default() }
     }
 
-    /// The readers, for questions that change nothing.
+    /// Returns the readers, for queries that change nothing.
     pub(in crate::session) fn slots(&self) -> &Slots {
         &self.slots
     }
@@ -68,17 +69,17 @@ impl MatchedReaders {
         self.counts.losses(self.slots.lost())
     }
 
-    /// Samples that came since this was last asked.
+    /// Returns the samples that came since the last call.
     pub(super) fn new_arrivals(&mut self) -> u64 {
         self.counts.new_arrivals(self.slots.arrived())
     }
 
-    /// Losses since this was last asked.
+    /// Returns the losses since the last call.
     pub(super) fn new_losses(&mut self) -> u64 {
         self.counts.new_losses(self.slots.lost())
     }
 
-    /// The lane that is, or from now on will be, the one for `writer`.
+    /// Returns the lane for `writer`, and allocates one if there is none.
     pub(in crate::session) fn lane_for<E>(
         &mut self,
         writer: Gid,
@@ -98,8 +99,7 @@ impl MatchedReaders {
         Ok(ServeRequest { lane: location, after })
     }
 
-    /// The lanes of all that are attached, or asked to be: what is repeated when `stands_for`
-    /// changes.
+    /// Returns the lanes of all attached and requested writers. They are sent again when `stands_for` changes.
     pub(in crate::session) fn lanes(&self) -> Vec<(Gid, Location)> {
         let attached = self.slots.iter().filter(|s| !s.over);
         let attached = attached.map(|s| (s.reader.writer(), s.reader.lane()));
@@ -108,14 +108,14 @@ impl MatchedReaders {
             .collect()
     }
 
-    /// What a grant of `writer` calls for.
+    /// Returns the reaction to a grant of `writer`.
     pub(in crate::session) fn accept(&mut self, writer: Gid, grant: Grant) -> Accept {
         if let Some(slot) = self.slots.attached_mut(&writer) {
             if slot.reader.grant() == grant {
                 return Accept::Stands;
             }
-            // The writer forgot us and granted anew, on a lane whose words we still use for what
-            // it wrote before.
+            // The writer forgot this reader and granted anew, on a lane whose words are still in use for the samples
+            // that it wrote before.
             slot.over = true;
             self.sweep();
             self.forget_older(writer);
@@ -124,7 +124,7 @@ impl MatchedReaders {
         self.pending.remove(&writer).map_or(Accept::Stands, |(lane, _)| Accept::Map(lane))
     }
 
-    /// A writer granted what comes `after` a number.
+    /// Adds a reader for which the writer granted the samples `after` a number.
     pub(in crate::session) fn add(
         &mut self,
         reader: Reader,
@@ -136,14 +136,14 @@ impl MatchedReaders {
         let last = earlier.unwrap_or_else(|| self.last.remove(&writer));
         let resumed = earlier.is_some() || last.is_some();
         let slot = MatchedReader::new(reader, after, last, resumed, numbers);
-        // It could not be taken from before it was here.
+        // Samples may have come before the reader was added.
         slot.reader.mark_active();
         self.slots.push(slot);
         self.forget_older(writer);
     }
 
-    /// The daemon said that the writer will not write any more, and that it has handed over everything. Returns whether a
-    /// reader of the writer stood as open until now.
+    /// Ends a writer: the daemon reported that it does not write any more, and has handed over all its messages.
+    /// Returns whether a reader of the writer was open until now.
     pub(in crate::session) fn end(&mut self, writer: &Gid) -> bool {
         self.pending.remove(writer);
         for slot in self.slots.of_mut(writer) {
@@ -153,7 +153,8 @@ impl MatchedReaders {
         self.end_where(|reader| reader.writer() == *writer)
     }
 
-    /// The writer leaves, with samples still to come, or takes that back. Returns whether this changes a reader.
+    /// Records that the writer is leaving, with samples still to come, or that it is not leaving any more. Returns
+    /// whether this changes a reader.
     pub(in crate::session) fn leave(&mut self, writer: &Gid, leaving: bool) -> bool {
         let mut news = false;
         for slot in self.slots.of_mut(writer) {
@@ -163,18 +164,17 @@ impl MatchedReaders {
         news
     }
 
-    /// Writers whose process is dead will not write any more. Memory of theirs may still be on its way.
-    /// Whether there are any.
+    /// Ends the writers whose process is dead. Their memory may still be in flight. Returns whether there were any.
     pub(in crate::session) fn end_dead(&mut self) -> bool {
         self.end_where(Reader::writer_dead)
     }
 
-    /// The writers that are attached, or asked to be.
+    /// Returns the attached and the requested writers.
     pub(in crate::session) fn writers(&self) -> Vec<Gid> {
         self.lanes().into_iter().map(|(gid, _)| gid).collect()
     }
 
-    /// The writers of which anything is read, or may be soon, those that have ended among them.
+    /// Returns the writers that are read or may be read soon, including ended ones.
     pub(in crate::session) fn all_writers(&self) -> BTreeSet<Gid> {
         let there = self.slots.iter().map(|slot| slot.reader.writer());
         there.chain(self.pending.keys().copied()).collect()
@@ -185,15 +185,15 @@ impl MatchedReaders {
         for slot in self.slots.iter_mut().filter(|s| !s.over && which(&s.reader)) {
             slot.over = true;
             news = true;
-            // A writer that died may have left samples without a word.
+            // A writer that died may have left samples without ringing.
             slot.reader.mark_active();
         }
         self.sweep();
         news
     }
 
-    /// Gives up all but the last of what a writer left, or the last few where nothing is to be lost: one
-    /// that begins anew and anew would otherwise take all lanes.
+    /// Gives up all ended rings of a writer but the last, or all but the last few if no sample may be lost: a writer
+    /// that begins anew again and again would otherwise take all lanes.
     fn forget_older(&mut self, writer: Gid) {
         loop {
             let of = self.slots.indices_of(&writer);
@@ -210,7 +210,7 @@ impl MatchedReaders {
         }
     }
 
-    /// Counts what a slot that is given up has not taken and no later one of its writer will.
+    /// Counts the samples that a slot which is given up has not taken, and that no later slot of its writer will take.
     fn count_left(&mut self, slot: &mut MatchedReader) {
         let writer = slot.reader.writer();
         let Some(newer) = self.slots.of(&writer).next() else { return };
@@ -219,11 +219,11 @@ impl MatchedReaders {
             self.counts.add_lost(slot.reader.unread_below(later));
             return;
         }
-        // They come again, and none of them counts as taken.
+        // The samples come again, and none of them counts as taken.
         if self.of_service {
             return;
         }
-        // One after the other: samples missing among them were counted, or are by their numbers.
+        // One by one: a sample missing among them is already counted, or is found by its number.
         for _ in 0..slot.reader.unread() {
             let Ok(Some(next)) = slot.reader.peek() else { break };
             if !slot.reader.skip() {
@@ -238,7 +238,7 @@ impl MatchedReaders {
         }
     }
 
-    /// Keeps what a slot that is given up leaves to be known.
+    /// Keeps the counts and the last number of a slot that is given up.
     pub(super) fn retire(&mut self, slot: &MatchedReader) {
         self.counts.retire(slot.lost(), slot.reader.arrived());
         if let Some(last) = slot.reached() {
@@ -246,36 +246,36 @@ impl MatchedReaders {
         }
     }
 
-    /// A writer is gone.
+    /// Remembers the last number of a writer that is gone.
     pub(super) fn remember(&mut self, writer: Gid, last: u64) {
         self.last.add(writer, last);
     }
 
-    /// This sample of `writer` was taken.
+    /// Records that this sample of `writer` was taken.
     pub(super) fn note(&mut self, writer: Gid, sequence: u64) {
         self.slots.of_mut(&writer).for_each(|slot| slot.last = Some(sequence));
     }
 
-    /// Whether anything of this writer's is read, or may be soon.
+    /// Returns whether this writer is read, or may be read soon.
     pub(in crate::session) fn reads(&self, writer: &Gid) -> bool {
         self.pending.contains_key(writer) || self.slots.of(writer).next().is_some()
     }
 
-    /// Gives up what a writer left in memory that never came, if it sends that once more.
+    /// Gives up samples in memory that never came, if their writer sends them once more.
     pub(super) fn skip_missing(&mut self) {
-        // To others nothing is sent again.
+        // For other subscriptions, nothing is sent again.
         if self.keeps_all && self.slots.skip_missing() {
             self.sweep();
         }
     }
 
-    /// Unmaps writers that are gone and drained, and of which nothing is under way.
+    /// Unmaps the rings of writers that are gone, if the rings are drained and none of their samples is in flight.
     pub(super) fn sweep(&mut self) {
         let gone = self.slots.remove_drained();
         gone.iter().for_each(|slot| self.retire(slot));
     }
 
-    /// Samples of `writer` up to this number are done with.
+    /// Confirms the samples of `writer` up to this number.
     pub(in crate::session) fn finish_of(&mut self, writer: &Gid, sequence: u64) {
         let mut over = false;
         for slot in self.slots.of_mut(writer) {
@@ -287,22 +287,22 @@ impl MatchedReaders {
         }
     }
 
-    /// As [`finish_of`](Self::finish_of), of a writer whose numbers do not rise: the message of this number, and all
-    /// that were taken before it.
+    /// Like [`finish_of`](Self::finish_of), for a writer whose numbers do not rise: confirms the message of this number
+    /// and all messages taken before it.
     pub(in crate::session) fn finish_through(&mut self, writer: &Gid, sequence: u64) {
         self.slots.of_mut(writer).for_each(|slot| slot.reader.finish_through(sequence));
         self.sweep();
     }
 
-    /// So many samples of `writer` do not get where they are to go.
+    /// Gives up `samples` samples of `writer` that do not reach their destination.
     pub(in crate::session) fn give_up_of(&mut self, writer: &Gid, samples: u64) {
         if let Some(slot) = self.slots.of_mut(writer).next() {
             slot.reader.give_up(samples);
         }
     }
 
-    /// What was taken and is not done with is to be taken once more; and all of the `history` that
-    /// stands, if so.
+    /// Makes the samples that were taken and are not confirmed available again; with `history`, the whole history in
+    /// the rings.
     pub(in crate::session) fn take_back(&mut self, history: bool) {
         for MatchedReader { reader, last, .. } in self.slots.iter_mut() {
             if history {
@@ -310,40 +310,42 @@ impl MatchedReaders {
             } else {
                 reader.take_back()
             }
-            // They are no repeats of those that were taken before.
+            // The samples that are taken again do not count as repeats.
             *last = None;
         }
     }
 
-    /// Samples of `writer` that newer ones replaced before they were taken, in its ring or within the depth.
+    /// Returns how many samples of `writer` newer samples replaced before they were taken, in its ring or within the
+    /// depth.
     pub(in crate::session) fn lost_of(&mut self, writer: &Gid) -> u64 {
         let lost = self.slots.of_mut(writer).map(|slot| {
-            // Finds what a take would find lost. The take says what is wrong with the memory.
+            // Finds the losses that a take would find. The take reports an error of the memory.
             let _ = slot.reader.peek();
             slot.reader.lost().saturating_add(slot.reader.skipped())
         });
         lost.sum()
     }
 
-    /// Passes over all samples of `writer` but the newest `depth`. They count as those beyond the subscription's depth.
+    /// Skips all samples of `writer` but the newest `depth`. They count as samples beyond the subscription's depth.
     pub(in crate::session) fn skip_of(&mut self, writer: &Gid, depth: u64) {
         self.slots.of_mut(writer).for_each(|slot| slot.reader.skip_to_depth(depth));
     }
 
-    /// Samples of `writer` that were lost before they came to its ring here. Samples missing before
-    /// the `first` in that ring are seen by its number, where the subscription knows an earlier one.
+    /// Counts samples of `writer` that were lost before they came to its ring here. With `first`, the samples were
+    /// missing before the first in that ring: their loss shows in the numbers if the subscription knows an earlier
+    /// number.
     pub(in crate::session) fn lost_elsewhere(&mut self, writer: &Gid, samples: u64, first: bool) {
         if self.slots.of(writer).any(|slot| !(slot.over || first && slot.resumed)) {
             self.counts.add_lost(samples);
         }
     }
 
-    /// `writer` has ended before this subscription learned of its grant, and there were `samples` for us. Returns whether
-    /// they are counted as lost: only if it was asked and its answer never came. Otherwise its ring is, or was, read, and
-    /// tells what was lost.
+    /// Handles a `writer` that ended before this subscription learned of its grant, with `samples` for this
+    /// subscription. Returns whether they count as lost: only if the writer was requested and its answer never came.
+    /// Otherwise its ring is, or was, read, and shows the losses.
     pub(in crate::session) fn count_unmet(&mut self, writer: &Gid, samples: u64) -> bool {
         let asked = self.pending.remove(writer).is_some();
-        // The writer's process may say any number. A loss that cannot be is not counted.
+        // The writer's process may send any number. A loss that is not possible is not counted.
         let counts = asked && self.slots.of(writer).next().is_none() && samples <= MAX_GAP;
         if counts {
             self.counts.add_lost(samples);

@@ -1,4 +1,4 @@
-//! What an application is told of a sample besides its bytes.
+//! The information that an application receives with a sample.
 
 use std::time::{Duration, SystemTime};
 
@@ -6,7 +6,7 @@ use axon_shm::Meta;
 
 use crate::{ids::Gid, session::clock};
 
-/// What is known of a sample besides its bytes.
+/// The information about a sample besides its bytes.
 ///
 /// ```
 /// # use std::time::Duration;
@@ -30,22 +30,22 @@ use crate::{ids::Gid, session::clock};
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct MessageInfo {
-    /// Who published it.
+    /// The publisher of the sample.
     pub publisher: Gid,
-    /// The publication's number, from 1.
+    /// The number of the publication, from 1.
     pub sequence: u64,
-    /// When it was published, by the publisher's clock.
+    /// The time of the publication, by the publisher's clock.
     pub source_timestamp: SystemTime,
-    /// When it was taken, by this host's clock.
+    /// The time at which the sample was taken, by this host's clock.
     pub received_timestamp: SystemTime,
-    /// Its number among those that the endpoint has taken, from 1.
+    /// The number of the sample among the samples that the endpoint has taken, from 1.
     pub reception: u64,
-    /// Its age and lifespan, where the lifespan is finite.
+    /// The age and lifespan of the sample, if the lifespan is finite.
     pub lifetime: Option<Lifetime>,
 }
 
-/// The age of a sample when it was taken, and its publisher's lifespan. The monotonic clock tells both,
-/// so that neither a step of the wall clock nor that of another host counts.
+/// The age of a sample when it was taken, and its publisher's lifespan. Both are measured by the monotonic clock, so a
+/// step of this or another host's wall clock does not matter.
 ///
 /// ```
 /// # use std::time::Duration;
@@ -72,9 +72,9 @@ pub struct MessageInfo {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Lifetime {
-    /// How long ago it was published when it was taken.
+    /// The time from the publication until the sample was taken.
     pub age: Duration,
-    /// How old it may be to be delivered.
+    /// The maximum age at which the sample is delivered.
     pub lifespan: Duration,
 }
 
@@ -84,7 +84,7 @@ impl Lifetime {
         Self { age: Duration::from_nanos(age), lifespan }
     }
 
-    /// Whether the sample is not to be delivered any more.
+    /// Returns whether the sample is too old to be delivered.
     pub(super) fn is_over(self) -> bool {
         self.age > self.lifespan
     }

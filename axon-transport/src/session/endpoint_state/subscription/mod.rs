@@ -56,29 +56,29 @@ use crate::{
 /// with the handle.
 pub(in crate::session) struct SubscriptionInner {
     pub(in crate::session) endpoint: Endpoint,
-    /// What its readers request.
+    /// The QoS that its readers request.
     pub(in crate::session) qos: Qos,
-    /// How many samples stand of all its writers together. Of each alone it is what `qos` says: a
-    /// client's requests do not take the room of another's.
+    /// Maximum number of unread samples of all writers together. For each writer alone, `qos` has the maximum: a
+    /// client's requests do not take the space of another client's.
     shared_depth: Option<u32>,
-    /// Whether it is never matched with publishers of its own session.
+    /// True if it is never matched with publishers of its own session.
     pub(in crate::session) ignores_local: bool,
-    /// The only publisher that a relay reads, where it is not all.
+    /// The only publisher that a relay reads, if it does not read all.
     pub(in crate::session) only: Option<Gid>,
-    /// Whether it carries samples to another process, which says what it has.
+    /// True if it carries samples to another process, which reports what it has received.
     pub(in crate::session) carries: bool,
-    /// Whether a writer's numbers rise: the responses of a server come in whatever order it likes.
+    /// True if a writer's numbers rise. The responses of a server come in any order.
     pub(in crate::session) rising: bool,
     pub(in crate::session) role: EndpointRole,
     pub(in crate::session) events: EndpointEvents,
     stands_for: Mutex<Vec<Gid>>,
     matched_readers: Mutex<MatchedReaders>,
     arrived: Callback,
-    /// Whether the control thread listens for its callback.
+    /// True if the control thread listens for its callback.
     listens: Mutex<bool>,
     /// The tasks that wait for a message.
     pub(in crate::session) wakers: Wakers,
-    /// Of a client: the requests whose responses tasks wait for.
+    /// The requests of a client whose tasks wait for the responses.
     pub(in crate::session) calls: Calls,
 }
 
@@ -123,12 +123,12 @@ impl SubscriptionInner {
         }
     }
 
-    /// Whether it wants every sample of its publishers.
+    /// Returns whether it wants every sample of its publishers.
     pub(in crate::session) fn keeps_all(&self) -> bool {
         self.endpoint.kind == EndpointKind::Subscription && holds(&self.qos)
     }
 
-    /// What a take has to know.
+    /// Returns the rules of a take.
     fn take_rules(&self) -> TakeRules<'_> {
         TakeRules {
             topic: &self.endpoint.topic,
@@ -138,7 +138,7 @@ impl SubscriptionInner {
         }
     }
 
-    /// The oldest sample that may be taken, in place.
+    /// Takes the oldest available sample, in place.
     pub(in crate::session) fn take_sample(
         &self,
         core: &SessionCore,
@@ -150,7 +150,7 @@ impl SubscriptionInner {
         })
     }
 
-    /// The oldest sample that may be taken, as `take` takes it from its ring.
+    /// Takes the oldest available sample; `take` takes it from its ring.
     pub(in crate::session) fn take<T>(
         &self,
         core: &SessionCore,
@@ -159,7 +159,7 @@ impl SubscriptionInner {
         self.take_with(core, |begun| begun.next(take))
     }
 
-    /// The oldest sample that may be taken, as bytes, into `out`, which it replaces.
+    /// Takes the oldest available sample, as bytes, into `out`, whose content it replaces.
     pub(in crate::session) fn take_bytes(
         &self,
         core: &SessionCore,
@@ -169,7 +169,7 @@ impl SubscriptionInner {
         self.take(core, take).map(|(info, ())| info)
     }
 
-    /// The next sample of one writer, as bytes.
+    /// Takes the next sample of one writer, as bytes.
     pub(in crate::session) fn take_of(
         &self,
         core: &SessionCore,
@@ -181,7 +181,8 @@ impl SubscriptionInner {
         Some((info, out))
     }
 
-    /// Samples of one writer, into `out`, which it replaces. `each` is told where a sample's payload is. Returns how many.
+    /// Takes samples of one writer into `out`, whose content it replaces. `each` receives the position of each sample's
+    /// payload. Returns the number of samples.
     pub(in crate::session) fn take_many_of(
         &self,
         core: &SessionCore,
@@ -197,12 +198,13 @@ impl SubscriptionInner {
         taken.unwrap_or(0)
     }
 
-    /// The next sample of one writer, for a relay, and how many of that writer's were lost by then. The process has not forked.
+    /// Takes the next sample of one writer, for a relay. Returns it and the number of that writer's samples lost by
+    /// then. The caller has made sure that the process has not forked.
     pub(in crate::session) fn sample_of(&self, writer: &Gid) -> Option<(Sample, u64)> {
         Take::begin(&mut self.lock(), self.take_rules()).sample_of(writer)
     }
 
-    /// What `take` takes; `None` when there is nothing.
+    /// Returns what `take` takes; `None` if there is nothing.
     fn take_with<T>(
         &self,
         core: &SessionCore,
@@ -230,7 +232,7 @@ impl SubscriptionInner {
         taken
     }
 
-    /// What `take` finds, after waiting for at most `timeout`.
+    /// Returns what `take` finds, after waiting for at most `timeout`.
     pub(in crate::session) fn recv<T>(
         self: &Arc<Self>,
         core: &SessionCore,
@@ -239,14 +241,14 @@ impl SubscriptionInner {
     ) -> Result<T, RecvError> {
         let mut begun = None;
         loop {
-            // Nothing comes to a forked child, however long it waits.
+            // A forked child receives nothing, however long it waits.
             if core.is_forked() {
                 return Err(RecvError::Forked);
             }
             if let Some(taken) = take() {
                 return Ok(taken);
             }
-            // What is there already is taken without a look at the clock.
+            // A sample that is already there is taken without reading the clock.
             let now = Instant::now();
             let waited = now.duration_since(*begun.get_or_insert(now));
             let left = timeout.map(|timeout| timeout.saturating_sub(waited));
@@ -258,15 +260,15 @@ impl SubscriptionInner {
         }
     }
 
-    /// Wakes the tasks whose message or response came. Called by the control thread. Returns whether further tasks wait: then
-    /// a writer has to ring the doorbell for its next sample.
+    /// Wakes the tasks whose message or response came. Called by the control thread. Returns whether further tasks
+    /// wait: in that case, a writer has to ring the doorbell for its next sample.
     pub(in crate::session) fn wake_tasks(&self, core: &SessionCore) -> bool {
         let calls = self.collect_responses(core);
         let receivers = self.wakers.wake_if(|| self.has_data());
         calls || receivers
     }
 
-    /// Gives each call the response that came to it; see [`Calls::collect`].
+    /// Gives each call its response; see [`Calls::collect`].
     pub(in crate::session) fn collect_responses(&self, core: &SessionCore) -> bool {
         let take = || self.take_sample(core).map(|(info, sample)| (info.sequence, sample));
         self.calls.collect(core, take, |servers| {
@@ -275,24 +277,24 @@ impl SubscriptionInner {
         })
     }
 
-    /// The publishers it receives from.
+    /// Returns the publishers that it receives from.
     pub(in crate::session) fn matched(&self) -> Vec<Gid> {
         let matched_readers = self.lock();
         let matched = matched_readers.slots.iter().filter(|slot| slot.counts());
         matched.map(|slot| slot.reader.writer()).collect()
     }
 
-    /// Samples taken.
+    /// Returns the number of samples taken.
     pub(in crate::session) fn received(&self) -> u64 {
         self.lock().counts.received
     }
 
-    /// Samples that were older than their publisher's lifespan when they would have been taken.
+    /// Returns the number of samples that were older than their publisher's lifespan when their turn came.
     pub(in crate::session) fn expired(&self) -> u64 {
         self.lock().counts.expired
     }
 
-    /// Samples that were lost.
+    /// Returns the number of samples that were lost.
     pub(in crate::session) fn lost(&self) -> u64 {
         self.lock().losses()
     }
@@ -310,25 +312,25 @@ impl SubscriptionInner {
         self.arrived.replace(callback, |untold| {
             self.listen(listens, core)?;
             let mut matched_readers = self.lock();
-            // Of those that nobody was told of some may have been taken, or lost.
+            // Some of the unreported samples may have been taken, or lost.
             let untold = untold + matched_readers.new_arrivals();
             Ok(untold.min(self.within_depth(matched_readers.slots.unread())))
         })
     }
 
-    /// At most as many samples as all writers together may have to be taken, if they share a depth.
+    /// Limits `unread` to the shared depth of all writers, if there is one.
     fn within_depth(&self, unread: u64) -> u64 {
         self.shared_depth.map_or(unread, |depth| unread.min(depth.into()))
     }
 
-    /// Nobody hears of samples any more, whatever is set from now on.
+    /// Ends the callback for good: a callback that is set later is ignored.
     pub(in crate::session) fn tell_no_more(&self, core: &SessionCore) {
         self.arrived.end();
-        // Only listening may fail, not ceasing to.
+        // Only the start of listening can fail.
         let _ = self.listen(false, core);
     }
 
-    /// Has the control thread listen for its callback, or not any more.
+    /// Makes the control thread listen for its callback, or stop listening.
     fn listen(&self, whether: bool, core: &SessionCore) -> Result<(), ShmError> {
         let mut listens = lock(&self.listens);
         match (*listens, whether) {
@@ -340,7 +342,7 @@ impl SubscriptionInner {
         Ok(())
     }
 
-    /// Tells of samples that came, where somebody wants to hear of them.
+    /// Reports new samples to the callback, if one is set.
     pub(in crate::session) fn tell_arrived(&self) {
         if self.arrived.is_set() {
             let new = self.lock().new_arrivals();
@@ -348,7 +350,7 @@ impl SubscriptionInner {
         }
     }
 
-    /// What reads the ring that a writer granted.
+    /// Maps the ring that a writer granted, and returns its reader.
     pub(in crate::session) fn map(
         &self,
         writer: Gid,
@@ -370,14 +372,14 @@ impl SubscriptionInner {
         if matches!(self.endpoint.kind, EndpointKind::Server | EndpointKind::Client) {
             mapped.tell_room();
         }
-        // Where its session is a gateway's, which reads too many rings to look at all of them.
+        // If the session belongs to a gateway, it reads too many rings to check all of them.
         if self.role != EndpointRole::Application {
             mapped.follow(self.endpoint.gid);
         }
         Ok(mapped)
     }
 
-    /// What became of its matches since it was asked last.
+    /// Updates the matched writers. Returns the changes since the last call.
     pub(in crate::session) fn rematch(&self) -> Changes {
         let leases = || {
             let matched_readers = self.lock();
@@ -387,8 +389,8 @@ impl SubscriptionInner {
         self.events.writers(leases, clock::monotonic())
     }
 
-    /// Counts the deadlines that passed and looks who is alive. When to look again, and whether
-    /// something happened.
+    /// Counts the missed deadlines, and checks the publishers' liveliness. Returns when to look again, and whether an
+    /// event occurred.
     pub(in crate::session) fn look_at_time(&self, now: u64) -> (Option<u64>, bool) {
         let times: Vec<_> = {
             let matched_readers = self.lock();
@@ -403,18 +405,19 @@ impl SubscriptionInner {
         self.events.requested(&self.qos, &times, now)
     }
 
-    /// The same for who must not wait for a thread that takes.
+    /// Like [`look_for_losses`](Self::look_for_losses), for a thread that must not wait for a thread that takes
+    /// samples: returns whether there may be new losses.
     pub(in crate::session) fn may_have_losses(&self) -> bool {
         let Ok(mut matched_readers) = self.matched_readers.try_lock() else { return true };
         matched_readers.slots.iter_mut().for_each(|slot| drop(slot.reader.peek()));
         matched_readers.counts.has_new_losses(matched_readers.slots.lost())
     }
 
-    /// Counts what would be found lost by taking now.
+    /// Counts the losses that a take would find now.
     pub(in crate::session) fn look_for_losses(&self) {
         let mut matched_readers = self.lock();
         for slot in matched_readers.slots.iter_mut() {
-            // What is wrong with its memory, the next take says.
+            // The next take reports an error of the memory.
             let _ = slot.reader.peek();
         }
         let lost = matched_readers.new_losses();
@@ -439,7 +442,7 @@ impl WakeCheck for SubscriptionInner {
     fn ready(&self) -> bool {
         match self.matched_readers.try_lock() {
             Ok(matched_readers) => matched_readers.slots.has_data(),
-            // The thread that holds the lock may be about to add something.
+            // The thread that holds the lock may be about to add a sample.
             Err(_) => true,
         }
     }

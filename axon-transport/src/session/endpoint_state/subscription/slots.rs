@@ -9,14 +9,14 @@ use std::{
 use super::matched_reader::{MatchedReader, TakeTurn};
 use crate::ids::Gid;
 
-/// How long nobody is woken for a sample that there was no memory to take.
+/// Time for which a sample that could not be taken for want of memory wakes no thread.
 const NO_MEMORY_PAUSE: Duration = Duration::from_secs(1);
 
 /// Readers in the order in which their publishers granted them. A publisher that granted anew has several.
 #[derive(Default)]
 pub(in crate::session) struct Slots {
     slots: Vec<MatchedReader>,
-    /// When there was no memory to take a sample last.
+    /// Time of the last shortage of memory for a sample.
     short: Option<Instant>,
 }
 
@@ -45,7 +45,7 @@ impl Slots {
         self.slots.iter_mut()
     }
 
-    /// The readers of one writer.
+    /// Returns the readers of one writer.
     pub(super) fn of(&self, writer: &Gid) -> impl Iterator<Item = &MatchedReader> {
         self.slots.iter().filter(move |slot| slot.reader.writer() == *writer)
     }
@@ -54,7 +54,7 @@ impl Slots {
         self.slots.iter_mut().filter(move |slot| slot.reader.writer() == *writer)
     }
 
-    /// The reader by which this writer, which is not gone, is read.
+    /// Returns the reader of this writer, if the writer is not gone.
     pub(super) fn attached(&self, writer: &Gid) -> Option<&MatchedReader> {
         self.of(writer).find(|slot| !slot.over)
     }
@@ -63,13 +63,14 @@ impl Slots {
         self.of_mut(writer).find(|slot| !slot.over)
     }
 
-    /// Where the readers of this writer are.
+    /// Returns the indices of the readers of this writer.
     pub(super) fn indices_of(&self, writer: &Gid) -> Vec<usize> {
         let of = |index: &usize| self.slots[*index].reader.writer() == *writer;
         (0..self.slots.len()).filter(of).collect()
     }
 
-    /// Removes the readers of writers that are gone and drained, and of which nothing is under way.
+    /// Removes and returns the readers of writers that are gone, if their rings are drained and none of their samples
+    /// is in flight.
     pub(super) fn remove_drained(&mut self) -> Vec<MatchedReader> {
         let over = |slot: &mut MatchedReader| {
             slot.over && slot.reader.is_drained() && !slot.reader.is_under_way()
@@ -77,8 +78,8 @@ impl Slots {
         self.slots.extract_if(.., over).collect()
     }
 
-    /// Gives up what a writer left in memory that never came, where it has come back in another process and
-    /// sends once more what was not confirmed. Samples missing then show as gaps in its numbers. Returns whether it gave up
+    /// Gives up a writer's samples in memory that never came, if the writer has come back in another process and sends
+    /// the unconfirmed samples once more. Missing samples then show as gaps in its numbers. Returns whether it gave up
     /// anything.
     pub(super) fn skip_missing(&mut self) -> bool {
         let mut forgone = false;
@@ -94,12 +95,13 @@ impl Slots {
         forgone
     }
 
-    /// A take begins: each reader may have something.
+    /// Begins a take: each reader may have a sample.
     pub(super) fn begin_take(&mut self) {
         self.slots.iter_mut().for_each(|slot| slot.turn = TakeTurn::Open);
     }
 
-    /// There was no memory for the next sample of a reader. Returns false while an earlier shortage still counts.
+    /// Records that there was no memory for the next sample of a reader. Returns false while an earlier shortage still
+    /// counts.
     pub(super) fn note_short(&mut self, index: usize) -> bool {
         self.slots[index].turn = TakeTurn::Short;
         let news = self.short_until().is_none();
@@ -107,23 +109,23 @@ impl Slots {
         news
     }
 
-    /// Until when there is nothing to take, as there is no memory to take it.
+    /// Returns the end of the current shortage of memory, before which nothing can be taken.
     pub(super) fn short_until(&self) -> Option<Instant> {
         self.short.map(|since| since + NO_MEMORY_PAUSE).filter(|until| *until > Instant::now())
     }
 
-    /// Whether there is something to take.
+    /// Returns whether there is a sample to take.
     pub(super) fn has_data(&self) -> bool {
         self.short_until().is_none() && self.slots.iter().any(|slot| slot.reader.has_data())
     }
 
-    /// When to look again though nobody rings: for memory to take a sample, or for memory of a writer.
+    /// Returns when to look again without a doorbell: for memory to take a sample, or for memory of a writer.
     pub(in crate::session) fn look_again(&self) -> Option<Instant> {
         let missing = self.slots.iter().filter_map(|slot| slot.reader.look_again());
         missing.chain(self.short_until()).min()
     }
 
-    /// Where the next sample of a writer is.
+    /// Returns the index of the reader that has the next sample of a writer.
     pub(super) fn next_of(&self, writer: &Gid) -> Option<usize> {
         let next = self.slots.iter().position(|slot| {
             slot.reader.writer() == *writer
@@ -136,9 +138,9 @@ impl Slots {
         next.filter(|index| self.slots[*index].turn != TakeTurn::Short)
     }
 
-    /// The reader whose next sample is the oldest, of those that are not faster than we are. What a
-    /// writer wrote before it granted anew comes before what it wrote since, whatever its clock
-    /// says: taken the other way round it would count as repeated.
+    /// Returns the reader with the oldest next sample, except readers whose writer is faster than the take. Samples
+    /// that a writer wrote before it granted anew come before its later samples, whatever its clock says: in the other
+    /// order, they would count as repeated.
     pub(super) fn oldest(&mut self) -> Option<usize> {
         loop {
             let index = self.oldest_by_time()?;
@@ -162,7 +164,7 @@ impl Slots {
 
     fn oldest_by_time(&mut self) -> Option<usize> {
         if let [slot] = self.slots.as_slice() {
-            // Taking finds out whether it has anything, which most often it has.
+            // The take itself finds out whether there is a sample; usually there is.
             return (slot.turn == TakeTurn::Open).then_some(0);
         }
         let mut oldest = None;
@@ -182,7 +184,7 @@ impl Slots {
         oldest.map(|(_, index)| index)
     }
 
-    /// A subscription's KEEP_LAST(depth) counts over all publishers together.
+    /// Skips the oldest samples beyond `depth`: a subscription's KEEP_LAST(depth) counts over all publishers together.
     pub(super) fn skip_to_depth(&mut self, depth: u64) {
         let mut unread = self.unread();
         while unread > depth {
@@ -194,33 +196,33 @@ impl Slots {
         }
     }
 
-    /// Samples to be taken.
+    /// Returns the number of samples to be taken.
     pub(super) fn unread(&self) -> u64 {
         self.slots.iter().map(|slot| slot.reader.unread()).sum()
     }
 
-    /// Samples that were lost.
+    /// Returns the number of samples that were lost.
     pub(super) fn lost(&self) -> u64 {
         self.slots.iter().map(MatchedReader::lost).fold(0, u64::saturating_add)
     }
 
-    /// Samples that came.
+    /// Returns the number of samples that came.
     pub(super) fn arrived(&self) -> u64 {
         self.slots.iter().map(|slot| slot.reader.arrived()).sum()
     }
 
-    /// Writers that are gone, though more comes of them.
+    /// Returns the writers that are leaving, with samples still to come.
     pub(in crate::session) fn leaving(&self) -> Vec<Gid> {
         let leaving = self.slots.iter().filter(|slot| slot.leaving && !slot.over);
         leaving.map(|slot| slot.reader.writer()).collect()
     }
 
-    /// Whether the lease of one of the writers may run out.
+    /// Returns whether the lease of a writer may run out.
     pub(in crate::session) fn offers_lease(&self) -> bool {
         self.slots.iter().any(|slot| slot.counts() && slot.lease.is_some())
     }
 
-    /// The publishers that have a lease, and when each was last alive, by the monotonic clock.
+    /// Returns the publishers that have a lease, and when each was last alive, by the monotonic clock.
     pub(in crate::session) fn assertions(&self) -> Vec<(Gid, u64)> {
         let there = self.slots.iter().filter(|slot| !slot.over);
         let times = there.map(|slot| (slot.reader.writer(), slot.reader.times()));
@@ -228,36 +230,37 @@ impl Slots {
         leased.filter_map(|(gid, times)| Some((gid, times.asserted?))).collect()
     }
 
-    /// The writers of which there is something to take.
+    /// Returns the writers that have a sample to take.
     pub(in crate::session) fn with_data(&self) -> impl Iterator<Item = Gid> {
         let some = self.slots.iter().filter(|slot| slot.reader.has_data());
         some.map(|slot| slot.reader.writer())
     }
 
-    /// Whether there is something to take of `writer`.
+    /// Returns whether there is a sample of `writer` to take.
     pub(in crate::session) fn has_from(&self, writer: &Gid) -> bool {
         self.of(writer).any(|slot| slot.reader.has_data())
     }
 
-    /// After what time a sample of `writer` may be taken, if any waits.
+    /// Returns the time after which a sample of `writer` may be taken, if any waits.
     pub(in crate::session) fn retry_of(&self, writer: &Gid) -> Option<Duration> {
         let wait = |until: Instant| until.saturating_duration_since(Instant::now());
         self.has_from(writer).then(|| self.short_until().map_or(Duration::ZERO, wait))
     }
 
-    /// Whether samples of `writer` wait that cannot be taken yet, for want of its memory or of our own.
+    /// Returns whether samples of `writer` wait that cannot be taken yet, for want of its memory or of this process's
+    /// own.
     pub(in crate::session) fn is_held_up(&self, writer: &Gid) -> bool {
         let mut slots = self.of(writer);
         slots.any(|slot| slot.reader.missing().is_some())
             || self.short_until().is_some() && self.has_from(writer)
     }
 
-    /// How many publishes of `writer` found no room, if a reader of its oldest sample is not done with that.
+    /// Returns how many publishes of `writer` found no space, if a reader has not confirmed its oldest sample.
     pub(in crate::session) fn refused_of(&self, writer: &Gid) -> Option<u64> {
         self.of(writer).filter_map(|slot| slot.reader.refused()).max()
     }
 
-    /// Samples that are not done with, by writer.
+    /// Returns the number of unconfirmed samples by writer.
     pub(in crate::session) fn undone(&self) -> HashMap<Gid, u64> {
         let mut undone = HashMap::new();
         for slot in &self.slots {
@@ -269,12 +272,12 @@ impl Slots {
         undone
     }
 
-    /// Samples of `writer` that are not done with.
+    /// Returns the number of unconfirmed samples of `writer`.
     pub(in crate::session) fn undone_of(&self, writer: &Gid) -> u64 {
         self.of(writer).map(|slot| slot.reader.undone()).fold(0, u64::saturating_add)
     }
 
-    /// Bytes of the samples of `writer` that are not done with.
+    /// Returns the bytes of the unconfirmed samples of `writer`.
     pub(in crate::session) fn undone_bytes_of(&self, writer: &Gid) -> u64 {
         self.of(writer).map(|slot| slot.reader.undone_bytes()).fold(0, u64::saturating_add)
     }
@@ -307,7 +310,7 @@ mod tests {
         session::endpoint_state::subscription::{matched_reader::NumberKind, tests::reading},
     };
 
-    /// Readers of the rings of these writers in turn, each with samples of these times.
+    /// Creates readers of the rings of these writers in turn, each with samples of these times.
     fn slots(rings: &[(u32, &[i64])]) -> (Slots, Vec<Writer>) {
         let session = SessionSegment::create(SessionId::random()).unwrap();
         let mut slots = Slots::default();

@@ -11,15 +11,15 @@ use super::{
 };
 use crate::{ids::Gid, session::clock};
 
-/// Samples that one take passes over because they were taken before.
+/// Maximum number of samples that one take skips because they were taken before.
 const REPEATS: usize = 64;
 
-/// How much a relay takes in one go: one sample in any case.
+/// The limit of one take by a relay, which takes at least one sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TakeLimit {
-    /// Samples.
+    /// Maximum number of samples.
     pub samples: usize,
-    /// Bytes of several samples together.
+    /// Maximum number of bytes of several samples together.
     pub bytes: usize,
 }
 
@@ -27,16 +27,16 @@ fn clock_now() -> SystemTime {
     clock::from_unix_nanos(clock::wall())
 }
 
-/// What a take has to know of its subscription.
+/// The properties of a subscription that a take depends on.
 #[derive(Clone, Copy)]
 pub(super) struct TakeRules<'a> {
     /// The topic, for log lines.
     pub(super) topic: &'a str,
-    /// How many samples stand of all writers together, if they share a depth.
+    /// Maximum number of unread samples of all writers together, if they share a depth.
     pub(super) shared_depth: Option<u32>,
-    /// Whether the numbers of each writer rise: one that does not was taken before.
+    /// True if the numbers of each writer rise: a sample whose number does not rise was taken before.
     pub(super) rising: bool,
-    /// Whether samples that are skipped count as lost: nobody asked a relay to skip any.
+    /// True if skipped samples count as lost: a relay was not asked to skip any.
     pub(super) loses_skipped: bool,
 }
 
@@ -44,24 +44,24 @@ pub(super) struct TakeRules<'a> {
 pub(super) struct Take<'a> {
     readers: &'a mut MatchedReaders,
     of: TakeRules<'a>,
-    /// When its samples were received. Without a time, each sample has that at which it was taken.
+    /// The time at which its samples were received. Without it, each sample has the time at which it was taken.
     received_timestamp: Option<SystemTime>,
 }
 
 impl<'a> Take<'a> {
-    /// A take from these `readers`, which are `of` the subscription and whose lock the caller holds.
+    /// Begins a take from these `readers`, which are `of` the subscription and whose lock the caller holds.
     pub(super) fn begin(readers: &'a mut MatchedReaders, of: TakeRules<'a>) -> Self {
         readers.slots.begin_take();
         Self { readers, of, received_timestamp: None }
     }
 
-    /// The oldest sample of all writers.
+    /// Takes the oldest sample of all writers.
     pub(super) fn next<T>(
         mut self,
         mut take: impl FnMut(&mut Reader) -> Result<Option<(Meta, T)>, TakeError>,
     ) -> Option<(MessageInfo, T)> {
-        // A writer that repeats itself without end must not keep the lock: callers come back as
-        // long as there is something to take.
+        // A writer that repeats itself without end must not keep the lock: callers come back as long as there is a
+        // sample to take.
         for _ in 0..REPEATS {
             let slots = &mut self.readers.slots;
             if let Some(depth) = self.of.shared_depth.filter(|_| slots.len() > 1) {
@@ -69,7 +69,7 @@ impl<'a> Take<'a> {
             }
             self.readers.skip_missing();
             let Some(index) = self.readers.slots.oldest() else {
-                // What was skipped may have been the last of a writer that is gone.
+                // A skipped sample may have been the last of a writer that is gone.
                 if self.readers.slots.iter().any(|slot| slot.over) {
                     self.readers.sweep();
                 }
@@ -82,7 +82,7 @@ impl<'a> Take<'a> {
         None
     }
 
-    /// The next sample of one writer.
+    /// Takes the next sample of one writer.
     pub(super) fn next_of<T>(
         mut self,
         writer: &Gid,
@@ -101,8 +101,8 @@ impl<'a> Take<'a> {
         None
     }
 
-    /// Samples of one writer, with their payloads one behind the other in `out`, which holds nothing. `each` is
-    /// told where a sample's payload is. Returns how many samples it took.
+    /// Takes samples of one writer, with their payloads one behind the other in `out`, which is empty. `each` receives
+    /// the position of each sample's payload. Returns the number of samples taken.
     pub(super) fn many_of(
         mut self,
         writer: &Gid,
@@ -114,7 +114,7 @@ impl<'a> Take<'a> {
         let (mut taken, mut passed_over) = (0, 0);
         let mut last = None;
         while taken < most.samples && passed_over < REPEATS {
-            // Most often the next one is where the last one was.
+            // Usually the next sample is at the same reader as the last one.
             let Some(index) = last.take().or_else(|| {
                 self.readers.skip_missing();
                 self.readers.slots.next_of(writer)
@@ -135,7 +135,7 @@ impl<'a> Take<'a> {
                     last = slot.filter(|s| !s.over && s.reader.writer() == *writer).map(|_| index);
                 }
                 None => {
-                    // A sample that does not count is no part of it.
+                    // A sample that does not count is removed from the output.
                     out.truncate(start);
                     passed_over += 1;
                 }
@@ -145,7 +145,7 @@ impl<'a> Take<'a> {
         taken
     }
 
-    /// Takes from a reader, unless nothing is to be had there, or nothing that counts.
+    /// Takes a sample from a reader. Returns `None` if there is none, or it does not count.
     fn take_at<T>(
         &mut self,
         index: usize,
@@ -157,7 +157,7 @@ impl<'a> Take<'a> {
         let writer = slot.reader.writer();
         let (meta, taken) = match take(&mut slot.reader) {
             Ok(Some(taken)) => taken,
-            // Overwritten again and again while we read: the others have their turn first.
+            // Overwritten again and again during the read: the other readers have their turn first.
             Ok(None) => {
                 slot.turn = TakeTurn::Overtaken;
                 return None;
@@ -166,7 +166,7 @@ impl<'a> Take<'a> {
                 tracing::error!(topic, %error, "a sample is lost");
                 return None;
             }
-            // It stands, and may be taken when there is memory again.
+            // The sample stays, and can be taken when there is memory again.
             Err(error @ TakeError::NoMemory { .. }) => {
                 if readers.slots.note_short(index) {
                     tracing::error!(topic, %error, "cannot take a sample yet");
@@ -209,7 +209,8 @@ impl<'a> Take<'a> {
         Some((info, taken))
     }
 
-    /// The next sample of one writer, for a relay, and how many of that writer's were lost by then.
+    /// Takes the next sample of one writer, for a relay. Returns it and the number of that writer's samples lost by
+    /// then.
     pub(super) fn sample_of(mut self, writer: &Gid) -> Option<(Sample, u64)> {
         let readers = &mut *self.readers;
         let topic = self.of.topic;

@@ -1,4 +1,4 @@
-//! The receiving end: puts samples together of pieces, and grants the credit for more.
+//! The receiving end: assembles samples from pieces, and grants the credit for more.
 
 use std::{
     collections::{HashMap, VecDeque},
@@ -13,21 +13,21 @@ use axon_shm::Meta;
 use super::{FlowChannel, OVERHEAD, WINDOW};
 use crate::wire::session::{Credit, SampleFragment, SampleHeader};
 
-/// Bytes beyond the windows of its channels that one session's arriving samples may take, but for one
-/// that is long.
+/// Bytes beyond the windows of its channels that the arriving samples of one session may take; a long sample does not
+/// count.
 const SESSION: u64 = 64 << 20;
-/// Bytes beyond its window above which a sample is long: there is one at a time, so that those which
-/// are not read leave room for others.
+/// Bytes beyond its window above which a sample is long. Only one long sample is granted at a time, so that samples
+/// which are not read leave space for others.
 pub(super) const LONG_SAMPLE_BYTES: u64 = SESSION / 8;
 
-/// A sample that has come whole.
+/// A sample that has arrived completely.
 #[derive(Debug, PartialEq, Eq)]
 pub struct InboundSample {
-    /// On which channel.
+    /// The channel on which it arrived.
     pub channel: FlowChannel,
     /// Its number and time.
     pub meta: Meta,
-    /// Samples of its publisher that were lost since the one before.
+    /// Number of its publisher's samples that were lost since the previous one.
     pub lost: u64,
     /// Its bytes.
     pub payload: Vec<u8>,
@@ -39,17 +39,17 @@ impl InboundSample {
     }
 }
 
-/// What no sender does. The connection is closed.
+/// A violation of the protocol by the sender. The connection is closed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum FlowViolation {
-    /// A sample longer than any may be.
+    /// A sample longer than the maximum length of a message.
     #[error("a sample of {0} bytes, which is more than AXON_MAX_MESSAGE_MB allows")]
     TooLarge(u32),
     /// More bytes than there was credit for.
     #[error("more bytes of samples than it was given credit for")]
     Overrun,
-    /// A piece that does not follow the one before.
+    /// A piece that does not follow the previous one.
     #[error("a piece of a sample that does not follow the one before")]
     OutOfPlace,
 }
@@ -67,12 +67,13 @@ impl ArrivalPool {
         Arc::new(Self { held: AtomicU64::new(0), limit })
     }
 
-    /// Bytes that are taken.
+    /// Returns the number of bytes taken.
     pub fn held(&self) -> u64 {
         self.held.load(Ordering::Relaxed)
     }
 
-    /// One sample may always: what is larger than the pool must pass, too.
+    /// Takes bytes from the pool, if they fit. An empty pool accepts any sample: one that is larger than the pool must
+    /// pass, too.
     fn take(&self, bytes: u64) -> bool {
         let fits = |held: u64| {
             (held == 0 || held + bytes <= self.limit).then(|| held.saturating_add(bytes))
@@ -91,11 +92,11 @@ impl ArrivalPool {
 pub struct IncomingFlow {
     channels: HashMap<FlowChannel, Receiving>,
     max_message: u64,
-    /// Channels whose sample is longer than their window, until there is room.
+    /// Channels whose sample is longer than their window, until there is space.
     waiting: VecDeque<FlowChannel>,
-    /// Bytes that were granted beyond the windows to samples that are not long.
+    /// Bytes granted beyond the windows to samples that are not long.
     reserved: u64,
-    /// The channel of the one that is, and what it was granted.
+    /// The channel of the long sample, and the bytes granted to it.
     long: Option<(FlowChannel, u64)>,
     pool: Arc<ArrivalPool>,
     is_short: bool,
@@ -103,7 +104,7 @@ pub struct IncomingFlow {
 
 #[derive(Debug, Default)]
 struct Receiving {
-    /// Bytes that came and have not gone to where they belong.
+    /// Bytes that arrived and have not reached their destination.
     held: u64,
     /// Bytes granted beyond the window, for these samples.
     granted: u64,
@@ -117,15 +118,15 @@ struct Partial {
 }
 
 impl IncomingFlow {
-    /// An end that takes samples of at most `max_message` bytes, and memory beyond its windows out of
+    /// Creates an end that takes samples of at most `max_message` bytes, and takes memory beyond its windows from
     /// `pool`.
     pub fn new(max_message: u64, pool: Arc<ArrivalPool>) -> Self {
         let (channels, waiting) = (HashMap::new(), VecDeque::new());
         Self { channels, max_message, waiting, reserved: 0, long: None, pool, is_short: false }
     }
 
-    /// Opens a channel, unless it is open: what its sender, of which so many MATCHED were heard, is to
-    /// be told.
+    /// Opens a channel, unless it is open. Returns the credit message for its sender; `heard` is the number of MATCHED
+    /// messages that were received from the sender.
     pub fn open(&mut self, channel: FlowChannel, heard: u64) -> Option<Credit> {
         if self.channels.contains_key(&channel) {
             return None;
@@ -134,7 +135,7 @@ impl IncomingFlow {
         Some(channel.credit(WINDOW, Some(heard)))
     }
 
-    /// Closes those channels that `keep` does not want, and forgets what came on them.
+    /// Closes the channels that `keep` rejects, and forgets the pieces that came on them.
     pub fn retain(&mut self, keep: impl Fn(&FlowChannel) -> bool) {
         let closed = self.channels.extract_if(|name, _| !keep(name));
         for (name, channel) in closed.collect::<Vec<_>>() {
@@ -144,20 +145,20 @@ impl IncomingFlow {
         self.waiting.retain(|channel| channels.contains_key(channel));
     }
 
-    /// The channels of which a sample has come in part.
+    /// Returns the channels of which a sample has arrived in part.
     pub fn partial(&self) -> impl Iterator<Item = &FlowChannel> {
         let partial = self.channels.iter().filter(|(_, channel)| channel.partial.is_some());
         partial.map(|(name, _)| name)
     }
 
-    /// Takes a piece; the sample, if it was the last.
+    /// Takes a piece. Returns the sample if this was its last piece.
     ///
     /// # Errors
     /// [`FlowViolation`].
     pub fn piece(&mut self, piece: SampleFragment) -> Result<Option<InboundSample>, FlowViolation> {
         let SampleFragment { publisher, head, bytes, client } = piece;
         let name = FlowChannel { writer: publisher, client };
-        // Of a channel that was closed meanwhile.
+        // The channel was closed meanwhile.
         let Some(channel) = self.channels.get_mut(&name) else { return Ok(None) };
         let opens = head.is_some();
         let partial = match (head, channel.partial.take()) {
@@ -177,7 +178,7 @@ impl IncomingFlow {
             return Err(FlowViolation::Overrun);
         }
         let Partial { head, mut payload } = partial;
-        // Grows with what really arrives.
+        // The buffer grows with the bytes that really arrive.
         payload.extend_from_slice(&bytes);
         if payload.len() < length {
             channel.partial = Some(Partial { head, payload });
@@ -229,18 +230,18 @@ impl IncomingFlow {
         true
     }
 
-    /// Whether somebody waits for room that other sessions have.
+    /// Returns whether a sample waits for space that other sessions occupy.
     pub fn is_short(&self) -> bool {
         self.is_short
     }
 
-    /// A sample has gone to where it belongs, or nowhere: what its sender is given back.
+    /// Records that a sample has reached its destination, or was dropped. Returns the credit for its sender.
     pub fn done(&mut self, sample: &InboundSample) -> Option<Credit> {
         let name = sample.channel;
         let channel = self.channels.get_mut(&name)?;
         let (cost, more) = (sample.cost(), extra(sample.payload.len()));
         channel.held = channel.held.saturating_sub(cost);
-        // One that was not asked for can have come within the window, by the grant for another.
+        // A sample that did not ask for credit can have come within the window, by the grant for another one.
         let more = more.min(channel.granted);
         channel.granted -= more;
         self.release(name, more);
@@ -269,7 +270,7 @@ impl Drop for IncomingFlow {
     }
 }
 
-/// What a sample takes beyond its channel's window.
+/// Returns the bytes that a sample takes beyond its channel's window.
 fn extra(length: usize) -> u64 {
     (OVERHEAD + length as u64).saturating_sub(WINDOW)
 }

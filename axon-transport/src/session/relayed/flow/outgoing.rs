@@ -11,19 +11,19 @@ use crate::wire::session::{Credit, SampleFragment, SampleHeader};
 #[derive(Debug)]
 pub struct OutgoingFlow<S> {
     channels: BTreeMap<FlowChannel, SendingSample<S>>,
-    /// Channels that may send a piece, in their order.
+    /// Channels that may send a piece, in the order of their turns.
     turns: VecDeque<FlowChannel>,
 }
 
 #[derive(Debug)]
 struct SendingSample<S> {
-    /// MATCHED that this end had said when it opened its end.
+    /// Number of MATCHED messages that this end had sent when it opened its end.
     since: u64,
     /// Bytes that may still be sent; `None` until the receiver opened its end.
     credit: Option<u64>,
-    /// What it was when the receiver opened its end: all of it is back when nothing is under way.
+    /// The credit when the receiver opened its end. All of it is back when nothing is in flight.
     window: u64,
-    /// What is sent piece by piece, and how far.
+    /// The sample that is sent piece by piece, and the number of bytes sent; `None` before its first piece.
     current: Option<(OutboundSample<S>, Option<usize>)>,
     in_turn: bool,
 }
@@ -35,16 +35,15 @@ impl<S> Default for OutgoingFlow<S> {
 }
 
 impl<S: SampleContent> OutgoingFlow<S> {
-    /// Opens a channel, which waits for a receiver that has heard as many MATCHED as were said when it
-    /// was to be opened: one that has not means a channel of the same name that was closed since.
+    /// Opens a channel. `since` is the number of MATCHED messages sent until now. The channel waits for a receiver that
+    /// has received as many: a receiver that has received fewer means an earlier channel of the same name.
     pub fn open(&mut self, channel: FlowChannel, since: u64) {
         let closed =
             SendingSample { since, credit: None, window: 0, current: None, in_turn: false };
         self.channels.entry(channel).or_insert(closed);
     }
 
-    /// Closes those channels that `keep` does not want; the rest of a sample that is under way is not
-    /// sent.
+    /// Closes the channels that `keep` rejects. The rest of a sample that is in flight is not sent.
     pub fn retain(&mut self, keep: impl Fn(&FlowChannel) -> bool) {
         self.channels.retain(|channel, _| keep(channel));
         let channels = &self.channels;
@@ -57,7 +56,7 @@ impl<S: SampleContent> OutgoingFlow<S> {
         self.turns.retain(|other| other != channel);
     }
 
-    /// What the receiver of a channel says.
+    /// Handles a credit message of a channel's receiver.
     pub fn credit(&mut self, credit: &Credit) {
         let Credit { publisher, bytes, opens, client, .. } = *credit;
         let name = FlowChannel { writer: publisher, client };
@@ -68,13 +67,13 @@ impl<S: SampleContent> OutgoingFlow<S> {
                 channel.window = bytes;
             }
             (Some(credit), None) => *credit = credit.saturating_add(bytes),
-            // Of a channel that this one came after.
+            // The message is for an earlier channel of the same name.
             (None, _) | (Some(_), Some(_)) => {}
         }
         self.enqueue(name);
     }
 
-    /// Whether all that was sent on a channel has gone to where it belongs.
+    /// Returns whether all samples that were sent on a channel have reached their destination.
     pub fn is_idle(&self, channel: &FlowChannel) -> bool {
         self.channels.get(channel).is_none_or(|channel| {
             channel.current.is_none()
@@ -82,8 +81,7 @@ impl<S: SampleContent> OutgoingFlow<S> {
         })
     }
 
-    /// Asks for the next sample of each channel that has none under way and may send one. Whether
-    /// there was any.
+    /// Takes the next sample of each channel that has none in flight and may send one. Returns whether there was any.
     pub fn fill(
         &mut self,
         mut take: impl FnMut(&FlowChannel) -> Option<OutboundSample<S>>,
@@ -99,7 +97,7 @@ impl<S: SampleContent> OutgoingFlow<S> {
         !found.is_empty()
     }
 
-    /// The next piece, of the channel whose turn it is.
+    /// Returns the next piece, of the channel whose turn it is.
     pub fn next_piece(&mut self) -> Option<SampleFragment> {
         loop {
             let name = self.turns.pop_front()?;
@@ -130,7 +128,7 @@ impl<S: SampleContent> OutgoingFlow<S> {
             let may = usize::try_from(*credit - cost).unwrap_or(usize::MAX);
             let mut bytes = vec![0; left.min(PIECE).min(may)];
             if bytes.is_empty() && head.is_none() {
-                // It waits for credit.
+                // The channel waits for credit.
                 continue;
             }
             sample.content.read_at(from, &mut bytes);

@@ -45,12 +45,12 @@ use crate::{
     },
 };
 
-/// What outlives a connection.
+/// The state that outlives a connection.
 struct RelayContext {
     /// The session.
     shared: Arc<SessionShared>,
     local_registry: Arc<LocalRegistry>,
-    /// Stands for the world outside.
+    /// The session that represents the endpoints outside this process.
     outside: Session,
     leader: ExternalLeader,
     change_signal: Arc<ChangeSignal>,
@@ -59,7 +59,7 @@ struct RelayContext {
     reason: String,
 }
 
-/// Starts to carry the samples of `shared`.
+/// Starts the thread that carries the samples of `shared`.
 ///
 /// # Errors
 /// The process has no descriptors left, or no thread can be started.
@@ -115,39 +115,40 @@ impl RelayContext {
     }
 }
 
-/// One connection.
+/// The state of one connection to a daemon.
 struct RelayConnection<'a> {
     common: &'a RelayContext,
     daemon: DaemonId,
     pipe: RelaySocket,
-    /// The session's endpoints that the daemon was told of.
+    /// The session's endpoints that were announced to the daemon.
     own: BTreeMap<Gid, Arc<Endpoint>>,
-    /// Those that it does not take.
+    /// The session's endpoints that the daemon has refused.
     refused: BTreeSet<Gid>,
-    /// Those among them that write and are gone, and may have left something; whether the daemon was
-    /// told that they have.
+    /// Writing endpoints among `own` that are gone and may have left messages, each with whether the daemon was told
+    /// that it is leaving.
     ending: BTreeMap<Gid, bool>,
-    /// Whether one of them waits for something else before it is told of.
+    /// True if an endpoint of the session cannot be announced yet.
     held_back: bool,
-    /// Those that read and are gone, until the daemon has answered that.
+    /// Reading endpoints that are gone, until the daemon has confirmed that.
     parting: BTreeSet<Gid>,
-    /// With whom the daemon says they are matched.
+    /// The matches of the session's endpoints, as the daemon reports them.
     matched: HashMap<Gid, BTreeSet<Gid>>,
-    /// One for each of its publishers of which something crosses.
+    /// A relay for each of the session's publishers whose samples cross.
     relays: BTreeMap<Gid, SessionRelay>,
     stand_ins: BTreeMap<Gid, SessionStandIn>,
-    /// What the session's clients ask.
+    /// The requests of the session's clients.
     calls: CallChannels,
-    /// Their requests that have no response.
+    /// The clients' requests that have no response.
     unanswered: Unanswered,
-    /// Since when the daemon knows of each of its clients.
+    /// The time at which each client was announced to the daemon.
     asking: HashMap<Gid, Instant>,
-    /// Those whose requests wait until they have been matched outside with all that they count.
+    /// Clients whose requests wait until the daemon has matched them with all servers that they count, each with the
+    /// end of the wait.
     settling: HashMap<Gid, Instant>,
-    /// The clients outside whom the daemon may let each of its servers answer.
+    /// The remote clients that each of its servers may answer, as reported to the daemon.
     callers: BTreeMap<Gid, BTreeSet<Gid>>,
     alive: Alive,
-    /// The endpoints outside.
+    /// The remote endpoints, each with its daemon.
     world: HashMap<Gid, (DaemonId, Endpoint)>,
 }
 
@@ -159,8 +160,8 @@ impl<'a> RelayConnection<'a> {
         // A client may have ended while there was no daemon.
         let graph = common.outside.graph();
         unanswered.keep_clients(|client| graph.endpoints.contains_key(client));
-        // This end trusts its daemon with memory: there is one, and it takes what it is given credit
-        // for.
+        // This end trusts its daemon with memory: there is one daemon, and this end takes only as much as it gives
+        // credit for.
         let incoming =
             IncomingFlow::new(common.shared.core.config.max_message, ArrivalPool::new(u64::MAX));
         let socket = PassedFd::connection(connected.socket).trusted();
@@ -283,7 +284,7 @@ impl<'a> RelayConnection<'a> {
                     relay.acknowledge(sequence);
                 }
             }
-            // It comes before the credit that confirms them.
+            // It comes before the credit that confirms the samples.
             SessionMessage::GivenUp(RelayGivenUp { writer, samples, .. }) => {
                 if let Some(relay) = self.relays.get(&writer) {
                     relay.lose(samples);
@@ -299,7 +300,7 @@ impl<'a> RelayConnection<'a> {
                     self.refuse(gid, reason);
                 }
             }
-            // What a daemon never says is not worth more than not being heard.
+            // A message that a daemon never sends is ignored.
             _ => {}
         }
     }
@@ -313,7 +314,7 @@ impl<'a> RelayConnection<'a> {
         }
         for item in graph.added {
             let daemon = item.daemon.unwrap_or(self.daemon);
-            // This process knows better what its own endpoints are.
+            // The local registry describes this process's own endpoints.
             if !item.endpoint.gid.is_of(&self.common.shared.core.id) {
                 changes.entry(daemon).or_default().0.push(item.endpoint.clone());
                 self.world.insert(item.endpoint.gid, (daemon, item.endpoint));
@@ -329,7 +330,7 @@ impl<'a> RelayConnection<'a> {
         daemons.iter().for_each(|daemon| self.common.local_registry.outside_gone(daemon));
     }
 
-    /// Brings what the daemon knows of the session, and the session of the world, up to date.
+    /// Brings the daemon's knowledge of the session, and the session's knowledge of remote endpoints, up to date.
     fn update(&mut self) -> Result<(), End> {
         self.tell_endpoints()?;
         self.announce_ended()?;
@@ -398,8 +399,7 @@ impl<'a> RelayConnection<'a> {
         Ok(())
     }
 
-    /// Publishers that ended before the next daemon had all of what they left are announced to it once
-    /// more.
+    /// Announces once more the publishers that ended before the next daemon had all their samples.
     fn announce_ended(&mut self) -> Result<(), End> {
         let kept = self.relays.values_mut().filter(|relay| relay.is_carried_over());
         let untold = kept.filter(|relay| !self.own.contains_key(&relay.publisher().gid));
@@ -421,7 +421,7 @@ impl<'a> RelayConnection<'a> {
         self.pipe.say(&SessionMessage::EndpointGone(Gone { gid }))
     }
 
-    /// The daemon does not take an endpoint: it knows nothing of it.
+    /// Handles the daemon's refusal of an endpoint: the daemon does not know the endpoint.
     fn refuse(&mut self, gid: Gid, why: String) {
         if self.let_go(&gid).is_some() {
             self.ending.remove(&gid);
@@ -434,7 +434,7 @@ impl<'a> RelayConnection<'a> {
         self.common.shared.refuse(gid, why);
     }
 
-    /// Nothing that an endpoint of the session writes crosses any more.
+    /// Stops all outgoing messages of an endpoint of the session. Returns the endpoint, if it was announced.
     fn let_go(&mut self, gid: &Gid) -> Option<Arc<Endpoint>> {
         self.callers.remove(gid);
         self.asking.remove(gid);
@@ -447,7 +447,7 @@ impl<'a> RelayConnection<'a> {
         self.own.values().all(|e| self.has_left(e))
     }
 
-    /// Whether all that an endpoint has written is with the daemon.
+    /// Returns whether the daemon has all messages of an endpoint.
     fn has_left(&self, endpoint: &Endpoint) -> bool {
         match endpoint.kind {
             EndpointKind::Publisher => self.is_published(&endpoint.gid),
@@ -463,7 +463,7 @@ impl<'a> RelayConnection<'a> {
                 self.ending.remove(&gid);
                 self.tell_gone(gid)?;
             } else if self.is_revived(&gid) {
-                // The readers of one that leaves are told of it only where they knew it before.
+                // The daemon tells readers that a publisher is leaving only if they knew the publisher before.
             } else if self.ending.insert(gid, true) == Some(false) {
                 self.pipe.say(&SessionMessage::Leaving(WriterLeaving { gid, leaving: true }))?;
             }

@@ -16,7 +16,7 @@ use crate::{
     },
 };
 
-/// Between attempts to find a daemon.
+/// Shortest pause between attempts to find a daemon.
 const MIN_PAUSE: Duration = Duration::from_millis(100);
 const MAX_PAUSE: Duration = Duration::from_secs(2);
 
@@ -26,18 +26,18 @@ impl RelayContext {
         self.finish.load(Ordering::Acquire)
     }
 
-    /// Until when a session that ends waits for what it has left to be where it is to go.
+    /// Returns the time until which an ending session waits for the delivery of its messages.
     pub(super) fn finish_by(&self) -> Option<Instant> {
         self.finishes().then(|| *self.finish_by.get_or_init(|| Instant::now() + LINGER))
     }
 
-    /// Whether it waits no longer.
+    /// Returns whether the time of an ending session is over.
     pub(super) fn is_over(&self) -> bool {
         self.finish_by().is_some_and(|by| Instant::now() >= by)
     }
 
-    /// Another daemon; `None` when the session ends. `brief` says that the last one was as good as
-    /// none.
+    /// Connects to another daemon; returns `None` if the session ends. `brief` is true if the last connection ended
+    /// almost at once: the first attempt then waits, too.
     pub(super) fn reconnect(&self, brief: bool, kept: &mut LeftByConnection) -> Option<Connected> {
         let mut pause = MIN_PAUSE;
         let mut wait = brief;

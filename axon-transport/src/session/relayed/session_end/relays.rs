@@ -31,71 +31,74 @@ pub(super) struct SessionRelay {
     stands_for: BTreeSet<Gid>,
     /// Samples that it has lost, as far as the daemon knows.
     lost: u64,
-    /// It comes from an earlier connection, and sends nothing before this.
+    /// Set for a relay from an earlier connection, which sends nothing until its readers are matched again or the time
+    /// is over.
     awaits: Option<Awaits>,
-    /// Its publisher had ended when this daemon was told of it.
+    /// True if its publisher had ended when it was announced to this daemon.
     revived: bool,
 }
 
-/// The readers for which a relay waits, and how long: they lose what is sent before they are matched.
+/// The readers that a relay waits for, and the end of the wait. They would lose samples that are sent before they are
+/// matched.
 struct Awaits {
     readers: BTreeSet<Gid>,
     until: Instant,
 }
 
-/// How long samples that a daemon did not confirm are kept for their readers, once that daemon is gone.
+/// Time for which unconfirmed samples are kept for their readers after their daemon is gone.
 pub(super) const ABSENCE: Duration = Duration::from_secs(10);
 
 impl SessionRelay {
-    /// When its publisher was last alive, if that has a lease.
+    /// Returns when its publisher was last alive, if the publisher has a lease.
     pub(super) fn assertions(&self) -> Vec<(Gid, u64)> {
         self.subscription.assertions()
     }
 
-    /// Its publisher.
+    /// Returns its publisher.
     pub(super) fn publisher(&self) -> &Endpoint {
         &self.publisher
     }
 
-    /// Its publisher, which has ended, is announced for the sake of what it left.
+    /// Returns its publisher, which has ended, so that it is announced for the samples that it left.
     pub(super) fn resume(&mut self) -> Arc<Endpoint> {
         self.revived = true;
         Arc::clone(&self.publisher)
     }
 
-    /// The publisher's samples up to this number are where they are to go.
+    /// Records that the publisher's samples up to this number are delivered.
     pub(super) fn acknowledge(&self, sequence: u64) {
         self.subscription.acknowledge_of(&self.publisher.gid, sequence);
     }
 
-    /// The daemon says that so many of the publisher's samples do not get where they are to go.
+    /// Gives up `samples` samples of the publisher, which the daemon reported as undeliverable.
     pub(super) fn lose(&self, samples: u64) {
         self.subscription.give_up(self.publisher.gid, samples);
     }
 
-    /// How long it still waits at most for the readers that it had before the last daemon was gone.
+    /// Returns how long the relay still waits at most for the readers that it had with the last daemon.
     pub(super) fn waits_for(&self) -> Option<Duration> {
         let until = self.awaits.as_ref()?.until;
         Some(until.saturating_duration_since(Instant::now())).filter(|left| !left.is_zero())
     }
 
-    /// Whether it does.
+    /// Returns whether the relay waits for its earlier readers.
     fn waits(&self) -> bool {
         self.waits_for().is_some()
     }
 
-    /// Whether it comes from an earlier connection, and it is not decided yet how it goes on.
+    /// Returns whether the relay comes from an earlier connection, and still waits for its readers or for the decision
+    /// how to go on.
     pub(super) fn is_carried_over(&self) -> bool {
         self.awaits.is_some()
     }
 
-    /// Samples that are not where they are to go.
+    /// Returns the number of samples that are not confirmed.
     pub(super) fn unconfirmed(&self) -> u64 {
         self.subscription.unacknowledged().remove(&self.publisher.gid).unwrap_or(0)
     }
 
-    /// Its readers did not come back, and nobody else reads: its publisher and the log are told what is
-    /// lost.
+    /// Gives up the unconfirmed samples, because the readers did not come back and no other reader exists. Tells the
+    /// publisher, and logs the loss.
     pub(super) fn give_up(&self) {
         let samples = self.unconfirmed();
         if samples > 0 {
@@ -105,20 +108,20 @@ impl SessionRelay {
         }
     }
 
-    /// The next sample of its publisher.
+    /// Takes the next sample of its publisher.
     pub(super) fn take(&mut self) -> Option<OutboundSample<SamplePayload>> {
         if self.is_carried_over() {
             return None;
         }
         let (content, now) = self.subscription.take_from(&self.publisher.gid)?;
         let before = std::mem::replace(&mut self.lost, now);
-        // Where the publisher has granted anew, it counts from 0.
+        // If the publisher has granted anew, the count starts from 0.
         let lost = now.checked_sub(before).unwrap_or(now);
         Some(OutboundSample { meta: content.meta(), lost, content: SamplePayload::Ring(content) })
     }
 
-    /// Takes back what was not confirmed, to be sent through the next daemon; whether it is kept for
-    /// that. Its publisher waits for it as before, and counts none of its readers meanwhile.
+    /// Takes back the unconfirmed samples, to send them through the next daemon. Returns whether the relay is kept for
+    /// that. The publisher waits for the relay as before, and counts none of its readers meanwhile.
     fn outlive_connection(&mut self) -> bool {
         let readers = match self.awaits.take() {
             Some(awaits) if awaits.until > Instant::now() => awaits.readers,
@@ -135,7 +138,7 @@ impl SessionRelay {
     }
 }
 
-/// Lets go of the relays that waited for too long while there is no daemon.
+/// Removes the relays that waited for too long while there is no daemon.
 pub(super) fn drop_overdue(kept: &mut BTreeMap<Gid, SessionRelay>) {
     kept.retain(|_, relay| {
         let waits = relay.waits();
@@ -147,7 +150,7 @@ pub(super) fn drop_overdue(kept: &mut BTreeMap<Gid, SessionRelay>) {
 }
 
 impl RelayConnection<'_> {
-    /// The relays that outlive the connection.
+    /// Returns the relays that outlive the connection.
     pub(super) fn keep_relays(&mut self) -> BTreeMap<Gid, SessionRelay> {
         let mut relays = std::mem::take(&mut self.relays);
         relays.retain(|_, relay| relay.outlive_connection());
@@ -210,21 +213,21 @@ impl RelayConnection<'_> {
         }
     }
 
-    /// Whether all that a publisher has published is where it is to go.
+    /// Returns whether all samples of a publisher are delivered.
     pub(super) fn is_published(&self, publisher: &Gid) -> bool {
         let relay = self.relays.get(publisher);
         relay.is_none_or(|relay| relay.unconfirmed() == 0)
             && self.pipe.outgoing.is_idle(&FlowChannel::of(*publisher))
     }
 
-    /// Whether the daemon was told of a publisher after it had ended.
+    /// Returns whether a publisher was announced to the daemon after it had ended.
     pub(super) fn is_revived(&self, publisher: &Gid) -> bool {
         self.relays.get(publisher).is_some_and(|relay| relay.revived)
     }
 }
 
-/// What a relay requests to get all that its publisher offers: whether that is held back is up to the
-/// publisher's QoS, as ever.
+/// Returns the QoS with which a relay requests all that its publisher offers. The publisher's QoS decides, as always,
+/// whether it waits for the relay.
 fn requested(offered: &Qos) -> Qos {
     let newest =
         offered.reliability == Reliability::BestEffort && offered.history == History::KeepLast;

@@ -1,8 +1,8 @@
 //! Calls that outlive a connection: the daemon's process may have ended and taken requests and responses with it.
 //!
-//! The stand-ins of clients and servers on this host stay for a while, though nobody counts them. When the next daemon
-//! matches them again, the session sends the requests that have no response once more, and the servers' responses that
-//! were not confirmed. A server drops a request that it had, and a client's process drops a response that it had.
+//! The stand-ins of clients and servers on this host stay for a while, though no endpoint counts them. When the next
+//! daemon matches them again, the session sends the unanswered requests and the servers' unconfirmed responses once
+//! more. A server drops a request that it had, and a client's process drops a response that it had.
 
 use std::{
     collections::BTreeMap,
@@ -21,7 +21,7 @@ use crate::{
 };
 
 impl LeftByConnection {
-    /// Lets go of what waited for too long while there is no daemon.
+    /// Removes the relays and calls that waited for too long while there is no daemon.
     pub(super) fn drop_overdue(&mut self) {
         drop_overdue(&mut self.relays);
         let KeptCalls { stand_ins, unanswered, .. } = &mut self.calls;
@@ -30,8 +30,8 @@ impl LeftByConnection {
 }
 
 impl KeptCalls {
-    /// What of them a connection to this daemon goes on with. One that lives on told the other ends that this session
-    /// had ended: what was under way is lost, and the clients see their servers go.
+    /// Returns the calls that a connection to this daemon continues. A daemon that lives on has told the other ends
+    /// that this session had ended: calls in flight are lost, and the clients see their servers go.
     pub(super) fn for_daemon(self, daemon: DaemonId) -> Self {
         if self.daemon == Some(daemon) {
             Self { response_log: self.response_log, ..Self::default() }
@@ -41,7 +41,7 @@ impl KeptCalls {
     }
 }
 
-/// Lets go of the stand-ins that waited for too long: the clients see these servers go.
+/// Removes the stand-ins that waited for too long: the clients see these servers go.
 fn forget_overdue(stand_ins: &mut BTreeMap<Gid, SessionStandIn>, unanswered: &mut Unanswered) {
     let now = Instant::now();
     let overdue: Vec<Gid> =
@@ -60,14 +60,15 @@ fn forget_overdue(stand_ins: &mut BTreeMap<Gid, SessionStandIn>, unanswered: &mu
 }
 
 impl RelayConnection<'_> {
-    /// The calls that outlive the connection.
+    /// Returns the calls that outlive the connection.
     pub(super) fn keep_calls(&mut self) -> KeptCalls {
         let until = Instant::now() + ABSENCE;
         let mut stand_ins = std::mem::take(&mut self.stand_ins);
         let mut unanswered = std::mem::take(&mut self.unanswered);
         stand_ins.retain(|gid, stand_in| {
             let kind = stand_in.remote_writer().endpoint().kind;
-            // A host that is reached through the daemon learns of its end, and gives up what was under way.
+            // A host that is reached through the daemon learns that the daemon has ended, and gives up the calls in
+            // flight.
             let near = self.world.get(gid).is_some_and(|(daemon, _)| *daemon == self.daemon);
             let kept = matches!(kind, EndpointKind::Client | EndpointKind::Server)
                 && (near || stand_in.is_kept());
@@ -92,12 +93,12 @@ impl RelayConnection<'_> {
         }
     }
 
-    /// Lets go of the stand-ins that waited for too long.
+    /// Removes the stand-ins that waited for too long.
     pub(super) fn forget_overdue(&mut self) {
         forget_overdue(&mut self.stand_ins, &mut self.unanswered);
     }
 
-    /// How long the first of them still waits.
+    /// Returns how long the first kept stand-in still waits.
     pub(super) fn kept_for(&self) -> Option<Duration> {
         let until = self.stand_ins.values().filter_map(SessionStandIn::kept_until).min()?;
         Some(until.saturating_duration_since(Instant::now()))

@@ -27,7 +27,7 @@ const SETTLING: Duration = Duration::from_secs(1);
 pub(super) struct SessionStandIn {
     remote_writer: RemoteWriter,
     since: Instant,
-    /// Whether the remote writer is gone and has left messages.
+    /// True if the remote writer is gone and has left messages.
     leaving: bool,
     /// Set for a stand-in from an earlier connection: it ends at this time unless it is matched by then.
     kept_until: Option<Instant>,
@@ -96,7 +96,7 @@ impl RelayConnection<'_> {
         }
         let others: BTreeSet<Gid> = others.into_iter().collect();
         let before = self.matched.insert(gid, others.clone()).unwrap_or_default();
-        // A server that was not matched before is not waiting for any of these requests.
+        // A server that was not matched before does not expect any of these requests.
         self.unanswered.resend(&gid, &others.difference(&before).copied().collect());
         if !before.is_subset(&others) {
             self.forget_unwanted();
@@ -191,8 +191,8 @@ impl RelayConnection<'_> {
         Ok(())
     }
 
-    /// Marks the stand-ins whose writer is gone from the graph, so that no endpoint counts them. They stay
-    /// for the messages that the writer has left.
+    /// Marks the stand-ins whose writer is gone from the graph, so that no endpoint counts them. They stay for the
+    /// remaining messages of the writer.
     pub(super) fn note_leaving(&mut self) {
         for (gid, stand_in) in &mut self.stand_ins {
             let leaving = !self.world.contains_key(gid);

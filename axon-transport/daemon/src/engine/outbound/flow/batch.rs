@@ -1,60 +1,60 @@
-//! The messages that a flow sealed together, while QUIC takes them.
+//! A batch of messages that a flow sealed together, until QUIC has taken it.
 
 use std::collections::VecDeque;
 
 use bytes::Bytes;
 
-/// A message that was sealed and is not entirely with QUIC.
+/// A sealed message that is not entirely with QUIC.
 #[derive(Debug)]
 pub(super) struct Sealed {
     pub(super) sequence: u64,
     /// Bytes of the serialized message.
     pub(super) length: usize,
-    /// Where its frame ends, in bytes of the batch.
+    /// The end of its frame, in bytes of the batch.
     pub(super) end: u64,
 }
 
 /// A batch of sealed messages.
 #[derive(Debug, Default)]
 pub(super) struct Batch {
-    /// What QUIC has not taken.
+    /// The part that QUIC has not taken.
     chunks: VecDeque<Bytes>,
     sealed: VecDeque<Sealed>,
-    /// Where the frame of the first of them begins, in bytes of the batch.
+    /// The start of the first sealed message's frame, in bytes of the batch.
     begin: u64,
     /// Bytes that QUIC has taken.
     taken: u64,
 }
 
 impl Batch {
-    /// Whether QUIC has all of it.
+    /// Returns whether QUIC has all of it.
     pub(super) fn is_empty(&self) -> bool {
         self.chunks.is_empty()
     }
 
-    /// Bytes that QUIC has not taken.
+    /// Returns the number of bytes that QUIC has not taken.
     pub(super) fn left(&self) -> usize {
         self.chunks.iter().map(Bytes::len).sum()
     }
 
-    /// Forgets it, for the next one.
+    /// Clears the batch for the next one.
     pub(super) fn clear(&mut self) {
         self.chunks.clear();
         self.sealed.clear();
         (self.begin, self.taken) = (0, 0);
     }
 
-    /// A message belongs to it.
+    /// Adds a message to the batch.
     pub(super) fn add(&mut self, sealed: Sealed) {
         self.sealed.push_back(sealed);
     }
 
-    /// The bytes of all its messages.
+    /// Adds the bytes of all its messages.
     pub(super) fn set_chunks(&mut self, chunks: impl IntoIterator<Item = Bytes>) {
         self.chunks.extend(chunks);
     }
 
-    /// Puts bytes before its first message, of which QUIC has taken nothing.
+    /// Puts bytes in front of its first message, of which QUIC has taken nothing.
     pub(super) fn put_before(&mut self, bytes: &[u8]) {
         self.chunks.push_front(Bytes::copy_from_slice(bytes));
         self.sealed.iter_mut().for_each(|sealed| sealed.end += bytes.len() as u64);
@@ -70,8 +70,8 @@ impl Batch {
         self.chunks.drain(..chunks);
     }
 
-    /// QUIC took so many bytes. `each` is told of the messages that it has a part of, or the rest now: how many bytes of
-    /// the frame it has, and whether that is all.
+    /// QUIC took so many bytes. `each` is told of the messages that it has a part of, or the rest now: how many bytes
+    /// of the frame it has, and whether that is all.
     pub(super) fn handle_taken(&mut self, bytes: u64, mut each: impl FnMut(&Sealed, u64, bool)) {
         self.taken += bytes;
         while let Some(sealed) = self.sealed.front() {

@@ -25,9 +25,9 @@ use crate::{
 
 /// A sample without a lifespan that is older than this once it has crossed the link is dropped for a newer one.
 pub(super) const DEFAULT_LIFESPAN: Duration = Duration::from_millis(200);
-/// A sample that QUIC did not deliver within this time is given up.
+/// Maximum time that QUIC may take to deliver a sample, which is then given up.
 const DELIVERY_TIMEOUT: Duration = Duration::from_secs(10);
-/// So many samples may be under way whatever the congestion window.
+/// Number of samples that may be in flight whatever the congestion window.
 const ALWAYS: usize = 2;
 
 /// A sample that QUIC does not have entirely.
@@ -38,18 +38,18 @@ struct Writing {
     sample: SampleInFlight,
 }
 
-/// A sample on its way.
+/// A sample in flight.
 #[derive(Debug)]
 struct SampleInFlight {
     stream: StreamId,
     priority: i32,
-    /// With header and envelope.
+    /// Bytes including header and envelope.
     bytes: u64,
-    /// Bytes of the serialized message, and of what is sent of it.
+    /// Bytes of the serialized message; `payload` has the bytes that are sent of it.
     length: usize,
     payload: usize,
     begun: Duration,
-    /// When it is given up.
+    /// The time at which it is given up.
     deadline: Duration,
     /// The credit that it uses.
     _credit: CreditShare,
@@ -60,34 +60,34 @@ struct SampleInFlight {
 pub(super) struct BestEffort {
     writing: Option<Writing>,
     under_way: VecDeque<SampleInFlight>,
-    /// Samples that arrived.
+    /// Number of samples that arrived.
     arrived: u64,
-    /// What the last sample took to arrive.
+    /// The time that the last sample took to arrive.
     took: Duration,
 }
 
 impl BestEffort {
-    /// Whether QUIC has a part of a sample.
+    /// Returns whether QUIC has a part of a sample.
     pub(super) fn is_writing(&self) -> bool {
         self.writing.is_some()
     }
 
-    /// How many samples arrived.
+    /// Returns the number of samples that arrived.
     pub(super) fn arrived(&self) -> u64 {
         self.arrived
     }
 
-    /// Whether no sample is under way.
+    /// Returns whether no sample is in flight.
     pub(super) fn is_idle(&self) -> bool {
         self.writing.is_none() && self.under_way.is_empty()
     }
 
-    /// The stream of a sample that QUIC does not have entirely. It is given up.
+    /// Takes the stream of a sample that QUIC does not have entirely. The sample is given up.
     pub(super) fn take_cut(&mut self) -> Option<StreamId> {
         Some(self.writing.take()?.stream)
     }
 
-    /// Whether QUIC may take the next sample now, once those are dropped that are too late.
+    /// Drops samples that are too late. Returns the reason why QUIC may not take the next sample now, if it may not.
     pub(super) fn look_at_next(
         &mut self,
         info: &FlowInfo,
@@ -107,7 +107,7 @@ impl BestEffort {
         queue.peek().is_none().then_some(FlowPause::Empty)
     }
 
-    /// Hands the next sample, or a part of it, to QUIC. `None`: go on.
+    /// Hands the next sample, or a part of it, to QUIC. Returns `None` if the flow can continue.
     #[expect(clippy::too_many_arguments, reason = "the parts of a flow, borrowed one by one")]
     pub(super) fn write(
         &mut self,
@@ -189,7 +189,7 @@ impl BestEffort {
         }
     }
 
-    /// The peer's QUIC has all of a sample, or wants no more of it.
+    /// Handles the end of a sample's stream: the peer's QUIC has all of the sample, or wants no more of it.
     pub(super) fn handle_finished(
         &mut self,
         now: Duration,
@@ -209,13 +209,13 @@ impl BestEffort {
         }
     }
 
-    /// When the next sample is given up.
+    /// Returns when the next sample is given up.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         let writing = self.writing.as_ref().map(|writing| writing.sample.deadline);
         self.under_way.iter().map(|sample| sample.deadline).chain(writing).min()
     }
 
-    /// The peer wants no more of a sample.
+    /// Handles that the peer wants no more of a sample.
     pub(super) fn handle_stopped(
         &mut self,
         stream: StreamId,
@@ -248,7 +248,7 @@ impl BestEffort {
             !over
         });
         for stream in &late {
-            // Not finished: the sample would look whole.
+            // Reset, not finished: otherwise the sample would look complete.
             let _ = carrier.quic.send_stream(*stream).reset(goodbye());
             carrier.streams.remove(stream);
         }
@@ -256,7 +256,8 @@ impl BestEffort {
         !late.is_empty()
     }
 
-    /// A new link carries the flow. The old one delivers what it has, and the rest of a sample if it takes it.
+    /// Moves the flow to a new link. The old link delivers the samples that it has, and the rest of a sample if it
+    /// takes that.
     pub(super) fn leave(
         &mut self,
         old: Option<&mut Connection>,
@@ -282,7 +283,7 @@ impl BestEffort {
         }
     }
 
-    /// The link is over: what was under way is lost.
+    /// Handles the end of the link: samples in flight are lost.
     pub(super) fn link_over(&mut self, counters: &Counters, topic: &Arc<str>) {
         let lost = self.under_way.len() + usize::from(self.writing.is_some());
         counters.lost(topic, "no_link", lost as u64);

@@ -1,4 +1,4 @@
-//! Asks whether the next samples of one flow become shorter, while the link is so slow that it pays.
+//! Asks the compressor for the next samples of one flow, if the link is so slow that compression pays.
 
 use std::time::Duration;
 
@@ -12,22 +12,22 @@ use crate::engine::{
     quic::connection::Carrier,
 };
 
-/// Bytes of samples of a flow, and samples, that are compressed before the link takes them.
+/// Maximum bytes and number of samples of a flow that are compressed before the link takes them.
 const AHEAD: (usize, usize) = (256 << 10, 256);
-/// After a sample that does not become shorter so many are sent as they are.
+/// Number of samples that are sent uncompressed after one that did not become shorter.
 const PASSED: u32 = 64;
 
-/// What is known of the samples of a flow.
+/// The results of compressing the samples of a flow.
 #[derive(Debug, Default)]
 pub(super) struct Compressing {
-    /// Samples that are sent as they are, since one before them did not become shorter.
+    /// Number of samples still to be sent uncompressed, because an earlier one did not become shorter.
     passed: u32,
-    /// Whether the last one became shorter. If not, one at a time is tried.
+    /// True if the last sample became shorter. If not, one at a time is tried.
     is_worth_it: bool,
 }
 
 impl Compressing {
-    /// Asks for the next samples.
+    /// Asks the compressor for the next samples.
     pub(super) fn ask(
         &mut self,
         info: &FlowInfo,
@@ -74,7 +74,7 @@ impl Compressing {
         }
     }
 
-    /// A sample of this length that waits became this frame, or does not become shorter.
+    /// Handles the answer for a waiting sample of this length: it became this frame, or does not become shorter.
     pub(super) fn handle_answer(
         &mut self,
         frame: Option<&Bytes>,

@@ -1,9 +1,9 @@
-//! The credit for long samples towards one peer: what may be in flight at a time.
+//! The credit for long samples towards one peer: the amount that may be in flight at a time.
 //!
-//! A receiver reads no more of a long message while it has no memory for it. The bytes that wait there use up QUIC's
-//! connection window. If they use up all of it, the rest of the messages that do have memory cannot come, and the link
-//! stands still. So the samples in flight never use up the window, even if the receiver reads none of them, and the
-//! receiver has memory for all of them.
+//! A receiver stops reading a long message while it has no memory for it. The bytes that wait there use up QUIC's
+//! connection window. If they use up all of it, the rest of messages that do have memory cannot arrive, and the link
+//! makes no progress. So the samples in flight never use up the window, even if the receiver reads none of them, and
+//! the receiver has memory for all of them.
 
 use std::{
     cell::Cell,
@@ -30,7 +30,7 @@ const MIN_CREDIT: u64 = 1 << 20;
 const LONG_SAMPLE_BYTES: usize = 31 << 10;
 /// Memory that the receiver counts for header and seal.
 const OVERHEAD: u64 = 1 << 10;
-/// Small samples of one flow may be in flight up to so many bytes, whatever the credit.
+/// Bytes of small samples of one flow that may be in flight, whatever the credit.
 pub(in crate::engine::outbound) const ALWAYS: u64 = 256 << 10;
 
 /// The part of the credit that samples in flight use.
@@ -43,7 +43,7 @@ pub(in crate::engine::outbound) struct UsedCredit {
 }
 
 impl UsedCredit {
-    /// What samples of one stream use: `bytes` in all, the longest of `longest` bytes.
+    /// Returns the credit that the samples of one stream use: `bytes` in all, the longest of `longest` bytes.
     pub(in crate::engine::outbound) fn of(bytes: usize, longest: usize) -> Self {
         let memory = if longest > LONG_SAMPLE_BYTES { longest as u64 + OVERHEAD } else { 0 };
         Self { window: (bytes as u64).min(STREAM_WINDOW.1), memory }
@@ -57,7 +57,7 @@ pub(in crate::engine::outbound) struct PeerCredit {
     used: Cell<UsedCredit>,
     /// Counts the changes after which a flow that had too little may have enough.
     grown: Cell<u64>,
-    /// Counts how often some came back.
+    /// Counts how often credit came back.
     returned: Cell<u64>,
 }
 
@@ -69,7 +69,7 @@ pub(in crate::engine::outbound) struct CreditShare {
 }
 
 impl PeerCredit {
-    /// The credit at a peer that has not said how much it has.
+    /// Creates the credit at a peer that has not reported its memory.
     pub(in crate::engine::outbound) fn new() -> Rc<Self> {
         Rc::new(Self {
             most: Cell::new(limit(&UNSAID)),
@@ -79,7 +79,7 @@ impl PeerCredit {
         })
     }
 
-    /// The peer said what it has; `None`: it has not said it over this link.
+    /// Sets the memory that the peer reported; `None` if it has not reported it over this link.
     pub(in crate::engine::outbound) fn set(&self, intake: Option<&ReceiveLimits>) {
         let most = limit(intake.unwrap_or(&UNSAID));
         let before = self.most.replace(most);
@@ -88,12 +88,12 @@ impl PeerCredit {
         }
     }
 
-    /// How often credit came back. While it does not, the peer takes nothing in.
+    /// Returns how often credit came back. While it does not change, the peer takes nothing in.
     pub(in crate::engine::outbound) fn returned(&self) -> u64 {
         self.returned.get()
     }
 
-    /// An unused share.
+    /// Creates an unused share.
     pub(in crate::engine::outbound) fn share(self: &Rc<Self>) -> CreditShare {
         CreditShare { of: Rc::clone(self), used: UsedCredit::default() }
     }
@@ -112,18 +112,18 @@ impl PeerCredit {
 }
 
 impl CreditShare {
-    /// Whether it uses any.
+    /// Returns whether it uses any credit.
     pub(in crate::engine::outbound) fn is_used(&self) -> bool {
         self.used != UsedCredit::default()
     }
 
-    /// Another share of the same peer, unused.
+    /// Creates another unused share of the same peer.
     pub(in crate::engine::outbound) fn sibling(&self) -> Self {
         self.of.share()
     }
 
-    /// Whether it may use this much. It may use any amount while the others use little: one sample may always be in
-    /// flight, however long it is.
+    /// Returns whether it may use this much. It may use any amount while the other shares use little: one sample may
+    /// always be in flight, however long it is.
     pub(in crate::engine::outbound) fn may_use(&self, after: UsedCredit) -> bool {
         let (most, all) = (self.of.most.get(), self.of.used.get());
         let others = UsedCredit {
@@ -137,7 +137,7 @@ impl CreditShare {
             && (after.memory == 0 || fits(others.memory, after.memory, most.memory))
     }
 
-    /// Uses this much from now on.
+    /// Sets the credit that it uses from now on.
     pub(in crate::engine::outbound) fn set(&mut self, used: UsedCredit) {
         self.of.change(self.used, used);
         self.used = used;
@@ -150,29 +150,30 @@ impl Drop for CreditShare {
     }
 }
 
-/// What samples in flight may use at a peer that has this much. One that says nearly nothing is taken to have [`MIN_CREDIT`].
+/// Returns the credit that samples in flight may use at a peer with this memory. A peer that reports nearly nothing
+/// counts as having [`LEAST`].
 fn limit(intake: &ReceiveLimits) -> UsedCredit {
     let (unread, memory) = (intake.unread.max(MIN_CREDIT), intake.messages.max(MIN_CREDIT));
     UsedCredit { window: window_credit(unread), memory }
 }
 
-/// Flows that wait for credit, in order. A flow that came later does not overtake one of its own rank or a higher one,
-/// so a long sample is not kept out by shorter ones.
+/// Flows that wait for credit, in order. A later flow does not overtake a flow of its own or a higher rank, so shorter
+/// samples do not keep out a long one.
 #[derive(Debug, Default)]
 pub(in crate::engine::outbound) struct CreditQueue {
     order: VecDeque<FlowId>,
-    /// The place of the rank of each.
+    /// The place of each flow's rank.
     places: HashMap<FlowId, usize>,
-    /// How many wait at each place.
+    /// Number of flows that wait at each place.
     at_place: [usize; RANKS],
-    /// What `grown` was when the flows were taken out last.
+    /// The value of `grown` when the flows were last taken out.
     seen: u64,
-    /// A flow left the queue: those behind it may have enough.
+    /// True if a flow left the queue: the flows behind it may have enough.
     left: bool,
 }
 
 impl CreditQueue {
-    /// A flow of a rank at this place waits.
+    /// Adds a flow that waits, of the rank at this place.
     pub(in crate::engine::outbound) fn add(&mut self, flow: FlowId, place: usize) {
         if self.places.insert(flow, place).map(|before| self.at_place[before] -= 1).is_none() {
             self.order.push_back(flow);
@@ -180,7 +181,7 @@ impl CreditQueue {
         self.at_place[place] += 1;
     }
 
-    /// A flow is gone.
+    /// Forgets a flow that is gone.
     pub(in crate::engine::outbound) fn forget(&mut self, flow: FlowId) {
         if let Some(place) = self.places.remove(&flow) {
             self.at_place[place] -= 1;
@@ -189,7 +190,7 @@ impl CreditQueue {
         }
     }
 
-    /// Whether flows that wait may have enough now.
+    /// Returns whether flows that wait may have enough now.
     pub(in crate::engine::outbound) fn is_due(&self, credit: &PeerCredit) -> bool {
         !self.order.is_empty() && (self.left || self.seen != credit.grown.get())
     }
@@ -202,17 +203,17 @@ impl CreditQueue {
         std::mem::take(&mut self.order)
     }
 
-    /// The place of the highest rank that waits. Flows of this rank and of lower ones wait, too.
+    /// Returns the place of the highest rank that waits. Flows of this rank and of lower ones wait, too.
     pub(in crate::engine::outbound) fn closed_from(&self) -> Option<usize> {
         self.at_place.iter().position(|flows| *flows > 0)
     }
 
-    /// Whether no flow waits.
+    /// Returns whether no flow waits.
     pub(in crate::engine::outbound) fn is_empty(&self) -> bool {
         self.order.is_empty()
     }
 
-    /// How many flows wait.
+    /// Returns the number of waiting flows.
     #[cfg(test)]
     pub(in crate::engine::outbound) fn len(&self) -> usize {
         self.order.len()

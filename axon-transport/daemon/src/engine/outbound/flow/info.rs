@@ -14,7 +14,7 @@ use crate::engine::{
     },
 };
 
-/// What a flow carries over which route, and how the peer reads it.
+/// The content and route of a flow, and the formats that the peer reads.
 #[derive(Clone, Debug)]
 pub(in crate::engine::outbound) struct FlowInfo {
     pub(in crate::engine::outbound) route_number: u32,
@@ -22,19 +22,19 @@ pub(in crate::engine::outbound) struct FlowInfo {
     pub(in crate::engine::outbound) of: Gid,
     pub(super) topic: Arc<str>,
     pub(super) route: Route,
-    /// Of the topic.
+    /// The priority of the topic.
     pub(super) priority: TopicPriority,
-    /// Whether the peer acknowledges the samples.
+    /// True if the peer acknowledges the samples.
     pub(super) acknowledged: bool,
-    /// Whether the peer reads short headers.
+    /// True if the peer reads short headers.
     pub(super) short_headers: bool,
-    /// Whether its samples may be compressed. Of a flow that is not acknowledged nothing says when a stream with short headers
-    /// may be followed by one without.
+    /// True if its samples may be compressed. Without acknowledgements, a flow does not know when a stream with short
+    /// headers may be followed by one without.
     pub(super) compressed: bool,
 }
 
 impl FlowInfo {
-    /// The flow of a publisher, or client, over a route.
+    /// Describes the flow of a publisher, or client, over a route.
     pub(super) fn new(of: Gid, route: &FlowRoute) -> Self {
         Self {
             route_number: route.number,
@@ -48,23 +48,23 @@ impl FlowInfo {
         }
     }
 
-    /// Whether it carries the requests or responses of a service.
+    /// Returns whether it carries the requests or responses of a service.
     pub(super) fn is_service(&self) -> bool {
         self.route.kind != Kind::Topic
     }
 
-    /// The rank of a sample of this length.
+    /// Returns the rank of a sample of this length.
     pub(super) fn rank(&self, reliable: bool, length: usize) -> Rank {
         let class = Class::of(self.is_service(), reliable, length);
         Rank { priority: self.priority, class }
     }
 
-    /// The rank of a BEST_EFFORT sample of this length. No service has any.
+    /// Returns the rank of a BEST_EFFORT sample of this length. Services have none.
     pub(super) fn best_effort_rank(&self, length: usize) -> Rank {
         Rank { priority: self.priority, class: Class::of(false, false, length) }
     }
 
-    /// The header of a stream of RELIABLE samples.
+    /// Returns the header of a stream of RELIABLE samples.
     pub(super) fn reliable_header(&self, short: bool) -> StreamHeader {
         StreamHeader {
             reliable: true,
@@ -75,7 +75,7 @@ impl FlowInfo {
         }
     }
 
-    /// The header of the stream of one BEST_EFFORT sample.
+    /// Returns the header of the stream of one BEST_EFFORT sample.
     pub(super) fn best_effort_header(&self, short: bool) -> StreamHeader {
         let (route, of) = (self.route_number, self.of);
         StreamHeader { reliable: false, short, acknowledged: false, route, of }

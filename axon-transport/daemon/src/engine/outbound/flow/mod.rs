@@ -72,11 +72,11 @@ pub(super) struct Flow {
     reliable: ReliableStream,
     best_effort: BestEffort,
     compressing: Compressing,
-    /// Whether QUIC takes no more until it signals room.
+    /// True if QUIC takes no more until it signals room.
     pub(super) blocked: bool,
-    /// Whether the peer did not take in the next sample in the flow's last turn.
+    /// True if the peer did not take in the next sample in the flow's last turn.
     pub(super) waits_for_credit: bool,
-    /// Whether the flow's samples were given up.
+    /// True if the flow's samples were given up.
     is_given_up: bool,
     /// When [`handle_timeout`](Self::handle_timeout) is due; `None` if it is not.
     pub(super) timer: Option<Duration>,
@@ -394,7 +394,7 @@ impl Flow {
             return Some(pause);
         }
         if !self.best_effort.is_writing() {
-            // Once QUIC may take it, and no sooner: a newer one would have taken its place.
+            // Asked only once QUIC may take the sample: before, a newer sample could have replaced it.
             compressing.ask(info, queue, carrier, compression, counters, now);
             if queue.peek().is_some_and(RingSample::is_asked) {
                 return Some(FlowPause::Compressing);
@@ -407,7 +407,8 @@ impl Flow {
         pause
     }
 
-    /// An order is answered: the sample is sent as this frame, or as it is. It may be gone, and the order an earlier flow's.
+    /// Handles the answer to a compression order: the sample is sent as this frame, or uncompressed. The sample may be
+    /// gone, and the order may be an earlier flow's.
     pub(super) fn handle_compressed(
         &mut self,
         order: u64,
@@ -419,7 +420,7 @@ impl Flow {
         }
     }
 
-    /// The peer's QUIC has all of this best-effort stream.
+    /// Handles that the peer's QUIC has all of this best-effort stream.
     pub(super) fn handle_finished(
         &mut self,
         now: Duration,
@@ -430,7 +431,7 @@ impl Flow {
         self.best_effort.handle_finished(now, stream, quic, counters);
     }
 
-    /// The peer stopped this stream.
+    /// Handles that the peer stopped this stream.
     pub(super) fn handle_stopped(
         &mut self,
         stream: StreamId,

@@ -31,38 +31,39 @@ use crate::{
     link::CloseCode,
 };
 
-/// Bytes of samples that are sealed and written together.
+/// Maximum bytes of samples that are sealed and written together.
 pub(super) const TOGETHER: usize = 64 << 10;
-/// A sample of at most so many bytes is copied to its neighbours.
+/// Maximum length of a sample that is copied into one piece with its neighbours.
 const COPIED: usize = 4096;
 /// Bytes that count as progress of a long sample, if QUIC took them for the first time.
 const PART: u64 = 256 << 10;
-/// A stream that sent nothing for so long is finished.
+/// Time after which an idle stream is finished.
 pub(super) const STREAM_IDLE: Duration = Duration::from_secs(30);
 
-/// The stream of a flow's RELIABLE samples, and the batch that QUIC takes from. The samples themselves stay in the flow's
-/// queue until they are acknowledged or, where the peer acknowledges none, with QUIC.
+/// The stream of a flow's RELIABLE samples, and the batch that QUIC takes from. The samples themselves stay in the
+/// flow's queue until they are acknowledged or, if the peer acknowledges none, with QUIC.
 #[derive(Debug)]
 pub(super) struct ReliableStream {
     stream: Option<StreamId>,
     /// The headers of the stream, or of the one that the pending batch will open, if they are short.
     headers: Option<ShortHeaders>,
-    /// Whether its streams have no short headers since there were compressed samples, of which these say nothing.
+    /// True if its streams have no short headers because there were compressed samples, which short headers cannot
+    /// mark.
     compressed: bool,
-    /// The priority that QUIC knows of the stream.
+    /// The stream's priority in QUIC.
     priority: i32,
     batch: Batch,
-    /// The credit that the samples use that were sent over the stream.
+    /// The credit used by the samples that were sent over the stream.
     credit: CreditShare,
-    /// When the stream was opened, or handed something to QUIC last.
+    /// The time at which the stream was opened, or last handed data to QUIC.
     active_at: Duration,
-    /// Bytes that QUIC took for the first time, and how far.
+    /// Bytes that QUIC took for the first time; `sent_progress` has the position.
     new_bytes: u64,
     sent_progress: SentProgress,
 }
 
 impl ReliableStream {
-    /// No stream is open.
+    /// Creates the state without an open stream.
     pub(super) fn new(credit: CreditShare) -> Self {
         Self {
             stream: None,
@@ -77,47 +78,47 @@ impl ReliableStream {
         }
     }
 
-    /// Whether the stream is open.
+    /// Returns whether the stream is open.
     pub(super) fn is_open(&self) -> bool {
         self.stream.is_some()
     }
 
-    /// Whether this is its stream.
+    /// Returns whether this is its stream.
     pub(super) fn is(&self, stream: StreamId) -> bool {
         self.stream == Some(stream)
     }
 
-    /// Whether QUIC has not taken all of a batch.
+    /// Returns whether QUIC has not taken all of a batch.
     pub(super) fn is_writing(&self) -> bool {
         !self.batch.is_empty()
     }
 
-    /// Bytes of the batch that QUIC has not taken.
+    /// Returns the bytes of the batch that QUIC has not taken.
     pub(super) fn left(&self) -> usize {
         self.batch.left()
     }
 
-    /// The credit that its samples use.
+    /// Returns the credit that its samples use.
     pub(super) fn credit(&self) -> &CreditShare {
         &self.credit
     }
 
-    /// How often QUIC took a quarter of a MiB that it had never taken before.
+    /// Returns how often QUIC took a quarter of a MiB that it had never taken before.
     pub(super) fn parts(&self) -> u64 {
         self.new_bytes / PART
     }
 
-    /// How far QUIC took the samples.
+    /// Returns how far QUIC took the samples.
     pub(super) fn sent_progress(&self) -> SentProgress {
         self.sent_progress
     }
 
-    /// QUIC took them so far over a link before.
+    /// Continues from the position up to which QUIC took the samples over an earlier link.
     pub(super) fn go_on(&mut self, sent_progress: SentProgress) {
         self.sent_progress = self.sent_progress.max(sent_progress);
     }
 
-    /// Writes the pending batch, or seals the next one. `None`: go on.
+    /// Writes the pending batch, or seals the next one. Returns `None` if the flow can continue.
     #[expect(clippy::too_many_arguments, reason = "the parts of a flow, borrowed one by one")]
     pub(super) fn write(
         &mut self,
@@ -135,7 +136,7 @@ impl ReliableStream {
             }
             if !self.compressed && queue.peek().is_some_and(RingSample::is_compressed) {
                 if self.stream.is_some() && self.headers.is_some() {
-                    // The peer reads streams in the order in which it hears of them: it has to have heard of this one.
+                    // The peer reads streams in the order in which it learns of them: it must have learned of this one.
                     if queue.has_sent() {
                         return Some(FlowPause::Compressing);
                     }
@@ -172,7 +173,7 @@ impl ReliableStream {
         carrier.limit(rank);
         match carrier.quic.send_stream(stream).write_chunks(self.batch.chunks()) {
             Ok(taken) => {
-                // What the stream was lent leaves before its priority sinks.
+                // Data sent on a lent priority is passed to QUIC before the priority falls.
                 if rank.of_stream() < self.priority {
                     self.set_priority(rank, stream, carrier);
                 }
@@ -194,7 +195,7 @@ impl ReliableStream {
         }
     }
 
-    /// Whether the peer takes in the next sample now. Some small ones are sent whatever the peer holds.
+    /// Returns whether the peer takes in the next sample now. Some small samples are sent whatever the peer holds.
     fn has_credit(&self, info: &FlowInfo, queue: &Queue, carrier: &Carrier<'_>) -> bool {
         let Some(next) = queue.peek() else { return true };
         let credit = queue.credit_with(next);
@@ -209,7 +210,7 @@ impl ReliableStream {
         let _ = carrier.quic.send_stream(stream).set_priority(self.priority);
     }
 
-    /// QUIC took so many bytes of the batch.
+    /// Handles that QUIC took `bytes` bytes of the batch.
     fn handle_taken(
         &mut self,
         now: Duration,
@@ -245,7 +246,7 @@ impl ReliableStream {
         }
     }
 
-    /// Seals a batch of waiting samples. Returns how many.
+    /// Seals a batch of waiting samples. Returns their number.
     fn seal(
         &mut self,
         info: &FlowInfo,
@@ -296,12 +297,12 @@ impl ReliableStream {
         Ok(samples)
     }
 
-    /// The samples that were sent and are not acknowledged changed: they use credit.
+    /// Updates the credit that the unacknowledged samples use.
     pub(super) fn note_sent(&mut self, queue: &Queue) {
         self.credit.set(queue.credit());
     }
 
-    /// The peer stopped the stream.
+    /// Handles that the peer stopped the stream.
     pub(super) fn handle_stopped(
         &mut self,
         quic: &mut Connection,
@@ -317,7 +318,7 @@ impl ReliableStream {
         self.stop(info, queue, counters, done);
     }
 
-    /// The peer takes no more of this route: the samples that it was sent are given up.
+    /// Handles that the peer takes no more of this route: the samples that were sent to it are given up.
     fn stop(
         &mut self,
         info: &FlowInfo,
@@ -341,28 +342,28 @@ impl ReliableStream {
         self.note_sent(queue);
     }
 
-    /// A new link carries the flow: what the old one did not deliver goes first.
+    /// Moves to a new link: the samples that the old link did not deliver go first.
     pub(super) fn leave(&mut self, old: Option<&mut Connection>, queue: &mut Queue) {
         if let (Some(stream), Some(old)) = (self.stream.take(), old) {
-            // A message that is cut off at the end of its stream is none.
+            // A message that is cut off at the end of its stream does not count.
             let _ = old.send_stream(stream).finish();
         }
         self.rewind(queue);
     }
 
-    /// Takes its stream, which ends with the flow.
+    /// Takes the stream, which ends with the flow.
     pub(super) fn take(&mut self) -> Option<StreamId> {
         self.stream.take()
     }
 
-    /// The stream carries nothing more.
+    /// Finishes the stream.
     pub(super) fn finish(&mut self, carrier: &mut Carrier<'_>) {
         if let Some(stream) = self.stream.take() {
             let _ = carrier.quic.send_stream(stream).finish();
         }
     }
 
-    /// Finishes a stream that has been idle. Returns when to look again at one that is open.
+    /// Finishes a stream that has been idle. Returns when to look again at a stream that is open.
     pub(super) fn handle_timeout(
         &mut self,
         now: Duration,

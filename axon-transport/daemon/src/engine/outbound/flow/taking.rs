@@ -26,18 +26,18 @@ use crate::engine::{
     rings::RingSample,
 };
 
-/// Samples, and bytes, that one turn moves from the rings.
+/// Maximum number of samples, and of bytes, that one turn moves from the rings.
 const FILL: (usize, usize) = (1024, 256 << 10);
 /// Bytes of short samples that share one piece of memory. The piece stays as long as one of them is not
 /// acknowledged.
 const SHARED: usize = 32 << 10;
-/// Takes in one turn that find only samples that were sent before.
+/// Maximum number of takes in one turn that find only samples which were sent before.
 const REPEATS: u32 = 16;
-/// Takes in one turn of samples that a limit drops.
+/// Maximum number of takes in one turn of samples that a limit drops.
 const DROPS: usize = 64;
-/// A KEEP_ALL flow with so many bytes waiting leaves further samples in the ring, which keeps them.
+/// Number of waiting bytes at which a KEEP_ALL flow leaves further samples in the ring, which keeps them.
 const AHEAD: usize = 1 << 20;
-/// Bytes that a KEEP_LAST flow that is behind moves. The samples that it leaves in the ring are replaced
+/// Number of bytes that a KEEP_LAST flow which is behind moves. The samples that it leaves in the ring are replaced
 /// there without a copy.
 const BEHIND: usize = 64 << 10;
 /// Time after which a relay that may lose nothing tries again when it waits for memory.
@@ -57,9 +57,9 @@ pub(super) struct FlowRings {
     merge: Merge<RingSample>,
     /// Samples that were taken and are not in the queue.
     taken: VecDeque<RingSample>,
-    /// Whether the queue had no room for the first taken sample.
+    /// True if the queue had no room for the first taken sample.
     held: bool,
-    /// Whether the rings may hold more samples than the last turn moved.
+    /// True if the rings may hold more samples than the last turn moved.
     more: bool,
     /// Time after which to check the rings again, if the last turn moved no sample.
     retry: Option<Duration>,
@@ -132,7 +132,7 @@ impl FlowRings {
         self.more = true;
     }
 
-    /// Whether there may be samples to move.
+    /// Returns whether there may be samples to move.
     pub(super) fn has_more(&self) -> bool {
         self.more || !self.taken.is_empty()
     }

@@ -1,25 +1,25 @@
-//! The flows that cannot send because something is missing: a stream, a key, or room in their queue.
+//! The flows that cannot send because a stream, a key, or space in their queue is missing.
 
 use std::{collections::BTreeSet, time::Duration};
 
 use crate::engine::outbound::{budget::Budget, schedule::FlowId};
 
-/// A flow without a key looks again after this time, if nobody told it of one.
+/// Time after which a flow without a key looks again, unless a key is reported before.
 const KEY_RETRY: Duration = Duration::from_millis(250);
 
-/// The flows, by what they are without.
+/// The flows, by the resource that they lack.
 #[derive(Debug)]
 pub(super) struct BlockedFlows {
     stream: BTreeSet<FlowId>,
     key: BTreeSet<FlowId>,
     key_retry: Option<Duration>,
     room: BTreeSet<FlowId>,
-    /// What the budget had released when the flows without room were tried last.
+    /// The released bytes of the budget when the flows without space were last tried.
     released: usize,
 }
 
 impl BlockedFlows {
-    /// No flow lacks anything.
+    /// Creates the set without flows.
     pub(super) fn new(budget: &Budget) -> Self {
         Self {
             stream: BTreeSet::new(),
@@ -30,35 +30,35 @@ impl BlockedFlows {
         }
     }
 
-    /// The peer allows this flow no stream.
+    /// Adds a flow to which the peer allows no stream.
     pub(super) fn stream(&mut self, flow: FlowId) {
         self.stream.insert(flow);
     }
 
-    /// There is no key for this flow's next message.
+    /// Adds a flow without a key for its next message.
     pub(super) fn key(&mut self, flow: FlowId, now: Duration) {
         self.key.insert(flow);
         self.key_retry.get_or_insert(now + KEY_RETRY);
     }
 
-    /// This flow's queue has no room for its next sample.
+    /// Adds a flow whose queue has no space for its next sample.
     pub(super) fn room(&mut self, flow: FlowId) {
         self.room.insert(flow);
     }
 
-    /// A flow is gone.
+    /// Forgets a flow that is gone.
     pub(super) fn forget(&mut self, flow: FlowId) {
         self.stream.remove(&flow);
         self.key.remove(&flow);
         self.room.remove(&flow);
     }
 
-    /// When flows without a key look for one again.
+    /// Returns when flows without a key look for one again.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         self.key_retry
     }
 
-    /// How many flows wait for a stream.
+    /// Returns the number of flows that wait for a stream.
     pub(super) fn waits_for_stream(&self) -> usize {
         self.stream.len()
     }
@@ -74,7 +74,7 @@ impl BlockedFlows {
         std::mem::take(&mut self.key)
     }
 
-    /// Takes the flows that wait for room, if the budget has more than when they were tried last.
+    /// Takes the flows that wait for space, if the budget released some since they were last tried.
     pub(super) fn take_for_room(&mut self, budget: &Budget) -> BTreeSet<FlowId> {
         let released = budget.released();
         if self.room.is_empty() || released == std::mem::replace(&mut self.released, released) {

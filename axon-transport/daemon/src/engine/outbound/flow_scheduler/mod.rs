@@ -1,4 +1,5 @@
-//! Which flow sends next, and what the flows that cannot send wait for: QUIC, a stream, a key, room or credit.
+//! Decides which flow sends next, and tracks the flows that cannot send: they wait for QUIC, a stream, a key, space or
+//! credit.
 
 mod held_back;
 mod starvation;
@@ -19,7 +20,7 @@ pub(super) struct FlowTurn {
     pub(super) flow: FlowId,
     /// The rank under which it has the turn.
     pub(super) rank: Rank,
-    /// The rank as which it sends, if that is another one.
+    /// The rank as which it sends, if it differs.
     pub(super) lender: Option<Rank>,
 }
 
@@ -32,14 +33,14 @@ pub(super) struct FlowScheduler {
     /// The flows that wait for credit.
     for_credit: CreditQueue,
     budget: Rc<Budget>,
-    /// The flows whose last turn ended since QUIC took no more.
+    /// The flows whose last turn ended because QUIC took no more.
     for_quic: HashSet<FlowId>,
-    /// Streams may have become idle since a flow found none.
+    /// True if streams may have become idle since a flow found none.
     frees_streams: bool,
 }
 
 impl FlowScheduler {
-    /// No flow has a turn.
+    /// Creates the turns without flows.
     pub(super) fn new(budget: Rc<Budget>) -> Self {
         Self {
             schedule: Schedule::default(),
@@ -53,27 +54,27 @@ impl FlowScheduler {
         }
     }
 
-    /// Whether a flow waits for QUIC to take more.
+    /// Returns whether a flow waits for QUIC to take more.
     pub(super) fn wait_for_quic(&self) -> bool {
         !self.for_quic.is_empty()
     }
 
-    /// The peer's credit.
+    /// Returns the peer's credit.
     pub(super) fn credit(&self) -> &Rc<PeerCredit> {
         &self.credit
     }
 
-    /// Whether a flow waits for credit.
+    /// Returns whether a flow waits for credit.
     pub(super) fn wait_for_credit(&self) -> bool {
         !self.for_credit.is_empty()
     }
 
-    /// The place of the highest rank of which flows wait for credit.
+    /// Returns the place of the highest rank whose flows wait for credit.
     pub(super) fn closed_from(&self) -> Option<usize> {
         self.for_credit.closed_from()
     }
 
-    /// Gives a flow a turn, if it has something to send and QUIC may take it.
+    /// Gives a flow a turn, if it has samples to send and QUIC may take them.
     pub(super) fn add(&mut self, id: FlowId, flow: &Flow) {
         if !self.schedule.contains(id)
             && !flow.blocked
@@ -83,7 +84,7 @@ impl FlowScheduler {
         }
     }
 
-    /// A flow is gone. Its number is another's next.
+    /// Forgets a flow that is gone. Its number may be used for another flow.
     pub(super) fn forget(&mut self, id: FlowId) {
         self.schedule.remove(id);
         self.for_quic.remove(&id);
@@ -91,7 +92,7 @@ impl FlowScheduler {
         self.for_credit.forget(id);
     }
 
-    /// Tries the flows again that found no room or no credit, if there is more now.
+    /// Tries the flows again that found no space or no credit, if there is more now.
     pub(super) fn retry(&mut self, flows: &mut Flows) {
         let held = self.without.take_for_room(&self.budget);
         self.add_all(held, flows);
@@ -122,13 +123,13 @@ impl FlowScheduler {
         }
     }
 
-    /// The next turn.
+    /// Returns the next turn.
     pub(super) fn next(&mut self) -> Option<FlowTurn> {
         let (flow, rank) = self.schedule.pop(|at| self.lending.borrows(at))?;
         Some(FlowTurn { flow, rank, lender: self.lending.borrow(rank) })
     }
 
-    /// A flow handed so many bytes to QUIC in its turn.
+    /// Records that a flow handed `bytes` bytes to QUIC in its turn.
     pub(super) fn handle_sent(&mut self, turn: FlowTurn, bytes: u64) {
         match (bytes, turn.lender) {
             (0, _) => {}
@@ -137,13 +138,13 @@ impl FlowScheduler {
         }
     }
 
-    /// A flow found no room for a sample in its turn.
+    /// Records that a flow found no space for a sample in its turn.
     pub(super) fn handle_held(&mut self, turn: FlowTurn) {
         self.without.room(turn.flow);
     }
 
-    /// A turn is over. Flows that gave credit back in this pass may be the last ones that use any: those that wait for
-    /// it are tried again if there is no other turn.
+    /// Ends a turn. Flows that gave credit back in this pass may be the last ones that use any: if there is no other
+    /// turn, the flows that wait for credit are tried again.
     pub(super) fn handle_over(
         &mut self,
         now: Duration,
@@ -166,7 +167,7 @@ impl FlowScheduler {
             }
             FlowPause::NoKey => self.without.key(turn.flow, now),
             FlowPause::NoCredit => {
-                // What the flow took from its rings may have another rank.
+                // The sample that the flow took from its rings may have another rank.
                 let rank = flows.get(turn.flow).and_then(Flow::rank).unwrap_or(turn.rank);
                 self.for_credit.add(turn.flow, rank.place());
                 self.lending.handle_blocked(turn.rank);
@@ -177,12 +178,12 @@ impl FlowScheduler {
         }
     }
 
-    /// The peer acknowledged samples: streams may have become idle.
+    /// Records that the peer acknowledged samples, so that streams may have become idle.
     pub(super) fn handle_acknowledged(&mut self) {
         self.frees_streams |= self.without.waits_for_stream() > 0;
     }
 
-    /// How many idle streams are to be finished now, so that flows that wait for one get theirs.
+    /// Returns the number of idle streams to finish now, so that flows that wait for a stream get one.
     pub(super) fn take_wanted_streams(&mut self) -> usize {
         match std::mem::take(&mut self.frees_streams) {
             true => self.without.waits_for_stream(),
@@ -190,31 +191,31 @@ impl FlowScheduler {
         }
     }
 
-    /// The peer allows more streams.
+    /// Continues flows that wait for a stream, because the peer allows more streams.
     pub(super) fn handle_streams_available(&mut self, flows: &Flows) {
         let waiting = self.without.take_for_stream();
         self.add_all(waiting, flows);
     }
 
-    /// There may be keys for messages.
+    /// Continues flows that wait for keys, because there may be some now.
     pub(super) fn handle_keys(&mut self, flows: &Flows) {
         let waiting = self.without.take_for_key();
         self.add_all(waiting, flows);
     }
 
-    /// When flows without a key look for one again.
+    /// Returns when flows without a key look for one again.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         self.without.poll_timeout()
     }
 
-    /// Has the flows without a key look for one again, if that is due.
+    /// Makes the flows without a key look for one again, if that is due.
     pub(super) fn handle_timeout(&mut self, now: Duration, flows: &Flows) {
         if self.poll_timeout().is_some_and(|due| due <= now) {
             self.handle_keys(flows);
         }
     }
 
-    /// Whether a pass has something to do.
+    /// Returns whether a pass has work to do.
     pub(super) fn has_work(&self) -> bool {
         !self.schedule.is_empty() || self.frees_streams || self.for_credit.is_due(&self.credit)
     }
@@ -227,7 +228,7 @@ mod tests {
 
     const NOW: Duration = Duration::from_secs(1);
 
-    /// So many flows, each of which has something to send, and their turns.
+    /// Creates flows, each of which has samples to send, and their turns.
     fn turns(count: usize) -> (FlowScheduler, Flows) {
         let mut flows = Flows::default();
         let mut turns = FlowScheduler::new(Budget::new(1 << 20).of_peer());
@@ -243,7 +244,7 @@ mod tests {
         turns.next().map(|turn| turn.flow)
     }
 
-    /// The next flow pauses so, and loses its turn.
+    /// Lets the next flow pause, and lose its turn.
     fn pause(turns: &mut FlowScheduler, flows: &mut Flows, pause: FlowPause) -> FlowId {
         let turn = turns.next().unwrap();
         turns.handle_over(NOW, turn, pause, flows);

@@ -1,31 +1,31 @@
-//! Ranks that others keep from the link. QUIC sends the streams of a higher priority first, so a topic that fills the
-//! link by itself would starve all below it. For each eight bytes that a rank sends, each rank that waits below it may
-//! send one as if it were of the same rank.
+//! Keeps ranks from starving. QUIC sends the streams of a higher priority first, so a topic that fills the link by
+//! itself would starve all ranks below it. For each eight bytes that a rank sends, each rank that waits below it may
+//! send one as if it had the same rank.
 
 use crate::engine::outbound::schedule::{RANKS, Rank};
 
-/// A rank that waits is lent a byte for so many of a higher one.
+/// Number of bytes of a higher rank for which a waiting rank is lent one byte.
 const SHARE: i64 = 8;
-/// Bytes that are lent at least, and as many as a rank saves at most.
+/// Minimum number of bytes that are lent; `MOST` is the maximum that a rank saves.
 const QUANTUM: i64 = 64 << 10;
 const MAX_CREDIT: i64 = 4 * QUANTUM;
 
-/// What is lent to ranks.
+/// The bytes that are lent to ranks.
 #[derive(Debug, Default)]
 pub(super) struct StarvationCredit {
-    /// The bytes that are lent to each rank; `None`: it does not wait.
+    /// The bytes that are lent to each rank; `None` if the rank does not wait.
     saved: [Option<i64>; RANKS],
     /// The rank that sent last in its own right.
     lender: Option<Rank>,
 }
 
 impl StarvationCredit {
-    /// A flow of this rank waits for QUIC.
+    /// Records that a flow of this rank waits for QUIC.
     pub(super) fn handle_blocked(&mut self, rank: Rank) {
         self.saved[rank.place()].get_or_insert(0);
     }
 
-    /// A flow of this rank sent so many bytes in its own right.
+    /// Records that a flow of this rank sent `bytes` bytes in its own right.
     pub(super) fn handle_sent(&mut self, rank: Rank, bytes: u64) {
         let at = rank.place();
         self.saved[at] = None;
@@ -36,18 +36,18 @@ impl StarvationCredit {
         }
     }
 
-    /// Whether the rank at this place may send as another one now.
+    /// Returns whether the rank at this place may send as another one now.
     pub(super) fn borrows(&self, at: usize) -> bool {
         self.lender.is_some_and(|lender| lender.place() < at)
             && self.saved[at].is_some_and(|saved| saved >= QUANTUM)
     }
 
-    /// The rank as which a flow of this rank may send now.
+    /// Returns the rank as which a flow of this rank may send now.
     pub(super) fn borrow(&self, rank: Rank) -> Option<Rank> {
         self.lender.filter(|_| self.borrows(rank.place()))
     }
 
-    /// A flow of this rank sent so many bytes as another rank.
+    /// Records that a flow of this rank sent `bytes` bytes as another rank.
     pub(super) fn handle_borrowed(&mut self, rank: Rank, bytes: u64) {
         if let Some(saved) = &mut self.saved[rank.place()] {
             *saved -= i64::try_from(bytes).unwrap_or(i64::MAX);

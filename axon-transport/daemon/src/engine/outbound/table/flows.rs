@@ -9,11 +9,11 @@ use crate::engine::{
     quic::{connection::Carrier, transport::STREAMS_OPEN},
 };
 
-/// Flows that one search for idle streams looks at: all that have a stream. The peer may acknowledge all of them at
-/// once, and no further acknowledgement would begin another search.
+/// Number of flows that one search for idle streams checks: all that have a stream. The peer may acknowledge all of
+/// them at once, and no further acknowledgement would begin another search.
 const SEARCHED: usize = STREAMS_OPEN as usize;
 
-/// A flow, and when its timer is due as `timers` has it.
+/// A flow, and the time in `timers` at which its timer is due.
 struct FlowSlot {
     flow: Flow,
     due: Option<Duration>,
@@ -27,7 +27,7 @@ pub(in crate::engine::outbound) struct Flows {
     timers: BTreeSet<(Duration, FlowId)>,
     /// Flows with samples that are not acknowledged. The others cost nothing.
     busy: BTreeSet<FlowId>,
-    /// Streams of flows that ended, and whether a sample is cut off there.
+    /// Streams of flows that ended, each with whether a sample is cut off there.
     ended: Vec<(StreamId, bool)>,
 }
 
@@ -61,22 +61,22 @@ impl Flows {
         true
     }
 
-    /// A flow.
+    /// Returns a flow.
     pub(in crate::engine::outbound) fn get(&self, id: FlowId) -> Option<&Flow> {
         Some(&self.slots.get(id)?.as_ref()?.flow)
     }
 
-    /// A flow. If its timer may change, [`note_timer`](Self::note_timer) has to follow.
+    /// Returns a flow. If its timer may change, the caller has to call [`note_timer`](Self::note_timer) afterwards.
     pub(in crate::engine::outbound) fn get_mut(&mut self, id: FlowId) -> Option<&mut Flow> {
         Some(&mut self.slots.get_mut(id)?.as_mut()?.flow)
     }
 
-    /// The numbers of all flows.
+    /// Returns the numbers of all flows.
     pub(in crate::engine::outbound) fn ids(&self) -> Vec<FlowId> {
         (0..self.slots.len()).filter(|id| self.slots[*id].is_some()).collect()
     }
 
-    /// The timer of a flow may have changed.
+    /// Updates the timer of a flow, which may have changed.
     pub(in crate::engine::outbound) fn note_timer(&mut self, id: FlowId) {
         let Some(FlowSlot { flow, due }) = self.slots.get_mut(id).and_then(Option::as_mut) else {
             return;
@@ -90,12 +90,12 @@ impl Flows {
         self.timers.extend(due.map(|due| (due, id)));
     }
 
-    /// When [`take_due`](Self::take_due) returns a flow.
+    /// Returns when [`take_due`](Self::take_due) returns a flow.
     pub(in crate::engine::outbound) fn poll_timeout(&self) -> Option<Duration> {
         self.timers.first().map(|(due, _)| *due)
     }
 
-    /// The next flow whose timer is due. The timer stops; [`note_timer`](Self::note_timer) starts it again.
+    /// Takes the next flow whose timer is due. The timer stops; [`note_timer`](Self::note_timer) starts it again.
     pub(in crate::engine::outbound) fn take_due(&mut self, now: Duration) -> Option<FlowId> {
         self.poll_timeout().filter(|due| *due <= now)?;
         let (_, id) = self.timers.pop_first()?;
@@ -105,29 +105,29 @@ impl Flows {
         Some(id)
     }
 
-    /// Samples of a flow wait. Returns whether none of any flow did before.
+    /// Records that samples of a flow wait. Returns whether no flow had waiting samples before.
     pub(in crate::engine::outbound) fn set_busy(&mut self, id: FlowId) -> bool {
         let first = self.busy.is_empty();
         self.busy.insert(id);
         first
     }
 
-    /// No sample of a flow waits, or is not acknowledged.
+    /// Records that no sample of a flow waits or is unacknowledged.
     pub(in crate::engine::outbound) fn set_quiet(&mut self, id: FlowId) {
         self.busy.remove(&id);
     }
 
-    /// Whether all flows are quiet.
+    /// Returns whether all flows are quiet.
     pub(in crate::engine::outbound) fn are_quiet(&self) -> bool {
         self.busy.is_empty()
     }
 
-    /// The flows with samples that are not acknowledged.
+    /// Returns the flows with unacknowledged samples.
     pub(in crate::engine::outbound) fn busy(&self) -> impl Iterator<Item = (FlowId, &Flow)> {
         self.busy.iter().filter_map(|id| Some((*id, self.get(*id)?)))
     }
 
-    /// Has `each` look at the flows with samples that are not acknowledged.
+    /// Calls `each` for the flows with unacknowledged samples.
     pub(in crate::engine::outbound) fn for_each_busy(&mut self, mut each: impl FnMut(&mut Flow)) {
         for id in &self.busy {
             if let Some(slot) = &mut self.slots[*id] {
@@ -136,18 +136,18 @@ impl Flows {
         }
     }
 
-    /// Whether flows that ended left streams.
+    /// Returns whether ended flows left streams.
     pub(in crate::engine::outbound) fn has_ended_streams(&self) -> bool {
         !self.ended.is_empty()
     }
 
-    /// Takes the streams of flows that ended, and whether a sample is cut off there.
+    /// Takes the streams of flows that ended, each with whether a sample is cut off there.
     pub(in crate::engine::outbound) fn take_ended_streams(&mut self) -> Vec<(StreamId, bool)> {
         std::mem::take(&mut self.ended)
     }
 
-    /// Finishes at most `most` streams that carry nothing, of flows that had something to send longest ago. The peer
-    /// allows others in their place once it has read them.
+    /// Finishes at most `most` idle streams, of the flows that have been idle longest. The peer allows other streams in
+    /// their place once it has read them.
     pub(in crate::engine::outbound) fn finish_idle_streams(
         &mut self,
         most: usize,
@@ -180,7 +180,7 @@ mod tests {
         Duration::from_millis(millis)
     }
 
-    /// So many flows, with timers that are due at these times.
+    /// Creates flows with timers that are due at these times.
     fn flows<const N: usize>(timers: [Option<u64>; N]) -> Flows {
         let mut flows = Flows::default();
         for (expected, timer) in timers.into_iter().enumerate() {

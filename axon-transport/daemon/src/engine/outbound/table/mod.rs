@@ -15,8 +15,8 @@ use super::{
 };
 use crate::engine::counters::Counters;
 
-/// The routes and flows of one peer. Where a method returns the numbers of flows that are gone, the caller forgets them
-/// before another flow gets one of them.
+/// The routes and flows of one peer. If a method returns the numbers of flows that are gone, the caller forgets them
+/// before another flow gets one of the numbers.
 #[derive(Default)]
 pub(super) struct FlowTable {
     pub(super) routes: Routes,
@@ -26,26 +26,26 @@ pub(super) struct FlowTable {
 /// The flows of a route whose sources changed.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct Changed {
-    /// Flows that are gone: no source reads them, and nothing of them is left.
+    /// Flows that are gone: no source reads them, and none of their samples is left.
     pub(super) gone: Vec<FlowId>,
-    /// All others.
+    /// All other flows.
     pub(super) stay: Vec<FlowId>,
 }
 
 impl FlowTable {
-    /// A flow with its route.
+    /// Returns a flow with its route.
     pub(super) fn get_mut(&mut self, id: FlowId) -> Option<(&mut Flow, &ServedFlows)> {
         let flow = self.flows.get_mut(id)?;
         let served = self.routes.get(flow.info.route_number)?;
         Some((flow, served))
     }
 
-    /// The flow of a publisher, or client, over a route.
+    /// Returns the flow of a publisher, or client, over a route.
     pub(super) fn find(&self, number: u32, of: &Gid) -> Option<FlowId> {
         self.routes.get(number)?.flows.get(of).copied()
     }
 
-    /// As [`find`](Self::find). A flow that does not exist begins now.
+    /// Like [`find`](Self::find), but creates the flow if it does not exist.
     pub(super) fn find_or_insert(
         &mut self,
         number: u32,
@@ -71,7 +71,7 @@ impl FlowTable {
         Some(id)
     }
 
-    /// Gives a route other sources. `seen` has the newest sample of each publisher that the peer has.
+    /// Replaces the sources of a route. `seen` has the newest sample of each publisher that the peer has.
     pub(super) fn set_sources(
         &mut self,
         number: u32,
@@ -104,7 +104,7 @@ impl FlowTable {
         gone
     }
 
-    /// Gives up the samples of a route that are not acknowledged. Returns how many.
+    /// Gives up the unacknowledged samples of a route. Returns their number.
     pub(super) fn give_up(&mut self, number: u32, counters: &Counters) -> u64 {
         let Some(served) = self.routes.get(number) else { return 0 };
         let mut calls = 0;
@@ -128,14 +128,14 @@ impl FlowTable {
         (kept, gone)
     }
 
-    /// Whether BEST_EFFORT samples of a publisher wait for a limit.
+    /// Returns whether BEST_EFFORT samples of a publisher wait for a limit.
     pub(super) fn holds_best_effort(&self, number: u32, of: &Gid) -> bool {
         let flow = self.find(number, of).and_then(|id| self.flows.get(id));
         flow.is_some_and(Flow::holds_best_effort)
     }
 
-    /// What is left of a publisher that ended, whose route had this number. While the link `starves`, no flow that waits
-    /// for others is excused.
+    /// Returns the rest of a publisher that ended, whose route had this number. While the link `starves`, no flow that
+    /// waits for others is excused.
     pub(super) fn left_of(&self, number: u32, of: &Gid, starves: bool) -> Option<DrainedFlow> {
         let route = self.routes.successor_of(number, of);
         let flow = self.find(route, of).and_then(|id| self.flows.get(id));
@@ -147,19 +147,20 @@ impl FlowTable {
         Some(DrainedFlow { route, samples, progress, is_excused })
     }
 
-    /// Bytes of its ring that the samples of a publisher take that are not acknowledged.
+    /// Returns the bytes of its ring that the unacknowledged samples of a publisher take.
     pub(super) fn bytes_left_of(&self, number: u32, of: &Gid) -> u64 {
         self.routes.get(number).map_or(0, |served| served.unacknowledged_bytes_of(of))
     }
 
-    /// The flows with samples that are not acknowledged.
+    /// Returns the flows with unacknowledged samples.
     pub(super) fn busy(&self) -> impl Iterator<Item = BusyFlow> {
         self.flows.busy().filter_map(|(id, flow)| {
             Some(busy_flow(id, flow, self.routes.get(flow.info.route_number)?))
         })
     }
 
-    /// The flows of a route whose samples KEEP_ALL relays keep, by publisher, with how far QUIC took the samples.
+    /// Returns the flows of a route whose samples KEEP_ALL relays keep, by publisher, with how far QUIC took the
+    /// samples.
     pub(super) fn kept_flows(&self, number: u32) -> Vec<(Gid, BusyFlow, SentProgress)> {
         let Some(served) = self.routes.get(number) else { return Vec::new() };
         let flows = served.flows.iter().filter_map(|(of, id)| {
@@ -180,7 +181,7 @@ impl FlowTable {
         });
     }
 
-    /// What waits for the peer.
+    /// Returns the samples that wait for the peer.
     pub(super) fn backlog(&self) -> Backlog {
         let mut backlog = Backlog::default();
         for (_, flow) in self.flows.busy() {
@@ -192,8 +193,8 @@ impl FlowTable {
         backlog
     }
 
-    /// The link is over, and no other carries the flows: counts what did not arrive, and tells the publishers. Returns
-    /// the losses by topic.
+    /// Handles the end of the link if no other link carries the flows: counts the samples that did not arrive, and
+    /// reports them to the publishers. Returns the losses by topic.
     pub(super) fn link_over(&mut self, counters: &Counters) -> Vec<(Arc<str>, u64)> {
         let mut losses = Vec::new();
         for served in self.routes.values() {
@@ -254,7 +255,7 @@ mod tests {
         Gid([number; 16])
     }
 
-    /// A table with route 1, which reads the rings of publishers 11 and 12, and two rings.
+    /// Creates a table with route 1, which reads the rings of publishers 11 and 12, and two rings.
     struct Fixture {
         table: FlowTable,
         rings: [Rc<ModelRing>; 2],

@@ -10,7 +10,7 @@ use crate::engine::outbound::{
     source::Source,
 };
 
-/// The routes of one peer. `by_source` names each source that a route has, and no other.
+/// The routes of one peer. `by_source` contains exactly the sources of the routes.
 #[derive(Default)]
 pub(in crate::engine::outbound) struct Routes {
     served: HashMap<u32, ServedFlows>,
@@ -19,7 +19,7 @@ pub(in crate::engine::outbound) struct Routes {
 }
 
 impl Routes {
-    /// Adds a route without sources. A route that exists keeps what it has.
+    /// Adds a route without sources. An existing route keeps its state.
     pub(in crate::engine::outbound) fn add(&mut self, number: u32, shared: FlowRoute) {
         self.served.entry(number).or_insert_with(|| {
             self.priorities.add(shared.priority);
@@ -27,7 +27,7 @@ impl Routes {
         });
     }
 
-    /// Gives a route other sources. `seen` has the newest sample of each publisher that the peer has. Returns the
+    /// Replaces the sources of a route. `seen` has the newest sample of each publisher that the peer has. Returns the
     /// route, if it exists.
     pub(in crate::engine::outbound) fn set_sources(
         &mut self,
@@ -70,29 +70,29 @@ impl Routes {
         (kept, flows)
     }
 
-    /// A route.
+    /// Returns a route.
     pub(in crate::engine::outbound) fn get(&self, number: u32) -> Option<&ServedFlows> {
         self.served.get(&number)
     }
 
-    /// A route. The caller changes no source.
+    /// Returns a route. The caller must not change its sources.
     pub(in crate::engine::outbound) fn get_mut(&mut self, number: u32) -> Option<&mut ServedFlows> {
         self.served.get_mut(&number)
     }
 
-    /// All routes.
+    /// Returns all routes.
     pub(in crate::engine::outbound) fn values(&self) -> impl Iterator<Item = &ServedFlows> {
         self.served.values()
     }
 
-    /// The route of a source, and the source.
+    /// Returns the route of a source, and the source.
     pub(in crate::engine::outbound) fn of_source(&self, source: &Gid) -> Option<(u32, &Source)> {
         let number = *self.by_source.get(source)?;
         let sources = &self.served.get(&number)?.sources;
         Some((number, sources.iter().find(|other| other.gid() == *source)?))
     }
 
-    /// The route `number`, or the one that reads this publisher if the peer asked for that anew.
+    /// Returns the route `number`, or the route that reads this publisher if the peer asked for it anew.
     pub(in crate::engine::outbound) fn successor_of(&self, number: u32, publisher: &Gid) -> u32 {
         if self.served.contains_key(&number) {
             return number;
@@ -101,7 +101,7 @@ impl Routes {
         found.map_or(number, |(other, _)| *other)
     }
 
-    /// The priorities of the routes.
+    /// Returns the priorities of the routes.
     pub(in crate::engine::outbound) fn priorities(&self) -> Priorities {
         self.priorities
     }
@@ -119,7 +119,7 @@ mod tests {
         Gid([number; 16])
     }
 
-    /// The source with this GID, which reads `publisher`.
+    /// Returns the source with this GID, which reads `publisher`.
     fn source(number: u8, publisher: u8, qos: Qos) -> Source {
         ModelRing::new(gid(number), gid(publisher)).source(qos)
     }
