@@ -24,7 +24,7 @@ pub use self::{
 pub struct Status {
     /// The daemon's id, in hexadecimal; new at each start.
     pub daemon: String,
-    /// Its process.
+    /// The id of the daemon's process.
     pub pid: u32,
     /// The time since its start; whole seconds in JSON.
     #[serde(rename = "uptime_s", with = "times::seconds")]
@@ -35,15 +35,14 @@ pub struct Status {
     pub version: String,
     /// `ROS_DOMAIN_ID`.
     pub domain: u32,
-    /// Whether the rest is left out, except the state of the gateway: the daemon has access rules, and who asks is another user
-    /// of its host. False from a daemon of an earlier version.
+    /// True if the rest is left out, except the state of the gateway: the daemon has access rules, and the requesting
+    /// process belongs to another user of its host. False from a daemon of an earlier version.
     #[serde(default)]
     pub withheld: bool,
-    /// The effective security settings, as sessions are compared with them: `AXON_` name and value
-    /// or digest.
+    /// The effective security settings with which sessions are compared: `AXON_` name and value or digest.
     pub settings: BTreeMap<String, String>,
-    /// The [digest](crate::access::AccessRules::digest) of the access rules in force. Absent where there are none, and from
-    /// a daemon of an earlier version.
+    /// The [digest](crate::access::AccessRules::digest) of the access rules in force. Absent if there are none, and
+    /// from a daemon of an earlier version.
     #[serde(default)]
     pub access_digest: Option<String>,
     /// `classic` or `qkd`.
@@ -56,15 +55,15 @@ pub struct Status {
     pub cipher: String,
     /// This host's SAE ID in qkd.
     pub sae: Option<String>,
-    /// Where sessions find the daemon.
+    /// The address at which sessions find the daemon.
     pub socket: String,
-    /// Where it keeps files; nothing is kept when absent.
+    /// The directory of its files; if absent, nothing is kept.
     pub runtime_dir: Option<String>,
-    /// The gateway's UDP port; absent while it does not stand.
+    /// The gateway's UDP port; absent while the gateway is not running.
     pub port: Option<u16>,
-    /// `running`, `starting`, or why it is not.
+    /// `running`, `starting`, or the reason why the gateway does not run.
     pub gateway: String,
-    /// What discovery does, as far as the sessions need.
+    /// The present state of discovery, which follows the needs of the sessions.
     #[serde(default)]
     pub discovery: DiscoveryStatus,
     /// Packets exchanged with sessions since the daemon's start.
@@ -75,7 +74,7 @@ pub struct Status {
     pub descriptors: Option<DescriptorStatus>,
     /// Sessions on this host.
     pub sessions: Vec<SessionStatus>,
-    /// Topics with an endpoint somewhere.
+    /// Topics with an endpoint on any host.
     pub topics: Vec<TopicStatus>,
     /// Links to other hosts' daemons.
     pub links: Vec<LinkStatus>,
@@ -85,13 +84,13 @@ pub struct Status {
     pub refusals: Vec<RefusalStatus>,
 }
 
-/// What discovery does at present.
+/// The present state of discovery.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct DiscoveryStatus {
     /// The widest range of any session; `SUBNET` alone uses multicast.
     pub range: String,
-    /// Hosts that are looked for by address or name.
+    /// Hosts that discovery looks for by address or name.
     pub hosts: Vec<String>,
 }
 
@@ -99,11 +98,11 @@ pub struct DiscoveryStatus {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct TrafficStatus {
-    /// From sessions.
+    /// Number of packets from sessions.
     pub packets_in: u64,
-    /// To sessions.
+    /// Number of packets to sessions.
     pub packets_out: u64,
-    /// Bytes of those.
+    /// Number of bytes to sessions.
     pub bytes_out: u64,
 }
 
@@ -111,11 +110,11 @@ pub struct TrafficStatus {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct DescriptorStatus {
-    /// Those that are open.
+    /// Number of open descriptors.
     pub open: u64,
-    /// How many there may be (RLIMIT_NOFILE); absent where there is no limit.
+    /// Maximum number of descriptors (RLIMIT_NOFILE); absent if there is no limit.
     pub limit: Option<u64>,
-    /// Sessions that were refused for want of descriptors since the daemon's start, each time that they came.
+    /// Number of sessions refused for want of descriptors since the daemon's start; each attempt counts.
     pub sessions_refused: u64,
 }
 
@@ -123,55 +122,55 @@ pub struct DescriptorStatus {
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct SessionStatus {
-    /// Its process.
+    /// The id of the session's process.
     pub pid: u32,
     /// Its name.
     pub name: String,
     /// `application` or `gateway`.
     pub role: String,
-    /// Its user, where that is another than the daemon's.
+    /// Its user, if that is not the daemon's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub user: Option<u32>,
-    /// How the GIDs of its endpoints begin, in hexadecimal.
+    /// The common beginning of its endpoints' GIDs, in hexadecimal.
     #[serde(default)]
     pub gids: String,
-    /// How many endpoints it has.
+    /// Number of its endpoints.
     pub endpoints: usize,
-    /// Control packets that wait for it.
+    /// Number of control packets that wait for it.
     pub queued: usize,
-    /// Its discovery range: `SUBNET`, `LOCALHOST` or `OFF`; absent of the gateway.
+    /// Its discovery range: `SUBNET`, `LOCALHOST` or `OFF`; absent for the gateway.
     #[serde(default)]
     pub range: Option<String>,
-    /// Whether it stated that range; one that did not is kept to `LOCALHOST`.
+    /// True if it stated that range; a session that did not is limited to `LOCALHOST`.
     #[serde(default)]
     pub range_stated: bool,
     /// Its static peers.
     #[serde(default)]
     pub static_peers: Vec<String>,
-    /// The daemon ids of the linked peers that these name.
+    /// The daemon ids of the linked peers among its static peers.
     #[serde(default)]
     pub lists: Vec<String>,
-    /// Present where it shares no memory: its samples pass through the daemon.
+    /// Present if it shares no memory: its samples pass through the daemon.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub relay: Option<RelayStatus>,
 }
 
-/// What passes through the daemon for a session that shares no memory.
+/// The traffic through the daemon of a session that shares no memory.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct RelayStatus {
-    /// Why memory is not shared.
+    /// The reason why memory is not shared.
     pub reason: String,
-    /// Samples that came from the session.
+    /// Number of samples from the session.
     pub samples_in: u64,
     /// Their bytes.
     pub bytes_in: u64,
-    /// Samples that went to it.
+    /// Number of samples to the session.
     pub samples_out: u64,
     /// Their bytes.
     pub bytes_out: u64,
-    /// Samples of its publishers that were overwritten before they had crossed, or for which there
-    /// was no memory, and those that others had left when they ended and that it did not take.
+    /// Number of samples of its publishers that were overwritten before they had crossed, or for which there was no
+    /// memory, and of samples that ended remote writers left and that it did not take.
     pub lost: u64,
 }
 
@@ -212,19 +211,19 @@ pub struct TopicStatus {
     /// The publishers on this host, stand-ins for remote ones among them: up to 64, those with the
     /// most memory first.
     pub writers: Vec<WriterStatus>,
-    /// How many more there are.
+    /// Number of further ones.
     pub more_writers: usize,
     /// What each reader on this host took and lost, relays to other hosts among them: up to 64,
     /// those that wait longest and lost most first.
     pub readers: Vec<ReaderStatus>,
-    /// How many more there are.
+    /// Number of further ones.
     pub more_readers: usize,
     /// Pairs that are not matched since one session is out of the other's discovery range. Of
     /// endpoints on other hosts it has those that their daemons showed to this one.
     #[serde(default)]
     pub out_of_range: Vec<OutOfRangeStatus>,
-    /// Endpoints on this host that match some on another host, and to or from which nothing flows since a route is
-    /// refused, and endpoints that this daemon does not take: up to 64.
+    /// Up to 64 endpoints on this host that match endpoints on another host and exchange no samples with them because a
+    /// route is refused, and endpoints that this daemon refuses.
     #[serde(default)]
     pub refused: Vec<RefusedRouteStatus>,
 }
@@ -235,9 +234,9 @@ pub struct TopicStatus {
 pub struct RefusedRouteStatus {
     /// Its GID.
     pub endpoint: String,
-    /// The other host, as it calls itself; empty where this daemon does not take the endpoint.
+    /// The other host, as it calls itself; empty if this daemon refuses the endpoint.
     pub host: String,
-    /// Which host refuses it, and why.
+    /// The host that refuses it, and the reason.
     pub reason: String,
 }
 
@@ -249,7 +248,7 @@ pub struct OutOfRangeStatus {
     pub writer: String,
     /// The GID of the subscription, or of the endpoint of a service.
     pub reader: String,
-    /// Why.
+    /// The reason.
     pub reason: String,
 }
 
@@ -261,22 +260,22 @@ pub struct WriterStatus {
     pub pid: u32,
     /// The publisher's GID.
     pub writer: String,
-    /// Whether it stands in for a publisher on another host.
+    /// True if it is the stand-in for a publisher on another host.
     pub stand_in: bool,
     /// Its history's depth; `null` for KEEP_ALL.
     pub depth: Option<u32>,
-    /// Samples that it keeps at least, for its own depth and those of its readers.
+    /// Minimum number of samples that it keeps, for its own depth and those of its readers.
     pub window: u64,
     /// Bytes of memory that it has committed: descriptors, small samples, segments of large ones.
     pub bytes_committed: u64,
     /// Samples published.
     pub published: u64,
-    /// Publishes that failed since a KEEP_ALL reader left no room for as long as they could wait.
+    /// Number of publishes that failed because a KEEP_ALL reader freed no space for as long as they could wait.
     pub blocked: u64,
-    /// Publishes that failed for want of memory or descriptors, and samples that went for it though they
-    /// were to be kept: for late joiners, or within the depth of a reader.
+    /// Number of publishes that failed for want of memory or descriptors, and of samples that were dropped for that
+    /// reason although they should have been kept: for late joiners, or within the depth of a reader.
     pub no_memory: u64,
-    /// Publishes that failed since readers or loans keep all of its memory.
+    /// Number of publishes that failed because readers or loans hold all of its memory.
     pub pinned: u64,
 }
 
@@ -290,89 +289,89 @@ pub struct ReaderStatus {
     pub reader: String,
     /// The writer's GID.
     pub writer: String,
-    /// Whether it carries samples to other hosts.
+    /// True if it carries samples to other hosts.
     pub relay: bool,
     /// Its history's depth; `null` for KEEP_ALL.
     pub depth: Option<u32>,
-    /// Samples that it can take, at most its depth.
+    /// Number of samples that it can take, at most its depth.
     pub unread: u64,
     /// Samples taken.
     pub received: u64,
     /// Samples overwritten before they were taken, within its depth.
     pub lost: u64,
-    /// Samples passed over because more recent ones filled its depth: no loss.
+    /// Number of samples skipped because more recent ones filled its depth: no loss.
     pub skipped: u64,
-    /// How long ago the oldest sample that it has not taken was published, by the
-    /// clocks of both hosts where the publisher is on another one. Milliseconds in JSON; `null` when it has taken all.
+    /// The time since the publication of the oldest sample that it has not taken, by the clocks of both hosts if the
+    /// publisher is on another one. Milliseconds in JSON; `null` if it has taken all.
     #[serde(default, rename = "waiting_ms", with = "times::optional_millis")]
     pub waiting: Option<Duration>,
-    /// Whether its process is stopped, by a signal or a debugger.
+    /// True if its process is stopped, by a signal or a debugger.
     pub stopped: bool,
 }
 
 impl ReaderStatus {
-    /// Whether it has not taken a sample that has been there for a second.
+    /// Returns whether it has not taken a sample that has been available for a second.
     pub fn is_stalled(&self) -> bool {
         self.waiting.is_some_and(|waiting| waiting >= Duration::from_secs(1))
     }
 }
 
-/// Somebody who was refused.
+/// A refusal of a peer, session or endpoint.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct RefusalStatus {
-    /// When; milliseconds since the Unix epoch in JSON.
+    /// The time of the refusal; milliseconds since the Unix epoch in JSON.
     #[serde(rename = "unix_ms", with = "times::unix_millis")]
     pub at: SystemTime,
-    /// Who.
+    /// The refused peer or session.
     pub peer: String,
-    /// What was refused, or the variable that differs.
+    /// The subject of the refusal, or the variable that differs.
     pub what: String,
-    /// Why.
+    /// The reason.
     pub reason: String,
 }
 
 impl RefusalStatus {
-    /// `peer` was refused, at this time.
+    /// Creates the refusal of `peer` at this time.
     pub fn new(at: SystemTime, peer: String, what: String, reason: String) -> Self {
         Self { at, peer, what, reason }
     }
 }
 
-/// What came of reading a daemon's settings again.
+/// The result of reading a daemon's settings again.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct ReloadReport {
-    /// Settings that have another value now.
+    /// Settings that now have another value.
     pub changed: Vec<String>,
-    /// Settings that differ from those in force and count only once the daemon is started again.
+    /// Settings that differ from those in force and take effect only when the daemon is started again.
     pub needs_restart: Vec<String>,
-    /// What is wrong with the settings. Nothing was changed.
+    /// The error in the settings. If there is one, nothing was changed.
     pub error: Option<String>,
 }
 
-/// What access rules of a linked peer let this host do there.
+/// The decisions of a linked peer's access rules about this host.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct PeerDecisions {
     /// One decision for each use that was asked about, in that order.
     pub decisions: Vec<PeerDecision>,
-    /// Why there are none.
+    /// The reason why there are none.
     pub error: Option<String>,
 }
 
-/// What a peer's access rules say of one use.
+/// The decision of a peer's access rules about one use.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct PeerDecision {
-    /// Whether the peer allows it.
+    /// True if the peer allows it.
     pub allowed: bool,
-    /// Which rule decides, in the peer's words, without control characters.
+    /// The rule that decides, in the peer's words, without control characters.
     pub reason: String,
 }
 
 impl PeerDecision {
-    /// What a peer said.
+    /// Creates a peer's decision.
     pub fn new(allowed: bool, reason: String) -> Self {
         Self { allowed, reason }
     }

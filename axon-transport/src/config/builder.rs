@@ -8,13 +8,13 @@ use super::{
     daemon_env::DaemonEnv, names, resolve::resolve, sources::Given, values::method,
 };
 
-/// Makes a [`Config`] in code. Each method gives the setting of `docs/configuration.md` that has its name:
+/// Makes a [`Config`] in code. Each method sets the setting of `docs/configuration.md` that has its name:
 /// [`kme_url`](Self::kme_url) is `AXON_KME_URL`, and `kme_url` of `axon.toml`.
 ///
-/// [`Config::builder`] starts from the defaults and reads no environment and no file;
-/// [`ConfigBuilder::from_env`] starts from what [`Config::from_env`] would read. [`build`](Self::build)
-/// validates all settings together, by the same rules as those of the environment: what is refused there
-/// is refused here. A daemon that a session starts with the configuration gets the same settings.
+/// [`Config::builder`] starts from the defaults and reads no environment and no file; [`ConfigBuilder::from_env`]
+/// starts from what [`Config::from_env`] would read. [`build`](Self::build) validates all settings together, by the
+/// same rules as for the environment: a value that is refused there is refused here. A daemon that a session starts
+/// with the configuration gets the same settings.
 ///
 /// ```
 /// use axon_transport::{
@@ -49,13 +49,13 @@ pub struct ConfigBuilder {
 }
 
 impl Config {
-    /// A builder that starts from the defaults. It reads no environment, and no file but those given to it.
+    /// Returns a builder that starts from the defaults. It reads no environment, and no file except those given to it.
     pub fn builder() -> ConfigBuilder {
         ConfigBuilder::default()
     }
 }
 
-/// The defaults of `docs/configuration.md`. No environment and no file is read.
+/// Returns the defaults of `docs/configuration.md`. Reads no environment and no file.
 impl Default for Config {
     fn default() -> Self {
         match Self::builder().build() {
@@ -66,13 +66,13 @@ impl Default for Config {
 }
 
 impl ConfigBuilder {
-    /// A builder that starts from the environment and the `axon.toml` that [`Config::from_env`] would read,
-    /// at the time of [`build`](Self::build). What is given to it wins.
+    /// Returns a builder that starts from the environment and the `axon.toml` that [`Config::from_env`] would read, at
+    /// the time of [`build`](Self::build). Settings that are given to the builder win.
     pub fn from_env() -> Self {
         Self { reads_environment: true, ..Self::default() }
     }
 
-    /// The configuration.
+    /// Validates the settings, and returns the configuration.
     ///
     /// # Errors
     /// A setting that is wrong, half-given or without effect, by the name of its variable. Files that are
@@ -138,59 +138,59 @@ impl ConfigBuilder {
         self.set(name, time.as_secs())
     }
 
-    /// How peers prove themselves and agree on keys. Default [`Classic`](SecurityMode::Classic).
+    /// Sets how peers prove themselves and agree on keys. Default [`Classic`](SecurityMode::Classic).
     pub fn security_mode(self, mode: SecurityMode) -> Self {
         self.set("AXON_SECURITY_MODE", mode.name())
     }
 
-    /// The one cipher offered. Default ChaCha20-Poly1305.
+    /// Sets the one cipher that is offered. Default ChaCha20-Poly1305.
     pub fn quic_cipher(self, cipher: QuicCipher) -> Self {
         self.set("AXON_QUIC_CIPHER", cipher.name())
     }
 
-    /// How a peer is known in `classic`. Default [`Pinned`](ClassicAuth::Pinned) where
-    /// [`classic_key`](Self::classic_key) or [`classic_trust`](Self::classic_trust) is given, else
+    /// Sets how a peer is identified in `classic`. Default [`Pinned`](ClassicAuth::Pinned) if
+    /// [`classic_key`](Self::classic_key) or [`classic_trust`](Self::classic_trust) is given, otherwise
     /// [`None`](ClassicAuth::None).
     pub fn classic_auth(self, auth: ClassicAuth) -> Self {
         self.set("AXON_CLASSIC_AUTH", auth.name())
     }
 
-    /// This host's private key, PKCS#8, mode 0600 or 0400.
+    /// Sets the file of this host's private key, PKCS#8, mode 0600 or 0400.
     pub fn classic_key(self, file: impl AsRef<Path>) -> Self {
         self.path("AXON_CLASSIC_KEY", file)
     }
 
-    /// The file of pins.
+    /// Sets the file of pins.
     pub fn classic_trust(self, file: impl AsRef<Path>) -> Self {
         self.path("AXON_CLASSIC_TRUST", file)
     }
 
-    /// The file of roots, for [`Ca`](ClassicAuth::Ca).
+    /// Sets the file of roots, for [`Ca`](ClassicAuth::Ca).
     pub fn classic_ca(self, file: impl AsRef<Path>) -> Self {
         self.path("AXON_CLASSIC_CA", file)
     }
 
-    /// This host's certificate chain, for [`Ca`](ClassicAuth::Ca).
+    /// Sets the file of this host's certificate chain, for [`Ca`](ClassicAuth::Ca).
     pub fn classic_cert(self, file: impl AsRef<Path>) -> Self {
         self.path("AXON_CLASSIC_CERT", file)
     }
 
-    /// Certificate revocation lists, for [`Ca`](ClassicAuth::Ca).
+    /// Sets the file of certificate revocation lists, for [`Ca`](ClassicAuth::Ca).
     pub fn classic_crl(self, file: impl AsRef<Path>) -> Self {
         self.path("AXON_CLASSIC_CRL", file)
     }
 
-    /// What KME keys protect. Default [`Messages10`](KeyMode::Messages10).
+    /// Sets what KME keys protect. Default [`Messages10`](KeyMode::Messages10).
     pub fn qkd_key_mode(self, mode: KeyMode) -> Self {
         self.set("AXON_QKD_KEY_MODE", mode.name())
     }
 
-    /// The key exchange beside the KME key. Default `psk_ke`, none.
+    /// Sets the key exchange beside the KME key. Default `psk_ke`, none.
     pub fn qkd_kex(self, kex: QkdKex) -> Self {
         self.set("AXON_QKD_KEX", kex.name())
     }
 
-    /// Which SAEs may be peers. Required in `qkd`.
+    /// Sets the SAEs that may be peers. Required in `qkd`.
     pub fn qkd_peers(self, peers: QkdPeers) -> Self {
         const NAME: &str = "AXON_QKD_PEERS";
         match peers {
@@ -199,141 +199,140 @@ impl ConfigBuilder {
         }
     }
 
-    /// The age at which a connection is made anew under a new key, in whole seconds up to a day. Default
-    /// one hour.
+    /// Sets the age at which a connection is made anew under a new key, in whole seconds up to a day. Default one hour.
     pub fn qkd_session_max_age(self, age: Duration) -> Self {
         self.seconds("AXON_QKD_SESSION_MAX_AGE", age)
     }
 
-    /// `https://host[:port][/path]` of this host's KME. Required in `qkd`.
+    /// Sets the URL of this host's KME, `https://host[:port][/path]`. Required in `qkd`.
     pub fn kme_url(self, url: impl Into<String>) -> Self {
         self.set("AXON_KME_URL", url.into())
     }
 
-    /// The file of roots for the KME's certificate. Required in `qkd`.
+    /// Sets the file of roots for the KME's certificate. Required in `qkd`.
     pub fn kme_ca(self, file: impl AsRef<Path>) -> Self {
         self.path("AXON_KME_CA", file)
     }
 
-    /// The common name that the KME's certificate must have too. Default not checked.
+    /// Sets the common name that the KME's certificate must also have. By default it is not checked.
     pub fn kme_id(self, id: impl Into<String>) -> Self {
         self.set("AXON_KME_ID", id.into())
     }
 
-    /// Deviations of the KME to tolerate, by the names of
+    /// Sets the deviations of the KME to tolerate, by the names of
     /// [`QkdConfig::KME_QUIRKS`](super::QkdConfig::KME_QUIRKS). Default none.
     pub fn kme_quirks(self, names: impl IntoIterator<Item = impl Into<String>>) -> Self {
         self.list("AXON_KME_QUIRKS", names.into_iter().map(Into::into))
     }
 
-    /// The time that TCP and TLS to the KME may take, 1 to 10 whole seconds. Default 2 s.
+    /// Sets the time that TCP and TLS to the KME may take, 1 to 10 whole seconds. Default 2 s.
     pub fn kme_connect_timeout(self, time: Duration) -> Self {
         self.seconds("AXON_KME_CONNECT_TIMEOUT", time)
     }
 
-    /// The time that a whole call to the KME may take, 1 to 10 whole seconds. Default 3 s.
+    /// Sets the time that a whole call to the KME may take, 1 to 10 whole seconds. Default 3 s.
     pub fn kme_answer_timeout(self, time: Duration) -> Self {
         self.seconds("AXON_KME_ANSWER_TIMEOUT", time)
     }
 
-    /// This host's SAE ID. Required in `qkd`.
+    /// Sets this host's SAE ID. Required in `qkd`.
     pub fn sae_id(self, id: impl Into<String>) -> Self {
         self.set("AXON_SAE_ID", id.into())
     }
 
-    /// The client certificate for the KME. Required in `qkd`.
+    /// Sets the file of the client certificate for the KME. Required in `qkd`.
     pub fn sae_cert(self, file: impl AsRef<Path>) -> Self {
         self.path("AXON_SAE_CERT", file)
     }
 
-    /// Its private key, mode 0600 or 0400. Required in `qkd`.
+    /// Sets the file of the client certificate's private key, mode 0600 or 0400. Required in `qkd`.
     pub fn sae_key(self, file: impl AsRef<Path>) -> Self {
         self.path("AXON_SAE_KEY", file)
     }
 
-    /// What a session does about its daemon. Default [`Spawn`](DaemonPolicy::Spawn).
+    /// Sets what a session does about its daemon. Default [`Spawn`](DaemonPolicy::Spawn).
     pub fn daemon(self, policy: DaemonPolicy) -> Self {
         self.set("AXON_DAEMON", policy.name())
     }
 
-    /// The daemon's program. Default: it is looked for, as `docs/configuration.md` says.
+    /// Sets the daemon's program. By default it is searched as `docs/configuration.md` describes.
     pub fn daemon_path(self, program: impl AsRef<Path>) -> Self {
         self.path("AXON_DAEMON_PATH", program)
     }
 
-    /// The absolute path of the directory for what a daemon keeps, and for the session socket. Default
-    /// none: the daemon has an abstract name alone, and keeps nothing.
+    /// Sets the absolute path of the directory for the daemon's files and the session socket. Default none: the daemon
+    /// has only an abstract name, and keeps no files.
     pub fn runtime_dir(self, directory: impl AsRef<Path>) -> Self {
         self.path("AXON_RUNTIME_DIR", directory)
     }
 
-    /// The history of a publisher, 1 to 65536 MiB. Default 64.
+    /// Sets the size of a publisher's history, 1 to 65536 MiB. Default 64.
     pub fn ring_buffer_size_mb(self, mib: u64) -> Self {
         self.set("AXON_RING_BUFFER_SIZE_MB", mib)
     }
 
-    /// The largest message, 1 to 4095 MiB. Default 256.
+    /// Sets the size of the largest message, 1 to 4095 MiB. Default 256.
     pub fn max_message_mb(self, mib: u64) -> Self {
         self.set("AXON_MAX_MESSAGE_MB", mib)
     }
 
-    /// The daemon's queue of reliable samples for other hosts, 1 to 65536 MiB. Default 256.
+    /// Sets the size of the daemon's queue of reliable samples for other hosts, 1 to 65536 MiB. Default 256.
     pub fn reliable_queue_mb(self, mib: u64) -> Self {
         self.set("AXON_RELIABLE_QUEUE_MB", mib)
     }
 
-    /// Whether the process shares memory with others. Default true.
+    /// Sets whether the process shares memory with others. Default true.
     pub fn shm(self, shared: bool) -> Self {
         self.set("AXON_SHM", if shared { "on" } else { "off" })
     }
 
-    /// Whether samples of more than 4 KiB are copied when they are taken. Default false.
+    /// Sets whether samples of more than 4 KiB are copied when they are taken. Default false.
     pub fn shm_copy(self, copy: bool) -> Self {
         self.set("AXON_SHM_COPY", u8::from(copy))
     }
 
-    /// Users beside this one whose daemon and sessions are trusted. Default none.
+    /// Sets the users beside this one whose daemon and sessions are trusted. Default none.
     pub fn trusted_uids(self, uids: impl IntoIterator<Item = u32>) -> Self {
         self.list("AXON_TRUSTED_UIDS", uids)
     }
 
-    /// The file of access rules. Default none: everything is allowed.
+    /// Sets the file of access rules. Default none: everything is allowed.
     pub fn access_file(self, file: impl AsRef<Path>) -> Self {
         self.path("AXON_ACCESS_FILE", file)
     }
 
-    /// What the daemon logs: levels or `target=level`, separated by commas. Default `warn`.
+    /// Sets what the daemon logs: levels or `target=level`, separated by commas. Default `warn`.
     pub fn log(self, filter: impl Into<String>) -> Self {
         self.set("AXON_LOG", filter.into())
     }
 
-    /// An `axon.toml` to read; what is given to the builder wins over it. Default none from
+    /// Sets an `axon.toml` to read; settings that are given to the builder win over it. Default none from
     /// [`Config::builder`].
     pub fn config(self, file: impl AsRef<Path>) -> Self {
         self.path(names::CONFIG, file)
     }
 
-    /// Local addresses of discovery and links, 1 to 16. Default all.
+    /// Sets the local addresses of discovery and links, 1 to 16. Default all.
     pub fn bind_addrs(self, addresses: impl IntoIterator<Item = IpAddr>) -> Self {
         self.list("AXON_BIND_ADDRS", addresses)
     }
 
-    /// Peers to try beside those that discovery finds: `host`, `host:port` or `[IPv6]:port`, up to 64.
+    /// Sets the peers to try beside those that discovery finds: `host`, `host:port` or `[IPv6]:port`, up to 64.
     pub fn daemon_peers(self, peers: impl IntoIterator<Item = impl Into<String>>) -> Self {
         self.list("AXON_DAEMON_PEERS", peers.into_iter().map(Into::into))
     }
 
-    /// Addresses to state in beacons, up to 4. Default those of the interfaces.
+    /// Sets the addresses to state in beacons, up to 4. Default those of the interfaces.
     pub fn advertise_addrs(self, addresses: impl IntoIterator<Item = IpAddr>) -> Self {
         self.list("AXON_ADVERTISE_ADDRS", addresses)
     }
 
-    /// `ROS_DOMAIN_ID`, 0 to 232. Default 0.
+    /// Sets `ROS_DOMAIN_ID`, 0 to 232. Default 0.
     pub fn domain(self, domain: u32) -> Self {
         self.set("ROS_DOMAIN_ID", domain)
     }
 
-    /// How far a session is discovered (`ROS_AUTOMATIC_DISCOVERY_RANGE`). Default
+    /// Sets how far a session is discovered (`ROS_AUTOMATIC_DISCOVERY_RANGE`). Default
     /// [`Subnet`](DiscoveryRange::Subnet).
     pub fn discovery_range(mut self, range: DiscoveryRange) -> Self {
         // It would win.
@@ -341,40 +340,40 @@ impl ConfigBuilder {
         self.set("ROS_AUTOMATIC_DISCOVERY_RANGE", range.name())
     }
 
-    /// Addresses or host names of static peers (`ROS_STATIC_PEERS`), up to 32.
+    /// Sets the addresses or host names of static peers (`ROS_STATIC_PEERS`), up to 32.
     pub fn static_peers(self, peers: impl IntoIterator<Item = impl Into<String>>) -> Self {
         self.list("ROS_STATIC_PEERS", peers.into_iter().map(Into::into))
     }
 
-    /// How long a daemon that a session started outlives its last session, in whole seconds up to a day.
+    /// Sets the time that a daemon which a session started outlives its last session, in whole seconds up to a day.
     /// Default 10 s.
     pub fn link_grace(self, time: Duration) -> Self {
         self.seconds("AXON_LINK_GRACE_S", time)
     }
 
-    /// The time after which a peer that takes nothing of a KEEP_ALL topic is disconnected from it, in whole
+    /// Sets the time after which a peer that takes nothing of a KEEP_ALL topic is disconnected from it, in whole
     /// seconds from 1 s to a day. Default 10 s.
     pub fn link_stalled(self, time: Duration) -> Self {
         self.seconds("AXON_LINK_STALLED_S", time)
     }
 
-    /// The largest UDP payload that path discovery tries, 1200 to 65527 bytes. Default 1452.
+    /// Sets the largest UDP payload that path discovery tries, 1200 to 65527 bytes. Default 1452.
     pub fn link_mtu(self, bytes: u16) -> Self {
         self.set("AXON_LINK_MTU", bytes)
     }
 
-    /// Memory for the graph of one peer, 1 to 1024 MiB. Its routes may take four times as much. Default 16.
+    /// Sets the memory for the graph of one peer, 1 to 1024 MiB. Its routes may take four times as much. Default 16.
     pub fn link_graph_mb(self, mib: u64) -> Self {
         self.set("AXON_LINK_GRAPH_MB", mib)
     }
 
-    /// Memory for the samples and calls of one peer that are kept here for readers and servers, 16 to 1,048,576 MiB.
-    /// Default 2,048.
+    /// Sets the memory for the samples and calls of one peer that are kept here for readers and servers, 16 to
+    /// 1,048,576 MiB. Default 2,048.
     pub fn link_held_mb(self, mib: u64) -> Self {
         self.set("AXON_LINK_HELD_MB", mib)
     }
 
-    /// Whether the daemon looks for the next input before it sleeps. Default [`LinkPoll::Adaptive`].
+    /// Sets whether the daemon looks for the next input before it sleeps. Default [`LinkPoll::Adaptive`].
     pub fn link_poll(self, poll: LinkPoll) -> Self {
         let word = match poll {
             LinkPoll::Adaptive => "adaptive",
@@ -384,12 +383,12 @@ impl ConfigBuilder {
         self.set("AXON_LINK_POLL", word)
     }
 
-    /// The absolute path of the directory to which the daemon writes QUIC's events. Default none.
+    /// Sets the absolute path of the directory to which the daemon writes QUIC's events. Default none.
     pub fn link_qlog(self, directory: impl AsRef<Path>) -> Self {
         self.path("AXON_LINK_QLOG", directory)
     }
 
-    /// The congestion controller of links. Default [`Congestion::Auto`].
+    /// Sets the congestion controller of links. Default [`Congestion::Auto`].
     pub fn link_congestion(self, congestion: Congestion) -> Self {
         let word = match congestion {
             Congestion::Auto => "auto",
@@ -400,7 +399,7 @@ impl ConfigBuilder {
         self.set("AXON_LINK_CONGESTION", word)
     }
 
-    /// Whether samples are compressed for other hosts. Default [`LinkCompression::Auto`].
+    /// Sets whether samples are compressed for other hosts. Default [`LinkCompression::Auto`].
     pub fn link_compression(self, compression: LinkCompression) -> Self {
         let word = match compression {
             LinkCompression::Auto => "auto",

@@ -15,7 +15,7 @@ use crate::bench::{
     harness::{
         Channel, End as _, Load, Motion, Other, Result, Side, Wake, agree, cpu, spawn, stamp,
     },
-    session::place::{PATIENCE, Settings, session},
+    session::place::{MATCH_TIMEOUT, Settings, session},
 };
 
 /// The number of a stream's last message.
@@ -98,7 +98,7 @@ impl Reader {
         channel.tell(&StreamCommand::Read { settings: far.clone(), topic: topic.clone(), flow })?;
         let session = session(near)?;
         let publisher = session.create_publisher(spec(&topic, flow))?;
-        if !publisher.wait_matched(1, PATIENCE) {
+        if !publisher.wait_matched(1, MATCH_TIMEOUT) {
             return Err("the two hosts do not meet".into());
         }
         channel.hear::<()>()?;
@@ -149,13 +149,15 @@ pub(super) fn attend() -> Result<()> {
 fn read(channel: &Channel, settings: &Settings, topic: &str, flow: Flow) -> Result<Found> {
     let session = session(settings)?;
     let subscription = session.create_subscription(spec(topic, flow))?;
-    if !subscription.wait_matched(1, PATIENCE) {
+    if !subscription.wait_matched(1, MATCH_TIMEOUT) {
         return Err("the two hosts do not meet".into());
     }
     channel.tell(&())?;
     let mut bytes = Vec::new();
     count(|| {
-        subscription.recv(&mut bytes, Some(PATIENCE)).map_err(|_| "the stream does not end")?;
+        subscription
+            .recv(&mut bytes, Some(MATCH_TIMEOUT))
+            .map_err(|_| "the stream does not end")?;
         let [first, last] = [bytes.first_chunk(), bytes.last_chunk()];
         agree(*first.ok_or("too short")?, *last.ok_or("too short")?)
     })

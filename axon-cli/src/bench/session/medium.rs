@@ -9,7 +9,7 @@ use axon_transport::{
     Client, EndpointSpec, Publisher, Server, Session, Subscription, Waitable, ids::Gid, qos::Qos,
 };
 
-use super::place::{PATIENCE, Settings, daemon_pid, session};
+use super::place::{MATCH_TIMEOUT, Settings, daemon_pid, session};
 use crate::bench::harness::{
     Channel, End, Error, Load, Medium, Motion, Result, Side, agree, qos, stamp,
 };
@@ -86,7 +86,8 @@ impl Medium for Sessions {
         };
         let subscription = session.create_subscription(spec(back)?)?;
         let publisher = session.create_publisher(spec(out)?)?;
-        if !publisher.wait_matched(1, PATIENCE) || !subscription.wait_matched(1, PATIENCE) {
+        if !publisher.wait_matched(1, MATCH_TIMEOUT) || !subscription.wait_matched(1, MATCH_TIMEOUT)
+        {
             return Err("the two sessions do not meet".into());
         }
         let loans = load.motion == Motion::Touch && load.size > LOANS_COPIED;
@@ -165,7 +166,7 @@ impl Medium for Service {
         let (sleeps, bytes) = (load.wake.sleeps(), vec![0x5a; load.size]);
         if side == Side::Near {
             let client = session.create_client(spec(&name, Qos::default()))?;
-            if !client.wait_available(PATIENCE) {
+            if !client.wait_available(MATCH_TIMEOUT) {
                 return Err("there is no server".into());
             }
             return Ok(Box::new(Asking { client, session, sleeps, bytes }));

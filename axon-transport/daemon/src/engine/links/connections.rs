@@ -1,4 +1,4 @@
-//! The QUIC connections of this host: which of them have work, when each is due, and which transmits next.
+//! The QUIC connections of this host. Tracks which of them have work, when each is due, and which transmits next.
 
 use std::{
     collections::{BTreeSet, HashMap, VecDeque},
@@ -64,22 +64,22 @@ impl Connections {
         }
     }
 
-    /// The endpoints.
+    /// Returns the endpoints.
     pub(super) fn endpoints(&mut self) -> &mut QuicEndpoints {
         &mut self.endpoints
     }
 
-    /// A connection.
+    /// Returns a connection.
     pub(super) fn get(&self, number: u64) -> Option<&Connection> {
         self.all.get(&number)
     }
 
-    /// A connection.
+    /// Returns a connection.
     pub(super) fn get_mut(&mut self, number: u64) -> Option<&mut Connection> {
         self.all.get_mut(&number)
     }
 
-    /// The address of the other end.
+    /// Returns the address of the other end.
     pub(super) fn address(&self, number: u64) -> Option<SocketAddr> {
         Some(self.get(number)?.quic.remote_address())
     }
@@ -248,7 +248,7 @@ impl Connections {
         self.touch(number);
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) is due.
+    /// Returns when [`handle_timeout`](Self::handle_timeout) is due.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         let quic = self.deadlines.first().map(|(due, _)| due.saturating_duration_since(self.epoch));
         let control = self.all.values().filter_map(|c| c.control.poll_timeout()).min();

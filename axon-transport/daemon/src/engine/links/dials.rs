@@ -1,4 +1,4 @@
-//! The dials under way. Of each connection that is being opened, the dial that it belongs to.
+//! The dials under way, and for each connection that is being opened, the dial that it belongs to.
 
 use std::{
     collections::{HashMap, HashSet},
@@ -25,7 +25,7 @@ use crate::{
 pub(super) struct Dials {
     under_way: HashMap<u64, LinkDial>,
     next_number: u64,
-    /// Dials that may go on.
+    /// Dials that may continue.
     stirred: HashSet<u64>,
     /// The daemon that a dial looked for, by the connection that is being opened.
     opening: HashMap<u64, (DaemonId, AddressConfidence)>,
@@ -48,13 +48,13 @@ impl Dials {
         self.stirred.insert(number);
     }
 
-    /// How many there are.
+    /// Returns the number of dials.
     #[cfg(test)]
     pub(super) fn len(&self) -> usize {
         self.under_way.len()
     }
 
-    /// A dial.
+    /// Returns a dial.
     pub(super) fn get_mut(&mut self, number: u64) -> Option<&mut LinkDial> {
         self.under_way.get_mut(&number)
     }
@@ -69,7 +69,7 @@ impl Dials {
         self.under_way.clear();
     }
 
-    /// The handshake of a dial's connection is complete.
+    /// Handles that the handshake of a dial's connection is complete.
     pub(super) fn handle_connected(&mut self, number: u64) {
         if let Some(dial) = self.under_way.get_mut(&number) {
             dial.dialling.handle_connected();
@@ -77,7 +77,7 @@ impl Dials {
         }
     }
 
-    /// A dial's connection ended before its handshake was complete.
+    /// Handles that a dial's connection ended before its handshake was complete.
     pub(super) fn handle_failed(&mut self, number: u64, error: &ConnectionError) {
         if let Some(dial) = self.under_way.get_mut(&number) {
             dial.dialling.handle_failed(error);
@@ -85,7 +85,7 @@ impl Dials {
         }
     }
 
-    /// The KME answered: those that wait for a key ask for it again.
+    /// Handles an answer of the KME: dials that wait for a key ask for it again.
     pub(super) fn handle_key(&mut self) {
         for (number, dial) in &mut self.under_way {
             dial.dialling.handle_key();
@@ -93,12 +93,12 @@ impl Dials {
         }
     }
 
-    /// Takes the numbers of those that may go on.
+    /// Takes the numbers of the dials that may continue.
     pub(super) fn take_stirred(&mut self) -> HashSet<u64> {
         std::mem::take(&mut self.stirred)
     }
 
-    /// What a dial has to do next.
+    /// Returns a dial's next action.
     pub(super) fn poll_action(
         &mut self,
         number: u64,
@@ -108,12 +108,12 @@ impl Dials {
         self.under_way.get_mut(&number)?.dialling.poll_action(now, keyring)
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) is due.
+    /// Returns when [`handle_timeout`](Self::handle_timeout) is due.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         self.under_way.values().filter_map(|dial| dial.dialling.poll_timeout()).min()
     }
 
-    /// Has those go on that are due.
+    /// Continues the dials that are due.
     pub(super) fn handle_timeout(&mut self, now: Duration) {
         let due = self
             .under_way
@@ -122,7 +122,7 @@ impl Dials {
         self.stirred.extend(due.map(|(number, _)| *number));
     }
 
-    /// Notes which daemon a dial looked for, for the case that the connection cannot be opened.
+    /// Records which daemon a dial looked for, in case the connection cannot be opened.
     pub(super) fn note_opening(
         &mut self,
         connection: u64,
@@ -131,17 +131,17 @@ impl Dials {
         self.opening.extend(of.map(|of| (connection, of)));
     }
 
-    /// The daemon that was looked for with this connection, while it is being opened.
+    /// Returns the daemon that this connection was dialled for, while it is being opened.
     pub(super) fn expected(&self, connection: u64) -> Option<DaemonId> {
         self.opening.get(&connection).map(|(daemon, _)| *daemon)
     }
 
-    /// The opening of a dialled connection succeeded.
+    /// Records that the opening of a dialled connection succeeded.
     pub(super) fn opened(&mut self, connection: u64) {
         self.opening.remove(&connection);
     }
 
-    /// The opening of a connection failed. Returns the report of it if it was dialled.
+    /// Records that the opening of a connection failed. Returns the report if the connection was dialled.
     pub(super) fn opening_failed(&mut self, connection: u64) -> Option<LinkReport> {
         let (daemon, standing) = self.opening.remove(&connection)?;
         Some(LinkReport::DialFailed { daemon, standing })

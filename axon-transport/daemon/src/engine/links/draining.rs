@@ -1,4 +1,4 @@
-//! Links that a successor took over from: they deliver what is under way, and close.
+//! Links that a successor took over from: they deliver their data in flight, and close.
 
 use std::time::Duration;
 
@@ -14,12 +14,12 @@ use super::{
 };
 use crate::link::{CloseCode, LinkClosed};
 
-/// Superseded links of one identity. The oldest closes for another one.
+/// Maximum number of superseded links of one identity. The oldest closes for another one.
 const MAX_LEAVING: usize = 8;
 const SUPERSEDED: &str = "a successor took over";
 
 impl Links {
-    /// A successor took over from a link. Returns what the peer is told if the link is silent.
+    /// Handles that a successor took over from a link. Returns the message for the peer if the link is silent.
     pub(super) fn hand_over(&mut self, old: u64, now: Duration) -> Option<LinkClosed> {
         let ours = self.hello.daemon;
         let stats = self.connections.get(old)?.quic.stats();
@@ -41,8 +41,8 @@ impl Links {
         elected.filter(|_| silent).map(|elected| LinkClosed { link: elected.link })
     }
 
-    /// Gives up superseded links over which nothing comes although their peers are heard over the links in use. What is sent
-    /// again there waits for the streams of these.
+    /// Gives up superseded links over which nothing arrives although their peers are heard over the links in use. Data
+    /// that is sent again there waits for the streams of these links.
     pub(super) fn look_for_silent_leaving(&mut self) {
         for (number, daemon) in self.leaving() {
             let current = self.table.current_peer(daemon);
@@ -72,7 +72,7 @@ impl Links {
         })
     }
 
-    /// The peer sends over the successor.
+    /// Records that the peer sends over the successor.
     pub(super) fn succeeded(&mut self, daemon: DaemonId) {
         for (_, link) in self.leaving_of(daemon) {
             if let LinkPhase::Leaving(leaving) = &mut link.phase {
@@ -81,7 +81,7 @@ impl Links {
         }
     }
 
-    /// The peer says that it closed a link, whose packets do not arrive.
+    /// Handles the peer's message that it closed a link, whose packets do not arrive.
     pub(super) fn closed_by_peer(&mut self, daemon: DaemonId, closed: LinkClosed) {
         for (_, link) in self.leaving_of(daemon) {
             let elected = link.peer.as_ref().and_then(|peer| peer.elected);
@@ -93,25 +93,26 @@ impl Links {
         }
     }
 
-    /// The peer's last link is over: nothing more is waited for.
+    /// Closes the superseded links of a peer whose last link is over: nothing more is waited for.
     pub(super) fn abandon_leaving(&mut self, daemon: DaemonId, now: Duration) {
         let numbers: Vec<u64> = self.leaving_of(daemon).map(|(number, _)| number).collect();
         numbers.into_iter().for_each(|number| self.close_leaving(number, now));
     }
 
-    /// The peer's control stream of a superseded link ended.
+    /// Records that the peer's control stream of a superseded link ended.
     pub(super) fn leaving_ended(&mut self, number: u64) {
         if let Some(Link { phase: LinkPhase::Leaving(leaving), .. }) = self.table.get_mut(number) {
             leaving.handle_ended();
         }
     }
 
-    /// The superseded links.
+    /// Returns the superseded links.
     pub(in crate::engine) fn leaving(&self) -> Vec<(u64, DaemonId)> {
         self.table.leaving().map(|(number, peer)| (number, peer.summary.hello.daemon)).collect()
     }
 
-    /// Closes a superseded link once all has arrived in both directions. So many of its streams are being read.
+    /// Closes a superseded link once everything has arrived in both directions. `reading` is the number of its streams
+    /// that are being read.
     pub(in crate::engine) fn look_at_leaving(
         &mut self,
         number: u64,
@@ -136,7 +137,7 @@ impl Links {
         }
     }
 
-    /// The time of a superseded link is over.
+    /// Closes a superseded link if its time is over.
     pub(super) fn leaving_timeout(&mut self, number: u64, now: Duration) {
         let Some(Link { phase: LinkPhase::Leaving(leaving), .. }) = self.table.get(number) else {
             return;
@@ -156,7 +157,7 @@ impl Links {
     }
 }
 
-/// Whether the peer has acknowledged all streams of this side but the control stream, which is one of them.
+/// Returns whether the peer has acknowledged all streams of this side except the control stream.
 fn all_is_sent(quic: &mut quinn_proto::Connection) -> bool {
     quic.streams().send_streams() <= 1
 }

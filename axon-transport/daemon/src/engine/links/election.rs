@@ -1,4 +1,4 @@
-//! Which of several connections with a peer becomes its link, and when a link is renewed.
+//! Decides which of several connections with a peer becomes its link, and when a link is renewed.
 
 use std::{net::IpAddr, time::Duration};
 
@@ -33,15 +33,15 @@ use crate::{
 
 /// The peer elects one of its connections within this time.
 const ELECTION_TIMEOUT: Duration = Duration::from_secs(10);
-/// Links at a time.
+/// Maximum number of links at a time.
 const MAX_LINKS: usize = 128 + 32;
-/// Links of one proven identity.
+/// Maximum number of links of one proven identity.
 const MAX_LINKS_OF_PEER: usize = 16;
-/// What a peer is told that claims the id of another one.
+/// The text for a peer that claims the id of another one.
 const OTHERS: &str = "this daemon id is that of another host";
 
 impl Links {
-    /// A connection's peer said HELLO and proved its name.
+    /// Handles that a connection's peer sent HELLO and proved its name.
     pub(super) fn established(&mut self, number: u64, opened: OpenedConnection, now: Duration) {
         let (Some(connection), Some(link)) = (self.connections.get(number), self.table.get(number))
         else {
@@ -51,7 +51,7 @@ impl Links {
         let (side, address) = (link.side, connection.quic.remote_address());
         let replaces = if side == Side::Server { hello.replaces } else { link.replaces };
         let (daemon, ours) = (hello.daemon, self.hello.daemon);
-        // The other end compares, too. Who says nothing of that must not count as found.
+        // The other end compares, too. A peer that does not report a difference must not count as found.
         if let Some(expected) = self.dials.expected(number).filter(|expected| *expected != daemon) {
             let why = format!("daemon id is {daemon} there, and {expected} was dialled");
             return self.turn_away(number, &hello, why, now);
@@ -62,7 +62,7 @@ impl Links {
             return self.turn_away(number, &hello, why, now);
         }
         let auth = self.credentials.auth();
-        // The pins may have changed since they were looked at.
+        // The pins may have changed since they were checked.
         let who = match PeerIdentity::of(
             self.keyring.is_some(),
             auth.as_ref(),
@@ -154,7 +154,7 @@ impl Links {
         self.turn_away_told(number, hello, why.clone(), &why, now);
     }
 
-    /// As [`turn_away`](Self::turn_away), with another text for the peer.
+    /// Like [`turn_away`](Self::turn_away), with another text for the peer.
     fn turn_away_told(
         &mut self,
         number: u64,
@@ -174,7 +174,7 @@ impl Links {
         }
     }
 
-    /// Ends a link of an address that has more of them than a newcomer's.
+    /// Ends a link of an address that has more of them than the newcomer's. Returns whether it did.
     fn make_place(&mut self, newcomer: IpAddr, now: Duration) -> bool {
         let links = self.table.peers();
         let links: Vec<_> = links
@@ -197,7 +197,7 @@ impl Links {
         true
     }
 
-    /// A link is elected: it carries samples from now on.
+    /// Opens an elected link, which carries samples from now on.
     pub(super) fn open(&mut self, number: u64, elected: Elected, now: Duration) {
         let Some(peer) = self.table.peer(number) else {
             return;
@@ -256,10 +256,11 @@ impl Links {
         self.connections.touch(number);
     }
 
-    /// Whether a peer may link under a daemon id. A link under it whose peer did not prove the id ends if this one did.
+    /// Checks that a peer may link under a daemon id. If this peer proved the id, a link under it whose peer did not
+    /// prove it ends.
     ///
     /// # Errors
-    /// The id is another peer's.
+    /// The id belongs to another peer.
     fn claim(
         &mut self,
         daemon: DaemonId,
@@ -286,7 +287,7 @@ impl Links {
         Ok(())
     }
 
-    /// Lets the peer send more that is not read, as far as its identity has room. Returns whether it may.
+    /// Lets the peer have more unread data in flight, as far as its identity's limit allows. Returns whether it may.
     fn widen(&mut self, number: u64) -> bool {
         let (Some(connection), Some(peer)) =
             (self.connections.get_mut(number), self.table.peer_mut(number))
@@ -308,7 +309,7 @@ impl Links {
         self.send(number, &LinkMessage::ReceiveLimits(ReceiveLimits { unread, messages }), now);
     }
 
-    /// Bytes of long samples that the peer may have in flight over a link.
+    /// Returns the bytes of long samples that the peer may have in flight over a link.
     pub(in crate::engine) fn window_credit(&self, number: u64) -> Option<u64> {
         Some(window_credit(window(self.table.peer(number)?).into()))
     }
@@ -321,7 +322,7 @@ impl Links {
         }
     }
 
-    /// A successor is dialled, or the link is at its end.
+    /// Handles the timer of an open link: a successor is dialled, or the link ends.
     pub(super) fn open_timeout(&mut self, number: u64, now: Duration) {
         let Some(peer) = self.table.peer_mut(number) else { return };
         match peer.age.handle_timeout(now) {
@@ -354,7 +355,7 @@ impl Links {
         self.dial(target, now);
     }
 
-    /// The link of a peer, if its path is taken for cut: what discovery dials succeeds it.
+    /// Returns the link of a peer, if its path counts as cut: connections that discovery dials succeed it.
     pub(in crate::engine) fn cut_link(&self, daemon: DaemonId) -> Option<[u8; 16]> {
         let connection = self.connections.get(self.current(daemon)?)?;
         let peer = self.table.current_peer(daemon)?;
@@ -362,14 +363,14 @@ impl Links {
         peer.elected.filter(|_| cut).map(|elected| elected.link)
     }
 
-    /// Whether a link stands with a daemon that proved its id, and its path is not taken for cut.
+    /// Returns whether a link stands with a daemon that proved its id, and its path does not count as cut.
     pub(in crate::engine) fn stands(&self, daemon: DaemonId) -> bool {
         let proven = self.table.current_peer(daemon).is_some_and(|peer| peer.proven);
         proven && self.cut_link(daemon).is_none()
     }
 
-    /// Closes the links of peers that are no longer trusted. Certificates are looked at if `certificates` says so:
-    /// that costs signatures.
+    /// Closes the links of peers that are no longer trusted. With `certificates`, certificates are checked, too, which
+    /// costs signature verifications.
     pub(in crate::engine) fn close_untrusted(&mut self, certificates: bool, now: Duration) {
         let mut untrusted = Vec::new();
         for (number, link) in self.table.iter() {
@@ -390,7 +391,7 @@ impl Links {
     }
 }
 
-/// The connection window of a peer's link.
+/// Returns the connection window of a peer's link.
 fn window(peer: &LinkPeer) -> u32 {
     LINK_WINDOW.saturating_add(u32::try_from(peer.unread.amount()).unwrap_or(u32::MAX))
 }

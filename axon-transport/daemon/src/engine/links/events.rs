@@ -1,4 +1,4 @@
-//! What comes of the links: events for the owner of the peers, reports for the control plane.
+//! The output of the links: events for the owner of the peers, reports for the control plane.
 
 use std::{collections::VecDeque, net::SocketAddr};
 
@@ -12,15 +12,15 @@ use crate::{
     link::{LinkClosed, LinkMessage},
 };
 
-/// What came of the links, for the owner of the peers.
+/// An event of the links for the owner of the peers.
 #[derive(Debug)]
 pub(in crate::engine) enum LinkEvent {
-    /// A link of this peer is elected. It takes over from another one, if that is named.
+    /// A link of this peer is elected. It takes over from the `old` link, if there is one.
     Up {
         number: u64,
         daemon: DaemonId,
         old: Option<u64>,
-        /// To be said over the new link.
+        /// The message to send over the new link.
         closed: Option<LinkClosed>,
     },
     /// A message on the link in use, with what it weighs on the peer's account until it is handled.
@@ -29,13 +29,14 @@ pub(in crate::engine) enum LinkEvent {
     Stream(u64, DaemonId, StreamEvent),
     /// The keys of this link changed.
     Keys(DaemonId),
-    /// The peer has been silent for so long that it is taken for gone. Its link stands.
+    /// The peer has been silent for so long that it counts as gone. Its link stays.
     Silent(DaemonId),
     /// A peer that was silent is back, over the same link.
     Back(DaemonId),
-    /// A superseded link of this peer is given up, whose packets do not arrive. To be said over the link in use.
+    /// A superseded link of this peer is given up, because its packets do not arrive. The message is to be sent over
+    /// the link in use.
     Closed(DaemonId, LinkClosed),
-    /// A link that was not in use is over: nothing more of its streams can be read.
+    /// A link that was not in use is over: its streams cannot be read any more.
     Gone(u64, DaemonId),
     /// The last link of a peer is over.
     Down {
@@ -43,27 +44,27 @@ pub(in crate::engine) enum LinkEvent {
         daemon: DaemonId,
         peer: String,
         reason: String,
-        /// Another daemon of its host takes its place.
+        /// True if another daemon of its host takes its place.
         restarted: bool,
     },
 }
 
-/// What the links say to the control plane.
+/// A report of the links to the control plane.
 #[derive(Debug)]
 pub(in crate::engine) enum LinkReport {
     /// A link, or an attempt at one, was refused.
     Refused(RefusalKind, String, Refusal),
     /// A dial failed.
     DialFailed { daemon: DaemonId, standing: AddressConfidence },
-    /// A link of this daemon is up at this address. Whether the daemon proved its id.
+    /// A link of this daemon is up at this address. `proven` is true if the daemon proved its id.
     Up { daemon: DaemonId, address: SocketAddr, proven: bool },
-    /// Whether the path of this daemon's link carries anything: probes of it were not answered, or it answers again.
+    /// The path of this daemon's link fails, because probes of it were not answered, or works again.
     Path { daemon: DaemonId, works: bool },
     /// Datagrams of discovery.
     Datagrams(Datagrams),
 }
 
-/// Events and reports that were not taken yet, in order.
+/// Events and reports that have not been taken, in order.
 #[derive(Default)]
 pub(super) struct LinkOutbox {
     events: VecDeque<LinkEvent>,
@@ -81,23 +82,23 @@ impl LinkOutbox {
         self.reports.push_back(report);
     }
 
-    /// How many events wait.
+    /// Returns the number of waiting events.
     #[cfg(test)]
     pub(super) fn waiting(&self) -> usize {
         self.events.len()
     }
 
-    /// Whether events wait.
+    /// Returns whether events wait.
     pub(super) fn has_events(&self) -> bool {
         !self.events.is_empty()
     }
 
-    /// The next event.
+    /// Returns the next event.
     pub(super) fn poll_event(&mut self) -> Option<LinkEvent> {
         self.events.pop_front()
     }
 
-    /// The next report.
+    /// Returns the next report.
     pub(super) fn poll_report(&mut self) -> Option<LinkReport> {
         self.reports.pop_front()
     }

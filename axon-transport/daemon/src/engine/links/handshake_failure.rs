@@ -1,4 +1,4 @@
-//! Why an incoming handshake failed, in words that name the key.
+//! Explains why an incoming handshake failed, and names the key.
 
 use std::net::SocketAddr;
 
@@ -9,8 +9,8 @@ use crate::{
     keys::{Lookup, Resolver},
 };
 
-/// Why a handshake failed, with what the look-up of its key says; `None` where that is how every
-/// bootstrap begins: the key is being fetched, and the dialler comes again.
+/// Returns why a handshake failed, with the result of the key's look-up. Returns `None` for the normal start of a
+/// bootstrap: the key is being fetched, and the dialler comes again.
 pub(crate) fn explained(
     error: &ConnectionError,
     resolver: Option<&Resolver>,

@@ -1,20 +1,21 @@
-//! What connections and links take of this host's memory, for the simulator.
+//! The memory of this host that connections and links take, for the simulator.
 
 use super::Links;
 
-/// What is held.
+/// The numbers and bytes that are held.
 #[derive(Clone, Copy, Debug)]
 pub(in crate::engine) struct HeldByLinks {
-    /// Connections, those included that are closed and not yet drained.
+    /// Connections, including those that are closed and not yet drained.
     pub(in crate::engine) connections: usize,
     /// Links whose peer is known.
     pub(in crate::engine) links: usize,
     /// Connections that are being opened.
     pub(in crate::engine) opening: usize,
     pub(in crate::engine) dials: usize,
-    /// Events that nobody has handled.
+    /// Events that have not been handled.
     pub(in crate::engine) events: usize,
-    /// The longest queue of control messages of one connection, and the most that came and is not handled, in bytes.
+    /// The longest queue of control messages of one connection in bytes; `unhandled` is the maximum of received and
+    /// unhandled ones.
     pub(in crate::engine) unsent: usize,
     pub(in crate::engine) unhandled: usize,
 }

@@ -62,7 +62,7 @@ impl PeerIdentity {
         }
     }
 
-    /// The host's name as status shows it: the name that was proven, or else what the host `calls_itself`.
+    /// Returns the host's name for status: the proven name, or else the name that the host `calls_itself`.
     pub(super) fn host_name(&self, calls_itself: &str) -> String {
         match self {
             // The name that the peer gives itself is not proven.

@@ -1,32 +1,32 @@
 //! Discovery datagrams on their way to the control plane.
 //!
-//! Anybody can send them. The first ones go on at once. Those of a flood are held for some milliseconds and go on
-//! together, so that they cost the control plane one turn and not one each.
+//! Any host can send them. The first ones are passed on at once. Those of a flood are held for some milliseconds and
+//! passed on together, so that they cost the control plane one turn, not one each.
 
 use std::{net::SocketAddr, time::Duration};
 
 use crate::discovery::Datagrams;
 
-/// Datagrams that go on at once, and how many more of them each second.
+/// Number of datagrams that are passed on at once; `A_SECOND` more are each second.
 const DATAGRAM_BURST: f64 = 32.0;
 const A_SECOND: f64 = 16.0;
-/// How long others are held at most.
+/// Maximum time that other datagrams are held.
 const MAX_DATAGRAM_HOLD: Duration = Duration::from_millis(40);
-/// Datagrams that are held at most. The last quarter is for the addresses of listed peers and of links.
+/// Maximum number of held datagrams. The last quarter is for the addresses of listed peers and of links.
 const MAX_HELD_DATAGRAMS: usize = 512;
 
-/// The datagrams that are held.
+/// The held datagrams.
 #[derive(Debug)]
 pub(super) struct DiscoveryInbox {
     held: Datagrams,
     due: Option<Duration>,
-    /// Datagrams that may go on at once, and when that was reckoned.
+    /// Number of datagrams that may be passed on at once; `filled` is the time at which it was computed.
     tokens: f64,
     filled: Duration,
 }
 
 impl DiscoveryInbox {
-    /// An empty inbox.
+    /// Creates an empty inbox.
     pub(super) fn new() -> Self {
         Self {
             held: Datagrams::default(),
@@ -36,7 +36,7 @@ impl DiscoveryInbox {
         }
     }
 
-    /// A datagram came. `known` says whether it came from the address of a listed peer or of a link.
+    /// Adds a datagram. `known` returns whether it came from the address of a listed peer or of a link.
     pub(super) fn add(
         &mut self,
         from: SocketAddr,
@@ -60,17 +60,17 @@ impl DiscoveryInbox {
         self.due = Some(self.due.map_or(due, |other| other.min(due)));
     }
 
-    /// Whether datagrams are held.
+    /// Returns whether datagrams are held.
     pub(super) fn is_holding(&self) -> bool {
         !self.held.is_empty()
     }
 
-    /// When [`take`](Self::take) has something.
+    /// Returns when [`take`](Self::take) returns datagrams.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         self.due
     }
 
-    /// The datagrams, once they are due.
+    /// Takes the datagrams, once they are due.
     pub(super) fn take(&mut self, now: Duration) -> Option<Datagrams> {
         self.due.take_if(|due| *due <= now)?;
         Some(std::mem::take(&mut self.held))

@@ -1,4 +1,4 @@
-//! The keys of the links: what the KME and the ledger answer, and what protects messages.
+//! The keys of the links: passes on the answers of the KME and the ledger, and provides the protection of messages.
 
 use std::{collections::HashSet, time::Duration};
 
@@ -14,7 +14,7 @@ use crate::{
 };
 
 impl Links {
-    /// Passes on what the keyring says.
+    /// Passes on the messages and changes of the keyring.
     pub(super) fn pass_keys_on(&mut self, now: Duration) {
         let mut changed = HashSet::new();
         while let Some(keyring) = &mut self.keyring {
@@ -34,7 +34,7 @@ impl Links {
         }
     }
 
-    /// The KME answered, or the ledger of used keys.
+    /// Handles an answer of the KME, or of the ledger of used keys.
     pub(in crate::engine) fn handle_key_event(&mut self, now: Duration, event: keys::KmeAnswer) {
         let Some(keyring) = &mut self.keyring else { return };
         match keyring.handle_answer(now, event) {
@@ -49,7 +49,7 @@ impl Links {
         }
     }
 
-    /// The ledger of used keys recorded the key of a connection; `first` if it was new.
+    /// Handles that the ledger of used keys recorded the key of a connection; `first` if it was new.
     pub(in crate::engine) fn handle_recorded(&mut self, now: Duration, number: u64, first: bool) {
         if let Some(opening) = self.table.opening_mut(number) {
             opening.handle_recorded(now, first, self.keyring.as_mut());
@@ -57,7 +57,7 @@ impl Links {
         }
     }
 
-    /// The next request to the KME.
+    /// Returns the next request to the KME.
     pub(in crate::engine) fn poll_request(
         &mut self,
         now: Duration,
@@ -73,12 +73,12 @@ impl Links {
         self.keyring.as_mut()?.poll_request(now)
     }
 
-    /// The next key to record in the ledger of used keys, and its connection.
+    /// Returns the next key to record in the ledger of used keys, and its connection.
     pub(in crate::engine) fn poll_record(&mut self) -> Option<(u64, String)> {
         self.keyring.as_mut()?.poll_record()
     }
 
-    /// The connection of a link as a carrier of samples.
+    /// Returns the connection of a link as a carrier of samples.
     pub(in crate::engine) fn carrier(&mut self, number: u64, now: Duration) -> Option<Carrier<'_>> {
         let connection = self.connections.get_mut(number)?;
         let seals = self.table.get(number)?.peer.as_ref()?.seals;
@@ -92,7 +92,7 @@ impl Links {
         Some(connection.carrier(seal, now))
     }
 
-    /// The connection of a link, and what opens its messages.
+    /// Returns the connection of a link, and the opener of its messages.
     pub(in crate::engine) fn reader(
         &mut self,
         number: u64,

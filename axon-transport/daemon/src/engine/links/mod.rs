@@ -81,7 +81,7 @@ pub(super) struct Links {
     qlogs: Option<Rc<dyn Qlogs>>,
     epoch: Instant,
     wall: WallClock,
-    /// Gives link ids and the nonces of probes.
+    /// The generator of link ids and of the nonces of probes.
     random: StdRng,
     accounts: Accounts,
     connections: Connections,
@@ -89,7 +89,7 @@ pub(super) struct Links {
     dials: Dials,
     admission: AddressAdmission,
     next_election: u64,
-    /// Whether the daemon is shutting down, so that no new link is opened.
+    /// True if the daemon is shutting down, so that no new link is opened.
     closing: bool,
     unfinished: UnfinishedConnections,
     /// The silent links that are probed, by the nonces of the probes.
@@ -221,12 +221,12 @@ impl Links {
         self.connections.endpoints().send(to, bytes);
     }
 
-    /// The next report for the control plane.
+    /// Returns the next report for the control plane.
     pub(super) fn poll_report(&mut self) -> Option<LinkReport> {
         self.outbox.poll_report()
     }
 
-    /// The next event for the peers.
+    /// Returns the next event for the peers.
     pub(super) fn poll_event(&mut self) -> Option<LinkEvent> {
         self.outbox.poll_event()
     }
@@ -409,7 +409,7 @@ impl Links {
         }
     }
 
-    /// The connection of a link.
+    /// Returns the connection of a link.
     pub(super) fn connection(&mut self, number: u64) -> Option<&mut Connection> {
         self.connections.get_mut(number)
     }
@@ -453,12 +453,12 @@ impl Links {
         self.connections.get(number).map_or(0, |c| frames_came(&c.quic.stats()))
     }
 
-    /// The link in use of a peer.
+    /// Returns the link in use of a peer.
     pub(super) fn current(&self, daemon: DaemonId) -> Option<u64> {
         self.table.current(daemon)
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) is due.
+    /// Returns when [`handle_timeout`](Self::handle_timeout) is due.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         let keys = self.keyring.as_ref().map(Keyring::poll_timeout);
         let look = (!self.table.is_empty()).then(|| self.looks.poll_timeout());

@@ -26,7 +26,7 @@ use crate::{
     link::{CloseCode, LinkHello, Side},
 };
 
-/// A dialler that has its Retry is given this long for the rest of the handshake.
+/// Time that a dialler with its Retry has for the rest of the handshake.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
 
 impl Links {
@@ -38,7 +38,7 @@ impl Links {
         self.dials.begin(target, self.keyring.as_ref(), now);
     }
 
-    /// Accepts a connection, refuses it, or has its dialler prove where it is.
+    /// Accepts a connection, refuses it, or makes its dialler prove its address.
     pub(super) fn accept(&mut self, endpoint: usize, incoming: Incoming, now: Duration) {
         if self.closing {
             return self.connections.endpoints().refuse(endpoint, incoming);
@@ -100,7 +100,7 @@ impl Links {
         self.outbox.report(LinkReport::Refused(kind, peer, refusal));
     }
 
-    /// The TLS handshake of a connection is complete.
+    /// Handles that the TLS handshake of a connection is complete.
     pub(super) fn handle_connected(&mut self, now: Duration, number: u64) {
         let Some(link) = self.table.get_mut(number) else { return };
         let LinkPhase::Handshake(_, dial) = link.phase else { return };
@@ -154,7 +154,7 @@ impl Links {
         self.connections.touch(number);
     }
 
-    /// Passes on what an opening says, and what came of it.
+    /// Passes on the messages of an opening, and handles its outcome.
     pub(super) fn go_on_opening(&mut self, number: u64, now: Duration) {
         let (Some(connection), Some(link)) =
             (self.connections.get_mut(number), self.table.get_mut(number))
@@ -194,7 +194,7 @@ impl Links {
         }
     }
 
-    /// Goes on with the dials that have something to do.
+    /// Continues the dials that have work.
     pub(super) fn go_on_dialling(&mut self, now: Duration) {
         for dial in self.dials.take_stirred() {
             while let Some(action) = self.dials.poll_action(dial, now, self.keyring.as_mut()) {
@@ -261,7 +261,7 @@ impl Links {
             DialAction::Failed(refusal) => {
                 let Some(LinkDial { dialling, .. }) = self.dials.remove(dial) else { return };
                 let target = dialling.target();
-                // A successor is dialled where a peer with a link is, unless discovery says where it may be.
+                // A successor is dialled at the address of a linked peer, unless discovery suggested the address.
                 let kind = match target.replaces {
                     _ if target.listed => RefusalKind::Listed,
                     Some(_) if target.standing.is_none() && self.credentials.authenticates() => {

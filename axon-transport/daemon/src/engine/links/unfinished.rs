@@ -1,5 +1,5 @@
 //! The connections that a pass did not finish: control streams with more to read, and lost connections whose links end
-//! once all that came over them is read.
+//! once everything that arrived over them is read.
 
 use std::collections::VecDeque;
 
@@ -8,48 +8,49 @@ use quinn_proto::ConnectionError;
 /// Connections, by the numbers of their links.
 #[derive(Default)]
 pub(super) struct UnfinishedConnections {
-    /// Their control streams have more, once the events that came are handled.
+    /// Connections whose control streams have more to read, once the events so far are handled.
     unread: Vec<u64>,
-    /// The same, and there was no room for their next message: they go first.
+    /// Connections whose control streams have more to read, and for whose next message there was no memory: they go
+    /// first.
     blocked: Vec<u64>,
-    /// They are lost, and their links stand.
+    /// Connections that are lost and whose links still exist.
     lost: VecDeque<(u64, ConnectionError)>,
 }
 
 impl UnfinishedConnections {
-    /// The control stream of a connection has more.
+    /// Adds a connection whose control stream has more to read.
     pub(super) fn add_unread(&mut self, number: u64) {
         self.unread.push(number);
     }
 
-    /// The same, and there was no room for its next message.
+    /// Adds a connection whose control stream has more to read, and for whose next message there was no memory.
     pub(super) fn add_blocked(&mut self, number: u64) {
         self.blocked.push(number);
     }
 
-    /// Whether there are control streams with more.
+    /// Returns whether there are control streams with more to read.
     pub(super) fn has_unread(&self) -> bool {
         !self.unread.is_empty() || !self.blocked.is_empty()
     }
 
-    /// Takes the connections whose control streams have more.
+    /// Takes the connections whose control streams have more to read.
     pub(super) fn take_unread(&mut self) -> Vec<u64> {
         let mut next = std::mem::take(&mut self.blocked);
         next.append(&mut self.unread);
         next
     }
 
-    /// A connection was lost.
+    /// Adds a connection that was lost.
     pub(super) fn add_lost(&mut self, number: u64, reason: ConnectionError) {
         self.lost.push_back((number, reason));
     }
 
-    /// Whether a connection is lost, and its link stands.
+    /// Returns whether a connection is lost and its link still exists.
     pub(super) fn is_lost(&self, number: u64) -> bool {
         self.lost.iter().any(|(lost, _)| *lost == number)
     }
 
-    /// Takes the next connection that was lost, and why.
+    /// Takes the next lost connection, with the reason.
     pub(super) fn poll_lost(&mut self) -> Option<(u64, ConnectionError)> {
         self.lost.pop_front()
     }

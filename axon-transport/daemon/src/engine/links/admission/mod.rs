@@ -8,10 +8,11 @@ pub(super) use self::shares::HandshakeSlot;
 pub(crate) use self::shares::place;
 use self::shares::{HandshakeShares, LoggedRefusals, gives_way};
 
-/// Handshakes under way at once, but for those of listed peers; further dials are refused and come again.
+/// Maximum number of handshakes under way at once, without those of listed peers; further dials are refused and come
+/// again.
 const MAX_HANDSHAKES: usize = 64;
 
-/// What the addresses of peers have, and what they may have.
+/// The handshakes and links of peers by address, and their limits.
 pub(super) struct AddressAdmission {
     handshakes: Rc<HandshakeShares>,
     /// Addresses of listed peers.
@@ -20,7 +21,7 @@ pub(super) struct AddressAdmission {
 }
 
 impl AddressAdmission {
-    /// Nobody has anything yet.
+    /// Creates the state without handshakes and links.
     pub(super) fn new() -> Self {
         Self {
             handshakes: HandshakeShares::new(MAX_HANDSHAKES),
@@ -29,27 +30,27 @@ impl AddressAdmission {
         }
     }
 
-    /// The addresses of listed peers.
+    /// Sets the addresses of listed peers.
     pub(super) fn set_listed(&mut self, addresses: BTreeSet<IpAddr>) {
         self.listed = addresses;
     }
 
-    /// Whether this is the address of a listed peer.
+    /// Returns whether this is the address of a listed peer.
     pub(super) fn is_listed(&self, address: IpAddr) -> bool {
         self.listed.contains(&address.to_canonical())
     }
 
-    /// A place for a handshake from this address.
+    /// Returns a place for a handshake from this address.
     pub(super) fn enter(&self, address: IpAddr) -> Option<HandshakeSlot> {
         self.handshakes.enter(address, self.listed.contains(&address.to_canonical()))
     }
 
-    /// Whether a refusal at this address is to be said, which it then was.
+    /// Returns whether a refusal at this address should be reported, and counts it as reported then.
     pub(super) fn is_new(&mut self, address: IpAddr, now: Duration) -> bool {
         self.said.is_new(address, now)
     }
 
-    /// The link that gives way to one of a newcomer. `links` are those there are.
+    /// Returns the link that gives way to a link of a newcomer. `links` are the existing links.
     pub(super) fn gives_way(&self, newcomer: IpAddr, links: &[(IpAddr, u64)]) -> Option<u64> {
         gives_way(newcomer, links, |address| self.listed.contains(&address.to_canonical()))
     }

@@ -1,4 +1,4 @@
-//! Limits what the hosts behind one address may take of the daemon's handshakes and links.
+//! Limits the handshakes and links that hosts behind one address may take of the daemon.
 //!
 //! Limits are per source address: QUIC validates the address, while an attacker can create any number of keys.
 //! Hosts behind one translated address share it, so the limits apply only where there is scarcity.
@@ -11,14 +11,15 @@ use std::{
     time::Duration,
 };
 
-/// What may be under way beyond that to listed peers.
+/// Maximum number of handshakes under way beyond that with listed peers.
 const FOR_LISTED: usize = 16;
-/// A refusal at one address is said again after this.
+/// Time after which a refusal at one address is reported again.
 const SAID_AGAIN: Duration = Duration::from_secs(10);
-/// Most addresses of which it is remembered that a refusal was said.
+/// Maximum number of addresses whose reported refusals are remembered.
 const MOST_SAID: usize = 64;
 
-/// What counts as one address: of IPv6 the network, as a host may take any address in it.
+/// Returns the part of an address that counts as one address: for IPv6 the network, because a host may take any address
+/// in it.
 pub(crate) fn place(address: IpAddr) -> IpAddr {
     match address.to_canonical() {
         IpAddr::V6(v6) => {
@@ -36,7 +37,7 @@ pub(crate) struct HandshakeShares {
     under_way: RefCell<HashMap<IpAddr, usize>>,
 }
 
-/// A handshake that counts until this is dropped.
+/// The place of a handshake, which counts until this is dropped.
 #[derive(Debug)]
 pub(crate) struct HandshakeSlot {
     of: Rc<HandshakeShares>,
@@ -48,8 +49,8 @@ impl HandshakeShares {
         Rc::new(Self { most, under_way: RefCell::default() })
     }
 
-    /// A place for one more from this address: it may have as many as are free, so that another
-    /// address always finds one. A listed peer has some that nobody else gets.
+    /// Returns a place for one more handshake from this address. An address may have as many as are free, so another
+    /// address always finds one. A listed peer has some places that no other peer gets.
     pub(crate) fn enter(self: &Rc<Self>, address: IpAddr, listed: bool) -> Option<HandshakeSlot> {
         let at = place(address);
         let mut under_way = self.under_way.borrow_mut();
@@ -77,11 +78,11 @@ impl Drop for HandshakeSlot {
     }
 }
 
-/// Who has to go so that a link from `newcomer` has a place, by the address and number of each link.
-/// `None`: the newcomer is refused, as no other address has more than it would have.
+/// Returns the link that has to go so that a link from `newcomer` has a place, given the address and number of each
+/// link. Returns `None` if the newcomer is refused, because no other address has more than it would have.
 ///
-/// The address that has the most gives its newest link. A listed peer has a place even where others
-/// have few, and does not give its own to an unlisted one.
+/// The address with the most links gives up its newest link. A listed peer has a place even if others have few, and
+/// does not give up its own to an unlisted one.
 pub(crate) fn gives_way(
     newcomer: IpAddr,
     links: &[(IpAddr, u64)],
@@ -103,12 +104,12 @@ pub(crate) fn gives_way(
     (reserved || held[&place(*address)] > own + 1).then_some(*newest)
 }
 
-/// Of which addresses a refusal was said just now.
+/// The addresses for which a refusal was reported recently.
 #[derive(Debug, Default)]
 pub(crate) struct LoggedRefusals(VecDeque<(IpAddr, Duration)>);
 
 impl LoggedRefusals {
-    /// Whether it is to be said, which it then was.
+    /// Returns whether a refusal should be reported, and counts it as reported then.
     pub(crate) fn is_new(&mut self, address: IpAddr, now: Duration) -> bool {
         self.0.retain(|(_, at)| now.saturating_sub(*at) < SAID_AGAIN);
         let at = place(address);

@@ -1,19 +1,19 @@
-//! The age of a link's keys: when a successor is dialled, and when the link ends.
+//! The age of a link's keys, which decides when a successor is dialled, and when the link ends.
 
 use std::time::Duration;
 
 /// The age of a link's keys. In `classic` they do not age.
 #[derive(Clone, Copy, Debug, Default)]
 pub(in crate::engine::links) struct Age {
-    /// When a successor is dialled, by the side that dialled the link.
+    /// The time at which the side that dialled the link dials a successor.
     renew_at: Option<Duration>,
-    /// Should the dial fail, the next one is due after this: before the key's age is reached.
+    /// The time after a failed dial at which the next one is due: before the key's age is reached.
     again: Duration,
-    /// When the link ends.
+    /// The time at which the link ends.
     until: Option<Duration>,
 }
 
-/// What is due of a link that ages.
+/// The due action for a link that ages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(in crate::engine::links) enum AgeStep {
     /// No successor came: the link ends.
@@ -23,7 +23,7 @@ pub(in crate::engine::links) enum AgeStep {
 }
 
 impl Age {
-    /// The keys are used from `now` on, for `max_age`. The side that dialled the link `renews` it.
+    /// Creates the age of keys that are used from `now` on, for `max_age`. The side that dialled the link `renews` it.
     pub(in crate::engine::links) fn new(max_age: Duration, renews: bool, now: Duration) -> Self {
         Self {
             renew_at: renews.then(|| now + renewal_at(max_age)),
@@ -32,7 +32,7 @@ impl Age {
         }
     }
 
-    /// When the link ends.
+    /// Returns when the link ends.
     pub(in crate::engine::links) fn until(&self) -> Option<Duration> {
         self.until
     }
@@ -51,8 +51,8 @@ impl Age {
     }
 }
 
-/// When the successor of a link is dialled: a tenth of its age before the end, but at least ten seconds where that is
-/// no more than half of it, since the KMEs may be slow.
+/// Returns the age at which the successor of a link is dialled: a tenth of its maximum age before the end, but at least
+/// ten seconds if that is no more than half of it, because the KMEs may be slow.
 fn renewal_at(age: Duration) -> Duration {
     age - (age / 10).max(Duration::from_secs(10)).min(age / 2)
 }

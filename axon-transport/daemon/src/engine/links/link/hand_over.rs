@@ -2,51 +2,51 @@
 
 use std::time::Duration;
 
-/// The peer is waited for so long at a time.
+/// Time of one wait for the peer.
 const HAND_OVER: Duration = Duration::from_secs(5);
 
 /// How far a link is whose successor took over.
 ///
-/// It closes once all has arrived in both directions: this side's streams are sent, and the peer, which sends over the
-/// successor, has ended its control stream or had patience with this side for long enough. If it is silent, or the peer
-/// closed it, nothing more arrives.
+/// It closes once everything has arrived in both directions: this side's streams are sent, and the peer, which sends
+/// over the successor, has ended its control stream or has waited for this side for long enough. If the link is silent,
+/// or the peer closed it, nothing more arrives.
 #[derive(Clone, Copy, Debug)]
 pub(in crate::engine::links) struct DrainingLink {
-    /// When it ends at the latest, in qkd.
+    /// The latest time at which it ends, in qkd.
     until: Option<Duration>,
-    /// The peer sends over the successor.
+    /// True if the peer sends over the successor.
     succeeded: bool,
-    /// The peer's control stream ended.
+    /// True if the peer's control stream ended.
     ended: bool,
-    /// The peer said that it closed the link.
+    /// True if the peer reported that it closed the link.
     closed: bool,
-    /// When the peer's patience with this side's streams is looked at again.
+    /// The time at which the wait for this side's streams is checked again.
     wait: Option<Duration>,
 }
 
-/// What goes over a superseded link.
+/// The traffic of a superseded link.
 #[derive(Clone, Copy, Debug)]
 pub(in crate::engine::links) struct HandOverProgress {
-    /// The peer does not answer over it.
+    /// True if the peer does not answer over it.
     pub(in crate::engine::links) silent: bool,
-    /// Whether all of this side's streams but the control stream are sent.
+    /// True if all of this side's streams but the control stream are sent.
     pub(in crate::engine::links) sent: bool,
-    /// The peer's streams that are being read.
+    /// Number of the peer's streams that are being read.
     pub(in crate::engine::links) reading: usize,
 }
 
-/// What to do with a superseded link.
+/// The next step for a superseded link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(in crate::engine::links) enum HandOverStep {
     Wait,
     /// End this side's control stream.
     Finish,
-    /// All has arrived.
+    /// Close the link: everything has arrived.
     Close,
 }
 
 impl DrainingLink {
-    /// A successor took over. The link's keys may be used `until` a time.
+    /// Creates the state when a successor took over. The link's keys may be used `until` a time.
     pub(in crate::engine::links) fn new(
         until: Option<Duration>,
         succeeded: bool,
@@ -64,17 +64,17 @@ impl DrainingLink {
         self.until.is_some_and(|until| until <= now)
     }
 
-    /// The peer sends over the successor.
+    /// Records that the peer sends over the successor.
     pub(in crate::engine::links) fn handle_succeeded(&mut self) {
         self.succeeded = true;
     }
 
-    /// The peer says that it closed the link, whose packets do not arrive.
+    /// Records the peer's message that it closed the link, whose packets do not arrive.
     pub(in crate::engine::links) fn handle_closed(&mut self) {
         self.closed = true;
     }
 
-    /// The peer's control stream ended.
+    /// Records that the peer's control stream ended.
     pub(in crate::engine::links) fn handle_ended(&mut self) {
         self.ended = true;
     }
@@ -138,7 +138,7 @@ mod tests {
         let mut leaving = DrainingLink::new(None, true, NOW);
         assert_eq!(leaving.handle_progress(NOW, SENT), HandOverStep::Finish);
         assert_eq!(leaving.poll_timeout(), Some(NOW + HAND_OVER));
-        // A stream is being read when the time is over: as long again.
+        // A stream is being read when the time is over: the link waits as long again.
         let later = NOW + HAND_OVER;
         assert_eq!(leaving.handle_progress(later, SENT), HandOverStep::Finish);
         assert_eq!(leaving.poll_timeout(), Some(later + HAND_OVER));

@@ -26,9 +26,9 @@ use crate::{
     link::{Candidate, Elected, LinkHello, MessageOrder, Side},
 };
 
-/// How far a link has come.
+/// The phase of a link.
 pub(super) enum LinkPhase {
-    /// The TLS handshake is under way, until this time; this side's by a dial of this number.
+    /// The TLS handshake is under way, until this time; on the dialling side, for the dial of this number.
     Handshake(Duration, Option<u64>),
     /// HELLO, and in qkd the proof.
     Opening(Box<Opening>),
@@ -36,7 +36,7 @@ pub(super) enum LinkPhase {
     Electing(Duration),
     /// It carries samples.
     Open,
-    /// A successor took over: it delivers what is under way.
+    /// A successor took over: the link delivers its data in flight.
     Leaving(DrainingLink),
 }
 
@@ -44,29 +44,29 @@ pub(super) enum LinkPhase {
 pub(super) struct Link {
     pub(super) side: Side,
     pub(super) phase: LinkPhase,
-    /// The link that it replaces, as its dialler said.
+    /// The link that it replaces, as its dialler stated.
     pub(super) replaces: Option<[u8; 16]>,
     /// The peer, once HELLO was checked and its name proven.
     pub(super) peer: Option<LinkPeer>,
     /// The place of its handshake among those under way.
     pub(super) place: Option<HandshakeSlot>,
-    /// Tells why a PSK was not found.
+    /// The look-up of the PSK, which has the reason if it was not found.
     pub(super) resolver: Option<Arc<Resolver>>,
 }
 
-/// What is kept of a link's beginning.
+/// The data kept from a link's beginning.
 #[derive(Clone)]
 pub(crate) struct EstablishedPeer {
     /// The peer's HELLO.
     pub(crate) hello: LinkHello,
-    /// What the handshake agreed on.
+    /// The parameters negotiated in the handshake.
     pub(crate) negotiated: Negotiated,
-    /// As whom the peer proved itself.
+    /// The identity that the peer proved.
     pub(crate) who: PeerIdentity,
 }
 
 impl EstablishedPeer {
-    /// The status of a link, as far as its beginning says it.
+    /// Returns the part of a link's status that its beginning determines.
     pub(super) fn status(&self, since: SystemTime) -> LinkStatus {
         let mut link = LinkStatus::default();
         link.peer = self.hello.daemon.to_string();
@@ -84,13 +84,13 @@ impl EstablishedPeer {
 /// The peer of a link.
 pub(super) struct LinkPeer {
     pub(super) summary: EstablishedPeer,
-    /// Whether it proved that its daemon id is its own.
+    /// True if it proved that its daemon id is its own.
     pub(super) proven: bool,
     pub(super) order: MessageOrder,
     pub(super) candidate: Candidate,
     /// Key material of the connection, until it is elected.
     pub(super) sealing: Option<Sealing>,
-    /// Whether messages are sealed one by one.
+    /// True if messages are sealed one by one.
     pub(super) seals: bool,
     pub(super) elected: Option<Elected>,
     pub(super) age: Age,
@@ -104,7 +104,7 @@ pub(super) struct LinkPeer {
 }
 
 impl Link {
-    /// A link that begins with a handshake.
+    /// Creates a link that begins with a handshake.
     pub(super) fn new(side: Side, until: Duration, dial: Option<u64>) -> Self {
         Self {
             side,
@@ -116,7 +116,7 @@ impl Link {
         }
     }
 
-    /// When something is due.
+    /// Returns when an action is due.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         let phase = match &self.phase {
             LinkPhase::Handshake(until, dial) => dial.is_none().then_some(*until),
@@ -131,12 +131,12 @@ impl Link {
         [phase, age, probe].into_iter().flatten().min()
     }
 
-    /// Whether data may come over it: it is, or was, elected.
+    /// Returns whether data may come over it: it is, or was, elected.
     pub(super) fn carries(&self) -> bool {
         matches!(self.phase, LinkPhase::Open | LinkPhase::Leaving(_))
     }
 
-    /// Whether it carries samples.
+    /// Returns whether it carries samples.
     pub(super) fn is_open(&self) -> bool {
         matches!(self.phase, LinkPhase::Open)
     }

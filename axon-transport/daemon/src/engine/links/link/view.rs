@@ -1,4 +1,4 @@
-//! A link as the rest of the engine asks about it.
+//! A view of a link for the rest of the engine.
 
 use std::rc::Rc;
 
@@ -16,7 +16,7 @@ use crate::{
     owner::ChannelBinding,
 };
 
-/// A link whose connection stands: the connection, and its peer once that proved its name.
+/// A view of a link whose connection exists: the connection, and its peer once that proved its name.
 pub(in crate::engine) struct LinkView<'a> {
     connection: &'a Connection,
     peer: Option<&'a LinkPeer>,
@@ -30,28 +30,28 @@ impl<'a> LinkView<'a> {
         Self { connection, peer }
     }
 
-    /// The beginning of the link.
+    /// Returns the data from the link's beginning.
     pub(in crate::engine) fn summary(&self) -> Option<&'a EstablishedPeer> {
         Some(&self.peer?.summary)
     }
 
-    /// The account of the peer.
+    /// Returns the account of the peer.
     pub(in crate::engine) fn account(&self) -> Option<Rc<Account>> {
         Some(Rc::clone(&self.peer?.account))
     }
 
-    /// Who the peer proved to be, beyond its daemon id.
+    /// Returns the identity that the peer proved, beyond its daemon id.
     pub(in crate::engine) fn identity(&self) -> Option<String> {
         Some(self.summary()?.who.host_identity(self.connection.quic.remote_address()))
     }
 
-    /// What access rules let the peer do. The address of one that proved nothing is that at which the handshake took
-    /// place: any later one may be spoofed.
+    /// Returns the peer's permissions by the access rules. For a peer that proved nothing, the address is the one at
+    /// which the handshake took place: any later one may be spoofed.
     pub(in crate::engine) fn permissions(&self, rules: &AccessRules) -> Option<Permissions> {
         Some(rules.permissions(self.summary()?.who.party(self.connection.began_at)))
     }
 
-    /// The status of the link.
+    /// Returns the status of the link.
     pub(in crate::engine) fn status(&self) -> Option<LinkStatus> {
         let peer = self.peer?;
         let mut status = peer.summary.status(peer.since);
@@ -60,18 +60,18 @@ impl<'a> LinkView<'a> {
         Some(status)
     }
 
-    /// The peer, as log and status name it.
+    /// Returns the peer's name for log and status.
     pub(in crate::engine) fn peer_text(&self) -> String {
         let sae = self.summary().and_then(|summary| summary.hello.sae.as_deref());
         peer_text(sae, self.connection.quic.remote_address())
     }
 
-    /// Bytes that both ends of the connection share and no other connection has.
+    /// Returns the bytes that both ends of the connection share and no other connection has.
     pub(in crate::engine) fn binding(&self) -> Option<ChannelBinding> {
         self.connection.binding()
     }
 
-    /// The flow of a stream.
+    /// Returns the flow of a stream.
     pub(in crate::engine) fn flow_of(&self, stream: StreamId) -> Option<FlowId> {
         self.connection.flows.get(&stream).copied()
     }

@@ -20,11 +20,11 @@ use crate::{
     wire::beacon::Datagram,
 };
 
-/// No message of discovery is longer.
+/// Maximum length of a discovery message.
 const MAX_DISCOVERY: usize = 512;
 
 impl Links {
-    /// A datagram of discovery, or the echo of a probe.
+    /// Handles a discovery datagram, or the echo of a probe.
     pub(super) fn handle_discovery(&mut self, now: Duration, from: SocketAddr, bytes: BytesMut) {
         if bytes.len() > MAX_DISCOVERY {
             return;
@@ -33,7 +33,7 @@ impl Links {
             && let Ok(Datagram::Echo { nonce, daemon }) = Datagram::decode(&bytes)
             && let Some(number) = self.nonces.get(&nonce).copied()
         {
-            // Another daemon at the address says nothing of the path to this one.
+            // An answer of another daemon at the address does not show the path to this one.
             if let Some(peer) = self.table.peer_mut(number)
                 && peer.summary.hello.daemon == daemon
             {
@@ -49,7 +49,7 @@ impl Links {
         inbox.add(from, &bytes, known, now);
     }
 
-    /// Notes what had gone over a link when a datagram came.
+    /// Records the traffic of a link when a datagram came.
     pub(super) fn note_heard(&mut self, number: u64, now: Duration) {
         let (Some(connection), Some(peer)) =
             (self.connections.get(number), self.table.peer_mut(number))
@@ -62,8 +62,8 @@ impl Links {
         }
     }
 
-    /// Probes the path of links over which something went out, and nothing came in the last second. Takes peers for gone
-    /// of which nothing came for long.
+    /// Probes the path of links over which something was sent and nothing arrived in the last second. Peers from which
+    /// nothing came for long count as gone from now on.
     pub(super) fn look_for_silence(&mut self, now: Duration) {
         for number in self.table.open() {
             let (Some(connection), Some(peer)) =
@@ -91,7 +91,7 @@ impl Links {
         self.connections.endpoints().send(to, probe.encode());
     }
 
-    /// Goes on with the probes of a silent link.
+    /// Continues the probes of a silent link.
     pub(super) fn probe(&mut self, number: u64, now: Duration) {
         let (Some(connection), Some(peer)) =
             (self.connections.get(number), self.table.peer_mut(number))

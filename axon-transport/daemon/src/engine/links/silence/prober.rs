@@ -1,58 +1,59 @@
-//! Links that are silent though their path works again.
+//! Probes links that are silent although their path works again.
 //!
-//! QUIC doubles its pause after each packet that nobody acknowledges: after an outage of eight seconds a
-//! link may stay silent for eight more. A link over which something went out and nothing comes is therefore
-//! probed beside QUIC, four times a second. When a probe is answered and the peer still acknowledges
-//! nothing, a successor is dialled (`docs/architecture.md`, links).
+//! QUIC doubles its pause after each unacknowledged packet: after an outage of eight seconds a link may stay silent for
+//! eight more. A link over which something was sent and nothing arrives is therefore probed beside QUIC, four times a
+//! second. When a probe is answered and the peer still acknowledges nothing, a successor is dialled
+//! (`docs/architecture.md`, links).
 //!
-//! What counts is acknowledgements. A packet that the peer sends of itself does not end our QUIC's pause:
-//! what waits here would still wait for it.
+//! Only acknowledgements count. A packet that the peer sends by itself does not end the pause of this side's QUIC: data
+//! that waits here would still wait for it.
 
 use std::time::Duration;
 
 use crate::link::Side;
 
-/// Between two probes.
+/// Time between two probes.
 const PROBE_EVERY: Duration = Duration::from_millis(250);
 
-/// QUIC is given so long after an answer: a packet of its own may be on its way.
+/// Time that QUIC has after an answer: a packet of its own may be in flight.
 const GRACE: Duration = Duration::from_millis(300);
 
-/// After a long silence QUIC's next packet is as far away as the silence was long.
+/// Length of a long silence, after which QUIC's next packet is as far away as the silence was long.
 const LONG_SILENCE: Duration = Duration::from_secs(1);
 
 const GRACE_AFTER_LONG: Duration = Duration::from_millis(50);
 
-/// The side that was dialled waits for so much longer: two successors would be one too many.
+/// Additional wait of the side that was dialled: two successors would be one too many.
 const DIALLED: Duration = Duration::from_millis(100);
 
-/// When a successor did not come about, the next one is dialled after this, and after twice as long each time: a dial may
+/// Time after which the next successor is dialled if one did not come about; it doubles each time, because a dial may
 /// cost a key.
 const FIRST_REDIAL_PAUSE: Duration = Duration::from_secs(1);
 
 const AGAIN_AT_MOST: Duration = Duration::from_secs(8);
 
-/// So many probes in a row without an answer show that the path was cut after the dial, which may be why no successor came
-/// about. A lossy path loses one or two.
+/// Number of unanswered probes in a row that show that the path was cut after the dial, which may be why no successor
+/// came about. A lossy path loses one or two.
 const CUT: u32 = 3;
 
-/// After so many more it is said again: what is told to discovery may get lost.
+/// Number of further probes after which that is reported again: a report to discovery may get lost.
 const CUT_AGAIN: u32 = 16;
 
-/// What went over a connection, as far as silence is concerned.
+/// The traffic of a connection, as far as it matters for silence.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(in crate::engine::links) struct Traffic {
-    /// Frames that came. Datagrams would count that anybody sends; what is not authentic, or comes twice, has no frame.
+    /// Number of received frames. A count of datagrams would include those that any host sends; a packet that is not
+    /// authentic, or comes twice, has no frame.
     came: u64,
-    /// Acknowledgements among what came.
+    /// Number of acknowledgements among them.
     acknowledged: u64,
-    /// Frames that were sent and ask for an answer. What QUIC sends by itself to keep the connection, or
-    /// to find out how long a packet may be, is not among them.
+    /// Number of sent frames that ask for an answer. Frames that QUIC sends by itself to keep the connection, or to
+    /// find out how long a packet may be, do not count.
     asked: u64,
 }
 
 impl Traffic {
-    /// The counters in these statistics of a connection.
+    /// Reads the counters from a connection's statistics.
     pub(crate) fn from(stats: &quinn_proto::ConnectionStats) -> Self {
         let sent = stats.frame_tx;
         let asked = sent.stream
@@ -69,24 +70,24 @@ impl Traffic {
         Self { came, acknowledged, asked }
     }
 
-    /// Whether the peer acknowledged something since `before`: QUIC repeats at once what it has not got.
+    /// Returns whether the peer acknowledged something since `before`: QUIC then retransmits missing data at once.
     pub(crate) fn answered_since(self, before: Self) -> bool {
         self.acknowledged != before.acknowledged
     }
 
-    /// Whether nothing came since `before`, and something was asked since the last datagram came, when the traffic
-    /// was `heard`.
+    /// Returns whether nothing arrived since `before`, and something that asks for an answer was sent since the last
+    /// datagram came, when the traffic was `heard`.
     pub(crate) fn is_silent(self, before: Self, heard: Self) -> bool {
         self.came == before.came && self.asked > heard.asked
     }
 
-    /// Whether a datagram came since `before`.
+    /// Returns whether a datagram came since `before`.
     pub(crate) fn has_come_since(self, before: Self) -> bool {
         self.came != before.came
     }
 }
 
-/// Frames of the peer that show that it lives: in each of its packets is one of them.
+/// Returns the number of the peer's frames that show that it lives: each of its packets has one of them.
 pub(in crate::engine::links) fn frames_came(stats: &quinn_proto::ConnectionStats) -> u64 {
     let came = stats.frame_rx;
     let data = came.stream + came.datagram + came.crypto + came.reset_stream + came.stop_sending;
@@ -104,7 +105,7 @@ pub(in crate::engine::links) fn frames_came(stats: &quinn_proto::ConnectionStats
         + paths
 }
 
-/// What to do for a silent link.
+/// The action for a silent link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(in crate::engine::links) enum Step {
     /// Send a probe.
@@ -120,30 +121,30 @@ pub(in crate::engine::links) struct Prober {
     side: Side,
     next: Step,
     due: Duration,
-    /// Probes that were sent in a row and not answered.
+    /// Number of probes sent in a row and not answered.
     asked: u32,
-    /// When the first of them was sent.
+    /// The time at which the first of them was sent.
     unanswered_since: Duration,
-    /// How many there were when the path was found cut last.
+    /// The number of unanswered probes when the path was last found cut.
     said_cut: Option<u32>,
     /// The last dial, and the pause after it.
     dialled: Option<(Duration, Duration)>,
 }
 
 impl Prober {
-    /// The link was found silent: a probe is due.
+    /// Creates the prober of a link that was found silent: a probe is due.
     pub(crate) fn new(side: Side) -> Self {
         let due = Duration::ZERO;
         let next = Step::Probe;
         Self { side, next, due, asked: 0, unanswered_since: due, said_cut: None, dialled: None }
     }
 
-    /// Whether an answer to a probe counts.
+    /// Returns whether an answer to a probe counts.
     pub(crate) fn awaits_echo(&self) -> bool {
         self.asked > 0
     }
 
-    /// A probe was answered: QUIC is given some time more, and a successor that was dialled its pause.
+    /// Handles the answer to a probe: QUIC has some time more, and a successor that was dialled has its pause.
     pub(crate) fn handle_echo(&mut self, now: Duration) {
         self.asked = 0;
         if self.dialled.is_some_and(|(at, pause)| now < at + pause) {
@@ -154,8 +155,8 @@ impl Prober {
         (self.next, self.due) = (Step::Replace, now + grace + more);
     }
 
-    /// Whether the path is taken for cut at the latest probe: those before were not answered, the first of them for two
-    /// round trips. Said again from time to time, as long as that lasts.
+    /// Returns whether the path counts as cut at the latest probe: the previous ones were not answered, the first of
+    /// them for two round trips. Returns true again from time to time, as long as that lasts.
     pub(crate) fn find_cut(&mut self, round_trip: Duration, now: Duration) -> bool {
         let unanswered = self.asked.saturating_sub(1);
         let cut = unanswered >= CUT
@@ -167,12 +168,12 @@ impl Prober {
         cut
     }
 
-    /// When to call [`handle_timeout`](Self::handle_timeout).
+    /// Returns when to call [`handle_timeout`](Self::handle_timeout).
     pub(crate) fn poll_timeout(&self) -> Option<Duration> {
         Some(self.due)
     }
 
-    /// What is due at `now`.
+    /// Returns the action that is due at `now`.
     pub(crate) fn handle_timeout(&mut self, now: Duration) -> Option<Step> {
         if now < self.due {
             return None;
@@ -205,10 +206,10 @@ mod tests {
     use super::*;
 
     const ROUND_TRIP: Duration = Duration::from_millis(30);
-    /// From a dial to the first message over the successor, where no key has to be fetched.
+    /// Time from a dial to the first message over the successor, if no key has to be fetched.
     const HANDSHAKE: Duration = Duration::from_millis(60);
 
-    /// Walks the prober until it dials a successor. A probe is answered if it leaves when `path_works`. The
+    /// Walks the prober until it dials a successor. A probe is answered if it leaves when `path_works`. Returns the
     /// number of probes, and when the successor is dialled.
     fn walk(prober: &mut Prober, path_works: impl Fn(Duration) -> bool) -> (u32, Duration) {
         let mut probes = 0;
@@ -233,8 +234,8 @@ mod tests {
         }
     }
 
-    /// Cuts the path for `cut` after the link was found silent. How many probes were sent, and how long after
-    /// the path's return the successor carries messages.
+    /// Cuts the path for `cut` after the link was found silent. Returns the number of probes, and how long after the
+    /// path's return the successor carries messages.
     fn replaced_after(cut: Duration, side: Side) -> (u32, Duration) {
         let (probes, dialled) = walk(&mut Prober::new(side), |now| now >= cut);
         (probes, dialled + HANDSHAKE - cut)
@@ -276,7 +277,7 @@ mod tests {
     #[test]
     fn a_path_that_returns_several_times_too_shortly_is_replaced_within_500_ms_of_its_last_return()
     {
-        // How often it returns, for how long it works, and for how long it does not.
+        // How often the path returns, for how long it works, and for how long it does not.
         for returns in 1..6 {
             for (works, cut) in [(50, 1_000), (100, 1_800), (300, 2_500), (700, 5_000)] {
                 let [works, cut] = [works, cut].map(Duration::from_millis);

@@ -10,11 +10,11 @@ const MINUTE: u32 = 60;
 /// The scope of a check.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(in crate::engine::links) struct CheckKind {
-    /// Whether certificates are checked, too, which costs signature verifications.
+    /// True if certificates are checked, too, which costs signature verifications.
     pub(in crate::engine::links) at_certificates: bool,
 }
 
-/// When the next check is due.
+/// The time of the next check, and the number of checks so far.
 #[derive(Debug)]
 pub(in crate::engine::links) struct CheckSchedule {
     next: Duration,

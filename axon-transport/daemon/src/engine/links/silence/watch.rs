@@ -1,37 +1,37 @@
-//! Whether the peer of one link answers.
+//! Watches whether the peer of one link answers.
 
 use std::time::Duration;
 
 use super::prober::{Prober, Step, Traffic};
 use crate::link::Side;
 
-/// A link over which nothing came for so long is probed, even if nothing was asked: two of QUIC's keep-alives are lost.
+/// Time without arrivals after which a link is probed, even if nothing was asked: two of QUIC's keep-alives are lost.
 const UNHEARD: Duration = Duration::from_secs(10);
-/// A superseded link that waits for acknowledgements is silent if nothing came over it for so long before the last that
-/// came over the link in use.
+/// A superseded link that waits for acknowledgements is silent if its last arrival is this much older than that of the
+/// link in use.
 const OUTLIVED: Duration = Duration::from_secs(3);
-/// A peer that is silent for so long is taken for gone. Its link stands until QUIC gives it up.
+/// Time of silence after which a peer counts as gone. Its link stays until QUIC gives it up.
 const GONE: Duration = Duration::from_secs(20);
 
-/// Whether a peer answers over its link. A state machine as `docs/architecture.md` describes them.
+/// The state of a peer's answers over its link. A state machine as `docs/architecture.md` describes them.
 ///
-/// A link is *unheard* while nothing comes, *probed* once something was asked and nothing came for a second, *silent*
-/// once its path was found cut or a successor was dialled, and its peer is *gone* after a longer time. An acknowledgement
-/// ends all of that.
+/// A link is *unheard* while nothing arrives, *probed* once something was asked and nothing arrived for a second,
+/// *silent* once its path was found cut or a successor was dialled, and its peer is *gone* after a longer time. An
+/// acknowledgement ends all of these states.
 #[derive(Debug)]
 pub(in crate::engine::links) struct LinkSilence {
     side: Side,
-    /// What came and went at the last look.
+    /// The traffic at the last check.
     traffic: Traffic,
-    /// What had gone when the last datagram came.
+    /// The traffic when the last datagram came.
     heard: Traffic,
-    /// When the last datagram came.
+    /// The time at which the last datagram came.
     heard_at: Duration,
     /// Probes of the path, while the link is silent.
     probing: Option<Probing>,
-    /// Its path was found cut, or a successor was dialled, and nothing was acknowledged since.
+    /// True if its path was found cut, or a successor was dialled, and nothing was acknowledged since.
     silent: bool,
-    /// What had come and gone when the peer was taken for gone, while it is.
+    /// The traffic when the peer was found gone, while it is.
     gone: Option<Traffic>,
 }
 
@@ -40,34 +40,34 @@ pub(in crate::engine::links) struct LinkSilence {
 struct Probing {
     prober: Prober,
     nonce: Nonce,
-    /// When the probing began.
+    /// The time at which the probing began.
     begun: Duration,
     /// The traffic before.
     traffic: Traffic,
-    /// It was said that the path is cut.
+    /// True if the cut path was reported.
     said_cut: bool,
 }
 
-/// What a probe says and its echo repeats.
+/// The bytes that a probe carries and its echo repeats.
 pub(in crate::engine::links) type Nonce = [u8; 8];
 
-/// What a look at a link found.
+/// The result of checking a link.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct CheckResult {
-    /// The peer is taken for gone from now on.
+    /// True if the peer counts as gone from now on.
     pub(super) gone: bool,
-    /// The link's path is probed from now on.
+    /// True if the link's path is probed from now on.
     pub(super) probed: bool,
 }
 
-/// What to do for a link that is probed.
+/// The action for a link that is probed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum ProbeAction {
     /// Send a probe.
     Probe(Nonce),
-    /// Send a probe, and say that the path is cut: those before were not answered.
+    /// Send a probe, and report that the path is cut: the previous ones were not answered.
     ProbeCut(Nonce),
-    /// The peer answers: no echo of this is waited for. Whether it was said that the path is cut.
+    /// The peer answers: no echo of this nonce is expected any more. True if the cut path was reported.
     Answered(Nonce, bool),
     /// Dial a successor.
     Replace,
@@ -79,30 +79,29 @@ impl LinkSilence {
         Self { side, traffic, heard, heard_at: now, probing: None, silent: false, gone: None }
     }
 
-    /// Whether the peer is taken for gone.
+    /// Returns whether the peer counts as gone.
     pub(in crate::engine::links) fn is_gone(&self) -> bool {
         self.gone.is_some()
     }
 
-    /// Whether its path was found cut, or a successor dialled, and nothing was acknowledged since.
+    /// Returns whether its path was found cut, or a successor dialled, and nothing was acknowledged since.
     pub(in crate::engine::links) fn is_silent(&self) -> bool {
         self.silent
     }
 
-    /// Notes what had gone over the link when a datagram came. What is sent later has no answer yet. QUIC does not
-    /// always send it again: its probes may ask for an acknowledgement alone. Returns whether a peer that was gone is
-    /// back.
+    /// Records the traffic of the link when a datagram came. Later data has no answer yet. QUIC does not always
+    /// retransmit it: its probes may only ask for an acknowledgement. Returns whether a peer that was gone is back.
     pub(super) fn handle_heard(&mut self, now: Duration, traffic: Traffic) -> bool {
         if !traffic.has_come_since(self.heard) {
             return false;
         }
         (self.heard, self.heard_at) = (traffic, now);
-        // What comes over a path that works one way alone brings no peer back.
+        // Packets over a path that works in one direction only bring no peer back.
         self.gone.take_if(|gone| traffic.answered_since(*gone)).is_some()
     }
 
-    /// Looks once a second at what came and went. Probes begin if something went out and nothing came since the last
-    /// look; they say what `nonce` returns.
+    /// Checks the traffic once a second. Probing begins if something was sent and nothing arrived since the last check;
+    /// the probes carry the value of `nonce`.
     pub(super) fn handle_second(
         &mut self,
         now: Duration,
@@ -110,7 +109,7 @@ impl LinkSilence {
         nonce: impl FnOnce() -> Nonce,
     ) -> CheckResult {
         let before = std::mem::replace(&mut self.traffic, traffic);
-        // It is no longer silent: what is under way arrives.
+        // The link is no longer silent: data in flight arrives.
         self.silent &= !traffic.answered_since(before);
         let unheard = now.saturating_sub(self.heard_at);
         let gone = unheard >= GONE && self.gone.is_none();
@@ -126,7 +125,7 @@ impl LinkSilence {
         CheckResult { gone, probed }
     }
 
-    /// A probe was answered. Returns whether it was said that the path is cut.
+    /// Handles the answer to a probe. Returns whether the cut path was reported.
     pub(super) fn handle_echo(&mut self, now: Duration) -> bool {
         let Some(probing) = self.probing.as_mut().filter(|probing| probing.prober.awaits_echo())
         else {
@@ -136,26 +135,26 @@ impl LinkSilence {
         std::mem::take(&mut probing.said_cut)
     }
 
-    /// Whether the path is taken for cut: probes of it are not answered, and nothing was acknowledged since.
+    /// Returns whether the path counts as cut: probes of it are not answered, and nothing was acknowledged since.
     pub(in crate::engine::links) fn is_cut(&self, traffic: Traffic) -> bool {
         let cut = |probing: &Probing| probing.said_cut && !traffic.answered_since(probing.traffic);
         self.probing.as_ref().is_some_and(cut)
     }
 
-    /// A successor took over the link. Returns whether the link is silent.
+    /// Handles that a successor took over. Returns whether the link is silent.
     pub(in crate::engine::links) fn handle_superseded(&mut self, traffic: Traffic) -> bool {
         self.silent &= !traffic.answered_since(self.traffic);
         self.probing = None;
         self.silent
     }
 
-    /// When something came last.
+    /// Returns the time of the last arrival.
     pub(in crate::engine::links) fn heard_at(&self) -> Duration {
         self.heard_at
     }
 
-    /// Looks once a second at a superseded link with streams that the peer has not acknowledged. Over the link in use
-    /// something came last at `heard_at`. Returns whether this one is silent from now on.
+    /// Checks, once a second, a superseded link with streams that the peer has not acknowledged. `heard_at` is the time
+    /// of the last arrival over the link in use. Returns whether this link is silent from now on.
     pub(in crate::engine::links) fn handle_second_superseded(
         &mut self,
         heard_at: Duration,
@@ -210,7 +209,7 @@ mod tests {
         START + Duration::from_secs(number)
     }
 
-    /// What had come, been acknowledged and been asked.
+    /// The counts of arrivals, of acknowledgements and of requests.
     fn traffic(came: u64, acknowledged: u64, asked: u64) -> Traffic {
         Traffic::of(came, acknowledged, asked)
     }
@@ -250,7 +249,7 @@ mod tests {
         let due = silence.poll_timeout().unwrap();
         assert_eq!(silence.handle_timeout(due, asked, ROUND_TRIP), Some(ProbeAction::Replace));
         assert!(silence.is_silent());
-        // An acknowledgement ends it.
+        // An acknowledgement ends the silence.
         let answered = traffic(2, 2, 2);
         assert_eq!(
             silence.handle_timeout(due, answered, ROUND_TRIP),
@@ -275,7 +274,7 @@ mod tests {
         };
         for answered in [false, true] {
             let found: Vec<_> = (0..20).map(|_| probe(&mut silence).1).collect();
-            // Three are not answered when the fourth is sent. It is said again after a while.
+            // Three probes are unanswered when the fourth is sent. That is reported again after a while.
             let said = |action: &ProbeAction| *action == ProbeAction::ProbeCut(NONCE);
             let said: Vec<_> = (0..).zip(&found).filter(|(_, a)| said(a)).map(|(n, _)| n).collect();
             assert_eq!(said, [3, 19]);
