@@ -67,7 +67,7 @@ impl GuardCondition {
 }
 
 impl Guard {
-    /// Sets the condition. Costs one load and one exchange, and a system call if the condition was not set.
+    /// Sets the condition. Costs one exchange, and wakes waiters if the condition was not set.
     pub(in crate::session) fn trigger(&self) {
         // Release pairs with the acquire of `is_triggered` and `take`: a thread that sees the condition sees everything
         // that was done before. A waiter that looked before this is woken by the call below.

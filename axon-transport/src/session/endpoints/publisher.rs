@@ -69,8 +69,8 @@ impl Publisher {
         self.inner.published(self.writer.publish_next(clock::wall(), payload))
     }
 
-    /// Like [`publish`](Self::publish), with the caller's source timestamp, between the years 1677 and 2262, in
-    /// nanoseconds.
+    /// Like [`publish`](Self::publish), with the caller's source timestamp. A sample carries it in nanoseconds, which
+    /// reach from the year 1677 to 2262.
     ///
     /// # Errors
     /// As for [`publish`](Self::publish).
