@@ -279,7 +279,7 @@ pub(crate) fn receive_whole(socket: impl AsFd, buffer: &mut [u8]) -> Result<Sock
     Ok(packet)
 }
 
-/// Like [`receive`], for a packet of at most [`FEW`] descriptors: closes none of them for the last time, and needs no
+/// Like [`receive`], for a packet of at most [`FEW_DESCRIPTORS`] descriptors: closes none of them for the last time, and needs no
 /// space for more. A packet with more descriptors is reported as truncated and stays in the socket. If the process has
 /// no space for the descriptors of a packet, the packet is reported as lost and stays, too.
 pub fn receive_few(socket: impl AsFd, buffer: &mut [u8]) -> Result<SocketPacket, Errno> {
