@@ -397,7 +397,7 @@ mod tests {
     }
 
     #[test]
-    fn what_subscriptions_without_a_promise_missed_is_said_as_far_as_it_is_known() {
+    fn known_losses_of_subscriptions_without_a_delivery_promise_are_reported() {
         let outcome = Outcome { unpromised: 1, ..Outcome::default() };
         assert_eq!(unpromised("others", &Outcome::default(), None), "others");
         assert_eq!(unpromised("others", &Outcome::default(), Some(0)), "others");

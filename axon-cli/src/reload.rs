@@ -40,7 +40,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_a_daemon_took_is_named_beside_what_went_wrong() {
+    fn a_failed_reload_names_the_settings_that_were_changed() {
         assert_eq!(refused("line 3: x", &[]), "nothing was changed: line 3: x");
         let changed = ["access rules".to_owned(), "[[topic]]".to_owned()];
         let text = refused("the gateway did not take them", &changed);

@@ -47,7 +47,7 @@ impl Ruled {
 }
 
 #[test]
-fn check_says_what_a_linked_peer_denies_and_that_a_changed_file_is_not_in_force() {
+fn acl_check_reports_peer_denials_and_a_rules_file_not_yet_reloaded() {
     let dir = tempfile::tempdir().expect("directory");
     let [robot, base] = Host::pair();
     let robot =

@@ -174,7 +174,7 @@ fn all_that_it_saw_goes_on_under_the_rules_that_it_writes_and_nothing_else() {
 }
 
 #[test]
-fn it_says_that_the_daemon_ended_and_writes_what_it_saw_until_then() {
+fn acl_learn_reports_a_daemon_exit_and_writes_rules_learned_so_far() {
     let mut hosts = Hosts::start();
     let (here, there) = (hosts.robot.session("robot"), hosts.base.session("base"));
     let commands = (publisher(&there, "/cmd_vel"), subscription(&here, "/cmd_vel"));
@@ -204,7 +204,7 @@ fn it_says_that_the_daemon_ended_and_writes_what_it_saw_until_then() {
 }
 
 #[test]
-fn where_nobody_does_anything_no_rules_are_written() {
+fn acl_learn_writes_no_file_when_no_endpoints_were_observed() {
     let host = Host::new();
     let file = tempfile::tempdir().expect("directory");
     let file = file.path().join("access.toml");

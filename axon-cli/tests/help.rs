@@ -41,7 +41,7 @@ fn the_first_page_names_every_command_and_the_exit_statuses() {
 }
 
 #[test]
-fn each_command_says_what_it_does_and_shows_an_example() {
+fn the_help_of_commands_shows_examples_and_exit_status() {
     for command in ["demo", "play", "echo", "status", "reload", "daemon", "bench"] {
         let text = help(&[command]);
         assert!(text.contains("Examples:") && text.contains(&format!("axon {command}")), "{text}");

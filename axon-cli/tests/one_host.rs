@@ -25,7 +25,7 @@ fn status_without_a_daemon_says_so_and_starts_none() {
 }
 
 #[test]
-fn play_of_what_is_no_log_fails_and_names_it() {
+fn play_of_an_invalid_log_fails_and_names_the_file() {
     let host = Host::new();
     for file in ["/nonexistent.mcap", concat!(env!("CARGO_MANIFEST_DIR"), "/Cargo.toml")] {
         let output = host.run(&["play", file]);
@@ -80,7 +80,7 @@ fn play_of_a_damaged_log_publishes_nothing_unless_told_to_publish_its_whole_part
 }
 
 #[test]
-fn play_publishes_nothing_of_a_chunk_with_a_wrong_checksum_nor_what_follows_it() {
+fn play_publishes_only_messages_before_a_chunk_with_a_wrong_checksum() {
     publishes_the_whole_part_when_told(&log_with_a_wrong_checksum());
 }
 
@@ -205,7 +205,7 @@ fn assert_echo_says_what_it_missed(end: End) {
 }
 
 #[test]
-fn echo_says_what_it_missed_when_a_signal_or_a_closed_terminal_ends_it() {
+fn echo_reports_missed_messages_when_ended_by_a_signal_or_hangup() {
     for signal in [Signal::INT, Signal::TERM, Signal::HUP] {
         if signal == Signal::HUP && ignores_hangup() {
             let said = "skipped: SIGHUP, which this test was started to ignore, as under nohup";
@@ -224,7 +224,7 @@ fn ignores_hangup() -> bool {
 }
 
 #[test]
-fn echo_says_what_it_missed_when_it_is_no_longer_read_or_has_had_as_many_as_asked_for() {
+fn echo_reports_missed_messages_on_a_closed_pipe_or_reached_count() {
     for end in [End::Unread, End::Count] {
         assert_echo_says_what_it_missed(end);
     }
@@ -235,7 +235,7 @@ fn bytes(topic: &str) -> EndpointSpec {
 }
 
 #[test]
-fn echo_says_what_it_missed_where_the_disk_is_full() {
+fn echo_reports_missed_messages_on_a_full_disk() {
     let host = Host::new();
     let _daemon = Running::start(host.axon(&["daemon"]));
     host.wait_daemon();

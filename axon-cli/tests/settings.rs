@@ -12,7 +12,7 @@ const COMMANDS: [&[&str]; 5] =
 
 /// What `axon trust` does before a host is set up, and in order to set it up.
 #[test]
-fn a_key_is_made_and_looked_at_whatever_the_settings_are() {
+fn trust_keygen_and_scan_work_under_invalid_settings() {
     let dir = tempfile::tempdir().expect("temporary directory");
     let key = dir.path().join("host.key");
     let key = key.to_str().expect("UTF-8");

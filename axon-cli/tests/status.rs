@@ -164,7 +164,7 @@ fn a_variable_that_is_no_setting_is_named() {
 }
 
 #[test]
-fn a_daemon_that_runs_is_shown_whatever_is_wrong_here() {
+fn status_shows_a_running_daemon_despite_invalid_local_settings() {
     let dir = tempfile::tempdir().expect("temporary directory");
     let host = Host::new();
     let _daemon = Running::start(host.axon(&["daemon"]));

@@ -93,7 +93,7 @@ fn scan_prints_the_line_that_keygen_printed() {
 }
 
 #[test]
-fn where_nobody_answers_no_key_is_printed() {
+fn trust_scan_of_a_silent_target_prints_no_key() {
     let deaf = UdpSocket::bind(("127.0.0.1", 0)).expect("a socket");
     let target = deaf.local_addr().expect("an address").to_string();
     let scan = ["trust", "scan", target.as_str(), "--timeout", "1"];

@@ -57,7 +57,7 @@ fn nothing_is_called_acknowledged_where_no_subscription_keeps_all() {
 }
 
 #[test]
-fn a_profile_that_waits_for_nobody_acknowledges_nothing() {
+fn play_with_a_lossy_qos_profile_reports_no_acknowledgements() {
     for qos in ["default", "sensor-data"] {
         let [a, b] = Host::pair();
         let _echoes = echo_all(&b, qos);

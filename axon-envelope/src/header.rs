@@ -199,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn every_cut_is_truncated_and_says_what_is_needed() {
+    fn every_truncated_header_reports_the_needed_length() {
         let bytes = header(b"alice", b"key", 3);
         for cut in 0..bytes.len() {
             match Header::parse(&bytes[..cut]) {

@@ -234,7 +234,7 @@ fn each_refusal_is_one_open_over_everything_and_reads_the_same() {
 }
 
 #[test]
-fn a_refusal_does_what_an_opened_message_does() {
+fn opening_a_valid_message_costs_the_same_work_as_a_refusal() {
     let mut opener = opener();
     let mut sealer = sealer_on(&channel(), HELD);
     seal(&mut sealer, ROUTE);
@@ -260,7 +260,7 @@ fn a_key_that_age_alone_has_ended_costs_the_same() {
 }
 
 #[test]
-fn a_malformed_header_costs_nothing_and_says_what_is_wrong() {
+fn a_malformed_header_is_refused_with_its_error_and_without_decryption() {
     let honest = on(&channel());
     let with = |at: usize, byte: u8| {
         let mut envelope = honest.clone();

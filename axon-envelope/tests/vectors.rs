@@ -220,13 +220,13 @@ fn python_agrees_with_the_vectors() {
 }
 
 #[test]
-fn the_vectors_are_what_python_writes() {
+fn stored_vectors_match_the_python_output() {
     let Some(output) = python("vectors", b"") else { return };
     assert!(output == include_bytes!("vectors/axqkd001.json"), "regenerate tests/vectors");
 }
 
 #[test]
-fn python_opens_what_rust_seals_and_refuses_it_tampered_with() {
+fn python_opens_envelopes_sealed_by_rust_and_refuses_tampered_envelopes() {
     let mut cases = cases();
     let mut expected = Vec::new();
     for (number, case) in cases.iter_mut().enumerate() {
@@ -245,7 +245,7 @@ fn python_opens_what_rust_seals_and_refuses_it_tampered_with() {
 }
 
 #[test]
-fn rust_opens_what_python_seals() {
+fn rust_opens_envelopes_sealed_by_python() {
     let mut cases = cases();
     let Some(output) = python("seal", &serde_json::to_vec(&cases).unwrap()) else { return };
     let envelopes: Vec<String> = serde_json::from_slice(&output).unwrap();

@@ -138,7 +138,7 @@ fn accepted(
 }
 
 #[test]
-fn keys_that_are_not_pinned_are_refused_whatever_they_sign_with() {
+fn unpinned_keys_are_refused_for_every_signature_algorithm() {
     with_hybrid_openssl(|program| {
         let cipher = Cipher::default();
         let expected = Theirs::new(program, "ML-DSA-65", None);

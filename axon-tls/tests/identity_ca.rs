@@ -144,7 +144,7 @@ fn a_revoked_certificate_is_refused_in_both_directions() {
 }
 
 #[test]
-fn an_old_revocation_list_accepts_nobody() {
+fn an_expired_revocation_list_refuses_every_peer() {
     let ca = Ca::new();
     let crl = ca.crl(2, 2021);
     let us = ca.auth(&ca.host(&["a"], &[], 1), Some(&crl));
@@ -183,7 +183,7 @@ fn a_list_that_no_root_issued_is_refused_where_it_is_read() {
 }
 
 #[test]
-fn a_list_signed_by_somebody_of_the_same_name_accepts_nobody() {
+fn a_revocation_list_of_a_namesake_ca_refuses_every_peer() {
     let (ca, impostor) = (Ca::new(), Ca::new());
     let crl = impostor.crl(9, 2100);
     let us = ca.auth(&ca.host(&["a"], &[], 1), Some(&crl));
@@ -192,7 +192,7 @@ fn a_list_signed_by_somebody_of_the_same_name_accepts_nobody() {
 }
 
 #[test]
-fn later_material_says_who_would_be_accepted_now() {
+fn later_ca_material_rechecks_an_already_accepted_chain() {
     let (ca, other) = (Ca::new(), Ca::named("another CA"));
     let (us, peer) = (ca.host(&["a"], &[], 1), ca.host(&["b"], &[], 2));
     let chain = [peer.der.clone()];

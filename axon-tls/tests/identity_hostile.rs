@@ -162,7 +162,7 @@ fn a_certificate_with_one_bit_changed_is_refused() {
 }
 
 #[test]
-fn a_probe_survives_whatever_is_shown() {
+fn a_probe_refuses_malformed_raw_keys() {
     let pem = SigningKey::generate_pem_with(KeyAlgorithm::Ed25519).unwrap();
     let key = signs(&pem);
     let own = key.public_key().unwrap().to_vec();

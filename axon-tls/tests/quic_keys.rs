@@ -154,7 +154,7 @@ fn a_changed_retry_is_not_followed() {
 }
 
 #[test]
-fn both_ends_say_what_was_negotiated_and_not_before() {
+fn both_ends_report_the_key_exchange_only_after_the_handshake() {
     for (client, server, exchange) in modes() {
         let mut pair = Pair::new(server);
         let said = |end: &mut End| {

@@ -181,7 +181,7 @@ async fn half_closed_stream_goes_on_in_the_other_direction() {
 }
 
 #[tokio::test]
-async fn stream_that_is_cut_off_is_an_error_after_what_arrived() {
+async fn truncated_stream_returns_the_received_bytes_then_unexpected_eof() {
     let (near, far) = duplex(100_000);
     let (mut near, mut far) = connected(near, far).await;
     far.write_all(b"the first half").await.unwrap();
@@ -210,7 +210,7 @@ async fn plain_end_of_the_underlying_stream_is_no_end_of_data() {
 }
 
 #[tokio::test]
-async fn changed_record_is_an_error_after_what_was_good_and_the_peer_is_told() {
+async fn forged_record_is_an_error_after_valid_data_and_alerts_the_peer() {
     let (near, far) = duplex(100_000);
     let far = Shared::new(far);
     let mut past_tls = far.clone();

@@ -4,7 +4,7 @@ use std::io::Write;
 use std::process::Command;
 
 #[test]
-fn psk_vectors_are_what_the_script_makes() {
+fn stored_psk_vectors_match_the_script_output() {
     let directory = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join("vectors");
     std::fs::create_dir_all(&directory).unwrap();
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/vectors/make.py");

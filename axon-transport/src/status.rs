@@ -431,7 +431,7 @@ mod tests {
 
     /// An earlier daemon says nothing of what it does not know.
     #[test]
-    fn what_a_status_lacks_has_its_default() {
+    fn missing_status_fields_have_their_default() {
         let reader = r#"{"pid":41,"reader":"aa","writer":"bb","relay":false,"depth":null,"unread":0,
             "received":0,"lost":0,"skipped":0,"stopped":false}"#;
         let read: ReaderStatus = serde_json::from_str(reader).unwrap();

@@ -122,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn packets_leave_at_the_rate_and_what_the_queue_does_not_hold_is_dropped() {
+    fn packets_leave_at_the_rate_and_queue_overflow_is_dropped() {
         let (mut path, now) = path(Loss::NONE);
         let at: Vec<_> = (0..6).map(|_| path.handle_packet(now, PACKET)).collect();
         let ms = |ms| Some(now + Duration::from_millis(ms));

@@ -85,7 +85,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn it_refuses_what_exceeds_the_limit() {
+    fn the_buffer_refuses_bytes_beyond_its_limit() {
         let mut buf = SecretBuf::new(usize::MAX, 10);
         assert!(buf.extend(&[1; 11]).is_err());
         buf.extend(&[1; 10]).unwrap();

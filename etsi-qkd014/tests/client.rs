@@ -187,7 +187,7 @@ async fn requests_that_cannot_be_put_are_refused_before_they_are_sent() {
 }
 
 #[tokio::test]
-async fn a_kme_refuses_what_exceeds_its_limits() {
+async fn a_kme_refuses_requests_beyond_its_limits() {
     let Pair { network, master, .. } = pair().await;
     let over = [
         master.enc_keys("sae-b").number(129).send().await,
@@ -221,7 +221,7 @@ async fn a_kme_refuses_what_exceeds_its_limits() {
 }
 
 #[tokio::test]
-async fn an_sae_id_is_one_path_segment_whatever_it_holds() {
+async fn an_sae_id_with_any_characters_is_one_path_segment() {
     let Pair { network, master, .. } = pair().await;
     for id in ["sae-b/status?x=#", "a%2fb", "ü ; x", "sae-b/../sae-c"] {
         let error = master.status(id).await.unwrap_err();
@@ -247,7 +247,7 @@ async fn a_key_is_given_to_its_slave_once() {
 }
 
 #[tokio::test]
-async fn a_key_is_given_to_nobody_but_its_slave() {
+async fn a_key_is_given_only_to_its_slave() {
     let Pair { network, master, slave } = pair().await;
     let third = network.client_builder("sae-c").build().unwrap();
     let key = master.enc_keys("sae-b").send().await.unwrap().into_single();
@@ -363,7 +363,7 @@ async fn a_store_fills_again() {
 // Material
 
 #[tokio::test]
-async fn files_hold_what_a_client_needs_and_keys_are_private() {
+async fn written_files_suffice_for_a_client_and_key_files_are_private() {
     let Pair { network, .. } = pair().await;
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path().join("certs");

@@ -66,7 +66,7 @@ fn child_with_a_full_disk() {
 }
 
 #[test]
-fn a_pool_with_a_full_disk_hands_out_only_what_was_recorded() {
+fn a_pool_with_a_full_disk_hands_out_only_recorded_keys() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("ledger");
     passed(child("child_pool_with_a_full_disk", &path, SMALL_DISK));
@@ -135,7 +135,7 @@ fn child_that_goes_on() {
 }
 
 #[test]
-fn a_process_that_is_killed_leaves_a_ledger_that_knows_what_it_told() {
+fn the_ledger_of_a_killed_process_holds_all_reported_keys() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("ledger");
     let mut killed = child("child_that_is_killed", &path, "")

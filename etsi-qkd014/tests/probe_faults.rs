@@ -278,7 +278,7 @@ async fn each_check_sees_its_fault_and_no_other_does() {
 
 /// A KME that knows its peers and its limits may say so by any code.
 #[tokio::test(flavor = "multi_thread")]
-async fn refusals_without_a_code_in_the_specification_are_noted_whatever_their_code() {
+async fn refusals_with_any_unspecified_status_code_are_noted() {
     for code in [403, 404, 422, 503] {
         let status = simulated(&format!("status={code},on=status")).await;
         assert!(status.with("note").iter().any(|row| row.starts_with(STATUS_OF_NOBODY)));

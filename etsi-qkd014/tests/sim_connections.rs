@@ -124,14 +124,14 @@ async fn strangers_shut_nobody_out(limits: &str, floods: usize) {
 
 /// A few more than there are places.
 #[tokio::test]
-async fn more_strangers_than_places_shut_nobody_out() {
+async fn more_strangers_than_places_lock_out_no_known_client() {
     strangers_shut_nobody_out("", PLACES.div_ceil(CONNECTIONS)).await;
 }
 
 /// Were it not for those that give way, the last of them would wait for ten handshakes to time out.
 #[tokio::test]
 #[ignore = "ten thousand connections: cargo test -p etsi-qkd014 --test sim_connections -- --ignored"]
-async fn ten_thousand_strangers_shut_nobody_out() {
+async fn ten_thousand_strangers_lock_out_no_known_client() {
     strangers_shut_nobody_out("", 40).await;
 }
 

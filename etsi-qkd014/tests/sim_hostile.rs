@@ -259,7 +259,7 @@ async fn pipelined_requests_are_answered_in_their_order() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn slow_and_deaf_clients_hold_up_nobody() {
+async fn slow_and_non_reading_clients_do_not_block_others() {
     let network = network().await;
     let mut slow = Vec::new();
     for _ in 0..64 {

@@ -51,7 +51,7 @@ async fn a_python_sae_finds_the_simulator_as_specified() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_python_sae_finds_what_is_wrong() {
+async fn a_python_sae_detects_kme_faults() {
     for (fault, found) in [
         (Fault::WrongLength, "the size asked for"),
         (Fault::KeyMissing, "the number of keys"),

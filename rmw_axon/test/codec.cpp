@@ -115,7 +115,7 @@ void of_every_type(Test test)
 
 }  // namespace
 
-TEST(Codec, writes_what_fast_cdr_writes_and_reads_it_in_both_byte_orders)
+TEST(Codec, writes_fast_cdr_bytes_and_reads_both_byte_orders)
 {
   of_every_type(
     [](const auto & type) {

@@ -257,7 +257,7 @@ subscribe = "/mixed"
 """
 
 
-def test_tools_that_listen_get_what_the_rules_permit_and_nothing_else(site, tmp_path):
+def test_listening_tools_get_only_the_topics_the_rules_permit(site, tmp_path):
     need_bags()
     site.write(LISTEN)
     sources = site.robot.node('bag', 'sources')

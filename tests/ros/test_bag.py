@@ -31,7 +31,7 @@ def counts(info):
     return {topic: int(count) for topic, count in found}
 
 
-def test_what_is_recorded_is_played_as_it_was(host, tmp_path):
+def test_a_recorded_bag_plays_back_unchanged(host, tmp_path):
     bag = tmp_path / 'bag'
     sources = host.node('bag', 'sources')
     sources.said('sent 1')

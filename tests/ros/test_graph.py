@@ -4,7 +4,7 @@
 from conftest import until
 
 
-def test_the_command_line_shows_what_is_there(host):
+def test_the_command_line_shows_nodes_topics_and_services(host):
     host.start('ros2', 'run', 'demo_nodes_cpp', 'talker')
     host.start('ros2', 'run', 'demo_nodes_cpp', 'listener')
     until(

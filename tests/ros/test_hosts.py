@@ -107,7 +107,7 @@ def test_actions_are_followed_and_cancelled_from_the_other_host(hosts):
         server.said('cancelled')
 
 
-def test_what_is_latched_reaches_who_comes_late_on_the_other_host(hosts):
+def test_latched_messages_reach_late_subscribers_on_the_other_host(hosts):
     latched = {
         'map': ('std_msgs/msg/String', '{data: the whole map}', 'the whole map'),
         'tf_static': (

@@ -29,7 +29,7 @@ def test_a_daemon_that_is_killed_is_told_of_by_the_logger_unless_it_is_to_be_sil
     assert 'rmw_axon' not in silent.output
 
 
-def test_what_is_said_before_the_levels_are_set_obeys_them_too(host):
+def test_early_log_messages_obey_log_levels_set_later(host):
     host.env['AXON_SHM'] = 'off'
     told = host.node('qos', 'subscription', 0)
     silent = host.node('qos', 'subscription', 0, *level('warn'))

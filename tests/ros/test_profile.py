@@ -129,7 +129,7 @@ def test_two_hosts_with_roles_have_keys_and_can_do_without(lan, tmp_path):  # no
     assert [host.status()['mode'] for host in (a, b)] == ['classic', 'classic']
 
 
-def test_a_configuration_that_somebody_wrote_is_not_replaced(tmp_path):
+def test_install_does_not_replace_an_existing_configuration(tmp_path):
     build = Build(tmp_path / 'build', 1, tmp_path / 'material')
     assert build.build().returncode == 0
     written = tmp_path / 'prefix/lib/rmw_axon/axon.toml'

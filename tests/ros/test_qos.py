@@ -56,7 +56,7 @@ def test_a_publisher_that_is_killed_is_alive_no_more(host):
     ([], ['lease=100000000'], 'LIVELINESS'),
     (['lease=1000000000'], ['lease=1000000000', 'manual'], 'LIVELINESS'),
 ])
-def test_what_does_not_go_together_is_told_at_both_ends(host, offered, requested, policy):
+def test_incompatible_qos_is_reported_at_both_ends(host, offered, requested, policy):
     subscription = host.node('qos', 'subscription', 0, *requested)
     publisher = host.node('qos', 'publisher', 100000, 0.1, *offered)
     kinds = {'DURABILITY': 2, 'DEADLINE': 4, 'LIVELINESS': 8, 'RELIABILITY': 16}

@@ -137,7 +137,7 @@ def heard(host):
     return process
 
 
-def test_enforced_security_fails_where_nobody_is_authenticated(host, keystore):
+def test_enforced_security_fails_without_peer_authentication(host, keystore):
     enable(host, keystore, 'Enforce')
     process = subscription(host)
     assert process.wait() != 0
@@ -224,7 +224,7 @@ def test_a_process_stays_within_its_enclave(host, keystore, tmp_path):
     assert 'enclave /robot/listener may not publish rt/qos' in wrong.output, wrong.output
 
 
-def test_what_a_node_has_by_itself_needs_permission_too(host, keystore, tmp_path):
+def test_built_in_topics_of_a_node_need_permission_too(host, keystore, tmp_path):
     enforced(host, keystore, tmp_path)
     keystore.enclave('/', domain(host), (['rt/qos'], ['rt/qos']))
     process = subscription(host)

@@ -50,7 +50,7 @@ def test_a_listener_that_is_killed_leaves_the_others_alone(host):
     assert talker.running
 
 
-def test_a_latched_message_reaches_who_comes_late(host):
+def test_a_latched_message_reaches_a_late_subscriber(host):
     host.start(
         'ros2', 'topic', 'pub', '--qos-durability', 'transient_local', '--rate', '0.2',
         '/map', 'std_msgs/msg/String', '{data: the map}')

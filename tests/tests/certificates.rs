@@ -257,7 +257,7 @@ fn host(dir: &Path, roots: &str, pair: &Pair) -> Config {
 }
 
 #[test]
-fn our_own_certificate_is_refused_for_what_is_wrong_with_it() {
+fn our_own_certificate_is_refused_with_the_actual_cause() {
     let dir = tempfile::tempdir().unwrap();
     let ca = Authority::new();
     let good = ca.issue("a", &["a"]);

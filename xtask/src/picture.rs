@@ -234,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn the_picture_shows_what_is_imported_today() {
+    fn the_picture_shows_the_current_imports() {
         let drawn = fs::read_to_string(workspace().join(FILE)).unwrap();
         let today = picture(workspace()).unwrap();
         assert!(drawn == today, "{FILE} is out of date: cargo xtask picture draws it anew");

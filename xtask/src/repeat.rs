@@ -237,7 +237,7 @@ mod tests {
 
     /// What a test started would keep a processor, a port or a lock for as long as it lives.
     #[test]
-    fn program_that_is_late_is_killed_with_what_it_started() {
+    fn timed_out_program_is_killed_with_its_children() {
         let dir = tempfile::tempdir().unwrap();
         let note = dir.path().join("pid");
         let mut command = Command::new("sh");

@@ -16,7 +16,7 @@ fn dependencies(features: &str) -> Vec<String> {
 }
 
 #[test]
-fn each_feature_of_axon_tls_brings_what_it_needs_alone() {
+fn each_axon_tls_feature_adds_only_its_own_dependencies() {
     let has = |features, name: &str| {
         dependencies(features).iter().any(|line| line.starts_with(&format!("{name} v")))
     };

@@ -98,7 +98,7 @@ impl Installed {
 
 #[test]
 #[ignore = "builds all that axon-transport depends on once more"]
-fn programs_in_c_build_and_run_with_what_is_installed() {
+fn c_programs_build_and_run_against_the_installed_files() {
     let installed = Installed::new();
     let declared = installed.declared();
     assert!(declared.len() > 30, "{declared:?}");

@@ -194,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_peer_said_of_an_endpoint_is_shown_and_nothing_else_is_claimed() {
+    fn only_denials_reported_by_the_peer_are_shown() {
         let mut base = link("base");
         let why = "by the peer: denied by line 3 of access.toml";
         base.denied.insert("publish /scan (ours)".into(), why.into());

@@ -119,7 +119,7 @@ fn messages_that_no_checksum_covers_are_not_called_whole() {
 }
 
 #[test]
-fn a_checksum_that_was_compared_covers_what_precedes_it() {
+fn a_verified_checksum_covers_the_records_before_it() {
     // Damage behind the data section, of a log without chunks: that section was compared before.
     let whole = without_chunks(10, true);
     let cut = file(&whole[..whole.len() - 1]);

@@ -108,7 +108,7 @@ fn reader(pid: u32, waiting_ms: u64) -> ReaderStatus {
 }
 
 #[test]
-fn what_a_daemon_withholds_is_not_shown_as_nothing() {
+fn withheld_status_fields_are_not_shown_as_empty() {
     let mut status = Status::default();
     status.daemon = "00ff".to_owned();
     status.gateway = "running".to_owned();

@@ -81,7 +81,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_table_says_what_holds_now_and_which_key_is_ours() {
+    fn the_trust_list_shows_key_validity_and_marks_the_local_key() {
         let [ours, theirs] = [1, 2].map(|byte| SpkiDigest([byte; 32]));
         let text = format!("base {ours}\narm {theirs} 2024-02-29\n");
         let file = TrustFile::parse(&text).unwrap();

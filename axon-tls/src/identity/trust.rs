@@ -310,7 +310,7 @@ mod tests {
     }
 
     #[test]
-    fn pins_say_what_their_lines_say() {
+    fn pins_hold_the_name_key_and_last_day_of_their_lines() {
         let [one, two, three] = [1, 2, 3].map(|byte| SpkiDigest([byte; 32]));
         let text = format!("b {one}\nb {two} 2024-02-29 # old\na {three}");
         let file = TrustFile::parse(&text).unwrap();

@@ -89,7 +89,7 @@ fn until_it_ends(pid: u32) {
 }
 
 #[test]
-fn no_variable_influences_what_is_built_or_the_daemon_that_it_starts() {
+fn environment_variables_influence_neither_a_built_config_nor_its_daemon() {
     let host = Host::new();
     let run = host.dir.path().join("run");
     let mut command = host.command(std::env::current_exe().unwrap());

@@ -109,7 +109,7 @@ fn own_endpoints_are_in_the_graph_at_once_without_a_daemon() {
 }
 
 #[test]
-fn a_subscription_that_is_counted_gets_what_is_published_next() {
+fn a_subscription_in_the_graph_gets_the_next_published_sample() {
     let host = Host::new();
     let _daemon = host.daemon();
     let session = host.session("counting").unwrap();
@@ -136,7 +136,7 @@ fn a_subscription_that_is_counted_gets_what_is_published_next() {
 }
 
 #[test]
-fn a_publisher_reaches_at_once_whom_it_could_count_when_it_was_made() {
+fn a_new_publisher_reaches_subscriptions_in_the_graph_at_once() {
     let host = Host::new();
     let _daemon = host.daemon();
     let (here, there) = (host.session("here").unwrap(), host.session("there").unwrap());

@@ -128,7 +128,7 @@ fn a_process_at_rest_does_not_wake_up() {
 
 /// Each offers a lease, and watches its own and the other's.
 #[test]
-fn leases_wake_the_control_thread_up_three_times_each_and_nobody_else() {
+fn leases_wake_only_the_control_thread_three_times_per_period() {
     let host = Host::new();
     let _daemon = host.daemon();
     let mut players = [0, 1].map(|_| host.play("leased"));

@@ -142,7 +142,7 @@ fn call_in_thread(client: &Client, server: &Server) -> Vec<u8> {
 }
 
 #[test]
-fn responses_come_in_the_order_in_which_they_are_given_and_to_the_one_who_asked() {
+fn responses_reach_their_client_in_the_order_sent() {
     let session = alone();
     let server = session.create_server(spec()).unwrap();
     let clients: Vec<Client> = (0..3).map(|_| session.create_client(spec()).unwrap()).collect();
@@ -177,7 +177,7 @@ fn responses_come_in_the_order_in_which_they_are_given_and_to_the_one_who_asked(
 }
 
 #[test]
-fn a_response_to_nobody_is_no_error() {
+fn a_response_without_a_waiting_client_is_no_error() {
     let session = alone();
     let server = session.create_server(spec()).unwrap();
     let client = session.create_client(spec()).unwrap();
@@ -243,7 +243,7 @@ fn twenty_clients_in_twenty_processes_get_each_their_own() {
 }
 
 #[test]
-fn a_client_that_dies_with_responses_pending_harms_nobody() {
+fn a_client_killed_with_pending_responses_leaves_the_server_working() {
     let host = Host::new();
     let _daemon = host.daemon();
     let session = host.session("server").unwrap();
@@ -340,7 +340,7 @@ fn twenty_clients_that_ask_at_once_are_all_answered_by_a_server_that_keeps_one()
 }
 
 #[test]
-fn a_callback_that_is_set_late_is_told_of_what_can_be_taken() {
+fn a_late_callback_is_told_the_number_of_takeable_requests() {
     let session = alone();
     let server = session.create_server(keeping(Some(2))).unwrap();
     let clients = [spec(), spec()].map(|spec| session.create_client(spec).unwrap());

@@ -303,7 +303,7 @@ fn no_signal_is_delivered_to_the_control_thread() {
 }
 
 #[test]
-fn a_forked_child_is_refused_by_whatever_it_asks_and_never_waits() {
+fn every_call_of_a_forked_child_is_refused_without_waiting() {
     use std::sync::atomic::{AtomicBool, Ordering};
     let session = alone();
     let publisher = session.create_publisher(spec(Qos::keep_all())).unwrap();

@@ -53,7 +53,7 @@ fn reader_of(topic: &TopicStatus, pid: u32) -> &ReaderStatus {
 }
 
 #[test]
-fn a_stopped_reader_is_named_with_what_it_missed_and_none_that_takes() {
+fn status_names_a_stopped_reader_with_its_backlog_and_no_active_reader() {
     let host = Host::new();
     let _daemon = host.daemon();
     let session = host.session("camera").unwrap();

@@ -128,7 +128,7 @@ fn sessions_that_wait_for_each_other_hear_of_both() {
 }
 
 #[test]
-fn at_a_session_that_is_closed_nobody_waits() {
+fn waiting_on_a_guard_condition_of_a_closed_session_is_refused() {
     let (session, other) = (alone(), alone());
     let foreign = other.create_guard_condition();
     drop(other);
@@ -276,7 +276,7 @@ fn new_samples_are_told_of_each_once_and_those_that_wait_at_once() {
 }
 
 #[test]
-fn a_callback_that_replaces_another_is_not_told_what_that_one_was() {
+fn a_replacement_callback_is_not_told_already_reported_samples() {
     let session = alone();
     let (publisher, subscription) = pair(&session, "/t");
     let (sender, told) = std::sync::mpsc::channel();

@@ -6,7 +6,7 @@
 //! describes them.
 //!
 //! ```
-//! use axon_transport::access::{AccessRules, Party, Verb};
+//! use axon_transport::access::{AccessRules, Principal, Verb};
 //!
 //! let rules = AccessRules::parse(
 //!     r#"
@@ -17,12 +17,12 @@
 //!     "#,
 //!     "access.toml",
 //! )?;
-//! let base = Party::Name("base");
+//! let base = Principal::Name("base");
 //! assert!(rules.check(base, Verb::Publish, "/cmd_vel").allowed());
 //! let denied = rules.check(base, Verb::Publish, "/scan");
 //! assert_eq!(denied.to_string(), "denied: no [[allow]] in access.toml permits this");
 //! // A rule names the base station alone: nothing changes for others.
-//! assert!(rules.check(Party::Name("laptop"), Verb::Publish, "/scan").allowed());
+//! assert!(rules.check(Principal::Name("laptop"), Verb::Publish, "/scan").allowed());
 //! # Ok::<(), axon_transport::access::AccessError>(())
 //! ```
 

@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_pattern_is_refused() {
+    fn invalid_topic_patterns_are_refused() {
         let long = format!("/{}", "a".repeat(MAX_PATTERN_BYTES));
         for text in ["", "cmd_vel", "/", "/a//b", "/a/", "/a**", "/a/***", &long] {
             TopicPattern::new(text).unwrap_err();

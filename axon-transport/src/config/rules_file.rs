@@ -146,7 +146,7 @@ mod tests {
     const RULES: &str = "[[deny]]\npeer = \"*\"\ncall = \"/reboot\"\n";
 
     #[test]
-    fn rules_are_found_alone_and_among_settings_whatever_the_file_is_called() {
+    fn rules_are_found_alone_or_among_settings_under_any_file_name() {
         for settings in [
             "",
             "quic_cipher = \"aes-256-gcm\"\n",

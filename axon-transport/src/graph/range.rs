@@ -129,7 +129,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_session_that_says_nothing_or_what_nobody_knows_is_kept_in() {
+    fn missing_or_unknown_discovery_range_does_not_leave_the_host() {
         use DiscoveryRange::{Localhost, Off, Subnet};
         let peers = || vec!["10.0.0.1".to_owned(), String::new(), "a\nb".into(), "x".repeat(254)];
         for (said, range, listed, stated) in [

@@ -327,7 +327,7 @@ fn attached(registry: &mut Registry<Label>) -> Gid {
 }
 
 #[test]
-fn memory_that_is_given_up_does_not_wait_for_who_is_stopped() {
+fn segments_given_up_are_not_queued_for_a_stopped_session() {
     let mut registry = registry(&[SessionRole::Application; 2]);
     let writer = attached(&mut registry);
     let mut turn = |number| {

@@ -137,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn it_is_answered_when_those_who_keep_all_were_sent_what_came_before() {
+    fn a_fence_is_answered_once_keep_all_readers_were_sent_earlier_messages() {
         let mut registry = registry();
         ask(&mut registry, 1);
         assert_eq!(answers(&mut registry), [1], "nothing waits");
@@ -211,7 +211,7 @@ mod tests {
     }
 
     #[test]
-    fn nobody_asks_about_the_publisher_of_another() {
+    fn a_fence_for_the_publisher_of_another_session_is_refused() {
         let mut registry = registry();
         let fence = SessionMessage::Fence(Fence { writer: gid(WRITER), number: 1 });
         let refused = registry.handle_message(&id(KEEPS), fence, vec![]);

@@ -281,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn lost_is_what_none_of_them_has() {
+    fn lost_counts_samples_missing_from_every_reader() {
         let (mut merge, readers) = (merge(), Readers::default());
         readers.have(ONE, [(3, 2)]);
         assert_eq!(all(&mut merge, &readers), [(3, 2)], "before the first");
@@ -342,7 +342,7 @@ mod tests {
     }
 
     #[test]
-    fn what_one_has_waits_for_another_that_may_lose_nothing_and_waits_for_memory() {
+    fn merge_waits_for_a_lossless_reader_that_awaits_memory() {
         let mut merge = Merge::default();
         merge.set([ONE, OTHER]);
         let readers = Readers::default();

@@ -249,7 +249,7 @@ fn maps_of(inode: u64) -> usize {
 }
 
 #[test]
-fn memory_that_comes_with_a_repeated_grant_wakes_who_waits_for_it() {
+fn memory_in_a_repeated_grant_wakes_the_waiting_reader() {
     let (session, daemon) = session();
     let far = Far::new(&daemon);
     let (subscription, granted) = far.matched(&session, &daemon);
@@ -289,7 +289,7 @@ fn a_segment_that_is_refused_does_not_spoil_the_grant_it_came_with() {
 }
 
 #[test]
-fn memory_is_told_of_before_what_lies_in_it() {
+fn a_segment_is_announced_before_the_rings_in_it() {
     let (session, daemon) = session();
     // More rings than fit in the first segment.
     let spec = || EndpointSpec::new("/t", "test/Bytes", Qos::default());
@@ -383,7 +383,7 @@ fn a_reader_requests_the_memory_of_an_ended_writer() {
 }
 
 #[test]
-fn memory_that_a_writer_did_not_leave_is_given_up_with_what_is_in_it() {
+fn samples_in_memory_an_ended_writer_did_not_leave_are_lost() {
     let (session, daemon) = session();
     let far = Far::new(&daemon);
     let (subscription, _) = far.matched(&session, &daemon);

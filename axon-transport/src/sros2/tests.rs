@@ -236,7 +236,7 @@ fn of_several_grants_the_first_that_is_valid_counts() {
 }
 
 #[test]
-fn what_is_not_understood_counts_for_nothing() {
+fn permissions_with_unknown_or_invalid_elements_are_refused() {
     let allow = rule("allow", "publish", &["*"]);
     let with = |element: &str| {
         grant(&allow.replace("</allow_rule>", &format!("{element}</allow_rule>")), "DENY")
@@ -305,7 +305,7 @@ fn a_document_that_wants_to_do_harm_is_refused() {
 }
 
 #[test]
-fn a_file_that_everybody_may_write_or_that_is_none_is_refused() {
+fn world_writable_missing_or_irregular_permissions_files_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("permissions.p7s");
     let read = || EnclavePermissions::read(&path, "/arm").map_err(|error| error.to_string());

@@ -132,7 +132,7 @@ mod tests {
     use secrecy::ExposeSecret;
 
     #[test]
-    fn it_refuses_what_is_not_strict() {
+    fn decoder_refuses_non_strict_base64() {
         for bad in [
             "",
             "\"",
@@ -182,7 +182,7 @@ mod tests {
         }
 
         #[test]
-        fn it_accepts_what_the_reference_accepts(text in "[A-Za-z0-9+/]{0,9}[A-Za-z0-9+/=_ -]{0,4}") {
+        fn decoder_agrees_with_the_reference(text in "[A-Za-z0-9+/]{0,9}[A-Za-z0-9+/=_ -]{0,4}") {
             for text in [text.clone(), text.repeat(16)] {
                 let (ours, theirs) = (decode_text(text.as_bytes()), STANDARD.decode(&text));
                 prop_assert_eq!(ours.ok().map(|secret| secret.expose_secret().to_vec()), theirs.ok());

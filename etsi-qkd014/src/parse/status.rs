@@ -98,7 +98,7 @@ mod tests {
     }
 
     #[test]
-    fn quirks_tolerate_exactly_what_they_name() {
+    fn each_quirk_tolerates_only_its_named_deviation() {
         let mut bytes = answer();
         bytes["key_size"] = json!(32);
         assert_eq!(parse(&bytes, Quirks::SIZE_IN_BYTES).unwrap().key_size, 256);

@@ -79,7 +79,7 @@ mod tests {
     }
 
     #[test]
-    fn a_shrinking_stock_shows_what_flows_in() {
+    fn a_shrinking_stock_reveals_the_refill_rate() {
         let mut supply = Supply::default();
         supply.stocked(s(0), stock(1000));
         supply.answered(s(0), 100);

@@ -177,7 +177,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn text_that_is_no_fault_is_refused_with_what_is() {
+    fn invalid_fault_text_is_refused_with_the_valid_faults() {
         for wrong in [
             "",
             "Cut",

@@ -234,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn a_plan_happens_to_whom_and_as_often_as_it_says() {
+    fn a_fault_plan_applies_to_its_method_as_often_as_configured() {
         let mut faults = Faults::default();
         for text in ["cut,times=2,on=dec_keys", "handshake-refused,times=1", "garbage"] {
             faults.push(text.parse().unwrap());
@@ -262,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn probability_is_about_what_it_says() {
+    fn faults_occur_at_about_the_configured_probability() {
         let mut faults = Faults::default();
         faults.push(FaultPlan::new(Fault::CutAnswer).probability(0.5));
         let hits = (0..4000).filter(|_| faults.for_request(None).fault.is_some()).count();

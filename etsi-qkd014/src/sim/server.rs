@@ -217,7 +217,7 @@ mod tests {
     /// Connections that never end, of which the first has proved who it is. The clock goes on where
     /// all wait.
     #[tokio::test(start_paused = true)]
-    async fn strangers_give_way_one_after_the_other_and_who_is_known_stays() {
+    async fn unauthenticated_connections_give_way_in_turn_and_authenticated_connections_stay() {
         const PLACES: usize = 4;
         let places = Arc::new(Semaphore::new(PLACES));
         let (mut strangers, mut tasks) = (Strangers::default(), JoinSet::new());

@@ -264,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn each_named_slave_gets_a_key_once_and_nobody_else_does() {
+    fn only_named_slaves_get_a_key_and_each_only_once() {
         let mut store = Store::new(FillRate::Unlimited, 10, 10);
         let drawn = store.draw(&link(0, 1), 1, 32, 1, "m", &slaves(&["s", "t"])).unwrap();
         let ids = [drawn[0].0.clone()];
@@ -304,7 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_key_that_nobody_fetches_is_wiped_when_too_many_wait() {
+    fn the_oldest_unfetched_key_is_wiped_when_too_many_wait() {
         let mut store = Store::new(FillRate::Unlimited, 10, 10);
         let first = store.draw(&link(0, 1), 2, 32, 1, "m", &slaves(&["s"])).unwrap();
         for _ in 0..(MAX_WAITING - 1) / 5 {

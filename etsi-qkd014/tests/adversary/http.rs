@@ -111,7 +111,7 @@ async fn a_compressed_body_is_not_asked_for_and_not_taken() {
 
 /// Clause 5.1: UTF-8. RFC 8259 defines no parameter `charset`, so what it says counts for nothing.
 #[tokio::test]
-async fn a_body_is_utf_8_whatever_its_label_says() {
+async fn a_body_is_utf_8_regardless_of_its_charset_label() {
     for label in ["; charset=utf-8", ";charset=\"UTF-8\"", "; charset=iso-8859-1", " ; x=y"] {
         let line = format!("Content-Type: Application/JSON{label}\r\n");
         enc(answer("200 OK", &line, container().as_bytes()), Then::KeepAlive).await.unwrap();
@@ -148,7 +148,7 @@ async fn answers_that_are_no_http_are_ambiguous() {
 }
 
 #[tokio::test]
-async fn an_answer_nobody_asked_for_is_never_the_next_calls() {
+async fn an_unrequested_answer_is_never_used_for_the_next_call() {
     let other = container().replace("bc490419", "00000000");
     let twice = [ok(container().as_bytes()), ok(other.as_bytes())].concat();
     let server = Server::start(twice, Then::KeepAlive).await;

@@ -130,7 +130,7 @@ fn id(number: usize) -> String {
 }
 
 #[tokio::test]
-async fn another_policy_shares_the_connections_and_what_is_known() {
+async fn a_client_with_another_retry_policy_shares_connections_and_known_status() {
     let network = network().await;
     let kme = network.kme("kme-a").unwrap();
     let patient = RetryPolicy::none().enc_keys(5).status(5).pause(Duration::ZERO, Duration::ZERO);

@@ -223,7 +223,7 @@ async fn zeros_in_the_status_bound_nothing() {
 }
 
 #[tokio::test]
-async fn the_target_follows_what_is_set() {
+async fn the_pool_follows_a_changed_target() {
     let network = two().start().await.unwrap();
     let pool = pool(&network).target(0).build().unwrap();
     until(&pool, |status| status.stock.is_some()).await;
@@ -239,7 +239,7 @@ async fn the_target_follows_what_is_set() {
 }
 
 #[tokio::test]
-async fn keys_that_nobody_takes_are_replaced() {
+async fn untaken_keys_are_replaced() {
     let network = two().start().await.unwrap();
     let pool = pool(&network).target(2).max_age(Duration::from_millis(300)).build().unwrap();
     let status = until(&pool, |status| status.expired >= 4).await;

@@ -107,7 +107,7 @@ async fn keys_of_another_size_than_asked_for_are_refused() {
 
 /// A 200 with the body of an error, and errors with the body of a 200.
 #[tokio::test]
-async fn the_status_code_decides_what_a_body_is() {
+async fn the_status_code_decides_how_a_body_is_parsed() {
     let message = json!({ "message": "no keys", "details": [] }).to_string();
     let error = in_doubt(ok(message), 1).await;
     assert!(matches!(error.cause(), Error::Malformed { .. }), "{error}");

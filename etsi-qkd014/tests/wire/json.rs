@@ -41,7 +41,7 @@ async fn a_member_that_comes_twice_is_refused_however_it_is_spelled() {
 }
 
 #[tokio::test]
-async fn escapes_in_a_key_id_are_undone_and_what_they_hide_is_seen() {
+async fn escapes_in_a_key_id_are_decoded_before_validation() {
     let with = |id: &str| container().replace(ID, id);
     let escaped: String = ID.chars().map(|c| format!("\\u{:04x}", u32::from(c))).collect();
     let key = enc(&with(&escaped), Quirks::STRICT).await.unwrap().into_single();

@@ -74,7 +74,7 @@ async fn status_is_a_get_without_a_body() {
 
 /// Clause 6.2: all members are optional, and one that is not needed is absent, not `null` or empty.
 #[tokio::test]
-async fn enc_keys_by_post_carries_what_was_asked_for_and_nothing_else() {
+async fn enc_keys_by_post_carries_only_the_requested_members() {
     let kme = Kme::start().await;
     let client = kme.client().build().unwrap();
     once(&kme, post("sae-b/enc_keys", json!({}))).await;

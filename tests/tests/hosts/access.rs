@@ -330,7 +330,7 @@ fn a_peer_that_may_do_nothing_here_shows_no_nodes_here() {
 }
 
 #[test]
-fn rules_that_change_under_load_lose_nothing_of_what_they_allow() {
+fn rule_changes_under_load_lose_no_allowed_samples() {
     let keys = tempfile::tempdir().unwrap();
     let settings = pinned(keys.path(), [[false, true], [true, false]]);
     let hosts = Hosts::start(settings, "host-1", keys);

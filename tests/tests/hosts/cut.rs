@@ -70,7 +70,7 @@ fn in_messages10_a_link_flows_again_soon_after_its_path_is_back() {
 /// cut, and the successor that it dials is none too many. Such a cut says nothing of the rule, and is made
 /// again.
 #[test]
-fn a_cut_that_nobody_notices_makes_no_second_link() {
+fn an_unnoticed_cut_creates_no_second_link() {
     let (hosts, wire) = wired([classic(&[]), classic(&[])]);
     let mut there = hosts[1].subscribe(Sizes::Small);
     let mut publisher = hosts[0].publish(Sizes::Small, 1, Some(SOME));

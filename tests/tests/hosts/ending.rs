@@ -69,20 +69,20 @@ fn what_a_publisher_leaves_arrives(settings: [Settings; 2]) {
 }
 
 #[test]
-fn what_a_publisher_leaves_arrives_in_classic() {
+fn samples_of_an_ended_publisher_arrive_in_classic() {
     what_a_publisher_leaves_arrives([classic(&[]), classic(&[])]);
 }
 
 /// It waits for keys.
 #[test]
-fn what_a_publisher_leaves_arrives_in_messages10() {
+fn samples_of_an_ended_publisher_arrive_in_messages10() {
     let kmes = Kmes::start();
     let more = [("AXON_QKD_KEY_MODE", "messages10")];
     what_a_publisher_leaves_arrives([0, 1].map(|host| kmes.settings(host, &more)));
 }
 
 #[test]
-fn what_a_publisher_leaves_keeps_the_daemon_until_it_arrived() {
+fn samples_of_an_ended_publisher_keep_the_daemon_until_they_arrive() {
     let hosts = Plan { grace_s: 1, ..Plan::new([classic(&[]), classic(&[])]) }.prepare();
     // A daemon that a session started ends; one that is started by hand stays.
     let starters = hosts.each_ref().map(|host| host.node(&["subscribe", "/elsewhere", "small"]));
@@ -101,7 +101,7 @@ fn what_a_publisher_leaves_keeps_the_daemon_until_it_arrived() {
 }
 
 #[test]
-fn what_a_publisher_leaves_and_nobody_takes_is_counted() {
+fn undelivered_samples_of_an_ended_publisher_are_counted() {
     let hosts = Plan::new([classic(&[]), classic(&[])]).start();
     let (publisher, _subscription) = across(&hosts);
     signal(hosts[1].status().pid, Signal::STOP);
@@ -113,7 +113,7 @@ fn what_a_publisher_leaves_and_nobody_takes_is_counted() {
 }
 
 #[test]
-fn acknowledged_is_what_the_other_host_has() {
+fn samples_are_acknowledged_once_the_other_host_has_them() {
     let hosts = Plan::new([classic(&[]), classic(&[])]).start();
     let (publisher, subscription) = across(&hosts);
     publish(&publisher, 10);
@@ -131,7 +131,7 @@ fn acknowledged_is_what_the_other_host_has() {
 }
 
 #[test]
-fn what_a_killed_daemon_had_is_not_acknowledged() {
+fn samples_in_a_killed_daemon_are_not_acknowledged() {
     let mut hosts = Plan::new([classic(&[]), classic(&[])]).start();
     let (publisher, _subscription) = across(&hosts);
     let there = hosts[1].status().pid;
@@ -144,7 +144,7 @@ fn what_a_killed_daemon_had_is_not_acknowledged() {
 }
 
 #[test]
-fn what_a_link_had_when_a_daemon_was_killed_arrives_with_the_next_daemon() {
+fn samples_in_flight_to_a_killed_daemon_arrive_through_its_successor() {
     let mut hosts = Plan::new([classic(&[]), classic(&[])]).start();
     let (publisher, subscription) = across(&hosts);
     let there = hosts[1].status().pid;
@@ -158,7 +158,7 @@ fn what_a_link_had_when_a_daemon_was_killed_arrives_with_the_next_daemon() {
 }
 
 #[test]
-fn a_daemon_that_is_told_to_end_sends_what_waits_first() {
+fn a_terminated_daemon_first_sends_its_queued_samples() {
     let hosts = Plan::new([classic(&[]), classic(&[])]).start();
     let (publisher, subscription) = across(&hosts);
     let there = hosts[1].status().pid;
@@ -173,7 +173,7 @@ fn a_daemon_that_is_told_to_end_sends_what_waits_first() {
 }
 
 #[test]
-fn what_a_daemon_that_is_told_to_end_cannot_send_is_counted() {
+fn samples_that_a_terminated_daemon_cannot_send_are_counted() {
     let hosts = Plan::new([classic(&[]), classic(&[])]).start();
     let (publisher, _subscription) = across(&hosts);
     let there = hosts[1].status().pid;

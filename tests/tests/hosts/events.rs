@@ -197,7 +197,7 @@ fn a_deadline_is_missed_on_both_hosts() {
 }
 
 #[test]
-fn what_is_older_than_its_lifespan_is_not_taken_elsewhere() {
+fn samples_older_than_their_lifespan_are_not_taken_on_another_host() {
     let [a, b] = hosts();
     let (here, there) = (a.session("publisher"), b.session("subscription"));
     let lasts = |seconds| {
@@ -227,7 +227,7 @@ fn what_is_older_than_its_lifespan_is_not_taken_elsewhere() {
 }
 
 #[test]
-fn who_says_without_a_sample_that_it_is_alive_is_so_elsewhere() {
+fn asserted_liveliness_without_a_sample_reaches_the_other_host() {
     let [a, b] = hosts();
     let (here, there) = (a.session("publisher"), b.session("subscription"));
     let liveliness = Liveliness::ManualByTopic;

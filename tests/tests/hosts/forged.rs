@@ -227,6 +227,6 @@ fn hosts_that_list_each_other_link_through_forged_beacons() {
 }
 
 #[test]
-fn hosts_that_nobody_lists_link_through_forged_beacons() {
+fn unlisted_hosts_link_through_forged_beacons() {
     link_through_forged(|settings| Plan { listed: false, ..Plan::new(settings) });
 }

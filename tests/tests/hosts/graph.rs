@@ -67,7 +67,7 @@ fn named(gid: Gid, node: &str, namespace: &str, enclave: &str) -> Endpoint {
 }
 
 #[test]
-fn every_field_of_what_is_on_one_host_is_in_the_others_graph_for_as_long_as_it_is_there() {
+fn the_remote_graph_shows_every_endpoint_field_while_the_endpoint_exists() {
     let [a, b] = hosts();
     let witness = Witness::on(&b);
     let session = a.session("everything");
@@ -151,7 +151,7 @@ fn every_field_of_what_is_on_one_host_is_in_the_others_graph_for_as_long_as_it_i
 }
 
 #[test]
-fn what_a_process_had_that_is_killed_leaves_the_others_graph() {
+fn endpoints_of_a_killed_process_leave_the_remote_graph() {
     use EndpointKind::{Client, Publisher, Server, Subscription};
     let [a, b] = hosts();
     let witness = Witness::on(&b);

@@ -261,7 +261,7 @@ fn a_graph_has_a_bound_for_all_daemon_ids_of_a_peer_and_the_rest_of_the_link_goe
 }
 
 #[test]
-fn a_flood_of_changes_holds_up_nobody_and_ends_in_the_newest_state() {
+fn graph_change_floods_block_no_session_and_end_in_the_newest_state() {
     /// The flood is under way once so many are said: more than is on its way at a time.
     const BEFORE: u64 = 30_000;
     /// Others match before the flooder has said so many more.

@@ -55,7 +55,7 @@ fn all_published(camera: &Camera, met: &mut Met, topic: &str, all: &[Gid]) -> u3
 }
 
 #[test]
-fn what_a_peer_has_under_way_is_bounded_over_all_of_its_ids_and_given_back() {
+fn in_flight_memory_of_a_peer_is_bounded_across_ids_and_released() {
     let camera = Camera::new();
     let spec = EndpointSpec::new(TOPIC, TYPE, Qos::keep_all());
     let session = camera.a.session("slow");

@@ -104,7 +104,7 @@ fn secrets_of_the_connection_to_the_kme_are_on_no_stack_and_nowhere_after_its_en
 }
 
 #[test]
-fn a_daemon_that_may_lock_no_memory_says_once_what_that_means_and_what_to_set() {
+fn a_daemon_without_lockable_memory_warns_once_with_effect_and_remedy() {
     let kmes = Kmes::start();
     let [mut host, _other] = Plan::new([0, 1].map(|host| kmes.settings(host, &[]))).prepare();
     host.start_by("ulimit -l 0");

@@ -74,7 +74,7 @@ fn zeros(length: u32) -> Vec<u8> {
 }
 
 #[test]
-fn samples_that_are_far_longer_than_what_comes_of_them_arrive_in_order_and_others_meanwhile() {
+fn highly_compressed_samples_arrive_in_order_without_delaying_other_topics() {
     const LENGTH: u32 = 8 << 20;
     const SAMPLES: u64 = 24;
     let camera = Camera::new();

@@ -56,7 +56,7 @@ fn a_flood_that_overtakes_its_reader_arrives_in_order_with_its_end() {
 }
 
 #[test]
-fn a_topic_that_nobody_reads_holds_up_its_own_publisher_alone() {
+fn an_unread_topic_blocks_only_its_own_publisher() {
     const TINY: u64 = 2_000;
     let hosts = hosts();
     let (huge, unread) = across(&hosts, "/huge", Qos::keep_all());
@@ -116,7 +116,7 @@ fn survivors(queue_mb: &str) -> usize {
 
 /// A queue may take a thirty-second of all: 2 MiB, and 32.
 #[test]
-fn what_waits_for_a_slow_peer_is_bounded_as_configured() {
+fn the_queue_for_a_slow_peer_has_its_configured_bound() {
     let [few, many] = ["64", "1024"].map(survivors);
     assert!(few + 80 < many, "{few} and {many} of 300 samples of 300 kB");
 }

@@ -144,7 +144,7 @@ impl Crowd {
 }
 
 #[test]
-fn topics_beyond_what_may_cross_are_named_on_the_subscribing_host_and_harm_nothing_else() {
+fn excess_topics_are_named_on_the_subscribing_host_and_disturb_no_others() {
     let hosts = small_hosts();
     let mut crowd = Crowd::new(&hosts, CROWD);
     // What does not cross is refused, by its name on one of the hosts: as a route, or as an endpoint of a graph.
@@ -291,7 +291,7 @@ fn processor(host: &Host) -> Duration {
 #[test]
 #[ignore = "prints what it measures"]
 #[allow(clippy::print_stdout, reason = "it prints what it measures")]
-fn what_a_message_costs_with_many_topics() {
+fn the_processor_cost_of_a_message_with_many_topics_is_printed() {
     const MESSAGES: u32 = 10_000;
     for topics in [1, 100, 1_000, 10_000] {
         let hosts = Plan::new([classic(&[]), classic(&[])]).start();
@@ -333,7 +333,7 @@ fn links_of_made_up_keys_from_one_address_keep_no_listed_host_out() {
 }
 
 #[test]
-fn links_of_made_up_keys_from_one_address_keep_no_host_out_that_nobody_lists() {
+fn made_up_keys_from_one_address_keep_no_unlisted_host_out() {
     made_up_keys_keep_no_other_host_out(false);
 }
 

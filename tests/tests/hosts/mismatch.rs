@@ -49,7 +49,7 @@ fn another_cipher() {
 }
 
 #[test]
-fn pinned_against_anybody() {
+fn pinned_against_none() {
     let dir = tempfile::tempdir().unwrap();
     let [a, _] = super::mode::pinned(dir.path(), [[false, true], [true, false]]);
     differ([a, classic(&[])], "AXON_CLASSIC_AUTH");

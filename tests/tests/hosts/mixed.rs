@@ -113,7 +113,7 @@ fn one_that_keeps_all_holds_a_publisher_back_though_one_that_does_not_was_there_
 }
 
 #[test]
-fn nobody_loses_anything_because_somebody_else_asks_for_more() {
+fn a_subscription_loses_no_samples_when_another_requests_more_depth() {
     let hosts = hosts();
     let (here, there) = (hosts[0].session("publisher"), hosts[1].session("subscriptions"));
     let publisher = here.create_publisher(spec("/deeper", Qos::keep_all())).unwrap();

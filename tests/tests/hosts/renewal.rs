@@ -151,7 +151,7 @@ fn what_waits_is_not_lost(key_mode: &str) {
 
 /// What a link still carries when its key is at its end is counted, and nobody is blamed for it.
 #[test]
-fn in_messages10_what_waits_longer_than_its_key_may_live_is_nobodys_fault() {
+fn in_messages10_samples_older_than_their_key_cause_no_envelope_refusal() {
     let (_kmes, [a, b]) = little_room("messages10", "4");
     let (here, there) = (a.session("publisher"), b.session("subscription"));
     let spec = || EndpointSpec::new("/kept", "test/Bytes", Qos::keep_all());
@@ -168,11 +168,11 @@ fn in_messages10_what_waits_longer_than_its_key_may_live_is_nobodys_fault() {
 }
 
 #[test]
-fn in_session_what_waits_for_its_reader_is_not_lost() {
+fn in_session_samples_waiting_for_their_reader_are_not_lost() {
     what_waits_is_not_lost("session");
 }
 
 #[test]
-fn in_messages10_what_waits_for_its_reader_is_not_lost() {
+fn in_messages10_samples_waiting_for_their_reader_are_not_lost() {
     what_waits_is_not_lost("messages10");
 }

@@ -77,7 +77,7 @@ fn a_burst_within_the_depth_outlasts_a_cut() {
 }
 
 #[test]
-fn what_is_published_during_a_cut_that_outlasts_the_graph_arrives() {
+fn samples_published_during_a_cut_longer_than_the_link_timeout_arrive() {
     let (hosts, wire) = wired([classic(&[]), classic(&[])]);
     let (publisher, subscription) = across(&hosts, Qos::keep_all());
     publish(&publisher, 20, 4096, Duration::ZERO);
@@ -101,17 +101,17 @@ fn what_a_publisher_leaves_in_a_cut_link_arrives(qos: Qos) {
 }
 
 #[test]
-fn what_a_keep_all_publisher_leaves_in_a_cut_link_arrives() {
+fn samples_of_an_ended_keep_all_publisher_survive_a_cut() {
     what_a_publisher_leaves_in_a_cut_link_arrives(Qos::keep_all());
 }
 
 #[test]
-fn what_a_keep_last_publisher_leaves_in_a_cut_link_arrives() {
+fn samples_of_an_ended_keep_last_publisher_survive_a_cut() {
     what_a_publisher_leaves_in_a_cut_link_arrives(Qos::default().with_depth(100));
 }
 
 #[test]
-fn what_a_killed_process_published_into_a_cut_link_arrives() {
+fn samples_of_a_process_killed_during_a_cut_arrive() {
     let (hosts, wire) = wired([classic(&[]), classic(&[])]);
     let mut there = hosts[1].subscribe(Sizes::Small);
     let mut publisher = hosts[0].publish(Sizes::Small, 2, Some(100));

@@ -365,11 +365,11 @@ fn in_session(kex: &str) {
 }
 
 #[test]
-fn in_session_with_psk_ke_spent_keys_and_what_was_derived_of_them_are_nowhere() {
+fn in_session_with_psk_ke_spent_and_derived_keys_are_erased() {
     in_session("psk_ke");
 }
 
 #[test]
-fn in_session_with_psk_dhe_ke_spent_keys_and_what_was_derived_of_them_are_nowhere() {
+fn in_session_with_psk_dhe_ke_spent_and_derived_keys_are_erased() {
     in_session("psk_dhe_ke");
 }

@@ -99,7 +99,7 @@ fn twenty_clients_get_each_their_own() {
 }
 
 #[test]
-fn who_is_available_is_reached_and_who_is_gone_is_not_available() {
+fn available_servers_are_reached_and_gone_servers_are_unavailable() {
     in_all(|[a, b]| {
         let (here, there) = (a.session("server"), b.session("client"));
         let first = client(&there);
@@ -147,7 +147,7 @@ fn a_request_goes_to_all_servers_there_are_and_each_answers() {
 }
 
 #[test]
-fn a_client_that_dies_with_responses_pending_harms_nobody() {
+fn a_client_killed_with_pending_responses_leaves_the_server_working() {
     in_all(|[a, b]| {
         let session = a.session("server");
         let server = server(&session);

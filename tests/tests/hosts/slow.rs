@@ -33,7 +33,7 @@ fn shown(host: &Host, what: &str, fits: impl Fn(&LinkStatus) -> bool) -> LinkSta
 }
 
 #[test]
-fn what_waits_is_shown_by_class_and_with_the_age_of_the_oldest() {
+fn waiting_bytes_are_shown_by_class_with_the_oldest_age() {
     const LONGS: u32 = 4;
     const SHORTS: u32 = 1024;
     let (hosts, wire) = wired([classic(&[]), classic(&[])]);
@@ -65,7 +65,7 @@ fn what_waits_is_shown_by_class_and_with_the_age_of_the_oldest() {
 }
 
 #[test]
-fn lost_packets_are_shown_with_what_was_sent_again() {
+fn lost_packets_are_shown_with_bytes_and_congestion_events() {
     let (hosts, wire) = wired([classic(&[]), classic(&[])]);
     let mut there = hosts[1].subscribe(Sizes::Mixed);
     let mut publisher = hosts[0].flood(Sizes::Mixed, 1);

@@ -144,7 +144,7 @@ fn a_proof_of_another_connection_or_daemon_is_worth_nothing_and_one_of_its_own_c
 }
 
 #[test]
-fn a_flood_of_proofs_holds_up_nobody() {
+fn a_flood_of_proofs_blocks_no_session() {
     let camera = Camera::new();
     let mut link = camera.link(0xff);
     let key = SessionKey::generate().unwrap();

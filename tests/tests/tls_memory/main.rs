@@ -98,7 +98,7 @@ fn unhex(text: &str) -> Vec<u8> {
 /// Without this the other tests would show nothing: the child frees a block with the key in it, and
 /// holds another, and both are found.
 #[test]
-fn the_search_finds_what_was_freed_and_what_is_held() {
+fn the_memory_search_finds_held_and_freed_secrets() {
     let key = random();
     let mut examined =
         Examined::start(Cipher::default(), Mode::Psk(PskKex::PskKe), Has::Both, &key);
@@ -217,11 +217,11 @@ fn nothing_is_left_of_a_server_in_psk_dhe_ke() {
 
 /// The shared secret, and what is extracted from it and expanded for the next step, are nowhere.
 #[test]
-fn nothing_is_left_of_a_hybrid_client_but_what_rustls_holds() {
+fn a_hybrid_client_leaves_only_secrets_that_rustls_holds() {
     nothing_is_left_of_one_end(Mode::Hybrid, true);
 }
 
 #[test]
-fn nothing_is_left_of_a_hybrid_server_but_what_rustls_holds() {
+fn a_hybrid_server_leaves_only_secrets_that_rustls_holds() {
     nothing_is_left_of_one_end(Mode::Hybrid, false);
 }

@@ -197,7 +197,7 @@ fn an_identity_that_is_not_exactly_one_is_not_decoded() {
 }
 
 #[test]
-fn what_cannot_be_imported_is_refused() {
+fn psks_that_cannot_be_imported_are_refused() {
     let suite = SUITES[0].tls13().unwrap();
     assert!(ImportedIdentity::new(b"", b"", HashAlgorithm::SHA256).is_err());
     assert!(ImportedIdentity::new(b"k", b"", HashAlgorithm::SHA512).is_err());
@@ -251,7 +251,7 @@ fn vectors() -> Vec<Vector> {
 }
 
 #[test]
-fn the_vectors_are_what_the_script_computes() {
+fn stored_vectors_match_the_script_output() {
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/vectors/rfc9258.py");
     let Ok(output) = Command::new("python3").arg(script).output() else {
         // Past the harness, which would show it only beside a failure.

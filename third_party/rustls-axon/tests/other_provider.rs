@@ -313,7 +313,7 @@ fn pass<F, T>(from: &mut ConnectionCommon<F>, to: &mut ConnectionCommon<T>) -> R
 }
 
 #[test]
-fn who_does_not_know_the_psk_is_refused() {
+fn a_peer_that_does_not_know_the_psk_is_refused() {
     for (offered, known, error) in [
         (plain("a", 2), plain("a", 1), Error::from(PeerMisbehaved::IncorrectBinder)),
         (plain("b", 1), plain("a", 1), PeerIncompatible::UnknownExternalPskIdentity.into()),

@@ -370,7 +370,7 @@ mod tests {
     }
 
     #[test]
-    fn a_parent_that_uses_what_its_child_needs_of_it_is_a_circle() {
+    fn a_parent_and_a_child_that_use_each_other_are_a_circle() {
         let parent = ("room/mod.rs", "mod a; use self::a::A; pub struct Parent(A);");
         let found = circles(&[parent, ("room/a.rs", "use super::Parent; pub struct A;")]);
         assert_eq!(files(&found), [["room/a.rs", "room/mod.rs"]]);

@@ -61,7 +61,7 @@ fn imports_from_above_beside_and_the_root_are_named() {
 }
 
 #[test]
-fn own_files_and_tests_may_import_what_they_like() {
+fn own_files_and_tests_may_import_any_module() {
     let text = "mod inner; use inner::A; use self::inner::B;
             #[cfg(test)] mod tests;
             #[cfg(test)] mod checks { use crate::roof::Top; }

@@ -112,7 +112,7 @@ fn a_readme_is_read_as_its_reader_does() {
 
 #[test]
 #[should_panic(expected = "ignore")]
-fn a_block_that_nobody_compiles_is_refused() {
+fn an_uncompiled_readme_block_is_refused() {
     Readme::parse("x", "```rust,ignore\nlet x = 1;\n```\n");
 }
 

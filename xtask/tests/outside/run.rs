@@ -63,7 +63,7 @@ fn environment(printed: &str, sae: &str) -> Vec<(String, String)> {
 
 #[test]
 #[ignore = "builds all that etsi-qkd014 depends on"]
-fn the_readme_of_etsi_qkd014_does_what_it_says() {
+fn the_readme_of_etsi_qkd014_works_as_written() {
     let Some(programs) = built("etsi-qkd014") else { return };
     assert_ne!(programs.len(), 0);
     let commands = Readme::of("etsi-qkd014").commands;
@@ -106,31 +106,31 @@ fn programs_run(name: &str) {
 
 #[test]
 #[ignore = "builds all that axon-envelope depends on"]
-fn the_readme_of_axon_envelope_does_what_it_says() {
+fn the_readme_of_axon_envelope_works_as_written() {
     programs_run("axon-envelope");
 }
 
 #[test]
 #[ignore = "builds all that rustls-axon depends on"]
-fn the_readme_of_rustls_axon_does_what_it_says() {
+fn the_readme_of_rustls_axon_works_as_written() {
     programs_run("rustls-axon");
 }
 
 #[test]
 #[ignore = "builds all that axon-tls depends on"]
-fn the_readme_of_axon_tls_does_what_it_says() {
+fn the_readme_of_axon_tls_works_as_written() {
     programs_run("axon-tls");
 }
 
 #[test]
 #[ignore = "builds all that axon-shm depends on"]
-fn the_readme_of_axon_shm_does_what_it_says() {
+fn the_readme_of_axon_shm_works_as_written() {
     programs_run("axon-shm");
 }
 
 #[test]
 #[ignore = "builds all that axon-daemon depends on"]
-fn the_readme_of_axon_daemon_does_what_it_says() {
+fn the_readme_of_axon_daemon_works_as_written() {
     let Some(programs) = built("axon-daemon") else { return };
     assert_ne!(programs.len(), 0);
     for program in programs {
@@ -148,7 +148,7 @@ fn the_readme_of_axon_daemon_does_what_it_says() {
 
 #[test]
 #[ignore = "builds all that axon-transport and axon-cli depend on"]
-fn the_readmes_of_axon_transport_and_axon_cli_do_what_they_say() {
+fn the_readmes_of_axon_transport_and_axon_cli_work_as_written() {
     let install = format!("cargo install --locked --git {} axon-cli", env!("CARGO_PKG_REPOSITORY"));
     for readme in ["axon-transport", "axon-cli"].map(Readme::of) {
         assert!(readme.commands.contains(&install), "{install}: {:?}", readme.commands);

@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn what_no_pattern_says_is_refused() {
+    fn expressions_without_an_equivalent_pattern_are_refused() {
         let stars = format!("rt/{}", "a*".repeat(400_000));
         for expression in [
             "",

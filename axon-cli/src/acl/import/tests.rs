@@ -174,7 +174,7 @@ fn a_denial_of_all_names_those_without_a_slash_too() {
 }
 
 #[test]
-fn the_graph_is_seen_by_whom_ros_tells_of_it() {
+fn subscribe_permission_for_ros_discovery_info_becomes_see() {
     let (text, _) = imported(&permissions(&rule("allow", &[], &["ros_discovery_info"]), "DENY"));
     assert!(text.contains("see = \"**\"") && !may(&text, Verb::Subscribe, "/a"), "{text}");
     let (text, _) = imported(&permissions(&rule("allow", &["rt/a"], &["rt/b"]), "DENY"));
@@ -246,7 +246,7 @@ fn a_signed_document_says_the_same_with_the_lines_of_its_file() {
 }
 
 #[test]
-fn what_is_no_such_document_is_refused_in_one_line() {
+fn invalid_permissions_documents_are_refused_with_a_single_line() {
     let deep = |count: usize| format!("<dds>{}{}</dds>", "<a>".repeat(count), "</a>".repeat(count));
     let attributes: String = (0..100_000).map(|n| format!(" a{n}=\"\"")).collect();
     let spaces: String = (0..40).map(|n| format!(" xmlns:a{n}=\"b\"")).collect();

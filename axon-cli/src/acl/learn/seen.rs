@@ -329,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn what_had_another_end_here_is_allowed_and_the_rest_is_a_comment() {
+    fn learned_rules_allow_endpoints_matched_here_and_comment_out_unmatched_endpoints() {
         let mut seen = Seen::default();
         assert!(seen.is_empty());
         let alone = end(Owner::Host("base"), Verb::Publish, "/unheard");
@@ -425,7 +425,7 @@ mod tests {
     }
 
     #[test]
-    fn other_users_are_seen_with_what_they_do_with_anybody_else() {
+    fn matches_of_another_user_with_other_owners_are_learned() {
         let mut seen = Seen::default();
         let user = |verb, name| end(Owner::User(7), verb, name);
         seen.observe(&[

@@ -298,7 +298,7 @@ mod tests {
     }
 
     #[test]
-    fn nobody_else_is_the_gateway_and_strangers_are_not_heard() {
+    fn gateway_hellos_are_refused_and_unlisted_users_are_not_trusted() {
         let gateway = SessionHello { role: SessionRole::Gateway, ..hello() };
         assert!(refusal(&gateway).text.contains("gateway"));
         assert!(

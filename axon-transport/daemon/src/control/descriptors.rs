@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn session_is_refused_where_it_would_take_what_is_kept() {
+    fn session_is_refused_when_it_would_use_reserved_descriptors() {
         let last = 1024 - RESERVED_DESCRIPTORS - OF_SESSION - IN_GATEWAY;
         assert_eq!(room(1024, last, 0).refuses_session(false), None);
         let text = room(1024, last + 1, 0).refuses_session(false).unwrap();
@@ -174,7 +174,7 @@ mod tests {
 
     /// Each process takes as much as it gets.
     #[test]
-    fn whatever_processes_take_there_is_room_for_the_next_one() {
+    fn greedy_processes_leave_descriptors_for_the_next_process() {
         for limit in [256, 1024, 20_000] {
             let (mut open, mut shares) = (60, Vec::new());
             for _ in 0..5 {

@@ -263,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reload_takes_what_may_change_and_names_the_rest() {
+    fn a_reload_applies_changeable_settings_and_lists_settings_that_need_a_restart() {
         let mut control = control(Config::default());
         let mut seen = control.rules.subscribe();
         let mut new = Config::builder().daemon_peers(["10.0.0.7"]).domain(3).build().unwrap();

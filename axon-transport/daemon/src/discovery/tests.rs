@@ -174,7 +174,7 @@ async fn the_shared_port_reaches_all_and_comes_from_the_bound_address() {
 }
 
 #[tokio::test]
-async fn actions_nobody_takes_hold_nothing_up() {
+async fn unread_actions_do_not_block_discovery() {
     let (events, of_events) = mpsc::channel(8);
     let (of_actions, actions) = mpsc::channel(1);
     let config =

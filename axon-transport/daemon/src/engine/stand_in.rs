@@ -218,7 +218,7 @@ mod tests {
     use crate::engine::account::Accounts;
 
     #[test]
-    fn who_wants_less_than_an_equal_share_leaves_the_rest_to_the_others() {
+    fn the_unused_part_of_an_equal_share_goes_to_larger_demands() {
         assert_eq!(share(vec![], 60), usize::MAX);
         assert_eq!(share(vec![10, 20, 30], 60), usize::MAX);
         assert_eq!(share(vec![100], 60), 60);

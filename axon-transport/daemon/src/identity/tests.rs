@@ -125,7 +125,7 @@ fn another_file_in_its_place_is_seen() {
 }
 
 #[test]
-fn a_file_that_is_gone_lets_nobody_new_in_and_keeps_who_is_there() {
+fn a_missing_trust_file_admits_no_new_peer_and_keeps_known_peers() {
     let mut host = Host::new(line(1));
     fs::remove_file(host.file("trust")).unwrap();
     assert!(host.second());

@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn always_and_never_are_what_they_say_and_one_processor_is_left_to_the_others() {
+    fn fixed_poll_rules_hold_and_adaptive_does_not_poll_on_one_processor() {
         for busy in [false, true] {
             let after = |poll, processors| PollRule::new(poll, processors).after_pass(busy);
             assert_eq!(after(LinkPoll::Always, 1), PollDecision::On);

@@ -282,7 +282,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_files_go_and_what_is_not_a_daemons_stays() {
+    fn the_oldest_qlog_files_are_deleted_and_foreign_files_are_kept() {
         let dir = tempfile::tempdir().unwrap();
         for other in ["notes.txt", "axon-notes.txt", "other.sqlog"] {
             fs::write(dir.path().join(other), "mine").unwrap();

@@ -77,7 +77,7 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn waits_end_and_none_ends_early_whatever_became_of_the_one_before() {
+    async fn timer_waits_do_not_end_early_after_an_abandoned_wait() {
         let kernel = Timer::new();
         assert!(kernel.0.is_some(), "Linux has timerfd since 2.6.25");
         for timer in [kernel, Timer(None)] {

@@ -21,7 +21,7 @@ fn tool_hello() -> SessionMessage {
 }
 
 #[test]
-fn garbage_on_the_socket_hurts_nobody() {
+fn garbage_on_the_control_socket_does_not_disturb_sessions() {
     let host = Host::new();
     let _daemon = host.daemon();
     let session = host.session("witness").unwrap();
@@ -173,7 +173,7 @@ fn descriptors_that_are_slow_to_close_do_not_stop_the_daemon() {
 }
 
 #[test]
-fn keys_that_are_none_end_their_connection_and_hold_up_nobody() {
+fn key_packets_without_a_key_end_connections_and_hold_up_no_client() {
     let host = Host::new();
     let _daemon = host.daemon();
     let address = Address::of(&host.config());

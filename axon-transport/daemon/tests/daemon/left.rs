@@ -94,11 +94,11 @@ fn a_client_gets_the_response_that_a_server_sent_after_the_daemon_was_killed_and
 }
 
 #[test]
-fn a_reader_gets_what_was_published_after_the_daemon_was_killed_though_the_publisher_ended() {
+fn a_reader_gets_samples_an_ended_publisher_published_without_a_daemon() {
     daemon_killed(false);
 }
 
 #[test]
-fn a_stopped_reader_gets_what_was_published_after_the_daemon_was_killed() {
+fn a_stopped_reader_gets_samples_published_after_the_daemon_was_killed() {
     daemon_killed(true);
 }

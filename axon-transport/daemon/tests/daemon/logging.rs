@@ -79,7 +79,7 @@ fn assert_it_goes_on(host: &Host, mut daemon: Kept) {
 
 /// Without this the tests below could pass where nothing is logged.
 #[test]
-fn what_the_tests_do_is_logged_into_an_ordinary_file() {
+fn the_test_actions_are_logged_to_a_regular_file() {
     let host = Host::new();
     let log = host.dir.path().join("stderr");
     let daemon = foreground(&host, program(&host), File::create(&log).unwrap());
@@ -227,7 +227,7 @@ fn a_flood_of_one_kind_leaves_few_lines_and_a_count() {
 }
 
 #[test]
-fn another_user_who_connects_without_end_leaves_few_lines() {
+fn endless_connections_of_another_user_leave_few_log_lines() {
     const CONNECTIONS: u64 = 3_000;
     const CAUSE: &str = "closed the connection of a user who is not in AXON_TRUSTED_UIDS";
     if !rustix::process::geteuid().is_root() {

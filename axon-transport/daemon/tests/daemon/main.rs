@@ -450,7 +450,7 @@ fn failing_gateway(parts: GatewayParts) -> Result<(), String> {
 }
 
 #[test]
-fn a_gateway_that_panics_is_started_again_and_nobody_else_notices() {
+fn a_panicked_gateway_is_restarted_without_disturbing_sessions() {
     let host = Host::new();
     let config = host.config();
     let daemon = std::thread::spawn(move || {

@@ -98,7 +98,7 @@ fn publisher_of_a_stopped_reader(part: &str, meanwhile: impl FnOnce(Player)) {
 }
 
 #[test]
-fn a_reader_that_is_stopped_for_longer_than_a_dropped_publisher_stays_counts_what_it_lost() {
+fn a_reader_stopped_past_the_linger_of_a_dropped_publisher_counts_losses() {
     let mut ended = None;
     publisher_of_a_stopped_reader("ends its publisher", |mut publisher| {
         assert_eq!(publisher.hear(), "ended");
@@ -109,12 +109,12 @@ fn a_reader_that_is_stopped_for_longer_than_a_dropped_publisher_stays_counts_wha
 }
 
 #[test]
-fn a_reader_that_is_stopped_for_longer_than_a_process_that_ends_stays_counts_what_it_lost() {
+fn a_reader_stopped_past_the_linger_of_an_exiting_process_counts_losses() {
     publisher_of_a_stopped_reader("ends with its publisher", Player::finish);
 }
 
 #[test]
-fn a_stopped_reader_knows_what_there_was_of_a_publisher_whose_process_was_killed() {
+fn a_stopped_reader_accounts_for_every_sample_of_a_killed_publisher() {
     publisher_of_a_stopped_reader("is killed", |mut publisher| {
         assert_eq!(publisher.hear(), "published");
         signal(publisher.pid(), Signal::KILL);

@@ -87,7 +87,7 @@ fn an_endpoint_has_the_events_of_its_kind_and_no_others() {
 }
 
 #[test]
-fn matches_are_counted_at_both_ends_with_what_changed() {
+fn matches_are_counted_with_their_changes_at_both_ends() {
     for pair in Pair::all() {
         let publisher = pair.here.create_publisher(spec(Qos::default())).unwrap();
         let publication = of_publisher(&publisher, EventKind::PublicationMatched);
@@ -203,7 +203,7 @@ fn another_type_under_the_same_name_is_reported_at_both_ends() {
 }
 
 #[test]
-fn every_lost_sample_is_counted_whether_or_not_somebody_takes() {
+fn every_lost_sample_is_counted_with_or_without_a_take() {
     for pair in Pair::all() {
         let (publisher, subscription) = pair.matched(lossy(), lossy());
         let lost = of_subscription(&subscription, EventKind::MessageLost);

@@ -47,7 +47,7 @@ fn is_told(said: &str, limit: u64) {
 }
 
 #[test]
-fn session_beyond_the_daemons_descriptors_is_told_the_numbers_and_what_to_set() {
+fn session_beyond_the_descriptor_limit_is_told_the_numbers_and_the_setting() {
     let host = host();
     let daemon = host.daemon();
     limit(&daemon, 256);
@@ -117,7 +117,7 @@ fn process_with_many_sessions_leaves_the_others_their_share() {
 }
 
 #[test]
-fn limit_lowered_below_what_is_open_refuses_and_answers_and_ends_nobody() {
+fn limit_below_open_descriptors_refuses_new_sessions_and_keeps_existing_sessions() {
     let host = host();
     let daemon = host.daemon();
     let (mut first, second) = (host.play("one session"), host.play("one session"));

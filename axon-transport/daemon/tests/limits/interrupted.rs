@@ -12,7 +12,7 @@ use crate::{
 };
 
 #[test]
-fn a_reader_stopped_in_the_middle_of_its_attachment_holds_nobody_up() {
+fn a_reader_stopped_during_its_attachment_blocks_no_other_reader() {
     let host = Host::new();
     let _daemon = host.daemon();
     let session = host.session("writer").unwrap();

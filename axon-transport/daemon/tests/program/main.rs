@@ -48,7 +48,7 @@ impl Drop for Running {
 }
 
 #[test]
-fn processes_see_and_take_what_the_model_says() {
+fn processes_see_and_take_as_the_model_predicts() {
     if std::env::var("PLAY").is_ok() {
         return;
     }

@@ -5,7 +5,7 @@ use axon_transport::Waitable;
 use super::{services::*, *};
 
 #[test]
-fn who_takes_no_responses_holds_its_own_back_and_nobody_elses() {
+fn a_client_that_takes_no_responses_blocks_only_its_own_responses() {
     with_both_ends(|here, there| {
         let server = serve(here);
         let (stuck, other) = (ask(there, &server), ask(there, &server));
@@ -22,7 +22,7 @@ fn who_takes_no_responses_holds_its_own_back_and_nobody_elses() {
 }
 
 #[test]
-fn who_keeps_the_newest_only_gets_them_and_holds_nobody_back() {
+fn keep_last_services_get_the_newest_messages_and_block_no_peer() {
     const MANY: u64 = 500;
     let newest = Qos::default().with_depth(3);
     with_both_ends(|here, there| {
@@ -127,7 +127,7 @@ fn a_publisher_that_has_ended_is_not_counted_though_more_of_it_is_to_come() {
 }
 
 #[test]
-fn what_was_asked_or_answered_last_arrives_though_who_did_is_gone() {
+fn the_last_requests_and_responses_arrive_after_their_sender_has_gone() {
     with_both_ends(|here, there| {
         let (server, witness) = (serve(here), serve(here));
         let client = ask(there, &server);

@@ -94,7 +94,7 @@ fn piece(publisher: Gid, length: Option<u32>, bytes: usize) -> SessionMessage {
 }
 
 #[test]
-fn who_is_not_to_be_relayed_is_refused() {
+fn sessions_that_may_not_be_relayed_are_refused() {
     let host = host();
     let _daemon = host.daemon();
     let of = |role| SessionHello { role, ..hello(&host) };
@@ -206,7 +206,7 @@ pub(crate) fn publish_when_told() {
 }
 
 #[test]
-fn what_was_said_before_the_connection_ended_is_heard() {
+fn messages_sent_before_the_connection_ended_are_processed() {
     let host = host();
     let daemon = host.daemon();
     let listener = session(&host, "listener", true);
@@ -251,7 +251,7 @@ fn a_sample_that_cannot_be_written_is_given_up() {
 }
 
 #[test]
-fn what_a_process_said_before_it_was_killed_is_heard() {
+fn messages_sent_by_a_process_before_it_was_killed_are_processed() {
     let host = host();
     let daemon = host.daemon();
     let listener = session(&host, "listener", true);
@@ -270,7 +270,7 @@ fn what_a_process_said_before_it_was_killed_is_heard() {
 }
 
 #[test]
-fn who_talks_on_a_connection_after_its_process_ended_is_hung_up_on() {
+fn a_connection_used_after_its_process_ended_is_closed() {
     let host = host();
     let _daemon = host.daemon();
     let mut caller = host.play("one that has another talk");
@@ -380,7 +380,7 @@ fn server_for(host: &Host, own: Gid, others: Vec<Gid>) -> OwnedFd {
 }
 
 #[test]
-fn a_server_that_answers_what_nobody_asked_it_reaches_nobody() {
+fn unrequested_responses_of_a_hostile_server_reach_no_client() {
     let host = host();
     let _daemon = host.daemon();
     let (here, there) = (session(&host, "server", true), session(&host, "client", false));

@@ -263,7 +263,7 @@ fn a_process_that_ends_hands_over_to_the_next_daemon() {
 }
 
 #[test]
-fn a_process_that_ends_without_a_daemon_counts_what_it_could_not_hand_over() {
+fn a_process_that_ends_without_a_daemon_counts_its_undelivered_samples() {
     let Leaving { host: _host, _relaying, _listener, subscription: _subscription, mut leaver } =
         Leaving::new();
     leaver.go();
@@ -346,7 +346,7 @@ fn another_reader_goes_on_when_one_ends_without_a_daemon() {
 }
 
 #[test]
-fn what_a_killed_daemon_loses_of_keep_last_and_best_effort_is_counted() {
+fn keep_last_and_best_effort_losses_of_a_killed_daemon_are_counted() {
     for reliability in [Reliability::Reliable, Reliability::BestEffort] {
         for (from_shares, to_shares) in ENDS {
             let host = host();

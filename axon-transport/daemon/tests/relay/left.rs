@@ -66,7 +66,7 @@ pub(super) fn dropped(host: &Host, cause: &str) -> u64 {
 }
 
 #[test]
-fn what_an_ended_process_left_for_a_reader_that_takes_nothing_is_counted_by_topic() {
+fn undelivered_samples_of_an_ended_process_are_counted_by_topic() {
     let host = host();
     let _daemon = host.daemon();
     let listener = session(&host, "listener", true);

@@ -28,7 +28,7 @@ fn a_process_that_is_killed_leaves_whole_samples_and_nothing_else() {
 }
 
 #[test]
-fn what_a_killed_process_left_for_who_takes_nothing_is_not_kept_for_ever() {
+fn samples_of_a_killed_process_for_a_stalled_reader_are_eventually_discarded() {
     let host = host();
     let _daemon = host.daemon();
     let (relaying, listener) = (relaying(&host), session(&host, "listener", true));
@@ -50,7 +50,7 @@ fn what_a_killed_process_left_for_who_takes_nothing_is_not_kept_for_ever() {
 }
 
 #[test]
-fn what_was_published_last_arrives_though_the_process_ends() {
+fn the_last_samples_of_an_ending_process_arrive() {
     let host = host();
     let _daemon = host.daemon();
     let (relaying, listener) = (relaying(&host), session(&host, "listener", true));

@@ -301,7 +301,7 @@ fn a_late_joiner_gets_the_history_once() {
 }
 
 #[test]
-fn best_effort_waits_for_nobody_and_what_is_lost_is_counted() {
+fn a_best_effort_publisher_never_blocks_and_losses_are_counted() {
     let host = host();
     let _daemon = host.daemon();
     for (from, to) in ENDS {
@@ -346,7 +346,7 @@ fn a_sample_that_the_daemon_has_not_taken_is_not_acknowledged() {
 }
 
 #[test]
-fn a_reader_that_takes_nothing_holds_nobody_else_up() {
+fn a_reader_that_takes_nothing_blocks_no_other_topic() {
     let host = host();
     let _daemon = host.daemon();
     let (from, to) = (session(&host, "from", true), session(&host, "to", false));
@@ -365,7 +365,7 @@ fn a_reader_that_takes_nothing_holds_nobody_else_up() {
 }
 
 #[test]
-fn what_is_within_a_process_stays_there_and_crosses_once_for_all() {
+fn local_samples_stay_in_the_process_and_remote_samples_cross_once() {
     let host = host();
     let _daemon = host.daemon();
     let (relayed, other) = (session(&host, "relayed", false), session(&host, "other", true));
@@ -395,7 +395,7 @@ fn what_is_within_a_process_stays_there_and_crosses_once_for_all() {
 }
 
 #[test]
-fn what_came_by_way_of_one_subscription_that_ends_is_not_lost_for_another() {
+fn samples_relayed_for_an_ended_subscription_are_not_lost_for_another() {
     let host = host();
     let _daemon = host.daemon();
     let (from, to) = (session(&host, "from", true), session(&host, "to", false));
@@ -460,7 +460,7 @@ fn the_graph_is_the_same_for_all() {
 }
 
 #[test]
-fn the_status_says_who_is_relayed_and_why() {
+fn the_status_names_relayed_sessions_and_the_reason() {
     let host = host();
     let _daemon = host.daemon();
     let _sharing = session(&host, "sharing", true);

@@ -8,7 +8,7 @@ use super::*;
 const MOST: usize = 1024;
 
 #[test]
-fn what_the_daemon_refuses_is_in_no_graph_and_the_next_daemon_is_asked_again() {
+fn refused_endpoints_are_in_no_graph_and_offered_to_the_next_daemon() {
     let host = host();
     let mut daemon = host.daemon();
     let (witness, own) = (session(&host, "witness", true), session(&host, "own", false));

@@ -108,7 +108,7 @@ fn a_service_is_available_while_it_is_there_and_to_those_it_goes_with() {
 }
 
 #[test]
-fn a_request_goes_to_every_server_and_a_response_to_nobody_but_who_asked() {
+fn a_request_reaches_every_server_and_a_response_only_its_client() {
     let host = host();
     let _daemon = host.daemon();
     let sessions = [true, false, false].map(|shm| session(&host, "any", shm));
@@ -169,7 +169,7 @@ fn twenty_clients_in_twenty_relayed_processes_get_each_their_own() {
 }
 
 #[test]
-fn a_relayed_client_that_dies_with_responses_pending_harms_nobody() {
+fn a_relayed_client_killed_with_pending_responses_leaves_the_server_working() {
     beside_relayed("server", |session, relaying| {
         let server = serve(session);
         let mut asker = relaying.play("asker");
@@ -223,7 +223,7 @@ fn a_relayed_server_that_dies_in_a_call_is_not_available_and_another_one_is() {
 }
 
 #[test]
-fn whom_a_relayed_session_may_not_answer_does_not_count_it() {
+fn clients_beyond_the_pair_limit_do_not_match_a_relayed_server() {
     let host = host();
     let _daemon = host.daemon();
     let (here, there) = (session(&host, "servers", false), session(&host, "clients", true));

@@ -74,7 +74,7 @@ fn matched(socket: &OwnedFd, gid: Gid, others: &[Gid]) {
 }
 
 #[test]
-fn who_is_gone_and_back_at_once_is_received_from_anew() {
+fn a_publisher_removed_and_rematched_at_once_is_opened_again() {
     let host = host();
     let (session, socket) = simulated(&host);
     let subscription = session.create_subscription(spec("/t", Qos::default())).unwrap();
@@ -102,7 +102,7 @@ fn settle(session: &Session, socket: &OwnedFd) {
 }
 
 #[test]
-fn whom_the_daemon_names_for_another_publisher_is_not_counted() {
+fn a_match_announced_for_one_publisher_is_not_counted_by_others() {
     let host = host();
     let (session, socket) = simulated(&host);
     let publisher = |qos| {
@@ -187,7 +187,7 @@ fn samples_that_the_daemon_gave_up_are_not_acknowledged() {
 }
 
 #[test]
-fn a_session_ends_though_nobody_takes_what_it_left() {
+fn a_session_ends_despite_samples_left_without_credit() {
     let host = host();
     let (session, socket) = simulated(&host);
     let publisher = session.create_publisher(spec("/t", Qos::keep_all())).unwrap();
@@ -267,7 +267,7 @@ fn a_request_is_sent_once_however_many_servers_it_is_for() {
 }
 
 #[test]
-fn what_waits_for_one_server_goes_before_what_another_has_too() {
+fn requests_waiting_for_one_server_go_before_requests_for_both() {
     let host = host();
     let (session, socket) = simulated(&host);
     let own = session.create_client(services::service()).unwrap();

@@ -62,7 +62,7 @@ fn a_lease_runs_out_beyond_a_relay_and_a_sample_renews_it() {
 }
 
 #[test]
-fn who_says_without_a_sample_that_it_is_alive_is_so_beyond_a_relay() {
+fn asserted_liveliness_without_a_sample_crosses_a_relay() {
     with_both_ends(|from, to| {
         let liveliness = Liveliness::ManualByTopic;
         let manual = Qos::default().with_liveliness(liveliness, 200 * MILLI);

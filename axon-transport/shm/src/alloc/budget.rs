@@ -137,7 +137,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_ring_takes_at_most_half_of_what_others_leave_and_gives_all_of_it_back() {
+    fn a_ring_takes_at_most_half_the_free_budget_and_returns_it() {
         let budget = MemoryBudget::new(100);
         let [mut one, mut two] = [(); 2].map(|()| Holding::of(Arc::clone(&budget)));
         assert!(one.take(51).is_err() && one.take(30).is_ok() && one.take(20).is_ok());
@@ -151,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_pool_does_not_have_is_not_taken() {
+    fn a_nested_budget_cannot_exceed_its_pool() {
         let pool = MemoryBudget::new(100);
         let [one, two] = [80, 80].map(|most| MemoryBudget::within(&pool, most));
         let mut of_one = [(); 2].map(|()| Holding::of(Arc::clone(&one)));

@@ -270,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn lanes_have_room_in_the_first_segment_whatever_else_there_is() {
+    fn the_first_segment_reserves_room_for_all_lanes() {
         let (segments, heap) = heap();
         let allocate = || heap.allocate(&segments, 1, Need::Now, |_| true).unwrap().unwrap().block;
         let mut last = allocate();

@@ -109,7 +109,7 @@ mod tests {
     const MIB: u64 = 1 << 20;
 
     #[test]
-    fn a_generation_tells_what_it_allows() {
+    fn a_generation_encodes_its_pin_limit() {
         for pin_limit in [PinLimit::NONE, PinLimit::ALL, PinLimit::at_most(25 * MIB)] {
             let generation = 77 << 30 | pin_limit.bits() | 0xff_ffff;
             assert_eq!(PinLimit::of(generation), pin_limit);

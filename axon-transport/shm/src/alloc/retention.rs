@@ -63,7 +63,7 @@ mod tests {
     }
 
     #[test]
-    fn memory_that_nobody_uses_is_left() {
+    fn unused_memory_is_released_after_the_retention_time() {
         let start = Instant::now();
         let mut retention = Retention::begin(start);
         retention.used(MIB);
@@ -110,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn a_little_is_kept_whatever_is_in_use() {
+    fn a_small_amount_of_memory_is_always_kept() {
         let start = Instant::now();
         let mut retention = Retention::begin(start);
         for second in 1..60 {

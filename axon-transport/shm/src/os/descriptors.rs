@@ -378,7 +378,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn descriptors_that_never_close_keep_nobody_waiting_and_each_kind_by_itself() {
+    fn blocked_descriptor_closes_delay_no_other_descriptor_class() {
         let mut peers = Vec::new();
         for _ in 0..FdClass::Session.threads() + 2 {
             let (fd, peer) = hiding();

@@ -124,7 +124,7 @@ fn matched(others: &[Qos], goes: impl Fn(&Qos) -> bool) -> usize {
 
 proptest! {
     #[test]
-    fn the_best_available_profile_matches_everybody(others in prop::collection::vec(qos(), 0..6)) {
+    fn best_available_profile_matches_every_endpoint(others in prop::collection::vec(qos(), 0..6)) {
         let best = QosRequest::best_available();
         let subscription = best.for_subscription(&others);
         let publisher = best.for_publisher(&others);
@@ -134,7 +134,7 @@ proptest! {
 
     /// Any single policy raised by one level, and somebody is left out.
     #[test]
-    fn no_higher_request_matches_everybody(others in prop::collection::vec(qos(), 1..6)) {
+    fn no_stricter_profile_matches_every_endpoint(others in prop::collection::vec(qos(), 1..6)) {
         let mine = QosRequest::best_available().for_subscription(&others);
         let mut higher = Vec::new();
         if mine.reliability == Reliability::BestEffort {

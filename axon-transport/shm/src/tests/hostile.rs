@@ -440,7 +440,7 @@ fn a_sample_longer_than_the_reader_allows_is_lost_and_the_next_is_not() {
 }
 
 #[test]
-fn lanes_that_make_no_sense_hold_nobody_for_ever() {
+fn corrupt_lanes_never_block_the_publisher_forever() {
     let (a, b) = (session(), session());
     let writer = writer(&a, Qos::keep_all(), 8 * 1024);
     let reader = attach(&writer, &a, &b, Qos::keep_all());

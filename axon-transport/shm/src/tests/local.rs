@@ -28,7 +28,7 @@ fn each_length_arrives_as_it_was_sent() {
 }
 
 #[test]
-fn a_loan_written_in_pieces_is_what_was_written() {
+fn a_loan_written_in_pieces_delivers_the_written_bytes() {
     let a = session();
     let writer = writer(&a, keep_last(10), 1 << 20);
     let mut reader = attach(&writer, &a, &a, keep_last(10));
@@ -84,7 +84,7 @@ fn samples_beyond_the_maximum_length_are_refused() {
 }
 
 #[test]
-fn the_largest_fits_at_depth_one_whatever_the_budget() {
+fn the_largest_sample_fits_at_depth_one_with_any_budget() {
     let (a, b) = (session(), session());
     let gid = Gid::new(a.id(), 1);
     let max_message = 25_000_000;
@@ -262,7 +262,7 @@ fn a_late_joiner_gets_the_history_that_both_want() {
 }
 
 #[test]
-fn attaching_again_changes_nothing_but_whom_a_relay_stands_for() {
+fn attaching_again_changes_only_the_subscriptions_a_relay_represents() {
     let (a, b) = (session(), session());
     let writer = writer(&a, keep_last(5), 1 << 20);
     let relayed: Vec<_> = (0..3).map(|number| Gid::new(SessionId::random(), number)).collect();
@@ -435,7 +435,7 @@ fn a_ring_reaches_the_one_of_several_waiting_threads_that_it_is_for() {
 }
 
 #[test]
-fn one_who_carries_samples_on_from_later_has_none_of_those_before_to_hand_over() {
+fn a_relay_attached_later_owes_no_earlier_samples() {
     let a = session();
     let writer = writer(&a, keep_last(10), 1 << 20);
     let _reader = attach(&writer, &a, &a, keep_last(10));

@@ -426,7 +426,7 @@ fn a_publisher_that_is_gone_is_read_to_the_end() {
 }
 
 #[test]
-fn a_session_is_mapped_once_whatever_the_number_of_its_topics() {
+fn a_session_is_mapped_once_for_all_its_topics() {
     let (a, b) = (session(), session());
     let from = peer(&b, &a);
     let writers: Vec<_> = (0..100).map(|_| writer(&a, keep_last(1), 1 << 20)).collect();

@@ -37,11 +37,11 @@ fn caught_by(site: Site) -> &'static str {
         AskStore | CloseStore | GenerationLoad => {
             "tests::model::lanes::a_reader_that_has_left_has_read_all"
         }
-        LetGoSwap | TakeSwap => "tests::model::lock::a_new_lock_holder_sees_what_the_last_one_did",
+        LetGoSwap | TakeSwap => "tests::model::lock::a_new_holder_sees_the_last_holders_writes",
         NotedAdd | NotedLoad => {
             "tests::model::journal::a_follower_finds_each_sample_in_the_rings_that_are_named"
         }
-        ArmFence | SettleFence => "wake::tests::the_last_look_or_the_ring_finds_what_came",
+        ArmFence | SettleFence => "wake::tests::the_last_check_or_the_doorbell_finds_every_sample",
     }
 }
 

@@ -302,7 +302,7 @@ fn memory_that_readers_keep_is_named_and_comes_back() {
 }
 
 #[test]
-fn readers_of_other_processes_leave_room_whatever_they_pin() {
+fn pins_of_other_processes_leave_room_for_the_publisher() {
     const LEN: usize = 1 << 16;
     let (a, b) = (session(), session());
     let (gid, max_message) = (Gid::new(a.id(), 1), LEN as u64);

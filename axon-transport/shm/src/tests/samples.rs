@@ -278,7 +278,7 @@ fn nothing_is_given_up_for_a_sample_that_there_is_no_memory_for() {
 }
 
 #[test]
-fn a_sample_that_went_before_its_memory_came_holds_nobody_up() {
+fn a_sample_evicted_before_its_memory_arrived_does_not_block_readers() {
     let (a, b) = (silent_session(), session());
     let writer = writer(&a, keep_last(10), 0);
     let from = RingPeer::Remote(PeerSession::map(a.id(), a.descriptors().unwrap()).unwrap());

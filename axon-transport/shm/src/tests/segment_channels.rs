@@ -58,7 +58,7 @@ fn untold(
 }
 
 #[test]
-fn a_first_segment_that_is_full_keeps_nobody_from_connecting() {
+fn a_full_first_segment_does_not_prevent_connections() {
     let (here, there) = contexts();
     let publisher = publisher(&here, keep_last(1));
     let full = |context: &Context| {
@@ -250,7 +250,7 @@ fn fill(socket: &impl AsFd) -> u32 {
 }
 
 #[test]
-fn a_peer_that_sends_without_pause_holds_nobody_up() {
+fn a_peer_that_floods_packets_does_not_block_waits_or_takes() {
     // One whose time is over takes one packet, however many there are.
     let (ours, theirs) = pair();
     let sent = fill(&ours);

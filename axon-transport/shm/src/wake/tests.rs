@@ -38,7 +38,7 @@ fn await_woken(session: &SessionSegment, ready: impl FnMut() -> bool) {
 }
 
 #[test]
-fn the_last_look_or_the_ring_finds_what_came() {
+fn the_last_check_or_the_doorbell_finds_every_sample() {
     use loom::{
         sync::{Arc, Condvar, Mutex, atomic::AtomicU64},
         thread,
@@ -262,7 +262,7 @@ fn a_bell_that_was_closed_is_looked_after_by_time() {
 }
 
 #[test]
-fn descriptors_in_a_bell_are_not_taken_and_keep_nobody_waiting() {
+fn descriptors_sent_to_a_doorbell_are_not_received_and_delay_no_wait() {
     let mut doorbell = Doorbell::new().unwrap();
     // As where the kernel cannot refuse them.
     doorbell.let_rights_pass();

@@ -358,7 +358,7 @@ mod tests {
     }
 
     #[test]
-    fn growing_changes_nothing_of_what_stands() {
+    fn growing_the_history_preserves_its_entries() {
         let mut history = history(4, 1 << 20, 1 << 20);
         let mut expected = std::collections::VecDeque::new();
         for round in 0..100u64 {

@@ -5,7 +5,7 @@ fn limits(rules: &AccessRules, party: Principal<'_>, verb: Verb, name: &str) -> 
 }
 
 #[test]
-fn the_example_limits_what_cameras_send_and_get() {
+fn the_example_limit_applies_to_camera_publishers_and_subscriptions() {
     let rules = rules(
         r#"
 [[limit]]

@@ -144,7 +144,7 @@ fn no_entry_becomes_two_entries_or_every_peer() {
 }
 
 #[test]
-fn builder_refuses_what_the_environment_refuses() {
+fn the_builder_refuses_the_values_the_environment_refuses() {
     let new = Config::builder;
     for (builder, name) in [
         (new().security_mode(SecurityMode::Qkd), "AXON_SAE_ID"),

@@ -228,7 +228,7 @@ fn bad_values_are_refused_by_name() {
 }
 
 #[test]
-fn half_of_what_a_mode_needs_is_an_error() {
+fn a_mode_with_a_missing_setting_is_an_error() {
     for base in [QKD, PINNED, CA] {
         for (missing, _) in base {
             if ["AXON_SECURITY_MODE", "AXON_CLASSIC_AUTH"].contains(missing) {

@@ -257,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn threads_that_create_and_destroy_get_what_is_theirs() {
+    fn threads_creating_and_destroying_handles_get_their_own_objects() {
         static REMOVED: AtomicUsize = AtomicUsize::new(0);
         let table = table();
         let remove =

@@ -135,7 +135,7 @@ const SUBNET: RangeToHost = RangeToHost { range: Subnet, lists: false };
 const LOCALHOST: RangeToHost = RangeToHost { range: Localhost, lists: false };
 
 #[test]
-fn an_off_session_matches_nothing_but_itself_and_is_seen_by_nobody() {
+fn a_session_with_range_off_matches_only_itself_and_is_hidden() {
     for other in [Subnet, Localhost, Off] {
         let mut world = World::new(&[scope(Off, &[LISTED]), scope(other, &[])]);
         let writer = world.own(1, 1, Publisher);

@@ -153,7 +153,7 @@ fn ends_of_a_service_elsewhere_meet_those_here_and_never_each_other() {
 }
 
 #[test]
-fn a_gid_that_is_taken_is_nobody_elses() {
+fn a_gid_in_use_cannot_be_claimed_by_another_host() {
     let mut world = connected(1);
     let own = first(&world);
     let local = endpoint(Gid::new(own, 1), EndpointKind::Subscription, 0, Qos::default());
@@ -171,7 +171,7 @@ fn a_gid_that_is_taken_is_nobody_elses() {
 }
 
 #[test]
-fn a_tombstone_reaches_those_who_come_later() {
+fn a_tombstone_reaches_sessions_that_connect_later() {
     let mut world = connected(1);
     let own = first(&world);
     let gid = Gid::new(own, 7);

@@ -129,7 +129,7 @@ fn the_oldest_pair_is_forgotten_beyond_the_bound() {
 }
 
 #[test]
-fn nobody_speaks_for_the_publishers_of_another_session() {
+fn a_loss_report_for_the_publisher_of_another_session_is_refused() {
     let mut registry = registry(&[WRITER, READER]);
     let refused = registry.handle_message(&id(READER), SessionMessage::Unmet(unmet(3)), vec![]);
     assert_eq!(refused, Err(Violation::NotItsOwn(unmet(3).writer)));
@@ -191,7 +191,7 @@ fn a_reader_is_handed_the_ring_of_a_publisher_whose_process_was_killed_before_it
 }
 
 #[test]
-fn a_publisher_that_ended_by_itself_has_said_what_its_readers_lost() {
+fn a_publisher_that_ended_itself_has_reported_its_readers_losses() {
     let mut registry = with_earlier_grants(&[WRITER]);
     say(&mut registry, SessionMessage::Unmet(unmet(3)));
     registry.handle_disconnect(&id(WRITER));
@@ -298,7 +298,7 @@ fn others_say(
 const OTHER: u8 = 7;
 
 #[test]
-fn process_that_fills_what_is_kept_displaces_nothing_of_another_one() {
+fn a_process_that_floods_loss_reports_displaces_none_of_another_process() {
     let mut registry = registry(&[WRITER, OTHER]);
     say(&mut registry, SessionMessage::Unmet(unmet(3)));
     let of = |number| Unmet {
@@ -378,7 +378,7 @@ fn ring_of_a_session_that_hung_up_is_handed_over_once_its_process_has_ended() {
 }
 
 #[test]
-fn ring_of_a_session_that_hung_up_and_came_back_is_handed_to_nobody() {
+fn the_ring_of_a_reconnected_session_is_handed_to_no_reader() {
     let mut registry = with_earlier_grants(&[WRITER, READER]);
     hang_up(&mut registry, WRITER);
     connect(&mut registry, WRITER);

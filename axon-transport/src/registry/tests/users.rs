@@ -174,7 +174,7 @@ fn rules_that_change_end_pairs_and_make_pairs_at_once() {
 }
 
 #[test]
-fn another_user_sees_of_other_hosts_what_rules_let_it() {
+fn another_user_sees_only_permitted_endpoints_of_other_hosts() {
     let mut world = World::new(RULES);
     let gids = ["/out", "/in"].map(|topic| {
         let mut gid = Gid([9; 16]);

@@ -129,7 +129,7 @@ mod tests {
     }
 
     #[test]
-    fn a_whole_that_begins_anew_forgets_what_was_repeated() {
+    fn a_restarted_full_update_forgets_the_pairs_repeated_before() {
         let mut pairs = AnnouncedPairs::default();
         pairs.begin_whole();
         pairs.tell(pair(1));

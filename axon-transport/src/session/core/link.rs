@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_put_back_is_ahead_of_what_came_meanwhile() {
+    fn returned_messages_go_before_messages_queued_meanwhile() {
         let link = DaemonLink::default();
         link.queue(fence(2));
         link.put_back([fence(1)]);

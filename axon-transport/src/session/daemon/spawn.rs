@@ -287,7 +287,7 @@ mod tests {
     }
 
     #[test]
-    fn a_daemon_gets_the_settings_of_its_session_and_of_nobody_else() {
+    fn a_spawned_daemon_gets_only_the_settings_of_its_session() {
         let own = || {
             [
                 ("PATH", "/bin"),
@@ -331,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn a_daemon_is_preferred_to_the_tool_and_what_is_no_program_is_passed_over() {
+    fn the_daemon_is_preferred_to_the_tool_and_unusable_files_are_skipped() {
         let dir = tempfile::tempdir().unwrap();
         let file = |name: &str, mode| {
             let path = dir.path().join(name);

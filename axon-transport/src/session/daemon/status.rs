@@ -55,9 +55,9 @@ pub fn daemon_status(config: &Config) -> Result<String, SessionError> {
 /// Like [`daemon_status`], if only the daemon's location is known: other settings may be wrong.
 ///
 /// ```no_run
-/// use axon_transport::{config::DaemonPlace, daemon_status_at};
+/// use axon_transport::{config::DaemonLocation, daemon_status_at};
 ///
-/// println!("{}", daemon_status_at(&DaemonPlace::from_env()?)?);
+/// println!("{}", daemon_status_at(&DaemonLocation::from_env()?)?);
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 ///
@@ -76,9 +76,9 @@ pub fn daemon_status_at(place: &DaemonLocation) -> Result<String, SessionError> 
 /// the report gives the reason.
 ///
 /// ```no_run
-/// use axon_transport::{config::DaemonPlace, daemon_reload_at};
+/// use axon_transport::{config::DaemonLocation, daemon_reload_at};
 ///
-/// let report = daemon_reload_at(&DaemonPlace::from_env()?)?;
+/// let report = daemon_reload_at(&DaemonLocation::from_env()?)?;
 /// match report.error {
 ///     Some(error) => eprintln!("nothing changed: {error}"),
 ///     None => println!("changed: {}", report.changed.join(", ")),
@@ -104,10 +104,10 @@ pub fn daemon_reload_at(place: &DaemonLocation) -> Result<ReloadReport, SessionE
 ///
 /// ```no_run
 /// use axon_transport::{
-///     access::Verb, config::DaemonPlace, daemon_check_access_at, daemon_status_at, status::Status,
+///     access::Verb, config::DaemonLocation, daemon_check_access_at, daemon_status_at, status::Status,
 /// };
 ///
-/// let place = DaemonPlace::from_env()?;
+/// let place = DaemonLocation::from_env()?;
 /// let status: Status = serde_json::from_str(&daemon_status_at(&place)?)?;
 /// for link in &status.links {
 ///     let uses = [(Verb::Publish, "/cmd_vel".to_owned())];

@@ -13,7 +13,7 @@ use std::{
 /// ```
 /// # use std::time::Duration;
 /// use std::sync::{Arc, atomic::{AtomicU64, Ordering}};
-/// use axon_transport::OnNew;
+/// use axon_transport::NewDataCallback;
 /// # use axon_transport::{
 /// #     EndpointSpec, Session, SessionOptions,
 /// #     config::{Config, DaemonPolicy},
@@ -27,7 +27,7 @@ use std::{
 /// assert!(publisher.wait_matched(1, Duration::from_secs(10)));
 /// let new = Arc::new(AtomicU64::new(0));
 /// let counter = new.clone();
-/// let callback: OnNew = Arc::new(move |count| {
+/// let callback: NewDataCallback = Arc::new(move |count| {
 ///     counter.fetch_add(count, Ordering::Relaxed);
 /// });
 /// publisher.publish(b"1.5 m/s")?;
@@ -262,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn the_one_before_runs_no_more_once_it_is_replaced_and_the_next_is_told_what_is_counted_then() {
+    fn replacing_a_callback_waits_for_the_old_one_and_reports_pending_counts() {
         let callback = Callback::default();
         let (function, entries, go, inside) = gate();
         let (next, told) = counter();
@@ -290,7 +290,7 @@ mod tests {
     }
 
     #[test]
-    fn once_it_has_ended_nobody_is_told_whatever_is_set() {
+    fn an_ended_callback_slot_runs_no_callback_set_later() {
         let callback = Callback::default();
         let (function, entries, go, inside) = gate();
         let (late, told) = counter();
@@ -319,7 +319,7 @@ mod tests {
     }
 
     #[test]
-    fn it_may_end_within_itself_and_nobody_is_told_where_counting_fails() {
+    fn a_callback_may_end_itself_and_is_not_called_if_counting_fails() {
         let callback = Arc::new(Callback::default());
         let own = Arc::downgrade(&callback);
         callback.set(Some(Arc::new(move |_| own.upgrade().unwrap().end())));

@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_server_has_not_answered_is_due_in_order_when_it_is_reached_again() {
+    fn unanswered_requests_are_resent_in_order_when_a_server_returns() {
         let mut unanswered = Unanswered::default();
         for number in 1..=4 {
             add(&mut unanswered, number, 10, &[8, 9]);
@@ -177,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn request_to_nobody_and_requests_of_an_ended_client_are_not_kept() {
+    fn requests_without_a_server_or_of_an_ended_client_are_not_kept() {
         let mut unanswered = Unanswered::default();
         add(&mut unanswered, 1, 10, &[]);
         assert!(unanswered.requests.is_empty());

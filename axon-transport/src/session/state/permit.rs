@@ -58,7 +58,7 @@ mod tests {
     }
 
     #[test]
-    fn a_session_creates_what_its_enclave_may_have_and_nothing_else() {
+    fn a_session_creates_only_endpoints_its_enclave_permits() {
         let session = open(5, PERMISSIONS).unwrap();
         let _node = session.create_node("any", "/", "/arm").unwrap();
         let publisher = session.create_publisher(spec("/out")).unwrap();

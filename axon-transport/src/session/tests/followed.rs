@@ -112,7 +112,7 @@ fn a_pair_stands_though_a_new_daemon_that_tells_all_again_does_not_know_of_it_ye
 }
 
 #[test]
-fn a_reader_that_is_attached_anew_goes_on_where_it_was_and_counts_what_is_missing() {
+fn a_reattached_reader_resumes_its_position_and_counts_missing_samples() {
     let (session, daemon) = session();
     let far = Far::new(&daemon);
     let (subscription, _) = far.matched(&session, &daemon);

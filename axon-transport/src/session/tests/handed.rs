@@ -50,7 +50,7 @@ fn a_sample_is_handed_over_when_its_reader_was_sent_the_memory_that_it_is_in() {
 }
 
 #[test]
-fn a_question_counts_for_what_it_was_asked_though_more_is_to_be_sent_since() {
+fn a_fence_answer_counts_for_samples_before_the_fence_despite_later_samples() {
     let (session, daemon) = session();
     let spec = EndpointSpec::new("/p", "test/Bytes", Qos::keep_all());
     let publisher = session.create_publisher(spec).unwrap();

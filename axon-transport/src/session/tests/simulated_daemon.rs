@@ -385,7 +385,7 @@ fn no_more_is_given_up_than_was_published() {
 }
 
 #[test]
-fn a_reliable_publisher_is_held_up_by_who_takes_nothing_and_goes_on_when_it_does() {
+fn a_reliable_publisher_blocks_until_a_stalled_reader_takes_again() {
     let (relayed, mut taking) = Relayed::new(Qos::keep_all());
     let Relayed { publisher, daemon, .. } = &relayed;
     let published = relayed.fill();

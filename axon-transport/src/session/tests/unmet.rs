@@ -34,7 +34,7 @@ fn granted_in_vain(session: &Session, daemon: &Daemon, qos: Qos) -> (Publisher, 
 }
 
 #[test]
-fn each_daemon_is_told_what_a_reader_lost_that_did_not_come_in_time() {
+fn each_daemon_is_told_the_losses_of_a_reader_that_timed_out() {
     let stage = Stage::new();
     let (session, daemon) = stage.session();
     let (publisher, reader, _asked) = granted_in_vain(&session, &daemon, Qos::keep_all());
@@ -53,7 +53,7 @@ fn each_daemon_is_told_what_a_reader_lost_that_did_not_come_in_time() {
 }
 
 #[test]
-fn a_session_that_ends_waits_for_a_daemon_to_tell_what_a_reader_lost() {
+fn an_ending_session_waits_for_a_daemon_to_report_reader_losses() {
     let stage = Stage::new();
     let (session, daemon) = stage.session();
     let (publisher, reader, _asked) =
@@ -84,7 +84,7 @@ fn a_publisher_whose_reader_has_taken_up_its_grant_tells_nothing() {
 }
 
 #[test]
-fn a_reader_counts_what_it_lost_once_and_only_where_its_grant_never_came() {
+fn a_reader_counts_reported_losses_once_and_only_without_a_grant() {
     let (session, daemon) = session();
     let far = Far::new(&daemon);
     let (met, _) = far.matched(&session, &daemon);
@@ -115,7 +115,7 @@ fn a_reader_counts_what_it_lost_once_and_only_where_its_grant_never_came() {
 }
 
 #[test]
-fn each_daemon_is_told_what_was_granted_to_a_reader_that_has_not_come() {
+fn each_daemon_is_told_the_pending_grant_of_an_absent_reader() {
     let stage = Stage::new();
     let (session, daemon) = stage.session();
     let (publisher, reader, _asked) = granted_in_vain(&session, &daemon, Qos::keep_all());
@@ -139,7 +139,7 @@ fn each_daemon_is_told_what_was_granted_to_a_reader_that_has_not_come() {
 }
 
 #[test]
-fn a_reader_takes_what_a_publisher_left_that_is_gone_as_it_is_granted() {
+fn a_reader_takes_samples_of_a_publisher_that_ended_during_the_grant() {
     let (session, daemon) = session();
     let far = Far::new(&daemon);
     let subscription = subscription(&session);

@@ -136,7 +136,7 @@ fn trailing_text_and_every_cut_are_refused() {
 }
 
 #[test]
-fn dec_keys_returns_what_was_asked_in_its_order_and_spelling() {
+fn dec_keys_returns_requested_keys_in_requested_order_and_spelling() {
     let asked = [ID_2.to_ascii_uppercase(), ID_1.to_owned()];
     let container = parse(&two(), &Asked::Ids(&asked), Some(256)).unwrap();
     assert_eq!(container.keys[0].key_id(), asked[0]);

@@ -202,7 +202,7 @@ fn zeros_in_a_status_say_nothing() {
 }
 
 #[test]
-fn the_stock_and_the_limit_of_a_request_bound_what_is_asked() {
+fn the_stock_and_the_request_limit_bound_the_requested_keys() {
     let mut small = core(16, stock(20, 3));
     assert_eq!(asks(&mut small, ms(0)), [Ask::Keys(3), Ask::Keys(2)], "a quarter of 20");
     let mut last = core(16, stock(1, 8));
@@ -301,7 +301,7 @@ fn a_kme_that_gives_only_repeated_keys_is_not_asked_in_a_loop() {
 }
 
 #[test]
-fn keys_that_nobody_takes_are_dropped_when_they_are_old() {
+fn untaken_keys_are_dropped_at_their_maximum_age() {
     struct Counted(std::sync::Arc<()>);
     let live = std::sync::Arc::new(());
     let settings = Settings { target: 2, max_age: ms(1_000), ..Settings::default() };
@@ -404,7 +404,7 @@ fn a_stall_is_seen_while_calls_hang_and_ends_with_the_first_key() {
 }
 
 #[test]
-fn nobody_but_its_owner_sees_a_key_in_debug() {
+fn the_debug_output_of_a_pool_shows_no_key() {
     let mut core = Core::new(Settings::default(), || 0);
     core.on_keys(ms(0), 1, ["secret"]);
     let shown = format!("{core:?}");

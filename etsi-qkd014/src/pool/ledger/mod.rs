@@ -225,7 +225,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_key_id_is_new_once_in_whatever_letter_case() {
+    fn a_key_id_is_new_once_regardless_of_letter_case() {
         let ledger = Ledger::default();
         assert_eq!(ledger.record(["a", "b", "A"]).unwrap(), [true, true, false]);
         assert_eq!(ledger.record(["B", "c"]).unwrap(), [false, true]);

@@ -49,7 +49,7 @@ fn limit(hosts: &Hosts, name: &str) -> LimitStatus {
 }
 
 #[test]
-fn what_is_beyond_a_limit_waits_or_is_dropped_and_counted_in_each_mode() {
+fn samples_beyond_a_limit_wait_or_count_as_dropped_in_each_mode() {
     Hosts::in_all(|hosts| {
         hosts.write(LIMITS);
         assert_eq!(hosts.reload().error, None);
@@ -188,7 +188,7 @@ fn bytes_beyond_a_limit_are_dropped_or_wait_in_both_directions() {
 }
 
 #[test]
-fn an_egress_limit_slows_what_leaves_and_loses_nothing() {
+fn an_egress_limit_slows_samples_and_loses_none() {
     egress_is_limited("peer = \"PEER\"", "(all packets)");
 }
 
@@ -261,7 +261,7 @@ fn a_link_that_a_limit_slows_carries_compressed_samples() {
 }
 
 #[test]
-fn an_egress_limit_of_an_interface_slows_what_leaves_by_it_and_loses_nothing() {
+fn an_egress_limit_of_an_interface_slows_samples_and_loses_none() {
     egress_is_limited("interface = \"lo\"", "(all packets by lo)");
 }
 

@@ -63,7 +63,7 @@ fn change(host: &Host, rules: &str) {
 }
 
 #[test]
-fn another_user_of_the_host_publishes_what_rules_allow_it_and_nothing_else() {
+fn another_user_of_the_host_publishes_only_on_allowed_topics() {
     let rules = format!("[[allow]]\npeer = \"uid:{NOBODY}\"\npublish = \"/allowed\"");
     let Some((robot, session)) = host_of_two(&rules) else { return };
     let spec = |topic| EndpointSpec::new(topic, "test/Bytes", Qos::keep_all());
@@ -114,7 +114,7 @@ impl Numbers {
 }
 
 #[test]
-fn another_user_reads_history_and_calls_and_serves_what_rules_allow_it_and_nothing_else() {
+fn another_user_reads_history_calls_and_serves_only_as_allowed() {
     let rules = format!(
         "[[allow]]\npeer = \"uid:{NOBODY}\"\nsubscribe = \"/read\"\ncall = \"/ask\"\nserve = \"/serve\""
     );

@@ -84,7 +84,7 @@ fn a_revoked_certificate_is_refused() {
 }
 
 #[test]
-fn an_old_revocation_list_accepts_nobody() {
+fn an_expired_revocation_list_refuses_every_peer() {
     let (dir, ca) = (tempfile::tempdir().unwrap(), Authority::new("the CA"));
     let crl = ca.revoke(NOBODY, 2021);
     let [a, b] = start(dir.path(), &ca, &ca.issue("host-b", B, 2100), Some(&crl));
@@ -97,7 +97,7 @@ fn an_old_revocation_list_accepts_nobody() {
 }
 
 #[test]
-fn a_list_is_read_again_and_ends_the_link_of_who_is_on_it() {
+fn a_reloaded_revocation_list_ends_the_link_of_a_revoked_peer() {
     let (dir, ca) = (tempfile::tempdir().unwrap(), Authority::new("the CA"));
     let crl = dir.path().join("a.crl");
     let nobody = ca.revoke(NOBODY, 2100);

@@ -146,7 +146,7 @@ fn a_pin_that_ends_says_its_last_day_to_the_link_and_to_the_next_dial() {
 }
 
 #[test]
-fn a_file_that_is_gone_keeps_who_is_there_and_lets_nobody_in() {
+fn a_missing_trust_file_keeps_linked_peers_and_admits_no_new_peer() {
     let dir = tempfile::tempdir().unwrap();
     let [a, mut b] = Plan::new(pinned(dir.path(), EACH_OTHER)).start();
     let (trust, away) = (trust_of(dir.path(), 0), dir.path().join("away"));
@@ -166,7 +166,7 @@ fn a_file_that_is_gone_keeps_who_is_there_and_lets_nobody_in() {
 }
 
 #[test]
-fn strangers_get_no_link_and_who_is_pinned_none_under_another_name() {
+fn strangers_get_no_link_and_pinned_peers_cannot_take_another_identity() {
     let dir = tempfile::tempdir().unwrap();
     let settings = pinned(dir.path(), EACH_OTHER);
     let camera = new_key(dir.path());

@@ -16,7 +16,7 @@ use super::super::{
 };
 
 #[test]
-fn what_made_a_link_once_makes_no_second() {
+fn replayed_handshake_packets_make_no_second_link() {
     let dir = tempfile::tempdir().unwrap();
     let settings = pinned(dir.path(), [[false, true], [true, false]]);
     let key = SigningKey::from_pem(&SigningKey::generate_pem_with(KeyAlgorithm::Ed25519).unwrap())

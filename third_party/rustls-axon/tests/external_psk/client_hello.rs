@@ -409,7 +409,7 @@ fn server_refuses_with_the_right_alert() {
 /// RFC 8446 9.2: a ClientHello with neither `pre_shared_key` nor `signature_algorithms`. What is
 /// missing depends on the config, which an acceptor has not yet.
 #[test]
-fn server_refuses_who_offers_nothing_to_authenticate_with() {
+fn server_refuses_a_client_that_offers_no_authentication() {
     let hello = ClientHello { offers: vec![], ..offer_with_share() }.encode();
     let external = server_config(&[SHA256], Known::new(vec![psk("a", 1, SHA256)]), MODES[0]);
     for (config, error, alert) in [

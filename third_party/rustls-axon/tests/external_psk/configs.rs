@@ -211,7 +211,7 @@ fn a_resolver_that_is_wrong_ends_the_handshake() {
 
 /// A verifier and certificates can be put into a config that is built. They are not used.
 #[test]
-fn what_is_set_later_opens_no_way_to_certificates() {
+fn certificates_set_in_a_built_config_are_not_used() {
     for mode in MODES {
         let mut config = client_config(&[SHA256], vec![psk("a", 1, SHA256)], mode);
         config.dangerous().set_certificate_verifier(Unchecked::new());

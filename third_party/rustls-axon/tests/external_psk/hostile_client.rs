@@ -190,7 +190,7 @@ fn server_follows_key_updates_but_not_a_flood() {
 
 /// Not even the right Finished.
 #[test]
-fn server_refuses_what_should_be_encrypted_and_is_not() {
+fn server_refuses_plaintext_where_encryption_is_required() {
     for kind in [HANDSHAKE, APPLICATION_DATA] {
         let (server, client) = after_server_finished();
         let flight = records(kind, &message(20, &client.verify_data()));

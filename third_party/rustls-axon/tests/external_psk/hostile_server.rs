@@ -210,7 +210,7 @@ fn client_refuses_another_psk_than_was_selected() {
 }
 
 #[test]
-fn client_refuses_what_should_be_encrypted_and_is_not() {
+fn client_refuses_plaintext_where_encryption_is_required() {
     for (kind, content) in
         [(HANDSHAKE, message(8, &[0, 0])), (APPLICATION_DATA, b"in the clear, and 16".to_vec())]
     {

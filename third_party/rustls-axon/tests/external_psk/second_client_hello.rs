@@ -244,7 +244,7 @@ fn server_refuses_a_second_client_hello_that_changes_more() {
 
 /// What a second ClientHello may change, and the whole handshake that follows.
 #[test]
-fn server_takes_a_second_client_hello_that_changes_what_it_may() {
+fn server_accepts_permitted_changes_in_a_second_client_hello() {
     let right: &[(&str, Second<'_>)] = &[
         ("the share alone", &|hello| hello),
         ("PSKs left out", &|mut hello| {

@@ -162,7 +162,7 @@ impl Retried {
 }
 
 #[test]
-fn client_refuses_what_follows_a_retry() {
+fn client_refuses_an_invalid_server_hello_after_a_retry() {
     let retry = [TLS13, (51, &[0, 23])];
     let share = |group: u16, len| [&group.to_be_bytes()[..], &list16(&vec![4; len])].concat();
     let (none, first_group) = (share(23, 65), share(29, 32));
@@ -206,7 +206,7 @@ fn the_second_client_hello_is_bound_to_the_first() {
 
 /// RFC 8446 4.1.2 lists what may be another. The suites are not in that list.
 #[test]
-fn the_second_client_hello_is_the_first_but_for_what_was_asked() {
+fn the_second_client_hello_changes_only_the_requested_extension() {
     for (extensions, asked) in
         [(&[TLS13, (44, &[0, 3, 1, 2, 3])][..], 44), (&[TLS13, (51, &[0, 23])], 51)]
     {

@@ -148,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn an_address_is_the_same_whatever_its_port() {
+    fn refusals_of_one_address_are_merged_across_its_ports() {
         let mut refusals = Refusals::default();
         for port in 1..100 {
             add(&mut refusals, RefusalKind::Unproven, &format!("10.0.0.1:{port}"), "no");
@@ -163,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn whoever_proves_nothing_has_a_quarter_of_the_room() {
+    fn unproven_peers_use_at_most_a_quarter_of_the_refusal_list() {
         let mut refusals = Refusals::default();
         let honest = [RefusalKind::Listed, RefusalKind::Peer, RefusalKind::Local];
         for (kind, peer) in honest.into_iter().zip(["listed", "proven", "local"]) {
@@ -213,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_forgotten_makes_room() {
+    fn forget_removes_only_the_refusal_of_that_peer_and_operation() {
         let mut refusals = Refusals::default();
         add(&mut refusals, RefusalKind::Local, "session a", "1 of 2");
         add(&mut refusals, RefusalKind::Local, "session b", "1 of 2");

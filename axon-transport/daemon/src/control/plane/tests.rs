@@ -125,7 +125,7 @@ fn another_user_sees_no_details_where_there_are_rules_and_the_own_user_all() {
 }
 
 #[test]
-fn another_user_may_neither_reload_nor_ask_what_peers_allow() {
+fn another_user_may_neither_reload_nor_query_peer_access() {
     let mut control = with_users("");
     control.ask_reload(&SESSION);
     let answer = report(&mut control, SESSION).to_string();

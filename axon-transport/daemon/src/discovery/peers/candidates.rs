@@ -151,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn bound_addresses_restrict_what_is_dialled_and_advertised() {
+    fn bind_addresses_restrict_dialled_and_advertised_addresses() {
         let source = addresses(&["127.0.0.2:61300", "10.0.0.9:61300", "[2001:db8::1]:61300"]);
         for (bind, dialled) in [
             (&[][..], &["127.0.0.2:61300", "10.0.0.9:61300", "[2001:db8::1]:61300"][..]),

@@ -104,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn a_forged_beacon_is_not_dialled_while_nobody_answers_there() {
+    fn the_address_of_a_forged_beacon_is_not_dialled_without_its_echo() {
         let mut peers = linked();
         peers.handle_path(secs(5.0), HIGHER, false);
         let nonce = hear_new(&mut peers, 6.0).unwrap();

@@ -3,7 +3,7 @@ use crate::link::{ReceivedOf, ReceivedUpTo, RouteReady};
 use axon_shm::ids::Gid;
 
 #[test]
-fn an_identity_has_one_account_and_what_is_dropped_is_given_back() {
+fn one_identity_has_one_account_and_dropped_charges_are_refunded() {
     let mut accounts = Accounts::new(100, 1 << 20);
     let (one, again, other) = (accounts.of_one("a"), accounts.of_one("a"), accounts.of_one("b"));
     let charge = one.graph.charge(60).unwrap();
@@ -45,7 +45,7 @@ fn identities_with_one_budget_share_all_but_the_limits_of_rules() {
 }
 
 #[test]
-fn what_readers_have_of_an_identity_counts_when_it_comes_again() {
+fn memory_held_by_readers_still_counts_when_an_identity_reconnects() {
     let mut accounts = Accounts::new(100, 1000);
     let account = accounts.of_one("a");
     let (ring, pool) = (Arc::clone(&account.held), Arc::clone(&accounts.held.0));
@@ -59,7 +59,7 @@ fn what_readers_have_of_an_identity_counts_when_it_comes_again() {
 }
 
 #[test]
-fn no_identity_takes_the_last_of_what_all_share() {
+fn no_identity_exhausts_the_shared_pool() {
     let pool = Meter::new(100);
     let [one, two, three] = [80, 80, 10].map(|most| Meter::within(&pool, most));
     let first = one.charge(50).unwrap();
@@ -94,7 +94,7 @@ fn a_charge_makes_room_for_the_one_in_its_place_and_stays_where_that_does_not_fi
 }
 
 #[test]
-fn each_that_shares_leaves_as_much_and_takes_up_what_others_leave() {
+fn each_share_takes_half_the_rest_and_grows_when_others_leave() {
     let meter = Meter::new(64);
     let [mut one, mut two, mut three] = [0; 3].map(|_| meter.nothing());
     assert!(meter.share(&mut one) && meter.share(&mut two) && meter.share(&mut three));
@@ -108,7 +108,7 @@ fn each_that_shares_leaves_as_much_and_takes_up_what_others_leave() {
 }
 
 #[test]
-fn a_message_costs_what_it_says_and_a_frame_what_it_is_unpacked() {
+fn message_cost_counts_entries_and_frame_cost_counts_unpacked_bytes() {
     let flow = ReceivedOf { route: 1, publisher: Gid::default(), sequence: 1, dropped: 0 };
     let received = |count| LinkMessage::Received(ReceivedUpTo { flows: vec![flow; count] });
     let publishers = vec![Gid::default(); 65_536];

@@ -82,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn the_rate_is_what_leaves_while_more_waits_once_it_is_steady() {
+    fn the_link_rate_is_measured_from_steady_output_under_backlog() {
         let (mut rate, mut left) = (LinkRate::default(), 0);
         run(&mut rate, 0, 99, &mut left, 1_000);
         assert_eq!(rate.get(ms(99)), None, "one measure");
@@ -107,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_peer_does_not_read_or_an_outage_holds_up_is_no_rate() {
+    fn output_limited_by_the_peer_or_an_outage_gives_no_link_rate() {
         for each in [0, 100, 499] {
             let (mut rate, mut left) = (LinkRate::default(), 0);
             run(&mut rate, 0, 1_000, &mut left, each);

@@ -38,7 +38,7 @@ fn later(number: u64) -> Option<CompressionReply> {
 }
 
 #[test]
-fn what_becomes_shorter_comes_back_and_what_does_not_is_left_as_it_is() {
+fn compressor_returns_a_frame_only_for_payloads_that_shrink_enough() {
     let mut compressor = Compressor::new();
     for length in [SHORTEST, 100_000, LONGEST] {
         let payload = text(length);
@@ -60,7 +60,7 @@ fn what_becomes_shorter_comes_back_and_what_does_not_is_left_as_it_is() {
 }
 
 #[test]
-fn a_slow_link_gets_what_is_worth_it_and_a_fast_one_nothing() {
+fn compression_pays_on_a_slow_link_and_not_on_a_fast_link() {
     let compression = Compression::new();
     // 54 Mbit/s, 1 Gbit/s and 10 Gbit/s.
     let [radio, cable, fast] = [54e6 / 8.0, 125e6, 1.25e9];
@@ -125,7 +125,7 @@ fn a_sample_of_a_topic_is_compressed_once_for_all_peers() {
 }
 
 #[test]
-fn what_is_not_worth_it_is_not_tried_for_another_peer() {
+fn an_incompressible_sample_is_not_tried_again_for_another_peer() {
     let compression = Compression::new();
     let payload = noise(10_000);
     assert_eq!(compression.ask(asker(1), name(1), &payload), later(1));
@@ -176,7 +176,7 @@ fn orders_and_answers_that_are_kept_take_bounded_memory() {
 }
 
 #[test]
-fn what_waits_for_the_compressor_counts_as_well() {
+fn the_compressor_backlog_counts_in_the_decision_to_compress() {
     let compression = Compression::new();
     assert!(compression.pays(20_000, 54e6 / 8.0, NOW));
     for _ in 0..3 {

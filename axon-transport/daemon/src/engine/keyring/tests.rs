@@ -276,7 +276,7 @@ fn keys_are_fetched_announced_and_used_in_both_directions() {
 }
 
 #[test]
-fn successor_has_the_keys_and_the_old_connection_gets_what_is_owed() {
+fn keys_move_to_the_successor_and_retires_go_to_the_old_connection() {
     let mut pair = Pair::new();
     pair.connect(1);
     pair.run();

@@ -155,7 +155,7 @@ mod tests {
     proptest! {
         /// A sender that waits until the bucket opens sends as much as the limit allows, and no more.
         #[test]
-        fn what_passes_is_what_the_limit_says(
+        fn a_rate_bucket_passes_as_much_as_its_limit_allows(
             rate in 0.5_f64..2000.0,
             bytes in proptest::option::of(1e3_f64..1e7),
             burst in 1_u32..20,

@@ -117,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn strangers_leave_room_for_known_addresses_and_what_is_held_is_bounded() {
+    fn the_inbox_is_bounded_and_keeps_room_for_known_addresses() {
         let mut inbox = DiscoveryInbox::new();
         (0..10_000).for_each(|_| inbox.add(from(1), &[7; 512], || false, at(0)));
         inbox.add(from(2), &[8], || true, at(0));

@@ -311,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn what_exceeds_the_bound_in_bytes_is_given_up_from_the_first_that_ended() {
+    fn drains_beyond_the_byte_bound_are_given_up_oldest_first() {
         let mut endings = endings();
         assert!(given_up_beyond(&mut endings, &[3, 1], 500).is_empty());
         assert_eq!(given_up_beyond(&mut endings, &[2], 500), [3]);

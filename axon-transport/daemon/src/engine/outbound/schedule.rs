@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn services_are_a_class_of_their_own_whatever_their_length() {
+    fn service_messages_have_their_own_class_at_any_length() {
         assert_eq!(Class::of(true, true, 1 << 20), Class::Service);
         assert_eq!(Class::of(false, true, 4096), Class::SmallReliable);
         assert_eq!(Class::of(false, false, 4097), Class::Bulk);

@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn a_peer_is_told_what_changed_and_of_nothing_twice() {
+    fn a_peer_is_sent_each_graph_change_once() {
         let mut told = AdvertisedGraph::default();
         assert_eq!(said(told.tell(endpoints(1..4), false)), [(1, 0, 3, 0, false)]);
         assert!(told.tell(endpoints(1..4), false).is_empty());

@@ -367,7 +367,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_proved_on_one_connection_counts_for_nothing_on_the_next() {
+    fn session_proofs_of_one_connection_are_void_on_the_next() {
         let account = Accounts::new(10 * one(), 1 << 20).of_one("a");
         let mut remote = PeerGraph::new(account, true, Permissions::default());
         let key = SessionKey::generate().unwrap();
@@ -400,7 +400,7 @@ mod tests {
     }
 
     #[test]
-    fn what_there_is_no_room_for_is_left_out_by_name_and_the_rest_counts() {
+    fn endpoints_beyond_the_quota_are_omitted_by_name_and_the_rest_accepted() {
         let account = Accounts::new(2 * one(), 1 << 20).of_one("a");
         let (mut remote, mut other) = (
             PeerGraph::new(Rc::clone(&account), false, Permissions::default()),

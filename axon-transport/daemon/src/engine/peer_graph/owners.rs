@@ -244,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn a_flood_of_proofs_is_not_kept_and_what_is_used_stays() {
+    fn a_flood_of_proofs_is_discarded_and_used_proofs_are_kept() {
         let (used, new) = (key(), key());
         let mut proven = full_of([prefix(&used.id())]);
         for _ in 0..3 {
@@ -255,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_proved_before_its_endpoints_come_is_not_swept() {
+    fn fresh_proofs_are_not_swept_before_their_endpoints_arrive() {
         let (first, second) = (key(), key());
         let mut proven = full_of([]);
         proven.take(&[proof(&first), proof(&second)], &BINDING, HERE, |_| false, NOW);

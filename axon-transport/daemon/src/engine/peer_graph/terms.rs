@@ -39,7 +39,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_endpoint_that_no_field_names_is_for_the_subnet_and_denied_nobody() {
+    fn an_endpoint_without_terms_has_subnet_range_and_no_denial() {
         let gids = [1, 2, 3].map(|number| Gid([number; 16]));
         let terms = GraphTerms::new([Some(vec![gids[0]]), Some(vec![gids[0], gids[1]]), None]);
         let toward = gids.map(|gid| terms.toward(&gid));

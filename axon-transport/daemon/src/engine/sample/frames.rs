@@ -81,7 +81,7 @@ mod tests {
     }
 
     #[test]
-    fn everything_is_there_in_order_and_what_is_long_is_not_copied() {
+    fn frames_keep_their_order_and_long_pieces_are_not_copied() {
         let mut frames = Frames::default();
         let long = Bytes::from(vec![7; COPIED + 1]);
         frames.copy(b"ab");
@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn what_fails_leaves_nothing() {
+    fn a_failed_append_leaves_no_bytes() {
         let mut frames = Frames::default();
         frames.copy(b"a");
         for most in [4, COPIED + 4] {

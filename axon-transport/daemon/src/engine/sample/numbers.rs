@@ -94,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn a_number_may_be_ahead_of_the_last_by_what_can_have_been_published_since() {
+    fn the_lead_of_a_sequence_number_is_bounded_by_the_publish_rate() {
         let numbers = PublisherNumbers::new(at(0));
         numbers.judge(MAX_FIRST, at(0)).unwrap();
         numbers.judge(MAX_FIRST + 1, at(0)).unwrap_err();

@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_header_is_refused_and_changes_nothing() {
+    fn malformed_short_headers_are_refused_and_change_no_state() {
         let nine = [0x80; 9];
         let cases: [&[u8]; 6] = [
             &[],

@@ -56,7 +56,7 @@ mod tests {
     }
 
     #[test]
-    fn reports_are_ten_seconds_apart_and_count_what_came_between() {
+    fn reports_are_ten_seconds_apart_and_count_disagreements_in_between() {
         let s = Duration::from_secs;
         let mut disagreements = Disagreements::default();
         assert_eq!(disagreements.take(s(5)), None);

@@ -106,7 +106,7 @@ fn samples_that_overtook_the_journal_are_found() {
 }
 
 #[test]
-fn readers_are_looked_at_in_time_whatever_the_journal_says() {
+fn readers_are_checked_in_turn_independently_of_the_journal() {
     let (of, from) = (session(), session());
     from.follow();
     let topics = topics(&of, &from, 1..10, true);
@@ -177,7 +177,7 @@ fn a_sample_whose_entry_was_counted_and_not_stored_is_found() {
 }
 
 #[test]
-fn a_relay_that_joins_late_is_found_with_what_came_before_and_comes_after() {
+fn a_late_relay_is_found_active_for_earlier_and_later_samples() {
     let (of, from) = (session(), session());
     from.follow();
     let late = transient(keep_last(5));
@@ -224,7 +224,7 @@ fn memory_that_came_has_its_sessions_readers_looked_at() {
 }
 
 #[test]
-fn readers_that_are_gone_or_follow_nobody_are_not_found() {
+fn ended_and_non_following_readers_are_not_found() {
     let (of, from) = (session(), session());
     let unfollowed = topics(&of, &from, 1..3, true);
     unfollowed[0].publish(1);

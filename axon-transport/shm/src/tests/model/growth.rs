@@ -112,7 +112,7 @@ fn an_old_array_that_became_something_else_is_noticed() {
 
 /// A reader that is late, and one that has taken all, find so in an array that is new to both.
 #[test]
-fn a_new_array_says_who_is_late_and_who_must_wait() {
+fn a_new_array_shows_lapped_and_future_positions() {
     check(2, || {
         let ring = Growing::new();
         retire(&ring.header, 1);

@@ -97,7 +97,7 @@ fn a_follower_finds_each_sample_in_the_rings_that_are_named() {
 
 /// An entry that another thread has counted and not stored yet names no ring, and hides none.
 #[test]
-fn a_follower_finds_what_threads_of_one_process_note_at_the_same_time() {
+fn a_follower_finds_entries_that_threads_note_concurrently() {
     check(2, || {
         let words = Words::new();
         let publishers = [0, 1].map(|ring| {

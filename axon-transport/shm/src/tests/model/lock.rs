@@ -13,7 +13,7 @@ use crate::{
 
 /// `LetGoSwap`, `TakeSwap`.
 #[test]
-fn a_new_lock_holder_sees_what_the_last_one_did() {
+fn a_new_holder_sees_the_last_holders_writes() {
     check(3, || {
         let lock = Arc::new((AtomicU32::new(0), Cell::new(0)));
         let count = |lock: &(AtomicU32, Cell), thread| {

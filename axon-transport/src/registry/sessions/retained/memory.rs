@@ -123,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reader_that_comes_back_is_handed_what_a_session_left() {
+    fn a_returning_reader_is_handed_the_memory_of_an_ended_session() {
         let mut registry = registry();
         open(&mut registry, WRITER, 1);
         need(&mut registry, 1);
@@ -138,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn later_a_session_leaves_nothing_and_shows_nobody_its_memory() {
+    fn without_retention_a_session_leaves_and_hands_out_no_memory() {
         let mut registry = registry();
         registry.keep_left_memory(0);
         open(&mut registry, WRITER, 1);
@@ -173,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reader_that_comes_back_late_hears_of_the_end_of_what_it_reads() {
+    fn a_reader_reconnecting_late_is_told_of_the_ended_publisher() {
         let mut registry = registry();
         let gid = Gid::new(id(WRITER), 1);
         let endpoint = Endpoint::example(gid, EndpointKind::Publisher);

@@ -150,7 +150,7 @@ fn clients_that_were_there_last_are_remembered_when_there_were_very_many() {
 }
 
 #[test]
-fn nobody_is_woken_at_once_for_a_sample_that_there_is_no_memory_for() {
+fn a_sample_without_memory_to_copy_wakes_no_waiter_at_once() {
     let session = SessionSegment::create(SessionId::random()).unwrap();
     let [writer, gid] = [1, 2].map(|number| Gid::new(session.id(), number));
     let (publisher, reader) = reading(&session, writer, gid);

@@ -296,7 +296,7 @@ fn a_host_that_was_linked_is_dialled_again_through_any_flood() {
 }
 
 #[test]
-fn a_host_that_nobody_knows_is_dialled_once_it_answers() {
+fn an_unknown_host_is_dialled_through_any_flood_once_it_answers() {
     for honest in [LOWER, HIGHER] {
         Scene::new(honest, from_everywhere).links("unknown, 300/s from everywhere");
         Scene::new(honest, from_one_address).links("unknown, 300/s from one address");

@@ -132,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn one_address_takes_at_most_what_it_leaves_and_listed_peers_have_places_of_their_own() {
+    fn one_address_takes_half_the_free_handshakes_and_listed_peers_have_reserves() {
         let handshakes = HandshakeShares::new(64);
         let take = |host, listed| {
             std::iter::from_fn(|| handshakes.enter(at(host), listed)).collect::<Vec<_>>()

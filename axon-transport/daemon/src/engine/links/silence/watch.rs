@@ -264,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn a_path_whose_probes_nobody_answers_is_said_to_be_cut_and_to_work_again() {
+    fn unanswered_probes_report_the_path_as_cut_and_answers_restore_it() {
         let mut silence = LinkSilence::new(Side::Client, START);
         silence.handle_second(second(1), traffic(0, 0, 1), || NONCE);
         let asked = traffic(0, 0, 1);

@@ -274,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn flows_go_on_once_what_they_lack_is_there() {
+    fn paused_flows_resume_when_a_stream_or_key_is_available() {
         let (mut turns, mut flows) = turns(2);
         assert_eq!(pause(&mut turns, &mut flows, FlowPause::NoStream), 0);
         assert_eq!(pause(&mut turns, &mut flows, FlowPause::NoKey), 1);

@@ -67,7 +67,7 @@ mod tests {
     const BULK: Rank = Rank { priority: TopicPriority::Normal, class: Class::Bulk };
 
     #[test]
-    fn a_rank_that_waits_has_an_eighth_of_what_a_higher_one_sends() {
+    fn a_starved_rank_gets_an_eighth_of_the_higher_ranks_output() {
         let mut lending = StarvationCredit::default();
         [SMALL, BULK].iter().for_each(|rank| lending.handle_blocked(*rank));
         let mut sent = [0; 2];
@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_saved_has_a_bound() {
+    fn the_starvation_credit_is_bounded() {
         let mut lending = StarvationCredit::default();
         lending.handle_blocked(BULK);
         lending.handle_sent(SMALL, 1 << 30);

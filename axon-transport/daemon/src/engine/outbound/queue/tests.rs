@@ -163,7 +163,7 @@ fn a_link_that_ended_has_its_samples_sent_again_in_order() {
 }
 
 #[test]
-fn best_effort_keeps_its_depth_and_drops_what_would_be_late() {
+fn a_best_effort_queue_keeps_its_depth_and_drops_late_samples() {
     let budget = Budget::new(256 * MIB);
     let qos = Qos::sensor_data().with_depth(3);
     let mut queue = Queue::new(&qos, budget.of_peer());

@@ -98,7 +98,7 @@ fn a_kme_without_keys_excuses_for_longer_than_the_limit_and_not_for_good() {
 }
 
 #[test]
-fn an_outage_excuses_a_flow_that_holds_nobody_up() {
+fn an_outage_excuses_a_flow_that_blocks_no_publisher() {
     assert_eq!(look(false, |_| vec![FLOW], |_| 0), None);
     // Other flows hold up the publisher, or it was held up before.
     let before = BusyFlow { refused: Some(7), ..FLOW };
@@ -128,7 +128,7 @@ fn a_host_that_is_switched_off_holds_a_publisher_up_until_it_is_gone_and_the_lim
 }
 
 #[test]
-fn waiting_for_others_excuses_nobody_while_the_peer_is_gone() {
+fn waiting_for_other_flows_excuses_no_flow_while_the_peer_is_gone() {
     let waits = |now| vec![BusyFlow { waits_for_others: true, ..held(now) }];
     let (at, found) = look(true, waits, |_| 0).expect("it is found");
     assert_eq!(found, stalled(StallCause::NothingRead));
@@ -159,7 +159,7 @@ fn a_peer_that_holds_a_publisher_up_takes_its_share_or_is_found_too_slow() {
 }
 
 #[test]
-fn a_moment_in_which_the_publisher_waits_for_nobody_is_no_way_out() {
+fn a_briefly_unblocked_publisher_does_not_excuse_a_slow_flow() {
     let slow = |now: Duration| {
         let refused = (!secs(now).is_multiple_of(9)).then(|| 10 * secs(now));
         vec![BusyFlow { progress: (secs(now) / 9, 0), keeps: Some(8192), refused, ..FLOW }]
@@ -291,7 +291,7 @@ fn the_pace_goes_on_over_all_daemons_of_a_host() {
 }
 
 #[test]
-fn a_flow_goes_on_with_the_worse_of_what_is_known() {
+fn a_flow_inherits_the_longest_known_idle_time() {
     let (now, idle) = (Duration::from_secs(5), LIMIT - CHECK_INTERVAL);
     let known = |idle| Progress { idle, ..Progress::default() };
     let after = |flow: BusyFlow| {
@@ -359,7 +359,7 @@ fn one_look_counts_for_two_seconds_at_most() {
 }
 
 #[test]
-fn nobody_looks_for_a_second_after_the_first_sample() {
+fn the_first_stall_check_is_one_interval_after_the_first_sample() {
     let mut stalls = FlowStalls::new(LIMIT, Duration::ZERO);
     let now = Duration::from_secs(100);
     stalls.handle_first(now);

@@ -336,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn what_waits_is_told_of_busy_flows_alone() {
+    fn the_backlog_counts_busy_flows_only() {
         let mut of = Fixture::new(Qos::default());
         let flow = of.flow(11);
         of.rings[0].publish(3, 100);

@@ -295,7 +295,7 @@ mod tests {
     }
 
     #[test]
-    fn a_service_is_wanted_by_whom_it_has_on_either_side_and_in_one_direction_each() {
+    fn local_servers_want_requests_and_local_clients_want_responses() {
         use EndpointKind::{Client, Server};
         let q = Qos::default();
         let local = [endpoint(1, Server, "/s", q), endpoint(2, Server, "/s", q)];
@@ -333,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn who_stands_for_a_subscription_is_the_same_whoever_else_there_is() {
+    fn the_relay_of_a_subscription_is_independent_of_other_subscriptions() {
         let of = |depths: &[u32]| {
             let qos = |depth| Qos::default().with_depth(depth);
             let all = (0..).zip(depths).map(|(n, depth)| subscriber(n, qos(*depth)));

@@ -206,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn a_route_is_found_by_number_and_by_what_it_carries_until_it_ends() {
+    fn a_route_is_found_by_number_and_by_key_until_it_ends() {
         let mut routes = ServedRoutes::default();
         let all = [(1, Kind::Topic, "/t"), (7, Kind::Request, "/s"), (9, Kind::Response, "/s")];
         for (number, kind, topic) in all {

@@ -137,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn queue_limited_by_time_drops_what_would_wait_longer() {
+    fn queue_limited_by_time_drops_packets_that_would_wait_longer() {
         let rate = Rate::new(1_000, Duration::from_millis(500));
         let mut backlog = Backlog::default();
         let departures: Vec<_> =

@@ -53,7 +53,7 @@ fn compressions(world: &World) -> u64 {
 }
 
 #[test]
-fn what_becomes_shorter_crosses_a_slow_link_faster_and_the_rest_as_fast_as_before() {
+fn compressible_samples_cross_slow_links_faster_and_others_as_fast_as_before() {
     for (mode, config) in modes() {
         for (mbits, length) in [(8, 6_000), (54, 20_000), (54, 300_000)] {
             let (mut world, mut text) = stream(&config, mbits, "/text", Qos::keep_all(), length);

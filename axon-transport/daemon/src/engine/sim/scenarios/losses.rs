@@ -44,7 +44,7 @@ fn counted(world: &World, topic: &str) -> u64 {
 }
 
 #[test]
-fn what_one_relay_lost_while_another_sent_it_is_not_counted() {
+fn losses_of_one_relay_covered_by_another_are_not_counted() {
     let (mut world, pair) = attached(60, Qos::keep_all(), Path::default());
     // It has a relay of its own, which keeps the last samples alone.
     let last = world.hosts[1].rings.create_subscription("/t", Qos::default(), None);

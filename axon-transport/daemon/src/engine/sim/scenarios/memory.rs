@@ -308,7 +308,7 @@ fn without_lanes(world: &World, peer: usize, link: usize) -> Vec<u32> {
 }
 
 #[test]
-fn no_identity_takes_all_lanes_and_each_is_told_what_it_does_not_get() {
+fn no_identity_takes_all_lanes_and_each_is_told_its_refused_routes() {
     const PUBLISHERS: usize = 200;
     let mut world = World::new(87, 1, |_| Config::default());
     world.add_raw(Config::default(), DaemonId([0xff; 16]));

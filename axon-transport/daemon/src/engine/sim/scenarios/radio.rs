@@ -306,7 +306,7 @@ fn lone_samples_cross_a_link_that_loses_many_packets_in_time() {
 
 #[test]
 #[ignore = "prints a table, and takes minutes"]
-fn what_arrives_at_which_loss() {
+fn arrivals_by_loss_rate_are_printed() {
     for packets in [1, 8] {
         for row in rows() {
             for loss in [0.0, 0.05, 0.1, 0.2, 0.3, 0.4] {
@@ -329,7 +329,7 @@ fn what_arrives_at_which_loss() {
 }
 
 #[test]
-fn publishers_that_fill_a_link_have_equal_shares_whatever_their_samples_are() {
+fn saturating_publishers_share_a_link_equally_at_any_sample_size() {
     let mut world = hosts(Congestion::Auto, radio(54, 0.0));
     let ms = Duration::from_millis(1);
     let mut streams =

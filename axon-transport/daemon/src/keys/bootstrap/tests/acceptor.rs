@@ -18,7 +18,7 @@ fn look_up(acceptor: &Acceptor, source: &str, identity: &[u8]) -> Lookup {
 }
 
 #[test]
-fn the_kme_is_not_asked_for_who_is_no_peer() {
+fn the_kme_is_not_asked_about_unlisted_or_malformed_identities() {
     let (acceptor, _) = new(listed(&["sae-a"]));
     for (bytes, expected) in [
         (identity("sae-x", "k"), Lookup::NotAPeer),

@@ -25,7 +25,7 @@ fn attempt(dialler: &mut BootstrapDialler, now: Duration) -> Option<KeyId> {
 }
 
 #[test]
-fn no_kme_call_for_who_is_no_peer() {
+fn no_kme_call_is_made_for_an_unlisted_sae() {
     let mut dialler = new();
     for sae in ["sae-a", "sae-x", "", "SAE-B", "sae-b ", "*"] {
         assert!(matches!(dialler.dial(s(1), sae), DialDecision::Refused(_)), "{sae}");
@@ -169,7 +169,7 @@ fn made_up_names_under_a_star_are_bounded() {
 }
 
 #[test]
-fn answers_nobody_waits_for_are_dropped() {
+fn unexpected_kme_answers_are_dropped() {
     let mut dialler = holding(s(0), "k1");
     let request = KmeRequest::Status { slave: "sae-b".to_owned() };
     dialler.handle_answer(s(1), failed(request, FailureKind::Refused));

@@ -190,7 +190,7 @@ fn keys_adopted_over_and_over_are_bounded() {
 }
 
 #[test]
-fn no_more_than_a_quarter_of_the_stock_is_ahead_with_what_is_ready() {
+fn announced_and_ready_keys_are_at_most_a_quarter_of_the_stock() {
     let mut pair = Pair::new();
     pair.now = ms(1_000);
     pair.kmes.stock = 100;

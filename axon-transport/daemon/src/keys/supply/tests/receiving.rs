@@ -49,7 +49,7 @@ fn a_late_announcement_on_a_connection_before_takes_no_key_from_its_successor() 
 
 /// Two daemons that dial each other have two connections at a time. That which was opened first may be elected last.
 #[test]
-fn a_key_goes_to_the_connection_that_was_elected_last_in_whatever_order_they_were_opened() {
+fn a_key_goes_to_the_last_elected_connection_in_any_opening_order() {
     for is_fetched in [false, true] {
         let mut pair = Pair::new();
         let (key_id, _) = pair.kmes.issue();

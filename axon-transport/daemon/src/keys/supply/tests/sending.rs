@@ -305,7 +305,7 @@ fn a_key_in_use_ends_after_an_hour() {
 }
 
 #[test]
-fn an_announcement_that_nobody_answers_is_dropped() {
+fn an_unanswered_announcement_is_retired() {
     let mut pair = Pair::new();
     pair.draw();
     assert!(matches!(pair.sender.poll_message(pair.now), Some((1, KeyMessage::Announce(_)))));

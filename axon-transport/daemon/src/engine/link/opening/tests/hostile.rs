@@ -97,7 +97,7 @@ fn handshake_that_agreed_on_something_else_than_the_settings_is_refused() {
 }
 
 #[test]
-fn host_that_cannot_read_whom_it_trusts_tells_the_peer_less_than_its_log() {
+fn host_with_unreadable_trust_file_tells_the_peer_less_than_its_log() {
     let settings = Config::default();
     let closed = Some("/etc/axon/trust: permission denied".to_owned());
     let (facts, ours) = (facts(Side::Server, None), ours(Side::Server, &settings));

@@ -188,7 +188,7 @@ fn key_of(message: LinkMessage) -> Option<KeyId> {
 }
 
 #[test]
-fn proof_that_cost_no_key_counts_against_nobody() {
+fn a_failed_proof_without_key_consumption_is_not_counted() {
     for key_mode in MODES {
         let counted = counts(key_mode, |end, kmes| {
             kmes.failures = vec![FailureKind::Refused];

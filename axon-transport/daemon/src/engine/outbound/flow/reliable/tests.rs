@@ -130,7 +130,7 @@ fn samples_follow_the_header_on_one_stream_and_stay_until_they_are_acknowledged(
 }
 
 #[test]
-fn samples_that_nobody_acknowledges_are_done_with_once_quic_has_them() {
+fn samples_of_an_unacknowledged_flow_are_done_once_quic_has_them() {
     let mut way = Way::new(false);
     way.offer(3, 10);
     assert_eq!(way.write(), FlowPause::Empty);
@@ -157,7 +157,7 @@ fn a_long_sample_makes_progress_while_quic_takes_it() {
 }
 
 #[test]
-fn what_is_sent_again_over_another_link_is_no_progress() {
+fn samples_retransmitted_over_another_link_are_no_progress() {
     let mut way = Way::new(true);
     way.offer(8, 128 << 10);
     way.write_and_read_all();
@@ -226,7 +226,7 @@ fn a_stop_that_quic_tells_while_a_sample_is_written_is_the_same() {
 }
 
 #[test]
-fn a_new_link_carries_what_is_not_acknowledged() {
+fn a_new_link_resends_unacknowledged_samples() {
     let mut way = Way::new(true);
     way.offer(3, 10);
     way.write_all();

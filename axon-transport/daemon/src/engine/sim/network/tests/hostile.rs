@@ -44,7 +44,7 @@ fn tiny_rate_delivers_its_queue_and_drops_the_rest() {
 }
 
 #[test]
-fn host_reaches_itself_whatever_the_network_does() {
+fn host_reaches_itself_despite_total_loss_and_partition() {
     let mut network = network(1, 2);
     network.set_default_path(Path { loss: 1.0, ..Path::default() });
     network.partition(&[0], None);

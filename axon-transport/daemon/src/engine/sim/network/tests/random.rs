@@ -97,7 +97,7 @@ fn one_seed_gives_one_trace_and_packets_are_conserved() {
 }
 
 #[test]
-fn seed_alone_changes_what_is_lost() {
+fn only_the_seed_changes_which_packets_are_lost() {
     let lost = |seed| {
         let mut network = network(seed, 2);
         network.set_default_path(Path { loss: 0.5, ..Path::default() });

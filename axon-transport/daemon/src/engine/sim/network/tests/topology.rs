@@ -125,7 +125,7 @@ fn reply(network: &mut Network, now: Duration, to: SocketAddr) -> Vec<(Duration,
 }
 
 #[test]
-fn rebind_drops_what_goes_to_the_old_address() {
+fn nat_rebind_drops_packets_to_the_old_address() {
     let (mut network, nat) = behind_nat(Filtering::EndpointIndependent, None);
     send(&mut network, START, 1, 0, 1);
     let old = drain(&mut network)[0].1.from;

@@ -156,7 +156,7 @@ fn an_endpoint_that_may_be_seen_and_not_used_has_no_stand_in() {
 }
 
 #[test]
-fn a_denial_of_see_leaves_what_an_allow_names_and_takes_the_rest_with_a_reason() {
+fn denying_see_also_denies_topics_without_an_allow_and_reports_the_rule() {
     for hides in ["/scan", "**"] {
         let see = format!("[[deny]]\npeer = \"*\"\nsee = \"{hides}\"");
         let text = format!("{see}\n[[allow]]\npeer = \"*\"\nsubscribe = \"/scan\"");
@@ -184,7 +184,7 @@ fn a_denial_of_see_leaves_what_an_allow_names_and_takes_the_rest_with_a_reason()
 }
 
 #[test]
-fn rules_that_change_end_a_flow_and_begin_it_again_without_a_gap_in_what_is_allowed() {
+fn rule_changes_stop_and_restart_a_flow_without_gaps_in_allowed_topics() {
     let closed = "[[allow]]\npeer = \"*\"\npublish = \"/other\"\nsubscribe = \"/other\"";
     for host in [0, 1] {
         let mut world = hosts(2, OPEN);
@@ -213,7 +213,7 @@ fn rules_that_change_end_a_flow_and_begin_it_again_without_a_gap_in_what_is_allo
 }
 
 #[test]
-fn rules_that_change_a_hundred_times_under_load_lose_nothing_of_what_they_allow() {
+fn a_hundred_rule_changes_under_load_lose_no_allowed_samples() {
     let mut world = hosts(2, OPEN);
     let pairs = [0, 1].map(|from| {
         ["/log", "/other"].map(|topic| world.pair(from, 1 - from, topic, Qos::keep_all()))
@@ -374,7 +374,7 @@ fn a_peer_says_which_of_its_rules_decides_and_answers_each_question_once() {
 }
 
 #[test]
-fn answers_that_nobody_asked_for_and_questions_out_of_bounds_change_nothing() {
+fn unrequested_access_answers_and_oversized_access_queries_change_nothing() {
     let mut world = super::super::hostile::world(29, 1, LOWEST);
     let on = dial(&mut world, 0);
     greet(&mut world, on, None);

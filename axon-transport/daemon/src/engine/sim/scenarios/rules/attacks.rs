@@ -57,7 +57,7 @@ fn received(world: &World, reader: Gid, writer: Gid) -> Vec<u64> {
 }
 
 #[test]
-fn calls_and_answers_that_rules_deny_reach_nobody_whatever_the_peer_sends() {
+fn denied_requests_and_responses_of_a_hostile_peer_reach_no_endpoint() {
     const RULES: &str = "[[deny]]\npeer = \"*\"\ncall = \"/closed\"\nserve = \"/closed\"";
     let mut world = world(RULES, LOWEST);
     let rings = world.hosts[0].rings.clone();
@@ -131,7 +131,7 @@ fn calls_and_answers_that_rules_deny_reach_nobody_whatever_the_peer_sends() {
 }
 
 #[test]
-fn samples_and_requests_that_go_on_after_rules_deny_them_reach_nobody() {
+fn samples_and_subscribes_after_a_denial_are_neither_delivered_nor_served() {
     let mut world = world(OPEN, LOWEST);
     let qos = Qos::keep_all();
     let subscription = world.hosts[0].rings.create_subscription("/t", qos, None);
@@ -188,7 +188,7 @@ fn samples_and_requests_that_go_on_after_rules_deny_them_reach_nobody() {
 }
 
 #[test]
-fn requests_that_a_limit_holds_reach_nobody_once_rules_deny_them() {
+fn requests_held_by_a_limit_are_dropped_once_rules_deny_them() {
     const HELD: &str = "default = \"allow\"\n\
         [[limit]]\npeer = \"*\"\ncall = \"/set\"\nrate = 0.1\nburst = 1\nover = \"hold\"\n";
     for denies in [true, false] {

@@ -44,7 +44,7 @@ fn limits(world: &World, host: usize) -> &[LimitStatus] {
 }
 
 #[test]
-fn what_is_beyond_a_limit_does_not_cross_whichever_host_sets_it() {
+fn samples_beyond_a_limit_of_either_host_do_not_cross() {
     for with_rules in [0, 1] {
         for (over, qos) in [
             ("drop-oldest", Qos::keep_all()),
@@ -119,7 +119,7 @@ fn limits_that_change_count_at_once_and_lose_nothing_that_they_hold() {
 }
 
 #[test]
-fn the_topics_of_a_peer_share_what_it_may_have_together() {
+fn the_topics_of_a_peer_share_a_joint_limit() {
     let text = "[[limit]]\npeer = \"*\"\nsubscribe = \"/**\"\nbytes = \"2 kB/s\"\ntogether = true";
     let mut world = hosts(0, text);
     let pairs = ["/a", "/b", "/c"].map(|topic| world.pair(0, 1, topic, Qos::sensor_data()));
@@ -190,7 +190,7 @@ fn max_hz_that_changes_counts_for_a_topic_that_is_matched() {
 }
 
 #[test]
-fn egress_to_a_peer_stays_below_its_limit_and_what_leaves_is_fresh() {
+fn egress_to_a_peer_stays_below_its_limit_and_samples_stay_fresh() {
     let text = "[[limit]]\npeer = \"*\"\negress = \"1 MB/s\"";
     let mut world = hosts(0, text);
     world.network.set_default_path(radio(54, 0.0));

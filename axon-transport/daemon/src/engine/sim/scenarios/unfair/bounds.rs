@@ -45,7 +45,7 @@ fn open(world: &World) -> Vec<usize> {
 }
 
 #[test]
-fn an_identity_has_16_links_under_whatever_ids() {
+fn an_identity_has_at_most_16_links_across_its_daemon_ids() {
     let mut world = world(90, 2, Config::default);
     let links: Vec<_> = (0..16).map(|n| linked_as(&mut world, 0, 0xe0 + n)).collect();
     for id in [0xd0, 0xd1] {
@@ -205,7 +205,7 @@ fn a_whole_graph_is_sent_once_a_second_however_often_it_is_asked_for() {
 }
 
 #[test]
-fn what_ended_publishers_left_for_a_peer_that_does_not_read_is_bounded() {
+fn the_backlog_of_ended_publishers_for_a_stalled_peer_is_bounded() {
     let mut world = world(97, 1, || {
         let mut config = Config::default();
         config.reliable_queue = 4 << 20;
