@@ -5,10 +5,9 @@ mod support;
 use std::{
     collections::{BTreeMap, BTreeSet},
     fs,
-    path::{Path, PathBuf},
 };
 
-use support::workspace;
+use support::{rust_sources, workspace};
 
 const CRATES: [&str; 3] =
     ["axon-transport/src", "axon-transport/daemon/src", "axon-transport/shm/src"];
@@ -43,25 +42,10 @@ fn impls(source: &str) -> Vec<(String, usize)> {
     found
 }
 
-/// The sources below a folder, without tests and the simulator.
-fn sources(folder: &Path, into: &mut Vec<PathBuf>) {
-    for entry in fs::read_dir(folder).expect("a folder of sources") {
-        let path = entry.expect("an entry").path();
-        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        if path.is_dir() {
-            if name != "tests" && name != "sim" {
-                sources(&path, into);
-            }
-        } else if name.ends_with(".rs") && name != "tests.rs" {
-            into.push(path);
-        }
-    }
-}
-
 /// The structs of a crate with more than [`LINES`] of methods in several files.
 fn scattered(of: &str) -> BTreeSet<String> {
-    let mut files = Vec::new();
-    sources(&workspace().join(of), &mut files);
+    // Not the tests, and not the simulator.
+    let files = rust_sources(&workspace().join(of), &["tests", "tests.rs", "sim"]);
     let mut all: BTreeMap<String, Vec<usize>> = BTreeMap::new();
     for file in files {
         let source = fs::read_to_string(file).expect("a source");

@@ -2,12 +2,9 @@
 
 mod support;
 
-use std::{
-    fs,
-    path::{Path, PathBuf},
-};
+use std::fs;
 
-use support::workspace;
+use support::{rust_sources, workspace};
 
 /// Words that stand for an actor or a thing without naming it.
 const VAGUE: [&str; 9] =
@@ -32,29 +29,13 @@ fn test_names(source: &str) -> Vec<&str> {
     names
 }
 
-/// Adds the Rust sources below a folder.
-fn sources(folder: &Path, into: &mut Vec<PathBuf>) {
-    for entry in fs::read_dir(folder).expect("a folder of sources") {
-        let path = entry.expect("an entry").path();
-        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        if path.is_dir() {
-            if name != "target" && name != "patched" && !name.starts_with('.') {
-                sources(&path, into);
-            }
-        } else if name.ends_with(".rs") {
-            into.push(path);
-        }
-    }
-}
-
 fn is_vague(name: &str) -> bool {
     name.split('_').any(|word| VAGUE.contains(&word))
 }
 
 #[test]
 fn no_test_name_leaves_the_actor_out() {
-    let mut files = Vec::new();
-    sources(&workspace(), &mut files);
+    let files = rust_sources(workspace(), &["target", "patched"]);
     let mut count = 0;
     let mut vague = Vec::new();
     for file in files {

@@ -26,6 +26,25 @@ pub(crate) fn workspace() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("xtask is in the repository")
 }
 
+/// Returns the Rust sources below a folder. Files and folders with a name in `without`, and hidden folders, are left
+/// out.
+pub(crate) fn rust_sources(folder: &Path, without: &[&str]) -> Vec<PathBuf> {
+    let mut sources = Vec::new();
+    for entry in fs::read_dir(folder).expect("a folder of sources") {
+        let path = entry.expect("an entry").path();
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        if without.contains(&&*name) || name.starts_with('.') {
+            continue;
+        }
+        if path.is_dir() {
+            sources.extend(rust_sources(&path, without));
+        } else if name.ends_with(".rs") {
+            sources.push(path);
+        }
+    }
+    sources
+}
+
 /// The workspace's target directory: it has aws-lc, built.
 pub(crate) fn target() -> &'static Path {
     Path::new(env!("CARGO_TARGET_TMPDIR")).parent().expect("it is in the target directory")
