@@ -170,7 +170,7 @@ pub struct RelayStatus {
     /// Their bytes.
     pub bytes_out: u64,
     /// Number of samples of its publishers that were overwritten before they had crossed, or for which there was no
-    /// memory, and of samples that ended remote writers left and that it did not take.
+    /// memory, and of samples that writers outside the session left when they ended and that it did not take.
     pub lost: u64,
 }
 
@@ -222,8 +222,8 @@ pub struct TopicStatus {
     /// endpoints on other hosts it has those that their daemons showed to this one.
     #[serde(default)]
     pub out_of_range: Vec<OutOfRangeStatus>,
-    /// Up to 64 endpoints on this host that match endpoints on another host and exchange no samples with them because a
-    /// route is refused, and endpoints that this daemon refuses.
+    /// Endpoints on this host that match endpoints on another host and exchange no samples with them because a route is
+    /// refused, and endpoints that this daemon refuses. Up to 64 in all.
     #[serde(default)]
     pub refused: Vec<RefusedRouteStatus>,
 }

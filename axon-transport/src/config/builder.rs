@@ -255,7 +255,7 @@ impl ConfigBuilder {
         self.set("AXON_DAEMON", policy.name())
     }
 
-    /// Sets the daemon's program. By default it is searched as `docs/configuration.md` describes.
+    /// Sets the daemon's program. By default it is looked for as `docs/configuration.md` describes.
     pub fn daemon_path(self, program: impl AsRef<Path>) -> Self {
         self.path("AXON_DAEMON_PATH", program)
     }

@@ -70,7 +70,8 @@ pub(super) async fn serve(
 }
 
 /// Connections that have not proved who they are, oldest first. Where all places are taken, one of
-/// them gives way after [`HANDSHAKE_TIMEOUT_WHEN_FULL`], so that a peer without a certificate shuts nobody out for long.
+/// them gives way after [`HANDSHAKE_TIMEOUT_WHEN_FULL`], so that a peer without a certificate does not block others for
+/// long.
 #[derive(Default)]
 struct Strangers(VecDeque<Stranger>);
 

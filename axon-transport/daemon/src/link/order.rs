@@ -132,7 +132,7 @@ impl LinkMessage {
             Self::RouteUnasked(_) => "ROUTE_UNASKED",
             Self::Owners(_) => "OWNERS",
             Self::LinkClosed(_) => "LINK_CLOSED",
-            Self::ReceiveLimits(_) => "INTAKE",
+            Self::ReceiveLimits(_) => "RECEIVE_LIMITS",
             Self::Denied(_) => "DENIED",
             Self::AccessCheck(_) => "ACCESS_CHECK",
             Self::AccessDecisions(_) => "ACCESS_DECISIONS",

@@ -279,9 +279,9 @@ pub(crate) fn receive_whole(socket: impl AsFd, buffer: &mut [u8]) -> Result<Sock
     Ok(packet)
 }
 
-/// Like [`receive`], for a packet of at most [`FEW_DESCRIPTORS`] descriptors: closes none of them for the last time, and needs no
-/// space for more. A packet with more descriptors is reported as truncated and stays in the socket. If the process has
-/// no space for the descriptors of a packet, the packet is reported as lost and stays, too.
+/// Like [`receive`], for a packet of at most [`FEW_DESCRIPTORS`] descriptors: closes none of them for the last time,
+/// and needs no space for more. A packet with more descriptors is reported as truncated and stays in the socket. If the
+/// process has no space for the descriptors of a packet, the packet is reported as lost and stays, too.
 pub fn receive_few(socket: impl AsFd, buffer: &mut [u8]) -> Result<SocketPacket, Errno> {
     let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(FEW_DESCRIPTORS))];
     let packet = receive_with(&socket, buffer, RecvFlags::PEEK, &mut space)?;

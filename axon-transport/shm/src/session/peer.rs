@@ -297,7 +297,7 @@ impl PeerSession {
         }
     }
 
-    /// Makes a reader's lane show the session which of its segments are mapped.
+    /// Shows the highest number of the session's segments that came in the reader's lane: now, and whenever one comes.
     pub(crate) fn keep_told(&self, reader: &Arc<Attachment>) {
         let mut further = self.further();
         // Cleans up each time the number has doubled, since thousands of readers come one at a time.

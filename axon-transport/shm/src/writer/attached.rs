@@ -17,7 +17,7 @@ pub(super) struct AttachedReader {
     /// True if the reader carries samples to another process.
     pub(super) carries: bool,
     pub(super) dead: bool,
-    /// The furthest position up to which a relay was seen to have delivered its samples.
+    /// The furthest position up to which a relay was seen to have delivered its samples or given them up.
     done: u64,
     given_up: LaneGivenUp,
 }
@@ -90,8 +90,9 @@ impl AttachedReader {
         self.carries || self.info.is_relay()
     }
 
-    /// Returns the position below which a carrier has delivered its samples. A carrier that reads for itself and has
-    /// left wants nothing. Samples that a relay leaves are given up only when the daemon reports that.
+    /// Returns the position below which a carrier has delivered its samples or given them up; `None` if a carrier that
+    /// reads for itself has left and so wants nothing. Samples that a relay leaves are given up only when the daemon
+    /// reports that.
     pub(super) fn delivered(&mut self, head: u64) -> Option<u64> {
         match &self.info.stands_for {
             Some(_) => Some(self.done_with(head)),
@@ -99,8 +100,8 @@ impl AttachedReader {
         }
     }
 
-    /// Returns the position up to which a relay has delivered its samples. A relay that has left stays at the position
-    /// last seen, until the daemon reports that it ended, or what it gave up.
+    /// Returns the position up to which a relay has delivered its samples or given them up. A relay that has left stays
+    /// at the position last seen, until the daemon reports that it ended, or what it gave up.
     fn done_with(&mut self, head: u64) -> u64 {
         let position = self.position().filter(|position| *position < u64::MAX);
         // The cursor is read first: the samples that were given up below it are then counted with it.

@@ -162,7 +162,8 @@ impl Writer {
     pub(super) fn pass(&self, state: &mut WriterState, numbering: Numbering) -> Meta {
         let meta = state.numbers.number(numbering);
         self.header.show_published(state.numbers.count());
-        // Reclaims here: no later sample would trigger it for the memory of earlier ones.
+        // Frees the memory of given-up samples here: a sample that no reader reads needs no memory, so no search for
+        // memory frees theirs.
         self.reclaim(state);
         meta
     }

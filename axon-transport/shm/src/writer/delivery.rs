@@ -17,8 +17,8 @@ impl Writer {
         state.number_before(position)
     }
 
-    /// Waits until the carriers have delivered all samples published so far. Returns whether none of them was given up.
-    /// Samples that were given up make it false once.
+    /// Waits for at most `timeout` until the carriers have delivered or given up all samples published so far. Returns
+    /// false if the time is over, and once after samples were given up.
     pub fn wait_handed_over(&self, timeout: Duration) -> bool {
         if self.is_forked() {
             return true;
@@ -81,7 +81,7 @@ impl Writer {
         untaken_grants.map(|(gid, grant)| (gid, grant, state.number_before(grant.first))).collect()
     }
 
-    /// Returns the number of samples that the carriers have not delivered.
+    /// Returns the number of samples that the carriers have neither delivered nor given up.
     pub fn under_way(&self) -> u64 {
         if self.is_forked() {
             return 0;

@@ -33,7 +33,8 @@ pub(crate) enum Dropped {
 }
 
 impl Dropped {
-    /// Returns how a failed publish counts. A caller that gave it no time retries, so nothing is dropped yet.
+    /// Returns how a publish that failed with `error` counts. `deadline` is the time that it had: if that is zero, a
+    /// blocked publish does not count, because its caller tries again.
     pub(super) fn by(error: &PublishError, deadline: Duration) -> Option<Self> {
         match error {
             PublishError::Blocked { .. } if !deadline.is_zero() => Some(Self::Blocked),

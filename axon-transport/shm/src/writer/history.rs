@@ -171,8 +171,8 @@ impl SampleHistory {
         Ok(true)
     }
 
-    /// Returns whether giving up samples to keep the budget would still leave no memory for a sample of `len` bytes.
-    /// This is slow if samples differ in length.
+    /// Returns whether a sample of `len` bytes needs more memory in any case: the budget requires that samples are
+    /// given up for it, and the existing memory has no slot for it even then. This is slow if samples differ in length.
     pub(crate) fn is_short_of(&self, len: u64) -> bool {
         let alike = match self.extents[index(&self.extents, self.tail)] {
             SampleStorage::Slot { len: oldest, .. } => {

@@ -32,7 +32,7 @@ impl WriterNumbers {
         self.last
     }
 
-    /// Refuses a number from another host that would make readers count impossible losses.
+    /// Refuses a number from another process or host that would make readers count impossible losses.
     pub(super) fn judge(&self, numbering: Numbering) -> Result<(), PublishError> {
         let Numbering::Given(Meta { sequence, .. }) = numbering else { return Ok(()) };
         let last = self.last;

@@ -119,8 +119,8 @@ impl Writer {
     }
 
     /// Gives memory of large samples back that is not needed any more: all of it if there was no such sample for ten
-    /// seconds and none is wanted, or else the part far above the need of the last ten seconds. To be called about once
-    /// a second while it returns true, which means that there is such memory.
+    /// seconds and none is wanted, or else the part far above the need of the last ten seconds. Returns whether
+    /// memory of large samples is left. To be called about once a second while it returns true.
     pub fn reclaim_idle(&self, now: Instant) -> bool {
         if self.is_forked() {
             return false;
@@ -292,7 +292,8 @@ impl Writer {
         }
     }
 
-    /// Returns the lent place, after backing it with memory.
+    /// Backs the lent place with memory, and returns it. Returns `None`, and withdraws the loan, if memory has to be
+    /// added and must not `grow`.
     fn settled(
         &self,
         state: &mut WriterState,

@@ -1,8 +1,8 @@
 //! Remote endpoints that the graph does not show yet. An endpoint appears once its pairs with the session's own
 //! endpoints are attached, so that a counted endpoint can be reached.
 //!
-//! Plain data. An endpoint is delayed for [`ARRIVAL_TIMEOUT`] at most: a stopped process must not hide endpoints from other
-//! processes.
+//! Plain data. An endpoint is delayed for [`ARRIVAL_TIMEOUT`] at most: a stopped process must not hide endpoints from
+//! other processes.
 
 use std::{
     collections::{BTreeSet, HashMap},

@@ -40,7 +40,7 @@ impl Listening {
         let mut state = self.lock();
         let new = state.lead(segment)?;
         state.callbacks += 1;
-        // Wakes a thread that is asleep already and has armed no ticket since the last one was used up.
+        // Arms a ticket for a control thread that is asleep already and has armed none since the last one was used up.
         state.arm();
         Ok(new)
     }

@@ -148,8 +148,8 @@ fn is_trusted(path: &Path) -> bool {
     })
 }
 
-/// Returns the folders in which a daemon's program is searched, in this order: beside this program, beside the library
-/// that contains this code, in `PATH`, and where cargo installs programs. `variable` reads the environment.
+/// Returns the folders in which a daemon's program is looked for, in this order: beside this program, beside the
+/// library that contains this code, in `PATH`, and where cargo installs programs. `variable` reads the environment.
 fn folders(variable: impl Fn(&str) -> Option<OsString>) -> Vec<PathBuf> {
     let beside = [std::env::current_exe().ok(), own_file()].into_iter().flatten();
     let beside = beside.filter_map(|file| Some(file.parent()?.to_path_buf()));

@@ -76,9 +76,9 @@ impl Callback {
     }
 
     /// Replaces the function and reports the unreported events to it at once, unless this callback has
-    /// [ended](Self::end). Once this returns, the previous function is not called any more. The exception is a call
-    /// from within the previous function: it goes on, and the calling thread reports to `function` after it has left
-    /// it.
+    /// [ended](Self::end). Once this returns, the previous function is not running and is not called
+    /// any more. Exception: if the previous function itself calls this, its run continues, and its thread reports to
+    /// `function` after that.
     pub(in crate::session) fn set(&self, function: Option<NewDataCallback>) {
         let Ok(()) = self.replace(function, Ok::<_, Infallible>);
     }
@@ -103,7 +103,7 @@ impl Callback {
     }
 
     /// Removes the function for good: a function that is set later is ignored. Once this returns, the function is not
-    /// called any more. The exception is a call from within the function: that call goes on.
+    /// running and is not called any more. Exception: if the function itself calls this, its run continues.
     pub(in crate::session) fn end(&self) {
         self.lock().ended = true;
         drop(self.vacate());

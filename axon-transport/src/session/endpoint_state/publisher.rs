@@ -153,7 +153,8 @@ impl PublisherInner {
 
     /// Returns the number up to which the samples are safe whatever becomes of this process: the carriers to other
     /// processes and hosts have them, and all other readers can read them, since they were sent the memory that the
-    /// samples are in. The session's memory wakes the thread that waits for this.
+    /// samples are in. A thread that waits for this sleeps on the
+    /// session's segment, which wakes it.
     pub(in crate::session) fn delivered_up_to(&self, core: &SessionCore) -> u64 {
         let WriterRings::Shared(writer) = &self.rings else { return 0 };
         let (began, number) = (core.memory.connections(), writer.delivered_up_to());

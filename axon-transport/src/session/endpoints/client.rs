@@ -74,7 +74,7 @@ impl Client {
     ///
     /// # Errors
     /// [`PublishError::Blocked`] after 100 ms if a server does not take its requests and there is no space for more.
-    /// The other variants name the limit that was exceeded.
+    /// The other variants tell why the request was not sent.
     pub fn send_request(&self, payload: &[u8]) -> Result<u64, PublishError> {
         self.ring.publish_next(clock::wall(), payload)
     }

@@ -63,8 +63,8 @@ impl Publisher {
     /// Publishes a sample, stamped with the current time, and returns its sequence number.
     ///
     /// # Errors
-    /// [`PublishError::Blocked`] after 100 ms if a KEEP_ALL reader frees no space. The other variants name the limit
-    /// that was exceeded. A refused sample has no sequence number and does not count as lost.
+    /// [`PublishError::Blocked`] after 100 ms if a KEEP_ALL reader frees no space. The other variants tell why the
+    /// sample was not published. A refused sample has no sequence number and does not count as lost.
     pub fn publish(&self, payload: &[u8]) -> Result<u64, PublishError> {
         self.inner.published(self.writer.publish_next(clock::wall(), payload))
     }
@@ -175,7 +175,8 @@ impl Publisher {
 impl Publisher {
     /// Returns the number up to which the samples are safe whatever becomes of this process: the carriers to other
     /// processes and hosts have them, and all other readers can read them, since they were sent the memory that the
-    /// samples are in. The session's memory wakes the thread that waits for this.
+    /// samples are in. A thread that waits for this sleeps on the
+    /// session's segment, which wakes it.
     pub(crate) fn delivered_up_to(&self) -> u64 {
         self.inner.delivered_up_to(self.session.core())
     }

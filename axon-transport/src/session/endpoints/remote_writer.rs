@@ -123,7 +123,7 @@ impl RemoteWriter {
     /// Writes a sample, a request, or a response to `client`, without waiting for space.
     ///
     /// # Errors
-    /// [`PublishError::Blocked`] if there is no space. The other variants name the limit that was exceeded.
+    /// [`PublishError::Blocked`] if there is no space. The other variants tell why the message was not written.
     pub fn try_write(
         &self,
         client: &Gid,

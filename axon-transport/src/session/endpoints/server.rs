@@ -98,7 +98,7 @@ impl Server {
     ///
     /// # Errors
     /// [`PublishError::Blocked`] after 100 ms if the client does not take its responses and there is no space for more.
-    /// The other variants name the limit that was exceeded.
+    /// The other variants tell why the response was not sent.
     pub fn send_response(
         &self,
         client: Gid,

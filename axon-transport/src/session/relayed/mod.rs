@@ -26,7 +26,8 @@ pub use super::core::ChangeSignal;
 pub const MAX_SESSIONS: usize = 32;
 /// Maximum number of publishers, subscriptions, clients, and servers of a relayed session.
 pub const MAX_ENDPOINTS: usize = 1024;
-/// Maximum number of remote clients that a relayed session's servers answer. A client counts once for each server.
+/// Maximum number of clients outside the process that a relayed session's servers answer. A client counts once for each
+/// server.
 pub const MAX_CALLERS: usize = 1024;
 /// Maximum number of matches of one endpoint that are reported: one packet holds no more.
 pub const MAX_MATCHED: usize = 1024;

@@ -7,7 +7,7 @@ use std::{net::SocketAddr, time::Duration};
 
 use crate::discovery::Datagrams;
 
-/// Number of datagrams that are passed on at once; `A_SECOND` more are each second.
+/// Number of datagrams that are passed on at once; `A_SECOND` more may be in each second.
 const DATAGRAM_BURST: f64 = 32.0;
 const A_SECOND: f64 = 16.0;
 /// Maximum time that other datagrams are held.

@@ -116,10 +116,10 @@ impl Queue {
         }
     }
 
-    /// Returns whether the engine should move samples from the ring into the queue now. A KEEP_LAST flow that is
-    /// behind, or has no bytes left for a sample like its last, leaves them in the ring, where newer samples replace
-    /// them without a copy. A flow that is behind and holds more of a burst than its depth drops the surplus for new
-    /// samples.
+    /// Returns whether the engine should move samples from the ring into the queue now. A KEEP_LAST flow with
+    /// waiting samples leaves new ones in the ring, where newer samples replace them without a copy, if it is behind or
+    /// has no bytes left for a sample like its last. Exception: a flow that is behind and still holds more of a burst
+    /// than its depth takes new samples, and drops the surplus for them.
     pub(super) fn wants_more(&self, now: Duration) -> bool {
         match (self.policy, self.waiting.back()) {
             (Policy::KeepAll | Policy::BestEffort(_), _) | (_, None) => true,

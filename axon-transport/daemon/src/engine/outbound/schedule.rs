@@ -1,7 +1,7 @@
 //! Decides which flow sends next. Plain data: it knows flows by number, and no QUIC types.
 //!
 //! A higher rank goes first: the priority of the topic, and within a priority the class. Within a rank flows take
-//! turns. [`turns`](super::turns) keeps a rank from starving.
+//! turns. [`starvation`](super::flow_scheduler) keeps a rank from starving.
 
 use std::collections::VecDeque;
 

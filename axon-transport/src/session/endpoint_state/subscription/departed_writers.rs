@@ -4,8 +4,8 @@ use std::collections::HashMap;
 
 use crate::ids::Gid;
 
-/// Minimum number of departed writers that are remembered; the maximum is twice as many.
-pub(super) const MAX_DEPARTED_WRITERS: usize = 2048;
+/// Number of departed writers that are always remembered; there may be up to twice as many.
+pub(super) const REMEMBERED_WRITERS: usize = 2048;
 
 /// The last sequence number taken of each writer that is gone, so that samples which a returning writer sends again are
 /// not taken twice. A remote writer comes back with its link, a client with the next daemon. The writers that left
@@ -19,7 +19,7 @@ pub(super) struct DepartedWriters {
 impl DepartedWriters {
     /// Remembers the last number of a writer that is gone.
     pub(super) fn add(&mut self, writer: Gid, last: u64) {
-        if self.newer.len() >= MAX_DEPARTED_WRITERS {
+        if self.newer.len() >= REMEMBERED_WRITERS {
             self.older = std::mem::take(&mut self.newer);
         }
         self.newer.insert(writer, last);
@@ -46,15 +46,15 @@ mod tests {
         let gid = |number: u64| Gid((u128::from(number)).to_be_bytes());
         let mut remembered = DepartedWriters::default();
         remembered.add(gid(0), 1);
-        (1..5 * MAX_DEPARTED_WRITERS as u64).for_each(|number| remembered.add(gid(number), number));
-        assert!(remembered.newer.len() + remembered.older.len() <= 2 * MAX_DEPARTED_WRITERS);
-        let newest = 5 * MAX_DEPARTED_WRITERS as u64 - 1;
-        for number in newest - MAX_DEPARTED_WRITERS as u64 + 1..=newest {
+        (1..5 * REMEMBERED_WRITERS as u64).for_each(|number| remembered.add(gid(number), number));
+        assert!(remembered.newer.len() + remembered.older.len() <= 2 * REMEMBERED_WRITERS);
+        let newest = 5 * REMEMBERED_WRITERS as u64 - 1;
+        for number in newest - REMEMBERED_WRITERS as u64 + 1..=newest {
             assert_eq!(remembered.get(&gid(number)), Some(number));
         }
         assert_eq!(remembered.get(&gid(0)), None);
         // A writer that is in both maps.
-        let twice = newest - MAX_DEPARTED_WRITERS as u64 + 1;
+        let twice = newest - REMEMBERED_WRITERS as u64 + 1;
         remembered.add(gid(twice), 7);
         (0..10).for_each(|number| remembered.add(gid(1 << 40 | number), number));
         assert_eq!(remembered.get(&gid(twice)), Some(7));

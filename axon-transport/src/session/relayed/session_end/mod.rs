@@ -145,10 +145,10 @@ struct RelayConnection<'a> {
     /// Clients whose requests wait until the daemon has matched them with all servers that they count, each with the
     /// end of the wait.
     settling: HashMap<Gid, Instant>,
-    /// The remote clients that each of its servers may answer, as reported to the daemon.
+    /// The clients outside this process that each of its servers may answer, as reported to the daemon.
     callers: BTreeMap<Gid, BTreeSet<Gid>>,
     alive: Alive,
-    /// The remote endpoints, each with its daemon.
+    /// The endpoints outside this process, each with its daemon.
     world: HashMap<Gid, (DaemonId, Endpoint)>,
 }
 
