@@ -360,11 +360,6 @@ impl ReaderSet {
         self.readers.iter().filter(|reader| !reader.dead && reader.is_carrier())
     }
 
-    /// Returns whether a carrier has not taken the sample at `tail`.
-    pub(crate) fn has_carrier_behind(&self, tail: u64) -> bool {
-        self.carriers().filter_map(AttachedReader::position).any(|position| position <= tail)
-    }
-
     /// Returns whether samples are kept for a carrier whose process has ended.
     pub(crate) fn has_absent(&self) -> bool {
         !self.absent.is_empty()

@@ -120,11 +120,11 @@ impl Writer {
             let mut short = None;
             if surplus == 0 || state.history.capacity() < wanted {
                 // A publish that waits for readers leaves them the time to map missing memory. A publisher that keeps
-                // samples for later readers does not give them up because one reader lacks the memory. And no sample
-                // that another host wants is lost: the daemon is about to map the memory.
+                // samples for later readers does not give them up because one reader lacks the memory. And a reader
+                // that has not taken the oldest sample gets it late rather than never, once it maps the memory.
                 let now = floors.held < u64::MAX
                     || state.reader_set.keeps_all()
-                    || (surplus == 0 && state.reader_set.has_carrier_behind(state.history.tail()));
+                    || (surplus == 0 && state.consumed() <= state.history.tail());
                 let need = if now { Need::Now } else { Need::Mapped };
                 short = self.grow(state, need).err().map(no_memory);
             }
