@@ -60,7 +60,7 @@ pub(crate) fn draw(root: &Path) -> Result<String, String> {
 
 fn picture(root: &Path) -> Result<String, String> {
     let mut panels = vec![crates(root)?];
-    for house in floors::of_page(root)? {
+    for house in floors::of_page(root)?.into_iter().filter(House::is_crate) {
         panels.push(rooms(root, &house)?);
     }
     Ok(svg(&panels))

@@ -4,7 +4,6 @@ use std::{fmt, path::PathBuf};
 
 use axon_shm::{ShmError, internal::OwnLimit};
 
-use super::daemon::address::AddressError;
 #[cfg(feature = "sros2")]
 use crate::sros2::{Denial, PermissionsError};
 use crate::{config::ConfigError, ids::SessionId, wire::session::CodecError};
@@ -215,9 +214,9 @@ pub enum SessionError {
     /// A setting or a file that it names.
     #[error(transparent)]
     Config(#[from] ConfigError),
-    /// The daemon's address.
-    #[error(transparent)]
-    Address(#[from] AddressError),
+    /// The address of the daemon cannot be used: what is wrong with it, and where.
+    #[error("{0}")]
+    Address(String),
     /// Shared memory.
     #[error(transparent)]
     Memory(#[from] ShmError),
@@ -244,8 +243,9 @@ impl From<PermissionsError> for SessionError {
     }
 }
 
-impl From<CodecError> for SessionError {
-    fn from(error: CodecError) -> Self {
+impl SessionError {
+    /// Returns the error for a message that cannot be decoded.
+    pub(in crate::session) fn of_codec(error: CodecError) -> Self {
         Self::Protocol(error.to_string())
     }
 }

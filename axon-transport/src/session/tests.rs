@@ -32,6 +32,7 @@ use rustix::{
 
 use super::{
     daemon::socket::{self, ReceivedMessage, SocketError},
+    endpoints::EndpointFactory,
     *,
 };
 use crate::{
@@ -411,7 +412,7 @@ fn a_daemon_cannot_have_a_session_read_its_own_samples_as_rings_and_lanes() {
         session.create_publisher(EndpointSpec::new("/t", "test/Bytes", latched)).unwrap();
     // Of those that it makes itself, the daemon has no part in the pair.
     let spec = EndpointSpec::new("/t", "test/Bytes", latched);
-    let described = session.describe(spec, EndpointKind::Subscription).unwrap();
+    let described = EndpointFactory(&session).describe(spec, EndpointKind::Subscription).unwrap();
     let subscription = session.adopt_subscription(described);
     let (reader, writer, own) = (subscription.gid(), publisher.gid(), session.id());
     // A sample that looks like the ring.

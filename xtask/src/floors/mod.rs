@@ -5,6 +5,10 @@
 //! its own files; not from above, not from a room beside it, and not from the crate's root, which is the top.
 //! Tests may import what they like.
 //!
+//! A large room has a table of its own: its folders and files are the rooms of that table, and its `mod.rs` is the
+//! root. Imports from outside the large room are judged by the crate's table. The rooms of its first row may import
+//! from its root: they hold methods of the object there.
+//!
 //! Inside a room files may import each other in a circle only where the room is [small](circles).
 
 mod circles;
@@ -34,14 +38,16 @@ const MOST_FILES: usize = 15;
 pub(crate) fn check(root: &Path) -> Result<String, String> {
     let mut lines = Vec::new();
     let mut wrong = Vec::new();
-    for House { folder, floors, crowded } in of_page(root)? {
-        let mut sources = Vec::new();
-        read(&root.join(&folder), &root.join(&folder), &mut sources)?;
-        wrong.extend(judge_crowds(&root.join(&folder), &sources, &crowded));
-        let circles = circles::find(&root.join(&folder), &sources);
-        wrong.extend(circles::judge(&folder, &circles));
-        let imports = imports(sources);
-        wrong.extend(judge(&folder, &floors, &imports));
+    for house in of_page(root)? {
+        let House { folder, floors, crowded } = &house;
+        let sources = sources(root, &house)?;
+        if house.is_crate() {
+            wrong.extend(judge_crowds(&root.join(folder), &sources, crowded));
+            let circles = circles::find(&root.join(folder), &sources);
+            wrong.extend(circles::judge(folder, &circles));
+        }
+        let imports = imports(sources, &house.module());
+        wrong.extend(judge(&house, &imports));
         lines.push(format!(
             "{folder}: {} imports between {} rooms run down",
             imports.len(),
@@ -54,9 +60,9 @@ pub(crate) fn check(root: &Path) -> Result<String, String> {
 /// The floor of each room, 0 the highest.
 type Floors = BTreeMap<String, usize>;
 
-/// What the page says of a crate.
+/// What the page says of a crate, or of a large room.
 pub(crate) struct House {
-    /// Of its sources.
+    /// The folder of its sources: a crate's `src`, or a folder in one.
     pub(crate) folder: String,
     /// The rooms in the first column of the table.
     pub(crate) floors: Floors,
@@ -64,7 +70,36 @@ pub(crate) struct House {
     crowded: BTreeSet<PathBuf>,
 }
 
-/// The crates of which the page has a table.
+impl House {
+    /// Returns the folder of the crate's sources, and the path of the large room in it.
+    fn parts(&self) -> (&str, &str) {
+        const SOURCES: &str = "src";
+        match self.folder.split_once("src/") {
+            Some((before, room)) => (&self.folder[..before.len() + SOURCES.len()], room),
+            None => (&self.folder, ""),
+        }
+    }
+
+    /// Returns whether this is a crate, and not a large room of one.
+    pub(crate) fn is_crate(&self) -> bool {
+        self.parts().1.is_empty()
+    }
+
+    /// Returns the path of the large room's module from the crate's root, which is empty for a crate.
+    fn module(&self) -> Vec<String> {
+        self.parts().1.split('/').filter(|part| !part.is_empty()).map(str::to_owned).collect()
+    }
+}
+
+/// Reads the sources of the crate to which a table belongs.
+fn sources(root: &Path, house: &House) -> Result<Vec<Source>, String> {
+    let folder = root.join(house.parts().0);
+    let mut sources = Vec::new();
+    read(&folder, &folder, &mut sources)?;
+    Ok(sources)
+}
+
+/// The crates and large rooms of which the page has a table.
 pub(crate) fn of_page(root: &Path) -> Result<Vec<House>, String> {
     let page = root.join("docs/architecture.md");
     let text = fs::read_to_string(&page).map_err(|e| format!("{}: {e}", page.display()))?;
@@ -75,12 +110,10 @@ pub(crate) fn of_page(root: &Path) -> Result<Vec<House>, String> {
     Ok(houses)
 }
 
-/// Which rooms of a crate import from which others.
+/// Returns which rooms of a crate, or of a large room, import from which others.
 pub(crate) fn arrows(root: &Path, house: &House) -> Result<BTreeSet<(String, String)>, String> {
-    let folder = root.join(&house.folder);
-    let mut sources = Vec::new();
-    read(&folder, &folder, &mut sources)?;
-    let imports = imports(sources).into_iter().filter(|import| !import.to.is_empty());
+    let imports = imports(sources(root, house)?, &house.module());
+    let imports = imports.into_iter().filter(|import| !import.to.is_empty());
     Ok(imports.map(|import| (import.from, import.to)).collect())
 }
 
@@ -99,6 +132,7 @@ fn houses(page: &str) -> Result<Vec<House>, String> {
         for (floor, row) in rows.skip(2).enumerate() {
             let cell = row.split('|').nth(1).unwrap_or_default();
             for room in cell.split('`').skip(1).step_by(2) {
+                let room = room.trim_end_matches(".rs");
                 if floors.insert(room.to_owned(), floor).is_some() {
                     return Err(format!("{folder}: `{room}` is on two floors"));
                 }
@@ -119,7 +153,9 @@ struct Import {
 }
 
 /// What is wrong with a crate's imports and its table.
-fn judge(folder: &str, floors: &Floors, imports: &BTreeSet<Import>) -> Vec<String> {
+fn judge(house: &House, imports: &BTreeSet<Import>) -> Vec<String> {
+    let House { folder, floors, .. } = house;
+    let may_import_root = |room: &String| !house.is_crate() && floors.get(room) == Some(&0);
     let mut wrong = Vec::new();
     let rooms: BTreeSet<&String> = imports.iter().map(|import| &import.from).collect();
     for room in rooms.iter().filter(|room| !floors.contains_key(**room)) {
@@ -129,6 +165,9 @@ fn judge(folder: &str, floors: &Floors, imports: &BTreeSet<Import>) -> Vec<Strin
         let Import { from, file, to, what } = import;
         let file = file.display();
         if to.is_empty() {
+            if may_import_root(from) {
+                continue;
+            }
             wrong.push(format!("{file}: `{from}` imports {what} from the root, which is above it"));
             continue;
         }
@@ -165,27 +204,27 @@ fn judge_crowds(root: &Path, sources: &[Source], crowded: &BTreeSet<PathBuf>) ->
     unsaid.chain(empty).collect()
 }
 
-/// All imports between rooms, and from the root, of a crate.
-fn imports(sources: Vec<Source>) -> BTreeSet<Import> {
-    let rooms: BTreeSet<String> =
-        sources.iter().filter_map(|s| s.module.first()).cloned().collect();
+/// Returns all imports between the rooms, and from the root, of the module `house`, which is a crate's root if it is
+/// empty.
+fn imports(sources: Vec<Source>, house: &[String]) -> BTreeSet<Import> {
+    let room_of = |path: &[String]| path.strip_prefix(house)?.first().cloned();
+    let rooms: BTreeSet<String> = sources.iter().filter_map(|s| room_of(&s.module)).collect();
     let roots = sources.iter().filter(|source| source.module.is_empty());
     let foreign: BTreeSet<String> = roots.flat_map(|root| root.of_other_crates(&rooms)).collect();
     let tests: Vec<Vec<String>> = sources.iter().flat_map(Source::test_modules).collect();
     let mut found = BTreeSet::new();
     for Source { path, module, file, .. } in sources {
-        let Some(from) = module.first().cloned() else { continue };
+        let Some(from) = room_of(&module) else { continue };
         if tests.iter().any(|test| module.starts_with(test)) {
             continue;
         }
         let mut paths = Paths { module, found: Vec::new() };
         paths.visit_file(&file);
         for what in paths.found {
-            if what.first().is_some_and(|first| foreign.contains(first)) {
+            if !what.starts_with(house) || what.first().is_some_and(|f| foreign.contains(f)) {
                 continue;
             }
-            let to =
-                what.first().filter(|first| rooms.contains(*first)).cloned().unwrap_or_default();
+            let to = room_of(&what).filter(|room| rooms.contains(room)).unwrap_or_default();
             if to != from {
                 let what = format!("crate::{}", what.join("::"));
                 found.insert(Import { from: from.clone(), file: path.clone(), to, what });

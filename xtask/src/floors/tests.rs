@@ -113,3 +113,48 @@ fn a_room_without_a_floor_is_named() {
     let found = wrong(&[("attic.rs", ""), ("roof.rs", "use crate::attic::Box;")]);
     assert!(found.contains("`attic` is on no floor"), "{found}");
 }
+
+/// The same page, with a table of the room `left`.
+fn page_with_large_room() -> String {
+    format!(
+        "{PAGE}\n<!-- floors: src/left -->\n\n| rooms | what |\n| --- | --- |\n| `upper` | |\n| `lower.rs` | |\n"
+    )
+}
+
+#[test]
+fn imports_inside_a_large_room_run_down_by_its_own_table() {
+    let page = page_with_large_room();
+    let good = [
+        ("../docs/architecture.md", page.as_str()),
+        ("left/mod.rs", "mod upper; mod lower; pub use upper::Top;"),
+        ("left/upper/mod.rs", "use crate::{ground::Stone, left::{Top, lower::Deep}};"),
+        ("left/lower.rs", "use crate::ground::Stone;"),
+        ("roof.rs", "use crate::left::Top;"),
+    ];
+    assert_eq!(wrong(&good), "");
+    let cases = [
+        ("use crate::left::upper::Top;", "`lower` imports crate::left::upper::Top from above it"),
+        ("use super::upper::Top;", "`lower` imports crate::left::upper::Top from above it"),
+        ("use super::Top;", "`lower` imports crate::left::Top from the root"),
+        ("use crate::roof::Top;", "`left` imports crate::roof::Top from above it"),
+    ];
+    for (text, said) in cases {
+        let mut files = good;
+        files[3].1 = text;
+        let found = wrong(&files);
+        assert!(found.contains(said) && found.contains("left/lower.rs"), "{text}: {found}");
+    }
+}
+
+#[test]
+fn a_folder_of_a_large_room_without_a_floor_is_named() {
+    let page = page_with_large_room();
+    let files = [
+        ("../docs/architecture.md", page.as_str()),
+        ("left/mod.rs", "mod upper; mod attic;"),
+        ("left/upper.rs", ""),
+        ("left/attic.rs", "use super::upper::Top;"),
+    ];
+    let found = wrong(&files);
+    assert!(found.contains("src/left: `attic` is on no floor"), "{found}");
+}

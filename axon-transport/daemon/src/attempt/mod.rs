@@ -27,11 +27,10 @@ use self::{
 };
 use crate::{
     engine::{
-        inbound::StreamHeader,
         link::opening::OpenedConnection,
         refusal::Refusal,
         rings::RingSample,
-        sample::{frames::Frames, protection::Seal},
+        sample::{frames::Frames, protection::Seal, stream_header::StreamHeader},
     },
     error::GatewayError,
     link::{CloseCode, Elected, GraphUpdate, LinkMessage, Owners, Subscribe},

@@ -118,9 +118,9 @@ pub enum DaemonError {
     /// Another daemon serves this user and domain.
     #[error("another daemon serves {0} already")]
     Taken(String),
-    /// The session socket cannot be used.
+    /// The session socket cannot be used: what is wrong with its address, and where.
     #[error("the session socket: {0}")]
-    Address(#[from] AddressError),
+    Address(String),
     /// The gateway to other hosts did not start.
     #[error("the gateway: {0}")]
     Gateway(String),
@@ -247,7 +247,7 @@ fn start(config: Config, _options: &DaemonOptions) -> Result<Started, DaemonErro
     let (listeners, lock) = match address.bind() {
         Ok(bound) => bound.into_parts(),
         Err(AddressError::Taken) => return Err(DaemonError::Taken(address.to_string())),
-        Err(error) => return Err(error.into()),
+        Err(error) => return Err(DaemonError::Address(error.to_string())),
     };
     let mut config = config;
     if let Some(dir) = &config.runtime_dir

@@ -24,9 +24,11 @@ mod peer_factory;
 pub(crate) mod peer_graph;
 mod peers;
 pub(crate) mod quic;
+pub(crate) mod rank;
 pub(crate) mod refusal;
 mod reports;
 pub(crate) mod rings;
+pub(crate) mod route;
 pub(crate) mod sample;
 #[cfg(test)]
 mod sim;

@@ -124,7 +124,7 @@ impl<'a> Caller<'a> {
             Ok(socket) => socket,
             Err(AddressError::Absent) => return Err(Attempt::Absent),
             Err(AddressError::Busy) => return Err(Attempt::Again),
-            Err(error) => return Err(Attempt::Final(error.into())),
+            Err(error) => return Err(Attempt::Final(SessionError::Address(error.to_string()))),
         };
         let peer = peer_process(&socket).map_err(|_| Attempt::Again)?;
         let own = rustix::process::geteuid().as_raw();
@@ -176,7 +176,7 @@ impl<'a> Caller<'a> {
             range: Some(self.config.range.number()),
             static_peers: Some(self.config.static_peers.clone()),
         });
-        let packet = hello.encode().map_err(SessionError::from)?;
+        let packet = hello.encode().map_err(SessionError::of_codec)?;
         let descriptors = match self.segment {
             Some(segment) => {
                 let d = segment.descriptors().map_err(SessionError::from)?;

@@ -154,7 +154,8 @@ fn ask(
     let silent = || SessionError::Silent { address: address.to_owned() };
     let protocol = |e: SocketError| SessionError::Protocol(e.to_string());
     let deadline = Instant::now() + patience;
-    socket::send(socket, &question.encode()?, &[]).map_err(protocol)?;
+    socket::send(socket, &question.encode().map_err(SessionError::of_codec)?, &[])
+        .map_err(protocol)?;
     let (mut text, mut buffer) = (StatusText::default(), Vec::new());
     loop {
         match socket::receive(socket, &mut buffer) {

@@ -4,6 +4,7 @@
 mod call;
 mod client;
 mod event;
+mod factory;
 mod loan;
 mod messages;
 mod publisher;
@@ -13,6 +14,7 @@ mod service;
 mod subscription;
 mod trusted;
 
+pub(in crate::session) use self::factory::EndpointFactory;
 pub(crate) use self::loan::OwnedLoan;
 pub use self::{
     call::CallError,

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use axon_shm::{Meta, PublishError, Sample, internal::MemoryBudget};
 
-use super::{client::Client, publisher::Publisher, server::Server};
+use super::{client::Client, factory::EndpointFactory, publisher::Publisher, server::Server};
 use crate::{
     graph::{Endpoint, EndpointKind},
     ids::Gid,
@@ -78,14 +78,14 @@ impl RemoteWriter {
         let all = Qos::keep_all();
         Ok(match of.kind {
             EndpointKind::Client => {
-                Self::Client(session.add_client(of, role, all, carries, budget)?)
+                Self::Client(EndpointFactory(session).add_client(of, role, all, carries, budget)?)
             }
             EndpointKind::Server => {
                 // Requests to a stand-in are kept by the relay until they have a response (`relayed::unanswered`).
                 let carries = carries && role == EndpointRole::Application;
-                Self::Server(session.add_server(of, role, all, carries, budget))
+                Self::Server(EndpointFactory(session).add_server(of, role, all, carries, budget))
             }
-            _ => Self::Publisher(session.add_asserted(of, role, budget)?),
+            _ => Self::Publisher(EndpointFactory(session).add_asserted(of, role, budget)?),
         })
     }
 

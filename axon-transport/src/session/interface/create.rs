@@ -8,7 +8,7 @@ use crate::{
     session::{
         core::GuardCondition,
         endpoint_state::SubscriptionInner,
-        endpoints::{Client, Publisher, Server, Subscription},
+        endpoints::{Client, EndpointFactory, Publisher, Server, Subscription},
         error::SessionError,
         handle::Session,
         options::EndpointSpec,
@@ -24,8 +24,8 @@ impl Session {
     /// When the specification is out of bounds or there is no memory.
     pub fn create_publisher(&self, spec: EndpointSpec) -> Result<Publisher, SessionError> {
         let expected_len = spec.expected_len;
-        let endpoint = self.endpoint(spec, EndpointKind::Publisher)?;
-        let publisher = self.add_publisher(endpoint, expected_len)?;
+        let endpoint = EndpointFactory(self).endpoint(spec, EndpointKind::Publisher)?;
+        let publisher = EndpointFactory(self).add_publisher(endpoint, expected_len)?;
         let inner = &publisher.inner;
         self.shared().meet(&inner.endpoint);
         self.shared().await_pairs(&inner.endpoint, |other| inner.events.is_matched(other));
@@ -39,10 +39,10 @@ impl Session {
     /// When the specification is out of bounds.
     pub fn create_subscription(&self, spec: EndpointSpec) -> Result<Subscription, SessionError> {
         let ignores_local = spec.ignore_local;
-        let endpoint = self.endpoint(spec, EndpointKind::Subscription)?;
+        let endpoint = EndpointFactory(self).endpoint(spec, EndpointKind::Subscription)?;
         let mut inner = SubscriptionInner::new(endpoint, EndpointRole::Application, Vec::new());
         inner.ignores_local = ignores_local;
-        let subscription = self.add_reader(inner);
+        let subscription = EndpointFactory(self).add_reader(inner);
         let inner = &subscription.inner;
         self.shared().meet(&inner.endpoint);
         self.shared().await_pairs(&inner.endpoint, |other| inner.events.is_matched(other));
@@ -55,9 +55,15 @@ impl Session {
     /// # Errors
     /// When the specification is out of bounds.
     pub fn create_server(&self, spec: EndpointSpec) -> Result<Server, SessionError> {
-        let endpoint = self.endpoint(spec, EndpointKind::Server)?;
+        let endpoint = EndpointFactory(self).endpoint(spec, EndpointKind::Server)?;
         let reads = unread(&endpoint.qos);
-        let server = self.add_server(endpoint, EndpointRole::Application, reads, false, None);
+        let server = EndpointFactory(self).add_server(
+            endpoint,
+            EndpointRole::Application,
+            reads,
+            false,
+            None,
+        );
         self.shared().meet(server.endpoint());
         server.await_clients();
         Ok(server)
@@ -70,9 +76,15 @@ impl Session {
     /// # Errors
     /// When the specification is out of bounds or there is no memory.
     pub fn create_client(&self, spec: EndpointSpec) -> Result<Client, SessionError> {
-        let endpoint = self.endpoint(spec, EndpointKind::Client)?;
+        let endpoint = EndpointFactory(self).endpoint(spec, EndpointKind::Client)?;
         let reads = unread(&endpoint.qos);
-        let client = self.add_client(endpoint, EndpointRole::Application, reads, false, None)?;
+        let client = EndpointFactory(self).add_client(
+            endpoint,
+            EndpointRole::Application,
+            reads,
+            false,
+            None,
+        )?;
         self.shared().meet(client.endpoint());
         client.await_servers();
         Ok(client)
@@ -94,8 +106,10 @@ impl Session {
             namespace: namespace.to_owned(),
             ..EndpointSpec::new("", "", Qos::default())
         };
-        let described =
-            Endpoint { enclave: enclave.to_owned(), ..self.describe(spec, EndpointKind::Node)? };
+        let described = Endpoint {
+            enclave: enclave.to_owned(),
+            ..EndpointFactory(self).describe(spec, EndpointKind::Node)?
+        };
         if !described.is_sane() {
             return Err(SessionError::Node { name: described.node });
         }
@@ -127,11 +141,11 @@ impl Session {
         stands_for: Vec<Gid>,
         carries: bool,
     ) -> Result<Subscription, SessionError> {
-        let endpoint = self.endpoint(spec, EndpointKind::Subscription)?;
+        let endpoint = EndpointFactory(self).endpoint(spec, EndpointKind::Subscription)?;
         let mut inner = SubscriptionInner::new(endpoint, EndpointRole::Relay, stands_for);
         inner.only = only;
         inner.carries = carries;
-        Ok(self.add_reader(inner))
+        Ok(EndpointFactory(self).add_reader(inner))
     }
 }
 

@@ -22,7 +22,7 @@ use crate::{
         core::Outgoing,
         daemon::connect::Caller,
         endpoint_state::{Lifetime, MessageInfo, SubscriptionInner, TakeLimit},
-        endpoints::{Publisher, Server, Subscription},
+        endpoints::{EndpointFactory, Publisher, Server, Subscription},
         error::SessionError,
         handle::Session,
         options::{EndpointSpec, SessionOptions},
@@ -81,7 +81,7 @@ impl Session {
     pub fn adopt_subscription(&self, endpoint: Endpoint) -> Subscription {
         let mut inner = SubscriptionInner::new(endpoint, EndpointRole::Application, Vec::new());
         inner.carries = inner.keeps_all();
-        self.add_reader(inner)
+        EndpointFactory(self).add_reader(inner)
     }
 
     /// Like [`adopt_subscription`](Self::adopt_subscription), for a node.

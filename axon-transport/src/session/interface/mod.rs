@@ -1,6 +1,5 @@
 //! The interface of a session for applications: one file for each chapter.
 
-mod announce;
 mod create;
 mod hidden;
 mod node;

@@ -20,7 +20,8 @@ use std::{
 use axon_shm::internal::MemoryBudget;
 
 use self::change_turns::ChangeTurns;
-use super::{limits::IdentityLimits, peer::routes::RouteKey};
+use super::limits::IdentityLimits;
+use crate::engine::route::RouteKey;
 use crate::{
     keys::KeyMessage,
     link::{LinkMessage, MAX_INFLATED, is_known, unpacked_length},

@@ -3,7 +3,6 @@
 //! Compression pays while it takes much less time than what it saves: that is judged for each sample by the rate of the
 //! link and by what the compressor did so far. A sample that goes to several peers is compressed once.
 
-pub(crate) mod link_rate;
 #[cfg(test)]
 mod tests;
 
@@ -18,7 +17,7 @@ use axon_envelope::TopicHash;
 use axon_shm::ids::{DaemonId, Gid};
 use bytes::Bytes;
 
-use super::outbound::FlowId;
+use super::rank::FlowId;
 
 /// The level of zstd.
 const LEVEL: i32 = 1;

@@ -16,6 +16,7 @@
 
 mod competition;
 mod growth;
+pub(in crate::engine) mod marks;
 mod path;
 mod silence;
 
@@ -32,10 +33,9 @@ use quinn_proto::{
 
 use competition::{Competition, Outcome, PersistentQueue};
 use growth::{Growth, TRIAL};
+use marks::wrapped;
 use path::Path;
 use silence::UnansweredTime;
-
-use super::quic::marks::wrapped;
 
 /// The wanted queue is half as long as the path, within these bounds.
 const WANTED: (Duration, Duration) = (Duration::from_millis(2), Duration::from_millis(10));

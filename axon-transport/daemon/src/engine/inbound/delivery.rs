@@ -8,9 +8,10 @@ use axon_transport::internal::session::Written;
 
 use super::{
     FULL_RETRY, Inbound, RouteIn, StreamKey,
-    incoming::{IncomingStream, OpenedMessage, StreamHeader, StreamStep},
+    incoming::{IncomingStream, OpenedMessage, StreamStep},
     reading::{StepOutcome, wait},
 };
+use crate::engine::sample::stream_header::StreamHeader;
 use crate::engine::{rings::RingError, sample::dropped::EarlierFate, stand_in::StandIn};
 
 /// Maximum time that a message waits while other rings of its peer have the memory that it needs. The readers of these

@@ -28,7 +28,6 @@ use axon_shm::ids::Gid;
 use axon_transport::internal::log_limit::LogLimit;
 use quinn_proto::{StreamId, VarInt};
 
-pub(crate) use self::incoming::StreamHeader;
 use self::{
     incoming::{IncomingStream, StreamStep},
     limited::RateLimitedStreams,
@@ -41,6 +40,7 @@ use crate::{
         account::{MessageMemory, Meter},
         counters::Counters,
         limits::{Limit, RouteLimit},
+        sample::stream_header::StreamHeader,
         stand_in::StandIn,
     },
     link::{CloseCode, ReceivedUpTo},

@@ -8,8 +8,9 @@ use bytes::Bytes;
 
 use super::{
     ARRIVAL, ENDED, Inbound, LONG_MESSAGE_BYTES, LinkViolation, NO_ROUTE, StreamKey, TURN,
-    incoming::{HEADER, IncomingStream, OpenedMessage, Piece, StreamHeader, StreamStep},
+    incoming::{IncomingStream, OpenedMessage, Piece, StreamStep},
 };
+use crate::engine::sample::stream_header::{HEADER, StreamHeader};
 use crate::{
     engine::{
         account::Charge,

@@ -7,9 +7,10 @@ use bytes::{Buf, Bytes};
 
 use super::{
     ENDED, Inbound, LONG_MESSAGE_BYTES, LinkViolation, RouteIn, StreamKey,
-    incoming::{IncomingStream, OpenedMessage, StreamHeader, StreamStep},
+    incoming::{IncomingStream, OpenedMessage, StreamStep},
     reading::{StepOutcome, malformed, permit_short, refused, told},
 };
+use crate::engine::sample::stream_header::StreamHeader;
 use crate::engine::{
     sample::{
         dropped::EarlierFate,

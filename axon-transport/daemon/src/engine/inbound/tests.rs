@@ -19,9 +19,10 @@ use quinn_proto::{Dir, Side, StreamId};
 
 use super::{
     Inbound, RouteIn,
-    incoming::{IncomingStream, OpenedMessage, StreamHeader, StreamStep},
+    incoming::{IncomingStream, OpenedMessage, StreamStep},
     reading::StepOutcome,
 };
+use crate::engine::sample::stream_header::StreamHeader;
 use crate::{
     engine::{
         account::{Accounts, MessageMemory},

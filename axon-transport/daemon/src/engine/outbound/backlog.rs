@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use axon_transport::status::LinkStatus;
 
-use super::schedule::Class;
+use crate::engine::rank::Class;
 
 /// Bytes and samples that wait for one peer.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

@@ -30,7 +30,6 @@ use quinn_proto::{StreamId, VarInt};
 
 pub(crate) use self::{
     backlog::Backlog,
-    schedule::{Class, FlowId, Priorities, Rank},
     served::{ResponseNumbers, RouteOut},
     source::Source,
     stall::StallCause,
@@ -49,6 +48,7 @@ use self::{
 };
 use super::{
     compression::PeerCompression, congestion::let_probe_through, quic::connection::Carrier,
+    rank::FlowId,
 };
 use crate::{
     engine::{counters::Counters, limits::Limit},

@@ -18,7 +18,7 @@ use super::{
     served::{FlowRoute, ResponseNumbers},
     source::Source,
 };
-use crate::engine::{limits::RouteLimit, peer::routes::RelaySpec, rings::RingReader};
+use crate::engine::{limits::RouteLimit, rings::RingReader, route::RelaySpec};
 
 /// The ring of one publisher, with its one reader. It keeps every sample.
 pub(super) struct ModelRing {

@@ -8,7 +8,7 @@
 
 use std::{collections::HashMap, time::Duration};
 
-use super::schedule::FlowId;
+use crate::engine::rank::FlowId;
 
 /// Minimum distance of PINGs, which otherwise follow each other at half a round trip.
 const MIN_PING_INTERVAL: Duration = Duration::from_millis(3);

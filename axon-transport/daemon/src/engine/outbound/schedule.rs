@@ -5,91 +5,7 @@
 
 use std::collections::VecDeque;
 
-use axon_transport::config::TopicPriority;
-
-/// The number of a flow towards one peer.
-pub(crate) type FlowId = usize;
-
-/// Maximum length of a small sample in bytes.
-pub(super) const SMALL: usize = 4096;
-/// Number of classes; `RANKS` is the number of ranks.
-const CLASSES: usize = 4;
-pub(super) const RANKS: usize = 3 * CLASSES;
-/// Distance of two topic priorities in the priorities of QUIC's streams. It leaves space below each class.
-const PRIORITY: i32 = 8;
-
-/// The class of a flow's next sample. Control messages go before all classes: QUIC itself sends their stream first.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum Class {
-    /// Requests and responses of services and actions.
-    Service,
-    /// A RELIABLE sample of at most 4 KiB.
-    SmallReliable,
-    /// A BEST_EFFORT sample of at most 4 KiB.
-    SmallBestEffort,
-    /// All longer samples.
-    Bulk,
-}
-
-impl Class {
-    /// Returns the class of a flow that sends a sample of this length.
-    pub(super) fn of(service: bool, reliable: bool, length: usize) -> Self {
-        match (service, reliable) {
-            (true, _) => Self::Service,
-            _ if length > SMALL => Self::Bulk,
-            (_, true) => Self::SmallReliable,
-            (_, false) => Self::SmallBestEffort,
-        }
-    }
-}
-
-/// The rank of a sample, which decides the order of sending.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Rank {
-    /// The priority of the topic.
-    pub(crate) priority: TopicPriority,
-    /// The class of the sample.
-    pub(crate) class: Class,
-}
-
-impl Rank {
-    /// Returns the priority of its QUIC streams. QUIC shares the link evenly among streams of the same priority.
-    pub(super) fn of_stream(self) -> i32 {
-        let class = match self.class {
-            Class::Service => 3,
-            Class::SmallReliable => 2,
-            Class::SmallBestEffort => 1,
-            Class::Bulk => 0,
-        };
-        self.priority as i32 * PRIORITY + class
-    }
-
-    /// Returns its place among all ranks; the first to send is at 0.
-    pub(in crate::engine) fn place(self) -> usize {
-        (TopicPriority::High as usize - self.priority as usize) * CLASSES + self.class as usize
-    }
-}
-
-/// The priorities of the routes of a link.
-#[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Priorities([usize; 3]);
-
-impl Priorities {
-    /// Counts a route of this priority.
-    pub(super) fn add(&mut self, priority: TopicPriority) {
-        self.0[priority as usize] += 1;
-    }
-
-    /// Counts a route of this priority less.
-    pub(super) fn remove(&mut self, priority: TopicPriority) {
-        self.0[priority as usize] -= 1;
-    }
-
-    /// Returns how many priorities below this one have routes.
-    pub(crate) fn below(&self, priority: TopicPriority) -> u64 {
-        self.0[..priority as usize].iter().filter(|routes| **routes > 0).count() as u64
-    }
-}
+use crate::engine::rank::{FlowId, RANKS, Rank};
 
 /// The flows that have samples to send. Each is in the queue of the rank under which it was added.
 #[derive(Debug, Default)]
@@ -154,7 +70,10 @@ impl Schedule {
 
 #[cfg(test)]
 mod tests {
+    use axon_transport::config::TopicPriority;
+
     use super::*;
+    use crate::engine::rank::Class;
 
     fn normal(class: Class) -> Rank {
         Rank { priority: TopicPriority::Normal, class }

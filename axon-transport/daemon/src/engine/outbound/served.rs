@@ -11,11 +11,11 @@ use axon_transport::config::TopicPriority;
 
 use super::{
     flow::PeerCredit,
-    schedule::FlowId,
     source::{FlowProgress, Source},
     unfinished::UnfinishedFlows,
 };
 use crate::engine::limits::RouteLimit;
+use crate::engine::rank::FlowId;
 
 /// A route that the peer asked for.
 pub(crate) struct RouteOut {

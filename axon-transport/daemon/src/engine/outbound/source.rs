@@ -9,8 +9,8 @@ use axon_shm::{
 use axon_transport::internal::session::TakeLimit;
 
 use crate::engine::{
-    peer::routes::RelaySpec,
     rings::{RingReader, RingSample},
+    route::RelaySpec,
     sample::protection::call,
     stand_in::StandIn,
 };

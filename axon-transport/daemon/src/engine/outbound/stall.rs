@@ -16,7 +16,7 @@ mod tests;
 
 use std::{collections::HashMap, time::Duration};
 
-use super::schedule::FlowId;
+use crate::engine::rank::FlowId;
 
 /// Time between two checks.
 const CHECK_INTERVAL: Duration = Duration::from_secs(1);

@@ -29,7 +29,8 @@ use super::{
 use crate::{
     engine::{
         inbound::RouteIn,
-        peer::routes::{self, RouteKey, WantedRoute},
+        peer::routes::{self, WantedRoute},
+        route::RouteKey,
         stand_in::NoStandIn,
     },
     link::{LinkMessage, RouteRefused, Unsubscribe},

@@ -7,7 +7,8 @@ use std::{
     time::Duration,
 };
 
-use super::routes::{RelaySpec, RouteKey, served::ServedRoutes};
+use super::routes::served::ServedRoutes;
+use crate::engine::route::{RelaySpec, RouteKey};
 use crate::engine::{
     account::{Charge, Meter},
     outbound::{Outbound, Source, UnfinishedFlows},

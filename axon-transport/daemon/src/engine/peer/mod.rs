@@ -52,8 +52,8 @@ use crate::{
     engine::{
         account::{Account, MAX_STAND_INS},
         counters::Counters,
-        peer::routes::RouteKey,
         peer_graph::{GraphTaken, PeerGraph, owners::Prover},
+        route::RouteKey,
     },
     link::{AccessDecisions, CloseCode, GraphUpdate, LinkClosed, LinkMessage, LivelinessAsserted},
     owner::ChannelBinding,

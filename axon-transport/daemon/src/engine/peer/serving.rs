@@ -18,7 +18,8 @@ use crate::{
         account::Charge,
         limits::RouteLimit,
         outbound::{RouteOut, Source, StallCause, UnfinishedFlows},
-        peer::routes::{MAX_RELAYS_OF_ROUTE, RelaySpec, RouteKey, admit, kind_of, relays},
+        peer::routes::{MAX_RELAYS_OF_ROUTE, admit, kind_of, relays},
+        route::{RelaySpec, RouteKey},
     },
     link::{LinkMessage, RouteSubscriber, Subscribe},
 };

@@ -3,8 +3,8 @@
 
 use std::{collections::HashMap, rc::Rc, time::Duration};
 
-use super::routes::RouteKey;
 use crate::engine::account::{Charge, Meter};
+use crate::engine::route::RouteKey;
 
 /// The longest wait.
 const LONGEST: Duration = Duration::from_secs(320);

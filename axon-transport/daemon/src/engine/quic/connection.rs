@@ -10,12 +10,12 @@ use axon_transport::status::LinkStatus;
 use quinn_proto::{ConnectionHandle, StreamId, Transmit};
 use rustls_pki_types::CertificateDer;
 
-use super::{control_stream::ControlStream, marks::marks_reported};
+use super::{control_stream::ControlStream, link_rate::LinkRate};
 use crate::{
     engine::{
-        compression::link_rate::LinkRate,
+        congestion::marks::marks_reported,
         limits::{Egress, InterfaceLimits},
-        outbound::{Class, FlowId, Priorities, Rank},
+        rank::{Class, FlowId, Priorities, Rank},
         sample::protection::Seal,
     },
     owner::{ChannelBinding, EXPORTER},

@@ -3,7 +3,7 @@
 pub(crate) mod connection;
 pub(crate) mod control_stream;
 pub(crate) mod endpoints;
-pub(super) mod marks;
+pub(crate) mod link_rate;
 pub(crate) mod qlog;
 pub(crate) mod tls_settings;
 pub(crate) mod transport;

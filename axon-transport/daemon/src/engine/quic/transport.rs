@@ -11,8 +11,8 @@ use quinn_proto::{
     crypto::{CryptoError, HmacKey},
 };
 
-use super::marks::EcnCountingFactory;
 use crate::engine::congestion::DelayConfig;
+use crate::engine::congestion::marks::EcnCountingFactory;
 
 /// A link whose peer is silent ends after this. Until then its flows and routes stand, and a successor takes them over.
 const IDLE_TIMEOUT_MS: u32 = 120_000;

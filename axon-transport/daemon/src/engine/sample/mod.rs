@@ -5,3 +5,4 @@ pub(crate) mod frames;
 pub(super) mod numbers;
 pub(crate) mod protection;
 pub(crate) mod short_header;
+pub(crate) mod stream_header;

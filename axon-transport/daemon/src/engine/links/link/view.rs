@@ -11,7 +11,7 @@ use quinn_proto::StreamId;
 use super::{EstablishedPeer, LinkPeer};
 use crate::{
     engine::{
-        account::Account, link::failure::peer_text, outbound::FlowId, quic::connection::Connection,
+        account::Account, link::failure::peer_text, quic::connection::Connection, rank::FlowId,
     },
     owner::ChannelBinding,
 };

@@ -16,8 +16,9 @@ use super::{
 use crate::{
     engine::{
         counters::Counters,
-        outbound::{queue::Queue, schedule::SMALL, source::FlowProgress},
+        outbound::{queue::Queue, source::FlowProgress},
         quic::connection::Carrier,
+        rank::SMALL,
         sample::frames::Frames,
     },
     link::CloseCode,

@@ -13,8 +13,8 @@ use std::{
 
 use crate::{
     engine::{
-        outbound::schedule::{FlowId, RANKS},
         quic::transport::{LINK_WINDOW, STREAM_WINDOW, window_credit},
+        rank::{FlowId, RANKS},
     },
     link::ReceiveLimits,
 };

@@ -7,11 +7,9 @@ use axon_shm::ids::Gid;
 use axon_transport::config::TopicPriority;
 
 use crate::engine::{
-    inbound::StreamHeader,
-    outbound::{
-        schedule::{Class, Rank},
-        served::FlowRoute,
-    },
+    outbound::served::FlowRoute,
+    rank::{Class, Rank},
+    sample::stream_header::StreamHeader,
 };
 
 /// The content and route of a flow, and the formats that the peer reads.

@@ -30,10 +30,10 @@ use super::{
     budget::Budget,
     progress::SentProgress,
     queue::Queue,
-    schedule::{Class, Rank},
     served::FlowRoute,
     source::{FlowProgress, Source},
 };
+use crate::engine::rank::{Class, Rank};
 use crate::engine::{
     compression::PeerCompression, counters::Counters, quic::connection::Carrier, rings::RingSample,
     sample::frames::Frames,

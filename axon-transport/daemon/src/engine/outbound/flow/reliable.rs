@@ -17,13 +17,9 @@ use super::{
 use crate::{
     engine::{
         counters::Counters,
-        outbound::{
-            progress::SentProgress,
-            queue::Queue,
-            schedule::{Rank, SMALL},
-            source::FlowProgress,
-        },
+        outbound::{progress::SentProgress, queue::Queue, source::FlowProgress},
         quic::connection::Carrier,
+        rank::{Rank, SMALL},
         rings::RingSample,
         sample::{frames::Frames, short_header::ShortHeaders},
     },

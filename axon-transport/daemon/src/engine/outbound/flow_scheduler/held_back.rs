@@ -2,7 +2,7 @@
 
 use std::{collections::BTreeSet, time::Duration};
 
-use crate::engine::outbound::{budget::Budget, schedule::FlowId};
+use crate::engine::{outbound::budget::Budget, rank::FlowId};
 
 /// Time after which a flow without a key looks again, unless a key is reported before.
 const KEY_RETRY: Duration = Duration::from_millis(250);

@@ -10,9 +10,10 @@ use self::{held_back::BlockedFlows, starvation::StarvationCredit};
 use super::{
     budget::Budget,
     flow::{CreditQueue, Flow, FlowPause, PeerCredit},
-    schedule::{FlowId, Rank, Schedule},
+    schedule::Schedule,
     table::Flows,
 };
+use crate::engine::rank::{FlowId, Rank};
 
 /// The turn of one flow.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

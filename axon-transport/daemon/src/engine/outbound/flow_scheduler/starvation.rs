@@ -2,7 +2,7 @@
 //! itself would starve all ranks below it. For each eight bytes that a rank sends, each rank that waits below it may
 //! send one as if it had the same rank.
 
-use crate::engine::outbound::schedule::{RANKS, Rank};
+use crate::engine::rank::{RANKS, Rank};
 
 /// Number of bytes of a higher rank for which a waiting rank is lent one byte.
 const SHARE: i64 = 8;
@@ -60,7 +60,7 @@ mod tests {
     use axon_transport::config::TopicPriority;
 
     use super::*;
-    use crate::engine::outbound::schedule::Class;
+    use crate::engine::rank::Class;
 
     const HIGH: Rank = Rank { priority: TopicPriority::High, class: Class::Bulk };
     const SMALL: Rank = Rank { priority: TopicPriority::Normal, class: Class::SmallReliable };

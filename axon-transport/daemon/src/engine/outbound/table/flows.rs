@@ -5,8 +5,9 @@ use std::{collections::BTreeSet, time::Duration};
 use quinn_proto::StreamId;
 
 use crate::engine::{
-    outbound::{flow::Flow, schedule::FlowId},
+    outbound::flow::Flow,
     quic::{connection::Carrier, transport::STREAMS_OPEN},
+    rank::FlowId,
 };
 
 /// Number of flows that one search for idle streams checks: all that have a stream. The peer may acknowledge all of

@@ -11,9 +11,10 @@ pub(super) use self::flows::Flows;
 use self::routes::Routes;
 use super::{
     backlog::Backlog, budget::Budget, drains::DrainedFlow, flow::Flow, progress::SentProgress,
-    schedule::FlowId, served::ServedFlows, source::Source, stall::BusyFlow,
+    served::ServedFlows, source::Source, stall::BusyFlow,
 };
 use crate::engine::counters::Counters;
+use crate::engine::rank::FlowId;
 
 /// The routes and flows of one peer. If a method returns the numbers of flows that are gone, the caller forgets them
 /// before another flow gets one of the numbers.

@@ -4,10 +4,12 @@ use std::collections::HashMap;
 
 use axon_shm::ids::Gid;
 
-use crate::engine::outbound::{
-    schedule::{FlowId, Priorities},
-    served::{FlowRoute, ServedFlows},
-    source::Source,
+use crate::engine::{
+    outbound::{
+        served::{FlowRoute, ServedFlows},
+        source::Source,
+    },
+    rank::{FlowId, Priorities},
 };
 
 /// The routes of one peer. `by_source` contains exactly the sources of the routes.

@@ -10,9 +10,10 @@ use axon_envelope::{Kind, Route};
 use axon_shm::ids::Gid;
 
 use super::{
-    RouteKey, WantedRoute, check_after,
+    WantedRoute, check_after,
     lanes::{self, LocalWriterCounts},
 };
+use crate::engine::route::RouteKey;
 use crate::{
     engine::{
         account::{Charge, Meter},

@@ -8,8 +8,8 @@ use axon_envelope::Kind;
 
 use axon_transport::graph::Endpoint;
 
-use super::RouteKey;
 use crate::engine::account::Charge;
+use crate::engine::route::RouteKey;
 
 /// How many writers of this host there are for each route.
 #[derive(Debug, Default)]

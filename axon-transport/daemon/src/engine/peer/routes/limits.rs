@@ -8,7 +8,7 @@ use axon_transport::{
     config::Config,
 };
 
-use super::RouteKey;
+use crate::engine::route::RouteKey;
 use crate::engine::{account::Account, limits::Limit};
 
 /// The limits that the access rules set for a peer.

@@ -11,7 +11,6 @@ pub(in crate::engine::peer) mod unanswered;
 use std::{
     cmp::Reverse,
     collections::{BTreeMap, BTreeSet},
-    fmt,
     time::Duration,
 };
 
@@ -21,67 +20,19 @@ use axon_shm::{
     qos::{Durability, History, Qos, Reliability},
 };
 use axon_transport::{
-    graph::{Endpoint, EndpointKind},
+    graph::Endpoint,
     internal::graph::{Pairing, RangeToHost, RemoteEndpoint, out_of_range, pairing, reads, writes},
 };
 
-use crate::link::RouteSubscriber;
+use crate::{
+    engine::route::{RelaySpec, RouteKey},
+    link::RouteSubscriber,
+};
 
 /// The shortest time between two checks of pairs that are being attached.
 const CHECK: Duration = Duration::from_millis(5);
 /// The shortest time for each of these pairs, so that thousands of waiting pairs leave time for samples.
 const CHECK_EACH: Duration = Duration::from_micros(4);
-/// What a route carries: samples, requests or responses, of one name and type.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub(crate) struct RouteKey {
-    /// Which of the three.
-    pub(crate) kind: Kind,
-    /// Topic or service name.
-    pub(crate) topic: String,
-    /// Type name.
-    pub(crate) type_name: String,
-}
-
-impl fmt::Display for RouteKey {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let kind = match self.kind {
-            Kind::Topic => "",
-            Kind::Request => " (requests)",
-            Kind::Response => " (responses)",
-        };
-        write!(f, "{}{kind} [{}]", self.topic, self.type_name)
-    }
-}
-
-impl RouteKey {
-    /// The key of what `writer` writes; `None` where it writes nothing.
-    pub(in crate::engine::peer) fn of(writer: &Endpoint) -> Option<Self> {
-        let kind = match writer.kind {
-            EndpointKind::Publisher => Kind::Topic,
-            EndpointKind::Client => Kind::Request,
-            EndpointKind::Server => Kind::Response,
-            EndpointKind::Subscription | EndpointKind::Node => return None,
-        };
-        let (topic, type_name) = (writer.topic.clone(), writer.type_name.clone());
-        Some(Self { kind, topic, type_name })
-    }
-
-    /// Bytes of its names.
-    pub(crate) fn bytes(&self) -> usize {
-        self.topic.len() + self.type_name.len()
-    }
-
-    /// The key of the same service in the other direction; of a topic its own.
-    pub(crate) fn other_way(&self) -> Self {
-        let kind = match self.kind {
-            Kind::Topic => Kind::Topic,
-            Kind::Request => Kind::Response,
-            Kind::Response => Kind::Request,
-        };
-        Self { kind, ..self.clone() }
-    }
-}
-
 /// Returns what a route carries, from the number in a message.
 pub(in crate::engine::peer) fn kind_of(kind: u8) -> Option<Kind> {
     [Kind::Topic, Kind::Request, Kind::Response].into_iter().find(|k| *k as u8 == kind)
@@ -138,31 +89,6 @@ pub(crate) fn wanted<'a>(
 
 /// Relays for one route.
 pub(in crate::engine::peer) const MAX_RELAYS_OF_ROUTE: usize = 16;
-
-/// One relay subscription that the sending side opens for a topic's route.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct RelaySpec {
-    /// What it requests locally.
-    pub(crate) qos: Qos,
-    /// How many samples the deepest of those it stands for wants to wait at most.
-    pub(crate) depth: u32,
-    /// The hash of its type, where the peer's subscriptions know it.
-    pub(crate) type_hash: Vec<u8>,
-    /// The peer's subscriptions that it stands for.
-    pub(crate) stands_for: Vec<Gid>,
-}
-
-impl RelaySpec {
-    /// Whether it is the relay that `other` is, for the same subscriptions or for others.
-    pub(crate) fn is(&self, other: &Self) -> bool {
-        self.qos == other.qos && self.type_hash == other.type_hash
-    }
-
-    /// How what it sends is queued.
-    pub(crate) fn queued(&self) -> Qos {
-        self.qos.with_depth(self.depth)
-    }
-}
 
 /// The relays of a topic's route, those that ask for more first. `hash` gives the hash of a
 /// subscription's type.
@@ -224,8 +150,9 @@ fn class(depth: u32) -> u32 {
 
 #[cfg(test)]
 mod tests {
+    use axon_transport::{config::DiscoveryRange, graph::EndpointKind};
+
     use super::*;
-    use axon_transport::config::DiscoveryRange;
 
     fn endpoint(number: u8, kind: EndpointKind, topic: &str, qos: Qos) -> Endpoint {
         Endpoint::new(Gid([number; 16]), kind, topic, "t").with_qos(qos)

@@ -9,7 +9,8 @@ use std::{
 use axon_envelope::Kind;
 use axon_transport::{graph::EndpointKind, internal::log_limit::LogLimit, status::LinkStatus};
 
-use super::{RouteKey, kind_of};
+use super::kind_of;
+use crate::engine::route::RouteKey;
 use crate::{
     bridge::RefusedRoute,
     engine::{

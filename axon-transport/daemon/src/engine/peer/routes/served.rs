@@ -9,9 +9,10 @@ use axon_envelope::Kind;
 use axon_shm::ids::Gid;
 
 use super::{
-    RouteKey, check_after,
+    check_after,
     lanes::{self, LocalWriterCounts},
 };
+use crate::engine::route::RouteKey;
 use crate::{
     engine::{account::Charge, outbound::Source},
     link::RouteReady,

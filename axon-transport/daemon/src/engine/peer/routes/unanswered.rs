@@ -8,8 +8,9 @@ use std::{
 
 use axon_envelope::Kind;
 
-use super::{RouteKey, WantedRoute, asked::AskedRoutes};
+use super::{WantedRoute, asked::AskedRoutes};
 use crate::engine::outbound::UnfinishedFlows;
+use crate::engine::route::RouteKey;
 
 /// Time between two checks for responses that the peer does not ask for.
 const CHECK_INTERVAL: Duration = Duration::from_secs(1);

@@ -16,11 +16,11 @@ use quinn_proto::VarInt;
 
 use crate::{
     engine::{
-        inbound::StreamHeader,
         rings::RingSample,
         sample::{
             frames::Frames,
             protection::{Seal, call},
+            stream_header::StreamHeader,
         },
         sim::{
             network::Path,

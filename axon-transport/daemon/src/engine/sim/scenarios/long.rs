@@ -8,7 +8,7 @@ use bytes::Bytes;
 
 use super::memory::{gid, raw_publishers};
 use crate::engine::{
-    inbound::StreamHeader,
+    sample::stream_header::StreamHeader,
     sim::{
         network::{Path, Rate},
         tests::{all_cases, millis, secs, setting},

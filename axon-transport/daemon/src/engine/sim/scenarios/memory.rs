@@ -15,7 +15,7 @@ use bytes::Bytes;
 
 use crate::{
     engine::{
-        inbound::StreamHeader,
+        sample::stream_header::StreamHeader,
         sim::{
             network::{Path, Rate},
             rings::FOREIGN,

@@ -16,7 +16,7 @@ use crate::engine::sim::{
     world::{Pair, World},
 };
 use crate::{
-    engine::inbound::StreamHeader,
+    engine::sample::stream_header::StreamHeader,
     link::{CloseCode, Elected, LastSeen, LinkHello, LinkMessage},
     wire::link::samples,
 };

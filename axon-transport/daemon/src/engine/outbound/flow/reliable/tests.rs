@@ -5,7 +5,6 @@ use axon_transport::{MessageInfo, config::TopicPriority};
 
 use super::*;
 use crate::engine::{
-    inbound::StreamHeader,
     outbound::{
         budget::Budget,
         flow::{PeerCredit, UsedCredit},
@@ -13,6 +12,7 @@ use crate::engine::{
         queue::Offered,
     },
     rings::RingSample,
+    sample::stream_header::StreamHeader,
     sim::pair::Pair,
 };
 

@@ -17,7 +17,7 @@ struct EcnCountingController {
 }
 
 /// Makes [`EcnCountingController`] controllers around those of another factory.
-pub(in crate::engine) struct EcnCountingFactory<F>(pub(super) Arc<F>);
+pub(in crate::engine) struct EcnCountingFactory<F>(pub(in crate::engine) Arc<F>);
 
 impl<F: ControllerFactory> ControllerFactory for EcnCountingFactory<F> {
     fn build(self: Arc<Self>, now: Instant, current_mtu: u16) -> Box<dyn Controller> {

@@ -1,4 +1,4 @@
-//! Adds endpoints to a session and announces them to the daemon.
+//! Makes the endpoints of a session and announces them to the daemon.
 
 use std::sync::Arc;
 
@@ -14,7 +14,6 @@ use crate::{
     session::{
         core::Outgoing,
         endpoint_state::{PublisherInner, RingsByClient, SubscriptionInner, WriterRings},
-        endpoints::{Client, Publisher, Server, Subscription},
         error::SessionError,
         handle::Session,
         options::EndpointSpec,
@@ -22,7 +21,13 @@ use crate::{
     wire::session::EndpointRole,
 };
 
-impl Session {
+use super::{Client, Publisher, Server, Subscription};
+
+/// Makes endpoints of one session, for the application, for relays and for the publishers of other hosts.
+pub(in crate::session) struct EndpointFactory<'a>(pub(in crate::session) &'a Session);
+
+impl EndpointFactory<'_> {
+    /// Describes an endpoint that the session may have, with a GID of its own.
     pub(in crate::session) fn endpoint(
         &self,
         spec: EndpointSpec,
@@ -33,7 +38,7 @@ impl Session {
             return Err(SessionError::Endpoint { topic: endpoint.topic });
         }
         #[cfg(feature = "sros2")]
-        self.shared().permit(&endpoint)?;
+        self.0.shared().permit(&endpoint)?;
         Ok(endpoint)
     }
 
@@ -43,13 +48,13 @@ impl Session {
         spec: EndpointSpec,
         kind: EndpointKind,
     ) -> Result<Endpoint, SessionError> {
-        if self.is_forked() {
+        if self.0.is_forked() {
             return Err(ShmError::Forked.into());
         }
-        let number = self.shared().state().endpoints.next_number();
+        let number = self.0.shared().state().endpoints.next_number();
         let EndpointSpec { topic, type_name, type_hash, qos, node, namespace, .. } = spec;
         Ok(Endpoint {
-            gid: Gid::new(self.shared().core.id, number),
+            gid: Gid::new(self.0.shared().core.id, number),
             kind,
             topic,
             type_name,
@@ -93,17 +98,17 @@ impl Session {
         inner: impl FnOnce(Endpoint, WriterRings) -> PublisherInner,
     ) -> Result<Publisher, SessionError> {
         let options = RingOptions { expected, ..self.ring(&endpoint, endpoint.qos) };
-        let writer = Arc::new(Writer::create(self.shared().core.segment.clone(), options)?);
+        let writer = Arc::new(Writer::create(self.0.shared().core.segment.clone(), options)?);
         budget.into_iter().for_each(|budget| writer.share(budget));
         let inner = Arc::new(inner(endpoint, WriterRings::Shared(writer.clone())));
         self.announce(Some(&inner), None);
-        Ok(Publisher { inner, writer, session: self.clone() })
+        Ok(Publisher { inner, writer, session: self.0.clone() })
     }
 
     pub(in crate::session) fn add_reader(&self, inner: SubscriptionInner) -> Subscription {
         let inner = Arc::new(inner);
         self.announce(None, Some(&inner));
-        Subscription { inner, session: self.clone() }
+        Subscription { inner, session: self.0.clone() }
     }
 
     /// Adds a client. `reads` decides how many untaken responses it keeps. With `carries`, it carries the responses to
@@ -117,13 +122,13 @@ impl Session {
         budget: Option<&Arc<MemoryBudget>>,
     ) -> Result<Client, SessionError> {
         let options = self.ring(&endpoint, Qos::keep_all());
-        let segment = self.shared().core.segment.clone();
+        let segment = self.0.shared().core.segment.clone();
         let writer = Arc::new(Writer::create_for_calls(segment, options)?);
         budget.into_iter().for_each(|budget| writer.share(budget));
         let rings = WriterRings::Shared(writer.clone());
         let (requests, responses) = self.add_both(endpoint, role, reads, rings, carries);
         responses.calls.set_ring(writer.clone());
-        Ok(Client::new(requests, responses, writer, self.clone()))
+        Ok(Client::new(requests, responses, writer, self.0.clone()))
     }
 
     /// Adds a server. `reads` decides how many untaken requests it keeps. With `carries`, it carries the requests to
@@ -137,13 +142,13 @@ impl Session {
         budget: Option<&Arc<MemoryBudget>>,
     ) -> Server {
         let options = self.ring(&endpoint, Qos::keep_all());
-        let shared = self.shared();
+        let shared = self.0.shared();
         let (segment, room) = (shared.core.segment.clone(), shared.room.clone());
         let by_client = RingsByClient::new(segment, options, room, budget.cloned());
         let by_client = Arc::new(by_client);
         let rings = WriterRings::Each(by_client.clone());
         let (responses, requests) = self.add_both(endpoint, role, reads, rings, carries);
-        Server::new(responses, requests, by_client, self.clone())
+        Server::new(responses, requests, by_client, self.0.clone())
     }
 
     /// Creates and announces the two sides of an endpoint that writes and reads.
@@ -164,7 +169,7 @@ impl Session {
     }
 
     fn ring(&self, endpoint: &Endpoint, qos: Qos) -> RingOptions {
-        let config = &self.shared().core.config;
+        let config = &self.0.shared().core.config;
         let (budget, max_message) = (config.ring_bytes, config.max_message);
         RingOptions { gid: endpoint.gid, qos, budget, max_message, expected: 0 }
     }
@@ -175,7 +180,7 @@ impl Session {
         writes: Option<&Arc<PublisherInner>>,
         reads: Option<&Arc<SubscriptionInner>>,
     ) {
-        let shared = self.shared();
+        let shared = self.0.shared();
         let mut state = shared.state();
         let (mut endpoint, mut role) = (None, EndpointRole::Application);
         if let Some(inner) = writes {
