@@ -409,6 +409,49 @@ mod tests {
         Cli::command().debug_assert();
     }
 
+    /// Returns the commands of `axon` in the blocks of a page, without their comments.
+    fn commands_of(page: &str) -> Vec<String> {
+        let mut is_block = false;
+        let mut commands = Vec::new();
+        for line in page.lines() {
+            if line.starts_with("```") {
+                is_block = !is_block;
+            } else if is_block && line.starts_with("axon ") {
+                let command = line.split(" #").next().unwrap_or(line);
+                commands.push(command.split(['|', '>', '&']).next().unwrap_or(command).to_owned());
+            }
+        }
+        commands
+    }
+
+    #[test]
+    fn commands_are_found_in_blocks_and_without_comments() {
+        let page = "axon text\n```sh\naxon a FILE --b c   # d\n  axon e\naxon f > g\n```\naxon h\n";
+        assert_eq!(commands_of(page), ["axon a FILE --b c  ", "axon f "]);
+    }
+
+    #[test]
+    #[expect(clippy::print_stderr, reason = "a test that skips prints why")]
+    fn each_command_that_a_page_shows_is_accepted() {
+        let project = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/.."));
+        let mut pages = vec![project.join("axon-cli/README.md"), project.join("README.md")];
+        let Ok(docs) = std::fs::read_dir(project.join("docs")) else {
+            eprintln!("skipped: the pages are not in the package of axon-cli");
+            return;
+        };
+        pages.extend(docs.map(|page| page.unwrap().path()));
+        pages.retain(|page| page.extension().is_some_and(|extension| extension == "md"));
+        let mut accepted = 0;
+        for page in pages {
+            for command in commands_of(&std::fs::read_to_string(&page).unwrap()) {
+                let parsed = Cli::try_parse_from(command.split_whitespace());
+                parsed.unwrap_or_else(|error| panic!("{}: {command}: {error}", page.display()));
+                accepted += 1;
+            }
+        }
+        assert!(accepted >= 20, "{accepted} commands");
+    }
+
     /// The terminal's width decides where a line ends: a break in the text would be one more.
     fn assert_unbroken(command: &clap::Command) {
         let text = command.get_after_help().map(ToString::to_string).unwrap_or_default();

@@ -1,4 +1,5 @@
-//! Registers descriptors with tokio's reactor.
+//! Registers descriptors with tokio's reactor. tokio deprecates the safe constructors of `AsyncFd` as unsound, since a
+//! type may close its descriptor while it is registered. So this file promises what tokio cannot check.
 
 #![allow(unsafe_code)]
 
@@ -9,13 +10,13 @@ use tokio::io::unix::AsyncFd;
 
 /// Has the current runtime watch a descriptor.
 pub(crate) fn watch(fd: impl Into<PassedFd>) -> io::Result<AsyncFd<PassedFd>> {
-    // SAFETY: a `PassedFd` is always the same open descriptor, nobody else closes it, and
+    // SAFETY: a `PassedFd` is always the same open descriptor, no other code closes it, and
     // `AsyncFd` removes it from the reactor before it drops it.
     unsafe { AsyncFd::register(fd.into()) }.map_err(Into::into)
 }
 
-/// The same, for one that others hold as well.
+/// Has the current runtime watch a descriptor that other code holds as well.
 pub(crate) fn watch_shared(fd: &Arc<PassedFd>) -> io::Result<AsyncFd<Arc<PassedFd>>> {
-    // SAFETY: as above; it is not closed before the last of those that hold it has dropped it.
+    // SAFETY: as above; the descriptor is closed once its last holder has dropped it.
     unsafe { AsyncFd::register(Arc::clone(fd)) }.map_err(Into::into)
 }

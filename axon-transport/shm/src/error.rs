@@ -128,6 +128,7 @@ impl fmt::Display for OwnLimit<'_> {
 }
 
 impl ShmError {
+    /// Returns the error of a system call that failed while it did `what`. For this project's crates.
     #[doc(hidden)]
     pub fn system(what: &'static str) -> impl FnOnce(Errno) -> Self {
         move |errno| Self::System { what, source: errno.into() }

@@ -33,10 +33,10 @@ mod values;
 use daemon_env::DaemonEnv;
 use sources::Given;
 
+pub use crate::access::TopicPattern;
 pub use builder::ConfigBuilder;
 pub use error::ConfigError;
-// What `Config::resolve` reads files through, which the project's tests replace. Not part of the interface.
-pub use crate::access::TopicPattern;
+// `Config::resolve` reads files through these types, and the project's tests replace them. For this project's crates.
 #[doc(hidden)]
 pub use files::{FileFacts, FileKind, Files, OsFiles};
 pub use model::{
@@ -161,7 +161,8 @@ impl Config {
     }
 }
 
-/// The settings of the environment that name files by a relative path, with absolute ones: a daemon leaves its directory.
+/// Returns the settings of the environment that name files by a relative path, with absolute paths: a daemon leaves its
+/// directory. For this project's crates.
 #[doc(hidden)]
 pub fn absolute_paths() -> Vec<(&'static str, Option<OsString>)> {
     let Ok(directory) = std::env::current_dir() else { return Vec::new() };

@@ -66,6 +66,8 @@ impl Config {
     ///
     /// # Errors
     /// A file that cannot be read or used. It never counts as no rules.
+    ///
+    /// For this project's crates.
     #[doc(hidden)]
     pub fn with_rules_of_host(self) -> Result<Self, ConfigError> {
         self.with_rules_of(Path::new(OF_HOST), &OsFiles)

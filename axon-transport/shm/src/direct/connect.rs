@@ -170,8 +170,8 @@ impl Packet {
     }
 }
 
-/// Decodes a packet and encodes it anew; `None` where it is refused. For the fuzz target
-/// `connect_packet`.
+/// Decodes a packet and encodes it anew; `None` where it is refused. For this
+/// project's fuzz target `connect_packet`.
 #[doc(hidden)]
 #[must_use]
 pub fn reencode_packet(bytes: &[u8]) -> Option<Vec<u8>> {

@@ -130,7 +130,8 @@ impl<'a> Loan<'a> {
         self.publish_next(unix_nanos(source_time))
     }
 
-    /// Like [`publish_at`](Self::publish_at), with a source time in nanoseconds since the Unix epoch.
+    /// Like [`publish_at`](Self::publish_at), with a source time in nanoseconds since the Unix epoch. For this
+    /// project's crates.
     #[doc(hidden)]
     #[inline]
     pub fn publish_next(self, source_timestamp: i64) -> Result<u64, PublishError> {
@@ -146,7 +147,7 @@ impl<'a> Loan<'a> {
         self.publish_next(wall())
     }
 
-    /// Like [`publish_next`](Self::publish_next), for its first `len` bytes.
+    /// Like [`publish_next`](Self::publish_next), for its first `len` bytes. For this project's crates.
     #[doc(hidden)]
     #[inline]
     pub fn publish_front(self, len: usize, source_timestamp: i64) -> Result<u64, PublishError> {
