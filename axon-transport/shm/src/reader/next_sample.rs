@@ -58,7 +58,12 @@ impl Reader {
                 // The descriptors will never be found, and so no sample.
                 self.give_all_up().map_err(|what| self.corrupt(what)).map(|()| None)
             }
-            Err(ReadObstacle::Missing(_)) => Ok(None),
+            // The head tells without the descriptors which samples are skipped. A reader that left them at its cursor
+            // would have data and find none, again and again.
+            Err(ReadObstacle::Missing(_)) => match self.count(0) {
+                Err(ReadObstacle::Corrupt(what)) => Err(self.corrupt(what)),
+                _ => Ok(None),
+            },
             Err(ReadObstacle::Corrupt(what)) => Err(self.corrupt(what)),
         }
     }

@@ -193,11 +193,13 @@ fn an_overtaken_reader_counts_right_while_the_ring_grows() {
     assert!(descriptors(&writer) >= 8192);
 }
 
-#[test]
-fn a_ring_does_not_move_to_where_a_reader_that_has_taken_all_cannot_follow() {
+/// Has a publisher with `offered` fill its first segment for a reader that takes each sample at once and cannot follow,
+/// beside one that takes none and has a depth of 1. The ring stays where the first one reads it.
+fn ring_stays_in_its_segment(offered: Qos, wanted: Qos) {
     let (a, b) = (silent_session(), session());
-    let writer = writer(&a, keep_last(1), 64 << 20);
-    let (mut reader, from) = attach_untold(&writer, &a, &b, keep_last(10_000));
+    let writer = writer(&a, offered, 64 << 20);
+    let (mut reader, from) = attach_untold(&writer, &a, &b, wanted);
+    let (idle, _) = attach_untold(&writer, &a, &session(), keep_last(1));
     let start = Instant::now();
     let total = 6000;
     for sequence in 0..total {
@@ -208,6 +210,7 @@ fn a_ring_does_not_move_to_where_a_reader_that_has_taken_all_cannot_follow() {
         // So slow a host lets it move all the same.
         return;
     }
+    assert_eq!(idle.received(), 0);
     assert_eq!(a.segments().len(), 1, "the session has the segment, and the ring does not use it");
     assert!((1024..4096).contains(&descriptors(&writer)));
     hand(&a, 1, &from);
@@ -217,6 +220,51 @@ fn a_ring_does_not_move_to_where_a_reader_that_has_taken_all_cannot_follow() {
         assert_eq!(take(&mut reader), Some(sequence));
     }
     assert_eq!(reader.lost() + reader.skipped(), 0);
+}
+
+#[test]
+fn a_ring_does_not_move_to_where_a_reader_that_has_taken_all_cannot_follow() {
+    ring_stays_in_its_segment(keep_last(1), keep_last(10_000));
+    let latched = |depth| keep_last(depth).with_durability(Durability::TransientLocal);
+    ring_stays_in_its_segment(latched(1), latched(10_000));
+}
+
+#[test]
+fn history_within_the_depth_is_kept_though_a_reader_lacks_the_memory_that_it_moves_to() {
+    let (a, b) = (silent_session(), session());
+    let latched = keep_last(6000).with_durability(Durability::TransientLocal);
+    let writer = writer(&a, latched, 64 << 20);
+    let (mut reader, _from) = attach_untold(&writer, &a, &b, keep_last(10));
+    for sequence in 0..6000 {
+        publish(&writer, sequence, 64);
+        while take(&mut reader).is_some() {}
+    }
+    let mut late = attach(&writer, &a, &a, latched);
+    for sequence in 0..6000 {
+        assert_eq!(take(&mut late), Some(sequence));
+    }
+}
+
+#[test]
+fn a_reader_that_lacks_the_descriptors_sleeps_although_its_depth_is_exceeded() {
+    let (a, b) = (silent_session(), session());
+    let writer = writer(&a, keep_last(1), 64 << 20);
+    let (slow, _) = attach_untold(&writer, &a, &b, keep_last(10_000));
+    let (mut reader, from) = attach_untold(&writer, &a, &session(), keep_last(10));
+    (0..6000).for_each(|sequence| publish(&writer, sequence, 8));
+    assert!(slow.missing().is_none() && reader.has_data());
+    assert_eq!(take(&mut reader), None);
+    assert_eq!(reader.missing(), Some(1));
+    assert!(!reader.has_data(), "a reader that has data and finds none never sleeps");
+    publish(&writer, 6000, 8);
+    assert!(reader.has_data());
+    assert_eq!((take(&mut reader), reader.has_data()), (None, false));
+    hand(&a, 1, &from);
+    assert!(reader.has_data());
+    for sequence in 5991..=6000 {
+        assert_eq!(take(&mut reader), Some(sequence));
+    }
+    assert_eq!((take(&mut reader), reader.skipped(), reader.lost()), (None, 5991, 0));
 }
 
 #[test]

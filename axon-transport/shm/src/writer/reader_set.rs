@@ -348,6 +348,17 @@ impl ReaderSet {
         cursors.chain(absent).min().unwrap_or(head)
     }
 
+    /// Returns whether a reader has not taken the sample at `position` and has it within its depth, or a later reader
+    /// would get it.
+    pub(crate) fn is_wanted(&self, position: u64, head: u64) -> bool {
+        let is_history = self.offered.durability == Durability::TransientLocal
+            && head.saturating_sub(depth(&self.offered)) <= position;
+        let floors = self.readers.iter().filter(|reader| !reader.dead);
+        let floors = floors.filter_map(|reader| reader.floor(head));
+        let absent = self.absent.oldest().map(|(position, _)| position);
+        is_history || floors.chain(absent).any(|floor| floor <= position)
+    }
+
     /// Returns the position below which every carrier has delivered its samples.
     pub(crate) fn delivered_up_to(&mut self, head: u64) -> u64 {
         let carriers = self.readers.iter_mut().filter(|r| !r.dead && r.is_carrier());

@@ -118,13 +118,13 @@ impl Writer {
             let surplus = floors.retained.saturating_sub(state.history.tail());
             let wanted = window.saturating_add((window / 4).max(4));
             let mut short = None;
-            if surplus == 0 || state.history.capacity() < wanted {
+            if self.may_grow(state) && (surplus == 0 || state.history.capacity() < wanted) {
                 // A publish that waits for readers leaves them the time to map missing memory. A publisher that keeps
                 // samples for later readers does not give them up because one reader lacks the memory. And a reader
-                // that has not taken the oldest sample gets it late rather than never, once it maps the memory.
+                // that wants the oldest sample gets it late rather than never, once it maps the memory.
                 let now = floors.held < u64::MAX
                     || state.reader_set.keeps_all()
-                    || (surplus == 0 && state.consumed() <= state.history.tail());
+                    || (surplus == 0 && state.is_oldest_wanted());
                 let need = if now { Need::Now } else { Need::Mapped };
                 short = self.grow(state, need).err().map(no_memory);
             }
@@ -149,16 +149,19 @@ impl Writer {
         Ok(())
     }
 
+    /// Returns whether twice as many descriptors are within the limit of the ring.
+    fn may_grow(&self, state: &WriterState) -> bool {
+        2 * (state.history.capacity() + 1) <= self.limit
+    }
+
     /// Moves to twice as many descriptors, if the required memory is available. If not, the oldest samples go, and the
     /// next publish tries again.
     ///
     /// # Errors
     /// There is no memory for the descriptors.
     fn grow(&self, state: &mut WriterState, need: Need) -> Result<(), ShmError> {
+        debug_assert!(self.may_grow(state));
         let descriptors = 2 * (state.history.capacity() + 1);
-        if descriptors > self.limit {
-            return Ok(());
-        }
         let bytes = descriptors * layout::DESCRIPTOR;
         let more = bytes - state.array.block.len;
         state.holding.take(more)?;

@@ -59,6 +59,11 @@ impl WriterState {
         self.reader_set.consumed(self.history.head())
     }
 
+    /// Returns whether a reader has yet to take the oldest kept sample, or a later reader would get it.
+    pub(super) fn is_oldest_wanted(&self) -> bool {
+        self.reader_set.is_wanted(self.history.tail(), self.history.head())
+    }
+
     /// Returns the number of the last sample in front of a position.
     pub(super) fn number_before(&self, position: u64) -> u64 {
         let stands = position >= self.history.tail() && position < self.history.head();
