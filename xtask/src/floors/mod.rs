@@ -60,7 +60,7 @@ pub(crate) fn check(root: &Path) -> Result<String, String> {
 /// The floor of each room, 0 the highest.
 type Floors = BTreeMap<String, usize>;
 
-/// What the page says of a crate, or of a large room.
+/// A crate, or a large room, as the page describes it.
 pub(crate) struct House {
     /// The folder of its sources: a crate's `src`, or a folder in one.
     pub(crate) folder: String,
@@ -152,7 +152,7 @@ struct Import {
     what: String,
 }
 
-/// What is wrong with a crate's imports and its table.
+/// Returns the faults of a crate's imports and of its table.
 fn judge(house: &House, imports: &BTreeSet<Import>) -> Vec<String> {
     let House { folder, floors, .. } = house;
     let may_import_root = |room: &String| !house.is_crate() && floors.get(room) == Some(&0);

@@ -119,7 +119,7 @@ pub enum DaemonError {
     #[error("another daemon serves {0} already")]
     Taken(String),
     /// The session socket cannot be used: what is wrong with its address, and where.
-    #[error("the session socket: {0}")]
+    #[error("{0}")]
     Address(String),
     /// The gateway to other hosts did not start.
     #[error("the gateway: {0}")]

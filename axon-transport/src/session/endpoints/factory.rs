@@ -111,6 +111,24 @@ impl EndpointFactory<'_> {
         Subscription { inner, session: self.0.clone() }
     }
 
+    /// Creates a relay: a local reader that carries samples to the subscriptions `stands_for` of another process or
+    /// host, of the publisher `only` if there is one. A publisher keeps a sample until a relay that `carries`
+    /// [acknowledges](Subscription::acknowledge_of) it. That holds even where the relay stands for no remote
+    /// subscription.
+    pub(in crate::session) fn create_relay(
+        &self,
+        spec: EndpointSpec,
+        only: Option<Gid>,
+        stands_for: Vec<Gid>,
+        carries: bool,
+    ) -> Result<Subscription, SessionError> {
+        let endpoint = self.endpoint(spec, EndpointKind::Subscription)?;
+        let mut inner = SubscriptionInner::new(endpoint, EndpointRole::Relay, stands_for);
+        inner.only = only;
+        inner.carries = carries;
+        Ok(self.add_reader(inner))
+    }
+
     /// Adds a client. `reads` decides how many untaken responses it keeps. With `carries`, it carries the responses to
     /// another process and confirms their delivery.
     pub(in crate::session) fn add_client(

@@ -3,7 +3,6 @@
 use super::Node;
 use crate::{
     graph::{Endpoint, EndpointKind},
-    ids::Gid,
     qos::Qos,
     session::{
         core::GuardCondition,
@@ -119,33 +118,6 @@ impl Session {
     /// Creates a condition that the program triggers itself, for wait sets of the session.
     pub fn create_guard_condition(&self) -> GuardCondition {
         GuardCondition::new(self.core())
-    }
-
-    /// Creates a relay as [`create_relay`](Self::create_relay) does, for one publisher. A publisher that `waits` keeps
-    /// a sample until the relay [acknowledges](Subscription::acknowledge_of) it. That holds even where the relay stands
-    /// for no remote subscription.
-    pub(crate) fn create_relay_of(
-        &self,
-        publisher: Gid,
-        spec: EndpointSpec,
-        stands_for: Vec<Gid>,
-        waits: bool,
-    ) -> Result<Subscription, SessionError> {
-        self.add_relay(spec, Some(publisher), stands_for, waits)
-    }
-
-    pub(super) fn add_relay(
-        &self,
-        spec: EndpointSpec,
-        only: Option<Gid>,
-        stands_for: Vec<Gid>,
-        carries: bool,
-    ) -> Result<Subscription, SessionError> {
-        let endpoint = EndpointFactory(self).endpoint(spec, EndpointKind::Subscription)?;
-        let mut inner = SubscriptionInner::new(endpoint, EndpointRole::Relay, stands_for);
-        inner.only = only;
-        inner.carries = carries;
-        Ok(EndpointFactory(self).add_reader(inner))
     }
 }
 

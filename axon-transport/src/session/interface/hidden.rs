@@ -107,7 +107,7 @@ impl Session {
         spec: EndpointSpec,
         stands_for: Vec<Gid>,
     ) -> Result<Subscription, SessionError> {
-        self.add_relay(spec, None, stands_for, false)
+        EndpointFactory(self).create_relay(spec, None, stands_for, false)
     }
 
     /// Returns the session's segment, for waiting in other ways.

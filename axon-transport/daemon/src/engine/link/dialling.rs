@@ -1,7 +1,7 @@
-//! Dials a peer: each candidate address in turn, in qkd with one bootstrap key that is dialled again until
-//! the peer's KME has it (`docs/formats.md`, section 2).
+//! Dials a peer: each candidate address in turn. In qkd all attempts use one bootstrap key, which is dialled again
+//! until the peer's KME has it (`docs/formats.md`, section 2).
 //!
-//! The machine has no `handle_timeout`: [`poll_action`](Dialling::poll_action) does what is due.
+//! The machine has no `handle_timeout`: [`poll_action`](Dialling::poll_action) does the work that is due.
 
 use std::{fmt, net::SocketAddr, sync::Arc, time::Duration};
 
@@ -23,34 +23,34 @@ use crate::{
 #[cfg(test)]
 mod tests;
 
-/// Longest wait for a key until the dialler is asked again.
+/// Longest wait for a key before the dialler is asked again.
 const ASK_AGAIN: Duration = Duration::from_secs(1);
-/// A dial whose key needs a longer wait is given up; discovery dials again.
+/// Longest wait for a key. A dial with a longer wait fails; discovery dials again.
 const LONGEST_WAIT: Duration = Duration::from_secs(2);
 
 /// One dial of one peer.
 pub(crate) struct Dialling {
     target: DialTarget,
-    /// The whole dial ends at this time, `limit` after its start.
+    /// The time at which the whole dial ends: `limit` after its start.
     deadline: Duration,
     limit: Duration,
     state: DialPhase,
-    /// Why the dial last waited: logged once.
+    /// Reason of the last wait; each reason is logged once.
     waited_for: String,
 }
 
 enum DialPhase {
-    /// The key of the next attempt has to be chosen, in classic none.
+    /// The dial has to choose the key of the next attempt; in classic there is none.
     Choose,
-    /// No key can be used before this time, or before the dialler has an answer.
+    /// The dial has no usable key before this time, or before the dialler has an answer.
     WaitForKey(Duration),
-    /// The addresses from `next` on are to be tried.
+    /// The dial has to try the addresses from `next` on.
     Try(DialRound),
-    /// A handshake with the address before `next` is under way until this time.
+    /// A handshake with the address before `next` is in flight until this time.
     Connecting(DialRound, Duration),
-    /// That handshake ended.
+    /// The handshake with the address before `next` ended with this outcome.
     Ended(DialRound, HandshakeOutcome),
-    /// The connection is given up: the dial ends with the next poll.
+    /// The connection was discarded: the dial ends with the next poll.
     Ending(Refusal),
     /// The dial ended.
     Over,
@@ -60,7 +60,7 @@ enum DialPhase {
 struct DialRound {
     attempt: Option<Arc<DialKey>>,
     next: usize,
-    /// Why the last address is no connection.
+    /// Error of the last address.
     last: String,
 }
 
@@ -70,17 +70,17 @@ impl DialRound {
     }
 }
 
-/// How a handshake ended.
+/// The outcome of a handshake.
 enum HandshakeOutcome {
     Connected,
     Failed(ConnectionError),
     /// No packet was sent.
     Unreachable(String),
-    /// The TLS settings make no client.
+    /// The TLS settings do not make a valid client.
     Unusable(String),
 }
 
-/// What the owner has to do next.
+/// The owner's next action.
 #[derive(Debug)]
 pub(crate) enum DialAction {
     /// Start a handshake with this address, in qkd under this key.
@@ -90,22 +90,20 @@ pub(crate) enum DialAction {
         /// The PSK, in qkd.
         attempt: Option<Arc<DialKey>>,
     },
-    /// Close the connection of the last [`Connect`](Self::Connect). The dial takes no event of it any
-    /// more.
+    /// Close the connection of the last [`Connect`](Self::Connect). The dial ignores later events of that connection.
     Close {
         /// The application error code.
         code: CloseCode,
         /// The reason for the peer.
         reason: &'static str,
     },
-    /// The handshake of the last [`Connect`](Self::Connect) is complete: the opening begins. The dial is
-    /// over.
+    /// The handshake of the last [`Connect`](Self::Connect) is complete: the opening begins. The dial is over.
     Open,
     /// No address became a connection. The dial is over.
     Failed(Refusal),
 }
 
-/// Ends a handshake that takes too long, as a dropped connection ends.
+/// Ends a handshake that takes too long. The peer sees the same close as for a dropped connection.
 const ABANDON: DialAction = DialAction::Close { code: CloseCode::Goodbye, reason: "" };
 
 impl fmt::Debug for Dialling {
@@ -115,29 +113,29 @@ impl fmt::Debug for Dialling {
 }
 
 impl Dialling {
-    /// Dials `target`, in qkd with the keys of this daemon.
+    /// Starts a dial of `target`, in qkd with the keys of this daemon.
     pub(crate) fn new(now: Duration, target: DialTarget, keyring: Option<&Keyring>) -> Self {
         let limit = dial_limit(keyring.map(|keyring| keyring.config.kme_answer_timeout));
         let (state, waited_for) = (DialPhase::Choose, String::new());
         Self { target, deadline: now + limit, limit, state, waited_for }
     }
 
-    /// The peer that is dialled.
+    /// Returns the peer that is dialled.
     pub(crate) fn target(&self) -> &DialTarget {
         &self.target
     }
 
-    /// The handshake is complete.
+    /// Handles a complete handshake.
     pub(crate) fn handle_connected(&mut self) {
         self.end(HandshakeOutcome::Connected);
     }
 
-    /// The connection ended before its handshake was complete.
+    /// Handles a connection that ended before its handshake was complete.
     pub(crate) fn handle_failed(&mut self, error: &ConnectionError) {
         self.end(HandshakeOutcome::Failed(error.clone()));
     }
 
-    /// No handshake could be started with the address: no local address reaches it, or QUIC refused with
+    /// Handles an address with which no handshake could be started: no local address reaches it, or QUIC refused with
     /// this error.
     pub(crate) fn handle_unreachable(&mut self, error: Option<&ConnectError>) {
         let DialPhase::Connecting(round, _) = &self.state else { return };
@@ -150,31 +148,31 @@ impl Dialling {
         }));
     }
 
-    /// The settings, or the key, make no TLS client.
+    /// Handles settings, or a key, that do not make a valid TLS client.
     pub(crate) fn handle_unusable(&mut self, error: impl fmt::Display) {
         self.end(HandshakeOutcome::Unusable(error.to_string()));
     }
 
-    /// The dialler took an answer of the KME: a dial that waits for a key asks for it again.
+    /// Handles a KME answer that the dialler took: a dial that waits for a key asks for it again.
     pub(crate) fn handle_key(&mut self) {
         if let DialPhase::WaitForKey(_) = self.state {
             self.state = DialPhase::Choose;
         }
     }
 
-    /// When to call [`poll_action`](Self::poll_action) without other cause.
+    /// Returns when to call [`poll_action`](Self::poll_action) without other cause.
     pub(crate) fn poll_timeout(&self) -> Option<Duration> {
         match &self.state {
             DialPhase::Over => None,
             DialPhase::WaitForKey(until) | DialPhase::Connecting(_, until) => {
                 Some((*until).min(self.deadline))
             }
-            // At once.
+            // The action is due at once.
             _ => Some(Duration::ZERO),
         }
     }
 
-    /// What to do next. `keyring` is that of a daemon in qkd.
+    /// Returns the next action, if any. `keyring` is that of a daemon in qkd.
     pub(crate) fn poll_action(
         &mut self,
         now: Duration,
@@ -236,7 +234,7 @@ impl Dialling {
     fn end(&mut self, outcome: HandshakeOutcome) {
         match std::mem::replace(&mut self.state, DialPhase::Over) {
             DialPhase::Connecting(round, _) => self.state = DialPhase::Ended(round, outcome),
-            // An event of a connection that the dial gave up.
+            // An event of a connection that the dial discarded.
             other => self.state = other,
         }
     }
@@ -256,7 +254,7 @@ impl Dialling {
                 Some(DialAction::Failed(Refusal::here(CloseCode::NotAllowed, reason)))
             }
             DialDecision::Wait { until, why } => {
-                // Given up until the next dial: the dialler is in its backoff.
+                // Failed until the next dial: the dialler is in its backoff.
                 if until.is_some_and(|until| until > now + LONGEST_WAIT) {
                     return Some(DialAction::Failed(Refusal::here(CloseCode::KeySupply, why)));
                 }
@@ -275,7 +273,7 @@ impl Dialling {
         }
     }
 
-    /// What follows from the end of a handshake.
+    /// Handles the end of a handshake. Returns the next action, if there is one.
     fn ended(
         &mut self,
         now: Duration,
@@ -304,14 +302,14 @@ impl Dialling {
         }
     }
 
-    /// The address before `next` did not answer.
+    /// Records that the address before `next` did not answer.
     fn silent(&mut self, mut round: DialRound) {
         let address = self.target.addresses[round.next - 1];
         round.last = format!("{address} does not answer");
         self.state = DialPhase::Try(round);
     }
 
-    /// The handshake is complete: in qkd its key is spent.
+    /// Handles a complete handshake: in qkd its key is spent.
     fn connected(
         &mut self,
         now: Duration,
@@ -319,7 +317,7 @@ impl Dialling {
         keyring: Option<&mut Keyring>,
     ) -> DialAction {
         let spent = |(keyring, sae, key_id): (&mut Keyring, &str, &KeyId)| {
-            keyring.dialler().succeeded(now, sae, key_id) == Completion::First
+            keyring.dialler().handle_success(now, sae, key_id) == Completion::First
         };
         if round.attempt.is_none() || self.key(round, keyring).is_some_and(spent) {
             return DialAction::Open;
@@ -329,7 +327,7 @@ impl Dialling {
         DialAction::Close { code, reason }
     }
 
-    /// A round failed: in qkd the key may be dialled again.
+    /// Handles a failed round: in qkd the key may be dialled again.
     fn refused(
         &mut self,
         now: Duration,
@@ -343,17 +341,17 @@ impl Dialling {
         match refusal.alert {
             Some(UNKNOWN_PSK_IDENTITY) => {
                 tracing::debug!(peer = sae, %refusal, "the peer does not have the key yet");
-                keyring.dialler().refused(now, sae, key_id);
+                keyring.dialler().handle_refusal(now, sae, key_id);
             }
             Some(DECRYPT_ERROR) => {
                 tracing::debug!(peer = sae, %refusal, "the peer has another key");
-                if keyring.dialler().mismatched(now, sae, key_id) {
+                if keyring.dialler().handle_mismatch(now, sae, key_id) {
                     let what = format_args!("key_ID {key_id}");
                     warn_disagreement(&keyring.config, sae, &what);
                 }
             }
             _ => {
-                keyring.dialler().silent(now, sae, key_id);
+                keyring.dialler().handle_silence(now, sae, key_id);
                 return Some(DialAction::Failed(refusal));
             }
         }
@@ -361,7 +359,7 @@ impl Dialling {
         None
     }
 
-    /// The key of a round, and the peer that it is for.
+    /// Returns the keyring, the peer's SAE ID and the key of a round.
     fn key<'a>(
         &'a self,
         round: &'a DialRound,

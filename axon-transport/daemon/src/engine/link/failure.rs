@@ -1,4 +1,4 @@
-//! Why a connection does not become a link, and the checks that every link has to pass.
+//! The reasons for which a connection does not become a link, and the checks that every link has to pass.
 
 use std::{net::SocketAddr, time::Duration};
 
@@ -15,41 +15,40 @@ use crate::{
     link::{CloseCode, LinkHello},
 };
 
-/// HELLO must be done in this time.
+/// Timeout of HELLO.
 pub(crate) const HELLO_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// The proof must be done in this time and that of its KME calls: this side's, and three tries of
-/// the peer's.
+/// Timeout of the proof, without the time for its KME calls: one of this side and three tries of the peer.
 const PROOF_TIMEOUT: Duration = Duration::from_secs(3);
 
 const PROOF_CALLS: u32 = 4;
 
-/// How long the proof may take, where a KME call may take as long as `kme_answer`.
+/// Returns the timeout of the proof if a KME call may take up to `kme_answer`.
 pub(crate) fn proof_limit(kme_answer: Duration) -> Duration {
     PROOF_TIMEOUT + PROOF_CALLS * kme_answer
 }
 
-/// The bytes of `reason` that fit into a close: at most 300, and no part of a character.
+/// Returns the bytes of `reason` that fit into a close: at most 300, without a partial character.
 pub(crate) fn close_text(reason: &str) -> &[u8] {
     let end = reason.char_indices().map(|(i, c)| i + c.len_utf8()).take_while(|e| *e <= 300).last();
     &reason.as_bytes()[..end.unwrap_or(0)]
 }
 
-/// What went wrong on the way.
+/// A failure before the connection became a link.
 pub(crate) enum LinkFailure {
-    /// This side refuses.
+    /// This side refuses, with this code and reason.
     Ours(CloseCode, String),
-    /// This side refuses, and tells the peer less than its own people.
+    /// This side refuses, and tells the peer less than its own log.
     Quietly { code: CloseCode, told: &'static str, why: String },
-    /// The peer closed, or the connection broke.
+    /// The peer closed the connection, or it broke.
     Connection,
-    /// The control stream said so; the connection may know more.
+    /// The control stream reported this error; the connection may know more.
     Control(ControlError),
 }
 
 impl LinkFailure {
-    /// The refusal for log and status, and the code and text with which this side closes, if it does.
-    /// `ended` is why the connection ended, if it did.
+    /// Returns the refusal for log and status, and the code and text with which this side closes, if it does. `ended`
+    /// is the connection's error, if it ended.
     pub(crate) fn into_refusal(
         self,
         ended: Option<&ConnectionError>,
@@ -80,8 +79,8 @@ impl From<ControlError> for LinkFailure {
     }
 }
 
-/// What the handshake agreed on, checked against the settings once more: a defect in the TLS
-/// configuration must end here and not in a weaker link.
+/// Checks the outcome of the handshake against the settings once more: a defect in the TLS configuration must end here
+/// and not in a weaker link.
 pub(crate) fn agreed(
     config: &Config,
     negotiated: Option<Negotiated>,
@@ -104,7 +103,7 @@ pub(crate) fn agreed(
     Ok(negotiated)
 }
 
-/// Refuses a peer while this host does not know whom to trust; `closed` says why.
+/// Refuses a peer while this host has no readable list of trusted peers. `closed` is the reason.
 pub(crate) fn admits(closed: Option<String>) -> Result<(), LinkFailure> {
     let told = "this host cannot read its list of trusted peers, and refuses every peer; its log says more";
     match closed {
@@ -113,8 +112,8 @@ pub(crate) fn admits(closed: Option<String>) -> Result<(), LinkFailure> {
     }
 }
 
-/// In `ca` a certificate stands for the hosts that it names: the peer must be one of them. In
-/// `pinned` the pin has the peer's name, and what it calls itself counts for nothing.
+/// Checks that a certificate in `ca` names the peer's host. In `pinned` the pin states the peer's name, and the name in
+/// its HELLO is ignored.
 pub(crate) fn names_its_host(
     chain: &[CertificateDer<'_>],
     theirs: &LinkHello,
@@ -129,13 +128,13 @@ pub(crate) fn names_its_host(
     Err(LinkFailure::Ours(CloseCode::NotAllowed, text))
 }
 
-/// The PSK of the handshake was spent before.
+/// Returns the failure of a handshake whose PSK was spent before.
 pub(crate) fn reused() -> LinkFailure {
     let text = "this PSK has completed a handshake before; a KME key is used once";
     LinkFailure::Ours(CloseCode::KeyReused, text.into())
 }
 
-/// Where a peer is, for log and status.
+/// Returns the peer's SAE ID and address for log and status.
 pub(crate) fn peer_text(sae: Option<&str>, address: SocketAddr) -> String {
     sae.map_or_else(|| address.to_string(), |sae| format!("{sae} at {address}"))
 }

@@ -1,10 +1,10 @@
 //! From a completed TLS handshake to a connection that awaits its election: HELLO in both directions and, in
 //! qkd, the proof of the client's name (`docs/formats.md`, sections 2 and 6).
 //!
-//! After each call that changes the machine its owner drains [`poll_message`](Opening::poll_message), then
-//! [`poll_request`](Opening::poll_request), then [`poll_outcome`](Opening::poll_outcome). Key announcements
-//! that the keyring has for the connection go on its control stream before anything that the owner says
-//! because of the outcome: ELECTED must not overtake READY.
+//! After each call that changes the machine, its owner drains [`poll_message`](Opening::poll_message), then
+//! [`poll_request`](Opening::poll_request), then [`poll_outcome`](Opening::poll_outcome). Key announcements that the
+//! keyring has for the connection go on its control stream before any message that the owner sends because of the
+//! outcome: ELECTED must not overtake READY.
 
 use std::{collections::VecDeque, fmt, mem, net::SocketAddr, time::Duration};
 
@@ -33,15 +33,15 @@ mod tests;
 pub(crate) struct Handshake {
     /// This daemon's number for the connection.
     pub(crate) connection: u64,
-    /// Which end this side is.
+    /// The role of this side.
     pub(crate) side: Side,
     /// The peer's address.
     pub(crate) remote: SocketAddr,
-    /// What the two sides agreed on; `None` while the handshake is not complete.
+    /// The agreed parameters; `None` while the handshake is not complete.
     pub(crate) negotiated: Option<Negotiated>,
     /// The TLS exporters of the connection. They are used in qkd alone.
     pub(crate) exporters: Option<Exporters>,
-    /// The certificates that the peer showed, or one raw public key.
+    /// The peer's certificates, or one raw public key.
     pub(crate) chain: Vec<CertificateDer<'static>>,
     /// The SAE that the client dialled, in qkd.
     pub(crate) dialled: Option<String>,
@@ -53,7 +53,7 @@ pub(crate) struct Opening {
     side: Side,
     remote: SocketAddr,
     ours: LinkHello,
-    /// Whether the settings are those of qkd.
+    /// True if the settings are those of qkd.
     qkd: bool,
     /// In `ca`: the certificates that have to name the peer's host.
     chain: Option<Vec<CertificateDer<'static>>>,
@@ -61,53 +61,53 @@ pub(crate) struct Opening {
     exporters: Option<Exporters>,
     order: MessageOrder,
     step: OpeningStep,
-    /// When the step ends at the latest.
+    /// The time at which the step ends at the latest.
     until: Option<Duration>,
-    /// Both HELLOs were checked.
+    /// True if both HELLOs were checked.
     greeted: bool,
-    /// The opening succeeded.
+    /// True if the opening succeeded.
     opened: bool,
     messages: VecDeque<LinkMessage>,
     outcome: Option<Result<OpenedConnection, RefusedConnection>>,
 }
 
 enum OpeningStep {
-    /// Server in qkd: the ledger of used keys is asked about the PSK of this SAE.
+    /// Server in qkd: the ledger of used keys checks the PSK of this SAE.
     Recording(String),
     /// The peer's HELLO is due, in qkd with this SAE.
     Hello(Option<String>),
-    /// The client's name is being proven, and HELLO was this.
+    /// The client's name is being proven. The second field is the peer's HELLO.
     Proof(Box<Proving>, Box<LinkHello>),
     Over,
 }
 
-/// A connection whose peer said HELLO and, in qkd, proved its name.
+/// A connection whose peer sent HELLO and, in qkd, proved its name.
 pub(crate) struct OpenedConnection {
     /// The peer's HELLO.
     pub(crate) hello: LinkHello,
-    /// What the handshake agreed on.
+    /// The agreed parameters of the handshake.
     pub(crate) negotiated: Negotiated,
-    /// Judges the next messages.
+    /// Checks the order of the next messages.
     pub(crate) order: MessageOrder,
     /// The key material of the connection, in messages10. Its receiver is attached to the keyring.
     pub(crate) sealing: Option<Sealing>,
 }
 
-/// What [`Keyring::attach_sender`] takes once the connection is elected.
+/// The key material that [`Keyring::attach_sender`] takes once the connection is elected.
 pub(crate) struct Sealing {
-    /// Bind the message keys to this connection.
+    /// Exporters that bind the message keys to this connection.
     pub(crate) exporters: Exporters,
     /// Server: the key that proved the client's name, its first sending key.
     pub(crate) first: Option<(KeyId, KmeKey)>,
 }
 
-/// Why a connection does not become a link. The keyring has let go of it.
+/// The reason for which a connection does not become a link. The keyring has released the connection.
 #[derive(Debug)]
 pub(crate) struct RefusedConnection {
-    /// For log and status.
+    /// The refusal for log and status.
     pub(crate) refusal: Refusal,
-    /// The code and text with which this side closes the connection, if it does. The text may be longer
-    /// than a close takes.
+    /// The code and text with which this side closes the connection, if it does. The text may be longer than a close
+    /// permits.
     pub(crate) close: Option<(CloseCode, String)>,
 }
 
@@ -126,10 +126,10 @@ impl fmt::Debug for Opening {
 }
 
 impl Opening {
-    /// Begins with a connection whose TLS handshake is complete.
+    /// Starts the opening of a connection whose TLS handshake is complete.
     ///
-    /// `ours` is this side's HELLO, `closed` why this host accepts no new peer at present, and `keyring` that
-    /// of a daemon in qkd.
+    /// `ours` is this side's HELLO, `closed` the reason for which this host accepts no new peer at present, and
+    /// `keyring` that of a daemon in qkd.
     pub(crate) fn new(
         now: Duration,
         handshake: Handshake,
@@ -169,8 +169,8 @@ impl Opening {
         opening
     }
 
-    /// Whether the owner may read the next message from the control stream. What the peer sends
-    /// meanwhile waits in the stream.
+    /// Returns whether the owner may read the next message from the control stream. Until then the peer's messages wait
+    /// in the stream.
     pub(crate) fn reads(&self) -> bool {
         match &self.step {
             OpeningStep::Hello(_) => true,
@@ -179,7 +179,7 @@ impl Opening {
         }
     }
 
-    /// The limits of the next frame.
+    /// Returns the limits of the next frame.
     pub(crate) fn limits(&self) -> FrameLimits {
         match (self.greeted, self.opened) {
             (_, true) => FrameLimits::PROVEN,
@@ -188,8 +188,8 @@ impl Opening {
         }
     }
 
-    /// A message of a known type came. The owner calls it only while [`reads`](Self::reads) allows it: a
-    /// message at another time ends the opening.
+    /// Handles a message of a known type. The owner calls it only while [`reads`](Self::reads) allows it: a message at
+    /// another time ends the opening.
     pub(crate) fn handle_message(
         &mut self,
         now: Duration,
@@ -208,7 +208,7 @@ impl Opening {
         }
     }
 
-    /// The control stream carries bytes that are no frame.
+    /// Handles bytes of the control stream that are no frame.
     pub(crate) fn handle_unreadable(
         &mut self,
         now: Duration,
@@ -218,12 +218,12 @@ impl Opening {
         self.fail(now, ControlError::Frame(error).into(), None, keyring);
     }
 
-    /// The peer ended the control stream; the connection stands.
+    /// Handles the end of the control stream by the peer; the connection is still up.
     pub(crate) fn handle_ended(&mut self, now: Duration, why: &str, keyring: Option<&mut Keyring>) {
         self.fail(now, ControlError::Ended(why.to_owned()).into(), None, keyring);
     }
 
-    /// The connection ended.
+    /// Handles the end of the connection.
     pub(crate) fn handle_lost(
         &mut self,
         now: Duration,
@@ -233,7 +233,7 @@ impl Opening {
         self.fail(now, LinkFailure::Connection, Some(error), keyring);
     }
 
-    /// The KME's answer to a request of this opening.
+    /// Handles the KME's answer to a request of this opening.
     pub(crate) fn handle_answer(
         &mut self,
         now: Duration,
@@ -246,7 +246,7 @@ impl Opening {
         self.advance(now, keyring);
     }
 
-    /// The ledger of used keys recorded the PSK of the handshake; `first` when it was new there.
+    /// Handles the ledger's record of the handshake's PSK; `first` if it was new there.
     pub(crate) fn handle_recorded(
         &mut self,
         now: Duration,
@@ -261,12 +261,12 @@ impl Opening {
         }
     }
 
-    /// The next message for the control stream.
+    /// Returns the next message for the control stream.
     pub(crate) fn poll_message(&mut self) -> Option<LinkMessage> {
         self.messages.pop_front()
     }
 
-    /// The next call to the KME, if any.
+    /// Returns the next call to the KME, if any.
     pub(crate) fn poll_request(&mut self, now: Duration) -> Option<(RequestOrigin, KmeRequest)> {
         match &mut self.step {
             OpeningStep::Proof(proving, _) => proving.poll_request(now),
@@ -274,8 +274,8 @@ impl Opening {
         }
     }
 
-    /// How the opening ended, once. To be polled after each change of the connection's keys
-    /// ([`Keyring::poll_changed`]) as well.
+    /// Returns the outcome of the opening, once. The owner also polls it after each change of the connection's keys
+    /// ([`Keyring::poll_changed`]).
     pub(crate) fn poll_outcome(
         &mut self,
         now: Duration,
@@ -285,7 +285,7 @@ impl Opening {
         self.outcome.take()
     }
 
-    /// When to call [`handle_timeout`](Self::handle_timeout).
+    /// Returns when to call [`handle_timeout`](Self::handle_timeout).
     pub(crate) fn poll_timeout(&self) -> Option<Duration> {
         let proof = match &self.step {
             OpeningStep::Proof(proving, _) => proving.poll_timeout(),
@@ -294,7 +294,7 @@ impl Opening {
         [self.until, proof].into_iter().flatten().min()
     }
 
-    /// Ends a step whose time is over, and asks the KME again where that is due.
+    /// Ends a step whose time is over, and repeats a KME request that is due.
     pub(crate) fn handle_timeout(&mut self, now: Duration, mut keyring: Option<&mut Keyring>) {
         if let OpeningStep::Proof(proving, _) = &mut self.step {
             proving.handle_timeout(now);
@@ -316,7 +316,7 @@ impl Opening {
         self.fail(now, late, None, keyring);
     }
 
-    /// Finds out the peer's SAE by the PSK, in qkd. A server spends the PSK here: the client's Finished was
+    /// Derives the peer's SAE from the PSK, in qkd. A server spends the PSK here, because the client's Finished was
     /// verified.
     fn begin(
         &mut self,
@@ -350,7 +350,7 @@ impl Opening {
         Ok(())
     }
 
-    /// The client says HELLO, and both sides wait for the peer's.
+    /// Sends the client's HELLO. Both sides then wait for the peer's.
     fn greet(&mut self, now: Duration, psk_sae: Option<String>) {
         if self.side == Side::Client {
             self.messages.push_back(LinkMessage::Hello(self.ours.clone()));
@@ -359,7 +359,7 @@ impl Opening {
         self.until = Some(now + HELLO_TIMEOUT);
     }
 
-    /// Takes the message that the step waits for.
+    /// Handles the message that the step waits for.
     fn take(
         &mut self,
         now: Duration,
@@ -386,7 +386,7 @@ impl Opening {
         }
     }
 
-    /// The peer's HELLO is good.
+    /// Handles the peer's valid HELLO.
     fn greeted(
         &mut self,
         now: Duration,
@@ -416,7 +416,7 @@ impl Opening {
         Ok(())
     }
 
-    /// Takes from the proof what it has to say, and its end.
+    /// Takes the proof's messages and its outcome.
     fn advance(&mut self, now: Duration, keyring: Option<&mut Keyring>) {
         let (OpeningStep::Proof(proving, hello), Some(keyring)) = (&mut self.step, keyring) else {
             return;
@@ -437,7 +437,7 @@ impl Opening {
         }
     }
 
-    /// The connection awaits its election.
+    /// Ends the opening with success: the connection awaits its election.
     fn open(&mut self, hello: LinkHello, sealing: Option<Sealing>) {
         self.step = OpeningStep::Over;
         self.until = None;
@@ -448,7 +448,7 @@ impl Opening {
         }
     }
 
-    /// The connection does not become a link. `ended` is why it ended, if it did.
+    /// Ends the opening with a failure. `ended` is the connection's error, if it ended.
     fn fail(
         &mut self,
         now: Duration,
@@ -463,7 +463,7 @@ impl Opening {
         self.outcome = Some(Err(RefusedConnection { refusal, close }));
         self.until = None;
         if let Some(keyring) = keyring {
-            // Before the proof is dropped, which counts at this time.
+            // Before the drop of the proof, which counts as failed at this time.
             keyring.set_time(now);
             keyring.forget_connection(now, self.connection);
         }

@@ -1,4 +1,4 @@
-//! The proof of the client's name, from either end (`docs/formats.md`, section 2).
+//! The proof of the client's name, on either side (`docs/formats.md`, section 2).
 
 use std::{mem, net::IpAddr, time::Duration};
 
@@ -22,28 +22,27 @@ pub(super) struct Proving {
     connection: u64,
     sae: String,
     source: IpAddr,
-    /// How long the proof may take.
+    /// Timeout of the proof.
     limit: Duration,
     role: Role,
 }
 
 enum Role {
-    /// Server: a key was asked for, or announced, and nothing but the right READY counts.
+    /// Server: a key was requested or announced. Only the right READY succeeds.
     Demand(ClientProof, Tried),
     /// Client in `session`.
     Answer(ProofResponder),
-    /// Client in `session` whose key the KME was asked for.
+    /// Client in `session` that requested the key from the KME.
     Fetch(ProofResponder),
     /// Client in messages10: the server's ANNOUNCE is due.
     Announcement,
-    /// Client in messages10: one of these keys has to come from the KME. It is the server's first sending
-    /// key, so the receiver of message keys answers.
+    /// Client in messages10: the KME has to supply one of these keys. It is the server's first sending key, so the
+    /// receiver of message keys answers.
     Hold(Vec<KeyId>),
     Over,
 }
 
-/// A proof that costs a key, and counts against the client unless it succeeds: also if the connection ends
-/// before that.
+/// A proof that costs a key. It counts against the client unless it succeeds, also if the connection ends before.
 struct Tried {
     acceptor: Acceptor,
     source: IpAddr,
@@ -60,7 +59,7 @@ impl Drop for Tried {
 }
 
 impl Proving {
-    /// Server: has the client prove that it is `sae`.
+    /// Starts the proof on the server: the client has to prove that it is `sae`.
     pub(super) fn demand(
         now: Duration,
         connection: u64,
@@ -75,7 +74,7 @@ impl Proving {
         Self::new(connection, source, sae, keyring, role)
     }
 
-    /// Client: answers the ANNOUNCE of the server `sae`.
+    /// Starts the proof on the client, which answers the ANNOUNCE of the server `sae`.
     ///
     /// # Errors
     /// The receiver of message keys cannot be attached, in messages10.
@@ -101,20 +100,20 @@ impl Proving {
         Self { connection, sae: sae.to_owned(), source, limit, role }
     }
 
-    /// How long the proof may take.
+    /// Returns the timeout of the proof.
     pub(super) fn limit(&self) -> Duration {
         self.limit
     }
 
-    /// Whether it takes the next message.
+    /// Returns whether the proof takes the next message.
     pub(super) fn reads(&self) -> bool {
         matches!(self.role, Role::Demand(..) | Role::Answer(_) | Role::Announcement)
     }
 
-    /// A key announcement, in its order.
+    /// Handles a key announcement, in order.
     ///
     /// # Errors
-    /// The peer broke a rule.
+    /// The peer violated the protocol.
     pub(super) fn handle_message(
         &mut self,
         now: Duration,
@@ -156,7 +155,7 @@ impl Proving {
         Ok(())
     }
 
-    /// The KME's answer to one of our requests.
+    /// Handles the KME's answer to one of this side's requests.
     pub(super) fn handle_answer(&mut self, now: Duration, answer: Answer) {
         match &mut self.role {
             Role::Demand(proof, _) => proof.handle_answer(now, answer),
@@ -165,7 +164,7 @@ impl Proving {
         }
     }
 
-    /// The next call to the KME, if any.
+    /// Returns the next call to the KME, if any.
     pub(super) fn poll_request(&mut self, now: Duration) -> Option<(RequestOrigin, KmeRequest)> {
         let connection = self.connection;
         match &mut self.role {
@@ -179,7 +178,7 @@ impl Proving {
         }
     }
 
-    /// The next key announcement for the control stream.
+    /// Returns the next key announcement for the control stream.
     pub(super) fn poll_message(&mut self) -> Option<KeyMessage> {
         match &mut self.role {
             Role::Demand(proof, _) => proof.poll_message(),
@@ -188,7 +187,7 @@ impl Proving {
         }
     }
 
-    /// When to call [`handle_timeout`](Self::handle_timeout) and poll again without other cause.
+    /// Returns when to call [`handle_timeout`](Self::handle_timeout) and poll again without other cause.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         match &self.role {
             Role::Demand(proof, _) => proof.poll_timeout(),
@@ -197,14 +196,14 @@ impl Proving {
         }
     }
 
-    /// Ends a proof whose own time is over.
+    /// Ends a proof that exceeded its own time limit.
     pub(super) fn handle_timeout(&mut self, now: Duration) {
         if let Role::Demand(proof, _) = &mut self.role {
             proof.handle_timeout(now);
         }
     }
 
-    /// How the proof ended, once. The server gets the key that proved the client's name, in messages10 for
+    /// Returns the outcome of the proof, once. The server gets the key that proved the client's name, in messages10 for
     /// its first messages.
     pub(super) fn poll_outcome(
         &mut self,
@@ -216,7 +215,7 @@ impl Proving {
             Role::Demand(proof, tried) => match proof.state() {
                 ProofState::Pending => None,
                 ProofState::Failed(failure) => {
-                    // It cost no key.
+                    // The attempt cost no key.
                     tried.over |= matches!(failure, ProofFailure::NoKey { .. });
                     Some(Err(unproven(&keyring.config, &failure)))
                 }
@@ -241,7 +240,7 @@ impl Proving {
         }
     }
 
-    /// Server: the client is the SAE that it claims to be.
+    /// Handles a successful proof on the server: the client is the SAE that it claims to be.
     fn proven(
         &mut self,
         now: Duration,
@@ -259,7 +258,7 @@ impl Proving {
     }
 }
 
-/// In messages10: the keys of this peer can be received on this connection.
+/// Attaches the receiver of this peer's keys on this connection, in messages10.
 fn attach(
     now: Duration,
     connection: u64,
@@ -271,7 +270,7 @@ fn attach(
     keyring.attach_receiver(now, connection, sae, exporters).map_err(internal)
 }
 
-/// What the peer is told, and what the log says: there is more in it where keys differ.
+/// Returns the failure of a proof. If the keys differ, the log gets more details than the peer.
 fn unproven(config: &QkdConfig, failure: &ProofFailure) -> LinkFailure {
     let code = CloseCode::from_code(failure.code()).unwrap_or(CloseCode::Proof);
     if !matches!(failure, ProofFailure::WrongProof(_)) {

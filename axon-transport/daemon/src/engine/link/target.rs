@@ -6,37 +6,37 @@ use axon_shm::ids::DaemonId;
 
 use crate::{discovery::AddressConfidence, link::LinkHello};
 
-/// One address is given this long to complete the handshake.
+/// Timeout of the handshake with one address.
 pub(crate) const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// A dial, with all its redials, is given up after this, in qkd with two KME calls; discovery backs
-/// off and dials again.
+/// Timeout of a dial with all its redials. In qkd the time of two KME calls is added. Discovery backs off and dials
+/// again.
 const DIAL_TIMEOUT: Duration = Duration::from_secs(20);
 
-/// Alerts of a server that does not have the key (yet), or has another.
+/// Alert of a server that does not have the key (yet). [`DECRYPT_ERROR`] is that of a server that has another key.
 pub(crate) const UNKNOWN_PSK_IDENTITY: u8 = 115;
 
 pub(crate) const DECRYPT_ERROR: u8 = 51;
 
-/// Whom to dial.
+/// The target of a dial.
 #[derive(Clone, Debug)]
 pub(crate) struct DialTarget {
-    /// The daemon expected there, `None` when any will do.
+    /// The daemon expected there; `None` for any daemon.
     pub(crate) daemon: Option<DaemonId>,
-    /// Its SAE ID, in qkd.
+    /// The daemon's SAE ID, in qkd.
     pub(crate) sae: Option<String>,
-    /// Where it may be, best first.
+    /// Addresses where it may be, best first.
     pub(crate) addresses: Vec<SocketAddr>,
-    /// Whether this host lists it as a static peer.
+    /// True if this host lists it as a static peer.
     pub(crate) listed: bool,
-    /// Why it may be there, where discovery says so.
+    /// The confidence in the address, if discovery stated one.
     pub(crate) standing: Option<AddressConfidence>,
     /// The link that the new connection succeeds.
     pub(crate) replaces: Option<[u8; 16]>,
 }
 
 impl DialTarget {
-    /// For log and status.
+    /// Returns the SAE ID and the addresses for log and status.
     pub(crate) fn text(&self) -> String {
         let addresses: Vec<_> = self.addresses.iter().map(ToString::to_string).collect();
         match &self.sae {
@@ -45,7 +45,7 @@ impl DialTarget {
         }
     }
 
-    /// This side's HELLO to it.
+    /// Returns this side's HELLO to it.
     pub(crate) fn hello(&self, ours: &LinkHello) -> LinkHello {
         LinkHello {
             expects: self.daemon,
@@ -56,7 +56,7 @@ impl DialTarget {
     }
 }
 
-/// How long a whole dial may take; in qkd a KME call may take as long as `kme_answer`.
+/// Returns the timeout of a whole dial; in qkd a KME call may take up to `kme_answer`.
 pub(crate) fn dial_limit(kme_answer: Option<Duration>) -> Duration {
     DIAL_TIMEOUT + kme_answer.map(|answer| 2 * answer).unwrap_or_default()
 }

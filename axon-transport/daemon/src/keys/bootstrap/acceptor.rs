@@ -26,42 +26,43 @@ use crate::keys::{
     request::{Answer, FailureKind, Fetched, KeyPurpose, KmeRequest},
 };
 
-/// Unspent PSKs kept for one SAE.
+/// Most unspent PSKs that are kept for one SAE.
 const CACHED: usize = 8;
-/// SAEs with unspent PSKs.
+/// Most SAEs with unspent PSKs.
 const CACHED_SAES: usize = 256;
-/// How long an unspent PSK is kept.
+/// The time for which an unspent PSK is kept.
 const CACHED_FOR: Duration = Duration::from_secs(60);
-/// key_IDs that the KME does not know.
+/// Most remembered keys that the KME does not know.
 const UNKNOWN: usize = 1024;
-/// How long one is not asked for again after it was unknown twice, and remembered at all.
+/// The time for which a key is not requested again after it was unknown twice, and for which an unknown key is
+/// remembered at all.
 const UNKNOWN_FOR: Duration = Duration::from_secs(30);
-/// How long after the first time: KMEs that still relay a key answer as if there were none, and the
-/// dialler gives a key up after ten seconds.
+/// The time for which a key is not requested again after it was unknown once. KMEs that still relay a key answer as if
+/// there were none, and the dialler gives a key up after ten seconds.
 const MISSED_FOR: Duration = Duration::from_secs(1);
-/// Spent keys remembered.
+/// Most remembered spent keys.
 const SPENT: usize = 4096;
-/// Sources, and SAEs, remembered to have authenticated.
+/// Most sources, and most SAEs, that are remembered to have authenticated.
 const KNOWN: usize = 1024;
-/// After this a call counts as lost, answered or not.
+/// The time after which a call counts as lost, answered or not.
 const LOST: Duration = Duration::from_secs(60);
 
-/// What a look-up does about a key that is not at hand.
+/// The action of a look-up for a key that is not at hand.
 #[derive(Clone, Copy)]
 enum CacheMiss {
-    /// Has the KME asked for it, within the limits of its source.
+    /// The KME is asked for the key, within the limits of its source.
     Fetch,
-    /// Nothing.
+    /// No action.
     Leave,
 }
 
-/// What a look-up found, and why nothing more.
+/// The result of a look-up.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Lookup {
     /// The PSK is at hand.
     Found,
-    /// The KME is being asked: the client's next attempt may find it.
+    /// The KME is being asked: the client's next attempt may find the key.
     Fetching,
     /// A handshake under this key was completed before.
     Spent,
@@ -71,11 +72,11 @@ pub enum Lookup {
     NotAPeer,
     /// The identity names this host's own SAE.
     OwnSaeId,
-    /// Not an identity of AXON's form.
+    /// The identity does not have AXON's form.
     Malformed,
-    /// A bound on calls to the KME is reached; which one.
+    /// A limit on calls to the KME is reached; the text names the limit.
     Limited(&'static str),
-    /// The KME could not be asked.
+    /// The last call to the KME for this key failed for this reason. The KME is being asked again.
     KmeFailed(String),
 }
 
@@ -97,10 +98,10 @@ impl fmt::Display for Lookup {
     }
 }
 
-/// The keys under which this host accepts. One for the daemon; clones share it.
+/// The keys with which this host accepts handshakes. The daemon has one acceptor; clones share it.
 ///
-/// Look-ups happen inside the TLS handshake, from whatever thread drives it, so all methods take
-/// `&self` and the time comes from a [`Clock`].
+/// Look-ups happen inside the TLS handshake, on the thread that drives it. So all methods take `&self`, and the time
+/// comes from a [`Clock`].
 #[derive(Clone)]
 pub struct Acceptor(Arc<AcceptorInner>);
 
@@ -116,9 +117,9 @@ struct AcceptorState {
     cached: HashMap<String, VecDeque<Cached>>,
     /// Calls that are queued or in flight.
     pending: Vec<Pending>,
-    /// Unknown to the KME once.
+    /// Identities whose key was unknown to the KME once.
     missed: SeenSet<Fingerprint>,
-    /// Unknown to it again.
+    /// Identities whose key was unknown to the KME again.
     unknown: SeenSet<Fingerprint>,
     /// Keys whose last call failed, with the reason.
     failed: VecDeque<(Fingerprint, String)>,
@@ -151,7 +152,7 @@ struct Pending {
 }
 
 impl Acceptor {
-    /// For the host `sae_id`, which accepts `allowed`.
+    /// Creates the acceptor of the host `sae_id`, which accepts `allowed`.
     pub fn new(sae_id: &str, allowed: QkdPeers, cipher: Cipher, clock: Clock) -> Self {
         Self(Arc::new(AcceptorInner {
             sae_id: sae_id.to_owned(),
@@ -173,19 +174,18 @@ impl Acceptor {
         }))
     }
 
-    /// The resolver for one incoming connection from a validated `source`.
+    /// Returns the resolver for one incoming connection from a validated `source`.
     pub fn resolver(&self, source: IpAddr) -> Arc<Resolver> {
         let acceptor = self.clone();
         Arc::new(Resolver { acceptor, source, last: Mutex::new(None) })
     }
 
-    /// Looks up, and fetches within the same bounds, a key that a probe names ahead of its
-    /// handshake.
+    /// Looks up a key that a probe names before its handshake, and fetches it within the same limits.
     pub fn prefetch(&self, source: IpAddr, identity: &[u8]) -> Lookup {
         self.look_up(source, identity, CacheMiss::Fetch).0
     }
 
-    /// A handshake under `identity` is complete: the key is spent, and erased.
+    /// Handles a complete handshake under `identity`: the key is spent, and erased.
     pub fn spent(&self, identity: &[u8]) -> Completion {
         let now = self.0.clock.now();
         let Ok(parsed) = PskIdentity::parse(identity) else { return Completion::Reused };
@@ -199,7 +199,7 @@ impl Acceptor {
         }
     }
 
-    /// `client_sae` proved its name from `source`: both keep room of their own from now on.
+    /// Records that `client_sae` proved its name from `source`. Both have reserved capacity from now on.
     pub fn authenticated(&self, source: IpAddr, client_sae: &str) {
         let now = self.0.clock.now();
         let mut state = self.state();
@@ -208,14 +208,14 @@ impl Acceptor {
         state.unproven.proven(source.into(), client_sae);
     }
 
-    /// Somebody who claims to be `client_sae` had a key announced and did not prove to hold it.
-    /// Each such try costs a key, so that more of them from this source have to wait.
+    /// Records that a client that claims to be `client_sae` had a key announced and did not prove to hold it. Each such
+    /// attempt costs a key, so repeated attempts from this source have to wait.
     pub fn unproven(&self, source: IpAddr, client_sae: &str) {
         let now = self.0.clock.now();
         self.state().unproven.failed(now, source.into(), client_sae);
     }
 
-    /// The next call to the KME, if any.
+    /// Returns the next call to the KME, if any.
     pub fn poll_request(&self) -> Option<KmeRequest> {
         let mut state = self.state();
         let pending = state.pending.iter_mut().find(|p| !p.asked)?;
@@ -227,7 +227,7 @@ impl Acceptor {
         })
     }
 
-    /// The KME's answer to one of our requests.
+    /// Handles the KME's answer to one of this host's requests.
     pub fn handle_answer(&self, answer: Answer) {
         let now = self.0.clock.now();
         let KmeRequest::Dec { master, key_ids, .. } = answer.request else { return };
@@ -275,12 +275,12 @@ impl Acceptor {
         state.failed.push_back((seen, failure));
     }
 
-    /// Unspent keys at hand, for status.
+    /// Returns the number of unspent keys at hand, for status.
     pub fn cached(&self) -> usize {
         self.state().cached.values().map(VecDeque::len).sum()
     }
 
-    /// Erases what time has ended; to be called about once a second.
+    /// Erases expired keys and entries; to be called about once a second.
     pub fn expire(&self) {
         let now = self.0.clock.now();
         self.state().expire(now);
@@ -295,7 +295,7 @@ impl Acceptor {
         let inner = &*self.0;
         let Ok(parsed) = PskIdentity::parse(identity) else { return (Lookup::Malformed, None) };
         let Ok(key_id) = KeyId::new(parsed.key_id()) else { return (Lookup::Malformed, None) };
-        // One spelling only, or a copy in another spelling would be another key here.
+        // An identity has only one spelling: a copy in another spelling would count as another key here.
         if parsed.to_bytes() != identity {
             return (Lookup::Malformed, None);
         }
@@ -346,7 +346,7 @@ impl Acceptor {
     }
 
     fn state(&self) -> MutexGuard<'_, AcceptorState> {
-        // No operation leaves the state half-changed, so what a panicking thread held is sound.
+        // No operation leaves the state half-changed, so the state is consistent even if a thread panicked.
         self.0.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -358,7 +358,7 @@ impl fmt::Debug for Acceptor {
 }
 
 impl AcceptorState {
-    /// Which bound forbids another call, if one does. Takes a token where none does.
+    /// Returns the limit that forbids another call, if any. Takes a token if no limit forbids it.
     fn limit(
         &mut self,
         now: Duration,
@@ -378,10 +378,10 @@ impl AcceptorState {
         if self.pending.iter().filter(same).count() >= PER_SOURCE {
             return Some("2 in flight for one address and SAE");
         }
-        // Under `*` anyone can make names up, so those that never authenticated share a bucket.
+        // With `*` any client can invent names, so names that never authenticated share a bucket.
         let own =
             matches!(allowed, QkdPeers::Listed(_)) || self.known_saes.contains(&sae.to_owned());
-        // Strangers who name an SAE must not empty the bucket of the address that is this SAE.
+        // Unknown sources that name an SAE must not empty the bucket of this SAE's own address.
         let sae = if own { sae } else { "" };
         let bucket = format!("{} {sae}", if known { "known" } else { "new" });
         if !self.buckets.take(now, &bucket) {
@@ -420,7 +420,7 @@ impl AcceptorState {
     }
 }
 
-/// Looks keys up for one incoming connection, and remembers what it found.
+/// The look-up of keys for one incoming connection, with its last result.
 pub struct Resolver {
     acceptor: Acceptor,
     source: IpAddr,
@@ -428,12 +428,12 @@ pub struct Resolver {
 }
 
 impl Resolver {
-    /// What the look-up found; `None` before the client's identity was seen.
+    /// Returns the result of the look-up; `None` before the client's identity was seen.
     pub fn outcome(&self) -> Option<Lookup> {
         self.last().as_ref().map(|(lookup, _)| lookup.clone())
     }
 
-    /// The identity that was looked up, where it was one.
+    /// Returns the identity that was looked up, if it has the right form.
     pub fn identity(&self) -> Option<PskIdentity> {
         self.last().as_ref().and_then(|(_, identity)| identity.clone())
     }

@@ -13,9 +13,9 @@ use secrecy::ExposeSecret;
 use super::Completion;
 use crate::keys::request::{Answer, Fetched, KeyPurpose, KmeRequest};
 
-/// How long a key is kept without being spent.
+/// The time for which an unspent key is kept.
 const KEY_MAX_AGE: Duration = Duration::from_secs(600);
-/// Waits before the same key is tried again after it was refused; the last one repeats.
+/// Waits before the same key is tried again after a refusal; the last one repeats.
 const REDIAL: [Duration; 6] = [
     Duration::from_millis(50),
     Duration::from_millis(100),
@@ -24,37 +24,37 @@ const REDIAL: [Duration; 6] = [
     Duration::from_millis(800),
     Duration::from_millis(1600),
 ];
-/// How long a key is tried against refusals, beyond the time that the peer's KME may take.
+/// The time for which a refused key is tried again, in addition to the time that the peer's KME may take.
 const REFUSED_FOR: Duration = Duration::from_secs(7);
-/// Alerts `decrypt_error` after which a key is given up. More than one, since anybody on the path
-/// can forge the alert.
+/// The number of `decrypt_error` alerts after which a key is given up. It is more than one, because any host on the
+/// path can forge the alert.
 const MISMATCHES: u32 = 4;
 /// Longest wait before the KME is asked for another key, after a call or a key that failed.
 const BACK_OFF_MAX: Duration = Duration::from_secs(60);
-/// Most peers remembered: beacons, which anyone can send, name SAEs.
+/// Most remembered peers. SAE IDs come from beacons, which any host can send.
 const MAX_PEERS: usize = 256;
-/// Calls in flight at once.
+/// Most calls in flight.
 const IN_FLIGHT: usize = 8;
 
-/// What to do about a peer that is to be dialled.
+/// The decision about a peer that is to be dialled.
 #[derive(Debug)]
 pub enum DialDecision {
     /// Dial it with this key.
     Attempt(DialKey),
     /// Ask again later.
     Wait {
-        /// When; `None`: when the KME has answered.
+        /// The time to ask again; `None`: when the KME has answered.
         until: Option<Duration>,
-        /// For log and status.
+        /// The reason, for log and status.
         why: String,
     },
-    /// It is not to be dialled at all.
+    /// The peer must not be dialled at all.
     Refused(DialRefusal),
 }
 
 /// The key of a dial. Attempts may overlap: the first that succeeds spends the key for all.
 pub struct DialKey {
-    /// Names the key in what is reported back about this attempt.
+    /// The id of the key, which reports about this attempt name.
     pub key_id: KeyId,
     /// The PSK, for [`axon_tls::quic::qkd_client`].
     pub psk: Arc<Psk>,
@@ -66,27 +66,27 @@ impl fmt::Debug for DialKey {
     }
 }
 
-/// Why a peer is never dialled.
+/// The reason for which a peer is never dialled.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum DialRefusal {
-    /// It claims our own name.
+    /// The peer claims this host's own name.
     #[error("peer claims this host's own SAE ID {0:?}: give each host an AXON_SAE_ID of its own")]
     OwnSaeId(String),
-    /// It is not listed.
+    /// The peer is not listed.
     #[error("SAE {0:?} is not in AXON_QKD_PEERS")]
     NotAPeer(String),
-    /// Too many peers have keys or calls under way.
+    /// Too many peers have keys or calls in flight.
     #[error("more than {MAX_PEERS} SAEs are being dialled")]
     TooMany,
 }
 
-/// The keys with which this host dials. One for the daemon.
+/// The keys with which this host dials. The daemon has one dialler.
 pub struct BootstrapDialler {
     sae_id: String,
     allowed: QkdPeers,
     cipher: Cipher,
-    /// How long a KME may take.
+    /// The longest time that a KME may take to answer.
     answer: Duration,
     peers: HashMap<String, DialPeer>,
 }
@@ -98,12 +98,12 @@ struct DialPeer {
 }
 
 enum DialState {
-    /// The next dial asks for a key, from this time on.
+    /// The next dial requests a key, from this time on.
     Empty {
         not_before: Duration,
         why: String,
     },
-    /// A key is wanted.
+    /// A key has to be requested.
     Wanted,
     /// The KME was asked.
     Asked,
@@ -129,12 +129,12 @@ impl Drop for UnspentKey {
 }
 
 impl BootstrapDialler {
-    /// For the host `sae_id`, which may dial `allowed`. A KME may take as long as `answer`.
+    /// Creates the dialler of the host `sae_id`, which may dial `allowed`. A KME may take up to `answer`.
     pub fn new(sae_id: &str, allowed: QkdPeers, cipher: Cipher, answer: Duration) -> Self {
         Self { sae_id: sae_id.to_owned(), allowed, cipher, answer, peers: HashMap::new() }
     }
 
-    /// Whether and with which key to dial `sae` now. Asks the KME for one where there is none.
+    /// Returns whether to dial `sae` now, and with which key. Requests a key from the KME if there is none.
     pub fn dial(&mut self, now: Duration, sae: &str) -> DialDecision {
         if sae == self.sae_id {
             return DialDecision::Refused(DialRefusal::OwnSaeId(sae.to_owned()));
@@ -167,8 +167,8 @@ impl BootstrapDialler {
         DialDecision::Wait { until: None, why: "waiting for the KME's enc_keys answer".to_owned() }
     }
 
-    /// The handshake under `key_id` is complete: the key is spent, and erased.
-    pub fn succeeded(&mut self, _now: Duration, sae: &str, key_id: &KeyId) -> Completion {
+    /// Handles a complete handshake under `key_id`: the key is spent, and erased.
+    pub fn handle_success(&mut self, _now: Duration, sae: &str, key_id: &KeyId) -> Completion {
         let Some(peer) = self.peers.get_mut(sae) else { return Completion::Reused };
         match &peer.state {
             DialState::UnspentKey(held) if held.key_id == *key_id => {
@@ -179,8 +179,8 @@ impl BootstrapDialler {
         }
     }
 
-    /// The peer holds another key under `key_id` (0x133). Returns whether the key is given up.
-    pub fn mismatched(&mut self, now: Duration, sae: &str, key_id: &KeyId) -> bool {
+    /// Handles a report that the peer holds another key under `key_id` (0x133). Returns whether the key is given up.
+    pub fn handle_mismatch(&mut self, now: Duration, sae: &str, key_id: &KeyId) -> bool {
         let held = self.peers.get_mut(sae).and_then(|peer| match &mut peer.state {
             DialState::UnspentKey(held) if held.key_id == *key_id => Some(held),
             _ => None,
@@ -188,7 +188,7 @@ impl BootstrapDialler {
         let Some(held) = held else { return false };
         held.mismatches += 1;
         let given_up = held.mismatches >= MISMATCHES;
-        self.refused(now, sae, key_id);
+        self.handle_refusal(now, sae, key_id);
         if given_up
             && let Some(peer) = self.peers.get_mut(sae)
             && matches!(peer.state, DialState::UnspentKey(_))
@@ -198,8 +198,8 @@ impl BootstrapDialler {
         given_up
     }
 
-    /// The peer refused the key `key_id`: it is unknown to it (0x173).
-    pub fn refused(&mut self, now: Duration, sae: &str, key_id: &KeyId) {
+    /// Handles the peer's refusal of the key `key_id`, which is unknown to the peer (0x173).
+    pub fn handle_refusal(&mut self, now: Duration, sae: &str, key_id: &KeyId) {
         let Some(peer) = self.peers.get_mut(sae) else { return };
         let DialState::UnspentKey(held) = &mut peer.state else { return };
         if held.key_id != *key_id {
@@ -208,7 +208,7 @@ impl BootstrapDialler {
         let wait = REDIAL[held.refusals.min(REDIAL.len() - 1)];
         held.refusals += 1;
         held.not_before = now + wait;
-        // Only time between two refusals in a row counts, and a caller's own pauses do not.
+        // Only the time between two consecutive refusals counts, without the caller's own pauses.
         let since =
             held.last_refusal.replace(now).map_or(Duration::ZERO, |last| now.saturating_sub(last));
         held.refused_for += since.min(2 * REDIAL[REDIAL.len() - 1]);
@@ -222,8 +222,8 @@ impl BootstrapDialler {
         }
     }
 
-    /// Nothing came back about `key_id`. It stays; silence says nothing of the key.
-    pub fn silent(&mut self, _now: Duration, sae: &str, key_id: &KeyId) {
+    /// Handles an attempt under `key_id` without an answer. The key stays, because silence proves nothing about it.
+    pub fn handle_silence(&mut self, _now: Duration, sae: &str, key_id: &KeyId) {
         if let Some(DialPeer { state: DialState::UnspentKey(held), .. }) = self.peers.get_mut(sae)
             && held.key_id == *key_id
         {
@@ -231,7 +231,7 @@ impl BootstrapDialler {
         }
     }
 
-    /// The next call to the KME, if any.
+    /// Returns the next call to the KME, if any.
     pub fn poll_request(&mut self, now: Duration) -> Option<KmeRequest> {
         self.expire(now);
         let asked = self.peers.values().filter(|p| matches!(p.state, DialState::Asked)).count();
@@ -244,7 +244,7 @@ impl BootstrapDialler {
         Some(KmeRequest::Enc { slave: sae.clone(), number: 1, purpose: KeyPurpose::Bootstrap })
     }
 
-    /// The KME's answer to one of our requests.
+    /// Handles the KME's answer to one of this host's requests.
     pub fn handle_answer(&mut self, now: Duration, answer: Answer) {
         let KmeRequest::Enc { slave, .. } = answer.request else { return };
         let Some(peer) = self.peers.get_mut(&slave) else { return };
@@ -273,7 +273,7 @@ impl BootstrapDialler {
         }
     }
 
-    /// When to poll again without other cause: a key ends.
+    /// Returns when to poll again without other cause: when a key expires.
     pub fn poll_timeout(&self) -> Option<Duration> {
         let end = |p: &DialPeer| match &p.state {
             DialState::UnspentKey(held) => Some(held.since + KEY_MAX_AGE),
@@ -291,7 +291,7 @@ impl BootstrapDialler {
         }
     }
 
-    /// Forgets a peer that nothing hangs on, when there are too many.
+    /// Removes an idle peer if there are too many. Returns whether there is room for another peer.
     fn make_room(&mut self, now: Duration) -> bool {
         if self.peers.len() < MAX_PEERS {
             return true;
@@ -313,8 +313,8 @@ impl DialPeer {
         }
     }
 
-    /// A call or a key failed: a held PSK is erased, also for attempts under way, and the KME is left
-    /// alone for a while.
+    /// Handles a failed call or key: erases a held PSK, also for attempts in flight, and leaves the KME alone for a
+    /// while.
     fn failed(&mut self, now: Duration, why: String) {
         let wait = Duration::from_secs(1 << self.failures.min(6)).min(BACK_OFF_MAX);
         self.failures += 1;

@@ -1,4 +1,4 @@
-//! Limits the `dec_keys` calls that handshakes can cause, because anybody can make up an identity.
+//! Limits the `dec_keys` calls that handshakes can cause, because any client can invent an identity.
 
 use std::{
     collections::HashMap,
@@ -8,19 +8,18 @@ use std::{
 
 use crate::token_bucket::TokenBucket;
 
-/// Calls in flight for handshakes.
+/// Most calls in flight for handshakes.
 pub(super) const IN_FLIGHT: usize = 16;
-/// Those of them that only addresses which authenticated before may use.
+/// Calls in flight that are reserved for addresses that authenticated before.
 pub(super) const RESERVED_IN_FLIGHT: usize = 8;
-/// Calls in flight for one source and SAE.
+/// Most calls in flight for one source and SAE.
 pub(super) const PER_SOURCE: usize = 2;
-/// Calls a second for one SAE.
+/// Most calls per second for one SAE.
 const RATE: u32 = 5;
-/// Calls at once for one SAE.
+/// Most calls at once for one SAE.
 const BURST: u32 = 10;
 
-/// Where a handshake comes from. An IPv6 host has a whole /64 to choose from, so that counts as
-/// one.
+/// The source of a handshake. An IPv6 host can choose from a whole /64, so a /64 counts as one source.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(super) struct HandshakeSource(IpAddr);
 
@@ -38,9 +37,9 @@ impl From<IpAddr> for HandshakeSource {
 
 /// Proofs that a peer may fail from one source before it has to wait.
 const FAILED_PROOFS: u32 = 4;
-/// The first wait, which doubles, and the longest.
+/// The first wait, which doubles, and the longest wait.
 const PROOF_PAUSE: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(60));
-/// Peers and sources that failed.
+/// Most remembered pairs of source and SAE with failed proofs.
 const UNPROVEN: usize = 1024;
 
 /// Failed proofs by source and SAE: each one costs a key.
@@ -53,7 +52,7 @@ struct FailedProofs {
 }
 
 impl ProofBackoff {
-    /// One more proof failed.
+    /// Counts a failed proof.
     pub(super) fn failed(&mut self, now: Duration, source: HandshakeSource, sae: &str) {
         let key = (source, sae.to_owned());
         if self.0.len() >= UNPROVEN && !self.0.contains_key(&key) {
@@ -69,7 +68,7 @@ impl ProofBackoff {
         }
     }
 
-    /// A proof succeeded: it makes up for one that failed.
+    /// Handles a successful proof, which compensates a failed one.
     pub(super) fn proven(&mut self, source: HandshakeSource, sae: &str) {
         let key = (source, sae.to_owned());
         if let Some(tries) = self.0.get_mut(&key) {
@@ -80,24 +79,24 @@ impl ProofBackoff {
         }
     }
 
-    /// Whether this one has to wait.
+    /// Returns whether this source and SAE have to wait.
     pub(super) fn waits(&self, now: Duration, source: HandshakeSource, sae: &str) -> bool {
         let tries = self.0.get(&(source, sae.to_owned()));
         tries.is_some_and(|tries| now < tries.until)
     }
 
-    /// Forgets what happened long ago.
+    /// Forgets entries whose wait ended long ago.
     pub(super) fn expire(&mut self, now: Duration) {
         self.0.retain(|_, tries| now < tries.until.saturating_add(2 * PROOF_PAUSE.1));
     }
 }
 
-/// Token buckets by name. A bucket that is full again is no different from none.
+/// Token buckets by name. A full bucket is equivalent to none.
 #[derive(Default)]
 pub(super) struct Buckets(HashMap<String, TokenBucket>);
 
 impl Buckets {
-    /// Whether `name` may make another call now. The caller bounds the set of names.
+    /// Returns whether `name` may make another call now. The caller bounds the set of names.
     pub(super) fn take(&mut self, now: Duration, name: &str) -> bool {
         if let Some(bucket) = self.0.get_mut(name) {
             return bucket.take(now);
@@ -105,7 +104,7 @@ impl Buckets {
         self.0.entry(name.to_owned()).or_insert(TokenBucket::new(BURST, RATE)).take(now)
     }
 
-    /// Drops the full ones.
+    /// Removes the full buckets.
     pub(super) fn expire(&mut self, now: Duration) {
         self.0.retain(|_, bucket| !bucket.is_full(now));
     }
@@ -132,8 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn failed_proofs_are_spaced_out_for_their_source_alone_and_one_that_succeeds_makes_up_for_one()
-    {
+    fn failed_proofs_are_throttled_per_source_and_a_success_restores_one() {
         let source = |a: &str| HandshakeSource::from(a.parse::<IpAddr>().unwrap());
         let (here, there) = (source("10.0.0.1"), source("10.0.0.2"));
         let mut unproven = ProofBackoff::default();

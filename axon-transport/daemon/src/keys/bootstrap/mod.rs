@@ -1,5 +1,5 @@
-//! The first key of a link: which side fetches it, how long it is kept, and when it is spent (docs/formats.md,
-//! sections 1 and 2).
+//! The first key of a link: the side that fetches it, the time for which it is kept, and the point at which it is spent
+//! (docs/formats.md, sections 1 and 2).
 
 mod acceptor;
 mod dialler;
@@ -11,12 +11,12 @@ mod tests;
 pub use acceptor::{Acceptor, Lookup, Resolver};
 pub use dialler::{BootstrapDialler, DialDecision, DialKey, DialRefusal};
 
-/// Whether a completed handshake was the first under its key.
+/// The status of a completed handshake: the first under its key, or a later one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[must_use]
 pub enum Completion {
-    /// Yes. The key is erased now.
+    /// The handshake was the first under its key. The key is erased now.
     First,
-    /// No: the connection must be closed with `KEY_REUSED`.
+    /// The key had completed a handshake before: the connection must be closed with `KEY_REUSED`.
     Reused,
 }

@@ -7,14 +7,14 @@ use std::{
 
 use sha2::{Digest, Sha256};
 
-/// What stands for an identity or key_ID in a memory: its SHA-256.
+/// The SHA-256 of an identity or key_ID, which represents it in a [`SeenSet`].
 pub(super) type Fingerprint = [u8; 32];
 
 pub(super) fn fingerprint(bytes: &[u8]) -> Fingerprint {
     Sha256::digest(bytes).into()
 }
 
-/// The last `capacity` things seen, each with the time of that.
+/// The last `capacity` entries that were seen, each with its time.
 pub(super) struct SeenSet<K> {
     capacity: usize,
     seen: HashMap<K, Duration>,
@@ -26,7 +26,7 @@ impl<K: Clone + Eq + std::hash::Hash> SeenSet<K> {
         Self { capacity, seen: HashMap::new(), order: VecDeque::new() }
     }
 
-    /// Remembers `key`; false where it was remembered already, then its time is `now` from here on.
+    /// Adds `key`. Returns false if it was remembered already; its time is then `now`.
     pub(super) fn insert(&mut self, now: Duration, key: K) -> bool {
         let new = self.seen.insert(key.clone(), now).is_none();
         if !new {
@@ -44,12 +44,12 @@ impl<K: Clone + Eq + std::hash::Hash> SeenSet<K> {
         self.seen.contains_key(key)
     }
 
-    /// When `key` was last seen, where it is remembered.
+    /// Returns when `key` was last seen, if it is remembered.
     pub(super) fn last_seen(&self, key: &K) -> Option<Duration> {
         self.seen.get(key).copied()
     }
 
-    /// Forgets what was last seen before `limit`.
+    /// Forgets the entries that were last seen before `limit`.
     pub(super) fn forget_before(&mut self, limit: Duration) {
         while self.order.front().is_some_and(|(at, _)| *at < limit) {
             if let Some((_, key)) = self.order.pop_front() {

@@ -15,7 +15,7 @@ use crate::{
     ids::Gid,
     qos::{Durability, History, Liveliness, Qos, Reliability},
     session::{
-        endpoints::Subscription,
+        endpoints::{EndpointFactory, Subscription},
         options::EndpointSpec,
         relayed::{
             MAX_MATCHED,
@@ -196,7 +196,8 @@ impl RelayConnection<'_> {
             let Endpoint { topic, type_name, qos, .. } = &*endpoint;
             let spec = EndpointSpec::new(&**topic, &**type_name, requested(qos));
             let outside = &self.common.outside;
-            match outside.create_relay_of(publisher, spec, gids, holds(qos)) {
+            let factory = EndpointFactory(outside);
+            match factory.create_relay(spec, Some(publisher), gids, holds(qos)) {
                 Ok(subscription) => {
                     let relay = SessionRelay {
                         subscription,

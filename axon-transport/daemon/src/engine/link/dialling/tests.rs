@@ -1,4 +1,4 @@
-//! Tests dials against every end of a handshake, on a clock that the test moves.
+//! Tests dials against every outcome of a handshake, on a clock that the test moves.
 
 use axon_tls::qkd::Psk;
 use axon_transport::config::{Config, KeyMode, QkdPeers, Security};
@@ -31,7 +31,7 @@ fn target(sae: Option<&str>, addresses: u8) -> DialTarget {
     }
 }
 
-/// The peer, or this side, ended the handshake with a TLS alert.
+/// Returns the error of a handshake that the peer, or this side, ended with a TLS alert.
 fn alert(code: u8) -> ConnectionError {
     ConnectionError::ConnectionClosed(ConnectionClose {
         error_code: TransportErrorCode::crypto(code),
@@ -40,7 +40,7 @@ fn alert(code: u8) -> ConnectionError {
     })
 }
 
-/// A dial and the time at which it is.
+/// A dial with its clock.
 struct Dialled {
     now: Duration,
     dial: Dialling,
@@ -60,7 +60,7 @@ impl Dialled {
         Self { now: s(0), dial, ring: Some(ring), kmes: Kmes::default() }
     }
 
-    /// The next action, now.
+    /// Returns the next action at this time.
     fn poll(&mut self) -> Option<DialAction> {
         loop {
             let action = self.dial.poll_action(self.now, self.ring.as_mut());
@@ -74,7 +74,7 @@ impl Dialled {
         }
     }
 
-    /// The next action, whenever it comes.
+    /// Returns the next action, and moves the clock to it.
     fn next(&mut self) -> DialAction {
         for _ in 0..1000 {
             if let Some(action) = self.poll() {
@@ -170,7 +170,7 @@ fn whole_dial_ends_after_twenty_seconds() {
     assert_eq!(dialled.fails().reason, "no answer within 20s");
     assert_eq!(dialled.now, s(20));
 
-    // In the middle of a handshake.
+    // The limit is reached during a handshake.
     let mut dialled = Dialled::classic(9);
     dialled.connects();
     dialled.now = s(3);
@@ -280,7 +280,7 @@ fn key_that_the_peer_never_gets_is_given_up() {
     while dialled.connects().1.unwrap().key_id == id("key-1") {
         dialled.dial.handle_failed(&alert(UNKNOWN_PSK_IDENTITY));
     }
-    // Ten seconds of refusals, up to one wait more, and a second of backoff.
+    // Ten seconds of refusals, at most one more wait, and a second of backoff.
     assert!((s(11)..s(13)).contains(&dialled.now), "{:?}", dialled.now);
     assert_eq!(dialled.kmes.asked.len(), 2);
 }
@@ -357,7 +357,7 @@ fn classic_dial_opens_at_the_first_address_that_answers() {
     dialled.dial.handle_failed(&ConnectionError::TimedOut);
     assert_eq!(dialled.connects().0, address(2));
     dialled.dial.handle_connected();
-    // It came in time, although the poll is late.
+    // The handshake completed in time, although the poll is late.
     dialled.now = s(100);
     assert!(matches!(dialled.next(), DialAction::Open));
     assert_eq!(dialled.dial.target().addresses.len(), 3);

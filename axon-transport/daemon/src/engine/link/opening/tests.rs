@@ -35,7 +35,7 @@ const LINK: u64 = 7;
 const CLIENT: DaemonId = DaemonId([1; 16]);
 const SERVER: DaemonId = DaemonId([2; 16]);
 
-/// What a handshake in classic agreed on: the type has no other constructor.
+/// Returns the agreed parameters of a handshake in classic: the type has no other constructor.
 fn hybrid() -> Negotiated {
     static AGREED: OnceLock<Negotiated> = OnceLock::new();
     let handshake = || {
@@ -65,7 +65,7 @@ fn hybrid() -> Negotiated {
     AGREED.get_or_init(handshake).clone()
 }
 
-/// What a handshake of SAE `sae-a` under the key `key_id` agreed on.
+/// Returns the agreed parameters of a handshake of SAE `sae-a` under the key `key_id`.
 fn psk(key_id: &str) -> Negotiated {
     let mut negotiated = hybrid();
     negotiated.key_exchange = KeyExchange::PskKe;
@@ -73,7 +73,7 @@ fn psk(key_id: &str) -> Negotiated {
     negotiated
 }
 
-/// The settings of either end: in classic without a key mode.
+/// Returns the settings of either end: in classic without a key mode.
 fn settings(side: Side, key_mode: Option<KeyMode>) -> Config {
     match (side, key_mode) {
         (_, None) => Config::default(),
@@ -98,7 +98,7 @@ fn ours(side: Side, settings: &Config) -> LinkHello {
     LinkHello::new(settings, if side == Side::Client { CLIENT } else { SERVER })
 }
 
-/// The HELLO that the peer of `side` says.
+/// Returns the HELLO that the peer of `side` sends.
 fn theirs(side: Side, key_mode: Option<KeyMode>) -> LinkHello {
     ours(side.peer(), &settings(side.peer(), key_mode))
 }
@@ -116,10 +116,10 @@ impl Side {
 struct End {
     opening: Opening,
     ring: Option<Keyring>,
-    /// Messages on their way to it.
+    /// Messages in flight to it.
     inbox: VecDeque<LinkMessage>,
     outcome: Option<Result<OpenedConnection, RefusedConnection>>,
-    /// The key that it announced, where the test noted it.
+    /// The key that it announced, if the test recorded it.
     announced: Option<KeyId>,
 }
 
@@ -139,14 +139,14 @@ impl End {
         Self { opening, ring, inbox: VecDeque::new(), outcome: None, announced: None }
     }
 
-    /// An end whose handshake is complete.
+    /// Returns an end whose handshake is complete.
     fn new(now: Duration, side: Side, key_mode: Option<KeyMode>) -> Self {
         let settings = settings(side, key_mode);
         let ring = Keyring::new(&settings);
         Self::with(now, facts(side, key_mode), &settings, ring)
     }
 
-    /// An end that waits for HELLO.
+    /// Returns an end that waits for HELLO.
     fn awaiting_hello(now: Duration, side: Side, key_mode: Option<KeyMode>) -> Self {
         let mut end = Self::new(now, side, key_mode);
         end.opening.handle_recorded(now, true, end.ring.as_mut());
@@ -154,14 +154,14 @@ impl End {
         end
     }
 
-    /// An end that has the peer's HELLO, in qkd.
+    /// Returns an end that has the peer's HELLO, in qkd.
     fn greeted(now: Duration, side: Side, key_mode: KeyMode) -> Self {
         let mut end = Self::awaiting_hello(now, side, Some(key_mode));
         end.hears(now, &LinkMessage::Hello(theirs(side, Some(key_mode))));
         end
     }
 
-    /// A server that announced `key-1`.
+    /// Returns a server that announced `key-1`.
     fn announced(now: Duration, key_mode: KeyMode, kmes: &mut Kmes) -> Self {
         let mut end = Self::greeted(now, Side::Server, key_mode);
         end.ask(now, kmes);
@@ -194,7 +194,8 @@ impl End {
         refused
     }
 
-    /// It refuses with this name, and closes with the code of that name and the reason.
+    /// Checks that the end refuses with this name, and closes with the code of that name and the reason. Returns the
+    /// text for the peer.
     #[track_caller]
     fn refuses(&mut self, now: Duration, name: &str) -> String {
         let RefusedConnection { refusal, close } = self.refused(now);
@@ -204,7 +205,7 @@ impl End {
         told
     }
 
-    /// Answers what it asks of the KME; whether there was anything.
+    /// Answers the end's requests to the KME. Returns whether there were any.
     fn ask(&mut self, now: Duration, kmes: &mut Kmes) -> bool {
         let mut asked = Vec::new();
         asked.extend(std::iter::from_fn(|| self.opening.poll_request(now)));
@@ -223,7 +224,7 @@ impl End {
         any
     }
 
-    /// Polls it until nothing happens: whether anything did, and what it says.
+    /// Polls the end until nothing happens. Returns whether anything did, and its messages.
     fn step(&mut self, now: Duration, kmes: &mut Kmes) -> (bool, Vec<LinkMessage>) {
         let mut busy = false;
         while self.opening.reads()
@@ -263,7 +264,7 @@ struct Pair {
     kmes: Kmes,
     client: End,
     server: End,
-    /// Names of the messages, in their order, with the side that said them.
+    /// The names of the messages, in their order, each with the side that sent it.
     said: Vec<(Side, &'static str)>,
 }
 
@@ -279,7 +280,7 @@ impl Pair {
         }
     }
 
-    /// Polls the client, then the server; whether anything happened.
+    /// Polls the client, then the server. Returns whether anything happened.
     fn pass(&mut self) -> bool {
         let (client, said) = self.client.step(self.now, &mut self.kmes);
         self.said.extend(said.iter().map(|m| (Side::Client, m.name())));
@@ -290,12 +291,12 @@ impl Pair {
         client || server
     }
 
-    /// Lets happen what can happen now.
+    /// Polls both ends until nothing happens at this time.
     fn run(&mut self) {
         while self.pass() {}
     }
 
-    /// Lets time pass until both ends are done.
+    /// Moves the clock until both ends are done.
     fn run_on(&mut self) {
         for _ in 0..1000 {
             self.run();

@@ -134,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn a_peer_that_ends_no_control_stream_is_waited_for_some_seconds_at_a_time() {
+    fn hand_over_waits_a_bounded_time_for_the_end_of_the_control_stream() {
         let mut leaving = DrainingLink::new(None, true, NOW);
         assert_eq!(leaving.handle_progress(NOW, SENT), HandOverStep::Finish);
         assert_eq!(leaving.poll_timeout(), Some(NOW + HAND_OVER));

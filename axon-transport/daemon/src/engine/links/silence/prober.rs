@@ -157,7 +157,7 @@ impl Prober {
 
     /// Returns whether the path counts as cut at the latest probe: the previous ones were not answered, the first of
     /// them for two round trips. Returns true again from time to time, as long as that lasts.
-    pub(crate) fn find_cut(&mut self, round_trip: Duration, now: Duration) -> bool {
+    pub(crate) fn find_cut(&mut self, now: Duration, round_trip: Duration) -> bool {
         let unanswered = self.asked.saturating_sub(1);
         let cut = unanswered >= CUT
             && now.saturating_sub(self.unanswered_since) >= 2 * round_trip
@@ -242,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn a_successor_carries_messages_within_500_ms_of_the_paths_return_whichever_side_dials_it() {
+    fn successor_carries_messages_within_500_ms_after_the_path_returns() {
         for millis in 1_000..12_000 {
             let cut = Duration::from_millis(millis);
             for side in [Side::Client, Side::Server] {
@@ -263,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn a_path_that_is_cut_again_after_the_dial_is_replaced_within_500_ms_of_its_second_return() {
+    fn second_cut_after_the_dial_ends_within_500_ms_of_its_return() {
         for millis in 1_000..6_000 {
             let mut prober = Prober::new(Side::Client);
             let (_, dialled) = walk(&mut prober, |_| true);
@@ -275,8 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn a_path_that_returns_several_times_too_shortly_is_replaced_within_500_ms_of_its_last_return()
-    {
+    fn several_short_returns_end_within_500_ms_of_the_last_one() {
         // How often the path returns, for how long it works, and for how long it does not.
         for returns in 1..6 {
             for (works, cut) in [(50, 1_000), (100, 1_800), (300, 2_500), (700, 5_000)] {
@@ -314,7 +313,7 @@ mod tests {
     }
 
     #[test]
-    fn a_peer_that_answers_probes_and_takes_no_successor_is_dialled_less_and_less_often() {
+    fn dials_of_a_peer_that_refuses_successors_become_rarer() {
         let mut prober = Prober::new(Side::Client);
         assert!(!prober.awaits_echo(), "nothing was asked");
         let mut dials = Vec::new();

@@ -183,7 +183,7 @@ impl LinkSilence {
         }
         match probing.prober.handle_timeout(now.saturating_sub(probing.begun))? {
             Step::Probe => {
-                let cut = probing.prober.find_cut(round_trip, now.saturating_sub(probing.begun));
+                let cut = probing.prober.find_cut(now.saturating_sub(probing.begun), round_trip);
                 probing.said_cut |= cut;
                 self.silent |= cut;
                 let action = if cut { ProbeAction::ProbeCut } else { ProbeAction::Probe };

@@ -77,7 +77,7 @@ fn only_a_completed_handshake_spends_a_key_and_only_once() {
     look_up(&acceptor, "10.0.0.1", &bytes);
     acceptor.handle_answer(key(acceptor.poll_request().unwrap(), "k1", 9));
     for _ in 0..1000 {
-        // Copied ClientHellos, wrong binders.
+        // Copied ClientHellos with wrong binders.
         assert_eq!(look_up(&acceptor, "10.0.0.66", &bytes), Lookup::Found);
     }
     assert_eq!(acceptor.spent(&bytes), Completion::First);
@@ -191,7 +191,7 @@ fn strangers_do_not_empty_the_bucket_of_an_address_that_authenticated() {
     assert_eq!(look_up(&acceptor, "10.9.9.9", &identity("sae-a", "k")), Lookup::Fetching);
 }
 
-/// Handshakes under way keep the PSK that they looked up: letting go of it erases nothing.
+/// Handshakes in flight keep the PSK that they looked up, so a release by the acceptor alone would erase nothing.
 #[test]
 fn an_expired_displaced_or_spent_psk_is_erased_in_handshakes_under_way() {
     type End = fn(&Acceptor, &Clock);

@@ -4,7 +4,7 @@ fn new() -> BootstrapDialler {
     BootstrapDialler::new("sae-a", listed(&["sae-b", "sae-c"]), Cipher::default(), s(3))
 }
 
-/// A dialler that holds key `name` for sae-b since `now`.
+/// Returns a dialler that holds key `name` for sae-b since `now`.
 fn holding(now: Duration, name: &str) -> BootstrapDialler {
     let mut dialler = new();
     give(&mut dialler, now, name);
@@ -31,7 +31,7 @@ fn no_kme_call_is_made_for_an_unlisted_sae() {
         assert!(matches!(dialler.dial(s(1), sae), DialDecision::Refused(_)), "{sae}");
     }
     assert!(dialler.poll_request(s(1)).is_none());
-    // Not even under `*`.
+    // The own SAE ID is refused even with `*`.
     let mut dialler = BootstrapDialler::new("sae-a", QkdPeers::Any, Cipher::default(), s(3));
     let dial = dialler.dial(s(1), "sae-a");
     assert!(matches!(dial, DialDecision::Refused(DialRefusal::OwnSaeId(_))));
@@ -44,11 +44,11 @@ fn one_key_serves_every_address_and_attempt_until_it_is_spent() {
     for t in 0..100 {
         assert_eq!(attempt(&mut dialler, s(t)), Some(id("k1")));
         assert!(dialler.poll_request(s(t)).is_none());
-        dialler.silent(s(t), "sae-b", &id("k1"));
+        dialler.handle_silence(s(t), "sae-b", &id("k1"));
     }
-    assert_eq!(dialler.succeeded(s(100), "sae-b", &id("other")), Completion::Reused);
-    assert_eq!(dialler.succeeded(s(100), "sae-b", &id("k1")), Completion::First);
-    assert_eq!(dialler.succeeded(s(100), "sae-b", &id("k1")), Completion::Reused);
+    assert_eq!(dialler.handle_success(s(100), "sae-b", &id("other")), Completion::Reused);
+    assert_eq!(dialler.handle_success(s(100), "sae-b", &id("k1")), Completion::First);
+    assert_eq!(dialler.handle_success(s(100), "sae-b", &id("k1")), Completion::Reused);
     assert_eq!(attempt(&mut dialler, s(100)), None, "spent");
     assert!(dialler.poll_request(s(100)).is_some(), "the next dial has a key of its own");
 }
@@ -58,7 +58,7 @@ fn a_key_is_tried_again_with_growing_pauses_and_given_up_after_ten_seconds() {
     let mut dialler = holding(s(0), "k1");
     let (mut now, mut pauses) = (s(0), Vec::new());
     while attempt(&mut dialler, now).is_some() {
-        dialler.refused(now, "sae-b", &id("k1"));
+        dialler.handle_refusal(now, "sae-b", &id("k1"));
         match dialler.dial(now, "sae-b") {
             DialDecision::Wait { until: Some(until), .. } => {
                 pauses.push((until - now).as_millis());
@@ -80,16 +80,16 @@ fn a_key_is_tried_again_with_growing_pauses_and_given_up_after_ten_seconds() {
 }
 
 #[test]
-fn a_key_that_the_peer_holds_differently_is_given_up_at_the_fourth_word_of_it() {
+fn mismatched_key_is_given_up_at_the_fourth_report() {
     let mut dialler = holding(s(0), "k1");
     let mut now = s(0);
     for said in 1..=4 {
         assert_eq!(attempt(&mut dialler, now), Some(id("k1")), "{said}");
-        assert!(!dialler.mismatched(now, "sae-b", &id("k0")), "not the key in question");
-        assert_eq!(dialler.mismatched(now, "sae-b", &id("k1")), said == 4);
+        assert!(!dialler.handle_mismatch(now, "sae-b", &id("k0")), "not the key in question");
+        assert_eq!(dialler.handle_mismatch(now, "sae-b", &id("k1")), said == 4);
         now += s(2);
     }
-    assert!(!dialler.mismatched(now, "sae-b", &id("k1")), "it is gone");
+    assert!(!dialler.handle_mismatch(now, "sae-b", &id("k1")), "it is gone");
     give(&mut dialler, now, "k2");
     assert_eq!(attempt(&mut dialler, now), Some(id("k2")));
 }
@@ -100,14 +100,14 @@ fn kmes_that_disagree_about_every_key_are_asked_ever_more_seldom() {
     for tenth in 0..6_000 {
         let now = ms(100 * tenth);
         if let Some(key_id) = attempt(&mut dialler, now) {
-            dialler.mismatched(now, "sae-b", &key_id);
+            dialler.handle_mismatch(now, "sae-b", &key_id);
         }
         if let Some(request) = dialler.poll_request(now) {
             asked += 1;
             dialler.handle_answer(now, key(request, &format!("k{asked}"), 1));
         }
     }
-    // 1, 2, 4 … 60 s apart.
+    // Calls that are 1, 2, 4 … 60 s apart.
     assert!((10..=16).contains(&asked), "{asked} in ten minutes");
 }
 
@@ -116,9 +116,9 @@ fn silence_does_not_count_against_a_key() {
     let mut dialler = holding(s(0), "k1");
     let mut now = s(0);
     for _ in 0..100 {
-        dialler.refused(now, "sae-b", &id("k1"));
+        dialler.handle_refusal(now, "sae-b", &id("k1"));
         now += s(2);
-        dialler.silent(now, "sae-b", &id("k1"));
+        dialler.handle_silence(now, "sae-b", &id("k1"));
         now += s(2);
     }
     assert_eq!(attempt(&mut dialler, now), Some(id("k1")));
@@ -130,7 +130,7 @@ fn a_key_ends_after_ten_minutes() {
     assert_eq!(dialler.poll_timeout(), Some(s(607)));
     assert!(attempt(&mut dialler, s(606)).is_some());
     assert!(attempt(&mut dialler, s(607)).is_none());
-    assert_eq!(dialler.succeeded(s(607), "sae-b", &id("k1")), Completion::Reused);
+    assert_eq!(dialler.handle_success(s(607), "sae-b", &id("k1")), Completion::Reused);
 }
 
 #[test]
@@ -151,7 +151,7 @@ fn failed_calls_are_spaced_out_up_to_a_minute() {
     }
     assert_eq!(pauses, [1, 2, 4, 8, 16, 32, 60, 60, 60]);
     give(&mut dialler, now, "k1");
-    assert_eq!(dialler.succeeded(now, "sae-b", &id("k1")), Completion::First);
+    assert_eq!(dialler.handle_success(now, "sae-b", &id("k1")), Completion::First);
     give(&mut dialler, now, "k2");
 }
 
@@ -180,7 +180,7 @@ fn unexpected_kme_answers_are_dropped() {
     assert_eq!(attempt(&mut dialler, s(1)), Some(id("k1")));
 }
 
-/// Attempts and the connections that they lead to keep the PSK: letting go of it erases nothing.
+/// Attempts and their connections keep the PSK, so a release by the dialler alone would erase nothing.
 #[test]
 fn an_expired_refused_mismatched_or_spent_psk_is_erased_in_attempts_under_way() {
     let psk = |dialler: &mut BootstrapDialler| match dialler.dial(s(0), "sae-b") {
@@ -193,15 +193,15 @@ fn an_expired_refused_mismatched_or_spent_psk_is_erased_in_attempts_under_way() 
             dialler.dial(s(600), "sae-c");
         }),
         ("refused", |dialler| {
-            (0..20).for_each(|at| dialler.refused(s(at), "sae-b", &id("k1")));
+            (0..20).for_each(|at| dialler.handle_refusal(s(at), "sae-b", &id("k1")));
         }),
         ("mismatched", |dialler| {
             for _ in 0..4 {
-                dialler.mismatched(s(0), "sae-b", &id("k1"));
+                dialler.handle_mismatch(s(0), "sae-b", &id("k1"));
             }
         }),
         ("spent", |dialler| {
-            assert_eq!(dialler.succeeded(s(0), "sae-b", &id("k1")), Completion::First);
+            assert_eq!(dialler.handle_success(s(0), "sae-b", &id("k1")), Completion::First);
         }),
         ("dialler dropped", |dialler| *dialler = new()),
     ];

@@ -1,4 +1,4 @@
-//! A peer, or an owner, that does not keep to the rules: before the proof.
+//! Tests a peer, or an owner, that violates the protocol before the proof.
 
 use bytes::Bytes;
 use quinn_proto::{ApplicationClose, VarInt};
@@ -129,7 +129,7 @@ fn psk_that_an_earlier_daemon_had_is_refused() {
     assert_eq!(record, Some((LINK, "bootstrap".to_owned())));
     end.opening.handle_recorded(NOW, false, end.ring.as_mut());
     end.refuses(NOW, "KEY_REUSED");
-    // A second answer of the ledger opens nothing.
+    // A second answer of the ledger changes nothing.
     end.opening.handle_recorded(NOW, true, end.ring.as_mut());
     assert!(!end.opening.reads());
 }
@@ -152,7 +152,7 @@ fn qkd_without_keys_opens_nothing() {
             let mut end = End::with(NOW, facts(side, Some(key_mode)), &settings, None);
             end.refuses(NOW, "INTERNAL");
 
-            // Not even with a peer that claims no SAE.
+            // A peer that claims no SAE is refused too.
             let mut end = End::awaiting_hello(NOW, side, Some(key_mode));
             end.ring = None;
             let theirs = LinkHello { sae: None, ..theirs(side, Some(key_mode)) };
@@ -169,7 +169,7 @@ fn message_that_is_read_too_early_ends_the_opening() {
     end.hears(NOW, &LinkMessage::Hello(theirs(Side::Server, key_mode)));
     end.refuses(NOW, "INTERNAL");
 
-    // After the opening succeeded, and before its owner knows.
+    // The message arrives after the opening succeeded, and before its owner knows.
     let mut end = End::awaiting_hello(NOW, Side::Server, None);
     end.hears(NOW, &LinkMessage::Hello(theirs(Side::Server, None)));
     end.hears(NOW, &elected());

@@ -1,4 +1,4 @@
-//! The proof of the client's name against peers that cannot give it, and KMEs that give no key.
+//! Tests the proof of the client's name against peers that cannot give it, and KMEs that give no key.
 
 use std::net::IpAddr;
 
@@ -12,12 +12,12 @@ use crate::{
 
 const NOW: Duration = Duration::from_secs(1);
 const MODES: [KeyMode; 2] = [KeyMode::Session, KeyMode::Messages10];
-/// 3 s, and four calls of 3 s.
+/// The limit of the proof: 3 s, and four calls of 3 s.
 const LIMIT: Duration = Duration::from_secs(15);
 /// The READY exporter of the connection, at both ends.
 const EXPORTER: [u8; 32] = [!1; 32];
 
-/// The READY of a client that has this key, on the connection with this exporter.
+/// Returns the READY of a client that has this key, on the connection with this exporter.
 fn ready(key_id: &str, key: [u8; 32], exporter: [u8; 32]) -> LinkMessage {
     let (key_id, key) = (id(key_id), KmeKey::from_slice(&key).unwrap());
     let proof = proof::compute(&key, &key_id, &exporter);
@@ -28,14 +28,14 @@ fn announce(key_ids: &[&str]) -> LinkMessage {
     LinkMessage::Keys(KeyMessage::Announce(key_ids.iter().map(|key_id| id(key_id)).collect()))
 }
 
-/// `key-1` of the fake KMEs.
+/// Returns `key-1` of the fake KMEs.
 fn first_key() -> [u8; 32] {
     let mut key = [0; 32];
     key[3] = 1;
     key
 }
 
-/// Whether handshakes of sae-a from the client's address have to wait.
+/// Returns whether handshakes of sae-a from the client's address have to wait.
 fn is_held_off(ring: &Keyring) -> bool {
     let resolver = ring.resolver(NOW, IpAddr::from([10, 0, 0, 1]));
     let identity = PskIdentity::new("sae-a", "another").unwrap().to_bytes();
@@ -43,7 +43,7 @@ fn is_held_off(ring: &Keyring) -> bool {
     matches!(resolver.outcome(), Some(Lookup::Limited(which)) if which.contains("prove its name"))
 }
 
-/// Has five servers in a row fail like this; whether handshakes then have to wait.
+/// Makes five servers in a row fail in this way. Returns whether handshakes then have to wait.
 fn counts(key_mode: KeyMode, fail: impl Fn(&mut End, &mut Kmes)) -> bool {
     let settings = settings(Side::Server, Some(key_mode));
     let (mut ring, mut kmes) = (Keyring::new(&settings).unwrap(), Kmes::default());
@@ -71,7 +71,7 @@ fn nothing_but_key_messages_and_keepalives_comes_during_the_proof() {
                 end.hears(NOW, &message);
                 match message {
                     LinkMessage::Keepalive => assert!(end.outcome(NOW).is_none()),
-                    // Of two keys, which the test below looks at.
+                    // An announcement of two keys, which the test below checks.
                     LinkMessage::Keys(KeyMessage::Announce(_)) if side == Side::Client => {}
                     _ => drop(end.refuses(NOW, "OUT_OF_ORDER")),
                 }
@@ -179,7 +179,7 @@ fn failed_proofs_make_further_handshakes_wait() {
     }
 }
 
-/// The key that a message announces.
+/// Returns the key that a message announces.
 fn key_of(message: LinkMessage) -> Option<KeyId> {
     match message {
         LinkMessage::Keys(KeyMessage::Announce(key_ids)) => key_ids.into_iter().next(),
@@ -231,7 +231,7 @@ fn client_whose_kme_has_no_key_says_so() {
         assert!(server.refusal.reason.contains("its KME refused the request"), "{server:?}");
         match (key_mode, pair.client.outcome.take()) {
             (KeyMode::Session, Some(Err(client))) => assert_eq!(client.refusal.name, "KEY_SUPPLY"),
-            // It waits for the server to close, and for its limit at most.
+            // The client waits for the server to close, at most until its limit.
             (KeyMode::Messages10, None) => {
                 assert_eq!(pair.client.opening.poll_timeout(), Some(pair.now + LIMIT));
             }

@@ -1,4 +1,4 @@
-//! Two openings against each other that succeed.
+//! Tests two openings against each other that succeed.
 
 use axon_envelope::{Delivery, Kind, Route, TopicHash};
 use axon_tls::qkd::PskResolver;
@@ -14,7 +14,7 @@ const PROOF: [(Side, &str); 4] = [
     (Side::Client, "READY"),
 ];
 
-/// The daemon with the lower id elects, and nothing else comes before.
+/// Checks that the daemon with the lower id elects, and that no other message comes before.
 fn awaits_election(client: &mut OpenedConnection, server: &mut OpenedConnection) {
     assert_eq!((client.hello.daemon, server.hello.daemon), (SERVER, CLIENT));
     assert!(client.order.accept(&elected()).is_err(), "the client has the lower id");
